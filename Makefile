@@ -82,59 +82,59 @@ STUDY = OPENBLAS_NUM_THREADS=1 $(BIN)/python -m
 
 .PHONY: findings autopilot peers health health-hours truth filter-error cases campaign ablation foreign paper-scale excite optimisers subspace control kernel-speed bench
 truth: venv ## errors against their bound, coverage, bias with noise, status (an hour)
-	$(STUDY) studies.truth --out docs/results
+	$(STUDY) quadid_evaluation.studies.truth --out docs/results
 
 filter-error: venv ## the filter-error estimator beside today's fit: coverage, recorded vehicles, a fast loop, speed (an hour)
-	$(STUDY) studies.filter_error --out docs/results
+	$(STUDY) quadid_evaluation.studies.filter_error --out docs/results
 
 cases: venv ## the independent simulated cases, diagnosed
-	$(STUDY) studies.cases
+	$(STUDY) quadid_evaluation.studies.cases
 
 foreign: venv ## vehicles and logs of others: truth, answers, predictions beside regression and networks (half an hour)
-	$(STUDY) studies.foreign --out docs/results
+	$(STUDY) quadid_evaluation.studies.foreign --out docs/results
 
 DATA ?= $(or $(QUADID_DATA),../shared/data)
 findings: venv ## every input on which the product failed once: answers now, right or wrong (a minute; DATA=DIR)
-	$(STUDY) studies.findings --data $(DATA)
+	$(STUDY) quadid_evaluation.studies.findings --data $(DATA)
 
 peers: dev ## other programs beside ours on the same data (mujoco.sysid, sysid.tools' recipe, Kalman filters; hours)
-	$(STUDY) studies.peers --out docs/results
+	$(STUDY) quadid_evaluation.studies.peers --out docs/results
 autopilot: venv ## ArduCopter's and others' flights through the online session, replayed and live in real time (half an hour)
-	$(STUDY) studies.autopilot --out docs/results
-	$(STUDY) studies.autopilot --live --out docs/results
+	$(STUDY) quadid_evaluation.studies.autopilot --out docs/results
+	$(STUDY) quadid_evaluation.studies.autopilot --live --out docs/results
 
 campaign: venv ## blinded campaign of hidden effects (hours)
-	$(STUDY) studies.campaign --out docs/results
+	$(STUDY) quadid_evaluation.studies.campaign --out docs/results
 
 ablation: venv ## the diagnosis without each rule and number, with half and twice each number (hours; goes on where it stopped)
-	$(STUDY) studies.ablation --records ablation.jsonl --cache build/ablation --out docs/results
+	$(STUDY) quadid_evaluation.studies.ablation --records ablation.jsonl --cache build/ablation --out docs/results
 
 health-hours: venv ## online rotor health: alarms in 100 h of healthy hover, seconds to name a loss (accelerated)
-	$(STUDY) studies.health.hours --out docs/results
+	$(STUDY) quadid_evaluation.studies.health.hours --out docs/results
 
 health: venv ## damaged and loaded Crazyflies, recorded; hidden damage, simulated; what their spread allows
-	$(STUDY) studies.health --out docs/results
+	$(STUDY) quadid_evaluation.studies.health --out docs/results
 
 paper-scale: venv ## three 500 s sets: error, time and memory of the fit
-	$(STUDY) studies.paper_scale --out docs/results
+	$(STUDY) quadid_evaluation.studies.paper_scale --out docs/results
 
 excite: venv ## intervals that a proposed manoeuvre promises and obtains
-	$(STUDY) studies.excite --out docs/results
+	$(STUDY) quadid_evaluation.studies.excite --out docs/results
 
 optimisers: venv ## every optimiser on smooth and non-smooth problems, narrow and wide bounds (half an hour)
-	$(STUDY) studies.optimisers --out docs/results
+	$(STUDY) quadid_evaluation.studies.optimisers --out docs/results
 
 subspace: venv ## CVA and MOESP: poles of known systems, prediction of flights
-	$(STUDY) studies.subspace --out docs/results
+	$(STUDY) quadid_evaluation.studies.subspace --out docs/results
 
 control: venv ## tracking with guessed, identified, extended and true parameters
-	$(STUDY) studies.control --out docs/results
+	$(STUDY) quadid_evaluation.studies.control --out docs/results
 
 kernel-speed: venv ## nanoseconds per particle and step
-	$(STUDY) benchmarks.kernel --out docs/results
+	$(STUDY) quadid_evaluation.benchmarks.kernel --out docs/results
 
 bench: dev ## every speed beside its peers, in one run: docs/results/speed.md (half an hour on an idle machine)
-	$(STUDY) benchmarks.speed --out docs/results
+	$(STUDY) quadid_evaluation.benchmarks.speed --out docs/results
 
 # --- check
 
@@ -159,7 +159,7 @@ faults: $(MESSAGES) ## every fault of the list, and what happened, into docs/res
 
 .PHONY: poisoning
 poisoning: venv ## every sensor wrong by a factor, at once or slowly: what is published, into docs/results/poisoning.md (half an hour)
-	$(STUDY) studies.poisoning --fresh --out docs/results
+	$(STUDY) quadid_evaluation.studies.poisoning --fresh --out docs/results
 
 .PHONY: fuzz
 fuzz: $(DEV) ## mutated logs of seven formats through their readers for an hour; goes on where it stopped, into docs/results/fuzz.md
@@ -167,11 +167,11 @@ fuzz: $(DEV) ## mutated logs of seven formats through their readers for an hour;
 
 .PHONY: soak
 soak: $(MESSAGES) ## a day of flight at accelerated time, an hour in real time, into docs/results/soak.md (hours)
-	$(STUDY) studies.soak --out docs/results
+	$(STUDY) quadid_evaluation.studies.soak --out docs/results
 
 .PHONY: chaos
 chaos: $(MESSAGES) ## random faults at the running service for 20 min, into docs/results/chaos.md
-	$(STUDY) studies.chaos --minutes 20 --out docs/results
+	$(STUDY) quadid_evaluation.studies.chaos --minutes 20 --out docs/results
 
 # Allows a reader less memory than coverage itself needs in it.
 TOO_NARROW := tests/replay/test_reading.py::test_more_memory_than_allowed_is_refused
@@ -184,7 +184,7 @@ coverage: $(MESSAGES) ## lines and branches of quadid/ that the tests run, into 
 	$(BIN)/coverage run -m pytest -q -n 2 $(XDIST) -m "not browser and not slow" \
 		--deselect $(TOO_NARROW) $(COVERED_BY)
 	$(BIN)/coverage combine --quiet
-	$(STUDY) studies.coverage --out docs/results
+	$(STUDY) quadid_evaluation.studies.coverage --out docs/results
 
 QUALITY := $(VENV)/.stamp-quality
 $(QUALITY): pyproject.toml $(DEV)
@@ -193,7 +193,7 @@ $(QUALITY): pyproject.toml $(DEV)
 
 mutation: $(MESSAGES) $(QUALITY) ## gate, ledger and session spoilt line by line: which tests notice? into docs/results/mutation.md (40 min)
 	OPENBLAS_NUM_THREADS=1 $(BIN)/mutmut run --max-children 2
-	$(STUDY) studies.mutation --out docs/results
+	$(STUDY) quadid_evaluation.studies.mutation --out docs/results
 
 audit: $(QUALITY) ## known holes in what the container installs; fails where the advisories cannot be reached
 	$(BIN)/pip-audit --requirement docker/requirements.txt --strict --require-hashes --disable-pip \
@@ -225,7 +225,7 @@ typecheck: $(DEV) ## mypy --strict
 
 .PHONY: house
 house: venv ## lines, named numbers and files that data cross; fails where a figure rose (WHY='...' records it with the reason)
-	$(STUDY) studies.house $(if $(WHY),--record '$(WHY)')
+	$(STUDY) quadid_evaluation.studies.house $(if $(WHY),--record '$(WHY)')
 
 format: $(DEV) ## let ruff put files into the common form
 	$(BIN)/ruff check --fix .

@@ -16,12 +16,12 @@ from dataclasses import replace
 import numpy as np
 from scipy.optimize import minimize
 
+from quadid.data.grid import to_windows
+from quadid.data.window import Window
 from quadid.flight import TruthParameters, fly
-from quadid.grid import to_windows
-from quadid.identify.fit import FitOptions, fit
-from quadid.identify.score import mse_score
+from quadid.identification.fit import FitOptions, fit
+from quadid.identification.score import mse_score
 from quadid.vehicle import GRAVITY, Vehicle
-from quadid.window import Window
 
 TRUE = {"knee": 1.02, "share": 0.5}
 """The knee in hover speeds, which the flown vehicle knows and the fit does not."""

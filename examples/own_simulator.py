@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from quadid.model.simulate import simulate
+from quadid.model.step import simulate
 from quadid.vehicle import Vehicle
 
 DT = 0.005
@@ -41,9 +41,9 @@ def half_time(vehicle: Vehicle) -> float:
 
 def diagnosed() -> str:
     """Flies a Pelican with a motor lag of 40 ms, diagnoses the flight, and returns the extended vehicle file."""
-    from quadid.diagnose import diagnose
+    from quadid.data.grid import to_windows
+    from quadid.diagnosis import diagnose
     from quadid.flight import fly
-    from quadid.grid import to_windows
 
     pelican = Vehicle.shipped("pelican")
     flight = fly(pelican, seconds=60.0, seed=3, effects={"motor_lag": {"tau": 0.04}})

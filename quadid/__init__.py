@@ -15,52 +15,50 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
+from quadid.old_paths import install
+from quadid.version import __version__ as __version__
 from quadid.working_folder import guard
 
 if TYPE_CHECKING:
-    from quadid_workflow.diagnose import diagnose as diagnose
-    from quadid_workflow.excite import propose as excite
-    from quadid_workflow.export import export as export
-    from quadid_workflow.health import health as health
-    from quadid_workflow.identify import identify as identify
-    from quadid_workflow.init import init as init
-    from quadid_workflow.inspect import inspect as inspect
-    from quadid_workflow.loading import load as load
-    from quadid_workflow.score import score as score
-    from quadid_workflow.simulate import simulate as simulate
-
+    from quadid.app.diagnose import diagnose as diagnose
+    from quadid.app.excite import propose as excite
+    from quadid.app.export import export as export
+    from quadid.app.health import health as health
+    from quadid.app.identify import identify as identify
+    from quadid.app.init import init as init
+    from quadid.app.inspect import inspect as inspect
+    from quadid.app.logs import load as load
+    from quadid.app.score import score as score
+    from quadid.app.simulate import simulate as simulate
     from quadid.model.step import Simulator as Simulator
     from quadid.parameters import ParameterSet as ParameterSet
     from quadid.vehicle import Vehicle as Vehicle
 
 guard()
-__version__ = "0.1.0"
 
 _PUBLIC = {
-    "init": "quadid_workflow.init",
-    "load": "quadid_workflow.loading",
-    "inspect": "quadid_workflow.inspect",
-    "identify": "quadid_workflow.identify",
-    "diagnose": "quadid_workflow.diagnose",
-    "health": "quadid_workflow.health",
-    "score": "quadid_workflow.score",
-    "simulate": "quadid_workflow.simulate",
-    "export": "quadid_workflow.export",
+    "init": "quadid.app.init",
+    "load": "quadid.app.logs",
+    "inspect": "quadid.app.inspect",
+    "identify": "quadid.app.identify",
+    "diagnose": "quadid.app.diagnose",
+    "health": "quadid.app.health",
+    "score": "quadid.app.score",
+    "simulate": "quadid.app.simulate",
+    "export": "quadid.app.export",
     "Simulator": "quadid.model.step",
     "Vehicle": "quadid.vehicle",
     "ParameterSet": "quadid.parameters",
 }
 """Public names and where they are defined."""
-_ROOMS = ("identify", "diagnose", "health")
-"""Names that are packages too: those are callable (`quadid.callable_room`)."""
 __all__ = [*_PUBLIC, "excite"]
+
+install()
 
 
 def __getattr__(name: str) -> Any:
-    if name in _ROOMS:
-        return importlib.import_module(f"quadid.{name}")
     if name == "excite":
-        return importlib.import_module("quadid_workflow.excite").propose
+        return importlib.import_module("quadid.app.excite").propose
     if name in _PUBLIC:
         return getattr(importlib.import_module(_PUBLIC[name]), name)
     raise AttributeError(f"module 'quadid' has no attribute '{name}'")

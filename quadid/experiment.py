@@ -8,22 +8,21 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import yaml
 
 from quadid.errors import NotIdentifiableError
 from quadid.flight import Flight, FlightError, Segment, TruthParameters, fly
-from quadid.identify.excitation import excitation
-from quadid.identify.optimal_input import d_optimal, halfwidths
+from quadid.identification.excitation import excitation
+from quadid.identification.global_search import Progress as Advance
+from quadid.identification.noise_model import NoiseModel
+from quadid.identification.optimal_input import d_optimal, halfwidths
 from quadid.parameters import NOMINAL_NAMES
 from quadid.rotation import down
 from quadid.types import FloatArray
-
-if TYPE_CHECKING:
-    from quadid.identify.global_search import Progress as Advance
-    from quadid.identify.noise_model import NoiseModel
-    from quadid.vehicle import Vehicle
+from quadid.vehicle import Vehicle
 
 BLOCK = 6.0
 """Length of one movement [s]."""
@@ -246,8 +245,6 @@ def in_a_row(picked: Sequence[Movement]) -> tuple[Segment, ...]:
 
 def manoeuvre_file(vehicle: str, proposal: Proposal) -> str:
     """The manoeuvre as YAML that ``quadid simulate --manoeuvre`` flies."""
-    import yaml
-
     segments = [{k: v if isinstance(v, str) else round(v, 5) for k, v in asdict(s).items()} for s in proposal.segments]
     body: dict[str, Any] = {"vehicle": vehicle, "seconds": proposal.seconds, "segments": segments}
     units = "# amplitude: rms of roll, pitch, yaw [rad]; fraction of hover thrust for throttle. start, duration [s].\n"

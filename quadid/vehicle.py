@@ -1,39 +1,369 @@
-"""The vehicle: geometry, mass, command, initial parameters, known effects; read from and written as YAML text."""
+"""Vehicle files: geometry, mass, command, initial parameters, known effects; YAML in and out."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator, Mapping
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import yaml
-from pydantic import BaseModel, Field, PrivateAttr, ValidationError, field_validator, model_validator
+from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, ValidationError, field_validator, model_validator
 
 from quadid.effects import EFFECTS, known_keys, rotor_drag_losses
 from quadid.errors import ParameterError, VehicleError, nearest
 from quadid.parameters import INERTIAS, MAY_VANISH, NOMINAL_NAMES, VANISHED, impossible_inertia
-from quadid.provenance import Proof
-from quadid.residual import MOST_TERMS, ResidualTerm
 from quadid.sanitise import LONGEST_LINE, LONGEST_NAME, plain
 from quadid.types import FloatArray
-from quadid.vehicle_parts import (
-    MIXERS,
-    Command,
-    Coordinate,
-    Mounting,
-    Noise,
-    ParameterPrior,
-    PositiveFloat,
-    Rotor,
-    Spread,
-    Stabiliser,
-    Strict,
-    ThrustPoint,
-)  # fmt: skip
-from quadid.vehicle_size import impossible_hover, impossible_size
 from quadid.yaml_text import read_mapping
+
+# --- Parts of a vehicle file: rotors, the meaning of rotor columns, priors, noise, stabiliser, IMU, thrust stand
+
+
+DEFAULT_BOUND_FACTOR = 4.0
+"""A bare initial guess may be wrong by this factor each way."""
+PositiveFloat = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
+Spread = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
+Coordinate = Annotated[float, Field(allow_inf_nan=False)]
+Angle = Annotated[float, Field(ge=-6.3, le=6.3, allow_inf_nan=False)]
+
+MIXERS: dict[str, tuple[tuple[float, ...], ...]] = {
+    "crazyflie": ((1.0, -0.5, 0.5, 1.0), (1.0, -0.5, -0.5, -1.0), (1.0, 0.5, -0.5, 1.0), (1.0, 0.5, 0.5, -1.0)),
+}
+"""Mixers by name: rows are rotors, columns the inputs.  Crazyflie takes thrust, roll, pitch, yaw."""
+
+
+class Strict(BaseModel):
+    """A frozen part of a file that allows no other keys, and no text but printable text of one line."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    @field_validator("*", mode="after")
+    @classmethod
+    def _printable(cls, value: Any) -> Any:
+        for text in _texts(value):
+            if not text.isprintable():
+                raise ValueError(f"'{plain(text, 60)}' has a line break or another character that does not print")
+        return value
+
+
+def _texts(value: Any) -> Iterator[str]:
+    """All texts in a value, keys too."""
+    if isinstance(value, str):
+        yield value
+    elif isinstance(value, Mapping):
+        yield from _texts([*value.keys(), *value.values()])
+    elif isinstance(value, list | tuple):
+        for item in value:
+            yield from _texts(item)
+
+
+class Rotor(Strict):
+    """One rotor.
+
+    Attributes:
+        position: from the geometric centre, FRD [m].
+        spin: +1 or -1, its sign in Omega_r; +1 turns about -z and pushes the vehicle about +z.
+    """
+
+    position: tuple[Coordinate, Coordinate, Coordinate]
+    spin: Literal[-1, 1]
+
+
+class Command(Strict):
+    """What the rotor columns of a log mean.
+
+    Attributes:
+        kind: ``rotor_speed`` [rad/s], ``normalized`` [0..1], ``thrust`` [0..1, proportional to thrust, where the
+            flight controller undoes the motor's curve] or ``pwm`` [us].
+        sampling: ``held``: a row acts until the next; ``instant``: a reading, linear in between.
+        max_speed: rotor speed at full command [rad/s]; normalized and pwm need it, exports of hover thrust use it.
+        range: pulse widths of zero and full command [us], for pwm.
+    """
+
+    kind: Literal["rotor_speed", "normalized", "thrust", "pwm"] = "rotor_speed"
+    sampling: Literal["held", "instant"] = "held"
+    max_speed: PositiveFloat | None = None
+    range: tuple[PositiveFloat, PositiveFloat] = (1000.0, 2000.0)
+
+    @model_validator(mode="after")
+    def _complete(self) -> Command:
+        if self.kind != "rotor_speed" and self.max_speed is None:
+            raise ValueError(f"command kind '{self.kind}' needs max_speed [rad/s], the rotor speed at full command")
+        if self.range[1] <= self.range[0]:
+            raise ValueError(f"command range {list(self.range)} must rise, for example [1000, 2000]")
+        return self
+
+    def to_rotor_speed(self, values: FloatArray) -> FloatArray:
+        """Converts logged rotor columns, shape (n, rotors), to rotor speed [rad/s]."""
+        if self.kind == "rotor_speed":
+            return values
+        assert self.max_speed is not None
+        if self.kind == "pwm":
+            low, high = self.range
+            values = (values - low) / (high - low)
+        if self.kind == "thrust":
+            values = np.sqrt(np.maximum(values, 0.0))  # below zero a rotor stands still
+        return values * self.max_speed
+
+    def from_rotor_speed(self, speed: FloatArray) -> FloatArray:
+        """Converts rotor speeds [rad/s], shape (n, rotors), to logged rotor columns."""
+        if self.kind == "rotor_speed":
+            return speed
+        assert self.max_speed is not None
+        share = speed / self.max_speed
+        if self.kind == "thrust":
+            return share**2
+        low, high = self.range if self.kind == "pwm" else (0.0, 1.0)
+        return low + share * (high - low)
+
+
+class ParameterPrior(Strict):
+    """Initial guess of one parameter: value, bounds, and standard deviation where known (same unit)."""
+
+    initial: PositiveFloat
+    bounds: tuple[PositiveFloat, PositiveFloat] | None = None
+    sigma: PositiveFloat | None = None
+
+    @model_validator(mode="after")
+    def _ordered(self) -> ParameterPrior:
+        if self.bounds is not None and not self.bounds[0] <= self.initial <= self.bounds[1]:
+            raise ValueError(f"initial {self.initial:g} lies outside bounds [{self.bounds[0]:g}, {self.bounds[1]:g}]")
+        return self
+
+    @property
+    def limits(self) -> tuple[float, float]:
+        """Bounds, by default a factor of 4 each way."""
+        return self.bounds or (self.initial / DEFAULT_BOUND_FACTOR, self.initial * DEFAULT_BOUND_FACTOR)
+
+    @property
+    def log_halfwidth(self) -> float:
+        """Half the distance of the bounds on the log scale."""
+        return 0.5 * math.log(self.limits[1] / self.limits[0])
+
+    @property
+    def log_sigma(self) -> float:
+        """Standard deviation of the logarithm: that of the file, else `log_halfwidth`."""
+        return self.sigma / self.initial if self.sigma else self.log_halfwidth
+
+
+class Noise(Strict):
+    """Known 1-sigma noise: gyro [rad/s], attitude [rad], accel [m/s^2], velocity [m/s], position [m]."""
+
+    gyro: PositiveFloat | None = None
+    attitude: PositiveFloat | None = None
+    accel: PositiveFloat | None = None
+    velocity: PositiveFloat | None = None
+    position: PositiveFloat | None = None
+
+
+class Stabiliser(Strict):
+    """The on-board attitude stabiliser, where known.
+
+    Attributes:
+        gains: by name, as in `quadid.attitude_controller`.
+        rate: how often it runs [Hz]; None for once a log row.
+    """
+
+    gains: dict[str, float]
+    rate: PositiveFloat | None = None
+
+
+class Mounting(Strict):
+    """The IMU in the body: rotation (roll, pitch, yaw) [rad] and position from the geometric centre, FRD [m]."""
+
+    rotation: tuple[Angle, Angle, Angle] = (0.0, 0.0, 0.0)
+    position: tuple[Coordinate, Coordinate, Coordinate] = (0.0, 0.0, 0.0)
+
+
+class ThrustPoint(Strict):
+    """One reading of a thrust stand, one rotor: speed [rad/s], thrust [N]."""
+
+    speed: PositiveFloat
+    thrust: PositiveFloat
+
+
+# --- Whether mass, size and first guesses of a vehicle file can belong to one flying machine; names the slip of unit
+#
+# Multirotors from 3 g to 1 t carry between 20 and 1500 kg for each cubic metre of arm; a slip of unit is off by a
+# thousand and more.  The limits leave a factor of twenty on both sides.
+
+
+DENSITY = (1.0, 3.0e4)
+"""Mass over the cube of the arm [kg/m^3]."""
+MASSES = (1e-3, 5e3)
+"""[kg]."""
+SPEEDS = (5.0, 2.0e4)
+"""Rotor speed in hover [rad/s]: helicopters of 10 m and motors of a gram lie inside."""
+_UNITS = (
+    ("mass", 1e-3, "grams", "mass"),
+    ("arm", 1e-3, "millimetres", "rotor positions"),
+    ("arm", 1e-2, "centimetres", "rotor positions"),
+    ("arm", 0.1, "decimetres, or slipped by one digit", "rotor positions"),
+    ("arm", 0.0254, "inches", "rotor positions"),
+)
+
+
+def impossible_size(mass: float, arm: float) -> str:
+    """Says which unit a mass [kg] or an arm [m] seems to be in; empty for what can fly.
+
+    Args:
+        mass: of the vehicle.
+        arm: mean horizontal distance of the rotors from the centre.
+    """
+    if _fits(mass, arm):
+        return ""
+    found = f"mass {mass:.4g} kg with rotors {arm:.4g} m from the centre"
+    for what, factor, unit, where in _UNITS:
+        scaled = (mass * factor, arm) if what == "mass" else (mass, arm * factor)
+        if _fits(*scaled):
+            value, si = (scaled[0], "kg") if what == "mass" else (scaled[1], "m")
+            return f"{found}: {where} in {unit}? {value:.4g} {si} would fit"
+    return f"{found}: such a vehicle cannot fly; write mass in kg and positions in m"
+
+
+def _fits(mass: float, arm: float) -> bool:
+    return MASSES[0] <= mass <= MASSES[1] and 0.005 <= arm <= 20.0 and DENSITY[0] <= mass / arm**3 <= DENSITY[1]
+
+
+def impossible_hover(low: float, high: float) -> str:
+    """Says that no thrust coefficient within its bounds hovers at a speed rotors have; empty where one does.
+
+    Args:
+        low: rotor speed [rad/s] at which the upper bound of b carries the weight.
+        high: that of the lower bound.
+    """
+    if math.isfinite(low) and high >= SPEEDS[0] and low <= SPEEDS[1]:
+        return ""
+    return (
+        f"b within its bounds hovers at {low:.3g} to {high:.3g} rad/s, rotors turn at {SPEEDS[0]:g} to {SPEEDS[1]:g}: "
+        "b is N of one rotor over (rad/s)^2, not over rpm^2 or a command"
+    )
+
+
+# --- Terms beyond the catalogue: forces and moments, each a coefficient times a printed product of known signals
+#
+# They belong to a file that predicts, never to the physics: a residual term is called by its formula, not by a cause.
+
+
+SIGNALS: dict[str, str] = {
+    "v_x": "m/s", "v_y": "m/s", "v_z": "m/s", "p": "rad/s", "q": "rad/s", "r": "rad/s", "g_x": "", "g_y": "",
+    "g_z": "", "T": "N", "tau_x": "N m", "tau_y": "N m", "tau_z": "N m", "V": "m/s",
+}  # fmt: skip
+"""What may be multiplied, with units, all in body axes (FRD): velocity through the air, rates, direction of gravity,
+thrust of all rotors, their moments, airspeed.  In the order of `quadid.model.body_kernel`, after the number one."""
+TARGETS: dict[str, str] = {
+    "force_x": "N", "force_y": "N", "force_z": "N", "moment_x": "N m", "moment_y": "N m", "moment_z": "N m",
+}  # fmt: skip
+"""What a term acts on, with units: force and moment in body axes at the centre of gravity."""
+MOST_FACTORS = 3
+"""Signals in one product, at most."""
+MOST_TERMS = 500
+
+
+class ResidualTerm(Strict):
+    """A force or moment beyond the catalogue: `value` times a product of signals.
+
+    Attributes:
+        acts_on: one of `TARGETS`.
+        product: up to three of `SIGNALS`; empty for a constant.
+        value: coefficient, in the SI unit `unit`.
+    """
+
+    acts_on: str
+    product: tuple[str, ...] = Field(default=(), max_length=MOST_FACTORS)
+    value: Annotated[float, Field(allow_inf_nan=False)]
+
+    @field_validator("acts_on")
+    @classmethod
+    def _known_target(cls, name: str) -> str:
+        if name not in TARGETS:
+            raise ValueError(f"'{name}' is none of {', '.join(TARGETS)}; {nearest(name, TARGETS)}")
+        return name
+
+    @field_validator("product")
+    @classmethod
+    def _known_signals(cls, names: tuple[str, ...]) -> tuple[str, ...]:
+        for name in names:
+            if name not in SIGNALS:
+                raise ValueError(f"signal '{name}' is none of {', '.join(SIGNALS)}; {nearest(name, SIGNALS)}")
+        return names
+
+    @property
+    def unit(self) -> str:
+        """SI unit of the coefficient."""
+        factors = [SIGNALS[name] for name in self.product if SIGNALS[name]]
+        return " / ".join([TARGETS[self.acts_on], *(f"({unit})" for unit in factors)])
+
+    @property
+    def formula(self) -> str:
+        """As printed: ``moment_x += -1.2e-05 v_y T``."""
+        return " ".join([f"{self.acts_on} += {self.value:.4g}", *self.product])
+
+    def typical(self, weight: float, arm: float) -> float:
+        """Coefficient with which the term matters on a vehicle of `weight` [N] and `arm` [m].
+
+        A twentieth of its weight, for moments at its arm, when rates, velocities and directions are one, the rotors
+        carry the weight and their moments are a tenth of it at the arm (a hundredth in yaw).
+        """
+        size = 0.05 * weight * (arm if self.acts_on.startswith("moment") else 1.0)
+        usual = {"T": weight, "tau_x": 0.1 * weight * arm, "tau_y": 0.1 * weight * arm, "tau_z": 0.01 * weight * arm}
+        for name in self.product:
+            size /= usual.get(name, 1.0)
+        return size
+
+
+# --- What shows that the values of a vehicle file predict, and which flights they were fitted to
+
+
+MOST_FLIGHTS = 100
+"""Flights that a file remembers."""
+
+
+class FittedFlight(Strict):
+    """A flight that values were fitted to, so that it is known again under another name, in another format, in part.
+
+    Attributes:
+        log: its file name.
+        seconds: length of the part that was fitted.
+        begin: UNIX time of its first sample [s]; None where its clock has no date.
+        marks: short hashes of some stretches of its gyro, see `quadid.app.logs`.
+    """
+
+    log: str = Field(max_length=LONGEST_NAME)
+    seconds: Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
+    begin: Annotated[float, Field(allow_inf_nan=False)] | None = None
+    marks: Annotated[str, Field(max_length=600)] = ""
+
+
+class Proof(Strict):
+    """What shows that the values of this file predict.
+
+    Attributes:
+        verdict: on the result that the file was written by: good (green), fair (amber), poor (red).
+        unseen: flights that were predicted and not fitted.
+        error: largest of their errors over one second, in noise variances (1 is the noise floor).
+        fitted: flights that the values rest on; their standard deviations are no knowledge beside the same flights.
+    """
+
+    verdict: Literal["good", "fair", "poor"]
+    unseen: tuple[str, ...] = ()
+    error: Annotated[float, Field(gt=0.0, allow_inf_nan=False)] | None = None
+    fitted: Annotated[tuple[FittedFlight, ...], Field(max_length=MOST_FLIGHTS)] = ()
+
+    @property
+    def lacking(self) -> str:
+        """Why the values are not proven; empty when they are."""
+        if self.verdict == "poor":
+            error = f": error {self.error:.3g} times the noise variance on an unseen flight" if self.error else ""
+            return f"its fit was judged poor{error}"
+        return "" if self.unseen else "no flight was predicted that was not fitted"
+
+
+# --- The vehicle: geometry, mass, command, initial parameters, known effects; read from and written as YAML text
+
 
 GRAVITY = 9.80665
 """Standard gravity [m/s^2]."""

@@ -10,7 +10,7 @@ import numpy as np
 from quadid.estimate import kalman as k
 from quadid.estimate.kalman import Gains
 from quadid.estimate.problem import Problem
-from quadid.identify.particle_swarm import Stop, Swarm, SwarmOptions
+from quadid.identification.particle_swarm import Stop, Swarm, SwarmOptions
 from quadid.parameters import NOMINAL_NAMES
 from quadid.types import BoolArray, FloatArray
 

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from quadid.chi_square import Z95
+from quadid.data.window import Window
 from quadid.estimate import kalman as k
 from quadid.estimate.fit import ALL_NOISE, MOST, NEAR_SECONDS, NO_NOISE, Estimate, scoring
 from quadid.estimate.problem import Problem
@@ -22,7 +23,6 @@ from quadid.estimate.whole_model import WholeModel
 from quadid.model.layout import Layout
 from quadid.types import FloatArray
 from quadid.vehicle import GRAVITY, Vehicle
-from quadid.window import Window
 
 ROUNDS = 2
 """Filter passes between which effects are simulated anew along the filtered states."""

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
+from quadid.data.mounting import in_body_axes
+from quadid.data.resample import copied, sample_period
+from quadid.data.rotor_signal import rotor_signal
+from quadid.data.window import Recording, Window
 from quadid.estimate.kalman import MOMENTS, M, Track
-from quadid.mounting import in_body_axes
-from quadid.resample import copied, sample_period
-from quadid.rotor_signal import rotor_signal
 from quadid.types import BoolArray, FloatArray
 from quadid.vehicle import Vehicle
-from quadid.window import Recording, Window
 
 STILL = 3.0
 """Standard deviation of a velocity that nobody measures [m/s], where air matters."""

@@ -10,15 +10,14 @@ from __future__ import annotations
 
 import numpy as np
 
+from quadid.data.window import Window
 from quadid.estimate import kalman as k
 from quadid.estimate.kalman import Track
 from quadid.model.layout import Layout
-from quadid.model.rollout import Rollout
-from quadid.model.segments import Segments
+from quadid.model.rollout import Rollout, Segments
 from quadid.rotation import turn
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
-from quadid.window import Window
 
 IN_SENSORS = (
     "imu_lag", "attitude_delay", "imu_lever_arm", "imu_misalignment", "gyro_scale", "gyro_bias", "accel_bias",

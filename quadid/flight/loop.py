@@ -10,8 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from quadid.flight.airframe import orthonormalise
-from quadid.flight.airframe_constants import Body
+from quadid.flight.airframe import Body, orthonormalise
 from quadid.flight.jit import kernel
 from quadid.flight.rotors import Drive, load_input, spin_up_kick
 from quadid.types import FloatArray

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from quadid.attitude_controller import stabilise
-from quadid.flight.airframe_constants import Air, Body, Oddity
+from quadid.flight.airframe import Air, Body, Oddity
 from quadid.flight.jit import kernel
 from quadid.flight.loop import (
     EPSILON,

@@ -10,8 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from quadid.flight.airframe import RIGID_STATES, STATES, derivative, orthonormalise, rotor_wrench
-from quadid.flight.airframe_constants import Air, Body, Oddity
+from quadid.flight.airframe import RIGID_STATES, STATES, Air, Body, Oddity, derivative, orthonormalise, rotor_wrench
 from quadid.flight.jit import kernel
 from quadid.types import FloatArray
 

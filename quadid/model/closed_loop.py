@@ -8,19 +8,18 @@ from typing import NamedTuple
 import numpy as np
 
 from quadid.attitude_controller import mixer_matrix, pack_gains
+from quadid.data.window import Window
 from quadid.errors import ParameterError, WindowError
 from quadid.model import layout as ix
 from quadid.model.closed_loop_kernel import OUTPUTS, fly_closed_loop
+from quadid.model.kernel import needs_of
 from quadid.model.layout import residual_terms
-from quadid.model.needs_kernel import needs_of
-from quadid.model.rollout import Rollout
+from quadid.model.rollout import Rollout, Segments
 from quadid.model.rollout import _threads as worker_threads
-from quadid.model.segments import Segments
 from quadid.model.simd import LANES, aligned
 from quadid.rotation import down
 from quadid.types import FloatArray, check_shapes
 from quadid.vehicle import GRAVITY, Vehicle
-from quadid.window import Window
 
 
 class Flown(NamedTuple):

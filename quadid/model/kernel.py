@@ -1,37 +1,145 @@
-"""The hot kernel: one step of the rigid body for many parameter vectors ("lanes") at once.
-
-Lanes are the innermost, fixed-length axis, so that the compiler turns each lane loop into SIMD instructions: no
-trigonometry in the loops, no allocation, no branch that depends on a lane.  Where each row lies: `model.work_array`.
-
-Integration: forces and moments are taken linear in time over the step with the rotors' half-step means
-(`quadid.model.rotor_kernel`), and attitude, rate and velocity are integrated with the classical Runge-Kutta rule.
-Here is the nominal step; effects on the body are in `quadid.model.body_kernel`.  Both are the same equations, listed in
-`quadid.model.equations`.
-"""
+"""Hot kernel: one step for many parameter vectors ("lanes") at once, without the parts that none of them needs."""
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numba as nb
+import numpy as np
 
 from quadid.model import layout as ix
 from quadid.model.layout import places
-from quadid.types import FloatArray
+from quadid.model.simd import LANES, SOURCES, cached, exact, inlined, jit, lane_kernel
+from quadid.types import FloatArray, IntArray
 
 # isort: off
 from quadid.model.work_array import (
-    ALL_MOMENTS, A_G, A_M, A_O1, A_S2, A_X2, A_Y2, A_Z2, C_B, C_CGX, C_CGY, C_CLIMB, C_CPAR, C_CPAR_Z, C_D, C_DROP,
-    C_DRAG_ARM, C_DROP_TIME, C_FLOW_ARM, C_GROUND, C_GX, C_GXX, C_GXY, C_GY, C_GYY, C_HOVER, C_HUB, C_HX, C_HY,
-    C_INVM, C_IXX, C_IXY, C_IXZ, C_IYY, C_IYZ, C_IZZ, C_JR, C_JSPIN, C_JXX, C_JXY, C_JXZ, C_JYY, C_JYZ, C_JZZ, C_KX,
-    C_KY, C_KZ, C_LIFT, C_LOAD, C_LOAD_TIME, C_LOWEST, C_LP, C_MASS, C_MQ, C_NR, C_RX, C_RY, C_RZ, C_SAG, C_TURNING,
-    C_WE, C_WN, F0_X, F0_Y, F0_Z, F1_X, F1_Y, F1_Z, F2_X, F2_Y, F2_Z, HALF, N_STATE, S_BENDX, S_BENDY, S_BENDZ,
-    S_FX, S_FY, S_FZ, S_P, S_Q, S_QW, S_QX, S_QY, S_QZ, S_R, X_P, X_Q, X_QW, X_QX, X_QY, X_QZ, X_R,
+    ALL_MOMENTS, A_G, A_M, A_O1, A_S2, A_X2, A_Y2, A_Z2, C_B, C_CGX, C_CGY, C_CLIMB, C_CPAR, C_CPAR_Z, C_D, C_DRAG_ARM,
+    C_DROP, C_DROP_TIME, C_FLOW_ARM, C_GROUND, C_GX, C_GXX, C_GXY, C_GY, C_GYY, C_HOVER, C_HUB, C_HX, C_HY, C_INVM,
+    C_IXX, C_IXY, C_IXZ, C_IYY, C_IYZ, C_IZZ, C_JR, C_JSPIN, C_JXX, C_JXY, C_JXZ, C_JYY, C_JYZ, C_JZZ, C_KX, C_KY, C_KZ,
+    C_LIFT, C_LOAD, C_LOAD_TIME, C_LOWEST, C_LP, C_MASS, C_MQ, C_NR, C_RX, C_RY, C_RZ, C_SAG, C_TURNING, C_WE, C_WN,
+    F0_X, F0_Y, F0_Z, F1_X, F1_Y, F1_Z, F2_X, F2_Y, F2_Z, HALF, N_STATE, S_BENDX, S_BENDY, S_BENDZ, S_FX, S_FY, S_FZ,
+    S_P, S_Q, S_QW, S_QX, S_QY, S_QZ, S_R, X_P, X_Q, X_QW, X_QX, X_QY, X_QZ, X_R,
 )  # fmt: skip
-
 # isort: on
-from quadid.model.simd import LANES, exact, inlined, jit, lane_kernel
+
+# --- Which parts of the model a block of parameter vectors uses, so that the others cost nothing
+
+
+class Needs(NamedTuple):
+    """Which parts of the model any lane of a block uses.
+
+    Attributes:
+        full: more than the nominal step: one of the groups of `quadid.model.body_kernel`.
+        air, hub, solid, rare: these groups.
+        shared: all that acts on rotors is the same in all lanes, and their moments are tabled.
+        delayed: commands, or readings of speed, come late.
+        uneven: speeding up and slowing down lag differently.
+        voltage: the supply voltage scales commands.
+        growth: drag torque is not quadratic.
+        factors: thrust or mass change in flight.
+        payload: inertia or centre of gravity change with mass.
+        imu_lag, att_delay, imu_static, ahrs: these sensor effects act.
+    """
+
+    full: bool
+    air: bool
+    hub: bool
+    solid: bool
+    rare: bool
+    shared: bool
+    delayed: bool
+    uneven: bool
+    voltage: bool
+    growth: bool
+    factors: bool
+    payload: bool
+    imu_lag: bool
+    att_delay: bool
+    imu_static: bool
+    ahrs: bool
+    learned: bool
+
+
+HUB_ENTRIES = places("rotor_drag.k_x", "rotor_drag.k_y", "axial_inflow.k_z")
+RARE_ENTRIES = places("parasitic_drag", "ground_effect", "translational_lift", "axial_inflow.k_climb")
+PAYLOAD_ENTRIES = places(*(f"mass_change.{key}" for key in ("J_xx", "J_yy", "J_zz", "x", "y")))
+FACTOR_ENTRIES = (*places("battery_sag", "thrust_drop.fraction", "mass_change.fraction"), *PAYLOAD_ENTRIES)
+SOLID_ENTRIES = places(
+    "rotor_drag_moment", "rate_damping", "cg_offset", "product_of_inertia", "rotor_spin_up", "imu_lever_arm",
+    "no_gyroscopic_coupling", "rotor_drag.central", "axial_inflow.central",
+)  # fmt: skip
+IMU_ENTRIES = places("gyro_bias", "accel_bias", "gyro_scale", "imu_misalignment")
+DELAY_ENTRIES = places("command_delay", "rotor_telemetry_delay")
+ROTOR_ENTRIES = places(
+    "motor_lag", "command_delay", "rotor_telemetry_delay", "thrust_curve", "supply_voltage", "drag_torque_curve"
+)
+"""What makes rotors of one lane differ from those of another; losses beside them."""
+(OFFSET,) = places("thrust_curve.offset")
+# As arrays, which all are of one type: `_any_of` would be compiled anew for each length of a tuple.
+_HUB, _RARE, _PAYLOAD, _FACTORS = (np.array(e) for e in (HUB_ENTRIES, RARE_ENTRIES, PAYLOAD_ENTRIES, FACTOR_ENTRIES))
+_SOLID, _IMU, _DELAY = (np.array(e) for e in (SOLID_ENTRIES, IMU_ENTRIES, DELAY_ENTRIES))
+_SLOWER, _EXPONENT = np.array(places("motor_lag.slower")), np.array(places("supply_voltage"))
+_GROWTH, _AHRS = np.array(places("drag_torque_curve")), np.array([ix.AHRS_K])
+_IMU_LAG, _ATT_DELAY = np.array([ix.IMU_PERIOD]), np.array([ix.ATT_DELAY])
+
+
+@nb.njit(**jit)
+def _any_of(theta: FloatArray, entries: IntArray) -> bool:
+    """Whether any of these entries is not neutral in any lane."""
+    found = False
+    for lane in range(len(theta)):
+        for i in entries:
+            found |= theta[lane, i] != 0.0
+    return found
+
+
+def _on_disk(sources: int) -> Any:
+    @nb.njit(**cached)
+    def needs_of(theta: FloatArray, rotors: int, channels: int) -> Needs:
+        """Returns what a block of parameter vectors (LANES, size) needs of the model."""
+        _ = sources
+        rare, factors, payload = (
+            _any_of(theta, _RARE), _any_of(theta, _FACTORS), _any_of(theta, _PAYLOAD)
+        )  # fmt: skip
+        learned = False
+        for lane in range(len(theta)):
+            for i in range(ix.LOSS + 2 * rotors, theta.shape[1]):
+                learned |= theta[lane, i] != 0.0
+        rare |= learned
+        hub = rare or _any_of(theta, _HUB)
+        air, solid = channels > 9 or hub, factors or learned or _any_of(theta, _SOLID)
+        growth = _any_of(theta, _GROWTH)
+        varied = growth
+        for lane in range(len(theta)):
+            for i in ROTOR_ENTRIES:
+                varied |= theta[lane, i] != theta[0, i]
+            for i in range(ix.LOSS, ix.LOSS + 2 * rotors):
+                varied |= theta[lane, i] != theta[0, i]
+            varied |= theta[lane, OFFSET] != 0.0 and theta[lane, ix.B] != theta[0, ix.B]
+        return Needs(
+            air or solid, air, hub, solid, rare, not varied, _any_of(theta, _DELAY), _any_of(theta, _SLOWER),
+            _any_of(theta, _EXPONENT), growth, factors, payload, _any_of(theta, _IMU_LAG),
+            _any_of(theta, _ATT_DELAY), _any_of(theta, _IMU), _any_of(theta, _AHRS), learned,
+        )  # fmt: skip
+
+    return needs_of
+
+
+needs_of = _on_disk(SOURCES)
+
+
+# --- The hot kernel: one step of the rigid body for many parameter vectors ("lanes") at once
+#
+# Lanes are the innermost, fixed-length axis, so that the compiler turns each lane loop into SIMD instructions: no
+# trigonometry in the loops, no allocation, no branch that depends on a lane.  Where each row lies: `model.work_array`.
+#
+# Integration: forces and moments are taken linear in time over the step with the rotors' half-step means
+# (`quadid.model.rotor_kernel`), and attitude, rate and velocity are integrated with the classical Runge-Kutta rule.
+# Here is the nominal step; effects on the body are in `quadid.model.body_kernel`.  Both are the same equations, listed
+# in `quadid.model.equations`.
+
 
 __all__ = ["LANES", "N_STATE", "body_constants", "flight_factors", "step_core", "step_core_shared"]
 
@@ -42,7 +150,6 @@ SLOWEST_HOVER = 0.1
 of its own."""
 (LIFT,), (BESIDE_Z,) = places("translational_lift"), places("parasitic_drag.beside_z")
 (UNCOUPLED,) = places("no_gyroscopic_coupling")
-OFFSET = places("thrust_curve.offset")[0]
 LOAD_XX, LOAD_YY, LOAD_ZZ, LOAD_X, LOAD_Y = places(*(f"mass_change.{k}" for k in ("J_xx", "J_yy", "J_zz", "x", "y")))
 TWELFTH = 1.0 / 12.0
 

@@ -1,24 +1,26 @@
-"""One vector for everything: the paper's six parameters, then every effect parameter at its neutral value.
-
-The kernel reads this vector by index, people read it by name.  Extending a model frees more entries of the same
-vector, so models nest exactly and one kernel serves all.
-"""
+"""Layout of the parameter vector: the paper's six parameters, then every effect parameter at its neutral value."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
 
-from quadid.effects import EFFECTS, NEVER, Effect, EffectParameter, parameter_of, rotor_drag_losses, rotor_losses
-from quadid.effects.kinds import Scale
-from quadid.errors import ParameterError, nearest
+from quadid.data.window import Window
+from quadid.effects import EFFECTS, NEVER, Effect, EffectParameter, Scale, parameter_of, rotor_drag_losses, rotor_losses
+from quadid.errors import ParameterError, WindowError, nearest
 from quadid.parameters import NOMINAL_NAMES, NOMINAL_UNITS
-from quadid.residual import MOST_FACTORS, SIGNALS, TARGETS
 from quadid.types import FloatArray, IntArray
-from quadid.vehicle import GRAVITY, Vehicle
+from quadid.vehicle import GRAVITY, MOST_FACTORS, SIGNALS, TARGETS, Vehicle
+
+# --- One vector for everything: the paper's six parameters, then every effect parameter at its neutral value
+#
+# The kernel reads this vector by index, people read it by name.  Extending a model frees more entries of the same
+# vector, so models nest exactly and one kernel serves all.
+
 
 B, D, JXX, JYY, JZZ, JR = range(6)
 _ENTRIES: tuple[tuple[str, Effect, EffectParameter], ...] = tuple(
@@ -209,3 +211,103 @@ def _effect_entry(dotted: str, p: EffectParameter, scale: Mapping[Scale, float])
         return Entry(dotted, index, "s", NEVER, -NEVER, NEVER, 1.0)
     factor = scale[p.scale]
     return Entry(dotted, index, p.unit, p.neutral, p.lower * factor, p.upper * factor, p.typical * factor, p.sign)
+
+
+# --- Thrust of the rotors by a full parameter vector
+
+
+class ThrustModel:
+    """Thrust of the rotors by a full parameter vector: thrust curve and weak rotors included, inflow left out."""
+
+    def __init__(self, layout: Layout, theta: FloatArray) -> None:
+        """Thrust by `theta`, shape (layout.size,)."""
+        curve = layout.read_effect(theta, "thrust_curve")
+        self._b, self._dead_speed = float(theta[0]), curve["dead_speed"]
+        self._offset = curve.get("offset", 0.0)
+        self._share = 1.0 - theta[LOSS : LOSS + layout.rotors]
+
+    @classmethod
+    def stated(cls, vehicle: Vehicle) -> ThrustModel:
+        """Thrust by the vehicle file's guess and known effects."""
+        layout = Layout(vehicle)
+        return cls(layout, layout.initial(vehicle))
+
+    def with_b(self, b: float) -> ThrustModel:
+        """The same with another `b` [N s^2/rad^2]."""
+        other = copy(self)
+        other._b = b
+        return other
+
+    def at_speed(self, speed: float) -> FloatArray:
+        """Thrust of each rotor [N], shape (rotors,), where all turn at `speed` [rad/s]."""
+        return np.asarray(self.single(np.full((1, len(self._share)), speed))[0])
+
+    def single(self, rotor_speed: FloatArray) -> FloatArray:
+        """Thrust of each rotor [N], shape (n, rotors), of speeds [rad/s], shape (n, rotors)."""
+        thrust = self._b * np.maximum(rotor_speed - self._dead_speed, 0.0) ** 2 + self._offset
+        return np.asarray(np.where(rotor_speed > 0.0, thrust, 0.0) * self._share)
+
+    def total(self, rotor_speed: FloatArray) -> FloatArray:
+        """Sum over the rotors [N], shape (n,), of speeds [rad/s], shape (n, rotors)."""
+        return np.asarray(self.single(rotor_speed).sum(axis=1))
+
+    def hover_speed(self, weight: float) -> float:
+        """Speed [rad/s] at which the rotors, all alike, carry `weight` [N]."""
+        return self._dead_speed + math.sqrt(max(self._each(weight) - self._offset, 1e-9) / self._b)
+
+    def like(self, stated: ThrustModel, weight: float) -> float:
+        """The `b` with which `stated` carries `weight` [N] at the speed at which this one does [N s^2/rad^2].
+
+        Losses of single rotors count with their mean, a curve with what it gives at hover.
+        """
+        beyond = max(self.hover_speed(weight) - stated._dead_speed, 1e-9)
+        return max(stated._each(weight) - stated._offset, 1e-9) / beyond**2
+
+    def slope(self, weight: float) -> FloatArray:
+        """Change of each rotor's thrust with its speed where they carry `weight` [N], shape (rotors,) [N s/rad]."""
+        return np.asarray(2.0 * self._b * (self.hover_speed(weight) - self._dead_speed) * self._share)
+
+    def _each(self, weight: float) -> float:
+        return weight / max(float(self._share.sum()), 1e-9)
+
+
+# --- The supply voltage that scales commands: relative to a reference, row by row
+
+
+def voltage_at(times: FloatArray, t: FloatArray, volts: FloatArray) -> FloatArray | None:
+    """Voltage at `times` [V], linear between readings `volts` at `t`; None where no reading is above zero."""
+    good = np.isfinite(volts) & (volts > 0.0)
+    return np.interp(times, t[good], volts[good]) if good.any() else None
+
+
+def _voltage(window: Window) -> FloatArray | None:
+    """Voltage at every row [V], shape (n,); None without any."""
+    rows = np.arange(len(window), dtype=np.float64)
+    return None if window.battery is None else voltage_at(rows, rows, np.ravel(window.battery))
+
+
+def with_reference_voltage(vehicle: Vehicle, windows: Sequence[Window]) -> Vehicle:
+    """`vehicle` with its reference voltage: its own, or the mean over `windows` where each of them has a voltage."""
+    known = [_voltage(w) for w in windows]
+    volts = [v for v in known if v is not None]
+    if vehicle.reference_voltage is not None or not volts or len(volts) < len(known):
+        return vehicle
+    return vehicle.model_copy(update={"reference_voltage": float(np.mean(np.concatenate(volts)))})
+
+
+def relative_voltage(window: Window, vehicle: Vehicle) -> FloatArray:
+    """Logarithm of the supply voltage over the vehicle's reference at each row; 0 where either is not known.
+
+    Raises:
+        WindowError: the vehicle's rotors follow the voltage, and it is not known.
+    """
+    volts = _voltage(window)
+    if vehicle.reference_voltage is not None and volts is not None:
+        return np.asarray(np.log(volts / vehicle.reference_voltage))
+    if vehicle.effects.get("supply_voltage", {}).get("exponent"):
+        raise WindowError(
+            f"{window.name or 'window'}: no supply voltage, which scales this vehicle's commands (supply_voltage)",
+            "battery voltage in the log and reference_voltage in the vehicle file",
+            "log the battery, or leave supply_voltage out",
+        )  # fmt: skip
+    return np.zeros(len(window))

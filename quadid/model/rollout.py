@@ -1,34 +1,240 @@
-"""Typed wrapper of the kernel: segments of a window, initial states, many parameter vectors at once."""
+"""Simulation of windows: segments, initial states, many parameter vectors at once."""
 
 from __future__ import annotations
 
 import itertools
 import math
 import os
-from collections.abc import Callable
+from collections import OrderedDict
+from collections.abc import Callable, Hashable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from functools import lru_cache
+from itertools import permutations
 from queue import SimpleQueue
+from threading import Lock
 from typing import NamedTuple
+from weakref import WeakValueDictionary
 
 import numpy as np
 
+from quadid.data.window import Window
 from quadid.errors import WindowError
 from quadid.model import layout as ix
-from quadid.model.array_cache import ArrayCache
-from quadid.model.channels import channels_of, measurements
-from quadid.model.kernel import Flight
-from quadid.model.layout import places, residual_terms
-from quadid.model.needs_kernel import ROTOR_ENTRIES, Needs, needs_of
+from quadid.model.kernel import (
+    FACTOR_ENTRIES,
+    HUB_ENTRIES,
+    RARE_ENTRIES,
+    ROTOR_ENTRIES,
+    SOLID_ENTRIES,
+    Flight,
+    Needs,
+    needs_of,
+)
+from quadid.model.layout import places, relative_voltage, residual_terms
 from quadid.model.rollout_kernel import roll_segments
 from quadid.model.rotor_kernel import Drive, rotor_table
-from quadid.model.segments import Segments
 from quadid.model.simd import LANES, aligned
-from quadid.model.supply import relative_voltage
 from quadid.model.work_array import ALL_MOMENTS, MAX_TANGENTS, N_STATE
-from quadid.types import FloatArray, check_shapes
+from quadid.types import BoolArray, FloatArray, IndexArray, IntArray, check_shapes
 from quadid.vehicle import Vehicle
-from quadid.window import Window
+
+# --- Residual channels: their order, and what a window measured of each
+
+
+CHANNEL_NAMES = ("p", "q", "r", "phi", "theta", "psi", "a_x", "a_y", "a_z", "v_n", "v_e", "v_d", "x", "y", "z")
+"""Residual channels: rates, attitude error as a body rotation vector, specific force, velocity, position."""
+CHANNEL_UNITS = ("rad/s",) * 3 + ("rad",) * 3 + ("m/s^2",) * 3 + ("m/s",) * 3 + ("m",) * 3
+
+
+def channels_of(window: Window) -> int:
+    """Number of residual channels that a window has."""
+    if window.position is not None:
+        return 15
+    return 9 if window.velocity is None else 12
+
+
+def measurements(window: Window, channels: int) -> tuple[FloatArray, BoolArray]:
+    """What a window measured, as the kernel reads it.
+
+    Args:
+        window: the data, n rows.
+        channels: residual channels to look at, the first 9, 12 or 15.
+
+    Returns:
+        Rates, quaternion, specific force, and of those looked at velocity and position, shape (n, channels + 1), at
+        rest where missing; and where each channel was measured, shape (n, channels).
+    """
+    n = len(window)
+    measured = np.zeros((n, channels + 1))
+    measured[:, 3] = 1.0
+    valid = np.zeros((n, channels), dtype=bool)
+    places = ((window.gyro, 0, 0), (window.attitude, 3, 3), (window.accel, 7, 6), (window.velocity, 10, 9),
+              (window.position, 13, 12))  # fmt: skip
+    for values, column, channel in places:
+        if values is None or channel >= channels:
+            continue
+        good = np.isfinite(values).all(axis=1)
+        measured[good, column : column + values.shape[1]] = values[good]
+        valid[good, channel : channel + 3] = True
+    return measured, valid
+
+
+# --- How a window is cut into segments
+
+
+@dataclass(frozen=True)
+class Segments:
+    """How a window is cut for multiple shooting.
+
+    Attributes:
+        length: scored rows a segment.
+        lead: rows before the first scored one, available to roll in filters and delays.
+        starts: first scored row of each segment.
+    """
+
+    length: int
+    lead: int
+    starts: IntArray
+
+    @classmethod
+    def cut(cls, rows: int, length: int, lead: int = 1) -> Segments:
+        """Cuts `rows` rows into back-to-back segments of `length`, leaving `lead` rows before the first.
+
+        Raises:
+            WindowError: when not one segment fits.
+        """
+        starts = np.arange(lead, rows - length, length, dtype=np.int64)
+        if len(starts) == 0:
+            raise WindowError(f"window of {rows} rows", f"at least {length + lead + 1} rows", "use a longer stretch")
+        return cls(length, lead, starts)
+
+    @property
+    def rows(self) -> IntArray:
+        """Scored rows of each segment, shape (segments, length)."""
+        return self.starts[:, None] + np.arange(self.length)
+
+    def at(self, places: IndexArray) -> Segments:
+        """Returns the segments at `places`."""
+        return Segments(self.length, self.lead, self.starts[places])
+
+    def later(self, shift: int, rows: int) -> Segments:
+        """Returns the segments moved `shift` rows, without those that no longer fit into a window of `rows` rows."""
+        starts = self.starts + shift
+        return Segments(self.length, self.lead, starts[starts < rows - self.length])
+
+
+# --- Arrays kept for the next calls, the most recently used ones, up to a number of bytes together
+
+
+class ArrayCache:
+    """Arrays by key; the least recently used go first.
+
+    Args:
+        most: bytes of all together; a single larger array is not kept.
+    """
+
+    def __init__(self, most: int) -> None:
+        self._most, self._bytes = most, 0
+        self._kept: OrderedDict[Hashable, FloatArray] = OrderedDict()
+        self._lock = Lock()
+
+    def get(self, key: Hashable) -> FloatArray | None:
+        """The array kept under this key, if it still is."""
+        with self._lock:
+            found = self._kept.get(key)
+            if found is not None:
+                self._kept.move_to_end(key)
+            return found
+
+    def keep(self, key: Hashable, array: FloatArray) -> None:
+        """Keeps an array under a key, and drops those used longest ago."""
+        with self._lock:
+            self._bytes += array.nbytes - (self._kept.pop(key).nbytes if key in self._kept else 0)
+            self._kept[key] = array
+            while self._bytes > self._most:
+                self._bytes -= self._kept.popitem(last=False)[1].nbytes
+
+
+# --- Which parameter vectors share a block of lanes: those that need the same of the model, so that no block needs all
+
+
+_AIR, _HUB, _SOLID, _RARE, _ROTORS, _DELAYED, _FILTER, _LATE, _AHRS = range(9)
+_PLAIN, _AIR_COST, _HUB_COST, _SOLID_COST, _RARE_COST = 10.0, 7.0, 6.0, 10.0, 7.0
+_ROTOR_COST, _DELAYED_COST, _FILTER_COST, _LATE_COST, _AHRS_COST = 10.0, 22.0, 7.0, 14.0, 10.0
+"""Nanoseconds a particle and step, beside the plain ones; `python -m quadid_evaluation.benchmarks.speed --parts pieces`
+measures them."""
+
+
+def packing(thetas: FloatArray, rotors: int, channels: int) -> IndexArray:
+    """Lane of each of these parameter vectors (m, size), the first one in lane 0, shape (m,).
+
+    Of a few orders by what a vector needs beyond the first one, the one that should take least time.  Lanes beyond the
+    last vector are free to repeat the first.
+    """
+    if len(thetas) <= LANES:
+        return np.arange(len(thetas))
+    features = np.zeros((len(thetas), 9), dtype=bool)
+    groups = ((_HUB, HUB_ENTRIES + RARE_ENTRIES), (_SOLID, SOLID_ENTRIES + FACTOR_ENTRIES), (_RARE, RARE_ENTRIES))
+    for feature, entries in groups:
+        features[:, feature] = (thetas[:, list(entries)] != 0.0).any(axis=1)
+    features[:, _AIR] = features[:, _HUB] | (channels > 9)
+    own = np.concatenate([thetas[:, list(ROTOR_ENTRIES)], thetas[:, ix.LOSS : ix.LOSS + 2 * rotors]], axis=1)
+    features[:, _ROTORS] = (own != own[0]).any(axis=1)
+    for feature, entry in ((_DELAYED, ix.DELAY), (_FILTER, ix.IMU_PERIOD), (_LATE, ix.ATT_DELAY), (_AHRS, ix.AHRS_K)):
+        features[:, feature] = thetas[:, entry] != 0.0
+    return _cheapest(features.tobytes(), len(thetas))
+
+
+def packed(vectors: FloatArray, lane: IndexArray) -> FloatArray:
+    """Vectors (m, n) in whole blocks of lanes, spare ones repeating the first."""
+    out = np.repeat(vectors[:1], -(-len(vectors) // LANES) * LANES, axis=0)
+    out[lane] = vectors
+    return out
+
+
+@lru_cache(maxsize=512)
+def _cheapest(features: bytes, m: int) -> IndexArray:
+    needs = np.frombuffer(features, dtype=bool).reshape(m, -1)
+    best = min(_orders(needs), key=lambda order: _cost(needs, order))
+    place = np.empty(m, dtype=np.intp)
+    lanes = np.flatnonzero(best >= 0)
+    place[best[lanes]] = lanes
+    place.setflags(write=False)
+    return place
+
+
+def _orders(needs: BoolArray) -> Iterator[IndexArray]:
+    """Vectors by lane, -1 for those that repeat the first: sorted by groups of needs, spare lanes early or late."""
+    m = len(needs)
+    spare = np.full(-(-m // LANES) * LANES - m, -1)
+    groups = ([_ROTORS, _DELAYED], [_FILTER, _LATE, _AHRS], [_AIR, _HUB, _SOLID, _RARE])
+    for keys in permutations(groups):
+        columns = [needs[1:, f] for group in reversed(keys) for f in group]
+        order = 1 + np.lexsort(columns)
+        yield np.concatenate([[0], order, spare])
+        yield np.concatenate([[0], spare, order])
+
+
+def _cost(needs: BoolArray, order: IndexArray) -> float:
+    """Time of all blocks, nanoseconds a lane and step."""
+    total = 0.0
+    for first in range(0, len(order), LANES):
+        need: BoolArray = np.any(needs[np.maximum(order[first : first + LANES], 0)], axis=0)
+        total += (
+            _PLAIN
+            + need[_AIR] * _AIR_COST
+            + need[_HUB] * _HUB_COST
+            + need[_SOLID] * _SOLID_COST
+            + need[_RARE] * _RARE_COST
+        )
+        total += (_DELAYED_COST if need[_DELAYED] else _ROTOR_COST) * need[_ROTORS]
+        total += need[_FILTER] * _FILTER_COST + need[_LATE] * _LATE_COST + need[_AHRS] * _AHRS_COST
+    return total
+
+
+# --- Typed wrapper of the kernel: segments of a window, initial states, many parameter vectors at once
+
 
 TAU, SLOWER = places("motor_lag")
 (OFFSET,) = places("thrust_curve.offset")
@@ -317,3 +523,22 @@ class Rollout:
                 nearest = good[np.argmin(np.abs(rows[:, None] - good[None, :]), axis=1)] if len(good) < len(w) else rows
                 x0[:, place : place + values.shape[1]] = values[nearest]
         return x0
+
+
+# --- One simulation of a window for all problems that look at it
+
+
+_SHARED: WeakValueDictionary[tuple[int, int], Rollout] = WeakValueDictionary()
+
+
+def shared_rollout(window: Window, vehicle: Vehicle) -> Rollout:
+    """The `Rollout` of this very window and vehicle that somebody still uses, or a new one.
+
+    Problems with segments of several lengths look at the same data; of a long log each copy would be a large part of
+    all memory.
+    """
+    key = (id(window), id(vehicle))  # of objects that the one found keeps alive
+    found = _SHARED.get(key)
+    if found is None:
+        found = _SHARED[key] = Rollout(window, vehicle)
+    return found

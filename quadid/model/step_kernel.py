@@ -12,12 +12,20 @@ from typing import Any
 import numba as nb
 import numpy as np
 
-from quadid.model.body_kernel import step_air, step_air_solid, step_full, step_hub, step_hub_solid, step_rare
-from quadid.model.kernel import Flight, body_constants, flight_factors, load_payload
-from quadid.model.lag_kernel import rotor_constants
-from quadid.model.needs_kernel import Needs
-from quadid.model.residual_kernel import N_SIGNALS, residual_coefficients, residual_forces, residual_signals
-from quadid.model.rotor_kernel import input_constants, turn_rotor
+from quadid.model.body_kernel import (
+    N_SIGNALS,
+    residual_coefficients,
+    residual_forces,
+    residual_signals,
+    step_air,
+    step_air_solid,
+    step_full,
+    step_hub,
+    step_hub_solid,
+    step_rare,
+)
+from quadid.model.kernel import Flight, Needs, body_constants, flight_factors, load_payload
+from quadid.model.rotor_kernel import input_constants, rotor_constants, turn_rotor
 from quadid.types import BoolArray, FloatArray, IntArray
 
 # isort: off

@@ -21,9 +21,9 @@ What stands between samples and the parameter topic, in this order; each says wh
 """
 
 from quadid.online.gate import GateSettings as GateSettings
-from quadid.online.jobs import Job as Job
-from quadid.online.jobs import JobReply as JobReply
 from quadid.online.records import Event as Event
+from quadid.online.records import Job as Job
+from quadid.online.records import JobReply as JobReply
 from quadid.online.records import OnlineDiagnosis as OnlineDiagnosis
 from quadid.online.records import OnlineSet as OnlineSet
 from quadid.online.records import Phase as Phase

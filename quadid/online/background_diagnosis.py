@@ -12,16 +12,15 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, ClassVar
 
 from quadid.chi_square import Z95
+from quadid.data.rotor_signal import INERTIA_RATE
 from quadid.effects import EFFECTS
-from quadid.online.consistency import ALLOWED
+from quadid.online.checks import ALLOWED
 from quadid.online.grid_buffer import COMPLETE, GridBuffer
-from quadid.online.jobs import MOST_ERRORS, Job, JobReply
-from quadid.online.records import OnlineAlternative, OnlineDiagnosis, OnlineFinding
-from quadid.rotor_signal import INERTIA_RATE
+from quadid.online.records import MOST_ERRORS, Job, JobReply, OnlineAlternative, OnlineDiagnosis, OnlineFinding
 from quadid.vehicle import Vehicle
 
 if TYPE_CHECKING:
-    from quadid.diagnose.result import Finding
+    from quadid.diagnosis.result import Finding
 
 DIAGNOSED_SECONDS = 60.0
 """Flight that a diagnosis looks at [s]."""
@@ -59,7 +58,7 @@ class DiagnosisRequest(Job):
 
     def answer(self) -> DiagnosisReply:
         """Diagnoses the windows."""
-        from quadid.diagnose import diagnose  # a large import that only the process which diagnoses needs
+        from quadid.diagnosis import diagnose  # a large import that only the process which diagnoses needs
 
         result, _ = diagnose(self.windows, self.vehicle, seed=self.seed, swarm=True, predict=False)
         findings = tuple(_online(f, self.slow) for f in result.findings)

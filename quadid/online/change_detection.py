@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from quadid.online.flight_state import FlightState, Velocity, step_beside
-from quadid.online.rows import Rows
+from quadid.online.grid_buffer import Rows
 from quadid.types import BoolArray, FloatArray
 from quadid.vehicle import Vehicle
 

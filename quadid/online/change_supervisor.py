@@ -9,11 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from quadid.online.change_detection import CHUNK, ChangeDetector, ChangePoint
+from quadid.online.checks import Quality, judge
 from quadid.online.estimator import Estimator
 from quadid.online.fault_isolation import PULL, ChangeReply, ChangeRequest
 from quadid.online.fusion import DRIFT
 from quadid.online.grid_buffer import GridBuffer
-from quadid.online.quality import Quality, judge
 from quadid.online.records import OnlineAlternative, OnlineFinding
 from quadid.vehicle import GRAVITY, Vehicle
 

@@ -9,12 +9,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from quadid.identify.covariance import Uncertainty, parameter_set
-from quadid.identify.noise_model import NoiseModel
-from quadid.identify.shooting import Free
-from quadid.model.channels import channels_of
-from quadid.model.layout import LOSS, B, D, Layout
-from quadid.model.thrust import ThrustModel
+from quadid.data.window import Window
+from quadid.identification.covariance import Uncertainty, parameter_set
+from quadid.identification.noise_model import NoiseModel
+from quadid.identification.parameterization import Free
+from quadid.model.layout import LOSS, B, D, Layout, ThrustModel
+from quadid.model.rollout import channels_of
 from quadid.online.active_set import ActiveSet
 from quadid.online.flexible_fit import with_room
 from quadid.online.fusion import DRIFT, Fusion, WindowEstimate
@@ -25,7 +25,6 @@ from quadid.online.window_fit import FitReply, FitRequest, prior_of
 from quadid.parameters import NOMINAL_NAMES, ParameterSet, Status
 from quadid.types import FloatArray
 from quadid.vehicle import GRAVITY, Vehicle
-from quadid.window import Window
 
 HELD_OUT_WINDOWS = 4
 """Newest windows without a common sample in which sets are compared."""

@@ -8,16 +8,15 @@ import numpy as np
 
 from quadid.chi_square import exceeded, survival
 from quadid.effects import NEVER
-from quadid.identify.gauss_newton import polish
-from quadid.identify.initial_states import InitialStates
-from quadid.identify.noise_model import NoiseModel
-from quadid.identify.priors import Prior, posterior_covariance
-from quadid.identify.shooting import Shooting
+from quadid.identification.gauss_newton import polish
+from quadid.identification.initial_states import InitialStates
+from quadid.identification.noise_model import NoiseModel
+from quadid.identification.priors import Prior, posterior_covariance
+from quadid.identification.shooting import Shooting
 from quadid.model import layout as ix
 from quadid.model.layout import LOSS, Layout
 from quadid.online.change_detection import ChangePoint
-from quadid.online.jobs import Job, JobReply
-from quadid.online.records import OnlineAlternative, OnlineFinding
+from quadid.online.records import Job, JobReply, OnlineAlternative, OnlineFinding
 from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray
 from quadid.vehicle import GRAVITY

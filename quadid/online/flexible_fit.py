@@ -22,21 +22,21 @@ from dataclasses import replace
 
 import numpy as np
 
+from quadid.data.window import Sampling, Window
 from quadid.effects import EFFECTS
-from quadid.identify.covariance import variance_ratio
-from quadid.identify.gauss_newton import Polished, polish, robust_weights
-from quadid.identify.noise_estimation import residual_noise
-from quadid.identify.noise_model import NoiseModel
-from quadid.identify.priors import Prior, posterior_covariance, prior_terms
-from quadid.identify.schur_complement import eliminated
-from quadid.identify.shooting import Free, Shooting
-from quadid.model.layout import B
-from quadid.model.thrust import ThrustModel
+from quadid.identification.covariance import variance_ratio
+from quadid.identification.gauss_newton import Polished, polish, robust_weights
+from quadid.identification.noise_estimation import residual_noise
+from quadid.identification.noise_model import NoiseModel
+from quadid.identification.parameterization import Free
+from quadid.identification.priors import Prior, posterior_covariance, prior_terms
+from quadid.identification.schur_complement import eliminated
+from quadid.identification.shooting import Shooting
+from quadid.model.layout import B, ThrustModel
 from quadid.online.fusion import WindowEstimate
 from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray
 from quadid.vehicle import GRAVITY, Vehicle
-from quadid.window import Sampling, Window
 
 SEGMENT = 0.5
 """Length of the shooting segments [s]."""

@@ -18,9 +18,9 @@ import math
 
 import numpy as np
 
+from quadid.data.resample import median
 from quadid.model.layout import Layout
-from quadid.online.rows import Rows
-from quadid.resample import median
+from quadid.online.grid_buffer import Rows
 from quadid.rotation import conjugate, rotated
 from quadid.types import FloatArray
 from quadid.vehicle import GRAVITY, Vehicle

@@ -11,8 +11,8 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from quadid.chi_square import Z95
-from quadid.identify.covariance import PRIOR_SHARE
-from quadid.online.consistency import Factor
+from quadid.identification.covariance import PRIOR_SHARE
+from quadid.online.checks import Factor
 from quadid.online.records import WAITS, OnlineSet, SetState
 from quadid.parameters import MAY_VANISH, NOMINAL_NAMES, UNKNOWN, ParameterSet, Status, at_bound, impossible_inertia
 from quadid.types import FloatArray

@@ -8,11 +8,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from quadid.health.trim_estimation import FlightTrim
-from quadid.health.watch import HealthReport, HealthWatch
+from quadid.condition.trim import FlightTrim
+from quadid.condition.watch import HealthReport, HealthWatch
 from quadid.online.grid_buffer import GridBuffer
-from quadid.online.outbox import Outbox
-from quadid.online.records import HealthyFlight
+from quadid.online.records import HealthyFlight, Outbox
 from quadid.types import FloatArray
 from quadid.vehicle import GRAVITY, Vehicle
 

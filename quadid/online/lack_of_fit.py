@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from quadid.effects import EFFECTS
-from quadid.identify.gauss_newton import Polished
-from quadid.identify.shooting import Shooting
+from quadid.identification.gauss_newton import Polished
+from quadid.identification.shooting import Shooting
 from quadid.online.flexible_fit import EFFECT_WIDTH, moving_names
 
 TRIFLE = 0.01

@@ -1,15 +1,28 @@
-"""What a session hands out: parameter sets with their story, findings, events for the history, its status."""
+"""Records and jobs of a session: what it hands out and asks for."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+import traceback
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import ClassVar, Literal
+from pathlib import Path
+from typing import ClassVar, Literal, TypeGuard
 
-from quadid.health.trim_estimation import FlightTrim
+import numpy as np
+
+from quadid.condition.trim import FlightTrim
+from quadid.condition.watch import HealthReport
+from quadid.data.window import Window
+from quadid.errors import QuadidError
 from quadid.parameters import ParameterSet
 from quadid.types import FloatArray
+from quadid.vehicle import Vehicle
+
+# --- What a session hands out: parameter sets with their story, findings, events for the history, its status
+
 
 WAITS = "waits for approval: "
 """Begins the reason of a set that passed every check; what follows stays true once it is approved."""
@@ -216,3 +229,133 @@ class SessionStatus:
     faults: Mapping[str, int]
     backlog: float
     skipped: int = 0
+
+
+# --- Work that a session asks for and does not do itself: a fit, a question about a change, a diagnosis
+#
+# Whoever drives the session runs it, in its own process or another, and delivers the reply.
+
+
+UNEXPECTED = "unexpected error, please report it: "
+"""Begins the problem of a job that failed by an error of this program, not by what its data are."""
+
+MOST_ERRORS = 5
+"""After so many of them in a row no more such jobs are begun by themselves."""
+
+
+def unexpected(error: BaseException) -> str:
+    """The problem that an error is which nobody foresaw: what, and where it arose."""
+    *_, last = traceback.extract_tb(error.__traceback__)
+    return f"{UNEXPECTED}{type(error).__name__}: {str(error)[:200]} ({Path(last.filename).name}, line {last.lineno})"
+
+
+@dataclass(frozen=True)
+class JobReply:
+    """Answer to a job.
+
+    Attributes:
+        number: of the job.
+        problem: why there is no result, or empty.
+    """
+
+    number: int
+    problem: str = ""
+
+    @property
+    def is_unexpected(self) -> bool:
+        """Whether the job failed by an error of this program."""
+        return self.problem.startswith(UNEXPECTED)
+
+
+@dataclass(frozen=True)
+class Job(ABC):
+    """A pure function of its own fields.
+
+    Attributes:
+        background: whether the session goes on meanwhile; it stands still for all others.
+        reply: what it is answered with.
+        number: counts the jobs of a session.
+        vehicle: the vehicle.
+        windows: stretches of data on one grid.
+        start, stop: the time they stand for [s].
+    """
+
+    background: ClassVar[bool] = False
+    reply: ClassVar[type[JobReply]]
+
+    number: int
+    vehicle: Vehicle
+    windows: tuple[Window, ...]
+    start: float
+    stop: float
+
+    def run(self) -> JobReply:
+        """Does it; an error is the reply's `problem`, never raised."""
+        try:
+            return self.answer()
+        except (QuadidError, np.linalg.LinAlgError) as error:
+            return self.failed(str(error))
+        except MemoryError:
+            raise
+        except Exception as error:  # noqa: BLE001 - whatever it is, the flight goes on, and it is told with its input
+            return self.failed(unexpected(error))
+
+    @abstractmethod
+    def answer(self) -> JobReply:
+        """Does it; raises QuadidError or LinAlgError for data that allow no answer."""
+
+    def failed(self, problem: str) -> JobReply:
+        """The reply of a job that could not be run."""
+        return self.reply(self.number, problem)
+
+    def is_answered_by(self, reply: object) -> TypeGuard[JobReply]:
+        """Whether a reply is to this job, and of its kind."""
+        return isinstance(reply, self.reply) and reply.number == self.number
+
+
+# --- What a session says: its phase and reason, and the actions that wait to be handed out
+
+
+Action = Job | Publish | OnlineDiagnosis | HealthReport | HealthyFlight | Event
+
+
+class Outbox:
+    """Phase, reason and outgoing actions.
+
+    Attributes:
+        phase, reason: what the session is doing, and why.
+    """
+
+    def __init__(self, stamp: Callable[[float], float]) -> None:
+        """Speaks in the time of the stream's stamps: `stamp` turns session time [s] into them."""
+        self._stamp = stamp
+        self.phase, self.reason = Phase.WAITING, "no samples yet"
+        self._out: list[Action] = []
+
+    def stamp(self, t: float) -> float:
+        """Session time as a stamp [s]; NaN for no time."""
+        return self._stamp(t) if math.isfinite(t) else math.nan
+
+    def act(self, *actions: Action) -> None:
+        """Queues actions."""
+        self._out.extend(actions)
+
+    def say(self, t: float, level: str, kind: str, text: str) -> None:
+        """Queues an event at session time `t` [s]."""
+        self._out.append(Event(self.stamp(t), level, kind, text))
+
+    def state(self, phase: Phase, reason: str) -> None:
+        """Notes phase and reason."""
+        self.phase, self.reason = phase, reason
+
+    def note(self, t: float, phase: Phase, reason: str) -> None:
+        """Notes phase and reason, and journals them when they are of a new kind."""
+        if (phase, reason.split(":")[0]) != (self.phase, self.reason.split(":")[0]):
+            level = "warning" if phase in (Phase.BLOCKED, Phase.FAILED) else "info"
+            self.say(t, level, phase.name.lower(), reason)
+        self.state(phase, reason)
+
+    def take(self) -> list[Action]:
+        """Hands the queued actions out."""
+        out, self._out = self._out, []
+        return out

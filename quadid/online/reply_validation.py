@@ -10,7 +10,7 @@ from collections.abc import Container
 
 import numpy as np
 
-from quadid.identify.noise_model import SHAPE_POINTS, NoiseModel
+from quadid.identification.noise_model import SHAPE_POINTS, NoiseModel
 from quadid.model.layout import Layout
 from quadid.online.fusion import WindowEstimate
 from quadid.parameters import NOMINAL_NAMES

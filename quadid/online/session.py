@@ -19,27 +19,35 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 
-from quadid.health.trim_estimation import FlightTrim
+from quadid.condition.trim import FlightTrim
+from quadid.data.window import Block, Sample
 from quadid.online.active_set import ActiveSet, Answer
 from quadid.online.background_diagnosis import DIAGNOSED_SECONDS, BackgroundDiagnosis
 from quadid.online.change_supervisor import ChangeSupervisor
-from quadid.online.consistency import LEAD, Consistency
+from quadid.online.checks import LEAD, Consistency, Quality
 from quadid.online.estimator import Estimator
 from quadid.online.fault_isolation import ChangeReply, ChangeRequest
-from quadid.online.grid_buffer import GridBuffer
+from quadid.online.grid_buffer import GridBuffer, Rows
 from quadid.online.health_supervisor import HealthSupervisor
-from quadid.online.jobs import MOST_ERRORS, Job, JobReply, unexpected
-from quadid.online.outbox import Action, Outbox
-from quadid.online.quality import Quality
-from quadid.online.records import OnlineSet, Phase, Publish, SessionStatus, SetState
-from quadid.online.resampler import LEADER, Resampler
-from quadid.online.rows import Rows
+from quadid.online.records import (
+    MOST_ERRORS,
+    Action,
+    Job,
+    JobReply,
+    OnlineSet,
+    Outbox,
+    Phase,
+    Publish,
+    SessionStatus,
+    SetState,
+    unexpected,
+)
 from quadid.online.settings import SessionSettings
+from quadid.online.stream import LEADER, Resampler
 from quadid.online.supervisor import Supervisor
 from quadid.online.window_fit import FitReply, FitRequest, is_excited
 from quadid.online.window_supervisor import WindowSupervisor
 from quadid.vehicle import Vehicle
-from quadid.window import Block, Sample
 
 _EPS = 1e-6
 _DONE = object()

@@ -9,13 +9,12 @@ from dataclasses import replace
 from quadid.online.active_set import ActiveSet
 from quadid.online.background_diagnosis import BackgroundDiagnosis
 from quadid.online.change_detection import LEAST, ChangePoint
-from quadid.online.consistency import Consistency
+from quadid.online.checks import Consistency
 from quadid.online.estimator import Estimator
 from quadid.online.fault_isolation import PULL, ChangeReply, ChangeRequest
 from quadid.online.fusion import WindowEstimate
 from quadid.online.gate import GateSettings, decide
-from quadid.online.outbox import Outbox
-from quadid.online.records import OnlineDiagnosis, OnlineFinding, OnlineSet, Phase, Publish, SetState
+from quadid.online.records import OnlineDiagnosis, OnlineFinding, OnlineSet, Outbox, Phase, Publish, SetState
 from quadid.online.window_fit import FitReply, FitRequest
 from quadid.parameters import NOMINAL_NAMES
 

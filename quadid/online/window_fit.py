@@ -7,17 +7,19 @@ from typing import TypeGuard
 
 import numpy as np
 
-from quadid.identify.excitation import bounds_of
-from quadid.identify.fit import SWARM_SECONDS
-from quadid.identify.gauss_newton import Polished, polish, robust_weights
-from quadid.identify.global_search import swarm_search
-from quadid.identify.noise_estimation import residual_noise, reweighted_fit
-from quadid.identify.noise_model import NoiseModel
-from quadid.identify.particle_swarm import SwarmOptions
-from quadid.identify.priors import Prior
-from quadid.identify.shooting import Free, Shooting
-from quadid.model.channels import channels_of
+from quadid.data.window import Window
+from quadid.identification.excitation import bounds_of
+from quadid.identification.fit import SWARM_SECONDS
+from quadid.identification.gauss_newton import Polished, polish, robust_weights
+from quadid.identification.global_search import swarm_search
+from quadid.identification.noise_estimation import residual_noise, reweighted_fit
+from quadid.identification.noise_model import NoiseModel
+from quadid.identification.parameterization import Free
+from quadid.identification.particle_swarm import SwarmOptions
+from quadid.identification.priors import Prior
+from quadid.identification.shooting import Shooting
 from quadid.model.layout import Layout
+from quadid.model.rollout import channels_of
 from quadid.online.flexible_fit import (
     alike,
     flexible_fit,
@@ -29,13 +31,12 @@ from quadid.online.flexible_fit import (
     with_room,
 )
 from quadid.online.fusion import WindowEstimate
-from quadid.online.jobs import Job, JobReply
 from quadid.online.lack_of_fit import LackOfFit, lack_of_fit
+from quadid.online.records import Job, JobReply
 from quadid.online.reply_validation import SIX, is_estimate, is_noise, is_vector
 from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
-from quadid.window import Window
 
 FIT_SECONDS = 1.66
 """Length of the shooting segments [s]: six of them fill a window, one a short stretch.

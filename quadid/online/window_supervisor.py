@@ -5,12 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Generator
 
+from quadid.online.checks import Quality, judge, mistake
 from quadid.online.estimator import Estimator
 from quadid.online.grid_buffer import Cut, GridBuffer
-from quadid.online.jobs import MOST_ERRORS
-from quadid.online.outbox import Outbox
-from quadid.online.quality import Quality, judge, mistake
-from quadid.online.records import Phase
+from quadid.online.records import MOST_ERRORS, Outbox, Phase
 from quadid.online.settings import SessionSettings
 from quadid.online.supervisor import Supervisor
 from quadid.online.window_fit import FitRequest

@@ -10,7 +10,7 @@ from rclpy.clock_type import ClockType
 from rclpy.duration import Duration
 from rclpy.node import Node
 
-from quadid_node.convert import MessageTypeError, message_class
+from quadid_node.inputs import MessageTypeError, message_class
 from quadid_node.polling import NO_PUBLISHER_EVENTS, NO_SUBSCRIPTION_EVENTS
 
 TOPIC, TYPE = "bond", "bond/Status"

@@ -25,7 +25,7 @@ from rclpy.parameter_client import AsyncParameterClient
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from quadid.errors import QuadidError
-from quadid_node.convert import message_class, service_class, to_message
+from quadid_node.inputs import message_class, service_class, to_message
 from quadid_node.messages import PARAMETER_SET, SCHEMA_VERSION, TOPICS
 from quadid_node.transport import without_shared_memory
 

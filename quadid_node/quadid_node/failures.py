@@ -10,8 +10,8 @@ import sys
 import time
 from pathlib import Path
 
-from quadid.online.jobs import Job, JobReply
-from quadid_node.parcel import ParcelError, pack, unpack
+from quadid.online.records import Job, JobReply
+from quadid_node.wire_format import ParcelError, pack, unpack
 
 MOST = 8
 """Newest inputs kept: a minute of flight takes less than a mebibyte."""

@@ -1,20 +1,28 @@
-"""Fits on a ground machine: takes windows from services over Zenoh and answers with fits (`quadid worker`).
-
-quadid/<vehicle>/work/fit        query: a request as `parcel`; reply: the answer as `parcel`
-quadid/worker/<id>/alive         liveliness token of a worker whose kernels are warm
-"""
+"""Fits on a ground machine: requests from on board, and the worker that answers them."""
 
 from __future__ import annotations
 
+import contextlib
 import queue
+import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from quadid.online.jobs import Job, unexpected
-from quadid_node.parcel import LARGEST, ParcelError, content, pack, unpack
-from quadid_node.zenoh_session import ROOT, ZenohError, config_of, open_session
+import zenoh
+
+from quadid.errors import QuadidError
+from quadid.online.records import Job, JobReply, unexpected
+from quadid_node.wire_format import LARGEST, ParcelError, content, pack, unpack
+from quadid_node.worker import STUDY_LIMIT, ProcessWorker, Trouble, Worker
+from quadid_node.zenoh import ROOT, ZenohError, config_of, key_of, open_session
+
+# --- Fits on a ground machine: takes windows from services over Zenoh and answers with fits (`quadid worker`)
+#
+# quadid/<vehicle>/work/fit        query: a request as `parcel`; reply: the answer as `parcel`
+# quadid/worker/<id>/alive         liveliness token of a worker whose kernels are warm
+
 
 WORK = f"{ROOT}/*/work/fit"
 ALIVE = f"{ROOT}/worker/*/alive"
@@ -118,3 +126,212 @@ def _answer(query: Any, done: Done, told: Callable[[str], None]) -> None:
     else:
         done.answered += 1
     query.reply(query.key_expr, pack(reply))
+
+
+# --- A worker that lets a ground machine fit, and the child process on board whenever that machine is not there
+#
+# The same kernels get the same windows and start from the same values, so an answer is the same to the bit wherever it
+# was worked out, as long as both machines have the same kind of processor and the same version.
+
+
+FAR_LIMIT = 5.0
+"""A ground machine that does not answer a fit within this time [s] is given up for `REST`."""
+REST = 30.0
+MOST_ANSWERS, MOST_GROUNDS = 8, 256
+"""Answers that wait to be looked at, and ground machines that are told apart; more is nobody's honest work."""
+
+
+class Ground:
+    """The way to ground machines: a Zenoh session that is opened in the background, and who is there."""
+
+    def __init__(self, where: str, vehicle: str, clock: Callable[[], float] = time.monotonic) -> None:
+        """Begins to connect; raises ZenohError for a configuration that is none."""
+        config_of(where)
+        self._where, self._key, self._clock = where, key_of(vehicle, "work/fit"), clock
+        self._session: Any = None
+        self._alive: set[str] = set()
+        self._rests_until = -1e9
+        self._closed, self._lock = threading.Event(), threading.Lock()
+        threading.Thread(target=self._connect, name="ground", daemon=True).start()
+
+    @property
+    def there(self) -> bool:
+        """Whether a ground machine can be asked."""
+        return self._session is not None and bool(self._alive) and self._clock() >= self._rests_until
+
+    @property
+    def count(self) -> int:
+        """Ground machines that live."""
+        return len(self._alive)
+
+    @property
+    def vanished(self) -> bool:
+        """Whether no ground machine lives any more."""
+        return not self._alive
+
+    def ask(self, request: Job, answers: queue.Queue[tuple[int, Any]], seconds: float) -> None:
+        """Sends a request; what comes back is put into `answers` with its number, None for a refusal."""
+
+        def take(reply: Any) -> None:
+            ok = reply.ok
+            small = ok is not None and len(ok.payload) <= LARGEST
+            with contextlib.suppress(queue.Full):
+                answers.put_nowait((request.number, None if ok is None else ok.payload.to_bytes() if small else b""))
+
+        self._session.get(
+            self._key, take, payload=pack(request), timeout=seconds, target=zenoh.QueryTarget.BEST_MATCHING
+        )
+
+    def rest(self) -> None:
+        """Asks nobody for a while."""
+        self._rests_until = self._clock() + REST
+
+    def close(self) -> None:
+        """Leaves."""
+        self._closed.set()
+        with self._lock:
+            if self._session is not None:
+                self._session.close()
+                self._session = None
+
+    def _connect(self) -> None:
+        while not self._closed.is_set():
+            try:
+                session = open_session(self._where)
+            except ZenohError:
+                self._closed.wait(RETRY)
+                continue
+            with self._lock:
+                if self._closed.is_set():
+                    session.close()
+                    return
+                self._watch = session.liveliness().declare_subscriber(ALIVE, self._on_token, history=True)
+                self._session = session
+            return
+
+    def _on_token(self, sample: Any) -> None:
+        name = str(sample.key_expr)
+        if sample.kind != zenoh.SampleKind.PUT:
+            self._alive.discard(name)
+        elif len(self._alive) < MOST_GROUNDS:
+            self._alive.add(name)
+
+
+class RemoteWorker:
+    """Asks a ground machine; falls back to the child process on board when there is none.
+
+    Attributes:
+        far: how many answers came from a ground machine.
+    """
+
+    def __init__(self, local: ProcessWorker, ground: Ground, clock: Callable[[], float] = time.monotonic) -> None:
+        """Takes over `local`, which is closed with it."""
+        self._local, self._ground, self._clock = local, ground, clock
+        self._answers: queue.Queue[tuple[int, Any]] = queue.Queue(MOST_ANSWERS)
+        self._asked: Job | None = None
+        self._until = 0.0
+        self._told: list[Trouble] = []
+        self._was_there = False
+        self.far = 0
+
+    @property
+    def ready(self) -> bool:
+        """Whether the child on board is warm: only then nothing depends on the ground machine."""
+        return self._local.ready
+
+    @property
+    def state(self) -> str:
+        """As of the child; ``busy`` while a ground machine fits."""
+        return "busy" if self._asked is not None else self._local.state
+
+    @property
+    def restarts(self) -> int:
+        """Of the child."""
+        return self._local.restarts
+
+    def submit(self, request: Job) -> None:
+        """Begins a fit on the ground, or on board."""
+        if not self._ground.there:
+            self._local.submit(request)
+            return
+        limit = STUDY_LIMIT if request.background else FAR_LIMIT
+        self._asked, self._until = request, self._clock() + limit
+        try:
+            self._ground.ask(request, self._answers, limit)
+        except zenoh.ZError as error:
+            self._fall_back(f"cannot be asked ({str(error).splitlines()[0]:.80})")
+
+    def poll(self) -> list[JobReply | Trouble]:
+        """What has come from either; never waits."""
+        out: list[JobReply | Trouble] = list(self._local.poll())
+        while not self._answers.empty():
+            number, data = self._answers.get_nowait()
+            if self._asked is not None and number == self._asked.number:
+                self._take(number, data, out)
+        if self._asked is not None and (self._ground.vanished or self._clock() > self._until):
+            self._fall_back("vanished" if self._ground.vanished else "does not answer")
+        self._tell_changes()
+        told, self._told = self._told, []
+        return [*out, *told]
+
+    def poll_ready(self) -> bool:
+        """Polls the child while nothing was submitted yet."""
+        return self._local.poll_ready()
+
+    def sibling(self) -> RemoteWorker:
+        """Another one, for diagnoses, on the same way to the ground."""
+        return RemoteWorker(self._local.sibling(), self._ground, self._clock)
+
+    def close(self) -> None:
+        """Ends child and session."""
+        self._local.close()
+        self._ground.close()
+
+    def _take(self, number: int, data: bytes | None, out: list[JobReply | Trouble]) -> None:
+        try:
+            reply = unpack(data) if data is not None else None
+        except ParcelError as error:
+            self._fall_back(f"answers what cannot be read ({error})")
+            return
+        if self._asked is None or not self._asked.is_answered_by(reply):
+            self._fall_back("refused the request" if data is None else "answers something else")
+            return
+        if reply.is_unexpected:
+            self._fall_back("fails at the request")
+            return
+        self._asked = None
+        self.far += 1
+        out.append(reply)
+
+    def _fall_back(self, why: str) -> None:
+        request, self._asked = self._asked, None
+        self._ground.rest()
+        self._was_there = False
+        self._told.append(Trouble("warning", f"the ground machine {why}: work on board for {REST:g} s or longer"))
+        if request is not None:
+            self._local.submit(request)
+
+    def _tell_changes(self) -> None:
+        there = self._ground.there
+        if there and not self._was_there:
+            self._told.append(Trouble("info", "a ground machine is there: fits go to it"))
+        self._was_there = there
+
+
+# --- Who fits for a service: the child process on board, or a ground machine where one is asked for
+
+
+def with_ground(worker: ProcessWorker, where: str, vehicle: str) -> Worker:
+    """The worker itself, or, with a place on Zenoh, one that lets ground machines there fit for `vehicle`.
+
+    Raises:
+        ZenohError: a configuration that is none.
+    """
+    if not where:
+        return worker
+
+    try:
+        return RemoteWorker(worker, Ground(where, vehicle))
+    except QuadidError:
+        worker.close()
+        raise

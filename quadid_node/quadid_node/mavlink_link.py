@@ -1,31 +1,314 @@
-"""The service on a MAVLink link: asks for messages, measures what comes, and tells its results as component 191."""
+"""MAVLink link of the service: requests messages, decodes them, sends results as component 191."""
 
 from __future__ import annotations
 
 import math
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from quadid_replay.tlog_messages import READERS
+from quadid_replay.mavlink_messages import ESC_GROUPS, PREFERENCE, READERS, Reading, boot_seconds, boot_stamp
+from quadid_replay.message_times import BootClock
+from quadid_replay.motors import ESCS, MOTOR_FUNCTION, Outputs, changed_functions, esc_columns, motor_outputs
 
-from quadid.health.watch import HealthReport
+from quadid.condition.watch import HealthReport
+from quadid.data.window import Sample
 from quadid.online.records import OnlineSet
-from quadid.window import Sample
-from quadid_node.mavlink_decode import MavlinkDecoder
-from quadid_node.mavlink_parameters import parameters_of
-from quadid_node.mavlink_peers import Source
-from quadid_node.mavlink_requests import Requests
-from quadid_node.mavlink_wire import LinkError, Wire, dialect, message_id, sender
+from quadid_node.inputs import Chooser
+from quadid_node.mavlink_wire import LinkError, Source, Wire, dialect, message_id, sender
 from quadid_node.publication import Output
+
+# --- Which output drives which rotor of a live vehicle: asked of the autopilot, taken over once, never changed in use
+
+
+ASKED = tuple(f"SERVO{n}_FUNCTION" for n in range(1, ESCS + 1))
+"""Parameters of ArduPilot that are asked for, once with each heartbeat …"""
+MOST_ROUNDS = 5
+"""... and so often at most."""
+_ESC_MESSAGES = ("ESC_STATUS", "ESC_TELEMETRY")
+PATIENCE = 6.0
+"""What an ArduPilot has not told so long after its first outputs [s] is taken to go without saying."""
+
+
+class MotorOrder:
+    """The outputs that are motors.
+
+    Attributes:
+        ardupilot: whether the autopilot is one.
+        problem: what speaks against its outputs; empty for nothing.
+    """
+
+    def __init__(self, rotors: int) -> None:
+        """Knows nothing yet of a vehicle with `rotors` rotors."""
+        self.ardupilot = False
+        self.problem = ""
+        self._rotors = rotors
+        self._parameters: dict[str, float] = {}
+        self._used: dict[tuple[str, int], list[int]] = {}
+        self._first = math.nan
+        self._rounds = 0
+        self._moved = False
+        self._turning = [False] * ESCS
+
+    def lacking(self) -> list[str]:
+        """The parameters to ask for now; none where all are told, or it does not answer."""
+        names = [name for name in ASKED if self.ardupilot and name not in self._parameters]
+        self._rounds += 1
+        return names if self._rounds <= MOST_ROUNDS else []
+
+    def tell(self, name: str, value: float) -> None:
+        """Takes a parameter of the autopilot; one that moves a motor while outputs are in use ends their use.
+
+        An output is still wired to the rotor that it drove before: no order is right from then on.
+        """
+        if not MOTOR_FUNCTION.fullmatch(name):  # any other name would only take memory
+            return
+        changed = changed_functions([name, name], [self._parameters.get(name, value), value])
+        self._parameters[name] = value
+        against = any(
+            self._columns(message, width).columns != columns for (message, width), columns in self._used.items()
+        )
+        if against or (changed and self._used):
+            self._moved = True
+            self.problem = (
+                f"the motor order changes in use: {changed or f'{name} {value:g}'}; no output is used any more: put it "
+                "back as the vehicle file has it and start the service again"
+            )
+
+    def take(self, values: tuple[float, ...], message: str, now: float) -> tuple[float, ...]:
+        """The values of the rotors, one by one; empty where it is not known which they are, or no more.
+
+        Args:
+            values: of all outputs of a message.
+            message: its name.
+            now: when it came [s].
+        """
+        if self._moved:
+            return ()
+        if message in _ESC_MESSAGES:
+            self._turning = [turns or value > 0.0 for turns, value in zip(self._turning, values, strict=True)]
+        columns = self._used.get((message, len(values)))
+        if columns is None:
+            columns = self._found(values, message, now)
+        return tuple(values[i] for i in columns)
+
+    def _found(self, values: tuple[float, ...], message: str, now: float) -> list[int]:
+        """Columns to use from now on; none as long as an ArduPilot may still tell more, or where there is a problem."""
+        self._first = now if math.isnan(self._first) else self._first
+        found = self._columns(message, len(values))
+        silent = self.ardupilot and not found.told
+        if silent and now - self._first < PATIENCE:
+            return []
+        self.problem = found.problem
+        if silent and not found.problem:
+            outputs = ", ".join(str(k + 1) for k in found.columns)
+            self.problem = f"the autopilot has not told which outputs are motors (SERVOn_FUNCTION): {outputs} are used"
+        if found.columns and (message not in _ESC_MESSAGES or any(self._turning)):
+            self._used[message, len(values)] = found.columns
+        return found.columns
+
+    def _columns(self, message: str, width: int) -> Outputs:
+        if message in _ESC_MESSAGES:
+            return esc_columns(self._parameters, self._rotors, self._turning, message, self.ardupilot)
+        return motor_outputs(self._parameters, self._rotors, width, message, self.ardupilot)
+
+    def esc_groups(self) -> list[str]:
+        """ArduPilot's messages of ESCs that may be motors: those on their outputs, and the first ones."""
+        columns = motor_outputs(self._parameters, self._rotors, ESCS, "ESC", self.ardupilot).columns
+        return [ESC_GROUPS[k] for k in sorted({k // 4 for k in (*columns, *range(self._rotors))})]
+
+
+# --- A live vehicle's MAVLink messages to samples, at absolute times; the rules are those of telemetry logs
+
+
+REBOOT = 1.0
+"""The vehicle's clock this far back [s] is one that began anew."""
+MOTOR_PREFERENCE = {
+    "rotor_speed": ("ESC_STATUS", "ESC_TELEMETRY"),
+    "motor_command": ("ACTUATOR_OUTPUT_STATUS", "SERVO_OUTPUT_RAW"),
+}
+RANKS = {
+    (channel, name): rank
+    for table in (PREFERENCE, MOTOR_PREFERENCE)
+    for channel, names in table.items()
+    for rank, name in enumerate(names)
+}
+"""Which message a channel is best taken from."""
+
+
+_MOTORS = {"esc": "rotor_speed", "servo": "motor_command", "actuator": "motor_command"}
+
+
+@dataclass
+class _Round:
+    """Values of the messages of one round, by output, how many outputs they tell, where the last one began, and the
+    time of the first [s].
+    """
+
+    row: list[float] = field(default_factory=lambda: [math.nan] * ESCS)
+    width: int = 0
+    place: float = math.inf
+    t: float = math.nan
+
+
+class MavlinkDecoder:
+    """Messages of one vehicle to samples.
+
+    Attributes:
+        counts: messages by name.
+        order: of its motors among its outputs.
+    """
+
+    def __init__(self, rotors: int, wall: Callable[[], float] = time.time) -> None:
+        """Expects a vehicle with `rotors` rotors; `wall` tells the UNIX time [s] at which its clock is put."""
+        self.counts: Counter[str] = Counter()
+        self.order = MotorOrder(rotors)
+        self._chooser = Chooser({channel: 0 for channel, _ in RANKS})
+        self._boot_clock: BootClock[list[Reading]] = BootClock()
+        self._wall, self._epoch, self._newest = wall, 0.0, math.inf
+        self._rounds: dict[str, _Round] = {}
+
+    def samples(self, message: Any, received: float, earliest: float | None = None) -> Iterator[Sample]:
+        """Yields the samples that may be used now.
+
+        Args:
+            message: decoded message of the vehicle.
+            received: when it was read [s, any clock that runs on].
+            earliest: it came after this [s, same clock]; default: when it was read.
+        """
+        name = message.get_type()
+        self.counts[name] += 1
+        if name == "PARAM_VALUE":
+            self.order.tell(str(message.param_id), float(message.param_value))
+            return
+        if name not in READERS or (name == "RAW_IMU" and not self.order.ardupilot):
+            return
+        readings = [r for r in READERS[name](message) if r.known]
+        if not readings:
+            return
+        clock = self._boot_clock
+        boot = boot_stamp(float(boot_seconds(message)), name == "SERVO_OUTPUT_RAW", clock.newest)
+        came = received if earliest is None else earliest
+        placed = clock.unstamped(readings, came) if boot is None else clock.stamped(readings, boot, received)
+        for waited, t in placed:
+            if t is not None:
+                for reading in waited:
+                    yield from self._channel(self._absolute(t), reading, received)
+
+    def _absolute(self, boot: float) -> float:
+        """UNIX time of a time of the vehicle's clock, set by ours when it is first heard and when it reboots."""
+        if boot < self._newest - REBOOT:
+            self._epoch, self._newest = self._wall() - boot, boot
+        self._newest = max(self._newest, boot)
+        return boot + self._epoch
+
+    def _channel(self, t: float, reading: Reading, received: float) -> Iterator[Sample]:
+        source = reading.source.split(" ")[0]
+        channel, values = reading.signal, tuple(float(v) for v in reading.values)
+        if channel in ("esc", "servo"):
+            t, values = self._joined(t, reading, source)
+        if channel in _MOTORS:
+            channel, values = _MOTORS[channel], self.order.take(values, source, received)
+        rank = RANKS.get((channel, source))
+        if rank is None or not values or not all(math.isfinite(v) for v in values):
+            return
+        if reading.signal in ("esc", "servo"):
+            self._rounds[source].row = [math.nan] * ESCS  # it is told once
+        yield from self._chooser.take(Sample(t, channel, values), rank)
+
+    def _joined(self, t: float, reading: Reading, source: str) -> tuple[float, tuple[float, ...]]:
+        """The row so far of a round of messages (four ESCs or sixteen outputs each), at the time of the first."""
+        joined = self._rounds.setdefault(source, _Round())
+        if reading.place <= joined.place:
+            joined.row, joined.t = [math.nan] * ESCS, t
+        joined.place = reading.place
+        for k, value in enumerate(reading.values[: max(ESCS - reading.place, 0)]):
+            joined.row[reading.place + k] = float(value)
+        joined.width = ESCS if reading.signal == "esc" else max(joined.width, reading.place + len(reading.values))
+        return joined.t, tuple(joined.row[: joined.width])
+
+
+# --- A parameter set as read-only MAVLink parameters
+
+
+PARAMETERS = {"b": "QI_B", "d": "QI_D", "J_xx": "QI_J_XX", "J_yy": "QI_J_YY", "J_zz": "QI_J_ZZ", "J_r": "QI_J_R"}
+
+REFERENCES = {"none": 0.0, "vehicle_file": 1.0, "history": 2.0}
+"""What a set was compared with, as a number."""
+
+
+def parameters_of(item: OnlineSet | None) -> list[tuple[str, float]]:
+    """Names and values: number, state, reference of the set; the nominal parameters and their deviations."""
+    if item is None:
+        return [("QI_SEQ", 0.0)]
+    high, low = divmod(item.sequence, 1 << 24)  # a float holds 24 bits
+    out = [("QI_SEQ", float(low)), ("QI_SEQ_HI", float(high)), ("QI_MASS", item.mass)]
+    out += [("QI_STALE", float(item.state.value == "stale")), ("QI_OLD", float(bool(item.outdated)))]
+    out += [("QI_REF", REFERENCES[item.reference])]
+    for p in item.parameters:
+        if p.name in PARAMETERS:
+            out += [(PARAMETERS[p.name], p.value), (f"{PARAMETERS[p.name]}_SD", p.sigma)]
+    return out
+
+
+# --- Which messages to ask a vehicle for, and which it has refused: these are asked for no more
+
+
+REPEAT = 10.0
+"""Messages that do not come as asked are asked for again after this long [s],"""
+MOST_TRIES = 4
+"""... so many times in all,"""
+ANSWER = 1.0
+"""... from the second time on one by one, this long [s] apart: an answer does not say which message it is about."""
+
+
+class Requests:
+    """Requests for messages of one vehicle."""
+
+    def __init__(self) -> None:
+        self._tries: Counter[str] = Counter()
+        self._refused: dict[str, str] = {}
+        self._queue: list[str] = []
+        self._asked: str | None = None
+        self._asked_at = self._round_at = -1e9
+
+    @property
+    def denied(self) -> tuple[str, ...]:
+        """Messages that the vehicle refuses, each with its answer."""
+        return tuple(f"{name} ({answer})" for name, answer in sorted(self._refused.items()))
+
+    def due(self, lacking: Sequence[str], now: float) -> list[str]:
+        """The messages to ask for now [s], of those that do not come."""
+        first = not self._tries
+        if now - self._round_at >= REPEAT:
+            self._round_at = now
+            self._queue = [n for n in lacking if n not in self._refused and self._tries[n] < MOST_TRIES]
+        if not first and (now - self._asked_at < ANSWER or not self._queue):
+            return []
+        many, self._queue = (self._queue, []) if first else (self._queue[:1], self._queue[1:])
+        self._tries.update(many)
+        self._asked, self._asked_at = None if first or not many else many[0], now
+        return many
+
+    def answered(self, refusal: str) -> None:
+        """The vehicle's answer to what was asked last; empty when it accepts."""
+        if self._asked is not None and refusal:
+            self._refused[self._asked] = refusal
+        self._asked = None
+
+
+# --- The service on a MAVLink link: asks for messages, measures what comes, and tells its results as component 191
+
 
 COMPONENT = 191
 """MAV_COMP_ID_ONBOARD_COMPUTER."""
 MOTORS = 80.0
 """Sticks come in steps, mostly of 20 or 40 ms, and the rate loop answers each.  Snapshots of motors in step with them
-err alike: slow torque by 6 % where at this rate [Hz] it is 0.4 % (`python -m studies.autopilot.readings`)."""
+err alike: slow torque by 6 % where at this rate [Hz] it is 0.4 % (`python -m
+quadid_evaluation.studies.autopilot.readings`)."""
 REQUESTED = {
     "HIGHRES_IMU": 100.0, "RAW_IMU": 100.0, "ATTITUDE_QUATERNION": 50.0, "SERVO_OUTPUT_RAW": MOTORS,
     "ACTUATOR_OUTPUT_STATUS": MOTORS, "ESC_STATUS": MOTORS, "ATTITUDE_TARGET": 50.0,

@@ -12,8 +12,8 @@ from typing import Any
 from quadid.chi_square import Z95
 from quadid.online.records import OnlineDiagnosis, OnlineFinding, OnlineSet, Phase, SessionStatus, SetState
 from quadid.parameters import NOMINAL_NAMES
+from quadid_node.inputs import stamp
 from quadid_node.service import SILENT_ERROR, SILENT_WARNING, Health, lag
-from quadid_node.stamps import stamp
 from quadid_node.vehicle_health import health_message
 
 Message = dict[str, Any]

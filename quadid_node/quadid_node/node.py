@@ -12,7 +12,6 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from quadid_workflow.loading import load_vehicle
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock as RosClock
 from rclpy.clock_type import ClockType
@@ -20,15 +19,15 @@ from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackRet
 from rclpy.parameter import Parameter
 from rclpy.qos import HistoryPolicy, QoSCompatibility, QoSProfile, ReliabilityPolicy, qos_check_compatible
 
+from quadid.app.logs import load_vehicle
 from quadid.errors import QuadidError
 from quadid.online import Publish
 from quadid_node import messages
 from quadid_node.bond import Bond, bond_of
-from quadid_node.chooser import Chooser
 from quadid_node.commands import Commands
-from quadid_node.convert import Decoder, best_ranks, deserializer, message_class
-from quadid_node.intake import DEPTH, Intake
-from quadid_node.neighbours import Neighbours, Offer
+from quadid_node.ground import with_ground
+from quadid_node.history import Store, default_path
+from quadid_node.inputs import DEPTH, Chooser, Decoder, Intake, Source, best_ranks, deserializer, message_class, source
 from quadid_node.node_parameters import (
     PARAMETERS,
     READ_BACK,
@@ -39,15 +38,12 @@ from quadid_node.node_parameters import (
     vehicle_id,
 )
 from quadid_node.polling import PollingNode
-from quadid_node.presets import Source, source
 from quadid_node.publication import Output
+from quadid_node.publish import Neighbours, Offer, Speaker
 from quadid_node.recorder import WRITTEN, Beginning, Recorder
 from quadid_node.rounds import ROUND_SECONDS, STEP_SECONDS, WORK_SECONDS, Rounds
 from quadid_node.service import Service
-from quadid_node.speaker import Speaker
-from quadid_node.store import Store, default_path
 from quadid_node.worker import ProcessWorker
-from quadid_node.workers import with_ground
 
 CATCHING_UP, BACKLOG = 10.0, 2.0
 """A step lasts longer in proportion, up to so many times, when there is a backlog of more than this much data [s]."""
@@ -184,7 +180,7 @@ class IdentifyNode(PollingNode, LifecycleNode):
             self._recorder = Recorder(Path(values["record"]), beginning, preset.inputs)
         self._hint = preset.motor_hint
         if values["zenoh"]:
-            from quadid_node.zenoh_link import ZenohLink
+            from quadid_node.zenoh import ZenohLink
 
             self._zenoh = ZenohLink(values["zenoh"], self._id, self._service)
         self._speaker.open(self._observer)

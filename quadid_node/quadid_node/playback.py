@@ -11,15 +11,12 @@ from pathlib import Path
 
 import numpy as np
 from mcap_ros2._dynamic import generate_dynamic
-from quadid_replay.mcap_messages import type_name
-from quadid_replay.mcap_records import McapFile
+from quadid_replay.mcap_file import McapFile
+from quadid_replay.ros_messages import type_name
 
+from quadid.data.window import Recording, Sample
 from quadid.errors import LogError
-from quadid.window import Recording, Sample
-from quadid_node.chooser import Chooser
-from quadid_node.convert import Decoder, best_ranks
-from quadid_node.presets import source
-from quadid_node.stamps import seconds
+from quadid_node.inputs import Chooser, Decoder, best_ranks, seconds, source
 
 _BASE = re.compile(r"times count from UNIX time (\d+) s")
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from quadid.health.watch import HealthReport
+from quadid.condition.watch import HealthReport
 from quadid.online.records import Event, HealthyFlight, OnlineDiagnosis, OnlineSet, Publish
 
 Output = Publish | OnlineDiagnosis | HealthReport | HealthyFlight | Event

@@ -14,16 +14,16 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from quadid_replay import TopicWriter
-from quadid_replay.mcap_metadata import read_metadata
+from quadid_replay.mcap_file import read_metadata
 from quadid_replay.schemas import has_definition, whole_text
 
+from quadid.condition.trim import flight_from_dict, flight_to_dict
 from quadid.errors import LogError, QuadidError
-from quadid.health.stored import flight_from_dict, flight_to_dict
 from quadid.online import OnlineSet, SessionSettings
 from quadid.vehicle import Vehicle
 from quadid_node.codec import set_from_dict, set_to_dict
-from quadid_node.presets import Input
-from quadid_node.store import Restored
+from quadid_node.history import Restored
+from quadid_node.inputs import Input
 
 RECORD = "quadid.session"
 WRITTEN = 32

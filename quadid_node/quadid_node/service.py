@@ -12,15 +12,14 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from quadid.data.window import Block, Sample
 from quadid.online import Job, Session, SessionSettings
 from quadid.online.active_set import Answer
-from quadid.online.outbox import Action
-from quadid.online.records import Event, OnlineSet, SessionStatus, SetState
+from quadid.online.records import Action, Event, OnlineSet, SessionStatus, SetState
 from quadid.vehicle import Vehicle
-from quadid.window import Block, Sample
 from quadid_node.failures import keep
+from quadid_node.history import Restored, Store
 from quadid_node.publication import Output, Publication
-from quadid_node.store import Restored, Store
 from quadid_node.worker import Trouble, Worker
 
 SILENT_WARNING, SILENT_ERROR = 1.0, 5.0

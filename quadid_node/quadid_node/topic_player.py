@@ -9,13 +9,13 @@ from typing import Any
 
 import rclpy
 from quadid_replay import TopicWriter
-from quadid_replay.mcap_writer import write_recording
+from quadid_replay.writers import write_recording
 from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 
-from quadid.window import Recording
-from quadid_node.convert import message_class
+from quadid.data.window import Recording
+from quadid_node.inputs import message_class
 from quadid_node.playback import base_seconds
 from quadid_node.stopping import Stop
 from quadid_node.transport import without_shared_memory

@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from quadid.health.changes import Change
-from quadid.health.watch import HealthReport
+from quadid.condition.changes import Change
+from quadid.condition.watch import HealthReport
 from quadid.jsonable import jsonable
-from quadid_node.stamps import stamp
+from quadid_node.inputs import stamp
 
 FRAME = "base_link_frd"
 VERDICTS = {"unchanged": 0, "changed": 1, "unknown": 2}

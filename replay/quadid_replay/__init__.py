@@ -7,22 +7,18 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from quadid_replay.compared_writer import write_compared
-    from quadid_replay.csv_writer import write_csv
-    from quadid_replay.mcap_writer import write_mcap
     from quadid_replay.opening import open_log
-    from quadid_replay.tlog_writer import write_tlog
-    from quadid_replay.topic_writer import TopicWriter
+    from quadid_replay.writers import TopicWriter, write_compared, write_csv, write_mcap, write_tlog
 
 __all__ = ["TopicWriter", "open_log", "write_compared", "write_csv", "write_mcap", "write_tlog"]
 
 _HOME = {
-    "TopicWriter": "topic_writer",
+    "TopicWriter": "writers",
     "open_log": "opening",
-    "write_compared": "compared_writer",
-    "write_csv": "csv_writer",
-    "write_mcap": "mcap_writer",
-    "write_tlog": "tlog_writer",
+    "write_compared": "writers",
+    "write_csv": "writers",
+    "write_mcap": "writers",
+    "write_tlog": "writers",
 }
 
 

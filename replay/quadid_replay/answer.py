@@ -13,10 +13,10 @@ from typing import Any
 
 import numpy as np
 
+from quadid.data.window import CHANNELS, Channel, Recording
 from quadid.errors import LogError, QuadidError
 from quadid.sanitise import LONGEST_LINE, plain
 from quadid.types import FloatArray
-from quadid.window import CHANNELS, Channel, Recording
 
 _DOUBLE = "<f8"
 _MOST_ROWS = 1 << 40

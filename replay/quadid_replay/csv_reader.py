@@ -11,13 +11,12 @@ from pathlib import Path
 
 import numpy as np
 
+from quadid.data.resample import COINCIDENT, sample_period
+from quadid.data.window import Channel, Recording
 from quadid.errors import LogError, nearest
-from quadid.resample import COINCIDENT, sample_period
 from quadid.sanitise import plain
 from quadid.types import FloatArray
-from quadid.window import Channel, Recording
-from quadid_replay.clocks import LogClock
-from quadid_replay.columns import RawChannel, assemble
+from quadid_replay.columns import LogClock, RawChannel, assemble
 from quadid_replay.frames import from_euler
 from quadid_replay.recognise import HEAD_BYTES, header_line
 

@@ -9,10 +9,10 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+from quadid.data.window import Recording
 from quadid.errors import LogError
-from quadid.window import Recording
-from quadid_replay.bag_folder import bag_files, is_bag_folder
 from quadid_replay.recognise import ALLOWED, FORMATS, HEAD_BYTES, LogFormat, recognise
+from quadid_replay.rosbag import bag_files, is_bag_folder
 
 
 def reader_of(kind: str) -> Callable[..., Recording]:

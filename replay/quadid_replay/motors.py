@@ -1,14 +1,106 @@
-"""Which logged outputs are motors, and rows of rotor speeds from telemetry that comes one motor at a time."""
+"""Motor outputs of autopilots: numbering, positions, spins, and rows of rotor speeds."""
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
 
 from quadid.types import BoolArray, FloatArray
+
+# --- Rotor positions and spins as autopilots number them: ArduPilot's frames, PX4's geometry parameters
+#
+# ArduPilot stores angles only, no arm; PX4 stores positions.  Angles run clockwise from the nose, seen from above;
+# spin +1 is counter-clockwise seen from above, as in the vehicle file.
+
+
+class Place(NamedTuple):
+    """A rotor: x forward, y right, z down [m], and spin +1 or -1."""
+
+    x: float
+    y: float
+    z: float
+    spin: int
+
+
+class Frame(NamedTuple):
+    """An airframe as the log tells it; `scaled` says that its size is a guess, for the autopilot stores none."""
+
+    name: str
+    rotors: tuple[Place, ...]
+    scaled: bool
+
+
+CCW, CW = 1, -1
+_CLASSES = {1: "QUAD", 2: "HEXA", 3: "OCTA", 4: "OCTAQUAD", 5: "Y6", 7: "TRI"}
+_TYPES = {0: "PLUS", 1: "X", 2: "V", 3: "H", 12: "BF_X", 13: "DJI_X", 14: "CW_X", 18: "BF_X_REV"}
+
+ARDUPILOT: Mapping[str, tuple[tuple[float, int], ...]] = MappingProxyType({
+    "QUAD/PLUS": ((90, CCW), (-90, CCW), (0, CW), (180, CW)),
+    "QUAD/X": ((45, CCW), (-135, CCW), (-45, CW), (135, CW)),
+    "QUAD/H": ((45, CW), (-135, CW), (-45, CCW), (135, CCW)),
+    "QUAD/BF_X": ((135, CW), (45, CCW), (-135, CCW), (-45, CW)),
+    "QUAD/BF_X_REV": ((135, CCW), (45, CW), (-135, CW), (-45, CCW)),
+    "QUAD/DJI_X": ((45, CCW), (-45, CW), (-135, CCW), (135, CW)),
+    "QUAD/CW_X": ((45, CCW), (135, CW), (-135, CCW), (-45, CW)),
+    "HEXA/PLUS": ((0, CW), (180, CCW), (-120, CW), (60, CCW), (-60, CCW), (120, CW)),
+    "HEXA/X": ((90, CW), (-90, CCW), (-30, CW), (150, CCW), (30, CCW), (-150, CW)),
+    "OCTA/PLUS": ((0, CW), (180, CW), (45, CCW), (135, CCW), (-45, CCW), (-135, CCW), (-90, CW), (90, CW)),
+    "OCTA/X": (
+        (22.5, CW), (-157.5, CW), (67.5, CCW), (157.5, CCW), (-22.5, CCW), (-112.5, CCW), (-67.5, CW), (112.5, CW)
+    ),
+    "OCTAQUAD/X": ((45, CCW), (-45, CW), (-135, CCW), (135, CW), (-45, CCW), (45, CW), (135, CCW), (-135, CW)),
+})  # fmt: skip
+"""Angle [deg] and spin of motors 1, 2, 3 … (AP_MotorsMatrix.cpp of ArduPilot 4.x)."""
+
+
+def frame_of(parameters: Mapping[str, float], arm: float) -> Frame | None:
+    """Returns the airframe that an autopilot's parameters describe; None where they describe none that is known.
+
+    Args:
+        parameters: as logged (`Recording.autopilot`).
+        arm: distance of the rotors from the centre [m], used where the autopilot stores none.
+    """
+    if "yaw_motors_reversed" in parameters:  # Betaflight's quadrotor; the default has propellers turning inwards
+        name = "QUAD/BF_X_REV" if parameters["yaw_motors_reversed"] else "QUAD/BF_X"
+        return _numbered(name, "Betaflight", arm)
+    kind = _CLASSES.get(_whole(parameters, "FRAME_CLASS"), "")
+    name = f"{kind}/{_TYPES.get(_whole(parameters, 'FRAME_TYPE'), '')}"
+    return _px4(parameters) or (_numbered(name, "ArduPilot", arm) if name in ARDUPILOT else None)
+
+
+def _numbered(name: str, autopilot: str, arm: float) -> Frame:
+    rotors = [
+        Place(arm * math.cos(math.radians(angle)), arm * math.sin(math.radians(angle)), 0.0, spin)
+        for angle, spin in ARDUPILOT[name]
+    ]
+    return Frame(f"{autopilot} {name}", tuple(rotors), scaled=True)
+
+
+def _px4(parameters: Mapping[str, float]) -> Frame | None:
+    count = _whole(parameters, "CA_ROTOR_COUNT")
+    if not 3 <= count <= 12:
+        return None
+    rotors = []
+    for n in range(count):
+        entry = [parameters.get(f"CA_ROTOR{n}_{key}", math.nan) for key in ("PX", "PY", "PZ", "KM")]
+        if not all(math.isfinite(v) and abs(v) < 10.0 for v in entry) or entry[3] == 0.0:
+            return None
+        rotors.append(Place(entry[0], entry[1], entry[2], CCW if entry[3] > 0.0 else CW))
+    return Frame(f"PX4 geometry of {count} rotors", tuple(rotors), scaled=False)
+
+
+def _whole(parameters: Mapping[str, float], name: str) -> int:
+    value = parameters.get(name, -1.0)
+    return int(value) if abs(value) < 1e6 else -1
+
+
+# --- Which logged outputs are motors, and rows of rotor speeds from telemetry that comes one motor at a time
+
 
 RPM = 2.0 * np.pi / 60.0
 """One revolution per minute [rad/s]."""
@@ -87,7 +179,7 @@ def motor_outputs(
     order = list(_TRICOPTER) if tricopter else list(range(rotors or len(motors)))
     told = bool(motors) and set(motors) == set(order)
     against = [] if told else [
-        f"{name} {_whole(parameters, name)}" for name, output, motor in said
+        f"{name} {_motors_whole(parameters, name)}" for name, output, motor in said
         if motor != (output if output in order else None) and (ardupilot or motor in order)
     ]  # fmt: skip
     if against:
@@ -158,7 +250,7 @@ def changed_functions(names: Sequence[str], values: Sequence[float]) -> str:
     given: dict[str, list[int]] = {}
     for name, value in zip(names, values, strict=True):
         if MOTOR_FUNCTION.fullmatch(name):
-            function = _whole({name: value}, name)
+            function = _motors_whole({name: value}, name)
             seen = given.setdefault(name, [])
             if function not in seen[-1:]:
                 seen.append(function)
@@ -187,7 +279,7 @@ def px4_motor_outputs(parameters: Mapping[str, float], bank: str) -> list[int]:
         parameters: PX4 parameters of the log.
         bank: the beginning of their names.
     """
-    return motor_columns([_whole(parameters, f"{bank}_FUNC{output}") for output in range(1, 17)])
+    return motor_columns([_motors_whole(parameters, f"{bank}_FUNC{output}") for output in range(1, 17)])
 
 
 def motor_columns(functions: Sequence[int]) -> list[int]:
@@ -201,8 +293,8 @@ def motor_columns(functions: Sequence[int]) -> list[int]:
 
 def px4_rotor_count(parameters: Mapping[str, float]) -> int:
     """Returns the number of rotors that CA_ROTOR_COUNT, else MAV_TYPE, tells; 0 when neither does."""
-    count = _whole(parameters, "CA_ROTOR_COUNT")
-    return count if 0 < count <= MOST_ROTORS else MULTIROTORS.get(_whole(parameters, "MAV_TYPE"), 0)
+    count = _motors_whole(parameters, "CA_ROTOR_COUNT")
+    return count if 0 < count <= MOST_ROTORS else MULTIROTORS.get(_motors_whole(parameters, "MAV_TYPE"), 0)
 
 
 def _driven(name: str, value: float) -> tuple[int, int | None]:
@@ -210,10 +302,10 @@ def _driven(name: str, value: float) -> tuple[int, int | None]:
     match = MOTOR_FUNCTION.fullmatch(name)
     assert match is not None
     motors = _ARDUPILOT_MOTORS if match[1] else _PX4_MOTORS
-    return int(match[1] or match[2]) - 1, motors.get(_whole({name: value}, name))
+    return int(match[1] or match[2]) - 1, motors.get(_motors_whole({name: value}, name))
 
 
-def _whole(parameters: Mapping[str, float], name: str) -> int:
+def _motors_whole(parameters: Mapping[str, float], name: str) -> int:
     """A parameter as a whole number; 0, which tells nothing, where it is absent or damaged beyond any number."""
     value = parameters.get(name, 0.0)
     return int(value) if abs(value) < _LARGEST_WHOLE else 0
@@ -227,9 +319,9 @@ def no_multirotor(parameters: Mapping[str, float], mav_type: int = 0, firmware: 
         mav_type: MAV_TYPE of its heartbeats; 0 for unknown.
         firmware: of ArduPilot, such as Copter or Plane; empty for unknown.
     """
-    kind = mav_type or _whole(parameters, "MAV_TYPE")
-    airframe = _OTHER_AIRFRAMES.get(_whole(parameters, "CA_AIRFRAME"))
-    frame = _OTHER_FRAMES.get(_whole(parameters, "FRAME_CLASS"))
+    kind = mav_type or _motors_whole(parameters, "MAV_TYPE")
+    airframe = _OTHER_AIRFRAMES.get(_motors_whole(parameters, "CA_AIRFRAME"))
+    frame = _OTHER_FRAMES.get(_motors_whole(parameters, "FRAME_CLASS"))
     which = (
         f"MAV_TYPE {kind}" if kind and kind not in MULTIROTORS
         else f"Ardu{firmware}" if firmware not in ("", "Copter")

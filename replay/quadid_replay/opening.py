@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
+from quadid.data.window import Recording
 from quadid.errors import LogError
-from quadid.window import Recording
 from quadid_replay.formats import kind_of, parts_of
 from quadid_replay.presets import AUTO, preset_rank
 from quadid_replay.reading import read_in_child

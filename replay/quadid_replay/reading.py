@@ -20,9 +20,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
+from quadid.data.window import Recording
 from quadid.errors import LogError
 from quadid.sanitise import plain
-from quadid.window import Recording
 from quadid_replay.answer import unpack
 
 MEMORY, SECONDS = "QUADID_READ_MEMORY_MB", "QUADID_READ_SECONDS"

@@ -12,12 +12,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from quadid.checks.motion import flying_spans
+from quadid.data.rotor_signal import rotor_channel
+from quadid.data.window import Channel, Recording
 from quadid.errors import LogError
-from quadid.inspection.airborne import flying_spans
-from quadid.rotor_signal import rotor_channel
 from quadid.vehicle import GRAVITY, Vehicle
-from quadid.window import Channel, Recording
-from quadid_replay.airframes import Frame, frame_of
+from quadid_replay.motors import Frame, frame_of
 
 _MASS, _ARM, _MAX_SPEED = 1.5, 0.25, 900.0
 _BLADE = 0.5

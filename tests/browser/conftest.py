@@ -52,8 +52,8 @@ def hostile_page(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def demo_page(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The report that `quadid demo --quick` writes."""
-    from quadid_workflow import demo
-    from quadid_workflow.files import write_text
+    from quadid.app import demo
+    from quadid.app.logs import write_text
 
     folder = tmp_path_factory.mktemp("demo")
     shown = demo.run(demo.QUICK_SECONDS, 1, folder, lambda stage, share: None)
@@ -66,8 +66,8 @@ def failure_page(tmp_path_factory: pytest.TempPathFactory) -> Path:
     from dataclasses import replace
 
     from quadid_replay import write_csv
-    from quadid_workflow.reporting import failure_html
 
+    from quadid.app.outcome import failure_html
     from quadid.errors import LogError
     from quadid.flight import fly
     from quadid.vehicle import Vehicle
@@ -88,11 +88,11 @@ def failure_page(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def fleet_page(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The report of a fleet of two vehicles, one of which wears; of two others one has a propeller cut."""
     import numpy as np
-    from quadid_report.fleet_page import fleet_page as build
-    from quadid_report.fleet_summary import summarise
-    from quadid_report.page import render
-    from quadid_workflow.fleet_health import health_trend
 
+    from quadid.app.fleet import health_trend
+    from quadid.report.fleet import fleet_page as build
+    from quadid.report.fleet import summarise
+    from quadid.report.page import render
     from tests.cli.test_fleet_health import PELICAN_X, fleet
     from tests.report.test_fleet_page import rows
 
@@ -110,11 +110,11 @@ def fleet_page(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def health_page(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The report of a vehicle with a damaged rotor against healthy flights; a log's name tries to run something."""
+    from quadid_evaluation.studies.health.flights import Wrong, hover
     from quadid_replay import write_csv
 
     import quadid
     from quadid.vehicle import Vehicle
-    from studies.health.flights import Wrong, hover
 
     pelican, folder = Vehicle.shipped("pelican_x"), tmp_path_factory.mktemp("health")
     flown = {"now<img src=x onerror=alert(1)>.csv": hover(pelican, Wrong({3: 0.2}, {3: 0.2}), 99)}

@@ -17,7 +17,7 @@ from quadid_replay import write_csv, write_mcap
 from quadid.flight import Flight, fly
 from quadid.vehicle import Vehicle
 
-QUADID = [sys.executable, "-c", "import sys; from quadid_cli.main import app_main; sys.exit(app_main())"]
+QUADID = [sys.executable, "-c", "import sys; from quadid.cli.main import app_main; sys.exit(app_main())"]
 
 
 class Run(NamedTuple):
@@ -60,7 +60,7 @@ def quadid() -> Cli:
 @pytest.fixture
 def inside(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Cli:
     """The same in this process, through the same entry point: many calls cost no start."""
-    from quadid_cli.main import app_main
+    from quadid.cli.main import app_main
 
     monkeypatch.setenv("COLUMNS", "160")
 

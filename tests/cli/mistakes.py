@@ -303,7 +303,7 @@ def prepare(folder: Path) -> Place:
 
 def first_line(mistake: Mistake, place: Place) -> tuple[int, str]:
     """Exit code, and the first line of stderr, else of what was printed; folders left out."""
-    from quadid_cli.main import app_main
+    from quadid.cli.main import app_main
 
     out, err, kept = io.StringIO(), io.StringIO(), sys.argv
     sys.argv = ["quadid", *map(str, mistake.call(place))]

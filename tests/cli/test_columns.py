@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 from quadid_replay import write_csv
-from quadid_report.excite_page import grouped
 
+from quadid.report.fit_pages import grouped
 from tests.cli.conftest import Cli, Flights
 
 COMMANDS = {

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from quadid_paper.comparison import METHODS
+from quadid_evaluation.paper.comparison import METHODS
 
 from tests.cli.conftest import Cli, Flights, one_line, table, write_table
 

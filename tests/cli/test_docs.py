@@ -8,8 +8,8 @@ import shlex
 from pathlib import Path
 
 import pytest
-from quadid_cli.main import COMMANDS, EXAMPLES, load
 
+from quadid.cli.main import COMMANDS, EXAMPLES, load
 from tests.cli.conftest import Cli
 from tests.cli.followed_page import commands
 

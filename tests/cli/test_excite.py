@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from quadid_workflow.excite import propose
 
+from quadid.app.excite import propose
 from quadid.parameters import NOMINAL_NAMES
 from quadid.vehicle import GRAVITY, Vehicle
 from tests.cli.conftest import Cli, Flights, one_line

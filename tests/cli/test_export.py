@@ -11,13 +11,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from quadid_report.programs import FORMATS, export
-from quadid_workflow.init import init as begin
 
-from quadid.provenance import Proof
-from quadid.residual import ResidualTerm
-from quadid.vehicle import GRAVITY, Vehicle
-from quadid.vehicle_parts import Command, ParameterPrior
+from quadid.app.init import init as begin
+from quadid.report.programs import FORMATS, export
+from quadid.vehicle import GRAVITY, Command, ParameterPrior, Proof, ResidualTerm, Vehicle
 from tests.cli.conftest import Cli, one_line
 
 SPEED = 900.0

@@ -13,17 +13,15 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from quadid_report.programs import export
-from quadid_report.programs.facts import SHORTEST_LAG
-from quadid_workflow.export import export as exported
-from quadid_workflow.init import shipped
 from scipy.integrate import solve_ivp
 
+from quadid.app.export import export as exported
+from quadid.app.init import shipped
 from quadid.errors import ParameterError
-from quadid.model.simulate import simulate as fly_file
+from quadid.model.step import simulate as fly_file
+from quadid.report.programs import SHORTEST_LAG, export
 from quadid.types import FloatArray
-from quadid.vehicle import GRAVITY, Vehicle
-from quadid.vehicle_parts import Command
+from quadid.vehicle import GRAVITY, Command, Vehicle
 from tests.model.simulate import held, simulate, state
 
 VEHICLES = [entry["name"] for entry in shipped()]

@@ -15,13 +15,11 @@ from typing import Any
 import dask
 import pyarrow.parquet as pq
 import pytest
-from quadid_cli import fleet_cluster
-from quadid_cli.fleet_cluster import ClusterError, cluster, results
-from quadid_cli.fleet_folder import find_jobs
-from quadid_cli.fleet_store import open_store
 from quadid_replay import write_csv, write_mcap
-from quadid_workflow.fleet import Job, Row, identify_one
 
+from quadid.app.fleet import Job, Row, identify_one
+from quadid.cli import fleet_run as fleet_cluster
+from quadid.cli.fleet_run import ClusterError, cluster, find_jobs, open_store, results
 from quadid.errors import LogError, VehicleError
 from quadid.flight import fly
 from quadid.vehicle import Vehicle
@@ -178,7 +176,7 @@ def test_workers_begin_warm_and_with_one_thread_each() -> None:
         import os
         import sys
 
-        warm = "quadid_workflow.identify" in sys.modules
+        warm = "quadid.app.identify" in sys.modules
         return warm, sys.modules["numba"].config.NUMBA_NUM_THREADS, os.environ.get("OPENBLAS_NUM_THREADS")
 
     with cluster(None, 1, "1GiB") as client:

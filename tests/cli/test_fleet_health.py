@@ -7,17 +7,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from quadid_evaluation.studies.health.flights import Wrong, hover
 from quadid_replay import write_csv
-from quadid_report.fleet_page import fleet_page, fleet_verdict
-from quadid_report.fleet_summary import summarise
-from quadid_report.page import render
-from quadid_workflow.fleet import Job, identify_one
-from quadid_workflow.fleet_health import BASELINE, FEWEST, health_trend
 
-from quadid.health import flight_trim
-from quadid.health.stored import flight_to_dict
+from quadid.app.fleet import BASELINE, FEWEST, Job, health_trend, identify_one
+from quadid.condition import flight_trim
+from quadid.condition.trim import flight_to_dict
+from quadid.report.fleet import fleet_page, fleet_verdict, summarise
+from quadid.report.page import render
 from quadid.vehicle import Vehicle
-from studies.health.flights import Wrong, hover
 
 PELICAN_X = Vehicle.shipped("pelican_x")
 

@@ -7,12 +7,12 @@ import shutil
 from pathlib import Path
 
 import pytest
+from quadid_evaluation.studies.health.flights import hover
 from quadid_replay import write_csv
 
 import quadid
 from quadid.errors import LogError
 from quadid.vehicle import Vehicle
-from studies.health.flights import hover
 
 HEALTHY = ("controller_067", "controller_068", "motor_144", "motor_145", "motor_146")
 """Healthy flights of airframe E9, both kinds of log."""

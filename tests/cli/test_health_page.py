@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from quadid_evaluation.studies.health.flights import Wrong, hover
 
 from quadid.vehicle import GRAVITY, Vehicle
-from studies.health.flights import Wrong, hover
 from tests.cli.conftest import Cli
 from tests.cli.followed_page import commands
 from tests.replay import blackbox_writer as writer

@@ -167,7 +167,7 @@ def test_no_velocity_needed_for_rates(inside: Cli, flights: Flights, tmp_path: P
 
 def test_a_rotor_signal_too_slow_for_inertias_tells_thrust_alone(inside: Cli, data_dir: Path, tmp_path: Path) -> None:
     """Ten motor commands a second: thrust yes, inertia no."""
-    vehicle = Path(__file__).parents[2] / "studies" / "vehicles" / "ascend.yaml"
+    vehicle = Path(__file__).parents[2] / "evaluation" / "quadid_evaluation" / "studies" / "vehicles" / "ascend.yaml"
     # A flight of a real PX4 without the setpoints of torque, from which its motors would be known at 50 Hz.
     whole = (data_dir / "px4" / "ascend_cubeorange_test.ulg").read_bytes()
     log = tmp_path / "slow.ulg"

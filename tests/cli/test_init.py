@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from quadid_workflow.init import init
 
 import quadid
+from quadid.app.init import init
 from quadid.vehicle import Vehicle
 from tests.cli.conftest import Cli, Flights, one_line
 

@@ -12,19 +12,19 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
-from quadid_paper.compare import compare
+from quadid_evaluation.paper.compare import compare
+from quadid_evaluation.studies.health.flights import hover
 from quadid_replay import write_csv
-from quadid_workflow.excite import propose
-from quadid_workflow.health import HealthOutcome
-from quadid_workflow.init import init
-from quadid_workflow.logs import settled
 
 import quadid
+from quadid.app.excite import propose
+from quadid.app.health import HealthOutcome
+from quadid.app.init import init
+from quadid.app.logs import settled
+from quadid.condition import assess, flight_trim
 from quadid.errors import QuadidError, VehicleError
-from quadid.health import assess, flight_trim
 from quadid.jsonable import jsonable
 from quadid.vehicle import Vehicle
-from studies.health.flights import hover
 from tests.cli.conftest import Cli, Flights, one_line
 
 WRITTEN = ("vehicle_file", "prediction_file", "report", "files", "file", "log", "manoeuvre_file")
@@ -237,8 +237,8 @@ def test_the_import_is_cheap_and_reads_no_logs() -> None:
         "heavy = [m for m in ('numpy', 'numba', 'quadid_replay', 'plotly', 'pydantic') if m in sys.modules]\n"
         "assert not heavy, heavy\n"
         "for name in quadid.__all__: assert callable(getattr(quadid, name)), name\n"
-        "import quadid.identify.fit, quadid.diagnose.pipeline\n"
-        "assert quadid.identify.fit.fit and callable(quadid.identify) and callable(quadid.diagnose)\n"
+        "import quadid.identification.fit, quadid.diagnosis.pipeline\n"
+        "assert quadid.identification.fit.fit and callable(quadid.identify) and callable(quadid.diagnose)\n"
     )
     subprocess.run([sys.executable, "-c", text], check=True, timeout=120)
 

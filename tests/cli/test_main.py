@@ -7,9 +7,9 @@ import subprocess
 import sys
 
 import pytest
-from quadid_cli.main import BLAS_THREADS, COMMANDS
 
-from quadid import __version__
+from quadid.cli.main import BLAS_THREADS, COMMANDS
+from quadid.version import __version__
 from tests.cli.conftest import Cli, one_line
 
 
@@ -36,7 +36,7 @@ def test_every_command_has_help_examples_and_json(inside: Cli, command: str) -> 
 
 def test_start_imports_nothing_heavy() -> None:
     check = (
-        "import sys; sys.argv = ['quadid', '--help']; from quadid_cli.main import app_main; app_main(); "
+        "import sys; sys.argv = ['quadid', '--help']; from quadid.cli.main import app_main; app_main(); "
         "heavy = {'numpy', 'numba', 'scipy', 'pydantic', 'rich', 'plotly', 'yaml'} & set(sys.modules); "
         "sys.exit(f'imported {heavy}' if heavy else 0)"
     )
@@ -47,7 +47,7 @@ def test_start_imports_nothing_heavy() -> None:
 @pytest.mark.parametrize(("given", "used"), [({}, "1"), ({"OPENBLAS_NUM_THREADS": "2"}, "2")])
 def test_linear_algebra_takes_one_thread_unless_told_otherwise(given: dict[str, str], used: str) -> None:
     check = (
-        "import os, sys; sys.argv = ['quadid', '--version']; from quadid_cli.main import app_main; app_main(); "
+        "import os, sys; sys.argv = ['quadid', '--version']; from quadid.cli.main import app_main; app_main(); "
         "print(os.environ['OPENBLAS_NUM_THREADS'])"
     )
     unset = {n: v for n, v in os.environ.items() if n not in BLAS_THREADS}

@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
-from quadid_cli import compare, excite, fleet, history, replay
-from quadid_report.text_table import Column, TextTable
 
+from quadid.cli import compare, excite, fleet, history, replay
 from quadid.parameters import NOMINAL_UNITS
+from quadid.report.tables import Column, TextTable
 
 PARAMETERS = [
     {"name": name, "unit": unit, "value": 1.23456e-5 * (i + 1), "ci95": [1.23356e-5 * (i + 1), 1.23556e-5 * (i + 1)],

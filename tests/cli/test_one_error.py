@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from quadid_workflow.diagnose import Diagnosed
-from quadid_workflow.identify import Identified
-from quadid_workflow.loading import Log
 
 import quadid
+from quadid.app.diagnose import Diagnosed
+from quadid.app.identify import Identified
+from quadid.app.logs import Log
 
 
 @pytest.fixture(scope="module")

@@ -9,12 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from quadid_replay import write_csv, write_mcap
-from quadid_workflow.loading import Log
-from quadid_workflow.overlap import check_unseen
 
 import quadid
+from quadid.app.logs import Log, check_unseen
+from quadid.data.window import Recording
 from quadid.errors import LogError
-from quadid.window import Recording
 from tests.cli.conftest import Cli, Flights, one_line
 
 

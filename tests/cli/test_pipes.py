@@ -9,11 +9,11 @@ from pathlib import Path
 import pytest
 from quadid_node.mavlink_wire import read_key
 from quadid_node.store_file import read_history
-from quadid_node.zenoh_session import config_of
+from quadid_node.zenoh import config_of
 from quadid_replay import open_log
-from quadid_workflow.loading import load_vehicle
-from quadid_workflow.simulate import read_manoeuvre
 
+from quadid.app.logs import load_vehicle
+from quadid.app.simulate import read_manoeuvre
 from quadid.errors import QuadidError
 
 READERS: dict[str, Callable[[Path], object]] = {

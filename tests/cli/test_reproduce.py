@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from quadid_cli.reproduce import write
-from quadid_paper.protocol import Plan, reproduce
-from quadid_paper.result import summary
-from quadid_paper.tables import PAPER_GAIN, PAPER_MSE
+from quadid_evaluation.paper.protocol import Plan, reproduce
+from quadid_evaluation.paper.result import summary
+from quadid_evaluation.paper.tables import PAPER_GAIN, PAPER_MSE
 
+from quadid.cli.reproduce import write
 from quadid.jsonable import jsonable
 from quadid.parameters import NOMINAL_NAMES
 

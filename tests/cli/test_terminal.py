@@ -10,8 +10,8 @@ import subprocess
 from pathlib import Path
 
 import pytest
-from quadid_cli.main import COMMANDS, EXAMPLES, load
 
+from quadid.cli.main import COMMANDS, EXAMPLES, load
 from tests.cli.conftest import QUADID, Cli, Flights
 
 COLOUR = re.compile(r"\x1b\[[0-9;]*3[0-7]m")

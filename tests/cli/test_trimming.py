@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 import quadid
-import quadid.inspection
+import quadid.checks
+from quadid.checks.motion import Spans, flying_spans
+from quadid.data.window import Recording
 from quadid.errors import LogError
-from quadid.inspection.airborne import Spans, flying_spans
 from quadid.vehicle import Vehicle
-from quadid.window import Recording
 from tests.cli.conftest import Cli, Flights, table, write_table
 
 
@@ -63,7 +63,7 @@ def test_when_it_flies_is_worked_out_once(standing: Path, monkeypatch: pytest.Mo
         asked.append(recording.name)
         return flying_spans(recording, vehicle)
 
-    monkeypatch.setattr(quadid.inspection, "flying_spans", counted)
+    monkeypatch.setattr(quadid.checks, "flying_spans", counted)
     quadid.load(standing, vehicle="pelican")
     assert len(asked) == 1
 

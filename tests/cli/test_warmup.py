@@ -10,10 +10,10 @@ from pathlib import Path
 
 from tests.cli.conftest import Cli, Flights
 
-ASK = "from quadid_workflow.kernels import FIT, missing; print(*missing(FIT))"
+ASK = "from quadid.app.kernels import FIT, missing; print(*missing(FIT))"
 SIGNATURES = """
 import json, sys, quadid
-from quadid_workflow.kernels import FIT, PARTS
+from quadid.app.kernels import FIT, PARTS
 for name in FIT:
     PARTS[name].run()
 quadid.identify(quadid.load(sys.argv[1], vehicle="pelican"))

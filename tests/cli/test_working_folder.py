@@ -95,7 +95,7 @@ def test_processes_of_libraries_do_not_import_from_it_either(planted: Path, path
     assert not (planted / "ran").exists()
 
 
-@pytest.mark.parametrize("lines", ["import quadid", "import quadid.vehicle", "import os, quadid_workflow.loading"])
+@pytest.mark.parametrize("lines", ["import quadid", "import quadid.vehicle", "import os, quadid.app.logs"])
 def test_a_library_refuses_settings_of_numba_too(tmp_path: Path, lines: str) -> None:
     (tmp_path / ".numba_config.yaml").write_text("cache_dir: /tmp/somebody\n")
     done = subprocess.run([sys.executable, "-c", lines], cwd=tmp_path, capture_output=True, text=True, check=False)

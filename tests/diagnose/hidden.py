@@ -5,10 +5,11 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import lru_cache
 
-from quadid.diagnose import Diagnosis, Search, diagnose
+from quadid_evaluation.studies.campaign import SINGLES, Case, cases, flown
+
+from quadid.data.window import Window
+from quadid.diagnosis import Diagnosis, Search, diagnose
 from quadid.vehicle import Vehicle
-from quadid.window import Window
-from studies.campaign import SINGLES, Case, cases, flown
 
 SECONDS = 60.0
 

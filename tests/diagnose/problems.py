@@ -8,17 +8,17 @@ from typing import Any
 
 import numpy as np
 
-from quadid.diagnose.candidates import Candidate, candidates
-from quadid.diagnose.model import Model, fit_model
+from quadid.data.window import Window
+from quadid.diagnosis.candidates import Candidate, candidates
+from quadid.diagnosis.model import Model, fit_model
 from quadid.flight import draw_truth, fly
-from quadid.identify.fit import SWARM_SECONDS
-from quadid.identify.gauss_newton import polish
-from quadid.identify.noise_estimation import flexible_fit, reweighted_fit
-from quadid.identify.noise_model import NoiseModel
-from quadid.identify.shooting import Shooting
+from quadid.identification.fit import SWARM_SECONDS
+from quadid.identification.gauss_newton import polish
+from quadid.identification.noise_estimation import flexible_fit, reweighted_fit
+from quadid.identification.noise_model import NoiseModel
+from quadid.identification.shooting import Shooting
 from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray
-from quadid.window import Window
 from tests.identify.flights import PELICAN, guessed
 
 SECONDS = 60.0

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from quadid_evaluation.studies.cases import row
 
-from studies.cases import row
 from tests.conftest import absent
 
 QUICK = ("case_001", "case_012", "case_017")

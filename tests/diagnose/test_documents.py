@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from quadid.diagnose import log_evidence
-from quadid.diagnose.cross_validation import BLOCKS
-from quadid.diagnose.pipeline import SHARE_TO_NAME
+from quadid.diagnosis import log_evidence
+from quadid.diagnosis.cross_validation import BLOCKS
+from quadid.diagnosis.pipeline import SHARE_TO_NAME
 from quadid.effects import EFFECTS
 
 

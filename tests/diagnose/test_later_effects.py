@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from quadid.diagnose import Diagnosis, diagnose
+from quadid.diagnosis import Diagnosis, diagnose
 from quadid.flight import draw_truth, fly
-from quadid.vehicle import Vehicle
-from quadid.vehicle_parts import Command
+from quadid.vehicle import Command, Vehicle
 from tests.diagnose.hidden import confident, number
 from tests.identify.flights import PELICAN, guessed
 

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import pytest
 
-from quadid.diagnose.attribution import ordinary
-from quadid.diagnose.candidates import candidates
+from quadid.diagnosis.attribution import ordinary
+from quadid.diagnosis.candidates import candidates
 from tests.diagnose.problems import clean
 
 

@@ -8,11 +8,11 @@ import pytest
 from quadid_replay import open_log
 
 import quadid
-from quadid.diagnose import diagnose
-from quadid.grid import to_windows
+from quadid.data.grid import to_windows
+from quadid.data.window import Window
+from quadid.diagnosis import diagnose
 from quadid.parameters import Status
 from quadid.vehicle import Vehicle
-from quadid.window import Window
 
 LAG = (0.030, 0.045)
 """Between PWM and speed a regression gives about 40 ms; the split into lag and delay is not known."""

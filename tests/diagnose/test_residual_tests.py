@@ -8,13 +8,13 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from quadid.diagnose.cross_validation import Gain
-from quadid.diagnose.model import Model
-from quadid.diagnose.pipeline import judge
-from quadid.diagnose.residual_regressors import SITES, Follows
-from quadid.diagnose.residual_tests import ALARM, Remainder, Structure, remainder
-from quadid.diagnose.result import Explanation
-from quadid.identify.noise_spectrum import mode_power
+from quadid.diagnosis.cross_validation import Gain
+from quadid.diagnosis.model import Model
+from quadid.diagnosis.pipeline import judge
+from quadid.diagnosis.residual_regressors import SITES, Follows
+from quadid.diagnosis.residual_tests import ALARM, Remainder, Structure, remainder
+from quadid.diagnosis.result import Explanation
+from quadid.identification.noise_spectrum import mode_power
 from quadid.types import FloatArray
 from tests.diagnose.problems import Problem, clean, fitted, window_with
 

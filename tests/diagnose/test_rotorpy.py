@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from quadid_evaluation.studies.rotorpy_flight import RotorpyFlight, fly, hummingbird
 
-from quadid.diagnose.pipeline import diagnose
-from quadid.diagnose.result import Diagnosis, Explanation
+from quadid.diagnosis.pipeline import diagnose
+from quadid.diagnosis.result import Diagnosis, Explanation
 from quadid.vehicle import GRAVITY, Vehicle
-from studies.rotorpy_flight import RotorpyFlight, fly, hummingbird
 
 pytest.importorskip("rotorpy", reason="pip install rotorpy (extra dev)")
 SECONDS = 12.0

@@ -7,9 +7,9 @@ from typing import Any
 
 import pytest
 
-from quadid.diagnose import pipeline, selection
-from quadid.diagnose.candidates import Candidate, candidates
-from quadid.diagnose.log_evidence import better
+from quadid.diagnosis import pipeline, selection
+from quadid.diagnosis.candidates import Candidate, candidates
+from quadid.diagnosis.log_evidence import better
 from tests.diagnose.hidden import answer, of_class, require_named, require_nothing, single
 
 

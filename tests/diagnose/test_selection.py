@@ -8,10 +8,10 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
-from quadid.diagnose.log_evidence import better, relevant
-from quadid.diagnose.model import Model, extend, without
-from quadid.diagnose.score_test import Everything
-from quadid.diagnose.selection import pruned, select
+from quadid.diagnosis.log_evidence import better, relevant
+from quadid.diagnosis.model import Model, extend, without
+from quadid.diagnosis.score_test import Everything
+from quadid.diagnosis.selection import pruned, select
 from tests.diagnose.problems import Problem, cause, clean, fitted, window_with
 
 LAG = 0.03

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from quadid.diagnose import Diagnosis
+from quadid.diagnosis import Diagnosis
 from quadid.flight import OUTSIDE
 from quadid.parameters import NOMINAL_NAMES
 from tests.diagnose.hidden import SECONDS, answer, confident, number, of_class, require_named, require_nothing, single

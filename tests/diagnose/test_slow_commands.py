@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from quadid_replay.csv_writer import write_csv
+from quadid_replay.writers import write_csv
 
 import quadid
 from quadid.flight import fly

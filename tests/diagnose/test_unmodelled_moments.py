@@ -5,15 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from quadid.diagnose import Diagnosis, diagnose
-from quadid.diagnose.model import Model, fit_model
-from quadid.diagnose.unmodelled_moments import held_by_fast_motion
+from quadid.data.window import Window
+from quadid.diagnosis import Diagnosis, diagnose
+from quadid.diagnosis.model import Model, fit_model
+from quadid.diagnosis.unmodelled_moments import held_by_fast_motion
 from quadid.flight import draw_truth, fly
-from quadid.identify import fit as fitting
-from quadid.identify.shooting import Shooting
+from quadid.identification import fit as fitting
+from quadid.identification.shooting import Shooting
 from quadid.parameters import UNKNOWN
 from quadid.vehicle import Vehicle
-from quadid.window import Window
 from tests.diagnose.problems import cause, clean, fitted, window_with
 from tests.identify.flights import PELICAN, guessed
 

@@ -7,10 +7,10 @@ from pathlib import Path
 import pytest
 
 import quadid
-from quadid.diagnose import diagnose
+from quadid.data.window import Window
+from quadid.diagnosis import diagnose
 from quadid.flight import draw_truth, fly
-from quadid.flight.profiles import Segment
-from quadid.window import Window
+from quadid.flight.pilot import Segment
 from tests.diagnose.hidden import confident, number
 from tests.identify.flights import PELICAN, guessed
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from quadid.data.window import Window
 from quadid.estimate import kalman as k
 from quadid.estimate.kalman import Track
 from quadid.estimate.track import from_window
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
-from quadid.window import Window
 
 PELICAN = Vehicle.shipped("pelican")
 ROWS, STEP = 40, 0.02

@@ -15,8 +15,7 @@ from quadid.estimate.track import from_window
 from quadid.flight import TruthParameters, draw_truth, fly
 from quadid.model.layout import Layout
 from quadid.parameters import NOMINAL_NAMES
-from quadid.vehicle import Vehicle
-from quadid.vehicle_parts import ParameterPrior
+from quadid.vehicle import ParameterPrior, Vehicle
 
 PELICAN = Vehicle.shipped("pelican")
 SECONDS = 30.0

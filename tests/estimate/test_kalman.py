@@ -10,7 +10,7 @@ from quadid.estimate.track import from_window
 from quadid.estimate.whole_model import WholeModel
 from quadid.flight import Flight, draw_truth, fly
 from quadid.model.layout import Layout
-from quadid.model.simulate import simulate
+from quadid.model.step import simulate
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 from tests.estimate.linear import NOISE, PELICAN, batch, dense_filter, physics, tiny_flight

@@ -16,7 +16,7 @@ from quadid_replay import write_csv, write_mcap
 
 from quadid.errors import WindowError
 from quadid.flight import fly
-from quadid.model.simulate import simulate
+from quadid.model.step import simulate
 from quadid.vehicle import GRAVITY, Vehicle
 
 
@@ -63,7 +63,7 @@ def test_the_example_refuses_what_the_command_refuses(
     write_csv(tmp_path / "flight.csv", spoilt)
     done = run(repository, "identify.py", tmp_path / "flight.csv", cwd=tmp_path, code=1)
     command = subprocess.run(
-        [sys.executable, "-c", "import sys; from quadid_cli.main import app_main; sys.exit(app_main())",
+        [sys.executable, "-c", "import sys; from quadid.cli.main import app_main; sys.exit(app_main())",
          "identify", str(tmp_path / "flight.csv"), "--vehicle", "pelican", "--out", str(tmp_path)],
         capture_output=True, text=True, timeout=280, check=False,
     )  # fmt: skip

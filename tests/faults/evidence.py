@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 import pytest
+from quadid_evaluation.studies.judged import judged
 
-from studies.judged import judged
 from tests.faults.fault_list import FAULTS
 
 Happened = Callable[[int, str], None]

@@ -10,15 +10,15 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from quadid_node.store import Store
+from quadid_node.history import Store
 from quadid_node.store_file import read_history
 from quadid_replay import open_log
 from quadid_replay.schemas import schema_text
 
+from quadid.data.window import Recording
 from quadid.errors import LogError, VehicleError
 from quadid.sanitise import LONGEST_LINE
 from quadid.vehicle import Vehicle
-from quadid.window import Recording
 from tests.cli.conftest import Cli, inside
 from tests.faults.evidence import Happened
 from tests.fuzz.seeds import mcap_of

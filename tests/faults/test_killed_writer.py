@@ -9,14 +9,14 @@ from pathlib import Path
 
 import pytest
 from quadid_replay import open_log
-from quadid_replay.mcap_records import McapFile
+from quadid_replay.mcap_file import McapFile
 
 from tests.faults.evidence import Happened
 
 CHUNK = 16384
 WRITER = f"""
 import sys
-import quadid_replay.topic_writer as topic_writer
+import quadid_replay.writers as topic_writer
 topic_writer.CHUNK_BYTES = {CHUNK}
 writer = topic_writer.TopicWriter(sys.argv[1])
 for k in range(10**9):

@@ -7,11 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from quadid.data_faults import data_faults
-from quadid.inspection import inspect
+from quadid.checks import inspect
+from quadid.data.faults import at_limit, data_faults
+from quadid.online.checks import judge
 from quadid.online.grid_buffer import Cut
-from quadid.online.quality import judge
-from quadid.saturation import at_limit
 from quadid.vehicle import Vehicle
 from tests.faults.evidence import Happened
 from tests.online.driving import flight

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from quadid.data.window import Sample
 from quadid.online import Session, SessionSettings
 from quadid.online.gate import GateSettings
 from quadid.vehicle import Vehicle
-from quadid.window import Sample
 from tests.faults.evidence import Happened
 from tests.online.driving import drive, flight, published, samples
 

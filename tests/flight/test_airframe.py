@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from quadid.flight import TruthParameters, fly
-from quadid.flight.airframe import STATES, derivative, orthonormalise, rotor_wrench
-from quadid.flight.airframe_constants import Oddity
+from quadid.flight.airframe import STATES, Oddity, derivative, orthonormalise, rotor_wrench
 from quadid.flight.rotors import advance
 from quadid.flight.setup import Effects, Setup, prepare
 from quadid.types import FloatArray

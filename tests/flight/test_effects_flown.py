@@ -10,8 +10,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from quadid.effects import EFFECTS
 from quadid.errors import ParameterError
 from quadid.flight import Flight, check_effects, draw_effect, fly
-from quadid.flight.draw import SIZES
-from quadid.flight.setup import Effects
+from quadid.flight.setup import SIZES, Effects
 from quadid.types import FloatArray
 from quadid.vehicle import GRAVITY, Vehicle
 from tests.flight.test_airframe import PELICAN, setup_of, slope, state

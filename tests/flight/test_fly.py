@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from quadid.data.window import CHANNELS
 from quadid.effects import EFFECTS
 from quadid.errors import ParameterError
 from quadid.flight import (
@@ -18,11 +19,10 @@ from quadid.flight import (
     draw_truth,
     fly,
 )
-from quadid.flight.draw import SIZES
 from quadid.flight.outside import ARRANGE, DISTORT
+from quadid.flight.setup import SIZES
 from quadid.parameters import NOMINAL_NAMES
 from quadid.vehicle import Vehicle
-from quadid.window import CHANNELS
 
 VEHICLES = ["pelican", "pelican_x", "hexacopter", "hummingbird", "crazyflie_brushless"]
 PELICAN = Vehicle.shipped("pelican")

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from quadid.errors import ParameterError
 from quadid.flight import PROFILES, Flight, Segment, draw_truth, fly
-from quadid.flight.profiles import scripted, stick_profile
+from quadid.flight.pilot import scripted, stick_profile
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 

@@ -11,11 +11,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from quadid_cli.main import app_main
-from quadid_cli.simulate import check_target, stream
 from quadid_replay import open_log
-from quadid_workflow.simulate import SimulateError, parse_effects, read_manoeuvre
 
+from quadid.app.simulate import SimulateError, parse_effects, read_manoeuvre
+from quadid.cli.main import app_main
+from quadid.cli.simulate import check_target, stream
 from quadid.errors import ParameterError, VehicleError
 from quadid.flight import fly
 from quadid.vehicle import Vehicle

@@ -12,8 +12,7 @@ from quadid.attitude_controller import GAIN_NAMES, mixer_matrix, pack_gains, sta
 from quadid.errors import ParameterError
 from quadid.flight import TruthParameters, default_gains, fly
 from quadid.types import FloatArray
-from quadid.vehicle import Vehicle
-from quadid.vehicle_parts import Stabiliser
+from quadid.vehicle import Stabiliser, Vehicle
 
 NAMES = ["pelican", "pelican_x", "hexacopter", "hummingbird", "crazyflie_brushless"]
 

@@ -7,7 +7,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from studies.judged import judged
+from quadid_evaluation.studies.judged import judged
+
 from tests.fuzz.formats import FORMATS
 
 GOAL = 1_000_000

@@ -25,8 +25,8 @@ from typing import NamedTuple
 import numpy as np
 from quadid_replay.formats import read_here
 
+from quadid.data.window import Recording
 from quadid.errors import QuadidError
-from quadid.window import Recording
 from tests.fuzz.formats import FORMATS, mutated
 from tests.fuzz.seeds import seeds
 

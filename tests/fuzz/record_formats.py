@@ -8,7 +8,7 @@ import zlib
 from random import Random
 
 from pymavlink.dialects.v20 import ardupilotmega
-from quadid_replay.esc_messages import extend_dialect
+from quadid_replay.mavlink_messages import extend_dialect
 
 from tests.fuzz.text_mutated import mutate_text
 

@@ -10,8 +10,8 @@ from typing import Any
 
 from mcap.writer import CompressionType, Writer
 from mcap_ros2._dynamic import serialize_dynamic
+from quadid_replay.mavlink_messages import READERS
 from quadid_replay.schemas import schema_text
-from quadid_replay.tlog_messages import READERS
 
 from tests.fuzz import rosbag2_format
 from tests.replay import blackbox_writer

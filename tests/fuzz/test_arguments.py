@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from quadid_cli.main import app_main
+
+from quadid.cli.main import app_main
 
 COMMANDS = ("simulate", "inspect", "identify", "score", "compare", "diagnose", "excite", "replay", "history", "export",
             "fleet", "watch", "serve", "demo", "reproduce")  # fmt: skip

@@ -10,7 +10,7 @@ from random import Random
 import msgpack
 import pytest
 
-from quadid.window import Recording
+from quadid.data.window import Recording
 from tests.faults.evidence import Happened
 from tests.fuzz import book, campaign, rosbag2_format
 from tests.fuzz.formats import FLOODED, FORMATS

@@ -9,8 +9,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from quadid_replay import open_log
 
+from quadid.data.window import Recording
 from quadid.errors import QuadidError
-from quadid.window import Recording
 from tests.fuzz.campaign import broken_promise
 
 COLUMNS = ("t", "p", "q", "r", "ax", "ay", "az", "qw", "qx", "qy", "qz", "phi", "theta", "psi", "x", "y", "z", "vx",

@@ -12,13 +12,14 @@ from typing import Any
 import numpy as np
 import pytest
 import zstandard
-from quadid_replay import open_log, usd_records
+from quadid_replay import open_log
+from quadid_replay import usd as usd_records
 from quadid_replay.frames import from_euler, to_euler
 from quadid_replay.motors import motor_outputs, px4_motor_outputs, px4_rotor_count
 from quadid_replay.schemas import schema_text
 
+from quadid.data.rotor_signal import rotor_signal
 from quadid.errors import LogError
-from quadid.rotor_signal import rotor_signal
 from quadid.types import BoolArray, IndexArray
 from quadid.vehicle import Vehicle
 from tests.faults.evidence import Happened

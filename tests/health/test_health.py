@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from quadid_report.health_page import change_words, health_verdict
+from quadid_evaluation.studies.health.flights import Wrong, hover, squared_speeds
 
+from quadid.condition import Health, assess, flight_trim, healthy_spread
+from quadid.condition import changes as change_evidence
+from quadid.condition.changes import exact, hypotheses, p_healthy, p_unchanged, rotor_effect
+from quadid.condition.trim import trim_directions, trim_of_load
+from quadid.data.window import Recording
 from quadid.errors import NotIdentifiableError
-from quadid.health import Health, assess, change_evidence, flight_trim, healthy_spread
-from quadid.health.change_evidence import exact, p_healthy, p_unchanged
-from quadid.health.hypotheses import hypotheses, rotor_effect
-from quadid.health.trim_estimation import trim_directions, trim_of_load
-from quadid.vehicle import GRAVITY, Vehicle
-from quadid.vehicle_parts import Command
-from quadid.window import Recording
-from studies.health.flights import Wrong, hover, squared_speeds
+from quadid.report.health_page import change_words, health_verdict
+from quadid.vehicle import GRAVITY, Command, Vehicle
 
 PELICAN_X, PELICAN = Vehicle.shipped("pelican_x"), Vehicle.shipped("pelican")
 

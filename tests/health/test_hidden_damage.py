@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import pytest
-
-from studies.health.simulated import SIMULATORS, Case, judged
+from quadid_evaluation.studies.health.simulated import SIMULATORS, Case, judged
 
 TENTH, FIFTH = {2: 0.1}, {3: 0.2}
 BOTH = {1: 0.25, 4: 0.15}

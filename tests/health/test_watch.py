@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from quadid_evaluation.studies.health.flights import Wrong, hover_seconds
+from quadid_evaluation.studies.health.hours import alarms, named, practised
 
-from quadid.health.watch import ENOUGH, HealthWatch
-from quadid.vehicle import Vehicle
-from quadid.vehicle_parts import Command
-from studies.health.flights import Wrong, hover_seconds
-from studies.health.hours import alarms, named, practised
+from quadid.condition.watch import ENOUGH, HealthWatch
+from quadid.vehicle import Command, Vehicle
 
 PELICAN_X = Vehicle.shipped("pelican_x")
 

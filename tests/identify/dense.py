@@ -12,10 +12,9 @@ import numpy as np
 from scipy.linalg import solve_triangular
 from scipy.spatial.transform import Rotation
 
-from quadid.identify.noise_model import SLOW_TIME, NoiseModel
-from quadid.identify.shooting import Free
-from quadid.model.rollout import Rollout
-from quadid.model.segments import Segments
+from quadid.identification.noise_model import SLOW_TIME, NoiseModel
+from quadid.identification.parameterization import Free
+from quadid.model.rollout import Rollout, Segments
 from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray
 

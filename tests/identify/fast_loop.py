@@ -7,8 +7,8 @@ import math
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from quadid.data.window import Window
 from quadid.vehicle import Vehicle
-from quadid.window import Window
 
 STEP, EVERY = 1e-3, 20
 """Step of the simulation [s], and steps of a sample of the log."""

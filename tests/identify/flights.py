@@ -8,14 +8,13 @@ from typing import Any
 
 import numpy as np
 
+from quadid.data.window import Window
 from quadid.flight import Flight, TruthParameters, draw_truth, fly
-from quadid.identify.shooting import Shooting
+from quadid.identification.shooting import Shooting
 from quadid.model.layout import Layout
 from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray
-from quadid.vehicle import Vehicle
-from quadid.vehicle_parts import ParameterPrior
-from quadid.window import Window
+from quadid.vehicle import ParameterPrior, Vehicle
 
 PELICAN = Vehicle.shipped("pelican")
 SECONDS = 60.0

@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 
 from quadid.flight import draw_truth, fly
-from quadid.identify.fit import FitOptions, fit
+from quadid.identification.fit import FitOptions, fit
 from quadid.parameters import NOMINAL_NAMES, Status
-from quadid.vehicle import Vehicle
-from quadid.vehicle_parts import Rotor
+from quadid.vehicle import Rotor, Vehicle
 from tests.identify.flights import guessed
 
 

@@ -8,17 +8,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from quadid.identify import composite_likelihood
-from quadid.identify import fit as fitting
-from quadid.identify.composite_likelihood import BothCuts, with_second_cut
-from quadid.identify.fit import FitOptions, fit
-from quadid.identify.gauss_newton import polish
-from quadid.identify.noise_model import NoiseModel
-from quadid.identify.priors import default_prior
-from quadid.identify.shooting import Shooting
+from quadid.data.window import Window
+from quadid.identification import composite_likelihood
+from quadid.identification import fit as fitting
+from quadid.identification.composite_likelihood import BothCuts, with_second_cut
+from quadid.identification.fit import FitOptions, fit
+from quadid.identification.gauss_newton import polish
+from quadid.identification.noise_model import NoiseModel
+from quadid.identification.priors import default_prior
+from quadid.identification.shooting import Shooting
 from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray, IntArray
-from quadid.window import Window
 from tests.identify.flights import PELICAN, at_truth, flown, values_of, with_noise
 
 WHITE = np.repeat([0.01, 0.003, 0.1], 3)

@@ -9,14 +9,15 @@ import numpy as np
 import pytest
 
 import quadid
+from quadid.data.window import Window
 from quadid.flight import draw_truth, fly
-from quadid.identify import fit as fitting
-from quadid.identify.fit import Fit, FitOptions, fit
-from quadid.identify.noise_model import NoiseModel
-from quadid.identify.process_noise import likeliest
+from quadid.identification import fit as fitting
+from quadid.identification.fit import FitOptions, fit
+from quadid.identification.identifiability import Fit
+from quadid.identification.noise_model import NoiseModel
+from quadid.identification.process_noise import likeliest
 from quadid.parameters import Status
 from quadid.types import FloatArray
-from quadid.window import Window
 from tests.identify.flights import PELICAN, guessed
 
 DT = 0.02

@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from scipy.optimize import lsq_linear
 
 from quadid.errors import NotIdentifiableError, QuadidError
-from quadid.identify import gauss_newton as polishing
-from quadid.identify.fit import FitOptions, fit
-from quadid.identify.gauss_newton import (
+from quadid.identification import gauss_newton as polishing
+from quadid.identification.fit import FitOptions, fit
+from quadid.identification.gauss_newton import (
     LONGEST_STEP,
     Convergence,
     Polished,
@@ -21,13 +21,15 @@ from quadid.identify.gauss_newton import (
     polish,
     robust_weights,
 )
-from quadid.identify.initial_states import InitialStates
-from quadid.identify.priors import PRIOR_SIGMA_LINEAR, default_prior, prior_terms
-from quadid.identify.shooting import MEASURED, Free, Linearised, Shooting
+from quadid.identification.initial_states import InitialStates
+from quadid.identification.parameterization import Free
+from quadid.identification.priors import PRIOR_SIGMA_LINEAR, default_prior, prior_terms
+from quadid.identification.segment_cost import Linearised
+from quadid.identification.shooting import MEASURED, Shooting
 from quadid.model.layout import Layout
 from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray
-from quadid.vehicle_parts import ParameterPrior
+from quadid.vehicle import ParameterPrior
 from tests.identify.flights import PELICAN, at_truth, flown, guessed, values_of
 
 LAYOUT = Layout(PELICAN)

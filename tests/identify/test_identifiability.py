@@ -7,12 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from quadid.identify.fit import Fit, FitOptions, fit
-from quadid.identify.identifiability import final_answer, possible_inertia
-from quadid.identify.result import fitted_vehicle, parameter_entry
+from quadid.identification.fit import FitOptions, fit
+from quadid.identification.identifiability import Fit, final_answer, possible_inertia
+from quadid.identification.result import fitted_vehicle, parameter_entry
 from quadid.parameters import INERTIAS, ParameterSet, Status, at_bound, impossible_inertia
-from quadid.vehicle import Vehicle
-from quadid.vehicle_parts import ParameterPrior
+from quadid.vehicle import ParameterPrior, Vehicle
 from tests.identify.flights import PELICAN, flown, guessed
 
 

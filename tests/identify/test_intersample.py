@@ -8,20 +8,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from quadid.data.intersample import find_feedback, follow_feedback
+from quadid.data.window import Window
 from quadid.errors import WindowError
 from quadid.flight import fly
-from quadid.flight.stabiliser import default_gains
-from quadid.identify.fit import Fit, FitOptions, fit
-from quadid.identify.score import mse_score
-from quadid.intersample import find_feedback, follow_feedback
+from quadid.flight.pilot import default_gains
+from quadid.identification.fit import FitOptions, fit
+from quadid.identification.identifiability import Fit
+from quadid.identification.score import mse_score
 from quadid.model.layout import Layout
-from quadid.model.rollout import Rollout
-from quadid.model.segments import Segments
+from quadid.model.rollout import Rollout, Segments
 from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray
-from quadid.vehicle import Vehicle
-from quadid.vehicle_parts import Stabiliser
-from quadid.window import Window
+from quadid.vehicle import Stabiliser, Vehicle
 from tests.identify.fast_loop import EVERY, fly_fast
 
 PELICAN = Vehicle.shipped("pelican")

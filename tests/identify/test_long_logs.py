@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from quadid.flight import draw_truth
-from quadid.identify import long_logs
-from quadid.identify.fit import FitOptions, fit
+from quadid.identification import long_logs
+from quadid.identification.fit import FitOptions, fit
 from tests.identify.flights import PELICAN, flown, guessed, values_of
 
 

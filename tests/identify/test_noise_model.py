@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from scipy.signal import freqz, lfilter
 
-from quadid.identify.noise_model import SHAPE_POINTS, SLOW_TIME, NoiseModel, estimate_noise
-from quadid.identify.noise_spectrum import LOWEST, shaped_noise
-from quadid.identify.score import settle_states
-from quadid.identify.shooting import Shooting
+from quadid.identification.noise_model import SHAPE_POINTS, SLOW_TIME, NoiseModel, estimate_noise
+from quadid.identification.noise_spectrum import LOWEST, shaped_noise
+from quadid.identification.score import settle_states
+from quadid.identification.shooting import Shooting
 from quadid.types import FloatArray
-from quadid.vehicle_parts import Noise
+from quadid.vehicle import Noise
 from tests.identify.flights import PELICAN, at_truth, flown, turned
 
 DT = 0.02

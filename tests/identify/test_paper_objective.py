@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from quadid.errors import NotIdentifiableError
-from quadid.identify.controller_gains import Autopilot, find_autopilot
-from quadid.identify.paper_objective import OUTPUT_NAMES, PaperProblem, measured_outputs, paper_score
+from quadid.identification.controller_gains import Autopilot, find_autopilot
+from quadid.identification.paper_objective import OUTPUT_NAMES, PaperProblem, measured_outputs, paper_score
 from quadid.model.layout import Layout
 from quadid.parameters import NOMINAL_NAMES
-from quadid.vehicle_parts import Stabiliser
+from quadid.vehicle import Stabiliser
 from tests.identify.flights import PELICAN, flown, values_of
 
 FLIGHT = flown(31)

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from quadid.errors import ParameterError
-from quadid.identify.particle_swarm import Stop, Swarm, SwarmOptions
+from quadid.identification.particle_swarm import Stop, Swarm, SwarmOptions
 from quadid.types import FloatArray
 
 Cost = Callable[[FloatArray], FloatArray]

@@ -10,10 +10,10 @@ import yaml
 
 from quadid.errors import VehicleError
 from quadid.flight import draw_truth, fly
-from quadid.identify.fit import Fit, FitOptions, fit
+from quadid.identification.fit import FitOptions, fit
+from quadid.identification.identifiability import Fit
 from quadid.parameters import NOMINAL_NAMES, Status
-from quadid.vehicle import Vehicle
-from quadid.vehicle_parts import ParameterPrior, ThrustPoint
+from quadid.vehicle import ParameterPrior, ThrustPoint, Vehicle
 from tests.identify.flights import PELICAN, flown, guessed
 
 SEED = 3

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from quadid.flight import draw_truth, fly
-from quadid.identify.fit import Fit, FitOptions, fit
+from quadid.identification.fit import FitOptions, fit
+from quadid.identification.identifiability import Fit
 from quadid.parameters import NOMINAL_NAMES, Status
 from tests.identify.flights import PELICAN, flown, guessed
 

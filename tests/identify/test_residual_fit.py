@@ -9,12 +9,11 @@ import pytest
 
 from quadid.errors import NotIdentifiableError
 from quadid.flight import Flight, fly
-from quadid.identify.open_loop import mean_errors
-from quadid.identify.residual_fit import candidate_terms, fit_residual
+from quadid.identification.open_loop import mean_errors
+from quadid.identification.residual_fit import candidate_terms, fit_residual
 from quadid.model.layout import Layout
 from quadid.parameters import NOMINAL_NAMES
-from quadid.vehicle import Vehicle
-from quadid.vehicle_parts import ParameterPrior
+from quadid.vehicle import ParameterPrior, Vehicle
 from tests.identify.flights import PELICAN
 
 

@@ -9,15 +9,15 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from quadid_cli.main import app
 from quadid_replay import open_log
 from typer.testing import CliRunner
 
-from quadid.diagnose import diagnose, pipeline
-from quadid.diagnose.candidates import candidates
+from quadid.cli.main import app
+from quadid.data.grid import grid_recording
+from quadid.diagnosis import diagnose, pipeline
+from quadid.diagnosis.candidates import candidates
 from quadid.flight import fly
-from quadid.grid import grid_recording
-from quadid.identify.residual_prediction import AHEAD, _relative, learn_prediction
+from quadid.identification.residual_prediction import AHEAD, _relative, learn_prediction
 from quadid.vehicle import Vehicle
 
 NANODRONE = "nanodrone"

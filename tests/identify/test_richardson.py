@@ -7,12 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from quadid.data.window import Window
 from quadid.flight import draw_truth, fly
-from quadid.identify.fit import Fit, FitOptions, fit
-from quadid.identify.richardson import coarse
+from quadid.identification.fit import FitOptions, fit
+from quadid.identification.identifiability import Fit
+from quadid.identification.richardson import coarse
 from quadid.parameters import NOMINAL_NAMES, Status
 from quadid.types import FloatArray
-from quadid.window import Window
 from tests.identify.flights import PELICAN, guessed, values_of
 
 LATE = {"command_delay": {"delay": 0.027}}

@@ -5,10 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 
 from quadid.flight import TruthParameters, fly
-from quadid.identify.fit import FitOptions, fit
+from quadid.identification.fit import FitOptions, fit
 from quadid.parameters import Status
-from quadid.vehicle import Vehicle
-from quadid.vehicle_parts import ParameterPrior
+from quadid.vehicle import ParameterPrior, Vehicle
 
 
 def test_rotors_without_inertia_leave_yaw_and_roll_right() -> None:

@@ -7,10 +7,10 @@ import pytest
 
 from quadid.errors import NotIdentifiableError, ParameterError
 from quadid.flight import Flight, SensorNoise, fly
-from quadid.identify.noise_model import NoiseModel
-from quadid.identify.open_loop import OpenLoop, true_rate
-from quadid.identify.prediction import horizon_scores
-from quadid.identify.score import mse_score
+from quadid.identification.noise_model import NoiseModel
+from quadid.identification.open_loop import OpenLoop, true_rate
+from quadid.identification.prediction import horizon_scores
+from quadid.identification.score import mse_score
 from quadid.model import layout as ix
 from quadid.model.layout import Layout
 from quadid.rotation import euler

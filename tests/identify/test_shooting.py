@@ -9,15 +9,17 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
+from quadid.data.window import Window
 from quadid.errors import WindowError
 from quadid.flight import draw_truth, fly
-from quadid.identify.global_search import Projected
-from quadid.identify.noise_model import NoiseModel
-from quadid.identify.score import settle_states
-from quadid.identify.shooting import MEASURED, VELOCITY_PRIOR, Free, Linearised, Shooting
+from quadid.identification.global_search import Projected
+from quadid.identification.noise_model import NoiseModel
+from quadid.identification.parameterization import Free
+from quadid.identification.score import settle_states
+from quadid.identification.segment_cost import Linearised
+from quadid.identification.shooting import MEASURED, VELOCITY_PRIOR, Shooting
 from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray
-from quadid.window import Window
 from tests.identify.dense import DenseProblem, perturbed
 from tests.identify.flights import PELICAN, at_truth, flown, without_rows
 

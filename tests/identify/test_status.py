@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from quadid.identify.covariance import Uncertainty, parameter_set
-from quadid.identify.parameterization import Free
+from quadid.identification.covariance import Uncertainty, parameter_set
+from quadid.identification.parameterization import Free
 from quadid.model.layout import Layout
 from quadid.parameters import ParameterSet, Status
 from tests.identify.flights import PELICAN

@@ -5,15 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from quadid.data.window import Window
 from quadid.flight import fly
-from quadid.identify.open_loop import OpenLoop
-from quadid.identify.residual_fit import candidate_terms
-from quadid.identify.term_sensitivity import term_sensitivity, typical
+from quadid.identification.open_loop import OpenLoop
+from quadid.identification.residual_fit import candidate_terms
+from quadid.identification.term_sensitivity import term_sensitivity, typical
 from quadid.model.layout import Layout
-from quadid.residual import ResidualTerm
 from quadid.types import FloatArray
-from quadid.vehicle import Vehicle
-from quadid.window import Window
+from quadid.vehicle import ResidualTerm, Vehicle
 from tests.identify.flights import PELICAN
 
 AT = np.array([5, 25])

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 import quadid
-from quadid.identify.torque_coherence import LEAST, undecided
+from quadid.data.window import Window
+from quadid.identification.torque_coherence import LEAST, undecided
 from quadid.parameters import Status
 from quadid.types import FloatArray
-from quadid.window import Window
 from tests.identify.flights import PELICAN
 
 DT = 0.01

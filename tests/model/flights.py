@@ -6,10 +6,10 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from quadid.data.window import Sampling
 from quadid.model.layout import Layout
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
-from quadid.window import Sampling
 from tests.model.independent import Flown, Independent, Input
 
 

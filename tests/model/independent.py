@@ -13,9 +13,9 @@ import numpy as np
 from scipy.integrate import OdeSolution, solve_ivp
 from scipy.spatial.transform import Rotation
 
+from quadid.data.window import Sampling, Window
 from quadid.types import FloatArray, IntArray
 from quadid.vehicle import Vehicle
-from quadid.window import Sampling, Window
 
 G = 9.80665
 DOWN = np.array([0.0, 0.0, 1.0])

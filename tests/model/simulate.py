@@ -7,11 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from quadid.model.rollout import Rollout
-from quadid.model.segments import Segments
+from quadid.data.window import Window
+from quadid.model.rollout import Rollout, Segments
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
-from quadid.window import Window
 from tests.model.flights import vector
 from tests.model.independent import Input
 

@@ -5,11 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from quadid.model.rollout import Rollout
-from quadid.model.segments import Segments
+from quadid.data.window import Sampling
+from quadid.model.rollout import Rollout, Segments
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
-from quadid.window import Sampling
 from tests.model.flights import fly, lively_input, values_of, vector
 
 DRAG = {"rotor_drag.k_x": 0.3, "rotor_drag.k_y": 0.2}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from quadid.model.array_cache import ArrayCache
+from quadid.model.rollout import ArrayCache
 
 
 def test_the_least_recently_used_goes_first() -> None:

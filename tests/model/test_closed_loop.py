@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from quadid.data.window import Window
 from quadid.errors import ParameterError, WindowError
 from quadid.flight import Flight, fly
 from quadid.model.closed_loop import ClosedLoop, kinematic_acceleration
 from quadid.model.layout import Layout
 from quadid.parameters import NOMINAL_NAMES
 from quadid.vehicle import GRAVITY, Vehicle
-from quadid.window import Window
 
 PELICAN = Vehicle.shipped("pelican")
 LAYOUT = Layout(PELICAN)

@@ -5,11 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from quadid.model.rollout import Rollout
-from quadid.model.segments import Segments
+from quadid.data.window import Window
+from quadid.model.rollout import Rollout, Segments
 from quadid.model.simd import LANES
 from quadid.types import FloatArray
-from quadid.window import Window
 from tests.model.test_lanes import N_PRE, NOMINAL, VEHICLE, noisy_window, random_vectors
 
 

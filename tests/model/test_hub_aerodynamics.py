@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from quadid.flight.airframe import hub_forces
-from quadid.flight.airframe_constants import Air
+from quadid.flight.airframe import Air, hub_forces
 from quadid.types import FloatArray
 from quadid.vehicle import GRAVITY, Vehicle
 from tests.flight.test_airframe import setup_of, slope, state

@@ -5,14 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from quadid.data.window import Sampling, Window
 from quadid.model import layout as ix
 from quadid.model.layout import Entry, Layout
-from quadid.model.rollout import Rollout
-from quadid.model.segments import Segments
+from quadid.model.rollout import Rollout, Segments
 from quadid.model.simd import LANES
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
-from quadid.window import Sampling, Window
 from tests.model.flights import lively_input, values_of, vector
 
 VEHICLE = Vehicle.shipped("pelican").model_copy(update={"reference_voltage": 11.5})

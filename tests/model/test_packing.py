@@ -6,11 +6,9 @@ import numpy as np
 import pytest
 
 from quadid.model import layout as ix
+from quadid.model.kernel import needs_of
 from quadid.model.layout import Layout
-from quadid.model.needs_kernel import needs_of
-from quadid.model.packing import packed, packing
-from quadid.model.rollout import Rollout
-from quadid.model.segments import Segments
+from quadid.model.rollout import Rollout, Segments, packed, packing
 from quadid.model.simd import LANES
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle

@@ -7,8 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from quadid.types import FloatArray
-from quadid.vehicle import GRAVITY, Vehicle
-from quadid.vehicle_parts import Rotor
+from quadid.vehicle import GRAVITY, Rotor, Vehicle
 from tests.model.flights import lively_input, values_of
 from tests.model.independent import Input
 from tests.model.simulate import Trajectory, finer, held, simulate, state

@@ -7,10 +7,8 @@ import pytest
 
 from quadid.errors import VehicleError
 from quadid.model.layout import Layout
-from quadid.model.rollout import Rollout
-from quadid.model.segments import Segments
-from quadid.residual import SIGNALS, TARGETS, ResidualTerm
-from quadid.vehicle import Vehicle
+from quadid.model.rollout import Rollout, Segments
+from quadid.vehicle import SIGNALS, TARGETS, ResidualTerm, Vehicle
 from tests.model.test_lanes import noisy_window
 
 PELICAN = Vehicle.shipped("pelican")

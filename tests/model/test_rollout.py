@@ -11,17 +11,14 @@ import numba as nb
 import numpy as np
 import pytest
 
+from quadid.data.window import Window
 from quadid.errors import VehicleError, WindowError
 from quadid.model import layout as ix
-from quadid.model.channels import CHANNEL_NAMES, CHANNEL_UNITS
 from quadid.model.layout import Layout
-from quadid.model.rollout import Rollout
+from quadid.model.rollout import CHANNEL_NAMES, CHANNEL_UNITS, Rollout, Segments, shared_rollout
 from quadid.model.rollout_kernel import roll_segments
-from quadid.model.segments import Segments
-from quadid.model.shared_rollout import shared_rollout
 from quadid.model.simd import LANES
 from quadid.vehicle import Vehicle
-from quadid.window import Window
 from tests.model.flights import fly, lively_input, values_of, vector
 from tests.model.test_lanes import NOMINAL, VEHICLE, noisy_window
 

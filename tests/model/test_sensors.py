@@ -10,11 +10,10 @@ from scipy.integrate import solve_ivp
 from scipy.signal import butter, lsim
 from scipy.spatial.transform import Rotation
 
-from quadid.model.rollout import Rollout
-from quadid.model.segments import Segments
+from quadid.data.window import Window
+from quadid.model.rollout import Rollout, Segments
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
-from quadid.window import Window
 from tests.model.flights import fly, lively_input, values_of, vector
 from tests.model.independent import EULER, RATE, Flown, quaternion
 

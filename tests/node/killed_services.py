@@ -14,14 +14,14 @@ import time
 from pathlib import Path
 from typing import Any, Self
 
+from quadid_node.history import Store
 from quadid_node.service import Service
-from quadid_node.store import Store
 from quadid_node.worker import InlineWorker
 
 from quadid.online import SessionSettings
 from quadid.online.records import Publish
 from quadid.vehicle import Vehicle
-from quadid_node import history_writer
+from quadid_node import history as history_writer
 from tests.online.test_gate import TRUE, online_set
 
 ROOT = Path(__file__).resolve().parents[2]

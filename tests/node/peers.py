@@ -124,7 +124,7 @@ class Ear:
     def sets(self, topic: str = "quadid/parameters") -> list[Any]:
         """Subscribes to parameter sets, latched; that nothing is in force yet is left out."""
         from quadid_msgs.msg import ParameterSet
-        from quadid_node.speaker import LATCHED_QOS
+        from quadid_node.publish import LATCHED_QOS
 
         heard: list[Any] = []
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import random
 
 import pytest
-from quadid_node.claim import BESIDE, FOUND_WITHIN, OBSERVES, STRANGER, YOUNG, Claim
+from quadid_node.publish import BESIDE, FOUND_WITHIN, OBSERVES, STRANGER, YOUNG, Claim
 
 SETTLED = FOUND_WITHIN + 2.0
 """By then [s] a service that sees no other one speaks."""

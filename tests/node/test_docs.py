@@ -7,12 +7,12 @@ import shlex
 from pathlib import Path
 
 import pytest
-from quadid_cli.main import load
+from quadid_node.inputs import source
+from quadid_node.mavlink_link import PARAMETERS as MAVLINK_NAMES
 from quadid_node.mavlink_link import REQUESTED
-from quadid_node.mavlink_parameters import PARAMETERS as MAVLINK_NAMES
 from quadid_node.node_parameters import PARAMETERS
-from quadid_node.presets import source
 
+from quadid.cli.main import load
 from quadid.online.gate import CHECKS, GateSettings
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"

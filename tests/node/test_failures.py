@@ -6,13 +6,13 @@ from pathlib import Path
 
 import pytest
 from quadid_node.failures import MOST, folder_of, keep, repeat
-from quadid_node.parcel import ParcelError
+from quadid_node.history import Store
 from quadid_node.service import Service
-from quadid_node.store import Store
+from quadid_node.wire_format import ParcelError
 from quadid_node.worker import InlineWorker, Trouble
 
 from quadid.online import FitReply, FitRequest
-from quadid.online.jobs import JobReply
+from quadid.online.records import JobReply
 from tests.faults.evidence import Happened
 from tests.online.made_up import PELICAN, QUICK, light_flight
 

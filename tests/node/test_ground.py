@@ -24,19 +24,18 @@ import pytest
 import zenoh
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from quadid_node.ground import work
-from quadid_node.parcel import LARGEST, ParcelError, pack, unpack
-from quadid_node.remote_worker import Ground, RemoteWorker
+from quadid_node.ground import Ground, RemoteWorker, work
+from quadid_node.wire_format import LARGEST, ParcelError, pack, unpack
 from quadid_node.worker import InlineWorker, ProcessWorker, Trouble
-from quadid_node.zenoh_fleet import Fleet
-from quadid_node.zenoh_link import ZenohLink
+from quadid_node.zenoh import Fleet, ZenohLink
 
 from quadid.online import FitReply, FitRequest, Session, SessionSettings
 from quadid.online.background_diagnosis import DiagnosisReply
 from quadid.online.fault_isolation import ChangeReply
 from quadid.online.records import OnlineFinding
 from quadid.vehicle import Vehicle
-from quadid_node import ground, remote_worker
+from quadid_node import ground
+from quadid_node import ground as remote_worker
 from tests.cli.conftest import QUADID
 from tests.faults.evidence import Happened
 from tests.node.zenoh_net import Net, accepted, free_port, service, until

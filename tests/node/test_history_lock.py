@@ -13,8 +13,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from quadid_node.history import Store
 from quadid_node.service import Service
-from quadid_node.store import Store
 from quadid_node.store_file import VERSION, StoreError, read_history
 from quadid_node.worker import InlineWorker
 
@@ -28,7 +28,7 @@ PELICAN = Vehicle.shipped("pelican")
 OTHER = """
 import sys
 from pathlib import Path
-from quadid_node.store import Store
+from quadid_node.history import Store
 from quadid_node.store_file import StoreError
 try:
     Store(Path(sys.argv[1]), "pelican")

@@ -8,20 +8,15 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 from mcap_ros2._dynamic import generate_dynamic
-from quadid_node.chooser import Chooser
-from quadid_node.convert import Decoder, best_ranks
-from quadid_node.intake import SLICE, Intake
-from quadid_node.pace import MEMORY
-from quadid_node.presets import Input, source
+from quadid_node.inputs import MEMORY, SLICE, Chooser, Decoder, Input, Intake, best_ranks, source
 from quadid_replay import write_mcap
-from quadid_replay.mcap_messages import TYPES
-from quadid_replay.mcap_records import McapFile
+from quadid_replay.mcap_file import McapFile
+from quadid_replay.ros_messages import TYPES, SignalColumns
 from quadid_replay.schemas import schema_text
-from quadid_replay.signal_columns import SignalColumns
 
+from quadid.data.window import Block, Sample
 from quadid.flight import fly
 from quadid.vehicle import Vehicle
-from quadid.window import Block, Sample
 
 Message = tuple[str, bytes]
 SECONDS = 3.0

@@ -14,7 +14,7 @@ from quadid_node.mavlink_wire import dialect
 from tests.faults.evidence import Happened
 from tests.node.mavlink_ends import Sender, free_port
 
-COMMAND = "import sys; from quadid_cli.main import app_main; sys.exit(app_main())"
+COMMAND = "import sys; from quadid.cli.main import app_main; sys.exit(app_main())"
 SECRET = bytes(range(32, 64)).translate(bytes(reversed(range(256))))
 
 

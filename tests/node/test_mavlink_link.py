@@ -10,12 +10,9 @@ from collections.abc import Iterator
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from quadid_node.mavlink_decode import MavlinkDecoder
-from quadid_node.mavlink_link import FRAMES_A_SECOND, MavlinkLink
-from quadid_node.mavlink_peers import JUDGED, Source
-from quadid_node.mavlink_requests import Requests
-from quadid_node.mavlink_wire import LinkError, SafeMavlink, dialect, frames
-from quadid_replay.tlog_writer import mavlink_messages
+from quadid_node.mavlink_link import FRAMES_A_SECOND, MavlinkDecoder, MavlinkLink, Requests
+from quadid_node.mavlink_wire import JUDGED, LinkError, SafeMavlink, Source, dialect, frames
+from quadid_replay.writers import mavlink_messages
 
 from quadid.online.records import Event, OnlineDiagnosis, OnlineFinding
 from tests.faults.evidence import Happened

@@ -7,8 +7,7 @@ from pathlib import Path
 
 import pytest
 from quadid_node.mavlink_link import MavlinkLink
-from quadid_node.mavlink_wire import LinkError, dialect, read_key
-from quadid_node.signing_memory import memory_path
+from quadid_node.mavlink_wire import LinkError, dialect, memory_path, read_key
 
 from tests.faults.evidence import Happened
 from tests.node.mavlink_ends import KEY, Sender, free_port, samples

@@ -6,10 +6,8 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
-from quadid_node.mavlink_decode import MavlinkDecoder
-from quadid_node.mavlink_link import MavlinkLink
+from quadid_node.mavlink_link import ASKED, MOST_ROUNDS, PATIENCE, MavlinkDecoder, MavlinkLink, MotorOrder
 from quadid_node.mavlink_wire import dialect
-from quadid_node.motor_order import ASKED, MOST_ROUNDS, PATIENCE, MotorOrder
 from quadid_replay.motors import RPM
 
 from tests.faults.evidence import Happened

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from quadid_node.neighbours import Neighbours, Offer
+from quadid_node.publish import Neighbours, Offer
 
 IMU, JOINTS = "sensor_msgs/msg/Imu", "sensor_msgs/msg/JointState"
 GOOD = Offer(IMU, True)

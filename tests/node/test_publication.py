@@ -11,10 +11,9 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from quadid_node.history_writer import Row
+from quadid_node.history import LARGEST_NUMBER, Restored, Row, Store
 from quadid_node.publication import MOST_WAITING, Output, Publication
 from quadid_node.service import Service
-from quadid_node.store import LARGEST_NUMBER, Restored, Store
 from quadid_node.store_file import StoreError, connect, read_history
 from quadid_node.worker import InlineWorker
 
@@ -88,7 +87,7 @@ def said_until(service: Service, number: int, seconds: float) -> Iterator[Output
 def test_nothing_is_published_that_a_full_disk_did_not_take(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, happened: Happened
 ) -> None:
-    import quadid_node.history_writer as writing
+    import quadid_node.history as writing
 
     store = Store(tmp_path / "h.sqlite", "pelican")
     service = service_with(store)
@@ -276,7 +275,7 @@ def test_a_path_that_names_no_file_is_one_line() -> None:
 def test_while_the_disk_takes_nothing_candidates_are_forgotten_before_sets_and_decisions(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, happened: Happened
 ) -> None:
-    import quadid_node.history_writer as writing
+    import quadid_node.history as writing
 
     def full(path: Path, read_only: bool = False) -> sqlite3.Connection:
         raise sqlite3.OperationalError("database or disk is full")

@@ -7,10 +7,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from quadid_node.mavlink_decode import MavlinkDecoder
-from quadid_node.mavlink_link import MavlinkLink
+from quadid_node.mavlink_link import MavlinkDecoder, MavlinkLink
 from quadid_node.mavlink_wire import dialect
-from quadid_replay.mavlink_frames import read_frames
+from quadid_replay.tlog import read_frames
 
 from tests.node.mavlink_ends import Sender, free_port
 

@@ -7,17 +7,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from quadid_node.history import Restored
+from quadid_node.inputs import source
 from quadid_node.playback import arrivals, stream
-from quadid_node.presets import source
 from quadid_node.recorder import RECORD, Beginning, Recorder, read_beginning
-from quadid_node.store import Restored
 from quadid_replay import TopicWriter, open_log, write_mcap
-from quadid_replay.mcap_metadata import read_metadata
-from quadid_replay.mcap_records import McapFile
+from quadid_replay.mcap_file import McapFile, read_metadata
 
+from quadid.condition.trim import FlightTrim, flight_to_dict
 from quadid.errors import LogError
-from quadid.health.stored import flight_to_dict
-from quadid.health.trim_estimation import FlightTrim
 from quadid.online import SessionSettings
 from quadid.vehicle import Vehicle
 from tests.online.driving import flight

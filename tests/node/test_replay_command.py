@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import pytest
-from quadid_cli.main import app_main as main
-from quadid_node.store import Store
+from quadid_node.history import Store
 from quadid_replay import write_mcap
-from quadid_replay.mcap_records import McapFile
+from quadid_replay.mcap_file import McapFile
 
+from quadid.cli.main import app_main as main
 from quadid.online.records import OnlineSet, SetState
 from quadid.vehicle import Vehicle
 from tests.online.driving import flight

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 import yaml
-from quadid_node.convert import to_message
+from quadid_node.inputs import to_message
 
 from quadid.errors import QuadidError
 from quadid.online import SetState

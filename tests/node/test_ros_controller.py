@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from quadid_node.convert import to_message
+from quadid_node.inputs import to_message
 
 from quadid.online import SetState
 from quadid.parameters import Status

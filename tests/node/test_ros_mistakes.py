@@ -13,12 +13,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from quadid_node.convert import deserializer, message_class
+from quadid_node.inputs import deserializer, message_class
 from quadid_node.topic_player import QOS
 from quadid_replay import TopicWriter
-from quadid_replay.mcap_writer import write_recording
+from quadid_replay.writers import write_recording
 
-from quadid.window import Recording
+from quadid.data.window import Recording
 from tests.node.peers import Ear, node
 from tests.node.test_mistakes_are_said import MISTAKES
 from tests.online.driving import EPOCH, flight

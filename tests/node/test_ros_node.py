@@ -33,7 +33,7 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def latched() -> Any:
-    from quadid_node.speaker import LATCHED_QOS
+    from quadid_node.publish import LATCHED_QOS
 
     return LATCHED_QOS
 

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from quadid_node.claim import OBSERVES, YOUNG
-from quadid_node.store import Store
+from quadid_node.history import Store
+from quadid_node.publish import OBSERVES, YOUNG
 
 from tests.faults.evidence import Happened
 from tests.node.peers import Ear, node

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from quadid_node.zenoh_fleet import Fleet
+from quadid_node.zenoh import Fleet
 
 from tests.node.peers import node
 from tests.node.zenoh_net import Net, until

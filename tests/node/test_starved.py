@@ -12,10 +12,9 @@ from quadid_node.publication import Output
 from quadid_node.service import BEHIND, PATIENCE, Service
 from quadid_node.worker import InlineWorker, Trouble
 
+from quadid.data.window import Sample
 from quadid.online import FitRequest
-from quadid.online.jobs import Job, JobReply
-from quadid.online.records import Event, Publish
-from quadid.window import Sample
+from quadid.online.records import Event, Job, JobReply, Publish
 from tests.faults.evidence import Happened
 from tests.online.made_up import DROPPED, PELICAN, QUICK, light_flight, tells
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from quadid_node.codec import set_from_dict, set_to_dict
-from quadid_node.store import Store
+from quadid_node.history import Store
 from quadid_node.store_file import StoreError, connect, read_history
 
 from quadid.online.active_set import ActiveSet
@@ -153,7 +153,7 @@ def test_a_locked_database_is_waited_for_without_blocking(tmp_path: Path) -> Non
 
 
 def test_a_full_disk_is_told_and_later_forgotten(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    import quadid_node.history_writer as storing
+    import quadid_node.history as storing
 
     store = filled(tmp_path / "h.sqlite")
     time.sleep(0.3)
@@ -203,7 +203,7 @@ def test_a_power_cut_leaves_the_last_committed_set(tmp_path: Path) -> None:
         "import sys, time, os\n"
         "from pathlib import Path\n"
         "from dataclasses import replace\n"
-        "from quadid_node.store import Store\n"
+        "from quadid_node.history import Store\n"
         "from tests.online.test_gate import TRUE, online_set\n"
         "store = Store(Path(sys.argv[1]), 'pelican')\n"
         "for k in range(100000):\n"
@@ -228,7 +228,7 @@ def test_a_power_cut_leaves_the_last_committed_set(tmp_path: Path) -> None:
 
 
 def test_old_candidates_are_forgotten_sets_never(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    import quadid_node.history_writer as storing
+    import quadid_node.history as storing
 
     monkeypatch.setattr(storing, "PRUNE_EVERY", 5)
     store = filled(tmp_path / "h.sqlite", sets=40)

@@ -17,17 +17,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 from quadid_node.codec import set_to_dict
+from quadid_node.history import Store
 from quadid_node.publication import Output
 from quadid_node.service import Service
-from quadid_node.store import Store
 from quadid_node.store_file import StoreError, read_history
 from quadid_node.worker import InlineWorker
 
-from quadid.health.trim_estimation import FlightTrim
+from quadid.condition.trim import FlightTrim
 from quadid.online import SessionSettings, SetState
 from quadid.online.records import Event, OnlineSet
 from quadid.vehicle import Vehicle
-from quadid_node import store as store_module
+from quadid_node import history as store_module
 from tests.faults.evidence import Happened
 from tests.online.driving import flight, samples
 from tests.online.test_gate import TRUE, online_set

@@ -9,19 +9,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from quadid_evaluation.studies.health.flights import Wrong, hover_blocks
+from quadid_node.history import Store
 from quadid_node.publication import Output
 from quadid_node.service import Service
-from quadid_node.store import Store
 from quadid_node.vehicle_health import health_message, health_to_dict
 from quadid_node.worker import InlineWorker
 
-from quadid.health.stored import flight_from_dict, flight_to_dict
-from quadid.health.watch import ENOUGH, HealthReport
+from quadid.condition.trim import flight_from_dict, flight_to_dict
+from quadid.condition.watch import ENOUGH, HealthReport
+from quadid.data.window import Sample
 from quadid.online import Event, SessionSettings
 from quadid.online.records import HealthyFlight
 from quadid.vehicle import Vehicle
-from quadid.window import Sample
-from studies.health.flights import Wrong, hover_blocks
 
 PELICAN_X = Vehicle.shipped("pelican_x")
 SETTINGS = SessionSettings(rate=25.0, window=60.0, refit=60.0, diagnose=0.0)

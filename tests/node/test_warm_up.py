@@ -8,9 +8,9 @@ import sys
 import time
 
 import pytest
-from quadid_node.warm_up import STILL, WORK, WarmUp, processor_seconds
+from quadid_node.worker import STILL, WORK, WarmUp, processor_seconds
 
-from quadid_node import warm_up
+from quadid_node import worker as warm_up
 from tests.faults.evidence import Happened
 
 

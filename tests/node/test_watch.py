@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from quadid_node.zenoh_link import ZenohLink
+from quadid_node.zenoh import ZenohLink
 
 from tests.node.peers import Process
 from tests.node.zenoh_net import Net, accepted, service

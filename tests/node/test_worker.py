@@ -10,8 +10,7 @@ from collections.abc import Iterator
 
 import pytest
 import quadid_node.worker as working
-from quadid_node.warm_up import STILL
-from quadid_node.worker import InlineWorker, ProcessWorker, Trouble
+from quadid_node.worker import STILL, InlineWorker, ProcessWorker, Trouble
 
 from quadid.online import FitReply, FitRequest, Session, SessionSettings
 from quadid.vehicle import Vehicle

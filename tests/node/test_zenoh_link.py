@@ -11,13 +11,11 @@ from typing import Any, NamedTuple
 
 import pytest
 import zenoh
-from quadid_cli.watch import snapshot, table
-from quadid_node.zenoh_fleet import Fleet
-from quadid_node.zenoh_link import KINDS, ZenohLink
-from quadid_node.zenoh_session import ZenohError, key_of
+from quadid_node.zenoh import KINDS, Fleet, ZenohError, ZenohLink, key_of
 
+from quadid.cli.watch import snapshot, table
 from quadid.online.records import OnlineDiagnosis, OnlineFinding
-from quadid_node import zenoh_fleet
+from quadid_node import zenoh as zenoh_fleet
 from tests.faults.evidence import Happened
 from tests.node.zenoh_net import Net, accepted, free_port, service, until
 from tests.online.test_gate import TRUE, online_set

@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from functools import lru_cache
 
+from quadid.data.window import Recording, Sample
 from quadid.flight import Flight, fly
 from quadid.online import Job, JobReply, Session
-from quadid.online.outbox import Action
-from quadid.online.records import Event, OnlineDiagnosis, OnlineSet, Publish
+from quadid.online.records import Action, Event, OnlineDiagnosis, OnlineSet, Publish
 from quadid.vehicle import Vehicle
-from quadid.window import Recording, Sample
 
 Background = Callable[[Job], JobReply | None]
 EPOCH = 1_700_000_000.0

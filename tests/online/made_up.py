@@ -15,15 +15,14 @@ from itertools import accumulate
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from quadid.data.window import Sample
 from quadid.online import FitReply, FitRequest, GateSettings, Session, SessionSettings
 from quadid.online.fault_isolation import ChangeRequest
 from quadid.online.fusion import WindowEstimate
-from quadid.online.jobs import Job, JobReply
-from quadid.online.outbox import Action
+from quadid.online.records import Action, Job, JobReply
 from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray
 from quadid.vehicle import GRAVITY, Vehicle
-from quadid.window import Sample
 from tests.online.test_gate import TRUE
 
 PELICAN = Vehicle.shipped("pelican")

@@ -7,12 +7,11 @@ from dataclasses import replace
 
 import pytest
 
+from quadid.data.window import Sample
 from quadid.online import Job, JobReply, Session, SessionSettings
 from quadid.online.background_diagnosis import ANSWER_AFTER, DIAGNOSED_SECONDS, DiagnosisReply, DiagnosisRequest
-from quadid.online.outbox import Action
-from quadid.online.records import OnlineFinding
+from quadid.online.records import Action, OnlineFinding
 from quadid.vehicle import Vehicle
-from quadid.window import Sample
 from tests.online.driving import EPOCH, diagnosed, drive, flight, samples, unanswered
 
 PELICAN = Vehicle.shipped("pelican")
@@ -89,7 +88,7 @@ def test_a_flight_with_drag_is_diagnosed_as_such() -> None:
 
 
 def test_a_lag_is_not_named_with_confidence_where_rotors_are_read_slowly() -> None:
-    """As by the command (`quadid_workflow.diagnose`): the lag is over before the next reading."""
+    """As by the command (`quadid.app.diagnose`): the lag is over before the next reading."""
     made = flight(72.0, 11, effects=(("motor_lag", "tau", 0.06),))
     fast = samples(made.recording)
     kept = itertools.count()

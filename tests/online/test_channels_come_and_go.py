@@ -7,17 +7,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from quadid.data.window import Recording
 from quadid.flight import fly
-from quadid.identify.elimination import Reduced, StatePrior, Whitening
-from quadid.identify.elimination_kernel import reduce_segments
-from quadid.identify.noise_model import NoiseModel
-from quadid.identify.shooting import Shooting
+from quadid.identification.elimination import Reduced, StatePrior, Whitening
+from quadid.identification.elimination_kernel import reduce_segments
+from quadid.identification.noise_model import NoiseModel
+from quadid.identification.shooting import Shooting
 from quadid.model.layout import Layout
 from quadid.model.rollout import Rollout
 from quadid.online import FitReply, FitRequest, GateSettings, Session, SessionSettings
-from quadid.online.jobs import MOST_ERRORS, UNEXPECTED, Job, JobReply
+from quadid.online.records import MOST_ERRORS, UNEXPECTED, Job, JobReply
 from quadid.vehicle import Vehicle
-from quadid.window import Recording
 from tests.faults.evidence import Happened
 from tests.online.driving import drive, events, flight, published, samples
 from tests.online.made_up import QUICK, light_flight, tells, works

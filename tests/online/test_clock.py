@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from quadid.online.clock import AHEAD, CONFIRMATIONS, PAUSE_AHEAD, STEP_AHEAD, StreamClock
+from quadid.online.stream import AHEAD, CONFIRMATIONS, PAUSE_AHEAD, STEP_AHEAD, StreamClock
 
 STAMPS = st.lists(
     st.one_of(st.floats(allow_nan=True, allow_infinity=True), st.floats(0.0, 100.0), st.sampled_from([1e9, 1e9 + 0.2])),

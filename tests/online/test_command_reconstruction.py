@@ -7,15 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from quadid.data.window import Recording
 from quadid.flight import fly
-from quadid.flight.stabiliser import default_gains
+from quadid.flight.pilot import default_gains
 from quadid.online import GateSettings, Publish, Session, SessionSettings
-from quadid.online.command_reconstruction import SOURCE
 from quadid.online.records import Phase, SetState
-from quadid.online.resampler import Resampler
-from quadid.vehicle import Vehicle
-from quadid.vehicle_parts import Stabiliser
-from quadid.window import Recording
+from quadid.online.stream import SOURCE, Resampler
+from quadid.vehicle import Stabiliser, Vehicle
 from tests.online.driving import drive, samples
 from tests.online.test_resampler import next_rows
 

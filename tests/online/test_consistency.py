@@ -8,20 +8,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from quadid_evaluation.studies.poisoning.flying import Poison
 from quadid_replay import open_log
-from quadid_workflow.loading import load_vehicle
 from scipy.signal import butter, sosfiltfilt
 
+from quadid.app.logs import load_vehicle
+from quadid.data.window import Recording
 from quadid.online import Phase, Session
-from quadid.online.consistency import ALLOWED, AXES, LEAD, Consistency, Factor
+from quadid.online.checks import ALLOWED, AXES, LEAD, Consistency, Factor
 from quadid.online.gate import GateSettings, decide
 from quadid.online.grid_buffer import GridBuffer
 from quadid.online.records import SetState
-from quadid.online.resampler import Resampler
-from quadid.vehicle import Vehicle
-from quadid.vehicle_parts import ParameterPrior
-from quadid.window import Recording
-from studies.poisoning.flying import Poison
+from quadid.online.stream import Resampler
+from quadid.vehicle import ParameterPrior, Vehicle
 from tests.faults.evidence import Happened
 from tests.online.driving import flight, published, samples
 from tests.online.made_up import GATE, PELICAN, QUICK, between, light_flight, tells, works

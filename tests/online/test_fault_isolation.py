@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from quadid.identify.noise_model import NoiseModel
+from quadid.identification.noise_model import NoiseModel
 from quadid.model.layout import LOSS, Layout
 from quadid.online.change_detection import ChangeDetector, ChangePoint
 from quadid.online.fault_isolation import ChangeRequest
-from quadid.online.rows import Rows
+from quadid.online.grid_buffer import Rows
 from quadid.vehicle import Vehicle
 from tests.online.driving import flight
 

@@ -7,16 +7,14 @@ import math
 import numpy as np
 import pytest
 
-from quadid.model.layout import LOSS, Layout
-from quadid.model.thrust import ThrustModel
+from quadid.model.layout import LOSS, Layout, ThrustModel
 from quadid.online import FitReply, FitRequest, Session, SessionSettings
 from quadid.online.estimator import Estimator
 from quadid.online.flexible_fit import with_room
 from quadid.online.fusion import WindowEstimate
 from quadid.online.grid_buffer import Cut
 from quadid.parameters import Status
-from quadid.vehicle import GRAVITY, Vehicle
-from quadid.vehicle_parts import ParameterPrior
+from quadid.vehicle import GRAVITY, ParameterPrior, Vehicle
 from tests.online.driving import drive, events, flight, published, samples
 from tests.online.made_up import nothing_left_out
 from tests.online.test_gate import TRUE

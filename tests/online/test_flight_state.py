@@ -16,9 +16,8 @@ from quadid.online.change_detection import CHUNK, ChangeDetector
 from quadid.online.change_supervisor import ChangeSupervisor, Seen
 from quadid.online.estimator import Estimator
 from quadid.online.flight_state import FlightState, Velocity, step_beside
-from quadid.online.grid_buffer import GridBuffer
-from quadid.online.resampler import Resampler
-from quadid.online.rows import Rows
+from quadid.online.grid_buffer import GridBuffer, Rows
+from quadid.online.stream import Resampler
 from quadid.rotation import conjugate, rotated
 from quadid.types import FloatArray
 from quadid.vehicle import GRAVITY, Vehicle

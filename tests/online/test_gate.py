@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from quadid.chi_square import Z95
-from quadid.online.consistency import Factor
+from quadid.online.checks import Factor
 from quadid.online.gate import CHECKS, JUDGED, Case, GateSettings, decide
 from quadid.online.records import OnlineSet, SetState
 from quadid.parameters import NOMINAL_NAMES, NOMINAL_UNITS, Parameter, ParameterSet, Status, impossible_inertia

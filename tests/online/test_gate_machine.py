@@ -24,19 +24,18 @@ from hypothesis.stateful import (
     rule,
     run_state_machine_as_test,
 )
+from quadid_node.history import Store
 from quadid_node.publication import Output
 from quadid_node.service import Service
-from quadid_node.store import Store
 from quadid_node.store_file import read_history
 from quadid_node.worker import Trouble
 
+from quadid.data.window import Sample
 from quadid.online import FitReply, FitRequest, GateSettings, Publish, SessionSettings, SetState
 from quadid.online.fusion import WindowEstimate
-from quadid.online.jobs import Job, JobReply
-from quadid.online.records import OnlineSet
+from quadid.online.records import Job, JobReply, OnlineSet
 from quadid.parameters import NOMINAL_NAMES, impossible_inertia
 from quadid.vehicle import Vehicle
-from quadid.window import Sample
 from tests.faults.evidence import Happened
 from tests.online.driving import flight, samples
 from tests.online.test_gate import TRUE

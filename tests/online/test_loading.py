@@ -15,7 +15,7 @@ import sys
 import numpy as np
 from quadid.online import FitRequest, Session, SessionSettings
 from quadid.vehicle import Vehicle
-from quadid.window import Sample
+from quadid.data.window import Sample
 
 session = Session(Vehicle.shipped("pelican"), SessionSettings(window=5.0, diagnose=0.0))
 flown = np.load(sys.argv[1])

@@ -9,12 +9,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from quadid.data.window import Recording
 from quadid.online import Session, SessionSettings
 from quadid.online.change_detection import ChangePoint
 from quadid.online.records import OnlineFinding
 from quadid.online.supervisor import mass_factor
 from quadid.vehicle import GRAVITY
-from quadid.window import Recording
 from tests.online.driving import diagnosed, drive, events, flight, samples
 from tests.online.made_up import PELICAN
 from tests.online.test_gate import TRUE

@@ -8,12 +8,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from quadid.data.window import Recording
 from quadid.online import Session, SessionSettings
 from quadid.online.records import OnlineSet, SetState
 from quadid.types import FloatArray
-from quadid.vehicle import GRAVITY, Vehicle
-from quadid.vehicle_parts import ParameterPrior
-from quadid.window import Recording
+from quadid.vehicle import GRAVITY, ParameterPrior, Vehicle
 from tests.online.driving import drive, flight, published, samples
 from tests.online.made_up import GATE, PELICAN, QUICK, between, light_flight, tells, works
 from tests.online.test_gate import TRUE, online_set

@@ -7,14 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from quadid.inspection import inspect
-from quadid.inspection.findings import CheckResult
-from quadid.model.layout import Layout
-from quadid.model.thrust import ThrustModel
+from quadid.checks import inspect
+from quadid.checks.findings import CheckResult
+from quadid.data.window import Window
+from quadid.model.layout import Layout, ThrustModel
+from quadid.online.checks import Quality, judge, mistake
 from quadid.online.grid_buffer import Cut
-from quadid.online.quality import Quality, judge, mistake
 from quadid.vehicle import GRAVITY, Vehicle
-from quadid.window import Window
 from tests.faults.evidence import Happened
 from tests.online.driving import flight
 

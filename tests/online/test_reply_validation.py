@@ -10,11 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from quadid.identify.noise_model import NoiseModel
+from quadid.identification.noise_model import NoiseModel
 from quadid.online import FitReply, FitRequest, Session
 from quadid.online.background_diagnosis import _is_wrong_scale
-from quadid.online.jobs import Job, JobReply
-from quadid.online.records import OnlineFinding
+from quadid.online.records import Job, JobReply, OnlineFinding
 from tests.faults.evidence import Happened
 from tests.online.driving import published
 from tests.online.made_up import PELICAN, QUICK, light_flight, tells, works

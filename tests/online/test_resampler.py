@@ -10,13 +10,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from quadid.data.grid import to_windows
+from quadid.data.window import Sample
 from quadid.flight import fly
-from quadid.grid import to_windows
-from quadid.online.grid_buffer import GridBuffer
-from quadid.online.resampler import BLOCK, SETTLE, Resampler
-from quadid.online.rows import Rows
+from quadid.online.grid_buffer import GridBuffer, Rows
+from quadid.online.stream import BLOCK, SETTLE, Resampler
 from quadid.vehicle import Vehicle
-from quadid.window import Sample
 from tests.faults.evidence import Happened
 from tests.online.driving import EPOCH, flight, samples
 

@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 
 import quadid.online.flexible_fit as flexible_fit_room
-from quadid.identify.gauss_newton import polish
-from quadid.identify.shooting import Shooting
+from quadid.data.window import Sampling, Window
+from quadid.identification.gauss_newton import polish
+from quadid.identification.shooting import Shooting
 from quadid.model.layout import Layout
 from quadid.online.flexible_fit import LASTING, ORDER, alike, flexible_fit, halved, reduced, sampling_error, widened
 from quadid.online.fusion import Fusion, WindowEstimate
-from quadid.online.resampler import Resampler
+from quadid.online.stream import Resampler
 from quadid.online.window_fit import prior_of
 from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
-from quadid.window import Sampling, Window
 from tests.online.driving import flight, samples
 from tests.online.made_up import nothing_left_out
 

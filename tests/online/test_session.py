@@ -8,15 +8,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from quadid.identify.fit import FitOptions, fit
+from quadid.data.window import Sample
+from quadid.identification.fit import FitOptions, fit
 from quadid.online import FitReply, FitRequest, Phase, Session, SessionSettings, SetState
 from quadid.online.fault_isolation import ChangeReply
 from quadid.online.gate import GateSettings
-from quadid.online.outbox import Action
-from quadid.online.records import OnlineSet, Publish
+from quadid.online.records import Action, OnlineSet, Publish
 from quadid.parameters import NOMINAL_NAMES
 from quadid.vehicle import Vehicle
-from quadid.window import Sample
 from tests.faults.evidence import Happened
 from tests.online.driving import EPOCH, answer, diagnosed, drive, events, flight, published, samples
 

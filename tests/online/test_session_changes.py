@@ -8,13 +8,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from quadid.data.window import Sample
 from quadid.online import FitReply, FitRequest, Phase, Session
 from quadid.online.background_diagnosis import DiagnosisReply, DiagnosisRequest
 from quadid.online.fault_isolation import ChangeReply, ChangeRequest
-from quadid.online.jobs import Job, JobReply
-from quadid.online.outbox import Action
-from quadid.online.records import OnlineFinding
-from quadid.window import Sample
+from quadid.online.records import Action, Job, JobReply, OnlineFinding
 from tests.faults.evidence import Happened
 from tests.online.driving import EPOCH, diagnosed, events, published
 from tests.online.made_up import (

@@ -6,12 +6,11 @@ from dataclasses import replace
 
 import pytest
 
+from quadid.data.window import Sample
 from quadid.online import FitRequest, Phase, Session, SessionSettings, SetState
 from quadid.online.fault_isolation import ChangeRequest
 from quadid.online.gate import Decision
-from quadid.online.jobs import Job
-from quadid.online.records import Event
-from quadid.window import Sample
+from quadid.online.records import Event, Job
 from tests.online.driving import EPOCH, diagnosed, events, published
 from tests.online.made_up import (
     DROPPED,

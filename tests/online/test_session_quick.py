@@ -11,11 +11,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from quadid.data.window import Block
 from quadid.online import FitReply, FitRequest, GateSettings, Phase, Session, SessionSettings, SetState
-from quadid.online.outbox import Action
-from quadid.online.records import Publish
+from quadid.online.records import Action, Publish
 from quadid.parameters import NOMINAL_NAMES
-from quadid.window import Block
 from tests.online.driving import EPOCH, events, published
 from tests.online.made_up import PELICAN, PIECES, answered, between, light_flight, tells, works
 from tests.online.test_gate import TRUE, online_set, scaled

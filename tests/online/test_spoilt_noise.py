@@ -5,15 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from quadid.grid import to_windows
-from quadid.identify.noise_model import NoiseModel
+from quadid.data.grid import to_windows
+from quadid.data.window import Window
+from quadid.identification.noise_model import NoiseModel
 from quadid.model.layout import Layout
 from quadid.online.estimator import Estimator
 from quadid.online.grid_buffer import Cut
 from quadid.online.window_fit import FitReply, FitRequest
 from quadid.parameters import NOMINAL_NAMES
 from quadid.vehicle import Vehicle
-from quadid.window import Window
 from tests.online.driving import flight
 
 PELICAN = Vehicle.shipped("pelican")

@@ -9,13 +9,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from quadid.data.window import Block
 from quadid.flight import fly
-from quadid.online.channel_buffer import ChannelBuffer
-from quadid.online.clock import CONFIRMATIONS
-from quadid.online.resampler import APART, BLOCK, MOST_EARLY, Resampler
-from quadid.online.rows import Rows
+from quadid.online.grid_buffer import Rows
+from quadid.online.stream import APART, BLOCK, CONFIRMATIONS, MOST_EARLY, ChannelBuffer, Resampler
 from quadid.vehicle import Vehicle
-from quadid.window import Block
 from tests.faults.evidence import Happened
 from tests.online.driving import EPOCH, flight, samples
 from tests.online.test_resampler import run, same, taken

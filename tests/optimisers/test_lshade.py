@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from quadid_evaluation.optimisers.lshade import LShade, LShadeOptions, Stop
 
 from quadid.errors import ParameterError
-from quadid.optimisers.lshade import LShade, LShadeOptions, Stop
 from quadid.types import FloatArray
 
 Cost = Callable[[FloatArray], FloatArray]

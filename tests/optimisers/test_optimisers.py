@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from quadid_evaluation.optimisers.minimise import NAMES, NEED_RESIDUAL, Result, Stop, minimise
 
 from quadid.errors import ParameterError
-from quadid.optimisers.minimise import NAMES, NEED_RESIDUAL, Result, Stop, minimise
 from quadid.types import FloatArray
 
 Batch = Callable[[FloatArray], FloatArray]

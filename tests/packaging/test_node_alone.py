@@ -13,7 +13,7 @@ from packaging.requirements import Requirement
 LEFT_OUT = {"jinja2", "plotly", "matplotlib", "cma", "dask", "pandas", "pyarrow"}
 """Plots, reports, other optimisers, many logs at once."""
 IMPORTED = (*sorted(LEFT_OUT), "distributed")
-NEEDS_ROS = ("quadid_node.node", "quadid_node.polling", "quadid_node.speaker", "quadid_node.topic_player")
+NEEDS_ROS = ("quadid_node.node", "quadid_node.polling", "quadid_node.publish", "quadid_node.topic_player")
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +44,7 @@ for top in (quadid, quadid_node, quadid_replay):
     for module in pkgutil.walk_packages(top.__path__, top.__name__ + "."):
         if module.name.split(".")[1] != "report" and module.name not in {NEEDS_ROS!r}:
             importlib.import_module(module.name)
-import quadid_cli.serve, quadid_cli.replay, quadid_cli.history, quadid_cli.watch, quadid_cli.worker
+import quadid.cli.serve, quadid.cli.replay, quadid.cli.history, quadid.cli.watch, quadid.cli.worker
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr

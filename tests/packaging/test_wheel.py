@@ -12,7 +12,9 @@ from pathlib import Path
 
 import pytest
 
-PACKAGES = ("quadid", "quadid_replay", "quadid_report", "quadid_workflow", "quadid_node", "quadid_paper", "quadid_cli")
+PACKAGES = ("quadid", "quadid_replay", "quadid_node", "quadid_evaluation")
+OLD_NAMES = {"quadid_cli.py", "quadid_report.py", "quadid_workflow.py", "quadid_paper.py"}
+"""Modules that stand in for packages of the release before."""
 HEAVY = ("numba", "scipy", "pandas", "plotly", "dask", "distributed", "zenoh", "pymavlink", "mcap", "pyulog", "rclpy")
 
 
@@ -32,7 +34,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory, repository: Path) -> list[st
 
 
 def test_all_packages_are_at_the_top_and_typed(wheel: list[str]) -> None:
-    assert {name.split("/")[0] for name in wheel if ".dist-info" not in name} == set(PACKAGES)
+    assert {name.split("/")[0] for name in wheel if ".dist-info" not in name} == {*PACKAGES, *OLD_NAMES}
     for package in PACKAGES:
         assert f"{package}/__init__.py" in wheel
         assert f"{package}/py.typed" in wheel
@@ -41,14 +43,13 @@ def test_all_packages_are_at_the_top_and_typed(wheel: list[str]) -> None:
 def test_data_files_are_in_and_markers_are_out(wheel: list[str], repository: Path) -> None:
     """Every tracked file of a package that is not Python source is data that the package reads."""
     folders = {"quadid": "quadid", "replay": "replay/quadid_replay", "quadid_node": "quadid_node/quadid_node"}
-    folders |= {"cli": "cli/quadid_cli", "paper": "paper/quadid_paper"}
-    folders |= {"report": "report/quadid_report", "workflow": "workflow/quadid_workflow"}
+    folders |= {"evaluation": "evaluation/quadid_evaluation"}
     tracked = subprocess.run(
         ["git", "ls-files", *folders.values()], cwd=repository, check=True, capture_output=True, text=True
     ).stdout.split()
     assert "quadid/vehicles/pelican.yaml" in tracked
     for path in tracked:
-        name = re.sub(r"^(replay|report|workflow|cli|paper|quadid_node(?=/quadid_node/))/", "", path)
+        name = re.sub(r"^(replay|evaluation|quadid_node(?=/quadid_node/))/", "", path)
         assert (name in wheel) == (Path(path).name != "COLCON_IGNORE"), path
 
 

@@ -7,16 +7,16 @@ import math
 
 import numpy as np
 import pytest
-from quadid_paper import comparison
-from quadid_paper.black_box import fit_black_box, score_black_box
-from quadid_paper.comparison import METHODS, Scores, Tried, check_methods, lowest_cost, run_optimiser
+from quadid_evaluation.optimisers.minimise import Result, Stop
+from quadid_evaluation.paper import comparison
+from quadid_evaluation.paper.black_box import fit_black_box, score_black_box
+from quadid_evaluation.paper.comparison import METHODS, Scores, Tried, check_methods, lowest_cost, run_optimiser
 
 from quadid.errors import NotIdentifiableError, ParameterError
 from quadid.flight import fly
-from quadid.identify.noise_model import NoiseModel
-from quadid.identify.score import mse_score
+from quadid.identification.noise_model import NoiseModel
+from quadid.identification.score import mse_score
 from quadid.model.layout import Layout
-from quadid.optimisers.minimise import Result, Stop
 from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from quadid_paper.quadrotor_io import FEEDTHROUGH, OUTPUT_NAMES, OUTPUT_UNITS, quadrotor_io
-from quadid_paper.state_space import predict
-from quadid_paper.subspace import METHODS, fit_subspace
+from quadid_evaluation.paper.quadrotor_io import FEEDTHROUGH, OUTPUT_NAMES, OUTPUT_UNITS, quadrotor_io
+from quadid_evaluation.paper.state_space import predict
+from quadid_evaluation.paper.subspace import METHODS, fit_subspace
 
+from quadid.data.window import Window
 from quadid.errors import WindowError
 from quadid.flight import fly
 from quadid.vehicle import Vehicle
-from quadid.window import Window
 
 
 def turning(rows: int = 5) -> Window:

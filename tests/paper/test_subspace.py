@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from quadid_paper.order import choose_order
-from quadid_paper.state_space import SubspaceModel, predict
-from quadid_paper.subspace import METHODS, Loop, fit_orders, fit_subspace
+from quadid_evaluation.paper.order import choose_order
+from quadid_evaluation.paper.state_space import SubspaceModel, predict
+from quadid_evaluation.paper.subspace import METHODS, Loop, fit_orders, fit_subspace
 
 from quadid.errors import NotIdentifiableError, ParameterError, WindowError
 from quadid.types import ComplexArray, FloatArray

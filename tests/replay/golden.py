@@ -10,8 +10,8 @@ from typing import Any
 
 from quadid_replay import open_log
 
-from quadid.resample import sample_period
-from quadid.window import Recording
+from quadid.data.resample import sample_period
+from quadid.data.window import Recording
 
 GOLDEN = Path(__file__).with_name("golden.json")
 PATTERNS = (

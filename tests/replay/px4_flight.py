@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from quadid_replay.px4_allocation import allocation
+from quadid_replay.ulog import allocation
 
+from quadid.data.window import Channel
 from quadid.flight import Flight
 from quadid.vehicle import Vehicle
-from quadid.window import Channel
 from tests.replay.test_ulog import Ulog
 
 FORMATS = {

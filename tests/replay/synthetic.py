@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from quadid_replay.frames import from_euler
 
+from quadid.data.window import Channel, Recording
 from quadid.rotation import continuous_sign
 from quadid.types import FloatArray
 from quadid.vehicle import GRAVITY, Vehicle
-from quadid.window import Channel, Recording
 
 PELICAN = Vehicle.shipped("pelican")
 

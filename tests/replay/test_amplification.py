@@ -18,11 +18,11 @@ from pathlib import Path
 import lz4.frame  # type: ignore[import-untyped]
 import pytest
 import zstandard
-from quadid_cli.main import app_main
 from quadid_node.store_file import make_tables
 from quadid_replay import reading
 from quadid_replay.schemas import schema_text
 
+from quadid.cli.main import app_main
 from tests.faults.evidence import Happened
 from tests.fuzz.seeds import mcap_of
 from tests.replay.shared_pages import share_first_row

@@ -10,7 +10,7 @@ from random import Random
 import numpy as np
 import pytest
 from quadid_replay import open_log
-from quadid_replay.blackbox_frames import FrameDefinition, Reader
+from quadid_replay.blackbox import FrameDefinition, Reader
 
 from quadid.errors import LogError
 from quadid.types import FloatArray

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from quadid_replay import open_log, write_csv
 
+from quadid.checks import CheckResult, inspect
+from quadid.data.grid import to_windows
+from quadid.data.mounting import mounting_matrix
 from quadid.errors import LogError, VehicleError
-from quadid.grid import to_windows
-from quadid.inspection import CheckResult, inspect
-from quadid.mounting import mounting_matrix
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 from tests.replay.synthetic import PELICAN, Flight, full_recording

@@ -9,8 +9,8 @@ import pytest
 from quadid_replay import open_log
 from quadid_replay.frames import from_euler
 
+from quadid.data.grid import grid_recording
 from quadid.errors import LogError
-from quadid.grid import grid_recording
 from quadid.vehicle import Vehicle
 from tests.faults.evidence import Happened
 

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import quadid_replay.topic_writer
+import quadid_replay.writers
 from quadid_replay import open_log, write_csv, write_mcap, write_tlog
 
+from quadid.data.window import Recording
 from quadid.errors import QuadidError
-from quadid.window import Recording
 from tests.faults.evidence import Happened
 from tests.replay.synthetic import full_recording
 
@@ -30,7 +30,7 @@ def log(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
     if kind == "ulog":
         return (data_dir / "px4" / "ascend_cubeorange_test.ulg").read_bytes()[:400_000]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(quadid_replay.topic_writer, "CHUNK_BYTES", 8192)
+        patch.setattr(quadid_replay.writers, "CHUNK_BYTES", 8192)
         {"csv": write_csv, "mcap": write_mcap, "tlog": write_tlog}[kind](path, full_recording(2.0, 50.0))
     return path.read_bytes()
 

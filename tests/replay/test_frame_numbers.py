@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from quadid_replay.frame_numbers import two_rows
+from quadid_replay.mavlink_messages import two_rows
 
 from quadid.types import IntArray
 from tests.faults.evidence import Happened

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from quadid_replay.clocks import LogClock, WrapCounter
-from quadid_replay.columns import Columns, RawChannel, clean_channel, fastest_first
+from quadid_replay.columns import Columns, LogClock, RawChannel, WrapCounter, clean_channel, fastest_first
 from quadid_replay.frames import (
     cross,
     flip_attitude,

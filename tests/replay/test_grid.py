@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from quadid.data.grid import grid_recording, to_windows
+from quadid.data.window import Channel, Recording
 from quadid.errors import LogError, NotIdentifiableError
-from quadid.grid import grid_recording, to_windows
 from quadid.types import FloatArray, IndexArray
-from quadid.window import Channel, Recording
 from tests.replay.synthetic import PELICAN, Flight, with_command
 
 FLIGHT = Flight()

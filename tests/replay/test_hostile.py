@@ -13,8 +13,7 @@ import numpy as np
 import pytest
 from mcap.writer import CompressionType, Writer
 from quadid_replay import open_log
-from quadid_replay.mcap_order import in_log_time
-from quadid_replay.mcap_records import McapFile
+from quadid_replay.mcap_file import McapFile, in_log_time
 
 from quadid.errors import LogError
 from tests.faults.evidence import Happened

@@ -7,13 +7,13 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from quadid_cli.main import app_main
 from quadid_replay import write_csv
-from quadid_report.inspect_tables import channel_table, parameter_outlook_table
 
-from quadid.inspection import inspect
+from quadid.checks import inspect
+from quadid.cli.main import app_main
+from quadid.data.window import Recording
 from quadid.parameters import NOMINAL_NAMES
-from quadid.window import Recording
+from quadid.report.tables import channel_table, parameter_outlook_table
 from tests.replay.synthetic import Flight
 
 

@@ -12,12 +12,11 @@ import pytest
 from quadid_replay import open_log
 from quadid_replay.frames import flip_attitude, flip_body, flip_world
 
-from quadid.inspection import Check, CheckResult, Inspection, inspect, proposed_cuts
-from quadid.inspection.airborne import Spans
-from quadid.inspection.conventions import fit_axes, gyro_check
+from quadid.checks import Check, CheckResult, Inspection, inspect, proposed_cuts
+from quadid.checks.motion import Spans, fit_axes, gyro_check
+from quadid.data.window import Channel, Recording
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
-from quadid.window import Channel, Recording
 from tests.faults.evidence import Happened
 from tests.replay.synthetic import PELICAN, Flight, with_command
 

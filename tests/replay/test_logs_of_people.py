@@ -8,16 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 from quadid_replay import open_log
-from quadid_replay.airframes import frame_of
 from quadid_replay.columns import RawChannel, clean_channel
-from quadid_replay.motors import in_pulses, motor_columns, no_multirotor
+from quadid_replay.motors import frame_of, in_pulses, motor_columns, no_multirotor
 from quadid_replay.vehicle_from_log import vehicle_text
 
 import quadid
-from quadid.inspection import Check, CheckResult, inspect
+from quadid.checks import Check, CheckResult, inspect
+from quadid.data.window import Channel, Recording
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
-from quadid.window import Channel, Recording
 
 
 @pytest.fixture(scope="module")

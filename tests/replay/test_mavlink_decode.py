@@ -9,9 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from pymavlink.generator.mavcrc import x25crc
-from quadid_replay.mavlink_decode import decode, intact
-from quadid_replay.mavlink_frames import Frames, read_frames
-from quadid_replay.tlog_reader import _DIALECT, _WANTED
+from quadid_replay.tlog import _DIALECT, _WANTED, Frames, decode, intact, read_frames
 
 
 def frame_of(rng: Random, kind: Any, old: bool) -> bytes:

@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-import quadid_replay.topic_writer
+import quadid_replay.writers
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from mcap_ros2.writer import Writer as RosWriter
 from quadid_replay import TopicWriter, open_log, write_mcap
-from quadid_replay.mcap_messages import TYPES
 from quadid_replay.motors import RPM
+from quadid_replay.ros_messages import TYPES
 from quadid_replay.schemas import schema_text
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import QosDurability, QosReliability
@@ -259,7 +259,7 @@ def test_any_message_of_ours_can_be_written(tmp_path: Path) -> None:
 
 
 def test_our_definitions_are_those_of_the_message_package(repository: Path) -> None:
-    folder = Path(quadid_replay.topic_writer.__file__).parent / "schemas" / "quadid_msgs"
+    folder = Path(quadid_replay.writers.__file__).parent / "schemas" / "quadid_msgs"
     theirs = {f.name: f.read_text() for f in (repository / "msgs" / "msg").glob("*.msg")}
     ours = {f.name: f.read_text() for f in folder.glob("*.msg")}
     assert ours == theirs, "copy msgs/msg/*.msg to replay/quadid_replay/schemas/quadid_msgs"

@@ -9,16 +9,15 @@ from typing import Any
 import numpy as np
 import pytest
 from mcap_ros2.writer import Writer as RosWriter
-from quadid_replay import mcap_decode, write_mcap
-from quadid_replay.bag_topics import Topic
-from quadid_replay.cdr_blocks import Read
+from quadid_replay import ros_messages as mcap_decode
+from quadid_replay import write_mcap
 from quadid_replay.formats import read_here
-from quadid_replay.mcap_decode import Source, decode_messages, source_of
-from quadid_replay.mcap_messages import MessageType
+from quadid_replay.mcap_file import Topic
+from quadid_replay.ros_messages import MessageType, Read, Source, decode_messages, source_of
 from quadid_replay.schemas import schema_text
 
+from quadid.data.window import Recording
 from quadid.errors import LogError
-from quadid.window import Recording
 from tests.replay.synthetic import full_recording
 from tests.replay.test_mcap import EPOCH, header, imu
 

@@ -9,12 +9,12 @@ from pathlib import Path
 import lz4.frame  # type: ignore[import-untyped]
 import numpy as np
 import pytest
-import quadid_replay.topic_writer
+import quadid_replay.writers
 import zstandard
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 from quadid_replay import open_log, write_mcap
-from quadid_replay.mcap_records import McapFile
+from quadid_replay.mcap_file import McapFile
 from quadid_replay.schemas import schema_text
 
 from quadid.errors import LogError
@@ -48,7 +48,7 @@ def test_chunks_that_lie_about_their_size_inflate_no_further(
 
 @pytest.fixture
 def small_chunks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setattr(quadid_replay.topic_writer, "CHUNK_BYTES", 16384)
+    monkeypatch.setattr(quadid_replay.writers, "CHUNK_BYTES", 16384)
     path = tmp_path / "small.mcap"
     write_mcap(path, full_recording())
     return path

@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from pyulog import ULog
-from quadid_replay.px4_allocation import allocated, allocation
-from quadid_replay.ulog_reader import read_ulog
+from quadid_replay.ulog import allocated, allocation, read_ulog
 
 import quadid
 from quadid.flight import TruthParameters, fly

@@ -21,8 +21,8 @@ from quadid_replay import answer, open_log, write_csv, write_mcap, write_tlog
 from quadid_replay.formats import read_here
 from quadid_replay.reading import Limits, limits
 
+from quadid.data.window import Recording
 from quadid.errors import LogError
-from quadid.window import Recording
 from tests.faults.evidence import Happened
 from tests.fuzz.formats import FORMATS
 from tests.fuzz.seeds import seeds

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from quadid_replay import open_log
 
+from quadid.data.grid import grid_recording, to_windows
 from quadid.errors import NotIdentifiableError
-from quadid.grid import grid_recording, to_windows
 from quadid.vehicle import Vehicle
 from tests.replay.golden import GOLDEN, real_logs, summary
 from tests.replay.synthetic import PELICAN, with_command

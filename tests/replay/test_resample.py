@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy import ndimage
 from scipy.interpolate import CubicHermiteSpline
 
-from quadid.resample import (
+from quadid.data.resample import (
     fresh_rows,
     hold_mean,
     interpolate,

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from mcap.writer import Writer as McapWriter
 from quadid_replay import open_log, write_mcap
-from quadid_replay.mcap_records import McapFile
+from quadid_replay.mcap_file import McapFile
 from quadid_replay.schemas import schema_text
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
+from quadid.data.window import Recording
 from quadid.errors import LogError
-from quadid.window import Recording
 from tests.faults.evidence import Happened
 from tests.replay.synthetic import full_recording
 

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from quadid_replay import open_log
 
+from quadid.checks import Check, CheckResult, inspect
+from quadid.data.rotor_signal import rotor_signal
+from quadid.data.window import Channel, Recording
 from quadid.errors import LogError
-from quadid.inspection import Check, CheckResult, inspect
-from quadid.rotor_signal import rotor_signal
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
-from quadid.window import Channel, Recording
 
 
 @pytest.fixture(scope="module")

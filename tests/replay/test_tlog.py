@@ -14,12 +14,12 @@ import quadid_replay
 from pymavlink.dialects.v20 import ardupilotmega
 from pymavlink.generator import mavgen
 from quadid_replay import open_log
-from quadid_replay.esc_messages import ESC_INFO, ESC_STATUS, extend_dialect
 from quadid_replay.frames import GRAVITY
+from quadid_replay.mavlink_messages import ESC_INFO, ESC_STATUS, extend_dialect
 from quadid_replay.motors import RPM
 
+from quadid.data.grid import grid_recording
 from quadid.errors import LogError
-from quadid.grid import grid_recording
 from quadid.vehicle import Vehicle
 
 MAV = extend_dialect(ardupilotmega)

@@ -8,10 +8,9 @@ from random import Random
 
 import numpy as np
 import pytest
-from quadid_replay import mavlink_frames
+from quadid_replay import tlog as mavlink_frames
 from quadid_replay.frames import from_euler
-from quadid_replay.mavlink_frames import read_frames
-from quadid_replay.tlog_vehicle import _rounds
+from quadid_replay.tlog import _rounds, read_frames
 
 from tests.replay.test_tlog import Tlog, attitude, heartbeat, raw_imu, servo
 

@@ -10,7 +10,7 @@ import pytest
 from pyulog import ULog
 from quadid_replay import open_log
 from quadid_replay.motors import RPM
-from quadid_replay.ulog_check import unversioned
+from quadid_replay.ulog import unversioned
 
 from quadid.errors import LogError
 from tests.faults.evidence import Happened

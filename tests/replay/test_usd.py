@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from quadid_replay import open_log
 
+from quadid.data.rotor_signal import rotor_signal
 from quadid.errors import LogError
-from quadid.rotor_signal import rotor_signal
 from quadid.vehicle import Vehicle
 
 CRAZYFLIE = Vehicle.shipped("crazyflie")

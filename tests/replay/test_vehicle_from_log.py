@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from quadid_replay import open_log
-from quadid_replay.airframes import ARDUPILOT, frame_of
+from quadid_replay.motors import ARDUPILOT, frame_of
 from quadid_replay.vehicle_from_log import vehicle_text
 
+from quadid.checks import CheckResult, inspect
 from quadid.errors import LogError
-from quadid.inspection import CheckResult, inspect
 from quadid.vehicle import Vehicle
 
 

@@ -11,10 +11,10 @@ import pytest
 from quadid_replay import open_log, write_csv, write_mcap, write_tlog
 from quadid_replay.motors import RPM
 
+from quadid.data.grid import to_windows
+from quadid.data.window import Channel, Recording, as_recording
 from quadid.errors import LogError
-from quadid.grid import to_windows
 from quadid.vehicle import Vehicle
-from quadid.window import Channel, Recording, as_recording
 from tests.replay.synthetic import PELICAN, Flight, full_recording
 
 SINGLE = {"gyro": 1e-6, "accel": 1e-5, "attitude": 1e-7, "velocity": 1e-5, "position": 1e-6, "attitude_reference": 1e-6}

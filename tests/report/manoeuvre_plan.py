@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from dataclasses import asdict
 
-from quadid_report.manoeuvres.plan import Plan
-
 from quadid.flight import Segment
+from quadid.report.manoeuvres import Plan
 
 SECONDS = 13.0
 SEGMENTS = [

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from quadid_report.excitation_part import SHARP, excitation_part
 
-from quadid.identify.excitation import Excitation
+from quadid.identification.excitation import Excitation
+from quadid.report.fit_pages import SHARP, excitation_part
 
 
 def part(bound: list[float], alone: list[float]) -> list[str]:

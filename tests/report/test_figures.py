@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from quadid_report.figures import (
+
+from quadid.report.figures import (
     BUDGET,
     WHOLE_POINTS,
     channel_figures,
@@ -12,9 +13,8 @@ from quadid_report.figures import (
     gain_figure,
     liveliest,
     parameter_figure,
+    short,
 )
-from quadid_report.parts import short
-
 from tests.report.test_page import scored
 
 

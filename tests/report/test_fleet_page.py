@@ -6,10 +6,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from quadid_report.fleet_page import fleet_page, fleet_verdict
-from quadid_report.fleet_summary import DAY, summarise
-from quadid_report.page import render
 
+from quadid.report.fleet import DAY, fleet_page, fleet_verdict, summarise
+from quadid.report.page import render
 from tests.report.test_page import EVIL
 
 

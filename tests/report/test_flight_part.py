@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from quadid_replay import open_log
 from quadid_replay.flight_modes import ARDUCOPTER, mode_changes
-from quadid_report.flight_part import flight_section, mode_rows, spectrum
 
+from quadid.data.window import Channel
 from quadid.flight import fly
+from quadid.report.fit_pages import flight_section, mode_rows, spectrum
 from quadid.vehicle import Vehicle
-from quadid.window import Channel
 
 PELICAN = Vehicle.shipped("pelican")
 

@@ -21,15 +21,12 @@ from typing import Any, ClassVar
 import pytest
 import yaml
 from lupa import lua53
-from quadid_report.manoeuvres import FORMS, written_as
-from quadid_report.page import render as page
-from quadid_report.programs import FORMATS, export
 
 from quadid.experiment import Proposal, manoeuvre_file
-from quadid.provenance import FittedFlight, Proof
-from quadid.residual import ResidualTerm
-from quadid.vehicle import Vehicle
-from quadid.vehicle_parts import Command, ParameterPrior
+from quadid.report.manoeuvres import FORMS, written_as
+from quadid.report.page import render as page
+from quadid.report.programs import FORMATS, export
+from quadid.vehicle import Command, FittedFlight, ParameterPrior, Proof, ResidualTerm, Vehicle
 from tests.report.manoeuvre_plan import PLAN, SEGMENTS
 
 MARK = "INJECTED"

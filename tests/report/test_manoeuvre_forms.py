@@ -6,12 +6,11 @@ import math
 
 import numpy as np
 import pytest
-from quadid_report.manoeuvres import FORMS, written_as
 
 from quadid.errors import ParameterError
 from quadid.flight import Segment
-from quadid.flight.pilot import PILOT_STEP
-from quadid.flight.profiles import AXES, scripted
+from quadid.flight.pilot import AXES, PILOT_STEP, scripted
+from quadid.report.manoeuvres import FORMS, written_as
 from tests.report.manoeuvre_plan import PLAN
 
 

@@ -10,10 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 from lupa import lua53
-from quadid_report.manoeuvres import written_as
 
-from quadid.flight.pilot import PILOT_STEP
-from quadid.flight.profiles import AXES, scripted
+from quadid.flight.pilot import AXES, PILOT_STEP, scripted
+from quadid.report.manoeuvres import written_as
 from tests.report.manoeuvre_plan import PLAN, SECONDS, SEGMENTS
 
 LOITER, GUIDED, ALT_HOLD = 5, 4, 2

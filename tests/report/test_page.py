@@ -11,14 +11,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from quadid_report.diagnose_page import chance, diagnosis_part
-from quadid_report.identify_page import identify_page
-from quadid_report.page import code, fit, number, packed, render
-from quadid_report.parts import measures
 
-from quadid.identify.result import ScoredSet
-from quadid.identify.score import ChannelScore, Series, SetScore
-from quadid.model.channels import CHANNEL_NAMES, CHANNEL_UNITS
+from quadid.identification.result import ScoredSet
+from quadid.identification.score import ChannelScore, Series, SetScore
+from quadid.model.rollout import CHANNEL_NAMES, CHANNEL_UNITS
+from quadid.report.figures import measures
+from quadid.report.fit_pages import chance, diagnosis_part, identify_page
+from quadid.report.page import code, fit, number, packed, render
 from tests.faults.evidence import Happened
 
 EVIL = "<script>alert(1)</script>\"'&</title>`rm`{{7*7}}"
@@ -70,7 +69,7 @@ def result(sets: list[ScoredSet]) -> dict[str, Any]:
 
 def page(sets: list[ScoredSet]) -> str:
     """The page of an identification from logs with nasty names."""
-    from quadid.identify.noise_model import NoiseModel
+    from quadid.identification.noise_model import NoiseModel
 
     quality = [
         {

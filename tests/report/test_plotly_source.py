@@ -6,8 +6,8 @@ import re
 
 import pytest
 from plotly.offline import get_plotlyjs
-from quadid_report.page import render
-from quadid_report.plotly_source import plotly_source, shortened
+
+from quadid.report.page import plotly_source, render, shortened
 
 HEAD = (
     ': this, () => {\n"use strict";var Plotly=(()=>{var L=(e,t)=>()=>(e&&(t=e(e=0)),t);'

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from quadid_report.residual_maps import PAIRS, ResidualMap, map_figure, residual_map, switched_off
 
+from quadid.data.grid import to_windows
 from quadid.effects import EFFECTS, NEVER
 from quadid.flight import fly
-from quadid.grid import to_windows
 from quadid.model.layout import Layout
+from quadid.report.residual_maps import PAIRS, ResidualMap, map_figure, residual_map, switched_off
 from quadid.vehicle import Vehicle
 
 

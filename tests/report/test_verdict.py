@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
-from quadid_report.diagnose_page import HELD_OUT, diagnose_verdict
-from quadid_report.verdict import MOTION, digits, identify_verdict, percent, reason, score_verdict
 
 from quadid.effects import EFFECTS
+from quadid.report.fit_pages import HELD_OUT, diagnose_verdict
+from quadid.report.verdict import MOTION, digits, identify_verdict, percent, reason, score_verdict
 
 
 def _result(fitted: float | None = 1.0, status: str = "identified", role: str = "validate") -> dict[str, Any]:

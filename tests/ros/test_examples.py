@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from quadid_node.convert import to_message
+from quadid_node.inputs import to_message
 
 from quadid_node import messages
 from tests.node.peers import Ear, Process
@@ -68,7 +68,7 @@ def test_colcon_sees_the_package_in_cpp_and_builds_it_where_rclcpp_is(tmp_path: 
 
 def test_the_shortest_controller_has_forty_lines_and_applies_a_set(repository: Path) -> None:
     from quadid_msgs.msg import ParameterSet
-    from quadid_node.speaker import LATCHED_QOS
+    from quadid_node.publish import LATCHED_QOS
 
     assert importlib.util.find_spec("rclpy") is not None
     path = repository / "examples" / "minimal_controller.py"

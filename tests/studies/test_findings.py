@@ -5,9 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-
-from studies.findings.__main__ import judged
-from studies.findings.rows import FINDINGS, Finding
+from quadid_evaluation.studies.findings.__main__ import judged
+from quadid_evaluation.studies.findings.rows import FINDINGS, Finding
 
 
 @pytest.mark.parametrize("finding", FINDINGS, ids=lambda f: f"{f.folder}: {f.what}")

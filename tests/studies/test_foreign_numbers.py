@@ -5,9 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
-
-from studies.foreign.numbers import of_set, table
-from studies.foreign.sets import SETS
+from quadid_evaluation.studies.foreign.numbers import of_set, table
+from quadid_evaluation.studies.foreign.sets import SETS
 
 IRIS = SETS["iris"]
 

@@ -7,7 +7,7 @@ import json
 import tomllib
 from pathlib import Path
 
-from studies import house
+from quadid_evaluation.studies import house
 
 
 def test_no_figure_is_above_the_recorded_one() -> None:

@@ -23,7 +23,9 @@ def functions(source: str) -> set[str]:
 
 
 def test_every_judgement_is_of_a_function_that_is_spoilt() -> None:
-    judged = yaml.safe_load((ROOT / "studies" / "mutation" / "judged.yaml").read_text(encoding="utf-8"))
+    judged = yaml.safe_load(
+        (ROOT / "evaluation" / "quadid_evaluation" / "studies" / "mutation" / "judged.yaml").read_text(encoding="utf-8")
+    )
     there: set[str] = set()
     for module in ("gate", "active_set", "session"):
         spec = importlib.util.find_spec(f"quadid.online.{module}")

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections import Counter
 from pathlib import Path
 
-from benchmarks.online.accuracy import flown
-from studies import coverage
-from studies.judged import judged
-from studies.soak.accelerated import BATCH, batches
+from quadid_evaluation.benchmarks.online.accuracy import flown
+from quadid_evaluation.studies import coverage
+from quadid_evaluation.studies.judged import judged
+from quadid_evaluation.studies.soak.accelerated import BATCH, batches
 
 
 def test_what_people_judged_outlives_the_next_run(tmp_path: Path) -> None:
@@ -26,7 +26,7 @@ def test_compiled_functions_are_counted_apart(tmp_path: Path) -> None:
 
 def test_coverage_is_told_by_room() -> None:
     files = {
-        "quadid/window.py": Counter(statements=90, run=90, branches=10, taken=0),
+        "quadid/data/window.py": Counter(statements=90, run=90, branches=10, taken=0),
         "quadid/online/gate.py": Counter(statements=10, run=5, branches=10, taken=5),
     }
     text = coverage.page(files, 7)

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from quadid_evaluation.studies.peers import online, simulated
 
 from quadid.flight import SensorNoise, fly
 from quadid.parameters import NOMINAL_NAMES
 from quadid.vehicle import Vehicle
-from studies.peers import online, simulated
 
 PELICAN = Vehicle.shipped("pelican")
 

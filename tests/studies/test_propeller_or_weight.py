@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from quadid_evaluation.studies.health.flights import Wrong, hover
+from quadid_evaluation.studies.health.kinds import mass_effect, weighed
+from quadid_evaluation.studies.health.recorded import CRAZYFLIE, Flown, Judged
 
-from quadid.health import assess, flight_trim
-from studies.health.flights import Wrong, hover
-from studies.health.kinds import mass_effect, weighed
-from studies.health.recorded import CRAZYFLIE, Flown, Judged
+from quadid.condition import assess, flight_trim
 
 
 @pytest.mark.parametrize("label", ["W1 glued near M3", "W1 glued near M4", "W1 glued near M3 M4"])

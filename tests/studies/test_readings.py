@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from quadid_evaluation.studies.autopilot.readings import LOOP, errors
 from quadid_node.mavlink_link import MOTORS as RATE
 from quadid_node.mavlink_link import REQUESTED
 
 from quadid.types import FloatArray
-from studies.autopilot.readings import LOOP, errors
 
 MOTORS = ("SERVO_OUTPUT_RAW", "ACTUATOR_OUTPUT_STATUS", "ESC_STATUS", "ESC_TELEMETRY_1_TO_4")
 RING, DAMPING = 2.0 * np.pi * 22.0, 0.1

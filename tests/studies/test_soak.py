@@ -8,9 +8,9 @@ import mmap
 from pathlib import Path
 
 import numpy as np
+from quadid_evaluation.studies.soak import memory
+from quadid_evaluation.studies.soak.accelerated import slope
 
-from studies.soak import memory
-from studies.soak.accelerated import slope
 from tests.faults.evidence import Happened
 
 

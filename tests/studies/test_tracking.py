@@ -4,13 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-
-from quadid.flight import draw_truth
-from quadid.flight.airframe_constants import Oddity
-from quadid.flight.setup import prepare
-from quadid.parameters import NOMINAL_NAMES
-from studies.control import CRAFT, PATHS, unmixer
-from studies.tracking import (
+from quadid_evaluation.studies.control import CRAFT, PATHS, unmixer
+from quadid_evaluation.studies.tracking import (
     ATTITUDE_WEIGHTS,
     CONTROL,
     EDGE,
@@ -21,6 +16,11 @@ from studies.tracking import (
     reference,
     track,
 )
+
+from quadid.flight import draw_truth
+from quadid.flight.airframe import Oddity
+from quadid.flight.setup import prepare
+from quadid.parameters import NOMINAL_NAMES
 
 
 def test_gains_of_a_double_integrator_are_the_textbook_ones() -> None:

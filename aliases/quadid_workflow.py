@@ -1,0 +1,5 @@
+"""Old name of `quadid.app`, for one release."""
+
+from quadid.old_paths import stand_in
+
+stand_in(__name__)

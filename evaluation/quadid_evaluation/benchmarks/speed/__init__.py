@@ -1,0 +1,1 @@
+"""How fast everything is, beside its peers and the processor's peak: `python -m quadid_evaluation.benchmarks.speed`."""

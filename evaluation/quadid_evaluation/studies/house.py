@@ -1,0 +1,243 @@
+"""Size of the house: lines and named numbers of every room, and the files that data cross on their way to a result.
+
+python -m quadid_evaluation.studies.house  print all of it, and fail where a figure is above the recorded one
+python -m quadid_evaluation.studies.house --record WHY  record today's figures with the reason for what rose
+python -m quadid_evaluation.studies.house --no-walks    count only
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import json
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, nullcontext
+from functools import cache
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[3]
+RECORDED = ROOT / "docs" / "results" / "house.json"
+PRODUCT = {
+    "quadid": "quadid",
+    "replay": "replay/quadid_replay",
+    "node": "quadid_node/quadid_node",
+    "old names": "aliases",
+}
+EVALUATION = {"evaluation": "evaluation/quadid_evaluation"}
+TESTS = {"tests": "tests", "node's tests": "quadid_node/test"}
+DEEP = "quadid"
+"""The room whose packages are listed one by one."""
+SECONDS = 40.0
+"""Length of the flight that is followed [s]: long enough for a published set."""
+BATCH = 100
+"""Messages that the node takes at a time."""
+EPOCH = 1_700_000_000
+"""UNIX time at which it begins [s]."""
+
+
+def count(root: Path = ROOT) -> dict[str, dict[str, int]]:
+    """Lines of Python (`lines`) and named numbers (`numbers`) of product, evaluation and tests, as on disk."""
+    figures: dict[str, dict[str, int]] = {"lines": {}, "numbers": {}}
+    for name, rooms in (("product", PRODUCT), ("evaluation", EVALUATION), ("tests", TESTS)):
+        texts = [text for folder in rooms.values() for text in _texts(root / folder).values()]
+        figures["lines"][name] = sum(map(_lines, texts))
+        figures["numbers"][name] = sum(len(named_numbers(ast.parse(text))) for text in texts)
+    return figures
+
+
+def rooms(root: Path = ROOT) -> list[str]:
+    """One line a room: files, lines, named numbers; the packages of the largest room below it."""
+    rows: list[str] = []
+    for label, folder in {**PRODUCT, **EVALUATION, **TESTS}.items():
+        texts = _texts(root / folder)
+        rows.append(_row(label, list(texts.values())))
+        if label == DEEP:
+            parts: dict[str, list[str]] = {}
+            for path, text in texts.items():
+                inner = path.relative_to(root / folder).parts
+                parts.setdefault(inner[0] if len(inner) > 1 else "shared by all", []).append(text)
+            rows += [_row(f"  {name}", parts[name]) for name in sorted(parts)]
+    return rows
+
+
+def named_numbers(module: ast.Module) -> list[str]:
+    """Names in capitals, leading underscore or not, that stand for numbers."""
+    out: list[str] = []
+    for node in module.body:
+        targets = node.targets if isinstance(node, ast.Assign) else [node.target] if _annotated(node) else []
+        if targets and node.value is not None and _numeric(node.value):
+            names = [n.id for target in targets for n in ast.walk(target) if isinstance(n, ast.Name)]
+            out += [n for n in names if n.isupper()]
+    return out
+
+
+def risen(now: dict[str, dict[str, int]], recorded: dict[str, dict[str, int]]) -> list[str]:
+    """Figures above the recorded ones, a sentence each; those that nobody has recorded are none."""
+    return [
+        f"{kind} of {name}: {value}, recorded {recorded[kind][name]}"
+        for kind, figures in now.items()
+        for name, value in figures.items()
+        if value > recorded.get(kind, {}).get(name, value)
+    ]
+
+
+def walks() -> dict[str, list[str]]:
+    """Files that run between an IMU message of the ROS node and a parameter set, and between a log and its result.
+
+    Functions that numba has compiled are not seen.
+    """
+    from quadid_replay import write_mcap
+
+    import quadid
+    from quadid.flight import fly
+
+    with tempfile.TemporaryDirectory() as folder:
+        log = Path(folder) / "flight.mcap"
+        write_mcap(log, fly(quadid.Vehicle.shipped("pelican"), seconds=SECONDS, seed=5).recording, EPOCH * 10**9)
+        out: dict[str, list[str]] = {}
+        for follow in (nullcontext, _followed):  # the first time round kernels are compiled, which nobody is to watch
+            with follow() as row:
+                quadid.identify(log, vehicle="pelican").to_json()
+            with follow() as message:
+                _fly_through(log, Path(folder))
+            out = {"imu message": sorted(message or ()), "log row": sorted(row or ())}
+        return out
+
+
+def _fly_through(log: Path, folder: Path) -> None:
+    """Gives the messages of a log to the service, as the node does, until a set is published."""
+    from mcap_ros2._dynamic import generate_dynamic
+    from quadid_node.history import Store
+    from quadid_node.inputs import Chooser, Decoder, Intake, best_ranks, source
+    from quadid_node.service import Service
+    from quadid_node.worker import InlineWorker
+    from quadid_replay.mcap_file import McapFile
+
+    import quadid
+    from quadid.online import SessionSettings
+    from quadid_node import messages
+
+    vehicle = quadid.Vehicle.shipped("pelican")
+    file, inputs = McapFile(log), {entry.topic: entry for entry in source("canonical").inputs}
+    stamps, chooser = [0.0], Chooser(best_ranks(list(inputs.values())))
+    intake, arrived = Intake(lambda: stamps[0]), dict[str, list[bytes]]()
+    for topic in file.topics.values():
+        entry = inputs[topic.name]
+        decode = generate_dynamic(topic.type, topic.definition)[topic.type]
+        arrived[topic.name] = []
+        intake.open(
+            entry, topic.name, Decoder(entry, chooser, len(vehicle.rotors), decode), _taken(arrived[topic.name])
+        )
+    service = Service(
+        vehicle, SessionSettings(), InlineWorker(), Store(folder / f"{time.monotonic_ns()}.db", vehicle.name)
+    )
+    try:
+        for n, (number, nanoseconds, data) in enumerate(file.messages(file.topics.keys())):
+            arrived[file.topics[number].name].append(data)
+            if n % BATCH:
+                continue
+            stamps[0] = nanoseconds * 1e-9 - EPOCH
+            for items in intake.read(intake.take()):
+                service.push_all(items)
+            for output in [o for _ in range(5) for o in service.step()]:
+                if output.topic == "parameters":
+                    messages.RESULTS[output.topic](output, vehicle.name, service.boot_id)
+                    return
+    finally:
+        service.close()
+    raise RuntimeError(f"no set was published from {SECONDS:g} s of flight: nothing was followed to its end")
+
+
+def _taken(queue: list[bytes]) -> Callable[[], bytes | None]:
+    return lambda: queue.pop(0) if queue else None
+
+
+@contextmanager
+def _followed() -> Iterator[set[str]]:
+    """Collects the product's files whose functions are called within; imports do not count."""
+    folders = {str(ROOT / folder) + "/": ROOT for folder in PRODUCT.values()}
+    files: set[str] = set()
+
+    @cache
+    def ours(filename: str) -> str:
+        found = next((root for folder, root in folders.items() if filename.startswith(folder)), None)
+        return str(Path(filename).relative_to(found)) if found is not None else ""
+
+    def note(frame: FrameType, event: str, argument: Any) -> None:
+        if event == "call" and frame.f_code.co_name != "<module>" and (name := ours(frame.f_code.co_filename)):
+            files.add(name)
+
+    sys.setprofile(note)
+    threading.setprofile(note)
+    try:
+        yield files
+    finally:
+        sys.setprofile(None)
+        threading.setprofile(None)
+
+
+def _texts(folder: Path) -> dict[Path, str]:
+    return {path: path.read_text(encoding="utf-8") for path in sorted(folder.rglob("*.py"))}
+
+
+def _lines(text: str) -> int:
+    return len(text.splitlines())
+
+
+def _row(label: str, texts: Sequence[str]) -> str:
+    numbers = sum(len(named_numbers(ast.parse(text))) for text in texts)
+    return f"{label:<24}{len(texts):>6} files{sum(map(_lines, texts)):>8} lines{numbers:>6} numbers"
+
+
+def _annotated(node: ast.stmt) -> bool:
+    return isinstance(node, ast.AnnAssign)
+
+
+def _numeric(value: ast.expr) -> bool:
+    """Whether an expression holds numbers and other constants only."""
+    leaves = [n for n in ast.walk(value) if isinstance(n, ast.Constant | ast.Call)]
+    return bool(leaves) and all(
+        isinstance(n, ast.Constant) and isinstance(n.value, int | float) and not isinstance(n.value, bool)
+        for n in leaves
+    )
+
+
+def main() -> int:
+    """Command line; 1 where a figure rose."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--record", metavar="WHY", help="record the figures; WHY says what made any of them rise")
+    parser.add_argument("--no-walks", action="store_true", help="leave out the files that data cross")
+    options = parser.parse_args()
+    recorded = json.loads(RECORDED.read_text(encoding="utf-8")) if RECORDED.exists() else {}
+    now = count()
+    print(*rooms(), sep="\n")
+    if not options.no_walks:
+        followed = walks()
+        now["files crossed"] = {name: len(files) for name, files in followed.items()}
+        for name, files in followed.items():
+            print(f"\n{name} crosses {len(files)} files:", *files)
+    print()
+    for kind, figures in now.items():
+        print(f"{kind}: " + ", ".join(f"{name} {value}" for name, value in figures.items()))
+    if options.record:
+        RECORDED.write_text(
+            json.dumps({**recorded, **now, "reason": options.record}, indent=1) + "\n", encoding="utf-8"
+        )
+        return 0
+    problems = risen(now, recorded)
+    for problem in problems:
+        print(
+            f"risen: {problem}; remove as much, or say why: python -m quadid_evaluation.studies.house --record 'WHY'",
+            file=sys.stderr,
+        )
+    return bool(problems)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,106 @@
+"""Every channel wrong by a factor, at once or slowly; writes `poisoning.md`.
+
+python -m quadid_evaluation.studies.poisoning --out docs/results [--minutes 60]
+"""
+
+from __future__ import annotations
+
+import argparse
+import copy
+import json
+import os
+import time
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+from quadid.flight import Flight, fly
+from quadid.online import Session, SessionSettings
+from quadid.online.records import OnlineSet
+from quadid.vehicle import Vehicle
+from quadid_evaluation.studies.judged import judged
+from quadid_evaluation.studies.poisoning.flying import MUST, Poison, fly_online
+from quadid_evaluation.studies.poisoning.page import page
+
+CHANNELS: dict[str, tuple[str, int | None]] = {
+    "gyro p": ("gyro", 0), "gyro q": ("gyro", 1), "gyro r": ("gyro", 2), "accelerometer": ("accel", None),
+    "attitude": ("attitude", None), "all rotor speeds": ("rotor_speed", None),
+    "rotor 1": ("rotor_speed", 0), "rotor 2": ("rotor_speed", 1),
+}  # fmt: skip
+"""Rotors 3 and 4 are the mirror images of 1 and 2."""
+FACTORS, STEPS = (0.8, 0.9, 1.1, 1.25), (0.5, 1.5)
+RAMPS = (0.0, 120.0, 30.0, 300.0)
+LEARNT = 60.0
+"""Healthy flight before the poison sets in [s]: a set is in force by then."""
+AFTER = 45.0
+"""Flight after the poison is whole [s]."""
+SEED = 3
+SETTINGS = SessionSettings(refit=2.0)
+Cell = dict[str, Any]
+
+
+def cells() -> list[Cell]:
+    """All cells of both tables: steps first, because they take the shortest flights."""
+    out = []
+    for ramp in RAMPS:
+        for name in CHANNELS:
+            for factor in FACTORS + (STEPS if ramp == 0.0 else ()):
+                out.append({"when": "in flight", "channel": name, "factor": factor, "ramp": ramp})
+                if ramp == 0.0 or name == "all rotor speeds":
+                    out.append({"when": "from take-off", "channel": name, "factor": factor, "ramp": ramp})
+    return out
+
+
+class Study:
+    """One flight, a session that knows its first minute, and the set an earlier flight left."""
+
+    def __init__(self) -> None:
+        self.vehicle = Vehicle.shipped("pelican")
+        self.flight: Flight = fly(self.vehicle, seconds=LEARNT + RAMPS[-1] + AFTER, seed=SEED)
+        self.begin = min(float(c.t[0]) for c in self.flight.recording.channels.values())
+        self.session = Session(self.vehicle, SETTINGS)
+        self.healthy = fly_online(self.session, self.flight.recording, self.begin, LEARNT)
+
+    def error(self, item: OnlineSet) -> dict[str, float]:
+        """Relative errors of what must be known."""
+        return {n: item.parameters[n].value / getattr(self.flight.truth.parameters, n) - 1.0 for n in MUST}
+
+    def run(self, cell: Cell) -> Cell:
+        """Flies a cell and notes the errors of what was published after the poison had begun."""
+        begin = LEARNT if cell["when"] == "in flight" else self.begin
+        channel, column = CHANNELS[cell["channel"]]
+        poison = Poison(channel, column, cell["factor"], begin, cell["ramp"])
+        restored = self.healthy[-1]
+        session = copy.deepcopy(self.session) if begin == LEARNT else Session(self.vehicle, SETTINGS, restored, 100)
+        known = len(session.poll())
+        sets = fly_online(session, poison.spoil(self.flight.recording), begin, begin + cell["ramp"] + AFTER)
+        fresh = [s for s in sets if not s.outdated and s.state.value in ("accepted", "rolled_back")]
+        worst = {n: max((self.error(s)[n] for s in fresh), key=abs, default=None) for n in MUST}
+        status = session.status()
+        return {**cell, "sets": len(fresh), "worst": worst, "says": status.reason, "known": known}
+
+
+def main() -> None:
+    """Flies the cells that no earlier run has flown, until the time is over, and writes the page."""
+    parser = argparse.ArgumentParser(prog="python -m quadid_evaluation.studies.poisoning", description=__doc__)
+    parser.add_argument("--out", type=Path, default=Path("docs/results"), help="folder of poisoning.md")
+    parser.add_argument("--minutes", type=float, default=240.0, help="stop after this time; the next run goes on")
+    parser.add_argument("--fresh", action="store_true", help="forget what earlier runs have flown")
+    given = parser.parse_args()
+    kept = given.out / "poisoning.json"
+    done: list[Cell] = json.loads(kept.read_text()) if kept.exists() and not given.fresh else []
+    study, until = Study(), time.monotonic() + 60.0 * given.minutes
+    for cell in cells():
+        if any(all(d[k] == v for k, v in cell.items()) for d in done) or time.monotonic() > until:
+            continue
+        done.append(study.run(cell))
+        print(done[-1], flush=True)
+        kept.write_text("[\n" + ",\n".join(json.dumps(d) for d in done) + "\n]\n")
+    healthy = [(s.stop, study.error(s)) for s in study.healthy]
+    where = given.out / "poisoning.md"
+    where.write_text(page(cells(), done, healthy, SEED) + judged(where))
+
+
+if __name__ == "__main__":
+    main()

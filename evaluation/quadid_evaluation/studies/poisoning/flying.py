@@ -1,0 +1,101 @@
+"""A flight with one channel multiplied by a factor, and what the online session publishes of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from quadid.data.window import Block, Recording
+from quadid.online import Job, Publish, Session
+from quadid.online.records import OnlineSet
+from quadid.types import FloatArray
+
+MUST = ("b", "J_xx", "J_yy")
+STEP = 0.1
+"""Data are handed over in pieces of this length [s]."""
+
+
+@dataclass(frozen=True)
+class Poison:
+    """One channel wrong by a factor.
+
+    Attributes:
+        channel: name of the channel; column: which of it, None for all (of the attitude: roll and pitch).
+        factor: what it is multiplied by in the end.
+        begin: when it begins [s]; ramp: how long it grows [s], 0 for a step.
+    """
+
+    channel: str
+    column: int | None
+    factor: float
+    begin: float
+    ramp: float
+
+    def factors(self, t: FloatArray) -> FloatArray:
+        """Factor at times `t` [s], shape (n,)."""
+        share = np.clip((t - self.begin) / self.ramp, 0.0, 1.0) if self.ramp else (t >= self.begin).astype(float)
+        return np.asarray(1.0 + (self.factor - 1.0) * share)
+
+    def spoil(self, recording: Recording) -> Recording:
+        """The recording with the poison in it."""
+        channel = recording.channels[self.channel]
+        factor = self.factors(channel.t)
+        if self.channel == "attitude":
+            values = turned(channel.values, factor)
+        else:
+            scale = np.ones_like(channel.values)
+            scale[:, slice(None) if self.column is None else self.column] = (
+                factor[:, None] if self.column is None else factor
+            )
+            values = channel.values * scale
+        return replace(
+            recording, channels={**recording.channels, self.channel: replace(channel, values=np.asarray(values))}
+        )
+
+
+def turned(q: FloatArray, factor: FloatArray) -> FloatArray:
+    """Attitudes whose roll and pitch are multiplied, heading as it was; shapes (n, 4) and (n,)."""
+    w, x, y, z = q.T
+    roll = np.arctan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y)) * factor
+    pitch = np.arcsin(np.clip(2.0 * (w * y - z * x), -1.0, 1.0)) * factor
+    yaw = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+    (cr, sr), (cp, sp), (cy, sy) = ((np.cos(0.5 * a), np.sin(0.5 * a)) for a in (roll, pitch, yaw))
+    return np.column_stack([
+        cr * cp * cy + sr * sp * sy, sr * cp * cy - cr * sp * sy,
+        cr * sp * cy + sr * cp * sy, cr * cp * sy - sr * sp * cy,
+    ])  # fmt: skip
+
+
+def fly_online(session: Session, recording: Recording, start: float, stop: float) -> list[OnlineSet]:
+    """Sets that a session puts on the parameter topic while it hears a stretch of a recording, every job done at once.
+
+    Args:
+        session: it hears, and is changed.
+        recording: times in seconds.
+        start: first time heard [s].
+        stop: last one [s].
+    """
+    sets: list[OnlineSet] = []
+    edges = np.arange(start, stop + 0.5 * STEP, STEP)
+    places = {n: np.searchsorted(c.t, edges - 1e-6) for n, c in recording.channels.items()}
+    for k in range(len(edges) - 1):
+        for name, place in places.items():
+            a, b = int(place[k]), int(place[k + 1])
+            channel = recording.channels[name]
+            if b > a:
+                session.push_block(Block(channel.t[a:b], ((name, channel.values[a:b]),)))
+        _answer(session, sets)
+    return sets
+
+
+def _answer(session: Session, sets: list[OnlineSet]) -> None:
+    while True:
+        for action in session.poll():
+            if isinstance(action, Publish) and action.topic == "parameters":
+                sets.append(action.item)
+            elif isinstance(action, Job) and action.background:
+                session.deliver(action.run())
+        if session.running is None:
+            return
+        session.deliver(session.running.run())

@@ -1,0 +1,229 @@
+"""Diagnosis: what the simulation gets wrong, why, and what the better model gains."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from quadid.app.identify import OPTIMIZERS, check_seed, origin_remark, out_of_reach, proven, search
+from quadid.app.logs import Given, Log, file_name, settled
+from quadid.app.missing import MissingForces, missing_forces
+from quadid.app.outcome import LIBRARY, NUMBER_COLUMNS, Advance, Fitted, number_rows, provenance, quality, silent
+from quadid.effects import EFFECTS
+from quadid.model.layout import Layout, with_reference_voltage
+from quadid.parameters import INERTIAS, Status, unreliable
+from quadid.report.verdict import Verdict
+from quadid.types import FloatArray
+from quadid.vehicle import Vehicle
+
+if TYPE_CHECKING:
+    from quadid.diagnosis import Diagnosis
+    from quadid.diagnosis.selection import Search
+    from quadid.identification.identifiability import Fit
+    from quadid.identification.noise_model import NoiseModel
+    from quadid.identification.result import ScoredSet
+    from quadid.report.residual_maps import ResidualMap
+    from quadid.report.tables import TextTable
+
+
+@dataclass(frozen=True, repr=False)
+class Diagnosed(Fitted):
+    """What a diagnosis found.
+
+    Attributes:
+        result: of the form ``quadid.diagnose/1``; ``vehicle_file`` and ``prediction_file`` are None until
+            files are written.
+        found: the diagnosis itself.
+        sets: logs scored without and with the findings.
+        noise: estimated sensor noise.
+        nominal: vehicle that was given.
+        search: how the causes were selected.
+    """
+
+    result: dict[str, Any]
+    found: Diagnosis
+    sets: list[ScoredSet]
+    noise: NoiseModel
+    logs: list[Log]
+    nominal: Vehicle
+    search: Search
+    forces: MissingForces | None = None
+
+    @property
+    def vehicle(self) -> Vehicle:
+        """The fitted vehicle with the findings in it; ``vehicle.save("mine.yaml")`` writes it."""
+        vehicle = Vehicle.from_yaml(self.found.vehicle_yaml, self.found.vehicle_name)
+        unseen = self.result["validation"]
+        sets = [
+            {"log": log.name, "role": s.role, "mse": {"fitted": unseen["mse_extended"]}}
+            for log, s in zip(self.logs, self.sets, strict=True)
+        ]
+        return proven(vehicle, self.verdict, sets, self.train).with_remark(origin_remark(self.train))
+
+    @property
+    def prediction(self) -> Vehicle | None:
+        """The same physics with residual terms, where those predict better; else None."""
+        if self.found.prediction is None:
+            return None
+        wiser = self.vehicle.model_copy(update={"residual": self.found.prediction.terms})
+        remark = "Residual terms predict better; the physical values are those of the other file."
+        return wiser.with_remark(f"{origin_remark(self.train)}\n{remark}")
+
+    @property
+    def prediction_file_name(self) -> str:
+        """``pelican+motor_lag+prediction.yaml``."""
+        return f"{file_name(self.found.vehicle_name)}+prediction.yaml"
+
+    @property
+    def file_name(self) -> str:
+        """``pelican+motor_lag.yaml``, or ``pelican.fitted.yaml`` without findings."""
+        return f"{file_name(self.found.vehicle_name)}{'' if self.found.findings else '.fitted'}.yaml"
+
+    @property
+    def verdict(self) -> Verdict:
+        """Whether the model may be used, and what to do next."""
+        from quadid.report.fit_pages import diagnose_verdict
+
+        return diagnose_verdict(self.result)
+
+    def tables(self) -> list[TextTable]:
+        """The findings, then the parameters beside them."""
+        from quadid.report.tables import finding_table, parameter_table
+
+        findings, parameters = self.result["findings"], self.result.get("parameters")
+        return [
+            *([finding_table(findings)] if findings else []),
+            *([parameter_table(parameters)] if parameters else []),
+        ]
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Those of `records`."""
+        return (*NUMBER_COLUMNS, "mse_before", "mse_after", "p_value")
+
+    def records(self) -> list[dict[str, Any]]:
+        """One row a number of a finding."""
+        return [
+            dict(zip(self.columns, (*row, f["gain"]["mse_before"], f["gain"]["mse_after"], f["p_value"]), strict=True))
+            for f, row in number_rows(self.result["findings"])
+        ]
+
+    def plot(self, log: int = -1, group: str = "rates") -> Any:
+        """Measured and simulated outputs of one log, without and with the findings, as a plotly figure."""
+        from quadid.report.figures import MODELS, channel_plot
+
+        return channel_plot(self.sets[log], group, MODELS)
+
+    def page(self, command: str = LIBRARY) -> str:
+        """The page: findings with their pictures, parameters, residuals."""
+        from quadid.report.fit_pages import diagnose_page
+        from quadid.report.page import render
+
+        rows = provenance(self.logs, command) + [
+            {"name": "seed", "value": str(self.result["seed"])},
+            {"name": "vehicle file", "value": self.result["vehicle_file"] or "not written"},
+        ]
+        logs = [quality(log) for log in self.logs]
+        warnings = self.result["warnings"]
+        return render(
+            diagnose_page(self.result, self.nominal.name, self.sets, self.noise, logs, rows, warnings, self.maps())
+        )
+
+    def maps(self) -> dict[str, ResidualMap]:
+        """What every cause looks like in the residual of the diagnosed logs, by name of the effect."""
+        from quadid.report.residual_maps import residual_map
+
+        windows = [w for log in self.train for w in log.windows]
+        model = self.search.model
+        drawn = {
+            c.effect: residual_map(windows, self.nominal, model.theta, c.effect, c.names, self.noise)
+            for c in model.causes
+        }
+        return {effect: one for effect, one in drawn.items() if one is not None}
+
+
+def diagnose(
+    logs: Given, validate: Given = (), *, vehicle: str | Path | Vehicle | None = None, seed: int = 1,
+    advance: Advance = silent,
+) -> Diagnosed:  # fmt: skip
+    """Names what the simulation gets wrong, extends the model by it, and measures the gain on unseen data.
+
+    Args:
+        logs: a log or several to diagnose, as paths or from `load`.
+        validate: flights to measure the gain on; without any, held-out blocks of `logs` serve.
+        vehicle: nominal vehicle; default that of the first loaded log.
+        seed: of all random numbers.
+        advance: told how far it is.
+
+    Raises:
+        NotIdentifiableError: too little data.
+        LogError: a log that does not fit the vehicle.
+    """
+    from quadid.diagnosis.attribution import NominalFit
+    from quadid.diagnosis.pipeline import diagnose as diagnose_windows
+
+    check_seed(seed)
+    given = settled(logs, validate, vehicle)
+    described, train, held = given.vehicle, given.train, given.held
+    windows, unseen = ([w for log in part for w in log.windows] for part in (train, held))
+    unreachable = out_of_reach(train)
+    # One flight has one error: what `quadid identify` states for it, and what the findings make of that.
+    fit = search(
+        OPTIMIZERS[0], windows, with_reference_voltage(described, windows), seed,
+        lambda _, share: advance("nominal fit", share), unreachable,
+    )  # fmt: skip
+    nominal = NominalFit(fit.vehicle, fit.theta, fit.noise)
+    found, selection = diagnose_windows(windows, described, unseen, seed, advance, nominal=nominal)
+    found, model = _within_reach(found, unreachable), selection.model
+    result, (before, after) = found.to_dict(), found.validation.deciding
+    result["validation"]["deciding"] = {
+        "seconds": selection.shooting.seconds, "mse_nominal": before, "mse_extended": after
+    }  # fmt: skip
+    result["warnings"] = [*result.get("warnings", []), *given.warnings]
+    result["seed"] = seed
+    sets = [
+        scored(log, role, fit, model.theta) for role, part in (("train", train), ("validate", held)) for log in part
+    ]
+    result["sets"] = [
+        {"log": s.log, "role": s.role, "mse": {"nominal": s.initial.mse, "extended": s.fitted.mse, "noise_floor": 1.0}}
+        for s in sets
+    ]
+    forces = missing_forces(train, held, fit.vehicle, {"nominal": fit.theta, "extended": model.theta})
+    result["missing"] = None if forces is None else forces.result()
+    for entry in result["findings"]:
+        names = [n for c in model.causes if c.effect == entry["effect"] for n in c.names]
+        less = _neutral(fit.vehicle, model.theta, names)
+        entry["gain"]["missing_removed"] = None if forces is None else forces.taken(less)
+    return Diagnosed(result, found, sets, fit.noise, [*train, *held], described, selection, forces)
+
+
+def _neutral(vehicle: Vehicle, theta: FloatArray, names: Sequence[str]) -> FloatArray:
+    """A parameter vector without some effects."""
+    layout, out = Layout(vehicle), theta.copy()
+    for entry in (layout.entry(name) for name in names):
+        out[entry.index] = entry.neutral
+    return out
+
+
+def scored(log: Log, role: str, fit: Fit, extended: FloatArray) -> ScoredSet:
+    """Scores the nominal fit, and the parameter vector with the findings, on one log."""
+    from quadid.identification.result import ScoredSet
+    from quadid.identification.score import mse_score
+
+    before, after = (mse_score(log.windows, fit.vehicle, theta, fit.noise) for theta in (fit.theta, extended))
+    return ScoredSet(log.recording.name, role, before, after)
+
+
+def _within_reach(found: Diagnosis, unreachable: Mapping[str, str]) -> Diagnosis:
+    """The diagnosis without trust in what the channels of its logs cannot show, by parameter, and why."""
+    trusted = [p.name for p in found.parameters if p.name in unreachable and p.status is not Status.PRIOR_DOMINATED]
+    told = [f"{name} is not to be used: {unreachable[name]}" for name in trusted]
+    parameters = unreliable(found.parameters, trusted)
+    late = [
+        f.effect for f in found.findings if EFFECTS[f.effect].needs_fast_rotors and set(INERTIAS) & set(unreachable)
+    ]
+    told += [f"{name} is not named with confidence: {unreachable[INERTIAS[0]]}" for name in dict.fromkeys(late)]
+    findings = tuple(replace(f, confident=f.confident and f.effect not in late) for f in found.findings)
+    return replace(found, findings=findings, parameters=parameters, warnings=(*found.warnings, *told))

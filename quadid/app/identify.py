@@ -1,0 +1,301 @@
+"""Identification: fits the parameters of a vehicle to flight logs, and scores the fit on them and on others."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from numbers import Integral
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from quadid_evaluation.optimisers.minimise import minimise
+
+from quadid.app.logs import Given, Log, file_name, remembered, settled
+from quadid.app.missing import MissingForces, missing_forces
+from quadid.app.outcome import LIBRARY, Advance, Fitted, known, provenance, quality, silent, told
+from quadid.data.window import Window
+from quadid.errors import NotIdentifiableError, ParameterError, nearest
+from quadid.model.layout import Layout, with_reference_voltage
+from quadid.parameters import ParameterSet
+from quadid.report.verdict import Verdict, identify_verdict
+from quadid.sanitise import LONGEST_LINE, plain
+from quadid.types import FloatArray
+from quadid.vehicle import Proof, Vehicle
+from quadid.version import __version__
+
+if TYPE_CHECKING:
+    from quadid.identification.controller_gains import Autopilot
+    from quadid.identification.identifiability import Fit
+    from quadid.identification.result import ScoredSet
+    from quadid.report.tables import TextTable
+
+# --- The searches that an identification offers, behind one call
+
+
+OPTIMIZERS = (
+    "pso_polish", "pso", "initial", "quasi_newton", "least_squares", "cma_es", "l_shade", "differential_evolution",
+    "pso_algorithm_1",
+)  # fmt: skip
+BUDGET = 4000
+"""Simulations of the data that any search but the standard one may spend."""
+
+
+def check_optimizer(name: str) -> None:
+    """Raises ParameterError for an unknown search, with the nearest known one."""
+    if name not in OPTIMIZERS:
+        raise ParameterError(f"unknown optimizer '{name}'", ", ".join(OPTIMIZERS), nearest(name, OPTIMIZERS))
+
+
+def check_seed(seed: int) -> None:
+    """Raises ParameterError for a seed that no generator takes."""
+    if not isinstance(seed, Integral) or seed < 0:
+        raise ParameterError(f"seed {seed}", "a whole number from 0 on")
+
+
+def search(
+    name: str, windows: Sequence[Window], vehicle: Vehicle, seed: int, advance: Advance,
+    out_of_reach: Mapping[str, str] | None = None,
+) -> Fit:  # fmt: skip
+    """Identifies the parameters with the search called `name`.
+
+    The sensor noise, which decides intervals and scores, always comes from the standard fit; with the other searches
+    the parameters are where that search ended, not where the standard fit ends.  Parameters `out_of_reach` of the
+    channels, with the reason, keep the file's value.
+    """
+    from quadid.identification.fit import FitOptions, fit, fit_at
+
+    if name == "pso_polish":
+        return fit(windows, vehicle, FitOptions(seed=seed), progress=advance, out_of_reach=out_of_reach)
+
+    from quadid.identification.identifiability import final_answer
+    from quadid.identification.shooting_objective import BoxProblem
+
+    standard = fit(windows, vehicle, FitOptions(seed=seed), progress=lambda stage, share: advance("noise", share))
+    advance(name, 0.0)
+    problem = BoxProblem(windows, vehicle)
+    found = minimise(name, problem.cost, problem.start, problem.lower, problem.upper, BUDGET, seed, problem.residual)
+    at = fit_at(windows, vehicle, problem.theta(found.x), standard.noise, found.evaluations, str(found.stop))
+    return final_answer(at, out_of_reach or {})
+
+
+# --- Identification: fits the parameters of a vehicle to flight logs, and scores the fit on them and on others
+
+
+@dataclass(frozen=True, repr=False)
+class Identified(Fitted):
+    """What an identification found.
+
+    Attributes:
+        result: of the form ``quadid.identify/1``; ``vehicle_file`` is None until a file is written.
+        fit: the fit itself.
+    """
+
+    result: dict[str, Any]
+    fit: Fit
+    sets: list[ScoredSet]
+    logs: list[Log]
+    forces: MissingForces | None = None
+
+    @property
+    def parameters(self) -> ParameterSet:
+        """Parameters with intervals, statuses and covariance."""
+        return self.fit.parameters
+
+    @property
+    def vehicle(self) -> Vehicle:
+        """The vehicle with what was found; ``vehicle.save("mine.yaml")`` writes it."""
+        from quadid.identification.result import fitted_vehicle
+
+        vehicle = proven(fitted_vehicle(self.fit), self.verdict, self.result["sets"], self.train)
+        return vehicle.with_remark(origin_remark(self.train))
+
+    @property
+    def file_name(self) -> str:
+        """Name of the vehicle file, ``pelican.fitted.yaml``."""
+        return f"{file_name(self.fit.vehicle.name)}.fitted.yaml"
+
+    @property
+    def verdict(self) -> Verdict:
+        """Whether the result may be used, and what to do next."""
+        return identify_verdict(self.result)
+
+    @property
+    def heading(self) -> str:
+        """What the values rest on."""
+        return f"{self.fit.vehicle.name}: {known(self.fit.vehicle)}, from its file. All values depend on these."
+
+    def tables(self, truth: Mapping[str, float] | None = None) -> list[TextTable]:
+        """Parameters, beside the truth where a simulation knows it, and how well each log is followed."""
+        from quadid.report.tables import parameter_table, set_table
+
+        return [parameter_table(self.result["parameters"], truth), set_table(self.result["sets"])]
+
+    def records(self) -> list[dict[str, Any]]:
+        """One row a parameter."""
+        return [
+            {**{k: v for k, v in p.items() if k != "ci95"}, "low": p["ci95"][0], "high": p["ci95"][1]}
+            for p in self.result["parameters"]
+        ]
+
+    def sample(self, n: int, seed: int = 0) -> tuple[FloatArray, dict[str, str]]:
+        """Draws vehicles from the joint covariance, for `quadid.Simulator(fit.vehicle, thetas)`.
+
+        Args:
+            n: number of vehicles.
+            seed: decides them.
+
+        Returns:
+            Full parameter vectors, shape (n, size); and, by name, why a parameter has only a floor for its spread:
+            not identified by this flight, or an effect that the vehicle file states and no flight fitted, which stays
+            as it is.
+        """
+        values, floors = self.parameters.sample(n, seed)
+        thetas = np.repeat(Layout(self.vehicle).initial(self.vehicle)[None], n, axis=0)
+        thetas[:, : len(self.parameters)] = values
+        return thetas, floors | dict.fromkeys(self.vehicle.effects, "as in the vehicle file, without a spread")
+
+    def plot(self, log: int = -1, group: str = "rates") -> Any:
+        """Measured and simulated outputs of one log as a plotly figure.
+
+        Args:
+            log: which of the logs, in the order given, training logs first; -1 is the last.
+            group: rates, attitude, accel, velocity or position.
+        """
+        from quadid.report.figures import channel_plot
+
+        return channel_plot(self.sets[log], group)
+
+    def page(self, command: str = LIBRARY) -> str:
+        """The page: parameters, errors of every log, correlations, what the flights excite."""
+        from quadid.report.figures import MOST_LOGS
+        from quadid.report.fit_pages import correlation_section, flight_section, identify_page
+        from quadid.report.page import render
+
+        result, fit = self.result, self.fit
+        rows = provenance(self.logs, command) + [
+            {"name": "seed", "value": str(result["seed"])},
+            {
+                "name": "search",
+                "value": f"{result['optimizer']}, {fit.evaluations} simulations of the data; {fit.outcome.value}",
+            },
+            {"name": "vehicle file", "value": result["vehicle_file"] or "not written"},
+            {"name": "taken as known", "value": known(fit.vehicle)},
+        ]
+        page = identify_page(result, self.sets, fit.noise, [quality(log) for log in self.logs], rows)
+        flights = [flight_section(log.recording, fit.vehicle, i) for i, log in enumerate(self.logs[:MOST_LOGS])]
+        page["sections"] = [correlation_section(fit.parameters), *(f for f in flights if f is not None)]
+        page["excitation"] = told(fit, self.train)
+        return render(page)
+
+
+class UnansweredError(NotIdentifiableError):
+    """The data say nothing about any parameter; `outcome` holds what there is, which is the initial guess."""
+
+    def __init__(self, outcome: Identified) -> None:
+        self.outcome = outcome
+        super().__init__(
+            "the data reveal no parameter",
+            "a flight that moves in roll, pitch, yaw and height",
+            "fly what `quadid excite` proposes; results were written, but they are the initial guess",
+        )
+
+
+def identify(
+    logs: Given, validate: Given = (), *, vehicle: str | Path | Vehicle | None = None, optimizer: str = OPTIMIZERS[0],
+    seed: int = 1, advance: Advance = silent,
+) -> Identified:  # fmt: skip
+    """Fits the parameters to logs, and scores the fit on them and on others.
+
+    Args:
+        logs: a log or several, as paths or from `load`.
+        validate: flights that are scored only.
+        vehicle: initial guess and known effects; default that of the first loaded log.
+        optimizer: one of `OPTIMIZERS`.
+        seed: of all random numbers.
+        advance: told how far the fit is.
+
+    Raises:
+        UnansweredError: the data reveal no parameter.
+        NotIdentifiableError: too little data.
+        LogError: a log that does not fit the vehicle.
+        ParameterError: an unknown search.
+    """
+    from quadid.identification.controller_gains import find_autopilot
+    from quadid.identification.result import answered, identify_result
+
+    check_optimizer(optimizer)
+    check_seed(seed)
+    given = settled(logs, validate, vehicle)
+    train, held = given.train, given.held
+    windows = [w for log in train for w in log.windows]
+    described = with_reference_voltage(given.vehicle, windows)
+    begin = time.perf_counter()
+    fit = search(optimizer, windows, described, seed, advance, out_of_reach(train))
+    seconds = time.perf_counter() - begin
+    autopilot = find_autopilot(windows, described)
+    sets = [scored(log, role, fit, autopilot) for role, part in (("train", train), ("validate", held)) for log in part]
+    result = identify_result(fit, optimizer, seed, seconds, sets, None, given.warnings)
+    for entry, log in zip(result["sets"], (*train, *held), strict=True):
+        entry["seconds"] = log.grid.seconds_used
+    forces = missing_forces(train, held, fit.vehicle, {"nominal": fit.theta})
+    result["missing"] = None if forces is None else forces.result()
+    done = Identified(result, fit, sets, [*train, *held], forces)
+    result["verdict"] = done.verdict.level
+    if not answered(fit.parameters):
+        raise UnansweredError(done)
+    return done
+
+
+def out_of_reach(logs: Sequence[Log]) -> dict[str, str]:
+    """Parameters that no log can show, because a channel is missing or too slow, each with the reason."""
+    from quadid.checks.findings import parameter_outlook
+    from quadid.checks.motion import channel_facts
+
+    outlooks = [parameter_outlook(channel_facts(log.recording)) for log in logs]
+    each = [{o.parameter: o.reason for o in outlook if not o.possible} for outlook in outlooks]
+    return {name: each[0][name] for name in each[0] if all(name in one for one in each)} if each else {}
+
+
+def scored(log: Log, role: str, fit: Fit, autopilot: Autopilot | None) -> ScoredSet:
+    """Scores the initial guess and the fit on one log; as the paper does, too, where the stabiliser is known."""
+    from quadid.identification.paper_objective import paper_score
+    from quadid.identification.result import ScoredSet
+    from quadid.identification.score import mse_score
+
+    initial = Layout(fit.vehicle).initial(fit.vehicle)
+    before, after = (mse_score(log.windows, fit.vehicle, theta, fit.noise) for theta in (initial, fit.theta))
+    flown = [paper_score(log.windows, fit.vehicle, theta, autopilot) for theta in (initial, fit.theta)]
+    paper = None if flown[0] is None or flown[1] is None else (flown[0].mse, flown[1].mse)
+    return ScoredSet(log.recording.name, role, before, after, paper)
+
+
+def origin_remark(logs: Sequence[Log]) -> str:
+    """What a fitted vehicle file was made from."""
+    lines = [f"Fitted by quadid {__version__}; `initial` is the fitted value, `sigma` its standard deviation. From:"]
+    lines += [f"  {log.recording.name}  sha256 {log.recording.sha256 or 'unknown'}" for log in logs]
+    return "\n".join(plain(line, LONGEST_LINE) for line in lines)
+
+
+def proven(vehicle: Vehicle, verdict: Verdict, sets: Sequence[Mapping[str, Any]], train: Sequence[Log]) -> Vehicle:
+    """The vehicle with the proof of its values; values of a red fit become guesses without `sigma`.
+
+    Args:
+        vehicle: with what was found.
+        verdict: on the result.
+        sets: its scored logs, as in ``quadid.identify/1``.
+        train: the logs that were fitted.
+    """
+    unseen = [s for s in sets if s["role"] == "validate"]
+    errors = [s["mse"]["fitted"] for s in unseen]
+    proof = Proof(
+        verdict=verdict.level, unseen=tuple(s["log"] for s in unseen),
+        error=max(errors) if errors and all(math.isfinite(e) for e in errors) else None,
+        fitted=remembered(train, vehicle),
+    )  # fmt: skip
+    values = dict(vehicle.parameters)
+    if verdict.level == "poor":
+        values = {n: p.model_copy(update={"sigma": None}) for n, p in values.items()}
+    return vehicle.model_copy(update={"proof": proof, "parameters": values})

@@ -1,0 +1,183 @@
+"""The compiled kernels: which there are, whether this machine has them already, and short runs that compile them.
+
+The parts are made so that two processes side by side take about the same time.
+"""
+
+from __future__ import annotations
+
+import gc
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from quadid.data.window import Window
+    from quadid.vehicle import Vehicle
+
+
+@dataclass(frozen=True)
+class Part:
+    """Kernels that one process compiles.
+
+    Attributes:
+        run: calls each of them once, as a fit or a flight does.
+        kernels: the functions on disk.
+        functions: how many functions are compiled for them, about; for a share done.
+    """
+
+    run: Callable[[], None]
+    kernels: Callable[[], list[Any]]
+    functions: int
+
+
+def missing(names: tuple[str, ...]) -> list[str]:
+    """Parts with a kernel that is not compiled for this machine and these sources."""
+    return [name for name in names if not all(on_disk(kernel) for kernel in PARTS[name].kernels())]
+
+
+def on_disk(kernel: Any) -> bool:
+    """Whether machine code of a kernel, for this processor and this source, is in numba's cache."""
+    from numba.core.registry import cpu_target
+
+    cache = kernel._cache
+    if not hasattr(cache, "_cache_file"):  # nothing can be written
+        return True
+    now = cache._index_key((), cpu_target.target_context.codegen())[1:]
+    return any(key[1:] == now for key in cache._cache_file._load_index())
+
+
+def compiled(name: str, counted: Callable[[int], None]) -> None:
+    """Compiles one part, in a process of its own; `counted` is called with the number of functions that are done."""
+    from numba.core import event
+
+    gc.disable()  # a compiler makes many objects that live on: looking through them takes a tenth of its time
+
+    class Count(event.Listener):
+        done = 0
+
+        def on_start(self, event: Any) -> None:
+            pass
+
+        def on_end(self, event: Any) -> None:
+            self.done += 1
+            counted(self.done)
+
+    with event.install_listener("numba:compile", Count()):
+        PARTS[name].run()
+
+
+def _hover() -> tuple[Vehicle, Window]:
+    """Half a second of standing still in the air, made up."""
+    import numpy as np
+
+    from quadid.data.window import Window
+    from quadid.vehicle import GRAVITY, Vehicle
+
+    vehicle = Vehicle.shipped("pelican")
+    rows = 25
+    attitude, accel, references = np.zeros((rows, 4)), np.zeros((rows, 3)), np.zeros((rows, 4))
+    attitude[:, 0], accel[:, 2], references[:, 3] = 1.0, -GRAVITY, 0.5
+    speed = np.full((rows, len(vehicle.rotors)), vehicle.hover_speed())
+    return vehicle, Window(
+        0.0, 0.02, speed, np.zeros((rows, 3)), attitude, accel, attitude_reference=references, sampling="held"
+    )
+
+
+def _simulation() -> None:
+    from quadid.model.layout import Layout
+    from quadid.model.rollout import Rollout, Segments
+
+    vehicle, window = _hover()
+    rollout = Rollout(window, vehicle)
+    theta = Layout(vehicle).initial(vehicle)[None].repeat(2, axis=0)
+    segments = Segments.cut(len(window), 10)
+    states = rollout.initial_states(segments)
+    rollout.roll(segments, theta, states)  # rotors do the same in both lanes: from a table
+    theta[1, Layout(vehicle).entry("motor_lag.tau").index] = 0.02
+    rollout.roll(segments, theta, states)
+
+
+def _statistics() -> None:
+    import numpy as np
+
+    from quadid.flight.pilot import default_gains
+    from quadid.identification.elimination import Reduced, StatePrior, Whitening
+    from quadid.identification.elimination_kernel import reduce_segments
+    from quadid.model.closed_loop import ClosedLoop
+    from quadid.model.layout import Layout
+    from quadid.model.simd import LANES, aligned
+
+    own, rows, channels = 9, 8, 9
+    out = aligned((1, 1, rows, channels, LANES))
+    out[:] = np.random.default_rng(1).standard_normal(out.shape)
+    eye = np.repeat(np.eye(rows)[None], channels, axis=0)
+    reduce_segments(
+        out, np.arange(own + 2), np.ones(own + 1), np.ones((1, rows, channels)),
+        Whitening(np.ones(channels), np.zeros(channels, dtype=bool), eye),
+        StatePrior(np.ones(own), 0.0, np.zeros((1, 3))), Reduced.room(1, own, 1, rows, channels),
+    )  # fmt: skip
+    vehicle, window = _hover()
+    ClosedLoop(window, vehicle, default_gains(vehicle)).fly(Layout(vehicle).initial(vehicle)[None])
+
+
+def _estimate() -> None:
+    import numpy as np
+
+    from quadid.estimate import kalman
+    from quadid.estimate.problem import Problem
+    from quadid.estimate.track import from_window
+
+    vehicle, window = _hover()
+    track = from_window(window, vehicle)
+    problem = Problem.of([track], vehicle)
+    p, psi = problem.physics(problem.start(), 0), problem.first_noise()
+    _, gains = kalman.kalman(track, p, psi, problem.tail, True)
+    kalman.replay(track, p, psi, gains, gains.table, np.empty((0, kalman.M)))
+    kalman.backward(track, p, psi, gains, True)
+    kalman.single_steps(track, p, gains.mean)
+    kalman.specific_force(track, p, gains.mean)
+
+
+def _flight() -> None:
+    from quadid.flight import fly
+
+    fly(_hover()[0], seconds=0.5)
+
+
+def _simulation_kernels() -> list[Any]:
+    from quadid.model.kernel import needs_of
+    from quadid.model.rollout_kernel import roll_segments
+    from quadid.model.rotor_kernel import rotor_table
+
+    return [needs_of, roll_segments, rotor_table]
+
+
+def _statistics_kernels() -> list[Any]:
+    from quadid.identification.elimination_kernel import _reduce_on_disk
+    from quadid.model.closed_loop_kernel import fly_closed_loop
+
+    return [_reduce_on_disk, fly_closed_loop]
+
+
+def _estimate_kernels() -> list[Any]:
+    from quadid.estimate import kalman
+
+    return [
+        kalman.moments, kalman.kalman, kalman.replay, kalman.backward, kalman.single_steps, kalman.specific_force
+    ]  # fmt: skip
+
+
+def _flight_kernels() -> list[Any]:
+    from quadid.flight.march import march
+
+    return [march]
+
+
+PARTS = {
+    "simulation": Part(_simulation, _simulation_kernels, 100),
+    "statistics": Part(_statistics, _statistics_kernels, 100),
+    "estimate": Part(_estimate, _estimate_kernels, 30),
+    "flight": Part(_flight, _flight_kernels, 30),
+}
+"""What an identification or a diagnosis needs, in three parts, and the flown vehicle of `quadid simulate`."""
+FIT = ("simulation", "statistics", "estimate")

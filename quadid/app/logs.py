@@ -1,0 +1,626 @@
+"""Logs and vehicles of a piece of work: names to checked windows on a grid, parts, and repetitions."""
+
+from __future__ import annotations
+
+import errno
+import math
+import os
+import re
+import stat
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+import quadid_replay
+from numpy.typing import NDArray
+from quadid_replay import open_log
+
+from quadid.data.resample import linear
+from quadid.data.window import Recording, Window
+from quadid.errors import LogError, QuadidError, VehicleError
+from quadid.sanitise import LONGEST_NAME
+from quadid.types import FloatArray, IntArray
+from quadid.vehicle import MOST_FLIGHTS, FittedFlight, Vehicle
+
+if TYPE_CHECKING:
+    from quadid.checks.motion import Spans
+    from quadid.data.grid import GridReport
+
+# --- Files written whole or not at all; files of users read without waiting for one that is none
+
+
+class OutputError(QuadidError):
+    """A place that cannot be written to."""
+
+
+def read_regular(path: str | Path, most: int = 1 << 20) -> bytes:
+    """Reads at most `most` bytes of a file.
+
+    Raises:
+        OSError: it cannot be read, or is a pipe, a device or a folder, which may have no end and need never begin.
+    """
+    with open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK)) as file:
+        if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+            raise OSError(errno.EINVAL, "it is no regular file", str(path))
+        return file.read(most)
+
+
+def write_text(path: str | Path, text: str) -> Path:
+    """Writes a file whole or not at all; returns its absolute path."""
+    target = Path(path).absolute()
+    part = target.with_name(f".{target.name}.{os.getpid()}.part")
+    try:
+        part.write_text(text, encoding="utf-8")
+        os.replace(part, target)
+    except OSError as error:
+        part.unlink(missing_ok=True)
+        raise OutputError(
+            f"{target} cannot be written ({error.strerror})", fix="check permissions and free space"
+        ) from error
+    return target
+
+
+def file_name(name: str) -> str:
+    """A vehicle's name as part of a file name: letters, digits and ``-_+.`` only."""
+    return "".join(c if c.isalnum() or c in "-_+." else "_" for c in name).lstrip(".")[:100] or "vehicle"
+
+
+# --- Parts of a log: those asked for as LOG@from:to, and those in the air
+
+
+_CUT = re.compile(r"(?P<path>.+)@(?P<start>[0-9.]*):(?P<stop>[0-9.]*)")
+
+
+@dataclass(frozen=True)
+class LogPart:
+    """Part of a log that was asked for: seconds after its first IMU sample; None for open ends; units to be checked."""
+
+    path: Path
+    start: float | None = None
+    stop: float | None = None
+    checked: bool = True
+
+    def span(self, recording: Recording) -> tuple[float, float]:
+        """First and last time of the part [s], in the time of the recording; infinite for open ends."""
+        zero = recording.first_imu_time
+        low = -math.inf if self.start is None else zero + self.start
+        return low, math.inf if self.stop is None else zero + self.stop
+
+    def of(self, recording: Recording) -> Recording:
+        """The part of a recording; raises LogError where that is empty."""
+        if self.start is None and self.stop is None:
+            return recording
+        low, high = self.span(recording)
+        inside = {name: (c.t >= low) & (c.t <= high) for name, c in recording.channels.items()}
+        channels = {
+            name: replace(c, t=c.t[inside[name]], values=c.values[inside[name]])
+            for name, c in recording.channels.items()
+            if inside[name].any()
+        }
+        if not channels:
+            raise self._empty(recording)
+        return replace(recording, channels=channels, breaks=tuple(b for b in recording.breaks if low <= b <= high))
+
+    def _empty(self, recording: Recording) -> LogError:
+        """Nothing is there: which span was asked for, and which there is."""
+        zero = recording.first_imu_time
+        first, last = recording.span
+        asked = f"between {self.start} and {self.stop} s" if self.stop is not None else f"after {self.start} s"
+        if self.start is None:
+            asked = f"before {self.stop} s"
+        there = f", {first - zero:.1f} to {last - zero:.1f} s" if last > first else ""
+        return LogError(f"{recording.name}: nothing {asked}", f"a span inside the log{there}")
+
+
+def parse_part(text: str, start: float | None = None, stop: float | None = None) -> LogPart:
+    """Splits ``LOG@76:216`` into its parts, unless a file of that name exists; own limits go before the common ones."""
+    found = _CUT.fullmatch(text)
+    if found is None or Path(text).exists():
+        cut = LogPart(Path(text), start, stop)
+    else:
+        try:
+            own = [float(found[key]) if found[key] else None for key in ("start", "stop")]
+        except ValueError as error:
+            raise LogError(
+                f"cannot read the span of '{text}'", "LOG@START:STOP in seconds, for example LOG@76:216"
+            ) from error
+        cut = LogPart(Path(found["path"]), start if own[0] is None else own[0], stop if own[1] is None else own[1])
+    for limit in (cut.start, cut.stop):
+        if limit is not None and not math.isfinite(limit):
+            raise LogError(f"{text}: a span from {cut.start} to {cut.stop} s", "seconds")
+    if cut.start is not None and cut.stop is not None and not cut.start < cut.stop:
+        raise LogError(f"{text}: a span from {cut.start:g} to {cut.stop:g} s", "start before stop", "swap them")
+    return cut
+
+
+def flown_parts(recording: Recording, flying: Spans, cut: LogPart) -> Spans:
+    """What to use of a log that also stands on the ground [s, after its first IMU sample]; none where it hardly does.
+
+    A part that was asked for is used as it is.
+
+    Args:
+        recording: the whole log.
+        flying: when it flies [s, in the time of the recording].
+        cut: the part that is asked for.
+    """
+    from quadid.checks import proposed_cuts
+
+    imu = [c.t for n, c in recording.channels.items() if n in ("gyro", "accel") and len(c.t)]
+    if cut.start is not None or cut.stop is not None or not imu:
+        return ()
+    return proposed_cuts(flying, recording.first_imu_time, max(float(t[-1]) for t in imu))
+
+
+def names_of(cut: LogPart, parts: Spans) -> list[str]:
+    """Parts of a log as one asks for them: ``flight.bin@73.2:227.3``."""
+    return [f"{cut.path.name}@{a:g}:{b:g}" for a, b in parts]
+
+
+def left_on_ground(names: Sequence[str]) -> str:
+    """What is used of a log that also stands on the ground, by the names of its parts, and how to use all of it."""
+    whole = names[0].rpartition("@")[0]
+    return f"time on the ground is left out: fits use {' '.join(names)}; to use all of it: {whole}@0:"
+
+
+# --- From names of logs and vehicles to checked windows on a grid
+
+
+_FILL_IN = "FILL IN"
+"""Marks the guesses of `quadid init`."""
+GRID = 50.0
+"""Rate of the grid unless asked otherwise [Hz], as in the paper."""
+LONGEST = 3600.0
+"""Excitation is computed from this much flight at most [s]."""
+
+
+@dataclass(frozen=True)
+class Log:
+    """A log that was read, checked and brought onto the grid.
+
+    Attributes:
+        path: absolute path.
+        recording: as read, each channel at its own rate.
+        vehicle: whose log it is; says what the rotor columns mean.
+        windows: on one grid, without gaps.
+        grid: how the windows were made.
+        cut: the part that is used.
+        doubts: what looks wrong about units, frames, motors or clock, each with what to do.
+        flown: what is used of a log that also stands on the ground [s, after its first IMU sample]; empty: all of
+            the part that was asked for.
+    """
+
+    path: Path
+    recording: Recording
+    vehicle: Vehicle
+    windows: list[Window]
+    grid: GridReport
+    cut: LogPart
+    doubts: tuple[str, ...] = ()
+    flown: Spans = ()
+
+    @property
+    def name(self) -> str:
+        """Name of the file."""
+        return self.recording.name
+
+    @property
+    def warnings(self) -> list[str]:
+        """What was wrong with the log and its gridding, each with the log's name."""
+        return [f"{self.path.name}: {text}" for text in (*self.recording.warnings, *self.doubts, *self.grid.notes)]
+
+    def at(self, rate: float | None) -> Log:
+        """The same log on a grid of another rate [Hz]; None for the log's own."""
+        windows, grid = gridded(self.recording, self.vehicle, rate, self.cut, self.flown)
+        return replace(self, windows=windows, grid=grid)
+
+    def of(self, vehicle: str | Path | Vehicle) -> Log:
+        """The same log read with another description of its vehicle: checked anew, on a grid of the same rate."""
+        described = as_vehicle(vehicle)
+        if described == self.vehicle:
+            return self
+        return _read(self.path, self.recording, described, self.grid.rate, self.cut)
+
+    def __repr__(self) -> str:
+        used, whole = self.grid.seconds_used, self.grid.seconds_log
+        head = f"{self.name}: {self.recording.format}, {used:.1f} of {whole:.1f} s used at {self.grid.rate:.4g} Hz"
+        return "\n".join((f"{head}, vehicle {self.vehicle.name}", *(f"warning: {text}" for text in self.warnings)))
+
+
+def load_vehicle(name: str) -> Vehicle:
+    """Loads a vehicle file, or the shipped vehicle of that name.
+
+    Raises:
+        VehicleError: no such file or name, or a file that describes no vehicle.
+    """
+    path = Path(name)
+    looks_like_file = path.suffix.lower() in (".yaml", ".yml") or "/" in name
+    if not looks_like_file and not path.is_file():
+        return Vehicle.shipped(name)
+    if path.is_dir():
+        raise VehicleError(f"{name} is a directory", "a shipped name or a YAML file", "name the file in it")
+    try:
+        data = read_regular(path)
+    except FileNotFoundError as error:
+        raise VehicleError(f"no vehicle file {name}", "a shipped name or a YAML file", "check the path") from error
+    except OSError as error:
+        raise VehicleError(f"{name} cannot be read ({error.strerror})", fix="check its permissions") from error
+    try:
+        text = data.decode("utf-8")
+        blanks = [line.split(":")[0].strip(" -#") for line in text.splitlines() if _FILL_IN in line]
+        if blanks:
+            raise VehicleError(
+                f"{name}: {' and '.join(blanks)} {'is a guess' if len(blanks) == 1 else 'are guesses'} of "
+                f"`quadid init`, marked {_FILL_IN}", "measured values",
+                f"write your vehicle's and delete the words {_FILL_IN}",
+            )  # fmt: skip
+        return Vehicle.from_yaml(text, path.name)
+    except UnicodeDecodeError as error:
+        raise VehicleError(f"{name}: not text", "a YAML file", "if this is the log, pass it as LOG") from error
+
+
+def as_vehicle(vehicle: str | Path | Vehicle) -> Vehicle:
+    """The vehicle itself, or as `load_vehicle` has it."""
+    return load_vehicle(str(vehicle)) if isinstance(vehicle, str | Path) else vehicle
+
+
+def load(
+    log: str | Path, vehicle: str | Path | Vehicle, *, rate: float | None = GRID, start: float | None = None,
+    stop: float | None = None, preset: str = "auto", unchecked: bool = False, columns: Mapping[str, str] | None = None,
+) -> Log:  # fmt: skip
+    """Opens a log of any kind, checks it, and brings it onto the grid.
+
+    Args:
+        log: path, or path with a span as in ``flight.bin@76:216`` [s].
+        vehicle: a shipped name, a YAML file or a `Vehicle`; says what the rotor columns mean.
+        rate: of the grid [Hz]; None for the log's own.
+        start: first time to use [s], after the log's first IMU sample.
+        stop: last time to use [s], likewise.
+        preset: topic names of ROS logs.
+        unchecked: use the log even when its units, frames or motors look wrong.
+        columns: names in a CSV by names of the contract, as ``{"p": "gyro_x"}``; beside those of the vehicle file.
+
+    Raises:
+        LogError: not readable, in wrong units or frames, motors in another order, or nothing left of it.
+        VehicleError: no such vehicle.
+        NotIdentifiableError: no rotor signal that means anything.
+    """
+    from quadid_replay.reading import start as start_reading
+
+    start_reading()
+    described = as_vehicle(vehicle)
+    cut = replace(parse_part(str(log), start, stop), checked=not unchecked)
+    recording = open_recording(cut.path, preset, {**described.columns, **(columns or {})})
+    require_gyro(recording)
+    return _read(cut.path.resolve(), recording, described, rate, cut)
+
+
+def require_gyro(recording: Recording) -> None:
+    """Raises LogError where a log has no gyro: nothing can be fitted to it."""
+    if "gyro" not in recording.channels:
+        unused = next((f"; {note}" for note in recording.warnings if note.startswith("columns not used")), "")
+        raise LogError(
+            f"{recording.name}: no gyro in the data{unused}", "p q r [rad/s]",
+            "log the IMU at 50 Hz or faster, or name the columns of a CSV: --columns gyro_x=p,gyro_y=q,gyro_z=r",
+        )  # fmt: skip
+
+
+def open_recording(path: Path, preset: str = "auto", columns: Mapping[str, str] | None = None) -> Recording:
+    """Reads a log of any kind."""
+    return open_log(path, preset, columns)
+
+
+def write_recording(path: str | Path, recording: Recording) -> Path:
+    """Writes a log as MCAP, tlog or CSV by suffix; returns its absolute path."""
+    kind = Path(path).suffix.lower()[1:]
+    getattr(quadid_replay, f"write_{kind}")(path, recording)
+    return Path(path).absolute()
+
+
+def _read(path: Path, recording: Recording, vehicle: Vehicle, rate: float | None, cut: LogPart) -> Log:
+    """A log checked and on the grid."""
+    checked = check_conventions(recording, vehicle, cut) if cut.checked else Checked()
+    return on_grid(path, recording, vehicle, rate, cut, checked)
+
+
+def on_grid(
+    path: Path, recording: Recording, vehicle: Vehicle, rate: float | None, cut: LogPart, checked: Checked
+) -> Log:
+    """A checked log on the grid; of one that also stands on the ground, what is in the air."""
+    doubts, flown = checked
+    windows, report = gridded(recording, vehicle, rate, cut, flown)
+    left_out = [left_on_ground(names_of(cut, flown))] if flown else []
+    return Log(path, recording, vehicle, windows, report, cut, (*doubts, *left_out), flown)
+
+
+def gridded(
+    recording: Recording, vehicle: Vehicle, rate: float | None, cut: LogPart, flown: Spans
+) -> tuple[list[Window], GridReport]:
+    """What is flown of a log, or the part that was asked for, on a grid of so many rows a second [Hz]."""
+    from quadid.data.grid import grid_recording
+
+    zero = recording.first_imu_time
+    return grid_recording(recording, vehicle, rate, [(zero + a, zero + b) for a, b in flown] or [cut.span(recording)])
+
+
+def parse_columns(texts: Sequence[str]) -> dict[str, str]:
+    """Reads ``gyro_x=p`` (name in the file = name of the contract); returns ``{"p": "gyro_x"}``.
+
+    Raises:
+        LogError: a text of another form.
+    """
+    out = {}
+    for text in ",".join(texts).split(","):
+        given, sign, known = (part.strip() for part in text.partition("="))
+        if text and not (given and sign and known):
+            raise LogError(f"--columns {text}", "NAME_IN_FILE=NAME", "for example --columns gyro_x=p")
+        if text:
+            out[known] = given
+    return out
+
+
+class Checked(NamedTuple):
+    """A log that means what is believed: what looks wrong but need not be, and its parts to use (`Log.flown`)."""
+
+    doubts: tuple[str, ...] = ()
+    flown: Spans = ()
+
+
+def check_conventions(recording: Recording, vehicle: Vehicle, cut: LogPart) -> Checked:
+    """Checks that a log means what its reader and the vehicle file believe, before anything is fitted to it.
+
+    Args:
+        recording: the whole log.
+        vehicle: whose log it is.
+        cut: the part that is asked for; an error about a whole log proposes what is in the air.
+
+    Raises:
+        LogError: units, frames or a motor order that cannot be right; names the fix.
+    """
+    from quadid.checks import FATAL, CheckResult, inspect
+
+    found, doubts = inspect(recording, vehicle), []
+    flown = flown_parts(recording, found.flying, cut)
+    # Rotors at a speed that cannot carry this vehicle: what else is wrong about them is that of another one.
+    stranger = next((c.message for c in found.checks if c.name == "hover" and c.verdict is CheckResult.WARNING), "")
+    for check in found.checks:
+        # A check without numbers could not be made; what comes next says why, and better.
+        if check.verdict is CheckResult.ERROR and check.name in FATAL and check.numbers:
+            fix = f"{check.fix}, or insist with --unchecked" if check.fix else "insist with --unchecked"
+            of_rotors = stranger if check.name in ("motor_order", "rotor_timing") else ""
+            fix = f"use the vehicle file of this log; else {fix}" if of_rotors else fix
+            parts = " ".join(names_of(cut, flown))
+            fix = f"{fix}; or leave out the ground: use {parts}" if parts else fix
+            raise LogError(f"{recording.name}: {'; '.join(filter(None, (of_rotors, check.message)))}", fix=fix)
+        if check.verdict in (CheckResult.ERROR, CheckResult.WARNING):
+            doubts.append(f"{check.message}{'; ' * bool(check.fix)}{check.fix}")
+    return Checked(tuple(doubts), flown)
+
+
+# --- Whether a flight was fitted before: the same log, a copy of it, a part of it, a second recorder
+#
+# Such a flight is no validation, and what a vehicle file learnt from it is no knowledge beside it.
+
+
+Marks = NDArray[np.uint64]
+
+RUN = 8
+"""Gyro rows that must agree in a row: 24 numbers with sensor noise do not agree by chance."""
+ROUNDED = 4
+"""Decimals of the rates [rad/s] that are compared, so that a copy in another format agrees too."""
+ALIKE = 0.8
+"""Correlation of rates at the same date above which two recorders flew on one vehicle."""
+SHORTEST = 2.0
+"""Shortest common stretch that is called an overlap [s]."""
+KEPT = 16
+"""Runs of a fitted flight by which it is known again: those with the smallest hashes, wherever a part is cut."""
+COMMON = 2
+"""Of them so many in another log make it the same flight."""
+
+
+def check_unseen(train: Sequence[Log], held: Sequence[Log], vehicle: Vehicle | None = None) -> None:
+    """Raises LogError where a validation log holds flight that is fitted too, or that the file was fitted to."""
+    for log in held:
+        for other in train:
+            seconds = max(common_rows(other, log), same_flight(other, log))
+            if seconds > 0.0:
+                raise LogError(
+                    f"{log.name} cannot validate: {seconds:.1f} s of it are in {other.name}, which is fitted",
+                    "a flight, or a part of one, that is not fitted",
+                    "use another flight for --validate, or parts that do not overlap: LOG@0:60 --validate LOG@60:120",
+                )
+
+    for log in held:
+        for flight in () if vehicle is None else fitted_before(vehicle, log):
+            raise LogError(
+                f"{log.name} cannot validate: {flight.log}, to which this vehicle file was fitted, is the same flight",
+                "a flight that the file was not fitted to",
+                "use another flight for --validate, or the vehicle file from before that fit",
+            )
+
+
+def without_own_priors(vehicle: Vehicle, train: Sequence[Log]) -> tuple[Vehicle, list[str]]:
+    """The vehicle without standard deviations that come from the flights to be fitted, and a sentence that says so.
+
+    A flight would count twice otherwise: as data, and as what was known before.
+    """
+    known = {log.name: flight for log in train for flight in fitted_before(vehicle, log)}
+    if not known or all(p.sigma is None for p in vehicle.parameters.values()):
+        return vehicle, []
+    guesses = {n: p.model_copy(update={"sigma": None}) for n, p in vehicle.parameters.items()}
+    told = ", ".join(name if name == flight.log else f"{name} ({flight.log})" for name, flight in known.items())
+    return vehicle.model_copy(update={"parameters": guesses}), [
+        f"the vehicle file was fitted to {told} already: its values start the fit, but its sigmas are not "
+        "used, so that no flight counts twice"
+    ]
+
+
+def fitted_before(vehicle: Vehicle, log: Log) -> list[FittedFlight]:
+    """Flights that the values of a vehicle file were fitted to and that this log holds, by content or by date."""
+    fitted = () if vehicle.proof is None else vehicle.proof.fitted
+    if not fitted:
+        return []
+    t, rates = gyro(log)
+    here, epoch = _runs(rates), log.recording.epoch
+    out = []
+    for flight in fitted:
+        marks = np.array([int(mark, 16) for mark in flight.marks.split()], dtype=np.uint64)
+        alike = int(np.isin(marks, here).sum()) >= COMMON
+        if not alike and flight.begin is not None and epoch is not None and len(t):
+            begin, end = max(flight.begin, t[0] + epoch), min(flight.begin + flight.seconds, t[-1] + epoch)
+            alike = end - begin >= SHORTEST
+        out += [flight] if alike else []
+    return out
+
+
+def remembered(train: Sequence[Log], vehicle: Vehicle) -> tuple[FittedFlight, ...]:
+    """The fitted flights, and those that the vehicle file rested on before, for a new file."""
+    out = {}
+    for log in train:
+        t, rates = gyro(log)
+        epoch = log.recording.epoch
+        out[log.name] = FittedFlight(
+            log=log.name[:LONGEST_NAME], seconds=round(float(np.ptp(t)), 2) if len(t) else 0.0,
+            begin=None if epoch is None or not len(t) else round(epoch + float(t[0]), 2),
+            marks=" ".join(f"{mark:016x}" for mark in np.unique(_runs(rates))[:KEPT].tolist()),
+        )  # fmt: skip
+    before = () if vehicle.proof is None else vehicle.proof.fitted
+    return (*out.values(), *(flight for flight in before if flight.log not in out))[:MOST_FLIGHTS]
+
+
+def common_rows(train: Log, held: Log) -> float:
+    """Seconds of `held` whose gyro rows stand in `train` too, number by number."""
+    (_, a), (t, b) = gyro(train), gyro(held)
+    shared = np.isin(_runs(b), _runs(a))
+    return (int(shared.sum()) + RUN - 1) * float(np.median(np.diff(t))) if shared.sum() > 1 else 0.0
+
+
+def same_flight(train: Log, held: Log) -> float:
+    """Seconds that both logs have in common by date, where their rates agree; else 0."""
+    (s, a), (t, b) = gyro(train), gyro(held)
+    begun = train.recording.epoch, held.recording.epoch
+    if len(s) < 2 or len(t) < 2 or begun[0] is None or begun[1] is None:
+        return 0.0
+    t = t + (begun[1] - begun[0])
+    inside = (t >= s[0]) & (t <= s[-1])
+    common = float(np.ptp(t[inside])) if inside.any() else 0.0
+    if common < SHORTEST:
+        return 0.0
+    again = linear(s, a, t[inside])
+    here = b[inside] - b[inside].mean(axis=0)
+    again = again - again.mean(axis=0)
+    size = math.sqrt(float(np.sum(here**2)) * float(np.sum(again**2)))
+    return common if size > 0.0 and float(np.sum(here * again)) / size > ALIKE else 0.0
+
+
+def gyro(log: Log) -> tuple[FloatArray, FloatArray]:
+    """Times [s] and rates [rad/s] (n, 3) inside the part of a log that is used."""
+    channel = log.recording.channels.get("gyro")
+    if channel is None:
+        return np.zeros(0), np.zeros((0, 3))
+    low, high = log.cut.span(log.recording)
+    used = (channel.t >= low) & (channel.t <= high) & np.isfinite(channel.values).all(axis=1)
+    return channel.t[used], channel.values[used]
+
+
+def _runs(rates: FloatArray) -> Marks:
+    """Hashes of the `RUN` rows that begin at each row, but for those in which a sensor does not move."""
+    if len(rates) < RUN:
+        return np.zeros(0, dtype=np.uint64)
+    rounded: IntArray = np.rint(rates * 10.0**ROUNDED).astype(np.int64)
+    changes = np.cumsum(np.vstack([np.zeros((1, 3), dtype=np.int64), np.diff(rounded, axis=0) != 0]), axis=0)
+    moving = np.all(changes[RUN - 1 :] > changes[: len(changes) - RUN + 1], axis=1)
+    axes: Marks = rounded.view(np.uint64)
+    rows = _mixed(axes[:, 0] + _mixed(axes[:, 1] + _mixed(axes[:, 2] + np.uint64(1))))
+    out = np.zeros(len(rows) - RUN + 1, dtype=np.uint64)
+    for k in range(RUN):
+        out = _mixed(out + rows[k : k + len(out)])
+    return out[moving]
+
+
+def _mixed(x: Marks) -> Marks:
+    """A hash of 64 bits (the finaliser of splitmix64, Steele, Lea and Flood, OOPSLA 2014)."""
+    x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return x ^ (x >> np.uint64(31))
+
+
+# --- Which logs and which vehicle a piece of work is about
+
+
+Flight = str | Path | Log
+"""A log: its path, with a span if wanted, or as `quadid.load` returns it."""
+Given = Flight | Sequence[Flight]
+"""A log or several."""
+
+
+def listed(logs: Given) -> list[Flight]:
+    """Logs as a list."""
+    return [logs] if isinstance(logs, str | Path | Log) else list(logs)
+
+
+def vehicle_of(logs: Sequence[Flight], vehicle: str | Path | Vehicle | None) -> Vehicle:
+    """The vehicle that is asked for, else that of the first loaded log.
+
+    Raises:
+        VehicleError: no such vehicle, or only paths of logs, which do not say whose they are.
+    """
+    if vehicle is not None:
+        return as_vehicle(vehicle)
+    for log in logs:
+        if isinstance(log, Log):
+            return log.vehicle
+    raise VehicleError(
+        f"no vehicle for {logs[0]}", "a shipped name, a YAML file or a Vehicle",
+        'give vehicle="...", or a log from quadid.load(path, vehicle="...")',
+    )  # fmt: skip
+
+
+def read(logs: Given, vehicle: Vehicle) -> list[Log]:
+    """Logs as a list, read with this description of the vehicle: checked, and on the grid.
+
+    Raises:
+        LogError: a log that cannot be read or does not fit the vehicle.
+    """
+    return [log.of(vehicle) if isinstance(log, Log) else load(log, vehicle) for log in listed(logs)]
+
+
+@dataclass(frozen=True)
+class Settled:
+    """What a piece of work is about.
+
+    Attributes:
+        vehicle: as described, without priors that come from the flights to fit.
+        train: logs to fit.
+        held: logs to score only.
+        notes: what a user should know about this choice.
+    """
+
+    vehicle: Vehicle
+    train: list[Log]
+    held: list[Log]
+    notes: list[str]
+
+    @property
+    def warnings(self) -> list[str]:
+        """The notes, and what is wrong with the logs."""
+        found = [*self.notes, *(text for log in (*self.train, *self.held) for text in log.warnings)]
+        return list(dict.fromkeys(found))  # parts of one log repeat them
+
+
+def settled(logs: Given, validate: Given, vehicle: str | Path | Vehicle | None) -> Settled:
+    """The vehicle, and the logs to fit and to score, all read with its description.
+
+    Raises:
+        LogError: no log, or a log to score that is fitted too, or that the vehicle file was fitted to.
+        VehicleError: no such vehicle, or only paths of logs and none that says whose they are.
+    """
+    given = listed(logs)
+    if not given:
+        raise LogError("no log", "at least one, a path or from quadid.load", "give a log")
+    described = vehicle_of(given, vehicle)
+    train, held = read(given, described), read(validate, described)
+    check_unseen(train, held, described)
+    described, notes = without_own_priors(described, train)
+    return Settled(described, train, held, notes)

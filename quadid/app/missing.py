@@ -1,0 +1,156 @@
+"""The missing force and moment of identified and diagnosed flights: for JSON, as a sentence, over time."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from quadid.app.logs import Log, file_name
+from quadid.data.window import Window, beginning
+from quadid.types import FloatArray
+from quadid.vehicle import Vehicle
+
+if TYPE_CHECKING:
+    from quadid.estimate.missing import Missing, Vehicles
+
+SECONDS, ROWS = 120.0, 12000
+"""Of every log, its first so many seconds are looked at [s], and no more rows: a filter keeps 4 kB of each."""
+AXES = ("x", "y", "z")
+
+
+@dataclass(frozen=True)
+class MissingForces:
+    """What models miss on every log.
+
+    Attributes:
+        models: parameter vectors by name, ``nominal`` first.
+        logs: the logs, training logs first.
+        roles: ``train`` or ``validate`` of each.
+        parts: by model, the stretches of every log.
+        flights: the noise at which models are compared.
+        flown: windows of every log.
+    """
+
+    models: tuple[str, ...]
+    logs: Sequence[Log]
+    roles: Sequence[str]
+    parts: Mapping[str, Sequence[Sequence[Missing]]]
+    flights: Vehicles
+    flown: Sequence[Sequence[Window]]
+
+    def result(self) -> dict[str, Any]:
+        """The entry ``missing`` of contract §7; what all training logs miss first."""
+        train = [i for i, role in enumerate(self.roles) if role == "train"]
+        return {
+            **self._entry(train),
+            "statement": self.statement(train),
+            "sets": [
+                {"log": log.recording.name, "role": role, **self._entry([i])}
+                for i, (log, role) in enumerate(zip(self.logs, self.roles, strict=True))
+            ],
+        }
+
+    def _entry(self, which: Sequence[int]) -> dict[str, Any]:
+        force: dict[str, Any] = {"unit": "N"}
+        moment: dict[str, Any] = {"unit": "N m"}
+        for model in self.models:
+            parts = [part for i in which for part in self.parts[model][i]]
+            for entry, is_force in ((force, True), (moment, False)):
+                found, interval = self._size(parts, is_force)
+                entry[model] = _by_axis(found)
+                entry[f"{model}_ci95"] = {a: [float(x) for x in pair] for a, pair in zip(AXES, interval.T, strict=True)}
+            if model == self.models[0]:
+                control = np.concatenate([p.control for p in parts]).std(axis=0)
+                force |= {"of": parts[0].weight, "of_what": "weight"}
+                moment |= {"of": _by_axis(control), "of_what": "rms control moment"}
+        return {"force": force, "moment": moment}
+
+    def _size(self, parts: Sequence[Missing], force: bool) -> tuple[FloatArray, FloatArray]:
+        from quadid.estimate.missing import size
+
+        return size(parts, force)
+
+    def statement(self, which: Sequence[int]) -> str:
+        """One sentence: what the last model misses, as shares of weight and control moment."""
+        parts = [part for i in which for part in self.parts[self.models[-1]][i]]
+        force, moment = (self._size(parts, is_force)[0] for is_force in (True, False))
+        control = np.concatenate([p.control for p in parts]).std(axis=0)
+        shares = [
+            f"{100.0 * m / c:.2g} % of the {axis} moment" for m, c, axis in
+            zip(moment, control, ("roll", "pitch", "yaw"), strict=True)
+        ]  # fmt: skip
+        total = float(np.linalg.norm(force))
+        share = 100.0 * total / parts[0].weight
+        return (
+            f"Acting on the vehicle and missing in the simulation: {total:.2g} N, {share:.2g} % of the weight; "
+            f"{', '.join(shares)} that the rotors make (rms)."
+        )
+
+    def taken(self, without: FloatArray) -> float:
+        """Share of the squared missing force and moment of a model that the last one takes away.
+
+        Args:
+            without: parameter vector of that model; compared on logs that were not fitted, else on all.
+        """
+        from quadid.estimate.missing import removed
+
+        unseen = [i for i, role in enumerate(self.roles) if role == "validate"] or list(range(len(self.logs)))
+        before = [part for i in unseen for part in self.flights.missing(self.flown[i], without)]
+        return removed(before, [part for i in unseen for part in self.parts[self.models[-1]][i]])
+
+    def save(self, folder: str | Path = ".") -> list[Path]:
+        """Writes ``LOG.missing.csv`` for every log: force [N] and moment [N m] of every model, with their sigma."""
+        out: list[Path] = []
+        for i, log in enumerate(self.logs):
+            columns, table = ["t"], [np.concatenate([p.t for p in self.parts[self.models[0]][i]])[:, None]]
+            for model in self.models:
+                for name in ("force", "force_sigma", "moment", "moment_sigma"):
+                    columns += [f"{model}/{name}_{axis}" for axis in AXES]
+                    table.append(np.concatenate([getattr(p, name) for p in self.parts[model][i]]))
+            path, number = Path(folder).absolute() / f"{file_name(log.name)}.missing.csv", 2
+            while path in out:
+                path = path.with_name(f"{file_name(log.name)}.{number}.missing.csv")
+                number += 1
+            np.savetxt(path, np.concatenate(table, axis=1), "%.8g", ",", header=",".join(columns), comments="")
+            out.append(path)
+        return out
+
+
+def _by_axis(values: FloatArray) -> dict[str, float]:
+    return {axis: float(v) for axis, v in zip(AXES, values, strict=True)}
+
+
+def missing_forces(
+    train: Sequence[Log], held: Sequence[Log], vehicle: Vehicle, models: Mapping[str, FloatArray]
+) -> MissingForces | None:
+    """What parameter vectors of `quadid.model` miss, all at the noise of the first on the training logs.
+
+    None where a log lacks the gyro or the accelerometer, without which no force and moment is seen, and where a model
+    has no finite answer.
+
+    Args:
+        train: logs that were fitted.
+        held: logs that were not.
+        vehicle: geometry and mass.
+        models: parameter vectors by name, the nominal one first.
+    """
+    from quadid.estimate.missing import Vehicles
+
+    logs = [*train, *held]
+    flown = [beginning(log.windows, min(SECONDS, ROWS * log.windows[0].dt))[0] for log in logs]
+    if not all(windows and all(_seen(w) for w in windows) for windows in flown):
+        return None
+    flights = Vehicles([w for windows in flown[: len(train)] for w in windows], vehicle, next(iter(models.values())))
+    parts = {name: [flights.missing(windows, theta) for windows in flown] for name, theta in models.items()}
+    if not all(np.isfinite(p.force_sigma).all() for found in parts.values() for log in found for p in log):
+        return None
+    roles = ["train"] * len(train) + ["validate"] * len(held)
+    return MissingForces(tuple(models), logs, roles, parts, flights, flown)
+
+
+def _seen(window: Window) -> bool:
+    return all(v is not None and np.isfinite(v).all(axis=1).any() for v in (window.gyro, window.accel))

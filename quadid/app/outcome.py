@@ -1,0 +1,341 @@
+"""Results of the library: tables, data frame, JSON, and the parts every report has."""
+
+from __future__ import annotations
+
+import datetime
+import importlib.metadata
+import json
+import platform
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from html import escape
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from quadid_replay import write_compared
+from quadid_replay.frames import from_euler
+
+from quadid.app.logs import LONGEST, Log, file_name, open_recording, parse_part, write_text
+from quadid.app.missing import MissingForces
+from quadid.data.resample import sample_period
+from quadid.data.window import Channel, Recording, beginning
+from quadid.errors import ParameterError, QuadidError, nearest
+from quadid.jsonable import jsonable
+from quadid.report.verdict import Verdict
+from quadid.types import FloatArray, Json
+from quadid.vehicle import Vehicle
+from quadid.version import __version__
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from quadid.checks import Inspection
+    from quadid.identification.identifiability import Fit
+    from quadid.identification.result import ScoredSet
+    from quadid.report.tables import TextTable
+
+# --- How long work reports how far it is
+
+
+Advance = Callable[[str, float], None]
+"""Called with the name of a stage and the share of it done, 0..1."""
+
+
+def silent(stage: str, share: float) -> None:
+    """Takes no notice."""
+
+
+# --- What every result of the library offers: tables as text and HTML, a data frame, JSON
+
+
+class Outcome(ABC):
+    """A result that prints as its command prints it.
+
+    Attributes:
+        result: plain data of the command's JSON, without the files that only the command writes.
+    """
+
+    result: dict[str, Any]
+
+    @abstractmethod
+    def tables(self) -> list[TextTable]:
+        """The tables that the command prints, in order."""
+
+    @property
+    def verdict(self) -> Verdict | None:
+        """What the result means and what to do next; None where the numbers speak alone."""
+        return None
+
+    @property
+    def heading(self) -> str:
+        """What stands above the tables."""
+        return ""
+
+    @property
+    def sentences(self) -> list[str]:
+        """What stands below the tables, a sentence each."""
+        return []
+
+    @property
+    def warnings(self) -> list[str]:
+        """What a user should know, from logs and from the work itself."""
+        return list(self.result.get("warnings", ()))
+
+    def text(self, width: int = 100) -> str:
+        """Tables, verdict and warnings, for a page of `width` columns."""
+        parts = [self.heading] if self.heading else []
+        parts += [table.text(width) for table in self.tables()]
+        if self.sentences:
+            parts.append("\n".join(self.sentences))
+        if self.verdict is not None:
+            parts.append("\n".join(self.verdict.lines()))
+        parts += [f"warning: {warning}" for warning in self.warnings]
+        return "\n\n".join(parts)
+
+    def __repr__(self) -> str:
+        return self.text()
+
+    def _repr_html_(self) -> str:
+        parts = [f"<p><b>{escape(self.heading)}</b></p>"] if self.heading else []
+        parts += [table.html() for table in self.tables()]
+        parts += [f"<p>{escape(line)}</p>" for line in self.sentences]
+        if self.verdict is not None:
+            head, *more = (escape(line) for line in self.verdict.lines())
+            parts.append(f"<p><b>{head}</b></p>" + "".join(f"<p>{line}</p>" for line in more))
+        return "".join([*parts, *(f"<p>warning: {escape(warning)}</p>" for warning in self.warnings)])
+
+    def to_json(self, path: str | Path | None = None) -> str:
+        """The result as JSON text; with `path` also written there."""
+        text = json_text(self.result)
+        if path is not None:
+            Path(path).write_text(text, encoding="utf-8")
+        return text
+
+    def to_frame(self) -> pd.DataFrame:
+        """The main table with plain numbers as a pandas data frame."""
+        return data_frame(self.records(), self.columns)
+
+    @property
+    def columns(self) -> Sequence[str]:
+        """Columns of a main table that may have no row; else those of its rows."""
+        return ()
+
+    @abstractmethod
+    def records(self) -> list[dict[str, Any]]:
+        """Rows of the main table with plain numbers."""
+
+
+NUMBER_COLUMNS = ("effect", "confident", "parameter", "unit", "value", "low", "high")
+"""Columns of a table with one row a number of a finding."""
+
+
+def number_rows(found: Sequence[Json]) -> Iterator[tuple[Json, tuple[Any, ...]]]:
+    """Each finding with each of its numbers, as `NUMBER_COLUMNS`."""
+    for one in found:
+        for p in one["parameters"]:
+            low, high = p["ci95"] or (None, None)
+            yield one, (one["effect"], one["confident"], p["name"], p["unit"], p["value"], low, high)
+
+
+def json_text(result: Any) -> str:
+    """A result as JSON for people and programs; numbers that JSON has no word for become null."""
+    return json.dumps(jsonable(result), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+
+
+def data_frame(records: list[dict[str, Any]], columns: Sequence[str] = ()) -> pd.DataFrame:
+    """Rows as a data frame, without rows with these columns; raises QuadidError where pandas is not installed."""
+    try:
+        import pandas
+    except ImportError as error:
+        raise QuadidError("pandas is not installed", fix="pip install pandas, or use .records()") from error
+    return pandas.DataFrame(records) if records else pandas.DataFrame(columns=list(columns))
+
+
+# --- Simulated against measured outputs of scored logs as files, for PlotJuggler, Foxglove and programs of one's own
+
+
+KINDS = ("mcap", "csv")
+_CHANNELS = {"gyro": 0, "attitude": 3, "accel": 6, "velocity": 9, "position": 12}
+"""First of the three columns of each channel in a `quadid.identification.score.Series`."""
+
+
+def check_kinds(kinds: Iterable[str]) -> None:
+    """Raises ParameterError for a form that is not written."""
+    for kind in kinds:
+        if kind not in KINDS:
+            raise ParameterError(f"--series {kind}", ", ".join(KINDS), nearest(kind, KINDS))
+
+
+def save_series(sets: Sequence[ScoredSet], logs: Sequence[Log], folder: str | Path, kinds: Sequence[str]) -> list[Path]:
+    """Writes ``LOG.simulated.KIND`` for every log: measured, and both simulations, which start anew every second.
+
+    Args:
+        sets: scored logs.
+        logs: the same ones, as loaded.
+        folder: where to.
+        kinds: of `KINDS`.
+
+    Returns:
+        Absolute paths.
+
+    Raises:
+        ParameterError: another kind.
+        LogError: a file that cannot be written.
+    """
+    check_kinds(kinds)
+    out: list[Path] = []
+    for scored, log in zip(sets, logs, strict=True):
+        measured = scored.fitted.series.measured
+        parts = {
+            name: _recording(log.name, scored.fitted.series.t, values)
+            for name, values in (
+                ("measured", measured), ("simulated", scored.fitted.series.simulated),
+                ("before", scored.initial.series.simulated),
+            )
+        }  # fmt: skip
+        for kind in kinds:
+            path = _unused(Path(folder).absolute(), file_name(log.name), kind, out)
+            write_compared(path, parts, round(1e9 * (log.recording.epoch or 0.0)))
+            out.append(path)
+    return out
+
+
+def _unused(folder: Path, name: str, kind: str, taken: Sequence[Path]) -> Path:
+    """A name that no log of this run has; two logs of one name are told apart by number."""
+    path, number = folder / f"{name}.simulated.{kind}", 2
+    while path in taken:
+        path, number = folder / f"{name}.{number}.simulated.{kind}", number + 1
+    return path
+
+
+def _recording(name: str, t: FloatArray, values: FloatArray) -> Recording:
+    """Outputs (n, channels) as a recording; rows that were not measured, or ran away, are left out."""
+    channels = {}
+    for channel, first in _CHANNELS.items():
+        three = values[:, first : first + 3]
+        known = np.isfinite(three).all(axis=1)
+        if three.shape[1] and known.any():
+            rows = three[known]
+            channels[channel] = Channel(
+                channel, t[known], from_euler(rows) if channel == "attitude" else rows, "simulation"
+            )
+    return Recording(name, "series", channels)
+
+
+# --- What every report holds: the quality of the logs and where everything came from; and the page of a failure
+
+
+LIBRARY = "a call of the library"
+"""Stands for the command line where there is none."""
+_LIBRARIES = ("numpy", "numba", "scipy", "plotly")
+
+
+class Reported(Outcome):
+    """A result that has an HTML report."""
+
+    @abstractmethod
+    def page(self, command: str = LIBRARY) -> str:
+        """The report as HTML; `command` is the command line that led to it, if one did."""
+
+    def report(self, path: str | Path, command: str = LIBRARY) -> Path:
+        """Writes the HTML report, as `page`."""
+        return write_text(path, self.page(command))
+
+
+class Fitted(Reported):
+    """A result from logs that were fitted and scored.
+
+    Attributes:
+        sets: scored logs, for pictures.
+        logs: the same ones as loaded, training logs first.
+        forces: what the models miss on them; None where no gyro or accelerometer shows it.
+    """
+
+    sets: list[ScoredSet]
+    logs: list[Log]
+    forces: MissingForces | None
+
+    @property
+    def train(self) -> list[Log]:
+        """The logs that were fitted."""
+        return [log for log, s in zip(self.logs, self.sets, strict=True) if s.role == "train"]
+
+    def save_series(self, folder: str | Path = ".", kinds: Sequence[str] = ("mcap",)) -> list[Path]:
+        """Writes measured and simulated outputs of every log as mcap or csv, and what is missing as csv."""
+        missing = [] if self.forces is None else self.forces.save(folder)
+        return [*save_series(self.sets, self.logs, folder, kinds), *missing]
+
+
+def known(vehicle: Vehicle) -> str:
+    """Mass and geometry that the result rests on."""
+    return f"mass {vehicle.mass:g} kg, {len(vehicle.rotors)} rotors {vehicle.arm:.3g} m from the centre"
+
+
+def told(fit: Fit, logs: Sequence[Log]) -> dict[str, Any]:
+    """What the fitted logs can tell about each parameter, from `LONGEST` s of them at most."""
+    from quadid.identification.excitation import excitation
+    from quadid.report.fit_pages import excitation_part
+
+    windows, seconds = beginning((w for log in logs for w in log.windows), LONGEST)
+    return excitation_part(excitation(windows, fit.vehicle, fit.theta, fit.noise), seconds)
+
+
+def failure_html(
+    error: QuadidError, what: str, texts: Sequence[str], vehicle: Vehicle, preset: str, command: str = LIBRARY
+) -> str:
+    """The HTML report of an attempt that failed."""
+    from quadid.checks import inspect
+    from quadid.report.fit_pages import failure_page
+    from quadid.report.page import render
+
+    rows = provenance([], command)
+    read: list[tuple[Recording, Inspection | None]] = []
+    for text in texts:
+        try:
+            recording = open_recording(parse_part(text).path, preset)
+        except (QuadidError, OSError) as unreadable:
+            rows.append({"name": text, "value": f"cannot be read: {unreadable}"})
+            continue
+        rows.append({"name": text, "value": f"sha256 {recording.sha256 or 'unknown'}"})
+        try:
+            read.append((recording, inspect(recording, vehicle)))
+        except QuadidError as unclear:
+            rows.append({"name": f"{text}, inspection", "value": str(unclear)})
+            read.append((recording, None))
+    return render(failure_page(what, error.found, error.fix, read, rows, error.allowed))
+
+
+def quality(log: Log) -> dict[str, Any]:
+    """What one log offered and what of it was used."""
+    from quadid.report.figures import measures
+    from quadid.report.page import number
+
+    grid = log.grid
+    summary = [
+        f"{grid.seconds_used:.1f} of {grid.seconds_log:.1f} s used, on a {grid.rate:.4g} Hz grid",
+        f"{grid.gaps} gap{'s' * (grid.gaps != 1)}" if grid.gaps else "no gaps",
+        f"rotor signal {grid.rotor_source} at {grid.rotor_rate:.3g} Hz",
+        "all channels low-passed alike for the grid" if grid.filtered else "no filtering",
+    ]
+    rows = [
+        (
+            c.name, f"{number(1.0 / sample_period(c.t) if len(c.t) > 1 else None, 3)} Hz", str(len(c.t)), c.source,
+            ", ".join(f"{n} {why.replace('_', ' ')}" for why, n in c.faults.items()) or "none",
+        )
+        for c in log.recording.channels.values()
+    ]  # fmt: skip
+    channels = measures(("Channel", "Rate", "Samples", "Source", "Dropped"), rows, (1, 2))
+    return {"name": log.recording.name, "format": log.recording.format, "summary": summary, "channels": channels}
+
+
+def provenance(logs: Sequence[Log], command: str = LIBRARY) -> list[dict[str, str]]:
+    """Files with hashes, versions, command line and time."""
+    versions = [f"{name} {importlib.metadata.version(name)}" for name in _LIBRARIES]
+    rows = [
+        ("command", command),
+        ("made", f"{datetime.datetime.now(datetime.UTC):%Y-%m-%d %H:%M:%S UTC}"),
+        ("versions", ", ".join([f"quadid {__version__}", f"Python {platform.python_version()}", *versions])),
+        *((log.name, f"{log.path}  sha256 {log.recording.sha256 or 'unknown'}") for log in logs),
+    ]
+    return [{"name": name, "value": value} for name, value in rows]

@@ -1,0 +1,137 @@
+"""Looks at a log before anything is fitted: what is there, whether it can be true, and what it allows."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+from quadid.checks.findings import FATAL as FATAL
+from quadid.checks.findings import Check as Check
+from quadid.checks.findings import CheckResult as CheckResult
+from quadid.checks.findings import Inspection as Inspection
+from quadid.checks.findings import missing_signals, parameter_outlook
+from quadid.checks.motion import (
+    Spans,
+    attitude_check,
+    channel_facts,
+    gravity_check,
+    position_checks,
+    timing_checks,
+    velocity_check,
+)
+from quadid.checks.motion import flying_spans as flying_spans
+from quadid.checks.motion import proposed_cuts as proposed_cuts
+from quadid.checks.rotors import (
+    better_order,
+    geometry_check,
+    hover_check,
+    lagged_motion,
+    mass_check,
+    motor_order_check,
+    readings_check,
+    reordered,
+    rotor_speed_check,
+    rotor_timing_check,
+)
+from quadid.data.mounting import in_body_axes
+from quadid.data.window import Recording
+from quadid.vehicle import Vehicle
+
+
+def inspect(recording: Recording, vehicle: Vehicle | None = None) -> Inspection:
+    """Inspects a recording; what its motion excites is computed elsewhere (`quadid.identify`).
+
+    Args:
+        recording: a log in core units and frames, as the reader believes.
+        vehicle: with it, hover thrust, motor order and rotor columns are checked too.
+    """
+    turned = recording if vehicle is None else in_body_axes(recording, vehicle)
+    spans = flying_spans(turned, vehicle)
+    facts = channel_facts(recording, spans)
+    checks = timing_checks(recording, facts)
+    for stage in STAGES:  # each builds on the ones before it: what comes after an error is not asked
+        found = [check for check in stage(Log(turned, vehicle, spans, recording)) if check is not None]
+        checks += found
+        if any(check.verdict is CheckResult.ERROR for check in found):
+            break
+    return Inspection(
+        name=recording.name,
+        format=recording.format,
+        sha256=recording.sha256,
+        seconds=max(f.last for f in facts) - min(f.first for f in facts) if facts else 0.0,
+        channels=facts,
+        breaks=recording.breaks,
+        flying=spans,
+        checks=tuple(checks),
+        missing=missing_signals(recording.format, facts),
+        parameters=parameter_outlook(facts),
+        warnings=recording.warnings,
+        zero=recording.first_imu_time,
+    )
+
+
+class Log(NamedTuple):
+    """What is checked: the recording in body axes, the vehicle, when it flies [s], and the recording as it was read."""
+
+    recording: Recording
+    vehicle: Vehicle | None
+    spans: Spans
+    read: Recording
+
+
+Stage = Callable[[Log], Sequence[Check | None]]
+
+
+def _kinematics(log: Log) -> list[Check]:
+    """Units and frames, without any rotor."""
+    return [
+        gravity_check(log.recording, log.spans), attitude_check(log.recording), velocity_check(log.recording),
+        *position_checks(log.read),
+    ]  # fmt: skip
+
+
+def _readings(log: Log) -> list[Check | None]:
+    """Rotors that read nothing, or always the same; the unit of their speeds."""
+    if log.vehicle is None:
+        return []
+    dead = readings_check(log.recording, log.vehicle, log.spans)
+    if dead is not None and dead.verdict is CheckResult.ERROR:
+        return [dead]
+    return [dead, hover_check(log.recording, log.vehicle, log.spans)]
+
+
+def _time_and_order(log: Log) -> list[Check]:
+    """When torque acts, and which motors make it: an order is only judged, and advised, of a signal in time."""
+    if log.vehicle is None:
+        return []
+    vehicle, lagged = log.vehicle, lagged_motion(log.read, log.vehicle, log.spans)
+    time = rotor_timing_check(log.recording, vehicle, log.spans)
+    if order := better_order(lagged, vehicle):
+        other = rotor_timing_check(log.recording, reordered(vehicle, order), log.spans)
+        own, its = (check.numbers.get("correlation", 0.0) for check in (time, other))
+        if other.verdict is CheckResult.OK and its > own:
+            return [motor_order_check(lagged, vehicle)]
+        if time.verdict is CheckResult.ERROR:
+            return [time]
+        return [
+            Check("motor_order", CheckResult.UNKNOWN, "no order of the motors explains the motion at one lag"),
+            time,
+        ]
+    return [time] if time.verdict is CheckResult.ERROR else [motor_order_check(lagged, vehicle), time]
+
+
+def _balance(log: Log) -> list[Check]:
+    """Rotors one by one."""
+    return [] if log.vehicle is None else [rotor_speed_check(log.recording, log.vehicle, log.spans)]
+
+
+def _vehicle_file(log: Log) -> list[Check | None]:
+    """Mass and rotor positions."""
+    if log.vehicle is None:
+        return []
+    b = hover_check(log.recording, log.vehicle, log.spans).numbers.get("b_from_hover")
+    mass = mass_check(log.recording, log.vehicle, log.spans, b)
+    return [mass, geometry_check(lagged_motion(log.read, log.vehicle, log.spans), log.vehicle)]
+
+
+STAGES: tuple[Stage, ...] = (_kinematics, _readings, _time_and_order, _balance, _vehicle_file)

@@ -1,0 +1,233 @@
+"""Result of an inspection: channels, checks, what is missing and how to log it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from enum import StrEnum
+from typing import Any
+
+from quadid.data.rotor_signal import INERTIA_RATE, SLOWEST_RATE
+from quadid.jsonable import jsonable
+from quadid.parameters import NOMINAL_NAMES
+
+# --- Result of an inspection: facts of channels, checks, what is missing and how to get it
+
+
+FATAL = (
+    "gravity", "gyro_attitude", "velocity_attitude", "position_velocity", "rotor_speed", "hover", "motor_order",
+    "rotor_timing",
+)  # fmt: skip
+"""Checks whose error means that nothing may be fitted to the log."""
+
+
+class CheckResult(StrEnum):
+    """Outcome of one check."""
+
+    OK = "ok"
+    WARNING = "warning"
+    ERROR = "error"
+    UNKNOWN = "unknown"
+
+
+@dataclass(frozen=True)
+class ChannelFacts:
+    """One channel of a log.
+
+    Attributes:
+        name: key of `quadid.data.window.CHANNELS`.
+        unit: of its values.
+        source: topic, message or column names it came from.
+        rate: measured samples a second inside stretches without gaps, interpolated rows not counted [Hz].
+        count: samples kept.
+        first, last: times of the first and last one [s].
+        jitter: standard deviation of the step over its median (gaps left out).
+        gaps: steps longer than the gap limit.
+        longest_gap: [s], 0 when there is none.
+        bridged: lost samples too few for a gap.
+        repeated: fraction of rows equal to the row before.
+        stuck: longest time in flight without any change [s]; 0 where it is unknown when it flies.
+        saturated: samples at a limit that the channel hits several times.
+        dropped: samples the reader dropped, by reason.
+    """
+
+    name: str
+    unit: str
+    source: str
+    rate: float
+    count: int
+    first: float
+    last: float
+    jitter: float
+    gaps: int
+    longest_gap: float
+    bridged: int
+    repeated: float
+    stuck: float
+    saturated: int
+    dropped: Mapping[str, int] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Check:
+    """One question put to the data.
+
+    Attributes:
+        name: of the check: gravity, gyro_attitude, velocity_attitude, position_velocity, rotor_speed, hover,
+            motor_order, rotor_timing, geometry, mass, clock, timing.
+        verdict: the answer.
+        message: one sentence with numbers and units.
+        fix: what to do, empty when nothing.
+        numbers: the numbers behind it.
+    """
+
+    name: str
+    verdict: CheckResult
+    message: str
+    fix: str = ""
+    numbers: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Missing:
+    """A signal that is absent or too slow, why it matters, and how to log it."""
+
+    channel: str
+    why: str
+    how: str
+
+
+@dataclass(frozen=True)
+class Outlook:
+    """Whether the channels allow a parameter to be identified at all; excitation is another question."""
+
+    parameter: str
+    possible: bool
+    reason: str
+
+
+@dataclass(frozen=True)
+class Inspection:
+    """Everything an inspection found.
+
+    Attributes:
+        name, format, sha256: of the log.
+        seconds: first to last sample [s].
+        channels: facts by channel, in the order of `quadid.data.window.CHANNELS`.
+        breaks: times across which nothing is joined [s].
+        flying: spans in which the vehicle flies [s].
+        checks: unit, frame, motor and clock checks.
+        missing: signals to add to the log.
+        parameters: what the channels allow.
+        excitation: rows computed elsewhere, as given.
+        warnings: of the reader.
+        zero: time of the log's first IMU sample [s]: ``LOG@from:to``, and tables for people, count from there.
+    """
+
+    name: str
+    format: str
+    sha256: str
+    seconds: float
+    channels: tuple[ChannelFacts, ...]
+    breaks: tuple[float, ...]
+    flying: tuple[tuple[float, float], ...]
+    checks: tuple[Check, ...]
+    missing: tuple[Missing, ...]
+    parameters: tuple[Outlook, ...]
+    excitation: tuple[Mapping[str, Any], ...] = ()
+    warnings: tuple[str, ...] = ()
+    zero: float = 0.0
+
+    @property
+    def usable(self) -> bool:
+        """Whether something flies, at least one parameter can be identified, and no check finds the data wrong."""
+        wrong = any(check.verdict is CheckResult.ERROR for check in self.checks)
+        return bool(self.flying) and any(outlook.possible for outlook in self.parameters) and not wrong
+
+    def to_dict(self) -> dict[str, Any]:
+        """Returns the inspection as JSON-ready data, schema ``quadid.inspect/1``; NaN and infinity become null."""
+        data = {"schema": "quadid.inspect/1", "usable": self.usable, **asdict(self)}
+        return dict(jsonable(data))
+
+
+# --- What the channels of a log allow to identify, what is missing, and how to log it
+
+
+_HOW: dict[str, dict[str, str]] = {
+    "rotor": {
+        "ulog": "set SDLOG_PROFILE to 17 (default + high rate), or list actuator_motors and esc_status in "
+        "etc/logging/logger_topics.txt",
+        "dataflash": "ArduCopter writes RCOU at 10 Hz: log rotor speeds of the ESCs (bidirectional DShot, ESC), "
+        "or record SERVO_OUTPUT_RAW at 80 Hz as telemetry (.tlog)",
+        "tlog": "ask for SERVO_OUTPUT_RAW and ESC_STATUS at 50 Hz with SET_MESSAGE_INTERVAL, or use the on-board log",
+        "mcap": "record rotor_speeds (sensor_msgs/JointState) or motor_command; PX4's bridge needs actuator_motors and "
+        "esc_status added to dds_topics.yaml; mavros: rc/out and esc_status/status",
+        "csv": "add columns w1 … wN [rad/s] or u1 … uN",
+    },
+    "gyro": {
+        "ulog": "set SDLOG_PROFILE to 17 (default + high rate): sensor_combined at full rate",
+        "dataflash": "add IMU_FAST to LOG_BITMASK: IMU at loop rate",
+        "tlog": "ask for HIGHRES_IMU or RAW_IMU at 50 Hz or more, or use the on-board log",
+        "mcap": "record imu/data_raw (sensor_msgs/Imu) at 50 Hz or more; sensor_combined for PX4",
+        "csv": "add columns p, q, r [rad/s]",
+    },
+    "accel": {
+        "csv": "add columns ax, ay, az [m/s^2], specific force",
+    },
+    "attitude": {
+        "ulog": "log vehicle_attitude (in every SDLOG_PROFILE)",
+        "dataflash": "add ATTITUDE_FAST to LOG_BITMASK",
+        "tlog": "ask for ATTITUDE_QUATERNION at 50 Hz",
+        "mcap": "record attitude (geometry_msgs/QuaternionStamped) or an imu with orientation",
+        "csv": "add columns qw, qx, qy, qz or phi, theta, psi [rad]",
+    },
+}  # fmt: skip
+
+
+def missing_signals(log_format: str, facts: tuple[ChannelFacts, ...]) -> tuple[Missing, ...]:
+    """Names absent and slow signals with the reason and the way to log them for this kind of log."""
+    rates = {f.name: f.rate for f in facts}
+    rotor = max((rates[n] for n in ("rotor_speed", "motor_command") if n in rates), default=None)
+    out = [*_one(log_format, "rotor", rotor, "without rotor speeds or motor commands nothing can be identified")]
+    out += _one(log_format, "gyro", rates.get("gyro"), "inertias and the drag coefficient show in rotation rates")
+    if "accel" not in rates:
+        how = _HOW["accel"].get(log_format) or _HOW["gyro"].get(log_format, "log the IMU")
+        out.append(Missing("accel", "the thrust coefficient shows in the accelerometer", how))
+    if "attitude" not in rates:
+        why = "attitude constrains the fit over longer segments and reveals wrong units"
+        out.append(Missing("attitude", why, _HOW["attitude"].get(log_format, "log the attitude")))
+    return tuple(out)
+
+
+def _one(log_format: str, channel: str, rate: float | None, why: str) -> list[Missing]:
+    how = _HOW[channel].get(log_format, "log it")
+    if rate is None:
+        return [Missing(channel, why, how)]
+    if rate >= INERTIA_RATE:
+        return []
+    slow = "one sample is too little" if math.isnan(rate) else f"{rate:.3g} Hz is too slow"
+    return [Missing(channel, f"{slow} for inertias, which need {INERTIA_RATE:g} Hz or more", how)]
+
+
+def parameter_outlook(facts: tuple[ChannelFacts, ...]) -> tuple[Outlook, ...]:
+    """Says per parameter of the nominal model whether the channels and their rates allow it."""
+    rates = {f.name: f.rate for f in facts}
+    rotor = max((rates[n] for n in ("rotor_speed", "motor_command") if n in rates), default=0.0)
+    gyro = rates.get("gyro", 0.0)
+    out = []
+    for name in NOMINAL_NAMES:
+        if rotor < SLOWEST_RATE:
+            reason = "no rotor signal" if rotor == 0.0 else f"rotor signal at {rotor:.2g} Hz is too slow"
+            out.append(Outlook(name, False, reason))
+        elif name == "b":
+            possible = "accel" in rates
+            out.append(Outlook(name, possible, "rotor signal and accelerometer" if possible else "no accelerometer"))
+        elif gyro == 0.0:
+            out.append(Outlook(name, False, "no gyro"))
+        elif min(rotor, gyro) < INERTIA_RATE:
+            slow, rate = ("rotor signal", rotor) if rotor < gyro else ("gyro", gyro)
+            out.append(Outlook(name, False, f"{slow} at {rate:.3g} Hz is too slow, {INERTIA_RATE:g} Hz needed"))
+        else:
+            out.append(Outlook(name, True, "rotor signal and gyro; needs motion about its axis"))
+    return tuple(out)

@@ -1,0 +1,715 @@
+"""Checks of time, flight, units and frames, by physics."""
+
+from __future__ import annotations
+
+from functools import partial
+from itertools import permutations, product
+from typing import NamedTuple
+
+import numpy as np
+
+from quadid.checks.findings import ChannelFacts, Check, CheckResult
+from quadid.data.faults import at_limit
+from quadid.data.grid import GAP, holes, longest_step
+from quadid.data.resample import copied, linear, measured_period, moving_mean, sample_period, true_runs
+from quadid.data.rotor_signal import rotor_channel
+from quadid.data.window import CHANNELS, Channel, Recording
+from quadid.model.layout import ThrustModel
+from quadid.rotation import conjugate, rotated, turn
+from quadid.types import BoolArray, FloatArray
+from quadid.vehicle import GRAVITY, Vehicle
+
+# --- When the vehicle flies, from its motors or its vibration
+
+
+Spans = tuple[tuple[float, float], ...]
+
+_LEAST = 0.5
+"""Flying means at least this fraction of hover thrust …"""
+_FALLING = 0.8
+"""Who feels less than this share of his weight falls."""
+_OFF = 16.0
+"""A thrust coefficient that is wrong by more tells nothing of the weight."""
+_CARRIES = 0.9
+"""… from when the rotors first carry this fraction of what they usually do; below, the ground still has its share."""
+_IDLE = 0.15
+"""Commands that never exceed this fraction of full are idling motors."""
+_NOTHING = 0.1
+"""A rotor below this share of the median speed of all is ignored."""
+_GROUND = 3.0
+"""Rotors that carry nothing for longer than this [s] stand on the ground; a log with more of it is worth trimming."""
+_MARGIN = 2.0
+"""Left out after take-off and before landing [s]: feet, ground and the air above it push, too."""
+_FLIGHT = 5.0
+"""Shortest flight worth proposing [s]."""
+_SHORTEST, _BRIDGE = 1.0, 0.5
+"""Spans shorter than the first [s] are none; interruptions up to the second [s] do not end one."""
+
+
+def flying_spans(recording: Recording, vehicle: Vehicle | None) -> Spans:
+    """Returns the spans [s] in which the vehicle flies; empty without evidence.
+
+    Thrust and weight are those of the vehicle file where rotor speeds and a vehicle are known; else thrust grows with
+    the square of the command, and hover is what is felt as one g.  A vehicle that feels less than its weight falls, and
+    so flies, whatever its rotors do; one that feels it along an unusual direction for half a second lies somewhere.
+    """
+    channels = recording.channels
+    rotors, _ = rotor_channel(recording, vehicle)
+    if rotors is not None:
+        accel = channels.get("accel")
+        load = None if accel is None or len(accel.t) < 10 else _load(accel)
+        felt = None if load is None or accel is None else np.interp(rotors.t, accel.t, load)
+        thrust, hover = _thrust(rotors, vehicle, felt)
+        if hover <= 0.0:
+            return ()
+        t, on = rotors.t, thrust > _LEAST * hover
+        if accel is not None and len(accel.t) > 10:
+            on &= np.interp(t, accel.t, _felt(accel)) > 0.5
+        if felt is not None and on.any():
+            inside = (t >= t[on][0]) & (t <= t[on][-1])
+            on |= inside & (felt < _FALLING)
+        carried = t[on & (thrust > _CARRIES * np.median(thrust[on]))] if on.any() else t[on]
+        return tuple(later for span in _spans(t, on) if (later := _from_carried(span, carried)))
+    if "accel" in channels and len(channels["accel"].t) > 10:
+        return _spans(channels["accel"].t, _vibrates(channels["accel"]))
+    return ()
+
+
+def proposed_cuts(spans: Spans, first: float, last: float) -> Spans:
+    """Flights without take-off and landing [s after `first`, to a tenth]; none where the log holds little else.
+
+    Args:
+        spans: when it flies [s].
+        first: sample that is used when nothing is cut [s].
+        last: sample, likewise [s].
+    """
+    flights: list[tuple[float, float]] = []
+    for a, b in spans:
+        if flights and a - flights[-1][1] < _GROUND:
+            flights[-1] = (flights[-1][0], b)
+        else:
+            flights.append((a, b))
+    if last - first - sum(b - a for a, b in flights) < _GROUND:
+        return ()
+    cuts = [
+        (0.0 if a - first < _MARGIN else a + _MARGIN - first, (b if last - b < _MARGIN else b - _MARGIN) - first)
+        for a, b in flights
+    ]
+    return tuple((round(a, 1), round(b, 1)) for a, b in cuts if b - a >= _FLIGHT)
+
+
+def within(t: FloatArray, spans: Spans) -> BoolArray:
+    """Which of the times [s], shape (n,), lie in one of the spans."""
+    return np.asarray(np.any([np.zeros(len(t), dtype=bool), *((t >= a) & (t <= b) for a, b in spans)], axis=0))
+
+
+def _thrust(channel: Channel, vehicle: Vehicle | None, felt: FloatArray | None) -> tuple[FloatArray, float]:
+    """Returns relative thrust and the value that hovers; `felt` is the specific force [g], shape (n,)."""
+    values = channel.values
+    if channel.name == "motor_command" and np.median(np.abs(values)) > 100.0:
+        low, high = vehicle.command.range if vehicle is not None else (1000.0, 2000.0)
+        values = np.clip((values - low) / (high - low), 0.0, None)
+    values = _beside_others(values)
+    thrust = np.asarray(np.sum(values**2, axis=1))
+    if channel.name == "motor_command" and np.quantile(thrust, 0.95) < _IDLE**2 * values.shape[1]:
+        return thrust, 0.0
+    if channel.name == "rotor_speed" and vehicle is not None and values.shape[1] == len(vehicle.rotors):
+        modelled, hover = ThrustModel.stated(vehicle).total(values), vehicle.mass * GRAVITY
+        highest = float(np.max(modelled))  # of losses that no rotor has it may be negative
+        typical = float(np.median(modelled[modelled >= 0.25 * highest])) if highest > 0.0 else 0.0
+        if 1.0 / _OFF < typical / hover < _OFF:
+            return modelled, hover
+    strong = thrust > 0.5 * np.quantile(thrust, 0.95)
+    if felt is not None and (strong := strong & (felt > 0.5)).any():
+        return thrust, float(np.median(thrust[strong] / felt[strong]))
+    powered = thrust[thrust > 0.25 * np.quantile(thrust, 0.95)]
+    return thrust, float(np.median(powered)) if len(powered) else 0.0
+
+
+def _beside_others(speeds: FloatArray) -> FloatArray:
+    """Speeds with the others' median for a rotor that is ignored: it is dead, or its signal is; no ground carries."""
+    usual = np.median(speeds, axis=1, keepdims=True)
+    return np.asarray(np.where(speeds < _NOTHING * usual, usual, speeds))
+
+
+def _load(accel: Channel) -> FloatArray | None:
+    """Specific force [g] averaged over 0.2 s, shape (n,), whichever unit it is in; None where it is in none."""
+    length = np.linalg.norm(accel.values, axis=1)
+    middle = float(np.median(length))
+    unit = next((u for u in (GRAVITY, 1.0, 1e3) if 0.5 < middle / u < 4.0), None)
+    width = max(1, round(0.2 / sample_period(accel.t)))
+    return None if unit is None else np.asarray(moving_mean(length / unit, width))
+
+
+def _felt(accel: Channel) -> FloatArray:
+    """Returns 1 where the specific force, averaged over 0.5 s, points along its usual direction, else 0; any unit."""
+    usual = np.median(accel.values, axis=0)
+    share = accel.values @ usual / float(usual @ usual or 1.0)
+    width = max(1, round(0.5 / sample_period(accel.t)))
+    return np.asarray(moving_mean(share, width) > 0.3, dtype=np.float64)
+
+
+def _vibrates(accel: Channel) -> BoolArray:
+    """Tells where the accelerometer's length varies by more than at rest (0.3 m/s^2 over 25 samples)."""
+    length = np.linalg.norm(accel.values, axis=1)
+    mean, square = moving_mean(length, 25), moving_mean(length**2, 25)
+    return np.asarray(np.sqrt(np.maximum(square - mean**2, 0.0)) > 0.3)
+
+
+def _from_carried(span: tuple[float, float], carried: FloatArray) -> tuple[float, float] | None:
+    """A span from the first of the rising times [s] in it at which rotors carry; None where that is too short."""
+    first = float(carried[at]) if (at := int(np.searchsorted(carried, span[0]))) < len(carried) else np.inf
+    return (first, span[1]) if span[1] - first >= _SHORTEST else None
+
+
+def _spans(t: FloatArray, on: BoolArray) -> Spans:
+    spans: list[tuple[float, float]] = []
+    for first, end in zip(*true_runs(on), strict=True):
+        a, b = float(t[first]), float(t[end - 1])
+        if spans and a - spans[-1][1] <= _BRIDGE:
+            spans[-1] = (spans[-1][0], b)
+        else:
+            spans.append((a, b))
+    return tuple(span for span in spans if span[1] - span[0] >= _SHORTEST)
+
+
+# --- Timing of channels and values that do not move: rates, gaps, jitter, stuck and saturated signals, clock faults
+
+
+_GRID = 0.02
+"""Step of the grid [s] for which gaps are reported, that of the fit."""
+_STUCK = 0.5
+"""An IMU channel that does not change for this long [s] in flight is stuck."""
+FILLED = 1.5
+"""Rows for each measured one above which it is reported."""
+_UNSTEADY = 0.25
+"""Jitter above which the log's timing is worth a warning."""
+
+
+def channel_facts(recording: Recording, flying: Spans = ()) -> tuple[ChannelFacts, ...]:
+    """Returns the facts of all channels of a recording.
+
+    Args:
+        recording: the log.
+        flying: when it flies [s]; at rest a sensor may well repeat itself.
+    """
+    return tuple(_facts(recording.channels[name], flying) for name in CHANNELS if name in recording.channels)
+
+
+def _facts(channel: Channel, flying: Spans) -> ChannelFacts:
+    steps = np.diff(channel.t)
+    median = float(np.median(steps)) if len(steps) else np.nan
+    long = steps > (longest_step(channel.t, _GRID) if len(steps) else np.inf)
+    usual = steps[~long]
+    same = copied(channel.values)
+    return ChannelFacts(
+        name=channel.name,
+        unit=CHANNELS[channel.name][1],
+        source=channel.source,
+        rate=1.0 / measured_period(channel.t, channel.values) if len(channel.t) > 1 else np.nan,
+        count=len(channel.t),
+        first=float(channel.t[0]),
+        last=float(channel.t[-1]),
+        jitter=float(np.std(usual) / median) if len(usual) else np.nan,
+        gaps=int(np.count_nonzero(long)),
+        bridged=holes(channel.t, _GRID) if len(steps) else 0,
+        longest_gap=float(steps[long].max()) if long.any() else 0.0,
+        repeated=float(np.mean(same)) if len(same) else 0.0,
+        stuck=_longest_rest(channel.t, same & within(channel.t[:-1], flying) & within(channel.t[1:], flying)),
+        saturated=sum(end.samples for end in at_limit(channel.values))
+        if channel.name in ("gyro", "accel", "motor_command")
+        else 0,
+        dropped=dict(channel.faults),
+    )
+
+
+def _longest_rest(t: FloatArray, same: BoolArray) -> float:
+    """Returns the longest time [s] during which no column changed."""
+    first, end = true_runs(same)
+    return float(np.max(t[end] - t[first], initial=0.0))
+
+
+def timing_checks(recording: Recording, facts: tuple[ChannelFacts, ...]) -> list[Check]:
+    """Checks clocks, gaps, jitter and stuck sensors.
+
+    Args:
+        recording: the log.
+        facts: of its channels.
+    """
+    checks = [_clock_check(recording, facts)]
+    for f in facts:
+        rows = (f.count - 1) / max(f.last - f.first, 1e-9)
+        if not f.gaps and rows > FILLED * f.rate:
+            message = f"{f.name}: {rows:.3g} rows a second were interpolated between samples at {f.rate:.3g} Hz"
+            checks.append(
+                Check("timing", CheckResult.WARNING, message, "log it at this rate, or without the interpolated rows")
+            )
+    gaps = {f.name: f for f in facts if f.gaps}
+    if gaps:
+        worst = max(gaps.values(), key=lambda f: f.longest_gap)
+        text = ", ".join(f"{f.name} {f.gaps}" for f in gaps.values())
+        checks.append(
+            Check(
+                "timing", CheckResult.WARNING,
+                f"gaps: {text}; the longest lasts {worst.longest_gap:.3g} s ({worst.name})",
+                "windows are cut there; log to a faster card or at a lower rate",
+                {"gaps": float(sum(f.gaps for f in facts)), "longest_s": worst.longest_gap},
+            )
+        )  # fmt: skip
+    unsteady = [
+        f for f in facts if f.name in ("gyro", "accel", "rotor_speed", "motor_command") and f.jitter > _UNSTEADY
+    ]
+    for f in unsteady:
+        message = f"{f.name}: steps vary by {f.jitter:.0%} of their median: stamps are unsteady or samples are lost"
+        checks.append(Check("timing", CheckResult.WARNING, message, "stamp at the sensor", {"jitter": f.jitter}))
+    for f in facts:
+        if f.name in ("gyro", "accel") and f.stuck > _STUCK:
+            message = f"{f.name}: does not change for {f.stuck:.2g} s of flight ({f.source})"
+            checks.append(
+                Check("stuck", CheckResult.WARNING, message, "check this sensor or topic", {"stuck_s": f.stuck})
+            )
+        if f.name in ("gyro", "accel") and f.saturated:
+            message = f"{f.name}: {f.saturated} samples at the limit of its range"
+            checks.append(Check("saturated", CheckResult.WARNING, message, "choose a larger range or fly more gently"))
+    return checks
+
+
+def _clock_check(recording: Recording, facts: tuple[ChannelFacts, ...]) -> Check:
+    dropped: dict[str, int] = {}
+    for f in facts:
+        for reason, count in f.dropped.items():
+            dropped[reason] = dropped.get(reason, 0) + count
+    numbers = {"breaks": float(len(recording.breaks)), **{k: float(v) for k, v in dropped.items()}}
+    if not recording.breaks and not dropped:
+        return Check("clock", CheckResult.OK, "time rises steadily, no sample was dropped", numbers=numbers)
+    parts = [f"{len(recording.breaks)} breaks (reboots or clock steps)"] if recording.breaks else []
+    parts += [f"{count} samples dropped: {reason.replace('_', ' ')}" for reason, count in dropped.items()]
+    return Check(
+        "clock",
+        CheckResult.WARNING,
+        "; ".join(parts),
+        "nothing is joined across breaks" if recording.breaks else "",
+        numbers,
+    )
+
+
+# --- Units and frames, tested by physics: gravity, gyro against attitude, velocity against attitude and accelerometer
+
+
+DEGREES = 57.29577951308232
+"""Degrees in a radian."""
+_CLEAR = 0.5
+"""R^2 above which a relation between two channels is believed."""
+_MOTION = 0.03
+"""Rotation rate [rad/s] an axis must have, as standard deviation, to be checked."""
+_STEP = 0.1
+"""Attitudes are compared over steps of at least this [s]: noise and repeated readings matter little then."""
+_JUMP = 8.0
+"""An attitude step of so many times the usual one, beside half as much of the gyro's, is no motion."""
+_FARTHEST, _LAG, _TOO_LATE = 0.3, 0.02, 0.08
+"""Gyro and attitude are compared at times so far apart at most [s], in these steps; more than the last is an error."""
+_REVERSED = 0.7
+"""Correlation below the negative of which a vertical signal points up."""
+_RESTING = 50
+"""Samples on the ground that tell the length of gravity."""
+_AXES = ("x", "y", "z")
+
+
+class AxisMap(NamedTuple):
+    """The signed permutation of axes, times a scale, that turns one vector signal into another best.
+
+    Attributes:
+        axes: for each output axis, the input axis it follows.
+        signs: its sign, +1 or -1.
+        scale: common factor.
+        r2: fraction of the output's variance explained.
+    """
+
+    axes: tuple[int, ...]
+    signs: tuple[int, ...]
+    scale: float
+    r2: float
+
+    @property
+    def straight(self) -> bool:
+        """Each axis follows itself with its own sign."""
+        return self.axes == tuple(range(len(self.axes))) and all(s > 0 for s in self.signs)
+
+    def __str__(self) -> str:
+        return ", ".join(
+            f"{_AXES[i]} = {'-' if s < 0 else ''}{_AXES[a]}"
+            for i, (a, s) in enumerate(zip(self.axes, self.signs, strict=True))
+        )
+
+
+def fit_axes(source: FloatArray, target: FloatArray) -> AxisMap:
+    """Finds the signed permutation and scale that explain `target` (n, k) by `source` (n, k) best, k = 2 or 3.
+
+    Axes stay where they are unless one follows another axis, or its own reversed, clearly: what hardly moves is noise,
+    which any axis explains as well as any other.
+    """
+    x, y = source - source.mean(axis=0), target - target.mean(axis=0)
+    cross, power, total = y.T @ x, np.sum(x**2, axis=0), float(np.sum(y**2))
+    straight = tuple(range(x.shape[1]))
+    clear = cross**2 > _CLEAR * np.outer(np.sum(y**2, axis=0), power)
+    best = AxisMap(straight, (1,) * x.shape[1], np.nan, 0.0)
+    for axes in permutations(range(x.shape[1])):
+        for signs in product((1, -1), repeat=x.shape[1]):
+            moved = [(i, a) for i, a, s in zip(straight, axes, signs, strict=True) if a != i or s < 0]
+            if moved and not any(clear[place] for place in moved):
+                continue
+            gain = sum(s * cross[i, a] for i, (a, s) in enumerate(zip(axes, signs, strict=True)))
+            norm = float(sum(power[a] for a in axes))
+            if gain > 0.0 and norm > 0.0 and total > 0.0:
+                r2 = float(gain**2 / norm / total)
+                if r2 > best.r2 + 1e-9:
+                    best = AxisMap(axes, signs, float(gain / norm), r2)
+    return best
+
+
+def _fit_without_jumps(source: FloatArray, target: FloatArray) -> AxisMap:
+    """Fits twice, the second time without rows far off (estimators reset their heading, and rows jump with it)."""
+    fit = fit_axes(source, target)
+    if not np.isfinite(fit.scale):
+        return fit
+    miss = np.linalg.norm(target - fit.scale * source[:, fit.axes] * np.array(fit.signs), axis=1)
+    return fit_axes(*(rows[miss <= _JUMP * np.median(miss)] for rows in (source, target)))
+
+
+def gravity_check(recording: Recording, spans: Spans) -> Check:
+    """Length and direction of the mean specific force: 9.8 m/s^2 along -z in FRD."""
+    accel = recording.channels.get("accel")
+    if accel is None:
+        return Check("gravity", CheckResult.UNKNOWN, "no accelerometer")
+    inside = within(accel.t, spans) if spans else np.ones(len(accel.t), dtype=np.bool_)
+    values = accel.values[inside]
+    if not len(values):
+        return Check("gravity", CheckResult.UNKNOWN, "no accelerometer sample in flight")
+    length = float(np.median(np.linalg.norm(values, axis=1)))
+    z = float(np.median(values[:, 2]))
+    steady = float(np.linalg.norm(np.median(values, axis=0)))
+    check = partial(Check, "gravity", numbers={"length": length, "z": z})
+    message = f"specific force has length {length:.4g} and z {z:.4g} (medians; about 9.81 and -9.81 m/s^2 expected)"
+    if not _reads_gravity_at_rest(accel.values[~inside]):
+        for unit, factor in (("g", GRAVITY), ("milli-g (or cm/s^2)", GRAVITY * 1e-3)):
+            if 0.7 < length * factor / GRAVITY < 1.6 and steady > 0.5 * length:
+                fix = f"multiply acceleration by {factor:.6g}"
+                return check(CheckResult.ERROR, f"{message}: it seems to be in {unit}", fix)
+        if spans and steady < 0.3 * GRAVITY:
+            fix = "log specific force, not linear acceleration"
+            return check(CheckResult.ERROR, f"{message}: gravity is missing", fix)
+        if not 0.5 < length / GRAVITY < 2.0:
+            return check(CheckResult.ERROR, f"{message}: this is no specific force in m/s^2", "log raw acceleration")
+    if z > -0.5 * length and _attitude_explains(accel, recording.channels.get("attitude"), inside):
+        return check(CheckResult.UNKNOWN, f"{message}; its attitude says that the vehicle lies or turns so")
+    if not spans and abs(z) < 0.8 * length:
+        return check(CheckResult.UNKNOWN, f"{message}; the vehicle does not fly in this log")
+    if z > 0.5 * length:
+        turned = f"{message}: z points up (FLU, as ROS has it) or the sign is reversed"
+        return check(CheckResult.ERROR, turned, "turn body vectors to FRD: negate y and z")
+    if z > -0.5 * length:
+        return check(CheckResult.ERROR, f"{message}: gravity is not along z", "check the axes of the IMU")
+    return check(CheckResult.OK, message)
+
+
+def _reads_gravity_at_rest(values: FloatArray) -> bool:
+    """Whether specific force on the ground, shape (n, 3), has the length that it must have [m/s^2]."""
+    return len(values) >= _RESTING and abs(float(np.median(np.linalg.norm(values, axis=1))) / GRAVITY - 1.0) < 0.1
+
+
+def _attitude_explains(accel: Channel, attitude: Channel | None, inside: BoolArray) -> bool:
+    """Whether the attitude turns the specific force of the rows `inside` to one g upwards."""
+    if attitude is None or len(attitude.t) < 2:
+        return False
+    world = np.median(_in_world(accel, attitude)[inside], axis=0)
+    return bool(np.linalg.norm(world + [0.0, 0.0, GRAVITY]) < 0.3 * GRAVITY)
+
+
+def attitude_check(recording: Recording) -> Check:
+    """Attitude against gyro (axes, signs, degrees for radians) and against gravity (a world with z down)."""
+    rates = gyro_check(recording)
+    accel, attitude = recording.channels.get("accel"), recording.channels.get("attitude")
+    if rates.verdict is CheckResult.ERROR or accel is None or attitude is None or len(attitude.t) < 2:
+        return rates
+    down = float(np.median(_in_world(accel, attitude)[:, 2]))
+    if down < 0.5 * GRAVITY:
+        return rates
+    return Check(
+        rates.name, CheckResult.ERROR,
+        f"the attitude turns what the accelerometer reads to point down ({down:.3g} m/s^2): its world has z up",
+        "convert attitude, velocity and position to NED; ROS uses east, north, up (ENU)",
+    )  # fmt: skip
+
+
+def gyro_check(recording: Recording) -> Check:
+    """Gyro against differentiated attitude: axes, signs and scale (degrees for radians)."""
+    gyro, attitude = recording.channels.get("gyro"), recording.channels.get("attitude")
+    if gyro is None or attitude is None or min(len(gyro.t), len(attitude.t)) < 20:
+        return Check("gyro_attitude", CheckResult.UNKNOWN, "needs gyro and attitude")
+    best: tuple[str, AxisMap] | None = None
+    for name, q in _attitude_readings(attitude.values):
+        measured, derived = _moving_rates(gyro, attitude.t, q)
+        if len(measured) < 20:
+            continue
+        fit = _fit_without_jumps(measured, derived)
+        if best is None or _likely(name, fit) > _likely(*best):
+            best = (name, fit)
+    if best is None:
+        return Check("gyro_attitude", CheckResult.UNKNOWN, "too little rotation to compare gyro and attitude")
+    late = _apart(gyro, attitude, best[1].r2) if best[0] == "as given" else None
+    return late or _judge_rates(*best)
+
+
+def _apart(gyro: Channel, attitude: Channel, now: float) -> Check | None:
+    """An error where the gyro follows the attitude clearly better at another time; `now` is R^2 at its own."""
+    found = []
+    for lag in np.arange(-_FARTHEST, _FARTHEST + 1e-9, _LAG):
+        rows = _moving_rates(Channel("gyro", gyro.t - lag, gyro.values), attitude.t, attitude.values)
+        found.append((fit_axes(*rows).r2 if len(rows[0]) >= 20 else 0.0, float(lag)))
+    r2, lag = max(found)
+    if abs(lag) < _TOO_LATE or r2 < _CLEAR or r2 - now < 0.5 * (1.0 - now):
+        return None
+    which = ("gyro", "attitude") if lag > 0.0 else ("attitude", "gyro")
+    return Check(
+        "gyro_attitude", CheckResult.ERROR,
+        f"{which[0]} comes {1e3 * abs(lag):.0f} ms after the {which[1]} (R^2 {r2:.2f} there, {now:.2f} as stamped)",
+        f"stamp the {which[0]} when it is measured, on the clock of the {which[1]}", {"lag_s": lag, "r2": r2},
+    )  # fmt: skip
+
+
+def _moving_rates(gyro: Channel, t: FloatArray, q: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Rates as of `_rates` over steps long enough for the motion to stand above the attitude's noise; none if still.
+
+    White attitude noise adds a variance that falls with the square of the step and motion one that does not, so two
+    steps separate them: motion = (4 var(2 step) - var(step)) / 3.
+    """
+    stride = max(1, round(_STEP / sample_period(t)))
+    measured, derived = _without_jumps(*_rates(gyro, t[::stride], q[::stride]))
+    longer = _without_jumps(*_rates(gyro, t[:: 2 * stride], q[:: 2 * stride]))[1]
+    if len(longer) < 20:
+        return longer[:0], longer[:0]
+    total = np.var(derived, axis=0)
+    motion = np.maximum((4.0 * np.var(longer, axis=0) - total) / 3.0, 0.0)
+    if max(np.max(np.sqrt(motion)), np.max(np.std(measured, axis=0))) < _MOTION:
+        return longer[:0], longer[:0]
+    if np.sum(motion) > 0.8 * np.sum(total):
+        return measured, derived
+    return _rates(gyro, t[:: 4 * stride], q[:: 4 * stride])
+
+
+def _without_jumps(measured: FloatArray, derived: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Rates without rows in which the attitude jumps and the gyro does not: an estimator reset its heading there."""
+    if not len(derived):
+        return measured, derived
+    turned, felt = (np.linalg.norm(rows, axis=1) for rows in (derived, measured))
+    jumps = (turned > _JUMP * np.median(turned)) & (felt < 0.5 * _JUMP * np.median(felt))
+    return measured[~jumps], derived[~jumps]
+
+
+def _likely(reading: str, fit: AxisMap) -> float:
+    """R^2, with a bonus for axes that agree and one for taking the numbers as given."""
+    return fit.r2 + (0.1 if fit.straight else 0.0) + (0.05 if reading == "as given" else 0.0)
+
+
+def _judge_rates(reading: str, fit: AxisMap) -> Check:
+    check = partial(Check, "gyro_attitude", numbers={"scale": fit.scale, "r2": fit.r2})
+    if fit.r2 < _CLEAR:
+        message = f"gyro does not follow the attitude (R^2 {fit.r2:.2f})"
+        remedy = "check units, axes and time stamps of both; quaternions are scalar first, body to world"
+        return check(CheckResult.ERROR, message, remedy)
+    if reading != "as given":
+        message = f"attitude fits the gyro only when read as {reading} (R^2 {fit.r2:.2f})"
+        return check(CheckResult.ERROR, message, "write wxyz quaternions, body to world, FRD to NED")
+    if not fit.straight:
+        message = f"gyro axes differ from the attitude's: {fit} (R^2 {fit.r2:.2f})"
+        remedy = "body axes must be FRD for both; ROS' FLU has y and z reversed"
+        if (fit.axes, fit.signs) == ((1, 0, 2), (1, 1, -1)):
+            remedy = "that is an attitude in world axes east, north, up (ENU): turn it, velocity and position into NED"
+        return check(CheckResult.ERROR, message, remedy)
+    for scale, what in ((1.0 / DEGREES, "gyro seems to be in deg/s"), (DEGREES, "attitude seems to be in degrees")):
+        if 0.75 < fit.scale / scale < 1.33:
+            return check(CheckResult.ERROR, f"{what} (attitude rate / gyro = {fit.scale:.3g})", "convert to radians")
+    message = f"attitude rate / gyro = {fit.scale:.3f} (R^2 {fit.r2:.2f})"
+    if 0.85 < fit.scale < 1.15:
+        return check(CheckResult.OK, message)
+    return check(CheckResult.WARNING, message, "check scales and filters")
+
+
+def velocity_check(recording: Recording) -> Check:
+    """Change of world velocity against rotated specific force and gravity: world frame of attitude and velocity."""
+    channels = recording.channels
+    accel, attitude, velocity = (channels.get(n) for n in ("accel", "attitude", "velocity"))
+    if accel is None or attitude is None or velocity is None or min(map(len, (accel.t, attitude.t, velocity.t))) < 20:
+        return Check("velocity_attitude", CheckResult.UNKNOWN, "needs accelerometer, attitude and velocity")
+    gained, derived = _velocity_gains(accel, attitude, velocity)
+    level = _level_velocity(gained, derived)
+    if level.verdict is CheckResult.ERROR or len(gained) < 20 or not _upwards(gained[:, 2], derived[:, 2]):
+        return level
+    return Check(
+        "velocity_attitude", CheckResult.ERROR, "vertical velocity rises where the force pushes down: it points up",
+        "negate vz, and z if it points up too: the world is NED", {"vertical": -1.0},
+    )  # fmt: skip
+
+
+def _level_velocity(gained: FloatArray, derived: FloatArray) -> Check:
+    """Horizontal axes of `velocity_check`."""
+    if len(gained) < 20 or np.max(np.std(gained[:, :2], axis=0)) < 0.2:
+        return Check("velocity_attitude", CheckResult.UNKNOWN, "too little horizontal acceleration to compare")
+    fit = fit_axes(derived[:, :2], gained[:, :2])
+    check = partial(Check, "velocity_attitude", numbers={"scale": fit.scale, "r2": fit.r2})
+    if fit.r2 < _CLEAR:
+        return check(CheckResult.UNKNOWN, f"velocity does not follow tilt and thrust clearly (R^2 {fit.r2:.2f})")
+    if not fit.straight:
+        message = f"world axes of velocity differ from the attitude's: {fit} (R^2 {fit.r2:.2f})"
+        return check(CheckResult.ERROR, message, "use NED for both; ROS' ENU swaps x and y")
+    return check(CheckResult.OK, f"velocity follows tilt and thrust (scale {fit.scale:.3g}, R^2 {fit.r2:.2f})")
+
+
+def _upwards(gained: FloatArray, derived: FloatArray) -> bool:
+    """Whether vertical changes (n,) are clearly the reverse of what force makes (n,)."""
+    return bool(min(np.std(gained), np.std(derived)) > 0.2 and np.corrcoef(gained, derived)[0, 1] < -_REVERSED)
+
+
+def _attitude_readings(q: FloatArray) -> list[tuple[str, FloatArray]]:
+    """Ways in which four numbers may have been meant."""
+    return [
+        ("as given", q),
+        ("world to body", conjugate(q)),
+        ("x y z w (scalar last)", q[:, [3, 0, 1, 2]]),
+    ]
+
+
+def _rates(gyro: Channel, t: FloatArray, q: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Returns mean gyro and rotation over each interval between attitudes [rad/s], both (m, 3)."""
+    keep = usable_steps(t, gyro.t)
+    mean = np.diff(running_integral(gyro, t), axis=0)[keep] / np.diff(t)[keep, None]
+    return mean, turn(q[:-1], q[1:])[keep] / np.diff(t)[keep, None]
+
+
+def _velocity_gains(accel: Channel, attitude: Channel, velocity: Channel) -> tuple[FloatArray, FloatArray]:
+    """Returns mean acceleration [m/s^2] over steps of at least 0.2 s, of the velocity and from force, both (m, 3)."""
+    force = _in_world(accel, attitude) + np.array([0.0, 0.0, GRAVITY])
+    stride = max(1, round(0.2 / sample_period(velocity.t)))
+    t, speed = velocity.t[::stride], velocity.values[::stride]
+    keep = usable_steps(t, accel.t) & usable_steps(t, attitude.t)
+    world = Channel("accel", accel.t, force)
+    derived = np.diff(running_integral(world, t), axis=0)[keep] / np.diff(t)[keep, None]
+    return np.diff(speed, axis=0)[keep] / np.diff(t)[keep, None], derived
+
+
+def _in_world(accel: Channel, attitude: Channel) -> FloatArray:
+    """Specific force in the attitude's world [m/s^2], shape (n, 3), at the accelerometer's times."""
+    q = linear(attitude.t, attitude.values, accel.t)
+    return rotated(q / np.linalg.norm(q, axis=1, keepdims=True), accel.values)
+
+
+def usable_steps(t: FloatArray, other: FloatArray) -> BoolArray:
+    """Tells which steps of `t` have no gap, neither in `t` nor in the other channel's times."""
+    steps = np.diff(t)
+    longest = GAP * sample_period(other)
+    holes = np.flatnonzero(np.diff(other) > longest)
+    following = np.searchsorted(other[holes + 1], t[:-1], "right")
+    spoiled = np.append(other[holes], np.inf)[following] < t[1:]
+    inside = (t[:-1] >= other[0]) & (t[1:] <= other[-1])
+    return np.asarray(inside & ~spoiled & (steps < GAP * np.median(steps)))
+
+
+def running_integral(channel: Channel, at: FloatArray) -> FloatArray:
+    """Running integral (trapezoidal) of a channel, read at times `at`, shape (m, columns)."""
+    area = 0.5 * (channel.values[1:] + channel.values[:-1]) * np.diff(channel.t)[:, None]
+    total = np.concatenate([np.zeros((1, area.shape[1])), np.cumsum(area, axis=0)])
+    return linear(channel.t, total, at)
+
+
+# --- Whether logged velocity is the change of logged position: an estimator that scales one of them is wrong in one
+
+
+FEWEST_SAMPLES = 20
+"""Samples of each that a comparison needs."""
+FEWEST_STRETCHES = 4.0
+"""Independent stretches that it needs."""
+STRETCH = 1.0
+"""Changes are compared over this time [s]: slow enough for delays and low-passes of either channel not to count."""
+CLEAR = 0.98
+"""Correlation above which two changes are the same motion, seen by two channels."""
+UPWARDS = 0.8
+"""Correlation below the negative of which one of two vertical changes has the wrong sign."""
+LEAST_MOTION = 0.1
+"""Change of position [m], as standard deviation, below which its noise may decide."""
+SCALE = 0.03
+"""Deviation from scale 1 that matters to whoever predicts positions …"""
+SIGMAS = 4.0
+"""… when it is beyond chance by this many standard errors."""
+_PAIRS = (("horizontally", (0, 1)), ("vertically", (2,)))
+
+
+def position_checks(recording: Recording) -> list[Check]:
+    """Integral of the velocity against the change of position, where both are logged: scale and correlation.
+
+    Horizontal axes together, the vertical one by itself.
+    """
+    position, velocity = (recording.channels.get(n) for n in ("position", "velocity"))
+    if position is None or velocity is None or min(len(position.t), len(velocity.t)) < FEWEST_SAMPLES:
+        return []
+    return [_compared(position, velocity)]
+
+
+def _compared(position: Channel, velocity: Channel) -> Check:
+    moved, flown, independent = _changes(position, velocity)
+    if independent < FEWEST_STRETCHES:
+        return Check("position_velocity", CheckResult.UNKNOWN, "too few stretches without a gap to compare")
+    horizontal = fit_axes(moved[:, :2], flown[:, :2])
+    if np.max(np.std(moved[:, :2], axis=0)) > LEAST_MOTION and horizontal.r2 > CLEAR**2 and not horizontal.straight:
+        return Check(
+            "position_velocity", CheckResult.WARNING,
+            f"world axes of velocity differ from those of position: {horizontal} (R^2 {horizontal.r2:.2f})",
+            "use NED for both; ROS' ENU swaps x and y", {"r2": horizontal.r2},
+        )  # fmt: skip
+    numbers: dict[str, float] = {}
+    scales: list[str] = []
+    off: list[str] = []
+    for where, axes in _PAIRS:
+        p, v = (x[:, axes] - x[:, axes].mean(axis=0) for x in (moved, flown))
+        correlation = float(np.sum(p * v) / np.sqrt(max(np.sum(p * p) * np.sum(v * v), 1e-300)))
+        if where == "vertically" and np.max(np.std(p, axis=0)) > LEAST_MOTION and correlation < -UPWARDS:
+            return Check(
+                "position_velocity", CheckResult.ERROR,
+                f"position rises where velocity falls (correlation {correlation:.2f}): one of them points up",
+                "negate z or vz: the world is NED, its z down", {"correlation": correlation},
+            )  # fmt: skip
+        if np.max(np.std(p, axis=0)) < LEAST_MOTION or correlation < CLEAR:
+            continue
+        # Both have errors: the ratio of their sizes, not a regression of one on the other.
+        scale = float(np.sqrt(np.sum(v * v) / np.sum(p * p)))
+        error = scale * np.sqrt(max(1.0 - correlation**2, 0.0) / (independent * len(axes)))
+        numbers |= {f"scale {where}": scale, f"correlation {where}": correlation}
+        scales.append(f"{scale:.3f} ± {error:.3f} {where} (correlation {correlation:.4f})")
+        if abs(scale - 1.0) > max(SCALE, SIGMAS * error):
+            off.append(f"{abs(scale - 1.0):.1%} {'larger' if scale > 1.0 else 'smaller'} {where}")
+    if not scales:
+        message = "velocity does not follow the change of position clearly, or the vehicle hardly moves"
+        return Check("position_velocity", CheckResult.UNKNOWN, message)
+    measured = f"velocity against change of position: {', '.join(scales)}"
+    if not off:
+        return Check("position_velocity", CheckResult.OK, measured, numbers=numbers)
+    return Check(
+        "position_velocity", CheckResult.WARNING,
+        f"the logged velocity is {' and '.join(off)} than the logged change of position ({measured}): the scale of one "
+        "of them is wrong; a simulation fitted to such a log misses positions by as much, unless it has "
+        "`velocity_scale`",
+        "check the scale of the positioning system and of the estimator's velocity (flow sensor, marker distances)",
+        numbers,
+    )  # fmt: skip
+
+
+def _changes(position: Channel, velocity: Channel) -> tuple[FloatArray, FloatArray, float]:
+    """Changes of position and integrals of velocity over overlapping stretches, both (m, 3), and independent ones."""
+    period = sample_period(position.t)
+    steps, every = max(round(STRETCH / period), 1), max(round(0.1 * STRETCH / period), 1)
+    broken = np.concatenate([[0], np.cumsum(~usable_steps(position.t, velocity.t))])
+    start = np.arange(0, len(position.t) - steps, every)
+    start = start[broken[start + steps] == broken[start]]
+    path = running_integral(velocity, position.t)
+    moved, flown = (x[start + steps] - x[start] for x in (position.values, path))
+    known = np.isfinite(moved).all(axis=1) & np.isfinite(flown).all(axis=1)
+    return moved[known], flown[known], float(np.count_nonzero(known)) * every / steps

@@ -1,0 +1,687 @@
+"""Checks of rotor signals, mass and geometry against each other and the motion."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from functools import partial
+from itertools import permutations
+from typing import NamedTuple
+
+import numpy as np
+from scipy.optimize import nnls
+
+from quadid.checks.findings import Check, CheckResult
+from quadid.checks.motion import Spans, within
+from quadid.data.grid import to_windows
+from quadid.data.resample import linear, measured_period, moving_mean, sample_period, true_runs
+from quadid.data.rotor_signal import INERTIA_RATE, RotorSignal, rotor_signal
+from quadid.data.window import Channel, Recording, Window
+from quadid.errors import QuadidError
+from quadid.model.layout import ThrustModel, voltage_at
+from quadid.types import BoolArray, FloatArray
+from quadid.vehicle import GRAVITY, Vehicle
+
+# --- Whether the rotor signal stands in one place in time before the motion that it causes
+#
+# A motor answers its command late by its lag, always the same; measured speeds come a few milliseconds late.  A lag
+# that wanders over the flight is a clock's, not a motor's, and a torque that follows its own effect is a wrong stamp.
+
+
+_STEP = 0.01
+"""Lags are compared at multiples of this [s]; the peak is found between them."""
+_FARTHEST = 25
+_BLOCK = 15.0
+_SLOW = 0.4
+"""Motion slower than this [s] is left out, as in `motor_checks`."""
+_CLEAR = 0.3
+"""Correlation above which the peak of a block counts."""
+_WANDER, _EARLY = 0.012, 0.2
+"""Limits [s] of the spread of the lag over the flight, and of torque before its effect."""
+_LATE, _TOO_LATE = 0.015, 0.025
+"""Torque after its effect [s] that is named, and that is refused."""
+
+
+class _Peak(NamedTuple):
+    """Axis, lag [s] of its angular acceleration behind the torque in one block, and their correlation there."""
+
+    axis: int
+    lag: float
+    correlation: float
+
+
+def rotor_timing_check(recording: Recording, vehicle: Vehicle, spans: Spans) -> Check:
+    """Lag between roll and pitch torque and angular acceleration, block by block, and how far it wanders."""
+    name = "rotor_timing"
+    gyro = recording.channels.get("gyro")
+    if gyro is None or not spans:
+        return Check(name, CheckResult.UNKNOWN, "needs gyro and rotor signal in flight")
+    try:
+        signal = rotor_signal(recording, vehicle)
+    except QuadidError as error:
+        return Check(name, CheckResult.UNKNOWN, error.found)
+    slowest = max(measured_period(signal.t, signal.values), sample_period(gyro.t))
+    if not slowest <= 1.0 / INERTIA_RATE:
+        return Check(name, CheckResult.UNKNOWN, "rotor signal or gyro too slow to place them in time")
+    # Rows that no block takes are not read for each: the check of a long log takes time by its length.
+    width = max(3, round(2.5 * slowest / _STEP) | 1)
+    peaks = [peak for times in _blocks(spans) for peak in _peaks(signal, gyro, vehicle, times, width)]
+    return _judge(name, peaks)
+
+
+def _judge(name: str, peaks: list[_Peak]) -> Check:
+    if not peaks:
+        return Check(name, CheckResult.UNKNOWN, "too little flight to place the rotor signal in time")
+    correlation = float(np.median([p.correlation for p in peaks]))
+    clear = np.array([p.lag for p in peaks if p.correlation > _CLEAR])
+    about = [_about_median([p.lag for p in peaks if p.axis == axis and p.correlation > _CLEAR]) for axis in range(2)]
+    numbers = {"correlation": correlation}
+    if len(clear) < max(2, len(peaks) // 2):
+        message = f"torque and angular acceleration correlate by {correlation:.2f} only, at any lag"
+        return Check(name, CheckResult.UNKNOWN, message, "fly with more roll and pitch motion", numbers)
+    low, high = np.quantile(np.concatenate(about), [0.1, 0.9])
+    lag = float(np.median(clear))
+    numbers |= {"lag_s": lag, "wander_s": float(high - low)}
+    message = (
+        f"torque and angular acceleration correlate by {correlation:.2f} at a lag of {1e3 * lag:.0f} ms, "
+        f"which wanders by {1e3 * (high - low):.0f} ms"
+    )
+    fix = "stamp the rotor signal by the clock that stamps the IMU, or log both on board"
+    if high - low > _WANDER:
+        return Check(name, CheckResult.ERROR, f"{message}: the rotor signal is not in time with the gyro", fix, numbers)
+    if -_TOO_LATE < lag < -_LATE:
+        smoothed = f"{message}: rotor speeds are late, or the states were smoothed without a delay"
+        return Check(
+            name, CheckResult.WARNING, smoothed, "log raw states; `rotor_telemetry_delay` models a delay", numbers
+        )
+    if lag < -_LATE:
+        return Check(name, CheckResult.ERROR, f"{message}: the rotor signal lags its effect", fix, numbers)
+    if lag > _EARLY:
+        return Check(name, CheckResult.ERROR, f"{message}: no motor answers that late", fix, numbers)
+    return Check(name, CheckResult.OK, message, numbers=numbers)
+
+
+def _about_median(lags: list[float]) -> FloatArray:
+    """Lags of one axis about their own median: axes may differ, for other motion excites them."""
+    return np.array(lags) - np.median(lags) if lags else np.empty(0)
+
+
+def _blocks(spans: Spans) -> list[FloatArray]:
+    """Times on a uniform grid, in blocks of about `_BLOCK` seconds of uninterrupted flight."""
+    out = []
+    for a, b in spans:
+        parts = max(1, int((b - a) // _BLOCK))
+        bounds = np.linspace(a, b, parts + 1)
+        out += [np.arange(c, d, _STEP) for c, d in zip(bounds[:-1], bounds[1:], strict=True)]
+    return [times for times in out if len(times) > 8 * _FARTHEST]
+
+
+def _peaks(signal: RotorSignal, gyro: Channel, vehicle: Vehicle, at: FloatArray, width: int) -> list[_Peak]:
+    """Peaks of one block at times `at`, with both signals smoothed over `width` of its rows."""
+    turning, speeds = _around(gyro.t, at), _around(signal.t, at)
+    rates = linear(gyro.t[turning], gyro.values[turning, :2], at)
+    squares = linear(signal.t[speeds], signal.values[speeds] ** 2, at)
+    motion = _quick(np.gradient(rates, _STEP, axis=0), width)
+    torque = _quick(squares @ vehicle.torque_arms[:, :2], width)
+    return [_peak(axis, torque[:, axis], motion[:, axis]) for axis in range(2)]
+
+
+def _around(t: FloatArray, at: FloatArray) -> slice:
+    """Samples that straight lines to the times of a block need, of increasing times."""
+    return slice(max(int(np.searchsorted(t, at[0], side="right")) - 1, 0), int(np.searchsorted(t, at[-1])) + 1)
+
+
+def _quick(values: FloatArray, width: int) -> FloatArray:
+    """Band of frequencies that both signals hold: smoothed over `width` rows, slow motion left out."""
+    smooth = moving_mean(values, width)
+    return np.asarray(smooth - moving_mean(smooth, round(_SLOW / _STEP) | 1, mirrored=True))
+
+
+def _peak(axis: int, torque: FloatArray, motion: FloatArray) -> _Peak:
+    n, far = len(torque), _FARTHEST
+    later = motion[far : n - far]
+    rows = [torque[far - k : n - far - k] for k in range(-far, far + 1)]
+    scores = np.array([row @ later / np.sqrt(row @ row * (later @ later) + 1e-300) for row in rows])
+    best = int(np.argmax(scores))
+    shift = 0.0
+    if 0 < best < 2 * far:
+        before, here, after = scores[best - 1 : best + 2]
+        shift = 0.5 * float((before - after) / (before - 2.0 * here + after))
+    return _Peak(axis, (best - far + shift) * _STEP, float(scores[best]))
+
+
+# --- Rotor signals against each other, the thrust felt and the motion: dead, stuck, halved, and out of time
+#
+# All checks need flight only, no fit: a rotor that reads nothing, holds one value or half its speed, thrust per speed
+# squared that changes by more than any battery or payload makes it, and torque that does not stand in one fixed place
+# in time before the angular acceleration that it causes.
+
+
+_BIN = 0.5
+"""Means over this long [s] are compared: fast motion has passed by then."""
+_DEAD, _DEAD_SHARE, _IDLE_SHARE = 0.1, 0.05, 0.5
+"""A rotor below this share of the median speed for this share of the flight is dead; a command may rest longer."""
+_LEVELS = 40
+"""Rotors that read fewer different values may be too coarse."""
+_STUCK = 1.0
+"""A rotor that holds one value this long [s] while the vehicle moves is stuck."""
+_IMBALANCE, _UNBALANCED = 0.72, 0.1
+"""Mean moment of the squares about roll and pitch, over that of one hovering rotor at its arm, and how long it stands.
+
+One of four that reads half its speed makes 0.75; one that lost 45 % of its thrust, and turns faster for it, 0.64.
+"""
+_THRUST_RANGE = 1.8
+"""Thrust felt per speed squared: 90 % over 10 % quantile.  A payload of half the weight makes 1.5."""
+
+Bins = tuple[FloatArray, BoolArray]
+"""Means (m, columns) and which bins hold samples (m,)."""
+
+
+Problem = tuple[str, dict[str, float]]
+_NAME = "rotor_speed"
+_FIX = "repair that sensor or its wiring, leave it out with motor commands, or use the part of the flight before it"
+_COMMANDED = "these are commands: a damaged rotor is driven harder, which `quadid health` measures; or they mean thrust"
+
+
+def readings_check(recording: Recording, vehicle: Vehicle, spans: Spans) -> Check | None:
+    """A rotor that reads nothing or holds one value, all that read the same, coarse steps; None for none of these."""
+    try:
+        signal = rotor_signal(recording, vehicle)
+    except QuadidError:
+        return None
+    inside = within(signal.t, spans)
+    if np.count_nonzero(inside) < 20:
+        return None
+    most = _IDLE_SHARE if _commanded(signal, recording) else _DEAD_SHARE
+    values = signal.values[inside]
+    step = _coarse(values)
+    if step:
+        message = f"rotor speeds come in steps of {step:.3g} rad/s: too coarse for the motion ({signal.source})"
+        return Check(_NAME, CheckResult.WARNING, message, "log them finer, or motor commands", {"step_rad_s": step})
+    problem = _dead(values, most) or _same(values) or _stuck(signal, recording, inside)
+    return problem and Check(_NAME, CheckResult.ERROR, f"{problem[0]} ({signal.source})", _FIX, problem[1])
+
+
+def _coarse(speeds: FloatArray) -> float:
+    """Step [rad/s] between the few values that rotors read; 0 where it is finer than half their spread."""
+    levels = [np.unique(column) for column in speeds.T]
+    if max(map(len, levels)) > _LEVELS or min(map(len, levels)) < 3:
+        return 0.0
+    step = float(np.median(np.concatenate([np.diff(values) for values in levels])))
+    return step if step > 0.5 * float(np.median(np.std(speeds, axis=0))) else 0.0
+
+
+def _same(speeds: FloatArray) -> Problem | None:
+    """Columns that are one: their differences, which turn the vehicle, are lost."""
+    if speeds.shape[1] < 3 or np.ptp(speeds) == 0.0 or np.any(speeds != speeds[:, :1]):
+        return None
+    return "all rotor columns are the same: one was written for all", {"columns": float(speeds.shape[1])}
+
+
+def _commanded(signal: RotorSignal, recording: Recording) -> bool:
+    command = recording.channels.get("motor_command")
+    return command is not None and signal.source == command.source
+
+
+def rotor_speed_check(recording: Recording, vehicle: Vehicle, spans: Spans) -> Check:
+    """Each rotor against the others and all against the thrust felt; the first that cannot be true is named."""
+    name = _NAME
+    try:
+        signal = rotor_signal(recording, vehicle)
+    except QuadidError as error:
+        return Check(name, CheckResult.UNKNOWN, error.found)
+    edges = _edges(spans)
+    inside = within(signal.t, spans)
+    if len(edges) < 4 or np.count_nonzero(inside) < 20:
+        return Check(name, CheckResult.UNKNOWN, "too little flight to compare the rotors")
+    squares, known = _means(signal.t, signal.values**2, edges, spans)
+    problem = (_unbalanced(squares[known], vehicle) if known.any() else None) or _against_thrust(
+        recording, squares, known, edges, spans
+    )
+    if problem is not None and _commanded(signal, recording):
+        return Check(name, CheckResult.WARNING, f"{problem[0]} ({signal.source})", _COMMANDED, problem[1])
+    if problem is not None:
+        return Check(name, CheckResult.ERROR, f"{problem[0]} ({signal.source})", _FIX, problem[1])
+    return Check(name, CheckResult.OK, "the rotors agree with each other and with the thrust felt")
+
+
+def _edges(spans: Spans) -> FloatArray:
+    return np.arange(spans[0][0], spans[-1][1] + 0.5 * _BIN, _BIN) if spans else np.empty(0)
+
+
+def _means(t: FloatArray, values: FloatArray, edges: FloatArray, spans: Spans) -> Bins:
+    """Means of columns over the bins that lie in flight."""
+    row = np.digitize(t, edges)
+    count = np.bincount(row, minlength=len(edges) + 1)[1:-1]
+    sums = [np.bincount(row, column, minlength=len(edges) + 1)[1:-1] for column in values.T]
+    inside = np.any([(edges[:-1] >= a) & (edges[1:] <= b) for a, b in spans], axis=0)
+    return np.column_stack(sums) / np.maximum(count, 1)[:, None], np.asarray(inside & (count > 2))
+
+
+def _dead(speeds: FloatArray, most: float) -> Problem | None:
+    """A rotor that reads nothing for a share `most` of the time in which the others turn (else it is closed)."""
+    turning = speeds[speeds > 0.0]
+    if not len(turning):
+        return None
+    still = _DEAD * np.median(turning)
+    others = np.median(speeds, axis=1) > still
+    share = np.mean(speeds[others] < still, axis=0) if others.any() else np.zeros(speeds.shape[1])
+    if share.max() < most:
+        return None
+    rotor = int(np.argmax(share))
+    return (
+        f"rotor {rotor + 1} reads nothing for {share[rotor]:.0%} of the flight: its speed signal is dead",
+        {"rotor": rotor + 1.0, "dead_share": float(share[rotor])},
+    )
+
+
+def _stuck(signal: RotorSignal, recording: Recording, inside: BoolArray) -> Problem | None:
+    """A value held while the vehicle moves, unless it is a limit that all rotors share."""
+    gyro = recording.channels.get("gyro")
+    t, values = signal.t[inside], signal.values[inside]
+    low, high = np.min(values), np.max(values)
+    if np.ptp(values, axis=0).max() == 0.0 and gyro is not None and _moves(gyro, t[0], t[-1]):
+        return (
+            "no rotor ever changes its speed, though the vehicle moves: the speed signal is stuck",
+            {"stuck_s": float(t[-1] - t[0])},
+        )  # fmt: skip
+    for rotor, column in enumerate(values.T):
+        same = np.append(column[1:] == column[:-1], False) & (column > low) & (column < high)
+        begin, end = _longest(t, same)
+        if end - begin > _STUCK and gyro is not None and _moves(gyro, begin, end):
+            return (
+                f"rotor {rotor + 1} holds {column[np.searchsorted(t, begin)]:.4g} rad/s for {end - begin:.2g} s of "
+                "moving flight: its speed signal is stuck",
+                {"rotor": rotor + 1.0, "stuck_s": end - begin},
+            )
+    return None
+
+
+def _longest(t: FloatArray, same: BoolArray) -> tuple[float, float]:
+    first, end = true_runs(same)
+    if not len(first):
+        return 0.0, 0.0
+    begins, ends = t[first], t[np.minimum(end, len(t) - 1)]
+    longest = int(np.argmax(ends - begins))
+    return float(begins[longest]), float(ends[longest])
+
+
+def _moves(gyro: Channel, begin: float, end: float) -> bool:
+    inside = (gyro.t >= begin) & (gyro.t <= end)
+    return bool(inside.any() and np.max(np.std(gyro.values[inside], axis=0)) > 0.1)
+
+
+def _unbalanced(squares: FloatArray, vehicle: Vehicle) -> Problem | None:
+    """Mean roll and pitch moment of the rotors: half a second without balance turns a vehicle over.
+
+    Yaw is left free, for a vehicle may turn for long.  One rotor is named: that whose square, set to what balance
+    needs, agrees best with the others.
+    """
+    lever = vehicle.torque_arms[:, :2] / vehicle.arm
+    share = squares / np.maximum(squares.sum(axis=1, keepdims=True), 1e-9)
+    odd = np.linalg.norm(share @ lever, axis=1) > _IMBALANCE / (len(lever) - 0.25)
+    if odd.mean() < _UNBALANCED:
+        return None
+    typical = np.median(share[odd], axis=0)
+    fits = []
+    for rotor, arm in enumerate(lever):
+        needed = typical.copy()
+        needed[rotor] -= float(typical @ lever @ arm / (arm @ arm))
+        if needed[rotor] > 0.0:
+            fits.append(
+                (float(np.std(needed) / np.mean(needed)), rotor, float(np.sqrt(typical[rotor] / needed[rotor])))
+            )
+    if not fits:
+        return "the rotor speeds are far from balance", {"share": float(odd.mean())}
+    _, rotor, ratio = min(fits)
+    return (
+        f"rotor {rotor + 1} reads {ratio:.2f} times the speed that balance needs for {odd.mean():.0%} of the flight",
+        {"rotor": rotor + 1.0, "speed_ratio": ratio, "share": float(odd.mean())},
+    )
+
+
+def _against_thrust(
+    recording: Recording, squares: FloatArray, known: BoolArray, edges: FloatArray, spans: Spans
+) -> Problem | None:
+    accel = recording.channels.get("accel")
+    if accel is None:
+        return None
+    force, felt = _means(accel.t, -accel.values[:, 2:], edges, spans)
+    total = squares.sum(axis=1)
+    used = known & felt & (total > 0.0)
+    if np.count_nonzero(used) < 10:
+        return None
+    low, high = np.quantile(force[used, 0] / total[used], [0.1, 0.9])
+    if low > 0.0 and high < _THRUST_RANGE * low:
+        return None
+    ratio = float(high / low) if low > 0.0 else float("inf")
+    return (
+        f"thrust felt per rotor speed squared changes by a factor of {ratio:.2g} within the flight: "
+        "the rotor speeds disagree with the accelerometer",
+        {"thrust_range": ratio},
+    )
+
+
+# --- Rotor signals against weight and motion: unit of the speeds, order and spin of the motors
+
+
+_UNITS = (
+    ("in rpm", 2.0 * np.pi / 60.0), ("in rev/s", 2.0 * np.pi), ("of the electrical field (14 poles)", 1.0 / 7.0),
+    ("ten times too low", 10.0),
+)  # fmt: skip
+"""What speeds may be in instead of rad/s, and the factor that mends it."""
+_RATE = 50.0
+_SLOW_MOTION = 0.4
+"""Motion slower than about 1/0.4 s is left out: there aerodynamics and the controller rule [s]."""
+_LEAST_RATE = 30.0
+"""Slower rotor readings [Hz] miss the motion that distinguishes orders."""
+_LAGS = 5
+"""Motors answer late: torque up to this many rows earlier is tried."""
+_MOTOR_CHECKS_CLEAR, _MARGIN = 0.25, 0.15
+"""Mean correlation that settles an order, and by how much another order must be better."""
+_MOST_ROTORS = 6
+"""Beyond this only turns and mirror images of the order are tried, not all permutations."""
+
+
+def hover_check(recording: Recording, vehicle: Vehicle, spans: Spans) -> Check:
+    """Thrust by the vehicle file, with its effects, against weight in flight; separates rpm and rev/s from rad/s."""
+    try:
+        signal = rotor_signal(recording, vehicle)
+    except QuadidError as error:
+        return Check("hover", CheckResult.ERROR, error.found, error.fix or f"allowed: {error.allowed}")
+    inside = within(signal.t, spans)
+    if not inside.any():
+        most = float(np.max(ThrustModel.stated(vehicle).total(signal.values))) / (vehicle.mass * GRAVITY)
+        message = f"no flight in this log: its rotor speeds carry at most {most:.0%} of the weight"
+        fix = "did it fly? Else check mass, the unit of the rotor speeds, and b"
+        return Check("hover", CheckResult.WARNING, message, fix, {"most_load": most})
+    speeds = signal.values[inside] * _supply(recording, vehicle, signal.t[inside])
+    guess, thrust = vehicle.parameters["b"], float(np.mean(ThrustModel.stated(vehicle).total(speeds)))
+    needed = guess.initial * vehicle.mass * GRAVITY / thrust if thrust > 0.0 else np.inf
+    low, high = guess.limits
+    speed = float(np.sqrt(np.mean(speeds**2)))
+    check = partial(Check, "hover", numbers={"b_from_hover": needed, "speed_rad_s": speed})
+    message = f"rotors turn at {speed:.4g} rad/s in flight (rms), so b would be {needed:.3g} N s^2/rad^2"
+    if low <= needed <= high:
+        return check(CheckResult.OK, f"{message}; bounds {low:.3g} to {high:.3g}")
+    fitting = [(unit, factor) for unit, factor in _UNITS if low <= needed / factor**2 <= high]
+    if fitting:
+        units, factors = (" or ".join(parts) for parts in zip(*((u, f"{f:.6g}") for u, f in fitting), strict=True))
+        slip = f"{message}, outside {low:.3g} to {high:.3g}: speeds seem to be {units}"
+        return check(
+            CheckResult.ERROR, slip, f"multiply rotor speeds by {factors}, or use the vehicle file of this log"
+        )
+    root = ThrustModel.stated(vehicle).total(np.sqrt(np.abs(speeds)))
+    if low <= guess.initial * vehicle.mass * GRAVITY / max(float(np.mean(root)), 1e-300) <= high:
+        return check(CheckResult.ERROR, f"{message}: speeds seem to be squared", "take their square roots")
+    few = "did it fly? Else " if needed > high else ""
+    fix = few + "check mass, the unit of the rotor speeds, max_speed of the command, or the bounds of b"
+    return check(CheckResult.WARNING, f"{message}, outside its bounds {low:.3g} to {high:.3g}", fix)
+
+
+def _supply(recording: Recording, vehicle: Vehicle, t: FloatArray) -> FloatArray:
+    """Factor on the speeds at times `t` [s] by the supply voltage, shape (n, 1) or (1,); 1 where none is known."""
+    exponent = vehicle.effects.get("supply_voltage", {}).get("exponent", 0.0)
+    battery = recording.channels.get("battery")
+    volts = voltage_at(t, battery.t, battery.values[:, 0]) if exponent and battery is not None else None
+    if volts is None:
+        return np.ones(1)
+    return np.asarray((volts / (vehicle.reference_voltage or float(volts.mean()))) ** exponent)[:, None]
+
+
+Lagged = list[tuple[FloatArray, FloatArray, FloatArray]]
+"""Thrust over b (n, rotors), angular acceleration (n, 3) and rotors' own (n, rotors), for each lag of the motors."""
+
+
+def motor_order_check(lagged: Lagged | str, vehicle: Vehicle) -> Check:
+    """Correlates roll, pitch and yaw torque of every motor order with angular acceleration (of `lagged_motion`)."""
+    if isinstance(lagged, str):
+        return Check("motor_order", CheckResult.UNKNOWN, lagged)
+    return _judge_order(lagged, vehicle)
+
+
+def lagged_motion(recording: Recording, vehicle: Vehicle, spans: Spans) -> Lagged | str:
+    """Thrust over b by the vehicle file, angular acceleration and that of the rotors in flight, slow parts left out.
+
+    One entry for each lag of 0, 1, 2 … rows by which the motors may answer late; or why there is none.
+    """
+    if "gyro" not in recording.channels or not spans:
+        return "needs gyro and rotor signal in flight"
+    try:
+        signal = rotor_signal(recording, vehicle)
+        windows = to_windows(recording, vehicle, _RATE, spans[0][0], spans[-1][1])
+    except QuadidError as error:
+        return error.found
+    return lagged_of(windows, vehicle, 1.0 / measured_period(signal.t, signal.values))
+
+
+def lagged_of(windows: Sequence[Window], vehicle: Vehicle, rate: float) -> Lagged | str:
+    """As `lagged_motion`, of windows in flight, with rotor readings at `rate` [Hz]."""
+    if rate < _LEAST_RATE:
+        return f"rotor signal at {rate:.3g} Hz is too slow to check the motor order"
+    thrust, b = ThrustModel.stated(vehicle), vehicle.parameters["b"].initial
+    acted = [thrust.single(w.rotor_speed) / b for w in windows]
+    lagged = [_fast_motion(windows, acted, lag) for lag in range(_LAGS)]
+    return lagged if len(lagged[0][0]) >= 100 else "too little flight to check the motor order"
+
+
+def _fast_motion(
+    windows: Sequence[Window], thrust: list[FloatArray], lag: int
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Returns thrust over b and rotor acceleration `lag` rows earlier, and angular acceleration, no slow parts."""
+    parts: list[tuple[FloatArray, FloatArray, FloatArray]] = []
+    for w, acted in zip(windows, thrust, strict=True):
+        width = max(3, round(_SLOW_MOTION / w.dt))
+        if w.gyro is None or len(w) < 2 * width + lag or np.isnan(w.gyro).any():
+            continue
+        # The change over two steps against what acted in between: the row itself and its neighbours' halves.
+        acted = (
+            0.5 * (acted[:-2] + acted[1:-1])
+            if w.sampling == "held"
+            else 0.25 * (acted[:-2] + 2 * acted[1:-1] + acted[2:])
+        )
+        gained, spun = ((rows[2:] - rows[:-2]) / (2.0 * w.dt) for rows in (w.gyro, w.rotor_speed))
+        rows = acted[: len(acted) - lag], gained[lag:], spun[: len(spun) - lag]
+        acted, gained, spun = (r - moving_mean(r, width, mirrored=True) for r in rows)
+        parts.append((acted, gained, spun))
+    if not parts:
+        return np.empty((0, 0)), np.empty((0, 3)), np.empty((0, 0))
+    acted, gained, spun = (np.concatenate(column) for column in zip(*parts, strict=True))
+    return acted, gained, spun
+
+
+def better_order(lagged: Lagged | str, vehicle: Vehicle) -> tuple[int, ...] | None:
+    """The order of the log's columns with which torque follows the motion much better; None for none."""
+    if isinstance(lagged, str) or _still(lagged):
+        return None
+    orders = _orders(len(vehicle.rotors))
+    means = _correlations(lagged, vehicle, orders).mean(axis=1)
+    best = int(np.argmax(means))
+    own = float(means[orders.index(tuple(range(len(vehicle.rotors))))])
+    return orders[best] if means[best] - own > _MARGIN and means[best] > _MOTOR_CHECKS_CLEAR else None
+
+
+def reordered(vehicle: Vehicle, order: tuple[int, ...]) -> Vehicle:
+    """The vehicle whose rotor k is on column `order[k]` of the log, written for the log's columns."""
+    return vehicle.model_copy(update={"rotors": tuple(vehicle.rotors[order.index(k)] for k in range(len(order)))})
+
+
+def _still(lagged: Lagged) -> bool:
+    return float(np.max(np.std(lagged[0][1], axis=0))) < 0.05
+
+
+def _judge_order(lagged: Lagged, vehicle: Vehicle) -> Check:
+    if _still(lagged):
+        return Check("motor_order", CheckResult.UNKNOWN, "too little rotation to check the motor order")
+    own = _correlations(lagged, vehicle, [tuple(range(len(vehicle.rotors)))])[0]
+    numbers = {f"correlation_{axis}": float(c) for axis, c in zip(("roll", "pitch", "yaw"), own, strict=True)}
+    check = partial(Check, "motor_order", numbers=numbers)
+    text = f"correlation of torque and angular acceleration: roll {own[0]:.2f}, pitch {own[1]:.2f}, yaw {own[2]:.2f}"
+    if found := better_order(lagged, vehicle):
+        mean = float(_correlations(lagged, vehicle, [found]).mean())
+        order = ", ".join(str(i + 1) for i in found)
+        better = f"{text}; much better ({mean:.2f} on average) with the log's columns in the order {order}"
+        return check(CheckResult.ERROR, better, f"reorder the rotors of the vehicle file to take columns {order}")
+    right, reversed_ = (_yaw_explained(lagged, vehicle, sign) for sign in (1.0, -1.0))
+    if own[2] < -_MOTOR_CHECKS_CLEAR or (own[2] < _MOTOR_CHECKS_CLEAR < reversed_ and reversed_ - right > _MARGIN):
+        turned = f"{text}: yaw is reversed (with the other spins {reversed_:.2f}, drag and spin-up of the rotors)"
+        return check(CheckResult.ERROR, turned, "negate the spins in the vehicle file")
+    if min(own[0], own[1]) > _MOTOR_CHECKS_CLEAR:
+        return check(CheckResult.OK, text)
+    return check(CheckResult.UNKNOWN, f"{text}: too weak to judge")
+
+
+def _yaw_explained(lagged: Lagged, vehicle: Vehicle, sign: float) -> float:
+    """Correlation of yaw acceleration with drag and spin-up torque of the rotors, of spins times `sign`.
+
+    Each has a factor that cannot be negative: fast motion shows spin-up, slow motion drag.  The lag is that of roll and
+    pitch: spin-up at another one looks like drag.
+    """
+    arms, inertia = vehicle.torque_arms[:, :2], vehicle.initial[2:4]
+    tilt = [np.sum((squares @ arms) * motion[:, :2] * inertia) for squares, motion, _ in lagged]
+    squares, motion, spun = lagged[int(np.argmax(tilt))]
+    causes = sign * np.column_stack([squares @ vehicle.torque_arms[:, 2], spun @ vehicle.spins])
+    scale = np.linalg.norm(causes, axis=0) + 1e-300
+    torque = causes / scale @ nnls(causes / scale, motion[:, 2])[0]
+    norm = np.linalg.norm(torque) * np.linalg.norm(motion[:, 2])
+    return float(torque @ motion[:, 2] / max(norm, 1e-300))
+
+
+def _orders(rotors: int) -> list[tuple[int, ...]]:
+    own = tuple(range(rotors))
+    if rotors <= _MOST_ROTORS:
+        return list(permutations(own))
+    turns = [own[i:] + own[:i] for i in range(rotors)]
+    return turns + [turn[::-1] for turn in turns]
+
+
+def _correlations(lagged: Lagged, vehicle: Vehicle, orders: list[tuple[int, ...]]) -> FloatArray:
+    """Correlation of torque and angular acceleration at each order's best lag, shape (orders, 3)."""
+    arms = vehicle.torque_arms[np.argsort(orders, axis=1)]
+    found = []
+    for squares, motion, _ in lagged:
+        torque = np.einsum("nr,ora->noa", squares, arms, optimize=True)
+        norm = np.linalg.norm(torque, axis=0) * np.linalg.norm(motion, axis=0)
+        found.append(np.einsum("noa,na->oa", torque, motion) / np.maximum(norm, 1e-300))
+    at_lag = np.array(found)
+    return np.asarray(at_lag[at_lag.mean(axis=2).argmax(axis=0), np.arange(len(orders))])
+
+
+# --- Mass and rotor positions against what the flight shows, as far as physics reveals them
+#
+# Mass and thrust coefficient only ever show as their ratio, arm and inertia likewise.  So a wrong mass is seen when
+# the thrust coefficient is known (thrust stand, or a sigma of its own), a wrong arm when the inertias are known too;
+# that the whole frame is turned is seen always.
+
+
+_KNOWN = 0.1
+"""Relative standard deviation up to which a parameter counts as known."""
+_MASS_OFF, _ARM_OFF = 0.08, 0.2
+"""Relative differences that are reported: of mass; of arm, whose effect slow motors weaken."""
+_TURNED = math.radians(20.0)
+_GEOMETRY_CLEAR = 0.1
+"""Share of the variance of roll, and of pitch, that rotor torques must explain before geometry is judged by them."""
+
+
+def mass_check(recording: Recording, vehicle: Vehicle, spans: Spans, b_from_hover: float | None) -> Check | None:
+    """Weighs the vehicle by its known thrust coefficient; None where that is not known or nothing flew.
+
+    Args:
+        recording: the log.
+        vehicle: with `thrust_stand`, or a sigma of b.
+        spans: when it flew [s].
+        b_from_hover: thrust coefficient that would carry the weight [N s^2/rad^2], of `hover_check`.
+    """
+    known = _known_thrust(vehicle)
+    if known is None or b_from_hover is None or b_from_hover <= 0.0:
+        return None
+    b, sigma = known
+    factor = b / b_from_hover / _load(recording, spans)
+    mass = factor * vehicle.mass
+    numbers = {"mass_factor": factor, "mass_kg": mass}
+    message = (
+        f"the known thrust coefficient {b:.3g} N s^2/rad^2 carries {mass:.3g} kg, {factor:.3f} times the stated mass"
+    )
+    if abs(factor - 1.0) <= max(_MASS_OFF, 3.0 * sigma):
+        return Check("mass", CheckResult.OK, message, numbers=numbers)
+    fix = f"weigh the vehicle: {mass:.3g} kg would fit; or check the thrust stand and the unit of the rotor speeds"
+    return Check("mass", CheckResult.WARNING, message, fix, numbers)
+
+
+def _known_thrust(vehicle: Vehicle) -> tuple[float, float] | None:
+    """Thrust coefficient and its relative standard deviation, where it rests on more than a guess."""
+    if vehicle.stand_thrust is not None:
+        return vehicle.stand_thrust
+    return _known(vehicle, "b")
+
+
+def _known(vehicle: Vehicle, name: str) -> tuple[float, float] | None:
+    prior = vehicle.parameters[name]
+    if prior.sigma is None or prior.sigma > _KNOWN * prior.initial:
+        return None
+    return prior.initial, prior.sigma / prior.initial
+
+
+def _load(recording: Recording, spans: Spans) -> float:
+    """Mean thrust over weight in flight, by the accelerometer; 1 where that is implausible."""
+    accel = recording.channels.get("accel")
+    if accel is None:
+        return 1.0
+    inside = within(accel.t, spans)
+    load = -float(np.mean(accel.values[inside, 2])) / GRAVITY if inside.any() else 1.0
+    return load if 0.8 < load < 1.5 else 1.0
+
+
+def geometry_check(lagged: Lagged | str, vehicle: Vehicle) -> Check:
+    """Roll and pitch acceleration (of `lagged_motion`) against the torque that the stated rotor positions give.
+
+    With A the least-squares map from torque over b to inertia times acceleration, A = k R(alpha): the frame is turned
+    by alpha about z, and k is b times the factor by which arms (or inertias) are wrong.
+    """
+    name = "geometry"
+    if isinstance(lagged, str):
+        return Check(name, CheckResult.UNKNOWN, lagged)
+    arms, inertia = vehicle.torque_arms[:, :2], vehicle.initial[2:4]
+    fits = [_map(squares @ arms, motion[:, :2] * inertia) for squares, motion, _ in lagged]
+    share, a = max(fits, key=lambda fit: float(np.min(fit[0])))
+    if float(np.min(share)) < _GEOMETRY_CLEAR:
+        axis = ("roll", "pitch")[int(np.argmin(share))]
+        return Check(
+            name, CheckResult.UNKNOWN,
+            f"rotor torques explain only {np.min(share):.0%} of the {axis} motion: too little to judge positions",
+        )  # fmt: skip
+    angle = math.atan2(a[0, 1] - a[1, 0], a[0, 0] + a[1, 1])
+    scale = 0.5 * math.hypot(a[0, 1] - a[1, 0], a[0, 0] + a[1, 1])
+    numbers = {"turned_rad": angle, "explained": float(np.min(share))}
+    if abs(angle) > _TURNED:
+        degrees = math.degrees(angle)
+        return Check(
+            name, CheckResult.ERROR, f"the vehicle answers as if its rotors stood {degrees:+.0f} deg further about z",
+            f"turn the rotor positions of the vehicle file by {degrees:+.0f} deg (x towards y)", numbers,
+        )  # fmt: skip
+    return _judge_scale(vehicle, scale, numbers)
+
+
+def _map(torque: FloatArray, answer: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Least-squares map (2, 2) from torque (n, 2) to answer (n, 2), and the share of variance it explains per axis."""
+    a = np.asarray(np.linalg.lstsq(torque, answer, rcond=None)[0], dtype=np.float64)
+    total = np.maximum(np.sum(answer**2, axis=0), 1e-300)
+    return np.asarray(1.0 - np.sum((answer - torque @ a) ** 2, axis=0) / total), a
+
+
+def _judge_scale(vehicle: Vehicle, scale: float, numbers: dict[str, float]) -> Check:
+    thrust, inertias = _known_thrust(vehicle), [_known(vehicle, n) for n in ("J_xx", "J_yy")]
+    turned = f"rotor positions agree with the motion within {abs(math.degrees(numbers['turned_rad'])):.0f} deg"
+    if thrust is None or not all(inertias):
+        return Check(
+            "geometry", CheckResult.OK, f"{turned}; the arm itself shows only relative to the inertia", numbers=numbers
+        )
+    factor = scale / thrust[0]
+    numbers = {**numbers, "arm_factor": factor}
+    if abs(factor - 1.0) <= _ARM_OFF:
+        return Check("geometry", CheckResult.OK, f"{turned}, the arm within {abs(factor - 1.0):.0%}", numbers=numbers)
+    message = (
+        f"roll and pitch answer {factor:.2f} times as strongly as the stated arm of {vehicle.arm:.3g} m lets expect"
+    )
+    fix = f"measure the arm: {factor * vehicle.arm:.3g} m, {factor:.2f} times it, would fit; or the inertias are wrong"
+    return Check("geometry", CheckResult.WARNING, message, fix, numbers)

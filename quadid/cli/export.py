@@ -1,0 +1,101 @@
+"""`quadid export`: the parameters of a vehicle file for another program."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from quadid.app.export import export as exported
+from quadid.app.export import forms
+from quadid.app.logs import load_vehicle
+from quadid.cli.options import JsonTarget, OutFolder, shipped_names
+from quadid.report.programs import FORMATS, FORMS
+from quadid.vehicle import Vehicle
+
+
+def export(
+    vehicle: Annotated[
+        str | None,
+        typer.Option(
+            "--vehicle", metavar="V", help="A shipped name (pelican, ...) or a YAML file.", autocompletion=shipped_names
+        ),
+    ] = None,
+    form: Annotated[
+        str,
+        typer.Option(
+            "--format",
+            metavar="F",
+            help=f"{', '.join(FORMATS)}; programs and kinds of files name them too: crazyflow, sdf.",
+        ),
+    ] = "yaml",
+    what: Annotated[bool, typer.Option("--list", help="Print which effects each form carries, and end.")] = False,
+    history: Annotated[
+        Path | None,
+        typer.Option(
+            "--history", metavar="FILE", help="Values of the set in force in this history, not of the vehicle file."
+        ),
+    ] = None,
+    name: Annotated[
+        str | None, typer.Option("--id", metavar="NAME", help="Whose sets of the history; default the vehicle's.")
+    ] = None,
+    anyway: Annotated[bool, typer.Option("--anyway", help="Export values unproven or out of date, too.")] = False,
+    json: JsonTarget = None,
+    out: OutFolder = Path(),
+) -> None:
+    """Write the parameters for another program, with units and where each came from; nothing is sent to a vehicle."""
+    from quadid.cli import terminal
+    from quadid.cli import terminal as output
+
+    output.check_file(json, "--json")
+    if what:
+        listed(json)
+        return
+    if vehicle is None:
+        raise typer.BadParameter("no vehicle: use --vehicle, or --list", param_hint="--vehicle")
+    described, source, doubt = load_vehicle(vehicle), Path(vehicle).name, ""
+    if history is not None:
+        described, source, doubt = _in_force(described, history, name or described.name)
+    elif name is not None:
+        raise typer.BadParameter("it names sets of a history: give --history FILE too", param_hint="--id")
+    done = exported(described, form, source=source, doubt=doubt, anyway=anyway)
+    folder = output.out_folder(out)
+    for path in (folder / file for file in done.texts):
+        if path.exists() and Path(vehicle).exists() and path.samefile(vehicle):
+            raise output.OutputError(f"the export would overwrite {vehicle}", "another folder", "give --out")
+    done.result["files"] = [str(path) for path in done.save(folder)]
+    output.write_json(done.result, json)
+    console = terminal.console(quiet=json == "-")
+    for file in done.result["files"]:
+        console.print(f"Written: {file}", soft_wrap=True)
+    terminal.warn(done.result["warnings"])
+
+
+def listed(json: str | None) -> None:
+    """Prints what each form carries."""
+    from quadid.cli import terminal
+    from quadid.cli import terminal as output
+    from quadid.cli import terminal as tables
+
+    carried = {name: {"program": form.program, "effects": list(form.effects)} for name, form in FORMS.items()}
+    output.write_json({"schema": "quadid.formats/1", "formats": carried}, json)
+    console = terminal.console(quiet=json == "-")
+    tables.print_tables(console, forms())
+    console.print("\nEvery form carries mass and geometry; `yaml` carries all. What a form leaves out, its file names.")
+
+
+def _in_force(vehicle: Vehicle, history: Path, name: str) -> tuple[Vehicle, str, str]:
+    """The vehicle with the values that a service put in force last, where they come from, and what speaks against."""
+    from quadid_node.history import read_in_force
+    from quadid_node.store_file import StoreError, read_history
+
+    from quadid.identification.result import with_values
+
+    found = read_in_force(history, name, vehicle)
+    if found.item is None:
+        names = ", ".join(entry["name"] for entry in read_history(history, name, sets=0)["vehicles"]) or "none"
+        unread = f": {found.why_none}" if found.why_none else ""
+        raise StoreError(f"no set of '{name}' was ever in force in {history}{unread}", f"one of: {names}", "give --id")
+    fitted = with_values(vehicle, found.item.parameters).model_copy(update={"proof": None})
+    return fitted, f"{history.name}, set {found.item.sequence} of {name}", found.doubt

@@ -1,0 +1,245 @@
+"""`quadid replay`: drives the online session from a log, and writes what it would have published."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from quadid_replay import TopicWriter, open_log
+
+from quadid.cli.options import Columns, JsonTarget, Preset, Rate, Seed, VehicleName
+from quadid.errors import QuadidError
+
+if TYPE_CHECKING:
+    from quadid_node.publication import Output
+    from quadid_node.recorder import Beginning
+    from quadid_node.service import Service
+
+    from quadid.app.outcome import Advance
+    from quadid.data.window import Recording, Sample
+
+BATCH = 200
+"""Samples between two looks at the session."""
+NOTHING = 3
+"""Exit code when the log was played but no set was published."""
+
+
+class ReplayError(QuadidError):
+    """A replay that was asked for wrongly."""
+
+
+def replay(
+    log: Annotated[
+        str, typer.Argument(metavar="LOG", help="Flight log: MCAP, .tlog, DataFlash, ULog, CSV. LOG@76:216: a span.")
+    ],
+    vehicle: VehicleName,
+    speed: Annotated[str, typer.Option("--speed", metavar="1|max", help="Multiple of real time, or max.")] = "max",
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="F.mcap", help="Write what would have been published.")
+    ] = None,
+    rate: Rate = 50.0,
+    window: Annotated[float, typer.Option("--window", metavar="S", help="Flight that one fit looks at.")] = 10.0,
+    refit: Annotated[float, typer.Option("--refit", metavar="S", help="Time between fits.")] = 1.0,
+    diagnose: Annotated[
+        float, typer.Option("--diagnose", metavar="S", help="Time between two diagnoses of the last minute; 0: never.")
+    ] = 60.0,
+    approval: Annotated[str, typer.Option("--approval", metavar="HOW", help="auto or manual.")] = "auto",
+    gate: Annotated[
+        str,
+        typer.Option("--gate", metavar="K=V,...", help="Gate settings, as windows=3,width=0.05; see docs/online.md."),
+    ] = "",
+    as_recorded: Annotated[
+        bool,
+        typer.Option(
+            "--as-recorded",
+            help="LOG was recorded by the node (record:=F.mcap): use its settings, start and order; repeats that "
+            "run bit for bit.",
+        ),
+    ] = False,
+    candidates: Annotated[
+        bool, typer.Option("--candidates", help="Every estimate in the JSON, not only sets.")
+    ] = False,
+    seed: Seed = 0,
+    preset: Preset = "auto",
+    columns: Columns = None,
+    json: JsonTarget = None,
+) -> None:
+    """Drive the online session from a log: the sets, findings and reasons that a live service would have published."""
+    from quadid_node.playback import arrivals, stream
+    from quadid_node.service import Service
+    from quadid_node.settings import session_settings
+    from quadid_node.worker import InlineWorker
+
+    from quadid.app.logs import load_vehicle, parse_columns, parse_part
+    from quadid.cli import terminal
+    from quadid.cli import terminal as output
+
+    output.check_file(json, "--json")
+    output.check_file(out, "--out")
+    pace = _pace(speed)
+    described = load_vehicle(vehicle)
+    asked = {f"gate_{name}": value for name, value in parse_pairs(gate).items()}
+    settings = session_settings(approval, rate=rate, window=window, refit=refit, diagnose=diagnose, seed=seed, **asked)
+    cut = parse_part(log)
+    if as_recorded and cut.path != Path(log):
+        raise ReplayError(f"--as-recorded of {log}, a part", "whole recordings", f"--as-recorded {cut.path}")
+    recording = cut.of(open_log(cut.path, preset, described.columns | parse_columns(columns or [])))
+    if as_recorded:
+        beginning = _beginning(Path(log), described.name)
+        described = beginning.vehicle
+        service = Service(described, beginning.settings, InlineWorker(), restored=beginning.restored)
+        samples = arrivals(Path(log), beginning.source, len(described.rotors))
+    else:
+        service = Service(described, settings, InlineWorker())
+        samples = stream(recording)
+    with terminal.progress() as advance:
+        outputs = play(recording, samples, service, pace, advance)
+    result = summary(recording, service, outputs, candidates)
+    if out is not None:
+        write_outputs(out, outputs, described.name)
+        result["out"] = str(out.absolute())
+    output.write_json(result, json)
+    show(result, quiet=json == "-")
+    if not result["published"]:
+        raise typer.Exit(NOTHING)
+
+
+def _pace(speed: str) -> float:
+    if speed == "max":
+        return 0.0
+    try:
+        pace = float(speed)
+    except ValueError as error:
+        raise ReplayError(f"speed '{speed}'", "a factor of real time, or max", "for example --speed 1") from error
+    if not 0.0 < pace <= 1000.0:
+        raise ReplayError(f"speed {pace:g}", "more than 0, at most 1000, or max")
+    return pace
+
+
+def _beginning(log: Path, vehicle: str) -> Beginning:
+    """What the session of a node's recording began with; raises ReplayError when there is none, or of another one."""
+    from quadid_node.recorder import read_beginning
+
+    found = read_beginning(log)
+    if found is None:
+        raise ReplayError(f"{log.name} was not recorded by the node", fix="leave --as-recorded out")
+    if found.vehicle.name != vehicle:
+        raise ReplayError(f"{log.name} was recorded of '{found.vehicle.name}', not '{vehicle}'", fix="change --vehicle")
+    return found
+
+
+def play(
+    recording: Recording, samples: Iterable[Sample], service: Service, pace: float, advance: Advance
+) -> list[Output]:
+    """Plays a recording into a service.
+
+    Args:
+        recording: the log.
+        samples: its samples, in the order to play them.
+        service: with an inline worker.
+        pace: factor of real time; 0 for as fast as possible.
+        advance: told how far it is.
+
+    Returns:
+        Everything the service put out, in order.
+    """
+    total = sum(len(c.t) for c in recording.channels.values())
+    outputs: list[Output] = []
+    begin = first = None
+    for count, sample in enumerate(samples):
+        if pace > 0.0:
+            if begin is None or first is None:
+                begin, first = time.monotonic(), sample.t
+            time.sleep(max(begin + (sample.t - first) / pace - time.monotonic(), 0.0))
+        service.push(sample)
+        if count % BATCH == 0 or pace > 0.0:
+            outputs.extend(_work(service))
+            advance("replay", count / max(total, 1))
+    outputs.extend(_work(service))
+    advance("replay", 1.0)
+    return outputs
+
+
+def _work(service: Service) -> list[Output]:
+    """Steps until the session needs more samples."""
+    out = service.step()
+    while service.session.running is not None:
+        out.extend(service.step())
+    return out
+
+
+def parse_pairs(text: str) -> dict[str, float]:
+    """Reads ``name=number,name=number``; raises ReplayError."""
+    out = {}
+    for part in filter(None, text.split(",")):
+        name, _, number = part.partition("=")
+        try:
+            out[name.strip()] = float(number)
+        except ValueError as error:
+            raise ReplayError(f"cannot read '{part}'", "NAME=NUMBER,NAME=NUMBER", "for example windows=3") from error
+    return out
+
+
+def summary(
+    recording: Recording, service: Service, outputs: Sequence[Output], candidates: bool = False
+) -> dict[str, Any]:
+    """The replay as JSON, of the form ``quadid.replay/1``; times [s, UNIX], or since boot in a log that has no more."""
+    from quadid_node.codec import diagnosis_to_dict, set_to_dict, status_to_dict
+
+    sets = [o.item for o in outputs if o.topic == "parameters"]
+    estimates = [o.item for o in outputs if o.topic == "candidate"]
+    refused: dict[str, int] = {}
+    for item in estimates:
+        if item.state.value == "rejected":
+            refused[item.check] = refused.get(item.check, 0) + 1
+    return {
+        "schema": "quadid.replay/1",
+        "log": recording.name,
+        "epoch": 0,
+        "vehicle": service.vehicle.name,
+        "published": [set_to_dict(s) for s in sets],
+        **({"candidates": [set_to_dict(s, covariance=False) for s in estimates]} if candidates else {}),
+        "refused": refused,
+        "diagnoses": [diagnosis_to_dict(o) for o in outputs if o.topic == "diagnosis"],
+        "events": [dict(vars(o)) for o in outputs if o.topic == "event"],
+        "status": status_to_dict(service.session.status()),
+        "warnings": list(recording.warnings),
+    }
+
+
+def write_outputs(path: Path, outputs: Sequence[Output], vehicle: str) -> None:
+    """Writes what would have been published as MCAP: topics, types and stamps as of the live service."""
+    from quadid_node.messages import RESULTS, TOPICS
+
+    with TopicWriter(path) as writer:
+        for output in outputs:
+            if output.topic in RESULTS:
+                message = RESULTS[output.topic](output, vehicle, "")
+                stamp = message["header"]["stamp"]
+                writer.write(*TOPICS[output.topic], message, stamp["sec"] * 10**9 + stamp["nanosec"])
+
+
+def show(result: dict[str, Any], quiet: bool) -> None:
+    """Prints what was published, refused and found."""
+    from quadid.cli import terminal
+    from quadid.cli import terminal as tables
+    from quadid.report.tables import parameter_table
+
+    console = terminal.console(quiet=quiet)
+    for event in result["events"]:
+        if event["level"] != "info" or event["kind"] == "accepted":
+            console.print(f"{event['t'] or 0.0:9.1f} s  {event['text']}", soft_wrap=True)
+    for check, count in result["refused"].items():
+        console.print(f"{count} estimate{'s' * (count != 1)} not published: {check.replace('_', ' ')}")
+    if not result["published"]:
+        status = result["status"]
+        console.print(f"nothing published: {status['phase']}: {status['reason']}", soft_wrap=True)
+        return
+    last = result["published"][-1]
+    console.print(f"set {last['sequence']} of {result['vehicle']}, from {last['stop'] - last['start']:.0f} s")
+    tables.print_tables(console, [parameter_table(last["parameters"])])
+    if "out" in result:
+        console.print(f"Written: {result['out']}", soft_wrap=True)

@@ -1,0 +1,120 @@
+"""`quadid simulate`: flies the closed-loop vehicle and logs it, to a file or live over MAVLink."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from quadid.app.simulate import SimulateError, check_suffix
+from quadid.app.simulate import simulate as fly
+from quadid.cli.options import JsonTarget, Seed, VehicleName
+from quadid.data.window import Recording
+
+LIVE = "udpout:"
+
+
+def simulate(
+    out: Annotated[
+        str, typer.Argument(metavar="OUT", help="File (.mcap, .tlog, .csv), or udpout:HOST:PORT for live MAVLink.")
+    ],
+    vehicle: VehicleName = "pelican",
+    seconds: Annotated[float, typer.Option("--seconds", metavar="S", help="Length of the flight.")] = 500.0,
+    seed: Seed = 1,
+    effect: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--effect",
+            metavar="NAME[:KEY=VALUE,...]",
+            help="Hidden effect, as rotor_drag:k_x=0.3,k_y=0.3; without values it is drawn at a realistic size. "
+            "Repeatable.",
+        ),
+    ] = None,
+    profile: Annotated[
+        str, typer.Option("--profile", help="What the pilot does: excited, gentle, hover, one_axis, roll_pitch.")
+    ] = "excited",
+    manoeuvre: Annotated[
+        Path | None, typer.Option("--manoeuvre", metavar="FILE", help="Fly the segments of this YAML file instead.")
+    ] = None,
+    noise: Annotated[float, typer.Option("--noise", metavar="FACTOR", min=0.0, help="Scales all sensor noise.")] = 1.0,
+    rate: Annotated[float, typer.Option("--rate", metavar="HZ", help="Log rate.")] = 50.0,
+    extra: Annotated[
+        list[str] | None,
+        typer.Option("--extra", metavar="CHANNEL", help="Log velocity, position or battery as well."),
+    ] = None,
+    spread: Annotated[
+        float,
+        typer.Option(
+            "--spread", metavar="F", min=0.0, max=0.9, help="Draw the true parameters within this fraction of the type."
+        ),
+    ] = 0.0,
+    json: JsonTarget = None,
+) -> None:
+    """Fly the closed-loop vehicle, controlled at 1 kHz, and log it at 50 Hz."""
+    from quadid.cli.terminal import check_file, write_json
+
+    check_target(out)
+    check_file(json, "--json")
+    done = fly(
+        vehicle, seconds=seconds, seed=seed, effects=effect or (), profile=profile, manoeuvre=manoeuvre, noise=noise,
+        rate=rate, extras=extra or (), spread=spread,
+    )  # fmt: skip
+    if out.startswith(LIVE):
+        stream(out, done.flight.recording)
+    else:
+        done.save(out)
+    log = out if out.startswith(LIVE) else str(Path(out).absolute())
+    write_json({**done.result, "log": log}, json)
+    if json != "-":
+        typer.echo(f"{done.flight.vehicle.name}: {done.result['rows']} rows at {rate:g} Hz flown and logged to {out}")
+
+
+def check_target(out: str) -> None:
+    """Raises SimulateError unless `out` can be written: a known suffix in a folder that exists, or a UDP address."""
+    if out.startswith(LIVE):
+        host, _, port = out.removeprefix(LIVE).rpartition(":")
+        if not host or not port.isdigit() or not 0 < int(port) < 65536:
+            raise SimulateError(f"cannot send to '{out}'", "udpout:HOST:PORT", "for example udpout:127.0.0.1:14550")
+        return
+    from quadid.cli.terminal import check_file
+
+    check_suffix(out)
+    check_file(out, "OUT")
+
+
+def stream(address: str, recording: Recording) -> None:
+    """Sends a recording as MAVLink 2 over UDP, each message when its time has come.
+
+    Raises:
+        SimulateError: the address cannot be reached.
+    """
+    from pymavlink import mavutil
+    from pymavlink.dialects.v20 import ardupilotmega as dialect
+    from quadid_replay.writers import COMPONENT, SYSTEM, mavlink_messages
+
+    try:
+        link = mavutil.mavlink_connection(address, source_system=SYSTEM, source_component=COMPONENT)
+    except OSError as error:
+        raise SimulateError(f"cannot send to {address} ({error.strerror})", fix="check host and port") from error
+    mav = dialect.MAVLink(None, srcSystem=SYSTEM, srcComponent=COMPONENT)
+    try:
+        for message in in_real_time(mavlink_messages(recording)):
+            link.write(message.pack(mav))
+            mav.seq = (mav.seq + 1) % 256
+    finally:
+        link.close()
+
+
+def in_real_time(messages: Iterator[tuple[float, Any]]) -> Iterator[Any]:
+    """Yields messages when their time [s] has come, counted from the first."""
+    begin: float | None = None
+    for t, message in messages:
+        now = time.monotonic()
+        if begin is None:
+            begin = now - t
+        if begin + t > now:
+            time.sleep(begin + t - now)
+        yield message

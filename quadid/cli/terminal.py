@@ -1,0 +1,247 @@
+"""Terminal and files of a command: console, progress, tables, JSON, errors as one line."""
+
+from __future__ import annotations
+
+import os
+import shlex
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from quadid.app.logs import OutputError as OutputError
+from quadid.app.logs import file_name as file_name
+from quadid.app.logs import write_text as write_text
+from quadid.app.outcome import Advance as Advance
+from quadid.app.outcome import Outcome, silent
+from quadid.app.outcome import json_text as json_text
+from quadid.cli.compiling import prepare
+from quadid.errors import QuadidError
+from quadid.report.tables import SPACE, Cell, TextTable
+from quadid.report.verdict import Verdict
+from quadid.sanitise import one_line
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+
+# --- What people see: tables, notes, progress; colours and bars on a terminal only, nothing beside JSON on stdout
+
+
+_PIPE_WIDTH = 120
+
+
+def console(quiet: bool = False, stderr: bool = False) -> Console:
+    """Returns the console to print on.
+
+    Args:
+        quiet: print nothing (stdout carries JSON).
+        stderr: print on stderr instead of stdout.
+
+    Nothing is markup.  Colours follow the terminal and ``NO_COLOR``; a pipe gets plain text that is not broken at 80
+    columns.
+    """
+    from rich.console import Console
+
+    stream = sys.stderr if stderr else sys.stdout
+    width = None if stream.isatty() or "COLUMNS" in os.environ else _PIPE_WIDTH
+    return Console(stderr=stderr, quiet=quiet, width=width, highlight=False, markup=False)
+
+
+def warn(messages: tuple[str, ...] | list[str]) -> None:
+    """Prints warnings on stderr, one line each, without control characters that a name in a log may hold."""
+    for message in messages:
+        print(f"warning: {one_line(message)}", file=sys.stderr)
+
+
+@contextmanager
+def progress(compiled: Sequence[str] = ("simulation", "statistics", "estimate")) -> Iterator[Advance]:
+    """Shows a progress bar on stderr while the block runs, if stderr is a terminal; yields how to advance it.
+
+    Args:
+        compiled: kernels that the block needs (`quadid.app.kernels.PARTS`), compiled first where they are not.
+    """
+    if not sys.stderr.isatty():
+        prepare(compiled, silent)
+        yield silent
+        return
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.percentage:>3.0f} %"),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=console(stderr=True), transient=True) as bar:
+        task = bar.add_task("", total=1.0)
+
+        def advance(stage: str, share: float) -> None:
+            bar.update(task, description=stage, completed=share)
+
+        prepare(compiled, advance)
+        yield advance
+
+
+# --- Written results: folders that are checked before long work, and JSON that any parser accepts
+
+
+def out_folder(folder: Path) -> Path:
+    """Makes the folder where it does not exist, and returns its absolute path.
+
+    Raises:
+        OutputError: it cannot be made or written to.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"{folder} cannot be made ({error.strerror})", "a folder", "choose another --out") from error
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise OutputError(f"{folder} is not writable", "a folder you may write to", "choose another --out")
+    return folder.resolve()
+
+
+def check_file(path: Path | str | None, option: str) -> None:
+    """Raises OutputError when a file to be written later cannot be; ``-`` and None are fine."""
+    if path is None or str(path) == "-":
+        return
+    file = Path(path)
+    if file.is_dir():
+        raise OutputError(f"{option} {file} is a directory", "a file name", f"name a file in it: {file / 'result'}")
+    folder = file.absolute().parent
+    if not folder.is_dir():
+        raise OutputError(f"{option}: no folder {folder}", "an existing folder", f"mkdir -p {folder}")
+    if not os.access(file if file.exists() else folder, os.W_OK):
+        raise OutputError(f"{option}: {file} is not writable", "a file you may write", "choose another place")
+
+
+def command_line() -> str:
+    """The command as it was typed, for reports."""
+    return shlex.join(["quadid", *sys.argv[1:]])
+
+
+def write_json(result: Mapping[str, Any], target: str | None) -> None:
+    """Writes a result as JSON to a file, or to stdout for ``-``; numbers that JSON has no word for become null."""
+    if target is None:
+        return
+    text = json_text(result)
+    if target == "-":
+        sys.stdout.write(text)
+    else:
+        write_text(Path(target), text)
+
+
+# --- Tables and verdicts of the library on a terminal: as wide as it is, in colours where it has them
+
+
+_STYLES = {"": "", "good": "green", "fair": "yellow", "poor": "red", "title": "bold", "head": "underline", "dim": "dim"}
+
+
+def print_tables(console: Console, tables: Sequence[TextTable]) -> None:
+    """Prints tables, an empty line after each; columns that the terminal has no room for are left out."""
+    from rich.text import Text
+
+    for table in tables:
+        for line in table.lines(console.width):
+            text = Text()
+            for i, cell in enumerate(line):
+                text.append(SPACE * (i > 0) + cell.text, style=_STYLES[cell.tone])
+            text.rstrip()
+            console.print(text, soft_wrap=True)
+        console.print()
+
+
+def print_cell(console: Console, cell: Cell) -> None:
+    """Prints one sentence."""
+    from rich.text import Text
+
+    console.print(Text(cell.text, style=_STYLES[cell.tone]))
+
+
+def print_verdict(console: Console, verdict: Verdict) -> None:
+    """Prints the headline, details and next steps."""
+    headline, *rest = verdict.lines()
+    print_cell(console, Cell(headline, verdict.level))
+    for line in rest:
+        print_cell(console, Cell(line))
+
+
+def conclude(
+    done: Outcome, json: str | None, report: Path | None = None, files: Mapping[str, Path] | None = None,
+    series: Sequence[str] | None = None,
+) -> None:  # fmt: skip
+    """Writes what a command gives beside what it prints, names that in its JSON, and prints the result.
+
+    Args:
+        done: the result; its warnings go to stderr.
+        json: where its JSON goes, as `output.write_json`.
+        report: where its HTML report goes.
+        files: where its ``vehicle``, and its ``prediction``, go.
+        series: forms of simulated against measured, written beside the vehicle file.
+    """
+    from quadid.cli import terminal
+    from quadid.cli import terminal as output
+
+    whole: Any = done  # which of these a command offers depends on its result
+    for name, path in (files or {}).items():
+        done.result[f"{name}_file"] = str(output.write_text(path, getattr(done, name).to_yaml()))
+    if report is not None:
+        done.result["report"] = str(report.absolute())
+        whole.report(report, output.command_line())
+    if series and files:
+        done.result["series"] = [str(path) for path in whole.save_series(files["vehicle"].parent, series)]
+    output.write_json(done.result, json)
+    console = terminal.console(quiet=json == "-")
+    if done.heading:
+        console.print(done.heading)
+    print_tables(console, done.tables())
+    if done.verdict is not None:
+        print_verdict(console, done.verdict)
+    if done.result.get("missing"):
+        console.print(done.result["missing"]["statement"], soft_wrap=True)
+    for key, label in (("vehicle_file", "Vehicle file"), ("prediction_file", "Prediction file"), ("report", "Report")):
+        if done.result.get(key):
+            console.print(f"{label}: {done.result[key]}", soft_wrap=True)
+    for path in done.result.get("series", ()):
+        console.print(f"Simulated against measured: {path}", soft_wrap=True)
+    terminal.warn(done.warnings)
+
+
+# --- Errors as one line for people: what was found, what is allowed, what to do
+
+
+_MISSING = "MissingParameter"
+"""An error of usage for what was not given; its help says what that may be."""
+
+
+class Failure(NamedTuple):
+    """One line without line breaks, and the exit code that goes with it."""
+
+    line: str
+    exit_code: int
+
+
+def explain(error: Exception) -> Failure | None:
+    """Returns the line for an error that the user can act on, or None for a defect of the program."""
+    if isinstance(error, QuadidError):
+        return Failure(one_line(str(error)), error.exit_code)
+    if isinstance(error, OSError):
+        where = f"{error.filename}: " if error.filename else ""
+        return Failure(
+            one_line(f"{where}{error.strerror or error}; fix: check the path, its permissions and the disk"), 2
+        )
+    if type(error).__name__ == "LinAlgError":
+        cause = "the equations have no unique solution: these data cannot support an answer"
+        return Failure(f"{cause}; fix: look at the log with `quadid inspect`, use a livelier flight", 3)
+    # typer brings its own copy of click or uses the one installed; both have this method on errors of usage.
+    told = getattr(error, "format_message", None)
+    if callable(told):
+        context = getattr(error, "ctx", None)
+        path = context.command_path if context is not None else "quadid"
+        wanted = getattr(getattr(error, "param", None), "help", None) if type(error).__name__ == _MISSING else None
+        allowed = f"; allowed: {wanted[0].lower()}{wanted[1:].rstrip('.')}" if wanted else ""
+        return Failure(one_line(f"{str(told()).rstrip('.')}{allowed}; see `{path} --help`"), 2)
+    return None

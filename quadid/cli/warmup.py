@@ -1,0 +1,23 @@
+"""`quadid warmup`: compiles the kernels now, so that the first fit and the first flight need not."""
+
+from __future__ import annotations
+
+import time
+
+from quadid.app.kernels import PARTS
+from quadid.cli import terminal
+from quadid.cli import terminal as output
+from quadid.cli.compiling import prepare
+from quadid.cli.options import JsonTarget
+
+
+def warmup(json: JsonTarget = None) -> None:
+    """Compile all kernels for this machine's processor, in processes side by side; nothing to do where that is done."""
+
+    begin = time.perf_counter()
+    with terminal.progress(compiled=()) as advance:
+        made = prepare(tuple(PARTS), advance)
+    seconds = time.perf_counter() - begin
+    output.write_json({"schema": "quadid.warmup/1", "compiled": made, "seconds": seconds}, json)
+    what = f"compiled in {seconds:.0f} s" if made else "compiled already"
+    terminal.console(quiet=json == "-").print(f"Kernels: {what}.")

@@ -1,0 +1,569 @@
+"""Changes since healthy flights: hypotheses, their evidence, and the answer."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cache, lru_cache
+from itertools import combinations
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.special import chdtrc, chdtri, fdtrc, log_ndtr, ndtri, stdtr, stdtrit
+from scipy.stats import qmc
+
+from quadid.chi_square import Z95
+from quadid.condition.trim import AXES, FlightTrim, Healthy, healthy_spread, trim_directions
+from quadid.types import FloatArray
+from quadid.vehicle import Vehicle
+
+# --- What may have changed, and what it would do to the trim: linear in its parameters, with priors from physics
+#
+# A rotor j with share s_j of the load that loses the fraction l of its thrust and q of its drag torque moves the trim
+# by l s_j (G_kj - trim_k) in roll and pitch, by q s_j G_3j - l s_j trim_3 in yaw and by l s_j in effort.  A mass w at
+# (x, y) from the centre, w the part of the loaded vehicle's, moves it by -w y / arm, w x / arm, 0 and w.
+
+
+LOSS = 0.2
+"""Prior standard deviation of a rotor's loss of thrust."""
+DRAG_APART = ((0.02, 0.9), (0.15, 0.1))
+"""Prior standard deviations of its loss of drag torque from that of thrust, with their probabilities: a tired motor
+loses as much of both, a cut blade nearly so (R^4 and R^5 of its length; a tenth of `LOSS` apart), one with tape or a
+bend may lose thrust and gain drag."""
+MASS = 0.1
+"""Prior standard deviation of an added mass, as a fraction."""
+REACH = 0.7
+"""An added mass sits this far from the centre, in arms (standard deviation of each coordinate)."""
+SHIFT = 0.05
+"""Prior standard deviation of a shift of the CG without mass, in arms: a battery that has slid."""
+MOST_ROTORS = 3
+"""Most rotors that are damaged at once."""
+_KINDS = {"weak_rotor": 0.7, "payload": 0.2, "cg_offset": 0.06, "effort": 0.04}
+"""Prior odds of the kinds of change; a further damaged rotor costs `_ANOTHER`."""
+_ANOTHER = 0.3
+_STEP = 0.15
+_MASSES = tuple(float(mass) for mass in 0.01 * np.exp(2.0 * _STEP * np.arange(13)))
+"""Added masses that are tried, from 1 % in steps of twice `_STEP` (relative), each with that standard deviation."""
+
+
+class Hypothesis(NamedTuple):
+    """One explanation of a change of trim.
+
+    Attributes:
+        kind: weak_rotor, payload (mass_change with cg_offset), cg_offset, effort (mass_change or thrust_drop).
+        rotors: the damaged ones, from 0.
+        effect: change of trim per parameter, shape (4, parameters).
+        prior: covariance of the parameters, shape (parameters, parameters).
+        centre: their prior mean, shape (parameters,).
+        positive: which parameters cannot be negative.
+        log_odds: prior.
+    """
+
+    kind: str
+    rotors: tuple[int, ...]
+    effect: FloatArray
+    prior: FloatArray
+    centre: FloatArray
+    positive: tuple[int, ...]
+    log_odds: float
+
+
+def rotor_effect(vehicle: Vehicle, rotor: int, share: float, trim: FloatArray) -> FloatArray:
+    """Change of trim per loss of thrust and per loss of drag torque of one rotor, shape (4, 2)."""
+    g = trim_directions(vehicle)[:, rotor]
+    return share * np.array([[g[0] - trim[0], 0.0], [g[1] - trim[1], 0.0], [-trim[2], g[2]], [1.0, 0.0]])
+
+
+def hypotheses(vehicle: Vehicle, shares: FloatArray, trim: FloatArray) -> list[Hypothesis]:
+    """Every explanation that is compared.
+
+    Args:
+        vehicle: geometry.
+        shares: each rotor's share of the load in the flights in question, shape (rotors,).
+        trim: healthy trim, shape (4,).
+    """
+    rotors = range(len(vehicle.rotors))
+    single = [rotor_effect(vehicle, j, float(shares[j]), trim) for j in rotors]
+    out = []
+    for count in range(1, min(MOST_ROTORS, len(rotors) - 1) + 1):
+        chosen = list(combinations(rotors, count))
+        odds = np.log(_KINDS["weak_rotor"] * _ANOTHER ** (count - 1) / len(chosen))
+        blocks = [np.array([[LOSS**2, LOSS**2], [LOSS**2, LOSS**2 + apart**2]]) for apart, _ in DRAG_APART]
+        priors = [np.kron(np.eye(count), block) for block in blocks]
+        for group in chosen:
+            effect = np.hstack([single[j] for j in group])
+            positive = tuple(range(0, 2 * count, 2))
+            for prior, (_, part) in zip(priors, DRAG_APART, strict=True):
+                log_odds = float(odds + np.log(part))
+                out.append(Hypothesis("weak_rotor", group, effect, prior, np.zeros(2 * count), positive, log_odds))
+    return [*out, *_of_mass()]
+
+
+def _of_mass() -> Sequence[Hypothesis]:
+    """Added masses of several sizes at a place, a shifted CG, and more effort alone."""
+    shift = np.array([[0.0, -1.0], [1.0, 0.0], [0.0, 0.0], [0.0, 0.0]])  # per x and y of the CG, in arms
+    effort = np.array([[0.0], [0.0], [0.0], [1.0]])
+    odds = {kind: float(np.log(p)) for kind, p in _KINDS.items()}
+    weights = np.exp(-0.5 * (np.array(_MASSES) / MASS) ** 2)
+    out = []
+    for mass, weight in zip(_MASSES, weights / weights.sum(), strict=True):
+        prior = np.diag([(REACH * mass) ** 2, (REACH * mass) ** 2, (_STEP * mass) ** 2])
+        centre = np.array([0.0, 0.0, mass])
+        log_odds = odds["payload"] + float(np.log(weight))
+        out.append(Hypothesis("payload", (), np.hstack([shift, effort]), prior, centre, (), log_odds))
+    none = np.zeros(2)
+    out.append(Hypothesis("cg_offset", (), shift, SHIFT**2 * np.eye(2), none, (), odds["cg_offset"]))
+    out.append(Hypothesis("effort", (), effort, np.array([[MASS**2]]), none[:1], (), odds["effort"]))
+    return out
+
+
+# --- Healthy or changed, and by what: one Student-t likelihood for all explanations
+
+
+_DRAWS = 8192
+"""Healthy flights that are drawn to estimate how rare an evidence of change is among them."""
+LEAST_CHANCE = 1.0 / (_DRAWS + 1)
+"""The smallest `p_unchanged`: no drawn flight speaks for a change as much."""
+
+
+class Explained(NamedTuple):
+    """One explanation after the fact.
+
+    Attributes:
+        hypothesis: what may have changed.
+        log_evidence: of the change of trim, with the prior odds.
+        value: posterior mean of the parameters, shape (parameters,).
+        covariance: posterior covariance.
+        p_value: chance that healthy flights differ so much along this explanation.
+    """
+
+    hypothesis: Hypothesis
+    log_evidence: float
+    value: FloatArray
+    covariance: FloatArray
+    p_value: float
+
+
+def distance(change: FloatArray, deviation: FloatArray, freedom: FloatArray) -> FloatArray:
+    """Each trim's change as a standard normal deviate of the same probability as its Student t, shape (4,)."""
+    z = np.abs(change) / deviation
+    far = -ndtri(np.maximum(stdtr(freedom, -z), 1e-300))
+    return np.asarray(np.sign(change) * far)
+
+
+def p_healthy(change: FloatArray, deviation: FloatArray, freedom: FloatArray) -> float:
+    """Chance that healthy flights differ by `change` or more: chi-square of its `distance`."""
+    return float(chdtrc(len(change), (distance(change, deviation, freedom) ** 2).sum()))
+
+
+def exact(change: FloatArray) -> FloatArray:
+    """A change of trim (…, 4) with effort as the part of thrust per command that is missing, 1 - exp(-effort).
+
+    In these numbers every explanation is linear whatever its size: lost thrust adds up rotor by rotor, and a mass
+    counts as a part of the loaded vehicle's.
+    """
+    return np.concatenate([change[..., :3], -np.expm1(-change[..., 3:])], axis=-1)
+
+
+class _Fitted(NamedTuple):
+    """Explanations with as many parameters each, of several changes of trim.
+
+    Attributes:
+        log_evidence: with the prior odds, shape (explanations, changes).
+        value: posterior means, shape (explanations, changes, parameters).
+        covariance: posterior covariances of the Gaussian case, shape (explanations, parameters, parameters).
+        scale: what these are multiplied with, shape (explanations, changes).
+    """
+
+    log_evidence: FloatArray
+    value: FloatArray
+    covariance: FloatArray
+    scale: FloatArray
+
+
+def _log_student(quadratic: FloatArray, log_determinant: FloatArray, freedom: float) -> FloatArray:
+    """Student-t density of `quadratic` in as many dimensions as a trim has, to a constant."""
+    return np.asarray(-0.5 * (freedom + len(AXES)) * np.log1p(quadratic / freedom) - 0.5 * log_determinant)
+
+
+def _fit(changes: FloatArray, deviation: FloatArray, freedom: float, alike: Sequence[Hypothesis]) -> _Fitted:
+    """Evidence and posterior of explanations with as many parameters each, of changes of shape (changes, 4).
+
+    A change is Student-t with the spread's mean degrees of freedom v and p = 4 dimensions:
+    log t = -(v + p)/2 log(1 + Q/v) - log|S|/2, S = D + A P A', Q = r' S^-1 r with r the
+    change beyond the prior mean's, to a constant.  Parameters that cannot
+    be negative restrict the Gaussian posterior; the restriction's odds (posterior over prior) count.
+    """
+    a, p, centre = (
+        np.stack(part) for part in zip(*((one.effect, one.prior, one.centre) for one in alike), strict=True)
+    )
+    log_odds = np.array([one.log_odds for one in alike])
+    positive = np.array([[k in one.positive for k in range(p.shape[1])] for one in alike])
+    spread = np.diag(deviation**2) + a @ p @ a.transpose(0, 2, 1)
+    inverse = np.linalg.inv(spread)
+    gain = inverse @ a @ p
+    beyond = changes - np.einsum("hkj,hj->hk", a, centre)[:, None]
+    value = centre[:, None] + beyond @ gain
+    quadratic = (beyond @ inverse * beyond).sum(axis=-1)
+    scale = (freedom + quadratic) / (freedom + len(AXES))
+    covariance = p - p @ a.transpose(0, 2, 1) @ gain
+    evidence = _log_student(quadratic, np.linalg.slogdet(spread)[1][:, None], freedom)
+    deviations = np.sqrt(scale[..., None] * np.diagonal(covariance, axis1=1, axis2=2)[:, None])
+    some = positive.any(axis=0)
+    odds = (log_ndtr((value / deviations)[..., some]) + np.log(2.0)) * positive[:, None, some]
+    return _Fitted(evidence + odds.sum(axis=-1) + log_odds[:, None], value, covariance, scale)
+
+
+def _by_size(offered: Sequence[Hypothesis]) -> list[list[Hypothesis]]:
+    """Explanations with as many parameters each, together."""
+    sizes = sorted({len(one.centre) for one in offered})
+    return [[one for one in offered if len(one.centre) == size] for size in sizes]
+
+
+def _changed_over_unchanged(
+    changes: FloatArray, healthy: Healthy, flights: int, offered: Sequence[Hypothesis]
+) -> FloatArray:
+    """Logarithm of the evidence that something changed over that nothing did, to a constant, shape (changes,)."""
+    deviation, freedom = healthy.predictive(flights), float(healthy.freedom.mean())
+    fitted = [_fit(changes, deviation, freedom, alike).log_evidence for alike in _by_size(offered)]
+    quadratic, log_determinant = ((changes / deviation) ** 2).sum(axis=1), 2.0 * np.log(deviation).sum()
+    unchanged = _log_student(quadratic, log_determinant, freedom)
+    return np.asarray(np.logaddexp.reduce(np.vstack(fitted)) - unchanged)
+
+
+def p_unchanged(change: FloatArray, healthy: Healthy, flights: int, vehicle: Vehicle) -> float:
+    """Chance that healthy flights speak for a change as much as `change` of trim does; at least `LEAST_CHANCE`.
+
+    What is compared is the evidence of all explanations together over that of no change: among all tests with as many
+    false alarms, this one finds the most of what the priors expect (Neyman and Pearson).  Healthy flights are `_DRAWS`
+    points of a Sobol sequence in the predictive distribution of the spread.
+    """
+    offered = hypotheses(vehicle, healthy.shares, healthy.mean)
+    drawn = _evidence_of_draws(_Question(_bytes(healthy, offered), healthy, flights, tuple(offered)))
+    own = _changed_over_unchanged(exact(change)[None], healthy, flights, offered)
+    return float((1 + np.count_nonzero(drawn >= own)) / (len(drawn) + 1))
+
+
+@dataclass(frozen=True)
+class _Question:
+    """What the evidence of draws follows from, and its bytes, the key of the cache."""
+
+    key: tuple[bytes, ...]
+    healthy: Healthy = field(compare=False)
+    flights: int
+    offered: tuple[Hypothesis, ...] = field(compare=False)
+
+
+def _bytes(healthy: Healthy, offered: Sequence[Hypothesis]) -> tuple[bytes, ...]:
+    numbers = [healthy.mean, healthy.deviation, healthy.freedom, healthy.predictive(1), healthy.shares]
+    return tuple(part.tobytes() for part in (*numbers, *(one.effect for one in offered)))
+
+
+@lru_cache(maxsize=32)
+def _evidence_of_draws(question: _Question) -> FloatArray:
+    """Evidence of change in draws of healthy flights, which all flights after one baseline share, shape (draws,)."""
+    points = _healthy_points(*question.healthy.freedom) * question.healthy.predictive(question.flights)
+    return _changed_over_unchanged(exact(points), question.healthy, question.flights, question.offered)
+
+
+@cache
+def _healthy_points(*freedom: float) -> FloatArray:
+    """Draws of independent Student t of these degrees of freedom, shape (draws, axes); always the same."""
+    points = qmc.Sobol(len(freedom), scramble=True, seed=0).random(_DRAWS)
+    return np.column_stack([stdtrit(v, column) for v, column in zip(freedom, points.T, strict=True)])
+
+
+def _explain(change: FloatArray, healthy: Healthy, flights: int, alike: Sequence[Hypothesis]) -> list[Explained]:
+    """Explanations with as many parameters each, of one change."""
+    deviation, freedom = healthy.predictive(flights), float(healthy.freedom.mean())
+    fitted = _fit(change[None], deviation, freedom, alike)
+    chances = _along(change / deviation, np.stack([one.effect for one in alike]) / deviation[:, None], freedom)
+    value, covariance = fitted.value[:, 0], fitted.scale[:, 0, None, None] * fitted.covariance
+    each = zip(alike, fitted.log_evidence[:, 0].tolist(), value, covariance, chances.tolist(), strict=True)
+    return [Explained(*one) for one in each]
+
+
+def _along(z: FloatArray, scaled: FloatArray, freedom: float) -> FloatArray:
+    """F test of the part of the change that explanations' free parameters account for, shape (explanations,)."""
+    basis, sizes, _ = np.linalg.svd(scaled, full_matrices=False)
+    kept = sizes > 1e-9 * sizes[:, :1]
+    part = (np.einsum("hkj,k->hj", basis, z) ** 2 * kept).sum(axis=1)
+    count = kept.sum(axis=1)
+    return np.asarray(fdtrc(count, freedom, part / count))
+
+
+def compare(change: FloatArray, healthy: Healthy, flights: int, offered: Sequence[Hypothesis]) -> list[Explained]:
+    """All explanations of an `exact` change, the most probable first.
+
+    Those of one kind and rotors count as one, with the best's values.
+    """
+    groups: dict[tuple[str, tuple[int, ...]], list[Explained]] = {}
+    for alike in _by_size(offered):
+        for one in _explain(change, healthy, flights, alike):
+            groups.setdefault((one.hypothesis.kind, one.hypothesis.rotors), []).append(one)
+    found = []
+    for group in groups.values():
+        best = max(group, key=lambda one: one.log_evidence)
+        found.append(best._replace(log_evidence=float(np.logaddexp.reduce([one.log_evidence for one in group]))))
+    return sorted(found, key=lambda one: -one.log_evidence)
+
+
+# --- From trims to an answer: healthy or changed, which rotors, masses or shifts, how much, and how sure
+
+
+SIGNIFICANT = 0.01
+"""A change is one that healthy flights make less often than this."""
+HEALTHY_SCORE = float(np.sqrt(chdtri(len(AXES), SIGNIFICANT)))
+"""The score that one healthy flight in a hundred exceeds."""
+_SURE = 0.75
+"""A change is named with confidence where explanations that hold it have this much of the probability."""
+_UNEXPLAINED = 1e-3
+"""An explanation, be it that nothing changed, that leaves a rest less probable than this explains nothing."""
+_RIVALS = 3
+ENOUGH = 5
+"""Baseline flights that a verdict of no change needs, unless it would be the same with as many."""
+
+
+class Rival(NamedTuple):
+    """An explanation that lost: names of the contract, rotors from 1, p-value, probability among all explanations."""
+
+    effects: tuple[str, ...]
+    rotors: tuple[int, ...]
+    p_value: float
+    share: float
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data of contract form."""
+        more = {"with": list(self.effects[1:])} if len(self.effects) > 1 else {}
+        rotors = {"rotors": list(self.rotors)} if self.rotors else {}
+        return {"effect": self.effects[0], **more, **rotors, "p_value": self.p_value, "probability": self.share}
+
+
+@dataclass(frozen=True)
+class Change:
+    """One thing that changed.
+
+    Attributes:
+        effect: name of the contract.
+        parameters: (name, unit, value, 95 % interval or None).
+        p_value: chance that healthy flights differ so much along this explanation.
+        share: probability of the explanations that hold it, among all.
+        confident: whether it is certain enough to act on.
+        rivals: other explanations, the most probable first.
+        evidence: one sentence.
+    """
+
+    effect: str
+    parameters: tuple[tuple[str, str, float, tuple[float, float] | None], ...]
+    p_value: float
+    share: float
+    confident: bool
+    rivals: tuple[Rival, ...]
+    evidence: str
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data of contract form."""
+        return {
+            "effect": self.effect,
+            "confident": self.confident,
+            "p_value": self.p_value,
+            "probability": self.share,
+            "alternatives": [rival.to_dict() for rival in self.rivals],
+            "evidence": self.evidence,
+            "parameters": [
+                {"name": n, "unit": u, "value": v if ci else int(v), "ci95": None if ci is None else list(ci)}
+                for n, u, v, ci in self.parameters
+            ],
+        }
+
+
+@dataclass(frozen=True)
+class Health:
+    """What changed since the baseline flights.
+
+    Attributes:
+        verdict: unchanged, changed or unknown.
+        lacking: baseline flights that are lacking: with so many more that differ no more, this would be a change; the
+            verdict is unknown then.  Else 0.
+        changes: the most probable explanation; with confidence only where the verdict is changed.
+        score: how far the flights are from healthy ones, in standard deviations of these.
+        p_value: chance that a healthy flight looks as changed; where nothing explains a change, that one is as far
+            from what explains best.
+        trim: of the flights in question, shape (4,), see `trims.AXES`.
+        distance: of each trim from healthy, in standard deviations, shape (4,).
+        healthy: the baseline's trim and spread.
+        flights: trims of the flights in question.
+        baseline: trims of the baseline flights.
+    """
+
+    verdict: str
+    lacking: int
+    changes: tuple[Change, ...]
+    score: float
+    p_value: float
+    trim: FloatArray
+    distance: FloatArray
+    healthy: Healthy
+    flights: tuple[FlightTrim, ...]
+    baseline: tuple[FlightTrim, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data of the form ``quadid.health/1``, without the names of files."""
+        origin = np.where(np.array(AXES) == "effort", self.healthy.mean, 0.0)  # effort counts from the baseline's
+        trims = self.trim - origin, self.healthy.mean - origin
+        each = zip(AXES, *trims, self.healthy.deviation, self.distance, strict=True)
+        return {
+            "schema": "quadid.health/1",
+            "verdict": self.verdict,
+            "baseline_lacking": self.lacking,
+            "changes": [change.to_dict() for change in self.changes],
+            "score": self.score,
+            "p_value": self.p_value,
+            "trim": [
+                {"name": n, "value": v, "baseline": m, "spread": s, "distance": d} for n, v, m, s, d in each
+            ],
+        }  # fmt: skip
+
+
+def assess(flights: Sequence[FlightTrim], baseline: Sequence[FlightTrim], vehicle: Vehicle) -> Health:
+    """Compares flights with healthy ones of the same vehicle.
+
+    Args:
+        flights: trims of the flights in question, which share what changed.
+        baseline: trims of healthy flights.
+        vehicle: geometry.
+    """
+    healthy = healthy_spread(baseline)
+    trim = np.mean([flight.mean for flight in flights], axis=0)
+    shares = np.mean([flight.shares for flight in flights], axis=0)
+    change, deviation = trim - healthy.mean, healthy.predictive(len(flights))
+    far = distance(change, deviation, healthy.freedom)
+    p_value = p_unchanged(change, healthy, len(flights), vehicle)
+    found = compare(exact(change), healthy, len(flights), hypotheses(vehicle, shares, healthy.mean))
+    named = p_value < SIGNIFICANT
+    rest = exact(change) - (found[0].hypothesis.effect @ found[0].value if named else 0.0)
+    p_rest = p_healthy(rest, deviation, healthy.freedom)
+    unexplained = p_rest < _UNEXPLAINED
+    lacking = 0 if named or unexplained else _lacking(change, healthy, len(flights), vehicle)
+    verdict = "unknown" if unexplained or lacking else "changed" if named else "unchanged"
+    changes = () if unexplained else _changes(found, vehicle, verdict == "changed")
+    score = float(np.sqrt((far**2).sum()))
+    return Health(
+        verdict, lacking, changes, score, p_rest if unexplained else p_value, trim, far, healthy, tuple(flights),
+        tuple(baseline),
+    )  # fmt: skip
+
+
+def _lacking(change: FloatArray, healthy: Healthy, flights: int, vehicle: Vehicle) -> int:
+    """How many more baseline flights of the same spread would make this a change, up to `ENOUGH` in all; 0: none do."""
+    for count in range(healthy.flights + 1, ENOUGH + 1):
+        if p_unchanged(change, healthy.known_from(count), flights, vehicle) < SIGNIFICANT:
+            return count - healthy.flights
+    return 0
+
+
+def changes_of(
+    change: FloatArray, healthy: Healthy, flights: int, vehicle: Vehicle, shares: FloatArray, changed: bool
+) -> tuple[Change, ...]:
+    """The best explanation of a change of trim.
+
+    Args:
+        change: of trim, shape (4,).
+        healthy: what it counts from, and the spread.
+        flights: number of flights that the change is the mean of.
+        vehicle: geometry.
+        shares: each rotor's share of the load with the change, shape (rotors,).
+        changed: whether it is one; else nothing is named with confidence.
+    """
+    offered = hypotheses(vehicle, shares, healthy.mean)
+    return _changes(compare(exact(change), healthy, flights, offered), vehicle, changed)
+
+
+def _changes(found: Sequence[Explained], vehicle: Vehicle, changed: bool) -> tuple[Change, ...]:
+    """The best explanation as changes, largest first, with the explanations that lost."""
+    shares = np.exp([one.log_evidence - found[0].log_evidence for one in found])
+    shares /= shares.sum()
+    best, lost = found[0], _rivals(found, shares)
+    if best.hypothesis.kind == "weak_rotor":
+        out = []
+        for k, rotor in enumerate(best.hypothesis.rotors):
+            sure = float(sum(s for one, s in zip(found, shares, strict=True) if rotor in one.hypothesis.rotors))
+            out.append(_weak_rotor(best, k, sure, changed, lost))
+        return tuple(sorted(out, key=lambda c: -abs(c.parameters[1][2])))
+    return _changes_of_mass(best, vehicle, float(shares[0]), changed, lost)
+
+
+def _rivals(found: Sequence[Explained], shares: FloatArray) -> tuple[Rival, ...]:
+    """Explanations other than the first, the most probable ones."""
+    others = zip(found[1 : _RIVALS + 1], shares[1 : _RIVALS + 1], strict=True)
+    return tuple(Rival(*_names(one), one.p_value, float(share)) for one, share in others)
+
+
+def _names(one: Explained) -> tuple[tuple[str, ...], tuple[int, ...]]:
+    """An explanation in names of the contract, and its rotors from 1."""
+    kind = one.hypothesis.kind
+    if kind == "effort":
+        return ("thrust_drop" if one.value[0] > 0.0 else "mass_change",), ()  # alike but for the command's kind
+    effects = ("cg_offset", "mass_change") if kind == "payload" else (kind,)
+    return effects, tuple(j + 1 for j in one.hypothesis.rotors)
+
+
+def _interval(one: Explained, k: int, scale: float = 1.0) -> tuple[float, tuple[float, float]]:
+    value, half = float(one.value[k]) * scale, Z95 * float(np.sqrt(one.covariance[k, k])) * scale
+    return value, (value - half, value + half)
+
+
+def _added(one: Explained, k: int) -> tuple[float, tuple[float, float]]:
+    """A part of the loaded vehicle's mass as a fraction of the vehicle's without it, with its interval."""
+    value, (low, high) = _interval(one, k)
+    return value / (1.0 - value), (low / (1.0 - low), high / (1.0 - high))
+
+
+def _weak_rotor(one: Explained, k: int, share: float, changed: bool, lost: tuple[Rival, ...]) -> Change:
+    rotor = one.hypothesis.rotors[k] + 1
+    loss, loss_ci = _interval(one, 2 * k)
+    drag, drag_ci = _interval(one, 2 * k + 1)
+    sentence = (
+        f"For the same command rotor {rotor} produces {_less(loss)} thrust and {_less(drag)} drag torque than in the "
+        "baseline."
+    )
+    parameters = (
+        ("rotor", "", float(rotor), None), ("loss", "", loss, loss_ci), ("drag_loss", "", drag, drag_ci),
+    )  # fmt: skip
+    return Change("weak_rotor", parameters, one.p_value, share, changed and share > _SURE, lost, sentence)
+
+
+def _less(share: float) -> str:
+    """A loss in words: ``22 % less``."""
+    return f"{100.0 * abs(share):.0f} % {'less' if share >= 0.0 else 'more'}"
+
+
+def _changes_of_mass(
+    one: Explained, vehicle: Vehicle, share: float, changed: bool, lost: tuple[Rival, ...]
+) -> tuple[Change, ...]:
+    """A payload as mass_change and cg_offset, a shifted CG, or effort alone."""
+    kind, sure = one.hypothesis.kind, changed and share > _SURE
+
+    def change(effect: str, parameters: Any, sentence: str, rivals: Any = lost) -> Change:
+        return Change(effect, tuple(parameters), one.p_value, share, sure, rivals, sentence)
+
+    if kind == "effort":
+        value, (low, high) = _added(one, 0)
+        more = (
+            f"All rotors together need {100.0 * value:+.1f} % command for the same force, their balance is as it was."
+        )
+        # Of measured speeds rather a mass; of commands rather the battery, which they do not show.
+        thrust = value > 0.0 and vehicle.command.kind != "rotor_speed"
+        rival = Rival(("mass_change" if thrust else "thrust_drop",), (), one.p_value, share)
+        if thrust:
+            return (change("thrust_drop", [("fraction", "", *_interval(one, 0))], more, (rival, *lost)),)
+        return (change("mass_change", [("fraction", "", value, (low, high))], more, (rival, *lost)),)
+    arm = vehicle.arm
+    place = [(name, "m", *_interval(one, k, arm)) for k, name in enumerate("xy")]
+    where = ", ".join(f"{1e3 * p[2]:+.1f} mm along {p[0]}" for p in place)
+    shift = change("cg_offset", place, f"The centre of gravity moved by {where}; the yaw trim stayed.")
+    if kind == "cg_offset":
+        return (shift,)
+    mass, interval = _added(one, 2)
+    more = f"The rotors carry {100.0 * mass:.1f} % more, off centre."
+    return (change("mass_change", [("fraction", "", mass, interval)], more), shift)

@@ -1,0 +1,209 @@
+"""Health in flight: every second the trim of the last seconds against the vehicle's own healthy flights.
+
+Two questions, each with its own yardstick from these flights: does this flight differ from them more than they differ
+from each other, and do the last seconds differ from this flight so far more than seconds of a healthy flight do?  The
+second is the sharper one, for propellers, battery and landing are the same within a flight.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar, Literal
+
+import numpy as np
+from scipy.special import stdtrit
+
+from quadid.condition.changes import Change, changes_of, distance, p_healthy
+from quadid.condition.trim import AXES, FlightTrim, Healthy, healthy_spread, trim_of_load, wander
+from quadid.types import FloatArray
+from quadid.vehicle import GRAVITY, Vehicle
+
+RECENT = 3
+"""Seconds that are compared, as many as `FlightTrim.wander` is of."""
+SETTLING = 10
+"""Seconds of a flight before its own seconds are compared with it."""
+GUARD = 2
+"""Seconds before the recent ones that count neither as recent nor as before."""
+RARE = 1e-8
+"""An alarm is a second that healthy flight has less often than this, twice in a row: 100 h hold 3.6e5 seconds."""
+LEAST_FLIGHT = 30
+"""Steady seconds that make a flight worth keeping."""
+ENOUGH = 3
+"""So many healthy flights before a flight is judged at all; until then each one is kept."""
+_LEAST_WANDER = np.array([0.002, 0.002, 0.002, 0.005])
+"""Smallest standard deviation of `RECENT` seconds about their flight, of `AXES`."""
+_STEADY_FORCE = 0.1
+"""A second whose specific force differs from gravity by more than this share is no steady flight."""
+_AIRBORNE = 0.5
+"""Flying is at least this share of the usual load."""
+_NO_MASS = (math.nan, math.nan, math.nan)
+"""Said by one object: reports of equal content are equal."""
+
+
+@dataclass(frozen=True)
+class HealthReport:
+    """What is known of the vehicle's health in flight.
+
+    Attributes:
+        t: time of the last second that it rests on [s].
+        verdict: unchanged, changed or unknown.
+        has_baseline: whether there are enough healthy flights to compare with.
+        score: as `Health.score`; NaN without a baseline.
+        changes: what changed, the most probable explanation; empty where nothing did.
+        rotor_loss: fraction of thrust that each rotor lost, shape (rotors,); NaN without a baseline.
+        rotor_interval: 95 % intervals, shape (rotors, 2).
+        mass: mass that the rotors carry by the thrust of the baseline, and its 95 % interval [kg], shape (3,); NaN
+            without a baseline, where commands do not indicate thrust, and where a rotor or all of them lost thrust.
+        text: one sentence.
+    """
+
+    topic: ClassVar[Literal["vehicle_health"]] = "vehicle_health"
+    t: float
+    verdict: str
+    has_baseline: bool
+    score: float
+    changes: tuple[Change, ...]
+    rotor_loss: tuple[float, ...]
+    rotor_interval: tuple[tuple[float, float], ...]
+    mass: tuple[float, float, float]
+    text: str
+
+
+class HealthWatch:
+    """Watches one vehicle's flights.
+
+    Attributes:
+        history: healthy flights, the oldest first.
+    """
+
+    def __init__(self, vehicle: Vehicle, history: Sequence[FlightTrim] = ()) -> None:
+        """Starts with the healthy flights that are known."""
+        self.history = list(history)
+        self._vehicle = vehicle
+        self._healthy: Healthy | None = None
+        self._land()
+
+    def second(self, t: float, load: FloatArray, force: float) -> HealthReport | None:
+        """Takes one second of flight.
+
+        Args:
+            t: its end [s].
+            load: mean squared speed of each rotor, shape (rotors,).
+            force: mean specific force along -z [m/s²].
+
+        Returns:
+            A report on the first steady second, on an alarm, and every ten seconds between.
+        """
+        if abs(force / GRAVITY - 1.0) > _STEADY_FORCE or not load.min() > 0.0:
+            return None
+        self._trims.append(trim_of_load(load, force, self._vehicle))
+        self._shares.append(load / load.sum())
+        if self._healthy is None:
+            if len(self._trims) > 1:
+                return None
+            return self._without_baseline(t)
+        return self._judged(t, self._healthy)
+
+    def airborne(self, load: FloatArray) -> bool:
+        """Whether the rotors carry the vehicle, as far as the healthy flights or the first guess of b indicate."""
+        usual = self._vehicle.mass / self._vehicle.parameters["b"].initial
+        if self._healthy is not None:
+            usual = float(np.exp(self._healthy.mean[AXES.index("effort")]))
+        return bool(load.sum() > _AIRBORNE * usual * GRAVITY)
+
+    def landed(self) -> FlightTrim | None:
+        """Ends a flight; returns its trim where it is healthy and long enough to be kept, and keeps it."""
+        trims, alarmed = np.array(self._trims), self._alarm is not None
+        shares = np.mean(self._shares, axis=0) if self._shares else np.empty(0)
+        self._land()
+        if len(trims) < LEAST_FLIGHT or alarmed:
+            return None
+        mean = trims.mean(axis=0)
+        parts = np.array([part.mean(axis=0) for part in np.array_split(trims, 3)])
+        kept = FlightTrim("", mean, parts, shares, wander(trims), float(len(trims)), "in flight")
+        self.history.append(kept)
+        self._land()
+        return kept
+
+    def _land(self) -> None:
+        """Forgets the flight; looks at the history anew."""
+        self._trims: list[FloatArray] = []
+        self._before = np.zeros(len(AXES))
+        self._shares: list[FloatArray] = []
+        self._suspect = False
+        self._alarm: HealthReport | None = None
+        if len(self.history) >= ENOUGH:
+            self._healthy = healthy_spread(self.history)
+            squares = np.mean([flight.wander**2 for flight in self.history], axis=0)
+            self._wander = np.maximum(np.sqrt(squares), _LEAST_WANDER)
+
+    def _without_baseline(self, t: float) -> HealthReport:
+        n = len(self._vehicle.rotors)
+        text = f"no baseline: {len(self.history)} of {ENOUGH} healthy flights are known; this flight becomes one"
+        return HealthReport(
+            t, "unknown", False, math.nan, (), (math.nan,) * n, ((math.nan, math.nan),) * n, _NO_MASS, text
+        )
+
+    def _judged(self, t: float, healthy: Healthy) -> HealthReport | None:
+        if self._alarm is not None or len(self._trims) < RECENT:
+            return None
+        now = np.mean(self._trims[-RECENT:], axis=0)
+        against = [self._of_history(healthy)]
+        before = len(self._trims) - RECENT - GUARD
+        if before > 0:
+            self._before += self._trims[before - 1]
+        if before >= SETTLING:
+            against.append(self._of_flight(self._before / before, before, healthy))
+        chances = [p_healthy(now - one.mean, one.predictive(1), one.freedom) for one in against]
+        worst = int(np.argmin(chances))
+        rare = chances[worst] < RARE
+        if rare and self._suspect:
+            self._alarm = self._report(t, now, against[worst], "changed")
+            return self._alarm
+        self._suspect = rare
+        if len(self._trims) == RECENT or len(self._trims) % 10 == 0:
+            return self._report(t, now, against[0], "unchanged")
+        return None
+
+    def _of_history(self, healthy: Healthy) -> Healthy:
+        """The yardstick for seconds of another flight: between flights, and within one."""
+        between, within = healthy.deviation**2 * (1.0 + 1.0 / healthy.flights), self._wander**2
+        return healthy._replace(deviation=np.sqrt((between + within) / 2.0), flights=1)
+
+    def _of_flight(self, mean: FloatArray, seconds: int, healthy: Healthy) -> Healthy:
+        """The yardstick for seconds of the same flight."""
+        freedom = np.full(len(AXES), 10.0 * len(self.history))
+        flights = max(seconds // RECENT, 1)
+        return healthy._replace(mean=mean, deviation=self._wander, freedom=freedom, flights=flights)
+
+    def _report(self, t: float, now: FloatArray, against: Healthy, verdict: str) -> HealthReport:
+        change = now - against.mean
+        changes: tuple[Change, ...] = ()
+        if verdict == "changed":
+            shares = np.mean(self._shares[-RECENT:], axis=0)
+            changes = changes_of(change, against, 1, self._vehicle, shares, changed=True)
+        n = len(self._vehicle.rotors)
+        loss, interval = [0.0] * n, [(0.0, 0.0)] * n
+        for one in changes:
+            if one.effect == "weak_rotor":
+                numbers = {name: (value, ci) for name, _, value, ci in one.parameters}
+                j = int(numbers["rotor"][0]) - 1
+                loss[j] = numbers["loss"][0]
+                interval[j] = numbers["loss"][1] or (np.nan, np.nan)
+        far = distance(change, against.predictive(1), against.freedom)
+        text = " ".join(one.evidence for one in changes) or "as in healthy flights"
+        score, mass = float(np.sqrt((far**2).sum())), self._mass(now, changes)
+        return HealthReport(t, verdict, True, score, changes, tuple(loss), tuple(interval), mass, text)
+
+    def _mass(self, now: FloatArray, changes: Sequence[Change]) -> tuple[float, float, float]:
+        """Mass by the thrust of the baseline and its 95 % interval [kg], from effort against the healthy flights'."""
+        known = self._vehicle.command.kind == "rotor_speed"
+        if self._healthy is None or not known or any(one.effect in ("weak_rotor", "thrust_drop") for one in changes):
+            return _NO_MASS
+        k, healthy = AXES.index("effort"), self._of_history(self._healthy)
+        half = float(stdtrit(healthy.freedom[k], 0.975) * healthy.predictive(1)[k])
+        more = float(now[k] - healthy.mean[k])
+        low, value, high = (self._vehicle.mass * math.exp(more + side) for side in (-half, 0.0, half))
+        return value, low, high

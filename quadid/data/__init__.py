@@ -1,0 +1,1 @@
+"""Data: samples, recordings, windows, and channels resampled onto uniform grids."""

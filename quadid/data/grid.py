@@ -1,0 +1,388 @@
+"""Recordings to windows: channels resampled onto uniform grids."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+
+from quadid.data.intersample import follow_feedback
+from quadid.data.mounting import in_body_axes
+from quadid.data.resample import (
+    COINCIDENT,
+    fresh_rows,
+    hold_mean,
+    interpolate,
+    lowpass,
+    lowpass_span,
+    matching_rows,
+    measured_period,
+    median,
+    sample_period,
+    split_stretches,
+)
+from quadid.data.rotor_signal import RotorSignal, rotor_signal
+from quadid.data.window import Recording, Sampling, Window
+from quadid.errors import LogError, NotIdentifiableError
+from quadid.types import FloatArray
+from quadid.vehicle import Vehicle
+
+# --- Channels on their way to the grid: what each one's samples are worth there, and how it is read at grid times
+
+
+GAP = 3.5
+"""A step longer than this many median ones is a gap."""
+BRIDGED = 0.5
+"""A step no longer than this fraction of the grid's is never a gap: hardly anything shows of it on the grid."""
+HOLE = 1.5
+"""A step longer than this many median ones, and no gap, is a hole: it is bridged and counted."""
+_FAST = 0.77
+"""A channel whose period is below this many grid steps must be low-passed before it is read on the grid."""
+REQUIRED = ("rotor_speed", "gyro", "accel")
+OPTIONAL = ("attitude", "velocity", "position", "battery", "attitude_reference")
+
+
+@dataclass(frozen=True)
+class Track:
+    """One channel on its way to the grid; times strictly increase, `period` [s] is that of its samples."""
+
+    t: FloatArray
+    values: FloatArray
+    period: float
+    stretches: tuple[slice, ...]
+    held: bool = False
+
+    @cached_property
+    def begins(self) -> FloatArray:
+        """Time [s] of the first sample of each stretch."""
+        return self.t[[cut.start for cut in self.stretches]]
+
+    @cached_property
+    def ends(self) -> FloatArray:
+        """Time [s] of the last sample of each stretch."""
+        return self.t[[cut.stop - 1 for cut in self.stretches]]
+
+    def stretches_within(self, first: float, last: float) -> tuple[slice, ...]:
+        """Returns the stretches that have a sample in [first, last] [s] or span it."""
+        begin, end = np.searchsorted(self.ends, first, "left"), np.searchsorted(self.begins, last, "right")
+        return self.stretches[int(begin) : int(end)]
+
+
+class Plan(NamedTuple):
+    """Grid step [s], whether fast channels are low-passed for it, tracks by channel, meaning of the rotor rows."""
+
+    step: float
+    filtered: bool
+    tracks: dict[str, Track]
+    sampling: Sampling
+
+
+def make_plan(recording: Recording, t: FloatArray, speeds: FloatArray, sampling: Sampling, rate: float | None) -> Plan:
+    """Prepares all channels; `t`, `speeds` [rad/s], `sampling`: rotor signal; `rate` [Hz]: None for the log's own."""
+    raw = {"rotor_speed": (t, speeds)}
+    for name in (*REQUIRED[1:], *OPTIONAL):
+        channel = recording.channels.get(name)
+        if channel is not None and len(channel.t) >= 2:
+            raw[name] = (channel.t, channel.values)
+    raw = {name: _distinct(*pair) for name, pair in raw.items()}
+    periods = {name: sample_period(times) for name, (times, _) in raw.items()}
+    own = periods.get("gyro", periods["rotor_speed"])
+    step = round(own, 9) if rate is None else 1.0 / rate
+    filtered = min(periods[n] for n in REQUIRED if n in raw) < _FAST * step
+    tracks = {}
+    for name, (times, values) in raw.items():
+        period, longest = periods[name], longest_step(times, step)
+        if filtered and name in ("attitude", "velocity", "position", "gyro"):
+            rows = fresh_rows(values)
+            if len(rows) < len(times):
+                times, values = times[rows], values[rows]
+                period = sample_period(times)
+                longest = longest_step(times, step) if len(times) > 1 else period  # stuck: there is no period
+        cuts = tuple(split_stretches(times, longest, recording.breaks))
+        tracks[name] = Track(times, values, period, cuts, name == "rotor_speed" and sampling == "held")
+    return Plan(step, filtered, tracks, "instant" if filtered else sampling)
+
+
+def longest_step(t: FloatArray, grid_step: float) -> float:
+    """Returns the longest step [s] between samples at `t` that is no gap on a grid of `grid_step` [s]."""
+    return max(GAP * median(np.diff(t)), BRIDGED * grid_step)
+
+
+def holes(t: FloatArray, grid_step: float) -> int:
+    """Counts the lost samples that are bridged: steps longer than `HOLE` median ones that are no gap."""
+    steps = np.diff(t)
+    return int(np.count_nonzero((steps > HOLE * median(steps)) & (steps <= longest_step(t, grid_step))))
+
+
+def _distinct(t: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray]:
+    rising = t[1:] > t[:-1]
+    if bool(rising.all()):
+        return t, values
+    keep = np.concatenate([[True], rising])
+    return t[keep], values[keep]
+
+
+def _is_filtered(track: Track, plan: Plan) -> bool:
+    """A channel slower than the grid is not low-passed, but a staircase always is: it is known between its samples."""
+    return plan.filtered and (track.held or track.period <= 1.1 * plan.step)
+
+
+def reach(track: Track, cut: slice, plan: Plan) -> tuple[float, float]:
+    """Returns the first and last time [s] at which one stretch of a track can be read on the grid."""
+    t = track.t[cut]
+    if _is_filtered(track, plan):
+        return lowpass_span(t, plan.step, track.held)
+    return float(t[0]), float(t[-1])
+
+
+def on_grid(name: str, track: Track, at: FloatArray, plan: Plan) -> FloatArray:
+    """Reads one channel at the grid times; NaN where nothing was measured."""
+    out = np.full((len(at), track.values.shape[1]), np.nan)
+    tolerance = COINCIDENT * plan.step
+    for cut in track.stretches_within(at[0] - tolerance, at[-1] + tolerance):
+        a, b = reach(track, cut, plan)
+        rows = np.flatnonzero((at >= a - tolerance) & (at <= b + tolerance))
+        if len(rows):
+            out[rows] = _stretch_on_grid(name, track, cut, np.clip(at[rows], a, b), plan)
+    return out
+
+
+def _stretch_on_grid(name: str, track: Track, cut: slice, at: FloatArray, plan: Plan) -> FloatArray:
+    t, values, step = track.t[cut], track.values[cut], plan.step
+    filtered = _is_filtered(track, plan)
+    if not filtered:
+        rows = matching_rows(t, at, step)
+        if rows is not None:
+            return np.asarray(values[rows])
+    if name == "attitude_reference":
+        values = np.column_stack([np.unwrap(values[:, :3], axis=0), values[:, 3]])
+    if filtered:
+        out = lowpass(t, values, at, step, track.held)
+    elif track.held:
+        out = hold_mean(t, values, at, step)
+    elif name == "rotor_speed" or track.period <= 1.33 * step:
+        out = interpolate(t, values, at, smooth=track.period <= 1.33 * step)
+    else:
+        out = _at_nearest(t, interpolate(t, values, at, smooth=False), at, step)
+    if name == "attitude":
+        out = out / np.linalg.norm(out, axis=1, keepdims=True)
+    elif name == "attitude_reference":
+        out[:, :3] = np.remainder(out[:, :3] + np.pi, 2.0 * np.pi) - np.pi
+    return out
+
+
+def _at_nearest(t: FloatArray, values: FloatArray, at: FloatArray, step: float) -> FloatArray:
+    """Keeps only the grid rows nearest to a real sample."""
+    after = np.clip(np.searchsorted(t, at), 0, len(t) - 1)
+    before = np.maximum(after - 1, 0)
+    distance = np.minimum(np.abs(t[after] - at), np.abs(at - t[before]))
+    out: FloatArray = np.where((distance <= 0.5 * step)[:, None], values, np.nan)
+    return out
+
+
+# --- Merges the channels of a recording onto uniform grids: recording -> windows
+#
+# No lag is invented.  When the log is faster than the grid, one symmetric low-pass goes over all fast channels alike,
+# rotor speeds included; channels slower than the grid stay untouched and are NaN between their samples.  Gaps and
+# breaks (reboots, clock steps) end a window; nothing is joined across them.
+
+
+Span = tuple[float, float]
+
+WHOLE: Span = (-math.inf, math.inf)
+"""All of a log."""
+SHORTEST = 1.0
+"""Windows shorter than this [s] are dropped where a rate was asked for."""
+
+
+@dataclass(frozen=True)
+class GridReport:
+    """What became of a recording on its way to windows.
+
+    Attributes:
+        rate: grid rate [Hz].
+        windows: number of windows kept.
+        seconds_used: time inside windows [s].
+        seconds_log: first to last sample of the log [s].
+        gaps: number of places where the log was cut (gaps and breaks).
+        dropped: number of stretches too short to keep.
+        seconds_dropped: time in them [s].
+        rotor_source: where the rotor speeds came from.
+        rotor_rate: their own rate in the log [Hz].
+        filtered: whether the channels were low-passed for the grid.
+        bridged: number of holes in rotor signal, gyro and accelerometer too short for a gap, read between neighbours.
+        notes: sentences for people.
+    """
+
+    rate: float
+    windows: int
+    seconds_used: float
+    seconds_log: float
+    gaps: int
+    dropped: int
+    seconds_dropped: float
+    rotor_source: str
+    rotor_rate: float
+    filtered: bool
+    bridged: int = 0
+    notes: tuple[str, ...] = ()
+
+
+class Gridded(NamedTuple):
+    """Windows and the account of how they were made."""
+
+    windows: list[Window]
+    report: GridReport
+
+
+def to_windows(
+    recording: Recording, vehicle: Vehicle, rate: float | None = 50.0, start: float | None = None,
+    stop: float | None = None,
+) -> list[Window]:  # fmt: skip
+    """Merges what lies between `start` and `stop` [s] onto uniform grids; see `grid_recording` for the rest."""
+    part = -math.inf if start is None else start, math.inf if stop is None else stop
+    return grid_recording(recording, vehicle, rate, [part]).windows
+
+
+def grid_recording(
+    recording: Recording, vehicle: Vehicle, rate: float | None = 50.0, parts: Sequence[Span] = (WHOLE,)
+) -> Gridded:
+    """Merges the channels of a recording onto uniform grids, one per stretch without gaps.
+
+    A log whose rows already lie on the grid passes bit for bit.  Down-sampled commands come out as ``instant``, for the
+    filtered staircase has a value at an instant; commands at the grid's own rate stay ``held``, with the slope within
+    each sample that the flight controller's feedback makes (`quadid.data.intersample`).
+
+    Args:
+        recording: a log in core units and frames.
+        vehicle: defines what the rotor columns mean and how many there must be.
+        rate: grid rate [Hz]; None for the log's own (that of its gyro, else of its rotor signal).
+        parts: first and last time [s] of each part to use, rising, in the recording's time.
+
+    Raises:
+        LogError: no rotor signal, rotor columns that do not fit the vehicle, or no usable stretch.
+        NotIdentifiableError: a rotor signal too slow to mean anything.
+    """
+    if rate is not None and not (math.isfinite(rate) and 1.0 <= rate <= 2000.0):
+        raise LogError(f"grid rate {rate} Hz", "1 to 2000 Hz", "leave it out for 50 Hz")
+    recording = in_body_axes(recording, vehicle)
+    rotor = rotor_signal(recording, vehicle)
+    plan = make_plan(recording, rotor.t, rotor.values, rotor.sampling, rate)
+    spans = _spans(plan)
+    shortest = SHORTEST if rate is not None else 0.0
+    log_span = recording.span
+    windows: list[Window] = []
+    dropped: list[float] = []
+    for span in spans:
+        a, b = _inside(plan, span)
+        for low, high in _common([span], parts):
+            at = _grid_times(plan, max(a, low), min(b, high))
+            if len(at) >= 2 and (len(at) - 1) * plan.step >= shortest - 0.5 * plan.step:
+                windows.append(_window(plan, at, recording.name, log_span))
+            elif low < high:
+                dropped.append(high - low)
+    if not windows:
+        longest = max((b - a for a, b in spans), default=0.0)
+        raise _nothing_left(recording, longest, max(shortest, 2.0 * plan.step), parts)
+    windows, followed = follow_feedback(windows, vehicle)
+    report = _report(plan, rotor, windows, len(spans) - 1, dropped, log_span)
+    return Gridded(windows, replace(report, notes=(*report.notes, followed)) if followed else report)
+
+
+def _report(
+    plan: Plan, rotor: RotorSignal, windows: list[Window], gaps: int, dropped: list[float], log_span: Span
+) -> GridReport:
+    period = measured_period(rotor.t, rotor.values)
+    slow = [
+        f"rotor signal at {1 / period:.3g} Hz is slower than the grid at {1 / plan.step:.3g} Hz: "
+        "fast motion cannot be attributed to the rotors"
+    ] if period > 1.5 * plan.step else []  # fmt: skip
+    return GridReport(
+        rate=1.0 / plan.step,
+        windows=len(windows),
+        seconds_used=sum((len(w) - 1) * w.dt for w in windows),
+        seconds_log=log_span[1] - log_span[0],
+        gaps=gaps,
+        dropped=len(dropped),
+        seconds_dropped=sum(dropped),
+        rotor_source=rotor.source,
+        rotor_rate=1.0 / period,
+        filtered=plan.filtered,
+        bridged=sum(holes(plan.tracks[name].t, plan.step) for name in REQUIRED if name in plan.tracks),
+        notes=(*rotor.notes, *slow),
+    )
+
+
+def _spans(plan: Plan) -> list[Span]:
+    """Returns the times [s] during which every required channel is there, cut at gaps and breaks."""
+    spans: list[Span] = [(-math.inf, math.inf)]
+    for name in REQUIRED:
+        if name in plan.tracks:
+            track = plan.tracks[name]
+            spans = _common(spans, list(zip(track.begins.tolist(), track.ends.tolist(), strict=True)))
+    return spans
+
+
+def _common(one: Sequence[Span], other: Sequence[Span]) -> list[Span]:
+    """Intersects two rising lists of spans."""
+    out, i, j = [], 0, 0
+    while i < len(one) and j < len(other):
+        a, b = max(one[i][0], other[j][0]), min(one[i][1], other[j][1])
+        if a <= b:
+            out.append((a, b))
+        if one[i][1] < other[j][1]:
+            i += 1
+        else:
+            j += 1
+    return out
+
+
+def _inside(plan: Plan, span: Span) -> Span:
+    """Shrinks a span to where the low-pass, if there is one, has samples on both sides in every required channel."""
+    a, b = span
+    for name in REQUIRED:
+        for cut in plan.tracks[name].stretches_within(*span) if name in plan.tracks else ():
+            c, d = reach(plan.tracks[name], cut, plan)
+            a, b = max(a, c), min(b, d)
+    return a, b
+
+
+def _grid_times(plan: Plan, a: float, b: float) -> FloatArray:
+    """Returns the grid in [a, b]; its first point is a sample of the gyro, else of the rotor signal."""
+    tolerance = COINCIDENT * plan.step
+    t = plan.tracks["gyro" if "gyro" in plan.tracks else "rotor_speed"].t
+    first = int(np.searchsorted(t, a - tolerance))
+    if first >= len(t) or t[first] > b + tolerance:
+        return np.empty(0)
+    return np.asarray(t[first] + plan.step * np.arange(math.floor((b - t[first] + tolerance) / plan.step) + 1))
+
+
+def _window(plan: Plan, at: FloatArray, name: str, log_span: Span) -> Window:
+    columns = {}
+    for channel, track in plan.tracks.items():
+        values = on_grid(channel, track, at, plan)
+        if not np.isnan(values).all():
+            columns[channel] = values
+    return Window(float(at[0]), plan.step, **columns, sampling=plan.sampling, name=name, log_span=log_span)
+
+
+def _nothing_left(
+    recording: Recording, longest: float, needed: float, parts: Sequence[Span]
+) -> LogError | NotIdentifiableError:
+    if tuple(parts) != (WHOLE,):
+        # In the time in which people ask for a part.
+        zero = recording.first_imu_time
+        first, last = (t - zero for t in recording.span)
+        asked = " nor ".join(f"{a - zero:g} and {b - zero:g} s" for a, b in parts)
+        return LogError(
+            f"{recording.name}: nothing to use between {asked}",
+            f"{first:z.1f} to {last:z.1f} s after its first IMU sample", "see `quadid inspect` for the flying spans",
+        )  # fmt: skip
+    return NotIdentifiableError(
+        f"{recording.name}: the longest stretch with rotor signal and IMU and without gaps is {longest:.3g} s",
+        f"at least {needed:.3g} s", "log at a steady rate, or ask for a lower --rate",
+    )  # fmt: skip

@@ -1,0 +1,295 @@
+"""Measured data as the core sees it: samples, channels, recordings, and windows on a uniform grid.
+
+Inside the core all data are SI, world NED, body FRD, quaternions body to world, scalar first.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+from typing import Any, Literal, TypeGuard
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from quadid.errors import LogError, WindowError
+from quadid.types import FloatArray
+
+Sampling = Literal["held", "instant"]
+
+CHANNELS: dict[str, tuple[int | None, str]] = {
+    "gyro": (3, "rad/s"),
+    "accel": (3, "m/s^2"),
+    "attitude": (4, "quaternion wxyz, body to world"),
+    "rotor_speed": (None, "rad/s"),
+    "motor_command": (None, "normalized 0..1 or us"),
+    "mixer_input": (None, "as the vehicle file's mixer takes it"),
+    "attitude_reference": (4, "rad, rad, rad, throttle 0..1"),
+    "velocity": (3, "m/s, NED"),
+    "position": (3, "m, NED"),
+    "battery": (1, "V"),
+    "accel_z": (1, "m/s^2"),
+    "accel_world": (3, "m/s^2, NED"),
+}
+"""Known channels: number of columns (None: as many as the vehicle asks for) and unit.
+
+``accel`` is specific force (-g on z at rest); ``accel_z`` its z alone, ``accel_world`` the same in world axes, from
+logs that hold no more.
+"""
+_MEASURED = ("gyro", "attitude", "accel", "velocity", "position", "battery", "attitude_reference")
+"""Channels of a window that may be missing."""
+
+
+@dataclass(frozen=True)
+class Sample:
+    """One message's worth of one channel: time [s], channel name, values in the channel's unit."""
+
+    t: float
+    channel: str
+    values: tuple[float, ...]
+
+    @property
+    def block(self) -> Block:
+        """The sample as a block."""
+        return Block(np.array([self.t]), ((self.channel, np.array([self.values])),))
+
+
+@dataclass(frozen=True)
+class Block:
+    """Messages of one kind, in order: times [s], shape (n,), and values by channel, each of shape (n, columns).
+
+    It stands for its samples message by message, within a message in the order of `columns`.
+    """
+
+    t: FloatArray
+    columns: tuple[tuple[str, FloatArray], ...]
+
+    def samples(self, start: int = 0, stop: int | None = None) -> Iterator[Sample]:
+        """The samples of messages `start` to before `stop`."""
+        times = self.t[start:stop].tolist()
+        rows = [(name, values[start:stop].tolist()) for name, values in self.columns]
+        for k, t in enumerate(times):
+            for name, values in rows:
+                yield Sample(t, name, tuple(values[k]))
+
+
+def _never_changes(values: ArrayLike) -> TypeGuard[FloatArray]:
+    """Whether these are rows of doubles that nobody can write to, so that they need no copy."""
+    if not (isinstance(values, np.ndarray) and values.dtype == np.float64 and values.flags.c_contiguous):
+        return False
+    owner: object = values
+    while isinstance(owner, np.ndarray):
+        if owner.flags.writeable:
+            return False
+        owner = owner.base
+    return owner is None
+
+
+def _frozen(values: ArrayLike, name: str, columns: int | None) -> FloatArray:
+    array = values if _never_changes(values) else np.array(values, dtype=np.float64, order="C")
+    if array.ndim == 1 and columns == 1:
+        array = array[:, None]
+    if array.ndim != 2 or (columns is not None and array.shape[1] != columns):
+        raise WindowError(f"{name} of shape {array.shape}", f"(n, {columns if columns else 'rotors'})")
+    array.setflags(write=False)
+    return array
+
+
+@dataclass(frozen=True)
+class Channel:
+    """One channel of a recording at its own rate.
+
+    Attributes:
+        name: key of `CHANNELS`.
+        t: times [s], shape (n,), non-decreasing.
+        values: shape (n, columns).
+        source: where it came from, for people (topic, message name, column names).
+        faults: number of samples the reader dropped, by reason, such as duplicate, not_finite.
+    """
+
+    name: str
+    t: FloatArray
+    values: FloatArray
+    source: str = ""
+    faults: Mapping[str, int] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Checks name, shapes and order of time; raises WindowError."""
+        if self.name not in CHANNELS:
+            raise WindowError(f"unknown channel '{self.name}'", ", ".join(CHANNELS))
+        t = np.array(self.t, dtype=np.float64)
+        values = _frozen(self.values, self.name, CHANNELS[self.name][0])
+        if t.shape != (len(values),):
+            raise WindowError(f"{self.name}: {len(values)} rows but times of shape {t.shape}", "one time a row")
+        if len(t) > 1 and np.any(np.diff(t) < 0.0):
+            raise WindowError(f"{self.name}: time runs backwards", "non-decreasing time", "split at the step")
+        t.setflags(write=False)
+        object.__setattr__(self, "t", t)
+        object.__setattr__(self, "values", values)
+
+
+@dataclass(frozen=True)
+class Recording:
+    """What a log holds, in core units and frames, each channel at its own rate.
+
+    Attributes:
+        name: name for people (file name).
+        format: how it was recognised: csv, mcap, tlog, dataflash, ulog, usdlog.
+        channels: by name; absent channels are absent keys.
+        breaks: times [s] across which nothing may be joined (reboots, clock steps).
+        warnings: what was wrong with the log and what was done about it.
+        sha256: hash of the bytes read.
+        grid: for a log that already is a uniform grid (CSV), its step [s]; else None.
+        autopilot: the autopilot's own parameters as the log holds them, by their names there (`INS_GYRO_FILTER`).
+        epoch: UNIX time of its time 0 [s]; None where its clock has no date.
+        modes: when the autopilot entered a flight mode [s], and its name; empty where the log lacks them.
+    """
+
+    name: str
+    format: str
+    channels: Mapping[str, Channel]
+    breaks: tuple[float, ...] = ()
+    warnings: tuple[str, ...] = ()
+    sha256: str = ""
+    grid: float | None = None
+    autopilot: Mapping[str, float] = field(default_factory=dict)
+    epoch: float | None = None
+    modes: tuple[tuple[float, str], ...] = ()
+
+    @property
+    def span(self) -> tuple[float, float]:
+        """First and last time of any channel [s]; both 0 where there is no sample."""
+        ends = [(float(c.t[0]), float(c.t[-1])) for c in self.channels.values() if len(c.t)] or [(0.0, 0.0)]
+        return min(a for a, _ in ends), max(b for _, b in ends)
+
+    @property
+    def first_imu_time(self) -> float:
+        """Time [s] of the first gyro or accelerometer sample, else of the first of any channel: LOG@0 begins there."""
+        imu = (self.channels[name].t for name in ("gyro", "accel") if name in self.channels)
+        return min((float(t[0]) for t in imu if len(t)), default=self.span[0])
+
+
+@dataclass(frozen=True)
+class Window:
+    """A stretch of flight without gaps on a uniform grid.
+
+    NaN in a measured channel means "no measurement at this grid point"; rotor speeds must be finite.
+
+    Attributes:
+        t0: time of the first row [s].
+        dt: grid step [s].
+        rotor_speed: shape (n, rotors) [rad/s]; see `sampling`.
+        gyro: shape (n, 3) [rad/s], body FRD, instants; or None.
+        attitude: shape (n, 4), unit quaternions body to world; or None.
+        accel: shape (n, 3) [m/s^2], specific force in body FRD, mean over one sample centred on t; or None.
+        velocity: shape (n, 3) [m/s], world NED; or None.
+        position: shape (n, 3) [m], world NED; or None.
+        battery: shape (n, 1) [V]; or None.
+        attitude_reference: shape (n, 4): roll, pitch, yaw [rad], throttle 0..1; or None.
+        sampling: ``held``: row k of `rotor_speed` acts from t_k to t_k+1; ``instant``: a reading, linear in between.
+        rotor_slope: shape (n, rotors) [rad/s^2]: a held row is the mean of a speed that runs on at this slope within
+            its sample (`quadid.data.intersample`); None: it stays the same.
+        name: where it came from.
+        log_span: first and last time [s] of the whole log, for effects that run over a flight.
+    """
+
+    t0: float
+    dt: float
+    rotor_speed: FloatArray
+    gyro: FloatArray | None = None
+    attitude: FloatArray | None = None
+    accel: FloatArray | None = None
+    velocity: FloatArray | None = None
+    position: FloatArray | None = None
+    battery: FloatArray | None = None
+    attitude_reference: FloatArray | None = None
+    sampling: Sampling = "held"
+    rotor_slope: FloatArray | None = None
+    name: str = ""
+    log_span: tuple[float, float] = field(default=(np.nan, np.nan))
+
+    def __post_init__(self) -> None:
+        """Checks shapes, finiteness and quaternion norms; normalises the sign of time span; raises WindowError."""
+        if not (np.isfinite(self.dt) and self.dt > 0.0):
+            raise WindowError(f"grid step {self.dt} s", "a positive step")
+        if self.sampling not in ("held", "instant"):
+            raise WindowError(f"sampling '{self.sampling}'", "held, instant")
+        rotor = _frozen(self.rotor_speed, "rotor_speed", None)
+        if not np.all(np.isfinite(rotor)):
+            bad = int(np.count_nonzero(~np.isfinite(rotor).all(axis=1)))
+            raise WindowError(
+                f"{bad} rows of rotor_speed are not finite", "finite rotor speeds", "split the window there"
+            )
+        object.__setattr__(self, "rotor_speed", rotor)
+        if self.rotor_slope is not None:
+            if self.sampling != "held":
+                raise WindowError(f"rotor_slope with sampling '{self.sampling}'", "held", "leave rotor_slope out")
+            slope = _frozen(self.rotor_slope, "rotor_slope", rotor.shape[1])
+            if slope.shape != rotor.shape or not np.all(np.isfinite(slope)):
+                raise WindowError("rotor_slope", f"finite values, as many as rotor_speed {rotor.shape}")
+            object.__setattr__(self, "rotor_slope", slope)
+        for name in _MEASURED:
+            values = getattr(self, name)
+            if values is None:
+                continue
+            array = _frozen(values, name, CHANNELS[name][0])
+            if len(array) != len(rotor):
+                raise WindowError(f"{name} has {len(array)} rows, rotor_speed {len(rotor)}", "equal numbers of rows")
+            if np.any(np.isinf(array)):
+                raise WindowError(f"{name} holds infinite values", "finite values, or NaN where nothing was measured")
+            object.__setattr__(self, name, array)
+        if self.attitude is not None:
+            norm = np.linalg.norm(self.attitude, axis=1)
+            if np.any(np.abs(norm[np.isfinite(norm)] - 1.0) > 1e-3):
+                raise WindowError("attitude quaternions are not of unit length", "unit quaternions, scalar first")
+        if not np.isfinite(self.log_span[0]):
+            object.__setattr__(self, "log_span", (self.t0, self.t0 + self.dt * (len(rotor) - 1)))
+
+    def __len__(self) -> int:
+        return len(self.rotor_speed)
+
+    @property
+    def t(self) -> FloatArray:
+        """Times of the rows [s], shape (n,)."""
+        return np.asarray(self.t0 + self.dt * np.arange(len(self)), dtype=np.float64)
+
+    def slice(self, start: int, stop: int) -> Window:
+        """Returns rows `start` to `stop` (exclusive) as a window of the same log."""
+        values = {name: getattr(self, name) for name in ("rotor_speed", "rotor_slope", *_MEASURED)}
+        cut: dict[str, Any] = {name: rows[start:stop] for name, rows in values.items() if rows is not None}
+        return replace(self, t0=self.t0 + self.dt * start, **cut)
+
+
+def as_recording(windows: Sequence[Window]) -> Recording:
+    """One recording of windows of one log, without the rows where nothing was measured.
+
+    Raises:
+        LogError: no window, or windows that overlap in time.
+    """
+    if not windows:
+        raise LogError("no window", "at least one")
+    if any(a.t[-1] >= b.t0 for a, b in pairwise(windows)):
+        raise LogError("windows overlap in time", "windows of one log in rising order of time")
+    channels = {}
+    for name in CHANNELS:
+        parts = [(w.t, getattr(w, name)) for w in windows if getattr(w, name, None) is not None]
+        if parts:
+            t, values = np.concatenate([p[0] for p in parts]), np.concatenate([p[1] for p in parts])
+            measured = np.isfinite(values).all(axis=1)
+            if measured.any():
+                channels[name] = Channel(name, t[measured], values[measured], "window")
+    return Recording(windows[0].name, "window", channels, grid=windows[0].dt)
+
+
+def beginning(windows: Iterable[Window], longest: float, least: float = 1.0) -> tuple[list[Window], float]:
+    """The first `longest` seconds of windows, and how long they are [s]; rests shorter than `least` are left out."""
+    taken: list[Window] = []
+    seconds = 0.0
+    for window in windows:
+        rows = int((longest - seconds) / window.dt)
+        if rows < least / window.dt:
+            break
+        taken.append(window if len(window) <= rows else window.slice(0, rows))
+        seconds += len(taken[-1]) * window.dt
+    return taken, seconds

@@ -1,0 +1,276 @@
+"""The diagnosis from windows to verdict: fit, noise floor, selection, remainder, validation."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from quadid.data.faults import data_faults, without_copies
+from quadid.data.window import Window
+from quadid.diagnosis.attribution import NominalFit, stated_errors, worths
+from quadid.diagnosis.candidates import Candidate, candidates
+from quadid.diagnosis.cross_validation import BLOCKS
+from quadid.diagnosis.log_evidence import better
+from quadid.diagnosis.model import Model, free_names, refit, without
+from quadid.diagnosis.plausibility import impossible_causes, late_unknown, slight_causes
+from quadid.diagnosis.residual_tests import Remainder, inconstant_causes, remainder
+from quadid.diagnosis.result import Diagnosis, Explanation, describe
+from quadid.diagnosis.segment_schedule import LINEAR_MISFIT
+from quadid.diagnosis.selection import Search, from_everything, pruned, select
+from quadid.diagnosis.unmodelled_moments import Held, held_by_fast_motion, refitted
+from quadid.effects import EFFECTS
+from quadid.errors import NotIdentifiableError
+from quadid.identification.covariance import SPREAD_LIMIT, parameter_set
+from quadid.identification.fit import SWARM_SECONDS, FitOptions, check_windows
+from quadid.identification.gauss_newton import polish
+from quadid.identification.global_search import Progress, swarm_search
+from quadid.identification.identifiability import on_bounds, possible_moments, tied
+from quadid.identification.noise_estimation import FAR_ITERATIONS, flexible_fit, residual_noise
+from quadid.identification.noise_memory import with_memory
+from quadid.identification.noise_model import NoiseModel
+from quadid.identification.reliability import reliability
+from quadid.identification.residual_prediction import POOR, learn_prediction
+from quadid.identification.result import with_values
+from quadid.identification.shooting import Shooting
+from quadid.model.layout import with_reference_voltage
+from quadid.parameters import INERTIAS, NOMINAL_NAMES, UNKNOWN, Parameter, unreliable
+from quadid.types import FloatArray
+from quadid.vehicle import Vehicle
+
+DECIDE_SECONDS = (4.0, 2.0, 1.0, 0.5)
+"""Lengths of segments that may decide (the longest as `segment_schedule.USUAL_SECONDS` allows), longest first;
+below them only the short ones of the first fit."""
+NOISE_FELL = 0.7
+"""When a channel's noise variance falls below this share once causes are known, the selection is repeated with it."""
+SHARE_TO_NAME = 0.8
+"""Named causes must account for this share of all structure, else the answer is `unknown` …"""
+SHARE_ALONE = 0.9
+"""… and a cause that stands alone for this one: nothing else is there to have left the rest, so its form is wrong."""
+LEAST_STRUCTURE = 0.01
+"""Structure below this share of the noise is not worth a word …"""
+LEAST_OF_EXPLAINED = 1e-3
+"""… nor below this share of what is explained: a huge effect is never described to the last digit."""
+
+
+def diagnose(
+    windows: Sequence[Window], vehicle: Vehicle, validation: Sequence[Window] = (), seed: int = 0,
+    progress: Progress | None = None, swarm: bool = False, nominal: NominalFit | None = None, predict: bool = True,
+) -> tuple[Diagnosis, Search]:  # fmt: skip
+    """Says what the simulation of `vehicle` gets wrong on `windows`, why, and what a better one gains.
+
+    Args:
+        windows: data to diagnose.
+        vehicle: nominal vehicle; effects already in its file are kept as they are.
+        validation: flights to measure the gain on; without them blocks of `windows` are left out.
+        seed: for the swarm, where asked for, and drawn noise.
+        progress: called with a stage and a fraction.
+        swarm: search globally first, for poor initial guesses.
+        nominal: identification of `windows` that errors are stated with; by default that of the selection.
+        predict: learn residual terms where much is left; the answer is the same without, but for its `prediction`.
+
+    Raises:
+        WindowError, NotIdentifiableError: as `quadid.identification.fit.fit`.
+    """
+    report = progress or (lambda stage, share: None)
+    check_windows(windows)
+    faults = data_faults([*windows, *validation])
+    windows, validation = without_copies(windows), without_copies(validation)
+    vehicle = with_reference_voltage(vehicle, windows)
+    begun = _begin(windows, vehicle, FitOptions(seed=seed) if swarm else None, report)
+    schedule, search = _select(windows, begun, report)
+    held = held_by_fast_motion(windows, schedule[-1], search.model)
+    if held is not None:
+        schedule, search = refitted(held, schedule, search)
+    decisive, model = search.shooting, search.model
+    left = remainder(decisive, model, seed)
+    report("validation", 0.0)
+    fewer = {c.label: without(decisive, model, c) for c in model.causes}
+    deciding, worth = worths(decisive, search.nominal, model, fewer, validation)
+    nominal = nominal or NominalFit(vehicle, search.nominal.theta, decisive.noise)
+    outcome = stated_errors(nominal, model, windows, validation, deciding)
+    doubts = impossible_causes(model) | inconstant_causes(model, left)
+    unnamed = sum(max(w.deviance, 0.0) for w in worth if w.cause.label in doubts)
+    verdict = judge(search.nominal, model, left, unnamed)
+    saturated = any(f.kind == "saturated" for f in faults)
+    if model.causes and (outcome.contradicted or saturated or len(doubts) == len(model.causes)):
+        verdict = Explanation.UNKNOWN
+    doubted = {label: m for label, m in fewer.items() if label in doubts}
+    parameters, reasons = _nominal_parameters(decisive, schedule[-1], model, verdict, doubted, held)
+    parameters, moved = possible_moments(parameters)
+    weak = late_unknown(model, parameters) | slight_causes(model)
+    alike = {c.family for c in model.causes if c.label in doubts}
+    believed = [c for c in model.causes if c.family not in alike and c.label not in weak]
+    findings = describe(decisive, search, worth, [] if verdict is Explanation.UNKNOWN else believed)
+    warnings = [
+        *(f.text for f in faults),
+        *(f"{reason}: it replaces another cause and is not confident" for reason in doubts.values()),
+        *(f"{label} is not named with confidence: {reason}" for label, reason in weak.items()),
+        *reasons, *([] if moved is None else [moved]),
+    ]  # fmt: skip
+    physical = with_values(vehicle, parameters, [c.effect for c in model.causes], model.theta)
+    prediction = None
+    if predict and model.lin.reduced_chi_square > POOR:
+        report("prediction", 0.0)
+        try:
+            prediction = learn_prediction(windows, physical, validation)
+        except NotIdentifiableError as error:
+            warnings.append(f"no residual terms could be learnt: {error}")
+    if prediction is not None:
+        warnings.append(prediction.sentence)
+    result = Diagnosis(
+        verdict, findings, outcome, left, parameters, physical.to_yaml(),
+        "+".join([vehicle.name, *dict.fromkeys(f.effect for f in findings)]), tuple(warnings), prediction,
+    )  # fmt: skip
+    report("done", 1.0)
+    return result, search
+
+
+def _nominal_parameters(
+    decisive: Shooting, short: Shooting, model: Model, verdict: Explanation, doubted: Mapping[str, Model] | None = None,
+    held: Held | None = None,
+) -> tuple[tuple[Parameter, ...], tuple[str, ...]]:  # fmt: skip
+    """The nominal six beside the findings, as an identification gives them, and why some are not to be used.
+
+    Estimates must agree as those of an identification, and with models without each cause `doubted` (by label).  Where
+    the cause of the error is unknown, none is to be used, nor an inertia beside a doubtful moment, nor what is `held`
+    beside causes that do not explain all.  What is `held` and shows without any cause is not concerned.
+    """
+    brief = polish(short, model.theta, model.free, model.prior, iterations=8)
+    trust = reliability(decisive, model, model.free, model.prior, brief)
+    uncertain, reasons = trust.widened(model.uncertainty), trust.reasons(model.free, model.uncertainty)
+    initial = decisive.layout.initial(decisive.vehicle)
+    steps = {label: model.free.step(model.theta, less.theta) for label, less in (doubted or {}).items()}
+    uncertain = uncertain.differing(list(steps.values()))
+    for label, step in steps.items():
+        moved = [n for n, s in zip(model.free.names, step, strict=True) if n in NOMINAL_NAMES and abs(s) > SPREAD_LIMIT]
+        if moved:
+            reasons = (*reasons, f"{', '.join(moved)}: more than {SPREAD_LIMIT:.0%} different without {label}")
+    everything = parameter_set(model.free, model.theta, initial, uncertain)
+    nominal = tuple(p for p in everything if p.name in NOMINAL_NAMES)
+    if held is not None:
+        nominal, reasons = held.among(nominal), (held.sentence, *reasons)
+    reasons = (*on_bounds(nominal), *reasons)
+    for cause in model.causes:
+        nominal = tied(nominal, EFFECTS[cause.effect].ties)
+    spoilt = {NOMINAL_NAMES: "the cause of the error is unknown"} if verdict is Explanation.UNKNOWN else {}
+    if turning := [c.label for c in model.causes if c.label in steps and EFFECTS[c.effect].turns]:
+        spoilt |= {INERTIAS: f"something else passes for {' and '.join(turning)}"}
+    if held and verdict is not Explanation.EXPLAINED:
+        spoilt |= {tuple(held.parameters): "fast motion shows them beside causes that leave too much unexplained"}
+    safe = held.regardless() if held and spoilt else set()
+    for names, why in spoilt.items():
+        open_to_it = set(names) - safe
+        if lost := [p.name for p in nominal if p.status not in UNKNOWN and p.name in open_to_it]:
+            nominal = unreliable(nominal, lost)
+            reasons = (*reasons, f"{', '.join(lost)}: not to be used while {why}")
+    return nominal, reasons
+
+
+@dataclass(frozen=True)
+class _Begun:
+    """What the selection starts from.
+
+    Attributes:
+        schedule: the lengths of segments that may decide, short ones last.
+        nominal: nominal optimum; flexible: that of the flexible fit; full vectors.
+        listed: the catalogue.
+    """
+
+    schedule: list[Shooting]
+    nominal: FloatArray
+    flexible: FloatArray
+    listed: list[Candidate]
+
+
+def _begin(windows: Sequence[Window], vehicle: Vehicle, swarm: FitOptions | None, report: Progress) -> _Begun:
+    """Fits the nominal model, estimates the noise, cuts the data into the segments of the schedule."""
+    short = Shooting.cut(windows, vehicle, SWARM_SECONDS)
+    free = short.free(NOMINAL_NAMES)
+    start = short.layout.initial(vehicle)
+    if swarm is not None:
+        settings = replace(swarm.swarm, iterations=swarm.iterations)
+        start, _ = swarm_search(short, start, free, settings, swarm.particles, swarm.seed, report)
+    report("fit", 0.0)
+    typical, first = short.noise, polish(short, start, free, iterations=8)
+    far = first.cost > LINEAR_MISFIT * first.lin.total_rows
+    short = short.with_noise(residual_noise(short, first))
+    first = polish(short, first.theta, free, states=first.states, iterations=8)
+    report("noise floor", 0.0)
+    # Far off, what the nominal model leaves is no measure of the noise, nor its optimum of the parameters.
+    begun = ([first.theta, start], free, typical, FAR_ITERATIONS) if far else ([first.theta], free, short.noise)
+    flexible = flexible_fit(windows, short, *begun)
+    short = short.with_noise(flexible.noise)
+    schedule = [Shooting.cut(windows, vehicle, t, short.noise, short.layout) for t in DECIDE_SECONDS]
+    schedule = [*(s for s in schedule if s.count >= BLOCKS), short]
+    listed = candidates(short.layout, short.has_velocity, short.channels >= 15, _rotor_columns(windows, vehicle))
+    listed = [c for c in listed if c.effect not in vehicle.effects]
+    return _Begun(schedule, first.theta, flexible.theta, listed)
+
+
+def _rotor_columns(windows: Sequence[Window], vehicle: Vehicle) -> list[str]:
+    """What rotor columns are, and whether the voltage that scales commands is known."""
+    readings = vehicle.command.sampling == "instant"
+    known = vehicle.reference_voltage is not None and all(w.battery is not None for w in windows)
+    return ["readings" if readings else "commands", *(["battery"] if known else [])]
+
+
+def _select(windows: Sequence[Window], begun: _Begun, report: Progress) -> tuple[list[Shooting], Search]:
+    """Selects causes, and again when they show the noise to be less; with the schedule under the noise that is left."""
+    schedule, search = begun.schedule, select(begun.schedule, begun.nominal, begun.listed, report)
+    if search.model.lin.reduced_chi_square > LINEAR_MISFIT:
+        # One by one led nowhere; from everything at once it may.
+        general = from_everything(schedule[-1], begun.flexible, begun.listed)
+        other = select(schedule, begun.nominal, begun.listed, report, general)
+        longer = other.shooting.length - search.shooting.length
+        search = other if longer > 0 or (longer == 0 and better(other.model, search.model)) else search
+    while search.model.causes:
+        report("noise floor", 0.5)
+        before = search.shooting.noise.variance
+        noise = _noise_around(windows, schedule[-1], search.model)
+        growth = noise.variance / before
+        if np.mean(np.log(growth)) > 0.0:
+            break  # around the causes there is no less noise than before
+        schedule, search = _with_noise(noise, schedule, search)
+        if np.all(growth > NOISE_FELL):
+            break
+        again = select(schedule, begun.nominal, begun.listed, report, search.model)
+        search = replace(again, rounds=(*search.rounds, *again.rounds))
+    noise = with_memory(windows, search.shooting, search.model.theta, search.model.free.names)
+    schedule, search = _with_noise(noise, schedule, search)
+    # Under other noise a cause may be nothing any more.
+    return schedule, replace(search, model=pruned(search.shooting, search.model))
+
+
+def _noise_around(windows: Sequence[Window], short: Shooting, model: Model) -> NoiseModel:
+    """Re-estimates the noise around the selected model, where the flexible fit is nearly linear."""
+    wide = short.free(free_names(model.causes))
+    return flexible_fit(windows, short, [model.theta], wide, iterations=2).noise
+
+
+def _with_noise(noise: NoiseModel, schedule: Sequence[Shooting], search: Search) -> tuple[list[Shooting], Search]:
+    """Problems under another noise model, nominal and selected model refitted there."""
+    decisive = search.shooting.with_noise(noise)
+    model, nominal = (refit(decisive, m, m.states) for m in (search.model, search.nominal))
+    return [s.with_noise(noise) for s in schedule], replace(search, shooting=decisive, model=model, nominal=nominal)
+
+
+def judge(nominal: Model, model: Model, left: Remainder, unnamed: float = 0.0) -> Explanation:
+    """Verdict from what the causes explain and what is left.
+
+    Args:
+        nominal: model without causes.
+        model: the selected one.
+        left: what it leaves.
+        unnamed: deviance that causes with implausible numbers take away; it counts as left.
+    """
+    explained = max(float(nominal.held_out.sum() - model.held_out.sum()) - unnamed, 0.0)
+    least = max(LEAST_STRUCTURE * model.rows, LEAST_OF_EXPLAINED * explained)
+    structure = left.deviance + unnamed if left.deviance + unnamed > least else 0.0
+    if not model.causes:
+        return Explanation.UNKNOWN if structure else Explanation.NOTHING_FOUND
+    if not structure:
+        return Explanation.EXPLAINED
+    share = SHARE_TO_NAME if len(model.effects) > 1 else SHARE_ALONE
+    return Explanation.PARTLY_EXPLAINED if explained >= share * (explained + structure) else Explanation.UNKNOWN

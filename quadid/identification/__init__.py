@@ -1,0 +1,1 @@
+"""Identification: from windows of flight data to parameters with honest intervals."""

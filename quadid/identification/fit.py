@@ -1,0 +1,249 @@
+"""Identification from first guess to parameters with intervals: swarm, polish, noise, covariance.
+
+`fit_at` estimates intervals of the parameters where some other search ended.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from quadid.data.window import Window
+from quadid.errors import NotIdentifiableError, WindowError
+from quadid.identification.composite_likelihood import with_second_cut
+from quadid.identification.covariance import SPREAD_LIMIT, parameter_set, uncertainty
+from quadid.identification.fast_motion import MOST_SEGMENTS, FastMotion, fast_motion, with_moments
+from quadid.identification.gauss_newton import Convergence, Polished, polish
+from quadid.identification.global_search import Progress, swarm_search
+from quadid.identification.identifiability import Fit as Fit
+from quadid.identification.identifiability import final_answer, on_bounds
+from quadid.identification.long_logs import spread
+from quadid.identification.noise_estimation import FAR_ITERATIONS, flexible_fit, reweighted_fit
+from quadid.identification.noise_memory import with_memory
+from quadid.identification.noise_model import NoiseModel
+from quadid.identification.parameterization import Free
+from quadid.identification.particle_swarm import SwarmOptions
+from quadid.identification.priors import Prior, default_prior, posterior_covariance
+from quadid.identification.reliability import reliability
+from quadid.identification.scale_uncertainty import with_scale_uncertainty
+from quadid.identification.score import settle_states
+from quadid.identification.shooting import Shooting
+from quadid.parameters import INERTIAS, NOMINAL_NAMES
+from quadid.types import FloatArray
+from quadid.vehicle import Vehicle
+
+SWARM_SECONDS = 0.2
+FIT_SECONDS = 1.0
+WHITE_SHARE = 0.5
+"""Fast motion alone decides where less than this share of what short segments leave of roll or pitch rate is white
+noise and the rest is made by random moments."""
+YAW = ("d", "J_zz", "J_r")
+"""What fast motion hardly shows: rotors turn a vehicle about z by drag, slowly, and there random moments rule."""
+_QUICK = (
+    "something that the model lacks turns the vehicle: b, J_xx and J_yy were estimated from fast motion; "
+    f"{', '.join(YAW[:-1])} and {YAW[-1]} cannot be; `quadid diagnose` looks for the cause"
+)
+
+
+@dataclass(frozen=True)
+class FitOptions:
+    """How to fit.
+
+    Attributes:
+        particles, iterations: swarm size and most iterations; 0 iterations start from the initial guess.
+        swarm: variant of the swarm.
+        seed: decides every random number.
+        robust: down-weight outliers.
+    """
+
+    particles: int = 64
+    iterations: int = 60
+    swarm: SwarmOptions = field(default_factory=SwarmOptions)
+    seed: int = 0
+    robust: bool = True
+
+
+LEAST_SECONDS = 2.0
+"""Shortest stretch worth fitting."""
+
+
+def check_windows(windows: Sequence[Window]) -> None:
+    """Raises when `windows` lack what identification needs, saying what is missing and how to get it."""
+    longest = max(((len(w) - 1) * w.dt for w in windows), default=0.0)
+    if longest < LEAST_SECONDS:
+        raise NotIdentifiableError(
+            f"the longest stretch of usable data is {longest:.3g} s", f"at least {LEAST_SECONDS:g} s without gaps",
+            "use a longer flight, or a wider span of it",
+        )  # fmt: skip
+    if all(w.gyro is None or not np.isfinite(w.gyro).any() for w in windows):
+        raise WindowError("no gyro in the data", "p q r [rad/s]", "log the IMU at 50 Hz or faster")
+    if len({round(w.dt, 9) for w in windows}) > 1:
+        raise WindowError("windows on different grids", "one grid step for all", "give --rate")
+
+
+def fit(
+    windows: Sequence[Window], vehicle: Vehicle, options: FitOptions | None = None, names: Sequence[str] | None = None,
+    progress: Progress | None = None, out_of_reach: Mapping[str, str] | None = None,
+) -> Fit:  # fmt: skip
+    """Identifies parameters from flight data.
+
+    Args:
+        windows: training data on one grid.
+        vehicle: geometry, mass, initial guess, bounds and known effects.
+        options: swarm, seed, segment length.
+        names: parameters to free; by default the paper's six.
+        progress: called with a stage and a fraction done.
+        out_of_reach: parameters that the channels of the log cannot show, and why; they keep the file's value.
+
+    Raises:
+        WindowError: no gyro, or several grids.
+        NotIdentifiableError: too little data, or equations that have no finite step; see `polish`.
+    """
+    options = options or FitOptions()
+    report = progress or (lambda stage, share: None)
+    check_windows(windows)
+    windows, thinned = spread(windows)
+    short = Shooting.cut(windows, vehicle, SWARM_SECONDS)
+    free = short.free(list(names or NOMINAL_NAMES))
+    theta, evaluations = short.layout.initial(vehicle), 0
+    if options.iterations > 0:
+        settings = replace(options.swarm, iterations=options.iterations)
+        theta, evaluations = swarm_search(short, theta, free, settings, options.particles, options.seed, report)
+    report("polish", 0.0)
+    short = short.at_most(MOST_SEGMENTS)
+    typical = short.noise
+    short, first = reweighted_fit(short, theta, free, iterations=10, robust=options.robust)
+    # Where channels cannot show how the vehicle turns, longer segments and other models cannot be compared either.
+    comparable = not set(INERTIAS) & set(out_of_reach or ())
+    quick = fast_motion(windows, short, first.theta, free.names) if restless(short, first) else None
+    if quick is not None:
+        # Longer segments would only let the missing moments in again, and what these leave is no measure of the noise.
+        starts = [quick.found.theta, first.theta]
+        noise = flexible_fit(windows, short, starts, free, typical, FAR_ITERATIONS).noise
+        found = fast_fit(quick, free.names, options.robust, comparable)
+    else:
+        noise = flexible_fit(windows, short, [first.theta], free).noise
+        report("polish", 0.4)
+        final = Shooting.cut(windows, vehicle, FIT_SECONDS, noise, short.layout)
+        result = polish(final, first.theta, free, robust=options.robust)
+        noise = with_memory(windows, final, result.theta, free.names)
+        final = final.with_noise(noise)
+        theta, states = result.theta, result.states
+        del result  # of a long log its residuals are a large part of all memory
+        result = polish(final, theta, free, states=states, robust=options.robust)
+        if not np.isfinite(result.cost):
+            final, result = short, first
+        judge = first if comparable else None
+        found = _finish(final, result, free, default_prior(short, free), result.simulated, options.robust, judge)
+        found = replace(found, warnings=(*found.warnings, *_warnings(found)))
+    report("polish", 1.0)
+    evaluations += first.simulated + found.evaluations
+    found = replace(found, noise=noise, evaluations=evaluations, warnings=(*thinned, *found.warnings))
+    return final_answer(found, out_of_reach or {})
+
+
+def restless(short: Shooting, plain: Polished) -> bool:
+    """Whether moments that the model lacks rule the rates: as random ones they explain most of what it leaves.
+
+    Turbulence, aerodynamic moments, uncalibrated rotor speeds and offsets act slowly; a model without them otherwise
+    takes them for a large inertia.
+
+    Args:
+        short: short segments, with the noise that the model leaves there.
+        plain: the model fitted to them.
+    """
+    white = with_moments(short, plain.lin).variance[:2]
+    return bool(np.isfinite(plain.cost) and np.any(white < WHITE_SHARE * short.noise.variance[:2]))
+
+
+def fast_fit(quick: FastMotion, names: Sequence[str], robust: bool = True, comparable: bool = True) -> Fit:
+    """Estimates of `names` from fast motion, with intervals and statuses.
+
+    Args:
+        quick: the fit.
+        names: of the vehicle's own parameters.
+        robust: down-weight outliers of the second cut.
+        comparable: whether short segments and other models test the numbers.
+    """
+    remarks = [_QUICK]
+    if late := [n for n, step in zip(quick.free.names, quick.prompt, strict=True) if abs(step) > SPREAD_LIMIT]:
+        remarks.append(f"{', '.join(late)}: more than {SPREAD_LIMIT:.0%} different where nothing is late")
+    remarks += [
+        f"{name}: the rotors' torque accounts for {np.exp(-by):.0%} of quick angular acceleration only"
+        for name, by in zip(quick.free.names, quick.undecided, strict=True)
+        if by > SPREAD_LIMIT
+    ]
+    judge = quick.short if comparable else None
+    others = [quick.prompt, quick.undecided]
+    found = _finish(quick.shooting, quick.found, quick.free, quick.prior, quick.simulated, robust, judge, others).of(
+        names
+    )
+    found = replace(found, parameters=found.parameters.unreliable(YAW))
+    return replace(found, warnings=(*remarks, *found.warnings, *_warnings(found)))
+
+
+def _finish(
+    shooting: Shooting, polished: Polished, free: Free, prior: Prior, evaluations: int, robust: bool = False,
+    short: Polished | None = None, others: Sequence[FloatArray] = (),
+) -> Fit:  # fmt: skip
+    """Intervals and statuses.
+
+    The fit to `short` segments tests the numbers, and so do `others`, scaled steps to other estimates.
+    """
+    theta, ended = polished.theta, np.isfinite(polished.cost)
+    both = with_second_cut(shooting, polished, free, prior, robust) if ended else None
+    unc = uncertainty(polished.lin, prior, None if both is None else both.information)
+    if both is not None:
+        theta, evaluations = both.theta, evaluations + both.simulated
+    theta, unc = with_scale_uncertainty(shooting.vehicle, free, prior, theta, unc)
+    doubts: tuple[str, ...] = ()
+    if short is not None and ended:
+        trust = reliability(shooting, polished, free, prior, short)
+        unc, doubts = trust.widened(unc).differing(others), trust.reasons(free, unc)
+    initial = shooting.layout.initial(shooting.vehicle)
+    parameters = parameter_set(free, theta, initial, unc)
+    return Fit(shooting.vehicle, theta, parameters, shooting.noise, unc, polished.outcome, evaluations, doubts)
+
+
+def _warnings(found: Fit) -> tuple[str, ...]:
+    out = on_bounds(found.parameters)
+    inflation = zip(found.parameters.names, found.uncertainty.inflation, strict=True)
+    grown = [f"{name} x{g:.1f}" for name, g in inflation if g > 1.5]
+    if grown:
+        out.append(
+            "residuals are larger or more correlated than noise, so intervals were widened: " + ", ".join(grown)
+            + "; quadid diagnose names the cause"
+        )  # fmt: skip
+    return tuple(out)
+
+
+def fit_at(
+    windows: Sequence[Window], vehicle: Vehicle, theta: FloatArray, noise: NoiseModel, evaluations: int, how: str
+) -> Fit:
+    """Wraps a parameter vector as a fit: intervals and status at `theta`, which need not be an optimum.
+
+    Args:
+        windows: training data.
+        vehicle: as given.
+        theta: full parameter vector, shape (size,).
+        noise: sensor noise.
+        evaluations: parameter vectors that the search simulated.
+        how: sentence on how it ended.
+    """
+    shooting = Shooting.cut(windows, vehicle, FIT_SECONDS, noise)
+    free = shooting.free(NOMINAL_NAMES)
+    lin = shooting.linearise(theta, free, settle_states(shooting, theta).states)
+    prior = default_prior(shooting, free)
+    unc = uncertainty(lin, prior)
+    parameters = parameter_set(free, theta, shooting.layout.initial(vehicle), unc)
+    step = posterior_covariance(lin.information, prior) @ lin.gradient
+    warnings = []
+    far = [n for n, z, s in zip(free.names, np.abs(step), unc.sigma, strict=True) if z > s]
+    if far:
+        warnings.append(
+            f"the search ended ({how}), but over whole seconds the data would still move {', '.join(far)}; "
+            "optimizer pso_polish goes all the way"
+        )
+    return Fit(vehicle, theta, parameters, noise, unc, Convergence.BUDGET, evaluations, tuple(warnings))

@@ -1,0 +1,219 @@
+"""Gauss-Newton with Levenberg damping on the scaled parameters; initial states are stepped along exactly."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from enum import StrEnum
+
+import numpy as np
+
+from quadid.errors import NotIdentifiableError
+from quadid.identification.box_qp import least_within
+from quadid.identification.initial_states import InitialStates
+from quadid.identification.parameterization import Free
+from quadid.identification.priors import Prior, default_prior, normal_equations, prior_terms
+from quadid.identification.segment_cost import Linearised
+from quadid.identification.shooting import MEASURED, Shooting
+from quadid.types import FloatArray
+
+HUBER = 4.0
+"""Residuals beyond this many sigma are down-weighted (Huber); Gaussian data lose nothing measurable."""
+
+
+class Convergence(StrEnum):
+    """How a polish ended; the values read as sentences."""
+
+    CONVERGED = "the step fell below the statistical resolution"
+    BUDGET = "the iteration limit was reached before the step was small"
+    STUCK = "no step reduced the cost any further"
+    ASTRAY = "the initial states went where no linear step follows them"
+
+
+LONGEST_STEP = 3.0
+"""No scaled parameter moves farther than this in one step."""
+_REFUSALS, _SETTLED = 3, 0.01
+"""Steps refused in a row after which initial states are looked at alone, and the share of the cost by which their own
+step may miss what it promised.  Beyond, they have gone where linearisation, and its cost, is worth nothing."""
+_STEADY_WEIGHT = 0.01
+"""Robust weights are renewed while any of them changes by more than this."""
+
+
+@dataclass(frozen=True)
+class Polished:
+    """Result of a polish.
+
+    Attributes:
+        theta: full parameter vector.
+        lin: linearisation at `theta`.
+        cost: total cost with prior; iterations: linearisations spent.
+        outcome: how it ended.
+    """
+
+    theta: FloatArray
+    lin: Linearised
+    cost: float
+    iterations: int
+    outcome: Convergence
+
+    @property
+    def states(self) -> InitialStates:
+        """Initial states of the optimum."""
+        return self.lin.states
+
+    @property
+    def simulated(self) -> int:
+        """Parameter vectors simulated for it: with one, each direction of the parameters and nine of initial states."""
+        return self.iterations * (len(self.lin.gradient) + 10)
+
+
+def robust_weights(shooting: Shooting, lin: Linearised) -> FloatArray:
+    """Huber weights of every sample (square roots of the row weights), 0 where nothing was measured, as `Linearised`.
+
+    Shape (segments, length, channels).
+    """
+    weight = lin.residuals / np.sqrt(shooting.noise.variance)
+    np.maximum(np.abs(weight, out=weight), HUBER, out=weight)
+    np.sqrt(np.divide(HUBER, weight, out=weight), out=weight)
+    weight[lin.weights == 0.0] = 0.0
+    return weight
+
+
+def polish(
+    shooting: Shooting, theta: FloatArray, free: Free, prior: Prior | None = None, states: InitialStates | None = None,
+    iterations: int = 12, robust: bool = False, tolerance: float = 0.02, settled: bool = False,
+) -> Polished:  # fmt: skip
+    """Refines `theta` to the local optimum, once more from measured initial states where those at hand went astray.
+
+    Args:
+        shooting: the problem.
+        theta: start, full vector.
+        free: parameters to move.
+        prior: weak by default.
+        states: initial states to start from; as measured by default.
+        iterations: most linearisations to spend.
+        robust: down-weight outliers (weights are renewed after accepted steps until they stay).
+        tolerance: stop when every step is below this fraction of the parameter's standard deviation.
+        settled: the initial states come from a fit, so that the first step may already be the last.
+
+    Raises:
+        NotIdentifiableError: the data lead to equations with infinite or missing entries.
+    """
+    prior = prior or default_prior(shooting, free)
+    states = states or MEASURED
+    settled = settled and shooting.start_of(theta, free)[0] in states.starts
+    first = _descend(shooting, theta, free, prior, states, iterations, robust, tolerance, settled)
+    if first.outcome is not Convergence.ASTRAY and not (states and _worse_than_measured(shooting, free, first)):
+        return first
+    again = _descend(shooting, first.theta, free, prior, MEASURED, iterations, robust, tolerance, False)
+    best = min(again, first, key=lambda p: p.cost)
+    return replace(best, iterations=first.iterations + again.iterations)
+
+
+def _descend(
+    shooting: Shooting, theta: FloatArray, free: Free, prior: Prior, states: InitialStates, iterations: int,
+    robust: bool, tolerance: float, settled: bool,
+) -> Polished:  # fmt: skip
+    """`polish` from the states as they are; gives up where these have gone astray."""
+    lin = shooting.linearise(theta, free, states)
+    if robust:
+        # Initial states as measured would let every sample of a segment look like an outlier.
+        lin = shooting.linearise(theta, free, lin.stepped())
+        shooting = shooting.with_robust(robust_weights(shooting, lin))
+        lin = shooting.linearise(theta, free, lin.states)
+    damping, refused, spent, outcome = 0.0, 0, 3 if robust else 1, Convergence.BUDGET
+    cost = lin.total_cost + prior_terms(free, prior, theta)[2]
+    while spent < iterations:
+        h, g = normal_equations(lin, free, prior, theta)
+        z = bounded_step(free, theta, h + damping * np.diag(np.diag(h)), g)
+        z *= min(1.0, LONGEST_STEP / max(float(np.max(np.abs(z), initial=0.0)), 1e-12))
+        moved = free.move(theta, z)
+        actual = free.step(theta, moved)
+        trial = shooting.linearise(moved, free, lin.stepped(actual))
+        spent += 1
+        trial_cost = trial.total_cost + prior_terms(free, prior, moved)[2]
+        # The first step also moves the initial states away from single noisy samples; it may cost a little.
+        least = cost * (1.0 + 1e-9 if settled else 1.05) + 1e-9
+        if not (trial_cost <= least and _leads_on(trial)):
+            damping, refused = max(4.0 * damping, 1e-2), refused + 1
+            if refused == _REFUSALS and _astray(shooting, theta, free, lin):
+                outcome = Convergence.ASTRAY
+                break
+            if damping > 1e6:
+                outcome = Convergence.STUCK
+                break
+            continue
+        gain, sigma = cost - trial_cost, 1.0 / np.sqrt(np.diag(h))
+        small = bool(np.all(np.abs(actual) <= tolerance * sigma)) or 0.0 <= gain < tolerance**2
+        theta, lin, cost, refused = moved, trial, trial_cost, 0
+        damping = damping * 0.2 if damping > 1e-4 else 0.0
+        if settled and small:
+            outcome = Convergence.CONVERGED
+            break
+        settled = True
+        if robust and (weights := _renewed(shooting, lin)) is not None:
+            # Costs under old and new weights cannot be compared.
+            shooting = shooting.with_robust(weights)
+            lin = shooting.linearise(theta, free, lin.states)
+            spent, cost = spent + 1, lin.total_cost + prior_terms(free, prior, theta)[2]
+    return Polished(theta, lin, cost, spent, outcome)
+
+
+def _worse_than_measured(shooting: Shooting, free: Free, found: Polished) -> bool:
+    """Whether the states of an unfinished descent cost more than twice what measured ones would."""
+    if found.outcome is Convergence.CONVERGED:
+        return False
+    return 2.0 * shooting.linearise(found.theta, free).total_cost < found.lin.total_cost
+
+
+def _leads_on(lin: Linearised) -> bool:
+    """Whether a next step can be worked out: a simulation that runs away leaves slopes beyond the digits of a float."""
+    h = lin.information
+    return bool(np.isfinite(h).all() and np.isfinite(lin.grad).all() and (np.diag(h) >= 0.0).all())
+
+
+def _astray(shooting: Shooting, theta: FloatArray, free: Free, lin: Linearised) -> bool:
+    """Whether initial states, moved alone, miss the cost that their linearisation counts on."""
+    reached = shooting.linearise(theta, free, lin.stepped()).total_cost
+    return not reached <= (1.0 + _SETTLED) * lin.total_cost
+
+
+def _renewed(shooting: Shooting, lin: Linearised) -> FloatArray | None:
+    """New robust weights; None when they would hardly differ from those in use."""
+    weights = robust_weights(shooting, lin)
+    if shooting.robust is None:
+        return weights
+    change = weights - shooting.robust
+    return weights if np.max(np.abs(change, out=change), initial=0.0) > _STEADY_WEIGHT else None
+
+
+def bounded_step(free: Free, theta: FloatArray, h: FloatArray, g: FloatArray) -> FloatArray:
+    """Minimises ``2 g z + z h z`` over steps that keep every parameter within its bounds.
+
+    Args:
+        free: parameters to move, with their bounds.
+        theta: where the step starts, full vector.
+        h: positive semi-definite, shape (P, P).
+        g: shape (P,).
+
+    Raises:
+        NotIdentifiableError: the data lead to equations with infinite or missing entries.
+    """
+    if not (np.isfinite(h).all() and np.isfinite(g).all()):
+        raise NotIdentifiableError(
+            "the linearised simulation is not finite, so no step towards a fit exists",
+            "a flight that the vehicle file can simulate for a second at a time",
+            "check mass, rotor positions and the unit of the rotor signal; `quadid inspect` looks for wrong units",
+        )
+    if not len(g):
+        return np.zeros(0)
+    low, high = _step_limits(free, theta)
+    # Parameters are scaled first, so that only a true lack of information makes a direction vanish.
+    scale = np.sqrt(np.where(np.diag(h) > 0.0, np.diag(h), 1.0))
+    z = least_within(h / np.outer(scale, scale), g / scale, low * scale, high * scale)
+    return np.clip(z / scale, low, high)
+
+
+def _step_limits(free: Free, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Smallest and largest scaled step of each parameter within its bounds, shapes (P,)."""
+    low, high = (free.difference(bound, theta[free.index]) for bound in free.bounds)
+    return np.minimum(low, 0.0), np.maximum(high, 0.0)

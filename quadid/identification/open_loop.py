@@ -1,0 +1,237 @@
+"""Open-loop runs of the simulation, each from a measured state, driven by the logged rotor speeds.
+
+Rotor speeds are held over each sample; runs never cross a gap.  Rates are compared as the gyro would read them: bias,
+scale and misalignment of the model are taken off the measured rate at the start and put on the predicted one; a delay
+of the attitude likewise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from quadid.data.window import Window
+from quadid.identification.initial_states import retract
+from quadid.model import layout as ix
+from quadid.model.rollout import Rollout, Segments
+from quadid.model.simd import LANES
+from quadid.model.work_array import N_STATE
+from quadid.types import BoolArray, FloatArray, IndexArray
+from quadid.vehicle import Vehicle
+
+QUANTITIES: dict[str, str] = {"position": "m", "velocity": "m/s", "rotation": "rad", "rate": "rad/s"}
+"""What is predicted, with units."""
+_PLACES = (12, 9, 3, 0)
+"""First of the three residual channels of each quantity."""
+RAN_AWAY = 1e30
+"""Misses from here on, or without a value, are infinite: the simulation has left every scale of a flight."""
+_CHUNK = 256
+"""Runs rolled at once; keeps the residuals of a chunk in cache."""
+
+
+class OpenLoop:
+    """Runs of one window, from every n-th row with a measured rate.
+
+    Attributes:
+        window: the data.
+        padded: the data with one row more, which the simulation rolls into and nothing is compared with.
+        known: rows at which each channel was measured.
+        longest: samples of a run.
+        rows: where runs start, shape (starts,).
+    """
+
+    def __init__(self, window: Window, vehicle: Vehicle, longest: int, every: int = 1) -> None:
+        """Finds the starts; raises WindowError when rotor columns do not match the vehicle."""
+        self.window, self.longest = window, longest
+        self.known, self.padded = _finite(window), _padded(window)
+        self._rollout = Rollout(self.padded, vehicle)
+        self.rows = np.flatnonzero(self.known["gyro"][: max(len(window) - longest, 0)])[::every]
+
+    def counted(self, rows: IndexArray, at: IndexArray) -> BoolArray:
+        """Which quantities of runs from `rows` count `at` samples after the start, shape (rows, at, 4).
+
+        A quantity counts where it was measured at the target and the start was known well enough: a velocity needs
+        attitude and velocity at the start, a position its own start too.
+        """
+        attitude = self.known["attitude"][rows]
+        velocity = attitude & self.known["velocity"][rows]
+        position = velocity & self.known["position"][rows]
+        starts = (position, velocity, attitude, self.known["gyro"][rows])
+        valid, target = self._rollout.valid, rows[:, None] + at
+        out = np.zeros((*target.shape, 4), dtype=bool)
+        for i, (place, started) in enumerate(zip(_PLACES, starts, strict=True)):
+            if place < valid.shape[1]:
+                out[..., i] = valid[:, place][target] & started[:, None]
+        return out
+
+    def parts(self, theta: FloatArray, at: IndexArray) -> Iterator[tuple[IndexArray, FloatArray]]:
+        """Yields rows of starts and what runs from them miss by, in turns.
+
+        Args:
+            theta: full parameter vectors, shape (vectors, size); all runs start at the rates that the first derives
+                from the gyro.
+            at: samples after the start, 1 to `longest`.
+
+        Yields:
+            Rows, and predicted - measured of each quantity, shape (vectors, rows, at, 4, 3).  A rotation is its axis
+            times twice the sine of half its angle.  What is not measured is NaN, what ran away infinite.
+        """
+        states = initial_states(self.window, theta[0], self.known)
+        step = max(_CHUNK // len(theta), LANES)
+        for first in range(0, len(self.rows), step):
+            rows = self.rows[first : first + step]
+            segments = Segments(self.longest, 1, (rows + 1).astype(np.int64))
+            blocks = self._rollout.roll(segments, theta, np.ascontiguousarray(states[rows]))[0]
+            residual = np.moveaxis(blocks, 4, 1).reshape(-1, *blocks.shape[1:4])[: len(theta)]
+            found = np.stack([_three(residual[:, :, at - 1], place) for place in _PLACES], axis=3)
+            ran = np.where(np.abs(found) < RAN_AWAY, found, np.inf)  # a comparison with NaN is false, too
+            yield rows, np.where(self.counted(rows, at)[..., None], ran, np.nan)
+
+    def misses(self, theta: FloatArray, at: IndexArray) -> FloatArray:
+        """What all runs miss by, shape (vectors, starts, at, 4, 3); see `parts`."""
+        none = np.full((len(theta), 0, len(at), 4, 3), np.nan)
+        return np.concatenate([none, *(misses for _, misses in self.parts(theta, at))], axis=1)
+
+    def no_change(self, at: IndexArray) -> FloatArray:
+        """Errors of predicting that nothing changes, shape (starts, at, 4); NaN for what is not measured."""
+        target = self.rows[:, None] + at
+        out = np.full((*target.shape, 4), np.nan)
+        w = self.window
+        for i, values in ((0, w.position), (1, w.velocity), (3, w.gyro)):
+            if values is not None:
+                out[..., i] = np.linalg.norm(values[target] - values[self.rows][:, None], axis=2)
+        if w.attitude is not None:
+            cosine = np.abs(np.sum(w.attitude[target] * w.attitude[self.rows][:, None], axis=2))
+            out[..., 2] = 2.0 * np.arccos(np.minimum(cosine, 1.0))
+        return np.where(self.counted(self.rows, at), out, np.nan)
+
+
+def lengths(misses: FloatArray) -> FloatArray:
+    """Errors (..., 4) out of misses (..., 4, 3): Euclidean, the rotation's as its angle."""
+    out: FloatArray = np.linalg.norm(misses, axis=-1)
+    half = 0.5 * out[..., 2]
+    out[..., 2] = np.where(np.isinf(half), np.inf, 2.0 * np.arcsin(np.minimum(half, 1.0)))
+    return out
+
+
+def _three(residual: FloatArray, place: int) -> FloatArray:
+    """Three channels of a residual from `place` on; zeros where it has none."""
+    if place < residual.shape[-1]:
+        return residual[..., place : place + 3]
+    return np.zeros((*residual.shape[:-1], 3))
+
+
+def mean_errors(windows: Sequence[Window], vehicle: Vehicle, theta: FloatArray, samples: int) -> dict[str, float]:
+    """Mean error `samples` after every start, by quantity; NaN for what the logs lack, infinite where a run went away.
+
+    Args:
+        windows: of one or more files, on one grid.
+        vehicle: geometry and mass.
+        theta: full parameter vector, shape (size,).
+        samples: after the start.
+    """
+    at = np.array([samples])
+    return _by_quantity([lengths(OpenLoop(w, vehicle, samples).misses(theta[None], at)[0, :, 0]) for w in windows])
+
+
+def no_change(windows: Sequence[Window], vehicle: Vehicle, samples: int) -> dict[str, float]:
+    """Mean error of predicting that nothing changes for `samples`, by quantity; NaN for what the logs lack.
+
+    Args:
+        windows: of one or more files, on one grid.
+        vehicle: geometry and mass.
+        samples: after the start.
+    """
+    at = np.array([samples])
+    return _by_quantity([OpenLoop(w, vehicle, samples).no_change(at)[:, 0] for w in windows])
+
+
+def _by_quantity(errors: Sequence[FloatArray]) -> dict[str, float]:
+    """Means over all starts of errors (starts, 4)."""
+    mean = mean_of_known(np.concatenate([np.zeros((0, 4)), *errors]))
+    return dict(zip(QUANTITIES, mean.tolist(), strict=True))
+
+
+def mean_of_known(errors: FloatArray) -> FloatArray:
+    """Mean over the first axis of what is not NaN; NaN where nothing is."""
+    known = ~np.isnan(errors)
+    total, count = np.where(known, errors, 0.0).sum(axis=0), known.sum(axis=0)
+    mean: FloatArray = np.divide(total, count, out=np.full(total.shape, np.nan), where=count > 0)
+    return mean
+
+
+def _padded(window: Window) -> Window:
+    """The window as held, with one row more."""
+
+    def extended(values: FloatArray | None, fill: float | None = np.nan) -> FloatArray | None:
+        if values is None:
+            return None
+        last = values[-1:] if fill is None else np.full_like(values[-1:], fill)
+        return np.concatenate([values, last])
+
+    rotor = extended(window.rotor_speed, None)
+    assert rotor is not None
+    return replace(
+        window,
+        rotor_speed=rotor,
+        rotor_slope=None,
+        gyro=extended(window.gyro),
+        attitude=extended(window.attitude),
+        accel=None,
+        velocity=extended(window.velocity),
+        position=extended(window.position),
+        battery=extended(window.battery, None),
+        attitude_reference=None,
+        sampling="held",
+    )
+
+
+def _finite(window: Window) -> dict[str, BoolArray]:
+    """Rows at which each channel was measured."""
+    out = {}
+    for name in ("gyro", "attitude", "velocity", "position"):
+        values = getattr(window, name)
+        out[name] = np.zeros(len(window), dtype=bool) if values is None else np.isfinite(values).all(axis=1)
+    return out
+
+
+def initial_states(window: Window, theta: FloatArray, known: dict[str, BoolArray]) -> FloatArray:
+    """Measured state of every row, shape (rows, 13): attitude, rate, velocity, position; level, at rest if unknown.
+
+    The model's gyro and its scale of the velocity are undone; an attitude that is late by it is turned on by the rate.
+    """
+    x = np.zeros((len(window), N_STATE))
+    x[:, 0] = 1.0
+    for name, place in (("attitude", 0), ("velocity", 7), ("position", 10)):
+        values = getattr(window, name)
+        if values is not None:
+            x[known[name], place : place + values.shape[1]] = values[known[name]]
+    x[:, 7:10] /= 1.0 + theta[[ix.VEL_SCALE, ix.VEL_SCALE, ix.VEL_SCALE_Z]]
+    if window.gyro is not None:
+        x[known["gyro"], 4:7] = true_rate(window.gyro[known["gyro"]], theta)
+        delay = float(theta[ix.ATT_DELAY])
+        if delay:
+            late = known["gyro"] & known["attitude"]
+            x[late] = retract(x[late], delay * _rate_before(x, known["gyro"], late, 0.5 * delay / window.dt))
+    return x
+
+
+def _rate_before(x: FloatArray, known: BoolArray, rows: BoolArray, samples: float) -> FloatArray:
+    """Rates `samples` before some rows, between two measured ones; where one of those is missing, the row's own."""
+    at = np.maximum(np.flatnonzero(rows) - samples, 0.0)
+    first = at.astype(int)
+    second = np.minimum(first + 1, len(x) - 1)
+    share = (at - first)[:, None]
+    between = (1.0 - share) * x[first, 4:7] + share * x[second, 4:7]
+    return np.where((known[first] & known[second])[:, None], between, x[rows, 4:7])
+
+
+def true_rate(measured: FloatArray, theta: FloatArray) -> FloatArray:
+    """Undoes the model's gyro: measured = (1 + s) exp([m]x) rate + bias, element by element in s; shapes (n, 3)."""
+    m = theta[[ix.MAX_, ix.MAY, ix.MAZ]]
+    cross = np.array([[0.0, -m[2], m[1]], [m[2], 0.0, -m[0]], [-m[1], m[0], 0.0]])
+    mounting = np.eye(3) + cross + 0.5 * cross @ cross  # to second order, as the kernel has it
+    sensor = (measured - theta[[ix.GBX, ix.GBY, ix.GBZ]]) / (1.0 + theta[[ix.GSX, ix.GSY, ix.GSZ]])
+    return np.asarray(np.linalg.solve(mounting, sensor.T).T)

@@ -1,0 +1,174 @@
+"""Import paths of the release before: they work for one release more, with a DeprecationWarning."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import pkgutil
+import sys
+import warnings
+from collections.abc import Sequence
+from importlib.abc import Loader, MetaPathFinder
+from importlib.machinery import ModuleSpec, PathFinder
+from types import ModuleType
+
+ROOMS = {
+    "quadid.workflow": "quadid.app",
+    "quadid.baselines": "quadid_evaluation.paper",
+    "quadid_cli": "quadid.cli",
+    "quadid_report": "quadid.report",
+    "quadid_workflow": "quadid.app",
+    "quadid_paper": "quadid_evaluation.paper",
+    "quadid.optimisers": "quadid_evaluation.optimisers",
+    "quadid.identify": "quadid.identification",
+    "quadid.diagnose": "quadid.diagnosis",
+    "quadid.health": "quadid.condition",
+    "quadid.inspection": "quadid.checks",
+}
+"""Packages that moved as they were, by their old names."""
+MOVED = {
+    "quadid.data.faults": "quadid.data_faults quadid.saturation",
+    "quadid.effects": "quadid.effects.kinds quadid.effects.table",
+    "quadid.flight.airframe": "quadid.flight.airframe_constants",
+    "quadid.flight.setup": "quadid.flight.draw quadid.flight.truth",
+    "quadid.flight.outside": "quadid.flight.outside_flight quadid.flight.outside_log",
+    "quadid.flight.pilot": "quadid.flight.profiles quadid.flight.stabiliser",
+    "quadid.flight.fly": "quadid.flight.record",
+    "quadid.data.grid": "quadid.grid quadid.resampling_plan",
+    "quadid.condition.changes": "quadid.health.change_evidence quadid.health.hypotheses",
+    "quadid.condition.trim": "quadid.health.spread quadid.health.stored quadid.health.trim_estimation",
+    "quadid.checks.motion": "quadid.inspection.airborne quadid.inspection.conventions "
+    "quadid.inspection.position quadid.inspection.timing",
+    "quadid.checks.rotors": "quadid.inspection.geometry quadid.inspection.motor_checks "
+    "quadid.inspection.rotor_checks quadid.inspection.rotor_timing",
+    "quadid.checks.findings": "quadid.inspection.outlook",
+    "quadid.data.intersample": "quadid.intersample",
+    "quadid.model.rollout": "quadid.model.array_cache quadid.model.channels quadid.model.packing "
+    "quadid.model.segments quadid.model.shared_rollout",
+    "quadid.model.rollout_kernel": "quadid.model.compare_kernel",
+    "quadid.model.rotor_kernel": "quadid.model.lag_kernel",
+    "quadid.model.kernel": "quadid.model.needs_kernel",
+    "quadid.model.body_kernel": "quadid.model.residual_kernel",
+    "quadid.model.step": "quadid.model.simulate",
+    "quadid.model.layout": "quadid.model.supply quadid.model.thrust",
+    "quadid.data.mounting": "quadid.mounting",
+    "quadid.online.stream": "quadid.online.channel_buffer quadid.online.clock "
+    "quadid.online.command_reconstruction quadid.online.resampler",
+    "quadid.online.checks": "quadid.online.consistency quadid.online.quality",
+    "quadid.online.records": "quadid.online.jobs quadid.online.outbox",
+    "quadid.online.grid_buffer": "quadid.online.rows",
+    "quadid.vehicle": "quadid.provenance quadid.residual quadid.vehicle_parts quadid.vehicle_size",
+    "quadid.data.resample": "quadid.resample",
+    "quadid.data.rotor_signal": "quadid.rotor_signal",
+    "quadid.data.window": "quadid.window",
+    "quadid.cli.terminal": "quadid_cli.failure quadid_cli.output quadid_cli.tables",
+    "quadid.cli.fleet_run": "quadid_cli.fleet_cluster quadid_cli.fleet_folder quadid_cli.fleet_store",
+    "quadid_node.inputs": "quadid_node.chooser quadid_node.convert quadid_node.intake quadid_node.pace "
+    "quadid_node.presets quadid_node.stamps",
+    "quadid_node.publish": "quadid_node.claim quadid_node.neighbours quadid_node.speaker",
+    "quadid_node.history": "quadid_node.history_writer quadid_node.restored_set quadid_node.store",
+    "quadid_node.mavlink_link": "quadid_node.mavlink_decode quadid_node.mavlink_parameters "
+    "quadid_node.mavlink_requests quadid_node.motor_order",
+    "quadid_node.mavlink_wire": "quadid_node.mavlink_peers quadid_node.signing_memory",
+    "quadid_node.wire_format": "quadid_node.parcel",
+    "quadid_node.ground": "quadid_node.remote_worker quadid_node.workers",
+    "quadid_node.store_file": "quadid_node.store_lock",
+    "quadid_node.worker": "quadid_node.warm_up",
+    "quadid_node.zenoh": "quadid_node.zenoh_fleet quadid_node.zenoh_link quadid_node.zenoh_session",
+    "quadid_replay.motors": "quadid_replay.airframes",
+    "quadid_replay.rosbag": "quadid_replay.bag_folder quadid_replay.mcap_reader quadid_replay.rosbag2_files",
+    "quadid_replay.mcap_file": "quadid_replay.bag_topics quadid_replay.mcap_metadata quadid_replay.mcap_order "
+    "quadid_replay.mcap_records",
+    "quadid_replay.blackbox": "quadid_replay.blackbox_frames quadid_replay.blackbox_reader",
+    "quadid_replay.message_times": "quadid_replay.boot_clock quadid_replay.tlog_times",
+    "quadid_replay.ros_messages": "quadid_replay.cdr_blocks quadid_replay.mcap_decode "
+    "quadid_replay.mcap_messages quadid_replay.signal_columns",
+    "quadid_replay.columns": "quadid_replay.clocks",
+    "quadid_replay.writers": "quadid_replay.compared_writer quadid_replay.csv_writer "
+    "quadid_replay.mcap_writer quadid_replay.tlog_writer quadid_replay.topic_writer quadid_replay.writing",
+    "quadid_replay.dataflash": "quadid_replay.dataflash_index quadid_replay.dataflash_reader",
+    "quadid_replay.mavlink_messages": "quadid_replay.esc_messages quadid_replay.frame_numbers "
+    "quadid_replay.tlog_messages",
+    "quadid_replay.tlog": "quadid_replay.mavlink_decode quadid_replay.mavlink_frames "
+    "quadid_replay.tlog_reader quadid_replay.tlog_vehicle",
+    "quadid_replay.ulog": "quadid_replay.px4_allocation quadid_replay.ulog_check quadid_replay.ulog_reader",
+    "quadid_replay.usd": "quadid_replay.usd_reader quadid_replay.usd_records",
+    "quadid.report.health_page": "quadid_report.airframe_picture",
+    "quadid.report.fit_pages": "quadid_report.diagnose_page quadid_report.excitation_part "
+    "quadid_report.excite_page quadid_report.failure_page quadid_report.flight_part quadid_report.identify_page",
+    "quadid.report.fleet": "quadid_report.fleet_page quadid_report.fleet_summary quadid_report.fleet_tables",
+    "quadid.report.tables": "quadid_report.inspect_tables quadid_report.result_tables quadid_report.text_table",
+    "quadid.report.manoeuvres": "quadid_report.manoeuvres.forms quadid_report.manoeuvres.plan",
+    "quadid.report.figures": "quadid_report.parts quadid_report.plotly_figure",
+    "quadid.report.page": "quadid_report.plotly_source",
+    "quadid.report.programs": "quadid_report.programs.facts quadid_report.programs.forms "
+    "quadid_report.programs.particulars",
+    "quadid.report.verdict": "quadid_report.words",
+    "quadid.app.logs": "quadid_workflow.files quadid_workflow.loading quadid_workflow.log_parts "
+    "quadid_workflow.overlap",
+    "quadid.app.fleet": "quadid_workflow.fleet_health",
+    "quadid.app.outcome": "quadid_workflow.progress quadid_workflow.reporting quadid_workflow.series",
+    "quadid.app.identify": "quadid_workflow.searching",
+}
+"""Old modules of each new one."""
+_NEW = {old: new for new, olds in MOVED.items() for old in olds.split()}
+_FILES = ("quadid.effects", "quadid.report.manoeuvres", "quadid.report.programs")
+"""Packages that are one file now."""
+_FUNCTIONS = ("quadid.identify", "quadid.diagnose", "quadid.health")
+"""Old packages whose names are functions now: these carry what the packages held."""
+
+
+def new_paths() -> dict[str, str]:
+    """New path of every module that moved to a file of another name."""
+    return dict(_NEW)
+
+
+def new_path(name: str) -> str:
+    """Path of what was called `name`; empty where nothing moved."""
+    if name in _NEW:
+        return _NEW[name]
+    room = next((room for room in ROOMS if name == room or name.startswith(f"{room}.")), "")
+    return ROOMS[room] + name.removeprefix(room) if room else ""
+
+
+class _OldPaths(MetaPathFinder, Loader):
+    def find_spec(
+        self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
+    ) -> ModuleSpec | None:
+        if fullname in _FILES:
+            spec = PathFinder.find_spec(fullname, path)
+            if spec is not None:
+                spec.submodule_search_locations = []  # what was within is asked for here
+            return spec
+        new = new_path(fullname)
+        if not new or importlib.util.find_spec(new) is None:
+            return None
+        return ModuleSpec(fullname, self, is_package=True)
+
+    def exec_module(self, module: ModuleType) -> None:
+        old = module.__name__
+        new = importlib.import_module(new_path(old))
+        warnings.warn(f"{old} is {new.__name__} now; the old path goes with the next release", DeprecationWarning, 2)
+        sys.modules[old] = _function(old, new) if old in _FUNCTIONS else new
+
+
+def _function(old: str, room: ModuleType) -> ModuleType:
+    """The function of an old package's name, which for one release holds what the package held."""
+    function = getattr(importlib.import_module("quadid"), old.rpartition(".")[2])
+    for entry in pkgutil.iter_modules(room.__path__):
+        importlib.import_module(f"{room.__name__}.{entry.name}")
+    held = {name: value for name, value in vars(room).items() if not name.startswith("_")}
+    function.__dict__.update(held, __path__=[], __spec__=None)
+    return function  # type: ignore[no-any-return]
+
+
+def stand_in(name: str) -> None:
+    """Puts the package that was called `name` in its place."""
+    install()
+    _OldPaths().exec_module(sys.modules[name])
+
+
+def install() -> None:
+    """Makes old paths importable."""
+    if not any(isinstance(finder, _OldPaths) for finder in sys.meta_path):
+        sys.meta_path.insert(0, _OldPaths())

@@ -1,0 +1,371 @@
+"""Checks of sensors and windows before anything is learned: consistency, quality, flight."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from quadid.checks.findings import CheckResult
+from quadid.checks.motion import attitude_check, gravity_check, velocity_check
+from quadid.checks.rotors import lagged_of, motor_order_check
+from quadid.data.faults import at_limit
+from quadid.data.resample import copied, true_runs
+from quadid.data.window import Window, as_recording
+from quadid.model.layout import ThrustModel
+from quadid.online.grid_buffer import Cut, Rows
+from quadid.rotation import down, integrated, turn
+from quadid.types import FloatArray
+from quadid.vehicle import GRAVITY, Vehicle
+
+# --- Do the sensors agree?  Factors of channels against each other, from physics that needs no model of the vehicle
+#
+# * Gyro against attitude: by how much the turns over `TURN` change, as the gyro adds up to them and as the attitude has
+# them, about each axis.  Changes of turns have neither the gyro's bias nor the slow pull of an attitude filter in them,
+# and lie where inertias are seen.  All axes of the gyro are regressors, so that one that leaks into another shows; the
+# change of rate takes up a delay, so that the factor is a ratio of sizes.
+# * Accelerometer against gravity: the vertical specific force of a flight is g on average, because velocity stays
+#   small.
+#
+# Every factor is estimated from the last data that tell it, with its standard deviation; it ought to be 1, what leaks
+# 0. One that is not has two channels that may be to blame: both are named.  Data fade, and in the end are dropped: a
+# channel that was wrong by a thousand would outweigh for minutes all that is right after it.
+
+
+ALLOWED = 0.03
+"""Calibrated sensors differ by less than this share."""
+ERRORS = 2.0
+"""... and these many standard deviations, when they are compared."""
+MEMORY, GONE = 30.0, 45.0
+"""Data that tell a factor fade with this time constant, and are gone at this age [s of such data]."""
+TURN = 0.2
+"""Gyro and attitude are compared over turns of this length [s]."""
+LEAD = 2.0 * TURN
+"""A change of turn needs so much of the past [s]."""
+MOVING = 0.1
+"""An axis that turns slower than this on average [rad/s] tells nothing: gyro noise would make the factor too small."""
+VERTICAL = 1.5
+"""Vertical velocity of a flight [m/s], as standard deviation."""
+FEWEST = 15
+"""Turns that tell a factor, at least,"""
+KNOWN = 0.05
+"""... and the standard deviation from which on it is told: noise makes a ratio of small turns too large."""
+AXES = ("roll", "pitch", "yaw")
+TURN_FACTOR = "turn by the attitude over that by the gyro"
+GRAVITY_FACTOR = "accelerometer over gravity by the attitude"
+
+
+@dataclass(frozen=True)
+class Factor:
+    """Size of one channel over that of another.
+
+    Attributes:
+        what: the two, in words.
+        value: of the factor; sigma: its standard deviation, infinite where nothing tells it.
+        ideal: what it is where they agree.
+    """
+
+    what: str
+    value: float
+    sigma: float
+    ideal: float = 1.0
+
+    @property
+    def known(self) -> bool:
+        """Whether it says anything."""
+        return self.sigma <= KNOWN
+
+    @property
+    def off(self) -> float:
+        """How far it is from where it ought to be."""
+        return self.value - self.ideal
+
+    @property
+    def disagrees(self) -> bool:
+        """Whether it is known, and cannot be what it ought to be."""
+        return self.known and abs(self.off) > ALLOWED + ERRORS * self.sigma
+
+    def __str__(self) -> str:
+        return f"{self.what} = {self.value:.3f} +- {self.sigma:.3f}"
+
+
+class _Fading:
+    """Moments of data that tell a factor, fading; what is older than `GONE` leaves no trace."""
+
+    def __init__(self, *shape: int) -> None:
+        self._parts: deque[tuple[float, FloatArray]] = deque()
+        self.seconds, self.sum = 0.0, np.zeros(shape)
+
+    def add(self, seconds: float, moments: FloatArray) -> None:
+        """Takes in the moments of some seconds of data."""
+        self._parts.appendleft((seconds, moments))
+        lengths = np.array([length for length, _ in self._parts])
+        ages = np.cumsum(lengths) - lengths
+        while ages[-1] > GONE - 0.5 * seconds:
+            self._parts.pop()
+            ages = ages[:-1]
+        fade = np.exp(-ages / MEMORY)
+        self.seconds = float(fade @ lengths[: len(ages)])
+        self.sum = np.asarray(sum(f * part for f, (_, part) in zip(fade, self._parts, strict=True)))
+
+
+class Consistency:
+    """Factors of the channels of one stream."""
+
+    def __init__(self) -> None:
+        """Knows nothing yet."""
+        self.restart()
+
+    def restart(self) -> None:
+        """Begins anew: another stream."""
+        # Moments of (changes of turn by the gyro about x, y, z, of rate, of turn by the attitude), for each axis.
+        self._turns = [_Fading(5, 5) for _ in AXES]
+        self._force = _Fading()
+        self._compared = False
+
+    def add(self, rows: Rows | None, seconds: float) -> None:
+        """Takes in the last `seconds` of the rows, before which there should be `LEAD` that were taken in earlier."""
+        if rows is None or len(rows.t) < 2 or "attitude" not in rows.columns:
+            return
+        step, q, self._compared = float(rows.t[1] - rows.t[0]), rows.columns["attitude"], True
+        if "gyro" in rows.columns:
+            self._add_turns(rows.columns["gyro"], q, step)
+        if "accel" in rows.columns:
+            new = round(seconds / step)
+            force = -np.sum(down(q[-new:]) * rows.columns["accel"][-new:], axis=1)
+            force = force[np.isfinite(force)]
+            if len(force):
+                self._force.add(len(force) * step, np.asarray(force.sum() * step))
+
+    def _add_turns(self, gyro: FloatArray, q: FloatArray, step: float) -> None:
+        long = max(round(TURN / step), 1)
+        # A turn from every row: readings in step with the sticks would put all others at one phase of their motion.
+        starts = np.arange(len(gyro) - long)
+        if len(starts) <= long:
+            return
+        turns = (
+            integrated(np.stack([gyro[k : k + long + 1] for k in starts], axis=1), step),
+            gyro[starts + long] - gyro[starts],
+            turn(q[starts], q[starts + long]),
+        )
+        by_gyro, rate, by_attitude = (t[long:] - t[:-long] for t in turns)
+        good = np.isfinite(by_gyro + rate + by_attitude).all(axis=1)
+        moving = np.sqrt(np.mean(gyro[np.isfinite(gyro).all(axis=1)] ** 2, axis=0)) > MOVING
+        for axis in np.flatnonzero(moving) if good.any() else ():
+            rows = np.column_stack([by_gyro, rate[:, axis], by_attitude[:, axis]])[good]
+            self._turns[axis].add(len(rows) * step, rows.T @ rows / long)
+
+    def factors(self) -> tuple[Factor, ...]:
+        """Every factor of which there are data: of the gyro by axis, what leaks into it, of the accelerometer."""
+        found = [f for axis, t in enumerate(self._turns) if t.seconds > FEWEST * TURN for f in _gyro_factors(axis, t)]
+        if self._force.seconds > 0.0:
+            # The mean of an acceleration is a change of velocity over a time.
+            sigma = math.sqrt(2.0) * VERTICAL / self._force.seconds / GRAVITY
+            mean = float(self._force.sum) / self._force.seconds / GRAVITY
+            found.append(Factor(GRAVITY_FACTOR, mean, sigma))
+        return tuple(found)
+
+    @property
+    def fault(self) -> str:
+        """Which channels contradict each other, and what is waited for; empty where none do."""
+        wrong = [f for f in self.factors() if f.disagrees]
+        if not wrong:
+            return ""
+        worst = max(wrong, key=lambda f: abs(f.off))
+        return f"sensors disagree: {worst}, allowed {worst.ideal:g} +- {ALLOWED:g}; nothing is learned until they agree"
+
+    def doubts(self) -> tuple[Factor, ...]:
+        """Products that b, J_xx and J_yy are off by: of the accelerometer alone, and of it and the gyro about an axis.
+
+        Each channel may be within its own limit and all together not.  Yaw may turn too little for ever; a stream
+        without an attitude allows no comparison at all.
+        """
+        if not self._compared:
+            return ()
+        found = {f.what: f for f in self.factors()}
+        force = found.get(GRAVITY_FACTOR)
+        turns = [
+            found.get(what, Factor(what, 1.0, math.inf)) for what in (f"{axis} {TURN_FACTOR}" for axis in AXES[:2])
+        ]
+        if force is None:
+            return tuple(turns)
+        both = [
+            Factor(f"{force.what} times {t.what}", force.value * t.value, math.hypot(force.sigma, t.sigma))
+            for t in turns
+        ]  # fmt: skip
+        return (force, *both)
+
+
+def _gyro_factors(axis: int, told: _Fading) -> list[Factor]:
+    """Size of the attitude's turns over the gyro's about an axis, then what it has of the gyro's other axes."""
+    gram, cross = told.sum[:4, :4], told.sum[:4, 4]
+    inverse = np.linalg.pinv(gram, hermitian=True)
+    slope = inverse @ cross
+    left = max(float(told.sum[4, 4] - slope @ cross), 0.0) / (told.seconds / TURN - 4.0)
+    sigma = np.sqrt(left * np.diag(inverse))
+    own = [axis, 3]
+    size = math.sqrt(float(slope[own] @ gram[np.ix_(own, own)] @ slope[own]) / gram[axis, axis])
+    found = [Factor(f"{AXES[axis]} {TURN_FACTOR}", math.copysign(size, slope[axis]), float(sigma[axis]))]
+    return found + [
+        Factor(f"part of the gyro's {AXES[k]} in the attitude's {AXES[axis]}", float(slope[k]), float(sigma[k]), 0.0)
+        for k in range(3) if k != axis
+    ]  # fmt: skip
+
+
+# --- Is this window fit to be learned from?  Stuck, saturated or mis-scaled sensors, and whether the vehicle flies
+
+
+STUCK_SECONDS = 1.0
+"""A sensor that repeats itself to the bit for longer than this [s] is stuck."""
+THRUST_KNOWN = (0.4, 4.0)
+"""Mean thrust over weight of a flying vehicle whose thrust coefficient is known."""
+THRUST_GUESSED = (0.2, 5.0)
+"""... and while it is only the vehicle file's guess."""
+RPM_SQUARED = (30.0 / np.pi) ** 2
+"""Thrust that speeds in rpm would give, over that of the same speeds in rad/s."""
+TUMBLED = 0.0
+"""Cosine of the tilt [1] below which the vehicle has tumbled or lies on its side."""
+IMPACT = 8.0 * GRAVITY
+"""Specific force [m/s^2] that only a crash brings."""
+FLOOR_SLOPE = 0.2
+"""Specific force must follow thrust at least with this slope [1]; on the ground it does not follow at all."""
+
+
+@dataclass(frozen=True)
+class Quality:
+    """Verdict on one window: `fault` names a broken sensor, `grounded` why it is not flight; both empty when good.
+
+    `carried`: it is not flight only because the specific force does not follow the thrust.  A load that is taken up in
+    hover looks alike: there the thrust follows the weight.
+    """
+
+    fault: str = ""
+    grounded: str = ""
+    carried: bool = False
+
+
+def judge(cut: Cut, vehicle: Vehicle, thrust: ThrustModel, known: bool) -> Quality:
+    """Judges the windows of one fit.
+
+    Args:
+        cut: stretches on the grid.
+        vehicle: the vehicle.
+        thrust: of the rotors, by the best estimate at hand.
+        known: whether it was identified or is a guess.
+    """
+    # First whether the rotors lift: at rest sensors and rotors may well repeat themselves.
+    for window in cut.windows:
+        lift = _lift(_weight_share(window, vehicle, thrust), window.dt, known)
+        if lift != Quality():
+            return lift
+        if fault := _broken(window):
+            return Quality(fault=fault)
+    if fault := mistake(cut, vehicle, known):
+        return Quality(fault=fault)
+    if why := next((why for w in cut.windows if (why := _not_flying(w))), ""):
+        return Quality(grounded=why)
+    carried = next((why for w in cut.windows if (why := _floor(w, _weight_share(w, vehicle, thrust)))), "")
+    return Quality(grounded=carried, carried=bool(carried))
+
+
+def _broken(window: Window) -> str:
+    still = round(STUCK_SECONDS / window.dt)
+    for name in ("gyro", "accel", "attitude", "rotor_speed"):
+        values = getattr(window, name)
+        if values is None:
+            continue
+        rows = values[np.isfinite(values).all(axis=1)]
+        first, end = true_runs(copied(rows))
+        if np.max(end - first, initial=0) > still:
+            return f"{name} is stuck: it repeated the same value for more than {STUCK_SECONDS:g} s"
+        if name in ("gyro", "accel") and (ends := at_limit(rows)):
+            return f"{name} axis {'xyz'[ends[0].axis]} is saturated at {ends[0].level:.4g}: widen its range"
+    return ""
+
+
+def mistake(cut: Cut, vehicle: Vehicle, known: bool) -> str:
+    """Names the wrong unit or frame, or the wrong order of rotors, that would be fitted into the parameters.
+
+    Args:
+        cut: stretches on the grid.
+        vehicle: the vehicle.
+        known: whether it was identified: then its rotors are in order.
+
+    Returns:
+        What is wrong and how to mend it; empty for nothing.
+    """
+    units = next((why for window in cut.windows if (why := _wrong_unit(window))), "")
+    return units or ("" if known else _wrong_order(cut, vehicle))
+
+
+def _wrong_unit(window: Window) -> str:
+    recording, spans = as_recording([window]), ((window.t0, window.t0 + window.dt * len(window)),)
+    for check in (gravity_check(recording, spans), attitude_check(recording), velocity_check(recording)):
+        if check.verdict is CheckResult.ERROR:
+            return f"{check.message}; {check.fix}; on ROS topics FLU and ENU: PX4 has FRD and NED"
+    return ""
+
+
+def _wrong_order(cut: Cut, vehicle: Vehicle) -> str:
+    rate = min((1.0 / (cut.spacing * window.dt) for window in cut.windows), default=0.0)
+    check = motor_order_check(lagged_of(cut.windows, vehicle, rate), vehicle)
+    return f"motor order: {check.message}; {check.fix}" if check.verdict is CheckResult.ERROR else ""
+
+
+def _weight_share(window: Window, vehicle: Vehicle, thrust: ThrustModel) -> FloatArray:
+    """Thrust over weight, shape (n,)."""
+    return np.asarray(thrust.total(window.rotor_speed) / (vehicle.mass * GRAVITY))
+
+
+def _lift(share: FloatArray, dt: float, known: bool) -> Quality:
+    """Whether the rotors carry the vehicle; judged second by second, back from the end."""
+    low, high = THRUST_KNOWN if known else THRUST_GUESSED
+    second = max(round(1.0 / dt), 1)
+    first = len(share) % second or second
+    means = [float(part.mean()) for part in np.split(share, np.arange(first, len(share), second))]
+    if not min(means) > low:
+        return Quality(grounded=f"rotors carry {min(means):.0%} of the weight: on the ground")
+    if not max(means) < high and low < float(np.mean(means)) / RPM_SQUARED < high:
+        return Quality(fault="rotor speeds look like rpm, wanted rad/s")
+    if not max(means) < high:
+        return Quality(grounded=f"rotors carry {max(means):.0%} of the weight: not this vehicle, or not flying")
+    return Quality()
+
+
+def _not_flying(window: Window) -> str:
+    """Says why a window with turning rotors is not flight, whatever they give, or returns an empty string."""
+    if window.attitude is not None and np.any(down(window.attitude)[:, 2] < TUMBLED):
+        return "tumbled, or lying on its side"
+    if window.accel is None or not np.isfinite(window.accel).any():
+        return ""
+    if float(np.nanmax(np.linalg.norm(window.accel, axis=1))) > IMPACT:
+        return f"a knock of more than {IMPACT / GRAVITY:.0f} g: landing or crash"
+    return ""
+
+
+def _floor(window: Window, thrust: FloatArray) -> str:
+    """The accelerometer must follow the thrust where the thrust varies enough to tell.
+
+    On the ground the floor carries the rest, and the accelerometer reads gravity whatever the rotors do.
+    """
+    if window.accel is None:
+        return ""
+    width = max(round(0.1 / window.dt), 1)
+    rows = len(thrust) // width * width
+    force = -window.accel[:rows, 2].reshape(-1, width) / GRAVITY
+    given = thrust[:rows].reshape(-1, width)
+    both = np.isfinite(force).all(axis=1)
+    x, y = given[both].mean(axis=1), force[both].mean(axis=1)
+    if len(x) < 10:
+        return ""
+    x, y = x - x.mean(), y - y.mean()
+    power = float(x @ x)
+    if power == 0.0:
+        return ""
+    slope = float(x @ y) / power
+    error = float(np.sqrt(np.sum((y - slope * x) ** 2) / max(len(x) - 2, 1) / power))
+    if slope + 3.0 * error < FLOOR_SLOPE and error < 0.2:
+        return f"specific force follows thrust with slope {slope:.2f} only: something carries the vehicle"
+    return ""

@@ -1,1 +1,0 @@
-"""Searches that an identification offers beside its own fit, behind one call: `quadid.optimisers.minimise`."""

@@ -1,0 +1,342 @@
+"""Figures of results: sections, tables and plots as plain descriptions without colours."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from quadid.errors import ParameterError
+from quadid.identification.result import ScoredSet
+from quadid.identification.score import SetScore
+from quadid.model.rollout import CHANNEL_NAMES, CHANNEL_UNITS
+from quadid.types import FloatArray, IndexArray, JsonDict
+
+# --- Pieces of a page: sections, tables, and figures as plain Plotly descriptions without colours
+#
+# The page gives every trace the colour of its role: ``measured``, ``before`` (current parameters), ``after`` (proposed
+# ones), ``truth``, ``floor``.
+
+
+def section(
+    identifier: str, title: str, intro: str = "", figures: Sequence[Mapping[str, Any]] = (),
+    tables: Sequence[Mapping[str, Any]] = (),
+    **more: Any,
+) -> JsonDict:  # fmt: skip
+    """A section of the page: what it says, then its figures and tables."""
+    return {
+        "id": identifier, "title": title, "intro": intro, "figures": list(figures), "tables": list(tables), **more,
+    }  # fmt: skip
+
+
+def rows_of(
+    head: Sequence[str], rows: Sequence[Sequence[Any]], fold: str = "", kind: str = "cards",
+    classes: Sequence[str] | None = None,
+) -> JsonDict:  # fmt: skip
+    """A table; folded under a line where one is given; `classes` are of the cells of each column.
+
+    On a phone each row is a card (`kind` ``cards``, ``cards narrow``), or a line or two (``compact``).
+    """
+    given = list(classes or ["wrap"] * len(head))
+    return {"head": list(head), "rows": [list(row) for row in rows], "fold": fold, "kind": kind, "classes": given}
+
+
+def measures(head: Sequence[str], rows: Sequence[Sequence[Any]], numbers: Sequence[int]) -> JsonDict:
+    """A narrow table in which the columns `numbers`, counted from 0, hold numbers."""
+    return rows_of(head, rows, kind="cards narrow", classes=["number" * (i in numbers) for i in range(len(head))])
+
+
+def figure(
+    identifier: str, title: str, data: Sequence[Mapping[str, Any]], layout: JsonDict, height: int, **more: Any
+) -> JsonDict:
+    """A figure of one view."""
+    views = [{"label": "", "data": list(data), "layout": layout}]
+    return {"id": identifier, "title": title, "views": views, "height": height, **more}
+
+
+def axis(text: str, **more: Any) -> JsonDict:
+    """An axis with its title."""
+    return {"title": {"text": text}, **more}
+
+
+def upright(x: float) -> JsonDict:
+    """An upright line through a figure."""
+    return {"type": "line", "x0": x, "x1": x, "y0": 0, "y1": 1, "yref": "paper", "role": "floor"}
+
+
+def level(y: float) -> JsonDict:
+    """A line across a figure at the height that all should keep to."""
+    return {"type": "line", "x0": 0, "x1": 1, "xref": "paper", "y0": y, "y1": y, "role": "floor"}
+
+
+def trace(role: str, name: str, x: FloatArray | None, y: FloatArray, **more: Any) -> JsonDict:
+    """One line of a figure; without `x` it takes that of its view.  Numbers keep what a picture can show."""
+    across = {} if x is None else {"x": short(x)}
+    return {"role": role, "name": name, **across, "y": short(y), "type": "scatter", "mode": "lines", **more}
+
+
+def short(values: FloatArray, resolution: float | None = None) -> list[float | None]:
+    """Numbers rounded to a two-thousandth of their range, so that a page stays small; None where not finite.
+
+    Args:
+        values: shape (n,).
+        resolution: smallest difference to keep, instead.
+    """
+    good = values[np.isfinite(values)]
+    if len(good) == 0:
+        return [None] * len(values)
+    finest = resolution or max(float(np.ptp(good)), 1e-3 * float(np.abs(good).max()), 1e-12) / 2000.0
+    decimals = max(0, math.ceil(-math.log10(finest)))
+    return [round(v, decimals) if math.isfinite(v) else None for v in values.tolist()]
+
+
+# --- Figures of results: channels over time, errors, parameters, gains; see `quadid.report.figures` for their form
+
+
+GROUPS: dict[str, tuple[str, tuple[int, ...]]] = {
+    "rates": ("Body rates", (0, 1, 2)),
+    "attitude": ("Attitude", (3, 4, 5)),
+    "accel": ("Specific force", (6, 7, 8)),
+    "velocity": ("Velocity", (9, 10, 11)),
+    "position": ("Position", (12, 13, 14)),
+}
+PARAMETERS = ("current parameters", "proposed parameters")
+MODELS = ("model without the findings", "model with the findings")
+LABELS = {"phi": "φ", "theta": "θ", "psi": "ψ"}
+DECADES = 30.0
+"""Ratio of bars from which they are drawn on a logarithmic axis."""
+WHOLE_POINTS = 800
+"""Points a trace over a whole log keeps at most."""
+DETAIL_POINTS = 600
+DETAIL_SECONDS = 12.0
+MOST_LOGS = 4
+"""Logs that get pictures; the others are in the tables."""
+BUDGET = 90_000
+"""Numbers that all pictures of channels may take together, so that a page stays below 6 MB."""
+
+
+def channel_figures(
+    scored: ScoredSet, prefix: str, logs: int = 1, labels: tuple[str, str] = PARAMETERS
+) -> list[JsonDict]:
+    """Measured and simulated outputs of one log, one figure a group of channels: the whole log and its liveliest part.
+
+    Args:
+        scored: the log with both scores.
+        prefix: makes the figures' identifiers unique.
+        logs: number of logs that share the page.
+        labels: what the two simulations are called.
+    """
+    series = scored.fitted.series
+    share = min(1.0, BUDGET / (3 * series.measured.shape[1] * logs * (WHOLE_POINTS + 2 * DETAIL_POINTS)))
+    whole = thinned(series.measured, int(share * WHOLE_POINTS))
+    detail = liveliest(series.t, series.measured, int(share * DETAIL_POINTS))
+    out = []
+    for key, (title, channels) in GROUPS.items():
+        here = [c for c in channels if c < series.measured.shape[1] and np.isfinite(series.measured[:, c]).any()]
+        if here:
+            views = [
+                {"label": "Most excited part, every sample", **_stack(scored, detail, here, labels)},
+                {"label": "Whole log", **_stack(scored, whole, here, labels)},
+            ]
+            shown = views if len(whole) > len(detail) else views[1:]
+            residual = {"label": "Residual, every sample", **_stack(scored, detail, here, labels, residual=True)}
+            shown = [*shown, residual]
+            out.append({"id": f"{prefix}-{key}", "title": title, "views": shown, "height": 130 * len(here) + 70})
+    return out
+
+
+def _stack(
+    scored: ScoredSet, rows: IndexArray, channels: Sequence[int], labels: tuple[str, str], residual: bool = False
+) -> JsonDict:
+    """Channels above each other with one time axis; with `residual`: measured less simulated."""
+    after, before = scored.fitted.series, scored.initial.series
+    t = after.t[rows] - after.t[0]
+    data, layout = [], dict[str, Any]()
+    for i, c in enumerate(channels):
+        place = "" if i == 0 else str(i + 1)
+        where = {"xaxis": "x", "yaxis": f"y{place}", "showlegend": i == 0}
+        name, measured = CHANNEL_NAMES[c], after.measured[rows, c]
+        lines = [
+            ("before", labels[0], before.simulated[rows, c]),
+            ("after", labels[1], after.simulated[rows, c]),
+        ]
+        if residual:
+            lines = [(role, label, measured - y) for role, label, y in lines]
+        else:
+            lines.insert(0, ("measured", "measured", measured))
+        low, high = _focus(lines[-1][2] if residual else measured)
+        for role, label, y in lines:
+            # A poor first guess may run far away; what leaves the picture need not be kept.
+            inside = np.clip(y, low - 3.0 * (high - low), high + 3.0 * (high - low))
+            line = trace(role, label, None, inside, legendgroup=role, **where)
+            data.append({**line, "y": short(inside, (high - low) / 2000.0)})
+        share = 1.0 / len(channels)
+        layout[f"yaxis{place}"] = {
+            "domain": [1.0 - (i + 1) * share + 0.03, 1.0 - i * share - 0.01],
+            **axis(f"{LABELS.get(name, name)} [{CHANNEL_UNITS[c]}]", range=[low, high]),
+        }
+    last = "y" if len(channels) == 1 else f"y{len(channels)}"
+    layout["xaxis"] = axis("time [s]", anchor=last)
+    return {"x": short(t), "data": data, "layout": layout}
+
+
+def _focus(measured: FloatArray) -> tuple[float, float]:
+    """Axis limits that show the measurement."""
+    good = measured[np.isfinite(measured)]
+    if len(good) == 0:
+        return -1.0, 1.0
+    low, high = float(good.min()), float(good.max())
+    margin = 0.15 * max(high - low, 1e-3)
+    return low - margin, high + margin
+
+
+def thinned(values: FloatArray, points: int) -> IndexArray:
+    """Rows that keep the peaks: of each bin the rows where the liveliest channel is smallest and largest."""
+    n = len(values)
+    if n <= points:
+        return np.arange(n)
+    loud = values[:, _loudest(values)]
+    edges = np.linspace(0, n, points // 2 + 1).astype(np.intp)
+    filled = np.nan_to_num(loud)
+    keep = [
+        i + np.array([filled[i:j].argmin(), filled[i:j].argmax()]) for i, j in zip(edges[:-1], edges[1:], strict=True)
+    ]
+    return np.unique(np.concatenate(keep))
+
+
+def _loudest(values: FloatArray) -> int:
+    return int(np.argmax(np.nan_to_num(values[:, :3]).std(axis=0)))
+
+
+def liveliest(t: FloatArray, values: FloatArray, points: int = DETAIL_POINTS) -> IndexArray:
+    """Rows of the `DETAIL_SECONDS`, or as many as `points` last, with the most rotation."""
+    n = len(t)
+    step = float(np.median(np.diff(t))) if n > 1 else 1.0
+    width = min(n, points, max(int(DETAIL_SECONDS / step), 2))
+    energy = np.concatenate([[0.0], np.cumsum(np.nan_to_num(np.sum(values[:, :3] ** 2, axis=1)))])
+    first = int(np.argmax(energy[width:] - energy[:-width])) if n > width else 0
+    return np.arange(first, first + width)
+
+
+def error_figure(scored: ScoredSet, identifier: str, labels: tuple[str, str] = PARAMETERS) -> JsonDict:
+    """Error over time: mean squared residual of each second over that of a perfect model, before and after."""
+    zero = float(scored.fitted.series.t[0])
+    data = []
+    for role, name, score in (
+        ("before", labels[0], scored.initial),
+        ("after", labels[1], scored.fitted),
+    ):
+        t, ratio = error_over_time(score, scored.fitted)
+        data.append(trace(role, name, t - zero, ratio))
+    ends = series_ends(scored) - zero
+    data.append(trace("floor", "sensor noise alone", ends, np.ones(2)))
+    layout = {"xaxis": axis("time [s]"), "yaxis": axis("squared error / noise", type="log", dtick=1)}
+    return figure(identifier, "Error over the flight", data, layout, 240)
+
+
+def series_ends(scored: ScoredSet) -> FloatArray:
+    """First and last scored time [s], shape (2,)."""
+    return scored.fitted.series.t[[0, -1]]
+
+
+def error_over_time(score: SetScore, fitted: SetScore) -> tuple[FloatArray, FloatArray]:
+    """Time [s] and squared error over that of a perfect model, one value for about a second.
+
+    Args:
+        score: whose residuals.
+        fitted: says how large those of a perfect model are.
+    """
+    perfect = np.array([c.rmse / np.sqrt(c.mse) if c.samples and c.mse > 0.0 else np.nan for c in fitted.channels])
+    series = score.series
+    squares = ((series.simulated - series.measured) / perfect) ** 2
+    step = float(np.median(np.diff(series.t)))
+    width = max(round(1.0 / step), len(series.t) // WHOLE_POINTS, 1)
+    bins = np.arange(0, len(series.t) - width + 1, width)
+    mean = [np.nanmean(part) if np.isfinite(part).any() else np.nan for part in (squares[i : i + width] for i in bins)]
+    return series.t[bins] + 0.5 * width * step, np.array(mean)
+
+
+def parameter_figure(parameters: Sequence[Mapping[str, Any]], truth: Mapping[str, float] | None = None) -> JsonDict:
+    """Proposed over current value with its interval, one row a parameter; the truth where a simulation knows it."""
+    shown = [p for p in parameters if p["initial"] and np.isfinite(p["initial"])][::-1]
+    names = [p["name"] for p in shown]
+    scale = np.array([p["initial"] for p in shown])
+    value = np.array([p["value"] for p in shown]) / scale
+    interval = (
+        np.array([[np.nan if v is None else v for v in p["ci95"]] for p in shown]).reshape(-1, 2) / scale[:, None]
+    )
+    upper, lower = short(interval[:, 1] - value, 1e-5), short(value - interval[:, 0], 1e-5)
+    bars = {"type": "data", "symmetric": False, "array": upper, "arrayminus": lower}
+    common = {"y": names, "mode": "markers", "type": "scatter"}
+    data: list[JsonDict] = [
+        {"role": "before", "name": "current", "x": [1.0] * len(names), **common},
+        {"role": "after", "name": "proposed, 95 % interval", "x": short(value), "error_x": bars, **common},
+    ]
+    if truth:
+        known = np.array([truth.get(n, np.nan) for n in names]) / scale
+        data.append({"role": "truth", "name": "truth", "x": short(known), **common})
+    layout = {"xaxis": axis("value / current value"), "yaxis": {"type": "category"}}
+    return figure("parameters", "Proposed against current", data, layout, 120 + 38 * len(names))
+
+
+def gain_figure(finding: Mapping[str, Any], floor: float, identifier: str) -> JsonDict:
+    """Error on unseen data with the finding, with each alternative in its place, and without either.
+
+    Args:
+        finding: of the form ``quadid.diagnose/1``.
+        floor: noise floor in the same measure.
+        identifier: of the figure.
+    """
+    title = finding["effect"].replace("_", " ")
+    rows = [("without it", finding["gain"]["mse_before"], "before"), (title, finding["gain"]["mse_after"], "after")]
+    rows += [(a["effect"].replace("_", " "), a["mse_after"], "measured") for a in finding["alternatives"]]
+    data = [
+        {"role": role, "name": name, "type": "bar", "orientation": "h", "x": [value], "y": [name], "showlegend": False}
+        for name, value, role in rows[::-1]
+    ]
+    sizes = [v for _, v, _ in rows if v is not None and math.isfinite(v) and v > 0.0] or [floor]
+    lowest, highest = min(*sizes, floor), 1.05 * max(sizes)
+    # Bars that differ much are drawn in decades, else the short ones would not be seen.
+    decades = {"type": "log", "range": [math.log10(0.5 * lowest), math.log10(highest)]}
+    scale = decades if highest > DECADES * lowest else {"range": [0.0, highest]}
+    layout = {
+        "xaxis": axis(f"error, {finding['gain']['seconds']:g} s runs (noise = 1)", **scale),
+        "yaxis": {"type": "category"},
+        "hovermode": "closest",
+        "shapes": [upright(floor)],
+    }
+    return figure(identifier, "Validation error with and without it", data, layout, 90 + 32 * len(rows))
+
+
+# --- The report's descriptions of figures as plotly figures, for notebooks
+
+
+COLOURS = {"measured": "#555555", "before": "#c2762b", "after": "#1f6fb2"}
+"""Of every role on a light page."""
+
+
+def channel_plot(scored: ScoredSet, group: str = "rates", labels: tuple[str, str] = PARAMETERS) -> Any:
+    """Measured and simulated outputs of one log as a ``plotly.graph_objects.Figure``.
+
+    Args:
+        scored: the log with both scores.
+        group: one of `figures.GROUPS`.
+        labels: what the two simulations are called.
+
+    Raises:
+        ParameterError: no such group in this log.
+    """
+    import plotly.graph_objects as go
+
+    found = {f["id"].removeprefix("plot-"): f for f in channel_figures(scored, "plot", labels=labels)}
+    if group not in found:
+        raise ParameterError(f"no group '{group}' in {scored.log}", ", ".join(n for n in GROUPS if n in found))
+    view = found[group]["views"][0]
+    lines = [
+        {**{k: v for k, v in line.items() if k != "role"}, "x": view["x"], "line": {"color": COLOURS[line["role"]]}}
+        for line in view["data"]
+    ]
+    figure = go.Figure(lines, view["layout"])
+    return figure.update_layout(title=f"{found[group]['title']}, {scored.log}", height=found[group]["height"])

@@ -1,0 +1,720 @@
+"""Pages of identification, diagnosis, manoeuvre and failure."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from itertools import groupby
+from typing import Any
+
+import numpy as np
+from scipy.signal import welch
+
+from quadid.checks import Inspection
+from quadid.checks.motion import Spans, flying_spans, within
+from quadid.data.resample import sample_period
+from quadid.data.rotor_signal import rotor_channel
+from quadid.data.window import CHANNELS, Channel, Recording, Window
+from quadid.effects import EFFECTS
+from quadid.identification.excitation import Excitation
+from quadid.identification.noise_model import NoiseModel
+from quadid.identification.result import ScoredSet
+from quadid.identification.score import SCORE_SECONDS
+from quadid.model.rollout import CHANNEL_NAMES, CHANNEL_UNITS
+from quadid.parameters import ParameterSet
+from quadid.report.figures import (
+    MODELS,
+    MOST_LOGS,
+    WHOLE_POINTS,
+    axis,
+    channel_figures,
+    error_figure,
+    figure,
+    gain_figure,
+    measures,
+    parameter_figure,
+    rows_of,
+    section,
+    short,
+    thinned,
+    trace,
+    upright,
+)
+from quadid.report.manoeuvres import half_width
+from quadid.report.page import fit, number, render, unit
+from quadid.report.residual_maps import ResidualMap, map_figure
+from quadid.report.tables import Column, TextTable
+from quadid.report.verdict import (
+    MOTION,
+    NOISE_LEVEL,
+    Level,
+    Verdict,
+    at_bounds,
+    identify_verdict,
+    parameter_name,
+    percent,
+    reason,
+    relative_halfwidth,
+    status_words,
+)
+from quadid.rotation import euler
+from quadid.types import FloatArray, Json, JsonDict
+from quadid.vehicle import Vehicle
+
+# --- What a log tells of its flight beside the outputs: flight modes, and the spectrum of its vibration
+
+
+SECONDS = 2.0
+"""Length of the stretches whose spectra are averaged: lines half a hertz apart are told apart."""
+MOST_POINTS = 400
+_AXES = ("forward", "to the right", "downwards")
+_ROLES = ("measured", "before", "after")
+
+
+def flight_section(recording: Recording, vehicle: Vehicle, place: int) -> dict[str, Any] | None:
+    """Modes and vibration of one log as a section of a page; None where it tells neither.
+
+    Args:
+        recording: as read, each channel at its own rate.
+        vehicle: whose log it is.
+        place: of the log among those of the page.
+    """
+    spans = flying_spans(recording, vehicle)
+    drawn, said = _vibration(recording, vehicle, spans, f"log{place}-vibration") if spans else (None, "")
+    modes = mode_rows(recording)
+    if drawn is None and not modes:
+        return None
+    figures = [] if drawn is None else [drawn]
+    tables = [rows_of(("flight mode", "from (s)", "to (s)"), modes)] if modes else []
+    return section(f"flight-{place}", f"Flight of {recording.name}", said, figures, tables)
+
+
+def mode_rows(recording: Recording) -> list[list[str]]:
+    """Flight modes with the times between which they held [s after the first IMU sample]."""
+    imu = [c.t for n, c in recording.channels.items() if n in ("gyro", "accel")]
+    if not recording.modes or not imu:
+        return []
+    zero, end = min(float(t[0]) for t in imu), max(float(t[-1]) for t in imu)
+    starts = [t for t, _ in recording.modes]
+    held = zip(recording.modes, [*starts[1:], end], strict=True)
+    return [
+        [name, f"{max(begin - zero, 0.0):.1f}", f"{stop - zero:.1f}"] for (begin, name), stop in held if stop > zero
+    ]
+
+
+def _vibration(
+    recording: Recording, vehicle: Vehicle, spans: Spans, identifier: str
+) -> tuple[dict[str, Any] | None, str]:
+    """Amplitude spectrum of the accelerometer in the air, and a sentence about where the rotors are in it."""
+    accel = recording.channels.get("accel")
+    found = None if accel is None else spectrum(accel, spans)
+    if found is None:
+        return None, ""
+    frequency, density = found
+    data = [
+        trace(role, name, frequency, density[:, i]) for i, (role, name) in enumerate(zip(_ROLES, _AXES, strict=True))
+    ]
+    turning, said = _turning(recording, vehicle, spans, float(frequency[-1]))
+    layout = {
+        "xaxis": axis("frequency (Hz)"),
+        "yaxis": axis("(m/s²)/√Hz", type="log"),
+        "shapes": [] if turning is None else [upright(turning)],
+    }
+    return figure(identifier, "Vibration in the air", data, layout, 300), said
+
+
+def spectrum(accel: Channel, spans: Spans) -> tuple[FloatArray, FloatArray] | None:
+    """Amplitude spectral density of the specific force, averaged over the flight (Welch).
+
+    Args:
+        accel: at its own rate.
+        spans: when it flies [s].
+
+    Returns:
+        Frequencies [Hz], shape (n,), and densities [(m/s^2)/sqrt(Hz)], shape (n, 3); None where no stretch is long
+        enough.
+    """
+    rate = 1.0 / sample_period(accel.t)
+    rows = round(SECONDS * rate)
+    parts = [accel.values[(accel.t >= a) & (accel.t <= b)] for a, b in spans]
+    parts = [p for p in parts if len(p) >= rows]
+    if rows < 8 or not parts:
+        return None
+    each = [welch(p, rate, nperseg=rows, axis=0) for p in parts]
+    power = np.average([p for _, p in each], axis=0, weights=[len(p) for p in parts])
+    keep = np.unique(np.linspace(1, len(power) - 1, MOST_POINTS).astype(int))
+    return each[0][0][keep], np.sqrt(power[keep])
+
+
+def _turning(recording: Recording, vehicle: Vehicle, spans: Spans, highest: float) -> tuple[float | None, str]:
+    """Where the mean rotor speed in flight shows in the spectrum [Hz], and that in words."""
+    rotors, _ = rotor_channel(recording, vehicle)
+    if rotors is None or rotors.name != "rotor_speed":
+        return None, "The rotor speed is not logged; peaks are most often rotors out of balance."
+    turns = float(np.mean(rotors.values[within(rotors.t, spans)])) / (2.0 * np.pi)
+    if turns <= highest:
+        return turns, f"The rotors turn {turns:.0f} times a second (dashed): a peak there is imbalance."
+    folded = abs(turns - 2.0 * highest * round(turns / (2.0 * highest)))
+    return None, (
+        f"The rotors turn {turns:.0f} times a second, faster than this log can show ({highest:.0f} Hz): without a "
+        f"filter before sampling their imbalance appears at {folded:.0f} Hz."
+    )
+
+
+# --- What a flight can tell about each parameter, what limits it, and what to fly next
+
+
+SHARP = 0.02
+"""Relative standard deviation below which more flying gains nothing that anybody needs."""
+COUPLED = 5.0
+"""From this ratio on, it is the coupling with other parameters that limits, not the motion."""
+_HEAD = ("Parameter", "Best achievable σ", "If all others were known", "Manoeuvre needed")
+
+
+def excitation_part(found: Excitation, seconds: float) -> dict[str, Any]:
+    """The section of the page as plain data.
+
+    Args:
+        found: bounds from the flight.
+        seconds: length of the flight that they were computed from.
+    """
+    rows = []
+    for name, bound, alone in zip(found.names, found.bound.tolist(), found.alone.tolist(), strict=True):
+        rows.append((name, _sigma(bound), _sigma(alone), _advice(name, bound, alone, seconds)))
+    sharp = all(b <= SHARP for b in found.bound.tolist())
+    intro = (
+        f"Smallest possible standard deviation from these {seconds:.0f} s, whatever the method, were the model right "
+        "(Cramér–Rao bound): with all parameters unknown, and with all others known. If they differ much, the flight "
+        "couples parameters."
+    )
+    return {
+        "intro": intro,
+        "table": rows_of(_HEAD, rows, classes=("", "number", "number", "")),
+        "done": "Nothing more needs to be flown for these." if sharp else "",
+    }
+
+
+def _sigma(bound: float) -> str:
+    if not math.isfinite(bound) or bound > 10.0:
+        return "not at all"
+    return percent(bound).replace(" ", "\u00a0")
+
+
+def _advice(name: str, bound: float, alone: float, seconds: float) -> str:
+    if bound <= SHARP:
+        return "nothing more"
+    motion = MOTION.get(name, "more motion")
+    if not math.isfinite(bound) or bound > 10.0:
+        return f"{motion}: this flight does not show it"
+    if bound > COUPLED * alone:
+        return f"{motion}, so that it moves apart from the others"
+    # A deviation falls with the square root of the time flown.
+    need = seconds * (bound / SHARP) ** 2
+    return f"{motion}; flown like this, {percent(SHARP)} would take {need:.0f} s"
+
+
+# --- The page of an identification: its dictionary, the scored logs and where all came from, as `render` wants them
+
+
+FIT_NAMES = ("p", "q", "r", "phi", "theta", "psi", "a_z")
+
+
+def identify_page(
+    result: Json, sets: Sequence[ScoredSet], noise: NoiseModel, quality: Sequence[Json],
+    provenance: Sequence[Json], truth: Mapping[str, float] | None = None,
+) -> dict[str, Any]:  # fmt: skip
+    """Builds the page of an identification.
+
+    Args:
+        result: of the form ``quadid.identify/1``.
+        sets: the scored logs in the order of ``result["sets"]``.
+        noise: estimated sensor noise.
+        quality: per log: name, format, summary (sentences), channels (name, rate [Hz], samples, source, faults).
+        provenance: rows of name and value.
+        truth: true parameters, where a simulation knows them.
+    """
+    return {
+        "title": f"Identification of {result['vehicle']}",
+        "subtitle": _subtitle(result),
+        "verdict": asdict(identify_verdict(result)),
+        "parameters": [parameter_row(p, truth, at_bounds(result)) for p in result["parameters"]],
+        "parameter_figure": parameter_figure(result["parameters"], truth),
+        "fit": fit_table(result["sets"]),
+        "sets": set_sections(result["sets"], sets),
+        "warnings": result["warnings"],
+        "quality": quality,
+        "noise": noise_table(noise),
+        "provenance": provenance,
+    }
+
+
+def _subtitle(result: Json) -> str:
+    roles = [s["role"] for s in result["sets"]]
+    fitted, held = roles.count("train"), roles.count("validate")
+    text = f"{fitted} log{'s' * (fitted != 1)} fitted, {held or 'none'} held out for validation"
+    return f"{text}; search {result['optimizer']}, {result['seconds']:.1f} s"
+
+
+def parameter_row(
+    parameter: Json, truth: Mapping[str, float] | None = None, stuck: Sequence[str] = ()
+) -> dict[str, Any]:
+    """A parameter with its margin, its reason, and the truth where known."""
+    row = {
+        "relative_to": None,
+        **parameter,
+        "title": parameter_name(parameter["name"]),
+        "status_words": status_words(parameter),
+        "margin": percent(relative_halfwidth(parameter)).replace(" ", "\u00a0"),
+        "reason": reason(parameter, stuck).replace(" %", "\u00a0%"),
+    }
+    if truth:
+        row["truth"] = truth.get(parameter["name"])
+    return row
+
+
+def set_sections(entries: Sequence[Json], sets: Sequence[ScoredSet]) -> list[dict[str, Any]]:
+    """The logs of a result with their figures; the first few logs only get figures."""
+    out, shown = [], min(len(sets), MOST_LOGS)
+    for i, (entry, scored) in enumerate(zip(entries, sets, strict=True)):
+        figures = (
+            [error_figure(scored, f"log{i}-error"), *channel_figures(scored, f"log{i}", shown)] if i < MOST_LOGS else []
+        )
+        rows = [
+            (n, number(e["value"], 3), unit(e["unit"]), fit(entry["fit_percent"].get(n)))
+            for n, e in entry["rmse"].items()
+        ]
+        channels = measures(("Channel", "Root mean squared error", "Unit", "Fit"), rows, (1, 3))
+        out.append({**entry, "figures": figures, "channels": channels})
+    return out
+
+
+def fit_table(entries: Sequence[Json]) -> JsonDict:
+    """Errors of every log before and after, and how well channels fit."""
+    names = [n for n in FIT_NAMES if any(n in s["fit_percent"] for s in entries)]
+    head = ("Log", "Used for", "Error before", "Error after", *(f"Fit {n}" for n in names))
+    rows = [
+        (
+            s["log"], "fitting" if s["role"] == "train" else "validation", number(s["mse"]["initial"], 3),
+            number(s["mse"]["fitted"], 3), *(fit(s["fit_percent"].get(n)) for n in names),
+        )
+        for s in entries
+    ]  # fmt: skip
+    return rows_of(head, rows, classes=("", "", "number", "number strong", *["number"] * len(names)))
+
+
+def noise_table(noise: NoiseModel) -> JsonDict:
+    """Standard deviations of the white and the slow part of every channel."""
+    each = zip(CHANNEL_NAMES, noise.white, noise.slow, CHANNEL_UNITS, strict=False)
+    rows = [(name, number(float(white), 3), number(float(slow), 3), unit(of)) for name, white, slow, of in each]
+    return measures(("Channel", "White", "Slow", "Unit"), rows, (1, 2))
+
+
+def correlation_section(parameters: ParameterSet) -> dict[str, Any]:
+    """Correlations of the parameters: near 1 or -1, the flight hardly separates two of them."""
+    correlation, names = parameters.correlation, list(parameters.names)
+    rows = [
+        [name, *(f"{correlation[i, j]:+.2f}" if i != j else "1" for j in range(len(names)))]
+        for i, name in enumerate(names)
+    ]
+    intro = "Near +1 or -1 the flight hardly separates two parameters: fly what moves one of them alone."
+    return section("correlations", "Correlations", intro, tables=[rows_of(["", *names], rows)])
+
+
+# --- The page of a diagnosis, and the part that other pages take from it
+
+
+HELD_OUT = "held-out blocks"
+"""What a diagnosis without validation logs measures its gain on."""
+_LEVELS: dict[str, Level] = {
+    "nothing_found": "good",
+    "explained": "good",
+    "partly_explained": "fair",
+    "unknown": "poor",
+}
+
+
+def diagnose_verdict(result: Json) -> Verdict:
+    """Judges a result of the form ``quadid.diagnose/1``."""
+    large, small = _named(result)
+    verdict = result["verdict"]
+    headline = result["statement"]
+    if (large or small) and verdict != "unknown":
+        found = [", ".join(large)] if large else []
+        found += [f"no larger than on most vehicles: {', '.join(small)}"] if small else []
+        headline = f"Found: {'; '.join(found)}. {headline}"
+    v = result["validation"]
+    held_out = v.get("on") == HELD_OUT
+    where = "held-out blocks of the same flight" if held_out else "unseen flights"
+    change = _change(v, bool(result["findings"]))
+    details: tuple[str, ...] = (f"The error on {where} {change} noise variances (1 is the noise floor).",)
+    deciding = v.get("deciding")
+    if result["findings"] and deciding and deciding["seconds"] != SCORE_SECONDS:
+        details = (
+            *details,
+            f"In simulations of {deciding['seconds']:g} s, on which the causes were chosen, "
+            f"it {_change(deciding, True)}.",
+        )
+    level, left = _LEVELS[verdict], v.get("mse_extended_refitted") or v["mse_extended"]
+    steps = _next_steps(result)
+    if level == "good" and (held_out or left is None or left > NOISE_LEVEL):
+        level = "fair"
+    if held_out:
+        details = (*details, "Not validated: no unseen flight was given.")
+        steps = ("To validate it, add another flight with --validate.", *steps)
+    return Verdict(level, headline, details, steps)
+
+
+def _change(errors: Json, found: bool) -> str:
+    """What findings make of the error."""
+    before, after = errors["mse_nominal"], errors["mse_extended"]
+    if not found:
+        return f"is {_short(before)}"
+    rises = before is not None and after is not None and after > before
+    return f"{'rises' if rises else 'falls'} from {_short(before)} to {_short(after)}"
+
+
+def chance(p_value: float) -> str:
+    """A p-value that claims no more than its distribution holds: below a billionth only that it is."""
+    return f"p = {number(p_value, 2)}" if p_value >= 1e-9 else "p < 1e-9"
+
+
+def _short(value: float | None) -> str:
+    return "unknown" if value is None else f"{value:.3g}"
+
+
+def _named(result: Json) -> tuple[list[str], list[str]]:
+    """Confident findings by name: those to do something about, and those no larger than on most vehicles."""
+    sure = [f for f in result["findings"] if f["confident"]]
+    large = [f["effect"].replace("_", " ") for f in sure if not f.get("ordinary")]
+    small = [f["effect"].replace("_", " ") for f in sure if f.get("ordinary")]
+    return large, small
+
+
+def _next_steps(result: Json) -> tuple[str, ...]:
+    sure = [f for f in result["findings"] if f["confident"] and not f.get("ordinary")]
+    named = [f["effect"] for f in sure if f["effect"] in EFFECTS][:3]
+    out = [
+        f"{effect.replace('_', ' ').capitalize()}: {advice[0].lower()}{advice[1:]}"
+        for effect, advice in ((e, EFFECTS[e].advice) for e in named)
+    ]
+    if result["verdict"] in ("partly_explained", "unknown"):
+        where = f"is in {', '.join(result['unexplained'])}" if result["unexplained"] else "is spread over all channels"
+        out.append(f"The unexplained error {where}: a livelier flight (`quadid excite`) may show its cause.")
+    if result["findings"]:
+        out.append("The extended vehicle file works with every other command, for example `quadid score`.")
+    else:
+        out.append("Nothing to change. A livelier flight shows more: `quadid excite`.")
+    return tuple(out)
+
+
+def diagnosis_part(
+    result: Json, sets: Sequence[ScoredSet] = (), prefix: str = "d", title: str = "", intro: str = "",
+    maps: Mapping[str, ResidualMap] | None = None,
+) -> dict[str, Any]:  # fmt: skip
+    """A diagnosis as part of a page: verdict, findings, pictures.
+
+    Args:
+        result: of the form ``quadid.diagnose/1``.
+        sets: logs scored without (`initial`) and with (`fitted`) the findings.
+        prefix: makes identifiers of figures unique on the page.
+        title: heading, where a page holds several.
+        intro: sentence below it.
+        maps: what each cause looks like in the residual, by name of the effect.
+    """
+    findings = [
+        finding_part(finding, result["validation"]["noise_floor"], f"{prefix}-{i}", (maps or {}).get(finding["effect"]))
+        for i, finding in enumerate(result["findings"])
+    ]
+    pictured = list(sets)[:MOST_LOGS] if findings else []
+    logs = [
+        {
+            "log": s.log,
+            "role": s.role,
+            "figures": [
+                error_figure(s, f"{prefix}-log{i}-error", MODELS),
+                *channel_figures(s, f"{prefix}-log{i}", len(pictured) + 2, MODELS),
+            ],
+        }
+        for i, s in enumerate(pictured)
+    ]
+    return {
+        "title": title,
+        "intro": intro,
+        "verdict": asdict(diagnose_verdict(result)),
+        "findings": findings,
+        "remains": remaining(result, sets),
+        "logs": logs,
+    }
+
+
+_REMARKS = {
+    "per_log": "It belongs to this flight, not to the vehicle: another flight has its own.",
+    "ordinary": "It is no larger than on most vehicles and is therefore listed after larger causes.",
+}
+
+
+def _diagnose_page_advice(finding: Json) -> str:
+    """What to do about a cause, and what sets it apart."""
+    known = EFFECTS.get(finding["effect"])
+    parts = [] if known is None or finding.get("ordinary") else [known.advice]
+    return " ".join([*parts, *(text for key, text in _REMARKS.items() if finding.get(key))]).strip()
+
+
+def finding_part(finding: Json, floor: float, identifier: str, seen: ResidualMap | None) -> dict[str, Any]:
+    """One cause: its picture, its gain with interval, the rejected alternatives.
+
+    Args:
+        finding: of the form ``quadid.diagnose/1``.
+        floor: noise floor in the measure of the gains.
+        identifier: makes identifiers of figures unique.
+        seen: the cause in the residual, where the flight shows it.
+    """
+    name, gain = finding["effect"].replace("_", " "), finding["gain"]
+    low, high = gain.get("ci95", (None, None))
+    gained = [
+        f"The error of {gain['seconds']:g} s runs on unseen data falls by "
+        f"{_short(_less(gain['mse_before'], gain['mse_after']))} noise variances"
+    ]
+    if low is not None and high is not None:
+        gained.append(f" (95 % interval {low:.3g} to {high:.3g})")
+    if finding["p_value"] is not None:
+        gained.append(f"; {chance(finding['p_value'])}")
+    rivals = [f"{a['effect'].replace('_', ' ')} ({_short(a['mse_after'])})" for a in finding["alternatives"]]
+    return {
+        **finding,
+        "title": name,
+        "advice": _diagnose_page_advice(finding),
+        "gained": "".join(gained) + ".",
+        "noise": _noise_sentence(gain, floor, name),
+        "rivals": f"Rejected alternatives, with the error they leave: {', '.join(rivals)}."
+        if rivals else "No other cause of the catalogue came near it.",
+        "figures": [
+            *([map_figure(seen, f"{identifier}-map", name)] if seen is not None else []),
+            gain_figure(finding, floor, f"{identifier}-gain"),
+        ],
+    }  # fmt: skip
+
+
+def _less(before: float | None, after: float | None) -> float | None:
+    return None if before is None or after is None else before - after
+
+
+def _noise_sentence(gain: Json, floor: float, name: str) -> str:
+    """How much of the error is sensor noise that no model removes, without and with the cause."""
+    shares = [min(floor / v, 1.0) if v else None for v in (gain["mse_before"], gain["mse_after"])]
+    if None in shares:
+        return ""
+    without, having = (percent(s) for s in shares if s is not None)
+    return (
+        f"Share of the error that is sensor noise, which no model can remove: {without} without {name}, {having} with."
+    )
+
+
+def remaining(result: Json, sets: Sequence[ScoredSet]) -> dict[str, Any]:
+    """What is left: by channel, and what it follows."""
+    channels = {c.name: c for s in sets[-1:] for c in s.fitted.channels}
+    rows = [
+        (name, percent(share), number(known.rmse if known else None, 3), unit(known.unit if known else ""))
+        for name, share in sorted(result["unexplained"].items(), key=lambda item: -item[1])
+        for known in [channels.get(name)]
+    ]
+    follows = [
+        f"the {f['acts_on']} follows {f['signal'].rstrip(',')} ({percent(f['share'])} of the noise)"
+        for f in result.get("unexplained_follows", ())
+    ]
+    head = ("Channel", "Share of its error beyond noise", "Root mean squared error", "Unit")
+    return {"table": measures(head, rows, (1, 2)), "follows": follows}
+
+
+def diagnose_page(
+    result: Json, vehicle: str, sets: Sequence[ScoredSet], noise: NoiseModel, quality: Sequence[Json],
+    provenance: Sequence[Json], warnings: Sequence[str] = (), maps: Mapping[str, ResidualMap] | None = None,
+) -> dict[str, Any]:  # fmt: skip
+    """Builds the page of a diagnosis; arguments as in `diagnosis_part` and `identify_page`."""
+    part = diagnosis_part(result, sets, maps=maps)
+    fitted, held = (sum(s.role == role for s in sets) for role in ("train", "validate"))
+    return {
+        "title": f"Diagnosis of {vehicle}",
+        "subtitle": f"{fitted} log{'s' * (fitted != 1)} diagnosed, {held or 'none'} held out for validation",
+        "verdict": part["verdict"],
+        "parameters": [parameter_row(p) for p in result.get("parameters", ())],
+        "diagnoses": [{**part, "verdict": None}],
+        "warnings": list(warnings),
+        "quality": quality,
+        "noise": noise_table(noise),
+        "provenance": provenance,
+    }
+
+
+# --- The page of a proposed manoeuvre: what it would gain, and how it looks when flown
+
+
+def excite_html(result: Json, window: Window) -> str:
+    """The page.
+
+    Args:
+        result: of the form ``quadid.excite/1``.
+        window: the manoeuvre as flown in simulation.
+    """
+    peak = result["peak"]
+    return render({
+        "title": f"What to fly next: {result['vehicle']}",
+        "subtitle": f"{result['seconds']:g} s, at most {peak['tilt_deg']:.0f}° of tilt and {peak['rate_deg_s']:.0f}°/s",
+        "sections": [
+            section(
+                "gain", "What it would gain",
+                "Relative half-width of the 95 % interval, from the Fisher information of simulated flights.",
+                [_bars(result)],
+                [gain_table(result).part()],
+            ),
+            section(
+                "manoeuvre", "The manoeuvre",
+                "Stick movements one after the other, and the attitude that the simulation flies.",
+                [_attitude(window)], [rows_of(("movement", "times", "amplitude, rms"), grouped(result["movements"]))],
+            ),
+            section(
+                "envelope", "Where it may be flown",
+                "Scripts start only inside the envelope and stop outside it.",
+                tables=[rows_of(("", "needed in simulation", "envelope"), _limits(result))],
+            ),
+        ],
+    })  # fmt: skip
+
+
+def gain_table(result: Json) -> TextTable:
+    """Half-widths now, and after each kind of flight."""
+    keys = ("now", "gentle_flight", "manoeuvre", "one_axis_at_a_time")
+    rows = tuple((p["name"], *(half_width(p[key]) for key in keys)) for p in result["parameters"])
+    heads = (Column("parameter"), *(Column(key.replace("_", " "), right=True) for key in keys))
+    return TextTable(f"Relative 95 % half-width (±) before and after {result['seconds']:g} s", heads, rows)
+
+
+def grouped(movements: Sequence[Json]) -> list[tuple[str, str, str]]:
+    """Movements that follow each other alike as one: name, how many times, amplitudes."""
+    each = [(m["name"], ", ".join(f"{a} {_amplitude(a, v)}" for a, v in m["amplitudes"].items())) for m in movements]
+    return [(name, str(len(list(same))), size) for (name, size), same in groupby(each)]
+
+
+def _limits(result: Json) -> list[list[str]]:
+    room, e, peak = result["room"], result["envelope"], result["peak"]
+    return [
+        [
+            "height above take-off",
+            f"{room['up_m'] + room['down_m']:.1f} m",
+            f"{e['lowest_m']:g} to {e['highest_m']:g} m",
+        ],
+        ["distance from the start", f"{room['sideways_m']:.0f} m", f"{e['radius_m']:g} m"],
+        ["tilt", f"{peak['tilt_deg']:.0f}°", f"{e['abort_tilt_deg']:.0f}°"],
+        ["battery", "–", f"{e['battery_percent']:g} % left"],
+    ]
+
+
+def _amplitude(axis: str, value: float) -> str:
+    return f"{100.0 * value:.0f} %" if axis == "throttle" else f"{math.degrees(value):.1f}°"
+
+
+def _bars(result: Json) -> dict[str, Any]:
+    names = [p["name"] for p in result["parameters"]]
+    data = [
+        {"role": role, "name": label, "type": "bar", "x": names,
+         "y": [100.0 * min(p[key], 2.0) for p in result["parameters"]]}
+        for role, label, key in (
+            ("measured", "now", "now"), ("before", "after a gentle flight", "gentle_flight"),
+            ("after", "after the manoeuvre", "manoeuvre"),
+        )
+    ]  # fmt: skip
+    layout = {"yaxis": axis("half-width (%)", type="log"), "xaxis": {"type": "category"}}
+    return figure("gain-bars", "Half-widths", data, layout, 320)
+
+
+def _attitude(window: Window) -> dict[str, Any]:
+
+    assert window.attitude is not None
+    angles = np.degrees(np.unwrap(euler(window.attitude), axis=0))
+    t = window.t - window.t0
+    data = [
+        trace(role, label, t, angles[:, i])
+        for i, (role, label) in enumerate((("measured", "roll"), ("before", "pitch"), ("after", "yaw")))
+    ]
+    return figure("attitude", "Attitude", data, {"xaxis": axis("time (s)"), "yaxis": axis("angle (°)")}, 320)
+
+
+# --- The page when there is no answer: why, what to do, and the data as they are
+
+
+MOST_FIGURES = 30
+_WORDS = {"ok": "fine", "warning": "doubtful", "error": "wrong", "unknown": "not checked"}
+
+
+def failure_page(
+    what: str, why: str, fix: str, logs: Sequence[tuple[Recording, Inspection | None]],
+    provenance: Sequence[Json], allowed: str = "",
+) -> dict[str, Any]:  # fmt: skip
+    """Builds the page.
+
+    Args:
+        what: what was asked for, for the title.
+        why: what was found.
+        fix: what to do.
+        logs: what could be read, with its inspection.
+        provenance: rows of name and value.
+        allowed: what would have been valid.
+    """
+    steps = [text for text in (fix[:1].upper() + fix[1:], *_missing(logs)) if text]
+    details = (f"Needed: {allowed}.",) if allowed else ()
+    verdict = Verdict("poor", f"No answer: {why}.", details, tuple(steps or ["`quadid inspect LOG` shows more."]))
+    sections: list[dict[str, Any]] = []
+    for i, (recording, inspection) in enumerate(logs):
+        sections.append(_data(recording, i))
+        if inspection is not None:
+            sections.append(_checks(recording, inspection, i))
+    return {
+        "title": f"{what}: no answer",
+        "subtitle": "Nothing was identified. What the logs hold is shown as it was read.",
+        "verdict": asdict(verdict),
+        "sections": sections,
+        "provenance": provenance,
+    }
+
+
+def _missing(logs: Sequence[tuple[Recording, Inspection | None]]) -> list[str]:
+    found = [m for _, inspection in logs if inspection is not None for m in inspection.missing]
+    return [f"{m.channel}: {m.why}. To get it: {m.how}." for m in dict.fromkeys(found)]
+
+
+def _data(recording: Recording, number: int) -> dict[str, Any]:
+    figures = [
+        _figure(name, channel, f"raw{number}-{i}")
+        for i, (name, channel) in enumerate(recording.channels.items())
+        if len(channel.t) > 1 and i < MOST_FIGURES
+    ]
+    intro = f"{recording.format}, {len(recording.channels)} channels."
+    if recording.warnings:
+        intro += " Notes: " + "; ".join(recording.warnings) + "."
+    return section(f"raw{number}", recording.name, intro, figures)
+
+
+def _figure(name: str, channel: Channel, identifier: str) -> dict[str, Any]:
+    values = channel.values.reshape(len(channel.t), -1)
+    rows = thinned(values, WHOLE_POINTS)
+    data = [
+        {
+            "role": f"unit{i}", "name": f"{name} {i + 1}", "type": "scatter", "mode": "lines",
+            "y": short(np.asarray(values[rows, i], dtype=np.float64)),
+        }
+        for i in range(values.shape[1])
+    ]  # fmt: skip
+    t = short(np.asarray(channel.t[rows] - channel.t[0], dtype=np.float64))
+    views = [{"label": "", "x": t, "data": data, "layout": {"xaxis": axis("time [s]")}}]
+    title, caption = name.replace("_", " "), CHANNELS[name][1]
+    return {"id": identifier, "title": title, "caption": caption, "views": views, "height": 220}
+
+
+def _checks(recording: Recording, inspection: Inspection, number: int) -> dict[str, Any]:
+    rows = [[c.name.replace("_", " "), _WORDS[c.verdict.value], c.message, c.fix or "–"] for c in inspection.checks]
+    outlook = [[o.parameter, "yes" if o.possible else "no", o.reason] for o in inspection.parameters]
+    tables = [
+        rows_of(("Check", "Result", "Found", "What to do"), rows), rows_of(("Parameter", "Possible", "Why"), outlook),
+    ]  # fmt: skip
+    return section(f"checks{number}", f"What {recording.name} allows", tables=tables)

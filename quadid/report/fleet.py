@@ -1,0 +1,483 @@
+"""Fleet report: parameters over time, drift, outliers, common findings, unusable logs."""
+
+from __future__ import annotations
+
+import math
+import shlex
+from collections import Counter, defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from itertools import groupby
+from typing import Any
+
+import numpy as np
+from scipy import stats
+
+from quadid.chi_square import Z95
+from quadid.condition.changes import HEALTHY_SCORE
+from quadid.report.figures import axis, figure, level, rows_of, section, trace
+from quadid.report.health_page import change_words, has_changed
+from quadid.report.page import number
+from quadid.report.page import unit as unit_text
+from quadid.report.verdict import ROUGH, Level, Verdict, percent
+from quadid.types import Json, JsonDict
+
+# --- What many flights say together: parameters of every vehicle over time, drift, outliers, findings they share
+
+
+FEWEST_FOR_DRIFT = 5
+"""Flights on different days or hours that a drift takes at least."""
+FEWEST_FOR_OUTLIERS = 5
+FALSE_ALARM = 0.01
+"""Chance that any drift at all is reported of a fleet without one."""
+FAR = 4.5
+"""Robust standard deviations from the vehicle's own median that make an outlier."""
+DAY = 86_400.0
+
+
+def summarise(
+    logs: Sequence[Json], parameters: Sequence[Json], findings: Sequence[Json], copies: Sequence[tuple[str, str]] = ()
+) -> dict[str, Any]:
+    """Sums up a fleet.
+
+    Args:
+        logs: rows with name, unit, status, reason, started [s since 1970], dated_by, mse_initial, mse_fitted, verdict.
+        parameters: rows with log, parameter, unit, value, low, high (95 % interval), status.
+        findings: rows with log, effect, confident, parameter, value.
+        copies: files that are not counted because they hold the bytes of a log, each with that log's name.
+
+    Returns:
+        ``counts`` by status, ``rough`` (logs that the simulation misses much of), ``units`` (each with its parameters:
+        median, spread, flights), ``drifts``, ``outliers``, ``common`` (findings by number of flights), ``reasons``
+        (failures and copies by reason), ``copies``.
+    """
+    by_name = {log["name"]: log for log in logs}
+    series = _series(by_name, parameters)
+    return {
+        "counts": dict(Counter(log["status"] for log in logs)),
+        "rough": sum(log["mse_fitted"] is not None and not log["mse_fitted"] <= ROUGH for log in logs),
+        "units": _units(logs, series),
+        "drifts": _drifts(series),
+        "outliers": _outliers(series),
+        "common": _common(by_name, findings),
+        "reasons": [*_reasons(logs), *_copied(copies)],
+        "copies": [{"log": log, "of": of} for log, of in copies],
+    }
+
+
+def _series(by_name: Mapping[str, Json], parameters: Sequence[Json]) -> dict[tuple[str, str], list[Json]]:
+    """Identified values by vehicle and parameter, in the order of time."""
+    out: dict[tuple[str, str], list[Json]] = defaultdict(list)
+    for row in parameters:
+        log = by_name.get(row["log"])
+        known = row["status"] == "identified" and row["low"] is not None and row["high"] is not None
+        if log is not None and known and row["value"] and math.isfinite(row["high"] - row["low"]):
+            out[log["unit"], row["parameter"]].append({**row, "started": log["started"]})
+    for rows in out.values():
+        rows.sort(key=lambda r: r["started"])
+    return dict(sorted(out.items()))
+
+
+def _units(logs: Sequence[Json], series: Mapping[tuple[str, str], list[Json]]) -> list[dict[str, Any]]:
+    out = []
+    for unit in sorted({log["unit"] for log in logs}):
+        mine = [log for log in logs if log["unit"] == unit]
+        rows = [
+            {"parameter": name, "unit": values[0]["unit"], "flights": len(values), **_centre(values)}
+            for (owner, name), values in series.items()
+            if owner == unit
+        ]
+        done = sum(log["status"] == "done" for log in mine)
+        out.append({"unit": unit, "logs": len(mine), "done": done, "parameters": rows})
+    return out
+
+
+def _centre(rows: Sequence[Json]) -> dict[str, float]:
+    values = np.array([r["value"] for r in rows])
+    middle = float(np.median(values))
+    spread = 1.4826 * float(np.median(np.abs(values - middle)))
+    return {"median": middle, "spread": spread / abs(middle) if middle else math.nan}
+
+
+def _drifts(series: Mapping[tuple[str, str], list[Json]]) -> list[dict[str, Any]]:
+    """Parameters that rise or fall with time: Kendall's tau decides, Theil and Sen's slope says how fast."""
+    fit_for = {
+        key: rows for key, rows in series.items()
+        if len(rows) >= FEWEST_FOR_DRIFT and len({r["started"] for r in rows}) >= FEWEST_FOR_DRIFT
+    }  # fmt: skip
+    out = []
+    for (unit, name), rows in fit_for.items():
+        t = np.array([r["started"] for r in rows]) / DAY
+        relative = np.array([r["value"] for r in rows]) / float(np.median([r["value"] for r in rows]))
+        p_value = float(stats.kendalltau(t, relative).pvalue) * len(fit_for)
+        if p_value < FALSE_ALARM:
+            slope = stats.theilslopes(relative, t)
+            change = float(slope.slope) * float(np.ptp(t))
+            out.append({
+                "unit": unit, "parameter": name, "change": change, "days": float(np.ptp(t)),
+                "per_day": float(slope.slope), "ci95": [float(slope.low_slope), float(slope.high_slope)],
+                "p_value": p_value, "flights": len(rows),
+            })  # fmt: skip
+    return sorted(out, key=lambda d: -abs(d["change"]))
+
+
+def _outliers(series: Mapping[tuple[str, str], list[Json]]) -> list[dict[str, Any]]:
+    """Flights far from the vehicle's median, measured by the vehicle's spread and the flight's own interval."""
+    out = []
+    for (unit, name), rows in series.items():
+        if len(rows) < FEWEST_FOR_OUTLIERS:
+            continue
+        centre = _centre(rows)
+        for row in rows:
+            own = (row["high"] - row["low"]) / (2.0 * Z95)
+            scale = math.hypot(centre["spread"] * abs(centre["median"]), own)
+            distance = (row["value"] - centre["median"]) / scale if scale > 0.0 else 0.0
+            if abs(distance) > FAR:
+                out.append({
+                    "log": row["log"], "unit": unit, "parameter": name, "value": row["value"],
+                    "median": centre["median"], "unit_of_value": row["unit"], "deviations": distance,
+                })  # fmt: skip
+    return sorted(out, key=lambda o: -abs(o["deviations"]))
+
+
+def _common(by_name: Mapping[str, Json], findings: Sequence[Json]) -> list[dict[str, Any]]:
+    diagnosed: Counter[str] = Counter(log["unit"] for log in by_name.values() if log["verdict"] is not None)
+    seen: dict[tuple[str, str], dict[str, Json]] = defaultdict(dict)
+    for row in findings:
+        log = by_name.get(row["log"])
+        if log is not None and row["confident"]:
+            seen[log["unit"], row["effect"]].setdefault(row["log"], row)
+    out = [
+        {
+            "unit": unit, "effect": effect, "flights": len(rows), "of": diagnosed[unit],
+            "parameter": (first := next(iter(rows.values())))["parameter"], "unit_of_value": first["unit"],
+            "median": float(np.median([r["value"] for r in rows.values()])),
+            "lowest": min(r["value"] for r in rows.values()), "highest": max(r["value"] for r in rows.values()),
+        }
+        for (unit, effect), rows in seen.items()
+    ]  # fmt: skip
+    return sorted(out, key=lambda c: (-c["flights"], c["unit"], c["effect"]))
+
+
+def _reasons(logs: Sequence[Json]) -> list[dict[str, Any]]:
+    """Logs without a result by what kept them from one, most frequent first."""
+    grouped: dict[tuple[str, str], list[str]] = defaultdict(list)
+    for log in logs:
+        if log["status"] != "done":
+            reason = log["reason"].replace(f"{log['name'].rsplit('/', 1)[-1]}: ", "")
+            grouped[log["status"], reason].append(log["name"])
+    ordered = sorted(grouped.items(), key=lambda item: (-len(item[1]), item[0]))
+    return [{"status": s, "reason": r, "logs": len(names), "names": names} for (s, r), names in ordered]
+
+
+def _copied(copies: Sequence[tuple[str, str]]) -> list[dict[str, Any]]:
+    """Copies in the form of logs without a result."""
+    grouped: dict[str, list[str]] = defaultdict(list)
+    for log, of in copies:
+        grouped[of].append(log)
+    return [
+        {"status": "copy", "reason": f"the bytes of {of}, which is counted once", "logs": len(names), "names": names}
+        for of, names in sorted(grouped.items())
+    ]
+
+
+# --- Tables of the report of a fleet: a row a thing, folded where they are long, so that a phone shows them too
+
+
+MOST_ROWS = 200
+"""Rows of one section; the database has all."""
+FOLDED = 8
+"""Tables of more rows are folded."""
+
+
+def summary_sections(summary: Json) -> list[JsonDict | None]:
+    """What `quadid.report.fleet.summarise` found, a section a kind; None for kinds without a row."""
+    return [
+        _fleet_tables_units(summary),
+        _fleet_tables_drifts(summary),
+        _fleet_tables_outliers(summary),
+        _fleet_tables_common(summary),
+        _unusable(summary),
+    ]
+
+
+def date(seconds: float) -> str:
+    """A time [s since 1970] as ``2026-11-25 15:05:00``."""
+    return str(np.datetime_as_string(np.datetime64(round(seconds), "s"))).replace("T", " ")
+
+
+def _section(
+    identifier: str, title: str, head: Sequence[str], rows: Sequence[Sequence[str]], intro: str = ""
+) -> JsonDict | None:  # fmt: skip
+    if not rows:
+        return None
+    fold = f"All {len(rows)}" if len(rows) > FOLDED else ""
+    return section(
+        identifier, title, intro + _left_out(rows), tables=[rows_of(head, rows[:MOST_ROWS], fold, "compact")]
+    )
+
+
+def _left_out(rows: Sequence[Any]) -> str:
+    return f" The first {MOST_ROWS} of {len(rows)}; the database has all." if len(rows) > MOST_ROWS else ""
+
+
+def _fleet_tables_units(summary: Json) -> JsonDict | None:
+    """Parameters of every vehicle; the first is open."""
+    head = ("Parameter", "Median", "Unit", "Spread", "Flights")
+    tables: list[JsonDict] = []
+    for unit in summary["units"][:MOST_ROWS]:
+        rows = [
+            (p["parameter"], number(p["median"]), unit_text(p["unit"]), percent(p["spread"]), str(p["flights"]))
+            for p in unit["parameters"]
+        ]
+        if rows:
+            title = f"{unit['unit']}: {unit['done']} of {unit['logs']} logs gave an answer"
+            tables.append({**rows_of(head, rows, title, "compact"), "open": not tables})
+    intro = f"Spread between flights: robust standard deviation over the median.{_left_out(summary['units'])}"
+    return section("vehicles", "Vehicles", intro, tables=tables) if tables else None
+
+
+def _fleet_tables_drifts(summary: Json) -> JsonDict | None:
+    rows = [
+        (d["unit"], d["parameter"], f"{100 * d['change']:+.2g} % in {d['days']:.3g} days".replace("-", "−"),
+         f"{number(100 * d['ci95'][0], 2)} … {number(100 * d['ci95'][1], 2)} % a day", number(d["p_value"], 2),
+         str(d["flights"]))
+        for d in summary["drifts"]
+    ]  # fmt: skip
+    head = ("Vehicle", "Parameter", "Change", "Rate, 95 % interval", "Chance without drift", "Flights")
+    intro = "Kendall's rank test, corrected for the number of tests; slope after Theil and Sen."
+    return _section("drift", "Drift", head, rows, intro)
+
+
+def _fleet_tables_outliers(summary: Json) -> JsonDict | None:
+    rows = [
+        (o["log"], o["parameter"], f"{number(o['value'])} {unit_text(o['unit_of_value'])}", number(o["median"]),
+         number(o["deviations"], 2))
+        for o in summary["outliers"]
+    ]  # fmt: skip
+    head = ("Log", "Parameter", "Value", "Median of the vehicle", "Deviations")
+    return _section("outliers", "Outliers", head, rows, "In robust standard deviations of the vehicle.")
+
+
+def _fleet_tables_common(summary: Json) -> JsonDict | None:
+    rows = [
+        (c["unit"], c["effect"].replace("_", " "), f"{c['flights']} of {c['of']}",
+         f"{c['parameter']} = {number(c['median'])} {c['unit_of_value']}".rstrip(),
+         f"{number(c['lowest'])} … {number(c['highest'])}")
+        for c in summary["common"]
+    ]  # fmt: skip
+    head = ("Vehicle", "Finding", "Flights", "Median", "Range")
+    return _section("common", "What the simulation gets wrong, flight after flight", head, rows)
+
+
+def _unusable(summary: Json) -> JsonDict | None:
+    rows = [
+        (r["status"], r["reason"], str(r["logs"]), ", ".join(r["names"][:5]) + (" …" if r["logs"] > 5 else ""))
+        for r in summary["reasons"]
+    ]
+    return _section("unusable", "Logs without an answer", ("Outcome", "Reason", "Logs", "Which"), rows)
+
+
+def every_log(logs: Sequence[Json]) -> JsonDict:
+    """Every log with its error and where its date comes from, folded by vehicle, the worst error first."""
+    worst = sorted(logs, key=lambda log: -(log["mse_fitted"] if log["mse_fitted"] is not None else math.inf))
+    head, errors = ("Log", "Outcome", "Error", "Date"), ("mse_initial", "mse_fitted")
+    tables = []
+    for unit, some in groupby(sorted(worst[:MOST_ROWS], key=lambda log: str(log["unit"])), key=lambda log: log["unit"]):
+        rows = [
+            (
+                log["name"], log["status"],
+                " → ".join(number(log[key], 3) for key in errors) if log[errors[-1]] is not None else "–",
+                f"{date(log['started'])[:-3]} ({log['dated_by']})",
+            )
+            for log in some
+        ]  # fmt: skip
+        tables.append(rows_of(head, rows, f"{unit}: {len(rows)} log{'s' * (len(rows) != 1)}", "compact"))
+    intro = (
+        "Error over one second of simulation, before and after, in noise variances: 1 is the noise floor. The worst "
+        "come first. Dates are those of the clock in the log or of its file."
+    )
+    return section("logs", "Every log", intro + _left_out(logs), tables=tables)
+
+
+# --- The report of a fleet: verdict, parameters over time, drift, outliers, common findings, what was not usable
+
+
+MOST_UNITS = 12
+"""Vehicles in one figure."""
+MOST_POINTS = 20_000
+"""Flights that all figures together show; of more, every n-th."""
+
+
+def fleet_page(
+    summary: Json, logs: Sequence[Json], parameters: Sequence[Json], provenance: Sequence[Json],
+    title: str, health: Sequence[Json] = (),
+) -> dict[str, Any]:  # fmt: skip
+    """Builds the page from `quadid.report.fleet.summarise` and the rows it was made from.
+
+    `health` holds the rows of `quadid.app.fleet.health_trend`.
+    """
+    return {
+        "title": title,
+        "subtitle": f"{len(logs)} logs of {len(summary['units'])} vehicle{'s' * (len(summary['units']) != 1)}",
+        "verdict": asdict(fleet_verdict(summary, health)),
+        "sections": [s for s in (
+            _health(health, logs), _over_time(logs, parameters), *summary_sections(summary), every_log(logs),
+        ) if s is not None],
+        "provenance": provenance,
+    }  # fmt: skip
+
+
+def fleet_verdict(summary: Json, health: Sequence[Json] = ()) -> Verdict:
+    """How many logs gave an answer, which vehicles have changed by their last flight, and what needs attention."""
+    counts = summary["counts"]
+    total, done = sum(counts.values()), counts.get("done", 0)
+    last = {row["unit"]: row for row in health if not row["baseline"]}  # in the order of time
+    changed = [row for row in last.values() if has_changed(row)]
+    rough = summary["rough"]
+    fit = done - rough
+    level: Level = "good" if fit == total and not changed else "fair" if fit >= 0.5 * total else "poor"
+    gave = f"{done} of {total} logs gave parameters."
+    headline = f"{len(changed)} of {len(last)} vehicles have changed." if changed else gave
+    words = (
+        ("refused", "cannot support a fit"),
+        ("unreadable", "cannot be read or used"),
+        ("failed", "stopped this program"),
+    )
+    details = [f"{row['unit']} has changed: {_what_changed(row)}." for row in changed[:3]]
+    details += [gave] if changed else []
+    details += [f"{counts[key]} {text}." for key, text in words if counts.get(key)]
+    if copies := len(summary["copies"]):
+        told = "log is a copy of another and is" if copies == 1 else "logs are copies of others and are"
+        details.append(f"{copies} {told} not counted.")
+    if rough:
+        what = "answer misses much of its flight" if rough == 1 else "answers miss much of their flights"
+        details.append(f"{rough} {what} (error above {ROUGH:g} noise variances): not to be used.")
+    details += [
+        f"{d['unit']}: {d['parameter']} {'rose' if d['change'] > 0 else 'fell'} by {percent(abs(d['change']))} "
+        f"in {d['days']:.3g} days."
+        for d in summary["drifts"][:3]
+    ]
+    steps = ["`quadid fleet --diagnose` names what the simulation gets wrong."] if rough else []
+    if changed:
+        today = shlex.quote(changed[0]["log"])
+        steps.append(f"To see how certain this is: `quadid health {today} --baseline …` (the vehicle's first flights).")
+    if summary["drifts"]:
+        steps.append("A parameter that drifts: look for wear of propellers and motors, or a changed payload.")
+    if summary["outliers"]:
+        log = summary["outliers"][0]["log"]
+        steps.append(f"Look at the largest outlier: `quadid diagnose {log}`.")
+    if counts.get("refused") or counts.get("unreadable"):
+        steps.append("`quadid inspect LOG` names what an unusable log lacks and how to log it.")
+    if counts.get("failed"):
+        steps.append("Please report failures of this program; the last table names the logs.")
+    if not steps:
+        steps.append("Nothing to do. The tables are in SQLite and Parquet for questions of your own.")
+    return Verdict(level, headline, tuple(details), tuple(steps))
+
+
+def _when(logs: Sequence[Json]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Where each log lies on an axis of time, and that axis.
+
+    Dates of files are mostly those of a copy: then flights are counted, in the order of their dates and names.
+    """
+    if all(log["dated_by"] == "log" for log in logs):
+        return {log["name"]: date(log["started"]) for log in logs}, {"type": "date"}
+    count: Counter[str] = Counter()
+    places = {}
+    readable = (log for log in logs if log["status"] != "unreadable")
+    for log in sorted(readable, key=lambda log: (log["started"], log["name"])):
+        count[log["unit"]] += 1
+        places[log["name"]] = count[log["unit"]]
+    whole = {"tickformat": "d", "dtick": 1} if max(count.values(), default=0) <= 12 else {"tickformat": "d"}
+    return places, {**axis("flight"), **whole}
+
+
+def _counted(time: Json) -> str:
+    """A sentence where flights are counted."""
+    return "" if time.get("type") == "date" else " Flights are counted in the order of their files' dates."
+
+
+def _health(rows: Sequence[Json], logs: Sequence[Json]) -> dict[str, Any] | None:
+    """Score of every flight over time, and what changed."""
+    judged = [row for row in rows if not row["baseline"]]
+    if not judged:
+        return None
+    by_unit: dict[str, list[Json]] = {}
+    for row in judged:
+        by_unit.setdefault(row["unit"], []).append(row)
+    places, time = _when(logs)
+    data = []
+    for i, (unit, own) in enumerate(sorted(by_unit.items())[:MOST_UNITS]):
+        score = np.array([row["score"] for row in own])
+        text = [f"{row['log']}: {row['verdict']}" for row in own]
+        line = trace(f"unit{i}", unit, None, score, mode="lines+markers", text=text)
+        data.append({**line, "x": [places[row["log"]] for row in own]})
+    layout = {
+        "xaxis": time, "yaxis": axis("healthy spreads", rangemode="tozero"), "hovermode": "closest",
+        "showlegend": True, "shapes": [level(HEALTHY_SCORE)],
+    }  # fmt: skip
+    drawn = figure("fleet-health", "Distance from healthy", data, layout, 280)
+    changed = [cells for _, own in sorted(by_unit.items()) if (cells := _changes_of(own))]
+    table = rows_of(("Vehicle", "Flights changed", "First", "Last", "Changed"), changed[:MOST_ROWS], kind="compact")
+    count = Counter(row["unit"] for row in rows if row["baseline"]).values()
+    most = "up to " * (len(set(count)) > 1) + str(max(count))
+    intro = (
+        f"Each flight against the first {most} of its vehicle, which are assumed healthy. 99 of 100 healthy flights "
+        f"are below {HEALTHY_SCORE:.1f}, the line."
+        f"{_counted(time)}"
+    )
+    return section("health", "Health over flights", intro, [drawn], [table] if changed else [])
+
+
+def _changes_of(own: Sequence[Json]) -> tuple[str, ...]:
+    """How many flights of a vehicle have changed, the first and last of them, and what had at the last; or nothing."""
+    changed = [row for row in own if has_changed(row)]
+    if not changed:
+        return ()
+    first, last = changed[0], changed[-1]
+    return last["unit"], f"{len(changed)} of {len(own)}", first["log"], last["log"], _what_changed(last)
+
+
+def _what_changed(row: Json) -> str:
+    return "; ".join(map(change_words, row["changes"])) or "by nothing that has a name"
+
+
+def _over_time(logs: Sequence[Json], parameters: Sequence[Json]) -> dict[str, Any] | None:
+    started = {log["name"]: (log["started"], log["unit"]) for log in logs if log["status"] == "done"}
+    when = _when(logs)
+    rows = [p for p in parameters if p["status"] == "identified" and p["log"] in started]
+    names = dict.fromkeys(p["parameter"] for p in rows)
+    views = [_view(name, [p for p in rows if p["parameter"] == name], started, *when) for name in names]
+    if not views:
+        return None
+    intro = f"Every flight with its 95 % interval; a vehicle is a folder.{_counted(when[1])}"
+    drawn = {"id": "fleet-parameters", "title": "Value of each flight", "views": views, "height": 280}
+    return section("over-time", "Parameters over time", intro, [drawn])
+
+
+def _view(
+    name: str, rows: Sequence[Json], started: Mapping[str, tuple[float, str]], places: Json, time: Json
+) -> dict[str, Any]:
+    """One parameter of every vehicle over its flights."""
+    mine = sorted(rows, key=lambda p: started[p["log"]][0])
+    units = list(dict.fromkeys(started[p["log"]][1] for p in mine))
+    data = []
+    for i, unit in enumerate(sorted(units)[:MOST_UNITS]):
+        own = [p for p in mine if started[p["log"]][1] == unit]
+        own = own[:: max(1, math.ceil(len(own) * len(units) * 6 / MOST_POINTS))]
+        value = np.array([p["value"] for p in own])
+        upper = np.array([_gap(p["high"], p["value"]) for p in own])
+        lower = np.array([_gap(p["value"], p["low"]) for p in own])
+        bars = {"type": "data", "symmetric": False, "array": upper.tolist(), "arrayminus": lower.tolist()}
+        line = trace(f"unit{i}", unit, None, value, mode="markers", error_y=bars, text=[p["log"] for p in own])
+        data.append({**line, "x": [places[p["log"]] for p in own]})
+    layout = {
+        "xaxis": time, "yaxis": axis(f"{name} [{mine[0]['unit']}]"), "hovermode": "closest",
+        "showlegend": True,
+    }  # fmt: skip
+    return {"label": name, "data": data, "layout": layout}
+
+
+def _gap(high: float | None, low: float | None) -> float:
+    return 0.0 if high is None or low is None or not math.isfinite(high - low) else max(high - low, 0.0)

@@ -1,0 +1,137 @@
+"""Manoeuvres in the forms in which they are flown: autopilot scripts, parameters, words for the sticks."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from itertools import groupby
+from typing import Any
+
+from quadid.errors import ParameterError, nearest
+from quadid.report.templating import render
+from quadid.types import Json
+
+# --- What a manoeuvre is, where it may be flown, and what it promises
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A manoeuvre to be written down.
+
+    Attributes:
+        vehicle: its name.
+        seconds: length.
+        segments: multisines: axis, start [s], duration [s], amplitude (rms) [rad, or share of hover thrust], frequency
+            and frequency_end [Hz].
+        sweeps: one axis at a time instead: axis, amplitude [rad, rad/s for yaw, share of hover thrust], frequency,
+            frequency_end [Hz], duration [s].
+        envelope: lowest_m, highest_m above take-off, radius_m, tilt_deg asked for at most, abort_tilt_deg,
+            battery_percent.
+        promise: relative 95 % half-widths by parameter, flown as `segments`.
+        promise_sweeps: likewise, flown as `sweeps`.
+    """
+
+    vehicle: str
+    seconds: float
+    segments: Sequence[Json]
+    sweeps: Sequence[Json]
+    envelope: Json
+    promise: Mapping[str, float]
+    promise_sweeps: Mapping[str, float]
+
+    def header(self, promise: Mapping[str, float], what: str) -> list[str]:
+        """The lines at the top of every form: what it is, the envelope, the promise and what that rests on."""
+        e = self.envelope
+        return [
+            f"{self.vehicle}: {what}. Proposed by `quadid excite`; read it before you fly it.",
+            "Neither a simulated autopilot (SITL) nor a vehicle has flown it yet: try it in SITL first.",
+            f"Envelope: {e['lowest_m']:g} to {e['highest_m']:g} m above take-off, {e['radius_m']:g} m around the "
+            f"start, tilt {e['abort_tilt_deg']:.0f} deg, {e['battery_percent']:g} % of the battery left.",
+            f"Promised 95 % intervals: {', '.join(f'{n} {half_width(v)}' for n, v in promise.items())}.",
+            "They are predicted by a simulated flight with the current values; `quadid identify` states what "
+            "a real log obtained.",
+        ]
+
+
+def half_width(half: float) -> str:
+    """A relative half-width for people."""
+    return "unknown" if half > 2.0 else f"± {100.0 * half:.3g} %"
+
+
+# --- The forms by name, each a template in ``templates/manoeuvres``
+#
+# Scripts watch the envelope themselves, begin only when the pilot has switched to them in flight, and end in a mode
+# that holds the place.
+
+
+FORMS = {
+    "ardupilot-lua": "Lua script for ArduCopter, all axes at once",
+    "ardupilot-sid": "parameters of ArduCopter's SystemID mode, one axis at a time",
+    "px4": "ROS 2 script for PX4's Offboard mode, all axes at once",
+    "sticks": "instructions for a pilot",
+}
+PEAK = math.sqrt(2.0)
+"""Of a swing over its rms."""
+SID_AXES = {"roll": 1, "pitch": 2, "yaw": 3, "throttle": 13}
+"""What ArduCopter's SystemID mode adds a sweep to: roll and pitch angle [deg], yaw rate [deg/s], throttle (share of
+full).  It stops itself on landing and beyond the largest lean angle; fence and battery failsafe are the autopilot's
+own.  https://ardupilot.org/copter/docs/systemid-mode.html"""
+_WHAT = "a manoeuvre that shows mass-normalised thrust, drag torque and inertia"
+
+
+def check_form(form: str) -> None:
+    """Raises ParameterError for a form that is not written."""
+    if form not in FORMS:
+        raise ParameterError(f"--format {form}", ", ".join(FORMS), nearest(form, FORMS))
+
+
+def written_as(plan: Plan, form: str, hover_throttle: float) -> dict[str, str]:
+    """Texts of a form by the end of their file names.
+
+    Args:
+        plan: the manoeuvre.
+        form: of `FORMS`.
+        hover_throttle: share of full throttle at hover.
+
+    Raises:
+        ParameterError: an unknown form, or too short a manoeuvre for it.
+    """
+    check_form(form)
+    facts = {**asdict(plan), **plan.envelope, "header": plan.header(plan.promise, _WHAT)}
+    if form == "ardupilot-lua":
+        return {".manoeuvre.lua": render("manoeuvres/ardupilot.lua", facts)}
+    if form == "px4":
+        return {".manoeuvre_px4.py": render("manoeuvres/px4.py", facts)}
+    if form == "sticks":
+        facts["header"] = plan.header(plan.promise, "what to do with the sticks")
+        return {".sticks.txt": render("manoeuvres/sticks.txt", {**facts, "blocks": _blocks(plan)})}
+    if not plan.sweeps:
+        raise ParameterError(
+            f"too short for sweeps of one axis after the other: {plan.seconds:g} s",
+            "36 s or more",
+            "use --seconds 60",
+        )
+    return {
+        f".sid_{i}_{sweep['axis']}.param": render(
+            "manoeuvres/system_id.param", {**facts, **_sweep(plan, i, sweep, hover_throttle)}
+        )
+        for i, sweep in enumerate(plan.sweeps, 1)
+    }
+
+
+def _sweep(plan: Plan, i: int, sweep: Json, hover_throttle: float) -> dict[str, Any]:
+    axis, size = str(sweep["axis"]), float(sweep["amplitude"])
+    what = f"sweeps of SystemID mode, {i} of {len(plan.sweeps)} ({axis})"
+    magnitude = size * hover_throttle if axis == "throttle" else math.degrees(size)
+    header = plan.header(plan.promise_sweeps, what)
+    return {"sweep": sweep, "axis": SID_AXES[axis], "magnitude": magnitude, "header": header}
+
+
+def _blocks(plan: Plan) -> list[tuple[list[dict[str, Any]], int]]:
+    """Movements of the sticks at one time, alike ones counted."""
+    shown = [
+        [{**s, "start": 0.0, "peak": PEAK * s["amplitude"], "peak_deg": math.degrees(PEAK * s["amplitude"])} for s in b]
+        for _, b in groupby(plan.segments, key=lambda s: s["start"])
+    ]
+    return [(block, len(list(same))) for block, same in groupby(shown)]

@@ -1,0 +1,583 @@
+"""Inputs of the node: topics and types of the stacks, decoded messages, one source a channel."""
+
+from __future__ import annotations
+
+import importlib
+import math
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import islice
+from typing import Any, NamedTuple
+
+import numpy as np
+from quadid_replay.presets import PRESETS
+from quadid_replay.ros_messages import SIGNALS, TYPES, BlockReader, Read, SignalColumns
+
+from quadid.data.window import Block, Sample
+from quadid.errors import QuadidError, nearest
+from quadid.types import FloatArray, IntArray
+
+# --- Stamps: absolute times of messages, in nanoseconds there and in seconds [s, UNIX] here, to a quarter microsecond
+
+
+def seconds(ns: int) -> float:
+    """Seconds of a stamp in nanoseconds."""
+    return ns * 1e-9
+
+
+def many_seconds(ns: IntArray) -> FloatArray:
+    """As `seconds`, for many stamps, the same numbers to the bit."""
+    return np.asarray(ns * 1e-9)
+
+
+def nanoseconds(t: float) -> int:
+    """Nanoseconds of a time [s], to the microsecond; 0 for none."""
+    return max(round(t * 1e6) * 1000, 0) if math.isfinite(t) else 0
+
+
+def stamp(t: float) -> dict[str, int]:
+    """builtin_interfaces/Time of a time [s]; zero for none."""
+    ns = nanoseconds(t)
+    return {"sec": ns // 10**9, "nanosec": ns % 10**9}
+
+
+# --- Of several topics that tell one channel, uses the best that arrives, from the first sample on
+
+
+DECIDE = 1.0
+"""Time of the data [s] in which a better source may still show up before a worse one is used."""
+SILENT = 3.0
+"""A chosen source that is silent for this long [s] gives way to the next."""
+MOST_HELD = 5000
+
+
+class Chooser:
+    """Picks one source for each channel.
+
+    Samples of a source that is not the best possible are held back until it is certain that no better one comes, so
+    that a channel never mixes two sources.
+    """
+
+    def __init__(self, best: dict[str, int]) -> None:
+        """Knows the best (lowest) rank that each channel could have."""
+        self._best = best
+        self._chosen: dict[str, int] = {}
+        self._last: dict[str, float] = {}
+        self._held: dict[str, dict[int, list[Sample]]] = {}
+
+    def take(self, sample: Sample, rank: int) -> Iterator[Sample]:
+        """Yields what may be used now.
+
+        Args:
+            sample: a sample.
+            rank: of its source for this channel; 0 is the best.
+        """
+        channel = sample.channel
+        chosen = self._chosen.get(channel)
+        if chosen is not None and rank > chosen and sample.t > self._last[channel] + SILENT:
+            chosen = None  # the chosen one fell silent
+        if chosen is None and rank == self._best.get(channel, 0):
+            chosen = rank
+            self._held.pop(channel, None)
+        elif chosen is not None and rank < chosen:
+            chosen = rank  # a better one has come
+        if chosen is not None:
+            self._chosen[channel] = chosen
+            if rank == chosen:
+                self._last[channel] = sample.t
+                yield sample
+            return
+        yield from self._hold(sample, rank)
+
+    def has(self, channel: str) -> bool:
+        """Whether some source tells the channel."""
+        return channel in self._chosen or channel in self._held
+
+    def settled(self, channel: str, rank: int, newest: float) -> bool | None:
+        """Whether all samples of a source up to time `newest` [s] may be used; None: to be decided one by one."""
+        chosen = self._chosen.get(channel)
+        if chosen is None or rank < chosen or (rank > chosen and newest > self._last[channel] + SILENT):
+            return None
+        return rank == chosen
+
+    def used(self, channel: str, t: float) -> None:
+        """Notes that samples up to one at `t` [s] were used, as `settled` allowed."""
+        self._last[channel] = t
+
+    def _hold(self, sample: Sample, rank: int) -> Iterator[Sample]:
+        by_rank = self._held.setdefault(sample.channel, {})
+        held = by_rank.setdefault(rank, [])
+        held.append(sample)
+        first = min(samples[0].t for samples in by_rank.values())
+        if sample.t - first < DECIDE and len(held) < MOST_HELD:
+            return
+        best = min(by_rank)
+        self._chosen[sample.channel] = best
+        samples = self._held.pop(sample.channel)[best]
+        self._last[sample.channel] = samples[-1].t
+        yield from samples
+
+
+# --- Whether the messages of a topic come evenly: by when they are there, and by their stamps
+
+
+QUIET = 0.25
+"""Messages that come together after more than this [s] without any are a burst: half of what rows wait for."""
+TOGETHER = 5
+"""... of so many at least."""
+AGAIN, MEMORY = 3, 10.0
+"""So many bursts within this [s] are no accident.  What was wrong with a message is told for as long."""
+STAMPS = 100
+"""Newest stamps that are compared."""
+GAP = 1.0
+"""A step between stamps of more than this [s] is a pause."""
+CLOSE, CROWDED = 0.2, 0.4
+"""Stamps closer than this share of the mean step, and the share of them that even a random stream does not have."""
+
+
+class Pace:
+    """The pace of one topic.
+
+    Attributes:
+        looked: when somebody looked for its messages last [s].
+    """
+
+    def __init__(self) -> None:
+        self.looked, self._quiet = 0.0, 0.0
+        self._bursts: deque[tuple[float, int, float]] = deque(maxlen=AGAIN)
+        self._stamps: deque[float] = deque(maxlen=STAMPS)
+
+    def look(self, now: float, since: float, count: int) -> None:
+        """Somebody looked for messages.
+
+        Args:
+            now: time of the look [s].
+            since: of the look before [s].
+            count: messages that were there.
+        """
+        self.looked = now
+        if not count:
+            self._quiet += now - since
+            return
+        if self._quiet > QUIET and count >= TOGETHER:
+            self._bursts.append((now, count, self._quiet))
+        self._quiet = 0.0
+
+    def stamped(self, t: FloatArray) -> None:
+        """Takes the stamps of messages [s], shape (n,)."""
+        self._stamps.extend(t[-STAMPS:].tolist())
+
+    @property
+    def trouble(self) -> str:
+        """How they bunch; empty where they do not."""
+        if len(self._bursts) == AGAIN and self._bursts[0][0] > self.looked - MEMORY:
+            _, count, quiet = self._bursts[-1]
+            return f"comes in bursts: {count} messages at once after {quiet:.1f} s without one: send each when measured"
+        steps = np.diff(np.sort(np.array(self._stamps)))
+        steps = steps[steps < GAP]
+        if len(steps) < STAMPS // 2:
+            return ""
+        close = int(np.count_nonzero(steps < CLOSE * steps.mean()))
+        if close < CROWDED * len(steps):
+            return ""
+        return f"stamped in bursts: {close} of {len(steps)} follow at once on the one before: stamp when measured"
+
+
+# --- Topics and types that the stacks really publish, for live subscription; what a stack lacks, and the way out
+
+
+@dataclass(frozen=True)
+class Input:
+    """One topic to subscribe to.
+
+    Attributes:
+        topic: relative name.
+        type: ``package/Type``.
+        channels: the core's channels it may feed, each with its rank: the lowest that arrives is used.
+    """
+
+    topic: str
+    type: str
+    channels: tuple[tuple[str, int], ...]
+
+
+@dataclass(frozen=True)
+class Source:
+    """A preset: its inputs, and what its users should know when there is no motor signal."""
+
+    inputs: tuple[Input, ...]
+    motor_hint: str
+
+
+_TYPES = {
+    "canonical": {
+        "imu": "sensor_msgs/Imu",
+        "attitude": "geometry_msgs/QuaternionStamped",
+        "rotor_speeds": "sensor_msgs/JointState",
+        "motor_command": "quadid_msgs/MotorCommand",
+        "command": "quadid_msgs/AttitudeCommand",
+        "odom": "nav_msgs/Odometry",
+        "battery": "sensor_msgs/BatteryState",
+    },
+    "mavros": {
+        "imu/data_raw": "sensor_msgs/Imu",
+        "imu/data": "sensor_msgs/Imu",
+        "esc_status/status": "mavros_msgs/ESCStatus",
+        "esc_telemetry/telemetry": "mavros_msgs/ESCTelemetry",
+        "rc/out": "mavros_msgs/RCOut",
+        "setpoint_raw/target_attitude": "mavros_msgs/AttitudeTarget",
+        "local_position/odom": "nav_msgs/Odometry",
+        "battery": "sensor_msgs/BatteryState",
+    },
+    "px4": {
+        "fmu/out/sensor_combined": "px4_msgs/SensorCombined",
+        "fmu/out/vehicle_attitude": "px4_msgs/VehicleAttitude",
+        "fmu/out/esc_status": "px4_msgs/EscStatus",
+        "fmu/out/actuator_motors": "px4_msgs/ActuatorMotors",
+        "fmu/out/vehicle_attitude_setpoint": "px4_msgs/VehicleAttitudeSetpoint",
+        "fmu/out/vehicle_local_position": "px4_msgs/VehicleLocalPosition",
+        "fmu/out/battery_status": "px4_msgs/BatteryStatus",
+    },
+    "ardupilot": {
+        "ap/imu/experimental/data": "sensor_msgs/Imu",
+        "ap/pose/filtered": "geometry_msgs/PoseStamped",
+        "ap/battery": "sensor_msgs/BatteryState",
+    },
+    "rotors": {
+        "imu": "sensor_msgs/Imu",
+        "motor_speed": "actuator_msgs/Actuators",
+        "odometry_sensor1/odometry": "nav_msgs/Odometry",
+    },
+}
+_PREFIX = {"mavros": "mavros/"}
+_VERSIONED = {
+    f"fmu/out/{name}"
+    for name in ("vehicle_attitude", "vehicle_attitude_setpoint", "vehicle_local_position", "battery_status")
+}
+"""Topics to which newer PX4 appends the version of their messages: `_v1` is listened to as well."""
+_HINTS = {
+    "canonical": "publish rotor_speeds (sensor_msgs/JointState, rad/s) or motor_command (quadid_msgs/MotorCommand)",
+    "mavros": "mavros/rc/out carries the motor outputs: ask the autopilot for SERVO_OUTPUT_RAW at 80 Hz "
+    "(ros2 service call /mavros/set_message_interval, id 36), or for ESC telemetry",
+    "px4": "the default bridge exports no motor signal: add actuator_motors (or esc_status) to the publications in "
+    "dds_topics.yaml of the PX4 firmware and rebuild, or use quadid serve on MAVLink",
+    "ardupilot": "ArduPilot's DDS bridge has no motor topic: use quadid serve on MAVLink beside it, or MAVROS",
+    "rotors": "publish motor_speed (actuator_msgs/Actuators, rad/s)",
+}
+
+
+def source(name: str) -> Source:
+    """The preset of that name.
+
+    Raises:
+        QuadidError: unknown preset, with the nearest one.
+    """
+    if name not in _TYPES:
+        raise QuadidError(f"unknown source '{name}'", ", ".join(_TYPES), nearest(name, _TYPES))
+    inputs = []
+    for topic, kind in _TYPES[name].items():
+        ranks = [(channel, names.index(topic)) for channel, names in PRESETS[name].items() if topic in names]
+        for version in ("", "_v1") if topic in _VERSIONED else ("",):
+            inputs.append(Input(_PREFIX.get(name, "") + topic + version, kind, tuple(ranks)))
+    return Source(tuple(inputs), _HINTS[name])
+
+
+# --- Between ROS messages and the core: the only file that knows message types
+#
+# In: the same decoders as for MCAP logs (`quadid_replay.ros_messages`) read the serialized bytes, so that a live
+# stream and its recording give the same numbers bit for bit.  Out: dictionaries of `messages` become messages.
+
+
+FEWEST = 2
+"""Fewer messages than these are quicker read one by one."""
+_BEHIND = {"pose_attitude": 5}
+"""The attitude of a pose stands behind a topic of its own, as when reading logs."""
+
+
+class MessageTypeError(QuadidError):
+    """A message type whose package is not installed."""
+
+
+def message_class(name: str) -> Any:
+    """The class of ``package/Type`` or ``package/msg/Type``.
+
+    Raises:
+        MessageTypeError: the package is not installed, or has no such type.
+    """
+    return _interface(name, "msg")
+
+
+def service_class(name: str) -> Any:
+    """The class of the service ``package/Type``; raises MessageTypeError."""
+    return _interface(name, "srv")
+
+
+def _interface(name: str, folder: str) -> Any:
+    package, kind = name.split("/")[0], name.split("/")[-1]
+    apt = f"ros-jazzy-{package.replace('_', '-')}"
+    try:
+        return getattr(importlib.import_module(f"{package}.{folder}"), kind)
+    except ModuleNotFoundError as error:
+        fix = "colcon build the msgs folder, or run 'make messages'" if package == "quadid_msgs" else f"install {apt}"
+        raise MessageTypeError(f"message type {name}: package {package} is not installed", fix=fix) from error
+    except (ImportError, AttributeError) as error:
+        fix = f"install the version for this ROS distribution ({apt})"
+        raise MessageTypeError(f"message type {name} cannot be used ({error})", fix=fix) from error
+
+
+def deserializer(name: str) -> Callable[[bytes], Any]:
+    """ROS' own decoder of ``package/Type``; raises MessageTypeError."""
+    from rclpy.serialization import deserialize_message, serialize_message
+
+    cls = message_class(name)
+    deserialize_message(serialize_message(cls()), cls)  # loads its type support now, not when the first one arrives
+    return lambda data: deserialize_message(data, cls)
+
+
+class Decoder:
+    """Turns the serialized messages of one topic into samples.
+
+    Attributes:
+        failed: messages that could not be decoded; unstamped: those whose stamp is zero; of all that came.
+        pace: how evenly they come.
+    """
+
+    def __init__(
+        self, entry: Input, chooser: Chooser, rotors: int, decode: Callable[[bytes], Any]
+    ) -> None:  # fmt: skip
+        """Prepares for one input.
+
+        Args:
+            entry: topic, type, channels with ranks.
+            chooser: shared by all topics.
+            rotors: number of rotors; surplus motor outputs are left out.
+            decode: serialized bytes to a message of the type; see `deserializer`.
+        """
+        kind = TYPES[entry.type]
+        self._kind, self._columns = kind, SignalColumns(kind)
+        self._ranks = dict(entry.channels)
+        self._chooser, self._rotors = chooser, rotors
+        self.failed = self.unstamped = 0
+        self._failed_at = self._unstamped_at = -math.inf
+        self.pace = Pace()
+        self._deniable, self._denied = _DENIABLE.get(entry.type, {}), list[str]()
+
+        self._layout: BlockReader | None = None
+        if kind.stamp is None:
+            self._layout = BlockReader(decode, kind.blocks, kind.extra)
+            self._read = self._layout.read
+        else:
+            stamp = kind.stamp
+
+            def read(data: bytes) -> Read:
+                message = decode(data)
+                return Read(*stamp(message), kind.blocks(message), kind.extra(message))
+
+            self._read = read
+
+    @property
+    def trouble(self) -> str:
+        """What is wrong with messages of this topic, or empty."""
+        lately = self.pace.looked - MEMORY
+        if self._unstamped_at >= lately:
+            return f"{self.unstamped} messages have no time (header.stamp is zero) and are left out: stamp them"
+        if self._failed_at >= lately:
+            return f"{self.failed} messages could not be read"
+        for name in self._denied:
+            channel = SIGNALS[name][0]
+            if channel in self._ranks and not self._chooser.has(channel):
+                field = self._deniable[name]
+                return f"says that it has no {field} ({field}_covariance[0] is -1; 0 if unknown); nothing else tells it"
+        return self.pace.trouble
+
+    def take(self, messages: Sequence[bytes]) -> Iterator[Sample | Block]:
+        """Yields what may be used now of messages in order, at once where only numbers differ between them."""
+        block = self._block(messages) if len(messages) >= FEWEST else None
+        if block is None:
+            for data in messages:
+                yield from self.samples(data)
+        elif block.columns:
+            yield block
+
+    def _block(self, messages: Sequence[bytes]) -> Block | None:
+        """The messages as one block, the numbers of `samples` to the bit; None where each must be looked at."""
+        read = self._layout.read_many(messages) if self._layout is not None else None
+        told = self._columns.pick(read.blocks, read.extra) if read is not None else None
+        if read is None or told is None:
+            return None
+        ns = read.seconds * 10**9 + read.nanoseconds
+        if not (ns > 0).all():
+            return None
+        t = many_seconds(ns)
+        self.pace.stamped(t)
+        self._deny(name for name, _ in told)
+        columns = []
+        for name, values in told:
+            channel, convert = SIGNALS[name]
+            rank = self._ranks.get(channel)
+            if rank is None:
+                continue
+            used = self._chooser.settled(channel, rank + _BEHIND.get(name, 0), float(t.max()))
+            if used is None:
+                return None
+            if used:
+                width = self._rotors if channel in ("motor_command", "rotor_speed") else None
+                columns.append((channel, convert(values)[:, :width]))
+        for channel, _ in columns:
+            self._chooser.used(channel, float(t[-1]))
+        return Block(t, tuple(columns))
+
+    def samples(self, data: bytes) -> Iterator[Sample]:
+        """Yields the samples of one message that may be used now."""
+        try:
+            message = self._read(data)
+            signals = self._kind.signals(message.blocks, message.extra)
+        except Exception:  # noqa: BLE001 - a decoder of untrusted bytes raises anything; it is counted and reported
+            self.failed, self._failed_at = self.failed + 1, self.pace.looked
+            return
+        ns = message.seconds * 10**9 + message.nanoseconds
+        if ns <= 0:
+            self.unstamped, self._unstamped_at = self.unstamped + 1, self.pace.looked
+            return
+        t = seconds(ns)
+        self.pace.stamped(np.array([t]))
+        self._deny(name for name, _ in signals)
+        for name, values in signals:
+            channel, convert = SIGNALS[name]
+            rank = self._ranks.get(channel)
+            if rank is None:
+                continue
+            plain = tuple(convert(np.array([values]))[0].tolist())
+            if channel in ("motor_command", "rotor_speed"):
+                plain = plain[: self._rotors]
+            yield from self._chooser.take(Sample(t, channel, plain), rank + _BEHIND.get(name, 0))
+
+    def _deny(self, told: Iterable[str]) -> None:
+        """Notes which signals the newest messages say to have none of."""
+        self._denied = sorted(self._deniable.keys() - set(told)) if self._deniable else []
+
+
+_DENIABLE = {
+    "sensor_msgs/Imu": {
+        "body_rate": "angular_velocity", "body_force": "linear_acceleration", "attitude": "orientation",
+    }
+}  # fmt: skip
+"""Signals that a message may say to have none of, by a covariance of -1 (REP-145), and its field."""
+
+
+def best_ranks(inputs: tuple[Input, ...]) -> dict[str, int]:
+    """The best rank that each channel can have."""
+    out: dict[str, int] = {}
+    for entry in inputs:
+        for channel, rank in entry.channels:
+            out[channel] = min(rank, out.get(channel, rank))
+    return out
+
+
+def to_message(name: str, fields: Mapping[str, Any]) -> Any:
+    """A message of type `name` with these fields; absent fields keep their defaults."""
+    return _filled(message_class(name)(), fields)
+
+
+def _filled(message: Any, fields: Mapping[str, Any]) -> Any:
+    kinds: dict[str, str] = message.get_fields_and_field_types()
+    for name, value in fields.items():
+        if isinstance(value, Mapping):
+            _filled(getattr(message, name), value)
+        elif isinstance(value, list) and value and isinstance(value[0], Mapping):
+            cls = message_class(kinds[name].removeprefix("sequence<").rstrip(">"))
+            setattr(message, name, [_filled(cls(), item) for item in value])
+        else:
+            setattr(message, name, value)
+    return message
+
+
+# --- Messages are taken from the middleware many at a time, topic by topic, whenever the service looks for them
+#
+# Nobody is woken for a message: each carries its own time, and the rows of the grid wait half a second for the slowest
+# channel anyway.  Many of a kind are read for little more than one.
+
+
+Record = Callable[[str, str, bytes], None]
+
+SLICE = 0.2
+"""When longer than this [s] nobody looked, the messages of that time are taken in by slices of this length, so that no
+topic runs far ahead of the others, which would then come too late."""
+DEPTH = 4000
+"""Messages of a topic that are kept for the next look, and the most that one look takes."""
+
+
+class _Topic(NamedTuple):
+    entry: Input
+    decoder: Decoder
+    take: Callable[[], bytes | None]
+
+
+class Waiting(NamedTuple):
+    """Messages that were taken and not read yet: of each topic, and in how many slices of time they came."""
+
+    slices: int
+    messages: list[list[bytes]]
+
+
+class Intake:
+    """The messages of all topics of one vehicle.
+
+    Attributes:
+        decoders: by topic name as resolved.
+    """
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        """Takes a clock that never steps [s]."""
+        self.decoders: dict[str, Decoder] = {}
+        self._topics: list[_Topic] = []
+        self._clock, self._looked = clock, clock()
+
+    def open(self, entry: Input, topic: str, decoder: Decoder, take: Callable[[], bytes | None]) -> None:
+        """Adds a topic.
+
+        Args:
+            entry: topic, type, channels with ranks.
+            topic: its name as resolved.
+            decoder: of its messages.
+            take: gives the next serialized message that waits; None when there is none.
+        """
+        self.decoders[topic] = decoder
+        self._topics.append(_Topic(entry, decoder, take))
+        # The gyro sets the pace of the grid: what came with it has been taken in before it.
+        self._topics.sort(key=lambda item: any(channel == "gyro" for channel, _ in item.entry.channels))
+
+    def take(self) -> Waiting:
+        """Takes all messages that wait; those that are not read are forgotten."""
+        before, self._looked = self._looked, self._clock()
+        messages = [list(islice(iter(topic.take, None), DEPTH)) for topic in self._topics]
+        for topic, taken in zip(self._topics, messages, strict=True):
+            topic.decoder.pace.look(self._looked, before, len(taken))
+        return Waiting(max(1, math.ceil((self._looked - before) / SLICE)), messages)
+
+    def read(self, waiting: Waiting, record: Record | None = None) -> Iterator[list[Sample | Block]]:
+        """Reads what was taken, one topic after the other.
+
+        Args:
+            waiting: what `take` gave.
+            record: writes a message down (topic, type, bytes), in the order in which they are read.
+        """
+        for k in range(waiting.slices):
+            for (entry, decoder, _), messages in zip(self._topics, waiting.messages, strict=True):
+                piece = messages[k * len(messages) // waiting.slices : (k + 1) * len(messages) // waiting.slices]
+                if record is not None:
+                    for data in piece:
+                        record(entry.topic, entry.type.replace("/", "/msg/"), data)
+                if piece:
+                    yield list(decoder.take(piece))
+
+    def troubles(self) -> dict[str, str]:
+        """What is wrong with the messages of topics, by topic name as resolved."""
+        return {topic: why for topic, decoder in self.decoders.items() if (why := decoder.trouble)}
+
+    def clear(self) -> None:
+        """Forgets the topics."""
+        self._topics.clear()
+        self.decoders.clear()

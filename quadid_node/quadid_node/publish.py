@@ -1,0 +1,299 @@
+"""Publication over ROS: publishers, ownership of topics, and other nodes of the graph."""
+
+from __future__ import annotations
+
+import math
+import random
+import time
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+from rclpy.duration import Duration, Infinite
+from rclpy.lifecycle import LifecycleNode
+from rclpy.qos import (
+    DurabilityPolicy,
+    LivelinessPolicy,
+    QoSCompatibility,
+    QoSProfile,
+    ReliabilityPolicy,
+    qos_check_compatible,
+)
+
+from quadid.sanitise import plain
+from quadid_node.inputs import message_class, to_message
+from quadid_node.messages import TOPICS, Message
+from quadid_node.polling import NO_PUBLISHER_EVENTS
+
+# --- The right to publish the parameter sets of one vehicle: who comes second observes until the first is gone
+
+
+FOUND_WITHIN = 4.0
+"""Others are found by then [s]: Fast DDS announces a participant every 3 s, and half of the starts measured found a
+service that ran already only by its next announcement (up to 2.9 s)."""
+YOUNG = 10.0
+"""Two that claimed at once, within this time [s], both let go, and try again after pauses of different length."""
+PAUSES = (0.5, 4.0)
+"""Least and most of such a pause [s]."""
+OBSERVES = "another service publishes parameter sets here: this one observes until that one is gone"
+BESIDE = "another service publishes parameter sets too: one of the two stops in a moment"
+STRANGER = "someone else publishes parameter sets on our topic: check sequence and log_hash"
+
+
+class Claim:
+    """One topic that one service may publish on.
+
+    Attributes:
+        publisher: ours; None while another one is there.
+        problem: what is wrong, or empty.
+    """
+
+    def __init__(
+        self, count: Callable[[], int], kin: Callable[[], int], create: Callable[[], Any],
+        destroy: Callable[[Any], Any], clock: Callable[[], float] = time.monotonic,
+    ) -> None:  # fmt: skip
+        """Claims nothing yet.
+
+        Args:
+            count: publishers on the topic, ours included.
+            kin: those of them that are services like this one, ours included.
+            create: makes our publisher; destroy: takes it away.
+            clock: seconds, monotonic.
+        """
+        self._count, self._kin, self._create, self._destroy, self._clock = count, kin, create, destroy, clock
+        self._not_before, self._since = clock() + FOUND_WITHIN, 0.0
+        self._leaves = math.inf
+        self.publisher: Any = None
+        self.problem = ""
+
+    def step(self, wanted: bool = True) -> bool:
+        """Looks who is there; returns True when the topic has just become ours.
+
+        Args:
+            wanted: False while nothing is to be published yet: only looks.
+        """
+        now = self._clock()
+        others = self._count() - (self.publisher is not None)
+        if self.publisher is None:
+            if others > 0:
+                self._wait(now)
+            elif not wanted:
+                self.problem = ""
+            elif now >= self._not_before:
+                self.publisher, self._since, self.problem = self._create(), now, ""
+                return True
+        elif others > 0:
+            self._beside(now)
+        else:
+            self.problem, self._leaves = "", math.inf
+        return False
+
+    def _beside(self, now: float) -> None:
+        """Gives way at once while young; later only to a service, each after a pause of its own: one of them stays."""
+        if now - self._since >= YOUNG and self._kin() < 2:
+            self.problem, self._leaves = STRANGER, math.inf
+        elif now - self._since >= YOUNG and now < self._leaves:
+            self.problem = BESIDE
+            if math.isinf(self._leaves):
+                self._leaves = now + random.uniform(*PAUSES)
+        else:
+            self.let_go()
+            self._wait(now)
+
+    def let_go(self) -> None:
+        """Takes our publisher away."""
+        if self.publisher is not None:
+            self._destroy(self.publisher)
+            self.publisher, self._leaves = None, math.inf
+
+    def _wait(self, now: float) -> None:
+        self._not_before = now + random.uniform(*PAUSES)
+        self.problem = OBSERVES
+
+
+# --- The node's publishers: status and diagnostics always; results; parameter sets while the topic is ours
+
+
+# Said in full, so that they can be compared with what subscribers ask for.
+_ALWAYS = {"deadline": Infinite, "liveliness": LivelinessPolicy.AUTOMATIC, "liveliness_lease_duration": Infinite}
+USUAL_QOS = QoSProfile(
+    depth=10, durability=DurabilityPolicy.VOLATILE, reliability=ReliabilityPolicy.RELIABLE, **_ALWAYS
+)  # fmt: skip
+LATCHED_QOS = QoSProfile(
+    depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL, reliability=ReliabilityPolicy.RELIABLE, **_ALWAYS
+)  # fmt: skip
+LEASE = 5.0
+"""A service that asserts its liveliness on the parameter topic for longer than this [s] no more is dead or hangs."""
+PARAMETERS_QOS = QoSProfile(
+    depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL, reliability=ReliabilityPolicy.RELIABLE, deadline=Infinite,
+    liveliness=LivelinessPolicy.MANUAL_BY_TOPIC, liveliness_lease_duration=Duration(seconds=LEASE),
+)  # fmt: skip
+ALWAYS = ("status", "diagnostics")
+"""Topics that speak in every state of the life cycle."""
+LATCHED = ("diagnosis", "vehicle_health")
+"""Topics whose last message is for late joiners too, as is that of the parameters."""
+
+
+class Speaker:
+    """Publishes for one vehicle.
+
+    Attributes:
+        ours: full name of the topic of parameter sets.
+    """
+
+    def __init__(self, node: LifecycleNode) -> None:
+        """Publishes status and diagnostics of `node`."""
+        self._node = node
+        self.ours = node.resolve_topic_name(TOPICS["parameters"][0])
+        self._publishers = {topic: self._create(topic, USUAL_QOS, node.create_publisher) for topic in ALWAYS}
+        self._claim: Claim | None = None
+
+    def open(self, observer: bool) -> None:
+        """Offers the results too; an observer none of them."""
+        managed = self._node.create_lifecycle_publisher
+        for topic in TOPICS.keys() - {"parameters", *ALWAYS}:
+            self._publishers[topic] = self._create(topic, LATCHED_QOS if topic in LATCHED else USUAL_QOS, managed)
+        if not observer:
+            self._claim = Claim(
+                lambda: self._node.count_publishers(self.ours), self._kin, self._claimed,
+                self._node.destroy_lifecycle_publisher,
+            )  # fmt: skip
+
+    @property
+    def silent(self) -> bool:
+        """Whether results stay unsaid: an observer, or another service speaks for this vehicle."""
+        return self._claim is None or self._claim.publisher is None
+
+    @property
+    def problem(self) -> str:
+        """Who else publishes parameter sets, or empty."""
+        return self._claim.problem if self._claim is not None else ""
+
+    def step(self, wanted: bool = True) -> bool:
+        """Looks who else publishes parameter sets; True when the topic has just become ours, if it is `wanted`."""
+        if self._claim is None:
+            return False
+        if self._claim.publisher is not None:
+            self._claim.publisher.assert_liveliness()
+        return self._claim.step(wanted)
+
+    def publish(self, topic: str, fields: Message) -> None:
+        """Publishes a message given as a dictionary; parameter sets only while the topic is ours."""
+        publisher = self._publishers.get(topic)
+        if topic == "parameters" and self._claim is not None:
+            publisher = self._claim.publisher
+        if publisher is not None:
+            publisher.publish(to_message(TOPICS[topic][1], fields))
+
+    def deaf(self) -> dict[str, bool]:
+        """For each topic of ours: whether somebody subscribes with a QoS that is not offered, and hears nothing."""
+        published = dict(self._publishers)
+        if self._claim is not None and self._claim.publisher is not None:
+            published["parameters"] = self._claim.publisher
+        return {p.topic_name: self._unheard(p) for p in published.values()}
+
+    def _unheard(self, publisher: Any) -> bool:
+        asked = [info.qos_profile for info in self._node.get_subscriptions_info_by_topic(publisher.topic_name)]
+        offered = publisher.qos_profile
+        return any(qos_check_compatible(offered, wish)[0] == QoSCompatibility.ERROR for wish in asked)
+
+    def close(self) -> None:
+        """Takes the publishers of results away."""
+        if self._claim is not None:
+            self._claim.let_go()
+            self._claim = None
+        for topic in self._publishers.keys() - {*ALWAYS}:
+            self._node.destroy_lifecycle_publisher(self._publishers.pop(topic))
+
+    def _create(self, topic: str, qos: Any, create: Callable[..., Any]) -> Any:
+        name, kind = TOPICS[topic]
+        return create(message_class(kind), name, qos, event_callbacks=NO_PUBLISHER_EVENTS)
+
+    def _kin(self) -> int:
+        """Publishers of parameter sets that belong to a node of our name: services of this vehicle, this one too."""
+        found = self._node.get_publishers_info_by_topic(self.ours)
+        return sum(info.node_name == self._node.get_name() for info in found)
+
+    def _claimed(self) -> Any:
+        publisher = self._create("parameters", PARAMETERS_QOS, self._node.create_lifecycle_publisher)
+        publisher.on_activate(None)  # made after the node's own activation
+        return publisher
+
+
+# --- Who else is on our topics: a second publisher of an input, others whose QoS or type does not match
+
+
+ALONE = 1.0
+"""An input with several publishers is used when only one of them was heard for this long [s].  One that was killed
+stays listed until its lease ends (20 s with Fast DDS), while its successor already speaks."""
+
+
+class Offer(NamedTuple):
+    """One publisher of a topic: the type of its messages, and whether its QoS lets us hear them."""
+
+    kind: str
+    heard: bool
+
+
+class Neighbours:
+    """What is wrong on the topics.
+
+    Attributes:
+        notes: by topic.
+        paused: two publishers of an input are heard: taking samples would mix two vehicles.
+    """
+
+    def __init__(
+        self, inputs: Mapping[str, str], offered: Callable[[str], Sequence[Offer]],
+        unbroken: Callable[[str], float], tell: Callable[[str], None],
+    ) -> None:  # fmt: skip
+        """Watches the topics `inputs`.
+
+        Args:
+            inputs: type of messages by full name.
+            offered: a topic's publishers.
+            unbroken: for how long [s] a topic's messages have been one publisher's.
+            tell: takes a line for people.
+        """
+        self._inputs, self._offered, self._unbroken, self._tell = dict(inputs), offered, unbroken, tell
+        self.notes: dict[str, str] = {}
+        self.paused = False
+
+    def note(self, topic: str, text: str) -> None:
+        """Notes what is wrong on a topic; an empty text: nothing is."""
+        if not text:
+            self.notes.pop(topic, None)
+        elif self.notes.get(topic) != text:
+            self._tell(f"{topic}: {text}")
+            self.notes[topic] = text
+
+    def count(self, topic: str, publishers: int) -> None:
+        """So many publishers send to an input: two are noted, and pause it at once while both are heard."""
+        if publishers <= 1:
+            return
+        if self._unbroken(topic) < ALONE:
+            self.paused = True
+            self.note(topic, f"{publishers} publishers on one topic: paused until only one publishes")
+        else:
+            self.note(topic, f"{publishers} publishers on one topic, only one publishes")
+
+    def look(self, deaf: Mapping[str, bool]) -> None:
+        """Looks at every topic, once a second.
+
+        Args:
+            deaf: for each topic of ours, whether somebody subscribes with a QoS that is not offered.
+        """
+        self.paused = False
+        for topic, kind in self._inputs.items():
+            offers = self._offered(topic)
+            ours = [offer for offer in offers if offer.kind == kind]
+            strange = sorted({offer.kind for offer in offers} - {kind})
+            if len(ours) > 1:
+                self.count(topic, len(ours))
+            elif strange:
+                told = f"a publisher of another type ({plain(strange[0], 80)} for {kind}), which is not listened to"
+                self.note(topic, told)
+            else:
+                self.note(topic, "" if all(offer.heard for offer in ours) else "its publisher's QoS does not match")
+        for topic, found in deaf.items():
+            why = "asks for a QoS that is not offered here, and receives nothing" if found else ""
+            self.note(f"{topic}, its subscriber", why)

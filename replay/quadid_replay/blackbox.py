@@ -1,0 +1,513 @@
+"""Betaflight blackbox logs (.bbl, .bfl)."""
+
+from __future__ import annotations
+
+import struct
+from array import array
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from quadid.data.window import Recording
+from quadid.errors import LogError
+from quadid.sanitise import plain
+from quadid.types import FloatArray
+from quadid_replay.columns import LogClock, RawChannel, assemble
+from quadid_replay.frames import GRAVITY, flip_body
+from quadid_replay.motors import RPM
+
+# --- Frames of a Betaflight blackbox log: variable-length numbers, predicted from the frames before
+#
+# After the text header come main frames (I: complete, P: differences), slow, GPS and event frames.  A frame that cannot
+# be decoded, after which no frame begins, or whose time is impossible, is skipped to the next I frame, for what follows
+# builds on it.  There an I frame counts once the main frame after it decodes, too: its mark alone stands in any data.
+# Format: docs of Cleanflight, "Blackbox logging internals".  Own, for orangebox is GPL, does not know encoding 10 (the
+# accelerometer's) and neither wraps in 32 bits nor tests where it resumes.
+
+
+MAIN, MARKS = b"IP", b"IPSGHE"
+_LOG_END = b"End of log\x00"
+_TURN = 1 << 32
+"""All numbers have 32 bits, and predictions wrap in them as in the firmware."""
+LONGEST_STEP = 10_000_000
+"""Time [us] between main frames without an event that says why: more is damage."""
+_PACE = 2.0
+"""Time for each iteration of the loop may differ by this factor from what it was."""
+_EVENT_NUMBERS = {0: 1, 14: 2, 15: 1, 30: 2, 40: 1}
+"""Events by the unsigned numbers that follow them."""
+_RESUMED, _LOG_ENDS = 14, 255
+"""The events that logging goes on, with iteration and time, and that it ends."""
+_NEXT_FRAME = 1024
+"""Within so many bytes of an I frame the next main frame begins."""
+
+
+class BadFrameError(Exception):
+    """Bytes that are no frame."""
+
+
+@dataclass
+class Reader:
+    """A place in the bytes of a log."""
+
+    data: bytes
+    at: int
+
+    def byte(self) -> int:
+        """The next byte."""
+        if self.at >= len(self.data):
+            raise BadFrameError("end")
+        self.at += 1
+        return self.data[self.at - 1]
+
+    def unsigned(self) -> int:
+        """A number in groups of seven bits, lowest first."""
+        value = shift = 0
+        while True:
+            b = self.byte()
+            value |= (b & 0x7F) << shift
+            if b < 0x80:
+                return value
+            shift += 7
+            if shift > 28:
+                raise BadFrameError("number too long")
+
+    def signed(self) -> int:
+        """A zigzag number."""
+        value = self.unsigned()
+        return (value >> 1) ^ -(value & 1)
+
+    def little(self, width: int) -> int:
+        """A signed little-endian number of `width` bytes."""
+        self.at += width
+        if self.at > len(self.data):
+            raise BadFrameError("end")
+        return int.from_bytes(self.data[self.at - width : self.at], "little", signed=True)
+
+
+def extended(value: int, bits: int) -> int:
+    """The lowest `bits` of a value as a signed number."""
+    value &= (1 << bits) - 1
+    return value - (1 << bits) if value >> (bits - 1) else value
+
+
+def _tag2_3s32(r: Reader, count: int) -> list[int]:
+    lead = r.byte()
+    kind = lead >> 6
+    if kind == 0:
+        return [extended(lead >> 4, 2), extended(lead >> 2, 2), extended(lead, 2)]
+    if kind == 1:
+        second = r.byte()
+        return [extended(lead, 4), extended(second >> 4, 4), extended(second, 4)]
+    if kind == 2:
+        return [extended(lead, 6), extended(r.byte(), 6), extended(r.byte(), 6)]
+    return [r.little(1 + (lead >> 2 * i & 3)) for i in range(3)]
+
+
+def _tag2_3svariable(r: Reader, count: int) -> list[int]:
+    lead = r.byte()
+    kind = lead >> 6
+    if kind == 0:
+        return [extended(lead >> 4, 2), extended(lead >> 2, 2), extended(lead, 2)]
+    if kind == 1:
+        second = r.byte()
+        return [extended(lead >> 1, 5), extended((lead & 1) << 4 | second >> 4, 5), extended(second, 4)]
+    if kind == 2:
+        second, third = r.byte(), r.byte()
+        return [
+            extended((lead & 0x3F) << 2 | second >> 6, 8), extended((second & 0x3F) << 1 | third >> 7, 7),
+            extended(third, 7),
+        ]  # fmt: skip
+    return [r.little(1 + (lead >> 2 * i & 3)) for i in range(3)]
+
+
+def _tag8_4s16(r: Reader, count: int) -> list[int]:
+    """Four numbers of 0, 4, 8 or 16 bits, packed nibble by nibble, highest first."""
+    selector, out = r.byte(), []
+    nibbles: list[int] = []
+
+    def take(n: int) -> int:
+        value = 0
+        for _ in range(n):
+            if not nibbles:
+                b = r.byte()
+                nibbles.extend((b >> 4, b & 0xF))
+            value = value << 4 | nibbles.pop(0)
+        return value
+
+    for i in range(4):
+        bits = (0, 4, 8, 16)[selector >> 2 * i & 3]
+        out.append(extended(take(bits // 4), bits) if bits else 0)
+    return out
+
+
+def _tag8_8svb(r: Reader, count: int) -> list[int]:
+    if count == 1:
+        return [r.signed()]
+    present = r.byte()
+    return [r.signed() if present >> i & 1 else 0 for i in range(count)]
+
+
+_GROUPS: Mapping[int, tuple[int, Callable[[Reader, int], list[int]]]] = {
+    6: (8, _tag8_8svb), 7: (3, _tag2_3s32), 8: (4, _tag8_4s16), 10: (3, _tag2_3svariable),
+}  # fmt: skip
+"""Encodings of several fields at once: most fields in a group, and decoder."""
+_SINGLE: Mapping[int, Callable[[Reader], int]] = {
+    0: Reader.signed,
+    1: Reader.unsigned,
+    3: lambda r: -extended(r.unsigned(), 14),
+    9: lambda r: 0,
+}
+
+
+@dataclass(frozen=True)
+class FrameDefinition:
+    """Fields of one kind of frame: names, numbers of their predictors and encodings, whether they have a sign."""
+
+    names: tuple[str, ...]
+    predictors: tuple[int, ...]
+    encodings: tuple[int, ...]
+    signed: tuple[bool, ...] = ()
+
+    def raw(self, r: Reader) -> list[int]:
+        """Decodes one frame, before prediction."""
+        out: list[int] = []
+        while len(out) < len(self.encodings):
+            encoding = self.encodings[len(out)]
+            if encoding in _SINGLE:
+                out.append(_SINGLE[encoding](r))
+                continue
+            most, decode = _GROUPS[encoding]
+            same = 1
+            while same < most and len(out) + same < len(self.encodings) and self.encodings[len(out) + same] == encoding:
+                same += 1
+            out += decode(r, same)[:same]
+        return out
+
+
+def known_encodings(definition: FrameDefinition) -> bool:
+    """Tells whether all encodings and predictors are known."""
+    known = set(_SINGLE) | set(_GROUPS)
+    return set(definition.encodings) <= known and set(definition.predictors) <= {*range(12)}
+
+
+@dataclass
+class Decoded:
+    """Main frames as rows of numbers, and what could not be read."""
+
+    width: int
+    rows: array[int] = field(default_factory=lambda: array("q"))
+    skipped: int = 0
+    ended: bool = False
+
+
+def decode_frames(
+    data: bytes, start: int, stop: int, definitions: Mapping[str, FrameDefinition], constants: Mapping[int, int]
+) -> Decoded:
+    """Decodes the frames of one log.
+
+    Args:
+        data: the file.
+        start: where the frames begin.
+        stop: where the next log's header begins, or the end.
+        definitions: by kind; I and P at least.
+        constants: values of the predictors that the header holds: 4 minthrottle, 8 (1500), 9 vbatref, 11 minmotor.
+    """
+    names = definitions["I"].names
+    out, clock = Decoded(len(names)), _Clock(names.index("time"), names.index("loopIteration"))
+    r = Reader(data[:stop], start)
+    previous: list[int] | None = None
+    before: list[int] = []
+    resumed: int | None = None  # place of an I frame that the next main frame has to confirm
+    while r.at < stop:
+        place = r.at
+        mark = chr(r.byte())
+        try:
+            if resumed is not None and place - resumed > _NEXT_FRAME:
+                raise BadFrameError("no main frame follows")
+            if mark == "E":
+                kind, numbers = _event(r)
+                out.ended = kind == _LOG_ENDS
+                if out.ended:
+                    break
+                if kind == _RESUMED:
+                    clock.last, previous, resumed = (numbers[1], numbers[0]), None, None
+                continue
+            if mark not in definitions or (mark == "P" and previous is None):
+                raise BadFrameError(mark)
+            frame = definitions[mark]
+            raw = frame.raw(r)
+            if mark in "IP":
+                values = _predicted(raw, frame, definitions["I"].signed, previous, before, constants)
+                if r.at < stop and data[r.at] not in MARKS:
+                    raise BadFrameError("no frame follows")
+                if not clock.follows(values, previous, whole=mark == "I"):
+                    raise BadFrameError("time")
+                if previous is None:
+                    resumed = place
+                else:
+                    if resumed is not None:
+                        clock.take(previous)
+                        out.rows.extend(previous)
+                        resumed = None
+                    if mark == "I":
+                        clock.take(values)
+                    out.rows.extend(values)
+                before, previous = (values, values) if mark == "I" else (previous or values, values)
+        except BadFrameError:
+            previous = None
+            place, resumed = place if resumed is None else resumed, None
+            following = data.find(b"I", place + 1, stop)
+            following = stop if following < 0 else following
+            out.skipped += following - place
+            r.at = following
+    if resumed is not None and previous is not None and not len(out.rows):
+        out.rows.extend(previous)
+    return out
+
+
+@dataclass
+class _Clock:
+    """Tells which main frames may follow: columns of time [us] and iteration, and both of the last I frame."""
+
+    time: int
+    iteration: int
+    last: tuple[int, int] | None = None
+    pace: float | None = None
+
+    def follows(self, values: Sequence[int], previous: Sequence[int] | None, whole: bool) -> bool:
+        """Whether a frame, complete or not, may come after `previous`; None: after damage of any length."""
+        if previous is not None and not 0 <= (values[self.time] - previous[self.time]) % _TURN <= LONGEST_STEP:
+            return False
+        if self.last is None or not whole:
+            return True
+        elapsed, turns = self._since(values)
+        if self.pace is None:
+            return elapsed <= LONGEST_STEP
+        return turns * self.pace / _PACE <= elapsed <= turns * self.pace * _PACE
+
+    def take(self, values: Sequence[int]) -> None:
+        """Notes an I frame that is used."""
+        if self.last is not None and (since := self._since(values))[1]:
+            self.pace = since[0] / since[1]
+        self.last = values[self.time], values[self.iteration]
+
+    def _since(self, values: Sequence[int]) -> tuple[int, int]:
+        assert self.last is not None
+        return (values[self.time] - self.last[0]) % _TURN, (values[self.iteration] - self.last[1]) % _TURN
+
+
+def _event(r: Reader) -> tuple[int, list[int]]:
+    """Reads an event: its kind and its unsigned numbers."""
+    kind = r.byte()
+    if kind == _LOG_ENDS:
+        if r.data[r.at : r.at + len(_LOG_END)] != _LOG_END:
+            raise BadFrameError("end of log")
+    elif kind == 13:
+        r.little(4) if r.byte() & 0x80 else r.signed()
+    elif kind not in _EVENT_NUMBERS:
+        raise BadFrameError("event")
+    return kind, [r.unsigned() for _ in range(_EVENT_NUMBERS.get(kind, 0))]
+
+
+def _predicted(
+    raw: Sequence[int], frame: FrameDefinition, signed: Sequence[bool], previous: Sequence[int] | None,
+    before: Sequence[int], constants: Mapping[int, int],
+) -> list[int]:  # fmt: skip
+    """Adds, in 32 bits, to each number what its predictor expects of the header and the two main frames before."""
+    out: list[int] = []
+    names = frame.names
+    for i, (value, predictor) in enumerate(zip(raw, frame.predictors, strict=True)):
+        if predictor in constants:
+            value += constants[predictor]
+        elif predictor == 5:
+            value += out[names.index("motor[0]")] if "motor[0]" in names[:i] else 0
+        elif previous is not None and predictor:
+            if predictor == 1:
+                value += previous[i]
+            elif predictor == 2:
+                value += 2 * previous[i] - before[i]
+            elif predictor == 3:
+                value += int((previous[i] + before[i]) / 2)
+            elif predictor == 6:
+                value += previous[i] + 1
+        out.append(extended(value, 32) if signed[i] else value % _TURN)
+    return out
+
+
+def number(text: str) -> float:
+    """A header's number; one in hexadecimal is the bits of a float.  Raises ValueError."""
+    if text.startswith("0x"):
+        return float(struct.unpack("<f", struct.pack("<I", int(text, 16) & 0xFFFFFFFF))[0])
+    return float(text)
+
+
+# --- Betaflight blackbox logs (.bbl, .bfl): headers, gyro, accelerometer, motors, eRPM and battery
+#
+# Betaflight's body axes are x forward, y left, z up, as ROS'; motors count rear right, front right, rear left, front
+# left.  Attitude is not logged.  Of several logs in a file the longest is read.
+
+
+MAGIC = b"H Product:Blackbox"
+_DEGREE = np.pi / 180.0
+_MOST_FIELDS = 256
+_KEPT = (
+    "gyro_scale", "acc_1G", "minthrottle", "vbatref", "motorOutput", "motor_poles", "maxthrottle",
+    "blackbox_high_resolution", "yaw_motors_reversed",
+)  # fmt: skip
+
+
+class _Header(NamedTuple):
+    """Definitions of frames, values of the header by name, and where the frames begin."""
+
+    definitions: dict[str, FrameDefinition]
+    values: dict[str, str]
+    end: int
+
+
+def read_blackbox(path: Path) -> Recording:
+    """Reads a blackbox log, whole or damaged.
+
+    Raises:
+        LogError: a header that is damaged or of another dialect, or no frame that can be read.
+    """
+    data = path.read_bytes()
+    starts = _starts(data)
+    best: tuple[_Header, Decoded] | None = None
+    for start, stop in zip(starts, [*starts[1:], len(data)], strict=True):
+        header = _header(data, start, stop, path.name)
+        decoded = decode_frames(data, header.end, stop, header.definitions, _constants(header))
+        if best is None or len(decoded.rows) * best[1].width > len(best[1].rows) * decoded.width:
+            best = header, decoded
+    assert best is not None
+    notes = []
+    if len(starts) > 1:
+        notes.append(f"{len(starts)} logs in this file: the longest is read")
+    if best[1].skipped:
+        notes.append(f"{best[1].skipped} of {len(data)} bytes are damaged and were skipped")
+    if not best[1].ended:
+        notes.append("no end-of-log mark: power was cut or the file is not whole; everything before is used")
+    clock = LogClock()
+    return assemble(path.name, "blackbox", _channels(*best, clock), clock, notes, _parameters(best[0]))
+
+
+def _starts(data: bytes) -> list[int]:
+    out, at = [], data.find(MAGIC)
+    while at >= 0:
+        out.append(at)
+        at = data.find(MAGIC, at + 1)
+    return out[:64]
+
+
+def _header(data: bytes, start: int, stop: int, origin: str) -> _Header:
+    values: dict[str, str] = {}
+    at = start
+    while data[at : at + 2] == b"H ":
+        end = data.find(b"\n", at, min(at + 8192, stop))
+        if end < 0:
+            break
+        name, _, value = data[at + 2 : end].decode("latin-1").partition(":")
+        values[name.strip()] = value.strip()
+        at = end + 1
+    definitions: dict[str, FrameDefinition] = {}
+    try:
+        for kind in "IPSGH":
+            names = values.get(f"Field {'I' if kind == 'P' else kind} name", "").split(",")
+            if f"Field {kind} encoding" in values and names != [""]:
+                parts = [
+                    tuple(int(v) for v in values[f"Field {kind} {w}"].split(",")) for w in ("predictor", "encoding")
+                ]
+                signs = values.get(f"Field {kind} signed", "").split(",")
+                if len(signs) != len(names):  # P frames have those of I frames
+                    signs = ["0" if name in ("loopIteration", "time") else "1" for name in names]
+                if len({len(names), *map(len, parts)}) == 1 and len(names) <= _MOST_FIELDS:
+                    definition = FrameDefinition(tuple(names), parts[0], parts[1], tuple(sign == "1" for sign in signs))
+                    if known_encodings(definition):
+                        definitions[kind] = definition
+    except (KeyError, ValueError) as error:
+        raise _bad_header(origin, str(error)) from error
+    main = definitions.get("I")
+    if main is None or "P" not in definitions or not {"time", "loopIteration"} <= {*main.names}:
+        raise _bad_header(origin, "no main frame that is described whole")
+    return _Header(definitions, values, at)
+
+
+def _bad_header(origin: str, why: str) -> LogError:
+    return LogError(
+        f"{origin}: its blackbox header is damaged or of another dialect ({plain(why, 60)})",
+        "a log of Betaflight, Cleanflight or INAV", "copy the log from the flight controller again",
+    )  # fmt: skip
+
+
+def _constants(header: _Header) -> dict[int, int]:
+    values = header.values
+    return {
+        4: int(_value(values, "minthrottle", 1150.0)),
+        8: 1500,
+        9: int(_value(values, "vbatref", 0.0)),
+        11: int(_value(values, "motorOutput", 0.0)),
+    }
+
+
+def _value(values: dict[str, str], name: str, otherwise: float) -> float:
+    """First number of a header entry."""
+    try:
+        found = number(values[name].split(",")[0])
+    except (KeyError, ValueError):
+        return otherwise
+    return found if np.isfinite(found) and abs(found) < 1e9 else otherwise
+
+
+def _parameters(header: _Header) -> dict[str, float]:
+    return {name: _value(header.values, name, float("nan")) for name in _KEPT if name in header.values}
+
+
+def _channels(header: _Header, decoded: Decoded, clock: LogClock) -> list[RawChannel]:
+    names = header.definitions["I"].names
+    table = np.array(decoded.rows, dtype=np.float64).reshape(-1, decoded.width)
+    t, _ = clock.times(np.unwrap(table[:, names.index("time")], period=2.0**32) * 1e-6)  # 71.6 minutes of 32 bits
+    out: list[RawChannel] = []
+
+    def columns(name: str, count: int) -> FloatArray | None:
+        wanted = [f"{name}[{i}]" for i in range(count)]
+        return table[:, [names.index(w) for w in wanted]] if all(w in names for w in wanted) else None
+
+    def add(channel: str, values: FloatArray | None, source: str) -> None:
+        if values is not None and len(values):
+            out.append(RawChannel(channel, t, values, source))
+
+    gyro, accel = columns("gyroADC", 3), columns("accSmooth", 3)
+    unfiltered = columns("gyroUnfilt", 3)
+    used = gyro if unfiltered is None else unfiltered
+    scale = _value(header.values, "gyro_scale", 1.0) * _DEGREE
+    if _value(header.values, "blackbox_high_resolution", 0.0) > 0.0:
+        scale *= 0.1
+    label = "gyroADC (filtered on board)" if unfiltered is None else "gyroUnfilt"
+    add("gyro", None if used is None else flip_body(used * scale), label)
+    one = _value(header.values, "acc_1G", 0.0)
+    add("accel", None if accel is None or one <= 0.0 else flip_body(accel * (GRAVITY / one)), "accSmooth")
+    motors = sum(1 for i in range(8) if f"motor[{i}]" in names)
+    if motors:
+        add("motor_command", _normalized(header, columns("motor", motors)), f"motor[0..{motors - 1}] (normalized)")
+        poles = _value(header.values, "motor_poles", 14.0)
+        turns = columns("eRPM", motors)
+        if turns is not None and poles >= 2.0:
+            add("rotor_speed", turns * (100.0 * 2.0 / poles * RPM), f"eRPM, {poles:g} poles")
+    if "vbatLatest" in names and len(table):
+        volts = table[:, [names.index("vbatLatest")]]
+        add("battery", volts * (0.01 if np.median(volts) > 300.0 else 0.1), "vbatLatest")
+    return out
+
+
+def _normalized(header: _Header, motors: FloatArray | None) -> FloatArray | None:
+    """Motor outputs over the range that the header names (`motorOutput:48,2047`), else that of pulse widths."""
+    pair = header.values.get("motorOutput", "").split(",")
+    try:
+        low, high = (number(v) for v in pair)
+    except ValueError:
+        low, high = _value(header.values, "minthrottle", 1000.0), _value(header.values, "maxthrottle", 2000.0)
+    if motors is None or not low < high:
+        return None
+    return (motors - low) / (high - low)

@@ -1,0 +1,480 @@
+"""ArduPilot DataFlash logs."""
+
+from __future__ import annotations
+
+import mmap
+import re
+import struct
+from array import array
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from pymavlink.DFReader import FORMAT_TO_STRUCT, DFFormat, null_term
+
+from quadid.data.window import Recording
+from quadid.types import BoolArray, FloatArray, IntArray
+from quadid_replay.columns import LogClock, RawChannel, assemble, fastest_first, spikes
+from quadid_replay.flight_modes import ARDUCOPTER, mode_changes
+from quadid_replay.frames import from_euler
+
+# isort: off
+from quadid_replay.motors import (
+    ESCS, Outputs, RPM, active_outputs, changed_within, esc_columns, frame_rotors, in_pulses, merge_instances,
+    motor_outputs, no_multirotor,
+)  # fmt: skip
+# isort: on
+
+# --- Finds the records of an ArduPilot DataFlash log and reads their columns
+#
+# The format descriptions are pymavlink's (`DFFormat`); finding and reading are ours, because pymavlink makes one
+# Python object a record, stops at the first unknown record and raises on a damaged description.  Here a damaged place
+# is skipped and counted.
+
+
+_HEAD = b"\xa3\x95"
+_FMT_TYPE, _FMT_LENGTH = 0x80, 89
+_PADDING = 528
+"""Block-based logs end with up to this many bytes of padding, which is not damage."""
+_ROWS = 65536
+
+
+@dataclass
+class DataflashIndex:
+    """Where the records of a log are.
+
+    Attributes:
+        data: the file's bytes, mapped.
+        formats: description by message name.
+        offsets: byte offsets of the records, by message name.
+        skipped: bytes that belong to no record (padding at the end not counted).
+        damaged: names of messages whose description is damaged.
+        redefined: names of messages that are described anew within the log; what follows the change is not used.
+        cut: whether the file ends inside a record.
+    """
+
+    data: mmap.mmap
+    formats: dict[str, DFFormat] = field(default_factory=dict)
+    offsets: dict[str, array[int]] = field(default_factory=dict)
+    skipped: int = 0
+    damaged: list[str] = field(default_factory=list)
+    redefined: list[str] = field(default_factory=list)
+    cut: bool = False
+
+    def count(self, name: str) -> int:
+        """Returns the number of records called `name`."""
+        return len(self.offsets.get(name, ()))
+
+    def has(self, name: str, *columns: str) -> bool:
+        """Tells whether there are records called `name` with all these columns."""
+        return self.count(name) > 0 and all(c in self.formats[name].columns for c in columns)
+
+    def rows(self, name: str) -> IntArray:
+        """Returns the byte offsets of the records, shape (n,): their order in the file."""
+        return np.array(self.offsets.get(name, ()), dtype=np.int64)
+
+    def column(self, name: str, column: str) -> FloatArray:
+        """Returns one numeric column, scaled as its format says, shape (n,)."""
+        description = self.formats[name]
+        place, kind = _place(description, description.columns.index(column))
+        scale = FORMAT_TO_STRUCT[description.format[description.columns.index(column)]][1]
+        code = FORMAT_TO_STRUCT[description.format[description.columns.index(column)]][0]
+        raw = self._bytes(name, place, struct.calcsize("<" + code))
+        with np.errstate(invalid="ignore"):  # damaged records hold signalling NaN
+            values = np.asarray(raw.view(kind)[:, 0], dtype=np.float64)
+        return values if scale is None else values * scale
+
+    def text(self, name: str, column: str) -> list[str]:
+        """Returns one text column."""
+        description = self.formats[name]
+        position = description.columns.index(column)
+        width = struct.calcsize("<" + FORMAT_TO_STRUCT[description.format[position]][0])
+        raw = self._bytes(name, _place(description, position)[0], width)
+        return [bytes(row).split(b"\x00")[0].decode("ascii", "replace") for row in raw]
+
+    def _bytes(self, name: str, place: int, width: int) -> NDArray[np.uint8]:
+        buffer = np.frombuffer(self.data, dtype=np.uint8)
+        starts = self.rows(name) + place
+        out = np.empty((len(starts), width), dtype=np.uint8)
+        for begin in range(0, len(starts), _ROWS):
+            part = starts[begin : begin + _ROWS]
+            out[begin : begin + _ROWS] = buffer[part[:, None] + np.arange(width)]
+        return out
+
+
+def _place(description: DFFormat, position: int) -> tuple[int, str]:
+    codes = [FORMAT_TO_STRUCT[c][0] for c in description.format]
+    offset = 3 + struct.calcsize("<" + "".join(codes[:position]))
+    code = codes[position]
+    return offset, "<f2" if code == "e" else f"<{code}" if len(code) == 1 else "u1"
+
+
+def index_dataflash(path: Path) -> DataflashIndex:
+    """Walks through a log once and notes where its records are; damaged stretches are skipped and counted."""
+    with path.open("rb") as file:
+        data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+    index = DataflashIndex(data)
+    names: dict[int, str] = {}
+    lengths = [0] * 256
+    lengths[_FMT_TYPE] = _FMT_LENGTH
+    offset, size = 0, len(data)
+    in_step = True  # the record before this one was whole
+    while offset + 3 <= size:
+        length = lengths[data[offset + 2]] if data[offset : offset + 2] == _HEAD else 0
+        end = offset + length
+        if (
+            length == 0
+            or (end > size and not in_step)
+            or not (in_step or end + 2 > size or data[end : end + 2] == _HEAD)
+        ):
+            in_step = False
+            following = data.find(_HEAD, offset + 1)
+            following = size if following < 0 else following
+            index.skipped += following - offset if size - following > 0 or following - offset > _PADDING else 0
+            offset = following
+            continue
+        if end > size:
+            index.cut = True
+            break
+        kind = data[offset + 2]
+        in_step = True
+        if kind == _FMT_TYPE:
+            _note_format(index, data[offset + 3 : end], names, lengths)
+        elif names[kind]:
+            index.offsets[names[kind]].append(offset)
+        offset = end
+    return index
+
+
+def _note_format(index: DataflashIndex, body: bytes, names: dict[int, str], lengths: list[int]) -> None:
+    kind, length, raw_name, raw_format, raw_columns = struct.unpack("<BB4s16s64s", body)
+    if kind == _FMT_TYPE:
+        return
+    if not set(raw_format.split(b"\x00")[0].decode("latin-1")) <= set(FORMAT_TO_STRUCT):
+        index.damaged.append(f"type {kind}")  # pymavlink would print this
+        return
+    try:
+        name = null_term(raw_name.decode("ascii"))
+        description = DFFormat(
+            kind, name, length, null_term(raw_format.decode("ascii")), null_term(raw_columns.decode("ascii"))
+        )
+        size = 3 + struct.calcsize("<" + "".join(FORMAT_TO_STRUCT[c][0] for c in description.format))
+        fits = size == length and len(description.format) == len(description.columns) and name.isalnum()
+    except Exception as error:  # noqa: BLE001 - pymavlink raises bare Exception and more on damaged text; it is reported
+        index.damaged.append(f"type {kind} ({type(error).__name__})")
+        return
+    if not fits:
+        index.damaged.append(f"type {kind}")
+        return
+    closed = names.get(kind) == ""
+    known = None if closed else index.formats.get(names.get(kind, name))
+    same = known is not None and _meaning(known) == _meaning(description)
+    if same and kind in names:
+        return
+    if closed or known is not None:  # rows of two meanings make no column: what follows is left out
+        index.redefined += [] if known is None else [known.name]
+        names[kind], lengths[kind] = "", length
+        return
+    names[kind], lengths[kind] = name, length
+    index.formats[name] = description
+    index.offsets.setdefault(name, array("Q"))
+
+
+def _meaning(description: DFFormat) -> tuple[str, str, list[str]]:
+    return description.name, description.format, list(description.columns)
+
+
+# --- ArduPilot DataFlash logs: which record holds which channel, and its units
+#
+# Body FRD and world NED are ArduPilot's own; ATT is in degrees, RCOU in microseconds.  Time is TimeUS or TimeMS,
+# since boot.
+
+
+_ATTITUDE = ("Roll", "Pitch", "Yaw")
+_GYRO, _ACCEL = ("GyrX", "GyrY", "GyrZ"), ("AccX", "AccY", "AccZ")
+_RATES = ("R", "P", "Y")
+_QUATERNIONS = ("XKQ", "XKQ1", "NKQ1")
+_QUATERNION = ("Q1", "Q2", "Q3", "Q4")
+_FIRMWARE = re.compile(r"(?:Ardu|APM:)(\w+) V(\d+)\.(\d+)")
+_OUTPUTS = ("RCOU", "RCO2", "RCO3")
+"""Outputs 1 to 14, and those behind."""
+_OUTPUT = re.compile(r"Ch?(\d{1,2})")
+_VELOCITY, _POSITION = ("VN", "VE", "VD"), ("PN", "PE", "PD")
+
+
+_STAMPED = (
+    "IMU", "GYR", "ACC", "ATT", "ANG", "RATE", "XKF1", "NKF1", "EKF1", "BAT", "CURR", *_OUTPUTS, "ESC", "CTUN",
+    "MODE",
+    *_QUATERNIONS,
+)  # fmt: skip
+
+
+class _Source(NamedTuple):
+    """Records of one kind: recording times (NaN where refused), which rows to use, and how many stamps were refused."""
+
+    name: str
+    t: FloatArray
+    rows: BoolArray
+    refused: int
+
+
+def read_dataflash(path: Path) -> Recording:
+    """Reads a DataFlash log, whole or damaged.
+
+    Raises:
+        LogError: nothing usable in it.
+    """
+    index = index_dataflash(path)
+    clock = LogClock()
+    times = _recording_times(index, clock)
+    names, values = _parameters(index)
+    parameters = dict(zip(names, values, strict=True))
+    notes = _damage(index)
+    raw = [
+        *fastest_first([*_vectors(index, times, "gyro", _GYRO, ("IMU", "GYR")), *_rates(index, times)]),
+        *fastest_first(_vectors(index, times, "accel", _ACCEL, ("IMU", "ACC"))),
+        *_attitude(index, times),
+        *_reference(index, times),
+        *_states(index, times, parameters),
+        *_battery(index, times),
+    ]
+    firmware = _firmware(index)
+    if other := no_multirotor(parameters, firmware=firmware[1] if firmware else ""):
+        notes.append(other)
+    else:
+        raw += [*_outputs(index, times, parameters, notes), *_esc(index, times, parameters, notes)]
+    changed = changed_within(names, values)
+    notes += [changed] if changed else []
+    recording = assemble(_name(path), "dataflash", raw, clock, notes, parameters)
+    return replace(recording, modes=_modes(index, times))
+
+
+def _modes(index: DataflashIndex, times: dict[str, FloatArray]) -> tuple[tuple[float, str], ...]:
+    column = next((c for c in ("ModeNum", "Mode") if index.has("MODE", c)), None)
+    if column is None or "MODE" not in times:
+        return ()
+    return mode_changes(times["MODE"], index.column("MODE", column), ARDUCOPTER)
+
+
+def _name(path: Path) -> str:
+    """ArduPilot numbers its logs from 1 on every vehicle: such a name only tells something with its folder's."""
+    return f"{path.absolute().parent.name}/{path.name}" if path.stem.isdigit() else path.name
+
+
+def _damage(index: DataflashIndex) -> list[str]:
+    notes = []
+    if index.skipped:
+        notes.append(f"{index.skipped} of {len(index.data)} bytes are damaged and were skipped")
+    if index.damaged:
+        notes.append(f"damaged message descriptions: {', '.join(sorted(set(index.damaged))[:8])}")
+    if index.redefined:
+        names = ", ".join(sorted(set(index.redefined))[:8])
+        notes.append(f"{names} redefined within the log: data after the change are not used")
+    if index.cut:
+        notes.append("the file ends inside a record: it was cut; everything before is used")
+    return notes
+
+
+def _recording_times(index: DataflashIndex, clock: LogClock) -> dict[str, FloatArray]:
+    """Runs the stamps of all records that are used through one clock, in file order."""
+    stamps: dict[str, FloatArray] = {}
+    for name in _STAMPED:
+        for column, unit in (("TimeUS", 1e-6), ("TimeMS", 1e-3)):
+            if index.has(name, column):
+                stamps[name] = index.column(name, column) * unit
+    if not stamps:
+        return {}
+    order = np.argsort(np.concatenate([index.rows(name) for name in stamps]), kind="stable")
+    mapped, _ = clock.times(np.concatenate(list(stamps.values()))[order])
+    unsorted = np.empty_like(mapped)
+    unsorted[order] = mapped
+    ends = np.cumsum([len(s) for s in stamps.values()])
+    return dict(zip(stamps, np.split(unsorted, ends[:-1]), strict=True))
+
+
+def _parameters(index: DataflashIndex) -> tuple[list[str], list[float]]:
+    """Names and values in file order; a parameter that is changed comes again."""
+    if not index.has("PARM", "Name", "Value"):
+        return [], []
+    return index.text("PARM", "Name"), index.column("PARM", "Value").tolist()
+
+
+def _source(index: DataflashIndex, times: dict[str, FloatArray], name: str, columns: tuple[str, ...]) -> _Source | None:
+    """Returns the rows of instance 0 (of batteries the first) with an accepted stamp; None when columns are missing."""
+    if name not in times or not index.has(name, *columns):
+        return None
+    rows = np.isfinite(times[name])
+    for instance in ("I", "Instance", "Inst", "C"):
+        if index.has(name, instance):
+            number = index.column(name, instance)
+            rows &= number == (np.min(number, initial=255) if name == "BAT" else 0)
+    return _Source(name, times[name][rows], rows, int(np.count_nonzero(~np.isfinite(times[name]))))
+
+
+def _stack(index: DataflashIndex, source: _Source, columns: tuple[str, ...]) -> FloatArray:
+    return np.column_stack([index.column(source.name, column)[source.rows] for column in columns])
+
+
+def _vectors(
+    index: DataflashIndex, times: dict[str, FloatArray], channel: str, columns: tuple[str, ...], names: tuple[str, ...]
+) -> list[RawChannel]:
+    out = []
+    for name in names:
+        source = _source(index, times, name, columns)
+        if source is not None:
+            t = source.t
+            if index.has(name, "SampleUS"):  # the raw sensor's own clock is finer than the time of writing
+                sample = index.column(name, "SampleUS")[source.rows] * 1e-6
+                t = (
+                    t + (sample - sample[:1]) - (t - t[:1])
+                    if np.abs((sample - sample[:1]) - (t - t[:1])).max(initial=0.0) < 0.1
+                    else t
+                )
+            out.append(RawChannel(channel, t, _stack(index, source, columns), f"{name} instance 0", source.refused))
+    return out
+
+
+def _rates(index: DataflashIndex, times: dict[str, FloatArray]) -> list[RawChannel]:
+    """The rate controller's input: filtered on board, but at the loop's rate where the IMU is logged slowly."""
+    source = _source(index, times, "RATE", _RATES)
+    if source is None:
+        return []
+    rates = np.radians(_stack(index, source, _RATES))
+    return [RawChannel("gyro", source.t, rates, "RATE (degrees/s, filtered on board)", source.refused)]
+
+
+def _attitude(index: DataflashIndex, times: dict[str, FloatArray]) -> list[RawChannel]:
+    out = []
+    for name in ("ATT", "ANG"):
+        source = _source(index, times, name, _ATTITUDE)
+        if source is not None:
+            angles = np.radians(_stack(index, source, _ATTITUDE))
+            out.append(RawChannel("attitude", source.t, from_euler(angles), f"{name} (degrees)", source.refused))
+    for name in _QUATERNIONS:
+        source = _source(index, times, name, _QUATERNION)
+        if source is not None:
+            out.append(RawChannel("attitude", source.t, _stack(index, source, _QUATERNION), name, source.refused))
+    return fastest_first(out)
+
+
+def _reference(index: DataflashIndex, times: dict[str, FloatArray]) -> list[RawChannel]:
+    """Desired angles of ANG or ATT with the last throttle output of CTUN."""
+    columns = ("DesRoll", "DesPitch", "DesYaw")
+    desired, throttle = _source(index, times, "ANG", columns) or _source(index, times, "ATT", columns), None
+    column, unit = ("ThO", 1.0) if index.has("CTUN", "ThO") else ("ThrOut", 1e-3)
+    if index.has("CTUN", column):
+        throttle = _source(index, times, "CTUN", (column,))
+    if desired is None or throttle is None or len(throttle.t) == 0:
+        return []
+    level = _stack(index, throttle, (column,))[:, 0] * unit
+    latest = np.searchsorted(throttle.t, desired.t, side="right") - 1
+    known = latest >= 0
+    angles = np.radians(_stack(index, desired, columns)[known])
+    angles[:, 2] = np.remainder(angles[:, 2] + np.pi, 2.0 * np.pi) - np.pi
+    values = np.column_stack([angles, level[latest[known]]])
+    return [
+        RawChannel(
+            "attitude_reference", desired.t[known], values, f"{desired.name} Des*, CTUN {column}", desired.refused
+        )
+    ]
+
+
+def _states(index: DataflashIndex, times: dict[str, FloatArray], parameters: dict[str, float]) -> list[RawChannel]:
+    names = ["XKF1", "NKF1", "EKF1"]
+    if parameters.get("AHRS_EKF_TYPE") == 2.0:
+        names = ["NKF1", "XKF1", "EKF1"]
+    out = []
+    for channel, columns in (("velocity", _VELOCITY), ("position", _POSITION)):
+        for name in names:
+            source = _source(index, times, name, columns)
+            if source is not None:
+                values = _stack(index, source, columns)
+                out.append(RawChannel(channel, source.t, values, f"{name} {' '.join(columns)}", source.refused))
+    return out
+
+
+def _battery(index: DataflashIndex, times: dict[str, FloatArray]) -> list[RawChannel]:
+    out = []
+    for name in ("BAT", "CURR"):
+        source = _source(index, times, name, ("Volt",))
+        if source is not None:
+            volts = _stack(index, source, ("Volt",))
+            if len(volts) and np.median(volts) > 100.0:  # old CURR counts centivolts
+                volts = volts * 0.01
+            if len(volts) and np.max(volts) > 0.0:
+                out.append(RawChannel("battery", source.t, volts, f"{name} Volt", source.refused))
+    return out
+
+
+def _outputs(
+    index: DataflashIndex, times: dict[str, FloatArray], parameters: dict[str, float], notes: list[str]
+) -> list[RawChannel]:
+    place: dict[int, tuple[str, str]] = {}  # record and column of each output
+    for name in _OUTPUTS:
+        columns = index.formats[name].columns if name in index.formats else ()
+        place |= {int(m[1]) - 1: (name, m[0]) for c in columns if (m := _OUTPUT.fullmatch(c)) and 0 < int(m[1]) <= ESCS}
+    told = {name: _source(index, times, name, ()) for name, _ in place.values()}
+    first = next(iter(told.values()), None)
+    if first is None:
+        return []
+    pulses = np.full((len(first.t), 1 + max(place)), np.nan)
+    for output, (name, column) in place.items():
+        if (source := told[name]) is not None:
+            _, here, there = np.intersect1d(first.t, source.t, return_indices=True)  # of one moment
+            pulses[here, output] = _stack(index, source, (column,))[there, 0]
+    found = motor_outputs(parameters, frame_rotors(_frame(index)), pulses.shape[1], "RCOU", ardupilot=True)
+    notes += [found.problem] if found.problem else []
+    motors = [] if found.problem else found.columns or active_outputs(in_pulses(pulses)[0])
+    lost = [k + 1 for k in motors if k not in place]
+    if lost:
+        notes.append(f"motors on outputs {lost}, of which the log holds no column: no output is used")
+    if not motors or lost:
+        return []
+    values, how = in_pulses(pulses[:, motors])
+    label = " ".join([*dict.fromkeys(place[k][0] for k in motors), *(place[k][1] for k in motors)])
+    return [RawChannel("motor_command", first.t, values, f"{label}{how and f' ({how})'}", first.refused)]
+
+
+def _frame(index: DataflashIndex) -> str:
+    return next((text.split(":", 1)[1].strip() for text in _messages(index) if text.startswith("Frame:")), "")
+
+
+def _firmware(index: DataflashIndex) -> re.Match[str] | None:
+    return next((m for m in map(_FIRMWARE.search, _messages(index)) if m), None)
+
+
+def _messages(index: DataflashIndex) -> list[str]:
+    return index.text("MSG", "Message") if index.has("MSG", "Message") else []
+
+
+def _esc(
+    index: DataflashIndex, times: dict[str, FloatArray], parameters: dict[str, float], notes: list[str]
+) -> list[RawChannel]:
+    """ESC telemetry comes one motor at a time."""
+    number = next((c for c in ("Instance", "I") if index.has("ESC", c)), None)
+    if number is None or "ESC" not in times or not index.has("ESC", "RPM"):
+        return []
+    instance, rpm, t = index.column("ESC", number), index.column("ESC", "RPM"), times["ESC"]
+    turning = [bool(np.any(rpm[instance == k] != 0.0)) for k in range(ESCS)]
+    version = _firmware(index)
+    told = (int(version[2]), int(version[3])) if version else None
+    found = esc_columns(parameters, frame_rotors(_frame(index)), turning, "ESC", ardupilot=True, version=told)
+    silent = [k for k in found.columns if not np.any(instance == k)]
+    if silent and any(turning):
+        found = Outputs([], f"ESC: no records of instance {', '.join(map(str, silent))}, a motor: they are not used")
+    if found.problem:
+        notes.append(found.problem)
+        return []
+    series, dropped = [], 0
+    for motor in found.columns:
+        rows = (instance == motor) & np.isfinite(t) & np.isfinite(rpm)
+        rising = np.concatenate([[True], np.diff(t[rows]) > 0.0])[: int(rows.sum())]
+        speeds = rpm[rows][rising] * RPM
+        far = spikes(speeds)  # before others are interpolated to
+        dropped += int(np.count_nonzero(far))
+        series.append((t[rows][rising][~far], speeds[~far]))
+    at, values = merge_instances(series)
+    label = f"ESC RPM of {len(found.columns)} motors"
+    return [RawChannel("rotor_speed", at, np.abs(values), label, spikes=dropped)]

@@ -1,0 +1,311 @@
+"""MAVLink messages: channels, units, frames and stamps of each kind."""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Callable, Sequence
+from functools import partial
+from types import ModuleType
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from quadid.types import FloatArray, IntArray
+from quadid_replay.columns import WrapCounter
+from quadid_replay.frames import GRAVITY, from_euler, to_euler
+from quadid_replay.motors import ESCS, RPM
+
+# --- ESC_INFO (290) and ESC_STATUS (291) of MAVLink's common dialect, which pymavlink lacks, added at run time
+#
+# The definitions are those of `dialects/quadid.xml`; a test generates that file with mavgen and compares.
+
+
+ESC_INFO, ESC_STATUS = 290, 291
+
+
+class _Field(NamedTuple):
+    """A field in the order of the XML: name, C type, struct code, array length (0: none), place in the payload."""
+
+    name: str
+    kind: str
+    code: str
+    length: int
+    order: int
+
+
+_INFO = (
+    _Field("index", "uint8_t", "B", 0, 5),
+    _Field("time_usec", "uint64_t", "Q", 0, 0),
+    _Field("counter", "uint16_t", "H", 0, 2),
+    _Field("count", "uint8_t", "B", 0, 6),
+    _Field("connection_type", "uint8_t", "B", 0, 7),
+    _Field("info", "uint8_t", "B", 0, 8),
+    _Field("failure_flags", "uint16_t", "H", 4, 3),
+    _Field("error_count", "uint32_t", "I", 4, 1),
+    _Field("temperature", "int16_t", "h", 4, 4),
+)
+_STATUS = (
+    _Field("index", "uint8_t", "B", 0, 4),
+    _Field("time_usec", "uint64_t", "Q", 0, 0),
+    _Field("rpm", "int32_t", "i", 4, 1),
+    _Field("voltage", "float", "f", 4, 2),
+    _Field("current", "float", "f", 4, 3),
+)
+
+
+def extend_dialect(dialect: ModuleType) -> ModuleType:
+    """Adds both messages to a MAVLink 2 dialect module of pymavlink, unless it has them; returns the module.
+
+    The module gains ``MAVLink_esc_info_message`` and ``MAVLink_esc_status_message``, whose arguments are the fields in
+    the order of the XML, and decodes both.
+    """
+    for number, name, crc_extra, fields in (
+        (ESC_INFO, "ESC_INFO", 251, _INFO),
+        (ESC_STATUS, "ESC_STATUS", 10, _STATUS),
+    ):
+        if number not in dialect.mavlink_map:
+            message = _message_class(dialect, number, name, crc_extra, fields)
+            dialect.mavlink_map[number] = message
+            setattr(dialect, message.__name__, message)
+            setattr(dialect, f"MAVLINK_MSG_ID_{name}", number)
+    return dialect
+
+
+def _message_class(dialect: ModuleType, number: int, name: str, crc_extra: int, fields: Sequence[_Field]) -> type[Any]:
+    """Builds the class that mavgen would have written."""
+    packed = sorted(fields, key=lambda f: f.order)
+    base = dialect.MAVLink_message
+    unpacker = struct.Struct("<" + "".join(f"{f.length or ''}{f.code}" for f in packed))
+
+    def initialise(self: Any, *values: Any) -> None:
+        if len(values) != len(fields):
+            raise TypeError(f"{name} takes {len(fields)} values: {', '.join(f.name for f in fields)}")
+        base.__init__(self, number, name)
+        self._fieldnames = [f.name for f in fields]
+        self._instance_field, self._instance_offset = "index", unpacker.size
+        for field, value in zip(fields, values, strict=True):
+            setattr(self, field.name, value)
+
+    def pack(self: Any, mav: Any, force_mavlink1: bool = False) -> bytes:
+        flat: list[Any] = []
+        for field in packed:
+            value = getattr(self, field.name)
+            flat.extend(value if field.length else [value])
+        return bytes(self._pack(mav, crc_extra, unpacker.pack(*flat), force_mavlink1=force_mavlink1))
+
+    attributes = {
+        "id": number,
+        "msgname": name,
+        "fieldnames": [f.name for f in fields],
+        "ordered_fieldnames": [f.name for f in packed],
+        "fieldtypes": [f.kind for f in fields],
+        "fielddisplays_by_name": {},
+        "fieldenums_by_name": {},
+        "fieldunits_by_name": {},
+        "native_format": bytearray(("<" + "".join(f.code for f in packed)).encode()),
+        "orders": [f.order for f in fields],
+        "lengths": [f.length or 1 for f in packed],
+        "array_lengths": [f.length for f in packed],
+        "crc_extra": crc_extra,
+        "unpacker": unpacker,
+        "instance_field": "index",
+        "instance_offset": struct.calcsize(
+            "<" + "".join(f"{f.length or ''}{f.code}" for f in packed[: fields[0].order])
+        ),
+        "__init__": initialise,
+        "pack": pack,
+    }
+    return type(f"MAVLink_{name.lower()}_message", (base,), attributes)
+
+
+# --- What frame numbers tell of who sent them: one sender counts from 0 to 255 over and over, two do so each by itself
+
+
+FAR = 8
+"""Frame numbers that jump by no more come from frames that are lost, late or there twice."""
+FEWEST, SHARE = 6, 3
+"""Two rows are seen by more returns than so many, and than one in so many jumps: of one sender whose frames are lost it
+is one in thirty, and of two every second one, or each where the second one counts its frames."""
+
+
+def two_rows(number: IntArray) -> bool:
+    """Whether frame numbers of one id jump to and fro between two rows: jumps land where an earlier one had left off.
+
+    Numbers of one sender jump over what was lost, and seldom return to where they were before.
+
+    Args:
+        number: frame numbers, 0 to 255, in the order in which the frames came, shape (n,).
+    """
+    step = np.diff(number) % 256
+    jumps = np.flatnonzero((step > FAR) & (step < 256 - FAR))
+    onward = (number[jumps[1:] + 1] - number[jumps[:-1]]) % 256
+    returns = int(np.count_nonzero((onward >= 1) & (onward <= FAR)))
+    return returns > max(FEWEST, len(jumps) // SHARE)
+
+
+# --- What each MAVLink message tells: channel, values in core units and frames, and its own stamp
+#
+# MAVLink bodies are FRD and worlds NED, as the core's; only units differ (mG, mrad/s, rpm, mV, cm/s).
+
+
+MILLI = 1e-3
+SERVO_TURN = 2.0**32 * 1e-6
+"""SERVO_OUTPUT_RAW counts microseconds in 32 bits: [s] until it starts over."""
+ZERO_IS_BOOT = 1.0
+"""A stamp of zero farther than this [s] from the newest one stands for unknown."""
+_UNIX_US = 1e14
+"""Stamps above this [us] count from the UNIX epoch."""
+_NO_VOLTAGE = 65535
+ESC_GROUPS = tuple(f"ESC_TELEMETRY_{k + 1}_TO_{k + 4}" for k in range(0, ESCS, 4))
+"""ArduPilot's messages of four ESCs each."""
+
+
+class Reading(NamedTuple):
+    """Values of one signal, of one message or of many alike.
+
+    Attributes:
+        signal: channel name, or a name of the reader's own (``esc``, ``servo``, ``actuator``).
+        values: a number a column, or an array of shape (n,); in core units.
+        source: message name.
+        place: first column, for signals that come in several messages.
+        known: whether the message tells the signal.
+    """
+
+    signal: str
+    values: Sequence[Any]
+    source: str
+    place: Any = 0
+    known: Any = True
+
+
+def _imu(m: Any, rate: float, force: float, name: str) -> list[Reading]:
+    return [
+        Reading("gyro", (m.xgyro * rate, m.ygyro * rate, m.zgyro * rate), name),
+        Reading("accel", (m.xacc * force, m.yacc * force, m.zacc * force), name),
+    ]
+
+
+def _highres_imu(m: Any) -> list[Reading]:
+    updated = (0x38, 0x07)  # bits of fields_updated: gyro, accel
+    return [
+        r._replace(known=(m.fields_updated & bits == bits) | (m.fields_updated == 0))
+        for r, bits in zip(_imu(m, 1.0, 1.0, "HIGHRES_IMU"), updated, strict=True)
+    ]
+
+
+def _turned(turn: Callable[[FloatArray], FloatArray], columns: Sequence[Any]) -> tuple[Any, ...]:
+    """Columns of what `turn` makes of rows."""
+    rows = np.stack([np.asarray(c, dtype=np.float64) for c in columns], axis=-1)
+    return tuple(turn(rows[None])[0]) if rows.ndim == 1 else tuple(turn(rows).T)
+
+
+def _attitude(m: Any) -> list[Reading]:
+    return [
+        Reading("attitude", _turned(from_euler, (m.roll, m.pitch, m.yaw)), "ATTITUDE"),
+        Reading("gyro", (m.rollspeed, m.pitchspeed, m.yawspeed), "ATTITUDE (filtered on board)"),
+    ]
+
+
+def _attitude_quaternion(m: Any) -> list[Reading]:
+    return [
+        Reading("attitude", (m.q1, m.q2, m.q3, m.q4), "ATTITUDE_QUATERNION"),
+        Reading("gyro", (m.rollspeed, m.pitchspeed, m.yawspeed), "ATTITUDE_QUATERNION (filtered on board)"),
+    ]
+
+
+def _attitude_target(m: Any) -> list[Reading]:
+    return [Reading("attitude_reference", (*_turned(to_euler, m.q), m.thrust), "ATTITUDE_TARGET")]
+
+
+def _local_position(m: Any) -> list[Reading]:
+    return [
+        Reading("position", (m.x, m.y, m.z), "LOCAL_POSITION_NED"),
+        Reading("velocity", (m.vx, m.vy, m.vz), "LOCAL_POSITION_NED"),
+    ]
+
+
+def _servo_output(m: Any) -> list[Reading]:
+    outputs = [getattr(m, f"servo{i}_raw", 0) for i in range(1, 17)]
+    return [Reading("servo", outputs, "SERVO_OUTPUT_RAW", 16 * m.port, known=m.port < 2)]
+
+
+def _battery_status(m: Any) -> list[Reading]:
+    millivolts = sum(v * ((v != 0) & (v != _NO_VOLTAGE)) for v in m.voltages)
+    known = (m.id == 0) & (millivolts > 0)
+    return [Reading("battery", (millivolts * MILLI,), "BATTERY_STATUS", known=known)]
+
+
+def _system_status(m: Any) -> list[Reading]:
+    known = (m.voltage_battery != 0) & (m.voltage_battery != _NO_VOLTAGE)
+    return [Reading("battery", (m.voltage_battery * MILLI,), "SYS_STATUS", known=known)]
+
+
+def _escs(m: Any, place: Any, name: str) -> list[Reading]:
+    return [Reading("esc", [abs(rpm) * RPM for rpm in m.rpm], name, place)]
+
+
+READERS: dict[str, Callable[[Any], list[Reading]]] = {
+    "HIGHRES_IMU": _highres_imu,
+    "SCALED_IMU": lambda m: _imu(m, MILLI, MILLI * GRAVITY, "SCALED_IMU (mG, mrad/s)"),
+    "RAW_IMU": lambda m: _imu(m, MILLI, MILLI * GRAVITY, "RAW_IMU (ArduPilot: mG, mrad/s)"),
+    "ATTITUDE": _attitude,
+    "ATTITUDE_QUATERNION": _attitude_quaternion,
+    "ATTITUDE_TARGET": _attitude_target,
+    "LOCAL_POSITION_NED": _local_position,
+    "GLOBAL_POSITION_INT": lambda m: [
+        Reading("velocity", (m.vx * 0.01, m.vy * 0.01, m.vz * 0.01), "GLOBAL_POSITION_INT")
+    ],
+    "SERVO_OUTPUT_RAW": _servo_output,
+    "ACTUATOR_OUTPUT_STATUS": lambda m: [Reading("actuator", list(m.actuator), "ACTUATOR_OUTPUT_STATUS")],
+    "ESC_STATUS": lambda m: _escs(m, m.index, "ESC_STATUS"),
+    **{name: partial(_escs, place=4 * k, name="ESC_TELEMETRY") for k, name in enumerate(ESC_GROUPS)},
+    "BATTERY_STATUS": _battery_status,
+    "SYS_STATUS": _system_status,
+}
+"""Messages with measurements, each with the function that reads one, or many whose fields are arrays."""
+
+STATE_MESSAGES = ("HEARTBEAT", "PARAM_VALUE", "SYSTEM_TIME", "ESC_INFO")
+"""Messages about the vehicle and its clock."""
+
+PREFERENCE: dict[str, tuple[str, ...]] = {
+    "gyro": ("HIGHRES_IMU", "SCALED_IMU", "RAW_IMU", "ATTITUDE_QUATERNION", "ATTITUDE"),
+    "accel": ("HIGHRES_IMU", "SCALED_IMU", "RAW_IMU"),
+    "attitude": ("ATTITUDE_QUATERNION", "ATTITUDE"),
+    "attitude_reference": ("ATTITUDE_TARGET",),
+    "velocity": ("LOCAL_POSITION_NED", "GLOBAL_POSITION_INT"),
+    "position": ("LOCAL_POSITION_NED",),
+    "battery": ("BATTERY_STATUS", "SYS_STATUS"),
+}
+"""Which message a channel is taken from; a later one only when it comes twice as fast."""
+
+
+def boot_seconds(m: Any) -> Any:
+    """Returns the messages' own stamps [s] since boot, NaN where they have none or count UNIX time."""
+    stamp = getattr(m, "time_boot_ms", None)
+    if stamp is not None:
+        return stamp * MILLI
+    stamp = getattr(m, "time_usec", None)
+    return math.nan if stamp is None else np.where(stamp > _UNIX_US, math.nan, stamp * 1e-6)
+
+
+def unix_seconds(m: Any) -> Any:
+    """Returns the messages' own stamps as UNIX time [s], NaN where they do not count that."""
+    stamp = getattr(m, "time_usec", None)
+    return math.nan if stamp is None else np.where(stamp > _UNIX_US, stamp * 1e-6, math.nan)
+
+
+def boot_stamp(raw: float, servo: bool, newest: float | None) -> float | None:
+    """Returns a message's own stamp [s] since boot, with whole turns of a 32-bit counter added; None without one.
+
+    Args:
+        raw: what `boot_seconds` says.
+        servo: it is SERVO_OUTPUT_RAW, whose counter has 32 bits.
+        newest: newest stamp known of this vehicle [s].
+    """
+    if raw != raw:
+        return None
+    if newest is None or (raw != 0.0 and not servo):
+        return raw
+    boot = WrapCounter(SERVO_TURN).unwrap_near(raw, newest) if servo else raw
+    return None if raw == 0.0 and abs(boot - newest) > ZERO_IS_BOOT else boot

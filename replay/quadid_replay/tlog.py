@@ -1,0 +1,611 @@
+"""MAVLink telemetry logs: frames, one vehicle's messages, channels on its boot clock."""
+
+from __future__ import annotations
+
+import mmap
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any, NamedTuple, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+from pymavlink.dialects.v20 import ardupilotmega
+
+from quadid.data.window import Recording
+from quadid.errors import LogError
+from quadid.types import BoolArray, FloatArray, IntArray
+from quadid_replay.columns import LogClock, RawChannel, assemble, fastest_first
+from quadid_replay.mavlink_messages import (
+    PREFERENCE,
+    READERS,
+    STATE_MESSAGES,
+    Reading,
+    boot_seconds,
+    extend_dialect,
+    two_rows,
+    unix_seconds,
+)
+from quadid_replay.message_times import Stamps, place
+from quadid_replay.motors import (
+    ESCS,
+    MOST_ROTORS,
+    MULTIROTORS,
+    active_outputs,
+    changed_within,
+    esc_columns,
+    in_pulses,
+    motor_outputs,
+    no_multirotor,
+    px4_rotor_count,
+)
+
+# --- Frames of a telemetry log: receive times and MAVLink 1 or 2 frames, found all at once, through damage
+#
+# A tlog has neither index nor end mark.  After a damaged place the next frame is the next one that looks like one and
+# is followed by another.  Messages, fields and checksums are pymavlink's; its reader takes ten times as long.
+
+
+Bytes: TypeAlias = NDArray[np.uint8]
+
+_EARLIEST_US, _LATEST_US = 946_684_800_000_000, 4_102_444_800_000_000  # years 2000 to 2100
+_STAMP = 8
+_SIGNED = 1
+_SIGNATURE = 13
+_HEAD = _STAMP + 3
+"""Bytes that tell a frame's length: receive time, mark, payload length, flags."""
+_BLOCK = 1 << 18
+_MOST_FAILURES = 1_000_000
+"""So many places in a row that look like a frame and are none: this is no telemetry."""
+
+
+class Frames(NamedTuple):
+    """The frames of a tlog in file order; checksums are the caller's business.
+
+    Attributes:
+        data: the file.
+        start: offset of each frame's mark, shape (n,).
+        end: offset behind its payload, where its checksum stands.
+        head: bytes from the mark to the payload: 6 or 10.
+        stop: offset behind the whole frame.
+        received: receive times [s, UNIX].
+        number: of each frame, counted by its sender from 0 to 255 again and again.
+        message, system, component: message id and who sent it.
+        skipped: bytes that belong to no frame.
+        cut: whether the file ends inside a frame.
+    """
+
+    data: Bytes
+    start: IntArray
+    end: IntArray
+    head: IntArray
+    stop: IntArray
+    received: FloatArray
+    number: IntArray
+    message: IntArray
+    system: Bytes
+    component: Bytes
+    skipped: int
+    cut: bool
+
+    def frame(self, k: int) -> bytes:
+        """Frame `k` as it was on the link."""
+        return self.data[self.start[k] : self.stop[k]].tobytes()
+
+
+def read_frames(path: Path) -> Frames:
+    """Finds the frames of a tlog."""
+    with path.open("rb") as file:
+        data = np.frombuffer(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ), dtype=np.uint8)
+    marks = _marks(data)
+    received = _receive_times(data, marks)
+    possible = (received > _EARLIEST_US) & (received < _LATEST_US) & (marks + _HEAD <= len(data))
+    places, received = marks[possible], received[possible]
+    version_1 = data[places + _STAMP] == 0xFE
+    head = np.where(version_1, 6, 10)
+    end = places + _STAMP + head + data[places + _STAMP + 1]
+    signed = ~version_1 & (data[places + _STAMP + 2] & _SIGNED != 0)
+    stop = end + 2 + _SIGNATURE * signed
+    kept, skipped, cut = _walk(places, stop, marks, len(data))
+    start, head, end = places[kept] + _STAMP, head[kept], end[kept]
+    short = np.where(head == 6, 0, 2)  # MAVLink 2 has two flags more before these
+    kind = start + 5 + short
+    message = data[kind].astype(np.int64)
+    long = head == 10
+    message[long] |= data[kind[long] + 1].astype(np.int64) << 8 | data[kind[long] + 2].astype(np.int64) << 16
+    return Frames(
+        data, start, end, head, stop[kept], received[kept].astype(np.float64) * 1e-6,
+        data[start + 2 + short].astype(np.int64), message, data[start + 3 + short], data[start + 4 + short],
+        skipped, cut,
+    )  # fmt: skip
+
+
+def _marks(data: Bytes) -> IntArray:
+    """Where the high bytes of a receive time between the years 2000 and 2100 stand, and a mark behind it."""
+    found = [np.empty(0, dtype=np.int64)]
+    for begin in range(0, len(data) - _STAMP, _BLOCK):
+        end = min(begin + _BLOCK, len(data) - _STAMP)
+        mark, high = data[begin + _STAMP : end + _STAMP], data[begin + 1 : end + 1]
+        looks = (mark >= 0xFD) & (mark != 0xFF) & (data[begin:end] == 0) & (high >= 0x03) & (high <= 0x0E)
+        found.append(np.flatnonzero(looks) + begin)
+    return np.concatenate(found)
+
+
+def _receive_times(data: Bytes, places: IntArray) -> IntArray:
+    """Receive times [us, UNIX] at these places."""
+    time = np.zeros(len(places), dtype=np.int64)
+    for k in range(1, _STAMP):
+        time = time << 8 | data[places + k]
+    return time
+
+
+def _walk(places: IntArray, stops: IntArray, marks: IntArray, size: int) -> tuple[IntArray, int, bool]:
+    """Follows the frames from one to the next.
+
+    Args:
+        places: offsets where a frame may begin, rising; stops: where each ends.
+        marks: the same and places that only look like it at first sight.
+        size: of the file.
+
+    Returns:
+        Which of the places are frames, the bytes skipped, and whether the file ends inside a frame.
+    """
+    count = len(places)
+    following = np.searchsorted(places, stops)
+    linked = np.append(places, -1)[following] == stops
+    certain = np.flatnonzero((stops <= size) & (linked | (stops >= size)))
+    """Frames that another follows: what is looked for after damage."""
+    certain_places = places[certain]
+    turns = np.flatnonzero(~linked | (following != np.arange(1, count + 1)))
+    run_ends = turns[np.searchsorted(turns, np.arange(count))]
+    """The last place of a run that simply goes from each to the next."""
+    runs: list[tuple[int, int]] = []
+    skipped, offset, at = 0, 0, 0 if count and places[0] == 0 else -1
+    while True:
+        while at >= 0:
+            last = int(run_ends[at])
+            runs.append((at, last))
+            offset, at = int(stops[last]), int(following[last]) if linked[last] else -1
+        if offset > size:
+            return _members(runs, count)[:-1], skipped, True
+        if offset + _STAMP >= size:
+            return _members(runs, count), skipped, offset < size
+        found = int(np.searchsorted(certain_places, offset, side="right"))
+        at = int(certain[found]) if found < len(certain) else -1
+        resumed = int(places[at]) if at >= 0 else size
+        if 1 + np.searchsorted(marks, resumed) - np.searchsorted(marks, offset, side="right") >= _MOST_FAILURES:
+            at, resumed = -1, size
+        skipped, offset = skipped + resumed - offset, resumed
+
+
+def _members(runs: list[tuple[int, int]], count: int) -> IntArray:
+    """Indices in all of these runs, first and last included, of `count` places."""
+    steps = np.zeros(count + 1, dtype=np.int64)
+    bounds = np.array(runs, dtype=np.int64).reshape(-1, 2)
+    steps[bounds[:, 0]] += 1
+    steps[bounds[:, 1] + 1] -= 1
+    return np.flatnonzero(np.cumsum(steps[:-1]))
+
+
+# --- MAVLink messages of one kind to columns, and their checksums, all at once, from the dialect's own descriptions
+#
+# Fields, their order, padding, text and checksum are pymavlink's, message by message; a test compares both.
+
+
+_TYPES = {"float": "<f4", "double": "<f8", "char": "u1"}
+_MAVLINK_DECODE_BLOCK = 4096
+"""Frames that are looked at together: what they need stays in the processor's cache."""
+
+
+class Messages:
+    """Messages of one kind; its fields are attributes: shape (n,), of an array a list of those, of text strings."""
+
+    def __init__(self, kind: Any, payloads: Bytes) -> None:
+        """Takes a message class of the dialect and payloads padded with zeros, shape (n, size)."""
+        self._rows = payloads.view(_layout(kind))[:, 0]
+        self._texts = {f for f, t in zip(kind.fieldnames, kind.fieldtypes, strict=True) if t == "char"}
+
+    def __getattr__(self, name: str) -> Any:
+        """The field of this name, whole numbers of up to 32 bits as int64, others as float64 or uint64."""
+        if name not in (self._rows.dtype.names or ()):
+            raise AttributeError(name)
+        values = self._rows[name]
+        if name in self._texts:
+            return [row.tobytes().split(b"\0", 1)[0].decode("ascii", "replace") for row in values]
+        if values.dtype != np.uint64:
+            with np.errstate(invalid="ignore"):  # a signalling NaN
+                values = values.astype(np.float64 if values.dtype.kind == "f" else np.int64)
+        return values if values.ndim == 1 else list(values.T)
+
+
+def decode(frames: Frames, kind: Any, which: IntArray) -> Messages:
+    """Decodes the frames `which`, all of one kind of message, a class of the dialect."""
+    size = kind.unpacker.size
+    payloads = np.empty((len(which), size), dtype=np.uint8)
+    columns = np.arange(size)
+    for a in range(0, len(which), _MAVLINK_DECODE_BLOCK):
+        some = which[a : a + _MAVLINK_DECODE_BLOCK]
+        begin = frames.start[some] + frames.head[some]
+        block = frames.data.take(begin[:, None] + columns, mode="clip")
+        payloads[a : a + _MAVLINK_DECODE_BLOCK] = np.where(columns < (frames.end[some] - begin)[:, None], block, 0)
+    return Messages(kind, payloads)
+
+
+def intact(frames: Frames, which: IntArray, seeds: IntArray) -> BoolArray:
+    """Tells which of these frames have the right checksum; `seeds` are their messages' (`crc_extra`), shape (n,)."""
+    out = np.empty(len(which), dtype=np.bool_)
+    for a in range(0, len(which), _MAVLINK_DECODE_BLOCK):
+        some = which[a : a + _MAVLINK_DECODE_BLOCK]
+        end = frames.end[some]
+        told = frames.data[end].astype(np.uint16) | frames.data[end + 1].astype(np.uint16) << 8
+        out[a : a + _MAVLINK_DECODE_BLOCK] = told == _checksums(
+            frames.data, frames.start[some] + 1, end, seeds[a : a + _MAVLINK_DECODE_BLOCK]
+        )
+    return out
+
+
+def _checksums(data: Bytes, begin: IntArray, end: IntArray, seeds: IntArray) -> NDArray[np.uint16]:
+    """CRC-16/MCRF4XX of these bytes and of a seed behind each, two bytes at a time, the longest first."""
+    order = np.argsort(begin - end)
+    begin, length = begin[order], (end - begin)[order]
+    by_byte, by_two = _tables()
+    crc = np.full(len(begin), 0xFFFF, dtype=np.uint16)
+    for k in range(int(length.max()) // 2):
+        active = int(np.searchsorted(-length, -2 * (k + 1), side="right"))
+        at = begin[:active] + 2 * k
+        two = data.take(at).astype(np.uint16) | data.take(at + 1).astype(np.uint16) << 8
+        crc[:active] = by_two.take(crc[:active] ^ two)
+    odd = length % 2 == 1
+    crc[odd] = by_byte.take((crc[odd] ^ data.take((begin + length - 1)[odd])) & 0xFF) ^ crc[odd] >> 8
+    out = np.empty_like(crc)
+    out[order] = by_byte.take((crc ^ seeds[order].astype(np.uint16)) & 0xFF) ^ crc >> 8
+    return out
+
+
+@cache
+def _tables() -> tuple[NDArray[np.uint16], NDArray[np.uint16]]:
+    """What a byte, and what two, make of a checksum: shapes (256,) and (65536,)."""
+    bits = np.arange(256)
+    for _ in range(8):
+        bits = np.where(bits & 1, bits >> 1 ^ 0x8408, bits >> 1)
+    one, every = bits.astype(np.uint16), np.arange(65536, dtype=np.uint16)
+    first = one[every & 0xFF] ^ every >> 8
+    return one, one[first & 0xFF] ^ first >> 8
+
+
+@cache
+def _layout(kind: Any) -> np.dtype[np.void]:
+    """The fields of a payload in the order of the wire."""
+    types = dict(zip(kind.fieldnames, kind.fieldtypes, strict=True))
+    return np.dtype([
+        (name, _TYPES.get(types[name]) or _whole(types[name]), (length,) if length else ())
+        for name, length in zip(kind.ordered_fieldnames, kind.array_lengths, strict=True)
+    ])  # fmt: skip
+
+
+def _whole(kind: str) -> str:
+    """A whole number's type, of C in NumPy's words: ``uint16_t`` is ``<u2``."""
+    return f"<{'u' if kind.startswith('u') else 'i'}{int(kind.strip('uint_')) // 8}"
+
+
+# --- What one vehicle of a telemetry log tells: its signals on one clock, parameters and type
+
+
+_INVALID, _ARDUPILOT = 8, 3
+_BACKWARDS = 0.5
+"""Boot time that falls by more than this [s] is counted."""
+_EPOCH_US = 1e14
+"""SYSTEM_TIME tells the date where it counts more than this [us]."""
+_WIDTH = {"esc": ESCS, "servo": ESCS, "actuator": 32, "attitude": 4, "attitude_reference": 4, "battery": 1}
+
+
+class Told(NamedTuple):
+    """Messages of one kind, and which frames of the log they are, rising, shape (n,)."""
+
+    which: IntArray
+    messages: Messages
+
+
+class Signal(NamedTuple):
+    """Times [s] of n samples, shape (n,), their values, shape (n, columns), and how many the clock refused."""
+
+    t: FloatArray
+    values: FloatArray
+    refused: int
+
+
+@dataclass(frozen=True)
+class VehicleLog:
+    """What one MAVLink component told.
+
+    Attributes:
+        clock: of the log.
+        signals: by channel and message.
+        parameters: of the autopilot, by name.
+        changed: which of them that name a motor change within the log; empty for none.
+        ardupilot: whether it calls itself one.
+        kind: its MAV_TYPE; 0 for unknown.
+        rotors: as ESC_INFO says; 0 for unknown, and for more than a vehicle has.
+        heard: whether a measurement has its time before the log ends.
+        backwards: how often the boot time fell.
+    """
+
+    clock: LogClock
+    signals: Mapping[tuple[str, str], Signal]
+    parameters: Mapping[str, float]
+    changed: str
+    ardupilot: bool
+    kind: int
+    rotors: int
+    heard: bool
+    backwards: int
+
+
+class _Batch(NamedTuple):
+    """Messages of one kind that tell something: n frames, and of all messages of the kind which tell each reading."""
+
+    which: IntArray
+    readings: list[tuple[Reading, BoolArray]]
+    rows: IntArray
+    stamps: Stamps
+
+
+class _Part(NamedTuple):
+    """What messages of one kind tell of a signal: n places in the order of their times, first columns, values."""
+
+    position: IntArray
+    place: IntArray
+    values: FloatArray
+
+
+def vehicle_log(told: Mapping[str, Told], received: FloatArray) -> VehicleLog:
+    """Gathers what a vehicle tells.
+
+    Args:
+        told: its messages, by name.
+        received: receive times of all frames of the log [s, UNIX].
+    """
+    beats = told.get("HEARTBEAT")
+    escs = told.get("ESC_INFO")
+    clock = LogClock()
+    batches = [b for b in (_batch(name, told, received) for name in READERS if name in told) if len(b.which)]
+    signals, heard, backwards = _signals(batches, clock) if batches else ({}, False, 0)
+    names, values = _parameters(told)
+    rotors = 0 if escs is None else int(escs.messages.count.max())
+    return VehicleLog(
+        clock, signals, dict(zip(names, values, strict=True)), changed_within(names, values),
+        beats is not None and int(beats.messages.autopilot[-1]) == _ARDUPILOT,
+        0 if beats is None else int(beats.messages.type[-1]), rotors if rotors <= MOST_ROTORS else 0, heard, backwards,
+    )  # fmt: skip
+
+
+def _parameters(told: Mapping[str, Told]) -> tuple[list[str], list[float]]:
+    if "PARAM_VALUE" not in told:
+        return [], []
+    m = told["PARAM_VALUE"].messages
+    return list(m.param_id), m.param_value.tolist()
+
+
+def _batch(name: str, told: Mapping[str, Told], received: FloatArray) -> _Batch:
+    which, m = told[name]
+    readings = [(r, np.broadcast_to(r.known, len(which))) for r in READERS[name](m)]
+    known = np.any([k for _, k in readings], axis=0)
+    if name == "RAW_IMU" and "HEARTBEAT" in told:  # elsewhere than in ArduPilot it counts in sensor units
+        beats = told["HEARTBEAT"]
+        known = known & (_latest(beats.which, beats.messages.autopilot, which, _INVALID) == _ARDUPILOT)
+    elif name == "RAW_IMU":
+        known = np.zeros(len(which), dtype=np.bool_)
+    rows = np.flatnonzero(known)
+    which = which[rows]
+    unix = np.broadcast_to(unix_seconds(m), len(known))[rows]
+    stamps = Stamps(
+        received[which], np.broadcast_to(boot_seconds(m), len(known))[rows], unix - _unix_offset(told, which),
+        np.full(len(rows), name == "SERVO_OUTPUT_RAW"),
+    )  # fmt: skip
+    return _Batch(which, readings, rows, stamps)
+
+
+def _unix_offset(told: Mapping[str, Told], which: IntArray) -> FloatArray:
+    """UNIX time of boot [s] as the last SYSTEM_TIME before each frame says; NaN before the first."""
+    if "SYSTEM_TIME" not in told:
+        return np.full(len(which), np.nan)
+    at, m = told["SYSTEM_TIME"]
+    dated = m.time_unix_usec > _EPOCH_US
+    offset = m.time_unix_usec * 1e-6 - m.time_boot_ms * 1e-3
+    return _latest(at[dated], offset[dated], which, np.nan)
+
+
+def _latest(at: IntArray, values: FloatArray, which: IntArray, otherwise: float) -> FloatArray:
+    """The value of the last of the frames `at` before each of `which`."""
+    return np.asarray(np.concatenate([[otherwise], values])[np.searchsorted(at, which)], dtype=np.float64)
+
+
+def _signals(batches: list[_Batch], clock: LogClock) -> tuple[dict[tuple[str, str], Signal], bool, int]:
+    """Signals in the order in which they are first told; whether one is before the log ends; falls of boot time."""
+    which = np.concatenate([b.which for b in batches])
+    in_file = np.argsort(which)
+    stamps = Stamps(*(np.concatenate(column)[in_file] for column in zip(*(b.stamps for b in batches), strict=True)))
+    placing = place(stamps)
+    position = np.empty(len(which), dtype=np.int64)
+    position[in_file[placing.order]] = np.arange(len(which))
+    known = ~np.isnan(placing.time)
+    t = np.full(len(which), np.nan)
+    t[known] = clock.in_order(placing.time[known])
+    own = placing.boot[~stamps.servo & ~np.isnan(placing.boot)]
+    backwards = int(np.count_nonzero(own < np.concatenate([[0.0], own[:-1]]) - _BACKWARDS))
+
+    parts: dict[tuple[str, str], list[_Part]] = {}
+    first: dict[tuple[str, str], tuple[int, int]] = {}
+    for batch, its in zip(batches, np.split(position, np.cumsum([len(b.which) for b in batches])[:-1]), strict=True):
+        for number, (reading, tells) in enumerate(batch.readings):
+            key = reading.signal, reading.source
+            part = _part(reading, tells, batch.rows, its)
+            if len(part.position):
+                parts.setdefault(key, []).append(part)
+                first[key] = min(first.get(key, (len(t), 0)), (int(part.position.min()), number))
+    signals = {key: _signal(key[0], parts[key], t) for key in sorted(parts, key=first.__getitem__)}
+    return signals, placing.waited < len(t), backwards
+
+
+def _part(reading: Reading, tells: BoolArray, rows: IntArray, position: IntArray) -> _Part:
+    values = np.empty((len(tells), len(reading.values)))
+    for column, value in enumerate(reading.values):
+        values[:, column] = value
+    places = np.broadcast_to(reading.place, len(tells))
+    if len(rows) == len(tells) and tells.all():
+        return _Part(position, places, values)
+    here = tells[rows]
+    rows = rows[here]
+    return _Part(position[here], places[rows], values[rows])
+
+
+def _signal(signal: str, parts: list[_Part], t: FloatArray) -> Signal:
+    """The rows of a signal in the order of their times, zeros in columns that its messages lack."""
+    position, places, values = parts[0]
+    if len(parts) > 1 or np.any(position[1:] < position[:-1]):
+        position, places, values = (np.concatenate(column) for column in zip(*parts, strict=True))
+        order = np.argsort(position)
+        position, places, values = position[order], places[order], values[order]
+    width = _WIDTH.get(signal, 3)
+    t = t[position]
+    if signal in ("esc", "servo"):
+        t, values = _rounds(t, places, values, width)
+    elif values.shape[1] < width:
+        values = np.pad(values, ((0, 0), (0, width - values.shape[1])))
+    known = ~np.isnan(t)
+    return Signal(t, values, 0) if known.all() else Signal(t[known], values[known], int(np.count_nonzero(~known)))
+
+
+def _rounds(t: FloatArray, places: IntArray, values: FloatArray, width: int) -> tuple[FloatArray, FloatArray]:
+    """Joins the messages of one round (four ESCs or sixteen outputs each, rising) to a row at the time of the first."""
+    real = places < width  # what no vehicle has is left out
+    t, places, values = t[real], places[real], values[real]
+    begins = np.ones(len(t), dtype=np.bool_)
+    begins[1:] = places[1:] <= places[:-1]
+    rows = np.full((int(np.count_nonzero(begins)), width + values.shape[1]), np.nan)
+    rows[(np.cumsum(begins) - 1)[:, None], places[:, None] + np.arange(values.shape[1])] = values
+    return t[begins], rows[:, :width]
+
+
+# --- MAVLink telemetry logs: one vehicle's messages to channels on its boot clock
+
+
+_DIALECT = extend_dialect(ardupilotmega)
+_WANTED = {n: m for n, m in _DIALECT.mavlink_map.items() if m.msgname in READERS or m.msgname in STATE_MESSAGES}
+_MOST_BACKWARDS = 10
+"""Boot time that falls more often: no vehicle boots that often."""
+_MOST_SENDERS = 32
+"""Of more, those with the fewest frames are not looked into: damage makes senders, and none of them is the vehicle."""
+_NAMED = 8
+"""Other vehicles that are named; more are counted."""
+
+
+def read_tlog(path: Path) -> Recording:
+    """Reads a telemetry log, whole or damaged; of several vehicles the one that tells most.
+
+    Raises:
+        LogError: no vehicle in it tells anything usable.
+    """
+    frames = read_frames(path)
+    which = np.flatnonzero(np.isin(frames.message, list(_WANTED)))
+    seeds = np.zeros(max(_WANTED) + 1, dtype=np.int64)
+    seeds[list(_WANTED)] = [m.crc_extra for m in _WANTED.values()]
+    whole = intact(frames, which, seeds[frames.message[which]])
+    vehicles = _vehicles(frames, which[whole])
+    if not any(v.heard for v in vehicles.values()):
+        raise LogError(
+            f"{path.name}: {len(frames.start)} MAVLink frames but no measurements of a vehicle",
+            "IMU, attitude, servo or ESC messages", "ask the autopilot for them (SR*_RAW_SENS, SR*_EXTRA1, MAV_*_MODE)",
+        )  # fmt: skip
+    who = max(vehicles, key=lambda key: sum(len(s.t) for s in vehicles[key].signals.values()))
+    notes = _notes(frames, len(which) - int(np.count_nonzero(whole)))
+    if vehicles[who].backwards > _MOST_BACKWARDS:
+        raise LogError(
+            f"{path.name}: boot time under system {who[0]} component {who[1]} falls back {vehicles[who].backwards} "
+            "times: two vehicles under one system id", "one vehicle an id",
+            "give each vehicle its own SYSID_THISMAV (MAV_SYS_ID) and record again, or record each link by itself",
+        )  # fmt: skip
+    if two_rows(frames.number[(frames.system == who[0]) & (frames.component == who[1])]):
+        notes.append(
+            f"frame numbers of system {who[0]} component {who[1]} come in two rows: two links of one vehicle, or two "
+            "vehicles under one id, and then nothing of it can be trusted"
+        )
+    others = [key for key, v in vehicles.items() if key != who and v.signals]
+    if others:
+        more = f" and {len(others) - _NAMED} more" if len(others) > _NAMED else ""
+        named = ", ".join(f"{s}/{c}" for s, c in others[:_NAMED])
+        notes.append(f"vehicle {who[0]} used; also in the log: {named}{more}")
+    raw = _channels(vehicles[who], notes)
+    return assemble(path.name, "tlog", raw, vehicles[who].clock, notes, vehicles[who].parameters)
+
+
+def _vehicles(frames: Frames, which: IntArray) -> dict[tuple[int, int], VehicleLog]:
+    """What each system and component tells in the frames `which`, in the order in which they are first heard; of many
+    senders those with the most frames.
+    """
+    sender = frames.system[which].astype(np.int64) << 8 | frames.component[which]
+    found, first, count = np.unique(sender, return_index=True, return_counts=True)
+    most = np.argsort(-count, kind="stable")[:_MOST_SENDERS]
+    out = {}
+    for one in found[most][np.argsort(first[most])]:
+        its = which[sender == one]
+        message = frames.message[its]
+        told = {}
+        for number in np.unique(message):
+            kind, of_it = _WANTED[int(number)], its[message == number]
+            told[kind.msgname] = Told(of_it, decode(frames, kind, of_it))
+        out[int(one) >> 8, int(one) & 0xFF] = vehicle_log(told, frames.received)
+    return out
+
+
+def _notes(frames: Frames, bad: int) -> list[str]:
+    notes = []
+    if frames.skipped:
+        notes.append(f"{frames.skipped} of {len(frames.data)} bytes are damaged and were skipped")
+    if bad:
+        notes.append(f"{bad} frames with a wrong checksum were refused")
+    if frames.cut:
+        notes.append("the file ends inside a frame: it was cut; everything before is used")
+    return notes
+
+
+def _channels(vehicle: VehicleLog, notes: list[str]) -> list[RawChannel]:
+    raw: list[RawChannel] = []
+    for channel, messages in PREFERENCE.items():
+        found = []
+        for message in messages:
+            for (signal, source), (t, values, refused) in vehicle.signals.items():
+                if signal == channel and source.split(" ")[0] == message:
+                    found.append(RawChannel(channel, t, values, source, refused))
+        raw += fastest_first(found, 2.0)
+    return raw + _motors(vehicle, notes)
+
+
+def _motors(vehicle: VehicleLog, notes: list[str]) -> list[RawChannel]:
+    """Rotor speeds and outputs, each of the motors in their order."""
+    if other := no_multirotor(vehicle.parameters, vehicle.kind):
+        notes.append(other)
+        return []
+    rotors = vehicle.rotors or px4_rotor_count(vehicle.parameters) or MULTIROTORS.get(vehicle.kind, 0)
+    notes += [vehicle.changed] if vehicle.changed else []
+    raw: list[RawChannel] = []
+    for (signal, source), (t, values, refused) in vehicle.signals.items():
+        if signal == "esc":
+            turning = (np.nan_to_num(values) != 0.0).any(axis=0)
+            found = esc_columns(vehicle.parameters, rotors, turning, source, vehicle.ardupilot)
+            notes += [found.problem] if found.problem else []
+            raw.append(RawChannel("rotor_speed", t, values[:, found.columns], f"{source} (rpm)", refused))
+        elif signal in ("servo", "actuator"):
+            told = np.flatnonzero(np.isfinite(values).any(axis=0))
+            values = values[:, : told.max(initial=-1) + 1]
+            found = motor_outputs(vehicle.parameters, rotors, values.shape[1], source, vehicle.ardupilot)
+            notes += [found.problem] if found.problem else []
+            values, how = in_pulses(values) if signal == "servo" else (values, "")
+            guessed = active_outputs(values) if signal == "servo" and not found.problem else []
+            motors = found.columns or guessed
+            which = " ".join(str(i + 1) for i in motors) + how if signal == "servo" else "(normalized)"
+            if motors:
+                raw.append(RawChannel("motor_command", t, values[:, motors], f"{source} {which}", refused))
+    order: Iterable[RawChannel] = sorted(raw, key=lambda r: "ACTUATOR" not in r.source)
+    return list(order)

@@ -1,0 +1,300 @@
+"""Crazyflie µSD logs."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quadid.data.window import Recording
+from quadid.errors import LogError
+from quadid.sanitise import plain
+from quadid.types import FloatArray, IntArray
+from quadid_replay.columns import LogClock, RawChannel, assemble
+from quadid_replay.frames import GRAVITY, flip_body, from_euler
+from quadid_replay.motors import RPM
+
+# --- Walks through a Crazyflie µSD log: declared event types, then records of them, then a CRC-32 of all that
+#
+# The layout is in the file: byte 0xBC, version (uint16), number of event types (uint16); per type its id (uint16), its
+# name and its variables, zero-ended names with the type of the number in brackets, such as ``gyro.x(f)``.  Each record
+# is id (uint16), time (uint64, µs) and the values, little-endian without padding.
+
+
+MOST_TYPES, MOST_VARIABLES, LONGEST_NAME = 256, 512, 128
+_NUMBERS = dict(zip("bBhHiIqQfd", ("i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8", "f4", "f8"), strict=True))
+_STAMP = [("id", "<u2"), ("t", "<u8")]
+_CRC = 4
+_FIRST_LOOK = 16
+
+
+@dataclass
+class UsdRecords:
+    """What a walk found.
+
+    Attributes:
+        tables: records by event type's name: structured arrays with ``t`` [µs] and the variables by their full name.
+        places: where in the file each of these records stands.
+        notes: what is wrong with the file, in sentences.
+    """
+
+    tables: dict[str, NDArray[np.void]] = field(default_factory=dict)
+    places: dict[str, IntArray] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+
+
+class _Declared:
+    """An event type: its name and the layout of its records."""
+
+    def __init__(self, name: str, layout: np.dtype[np.void]) -> None:
+        self.name, self.layout = name, layout
+        self.parts: list[NDArray[np.void]] = []
+        self.places: list[IntArray] = []
+
+
+def collect_usd_records(data: bytes, name: str) -> UsdRecords:
+    """Reads all whole records.
+
+    Args:
+        data: the whole file.
+        name: file name, for errors.
+
+    Raises:
+        LogError: declarations that are damaged: without them no record can be read.
+    """
+    types, at = _declarations(data, name)
+    found = UsdRecords()
+    end = len(data)
+    if end - at >= _CRC and zlib.crc32(data[:-_CRC]) == int.from_bytes(data[-_CRC:], "little"):
+        end -= _CRC
+    else:
+        found.notes.append("checksum does not match: the log was cut off or damaged")
+    while at + 2 <= end:
+        declared = types.get(int.from_bytes(data[at : at + 2], "little"))
+        if declared is None:
+            break
+        run = _run(data, at, end, declared)
+        if len(run) == 0:
+            break
+        declared.parts.append(run)
+        declared.places.append(at + declared.layout.itemsize * np.arange(len(run), dtype=np.int64))
+        at += len(run) * declared.layout.itemsize
+    if at < end:
+        found.notes.append(f"{end - at} bytes at the end belong to no record")
+    found.tables = {d.name: np.concatenate(d.parts) for d in types.values() if d.parts}
+    found.places = {d.name: np.concatenate(d.places) for d in types.values() if d.parts}
+    return found
+
+
+def _run(data: bytes, at: int, end: int, declared: _Declared) -> NDArray[np.void]:
+    """The records of one type that follow each other from `at` on, without one of another between them.
+
+    It is looked for in stretches that double, so that the work is that of its own length, however much follows.
+    """
+    layout = declared.layout
+    rows = np.frombuffer(data, layout, max((end - at) // layout.itemsize, 0), at)
+    known, looked = 0, _FIRST_LOOK
+    while known < len(rows):
+        other = np.flatnonzero(rows["id"][known:looked] != rows["id"][0])
+        if len(other):
+            return rows[: known + other[0]]
+        known, looked = looked, 2 * looked
+    return rows
+
+
+def _declarations(data: bytes, name: str) -> tuple[dict[int, _Declared], int]:
+    """The event types by id, and where the records begin."""
+    at, types = 5, {}
+    try:
+        (count,) = struct.unpack_from("<H", data, 3)
+        if not 0 < count <= MOST_TYPES:
+            raise ValueError(f"{count} event types")
+        for _ in range(count):
+            (number,) = struct.unpack_from("<H", data, at)
+            title, at = _text(data, at + 2)
+            (width,) = struct.unpack_from("<H", data, at)
+            if width > MOST_VARIABLES:
+                raise ValueError(f"{width} variables in '{plain(title)}'")
+            at += 2
+            fields = list(_STAMP)
+            for _ in range(width):
+                variable, at = _text(data, at)
+                fields.append(_field(variable))
+            if number in types:
+                raise ValueError(f"event type {number} twice")
+            types[number] = _Declared(title, np.dtype(fields))
+    except (struct.error, ValueError) as error:
+        raise LogError(
+            f"{name}: damaged list of variables ({error})", "a Crazyflie µSD log, version 2", "copy the file again"
+        ) from error
+    return types, at
+
+
+def _text(data: bytes, at: int) -> tuple[str, int]:
+    """A zero-ended name and where the next thing begins."""
+    end = data.find(b"\0", at, at + LONGEST_NAME)
+    if end < 0:
+        raise ValueError("a name without end")
+    return data[at:end].decode("ascii"), end + 1
+
+
+def _field(variable: str) -> tuple[str, str]:
+    """Name and layout of a variable such as ``gyro.x(f)``."""
+    if len(variable) < 4 or variable[-3] != "(" or variable[-1] != ")" or variable[-2] not in _NUMBERS:
+        raise ValueError(f"variable '{plain(variable)}' of unknown type")
+    return variable[:-3], "<" + _NUMBERS[variable[-2]]
+
+
+# --- Crazyflie µSD logs: which of the firmware's variables are which channel, in core units and frames
+#
+# The firmware's body frame is x forward, y left, z up and its world z up; what its `controller` group holds is in the
+# frame of the old controllers: roll and pitch positive to the right and nose up, yaw positive to the left.
+
+
+FULL_SCALE = 65535.0
+"""The firmware's full motor command."""
+
+
+class Source(NamedTuple):
+    """How a channel is made of variables: its name, the variables in order, and the conversion of rows (n, k)."""
+
+    channel: str
+    variables: tuple[str, ...]
+    convert: Callable[[FloatArray], FloatArray]
+
+
+def _axes(prefix: str, names: str) -> tuple[str, ...]:
+    return tuple(f"{prefix}{name}" for name in names.split())
+
+
+def _scaled(factor: float) -> Callable[[FloatArray], FloatArray]:
+    return lambda rows: rows * factor
+
+
+def _level(rows: FloatArray) -> FloatArray:
+    """World vectors, z up to z down about the x axis, which stays."""
+    return flip_body(rows)
+
+
+def _specific_force(rows: FloatArray) -> FloatArray:
+    """Acceleration without gravity [g], world, z up, to specific force [m/s²], z down."""
+    return flip_body((rows + np.array([0.0, 0.0, 1.0])) * GRAVITY)
+
+
+def _attitude(rows: FloatArray) -> FloatArray:
+    """Roll, pitch (nose up), yaw (to the left) [deg] to quaternions."""
+    return from_euler(np.deg2rad(rows) * np.array([1.0, 1.0, -1.0]))
+
+
+def _quaternion(rows: FloatArray) -> FloatArray:
+    """Body FLU to a world with z up, to body FRD to a world with z down: y and z change their signs."""
+    return np.asarray(rows * np.array([1.0, 1.0, -1.0, -1.0]))
+
+
+def _reference(rows: FloatArray) -> FloatArray:
+    """Desired roll, pitch, yaw [deg] and thrust (16 bit)."""
+    return np.column_stack([np.deg2rad(rows[:, :3]) * np.array([1.0, 1.0, -1.0]), rows[:, 3] / FULL_SCALE])
+
+
+SOURCES: tuple[Source, ...] = (
+    Source("gyro", _axes("gyro.", "x y z"), lambda rows: flip_body(np.deg2rad(rows))),
+    Source("gyro", _axes("controller.r_", "roll pitch yaw"), lambda rows: rows * np.array([1.0, 1.0, -1.0])),
+    Source("accel", _axes("acc.", "x y z"), lambda rows: flip_body(rows * GRAVITY)),
+    Source("accel_z", ("controller.accelz",), _scaled(-GRAVITY)),
+    Source("accel_world", _axes("stateEstimate.", "ax ay az"), _specific_force),
+    Source("attitude", _axes("stateEstimate.", "qw qx qy qz"), _quaternion),
+    Source("attitude", _axes("stateEstimate.", "roll pitch yaw"), _attitude),
+    Source("attitude", _axes("stabilizer.", "roll pitch yaw"), _attitude),
+    Source("velocity", _axes("stateEstimate.", "vx vy vz"), _level),
+    Source("position", _axes("stateEstimate.", "x y z"), _level),
+    Source("rotor_speed", _axes("rpm.", "m1 m2 m3 m4"), _scaled(RPM)),
+    Source("motor_command", _axes("motor.", "m1 m2 m3 m4"), _scaled(1.0 / FULL_SCALE)),
+    Source("motor_command", _axes("pwm.", "m1_pwm m2_pwm m3_pwm m4_pwm"), _scaled(1.0 / FULL_SCALE)),
+    Source("mixer_input", _axes("controller.cmd_", "thrust roll pitch yaw"), _scaled(1.0 / FULL_SCALE)),
+    Source("attitude_reference", (*_axes("controller.", "roll pitch yaw"), "controller.actuatorThrust"), _reference),
+    Source("battery", ("pm.vbatMV",), _scaled(1e-3)),
+    Source("battery", ("pm.vbat",), _scaled(1.0)),
+)
+"""In order of preference: of several sources of one channel the first that a log holds is taken."""
+
+
+def read_usd(path: Path) -> Recording:
+    """Reads a Crazyflie µSD log by the variables that it holds.
+
+    Raises:
+        LogError: a damaged list of variables, or no variable that is known.
+    """
+    records = collect_usd_records(path.read_bytes(), path.name)
+    clock = LogClock()
+    raw: list[RawChannel] = []
+    left: list[str] = []
+    tables = {  # the others are events, such as a change of mode
+        title: table for title, table in records.tables.items()
+        if title == "fixedFrequency" or any(_holds(table, s) for s in SOURCES)
+    }  # fmt: skip
+    times = _on_one_clock(tables, records.places, clock)
+    for title, table in tables.items():
+        t = times[title]
+        accepted = np.isfinite(t)
+        rows, refused = table[accepted], len(t) - int(np.count_nonzero(accepted))
+        used = {"id", "t"}
+        for source in SOURCES:
+            if _holds(rows, source) and source.channel not in {entry.name for entry in raw}:
+                with np.errstate(invalid="ignore"):  # what is no number is dropped further on
+                    values = np.column_stack([rows[v].astype(np.float64) for v in source.variables])
+                shown = " ".join(source.variables)
+                raw.append(RawChannel(source.channel, t[accepted], source.convert(values), shown, refused))
+                used |= set(source.variables)
+        left += [name for name in table.dtype.names or () if name not in used]
+    if not raw:
+        raise LogError(
+            f"{path.name}: none of its variables is known ({plain(', '.join(left))[:120] or 'no record'})",
+            "motor.m1 … m4 or controller.cmd_thrust, cmd_roll, cmd_pitch, cmd_yaw; gyro.x y z; acc.x y z; pm.vbatMV",
+            "list them in the µSD card's config.txt",
+        )
+    notes = [*records.notes, *_partial(left)]
+    return assemble(path.name, "usdlog", raw, clock, notes)
+
+
+def _on_one_clock(
+    tables: Mapping[str, NDArray[np.void]], places: Mapping[str, IntArray], clock: LogClock
+) -> dict[str, FloatArray]:
+    """Recording times [s] of each table's records: all stamps run through one clock, in file order."""
+    if not tables:
+        return {}
+    order = np.argsort(np.concatenate([places[title] for title in tables]))
+    mapped = np.empty(len(order))
+    mapped[order] = clock.times(np.concatenate([table["t"] for table in tables.values()])[order] * 1e-6)[0]
+    ends = np.cumsum([len(table) for table in tables.values()])
+    return dict(zip(tables, np.split(mapped, ends[:-1]), strict=True))
+
+
+def _holds(table: NDArray[np.void], source: Source) -> bool:
+    return set(source.variables) <= set(table.dtype.names or ())
+
+
+_PARTIAL: Mapping[str, tuple[str, ...]] = {
+    "attitude": _axes("stateEstimate.", "roll pitch yaw"),
+    "gyro": _axes("gyro.", "x y z"),
+    "accel": _axes("acc.", "x y z"),
+    "motor_command": _axes("motor.", "m1 m2 m3 m4"),
+}
+"""Groups of which some variables are of no use without the others."""
+
+
+def _partial(left: list[str]) -> list[str]:
+    """Says which groups of variables are incomplete, and therefore not used."""
+    out = []
+    for channel, group in _PARTIAL.items():
+        there = [name for name in group if name in left]
+        missing = [name for name in group if name not in left]
+        if there and missing:
+            lack, rest = (f"{', '.join(names)} {'is' if len(names) == 1 else 'are'}" for names in (missing, there))
+            out.append(f"{channel}: {lack} missing, so {rest} not used")
+    return out

@@ -1,0 +1,701 @@
+"""Writers of recordings: MCAP, CSV, MAVLink telemetry."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from types import SimpleNamespace, TracebackType
+from typing import Any, BinaryIO, TypeAlias
+
+import numpy as np
+import yaml
+from mcap.writer import CompressionType, Writer
+from mcap_ros2._dynamic import serialize_dynamic
+from pymavlink.dialects.v20 import ardupilotmega
+
+from quadid.data.resample import linear
+from quadid.data.window import Channel, Recording, Window, as_recording
+from quadid.errors import LogError
+from quadid.rotation import conjugate, rotated
+from quadid.types import FloatArray
+from quadid_replay.csv_reader import EULER, GROUPS
+from quadid_replay.frames import flip_attitude, flip_body, flip_world, from_euler, to_euler
+from quadid_replay.mavlink_messages import extend_dialect
+from quadid_replay.motors import RPM
+from quadid_replay.ros_messages import BlockWriter
+from quadid_replay.schemas import has_definition, schema_text
+
+# --- What the writers share: recordings of windows, samples in time order, files that can be written
+
+
+Source: TypeAlias = Recording | Window | Sequence[Window]
+"""What can be written: a recording, or windows of one log."""
+
+
+def recording_of(source: Source) -> Recording:
+    """The recording that a source is, or that its windows make; raises LogError as `as_recording`."""
+    if isinstance(source, Recording):
+        return source
+    return as_recording([source] if isinstance(source, Window) else source)
+
+
+def in_time_order(times: Sequence[FloatArray]) -> Iterator[tuple[int, int]]:
+    """Yields (series, row) over several rising series of times, in time order; at equal times earlier series first."""
+    if not times:
+        return
+    series = np.concatenate([np.full(len(t), i) for i, t in enumerate(times)])
+    rows = np.concatenate([np.arange(len(t)) for t in times])
+    order = np.argsort(np.concatenate(times), kind="stable")
+    yield from zip(series[order].tolist(), rows[order].tolist(), strict=True)
+
+
+def union_rows(channels: Sequence[Channel | None]) -> tuple[FloatArray, list[FloatArray | None]]:
+    """Puts channels on the union of their times, shape (n,); rows without a sample are NaN, absent channels None."""
+    present = [c.t for c in channels if c is not None]
+    if not present:
+        return np.empty(0), [None for _ in channels]
+    t = present[0]
+    if any(len(other) != len(t) or np.any(other != t) for other in present[1:]):
+        t = np.unique(np.concatenate(present))
+    out: list[FloatArray | None] = []
+    for channel in channels:
+        if channel is None:
+            out.append(None)
+            continue
+        rows = np.full((len(t), channel.values.shape[1]), np.nan)
+        rows[np.searchsorted(t, channel.t)] = channel.values
+        out.append(rows)
+    return t, out
+
+
+def open_for_writing(path: str | Path) -> BinaryIO:
+    """Opens a file for writing; raises LogError with the reason when it cannot be."""
+    try:
+        return Path(path).open("wb")
+    except OSError as error:
+        raise LogError(
+            f"cannot write {path} ({error.strerror})", "a file in a folder that exists", "create the folder first"
+        ) from error
+
+
+# --- Writes ROS 2 messages of any type to MCAP without ROS: profile ros2, schemas ros2msg, CDR, zstd chunks with CRC
+
+
+CHUNK_BYTES = 1 << 20
+"""Compresses well; a caller who must not be held up for ten milliseconds takes less."""
+
+LATCHED = ("quadid/parameters", "quadid/diagnosis", "quadid/health")
+"""Ends of topics that the node offers transient local, depth 1: `ros2 bag play` offers them likewise."""
+
+
+def offered_qos(topic: str) -> str:
+    """QoS of a topic's publisher in the form of rosbag2 since Jazzy, which plays with it."""
+    latched = topic.endswith(LATCHED)
+    forever = {"sec": 9223372036, "nsec": 854775807}
+    return yaml.safe_dump([{
+        "history": "keep_last", "depth": 1 if latched else 10, "reliability": "reliable",
+        "durability": "transient_local" if latched else "volatile", "deadline": forever, "lifespan": forever,
+        "liveliness": "automatic", "liveliness_lease_duration": forever, "avoid_ros_namespace_conventions": False,
+    }], sort_keys=False)  # fmt: skip
+
+
+class TopicWriter:
+    """An MCAP file being written.  Use as a context manager; the file is complete only after `close`.
+
+    Args:
+        file: path, or a binary stream that stays open.
+        metadata: records by name, for `quadid_replay.mcap_file`; they stand at the beginning.
+        chunk_bytes: what is compressed and written at once, `CHUNK_BYTES` unless given; the caller waits for it.
+
+    Raises:
+        LogError: the file cannot be written.
+    """
+
+    def __init__(
+        self, file: str | Path | BinaryIO, metadata: Mapping[str, Mapping[str, str]] | None = None,
+        chunk_bytes: int | None = None,
+    ) -> None:  # fmt: skip
+        self._owned = open_for_writing(file) if isinstance(file, str | Path) else None
+        self._writer = Writer(
+            self._owned or file,  # type: ignore[arg-type]
+            chunk_size=CHUNK_BYTES if chunk_bytes is None else chunk_bytes,
+            compression=CompressionType.ZSTD,
+            enable_crcs=True,
+        )
+        self._writer.start(profile="ros2", library="quadid")
+        for name, data in (metadata or {}).items():
+            self._writer.add_metadata(name, dict(data))
+        self._definitions: dict[str, str] = {}
+        self._encoders: dict[str, Callable[[Any], bytes]] = {}
+        self._schemas: dict[str, int] = {}
+        self._channels: dict[str, int] = {}
+        self._sequence: dict[int, int] = {}
+        self._open = True
+        self._flushed = 0
+
+    def write(self, topic: str, kind: str, message: Any, stamp_ns: int) -> None:
+        """Writes one message.
+
+        Args:
+            topic: name, such as ``quadid/parameters``.
+            kind: ``package/msg/Type``, one of `quadid_replay.schemas`.
+            message: object or dict with the message's fields, nested likewise; absent fields take their defaults.
+            stamp_ns: log and publish time [ns].
+
+        Raises:
+            LogError: no definition of this type, or a message that does not fit it.
+        """
+        try:
+            data = self.encoder(kind)(_namespace(message))
+        except (ValueError, TypeError, AttributeError, LookupError) as error:
+            raise LogError(
+                f"message for {topic} does not fit {kind}: {error}", "the fields of its definition"
+            ) from error
+        self.write_cdr(topic, kind, data, stamp_ns)
+
+    def write_cdr(self, topic: str, kind: str, data: bytes, stamp_ns: int) -> None:
+        """Writes one message that is CDR already."""
+        channel = self._channels.get(topic)
+        if channel is None:
+            channel = self._writer.register_channel(
+                topic, "cdr", self._schema(kind), {"offered_qos_profiles": offered_qos(topic)}
+            )
+            self._channels[topic] = channel
+        sequence = self._sequence.get(channel, 0)
+        self._sequence[channel] = sequence + 1
+        self._writer.add_message(channel, stamp_ns, data, stamp_ns, sequence)
+        if self._owned is not None and self._owned.tell() != self._flushed:
+            # A chunk was written: its end must not wait in a buffer, or a killed process would lose two chunks.
+            self._owned.flush()
+            self._flushed = self._owned.tell()
+
+    def define(self, kind: str, text: str) -> None:
+        """Gives the definition of a type that `quadid_replay.schemas` does not hold (form ros2msg)."""
+        self._definitions[kind] = text
+
+    def encoder(self, kind: str) -> Callable[[Any], bytes]:
+        """Returns the function that makes CDR of a message of this type."""
+        if kind not in self._encoders:
+            self._encoders[kind] = serialize_dynamic(kind, _definition(kind))[kind]
+        return self._encoders[kind]
+
+    def blocks(self, kind: str, build: Callable[[list[list[float]]], Any], sizes: Sequence[int]) -> BlockWriter:
+        """Returns a fast writer for messages that differ in stamp and runs of doubles only; see `cdr_blocks`."""
+        return BlockWriter(self.encoder(kind), build, sizes)
+
+    def close(self) -> None:
+        """Writes index and footer; the file is readable without `close` too, but as a damaged one."""
+        if self._open:
+            self._open = False
+            self._writer.finish()  # type: ignore[no-untyped-call]
+            if self._owned is not None:
+                self._owned.close()
+
+    def _schema(self, kind: str) -> int:
+        if kind not in self._schemas:
+            text = self._definitions.get(kind) or _definition(kind)
+            self._schemas[kind] = self._writer.register_schema(kind, "ros2msg", text.encode())
+        return self._schemas[kind]
+
+    def __enter__(self) -> TopicWriter:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+def _namespace(message: Any) -> Any:
+    """Turns dicts into objects, throughout: the library takes an absent key ``values`` for the dict's own method."""
+    if isinstance(message, Mapping):
+        return SimpleNamespace(**{str(name): _namespace(value) for name, value in message.items()})
+    if isinstance(message, list | tuple):
+        return [_namespace(value) for value in message]
+    return message
+
+
+def _definition(kind: str) -> str:
+    if not has_definition(kind):
+        raise LogError(
+            f"no definition of message type {kind}", "the types in quadid_replay/schemas", "add its .msg there"
+        )
+    return schema_text(kind)
+
+
+# --- Writes a recording as the canonical MCAP: topics, types, frames and units of the contract (ENU, FLU, SI)
+
+
+_Series = tuple[FloatArray, Callable[[int], tuple[str, str, bytes]]]
+_ABSENT = -1.0
+_STAMP = {"sec": 0, "nanosec": 0}
+_MAP, _BODY = {"stamp": _STAMP, "frame_id": "map"}, {"stamp": _STAMP, "frame_id": "base_link"}
+
+
+def write_mcap(file: str | Path | BinaryIO, source: Source, epoch_ns: int = 0) -> None:
+    """Writes a recording or windows to MCAP.
+
+    Args:
+        file: path or binary stream.
+        source: what to write.
+        epoch_ns: added to recording time, so that stamps count from the UNIX epoch [ns].
+
+    Raises:
+        LogError: nothing to write, a file that cannot be written, or times before `epoch_ns` = 0.
+    """
+    recording = recording_of(source)
+    with TopicWriter(file) as writer:
+        write_recording(writer, recording, epoch_ns)
+
+
+def write_recording(writer: TopicWriter, recording: Recording, epoch_ns: int = 0) -> None:
+    """Writes all channels of a recording to an open writer, in time order; see `write_mcap`."""
+    write_recordings(writer, {"": recording}, epoch_ns)
+
+
+def write_recordings(writer: TopicWriter, recordings: Mapping[str, Recording], epoch_ns: int = 0) -> None:
+    """Writes recordings to an open writer, in time order, each with its name before its topics; see `write_mcap`."""
+    each = [(name, s) for name, recording in recordings.items() for s in _all_series(writer, recording, epoch_ns)]
+    for which, row in in_time_order([t for _, (t, _) in each]):
+        name, (t, message) = each[which]
+        topic, kind, data = message(row)
+        writer.write_cdr(f"{name}/{topic}" if name else topic, kind, data, _stamp(t[row], epoch_ns))
+
+
+def _all_series(writer: TopicWriter, recording: Recording, epoch_ns: int) -> list[_Series]:
+    channels = recording.channels
+    first = min((float(c.t[0]) for c in channels.values()), default=0.0)
+    if epoch_ns + round(first * 1e9) < 0:
+        raise LogError(f"times begin at {first:.3f} s", "times from 0 s on", "give an epoch that makes stamps positive")
+    return [
+        *_imu(writer, channels.get("gyro"), channels.get("accel"), epoch_ns),
+        *_attitude(writer, channels.get("attitude"), epoch_ns),
+        *_rotor_speeds(writer, channels.get("rotor_speed"), epoch_ns),
+        *_motor_command(writer, channels.get("motor_command"), epoch_ns),
+        *_command(writer, channels.get("attitude_reference"), epoch_ns),
+        *_odometry(writer, recording, epoch_ns),
+        *_battery(writer, channels.get("battery"), epoch_ns),
+    ]
+
+
+def _stamp(t: float, epoch_ns: int) -> int:
+    return epoch_ns + round(float(t) * 1e9)
+
+
+def _blocks(
+    writer: TopicWriter, topic: str, kind: str, t: FloatArray, rows: FloatArray, build: Callable[[Any], Any], epoch: int
+) -> _Series:
+    """One run of doubles a message."""
+    layout = writer.blocks(kind, build, [rows.shape[1]])
+    return t, lambda row: (topic, kind, layout.write(_stamp(t[row], epoch), rows[row].tolist()))
+
+
+def _imu(writer: TopicWriter, gyro: Channel | None, accel: Channel | None, epoch: int) -> list[_Series]:
+    """One message a stamp; what was not measured there says so in its covariance (REP-145)."""
+    t, (rate, force) = union_rows([gyro, accel])
+    if len(t) == 0:
+        return []
+    rows = np.zeros((len(t), 37))
+    rows[:, 3] = 1.0
+    rows[:, 4] = _ABSENT  # no orientation
+    for at, values in ((13, rate), (25, force)):
+        measured = np.zeros(len(t), dtype=np.bool_) if values is None else np.isfinite(values).all(axis=1)
+        rows[~measured, at + 3] = _ABSENT
+        if values is not None:
+            rows[measured, at : at + 3] = flip_body(values[measured])
+    return [_blocks(writer, "imu", "sensor_msgs/msg/Imu", t, rows, _imu_message, epoch)]
+
+
+def _imu_message(blocks: list[list[float]]) -> dict[str, Any]:
+    (v,) = blocks
+    return {
+        "header": _BODY,
+        "orientation": dict(zip("xyzw", v[:4], strict=True)),
+        "orientation_covariance": v[4:13],
+        "angular_velocity": _xyz(v[13:16]),
+        "angular_velocity_covariance": v[16:25],
+        "linear_acceleration": _xyz(v[25:28]),
+        "linear_acceleration_covariance": v[28:37],
+    }
+
+
+def _xyz(v: list[float]) -> dict[str, float]:
+    return dict(zip("xyz", v, strict=True))
+
+
+def _attitude(writer: TopicWriter, attitude: Channel | None, epoch: int) -> list[_Series]:
+    if attitude is None:
+        return []
+    rows = flip_attitude(attitude.values)[:, [1, 2, 3, 0]]
+    return [
+        _blocks(
+            writer, "attitude", "geometry_msgs/msg/QuaternionStamped", attitude.t, rows,
+            lambda b: {"header": _MAP, "quaternion": dict(zip("xyzw", b[0], strict=True))}, epoch,
+        )
+    ]  # fmt: skip
+
+
+def _rotor_speeds(writer: TopicWriter, speed: Channel | None, epoch: int) -> list[_Series]:
+    if speed is None:
+        return []
+    names = [f"rotor_{i + 1}" for i in range(speed.values.shape[1])]
+    return [
+        _blocks(
+            writer, "rotor_speeds", "sensor_msgs/msg/JointState", speed.t, speed.values,
+            lambda b: {"header": _BODY, "name": names, "position": [], "velocity": b[0], "effort": []}, epoch,
+        )
+    ]  # fmt: skip
+
+
+def _motor_command(writer: TopicWriter, command: Channel | None, epoch: int) -> list[_Series]:
+    if command is None:
+        return []
+    kind = 1 if np.nanmedian(np.abs(command.values)) > 100.0 else 0  # KIND_PWM, KIND_NORMALIZED
+    return [
+        _blocks(
+            writer, "motor_command", "quadid_msgs/msg/MotorCommand", command.t, command.values,
+            lambda b: {"header": _BODY, "kind": kind, "values": b[0]}, epoch,
+        )
+    ]  # fmt: skip
+
+
+def _command(writer: TopicWriter, reference: Channel | None, epoch: int) -> list[_Series]:
+    if reference is None:
+        return []
+    angles = to_euler(flip_attitude(from_euler(reference.values[:, :3])))
+    rows = np.column_stack([angles, reference.values[:, 3]])
+    return [
+        _blocks(
+            writer, "command", "quadid_msgs/msg/AttitudeCommand", reference.t, rows,
+            lambda b: {"header": _MAP, **dict(zip(("roll", "pitch", "yaw", "throttle"), b[0], strict=True))}, epoch,
+        )
+    ]  # fmt: skip
+
+
+def _odometry(writer: TopicWriter, recording: Recording, epoch: int) -> list[_Series]:
+    """Pose in the world; twist in the body where there is an attitude, else in the world (child frame = frame)."""
+    channels = recording.channels
+    t, (position, velocity) = union_rows([channels.get("position"), channels.get("velocity")])
+    attitude = channels.get("attitude")
+    if len(t) == 0:
+        return []
+    rows = np.zeros((len(t), 85))
+    rows[:, :3] = np.nan if position is None else flip_world(position)
+    rows[:, 6] = 1.0
+    world = np.full((len(t), 3), np.nan) if velocity is None else flip_world(velocity)
+    if attitude is not None:
+        q = linear(attitude.t, attitude.values, t)
+        q = flip_attitude(q / np.linalg.norm(q, axis=1, keepdims=True))
+        rows[:, 3:7] = q[:, [1, 2, 3, 0]]
+        world = rotated(conjugate(q), world)
+    rows[:, 43:46] = world
+    child = "base_link" if attitude is not None else "map"
+    return [
+        _blocks(writer, "odom", "nav_msgs/msg/Odometry", t, rows, lambda b: _odometry_message(b, child), epoch)
+    ]  # fmt: skip
+
+
+def _odometry_message(blocks: list[list[float]], child: str) -> dict[str, Any]:
+    (v,) = blocks
+    orientation = dict(zip("xyzw", v[3:7], strict=True))
+    return {
+        "header": _MAP,
+        "child_frame_id": child,
+        "pose": {"pose": {"position": _xyz(v[:3]), "orientation": orientation}, "covariance": v[7:43]},
+        "twist": {"twist": {"linear": _xyz(v[43:46]), "angular": _xyz(v[46:49])}, "covariance": v[49:85]},
+    }
+
+
+def _battery(writer: TopicWriter, battery: Channel | None, epoch: int) -> list[_Series]:
+    if battery is None:
+        return []
+    encode = writer.encoder("sensor_msgs/msg/BatteryState")
+    nan = float("nan")
+
+    def message(row: int) -> tuple[str, str, bytes]:
+        ns = _stamp(battery.t[row], epoch)
+        fields = {
+            "header": {"stamp": {"sec": ns // 10**9, "nanosec": ns % 10**9}, "frame_id": "base_link"},
+            "voltage": float(battery.values[row, 0]), "temperature": nan, "current": nan, "charge": nan,
+            "capacity": nan, "design_capacity": nan, "percentage": nan, "present": True,
+        }  # fmt: skip
+        return "battery", "sensor_msgs/msg/BatteryState", encode(fields)
+
+    return [(battery.t, message)]
+
+
+# --- Writes a recording as CSV of the contract; every number is written so that it reads back to the same bits
+
+
+_ROWS = 4096
+
+
+def write_csv(file: str | Path | BinaryIO, source: Source) -> None:
+    """Writes a recording or windows to CSV: one row a time, cells empty where a channel has no sample.
+
+    Args:
+        file: path or binary stream.
+        source: what to write.
+
+    Raises:
+        LogError: nothing to write, or a file that cannot be written.
+    """
+    recording = recording_of(source)
+    if not recording.channels:
+        raise LogError(f"{recording.name}: no channel to write", "at least one")
+    layout = column_names(recording)
+    t, columns = union_rows([recording.channels[name] for name in layout])
+    table = np.column_stack([t, *(c for c in columns if c is not None)])
+    write_table(file, ["t", *(column for names in layout.values() for column in names)], table)
+
+
+def column_names(recording: Recording) -> dict[str, tuple[str, ...]]:
+    """Names of the columns of every channel that a recording has."""
+    layout = {name: GROUPS[name] for name in GROUPS if name in recording.channels}
+    for name, letter in (("rotor_speed", "w"), ("motor_command", "u")):
+        if name in recording.channels:
+            width = recording.channels[name].values.shape[1]
+            layout[name] = tuple(f"{letter}{i + 1}" for i in range(width))
+    return layout
+
+
+def write_table(file: str | Path | BinaryIO, header: Sequence[str], table: FloatArray) -> None:
+    """Writes numbers (rows, columns) under their names; cells of NaN stay empty."""
+    stream = open_for_writing(file) if isinstance(file, str | Path) else file
+    try:
+        stream.write((",".join(header) + "\n").encode())
+        for begin in range(0, len(table), _ROWS):
+            lines = (",".join("" if v != v else repr(v) for v in row) for row in table[begin : begin + _ROWS].tolist())
+            stream.write(("\n".join(lines) + "\n").encode())
+    finally:
+        if stream is not file:
+            stream.close()
+
+
+# --- Writes a recording as MAVLink 2 messages: a telemetry log, or one by one for a live link
+#
+# HIGHRES_IMU and ESC_STATUS carry microseconds and single precision, ATTITUDE_QUATERNION, LOCAL_POSITION_NED and
+# ATTITUDE_TARGET milliseconds, ESC_STATUS whole rpm, SERVO_OUTPUT_RAW whole microseconds: the format's resolution.
+
+
+dialect = extend_dialect(ardupilotmega)
+SYSTEM, COMPONENT = 1, 1
+_UNIX_START_US = 1_600_000_000_000_000  # receive time at recording time 0
+_TYPES = {3: 15, 4: 2, 6: 13, 8: 14, 10: 35, 12: 29}  # rotors to MAV_TYPE
+_GENERIC_AUTOPILOT, _ACTIVE = 0, 4
+_LONGEST_MS = 2**32
+_GYRO_BITS, _ACCEL_BITS = 0x38, 0x07
+_TlogWriterSeries = tuple[FloatArray, Callable[[int], list[Any]]]
+
+
+def write_tlog(file: str | Path | BinaryIO, source: Source) -> None:
+    """Writes a recording or windows to a telemetry log.
+
+    Args:
+        file: path or binary stream.
+        source: what to write.
+
+    Raises:
+        LogError: nothing to write, times that boot clocks cannot tell, or a file that cannot be written.
+    """
+    recording = recording_of(source)
+    mav = dialect.MAVLink(None, srcSystem=SYSTEM, srcComponent=COMPONENT)
+    stream = open_for_writing(file) if isinstance(file, str | Path) else file
+    try:
+        for t, message in mavlink_messages(recording):
+            frame = message.pack(mav)
+            mav.seq = (mav.seq + 1) % 256
+            stream.write(struct.pack(">Q", _UNIX_START_US + round(t * 1e6)) + frame)
+    finally:
+        if stream is not file:
+            stream.close()
+
+
+def mavlink_messages(recording: Recording) -> Iterator[tuple[float, Any]]:
+    """Yields (time [s], message) of a recording in time order, with a HEARTBEAT and ESC_INFO every second.
+
+    Raises:
+        LogError: times below 0 or beyond what 32 bits of milliseconds hold, or nothing to write.
+    """
+    channels = recording.channels
+    if not channels:
+        raise LogError(f"{recording.name}: no channel to write", "at least one")
+    first, last = min(c.t[0] for c in channels.values()), max(c.t[-1] for c in channels.values())
+    if first < 0.0 or last * 1e3 >= _LONGEST_MS:
+        raise LogError(f"times from {first:.3f} to {last:.3f} s", "0 to 49 days, as boot clocks count")
+    motors = channels.get("rotor_speed") or channels.get("motor_command")
+    rotors = motors.values.shape[1] if motors is not None else 4
+    series = [
+        _heartbeats(float(first), float(last), rotors, channels.get("rotor_speed") is not None),
+        *_tlog_writer_imu(channels.get("gyro"), channels.get("accel")),
+        *_tlog_writer_attitude(channels.get("attitude")),
+        *_escs(channels.get("rotor_speed")),
+        *_outputs(channels.get("motor_command")),
+        *_reference(channels.get("attitude_reference")),
+        *_local_position(channels.get("position"), channels.get("velocity")),
+        *_tlog_writer_battery(channels.get("battery")),
+    ]
+    for which, row in in_time_order([t for t, _ in series]):
+        t, messages = series[which]
+        for message in messages(row):
+            yield float(t[row]), message
+
+
+def _ms(t: float) -> int:
+    return round(float(t) * 1e3)
+
+
+def _us(t: float) -> int:
+    return round(float(t) * 1e6)
+
+
+def _heartbeats(first: float, last: float, rotors: int, escs: bool) -> _TlogWriterSeries:
+    t = np.arange(first, last + 1.0, 1.0)
+    kind = _TYPES.get(rotors, 2)
+
+    def messages(row: int) -> list[Any]:
+        out = [dialect.MAVLink_heartbeat_message(kind, _GENERIC_AUTOPILOT, 0, 0, _ACTIVE, 3)]
+        if escs:
+            zeros = [0, 0, 0, 0]
+            for index in range(0, rotors, 4):
+                out.append(dialect.MAVLink_esc_info_message(index, _us(t[row]), 0, rotors, 0, 0, zeros, zeros, zeros))
+        return out
+
+    return t, messages
+
+
+def _tlog_writer_imu(gyro: Channel | None, accel: Channel | None) -> list[_TlogWriterSeries]:
+    t, (rate, force) = union_rows([gyro, accel])
+    if len(t) == 0:
+        return []
+
+    def messages(row: int) -> list[Any]:
+        updated, fields = 0, [0.0] * 6
+        for values, place, bits in ((force, 0, _ACCEL_BITS), (rate, 3, _GYRO_BITS)):
+            if values is not None and np.isfinite(values[row]).all():
+                updated |= bits
+                fields[place : place + 3] = values[row].tolist()
+        rest = [0.0] * 7
+        return [dialect.MAVLink_highres_imu_message(_us(t[row]), *fields, *rest, updated)]
+
+    return [(t, messages)]
+
+
+def _tlog_writer_attitude(attitude: Channel | None) -> list[_TlogWriterSeries]:
+    if attitude is None:
+        return []
+    return [
+        (attitude.t, lambda row: [_quaternion_message(_ms(attitude.t[row]), attitude.values[row].tolist())])
+    ]  # fmt: skip
+
+
+def _quaternion_message(ms: int, q: list[float]) -> Any:
+    return dialect.MAVLink_attitude_quaternion_message(ms, *q, 0.0, 0.0, 0.0)
+
+
+def _escs(speed: Channel | None) -> list[_TlogWriterSeries]:
+    if speed is None:
+        return []
+    width = speed.values.shape[1]
+
+    def messages(row: int) -> list[Any]:
+        rpm = [round(w / RPM) for w in speed.values[row].tolist()] + [0] * (-width % 4)
+        zeros = [0.0, 0.0, 0.0, 0.0]
+        return [
+            dialect.MAVLink_esc_status_message(i, _us(speed.t[row]), rpm[i : i + 4], zeros, zeros)
+            for i in range(0, width, 4)
+        ]
+
+    return [(speed.t, messages)]
+
+
+def _outputs(command: Channel | None) -> list[_TlogWriterSeries]:
+    """Pulse widths as SERVO_OUTPUT_RAW, normalized commands as ACTUATOR_OUTPUT_STATUS."""
+    if command is None:
+        return []
+    width = command.values.shape[1]
+    pwm = bool(np.nanmedian(np.abs(command.values)) > 100.0)
+
+    def messages(row: int) -> list[Any]:
+        values = command.values[row].tolist()
+        if pwm:
+            pulses = [round(v) for v in values] + [0] * (16 - width)
+            return [dialect.MAVLink_servo_output_raw_message(_us(command.t[row]) % 2**32, 0, *pulses)]
+        padded = values + [0.0] * (32 - width)
+        return [dialect.MAVLink_actuator_output_status_message(_us(command.t[row]), width, padded)]
+
+    return [(command.t, messages)]
+
+
+def _reference(reference: Channel | None) -> list[_TlogWriterSeries]:
+    if reference is None:
+        return []
+    q = from_euler(reference.values[:, :3])
+
+    def messages(row: int) -> list[Any]:
+        throttle = float(reference.values[row, 3])
+        return [
+            dialect.MAVLink_attitude_target_message(_ms(reference.t[row]), 0, q[row].tolist(), 0.0, 0.0, 0.0, throttle)
+        ]
+
+    return [(reference.t, messages)]
+
+
+def _local_position(position: Channel | None, velocity: Channel | None) -> list[_TlogWriterSeries]:
+    """One LOCAL_POSITION_NED a time; NaN stands for what was not measured there."""
+    t, (place, speed) = union_rows([position, velocity])
+    if len(t) == 0:
+        return []
+    nan = [float("nan")] * 3
+
+    def messages(row: int) -> list[Any]:
+        xyz = nan if place is None else place[row].tolist()
+        v = nan if speed is None else speed[row].tolist()
+        return [dialect.MAVLink_local_position_ned_message(_ms(t[row]), *xyz, *v)]
+
+    return [(t, messages)]
+
+
+def _tlog_writer_battery(battery: Channel | None) -> list[_TlogWriterSeries]:
+    """The whole pack's voltage as if of one cell [mV]."""
+    if battery is None:
+        return []
+
+    def messages(row: int) -> list[Any]:
+        cells = [min(round(float(battery.values[row, 0]) * 1e3), 65534)] + [65535] * 9
+        return [dialect.MAVLink_battery_status_message(0, 0, 0, 32767, cells, -1, -1, -1, -1)]
+
+    return [(battery.t, messages)]
+
+
+# --- Writes recordings of one flight side by side, such as measured and simulated, for viewers that draw curves
+
+
+def write_compared(path: str | Path, recordings: Mapping[str, Recording], epoch_ns: int = 0) -> None:
+    """Writes recordings under their names: topics ``simulated/imu`` in MCAP, columns ``simulated/p`` in CSV.
+
+    Args:
+        path: ends in .mcap (ENU, FLU) or .csv (NED, FRD).
+        recordings: by name.
+        epoch_ns: added to recording time in MCAP, so that stamps count from the UNIX epoch [ns].
+
+    Raises:
+        LogError: another suffix, nothing to write, or a file that cannot be written.
+    """
+    kind = Path(path).suffix.lower()
+    if kind == ".mcap":
+        with TopicWriter(path) as writer:
+            write_recordings(writer, recordings, epoch_ns)
+        return
+    if kind != ".csv":
+        raise LogError(f"cannot tell the format of '{path}'", ".mcap, .csv")
+    channels = [(name, layout) for name, r in recordings.items() for layout in column_names(r).items()]
+    t, columns = union_rows([recordings[name].channels[channel] for name, (channel, _) in channels])
+    header, table = ["t"], [t[:, None]]
+    for (name, (channel, names)), values in zip(channels, columns, strict=True):
+        assert values is not None
+        # Angles show more in a picture than a quaternion does.
+        header += [f"{name}/{column}" for column in (EULER if channel == "attitude" else names)]
+        table.append(to_euler(values) if channel == "attitude" else values)
+    write_table(path, header, np.concatenate(table, axis=1))
