@@ -90,10 +90,10 @@ def replay(
     if as_recorded:
         beginning = _beginning(Path(log), described.name)
         described = beginning.vehicle
-        service = Service(described, beginning.settings, InlineWorker(), restored=beginning.restored)
+        service = Service(described, beginning.settings, InlineWorker(), restored=beginning.restored, live=False)
         samples = arrivals(Path(log), beginning.source, len(described.rotors))
     else:
-        service = Service(described, settings, InlineWorker())
+        service = Service(described, settings, InlineWorker(), live=False)
         samples = stream(recording)
     with terminal.progress() as advance:
         outputs = play(recording, samples, service, pace, advance)

@@ -6,7 +6,6 @@ import contextlib
 import importlib
 import sys
 
-from quadid.errors import QuadidError
 from quadid_node.stopping import Stop, end_middleware
 from quadid_node.transport import without_shared_memory
 
@@ -33,6 +32,7 @@ def _run(args: list[str] | None, stop: Stop) -> int:
     from rclpy.signals import SignalHandlerOptions
     from rclpy.task import Future
 
+    from quadid.errors import QuadidError
     from quadid_node.node import IdentifyNode
 
     stop.opens()

@@ -6,9 +6,6 @@ import argparse
 import importlib
 import sys
 
-from quadid_replay import open_log
-
-from quadid.errors import QuadidError
 from quadid_node.stopping import Stop, end_middleware
 
 
@@ -30,8 +27,10 @@ def main(args: list[str] | None = None) -> int:
     except ImportError as error:
         print(f"replay: {error}", file=sys.stderr)  # noqa: T201 - a command's last word
         return 2
+    from quadid_replay import open_log
     from rclpy.utilities import remove_ros_args
 
+    from quadid.errors import QuadidError
     from quadid_node.topic_player import play
 
     given = parse(remove_ros_args(args or sys.argv)[1:])

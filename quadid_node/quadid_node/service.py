@@ -78,7 +78,7 @@ class Service:
 
     def __init__(
         self, vehicle: Vehicle, settings: SessionSettings, worker: Worker, store: Store | None = None,
-        clock: Callable[[], float] = time.monotonic, restored: Restored | None = None,
+        clock: Callable[[], float] = time.monotonic, restored: Restored | None = None, live: bool = True,
     ) -> None:  # fmt: skip
         """Starts where the last run of this vehicle ended.
 
@@ -89,6 +89,7 @@ class Service:
             store: history; None for none.
             clock: seconds, monotonic; only rates and silences are measured with it.
             restored: what an earlier run had left; default: what the history says.
+            live: data come at their own pace, so that work is shed when behind; a replay waits for every fit.
         """
         if restored is None:
             restored = store.restore(settings.gate, vehicle) if store is not None else Restored(None, 1)
@@ -100,7 +101,7 @@ class Service:
         self._approval: str = self._configured
         self._publication = Publication(store)
         self._decided: list[Output] = []
-        self._worker, self._store, self._clock = worker, store, clock
+        self._worker, self._store, self._clock, self._live = worker, store, clock, live
         self._studying: Worker | None = None
         self._jobs: dict[bool, Job] = {}
         self._arrived: dict[str, float] = {}
@@ -220,7 +221,9 @@ class Service:
         return [*outputs, *self._history_trouble()]
 
     def _keep_up(self) -> list[Event]:
-        """Lets a session that is behind its data shed work, and tells so."""
+        """Lets a live session that is behind its data shed work, and tells so; a replay waits for every fit."""
+        if not self._live:
+            return []
         session, behind = self.session, self.session.backlog
         waits = session.running is not None and self._clock() - self._fit_began > PATIENCE
         if behind > PATIENCE and (waits or self._unfinished):

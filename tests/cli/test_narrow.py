@@ -37,7 +37,7 @@ COMPARED = {"validate": ["other.mcap", "third.mcap"], "methods": [METHOD], "budg
 REPLAYED = {
     "vehicle": "pelican", "events": [], "refused": {"held_out_gain": 27}, "published": [SET], "status": {},
 }  # fmt: skip
-STORED = {"vehicle": "pelican", "sets": [SET], "vehicles": [], "candidates": [], "events": []}
+STORED = {"vehicle": "pelican", "sets": [SET], "vehicles": [], "candidates": [], "events": [], "in_force": None}
 FLEET = {
     "units": [{"unit": "airframe-07", "logs": 2, "done": 2, "parameters": [
         {"parameter": n, "unit": u, "median": 1.23456e-5, "spread": 0.0123} for n, u in NOMINAL_UNITS.items()
