@@ -226,12 +226,10 @@ class Service:
             return []
         session, behind = self.session, self.session.backlog
         waits = session.running is not None and self._clock() - self._fit_began > PATIENCE
-        if behind > PATIENCE and (waits or self._unfinished):
-            session.hurry(True)
-            if waits:
-                session.go_on()
-        elif behind < 0.5 * PATIENCE:
-            session.hurry(False)
+        hurried = behind > PATIENCE and (waits or self._unfinished)
+        session.hurry(hurried)
+        if hurried and waits:
+            session.go_on()
         t = session.status().t
         if behind >= self._tell_at:
             self._tell_at = 2.0 * behind

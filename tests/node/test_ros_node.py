@@ -271,9 +271,6 @@ def test_signals_end_it_cleanly_within_two_seconds(tmp_path: Path, number: int, 
     assert took < 2.0
 
 
-@pytest.mark.xfail(
-    strict=False, reason="a known fault: since fits are no longer waited for, no set comes within a minute of the kill"
-)
 def test_a_killed_fit_process_is_replaced_and_the_set_comes(
     log: Path, tmp_path: Path, ear: Ear, happened: Happened
 ) -> None:

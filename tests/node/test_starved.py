@@ -81,6 +81,24 @@ def test_a_session_never_waits_long_for_a_fit(seconds: float, happened: Happened
     )
 
 
+def test_one_slow_fit_does_not_end_all_others() -> None:
+    """A fit process that is killed answers seconds late, once; a service that hurried then once never fitted again."""
+    worker = Slow(0.0)
+    NOW[0] = 0.0
+    service = Service(PELICAN, QUICK, worker, clock=lambda: NOW[0])
+    sets = list[Output]()
+    for k, sample in enumerate(light_flight(30.0)):
+        NOW[0] = sample.t
+        worker.seconds = 5.0 if worker.asked == 2 else 0.1
+        service.push(sample)
+        if k % 4 == 3:
+            sets += [o for o in service.step() if isinstance(o, Publish) and o.topic == "parameters"]
+    status = service.session.status()
+    assert 3 <= status.skipped <= 8
+    assert status.fits > 12
+    assert sets
+
+
 class InlineTells(InlineWorker):
     """Answers at once."""
 
