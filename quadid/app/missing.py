@@ -24,7 +24,7 @@ AXES = ("x", "y", "z")
 
 @dataclass(frozen=True)
 class MissingForces:
-    """What models miss on every log.
+    """Missing force and moment of models on every log.
 
     Attributes:
         models: parameter vectors by name, ``nominal`` first.
@@ -127,7 +127,7 @@ def _by_axis(values: FloatArray) -> dict[str, float]:
 def missing_forces(
     train: Sequence[Log], held: Sequence[Log], vehicle: Vehicle, models: Mapping[str, FloatArray]
 ) -> MissingForces | None:
-    """What parameter vectors of `quadid.model` miss, all at the noise of the first on the training logs.
+    """Missing force and moment of parameter vectors, all at the noise of the first on the training logs.
 
     None where a log lacks the gyro or the accelerometer, without which no force and moment is seen, and where a model
     has no finite answer.

@@ -71,7 +71,7 @@ def inspect(recording: Recording, vehicle: Vehicle | None = None) -> Inspection:
 
 
 class Log(NamedTuple):
-    """What is checked: the recording in body axes, the vehicle, when it flies [s], and the recording as it was read."""
+    """Subject of the checks: the recording in body axes, the vehicle, times of flight [s], the recording as read."""
 
     recording: Recording
     vehicle: Vehicle | None
@@ -101,7 +101,7 @@ def _readings(log: Log) -> list[Check | None]:
 
 
 def _time_and_order(log: Log) -> list[Check]:
-    """When torque acts, and which motors make it: an order is only judged, and advised, of a signal in time."""
+    """Time and order of the motors: an order is only judged, and advised, of a signal in time."""
     if log.vehicle is None:
         return []
     vehicle, lagged = log.vehicle, lagged_motion(log.read, log.vehicle, log.spans)

@@ -141,7 +141,7 @@ class Inspection:
 
     @property
     def usable(self) -> bool:
-        """Whether something flies, at least one parameter can be identified, and no check finds the data wrong."""
+        """True where something flies, a parameter can be identified, and no check finds the data wrong."""
         wrong = any(check.verdict is CheckResult.ERROR for check in self.checks)
         return bool(self.flying) and any(outlook.possible for outlook in self.parameters) and not wrong
 

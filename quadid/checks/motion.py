@@ -413,12 +413,12 @@ def gravity_check(recording: Recording, spans: Spans) -> Check:
 
 
 def _reads_gravity_at_rest(values: FloatArray) -> bool:
-    """Whether specific force on the ground, shape (n, 3), has the length that it must have [m/s^2]."""
+    """Tests that specific force on the ground, shape (n, 3), has the length that it must have [m/s^2]."""
     return len(values) >= _RESTING and abs(float(np.median(np.linalg.norm(values, axis=1))) / GRAVITY - 1.0) < 0.1
 
 
 def _attitude_explains(accel: Channel, attitude: Channel | None, inside: BoolArray) -> bool:
-    """Whether the attitude turns the specific force of the rows `inside` to one g upwards."""
+    """Tests that the attitude turns the specific force of the rows `inside` to one g upwards."""
     if attitude is None or len(attitude.t) < 2:
         return False
     world = np.median(_in_world(accel, attitude)[inside], axis=0)
@@ -566,7 +566,7 @@ def _level_velocity(gained: FloatArray, derived: FloatArray) -> Check:
 
 
 def _upwards(gained: FloatArray, derived: FloatArray) -> bool:
-    """Whether vertical changes (n,) are clearly the reverse of what force makes (n,)."""
+    """Tests for vertical changes (n,) that are clearly the reverse of what force makes (n,)."""
     return bool(min(np.std(gained), np.std(derived)) > 0.2 and np.corrcoef(gained, derived)[0, 1] < -_REVERSED)
 
 

@@ -369,7 +369,7 @@ _UNITS = (
     ("in rpm", 2.0 * np.pi / 60.0), ("in rev/s", 2.0 * np.pi), ("of the electrical field (14 poles)", 1.0 / 7.0),
     ("ten times too low", 10.0),
 )  # fmt: skip
-"""What speeds may be in instead of rad/s, and the factor that mends it."""
+"""Units that speeds may be in instead of rad/s, and the factor that mends each."""
 _RATE = 50.0
 _SLOW_MOTION = 0.4
 """Motion slower than about 1/0.4 s is left out: there aerodynamics and the controller rule [s]."""

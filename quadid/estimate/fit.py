@@ -34,7 +34,7 @@ STALE = 0.2
 
 @dataclass(frozen=True)
 class Estimate:
-    """Where the likelihood is largest.
+    """Maximum of the likelihood.
 
     Attributes:
         problem: what was estimated.

@@ -92,7 +92,7 @@ class Track(NamedTuple):
 
 
 class Gains(NamedTuple):
-    """What a filter pass leaves for innovations under its gains, for the smoother and for the score.
+    """Results of a filter pass that innovations under its gains, the smoother and the score need.
 
     Attributes:
         gain: K of each scalar measurement, shape (n, M, N).
@@ -157,7 +157,7 @@ def moments(track: Track, delay: float) -> FloatArray:
 
 @nb.njit(**_FAST)
 def _constants(p: FloatArray, track: Track) -> FloatArray:
-    """What Eqs. 2 and 3 need of the physics."""
+    """Constants of Eqs. 2 and 3."""
     c = np.empty(20)
     hover = math.sqrt(track.mass * GRAVITY / track.rotors / p[B])
     c[0], c[1], c[2], c[3] = p[B] / track.mass, p[B] / p[JX], p[B] / p[JY], p[D] / p[JZ]
@@ -502,7 +502,7 @@ def _accel_slope(c, row, air, x, slope):  # type: ignore[no-untyped-def]
 
 @nb.njit(**_FAST)
 def _is_measured(track: Track, k: int, channel: int, air: bool) -> bool:
-    """Whether there is such a measurement; a velocity that nobody measures is about zero (see `Track.still`)."""
+    """Presence of such a measurement; a velocity that nobody measures is about zero (see `Track.still`)."""
     return track.seen[k, channel // 3] or (channel >= VELOCITY and track.still > 0.0)
 
 
@@ -672,7 +672,7 @@ def single_steps(track: Track, p: FloatArray, means: FloatArray) -> FloatArray:
 
 @nb.njit(**_FAST)
 def specific_force(track: Track, p: FloatArray, means: FloatArray) -> FloatArray:
-    """What an accelerometer reads at these means without random forces, shape (n, 3)."""
+    """Accelerometer readings at these means without random forces, shape (n, 3)."""
     air = track.still > 0.0 or track.seen[:, 3].any()
     c, table, out = _constants(p, track), moments(track, p[DELAY]), np.zeros((len(means), 3))
     for k in range(len(means)):

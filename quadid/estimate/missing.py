@@ -103,7 +103,7 @@ class Vehicles:
         _, self.psi, _, _ = scoring(problem.liveliest(NEAR_SECONDS), z, problem.first_noise(), MOST, ALL_NOISE)
 
     def missing(self, windows: Sequence[Window], theta: FloatArray) -> list[Missing]:
-        """What a parameter vector misses on these flights, which need not be those of the noise."""
+        """Missing force and moment of a parameter vector on these flights, which need not be those of the noise."""
         problem, z = self._settled(windows, theta, self.psi)
         part = problem.liveliest(NEAR_SECONDS)
         _, psi, _, _ = scoring(part, z, self.psi, RESIZING, _SIZES)

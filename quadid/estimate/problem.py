@@ -34,7 +34,7 @@ PER_FLIGHT = ("trim_moment", "gyro_bias", "accel_bias")
 UPRIGHT = "accel_bias.z"
 """Told from thrust only where velocity is measured; without, it stays zero."""
 TRIMMED = tuple(name for name in PLACES if name.split(".")[0] in PER_FLIGHT and name != UPRIGHT)
-"""What every model frees beside its own parameters: a constant moment and the sensors' biases."""
+"""Parameters free in every model beside its own: a constant moment and the sensors' biases."""
 _SIZE = {"gyro_bias": 0.05, "accel_bias": 0.5, "rotor_drag": 0.5, "rate_damping": 2.0, "command_delay": 0.01}
 """Standard deviation of the prior, in the parameter's unit; about what is met on real vehicles."""
 OFF_CENTRE = 0.05
@@ -50,7 +50,7 @@ MEMORY, MEMORY_SPREAD = 0.3, 1.5
 SHORTEST, LONGEST = 3.0, 0.1
 """Correlation times that can be identified: from so many samples to such a share of the flight."""
 WHITE = np.repeat([0.02, 0.003, 0.2, 0.05], 3)
-"""Where the search for the sensors' white noise begins."""
+"""First guess of the sensors' white noise."""
 STRETCH, SETTLED, NUDGE = 400, 30, 1e-3
 """Rows that stand for a flight where only variances matter, those until they are stationary, and a small change."""
 LEAST = 1e-2

@@ -8,7 +8,7 @@ from typing import Any
 import numba as nb
 
 from quadid.model import layout as ix
-from quadid.model.kernel import GRAVITY, TWELFTH, put_force, rotation_rate
+from quadid.model.kernel import GRAVITY, TWELFTH, Needs, put_force, rotation_rate
 from quadid.model.simd import LANES, exact, inlined, jit, lane_kernel, variant
 from quadid.types import FloatArray, IntArray
 
@@ -337,3 +337,26 @@ step_rare = _step_of(True, True, False, True)
 """One step of velocity with all that moving air does."""
 step_full = _step_of(True, True, True, True)
 """One step with every effect."""
+
+
+@nb.njit(**jit)
+def step_in_air(need: Needs, dt: float, s: FloatArray) -> None:
+    """One step of attitude, rate, velocity and position with the groups of effects that any lane needs.
+
+    Args:
+        need: which parts of the model any lane needs.
+        dt: step [s].
+        s: rows; as in `quadid.model.kernel.step_core`.
+    """
+    if need.rare and need.solid:
+        step_full(dt, s)
+    elif need.rare:
+        step_rare(dt, s)
+    elif need.hub and need.solid:
+        step_hub_solid(dt, s)
+    elif need.hub:
+        step_hub(dt, s)
+    elif need.solid:
+        step_air_solid(dt, s)
+    else:
+        step_air(dt, s)

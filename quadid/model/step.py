@@ -47,7 +47,7 @@ STILL = np.zeros(3)
 (EXPONENT,) = places("supply_voltage.exponent")
 _NO_OUT, _NO_WALK = np.empty((0, 0, 0)), np.empty((0, TURNS))
 _ROTORS_AT = N_ROWS * LANES - STATE
-"""Where the rotors begin in the memory of a block."""
+"""First number of the rotors in the memory of a block."""
 
 
 @dataclass(frozen=True)

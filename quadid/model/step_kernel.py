@@ -17,12 +17,7 @@ from quadid.model.body_kernel import (
     residual_coefficients,
     residual_forces,
     residual_signals,
-    step_air,
-    step_air_solid,
-    step_full,
-    step_hub,
-    step_hub_solid,
-    step_rare,
+    step_in_air,
 )
 from quadid.model.kernel import Flight, Needs, body_constants, flight_factors, load_payload
 from quadid.model.rotor_kernel import input_constants, rotor_constants, turn_rotor
@@ -271,18 +266,7 @@ def _on_disk(sources: int) -> Any:
                 if need.learned:
                     residual_signals(s, signals)
                     residual_forces(terms, coefficients[block], signals, step + k == 0, s)
-                if need.rare and need.solid:
-                    step_full(dt, s)
-                elif need.rare:
-                    step_rare(dt, s)
-                elif need.hub and need.solid:
-                    step_hub_solid(dt, s)
-                elif need.hub:
-                    step_hub(dt, s)
-                elif need.solid:
-                    step_air_solid(dt, s)
-                else:
-                    step_air(dt, s)
+                step_in_air(need, dt, s)
                 if len(walk) > 0:
                     for lane in range(min(LANES, count - first)):
                         for i in range(TURNS):

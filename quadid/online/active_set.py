@@ -72,7 +72,7 @@ class ActiveSet:
         return self._earlier[-1] if self._earlier else None
 
     def reference(self, stated: Container[str]) -> Reference:
-        """What a set is compared with, where the vehicle file claims to know the parameters `stated`."""
+        """Reference of a set, where the vehicle file claims to know the parameters `stated`."""
         if self._trusted:
             return "history"
         if self.baseline is not None:

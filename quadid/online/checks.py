@@ -79,12 +79,12 @@ class Factor:
 
     @property
     def off(self) -> float:
-        """How far it is from where it ought to be."""
+        """Distance from where it ought to be."""
         return self.value - self.ideal
 
     @property
     def disagrees(self) -> bool:
-        """Whether it is known, and cannot be what it ought to be."""
+        """True if it is known, and cannot be what it ought to be."""
         return self.known and abs(self.off) > ALLOWED + ERRORS * self.sigma
 
     def __str__(self) -> str:

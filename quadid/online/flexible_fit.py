@@ -60,7 +60,7 @@ ROOM = 16.0
 What the nominal model made of a flight that it misses is no better guess: it may be wrong by as much.
 """
 MOVING = ("command", "rotor", "air", "body")
-"""Where effects act that move the vehicle; of sensors only what shifts their time is fitted along:"""
+"""Places of effects that move the vehicle; of sensors only what shifts their time is fitted along:"""
 TIMING = ("imu_lag", "attitude_delay")
 
 
@@ -202,7 +202,7 @@ def widened(estimate: WindowEstimate, covariance: FloatArray) -> WindowEstimate:
 
 
 def left_out(problem: Shooting, free: Free, prior: Prior, result: Polished) -> FloatArray:
-    """What b w^2 leaves out of the thrust at hover: a row of values and one of their standard deviations, shape (2, R).
+    """Thrust at hover beyond b w^2: a row of values and one of their standard deviations, shape (2, R).
 
     The value of a rotor is the logarithm of its thrust's change with speed, as fitted, over that by the published b.  A
     thrust curve, a support force and an accelerometer of another scale give all rotors the same, a weak rotor itself.

@@ -212,13 +212,13 @@ def _is_sharper(case: Case, settings: GateSettings) -> bool:
 
 
 def _too_far(off: FloatArray, sigma: FloatArray, settings: GateSettings) -> tuple[bool, bool]:
-    """Whether something may be off by more than a parameter's interval may be wide; and whether data would tell."""
+    """True if something may be off by more than a parameter's interval may be wide; and if data would show it."""
     far = np.abs(off) + Z95 * sigma > settings.width
     return bool(far.any()), bool((far & (Z95 * sigma > 0.5 * settings.width)).any())
 
 
 def _unproven(case: Case, settings: GateSettings) -> str | None:
-    """What has to be known better before anything is published: how far sensors agree, how thrust follows speed."""
+    """Open questions before anything is published: agreement of sensors, thrust against speed."""
     for f in case.doubts:
         if _too_far(np.array([f.off]), np.array([f.sigma]), settings)[1]:
             return f"{f}, wanted +- {0.5 * settings.width / Z95:.3f}: whether the sensors agree is not known yet"
@@ -236,7 +236,7 @@ def _doubtful(case: Case, settings: GateSettings) -> str | None:
 
 
 def _left_out(case: Case, settings: GateSettings) -> str | None:
-    """What the six leave out of the thrust: the fit knows it, who uses them does not."""
+    """Thrust that the six leave out: the fit contains it, a user of the six does not."""
     value, sigma = case.left_out
     if not _too_far(value, sigma, settings)[0]:
         return None
@@ -271,7 +271,7 @@ def _step(case: Case, settings: GateSettings, times: float = 1.0) -> str | None:
 
 
 def _reference(case: Case, settings: GateSettings) -> str | None:
-    """What was trusted first: inertias, and torque over inertia, a controller's gain, which mass leaves as it is.
+    """First trusted values: inertias, and torque over inertia, a controller's gain, which mass leaves as it is.
 
     Room is left for what the reference did not know. The estimate's own deviation gives none: rotor speeds that drift
     widen it, and what it cannot tell apart from the reference it has not shown to be near it.
@@ -322,4 +322,4 @@ JUDGED: tuple[tuple[str, Check], ...] = (
     ("thrust", _left_out),
     ("reference", _reference),
 )
-"""What no further flight settles: a person decides."""
+"""Checks that no further flight settles: a person decides."""

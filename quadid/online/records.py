@@ -29,7 +29,7 @@ WAITS = "waits for approval: "
 
 
 Reference = Literal["history", "vehicle_file", "none"]
-"""What a set was compared with: sets of earlier flights or that a person approved, a b of the vehicle file with its
+"""Reference of a set: sets of earlier flights or that a person approved, a b of the vehicle file with its
 sigma, or nothing, where a wrong scale of all rotor speeds cannot be seen."""
 
 
@@ -263,7 +263,7 @@ class JobReply:
 
     @property
     def is_unexpected(self) -> bool:
-        """Whether the job failed by an error of this program."""
+        """True if the job failed by an error of this program."""
         return self.problem.startswith(UNEXPECTED)
 
 

@@ -77,7 +77,7 @@ class StreamClock:
         return stamps + self._bases[-1][1]
 
     def began_in(self, after: float, until: float) -> bool:
-        """Whether a time base began after one session time [s] and until another; the first one after all times."""
+        """True if a time base began after one session time [s] and until another; the first one after all times."""
         return after == -math.inf or any(after < start <= until for start, _ in self._bases)
 
     def follow(self, stamps: FloatArray) -> FloatArray:
@@ -599,7 +599,7 @@ class Resampler:
         return rows
 
     def _is_due(self) -> bool:
-        """Whether the stream has come past the next block of rows; goes on to the next stretch where one has ended."""
+        """True if the stream has come past the next block of rows; goes on to the next stretch where one has ended."""
         while True:
             end = self._stretches[0].end if self._stretches else self.time.newest
             if self._stretch is not None and end >= self._times()[-1] + SETTLE:

@@ -190,7 +190,7 @@ def _fit(request: FitRequest) -> FitReply:
 
 
 def _curved(shooting: Shooting, result: Polished) -> FloatArray:
-    """What the nominal six leave out of the thrust (`left_out`), a thrust curve freed beside them."""
+    """Thrust that the nominal six leave out (`left_out`), a thrust curve freed beside them."""
     free = shooting.free([*NOMINAL_NAMES, "thrust_curve.dead_speed"])
     prior = flexible_prior(prior_of(shooting.vehicle), free, shooting)
     return left_out(shooting, free, prior, polish(shooting, result.theta, free, prior, result.states, iterations=3))

@@ -17,7 +17,7 @@ from quadid.vehicle import Vehicle
 LEAD = 0.22
 """Flight before a window in which filters and delays settle [s]."""
 STARTING = 3.0
-"""What lacks in the first seconds of a stream [s] may still come, once the vehicle sends what it was asked for."""
+"""Time from the begin of a stream [s] in which channels may still come, once the vehicle sends what was asked."""
 SHORT_WINDOW = 4.0
 """Least data for a fit that a person asked for [s]."""
 _EPS = 1e-6

@@ -74,9 +74,9 @@ FORMS = {
 PEAK = math.sqrt(2.0)
 """Of a swing over its rms."""
 SID_AXES = {"roll": 1, "pitch": 2, "yaw": 3, "throttle": 13}
-"""What ArduCopter's SystemID mode adds a sweep to: roll and pitch angle [deg], yaw rate [deg/s], throttle (share of
-full).  It stops itself on landing and beyond the largest lean angle; fence and battery failsafe are the autopilot's
-own.  https://ardupilot.org/copter/docs/systemid-mode.html"""
+"""Axes that ArduCopter's SystemID mode adds a sweep to: roll and pitch angle [deg], yaw rate [deg/s], throttle (share
+of full).  It stops itself on landing and beyond the largest lean angle; fence and battery failsafe are the
+autopilot's own.  https://ardupilot.org/copter/docs/systemid-mode.html"""
 _WHAT = "a manoeuvre that shows mass-normalised thrust, drag torque and inertia"
 
 

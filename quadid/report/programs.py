@@ -145,7 +145,7 @@ class Facts:
 
     @property
     def lag_remark(self) -> str:
-        """What a reader of `lag` must know; empty where the vehicle file has one."""
+        """Remark for a reader of `lag`; empty where the vehicle file has one."""
         return "" if "motor_lag" in self.vehicle.effects else ", not measured: stands for rotors that follow at once"
 
     @property
@@ -453,7 +453,7 @@ class Form(NamedTuple):
 
     @property
     def names(self) -> set[str]:
-        """What people call it: its programs, and the kinds of its files."""
+        """Other names of a format: its programs, and the kinds of its files."""
         kinds = {part for end in self.templates for part in end.split(".")[1:]}
         return {*kinds, *self.program.lower().split(", "), *self.program.lower().replace(",", "").split()}
 
@@ -518,7 +518,7 @@ def form_of(name: str) -> str:
 
 
 def refused(vehicle: Vehicle, form: str) -> str:
-    """What a form does not write of this vehicle, and why; empty where it writes all it has."""
+    """Parts of this vehicle that a form does not write, and why; empty where it writes all."""
     return str(FORMS[form_of(form)].particulars(Facts(vehicle, "")).get("refused", ""))
 
 

@@ -110,7 +110,7 @@ def environment(ending: str) -> Environment:
     language = _LANGUAGES.get(ending, _Language())
 
     def written(value: Any) -> Any:
-        """What stands for a value in the text; escaped or filtered text stays as it is."""
+        """Text of a value; escaped or filtered text stays as it is."""
         if isinstance(value, Markup | Undefined):
             return value
         return language.bare(value if isinstance(value, str) else language.number(value))

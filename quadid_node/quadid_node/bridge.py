@@ -98,7 +98,7 @@ def objection(message: Any, vehicle: str, mass: float, newest: int) -> str:
 
 
 def plan(message: Any, entries: Sequence[Entry], now: Mapping[str, Any], step: float) -> Plan:
-    """What to set, from a set and the controller's values now; all of it or nothing."""
+    """Values to set, from a set and the controller's values now; all of them or none."""
     found = dict(zip(message.names, zip(message.values, message.status, strict=True), strict=True))
     values, left = dict[str, float](), []
     for target, factor, source, low, high in entries:

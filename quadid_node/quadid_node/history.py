@@ -224,7 +224,7 @@ class StoredSet(NamedTuple):
 
     @property
     def doubt(self) -> str:
-        """What the set is that speaks against its use, as "out of date: ..."; empty where nothing speaks against it."""
+        """Reason against using the set, as "out of date: ..."; empty where there is none."""
         if self.why_none:
             return f"no set that a fit makes: {self.why_none}"
         if self.item is not None and self.item.outdated:

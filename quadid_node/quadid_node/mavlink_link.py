@@ -237,7 +237,7 @@ class MavlinkDecoder:
 PARAMETERS = {"b": "QI_B", "d": "QI_D", "J_xx": "QI_J_XX", "J_yy": "QI_J_YY", "J_zz": "QI_J_ZZ", "J_r": "QI_J_R"}
 
 REFERENCES = {"none": 0.0, "vehicle_file": 1.0, "history": 2.0}
-"""What a set was compared with, as a number."""
+"""Reference of a set, as a number."""
 
 
 def parameters_of(item: OnlineSet | None) -> list[tuple[str, float]]:
@@ -418,7 +418,7 @@ class MavlinkLink:
             self._empty = last
 
     def _admits(self, frame: bytes) -> bool:
-        """Whether a frame is worth its decoding: the vehicle's have a budget of their own, others' floods leave it."""
+        """True if a frame is worth its decoding: the vehicle's have a budget of their own, others' floods leave it."""
         _, *who = sender(frame)
         is_named = (*who,) == (self.vehicle_system, self._target)
         own = is_named and self._source.is_from(self._wire.source)

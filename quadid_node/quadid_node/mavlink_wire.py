@@ -132,7 +132,7 @@ class Source:
         self._repeated: deque[float] = deque(maxlen=REPEATS)
 
     def is_from(self, address: Address | None) -> bool:
-        """Whether this is the address of the vehicle."""
+        """True if this is the address of the vehicle."""
         return address == self._address
 
     def take(self, address: Address | None, now: float) -> bool:

@@ -59,7 +59,7 @@ IDLE = {
     "inactive": "takes no samples; next: ros2 lifecycle set {name} activate",
     "finalized": "shut down for good; next: start the process again",
 }
-"""What a node that is not active says, by its state."""
+"""Messages of a node that is not active, by its state."""
 
 
 class IdentifyNode(PollingNode, LifecycleNode):

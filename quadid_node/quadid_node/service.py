@@ -35,7 +35,7 @@ RATE_MEMORY = 2.0
 
 
 def lag(seconds: float) -> str:
-    """What people are told of a session that is so far behind its data [s]; empty where it is not."""
+    """Message about a session that is so far behind its data [s]; empty where it is not."""
     if seconds < BEHIND:
         return ""
     return f"{seconds:.0f} s behind the data, the machine is too slow: fits are left out, changes come first"

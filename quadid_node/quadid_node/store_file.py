@@ -267,7 +267,7 @@ class HistoryLock:
         self._take()
 
     def moved(self) -> bool:
-        """Whether another file stands under the name now than before; then that one is locked.
+        """True if another file stands under the name now than before; then that one is locked.
 
         Raises:
             StoreError: another service has that one.

@@ -278,7 +278,7 @@ class _Clock:
     pace: float | None = None
 
     def follows(self, values: Sequence[int], previous: Sequence[int] | None, whole: bool) -> bool:
-        """Whether a frame, complete or not, may come after `previous`; None: after damage of any length."""
+        """True if a frame, complete or not, may come after `previous`; None: after damage of any length."""
         if previous is not None and not 0 <= (values[self.time] - previous[self.time]) % _TURN <= LONGEST_STEP:
             return False
         if self.last is None or not whole:

@@ -111,7 +111,7 @@ def _read(
     answer: socket.socket, format: str, path: str = "", preset: str = "", columns: dict[str, str] | None = None,
     memory: int = 0, seconds: float = 0.0, standing: float = 0.0,
 ) -> None:  # fmt: skip
-    """What the child does.  It never returns."""
+    """Runs the child.  It never returns."""
     nothing = os.open(os.devnull, os.O_RDWR)
     for stream in range(3):  # whatever a library prints
         os.dup2(nothing, stream)

@@ -464,7 +464,7 @@ def _motors_agree(log: _Log, moment: IntArray, thrust: FloatArray) -> bool:
 
 
 def _actuator_outputs(log: _Log) -> list[RawChannel]:
-    """What goes to the ESCs; of the banks and several instances the first whose motor columns look like it.
+    """Columns that go to the ESCs; of the banks and several instances the first whose motor columns look like it.
 
     Pulse widths, but with DShot or UAVCAN numbers up to their full command.
     """

@@ -200,7 +200,7 @@ def _annotated(node: ast.stmt) -> bool:
 
 
 def _numeric(value: ast.expr) -> bool:
-    """Whether an expression holds numbers and other constants only."""
+    """True if an expression contains numbers and other constants only."""
     leaves = [n for n in ast.walk(value) if isinstance(n, ast.Constant | ast.Call)]
     return bool(leaves) and all(
         isinstance(n, ast.Constant) and isinstance(n.value, int | float) and not isinstance(n.value, bool)

@@ -31,7 +31,7 @@ def main() -> int:
 
 
 def judged(finding: Finding, data: Path) -> tuple[bool, str, str]:
-    """Whether the answer is right, its first line that says what is wrong, and the numbers shown."""
+    """Judgement of an answer, its first line that names what is wrong, and the numbers shown."""
     with tempfile.TemporaryDirectory() as folder:
         answer = answer_of(finding.call(data.absolute() / "findings" / finding.folder, Path(folder)))
     checks = answer[2].get("checks", ())

@@ -51,7 +51,7 @@ def usable(answer: Answer) -> bool:
 
 
 def says(*words: str) -> Callable[[Answer], bool]:
-    """Whether all words are in what was said, and the log is refused."""
+    """Judges an answer: right if it contains all words and the log is refused."""
     return lambda answer: all(word in answer[1] for word in words) and not usable(answer)
 
 
