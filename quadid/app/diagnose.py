@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -192,19 +192,12 @@ def diagnose(
     ]
     forces = missing_forces(train, held, fit.vehicle, {"nominal": fit.theta, "extended": model.theta})
     result["missing"] = None if forces is None else forces.result()
+    layout = Layout(fit.vehicle)
     for entry in result["findings"]:
         names = [n for c in model.causes if c.effect == entry["effect"] for n in c.names]
-        less = _neutral(fit.vehicle, model.theta, names)
-        entry["gain"]["missing_removed"] = None if forces is None else forces.taken(less)
+        taken = None if forces is None else forces.taken(layout.without(model.theta, names))
+        entry["gain"]["missing_removed"] = taken
     return Diagnosed(result, found, sets, fit.noise, [*train, *held], described, selection, forces)
-
-
-def _neutral(vehicle: Vehicle, theta: FloatArray, names: Sequence[str]) -> FloatArray:
-    """A parameter vector without some effects."""
-    layout, out = Layout(vehicle), theta.copy()
-    for entry in (layout.entry(name) for name in names):
-        out[entry.index] = entry.neutral
-    return out
 
 
 def scored(log: Log, role: str, fit: Fit, extended: FloatArray) -> ScoredSet:

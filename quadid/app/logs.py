@@ -67,6 +67,15 @@ def file_name(name: str) -> str:
     return "".join(c if c.isalnum() or c in "-_+." else "_" for c in name).lstrip(".")[:100] or "vehicle"
 
 
+def free_name(folder: str | Path, name: str, ending: str, taken: Sequence[Path]) -> Path:
+    """An absolute path that no other log of this run has; two logs of one name are told apart by number."""
+    whole = Path(folder).absolute()
+    path, number = whole / f"{file_name(name)}.{ending}", 2
+    while path in taken:
+        path, number = whole / f"{file_name(name)}.{number}.{ending}", number + 1
+    return path
+
+
 # --- Parts of a log: those asked for as LOG@from:to, and those in the air
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from quadid.app.logs import Log, file_name
+from quadid.app.logs import Log, free_name
 from quadid.data.window import Window, beginning
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
@@ -55,30 +55,28 @@ class MissingForces:
         }
 
     def _entry(self, which: Sequence[int]) -> dict[str, Any]:
+        from quadid.estimate.missing import control_size, size
+
         force: dict[str, Any] = {"unit": "N"}
         moment: dict[str, Any] = {"unit": "N m"}
         for model in self.models:
             parts = [part for i in which for part in self.parts[model][i]]
             for entry, is_force in ((force, True), (moment, False)):
-                found, interval = self._size(parts, is_force)
+                found, interval = size(parts, is_force)
                 entry[model] = _by_axis(found)
                 entry[f"{model}_ci95"] = {a: [float(x) for x in pair] for a, pair in zip(AXES, interval.T, strict=True)}
             if model == self.models[0]:
-                control = np.concatenate([p.control for p in parts]).std(axis=0)
                 force |= {"of": parts[0].weight, "of_what": "weight"}
-                moment |= {"of": _by_axis(control), "of_what": "rms control moment"}
+                moment |= {"of": _by_axis(control_size(parts)), "of_what": "rms control moment"}
         return {"force": force, "moment": moment}
-
-    def _size(self, parts: Sequence[Missing], force: bool) -> tuple[FloatArray, FloatArray]:
-        from quadid.estimate.missing import size
-
-        return size(parts, force)
 
     def statement(self, which: Sequence[int]) -> str:
         """One sentence: what the last model misses, as shares of weight and control moment."""
+        from quadid.estimate.missing import control_size, size
+
         parts = [part for i in which for part in self.parts[self.models[-1]][i]]
-        force, moment = (self._size(parts, is_force)[0] for is_force in (True, False))
-        control = np.concatenate([p.control for p in parts]).std(axis=0)
+        force, moment = (size(parts, is_force)[0] for is_force in (True, False))
+        control = control_size(parts)
         shares = [
             f"{100.0 * m / c:.2g} % of the {axis} moment" for m, c, axis in
             zip(moment, control, ("roll", "pitch", "yaw"), strict=True)
@@ -111,10 +109,7 @@ class MissingForces:
                 for name in ("force", "force_sigma", "moment", "moment_sigma"):
                     columns += [f"{model}/{name}_{axis}" for axis in AXES]
                     table.append(np.concatenate([getattr(p, name) for p in self.parts[model][i]]))
-            path, number = Path(folder).absolute() / f"{file_name(log.name)}.missing.csv", 2
-            while path in out:
-                path = path.with_name(f"{file_name(log.name)}.{number}.missing.csv")
-                number += 1
+            path = free_name(folder, log.name, "missing.csv", out)
             np.savetxt(path, np.concatenate(table, axis=1), "%.8g", ",", header=",".join(columns), comments="")
             out.append(path)
         return out

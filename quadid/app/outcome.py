@@ -16,7 +16,7 @@ import numpy as np
 from quadid_replay import write_compared
 from quadid_replay.frames import from_euler
 
-from quadid.app.logs import LONGEST, Log, file_name, open_recording, parse_part, write_text
+from quadid.app.logs import LONGEST, Log, free_name, open_recording, parse_part, write_text
 from quadid.app.missing import MissingForces
 from quadid.data.resample import sample_period
 from quadid.data.window import Channel, Recording, beginning
@@ -195,18 +195,10 @@ def save_series(sets: Sequence[ScoredSet], logs: Sequence[Log], folder: str | Pa
             )
         }  # fmt: skip
         for kind in kinds:
-            path = _unused(Path(folder).absolute(), file_name(log.name), kind, out)
+            path = free_name(folder, log.name, f"simulated.{kind}", out)
             write_compared(path, parts, round(1e9 * (log.recording.epoch or 0.0)))
             out.append(path)
     return out
-
-
-def _unused(folder: Path, name: str, kind: str, taken: Sequence[Path]) -> Path:
-    """A name that no log of this run has; two logs of one name are told apart by number."""
-    path, number = folder / f"{name}.simulated.{kind}", 2
-    while path in taken:
-        path, number = folder / f"{name}.{number}.simulated.{kind}", number + 1
-    return path
 
 
 def _recording(name: str, t: FloatArray, values: FloatArray) -> Recording:

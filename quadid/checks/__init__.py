@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from dataclasses import dataclass
+from functools import cached_property
 
 from quadid.checks.findings import FATAL as FATAL
 from quadid.checks.findings import Check as Check
@@ -22,6 +23,7 @@ from quadid.checks.motion import (
 from quadid.checks.motion import flying_spans as flying_spans
 from quadid.checks.motion import proposed_cuts as proposed_cuts
 from quadid.checks.rotors import (
+    Lagged,
     better_order,
     geometry_check,
     hover_check,
@@ -49,8 +51,9 @@ def inspect(recording: Recording, vehicle: Vehicle | None = None) -> Inspection:
     spans = flying_spans(turned, vehicle)
     facts = channel_facts(recording, spans)
     checks = timing_checks(recording, facts)
+    log = Log(turned, vehicle, spans, recording)
     for stage in STAGES:  # each builds on the ones before it: what comes after an error is not asked
-        found = [check for check in stage(Log(turned, vehicle, spans, recording)) if check is not None]
+        found = [check for check in stage(log) if check is not None]
         checks += found
         if any(check.verdict is CheckResult.ERROR for check in found):
             break
@@ -70,13 +73,26 @@ def inspect(recording: Recording, vehicle: Vehicle | None = None) -> Inspection:
     )
 
 
-class Log(NamedTuple):
+@dataclass(frozen=True)
+class Log:
     """Subject of the checks: the recording in body axes, the vehicle, times of flight [s], the recording as read."""
 
     recording: Recording
     vehicle: Vehicle | None
     spans: Spans
     read: Recording
+
+    @cached_property
+    def hover(self) -> Check:
+        """Thrust at hover against the weight; needs the vehicle."""
+        assert self.vehicle is not None
+        return hover_check(self.recording, self.vehicle, self.spans)
+
+    @cached_property
+    def lagged(self) -> Lagged | str:
+        """Torque and angular acceleration at several lags, or why there are none; needs the vehicle."""
+        assert self.vehicle is not None
+        return lagged_motion(self.read, self.vehicle, self.spans)
 
 
 Stage = Callable[[Log], Sequence[Check | None]]
@@ -97,27 +113,28 @@ def _readings(log: Log) -> list[Check | None]:
     dead = readings_check(log.recording, log.vehicle, log.spans)
     if dead is not None and dead.verdict is CheckResult.ERROR:
         return [dead]
-    return [dead, hover_check(log.recording, log.vehicle, log.spans)]
+    return [dead, log.hover]
 
 
 def _time_and_order(log: Log) -> list[Check]:
     """Time and order of the motors: an order is only judged, and advised, of a signal in time."""
     if log.vehicle is None:
         return []
-    vehicle, lagged = log.vehicle, lagged_motion(log.read, log.vehicle, log.spans)
+    vehicle, lagged = log.vehicle, log.lagged
     time = rotor_timing_check(log.recording, vehicle, log.spans)
-    if order := better_order(lagged, vehicle):
+    order = better_order(lagged, vehicle)
+    if order:
         other = rotor_timing_check(log.recording, reordered(vehicle, order), log.spans)
         own, its = (check.numbers.get("correlation", 0.0) for check in (time, other))
         if other.verdict is CheckResult.OK and its > own:
-            return [motor_order_check(lagged, vehicle)]
+            return [motor_order_check(lagged, vehicle, order)]
         if time.verdict is CheckResult.ERROR:
             return [time]
         return [
             Check("motor_order", CheckResult.UNKNOWN, "no order of the motors explains the motion at one lag"),
             time,
         ]
-    return [time] if time.verdict is CheckResult.ERROR else [motor_order_check(lagged, vehicle), time]
+    return [time] if time.verdict is CheckResult.ERROR else [motor_order_check(lagged, vehicle, order), time]
 
 
 def _balance(log: Log) -> list[Check]:
@@ -129,9 +146,9 @@ def _vehicle_file(log: Log) -> list[Check | None]:
     """Mass and rotor positions."""
     if log.vehicle is None:
         return []
-    b = hover_check(log.recording, log.vehicle, log.spans).numbers.get("b_from_hover")
+    b = log.hover.numbers.get("b_from_hover")
     mass = mass_check(log.recording, log.vehicle, log.spans, b)
-    return [mass, geometry_check(lagged_motion(log.read, log.vehicle, log.spans), log.vehicle)]
+    return [mass, geometry_check(log.lagged, log.vehicle)]
 
 
 STAGES: tuple[Stage, ...] = (_kinematics, _readings, _time_and_order, _balance, _vehicle_file)

@@ -15,7 +15,7 @@ from quadid.checks.findings import Check, CheckResult
 from quadid.checks.motion import Spans, within
 from quadid.data.grid import to_windows
 from quadid.data.resample import linear, measured_period, moving_mean, sample_period, true_runs
-from quadid.data.rotor_signal import INERTIA_RATE, RotorSignal, rotor_signal
+from quadid.data.rotor_signal import INERTIA_RATE, RotorSignal, rotor_channel, rotor_signal
 from quadid.data.window import Channel, Recording, Window
 from quadid.errors import QuadidError
 from quadid.model.layout import ThrustModel, voltage_at
@@ -33,7 +33,7 @@ _STEP = 0.01
 _FARTHEST = 25
 _BLOCK = 15.0
 _SLOW = 0.4
-"""Motion slower than this [s] is left out, as in `motor_checks`."""
+"""Motion slower than this [s] is left out, as in `_SLOW_MOTION`."""
 _CLEAR = 0.3
 """Correlation above which the peak of a block counts."""
 _WANDER, _EARLY = 0.012, 0.2
@@ -192,7 +192,7 @@ def readings_check(recording: Recording, vehicle: Vehicle, spans: Spans) -> Chec
     inside = within(signal.t, spans)
     if np.count_nonzero(inside) < 20:
         return None
-    most = _IDLE_SHARE if _commanded(signal, recording) else _DEAD_SHARE
+    most = _IDLE_SHARE if _commanded(recording, vehicle) else _DEAD_SHARE
     values = signal.values[inside]
     step = _coarse(values)
     if step:
@@ -218,9 +218,9 @@ def _same(speeds: FloatArray) -> Problem | None:
     return "all rotor columns are the same: one was written for all", {"columns": float(speeds.shape[1])}
 
 
-def _commanded(signal: RotorSignal, recording: Recording) -> bool:
-    command = recording.channels.get("motor_command")
-    return command is not None and signal.source == command.source
+def _commanded(recording: Recording, vehicle: Vehicle) -> bool:
+    channel, _ = rotor_channel(recording, vehicle)
+    return channel is not None and channel.name == "motor_command"
 
 
 def rotor_speed_check(recording: Recording, vehicle: Vehicle, spans: Spans) -> Check:
@@ -238,7 +238,7 @@ def rotor_speed_check(recording: Recording, vehicle: Vehicle, spans: Spans) -> C
     problem = (_unbalanced(squares[known], vehicle) if known.any() else None) or _against_thrust(
         recording, squares, known, edges, spans
     )
-    if problem is not None and _commanded(signal, recording):
+    if problem is not None and _commanded(recording, vehicle):
         return Check(name, CheckResult.WARNING, f"{problem[0]} ({signal.source})", _COMMANDED, problem[1])
     if problem is not None:
         return Check(name, CheckResult.ERROR, f"{problem[0]} ({signal.source})", _FIX, problem[1])
@@ -377,7 +377,7 @@ _LEAST_RATE = 30.0
 """Slower rotor readings [Hz] miss the motion that distinguishes orders."""
 _LAGS = 5
 """Motors answer late: torque up to this many rows earlier is tried."""
-_MOTOR_CHECKS_CLEAR, _MARGIN = 0.25, 0.15
+_SETTLED, _MARGIN = 0.25, 0.15
 """Mean correlation that settles an order, and by how much another order must be better."""
 _MOST_ROTORS = 6
 """Beyond this only turns and mirror images of the order are tried, not all permutations."""
@@ -433,11 +433,17 @@ Lagged = list[tuple[FloatArray, FloatArray, FloatArray]]
 """Thrust over b (n, rotors), angular acceleration (n, 3) and rotors' own (n, rotors), for each lag of the motors."""
 
 
-def motor_order_check(lagged: Lagged | str, vehicle: Vehicle) -> Check:
-    """Correlates roll, pitch and yaw torque of every motor order with angular acceleration (of `lagged_motion`)."""
+def motor_order_check(lagged: Lagged | str, vehicle: Vehicle, order: tuple[int, ...] | None) -> Check:
+    """Correlates roll, pitch and yaw torque with angular acceleration.
+
+    Args:
+        lagged: of `lagged_motion`.
+        vehicle: whose geometry and order are judged.
+        order: the better one that `better_order` found, if any.
+    """
     if isinstance(lagged, str):
         return Check("motor_order", CheckResult.UNKNOWN, lagged)
-    return _judge_order(lagged, vehicle)
+    return _judge_order(lagged, vehicle, order)
 
 
 def lagged_motion(recording: Recording, vehicle: Vehicle, spans: Spans) -> Lagged | str:
@@ -498,7 +504,7 @@ def better_order(lagged: Lagged | str, vehicle: Vehicle) -> tuple[int, ...] | No
     means = _correlations(lagged, vehicle, orders).mean(axis=1)
     best = int(np.argmax(means))
     own = float(means[orders.index(tuple(range(len(vehicle.rotors))))])
-    return orders[best] if means[best] - own > _MARGIN and means[best] > _MOTOR_CHECKS_CLEAR else None
+    return orders[best] if means[best] - own > _MARGIN and means[best] > _SETTLED else None
 
 
 def reordered(vehicle: Vehicle, order: tuple[int, ...]) -> Vehicle:
@@ -510,23 +516,23 @@ def _still(lagged: Lagged) -> bool:
     return float(np.max(np.std(lagged[0][1], axis=0))) < 0.05
 
 
-def _judge_order(lagged: Lagged, vehicle: Vehicle) -> Check:
+def _judge_order(lagged: Lagged, vehicle: Vehicle, order: tuple[int, ...] | None) -> Check:
     if _still(lagged):
         return Check("motor_order", CheckResult.UNKNOWN, "too little rotation to check the motor order")
     own = _correlations(lagged, vehicle, [tuple(range(len(vehicle.rotors)))])[0]
     numbers = {f"correlation_{axis}": float(c) for axis, c in zip(("roll", "pitch", "yaw"), own, strict=True)}
     check = partial(Check, "motor_order", numbers=numbers)
     text = f"correlation of torque and angular acceleration: roll {own[0]:.2f}, pitch {own[1]:.2f}, yaw {own[2]:.2f}"
-    if found := better_order(lagged, vehicle):
-        mean = float(_correlations(lagged, vehicle, [found]).mean())
-        order = ", ".join(str(i + 1) for i in found)
-        better = f"{text}; much better ({mean:.2f} on average) with the log's columns in the order {order}"
-        return check(CheckResult.ERROR, better, f"reorder the rotors of the vehicle file to take columns {order}")
+    if order:
+        mean = float(_correlations(lagged, vehicle, [order]).mean())
+        columns = ", ".join(str(i + 1) for i in order)
+        better = f"{text}; much better ({mean:.2f} on average) with the log's columns in the order {columns}"
+        return check(CheckResult.ERROR, better, f"reorder the rotors of the vehicle file to take columns {columns}")
     right, reversed_ = (_yaw_explained(lagged, vehicle, sign) for sign in (1.0, -1.0))
-    if own[2] < -_MOTOR_CHECKS_CLEAR or (own[2] < _MOTOR_CHECKS_CLEAR < reversed_ and reversed_ - right > _MARGIN):
+    if own[2] < -_SETTLED or (own[2] < _SETTLED < reversed_ and reversed_ - right > _MARGIN):
         turned = f"{text}: yaw is reversed (with the other spins {reversed_:.2f}, drag and spin-up of the rotors)"
         return check(CheckResult.ERROR, turned, "negate the spins in the vehicle file")
-    if min(own[0], own[1]) > _MOTOR_CHECKS_CLEAR:
+    if min(own[0], own[1]) > _SETTLED:
         return check(CheckResult.OK, text)
     return check(CheckResult.UNKNOWN, f"{text}: too weak to judge")
 
@@ -579,7 +585,7 @@ _KNOWN = 0.1
 _MASS_OFF, _ARM_OFF = 0.08, 0.2
 """Relative differences that are reported: of mass; of arm, whose effect slow motors weaken."""
 _TURNED = math.radians(20.0)
-_GEOMETRY_CLEAR = 0.1
+_EXPLAINED = 0.1
 """Share of the variance of roll, and of pitch, that rotor torques must explain before geometry is judged by them."""
 
 
@@ -644,7 +650,7 @@ def geometry_check(lagged: Lagged | str, vehicle: Vehicle) -> Check:
     arms, inertia = vehicle.torque_arms[:, :2], vehicle.initial[2:4]
     fits = [_map(squares @ arms, motion[:, :2] * inertia) for squares, motion, _ in lagged]
     share, a = max(fits, key=lambda fit: float(np.min(fit[0])))
-    if float(np.min(share)) < _GEOMETRY_CLEAR:
+    if float(np.min(share)) < _EXPLAINED:
         axis = ("roll", "pitch")[int(np.argmin(share))]
         return Check(
             name, CheckResult.UNKNOWN,

@@ -47,10 +47,9 @@ def compare(
     from quadid_evaluation.paper import compare as work
 
     from quadid.cli import terminal
-    from quadid.cli import terminal as output
 
-    output.check_file(json, "--json")
-    output.out_folder(out)
+    terminal.check_file(json, "--json")
+    terminal.out_folder(out)
     names = work.check_names(method, objective)
     read = options.reader(load_vehicle(vehicle), rate, start, stop, preset, unchecked, columns)
     train, held = read(logs), read(validate or [])
@@ -59,7 +58,7 @@ def compare(
             train, held, methods=names, seeds=range(seed, seed + seeds), budget=budget, objective=objective,
             advance=advance,
         )  # fmt: skip
-    output.write_json(result, json)
+    terminal.write_json(result, json)
     show(result, quiet=json == "-")
     terminal.warn([text for log in (*train, *held) for text in log.warnings])
 
@@ -67,7 +66,6 @@ def compare(
 def show(result: JsonDict, quiet: bool) -> None:
     """Prints the table for people."""
     from quadid.cli import terminal
-    from quadid.cli import terminal as tables
     from quadid.report.tables import Column, TextTable, number
 
     console = terminal.console(quiet)
@@ -85,7 +83,7 @@ def show(result: JsonDict, quiet: bool) -> None:
             number(m["seconds"], 3), f"{m['failures']}/{m['runs']}", m.get("note", m.get("stop", "")),
         ))  # fmt: skip
     title = "Methods on the same data (error over 1 s of simulation, 1 = noise floor)"
-    tables.print_tables(console, [TextTable(title, columns, tuple(rows))])
+    terminal.print_tables(console, [TextTable(title, columns, tuple(rows))])
     console.print(
         f"failed: runs that ended above 1.01 times the lowest cost of all; at most {result['budget']} simulations a run"
     )

@@ -22,17 +22,16 @@ def demo(
     """Fly three Pelican flights, identify on the first, validate on the others, diagnose; write logs and a report."""
     from quadid.app import demo as work
     from quadid.cli import terminal
-    from quadid.cli import terminal as output
 
-    output.check_file(json, "--json")
-    folder = output.out_folder(out)
+    terminal.check_file(json, "--json")
+    folder = terminal.out_folder(out)
     with terminal.progress(("simulation", "statistics", "estimate", "flight")) as advance:
         shown = work.run(work.QUICK_SECONDS if quick else work.SECONDS, seed, folder, advance)
     page = folder / "report.html"
     result = work.summary(shown, str(page))
-    output.write_text(page, work.html(shown, seed, output.command_line()))
-    output.write_json(result, str(folder / "result.json"))
-    output.write_json(result, json)
+    terminal.write_text(page, work.html(shown, seed, terminal.command_line()))
+    terminal.write_json(result, str(folder / "result.json"))
+    terminal.write_json(result, json)
     show(shown, page, quiet=json == "-")
 
 
@@ -40,14 +39,13 @@ def show(shown: Shown, page: Path, quiet: bool) -> None:
     """Prints both results beside the truth, and where the files are."""
     from quadid.app.demo import HIDDEN_SECTION, TRUE_SECTION
     from quadid.cli import terminal
-    from quadid.cli import terminal as tables
 
     console = terminal.console(quiet)
-    tables.print_tables(console, shown.identified.tables(shown.truth))
-    tables.print_verdict(console, shown.identified.verdict)
+    terminal.print_tables(console, shown.identified.tables(shown.truth))
+    terminal.print_verdict(console, shown.identified.verdict)
     for title, part in ((TRUE_SECTION, shown.diagnosed), (HIDDEN_SECTION, shown.hidden)):
         console.print(f"\n{title}")
-        tables.print_tables(console, part.tables())
-        tables.print_verdict(console, part.verdict)
+        terminal.print_tables(console, part.tables())
+        terminal.print_verdict(console, part.verdict)
     console.print(f"\nLogs and vehicle files: {page.parent}", soft_wrap=True)
     console.print(f"Report: {page}", soft_wrap=True)

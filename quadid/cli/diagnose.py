@@ -29,15 +29,13 @@ def diagnose(
     from quadid.app import diagnose as work
     from quadid.app.outcome import check_kinds
     from quadid.cli import terminal
-    from quadid.cli import terminal as output
-    from quadid.cli import terminal as tables
 
     check_kinds(series or ())
-    output.check_file(json, "--json")
-    output.check_file(report, "--report")
+    terminal.check_file(json, "--json")
+    terminal.check_file(report, "--report")
     described = load_vehicle(vehicle)
     read = options.reader(described, rate, start, stop, preset, unchecked, columns)
-    folder = output.out_folder(out)
+    folder = terminal.out_folder(out)
     with explained(report, f"Diagnosis of {described.name}", [*logs, *(validate or [])], described, preset):
         train, held = read(logs), read(validate or [])
         with terminal.progress() as advance:
@@ -45,7 +43,7 @@ def diagnose(
     files = {"vehicle": free_path(folder / done.file_name, vehicle)}
     if done.prediction is not None:
         files["prediction"] = free_path(folder / done.prediction_file_name, vehicle)
-    tables.conclude(done, json, report, files, series)
+    terminal.conclude(done, json, report, files, series)
 
 
 def free_path(path: Path, given: str) -> Path:

@@ -53,15 +53,14 @@ def excite(
     """Propose the manoeuvre that shrinks the intervals most, within limits; write it, and what flies it."""
     from quadid.app.excite import check_forms, check_limits, parse_height, propose
     from quadid.cli import terminal
-    from quadid.cli import terminal as output
 
     heights = parse_height(height)
     check_limits(seconds, tilt, rate_limit, heights, battery)
     check_forms(forms or ())
-    output.check_file(json, "--json")
-    output.check_file(report, "--report")
+    terminal.check_file(json, "--json")
+    terminal.check_file(report, "--report")
     described = load_vehicle(vehicle)
-    folder = output.out_folder(out)
+    folder = terminal.out_folder(out)
     opened = reader(described, rate, None, None, preset, unchecked, columns)(logs or [])
     with terminal.progress() as advance:
         done = propose(
@@ -74,8 +73,8 @@ def excite(
     if report is not None:
         from quadid.report.fit_pages import excite_html
 
-        result["report"] = str(output.write_text(report, excite_html(result, done.proposal.flight.window)))
-    output.write_json(result, json)
+        result["report"] = str(terminal.write_text(report, excite_html(result, done.proposal.flight.window)))
+    terminal.write_json(result, json)
     show(result, quiet=json == "-")
     terminal.warn([text for log in opened for text in log.warnings])
 
@@ -83,12 +82,11 @@ def excite(
 def show(result: Mapping[str, Any], quiet: bool) -> None:
     """Prints the result for people."""
     from quadid.cli import terminal
-    from quadid.cli import terminal as tables
     from quadid.experiment import BLOCK
     from quadid.report.fit_pages import gain_table, grouped
 
     console = terminal.console(quiet)
-    tables.print_tables(console, [gain_table(result)])
+    terminal.print_tables(console, [gain_table(result)])
     console.print(f"Manoeuvre: movements of {BLOCK:g} s, amplitudes rms")
     for name, times, amplitudes in grouped(result["movements"]):
         console.print(f"  {times} × {name}: {amplitudes}")

@@ -46,9 +46,8 @@ def export(
 ) -> None:
     """Write the parameters for another program, with units and where each came from; nothing is sent to a vehicle."""
     from quadid.cli import terminal
-    from quadid.cli import terminal as output
 
-    output.check_file(json, "--json")
+    terminal.check_file(json, "--json")
     if what:
         listed(json)
         return
@@ -60,12 +59,12 @@ def export(
     elif name is not None:
         raise typer.BadParameter("it names sets of a history: give --history FILE too", param_hint="--id")
     done = exported(described, form, source=source, doubt=doubt, anyway=anyway)
-    folder = output.out_folder(out)
+    folder = terminal.out_folder(out)
     for path in (folder / file for file in done.texts):
         if path.exists() and Path(vehicle).exists() and path.samefile(vehicle):
-            raise output.OutputError(f"the export would overwrite {vehicle}", "another folder", "give --out")
+            raise terminal.OutputError(f"the export would overwrite {vehicle}", "another folder", "give --out")
     done.result["files"] = [str(path) for path in done.save(folder)]
-    output.write_json(done.result, json)
+    terminal.write_json(done.result, json)
     console = terminal.console(quiet=json == "-")
     for file in done.result["files"]:
         console.print(f"Written: {file}", soft_wrap=True)
@@ -75,13 +74,11 @@ def export(
 def listed(json: str | None) -> None:
     """Prints what each form carries."""
     from quadid.cli import terminal
-    from quadid.cli import terminal as output
-    from quadid.cli import terminal as tables
 
     carried = {name: {"program": form.program, "effects": list(form.effects)} for name, form in FORMS.items()}
-    output.write_json({"schema": "quadid.formats/1", "formats": carried}, json)
+    terminal.write_json({"schema": "quadid.formats/1", "formats": carried}, json)
     console = terminal.console(quiet=json == "-")
-    tables.print_tables(console, forms())
+    terminal.print_tables(console, forms())
     console.print("\nEvery form carries mass and geometry; `yaml` carries all. What a form leaves out, its file names.")
 
 

@@ -53,11 +53,10 @@ def fleet(
     """Identify every log of a folder on Dask; write SQLite, Parquet and a report. Run it again and it goes on."""
     from quadid.cli import fleet_run as fleet_folder
     from quadid.cli import terminal
-    from quadid.cli import terminal as output
     from quadid.cli.fleet_run import open_store
 
-    output.check_file(json, "--json")
-    target = output.out_folder(out)
+    terminal.check_file(json, "--json")
+    target = terminal.out_folder(out)
     named = parse_columns(columns or [])
     if named and vehicle is None:
         raise typer.BadParameter(
@@ -73,7 +72,7 @@ def fleet(
         with terminal.progress() as advance:
             work(waiting, store, scheduler, workers, memory, advance)
         result = conclude(store, found, target, len(waiting), time.perf_counter() - begin)
-    output.write_json(result, json)
+    terminal.write_json(result, json)
     show(result, quiet=json == "-")
 
 
@@ -103,26 +102,25 @@ def conclude(store: Store, found: Found, target: Path, worked: int, seconds: flo
     """Writes Parquet files and the report; returns the result as JSON has it."""
     from quadid.app.fleet import health_trend
     from quadid.app.outcome import provenance
-    from quadid.cli import terminal as output
+    from quadid.cli import terminal
     from quadid.report.fleet import fleet_page, summarise
     from quadid.report.page import render
 
     logs, parameters, findings, trims = (store.rows(table) for table in ("logs", "parameters", "findings", "trims"))
     summary = summarise(logs, parameters, findings, found.copies)
     health = health_trend(logs, trims, {job.unit: job.vehicle for job in found.jobs})
-    page = fleet_page(summary, logs, parameters, provenance([], output.command_line()), "Report of a fleet", health)
+    page = fleet_page(summary, logs, parameters, provenance([], terminal.command_line()), "Report of a fleet", health)
     files = [target / "fleet.sqlite", *store.write_parquet(target)]
     return {
         "schema": "quadid.fleet/1", "logs": len(logs), "worked": worked, "seconds": seconds, **summary,
         "health": health, "other_files": list(found.others), "files": [str(f) for f in files],
-        "report": str(output.write_text(target / "fleet.html", render(page))),
+        "report": str(terminal.write_text(target / "fleet.html", render(page))),
     }  # fmt: skip
 
 
 def show(result: dict[str, Any], quiet: bool) -> None:
     """Prints counts, vehicles, reasons of failures, and where the files are."""
     from quadid.cli import terminal
-    from quadid.cli import terminal as tables
     from quadid.report.fleet import fleet_verdict
     from quadid.report.tables import Column, TextTable, number
 
@@ -139,8 +137,8 @@ def show(result: dict[str, Any], quiet: bool) -> None:
         Column("vehicle"), Column("logs", right=True, rank=1), Column("answers", right=True, rank=2),
         Column("parameter"), Column("median", right=True), Column("unit"), Column("spread", right=True),
     )  # fmt: skip
-    tables.print_tables(console, [TextTable("Vehicles", columns, tuple(rows))])
-    tables.print_verdict(console, fleet_verdict(result, result["health"]))
+    terminal.print_tables(console, [TextTable("Vehicles", columns, tuple(rows))])
+    terminal.print_verdict(console, fleet_verdict(result, result["health"]))
     for reason in result["reasons"][:10]:
         console.print(f"{reason['logs']} {reason['status']}: {reason['reason']}", soft_wrap=True)
     console.print(f"{result['worked']} of {result['logs']} logs worked on in {result['seconds']:.1f} s")

@@ -28,13 +28,12 @@ def health(
     """What changed since the baseline flights: which rotor, mass, centre of gravity, thrust, how much, how sure."""
     from quadid.app import health as work
     from quadid.app.logs import load_vehicle
-    from quadid.cli import terminal as output
-    from quadid.cli import terminal as tables
+    from quadid.cli import terminal
 
-    output.check_file(json, "--json")
-    output.check_file(report, "--report")
-    output.out_folder(out)
+    terminal.check_file(json, "--json")
+    terminal.check_file(report, "--report")
+    terminal.out_folder(out)
     described = load_vehicle(vehicle)
     with explained(report, f"Health of {described.name}", [*logs, *baseline], described, preset):
         done = work.health(logs, baseline, vehicle=described, preset=preset, unchecked=unchecked)
-    tables.conclude(done, json, report)
+    terminal.conclude(done, json, report)

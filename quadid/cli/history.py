@@ -39,9 +39,9 @@ def history(
     from quadid_node.history import default_path, read_in_force
     from quadid_node.store_file import StoreError, read_history
 
-    from quadid.cli import terminal as output
+    from quadid.cli import terminal
 
-    output.check_file(json, "--json")
+    terminal.check_file(json, "--json")
     path, name, described = file or default_path(), vehicle, None
     found = read_history(path, name, candidates, events)
     names = [entry["name"] for entry in found["vehicles"]]
@@ -59,7 +59,7 @@ def history(
     result = {
         "schema": "quadid.history/1", "vehicle": name, "history": str(path.absolute()), "in_force": force, **found,
     }  # fmt: skip
-    output.write_json(result, json)
+    terminal.write_json(result, json)
     show(result, quiet=json == "-")
 
 

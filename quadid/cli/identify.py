@@ -37,19 +37,17 @@ def identify(
 ) -> None:
     """Fit b, d, J_xx, J_yy, J_zz and J_r to flight logs; say how well each is known and how well they predict."""
     from quadid.cli import terminal
-    from quadid.cli import terminal as output
-    from quadid.cli import terminal as tables
 
     check_optimizer(optimizer)
     check_kinds(series or ())
-    output.check_file(json, "--json")
-    output.check_file(report, "--report")
+    terminal.check_file(json, "--json")
+    terminal.check_file(report, "--report")
     described = load_vehicle(vehicle)
     read = options.reader(described, rate, start, stop, preset, unchecked, columns)
-    target = fitted_path(output.out_folder(out), described, vehicle)
+    target = fitted_path(terminal.out_folder(out), described, vehicle)
 
     def conclude(done: Identified) -> None:
-        tables.conclude(done, json, report, {"vehicle": target}, series)
+        terminal.conclude(done, json, report, {"vehicle": target}, series)
 
     with explained(report, f"Identification of {described.name}", [*logs, *(validate or [])], described, preset):
         train, held = read(logs), read(validate or [])

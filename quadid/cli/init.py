@@ -27,13 +27,12 @@ def init(
     """Write a vehicle file to fill in; with a log, filled with what the autopilot's logged parameters describe."""
     from quadid.app import init as work
     from quadid.cli import terminal
-    from quadid.cli import terminal as output
 
-    output.check_file(json, "--json")
+    terminal.check_file(json, "--json")
     done = work.init(name, log, mass=mass, arm=arm, preset=preset)
-    path = done.save(output.out_folder(out) / f"{output.file_name(name)}.yaml")
+    path = done.save(terminal.out_folder(out) / f"{terminal.file_name(name)}.yaml")
     done.result["file"] = str(path)
-    output.write_json(done.result, json)
+    terminal.write_json(done.result, json)
     console = terminal.console(quiet=json == "-")
     console.print(f"Written: {path}", soft_wrap=True)
     if done.result["fill_in"]:

@@ -56,12 +56,11 @@ def inspect(
 def show(done: Inspected, quiet: bool) -> None:
     """Prints the tables, then what the checks found and what is missing."""
     from quadid.cli import terminal
-    from quadid.cli import terminal as tables
 
     console = terminal.console(quiet)
-    tables.print_cell(console, Cell(heading(done.found), "title"))
+    terminal.print_cell(console, Cell(heading(done.found), "title"))
     for warning in done.warnings:
-        tables.print_cell(console, Cell(f"note: {plain(warning, LONGEST_LINE)}", "fair"))
-    tables.print_tables(console, done.tables())
+        terminal.print_cell(console, Cell(f"note: {plain(warning, LONGEST_LINE)}", "fair"))
+    terminal.print_tables(console, done.tables())
     for sentence in sentences(done.found):
-        tables.print_cell(console, sentence)
+        terminal.print_cell(console, sentence)

@@ -75,10 +75,9 @@ def replay(
 
     from quadid.app.logs import load_vehicle, parse_columns, parse_part
     from quadid.cli import terminal
-    from quadid.cli import terminal as output
 
-    output.check_file(json, "--json")
-    output.check_file(out, "--out")
+    terminal.check_file(json, "--json")
+    terminal.check_file(out, "--out")
     pace = _pace(speed)
     described = load_vehicle(vehicle)
     asked = {f"gate_{name}": value for name, value in parse_pairs(gate).items()}
@@ -101,7 +100,7 @@ def replay(
     if out is not None:
         write_outputs(out, outputs, described.name)
         result["out"] = str(out.absolute())
-    output.write_json(result, json)
+    terminal.write_json(result, json)
     show(result, quiet=json == "-")
     if not result["published"]:
         raise typer.Exit(NOTHING)
@@ -225,7 +224,6 @@ def write_outputs(path: Path, outputs: Sequence[Output], vehicle: str) -> None:
 def show(result: dict[str, Any], quiet: bool) -> None:
     """Prints what was published, refused and found."""
     from quadid.cli import terminal
-    from quadid.cli import terminal as tables
     from quadid.report.tables import parameter_table
 
     console = terminal.console(quiet=quiet)
@@ -240,6 +238,6 @@ def show(result: dict[str, Any], quiet: bool) -> None:
         return
     last = result["published"][-1]
     console.print(f"set {last['sequence']} of {result['vehicle']}, from {last['stop'] - last['start']:.0f} s")
-    tables.print_tables(console, [parameter_table(last["parameters"])])
+    terminal.print_tables(console, [parameter_table(last["parameters"])])
     if "out" in result:
         console.print(f"Written: {result['out']}", soft_wrap=True)

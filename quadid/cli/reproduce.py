@@ -27,10 +27,9 @@ def reproduce(
     """Fly the paper's three sets, fit as it does and better; write Tables 1 and 2, Figures 3 to 8, and one page."""
 
     from quadid.cli import terminal
-    from quadid.cli import terminal as output
 
-    output.check_file(json, "--json")
-    folder = output.out_folder(out)
+    terminal.check_file(json, "--json")
+    folder = terminal.out_folder(out)
     plan = protocol.QUICK if quick else protocol.Plan()
     begin = time.perf_counter()
     with terminal.progress() as advance:
@@ -39,8 +38,8 @@ def reproduce(
         result = summary(done, plan, seed, time.perf_counter() - begin, command)
         advance("draw", 0.0)
         result["files"] = write(done, result, folder)
-    output.write_json(result, str(folder / "paper.json"))
-    output.write_json(result, json)
+    terminal.write_json(result, str(folder / "paper.json"))
+    terminal.write_json(result, json)
     show(result, quiet=json == "-")
 
 
@@ -71,9 +70,8 @@ def show(result: JsonDict, quiet: bool) -> None:
     from quadid_evaluation.paper.tables import all_tables
 
     from quadid.cli import terminal
-    from quadid.cli import terminal as tables
 
     console = terminal.console(quiet)
-    tables.print_tables(console, all_tables(result))
+    terminal.print_tables(console, all_tables(result))
     for path in result["files"][-2:]:
         console.print(path, soft_wrap=True)

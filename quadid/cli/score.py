@@ -29,14 +29,13 @@ def score(
     """Open-loop prediction error after h samples: every sample starts one run from the measured state."""
     from quadid.app import score as work
     from quadid.app.logs import load_vehicle
-    from quadid.cli import terminal as output
-    from quadid.cli import terminal as tables
+    from quadid.cli import terminal
 
-    output.check_file(json, "--json")
+    terminal.check_file(json, "--json")
     wanted = parse_horizons(horizons)
     read = options.reader(load_vehicle(vehicle), rate, start, stop, preset, unchecked, columns)
     done = work.score(read(logs), horizons=wanted, rate=rate)
-    tables.conclude(done, json)
+    terminal.conclude(done, json)
 
 
 def parse_horizons(text: str) -> list[int]:

@@ -77,9 +77,8 @@ def serve(
 
     from quadid.app.logs import load_vehicle
     from quadid.cli import terminal
-    from quadid.cli import terminal as output
 
-    output.check_file(json, "--json")
+    terminal.check_file(json, "--json")
     described = load_vehicle(vehicle)
     asked = {f"gate_{n}": v for n, v in parse_pairs(gate).items()}
     settings = session_settings(approval=approval, window=window, refit=refit, diagnose=diagnose, seed=seed, **asked)
@@ -101,7 +100,7 @@ def serve(
         opened.callback(stop.ignore_more)
         run(service, link, outlets, lambda: stop() or time.monotonic() > end)
         result = summary(service, link, known)
-    output.write_json(result, json)
+    terminal.write_json(result, json)
 
 
 class _Console:

@@ -177,37 +177,34 @@ def conclude(
 
     Args:
         done: the result; its warnings go to stderr.
-        json: where its JSON goes, as `output.write_json`.
+        json: where its JSON goes, as `write_json`.
         report: where its HTML report goes.
         files: where its ``vehicle``, and its ``prediction``, go.
         series: forms of simulated against measured, written beside the vehicle file.
     """
-    from quadid.cli import terminal
-    from quadid.cli import terminal as output
-
     whole: Any = done  # which of these a command offers depends on its result
     for name, path in (files or {}).items():
-        done.result[f"{name}_file"] = str(output.write_text(path, getattr(done, name).to_yaml()))
+        done.result[f"{name}_file"] = str(write_text(path, getattr(done, name).to_yaml()))
     if report is not None:
         done.result["report"] = str(report.absolute())
-        whole.report(report, output.command_line())
+        whole.report(report, command_line())
     if series and files:
         done.result["series"] = [str(path) for path in whole.save_series(files["vehicle"].parent, series)]
-    output.write_json(done.result, json)
-    console = terminal.console(quiet=json == "-")
+    write_json(done.result, json)
+    out = console(quiet=json == "-")
     if done.heading:
-        console.print(done.heading)
-    print_tables(console, done.tables())
+        out.print(done.heading)
+    print_tables(out, done.tables())
     if done.verdict is not None:
-        print_verdict(console, done.verdict)
+        print_verdict(out, done.verdict)
     if done.result.get("missing"):
-        console.print(done.result["missing"]["statement"], soft_wrap=True)
+        out.print(done.result["missing"]["statement"], soft_wrap=True)
     for key, label in (("vehicle_file", "Vehicle file"), ("prediction_file", "Prediction file"), ("report", "Report")):
         if done.result.get(key):
-            console.print(f"{label}: {done.result[key]}", soft_wrap=True)
+            out.print(f"{label}: {done.result[key]}", soft_wrap=True)
     for path in done.result.get("series", ()):
-        console.print(f"Simulated against measured: {path}", soft_wrap=True)
-    terminal.warn(done.warnings)
+        out.print(f"Simulated against measured: {path}", soft_wrap=True)
+    warn(done.warnings)
 
 
 # --- Errors as one line for people: what was found, what is allowed, what to do

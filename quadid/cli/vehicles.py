@@ -9,13 +9,11 @@ def vehicles(json: JsonTarget = None) -> None:
     """List the vehicles that ship; each name may be given to --vehicle."""
     from quadid.app.init import shipped
     from quadid.cli import terminal
-    from quadid.cli import terminal as output
-    from quadid.cli import terminal as tables
     from quadid.report.tables import Column, TextTable
 
-    output.check_file(json, "--json")
+    terminal.check_file(json, "--json")
     rows = shipped()
-    output.write_json({"schema": "quadid.vehicles/1", "vehicles": rows}, json)
+    terminal.write_json({"schema": "quadid.vehicles/1", "vehicles": rows}, json)
     columns = (
         Column("vehicle"), Column("rotors", right=True), Column("mass [kg]", right=True), Column("arm [m]", right=True),
         Column("command", rank=1), Column("description", rank=2),
@@ -25,4 +23,4 @@ def vehicles(json: JsonTarget = None) -> None:
         for r in rows
     )
     table = TextTable("Vehicles that ship (--vehicle NAME)", columns, cells)
-    tables.print_tables(terminal.console(quiet=json == "-"), [table])
+    terminal.print_tables(terminal.console(quiet=json == "-"), [table])

@@ -6,7 +6,6 @@ import time
 
 from quadid.app.kernels import PARTS
 from quadid.cli import terminal
-from quadid.cli import terminal as output
 from quadid.cli.compiling import prepare
 from quadid.cli.options import JsonTarget
 
@@ -18,6 +17,6 @@ def warmup(json: JsonTarget = None) -> None:
     with terminal.progress(compiled=()) as advance:
         made = prepare(tuple(PARTS), advance)
     seconds = time.perf_counter() - begin
-    output.write_json({"schema": "quadid.warmup/1", "compiled": made, "seconds": seconds}, json)
+    terminal.write_json({"schema": "quadid.warmup/1", "compiled": made, "seconds": seconds}, json)
     what = f"compiled in {seconds:.0f} s" if made else "compiled already"
     terminal.console(quiet=json == "-").print(f"Kernels: {what}.")

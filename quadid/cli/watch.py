@@ -44,9 +44,8 @@ def watch(
     from quadid_node.zenoh import Fleet
 
     from quadid.cli import terminal
-    from quadid.cli import terminal as output
 
-    output.check_file(json, "--json")
+    terminal.check_file(json, "--json")
     fleet = Fleet(zenoh)
     try:
         for vehicle, name in ((approve, "approve"), (rollback, "rollback")):
@@ -54,12 +53,12 @@ def watch(
                 done = _command(fleet, vehicle, name)
                 if json != "-":
                     typer.echo(f"{vehicle}: {done['text']}")
-                output.write_json(done, json)
+                terminal.write_json(done, json)
         if approve or rollback:
             return
         if json is not None:
             time.sleep(max(seconds, SETTLE))
-            output.write_json(snapshot(fleet), json)
+            terminal.write_json(snapshot(fleet), json)
             return
         with contextlib.suppress(KeyboardInterrupt):
             _live(fleet, seconds, terminal.console())

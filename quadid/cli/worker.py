@@ -26,11 +26,10 @@ def worker(
     from quadid_node.ground import work
 
     from quadid.cli import terminal
-    from quadid.cli import terminal as output
     from quadid.online.window_fit import warm_up
     from quadid.vehicle import Vehicle
 
-    output.check_file(json, "--json")
+    terminal.check_file(json, "--json")
     console = terminal.console(quiet=json == "-")
     end = time.monotonic() + seconds if seconds > 0.0 else float("inf")
     warm_up(Vehicle.shipped("pelican"))
@@ -42,4 +41,4 @@ def worker(
     stop.ignore_more()
     result = {"schema": "quadid.worker/1", "answered": done.answered, "refused": done.refused, "seconds": done.seconds}
     console.print(f"{done.answered} requests answered, {done.refused} refused")
-    output.write_json(result, json)
+    terminal.write_json(result, json)

@@ -35,6 +35,7 @@ import numba as nb
 import numpy as np
 
 from quadid.types import BoolArray, FloatArray
+from quadid.vehicle import GRAVITY
 
 # Error state: rotation vector, rate, velocity, random force, random angular acceleration, attitude error.
 TH, OM, VE, FO, AL, AE, N = 0, 3, 6, 9, 12, 15, 18
@@ -56,7 +57,6 @@ _CLOCK = np.array([0, 0, 1, 2, 2, 3, 4, 4, 4])
 """… and which correlation time."""
 # Rotor moments over all rotors: squares, squares times x, y, spin, speeds times spin, speeds.
 MOMENTS = 6
-GRAVITY = 9.80665
 STILL_TIME = 1.0
 """Correlation time of a velocity that nobody measures [s]; see `Track.still`."""
 _FAST: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy", "fastmath": {"contract", "nsz"}}
@@ -501,7 +501,7 @@ def _accel_slope(c, row, air, x, slope):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(**_FAST)
-def _is_measured(track: Track, k: int, channel: int, air: bool) -> bool:
+def _is_measured(track: Track, k: int, channel: int) -> bool:
     """Presence of such a measurement; a velocity that nobody measures is about zero (see `Track.still`)."""
     return track.seen[k, channel // 3] or (channel >= VELOCITY and track.still > 0.0)
 
@@ -564,7 +564,7 @@ def kalman(track: Track, p: FloatArray, psi: FloatArray, tail: FloatArray, store
         _read_beyond(track, k, nu)
         dx[:] = 0.0
         for m in range(M):
-            if not _is_measured(track, k, m, air):
+            if not _is_measured(track, k, m):
                 continue
             count = _places(m, slope, where, what)
             v, S = nu[m], _white(track, psi, k, m)
@@ -791,9 +791,9 @@ def backward(
             for i in range(9):
                 s, T = psi[SIGMA + _GROUP[i]], psi[TIME + _CLOCK[i]]
                 _kick(h, air, i, turn, G)  # F's column is (what acts in the step) (1 + keep) / 2, and keep itself
-                smooth = g.mean[k, FO + 1 + i]
+                state = g.mean[k, FO + 1 + i]
                 for j in range(N):
-                    smooth += g.P[k, j, i] * fl[j]
+                    state += g.P[k, j, i] * fl[j]
                 by_keep = 0.0
                 for a in range(N):
                     part = G[a]
@@ -803,7 +803,7 @@ def backward(
                         inner = 0.0
                         for j in range(N):
                             inner += FL[a, j] * g.P[k, j, i]
-                        by_keep += part * (l[a] * smooth - inner)
+                        by_keep += part * (l[a] * state - inner)
                 score[TIME + _CLOCK[i]] -= 2.0 * by_keep * keep[i] * h / (T * T)
             for i in range(N):
                 l[i] = fl[i]

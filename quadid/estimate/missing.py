@@ -145,6 +145,11 @@ def size(parts: Sequence[Missing], force: bool) -> tuple[FloatArray, FloatArray]
     return np.sqrt(square), interval
 
 
+def control_size(parts: Sequence[Missing]) -> FloatArray:
+    """Standard deviation of the rotor moments over flights, shape (3,) [N m]."""
+    return np.asarray(np.concatenate([m.control for m in parts]).std(axis=0))
+
+
 def removed(before: Sequence[Missing], after: Sequence[Missing]) -> float:
     """Share of the squared missing force and moment that a larger model takes away.
 
@@ -152,6 +157,6 @@ def removed(before: Sequence[Missing], after: Sequence[Missing]) -> float:
     """
     shares = []
     for parts in (before, after):
-        weight, control = parts[0].weight, np.concatenate([m.control for m in parts]).std(axis=0)
+        weight, control = parts[0].weight, control_size(parts)
         shares.append(np.sum((size(parts, True)[0] / weight) ** 2) + np.sum((size(parts, False)[0] / control) ** 2))
     return float(1.0 - shares[1] / shares[0])

@@ -113,13 +113,13 @@ class Problem:
     control: FloatArray
 
     @classmethod
-    def of(cls, tracks: Sequence[Track], vehicle: Vehicle, names: Sequence[str] = (), tail: float = 0.0) -> Problem:
+    def of(cls, tracks: Sequence[Track], vehicle: Vehicle, names: Sequence[str] = ()) -> Problem:
         """The six, trim moment, biases and `names` free, from the vehicle file's guess."""
         base = np.zeros(k.N_PHYSICS)
         base[:6] = vehicle.initial
         upright = (UPRIGHT,) if any(t.seen[:, 3].any() for t in tracks) else ()
         free, control = (*NOMINAL_NAMES, *TRIMMED, *upright, *names), control_moment(tracks, base)
-        return cls(tuple(tracks), vehicle, free, base, np.full(4, tail), control)
+        return cls(tuple(tracks), vehicle, free, base, np.zeros(4), control)
 
     @classmethod
     def fixed(cls, tracks: Sequence[Track], vehicle: Vehicle, six: FloatArray) -> Problem:
@@ -216,9 +216,9 @@ class Problem:
         out[k.TIME :] = SHORTEST * step, max(LONGEST * long, 4.0 * SHORTEST * step)
         return out
 
-    def first_noise(self, share: float = 2.0) -> FloatArray:
-        """Noise numbers where the search begins: random forces large, `share` times their prior."""
-        out = np.concatenate([WHITE, share * self.noise_scale, np.full(5, MEMORY)])
+    def first_noise(self) -> FloatArray:
+        """Noise numbers where the search begins: random forces large, twice their prior."""
+        out = np.concatenate([WHITE, 2.0 * self.noise_scale, np.full(5, MEMORY)])
         out[k.SIGMA + 4 : k.TIME] = 0.25 * TILT
         return np.asarray(np.clip(out, *self.noise_bounds.T))
 

@@ -38,19 +38,13 @@ def from_window(window: Window, vehicle: Vehicle, air: bool = False) -> Track:
     )
 
 
-def from_recording(
-    recording: Recording, vehicle: Vehicle, start: float = -np.inf, stop: float = np.inf, air: bool = False,
-    every: int = 1,
-) -> Track:  # fmt: skip
+def from_recording(recording: Recording, vehicle: Vehicle, air: bool = False) -> Track:
     """A log, channels at their own rates: an update where a new value was measured; a repeated one is none.
 
     Args:
         recording: the log.
         vehicle: what its rotor columns mean.
-        start: first time to use [s].
-        stop: last one.
         air: velocity matters though it is not measured.
-        every: use one of so many measurements; rotor signals keep all theirs.
 
     Raises:
         LogError, NotIdentifiableError: see `rotor_signal`.
@@ -61,8 +55,7 @@ def from_recording(
     for name, _, _ in _COLUMNS:
         channel = recording.channels.get(name)
         if channel is not None:
-            rows = (channel.t >= max(start, rotor.t[0])) & (channel.t <= min(stop, rotor.t[-1])) & _new(channel.values)
-            rows[np.flatnonzero(np.arange(len(rows)) % every != 0)] = False
+            rows = (channel.t >= rotor.t[0]) & (channel.t <= rotor.t[-1]) & _new(channel.values)
             channels[name] = channel.t[rows], channel.values[rows]
     period = sample_period(recording.channels["accel"].t) if "accel" in recording.channels else 0.02
     return _track(channels, rotor.t, rotor.values, None, rotor.sampling == "held", period, vehicle, air)

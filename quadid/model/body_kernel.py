@@ -8,9 +8,10 @@ from typing import Any
 import numba as nb
 
 from quadid.model import layout as ix
-from quadid.model.kernel import GRAVITY, TWELFTH, Needs, put_force, rotation_rate
+from quadid.model.kernel import TWELFTH, Needs, put_force, rotation_rate
 from quadid.model.simd import LANES, exact, inlined, jit, lane_kernel, variant
 from quadid.types import FloatArray, IntArray
+from quadid.vehicle import GRAVITY
 
 # isort: off
 from quadid.model.work_array import (
@@ -25,8 +26,7 @@ from quadid.model.work_array import (
 
 # --- Forces and moments beyond the catalogue: sums of coefficients times products of signals of the simulation
 #
-# What may be multiplied: `quadid.vehicle.SIGNALS`, in this
-# order; 0 stands for the constant one.
+# Factors: `quadid.vehicle.SIGNALS`, in this order; 0 stands for the constant one.
 
 
 N_SIGNALS = 15

@@ -90,7 +90,7 @@ def _on_disk(sources: int) -> Any:
             substeps: runs of the stabiliser a row.
             lanes: how many of the block's lanes are wanted.
             geometry: (rotors, 4), see `rotor_kernel.Drive`.
-            terms: beyond the catalogue, (terms, 4), see `residual_kernel.residual_forces`.
+            terms: beyond the catalogue, (terms, 4), see `body_kernel.residual_forces`.
             flight: numbers of the window.
             theta: parameter vectors (LANES, size).
             need: which parts of the model any lane needs.

@@ -12,14 +12,15 @@ from quadid.model import layout as ix
 from quadid.model.layout import places
 from quadid.model.simd import LANES, SOURCES, cached, exact, inlined, jit, lane_kernel
 from quadid.types import FloatArray, IntArray
+from quadid.vehicle import GRAVITY
 
 # isort: off
 from quadid.model.work_array import (
     ALL_MOMENTS, A_G, A_M, A_O1, A_S2, A_X2, A_Y2, A_Z2, C_B, C_CGX, C_CGY, C_CLIMB, C_CPAR, C_CPAR_Z, C_D, C_DRAG_ARM,
     C_DROP, C_DROP_TIME, C_FLOW_ARM, C_GROUND, C_GX, C_GXX, C_GXY, C_GY, C_GYY, C_HOVER, C_HUB, C_HX, C_HY, C_INVM,
     C_IXX, C_IXY, C_IXZ, C_IYY, C_IYZ, C_IZZ, C_JR, C_JSPIN, C_JXX, C_JXY, C_JXZ, C_JYY, C_JYZ, C_JZZ, C_KX, C_KY, C_KZ,
-    C_LIFT, C_LOAD, C_LOAD_TIME, C_LOWEST, C_LP, C_MASS, C_MQ, C_NR, C_RX, C_RY, C_RZ, C_SAG, C_TURNING, C_WE, C_WN,
-    F0_X, F0_Y, F0_Z, F1_X, F1_Y, F1_Z, F2_X, F2_Y, F2_Z, HALF, N_STATE, S_BENDX, S_BENDY, S_BENDZ, S_FX, S_FY, S_FZ,
+    C_LIFT, C_LOAD, C_LOAD_TIME, C_LOWEST, C_LP, C_MQ, C_NR, C_RX, C_RY, C_RZ, C_SAG, C_TURNING, C_WE, C_WN,
+    F0_X, F0_Y, F0_Z, F1_X, F1_Y, F1_Z, F2_X, F2_Y, F2_Z, HALF, S_BENDX, S_BENDY, S_BENDZ, S_FX, S_FY, S_FZ,
     S_P, S_Q, S_QW, S_QX, S_QY, S_QZ, S_R, X_P, X_Q, X_QW, X_QX, X_QY, X_QZ, X_R,
 )  # fmt: skip
 # isort: on
@@ -41,6 +42,7 @@ class Needs(NamedTuple):
         factors: thrust or mass change in flight.
         payload: inertia or centre of gravity change with mass.
         imu_lag, att_delay, imu_static, ahrs: these sensor effects act.
+        learned: terms beyond the catalogue act.
     """
 
     full: bool
@@ -76,7 +78,6 @@ ROTOR_ENTRIES = places(
     "motor_lag", "command_delay", "rotor_telemetry_delay", "thrust_curve", "supply_voltage", "drag_torque_curve"
 )
 """What makes rotors of one lane differ from those of another; losses beside them."""
-(OFFSET,) = places("thrust_curve.offset")
 # As arrays, which all are of one type: `_any_of` would be compiled anew for each length of a tuple.
 _HUB, _RARE, _PAYLOAD, _FACTORS = (np.array(e) for e in (HUB_ENTRIES, RARE_ENTRIES, PAYLOAD_ENTRIES, FACTOR_ENTRIES))
 _SOLID, _IMU, _DELAY = (np.array(e) for e in (SOLID_ENTRIES, IMU_ENTRIES, DELAY_ENTRIES))
@@ -117,7 +118,7 @@ def _on_disk(sources: int) -> Any:
                 varied |= theta[lane, i] != theta[0, i]
             for i in range(ix.LOSS, ix.LOSS + 2 * rotors):
                 varied |= theta[lane, i] != theta[0, i]
-            varied |= theta[lane, OFFSET] != 0.0 and theta[lane, ix.B] != theta[0, ix.B]
+            varied |= theta[lane, ix.OFFSET] != 0.0 and theta[lane, ix.B] != theta[0, ix.B]
         return Needs(
             air or solid, air, hub, solid, rare, not varied, _any_of(theta, _DELAY), _any_of(theta, _SLOWER),
             _any_of(theta, _EXPONENT), growth, factors, payload, _any_of(theta, _IMU_LAG),
@@ -141,10 +142,6 @@ needs_of = _on_disk(SOURCES)
 # in `quadid.model.equations`.
 
 
-__all__ = ["LANES", "N_STATE", "body_constants", "flight_factors", "step_core", "step_core_shared"]
-
-
-GRAVITY = 9.80665
 SLOWEST_HOVER = 0.1
 """Least speed in hover, as a share of what a thrust without dead speed gives: a curve that is nearly straight has none
 of its own."""
@@ -195,7 +192,7 @@ def _hover_speed(th, weight):  # type: ignore[no-untyped-def]
     """Speed at which a rotor carries its share of the weight [N]: b (omega - dead_speed)^2 + offset."""
     b = abs(th[ix.B])
     least = SLOWEST_HOVER * math.sqrt(weight / b)
-    return max(math.sqrt(max(weight - th[OFFSET], 0.0) / b) + th[ix.DEAD_SPEED], least)
+    return max(math.sqrt(max(weight - th[ix.OFFSET], 0.0) / b) + th[ix.DEAD_SPEED], least)
 
 
 @nb.njit(**exact)
@@ -212,7 +209,7 @@ def body_constants(theta: FloatArray, flight: Flight, rotors: int, s: FloatArray
         th = theta[lane]
         _inertia(th[ix.JXX], th[ix.JYY], th[ix.JZZ], -th[ix.JXY], -th[ix.JXZ], -th[ix.JYZ], lane, s)
         s[C_B + lane], s[C_D + lane], s[C_JR + lane], s[C_JSPIN + lane] = th[ix.B], th[ix.D], th[ix.JR], th[ix.JSPIN]
-        s[C_INVM + lane], s[C_MASS + lane] = 1.0 / flight.mass, flight.mass
+        s[C_INVM + lane] = 1.0 / flight.mass
         hover = 1.0 / (rotors * _hover_speed(th, flight.mass * GRAVITY / rotors))
         s[C_HOVER + lane], s[C_HUB + lane] = hover, flight.hub
         each = flight.mass * hover

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass
 
@@ -36,7 +36,9 @@ def places(*effects: str) -> tuple[int, ...]:
     return tuple(i for e in effects for name, i in _INDEX.items() if e in (name, name.split(".")[0]))
 
 
-(TAU,) = places("motor_lag.tau")
+TAU, SLOWER = places("motor_lag")
+(TELEMETRY,) = places("rotor_telemetry_delay")
+(EXPONENT,) = places("supply_voltage.exponent")
 (DELAY,) = places("command_delay")
 (IMU_PERIOD,) = places("imu_lag")
 (ATT_DELAY,) = places("attitude_delay")
@@ -50,7 +52,7 @@ CGX, CGY = places("cg_offset")
 MASS_TIME, MASS_FRACTION, *_ = places("mass_change")
 DROP_TIME, DROP_FRACTION = places("thrust_drop")
 (SAG,) = places("battery_sag")
-(DEAD_SPEED,) = places("thrust_curve.dead_speed")
+DEAD_SPEED, OFFSET = places("thrust_curve")
 JXY, JXZ, JYZ = places("product_of_inertia")
 (JSPIN,) = places("rotor_spin_up")
 GBX, GBY, GBZ = places("gyro_bias")
@@ -122,6 +124,13 @@ class Layout:
         for entry in self.entries.values():
             theta[entry.index] = entry.neutral
         return theta
+
+    def without(self, theta: FloatArray, names: Iterable[str]) -> FloatArray:
+        """Returns a copy of `theta`, shape (size,), with these entries neutral."""
+        out = theta.copy()
+        for entry in map(self.entry, names):
+            out[entry.index] = entry.neutral
+        return out
 
     def initial(self, vehicle: Vehicle) -> FloatArray:
         """Returns the vehicle file's initial guess with its known effects, shape (size,)."""

@@ -31,7 +31,7 @@ from quadid.model.kernel import (
     Needs,
     needs_of,
 )
-from quadid.model.layout import places, relative_voltage, residual_terms
+from quadid.model.layout import relative_voltage, residual_terms
 from quadid.model.rollout_kernel import roll_segments
 from quadid.model.rotor_kernel import Drive, rotor_table
 from quadid.model.simd import LANES, aligned
@@ -236,8 +236,6 @@ def _cost(needs: BoolArray, order: IndexArray) -> float:
 # --- Typed wrapper of the kernel: segments of a window, initial states, many parameter vectors at once
 
 
-TAU, SLOWER = places("motor_lag")
-(OFFSET,) = places("thrust_curve.offset")
 _PART_ROWS = 800
 """Rows of one block simulated before their residuals are used, fewer of more blocks: they stay in cache."""
 _TABLES = ArrayCache(32 << 20)
@@ -461,7 +459,8 @@ class Rollout:
         check_shapes("needs_of", ("theta", theta, self._size))
         need = needs_of(theta, len(self.geometry), channels)
         table = self._table(theta, need) if need.shared else _NO_TABLE
-        lag, late = float((theta[:, TAU] + np.maximum(theta[:, SLOWER], 0.0)).max()), float(theta[:, ix.DELAY].max())
+        lag = float((theta[:, ix.TAU] + np.maximum(theta[:, ix.SLOWER], 0.0)).max())
+        late = float(theta[:, ix.DELAY].max())
         memory = math.ceil((_FORGOTTEN * lag + late) / self.window.dt) + 4
         return _Lanes(theta, np.ascontiguousarray(dx.T), need, table, memory)
 
@@ -470,7 +469,7 @@ class Rollout:
         own = np.concatenate(
             [theta[0, list(ROTOR_ENTRIES)], theta[0, ix.LOSS : ix.LOSS + 2 * len(self.geometry)]]
         ).tobytes()
-        key = self._number, own, theta[0, ix.B] if theta[0, OFFSET] else 0.0, need.hub
+        key = self._number, own, theta[0, ix.B] if theta[0, ix.OFFSET] else 0.0, need.hub
         table = _TABLES.get(key)
         if table is None:
             table = np.empty((len(self.window), 2 * ALL_MOMENTS))

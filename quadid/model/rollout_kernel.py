@@ -12,12 +12,7 @@ from quadid.model.body_kernel import (
     residual_coefficients,
     residual_forces,
     residual_signals,
-    step_air,
-    step_air_solid,
-    step_full,
-    step_hub,
-    step_hub_solid,
-    step_rare,
+    step_in_air,
     step_solid,
 )
 from quadid.model.kernel import (
@@ -226,7 +221,7 @@ def _on_disk(sources: int) -> Any:
 
         Args:
             drive: rotor input of the window.
-            terms: beyond the catalogue, (terms, 4), see `residual_kernel.residual_forces`.
+            terms: beyond the catalogue, (terms, 4), see `body_kernel.residual_forces`.
             flight: numbers of the window.
             table: moments that all lanes share, see `rotor_table`; not read unless `need.shared`.
             measured: (n, 16), see `compare`.
@@ -305,18 +300,8 @@ def _on_disk(sources: int) -> Any:
                     residual_signals(s, signals)
                     residual_forces(terms, coefficients, signals, i == 0, s)
                 # This step gives the second half of the accelerometer's mean at t_k; the step before, the first.
-                if need.rare and need.solid:
-                    step_full(dt, s)
-                elif need.rare:
-                    step_rare(dt, s)
-                elif need.hub and need.solid:
-                    step_hub_solid(dt, s)
-                elif need.hub:
-                    step_hub(dt, s)
-                elif need.air and need.solid:
-                    step_air_solid(dt, s)
-                elif need.air:
-                    step_air(dt, s)
+                if need.air:
+                    step_in_air(need, dt, s)
                 elif need.solid:
                     step_solid(dt, s)
                 elif need.shared:

@@ -36,9 +36,6 @@ from quadid.model.work_array import (
 THIRD = 1.0 / 3.0
 A, B, C, D = 0, PIECE, 2 * PIECE, 3 * PIECE
 """Pieces of a step: its halves, each before and after the input switches."""
-TAU, SLOWER = places("motor_lag")
-(TELEMETRY,) = places("rotor_telemetry_delay")
-DEAD_SPEED, OFFSET = places("thrust_curve")
 
 
 @nb.njit(**exact)
@@ -56,11 +53,11 @@ def rotor_constants(theta: FloatArray, dt: float, rot: FloatArray, s: FloatArray
         for r in range(len(rot)):
             loss = th[ix.LOSS + r]
             rot[r, R_GAIN + lane], rot[r, R_DRAG + lane] = 1.0 - loss, 1.0 - loss - th[ix.LOSS + len(rot) + r]
-        s[C_W0 + lane], s[C_CURVE + lane] = th[DEAD_SPEED], th[DEAD_SPEED] ** 2 + th[OFFSET] / th[ix.B]
-        delay = (max(th[ix.DELAY], 0.0) - max(th[TELEMETRY], 0.0)) / dt
+        s[C_W0 + lane], s[C_CURVE + lane] = th[ix.DEAD_SPEED], th[ix.DEAD_SPEED] ** 2 + th[ix.OFFSET] / th[ix.B]
+        delay = (max(th[ix.DELAY], 0.0) - max(th[ix.TELEMETRY], 0.0)) / dt
         f = delay - math.floor(delay)
         s[C_SHIFT + lane], s[C_PART + lane] = math.floor(delay), f
-        s[C_TAU + lane], s[C_TAU_DOWN + lane] = max(th[TAU], 0.0), max(th[TAU] + th[SLOWER], 0.0)
+        s[C_TAU + lane], s[C_TAU_DOWN + lane] = max(th[ix.TAU], 0.0), max(th[ix.TAU] + th[ix.SLOWER], 0.0)
         cuts = (min(f, 0.5), 0.5 - min(f, 0.5), max(f - 0.5, 0.0), 0.5 - max(f - 0.5, 0.0))
         begins = (1.0 - f, 0.0, 1.5 - f, max(0.5 - f, 0.0))  # of each piece, in its sample of the input
         for way in range(2):
@@ -209,14 +206,11 @@ def next_input(r: int, held: bool, sloped: bool, inv: float, rot: FloatArray, s:
         rot[r, R_PAST + lane], rot[r, R_NOW + lane] = rot[r, R_NOW + lane], rot[r, R_NEXT + lane]
 
 
-# --- Rotors of many parameter vectors at once: their input, and their moments over each half step
-#
-# Speeds and their means are those of `quadid.model.rotor_kernel`; here is what is read for them, and what is summed.
+# --- Their input, and their moments over each half step
 
 
 PLAIN_MOMENTS = 7
 """Moments that every model needs; the others belong to the air at each hub."""
-(EXPONENT,) = places("supply_voltage.exponent")
 (GROWTH,) = places("drag_torque_curve")
 
 
@@ -248,7 +242,7 @@ def rotors_start(drive: Drive, k: int, need: Needs, rot: FloatArray, s: FloatArr
             factor = math.exp(s[C_VOLT + lane] * drive.volts[k]) if need.voltage else 1.0
             # A reading that comes late shows what the rotors did before: their input lies ahead in the log.
             now = min(k + max(int(-s[C_SHIFT + lane]), 0), len(drive.u) - 1)
-            for row in (R_SPEED, R_PAST, R_NEXT):
+            for row in (R_PAST, R_NEXT):
                 rot[r, row + lane] = factor * drive.u[max(now - 1, k), r]
             rot[r, R_NOW + lane] = factor * drive.u[now, r]
             rot[r, R_SPEED + lane] = factor * drive.u[k, r]
@@ -260,7 +254,7 @@ def rotors_start(drive: Drive, k: int, need: Needs, rot: FloatArray, s: FloatArr
 def input_constants(theta: FloatArray, s: FloatArray) -> None:
     """Derives what scales input and drag torque of all lanes from parameter vectors (LANES, size)."""
     for lane in range(LANES):
-        s[C_VOLT + lane], s[C_GROWTH + lane] = theta[lane, EXPONENT], theta[lane, GROWTH]
+        s[C_VOLT + lane], s[C_GROWTH + lane] = theta[lane, ix.EXPONENT], theta[lane, GROWTH]
 
 
 @nb.njit(**jit)
@@ -315,7 +309,7 @@ def turn_rotor(
     x, y, spin, z = geometry[r, 0], geometry[r, 1], geometry[r, 2], geometry[r, 3]
     for i in range(3 * LANES):
         s[T_SPEED + i] = rot[r, R_SPEED + i]  # and both gains
-    if plain and not need.uneven:
+    if plain:
         turn_held(x, y, spin, inv, keep, s)
     else:
         next_input(r, held, sloped, inv, rot, s)

@@ -1,7 +1,7 @@
 """What the sensors make of the motion, for many parameter vectors at once: IMU filter, AHRS, errors of the IMU.
 
 The rows S_* hold what reaches the sensors at one sample; each stage works on them in place, and
-`compare_kernel.compare` ends the chain.
+`rollout_kernel.compare` ends the chain.
 """
 
 from __future__ import annotations

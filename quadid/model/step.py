@@ -10,7 +10,7 @@ import numpy as np
 from quadid.errors import ParameterError, WindowError
 from quadid.model import layout as ix
 from quadid.model.kernel import Flight, Needs, needs_of
-from quadid.model.layout import Layout, places, residual_terms
+from quadid.model.layout import Layout, residual_terms
 from quadid.model.rollout import hub_geometry
 from quadid.model.simd import LANES
 from quadid.model.step_kernel import STATE, TURNS, step_blocks, write_constants
@@ -35,16 +35,14 @@ from quadid.vehicle import Vehicle
 
 # --- The identified vehicle as a simulator to be stepped, one vehicle or a batch of them
 #
-# simulator = Simulator(vehicle)
-# state = simulator.start(height=2.0)
-# while flying:
-# state = simulator.step(state, controller(state), 0.005)
+#     simulator = Simulator(vehicle)
+#     state = simulator.start(position=np.array([0.0, 0.0, -2.0]))
+#     while flying:
+#         state = simulator.step(state, controller(state), 0.005)
 
 
 LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
 STILL = np.zeros(3)
-(TELEMETRY,) = places("rotor_telemetry_delay")
-(EXPONENT,) = places("supply_voltage.exponent")
 _NO_OUT, _NO_WALK = np.empty((0, 0, 0)), np.empty((0, TURNS))
 _ROTORS_AT = N_ROWS * LANES - STATE
 """First number of the rotors in the memory of a block."""
@@ -181,7 +179,7 @@ class Simulator:
         blocks = -(-len(points) // LANES)
         self._theta = np.repeat(points[-1:], blocks * LANES, axis=0)
         self._theta[: len(points)] = points
-        self._theta[:, TELEMETRY] = 0.0  # late readings are no part of what rotors do
+        self._theta[:, ix.TELEMETRY] = 0.0  # late readings are no part of what rotors do
         self._theta = self._theta.reshape(blocks, LANES, -1)
         self._geometry, self._hub, self._plan, self._reach = hub_geometry(vehicle)
         flat = self._theta.reshape(blocks * LANES, -1)
@@ -294,7 +292,7 @@ class Simulator:
         if dt != self._dt:
             self._settle(dt)
         if voltage is not None:
-            exponent = self._theta[..., EXPONENT].reshape(-1)[: state.vehicles]
+            exponent = self._theta[..., ix.EXPONENT].reshape(-1)[: state.vehicles]
             commands = commands * voltage ** exponent[None, :, None]
         step_blocks(
             commands, self._geometry, self._theta, self._terms, self._coefficients, self._needs, self._constants,
@@ -328,7 +326,7 @@ def _in_lanes(values: FloatArray, blocks: int) -> FloatArray:
     return full.reshape(blocks, LANES, -1).transpose(0, 2, 1)
 
 
-# --- A flight of the identified vehicle: rotor speeds in, states out; a loop over `quadid.model.step`
+# --- A flight of the identified vehicle: rotor speeds in, states out; a loop over `Simulator`
 
 
 @dataclass(frozen=True)

@@ -22,10 +22,10 @@ def _rows(first: int, count: int) -> range:
 # Constants: rigid body, rotors, air, flight.
 (
     C_B, C_D, C_IXX, C_IYY, C_IZZ, C_IXY, C_IXZ, C_IYZ, C_JXX, C_JYY, C_JZZ, C_JXY, C_JXZ, C_JYZ, C_JR, C_JSPIN,
-    C_INVM, C_MASS, C_HOVER, C_KX, C_KY, C_KZ, C_CPAR, C_HX, C_HY, C_LP, C_MQ, C_NR, C_WN, C_WE, C_CGX, C_CGY, C_W0,
+    C_INVM, C_HOVER, C_KX, C_KY, C_KZ, C_CPAR, C_HX, C_HY, C_LP, C_MQ, C_NR, C_WN, C_WE, C_CGX, C_CGY, C_W0,
     C_RX, C_RY, C_RZ, C_GROUND, C_LOWEST, C_SAG, C_DROP_TIME, C_DROP, C_LOAD_TIME, C_LOAD, C_HUB, C_TURNING, C_CPAR_Z,
     C_LIFT, C_GX, C_GY, C_GXX, C_GYY, C_GXY, C_CLIMB, C_DRAG_ARM, C_FLOW_ARM,
-) = _rows(0, 55)  # fmt: skip
+) = _rows(0, 54)  # fmt: skip
 # Constants of the sensors; three rows from C_GB, C_AB, C_GS; nine, row by row of a matrix, from C_R.
 (C_SIGMA, C_KAPPA, C_EC, C_ES, C_EC2, C_ES2, C_AHRS, C_ATT_DELAY) = _rows(C_FLOW_ARM + LANES, 8)
 (C_GB, C_AB, C_GS, C_R) = range(C_ATT_DELAY + LANES, C_ATT_DELAY + 13 * LANES, 3 * LANES)

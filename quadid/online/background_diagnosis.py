@@ -129,7 +129,7 @@ class BackgroundDiagnosis:
         if asked is None or reply is None or tick < asked.stop + ANSWER_AFTER:
             return None
         self._asked = self._reply = None
-        self._errors += reply.is_unexpected
+        self._errors = self._errors + 1 if reply.is_unexpected else 0
         if asked.start < since:
             return None
         self.wrong_scale = next((f.evidence for f in reply.findings if f.confident and _is_wrong_scale(f)), "")

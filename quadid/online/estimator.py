@@ -291,20 +291,21 @@ class Estimator:
 
     def _held_out(self, in_force: OnlineSet | None, seen: float) -> tuple[float, ...]:
         """Gain over the set in force in disjoint windows after `seen` [s], by estimates that had not seen them."""
-        reference, out = self._z(in_force), []
+        reference, scatter, out = self._z(in_force), self._scatter, []
         for window in self.fusion.disjoint(HELD_OUT_WINDOWS):
             earlier = self.fusion.before(window.start)
             if earlier is not None and window.start >= seen - 1e-6:
                 if self._yaw_missed:
                     earlier[_YAW_PLACES] = reference[_YAW_PLACES]
-                out.append((window.deviance(reference) - window.deviance(earlier)) / self._scatter)
+                out.append((window.deviance(reference) - window.deviance(earlier)) / scatter)
         return tuple(out)
 
     def _thrust_ratio(self, windows: Sequence[Window]) -> float:
         """Thrust by the published numbers over what the accelerometer felt."""
         lift = [-w.accel[:, 2] for w in windows if w.accel is not None]
         felt = float(np.nanmean(np.concatenate(lift))) if lift else GRAVITY
-        total = float(np.mean(np.concatenate([self.published.total(w.rotor_speed) for w in windows])))
+        published = self.published
+        total = float(np.mean(np.concatenate([published.total(w.rotor_speed) for w in windows])))
         return total / (self.vehicle.mass * max(felt, 1e-3))
 
 

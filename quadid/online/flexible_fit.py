@@ -120,10 +120,14 @@ def flexible_fit(
     return problem, free, prior, polish(robust, result.theta, free, prior, result.states, iterations=4)
 
 
-def reduced(start: float, stop: float, problem: Shooting, free: Free, prior: Prior, result: Polished) -> WindowEstimate:
+def reduced(
+    start: float, stop: float, problem: Shooting, free: Free, prior: Prior, result: Polished,
+    known: FloatArray | None = None,
+) -> WindowEstimate:  # fmt: skip
     """What a window says of the nominal six, whatever the effects are; b is that at hover.
 
     Information counts for less where the scores of segments scatter more than the noise explains (`score_products`).
+    `known`: thrust that the six leave out (`left_out`), where that was computed already.
     """
     lin, six = result.lin, len(NOMINAL_NAMES)
     precision, pull, _ = prior_terms(free, prior, result.theta)
@@ -142,7 +146,7 @@ def reduced(start: float, stop: float, problem: Shooting, free: Free, prior: Pri
     information = 0.5 * (information + information.T) / np.outer(excess, excess)
     return WindowEstimate(
         start, stop, z, information, information @ step, lin.total_cost, lin.total_rows,
-        left_out(problem, free, prior, result),
+        left_out(problem, free, prior, result) if known is None else known,
     )  # fmt: skip
 
 
@@ -180,7 +184,7 @@ def sampling_error(
         sparse = problem.on([halved(w, first) for w in windows])
         # One linear step tells the size; a descent may refuse every step, and would then tell of no error at all.
         lin = sparse.linearise(best.theta, free, best.states)
-        there = reduced(estimate.start, estimate.stop, problem, free, prior, replace(best, lin=lin))
+        there = reduced(estimate.start, estimate.stop, problem, free, prior, replace(best, lin=lin), estimate.left_out)
         shifts.append(there.optimum - estimate.optimum)
     share = (0.5 * spacing) ** ORDER[windows[0].sampling]
     missed = (share * 0.5 * (shifts[0] - shifts[1])) ** 2 + (share**2 * 0.5 * (shifts[0] + shifts[1])) ** 2

@@ -6,8 +6,6 @@ estimate itself, which the gate judges.
 
 from __future__ import annotations
 
-from collections.abc import Container
-
 import numpy as np
 
 from quadid.identification.noise_model import SHAPE_POINTS, NoiseModel
@@ -22,10 +20,10 @@ ROOM = 2.0
 SIX = len(NOMINAL_NAMES)
 
 
-def is_noise(noise: NoiseModel, channels: Container[int]) -> bool:
+def is_noise(noise: NoiseModel, channels: int) -> bool:
     """A noise model of so many channels."""
     shape = noise.white.shape
-    if len(shape) != 1 or shape[0] not in channels or noise.slow.shape != shape or not noise.slow_time > 0.0:
+    if len(shape) != 1 or shape[0] != channels or noise.slow.shape != shape or not noise.slow_time > 0.0:
         return False
     return noise.shape is None or noise.shape.shape == (*shape, SHAPE_POINTS)
 

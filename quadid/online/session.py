@@ -280,7 +280,7 @@ class Session:
         if self._change_supervisor.seen is not None:
             self._isolate(tick)
         elif self._windows.due(tick):
-            if self._hurried or self._late is not None:
+            if self._hurried or self._late is not None or self._waiting is not None:
                 self.skipped += 1
             else:
                 yield from self._fit(tick)

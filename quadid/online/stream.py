@@ -513,7 +513,11 @@ class Resampler:
         for k in np.flatnonzero(t > reached + HISTORY).tolist():
             new_clock = self.time.began_in(float(reached[k]), float(t[k]))
             self._stretches.append(_Stretch(float(t[k]), float(reached[k]), new_clock))
-            self._told -= self._told if new_clock else {LEADER}
+            if new_clock:
+                self._told.clear()
+                self._apart.clear()
+            else:
+                self._told.discard(LEADER)
         if before == -math.inf < self.time.newest:
             early, self._early = self._early, deque(maxlen=MOST_EARLY)
             for followers in early:

@@ -123,7 +123,7 @@ class FitRequest(Job):
         """Whether a reply is to this job, and of its form."""
         if not (super().is_answered_by(reply) and isinstance(reply, FitReply)):
             return False
-        channels = (min(map(channels_of, self.windows), default=0),)
+        channels = min(map(channels_of, self.windows), default=0)
         estimate = reply.estimate
         return (
             all(a is None or a.shape == (SIX,) for a in (reply.excitation, reply.misfit, reply.between_rows))

@@ -454,7 +454,7 @@ _REMARKS = {
 }
 
 
-def _diagnose_page_advice(finding: Json) -> str:
+def _finding_advice(finding: Json) -> str:
     """What to do about a cause, and what sets it apart."""
     known = EFFECTS.get(finding["effect"])
     parts = [] if known is None or finding.get("ordinary") else [known.advice]
@@ -484,7 +484,7 @@ def finding_part(finding: Json, floor: float, identifier: str, seen: ResidualMap
     return {
         **finding,
         "title": name,
-        "advice": _diagnose_page_advice(finding),
+        "advice": _finding_advice(finding),
         "gained": "".join(gained) + ".",
         "noise": _noise_sentence(gain, floor, name),
         "rivals": f"Rejected alternatives, with the error they leave: {', '.join(rivals)}."

@@ -193,10 +193,10 @@ FOLDED = 8
 def summary_sections(summary: Json) -> list[JsonDict | None]:
     """What `quadid.report.fleet.summarise` found, a section a kind; None for kinds without a row."""
     return [
-        _fleet_tables_units(summary),
-        _fleet_tables_drifts(summary),
-        _fleet_tables_outliers(summary),
-        _fleet_tables_common(summary),
+        _units_table(summary),
+        _drifts_table(summary),
+        _outliers_table(summary),
+        _common_table(summary),
         _unusable(summary),
     ]
 
@@ -221,7 +221,7 @@ def _left_out(rows: Sequence[Any]) -> str:
     return f" The first {MOST_ROWS} of {len(rows)}; the database has all." if len(rows) > MOST_ROWS else ""
 
 
-def _fleet_tables_units(summary: Json) -> JsonDict | None:
+def _units_table(summary: Json) -> JsonDict | None:
     """Parameters of every vehicle; the first is open."""
     head = ("Parameter", "Median", "Unit", "Spread", "Flights")
     tables: list[JsonDict] = []
@@ -237,7 +237,7 @@ def _fleet_tables_units(summary: Json) -> JsonDict | None:
     return section("vehicles", "Vehicles", intro, tables=tables) if tables else None
 
 
-def _fleet_tables_drifts(summary: Json) -> JsonDict | None:
+def _drifts_table(summary: Json) -> JsonDict | None:
     rows = [
         (d["unit"], d["parameter"], f"{100 * d['change']:+.2g} % in {d['days']:.3g} days".replace("-", "−"),
          f"{number(100 * d['ci95'][0], 2)} … {number(100 * d['ci95'][1], 2)} % a day", number(d["p_value"], 2),
@@ -249,7 +249,7 @@ def _fleet_tables_drifts(summary: Json) -> JsonDict | None:
     return _section("drift", "Drift", head, rows, intro)
 
 
-def _fleet_tables_outliers(summary: Json) -> JsonDict | None:
+def _outliers_table(summary: Json) -> JsonDict | None:
     rows = [
         (o["log"], o["parameter"], f"{number(o['value'])} {unit_text(o['unit_of_value'])}", number(o["median"]),
          number(o["deviations"], 2))
@@ -259,7 +259,7 @@ def _fleet_tables_outliers(summary: Json) -> JsonDict | None:
     return _section("outliers", "Outliers", head, rows, "In robust standard deviations of the vehicle.")
 
 
-def _fleet_tables_common(summary: Json) -> JsonDict | None:
+def _common_table(summary: Json) -> JsonDict | None:
     rows = [
         (c["unit"], c["effect"].replace("_", " "), f"{c['flights']} of {c['of']}",
          f"{c['parameter']} = {number(c['median'])} {c['unit_of_value']}".rstrip(),

@@ -127,7 +127,6 @@ _RAISED = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
 
 
 def _drawing(figures: Mapping[str, Any]) -> str:
-
     views = [view for figure in figures.values() for view in figure["views"]]
     return plotly_source(frozenset(trace.get("type", "scatter") for view in views for trace in view["data"]))
 

@@ -120,10 +120,7 @@ def residual_map(
 
 def switched_off(layout: Layout, theta: FloatArray, effect: str, names: Sequence[str]) -> FloatArray:
     """The vector with one cause at neutral."""
-    out = theta.copy()
-    for name in names:
-        entry = layout.entry(name)
-        out[entry.index] = entry.neutral
+    out = layout.without(theta, names)
     if f"{effect}.time" in layout.entries:
         out[layout.entry(f"{effect}.time").index] = NEVER
     return out

@@ -195,9 +195,13 @@ class BridgeNode(Node):
             return
         why = objection(message, self._option("vehicle_id"), self._option("mass"), self._applied)
         if why:
-            self._say(f"set {message.sequence} not applied: {why}", b"\x01")
-            if message.out_of_date and self._original and self._option("restore_out_of_date"):
-                await self._set(self._original, f"set {message.sequence} is out of date: first values put back")
+            own = self._option("vehicle_id") in ("", message.vehicle_id)
+            wanted = self._option("restore_out_of_date") and not self._option("dry_run")
+            if not (own and wanted and message.out_of_date and self._original):
+                self._say(f"set {message.sequence} not applied: {why}", b"\x01")
+            elif not self._client.services_are_ready():
+                self._say(f"{self._option('controller')} does not answer", b"\x01")
+            elif await self._set(self._original, f"set {message.sequence} is out of date: first values put back"):
                 self._original, self._applied = {}, message.sequence
             return
         if not self._client.services_are_ready():

@@ -45,7 +45,7 @@ def work(where: str, stop: Callable[[], bool], told: Callable[[str], None]) -> D
     """Answers requests until `stop` says so; waits for a router that is not there yet.
 
     Args:
-        where: see `zenoh_session.open_session`.
+        where: see `zenoh.open_session`.
         stop: asked often.
         told: takes a sentence for people.
 
@@ -267,16 +267,12 @@ class RemoteWorker:
         while not self._answers.empty():
             number, data = self._answers.get_nowait()
             if self._asked is not None and number == self._asked.number:
-                self._take(number, data, out)
+                self._take(data, out)
         if self._asked is not None and (self._ground.vanished or self._clock() > self._until):
             self._fall_back("vanished" if self._ground.vanished else "does not answer")
         self._tell_changes()
         told, self._told = self._told, []
         return [*out, *told]
-
-    def poll_ready(self) -> bool:
-        """Polls the child while nothing was submitted yet."""
-        return self._local.poll_ready()
 
     def sibling(self) -> RemoteWorker:
         """Another one, for diagnoses, on the same way to the ground."""
@@ -287,7 +283,7 @@ class RemoteWorker:
         self._local.close()
         self._ground.close()
 
-    def _take(self, number: int, data: bytes | None, out: list[JobReply | Trouble]) -> None:
+    def _take(self, data: bytes | None, out: list[JobReply | Trouble]) -> None:
         try:
             reply = unpack(data) if data is not None else None
         except ParcelError as error:

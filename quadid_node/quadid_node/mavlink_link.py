@@ -489,9 +489,7 @@ class MavlinkLink:
         elif wanted in names or message.target_component == COMPONENT:
             self._refuse(message, wanted, _READ_ONLY if wanted in names else _UNKNOWN)
             if wanted in names:
-                self._send_parameter(
-                    names.index(wanted), self._wire.source
-                )  # for ground stations that do not know PARAM_ERROR
+                self._send_parameter(names.index(wanted), answer=True)  # for stations that do not know PARAM_ERROR
 
     def _refuse(self, message: Any, name: str, error: int) -> None:
         index = getattr(message, "param_index", -1)

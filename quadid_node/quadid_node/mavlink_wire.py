@@ -217,7 +217,7 @@ dialect: Any = extend_dialect(ardupilotmega)
 _Coder: Any = dialect.MAVLink
 SIGNING_EPOCH = 1420070400
 """Signature timestamps count 10 us units from 2015-01-01."""
-MOST_BEHIND = 60 * 100_000
+MOST_BEHIND = 60 * UNITS
 """A new stream may be this far behind the newest signature seen [10 us]: older ones are replays."""
 LAST_PORT = 65535
 KEY_BYTES = 32
@@ -400,7 +400,7 @@ class Wire:
         if key is not None:
             self.mav.signing.secret_key = key
             self.mav.signing.sign_outgoing = True
-            self.mav.signing.timestamp = int((time.time() - SIGNING_EPOCH) * 100_000)
+            self.mav.signing.timestamp = int((time.time() - SIGNING_EPOCH) * UNITS)
             self._memory = SigningMemory(memory, self.mav.signing) if memory is not None else None
         self._buffer = bytearray()
         self._own: socket.socket | None = None

@@ -174,7 +174,13 @@ class IdentifyNode(PollingNode, LifecycleNode):
         keeps = not self._observer and values["history"] != "none"
         store = Store(Path(values["history"] or default_path()), self._id) if keeps else None
         worker = ProcessWorker(vehicle, values["worker_memory"])
-        self._service = Service(vehicle, settings, with_ground(worker, values["ground_worker"], self._id), store)
+        try:
+            fits = with_ground(worker, values["ground_worker"], self._id)
+        except QuadidError:
+            if store is not None:
+                store.close()
+            raise
+        self._service = Service(vehicle, settings, fits, store)
         if values["record"]:
             beginning = Beginning(vehicle, settings, values["source"], self._service.restored)
             self._recorder = Recorder(Path(values["record"]), beginning, preset.inputs)
@@ -215,9 +221,6 @@ class IdentifyNode(PollingNode, LifecycleNode):
             [Parameter(n, value=v) for n, v in values.items() if v != now[n] or type(v) is not type(now[n])]
         )
         self._reads_back = False
-
-    def _reads(self, name: str) -> str:
-        return repr(self.get_parameter(name).value)
 
     def _subscribe(self, preset: Source, rotors: int) -> None:
         chooser = Chooser(best_ranks(preset.inputs))

@@ -99,7 +99,7 @@ def read_beginning(path: Path) -> Beginning | None:
         left = json.loads(found["restored"])
         restored = Restored(
             _set(left["item"]), int(left["next_sequence"]), _set(left["baseline"]), str(left.get("approval", "")),
-            tuple(map(flight_from_dict, left.get("healthy", ()))),
+            tuple(map(flight_from_dict, left.get("healthy", ()))), str(left.get("decided", Restored.decided)),
         )  # fmt: skip
         settings = SessionSettings.model_validate_json(found["settings"])
         return Beginning(Vehicle.from_yaml(found["vehicle"], path.name), settings, found["source"], restored)
@@ -115,6 +115,7 @@ def _to_strings(beginning: Beginning) -> Mapping[str, str]:
         "approval": left.approval,
         "baseline": set_to_dict(left.baseline) if left.baseline is not None else None,
         "healthy": list(map(flight_to_dict, left.healthy)),
+        "decided": left.decided,
     }
     return {
         "vehicle": beginning.vehicle.to_yaml(),

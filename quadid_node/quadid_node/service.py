@@ -230,13 +230,12 @@ class Service:
         session.hurry(hurried)
         if hurried and waits:
             session.go_on()
-        t = session.status().t
         if behind >= self._tell_at:
             self._tell_at = 2.0 * behind
-            return [Event(t, "warning", "behind", lag(behind))]
+            return [Event(session.status().t, "warning", "behind", lag(behind))]
         if behind < PATIENCE and self._tell_at > BEHIND:
             self._tell_at = BEHIND
-            return [Event(t, "info", "behind", "caught up with the data")]
+            return [Event(session.status().t, "info", "behind", "caught up with the data")]
         return []
 
     def _journalled(self, outputs: list[Output]) -> list[Output]:

@@ -28,7 +28,7 @@ from quadid_replay.motors import RPM
 # accelerometer's) and neither wraps in 32 bits nor tests where it resumes.
 
 
-MAIN, MARKS = b"IP", b"IPSGHE"
+MARKS = b"IPSGHE"
 _LOG_END = b"End of log\x00"
 _TURN = 1 << 32
 """All numbers have 32 bits, and predictions wrap in them as in the firmware."""

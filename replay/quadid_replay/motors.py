@@ -179,7 +179,7 @@ def motor_outputs(
     order = list(_TRICOPTER) if tricopter else list(range(rotors or len(motors)))
     told = bool(motors) and set(motors) == set(order)
     against = [] if told else [
-        f"{name} {_motors_whole(parameters, name)}" for name, output, motor in said
+        f"{name} {_whole_or_zero(parameters, name)}" for name, output, motor in said
         if motor != (output if output in order else None) and (ardupilot or motor in order)
     ]  # fmt: skip
     if against:
@@ -250,7 +250,7 @@ def changed_functions(names: Sequence[str], values: Sequence[float]) -> str:
     given: dict[str, list[int]] = {}
     for name, value in zip(names, values, strict=True):
         if MOTOR_FUNCTION.fullmatch(name):
-            function = _motors_whole({name: value}, name)
+            function = _whole_or_zero({name: value}, name)
             seen = given.setdefault(name, [])
             if function not in seen[-1:]:
                 seen.append(function)
@@ -279,7 +279,7 @@ def px4_motor_outputs(parameters: Mapping[str, float], bank: str) -> list[int]:
         parameters: PX4 parameters of the log.
         bank: the beginning of their names.
     """
-    return motor_columns([_motors_whole(parameters, f"{bank}_FUNC{output}") for output in range(1, 17)])
+    return motor_columns([_whole_or_zero(parameters, f"{bank}_FUNC{output}") for output in range(1, 17)])
 
 
 def motor_columns(functions: Sequence[int]) -> list[int]:
@@ -293,8 +293,8 @@ def motor_columns(functions: Sequence[int]) -> list[int]:
 
 def px4_rotor_count(parameters: Mapping[str, float]) -> int:
     """Returns the number of rotors that CA_ROTOR_COUNT, else MAV_TYPE, tells; 0 when neither does."""
-    count = _motors_whole(parameters, "CA_ROTOR_COUNT")
-    return count if 0 < count <= MOST_ROTORS else MULTIROTORS.get(_motors_whole(parameters, "MAV_TYPE"), 0)
+    count = _whole_or_zero(parameters, "CA_ROTOR_COUNT")
+    return count if 0 < count <= MOST_ROTORS else MULTIROTORS.get(_whole_or_zero(parameters, "MAV_TYPE"), 0)
 
 
 def _driven(name: str, value: float) -> tuple[int, int | None]:
@@ -302,10 +302,10 @@ def _driven(name: str, value: float) -> tuple[int, int | None]:
     match = MOTOR_FUNCTION.fullmatch(name)
     assert match is not None
     motors = _ARDUPILOT_MOTORS if match[1] else _PX4_MOTORS
-    return int(match[1] or match[2]) - 1, motors.get(_motors_whole({name: value}, name))
+    return int(match[1] or match[2]) - 1, motors.get(_whole_or_zero({name: value}, name))
 
 
-def _motors_whole(parameters: Mapping[str, float], name: str) -> int:
+def _whole_or_zero(parameters: Mapping[str, float], name: str) -> int:
     """A parameter as a whole number; 0, which tells nothing, where it is absent or damaged beyond any number."""
     value = parameters.get(name, 0.0)
     return int(value) if abs(value) < _LARGEST_WHOLE else 0
@@ -319,9 +319,9 @@ def no_multirotor(parameters: Mapping[str, float], mav_type: int = 0, firmware: 
         mav_type: MAV_TYPE of its heartbeats; 0 for unknown.
         firmware: of ArduPilot, such as Copter or Plane; empty for unknown.
     """
-    kind = mav_type or _motors_whole(parameters, "MAV_TYPE")
-    airframe = _OTHER_AIRFRAMES.get(_motors_whole(parameters, "CA_AIRFRAME"))
-    frame = _OTHER_FRAMES.get(_motors_whole(parameters, "FRAME_CLASS"))
+    kind = mav_type or _whole_or_zero(parameters, "MAV_TYPE")
+    airframe = _OTHER_AIRFRAMES.get(_whole_or_zero(parameters, "CA_AIRFRAME"))
+    frame = _OTHER_FRAMES.get(_whole_or_zero(parameters, "FRAME_CLASS"))
     which = (
         f"MAV_TYPE {kind}" if kind and kind not in MULTIROTORS
         else f"Ardu{firmware}" if firmware not in ("", "Copter")

@@ -133,13 +133,13 @@ def header_line(head: bytes) -> str | None:
 
 
 FORMATS = (
-    LogFormat("mcap", b"\x89MCAP0\r\n", "mcap_reader:read_mcap", ("preset",)),
-    LogFormat("rosbag2", b"SQLite format 3\x00", "mcap_reader:read_mcap", ("preset",)),
-    LogFormat("ulog", b"ULog\x01\x12\x35", "ulog_reader:read_ulog"),
-    LogFormat("blackbox", b"H Product:Blackbox", "blackbox_reader:read_blackbox"),
-    LogFormat("usdlog", b"\xbc\x02\x00", "usd_reader:read_usd"),
-    LogFormat("dataflash", lambda head, time: _is_dataflash(head), "dataflash_reader:read_dataflash"),
-    LogFormat("tlog", lambda head, time: _is_tlog(head), "tlog_reader:read_tlog"),
+    LogFormat("mcap", b"\x89MCAP0\r\n", "rosbag:read_mcap", ("preset",)),
+    LogFormat("rosbag2", b"SQLite format 3\x00", "rosbag:read_mcap", ("preset",)),
+    LogFormat("ulog", b"ULog\x01\x12\x35", "ulog:read_ulog"),
+    LogFormat("blackbox", b"H Product:Blackbox", "blackbox:read_blackbox"),
+    LogFormat("usdlog", b"\xbc\x02\x00", "usd:read_usd"),
+    LogFormat("dataflash", lambda head, time: _is_dataflash(head), "dataflash:read_dataflash"),
+    LogFormat("tlog", lambda head, time: _is_tlog(head), "tlog:read_tlog"),
     LogFormat("csv", lambda head, time: time in _cells(head), "csv_reader:read_csv", ("columns",)),
 )
 """In the order in which they are tried."""

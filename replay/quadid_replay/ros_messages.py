@@ -14,7 +14,7 @@ from mcap.exceptions import McapError
 from quadid.types import BoolArray, FloatArray, IndexArray, IntArray
 from quadid_replay.columns import Columns, LogClock
 from quadid_replay.frames import cross, flip_attitude, flip_body, flip_world, from_euler, to_euler
-from quadid_replay.mcap_file import Topic
+from quadid_replay.mcap_file import Message, Topic
 from quadid_replay.motors import RPM, motor_columns
 
 # --- Fast reading and writing of messages whose numbers stand in the same places each time
@@ -489,13 +489,11 @@ def _taken(blocks: list[FloatArray], at: list[tuple[int, int]]) -> FloatArray:
 
 # --- From the messages of an MCAP to columns of numbers
 #
-# Messages are taken in batches.  Those of a topic that keeps its layout (`cdr_blocks.BlockReader`) are read at once,
+# Messages are taken in batches.  Those of a topic that keeps its layout (`BlockReader`) are read at once,
 # column by column; where it changes within a batch, each half is read by itself, down to a single message, which the
 # library decodes and the layout is learnt from.
 
 
-Message = tuple[int, int, bytes]
-"""Channel id, log time [ns], payload."""
 ColumnsOf = dict[tuple[int, str], Columns]
 
 BATCH, BATCH_BYTES = 8192, 8 << 20

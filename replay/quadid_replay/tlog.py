@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import mmap
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -194,7 +194,7 @@ def _members(runs: list[tuple[int, int]], count: int) -> IntArray:
 
 
 _TYPES = {"float": "<f4", "double": "<f8", "char": "u1"}
-_MAVLINK_DECODE_BLOCK = 4096
+_AT_ONCE = 4096
 """Frames that are looked at together: what they need stays in the processor's cache."""
 
 
@@ -224,24 +224,22 @@ def decode(frames: Frames, kind: Any, which: IntArray) -> Messages:
     size = kind.unpacker.size
     payloads = np.empty((len(which), size), dtype=np.uint8)
     columns = np.arange(size)
-    for a in range(0, len(which), _MAVLINK_DECODE_BLOCK):
-        some = which[a : a + _MAVLINK_DECODE_BLOCK]
+    for a in range(0, len(which), _AT_ONCE):
+        some = which[a : a + _AT_ONCE]
         begin = frames.start[some] + frames.head[some]
         block = frames.data.take(begin[:, None] + columns, mode="clip")
-        payloads[a : a + _MAVLINK_DECODE_BLOCK] = np.where(columns < (frames.end[some] - begin)[:, None], block, 0)
+        payloads[a : a + _AT_ONCE] = np.where(columns < (frames.end[some] - begin)[:, None], block, 0)
     return Messages(kind, payloads)
 
 
 def intact(frames: Frames, which: IntArray, seeds: IntArray) -> BoolArray:
     """Tells which of these frames have the right checksum; `seeds` are their messages' (`crc_extra`), shape (n,)."""
     out = np.empty(len(which), dtype=np.bool_)
-    for a in range(0, len(which), _MAVLINK_DECODE_BLOCK):
-        some = which[a : a + _MAVLINK_DECODE_BLOCK]
+    for a in range(0, len(which), _AT_ONCE):
+        some = which[a : a + _AT_ONCE]
         end = frames.end[some]
         told = frames.data[end].astype(np.uint16) | frames.data[end + 1].astype(np.uint16) << 8
-        out[a : a + _MAVLINK_DECODE_BLOCK] = told == _checksums(
-            frames.data, frames.start[some] + 1, end, seeds[a : a + _MAVLINK_DECODE_BLOCK]
-        )
+        out[a : a + _AT_ONCE] = told == _checksums(frames.data, frames.start[some] + 1, end, seeds[a : a + _AT_ONCE])
     return out
 
 
@@ -607,5 +605,4 @@ def _motors(vehicle: VehicleLog, notes: list[str]) -> list[RawChannel]:
             which = " ".join(str(i + 1) for i in motors) + how if signal == "servo" else "(normalized)"
             if motors:
                 raw.append(RawChannel("motor_command", t, values[:, motors], f"{source} {which}", refused))
-    order: Iterable[RawChannel] = sorted(raw, key=lambda r: "ACTUATOR" not in r.source)
-    return list(order)
+    return sorted(raw, key=lambda r: "ACTUATOR" not in r.source)

@@ -101,7 +101,7 @@ def collect_records(path: Path, topics: frozenset[str]) -> UlogRecords:
         else:
             _take(found, path.name, kind, data[offset + 3 : end], topics)
             offset = size if found.described_anew else end
-    found.cut |= not found.cut and offset < size
+    found.cut |= offset < size
     found.clean.seek(0)
     return found
 

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from quadid.checks.motion import flying_spans
+from quadid.checks.motion import flying_spans, within
 from quadid.data.rotor_signal import rotor_channel
 from quadid.data.window import Channel, Recording
 from quadid.errors import LogError
@@ -110,7 +110,7 @@ def _hover_thrust(recording: Recording, channel: Channel | None, command: _Comma
     squares = rotors * (0.55 * _MAX_SPEED) ** 2
     spans = flying_spans(recording, None)
     if channel is not None and spans:
-        inside = np.any([(channel.t >= a) & (channel.t <= b) for a, b in spans], axis=0)
+        inside = within(channel.t, spans)
         speed = np.maximum(channel.values[inside] - command.low, 0.0) * command.scale
         squares = float(np.mean(np.sum(speed**2, axis=1))) if inside.any() and speed.any() else squares
     return mass * GRAVITY / squares

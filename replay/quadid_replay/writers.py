@@ -181,7 +181,7 @@ class TopicWriter:
         return self._encoders[kind]
 
     def blocks(self, kind: str, build: Callable[[list[list[float]]], Any], sizes: Sequence[int]) -> BlockWriter:
-        """Returns a fast writer for messages that differ in stamp and runs of doubles only; see `cdr_blocks`."""
+        """Returns a fast writer for messages that differ in stamp and runs of doubles only; see `BlockWriter`."""
         return BlockWriter(self.encoder(kind), build, sizes)
 
     def close(self) -> None:
@@ -486,7 +486,7 @@ _TYPES = {3: 15, 4: 2, 6: 13, 8: 14, 10: 35, 12: 29}  # rotors to MAV_TYPE
 _GENERIC_AUTOPILOT, _ACTIVE = 0, 4
 _LONGEST_MS = 2**32
 _GYRO_BITS, _ACCEL_BITS = 0x38, 0x07
-_TlogWriterSeries = tuple[FloatArray, Callable[[int], list[Any]]]
+_TlogSeries = tuple[FloatArray, Callable[[int], list[Any]]]
 
 
 def write_tlog(file: str | Path | BinaryIO, source: Source) -> None:
@@ -528,13 +528,13 @@ def mavlink_messages(recording: Recording) -> Iterator[tuple[float, Any]]:
     rotors = motors.values.shape[1] if motors is not None else 4
     series = [
         _heartbeats(float(first), float(last), rotors, channels.get("rotor_speed") is not None),
-        *_tlog_writer_imu(channels.get("gyro"), channels.get("accel")),
-        *_tlog_writer_attitude(channels.get("attitude")),
+        *_tlog_imu(channels.get("gyro"), channels.get("accel")),
+        *_tlog_attitude(channels.get("attitude")),
         *_escs(channels.get("rotor_speed")),
         *_outputs(channels.get("motor_command")),
         *_reference(channels.get("attitude_reference")),
         *_local_position(channels.get("position"), channels.get("velocity")),
-        *_tlog_writer_battery(channels.get("battery")),
+        *_tlog_battery(channels.get("battery")),
     ]
     for which, row in in_time_order([t for t, _ in series]):
         t, messages = series[which]
@@ -550,7 +550,7 @@ def _us(t: float) -> int:
     return round(float(t) * 1e6)
 
 
-def _heartbeats(first: float, last: float, rotors: int, escs: bool) -> _TlogWriterSeries:
+def _heartbeats(first: float, last: float, rotors: int, escs: bool) -> _TlogSeries:
     t = np.arange(first, last + 1.0, 1.0)
     kind = _TYPES.get(rotors, 2)
 
@@ -565,7 +565,7 @@ def _heartbeats(first: float, last: float, rotors: int, escs: bool) -> _TlogWrit
     return t, messages
 
 
-def _tlog_writer_imu(gyro: Channel | None, accel: Channel | None) -> list[_TlogWriterSeries]:
+def _tlog_imu(gyro: Channel | None, accel: Channel | None) -> list[_TlogSeries]:
     t, (rate, force) = union_rows([gyro, accel])
     if len(t) == 0:
         return []
@@ -582,7 +582,7 @@ def _tlog_writer_imu(gyro: Channel | None, accel: Channel | None) -> list[_TlogW
     return [(t, messages)]
 
 
-def _tlog_writer_attitude(attitude: Channel | None) -> list[_TlogWriterSeries]:
+def _tlog_attitude(attitude: Channel | None) -> list[_TlogSeries]:
     if attitude is None:
         return []
     return [
@@ -594,7 +594,7 @@ def _quaternion_message(ms: int, q: list[float]) -> Any:
     return dialect.MAVLink_attitude_quaternion_message(ms, *q, 0.0, 0.0, 0.0)
 
 
-def _escs(speed: Channel | None) -> list[_TlogWriterSeries]:
+def _escs(speed: Channel | None) -> list[_TlogSeries]:
     if speed is None:
         return []
     width = speed.values.shape[1]
@@ -610,7 +610,7 @@ def _escs(speed: Channel | None) -> list[_TlogWriterSeries]:
     return [(speed.t, messages)]
 
 
-def _outputs(command: Channel | None) -> list[_TlogWriterSeries]:
+def _outputs(command: Channel | None) -> list[_TlogSeries]:
     """Pulse widths as SERVO_OUTPUT_RAW, normalized commands as ACTUATOR_OUTPUT_STATUS."""
     if command is None:
         return []
@@ -628,7 +628,7 @@ def _outputs(command: Channel | None) -> list[_TlogWriterSeries]:
     return [(command.t, messages)]
 
 
-def _reference(reference: Channel | None) -> list[_TlogWriterSeries]:
+def _reference(reference: Channel | None) -> list[_TlogSeries]:
     if reference is None:
         return []
     q = from_euler(reference.values[:, :3])
@@ -642,7 +642,7 @@ def _reference(reference: Channel | None) -> list[_TlogWriterSeries]:
     return [(reference.t, messages)]
 
 
-def _local_position(position: Channel | None, velocity: Channel | None) -> list[_TlogWriterSeries]:
+def _local_position(position: Channel | None, velocity: Channel | None) -> list[_TlogSeries]:
     """One LOCAL_POSITION_NED a time; NaN stands for what was not measured there."""
     t, (place, speed) = union_rows([position, velocity])
     if len(t) == 0:
@@ -657,7 +657,7 @@ def _local_position(position: Channel | None, velocity: Channel | None) -> list[
     return [(t, messages)]
 
 
-def _tlog_writer_battery(battery: Channel | None) -> list[_TlogWriterSeries]:
+def _tlog_battery(battery: Channel | None) -> list[_TlogSeries]:
     """The whole pack's voltage as if of one cell [mV]."""
     if battery is None:
         return []

@@ -9,6 +9,7 @@ import subprocess
 import sys
 
 import pytest
+from quadid_replay.recognise import FORMATS, LogFormat
 
 import quadid
 from quadid import old_paths
@@ -20,6 +21,11 @@ def test_an_old_path_is_the_new_module_and_warns(old: str) -> None:
     with pytest.warns(DeprecationWarning, match=f"{old} is "):
         found = importlib.import_module(old)
     assert found is importlib.import_module(old_paths.new_path(old))
+
+
+@pytest.mark.parametrize("one", FORMATS, ids=lambda one: one.name)
+def test_no_reader_of_logs_is_found_by_an_old_path(one: LogFormat) -> None:
+    assert not old_paths.new_path("quadid_replay." + one.reader.split(":")[0])
 
 
 @pytest.mark.parametrize("name", ["identify", "diagnose", "health"])

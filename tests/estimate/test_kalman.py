@@ -36,6 +36,18 @@ def test_smoother_is_batch_least_squares() -> None:
     np.testing.assert_allclose(spread, variance[:, k.FO :], rtol=1e-6)
 
 
+def test_smoother_needs_no_attitude() -> None:
+    """Without attitude the estimator's error is exactly zero; random forces are smoothed all the same."""
+    track = tiny_flight()
+    seen = track.seen.copy()
+    seen[:, 1] = False
+    track = track._replace(seen=seen)
+    _, gains = k.kalman(track, physics(), NOISE, GAUSS, True)
+    _, found, spread = k.backward(track, physics(), NOISE, gains, True)
+    assert (spread[:, : k.AE - k.FO] > 0.0).all()
+    assert np.abs(found[0, : k.AE - k.FO]).max() > 0.0
+
+
 def flown(seed: int = 1, seconds: float = 12.0) -> tuple[k.Track, FloatArray]:
     truth = draw_truth(PELICAN, seed)
     p = np.zeros(k.N_PHYSICS)

@@ -23,7 +23,7 @@ from quadid_replay.opening import open_log
 
 from quadid.data.grid import grid_recording
 from quadid.estimate.fit import estimate
-from quadid.estimate.missing import size, smoothed
+from quadid.estimate.missing import control_size, size, smoothed
 from quadid.estimate.problem import Problem
 from quadid.estimate.track import from_recording, from_window
 from quadid.flight import draw_truth, fly
@@ -151,7 +151,7 @@ def recorded(data: Path) -> str:
         delay, late = found.value("command_delay.delay")
         acted = smoothed(found)
         force = size(acted, force=True)[0] / acted[0].weight
-        moment = size(acted, force=False)[0] / np.concatenate([m.control for m in acted]).std(axis=0)
+        moment = size(acted, force=False)[0] / control_size(acted)
         six = {n: found.value(n) for n in ("b", "J_xx", "J_yy")}
         lines.append(
             f"| `{folder}` {', '.join(f.removesuffix('.csv') for f in files)} | {rate or 'own'} | "
