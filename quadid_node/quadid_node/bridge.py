@@ -11,7 +11,8 @@ import contextlib
 import math
 import re
 import sys
-from collections.abc import Mapping, Sequence
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import rclpy
@@ -23,6 +24,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.parameter_client import AsyncParameterClient
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.task import Future
 
 from quadid.errors import QuadidError
 from quadid_node.inputs import message_class, service_class, to_message
@@ -34,6 +36,8 @@ SAME_MASS = 0.02
 """Relative difference of masses [1] within which a set belongs to the controller's vehicle."""
 RETRY_SECONDS = 1.0
 """A controller that does not answer is asked again after this time [s]; health is reported as often."""
+ANSWER_SECONDS = 5.0
+"""A question that the controller has not answered after this time [s] is given up: it died, or hangs."""
 _NUMBER = r"[-+]?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?"
 _ENTRY = re.compile(rf"(\S+) = (?:({_NUMBER}) \* )?(\w+) in ({_NUMBER}) \.\. ({_NUMBER})")
 OPTIONS = {
@@ -84,6 +88,8 @@ def objection(message: Any, vehicle: str, mass: float, newest: int) -> str:
     """Why a set is not for this controller, or not in force; empty when it may be applied."""
     if message.schema_version != SCHEMA_VERSION:
         return f"schema {message.schema_version}, this bridge knows {SCHEMA_VERSION}"
+    if not len(message.names) == len(message.values) == len(message.status):
+        return f"{len(message.names)} names, {len(message.values)} values and {len(message.status)} status"
     if vehicle and message.vehicle_id != vehicle:
         return f"it belongs to {message.vehicle_id}"
     if message.state not in (message.STATE_ACCEPTED, message.STATE_ROLLED_BACK):
@@ -137,9 +143,12 @@ class BridgeNode(Node):
         group = ReentrantCallbackGroup()  # callbacks wait for answers, which must come meanwhile
         self._client = AsyncParameterClient(self, controller, callback_group=group)
         self._newest: Any = None
-        self._applied, self._busy, self._said, self._level = 0, False, "no set yet", b"\x00"
+        self._applied, self._said, self._level = 0, "no set yet", b"\x00"
+        self._busy: Future | None = None
+        self._asked, self._asked_at = Future(), 0.0
         self._original: dict[str, float] = {}
         self._before: dict[str, float] = {}
+        self._tried = 0
         self.add_post_set_parameters_callback(self._on_option)
         kind, topic = message_class(PARAMETER_SET), TOPICS["parameters"][0]
         self.create_subscription(kind, topic, self._on_set, LATCHED, callback_group=group)
@@ -160,7 +169,9 @@ class BridgeNode(Node):
                 self.get_logger().warning(text)
 
     async def _report(self) -> None:
-        """Once a second: health, and what could not be applied yet."""
+        """Once a second: health, and what could not be applied yet; a question without an answer is given up."""
+        if time.monotonic() > self._asked_at + ANSWER_SECONDS:
+            self._asked.cancel()
         stamp = self.get_clock().now().to_msg()
         status = {
             "level": self._level, "name": f"{self.get_name()}: controller", "message": self._said,
@@ -182,13 +193,29 @@ class BridgeNode(Node):
 
     async def _work(self) -> None:
         """Applies the newest set, if that is asked for and possible."""
-        if self._busy or self._newest is None:
-            return
-        self._busy = True
+        if self._busy is None and self._newest is not None:
+            with self._turn():
+                await self._apply(self._newest)
+
+    @contextlib.contextmanager
+    def _turn(self) -> Iterator[None]:
+        """Lets others wait for the end of what is done within."""
+        self._busy = turn = Future()
         try:
-            await self._apply(self._newest)
+            yield
         finally:
-            self._busy = False
+            self._busy = None
+            turn.set_result(None)
+
+    async def _ask(self, question: Callable[[Any], Future], about: Any) -> Any:
+        """The controller's answer; None, and said, where none comes."""
+        answer = None
+        if self._client.services_are_ready():
+            self._asked, self._asked_at = question(about), time.monotonic()
+            answer = await self._asked
+        if answer is None:
+            self._say(f"{self._option('controller')} does not answer", b"\x01")
+        return answer
 
     async def _apply(self, message: Any) -> None:
         if message.sequence == self._applied:
@@ -199,32 +226,37 @@ class BridgeNode(Node):
             wanted = self._option("restore_out_of_date") and not self._option("dry_run")
             if not (own and wanted and message.out_of_date and self._original):
                 self._say(f"set {message.sequence} not applied: {why}", b"\x01")
-            elif not self._client.services_are_ready():
-                self._say(f"{self._option('controller')} does not answer", b"\x01")
             elif await self._set(self._original, f"set {message.sequence} is out of date: first values put back"):
                 self._original, self._applied = {}, message.sequence
             return
-        if not self._client.services_are_ready():
-            self._say(f"{self._option('controller')} does not answer", b"\x01")
-            return
         targets = [e.target for e in self._entries]
-        read = await self._client.get_parameters(targets)
+        read = await self._ask(self._client.get_parameters, targets)
+        if read is None:
+            return
         now = dict(zip(targets, (rclpy.parameter.parameter_value_to_python(v) for v in read.values), strict=False))
         made = plan(message, self._entries, now, self._option("step"))
+        if self._tried == message.sequence and now.items() >= made.values.items():
+            now |= self._before  # it was set, only the answer was lost
         shown = ", ".join(f"{name} {now[name]:.4g} -> {value:.4g}" for name, value in made.values.items())
         if made.refused:
             self._say(f"set {message.sequence} not applied: {made.refused}", b"\x01")
         elif self._option("dry_run"):
             self._say(f"dry run: set {message.sequence} would set {shown}{made.left and f'; stays: {made.left}'}")
-        elif await self._set(made.values, f"set {message.sequence} applied: {shown}"):
-            self._before = {name: now[name] for name in made.values}
-            self._original = {**self._before, **self._original}
-            self._applied = message.sequence
+        else:
+            done = await self._set(made.values, f"set {message.sequence} applied: {shown}")
+            if done is not False:
+                self._before, self._tried = {name: now[name] for name in made.values}, message.sequence
+                self._original = {**self._before, **self._original}
+            if done:
+                self._applied = message.sequence
 
-    async def _set(self, values: Mapping[str, float], done: str) -> bool:
-        """Sets parameters of the controller, all or none; says `done`, or why not."""
+    async def _set(self, values: Mapping[str, float], done: str) -> bool | None:
+        """Sets parameters of the controller, all or none; says `done`, or why not.  None: no answer, perhaps set."""
         asked = [Parameter(name, value=value) for name, value in values.items()]
-        result: SetParametersResult = (await self._client.set_parameters_atomically(asked)).result
+        answer = await self._ask(self._client.set_parameters_atomically, asked)
+        if answer is None:
+            return None
+        result: SetParametersResult = answer.result
         if result.successful:
             self._say(done)
         else:
@@ -233,11 +265,14 @@ class BridgeNode(Node):
 
     async def _on_rollback(self, request: Any, response: Any) -> Any:
         """Puts the values from before the last set back; from then on the bridge only shows what it would set."""
+        self.set_parameters([Parameter("dry_run", value=True)])
+        while self._busy is not None:
+            await self._busy
         if not self._before:
             response.success, response.message = False, "no set was applied"
             return response
-        self.set_parameters([Parameter("dry_run", value=True)])
-        response.success = await self._set(self._before, "rolled back: dry_run is true from now on")
+        with self._turn():
+            response.success = bool(await self._set(self._before, "rolled back: dry_run is true from now on"))
         response.message = self._said
         if response.success:
             self._before, self._applied = {}, 0

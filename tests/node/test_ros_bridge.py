@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import sys
 from collections.abc import Iterator
 from dataclasses import replace
@@ -83,6 +84,7 @@ def test_a_wrong_entry_is_an_error(text: str) -> None:
     [
         (GOOD, {"schema_version": 2}, "schema 2"),
         (GOOD, {"vehicle_id": "quad2"}, "belongs to quad2"),
+        (GOOD, {"names": ["b"]}, "1 names, 6 values"),
         (replace(GOOD, sequence=8), {}, "not newer"),
         (replace(GOOD, state=SetState.STALE), {}, "not in force"),
         (GOOD, {"state": messages.NO_SET, "sequence": 0}, "not in force"),
@@ -129,9 +131,14 @@ def controller(ear: Ear) -> Controller:
 
 
 @pytest.fixture
-def bridge(controller: Controller, tmp_path: Path) -> Iterator[Process]:
+def controller_name() -> str:
+    return "/ear"
+
+
+@pytest.fixture
+def bridge(controller: Controller, controller_name: str, tmp_path: Path) -> Iterator[Process]:
     """The bridge, dry, as the page starts it."""
-    given = {"controller": "/ear", "map": list(ENTRIES), "mass": 1.3, "restore_out_of_date": True}
+    given = {"controller": controller_name, "map": list(ENTRIES), "mass": 1.3, "restore_out_of_date": True}
     path = tmp_path / "bridge.yaml"
     path.write_text(yaml.safe_dump({"quadid_bridge": {"ros__parameters": given}}))
     with Process(sys.executable, "-m", "quadid_node.bridge", "--ros-args", "--params-file", str(path)) as started:
@@ -182,6 +189,67 @@ def test_a_withdrawn_set_puts_the_first_values_back(controller: Controller, brid
     assert controller.values() != BEFORE
     controller.send(replace(GOOD, sequence=10, outdated="thrust fell", outdated_code="thrust_drop"))
     assert ear.until(lambda: controller.values() == BEFORE, 20.0), bridge.text
+
+
+ALONE = f"""
+import rclpy, sys
+rclpy.init()
+node = rclpy.create_node("alone")
+for name, value in {BEFORE}.items():
+    node.declare_parameter(name, value)
+node.add_on_set_parameters_callback(
+    lambda changed: print("asked", *(p.value for p in changed)) or rclpy.node.SetParametersResult(successful=True)
+)
+print("ready")
+rclpy.spin(node)
+"""
+"""A controller that is a process of its own and can be stopped and killed."""
+
+
+@pytest.mark.parametrize("controller_name", ["/alone"])
+def test_a_controller_that_dies_before_its_answer_holds_nothing_up(
+    controller: Controller, bridge: Process, ear: Ear
+) -> None:
+    from std_srvs.srv import Trigger
+
+    with Process(sys.executable, "-c", ALONE) as first:
+        first.wait_for("ready")
+        controller.send(GOOD)
+        assert ear.until(lambda: "dry run: set 9" in bridge.text, 30.0), bridge.text
+        first.child.send_signal(signal.SIGSTOP)
+        dry(ear, False)
+        assert ear.until(lambda: "/alone does not answer" in bridge.text, 30.0), bridge.text
+    with Process(sys.executable, "-c", ALONE) as second:
+        assert ear.until(lambda: "set 9 applied" in bridge.text, 60.0), bridge.text
+        second.wait_for(f"asked {20.0 * TRUE['J_xx']}", 10.0)
+        second.child.send_signal(signal.SIGSTOP)
+        answer = ear.call("quadid_bridge/rollback", Trigger, seconds=30.0)
+        assert not answer.success
+        assert answer.message == "/alone does not answer"
+        second.child.send_signal(signal.SIGCONT)
+        assert ear.call("quadid_bridge/rollback", Trigger).success
+        second.wait_for(f"asked {BEFORE['gains.roll_rate.p']}", 10.0)
+
+
+def test_a_lost_answer_leaves_the_way_back(controller: Controller, bridge: Process, ear: Ear) -> None:
+    """The controller sets the values, and nobody hears that it did: it is not spun until the bridge gave up."""
+    from rcl_interfaces.msg import SetParametersResult
+    from std_srvs.srv import Trigger
+
+    dry(ear, False)
+    asked = list[Any]()
+
+    def hang(changed: list[Any]) -> Any:
+        asked.append(changed)
+        if len(asked) == 1:
+            bridge.wait_for("/ear does not answer", 30.0)
+        return SetParametersResult(successful=True)
+
+    ear.node.add_on_set_parameters_callback(hang)
+    controller.send(GOOD)
+    assert ear.until(lambda: "set 9 applied" in bridge.text, 40.0), bridge.text
+    assert ear.call("quadid_bridge/rollback", Trigger).success
+    assert controller.values() == BEFORE
 
 
 def test_options_that_are_wrong_end_it_with_the_fix() -> None:
