@@ -27,6 +27,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.task import Future
 
 from quadid.errors import QuadidError
+from quadid_node import messages
 from quadid_node.inputs import message_class, service_class, to_message
 from quadid_node.messages import PARAMETER_SET, SCHEMA_VERSION, TOPICS
 from quadid_node.transport import without_shared_memory
@@ -173,11 +174,10 @@ class BridgeNode(Node):
         if time.monotonic() > self._asked_at + ANSWER_SECONDS:
             self._asked.cancel()
         stamp = self.get_clock().now().to_msg()
-        status = {
-            "level": self._level, "name": f"{self.get_name()}: controller", "message": self._said,
-            "hardware_id": self._option("vehicle_id"),
-            "values": [{"key": "applied set", "value": str(self._applied)}],
-        }  # fmt: skip
+        status = messages.entry(
+            self.get_fully_qualified_name(), "controller", self._option("vehicle_id"), self._level, self._said,
+            {"applied set": self._applied},
+        )  # fmt: skip
         fields = {"header": {"stamp": {"sec": stamp.sec, "nanosec": stamp.nanosec}}, "status": [status]}
         self._health.publish(to_message(TOPICS["diagnostics"][1], fields))
         await self._work()

@@ -64,7 +64,7 @@ class Commands:
         except StoreError as error:
             response.message = str(error)
             return response
-        found = [messages.parameter_set(set_from_dict(row), self._vehicle) for row in sets]
+        found = [messages.parameter_set(set_from_dict(r), self._vehicle, str(r.get("boot_id", ""))) for r in sets]
         response.sets = [to_message(messages.PARAMETER_SET, fields) for fields in found]
         response.success, response.message = True, f"the newest {len(found)} sets of {service.history}"
         return response

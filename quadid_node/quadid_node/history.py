@@ -9,6 +9,7 @@ import os
 import sqlite3
 import threading
 import time
+import uuid
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -216,11 +217,13 @@ class StoredSet(NamedTuple):
         item: the set; None where there is none, or none that can be read.
         why_none: why it cannot be taken up; empty where it can, or where there is none.
         confirmed: whether a flight of the last run confirmed it; after a restart a set is stale until one does.
+        boot_id: of the run that numbered it; empty where the history does not say.
     """
 
     item: OnlineSet | None
     why_none: str = ""
     confirmed: bool = True
+    boot_id: str = ""
 
     @property
     def doubt(self) -> str:
@@ -249,7 +252,7 @@ def in_force(db: sqlite3.Connection, name: str, gate: GateSettings, vehicle: Veh
     if vehicle is not None and not item.outdated and abs(item.mass / vehicle.mass - 1.0) > _SAME_MASS:
         why = f"it rests on a mass of {item.mass:g} kg, the vehicle file has {vehicle.mass:g} kg"
         item = replace(item, outdated=why, outdated_code="mass_change")
-    return StoredSet(item, "", told.state is not SetState.STALE)
+    return last._replace(item=item, confirmed=told.state is not SetState.STALE)
 
 
 def read_in_force(path: Path, name: str, vehicle: Vehicle | None) -> StoredSet:
@@ -265,8 +268,9 @@ def stored(db: sqlite3.Connection, name: str, which: str, gate: GateSettings, ve
         return StoredSet(None)
     found = None
     try:
-        found = set_from_dict(json.loads(row[0]))
-        return StoredSet(found, why_none(found, row[1], gate, vehicle))
+        data = json.loads(row[0])
+        found = set_from_dict(data)
+        return StoredSet(found, why_none(found, row[1], gate, vehicle), boot_id=str(data.get("boot_id", "")))
     except UNREADABLE as error:
         return StoredSet(found, f"{type(error).__name__}: {str(error)[:120]}")
 
@@ -359,6 +363,7 @@ class Store:
 
     Attributes:
         notes: what people should know: a damaged history set aside, a row refused.
+        boot_id: of this run; stands with every set that it numbers.
     """
 
     def __init__(self, path: Path, vehicle: str, kept: Mapping[str, int] = KEPT) -> None:
@@ -373,7 +378,8 @@ class Store:
             StoreError: name or path is none, another program writes this vehicle's history or holds the file, the file
                 has a second name, or it is of a newer version.
         """
-        self.path, self.vehicle = real(path), text(vehicle)
+        self.path, self.vehicle, self.boot_id = real(path), text(vehicle), uuid.uuid4().hex
+        self._boots: dict[int, str] = {}
         self.notes: list[str] = []
         self._problem = ""
         self._lock: HistoryLock | None = None
@@ -456,6 +462,8 @@ class Store:
     def _taken_up(self, found: StoredSet) -> OnlineSet | None:
         """The set; one that no fresh estimate could be is left out, and said."""
         if not found.why_none:
+            if found.item is not None:
+                self._boots[found.item.sequence] = found.boot_id
             return found.item
         self.notes.append(f"a set of the history is no set and is not taken up again ({found.why_none})")
         return None
@@ -492,7 +500,7 @@ class Store:
 
     def _row(self, item: OnlineSet) -> Row:
         values = (self.vehicle, item.sequence, item.state.value, item.reason, item.approved_by, item.stop, time.time())
-        data = json.dumps(set_to_dict(item))
+        data = json.dumps({**set_to_dict(item), "boot_id": self._boots.get(item.sequence, self.boot_id)})
         another = "SELECT 1 FROM sets WHERE vehicle = ? AND sequence = ? AND data != ?"
         statement = f"INSERT INTO sets SELECT ?, ?, ?, ?, ?, ?, ?, ? WHERE NOT EXISTS ({another})"
         return Row(statement, (*values, data, self.vehicle, item.sequence, data), item.sequence)

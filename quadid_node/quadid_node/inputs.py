@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import math
+import re
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -17,6 +18,7 @@ from quadid_replay.ros_messages import SIGNALS, TYPES, BlockReader, Read, Signal
 
 from quadid.data.window import Block, Sample
 from quadid.errors import QuadidError, nearest
+from quadid.sanitise import plain
 from quadid.types import FloatArray, IntArray
 
 # --- Stamps: absolute times of messages, in nanoseconds there and in seconds [s, UNIX] here, to a quarter microsecond
@@ -345,7 +347,7 @@ class Decoder:
     """
 
     def __init__(
-        self, entry: Input, chooser: Chooser, rotors: int, decode: Callable[[bytes], Any]
+        self, entry: Input, chooser: Chooser, rotors: int, decode: Callable[[bytes], Any], mounted: bool = True
     ) -> None:  # fmt: skip
         """Prepares for one input.
 
@@ -354,8 +356,10 @@ class Decoder:
             chooser: shared by all topics.
             rotors: number of rotors; surplus motor outputs are left out.
             decode: serialized bytes to a message of the type; see `deserializer`.
+            mounted: the vehicle file says how the IMU stands in the body.
         """
         kind = TYPES[entry.type]
+        self._frame, self._mounted = "", mounted
         self._kind, self._columns = kind, SignalColumns(kind)
         self._ranks = dict(entry.channels)
         self._chooser, self._rotors = chooser, rotors
@@ -366,7 +370,14 @@ class Decoder:
 
         self._layout: BlockReader | None = None
         if kind.stamp is None:
-            self._layout = BlockReader(decode, kind.blocks, kind.extra)
+
+            def noted(data: bytes) -> Any:
+                """Decodes a message of another layout, as is one of another frame."""
+                message = decode(data)
+                self._frame = message.header.frame_id
+                return message
+
+            self._layout = BlockReader(noted, kind.blocks, kind.extra)
             self._read = self._layout.read
         else:
             stamp = kind.stamp
@@ -390,6 +401,9 @@ class Decoder:
             if channel in self._ranks and not self._chooser.has(channel):
                 field = self._deniable[name]
                 return f"says that it has no {field} ({field}_covariance[0] is -1; 0 if unknown); nothing else tells it"
+        if "gyro" in self._ranks and not self._mounted and not _BODY_FRAME.search(self._frame):
+            frame = plain(self._frame, 40)
+            return f"is measured in {frame}, not base_link: say mounting: {{rotation, position}} in the vehicle file"
         return self.pace.trouble
 
     def take(self, messages: Sequence[bytes]) -> Iterator[Sample | Block]:
@@ -449,16 +463,18 @@ class Decoder:
             rank = self._ranks.get(channel)
             if rank is None:
                 continue
-            plain = tuple(convert(np.array([values]))[0].tolist())
+            numbers = tuple(convert(np.array([values]))[0].tolist())
             if channel in ("motor_command", "rotor_speed"):
-                plain = plain[: self._rotors]
-            yield from self._chooser.take(Sample(t, channel, plain), rank + _BEHIND.get(name, 0))
+                numbers = numbers[: self._rotors]
+            yield from self._chooser.take(Sample(t, channel, numbers), rank + _BEHIND.get(name, 0))
 
     def _deny(self, told: Iterable[str]) -> None:
         """Notes which signals the newest messages say to have none of."""
         self._denied = sorted(self._deniable.keys() - set(told)) if self._deniable else []
 
 
+_BODY_FRAME = re.compile(r"^$|(^|/)(base_|body|fcu)[^/]*$")
+"""Names of frames that are the body's, or say nothing."""
 _DENIABLE = {
     "sensor_msgs/Imu": {
         "body_rate": "angular_velocity", "body_force": "linear_acceleration", "attitude": "orientation",

@@ -12,6 +12,7 @@ ARGUMENTS: dict[str, str] = {
     "history": "history file; none keeps none",
     "record": "MCAP file to record what arrives to",
     "observer": "true: keep no history and publish nothing",
+    "zenoh": "Zenoh locator or configuration file to publish on too, for quadid watch",
     "autostart": "false: a lifecycle manager configures and activates",
     "use_sim_time": "true: take the time from /clock",
 }

@@ -45,7 +45,7 @@ OK, WARN, ERROR = b"\x00", b"\x01", b"\x02"
 
 
 def parameter_set(item: OnlineSet, vehicle: str, boot_id: str = "") -> Message:
-    """quadid_msgs/ParameterSet of a set; `boot_id` of the run of the service, empty for a replay."""
+    """quadid_msgs/ParameterSet of a set; `boot_id` of the run that numbered it, empty for a replay."""
     parameters = list(item.parameters)
     return {
         "header": {"stamp": stamp(item.stop), "frame_id": BODY_FRAME},
@@ -146,6 +146,7 @@ def fit_status(status: SessionStatus, vehicle: str, seconds: float = math.nan) -
         "excitation": [float(v) for v in status.excitation],
         "samples": status.samples,
         "window_seconds": status.window_seconds,
+        "backlog": status.backlog,
         "gaps": status.gaps,
         "cost": status.mse,
         "seconds": seconds,
@@ -177,22 +178,22 @@ def diagnostics(
     """
     if health is None:
         said = f"{idle}; {problem}" if problem else idle
-        entries = [_entry(name, "session", hardware, ERROR if problem else WARN, said, {})]
+        entries = [entry(name, "session", hardware, ERROR if problem else WARN, said, {})]
         return {"header": {"stamp": now, "frame_id": ""}, "status": entries}
     status = health.status
     warned = bool(idle) or status.phase in (Phase.BLOCKED, Phase.FAILED) or bool(lag(status.backlog))
     said = idle or f"{status.phase.value}: {status.reason}"
     if lag(status.backlog):
         said = f"{lag(status.backlog)}; {said}"
-    session = _entry(name, "session", hardware, WARN if warned else OK, said, {
+    session = entry(name, "session", hardware, WARN if warned else OK, said, {
         "set in force": f"{status.in_force}{' (stale)' * status.stale}", "waiting for approval": status.pending,
         "approval": status.approval, "fits": status.fits, "refused": status.rejected, "mse": f"{status.mse:.3f}",
         "backlog [s]": f"{status.backlog:.2f}", "fits left out": status.skipped,
     })  # fmt: skip
     worker_level = OK if health.worker in ("idle", "busy", "inline") else WARN
-    worker = _entry(name, "worker", hardware, worker_level, health.worker, {"restarts": health.restarts})
+    worker = entry(name, "worker", hardware, worker_level, health.worker, {"restarts": health.restarts})
     history_level = OK if health.history in ("", "none kept") else ERROR
-    history = _entry(name, "history", hardware, history_level, health.history or "written", {})
+    history = entry(name, "history", hardware, history_level, health.history or "written", {})
     entries = [session, _inputs(health, name, hardware, notes, hints), worker, history]
     return {"header": {"stamp": now, "frame_id": ""}, "status": entries}
 
@@ -211,10 +212,11 @@ def _inputs(health: Health, name: str, hardware: str, notes: dict[str, str], hin
         level = ERROR if notes else max(level, WARN)
     values: dict[str, Any] = {f"{k} [Hz]": f"{feed.rate:.1f}" for k, feed in health.feeds.items()}
     values |= {f"dropped: {reason}": count for reason, count in health.status.faults.items()}
-    return _entry(name, "inputs", hardware, level, message, values)
+    return entry(name, "inputs", hardware, level, message, values)
 
 
-def _entry(name: str, part: str, hardware: str, level: bytes, message: str, values: dict[str, Any]) -> Message:
+def entry(name: str, part: str, hardware: str, level: bytes, message: str, values: dict[str, Any]) -> Message:
+    """diagnostic_msgs/DiagnosticStatus of one part of the node with this full name."""
     pairs = [{"key": str(k), "value": str(v)} for k, v in values.items()]
     return {
         "level": level, "name": f"{name.lstrip('/')}: {part}", "message": message, "hardware_id": hardware,

@@ -22,6 +22,7 @@ from rclpy.qos import HistoryPolicy, QoSCompatibility, QoSProfile, ReliabilityPo
 from quadid.app.logs import load_vehicle
 from quadid.errors import QuadidError
 from quadid.online import Publish
+from quadid.vehicle import Vehicle
 from quadid_node import messages
 from quadid_node.bond import Bond, bond_of
 from quadid_node.commands import Commands
@@ -169,7 +170,7 @@ class IdentifyNode(PollingNode, LifecycleNode):
         self._observer = bool(values["observer"])
         inputs = {self.resolve_topic_name(entry.topic): entry.type.replace("/", "/msg/") for entry in preset.inputs}
         self._neighbours = Neighbours(inputs, self._offers_on, self.unbroken, lambda text: self._log("error", text))
-        self._subscribe(preset, len(vehicle.rotors))
+        self._subscribe(preset, vehicle)
         self._given = values
         keeps = not self._observer and values["history"] != "none"
         store = Store(Path(values["history"] or default_path()), self._id) if keeps else None
@@ -222,10 +223,11 @@ class IdentifyNode(PollingNode, LifecycleNode):
         )
         self._reads_back = False
 
-    def _subscribe(self, preset: Source, rotors: int) -> None:
+    def _subscribe(self, preset: Source, vehicle: Vehicle) -> None:
+        mounted = "mounting" in vehicle.model_fields_set
         chooser = Chooser(best_ranks(preset.inputs))
         for entry in preset.inputs:
-            decoder = Decoder(entry, chooser, rotors, deserializer(entry.type))
+            decoder = Decoder(entry, chooser, len(vehicle.rotors), deserializer(entry.type), mounted)
             topic = self.resolve_topic_name(entry.topic)
             take = self.poll(message_class(entry.type), entry.topic, SENSOR_QOS)
             self._intake.open(entry, topic, decoder, take)

@@ -93,7 +93,8 @@ class Service:
         """
         if restored is None:
             restored = store.restore(settings.gate, vehicle) if store is not None else Restored(None, 1)
-        self.vehicle, self.restored, self.boot_id = vehicle, restored, uuid.uuid4().hex
+        self.vehicle, self.restored = vehicle, restored
+        self.boot_id = store.boot_id if store is not None else uuid.uuid4().hex
         self.session = Session(
             vehicle, settings, restored.item, restored.next_sequence, restored.baseline, restored.healthy
         )

@@ -90,13 +90,16 @@ LATCHED = ("quadid/parameters", "quadid/diagnosis", "quadid/health")
 
 
 def offered_qos(topic: str) -> str:
-    """QoS of a topic's publisher in the form of rosbag2 since Jazzy, which plays with it."""
+    """QoS of a topic's publisher in the form of rosbag2 that all its versions read: numbers of rmw's policies.
+
+    Jazzy writes names, and reads both; before Iron, names are an error.
+    """
     latched = topic.endswith(LATCHED)
     forever = {"sec": 9223372036, "nsec": 854775807}
     return yaml.safe_dump([{
-        "history": "keep_last", "depth": 1 if latched else 10, "reliability": "reliable",
-        "durability": "transient_local" if latched else "volatile", "deadline": forever, "lifespan": forever,
-        "liveliness": "automatic", "liveliness_lease_duration": forever, "avoid_ros_namespace_conventions": False,
+        "history": 1, "depth": 1 if latched else 10, "reliability": 1,
+        "durability": 1 if latched else 2, "deadline": forever, "lifespan": forever,
+        "liveliness": 1, "liveliness_lease_duration": forever, "avoid_ros_namespace_conventions": False,
     }], sort_keys=False)  # fmt: skip
 
 

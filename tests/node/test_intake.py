@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
-from mcap_ros2._dynamic import generate_dynamic
+from mcap_ros2._dynamic import generate_dynamic, serialize_dynamic
 from quadid_node.inputs import MEMORY, SLICE, Chooser, Decoder, Input, Intake, best_ranks, source
 from quadid_replay import write_mcap
 from quadid_replay.mcap_file import McapFile
@@ -37,10 +37,10 @@ def messages(tmp_path_factory: pytest.TempPathFactory) -> list[Message]:
     return [(file.topics[number].name, data) for number, _, data in file.messages(file.topics.keys())]
 
 
-def decoder(entry: Input, chooser: Chooser) -> Decoder:
+def decoder(entry: Input, chooser: Chooser, mounted: bool = True) -> Decoder:
     kind = entry.type.replace("/", "/msg/")
     decode = generate_dynamic(kind, schema_text(kind))[kind]
-    return Decoder(entry, chooser, 4, decode)
+    return Decoder(entry, chooser, 4, decode, mounted)
 
 
 def flat(items: Iterator[Sample | Block]) -> list[Sample]:
@@ -97,6 +97,40 @@ def test_no_topic_runs_far_ahead_when_much_has_piled_up(messages: list[Message])
     per_second = len(messages) / SECONDS
     behind = max(newest - k for newest, k in zip(np.maximum.accumulate(arrived), arrived, strict=True)) / per_second
     assert 0.0 < behind < 1.2 * SLICE < 0.1 * SECONDS
+
+
+@pytest.mark.parametrize(
+    ("frame", "told"),
+    [
+        ("base_link", False), ("quad1/base_link_frd", False), ("", False), ("fcu", False),
+        ("imu_link", True), ("base_link/imu", True), ("rebase_link", True),
+    ],
+)  # fmt: skip
+def test_an_imu_in_a_frame_of_its_own_is_told_unless_its_mounting_is_given(
+    messages: list[Message], frame: str, told: bool
+) -> None:
+    entry = next(e for e in INPUTS if e.topic == "imu")
+    (type_name, text) = ("sensor_msgs/msg/Imu", schema_text("sensor_msgs/msg/Imu"))
+    decode = generate_dynamic(type_name, text)[type_name]
+    encode = serialize_dynamic(type_name, text)[type_name]
+    original = [data for topic, data in messages if topic == "imu"][:20]
+    framed = []
+    for data in original:
+        message = decode(data)
+        message.header.frame_id = frame
+        framed.append(encode(message))
+    attitude = next(e for e in INPUTS if e.topic == "attitude")
+    for mounted in (False, True):
+        chooser = Chooser(best_ranks(INPUTS))
+        assert flat(decoder(attitude, chooser).take([data for topic, data in messages if topic == "attitude"]))
+        reader = decoder(entry, chooser, mounted)
+        assert len(flat(reader.take(original))) == 40
+        assert reader.trouble == ""
+        assert len(flat(reader.take(framed))) == 40
+        assert reader.trouble == (
+            f"is measured in {frame}, not base_link: say mounting: {{rotation, position}} in the vehicle file"
+            if told and not mounted else ""
+        )  # fmt: skip
 
 
 def test_a_damaged_message_spoils_only_itself(messages: list[Message]) -> None:

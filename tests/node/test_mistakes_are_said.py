@@ -13,6 +13,7 @@ from quadid_node.worker import InlineWorker
 
 from quadid.online import SessionSettings
 from quadid.vehicle import GRAVITY
+from tests.node.aggregator import branches
 from tests.online.driving import EPOCH, flight, samples
 from tests.online.made_up import PELICAN
 
@@ -58,7 +59,8 @@ def test_a_mistake_is_named_at_warn_and_nothing_is_learned(mistake: str) -> None
         change = changes.get(sample.channel)
         service.push(sample if change is None else replace(sample, values=change(sample.values)))
     service.step()
-    told = diagnostics(service.health(), "quadid", "pelican", {}, {}, {})
+    told = diagnostics(service.health(), "/quad1/quadid", "pelican", {}, {}, {})
+    assert all(len(branches(entry["name"])) == 1 for entry in told["status"])
     session = next(entry for entry in told["status"] if entry["name"].endswith("session"))
     assert word in session["message"]
     assert session["level"] == WARN

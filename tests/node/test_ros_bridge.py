@@ -17,6 +17,7 @@ from quadid.errors import QuadidError
 from quadid.online import SetState
 from quadid.parameters import Status
 from quadid_node import messages
+from tests.node.aggregator import branches
 from tests.node.peers import ROOT, Ear, Process
 from tests.node.test_ros_node import latched
 from tests.online.test_gate import TRUE, online_set, parameter_set, scaled
@@ -156,11 +157,15 @@ def dry(ear: Ear, on: bool) -> None:
 
 
 def test_dry_run_then_applied_then_rolled_back(controller: Controller, bridge: Process, ear: Ear) -> None:
+    from diagnostic_msgs.msg import DiagnosticArray
     from std_srvs.srv import Trigger
 
+    health = ear.listen("/diagnostics", DiagnosticArray)
     controller.send(GOOD)
     assert ear.until(lambda: "dry run: set 9 would set" in bridge.text, 30.0), bridge.text
     assert controller.values() == BEFORE, "only said"
+    assert ear.until(lambda: health, 20.0)
+    assert [branches(s.name) for s in health[-1].status] == [["quadid/Bridge"]]
     dry(ear, False)
     after = {"gains.roll_rate.p": pytest.approx(20.0 * TRUE["J_xx"]), "thrust": pytest.approx(TRUE["b"])}
     assert ear.until(lambda: "set 9 applied" in bridge.text, 20.0), bridge.text

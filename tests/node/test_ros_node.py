@@ -16,6 +16,7 @@ from quadid_replay import write_mcap
 
 from quadid.vehicle import Vehicle
 from tests.faults.evidence import Happened
+from tests.node.aggregator import branches
 from tests.node.peers import ROOT, Ear, Process, node, player
 from tests.online.driving import flight
 
@@ -62,7 +63,8 @@ def test_a_late_subscriber_gets_the_latched_set_and_the_replay_gives_the_same_bi
             assert "applied" in late.text
             before, after = (float(word) for word in line.split() if word.startswith("0."))
             assert after < before, line
-        assert {s.name.split(": ")[1] for s in health[-1].status} == {"session", "inputs", "worker", "history"}
+        shown = [branch for s in health[-1].status for branch in branches(s.name)]
+        assert shown == ["quadid/Session", "quadid/Inputs", "quadid/Fit process", "quadid/History"]
         assert identify.end()[0] == 0
     accepted = next(c for c in candidates if c.state == ParameterSet.STATE_ACCEPTED)
     assert dict(zip(accepted.names, accepted.values, strict=True))["b"] == pytest.approx(2.33e-5, rel=0.01)
@@ -97,6 +99,7 @@ def test_a_late_subscriber_gets_the_latched_set_and_the_replay_gives_the_same_bi
         assert found.success
         assert [s.sequence for s in found.sets][-1] == stale[-1].sequence
         assert len(found.sets) == 2
+        assert [s.boot_id for s in found.sets] == [accepted.boot_id, stale[-1].boot_id]
 
 
 def test_approve_and_rollback_by_service_and_parameters_are_guarded(log: Path, tmp_path: Path, ear: Ear) -> None:

@@ -101,6 +101,29 @@ def test_the_baseline_is_the_last_set_a_person_approved(tmp_path: Path) -> None:
     assert baseline.sequence == 3
 
 
+def test_every_set_stands_with_the_run_that_numbered_it(tmp_path: Path) -> None:
+    """Also where a file that was lost is begun anew with the sets of earlier runs."""
+    path = tmp_path / "h.sqlite"
+    first = filled(path, sets=1)
+    first.close()
+    second = Store(path, "pelican")
+    assert second.restore().item is not None
+    second.numbered(replace(online_set(TRUE), sequence=9, approved_by="auto"))
+    second.close()
+    assert second.boot_id != first.boot_id
+    told = [(s["sequence"], s["boot_id"]) for s in read_history(path, "pelican")["sets"]]
+    assert told == [(1, first.boot_id), (9, second.boot_id)]
+    third = Store(path, "pelican")
+    third.restore()
+    for name in tmp_path.iterdir():
+        name.write_bytes(b"")
+    third.numbered(replace(online_set(TRUE), sequence=10, approved_by="auto"))
+    assert third.flush(20.0)
+    third.close()
+    told = [(s["sequence"], s["boot_id"]) for s in read_history(path, "pelican")["sets"]]
+    assert told == [(1, first.boot_id), (10, third.boot_id)]
+
+
 def test_a_second_service_on_one_vehicle_is_refused(tmp_path: Path) -> None:
     first = filled(tmp_path / "h.sqlite")
     with pytest.raises(StoreError, match="another service"):

@@ -48,7 +48,11 @@ def test_data_files_are_in_and_markers_are_out(wheel: list[str], repository: Pat
         ["git", "ls-files", *folders.values()], cwd=repository, check=True, capture_output=True, text=True
     ).stdout.split()
     assert "quadid/vehicles/pelican.yaml" in tracked
-    for path in tracked:
+    links = {path: sorted((repository / path).iterdir()) for path in tracked if (repository / path).is_dir()}
+    assert links
+    for path in (*tracked, *(f"{link}/{file.name}" for link, files in links.items() for file in files)):
+        if path in links:
+            continue
         name = re.sub(r"^(replay|evaluation|quadid_node(?=/quadid_node/))/", "", path)
         assert (name in wheel) == (Path(path).name != "COLCON_IGNORE"), path
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-import quadid_replay.writers
+import yaml
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from mcap_ros2.writer import Writer as RosWriter
@@ -17,6 +17,7 @@ from quadid_replay import TopicWriter, open_log, write_mcap
 from quadid_replay.motors import RPM
 from quadid_replay.ros_messages import TYPES
 from quadid_replay.schemas import schema_text
+from quadid_replay.writers import offered_qos
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import QosDurability, QosReliability
 
@@ -258,13 +259,6 @@ def test_any_message_of_ours_can_be_written(tmp_path: Path) -> None:
     assert messages["quadid/diagnosis"].findings[0].effect == "motor_lag"
 
 
-def test_our_definitions_are_those_of_the_message_package(repository: Path) -> None:
-    folder = Path(quadid_replay.writers.__file__).parent / "schemas" / "quadid_msgs"
-    theirs = {f.name: f.read_text() for f in (repository / "msgs" / "msg").glob("*.msg")}
-    ours = {f.name: f.read_text() for f in folder.glob("*.msg")}
-    assert ours == theirs, "copy msgs/msg/*.msg to replay/quadid_replay/schemas/quadid_msgs"
-
-
 @dataclass
 class _Esc:
     esc_rpm: int
@@ -309,3 +303,27 @@ def test_written_topics_say_how_they_are_offered_so_that_a_bag_is_played_latched
     assert (latched.durability, latched.depth) == (QosDurability.TRANSIENT_LOCAL, 1)
     assert (plain.durability, plain.depth) == (QosDurability.VOLATILE, 10)
     assert latched.reliability == plain.reliability == QosReliability.RELIABLE
+
+
+RECORDED = """- history: 3
+  depth: 0
+  reliability: 1
+  durability: 2
+  deadline:
+    sec: 9223372036
+    nsec: 854775807
+  lifespan:
+    sec: 9223372036
+    nsec: 854775807
+  liveliness: 1
+  liveliness_lease_duration:
+    sec: 9223372036
+    nsec: 854775807
+  avoid_ros_namespace_conventions: false"""
+"""What `ros2 bag record` wrote of /parameter_events: a bag of rosbag2's own tests (topics_and_services.mcap)."""
+
+
+def test_the_qos_of_a_topic_has_the_form_of_a_real_bag() -> None:
+    (real,), (ours,) = yaml.safe_load(RECORDED), yaml.safe_load(offered_qos("quadid/candidate"))
+    assert list(ours) == list(real)
+    assert {**ours, "history": 3, "depth": 0} == real, "a recorder does not know how much a publisher keeps"

@@ -1,7 +1,7 @@
 """ROS 2 message definitions as text, so that logs are written and read without ROS.
 
-`<package>/<Type>.msg`; those of other packages are theirs (Apache-2.0) without comments, quadid_msgs are copies of
-`msgs/msg` (a test keeps them equal).
+`<package>/<Type>.msg`; those of other packages are theirs (Apache-2.0) without comments, `quadid_msgs` is a link to
+`msgs/msg`.
 """
 
 from __future__ import annotations

@@ -1,0 +1,57 @@
+"""The launch files as `ros2 launch` runs them: every node gets ready, and Ctrl-C ends all of them cleanly."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+launch: Any = pytest.importorskip("launch", reason="on no package index: runs where ROS is installed")
+pytest.importorskip("launch_ros")
+pytest.importorskip("quadid_msgs")
+
+SECONDS = 180.0
+"""The first start on a machine compiles."""
+
+
+@pytest.mark.parametrize(
+    ("name", "given", "nodes"),
+    [("identify", {"namespace": "quad1"}, {"/quad1/quadid"}),
+     ("fleet", {"namespaces": "quad1,quad2"}, {"/quad1/quadid", "/quad2/quadid"})],
+)  # fmt: skip
+def test_nodes_get_ready_and_end(
+    name: str, given: dict[str, str], nodes: set[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from launch import actions, event_handlers
+    from launch.launch_description_sources import PythonLaunchDescriptionSource
+
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    monkeypatch.setenv("ROS_LOG_DIR", str(tmp_path))
+    said, ended = list[str](), list[int]()
+
+    def heard(event: Any) -> Any:
+        said.append(event.text.decode())
+        ready = sum(line.count("ready: identifies") for line in said)
+        return [actions.EmitEvent(event=launch.events.Shutdown())] if ready == len(nodes) else []
+
+    def exited(event: Any, context: Any) -> None:
+        ended.append(event.returncode)
+
+    file = Path(__file__).resolve().parents[1] / "launch" / f"{name}.launch.py"
+    arguments = {**given, "vehicle": "pelican", "history": "none"}
+    service = launch.LaunchService(argv=[], noninteractive=True)
+    service.include_launch_description(launch.LaunchDescription([
+        actions.IncludeLaunchDescription(
+            PythonLaunchDescriptionSource(str(file)), launch_arguments=arguments.items()
+        ),
+        actions.RegisterEventHandler(event_handlers.OnProcessIO(on_stdout=heard, on_stderr=heard)),
+        actions.RegisterEventHandler(event_handlers.OnProcessExit(on_exit=exited)),
+        actions.TimerAction(period=SECONDS, actions=[actions.EmitEvent(event=launch.events.Shutdown())]),
+    ]))  # fmt: skip
+    assert service.run() == 0
+    text = "".join(said)
+    assert ended == [0] * len(nodes), text
+    assert all(f"[{node.strip('/').replace('/', '.')}]" in text for node in nodes), text
