@@ -20,9 +20,11 @@ from quadid.version import __version__ as __version__
 from quadid.working_folder import guard
 
 if TYPE_CHECKING:
+    from quadid.app.compare_vehicles import compare_vehicles as compare_vehicles
     from quadid.app.diagnose import diagnose as diagnose
     from quadid.app.excite import propose as excite
     from quadid.app.export import export as export
+    from quadid.app.gains import gains as gains
     from quadid.app.health import health as health
     from quadid.app.identify import identify as identify
     from quadid.app.init import init as init
@@ -46,6 +48,8 @@ _PUBLIC = {
     "score": "quadid.app.score",
     "simulate": "quadid.app.simulate",
     "export": "quadid.app.export",
+    "compare_vehicles": "quadid.app.compare_vehicles",
+    "gains": "quadid.app.gains",
     "Simulator": "quadid.model.step",
     "Vehicle": "quadid.vehicle",
     "ParameterSet": "quadid.parameters",

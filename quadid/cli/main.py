@@ -35,6 +35,8 @@ COMMANDS: dict[str, str] = {
     "watch": "Live terminal view of one or many vehicles.",
     "history": "Stored parameter sets: what, when, from which data, by whom.",
     "export": "The parameters for another program.",
+    "compare-vehicles": "Two vehicle files on the same flights.",
+    "gains": "Rate and attitude gains from the identified vehicle.",
     "fleet": "Identify a folder of logs in parallel.",
     "warmup": "Compile now what the first fit would compile.",
 }
@@ -71,6 +73,11 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
         "quadid export --vehicle pelican --history h.sqlite --format ardupilot",
         "quadid export --list",
     ),
+    "compare-vehicles": ("quadid compare-vehicles old.yaml new.yaml --on flight.mcap --report compared.html",),
+    "gains": (
+        "quadid gains --vehicle mine.yaml --format px4 --report gains.html",
+        "quadid gains --vehicle mine.yaml --format ardupilot --from flight.bin --bandwidth 5",
+    ),
     "fleet": (
         "quadid fleet logs --vehicle pelican --workers 4 --out fleet-out",
         "quadid fleet logs --scheduler tcp://10.0.0.1:8786 --diagnose",
@@ -82,7 +89,12 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
 
 def _available() -> dict[str, str]:
     """Commands whose module is installed."""
-    return {n: text for n, text in COMMANDS.items() if importlib.util.find_spec(f"quadid.cli.{n}") is not None}
+    return {n: text for n, text in COMMANDS.items() if importlib.util.find_spec(_module(n)) is not None}
+
+
+def _module(name: str) -> str:
+    """Where a command is: ``quadid foo-bar`` is `quadid.cli.foo_bar.foo_bar`."""
+    return f"quadid.cli.{name.replace('-', '_')}"
 
 
 class LazyGroup(TyperGroup):
@@ -101,12 +113,12 @@ class LazyGroup(TyperGroup):
 
 def load(name: str) -> Any:
     """Imports one command, ready to run."""
-    module = importlib.import_module(f"quadid.cli.{name}")
+    module = importlib.import_module(_module(name))
+    function = getattr(module, name.replace("-", "_"))
     alone = typer.Typer(rich_markup_mode=None, add_completion=False)
     # A backspace character alone on a line keeps click from joining the lines.
     examples = "\n".join(("\b", "Examples:", *(f"  {line}" for line in EXAMPLES[name])))
-    text = COMMANDS[name] if not getattr(module, name).__doc__ else None
-    alone.command(name, help=text, epilog=examples)(getattr(module, name))
+    alone.command(name, help=None if function.__doc__ else COMMANDS[name], epilog=examples)(function)
     return get_command(alone)
 
 

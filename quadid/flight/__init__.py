@@ -19,3 +19,4 @@ from quadid.flight.setup import check_effects as check_effects
 from quadid.flight.setup import draw_effect as draw_effect
 from quadid.flight.setup import draw_truth as draw_truth
 from quadid.flight.setup import propeller_radius as propeller_radius
+from quadid.flight.stepped import SteppedFlight as SteppedFlight

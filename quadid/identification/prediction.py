@@ -15,6 +15,7 @@ import numpy as np
 from quadid.data.window import Window
 from quadid.errors import NotIdentifiableError, ParameterError
 from quadid.identification.open_loop import QUANTITIES, OpenLoop, lengths
+from quadid.model.layout import Layout
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 
@@ -67,9 +68,7 @@ def horizon_scores(
         ParameterError: impossible horizons.
         NotIdentifiableError: no run fits into any file, or there is no gyro.
     """
-    wanted = tuple(dict.fromkeys(horizons))
-    if not wanted or not all(isinstance(h, Integral) and 1 <= h <= LONGEST for h in wanted):
-        raise ParameterError(f"horizons {list(horizons)}", f"whole numbers of samples from 1 to {LONGEST}")
+    wanted = _checked(horizons)
     longest = max(*wanted, SUM_TO)
     tallies = [_tally(windows, vehicle, theta, longest) for windows in files]
     pooled, starts = np.sum([sums for sums, _ in tallies], axis=0), sum(count for _, count in tallies)
@@ -79,6 +78,33 @@ def horizon_scores(
             f"stretches longer than {longest} samples with gyro", "log without gaps, or ask for a lower --rate",
         )  # fmt: skip
     return _score(pooled, starts, wanted), [_score(*tally, wanted) for tally in tallies]
+
+
+def _checked(horizons: Sequence[int]) -> tuple[int, ...]:
+    """The horizons, each once; raises ParameterError for what is none."""
+    wanted = tuple(dict.fromkeys(horizons))
+    if not wanted or not all(isinstance(h, Integral) and 1 <= h <= LONGEST for h in wanted):
+        raise ParameterError(f"horizons {list(horizons)}", f"whole numbers of samples from 1 to {LONGEST}")
+    return wanted
+
+
+def start_errors(windows: Sequence[Window], vehicle: Vehicle, horizons: Sequence[int]) -> list[FloatArray]:
+    """Errors of every run, for pairs of models from the same starts.
+
+    Args:
+        windows: of one file.
+        vehicle: its values, effects included, are taken as they are.
+        horizons: samples after the start, 1 to `LONGEST`.
+
+    Returns:
+        Of each window, shape (starts, horizons, 4), columns as `QUANTITIES`; NaN for what was not measured.
+
+    Raises:
+        ParameterError: impossible horizons.
+    """
+    wanted = _checked(horizons)
+    theta = Layout(vehicle).initial(vehicle)[None]
+    return [lengths(OpenLoop(w, vehicle, max(wanted)).misses(theta, np.array(wanted))[0]) for w in windows]
 
 
 def _score(sums: FloatArray, starts: int, horizons: tuple[int, ...]) -> HorizonScore:

@@ -191,6 +191,17 @@ class Facts:
         return ThrustModel.stated(self.vehicle).hover_speed(self.vehicle.mass * GRAVITY) / self.max_speed
 
     @property
+    def thrust_expo(self) -> float | None:
+        """Share e of the square in ArduPilot's curve thrust / full = (1 - e) c + e c^2; None where none is fitted.
+
+        Of b (w - w0)^2 with w = c w_full, the linear part is -2 w0 c w_full; what is left at no command has no place.
+        """
+        if "thrust_curve" not in self.vehicle.effects or self.max_speed is None:
+            return None
+        bend = -2.0 * self.effect("thrust_curve", "dead_speed") / self.max_speed
+        return 1.0 / (1.0 + bend) if bend > -1.0 else None
+
+    @property
     def unproven(self) -> str:
         """Why nothing shows that the values predict; empty where something does."""
         proof = self.vehicle.proof
@@ -317,17 +328,13 @@ def _drag_fusion(facts: Facts) -> list[tuple[str, float]]:
 def ardupilot(facts: Facts) -> dict[str, Any]:
     """Thrust curve, and the frame that the vehicle is in SITL with the rotor behind each of its motors.
 
-    ``expo`` is the share e of the square in ArduPilot's curve thrust / full = (1 - e) c + e c^2; None: none is fitted.
+    ``expo`` is `Facts.thrust_expo`.
     SITL, whose own e is 0.65 without ``propExpo``, is given 1 then, as rotor speed follows command; a flight controller
     that undoes the curve (kind ``thrust``) may have any.
-    Of b (w - w0)^2 with w = c w_full, the linear part is -2 w0 c w_full; what is left at no command has no place.
     SITL calls the distance of the motors from the centre ``diagonal_size`` (`SIM_Frame.cpp`).
     """
-    expo = None
-    if "thrust_curve" in facts.vehicle.effects and facts.max_speed is not None:
-        bend = -2.0 * facts.effect("thrust_curve", "dead_speed") / facts.max_speed
-        expo = 1.0 / (1.0 + bend) if bend > -1.0 else None
-    frame, motors = _sitl_frame(facts)
+    expo = facts.thrust_expo
+    frame, motors = sitl_frame(facts)
     refused = f"no .sitl.json: the rotors stand in none of the frames {', '.join(SITL_FRAMES)} of ArduPilot's simulator"
     return {
         "expo": expo, "sitl_expo": 1.0 if expo is None and facts.vehicle.command.kind != "thrust" else expo,
@@ -336,7 +343,7 @@ def ardupilot(facts: Facts) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _sitl_frame(facts: Facts) -> tuple[str, list[int]]:
+def sitl_frame(facts: Facts) -> tuple[str, list[int]]:
     """The frame of SITL whose motors stand and turn as the rotors do, and the rotor (from 1) of each motor."""
     arm = facts.vehicle.arm
     for name, motors in SITL_FRAMES.items():

@@ -1,0 +1,347 @@
+"""Gains of rate and attitude loops for a vehicle as identified, with margins; nothing is sent to a vehicle."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from quadid.app.export import UnprovenError
+from quadid.app.logs import as_vehicle, file_name, open_recording, read_regular, write_text
+from quadid.app.outcome import LIBRARY, Reported, provenance
+from quadid.chi_square import Z95
+from quadid.errors import LogError, ParameterError, nearest
+from quadid.model.rate_loop import AxisPlant, Loops, RateGains, design, slowed, with_rate
+from quadid.report.autopilots import AUTOPILOTS, AXES, Autopilot, authority, hover, moments
+from quadid.report.programs import Facts
+from quadid.types import Json
+from quadid.vehicle import Vehicle
+
+if TYPE_CHECKING:
+    from quadid.report.tables import TextTable
+    from quadid.report.verdict import Verdict
+
+PHASE_MARGIN = 55.0
+"""Default [deg]: the rate overshoots by about a seventh."""
+STEP, SHARE = 1.0, 0.5
+"""A step of the rate by this much [rad/s] may take this share of the moment that the rotors have beside hover."""
+UNSTATED = 0.2
+"""Half-width of the interval of a delay or lag, relative: vehicle files hold none for effects."""
+_LINE = re.compile(
+    r"^\s*(?:set\s+|\d+\s+\d+\s+)?([A-Za-z_]\w*)\s*[\s,=]\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)(?=[\s,]|$)",
+    re.MULTILINE,
+)
+"""A line of a parameter file: of QGroundControl, of Mission Planner or MAVProxy, of Betaflight's `diff` and `dump`."""
+
+
+_FILES = {
+    "px4": (".params", "1\t1\t{name}\t{value}\t9\n"), "ardupilot": (".param", "{name},{value}\n"),
+    "betaflight": (".txt", "set {name} = {value:.0f}\n"),
+}  # fmt: skip
+"""Ending and line of a file of parameters."""
+
+
+class Used(NamedTuple):
+    """A number that the gains rest on, with its 95 % interval and where it comes from."""
+
+    name: str
+    unit: str
+    value: float
+    low: float
+    high: float
+    source: str
+
+
+@dataclass(frozen=True, repr=False)
+class Gains(Reported):
+    """Proposed gains.
+
+    Attributes:
+        result: of the form ``quadid.gains/1``.
+        loops: the loops with the proposed gains, by axis.
+        before: those with the gains flown so far, where they are known.
+    """
+
+    result: dict[str, Any]
+    loops: Mapping[str, Loops]
+    before: Mapping[str, Loops]
+
+    @property
+    def values(self) -> dict[str, float]:
+        """Parameters of the autopilot by name."""
+        return {g["name"]: g["value"] for g in self.result["gains"]}
+
+    @property
+    def verdict(self) -> Verdict:
+        """What can be promised, and what limits it."""
+        from quadid.report.gains_page import gains_verdict
+
+        return gains_verdict(self.result)
+
+    def tables(self) -> list[TextTable]:
+        """Gains, loops, and what they rest on."""
+        from quadid.report.gains_page import gains_tables
+
+        return gains_tables(self.result)
+
+    def save(self, folder: str | Path = ".") -> Path:
+        """Writes the proposed parameters in the autopilot's own form; returns the absolute path."""
+        ending, line = _FILES[self.result["format"]]
+        text = "".join(line.format(**g) for g in self.result["gains"])
+        return write_text(Path(folder) / f"{file_name(self.result['vehicle'])}.gains{ending}", text)
+
+    def records(self) -> list[dict[str, Any]]:
+        """One row a gain."""
+        return [dict(g) for g in self.result["gains"]]
+
+    def page(self, command: str = LIBRARY) -> str:
+        """The page: gains, step responses with bands before and after, what limits the bandwidth."""
+        from quadid.report.gains_page import gains_page, step_figure
+        from quadid.report.page import render
+
+        pairs = [(axis, angle) for axis in AXES for angle in (False, True)]
+        figures = [step_figure(axis, angle, self.loops[axis], self.before.get(axis)) for axis, angle in pairs]
+        return render(gains_page(self.result, figures, provenance([], command)))
+
+
+def gains(
+    vehicle: str | Path | Vehicle, format: str = "px4", *, bandwidth: float | None = None,
+    phase_margin: float = PHASE_MARGIN, derivative: bool = True, motor_lag: float | None = None,
+    delay: float | None = None, current: str | Path | Mapping[str, float] | None = None, anyway: bool = False,
+) -> Gains:  # fmt: skip
+    """Proposes rate and attitude gains from the identified vehicle; nothing is sent to a vehicle.
+
+    The loops keep their margins for every combination of the ends of the 95 % intervals.
+
+    Args:
+        vehicle: a fitted file, a shipped name or a `Vehicle`; with `command.max_speed`.
+        format: px4, ardupilot or betaflight: in whose parameters.
+        bandwidth: wanted of roll and pitch rate [Hz], at -3 dB; default the largest that keeps the margin.
+        phase_margin: least one of the rate loops [deg], 20 to 80.
+        derivative: use the D term, which takes motor lag back.
+        motor_lag: time constant [s] where the file has none, because the log showed no commands.
+        delay: from command to rotor [s], likewise.
+        current: log, parameter file or parameters of the autopilot: its filters and rates, and its gains to compare.
+        anyway: take guesses of the file as if they were identified.
+
+    Raises:
+        ParameterError: a format, margin, bandwidth or lag that cannot be, or a vehicle that the autopilot cannot fly.
+        UnprovenError: thrust, drag or inertia are guesses, or neither lag nor delay is known.
+        LogError: `current` holds no parameters of this autopilot.
+    """
+    if format not in AUTOPILOTS:
+        raise ParameterError(f"unknown format '{format}'", ", ".join(AUTOPILOTS), nearest(format, AUTOPILOTS))
+    if not 20.0 <= phase_margin <= 80.0:
+        raise ParameterError(f"a phase margin of {phase_margin:g} deg", "20 to 80 deg")
+    if bandwidth is not None and not 0.0 < bandwidth < math.inf:
+        raise ParameterError(f"a bandwidth of {bandwidth:g} Hz", "more than 0 Hz")
+    described, autopilot = as_vehicle(vehicle), AUTOPILOTS[format]
+    facts, known = Facts(described, ""), _told(current, autopilot)
+    warnings = _check_identified(described, anyway)
+    late = _lateness(described, motor_lag, delay)
+    at = hover(facts)
+    turning = moments(facts, at, autopilot.outputs(facts, known, at))
+    inertia = np.diag(facts.inertia)
+    most = SHARE * authority(facts, at) / inertia / STEP
+    fixed = _on_board(autopilot, known, described)
+    used = [*_measured(facts), *late, *fixed.values()]
+    loops, before, axes, chosen = {}, {}, [], []
+    for k, axis in enumerate(AXES):
+        plant = _plant(facts, k, late, fixed)
+        cutoff, names = fixed["derivative filter"].value, autopilot.names[k]
+        try:
+            best = design(plant, phase_margin, float(most[k]), cutoff, derivative, autopilot.on_error)
+            wanted = bandwidth if k < 2 or bandwidth is None else min(bandwidth, float(best.bandwidth()[0]))
+            found = best if wanted is None else slowed(best, wanted, phase_margin, derivative)
+        except ParameterError as error:
+            raise ParameterError(f"{axis}: {error.found}", error.allowed, _remedy(plant, phase_margin)) from error
+        per = turning[k] / inertia[k]  # angular acceleration of one unit of output
+        values = _parameters(found, per, autopilot)
+        loops[axis] = _loops(plant, values, per, autopilot, cutoff)
+        now = [known.get(name) for name in names]
+        if None not in now[:3]:
+            before[axis] = _loops(plant, [v or 0.0 for v in now], per, autopilot, cutoff)
+        held = bool(best.rate.p >= 0.999 * most[k])
+        axes.append(_axis(axis, loops[axis], before.get(axis), best, held))
+        terms = zip(("P", "I", "D", "attitude"), names, values, now, strict=True)
+        chosen += [
+            {"name": n, "axis": axis, "term": term, "value": v, "current": old} for term, n, v, old in terms if n
+        ]
+    chosen = list({g["name"]: g for g in reversed(chosen)}.values())[::-1]  # roll and pitch share one in Betaflight
+    result = {
+        "schema": "quadid.gains/1", "vehicle": described.name, "format": format, "program": autopilot.program,
+        "phase_margin": phase_margin, "bandwidth": bandwidth, "gains": chosen, "axes": axes,
+        "used": [{"name": u.name, "unit": u.unit, "value": u.value, "ci95": [u.low, u.high], "source": u.source}
+                 for u in used],
+        "warnings": warnings + [f"{a}: the present gains are unstable" for a, b in before.items() if not b.stable],
+    }  # fmt: skip
+    return Gains(result, loops, before)
+
+
+def _check_identified(vehicle: Vehicle, anyway: bool) -> list[str]:
+    """Raises UnprovenError where a parameter that sets a gain was not identified; with `anyway` warns."""
+    guessed = [n for n in ("b", "d", "J_xx", "J_yy", "J_zz") if vehicle.parameters[n].sigma is None]
+    lacking = f"{', '.join(guessed)}: not identified, guesses of the vehicle file without a sigma" if guessed else ""
+    if vehicle.proof is not None and vehicle.proof.lacking:
+        lacking = "; ".join(filter(None, (lacking, f"not proven: {vehicle.proof.lacking}")))
+    if lacking and not anyway:
+        raise UnprovenError(
+            f"{vehicle.name}: {lacking}", "a fitted vehicle file that predicts an unseen flight",
+            "`quadid diagnose LOG --validate OTHER`; insist with --anyway",
+        )  # fmt: skip
+    return [lacking] if lacking else []
+
+
+def _lateness(vehicle: Vehicle, motor_lag: float | None, delay: float | None) -> list[Used]:
+    """Motor lag and delay of the command; raises UnprovenError where nothing is known of either."""
+    lag, wait = vehicle.effects.get("motor_lag", {}), vehicle.effects.get("command_delay", {})
+    if not lag and not wait and motor_lag is None and delay is None:
+        why = " (rotor columns are readings, which show no command)" * (vehicle.command.sampling == "instant")
+        raise UnprovenError(
+            f"{vehicle.name}: neither motor_lag nor command_delay is in the file: not identified{why}",
+            "one of them: they limit every loop",
+            "`quadid diagnose` on a log with motor commands, or give --motor-lag and --delay",
+        )  # fmt: skip
+    tau = max(lag.get("tau", 0.0), lag.get("tau_down", 0.0))
+    out = []
+    for name, given, held, stated in (
+        ("motor lag", motor_lag, tau, bool(lag)), ("command delay", delay, wait.get("delay", 0.0), bool(wait)),
+    ):  # fmt: skip
+        value = held if given is None else given
+        if not 0.0 <= value <= 1.0:
+            raise ParameterError(f"{name} {value:g} s", "0 to 1 s")
+        source = "given" if given is not None else "vehicle file" if stated else "not found beside the other"
+        spread = f"; the file holds no interval, {UNSTATED:.0%} each way assumed" if stated and given is None else ""
+        out.append(Used(name, "s", value, value * (1.0 - UNSTATED), value * (1.0 + UNSTATED), source + spread))
+    return out
+
+
+def _measured(facts: Facts) -> list[Used]:
+    """Parameters of the vehicle that set the gains."""
+    units = {"b": "N s^2/rad^2", "d": "N m s^2/rad^2"}
+    return [
+        Used(n, units.get(n, "kg m^2"), facts.value(n), *facts.interval(n), facts.origin(n))
+        for n in ("b", "d", "J_xx", "J_yy", "J_zz")
+    ]
+
+
+def _on_board(autopilot: Autopilot, known: Mapping[str, float], vehicle: Vehicle) -> dict[str, Used]:
+    """Filters and period of the autopilot's loop: as told, as the vehicle file has it, or its defaults."""
+    out = {}
+    parts = {
+        "gyro filter": autopilot.gyro, "derivative filter": autopilot.derivative, "loop rate": autopilot.rate,
+        "yaw error filter": autopilot.yaw_error,
+    }  # fmt: skip
+    for name, (parameter, default) in parts.items():
+        value, source = known.get(parameter, default), parameter if parameter in known else f"default of {parameter}"
+        held = vehicle.effects.get("imu_lag", {}).get("cutoff")
+        if name == "gyro filter" and held is not None and parameter not in known:
+            value, source = held, "imu_lag of the vehicle file"
+        value = value if value > 0.0 else math.inf  # 0 turns a filter off
+        if parameter:
+            out[name] = Used(name, "Hz", value, value, value, source)
+    return out
+
+
+def _plant(facts: Facts, axis: int, late: list[Used], fixed: Mapping[str, Used]) -> AxisPlant:
+    """The axis as identified, and with every combination of the ends of the intervals.
+
+    About hover b (w_h - w_0) is the root of b times the load, so thrust goes with the root of b, drag torque with
+    d over that root; errors of the parameters are taken as independent.
+    """
+    relative = {n: (facts.vehicle.parameters[n].sigma or 0.0) / facts.value(n) for n in ("b", "d", *_INERTIA)}
+    spread = math.hypot(0.5 * relative["b"], relative[_INERTIA[axis]], relative["d"] * (axis == 2))
+    ends = (math.exp(-Z95 * spread), math.exp(Z95 * spread))
+    corners = [*itertools.product(ends, *((u.low, u.high) for u in late))]
+    gain, lag, wait = np.array([(1.0, late[0].value, late[1].value), *corners]).T
+    held = 0.5 / fixed["loop rate"].value
+    lead = 0.0
+    if axis == 2 and "rotor_spin_up" in facts.vehicle.effects:
+        lead = facts.effect("rotor_spin_up", "J") / (2.0 * facts.value("d") * facts.hover_speed)
+    error = fixed["yaw error filter"].value if axis == 2 and "yaw error filter" in fixed else math.inf
+    return AxisPlant(gain, lag, wait + held, lead, fixed["gyro filter"].value, error)
+
+
+_INERTIA = ("J_xx", "J_yy", "J_zz")
+
+
+def _parameters(loops: Loops, per: float, autopilot: Autopilot) -> list[float]:
+    """P, I, D and attitude gain in the autopilot's unit, as it stores them or to three digits."""
+    wanted = (*(g / per for g in loops.rate[:3]), loops.attitude)
+    scaled = [value / unit for value, unit in zip(wanted, autopilot.units, strict=True)]
+    if autopilot.digits is not None:
+        return [round(v, autopilot.digits) for v in scaled]
+    return [float(f"{v:.3g}") for v in scaled]
+
+
+def _loops(plant: AxisPlant, values: list[float], per: float, autopilot: Autopilot, cutoff: float) -> Loops:
+    """The loops that these parameters of the autopilot make."""
+    p, i, d = (v * unit * per for v, unit in zip(values[:3], autopilot.units[:3], strict=True))
+    return Loops(plant, RateGains(p, i, d, cutoff), values[3] * autopilot.units[3], autopilot.on_error)
+
+
+def _axis(axis: str, now: Loops, before: Loops | None, best: Loops, held: bool) -> Json:
+    """Promises of one axis."""
+    crossover = float(best.margins().crossover[0])
+    phases = best.plant.phases(crossover, best.rate)
+    largest = max(phases, key=lambda name: phases[name])
+    return {
+        "axis": axis, **_promises(now), "before": None if before is None else _promises(before),
+        "largest_bandwidth": float(best.bandwidth()[0]), "limited_by": "moment of the rotors" if held else largest,
+        "phase_taken": phases, "at": crossover,
+    }  # fmt: skip
+
+
+def _promises(loops: Loops) -> Json:
+    """Bandwidth, margins and overshoot of the rate loop and of the attitude loop."""
+    out: dict[str, Any] = {}
+    for name, angle in (("rate", False), ("attitude", True)):
+        if angle and loops.attitude == 0.0:
+            out[name] = None
+            continue
+        m, band = loops.margins(angle), loops.bandwidth(angle)
+        top = loops.step(angle)[1].max(axis=1) - 1.0 if loops.stable else np.full(len(band), np.inf)
+        out[name] = {
+            "bandwidth": float(band[0]), "bandwidth_range": [float(band.min()), float(band.max())],
+            "phase_margin": float(m.phase[0]), "phase_margin_least": float(m.phase.min()),
+            "gain_margin": float(m.gain[0]), "gain_margin_least": float(m.gain.min()),
+            "overshoot": max(float(top[0]), 0.0), "overshoot_most": max(float(top.max()), 0.0),
+        }  # fmt: skip
+    return out
+
+
+def _remedy(plant: AxisPlant, phase_margin: float) -> str:
+    """What would make the loop faster."""
+    hz = 1.0 / (2.0 * math.pi * max(float(plant.delay[0] + plant.lag[0]), 1e-3))
+    phases = plant.phases(hz, with_rate(plant, 1.0, math.inf, False))
+    largest = max(("delay", "motor lag", "gyro filter"), key=lambda name: phases[name])
+    return f"ask for less, for a smaller margin than {phase_margin:g} deg, or for less {largest}"
+
+
+def _told(current: str | Path | Mapping[str, float] | None, autopilot: Autopilot) -> dict[str, float]:
+    """Parameters of an autopilot, from a log, a parameter file or as given; raises LogError where none is its."""
+    if current is None:
+        return {}
+    if isinstance(current, Mapping):
+        return dict(current)
+    path = Path(current)
+    wanted = {name for names in autopilot.names for name in names if name}
+    head = read_regular(path, 1 << 22) if path.is_file() and path.stat().st_size < 1 << 22 else b""
+    found = {}
+    if b"\0" not in head:
+        text = head.decode("utf-8", "replace")
+        found = {m[1]: float(m[2]) for m in _LINE.finditer(text)}
+    if not wanted & set(found):
+        found = dict(open_recording(path).autopilot)
+    if not wanted & set(found):
+        raise LogError(
+            f"{path.name}: no rate gains of {autopilot.program}", f"parameters such as {autopilot.names[0][0]}",
+            "a log or parameter file of this autopilot, or leave --from out",
+        )  # fmt: skip
+    return found
