@@ -66,13 +66,14 @@ MOVED = {
     "quadid_node.inputs": "quadid_node.chooser quadid_node.convert quadid_node.intake quadid_node.pace "
     "quadid_node.presets quadid_node.stamps",
     "quadid_node.publish": "quadid_node.claim quadid_node.neighbours quadid_node.speaker",
-    "quadid_node.history": "quadid_node.history_writer quadid_node.restored_set quadid_node.store",
+    "quadid_node.codec": "quadid_node.vehicle_health",
+    "quadid_node.history": "quadid_node.history_writer quadid_node.restored_set quadid_node.store "
+    "quadid_node.store_file quadid_node.store_lock",
     "quadid_node.mavlink_link": "quadid_node.mavlink_decode quadid_node.mavlink_parameters "
     "quadid_node.mavlink_requests quadid_node.motor_order",
     "quadid_node.mavlink_wire": "quadid_node.mavlink_peers quadid_node.signing_memory",
     "quadid_node.wire_format": "quadid_node.parcel",
     "quadid_node.ground": "quadid_node.remote_worker quadid_node.workers",
-    "quadid_node.store_file": "quadid_node.store_lock",
     "quadid_node.worker": "quadid_node.warm_up",
     "quadid_node.zenoh": "quadid_node.zenoh_fleet quadid_node.zenoh_link quadid_node.zenoh_session",
     "quadid_replay.motors": "quadid_replay.airframes",

@@ -84,8 +84,7 @@ def listed(json: str | None) -> None:
 
 def _in_force(vehicle: Vehicle, history: Path, name: str) -> tuple[Vehicle, str, str]:
     """The vehicle with the values that a service put in force last, where they come from, and what speaks against."""
-    from quadid_node.history import read_in_force
-    from quadid_node.store_file import StoreError, read_history
+    from quadid_node.history import StoreError, read_history, read_in_force
 
     from quadid.identification.result import with_values
 

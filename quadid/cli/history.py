@@ -36,8 +36,7 @@ def history(
     json: JsonTarget = None,
 ) -> None:
     """Show the stored parameter sets of a vehicle: what, when, from which data, who approved."""
-    from quadid_node.history import default_path, read_in_force
-    from quadid_node.store_file import StoreError, read_history
+    from quadid_node.history import StoreError, default_path, read_history, read_in_force
 
     from quadid.cli import terminal
 

@@ -74,6 +74,7 @@ def serve(
     from quadid_node.service import Service
     from quadid_node.settings import session_settings
     from quadid_node.worker import ProcessWorker
+    from quadid_node.zenoh import ZenohLink
 
     from quadid.app.logs import load_vehicle
     from quadid.cli import terminal
@@ -94,8 +95,6 @@ def serve(
         service = opened.enter_context(closing(Service(described, settings, worker, store)))
         outlets: list[Outlet] = [_Console(terminal.console(quiet=json == "-"), link)]
         if zenoh is not None:
-            from quadid_node.zenoh import ZenohLink
-
             outlets.append(opened.enter_context(closing(ZenohLink(zenoh, known, service))))
         opened.callback(stop.ignore_more)
         run(service, link, outlets, lambda: stop() or time.monotonic() > end)

@@ -9,44 +9,25 @@ from typing import Any, get_args
 import numpy as np
 
 from quadid.chi_square import Z95
+from quadid.condition.watch import HealthReport
 from quadid.jsonable import jsonable
-from quadid.online.records import OnlineDiagnosis, OnlineFinding, OnlineSet, Reference, SessionStatus, SetState
+from quadid.online.records import OnlineDiagnosis, OnlineSet, Reference, SessionStatus, SetState
 from quadid.parameters import NOMINAL_NAMES, Parameter, ParameterSet, Status
 
 
-def number(value: float | None) -> float | None:
-    """A number that JSON can hold: NaN and infinities become null."""
-    return None if value is None or not math.isfinite(value) else float(value)
-
-
-def parameters_to_dict(parameters: ParameterSet) -> list[dict[str, Any]]:
-    """Parameters as in `quadid identify`'s JSON, with standard deviation and bounds."""
-    out = []
-    for p in parameters:
-        entry = {
-            "name": p.name, "unit": p.unit, "value": number(p.value), "sigma": number(p.sigma),
-            "ci95": [number(p.ci95[0]), number(p.ci95[1])], "initial": number(p.initial),
-            "bounds": [number(p.bounds[0]), number(p.bounds[1])], "status": p.status.value,
-        }  # fmt: skip
-        if p.relative_to is not None:
-            entry["relative_to"] = p.relative_to
-        out.append(entry)
-    return out
-
-
 def set_to_dict(item: OnlineSet, covariance: bool = True) -> dict[str, Any]:
-    """A set; times are stamps [s]."""
-    out: dict[str, Any] = {
-        "sequence": item.sequence, "state": item.state.value, "check": item.check, "reason": item.reason,
-        "approved_by": item.approved_by, "start": number(item.start), "stop": number(item.stop),
-        "samples": item.samples, "mse": number(item.mse), "mse_held_out": number(item.mse_held_out),
-        "input_hash": item.input_hash, "mass": number(item.mass), "outdated": item.outdated,
-        "outdated_code": item.outdated_code, "reference": item.reference,
-        "parameters": parameters_to_dict(item.parameters),
-    }  # fmt: skip
-    if covariance:
-        out["covariance"] = item.parameters.covariance.tolist()
-    return out
+    """A set; times are stamps [s], parameters as in `quadid identify`'s JSON, with standard deviation and bounds."""
+    parameters = [
+        {
+            "name": p.name, "unit": p.unit, "value": p.value, "sigma": p.sigma, "ci95": p.ci95, "initial": p.initial,
+            "bounds": p.bounds, "status": p.status, **({"relative_to": p.relative_to} if p.relative_to else {}),
+        }
+        for p in item.parameters
+    ]  # fmt: skip
+    data: dict[str, Any] = jsonable({
+        **vars(item), "parameters": parameters, **({"covariance": item.parameters.covariance} if covariance else {}),
+    })  # fmt: skip
+    return data
 
 
 def set_from_dict(data: Mapping[str, Any]) -> OnlineSet:
@@ -69,29 +50,33 @@ def set_from_dict(data: Mapping[str, Any]) -> OnlineSet:
     )  # fmt: skip
 
 
-def finding_to_dict(finding: OnlineFinding) -> dict[str, Any]:
-    """A finding as in `quadid diagnose`'s JSON."""
-    parameters = []
-    for name, value in finding.values.items():
-        half = Z95 * finding.sigma.get(name, math.nan)
-        parameters.append({
-            "name": name, "unit": finding.units.get(name, ""), "value": number(value),
-            "ci95": [number(value - half), number(value + half)],
-        })  # fmt: skip
-    return {
-        "effect": finding.effect, "confident": finding.confident, "parameters": parameters,
-        "gain": {"mse_before": number(finding.mse_before), "mse_after": number(finding.mse_after)},
-        "p_value": number(finding.p_value), "evidence": finding.evidence,
-        "alternatives": [{"effect": a.effect, "mse_after": number(a.mse_after)} for a in finding.alternatives],
-    }  # fmt: skip
-
-
 def diagnosis_to_dict(item: OnlineDiagnosis) -> dict[str, Any]:
-    """A diagnosis; times are stamps [s]."""
-    return {
-        "t": number(item.t), "start": number(item.start), "stop": number(item.stop), "verdict": item.verdict,
-        "findings": [finding_to_dict(f) for f in item.findings],
-    }  # fmt: skip
+    """A diagnosis; times are stamps [s], findings as in `quadid diagnose`'s JSON."""
+    findings = []
+    for found in item.findings:
+        parameters = []
+        for name, value in found.values.items():
+            half = Z95 * found.sigma.get(name, math.nan)
+            ci95 = value - half, value + half
+            parameters.append({"name": name, "unit": found.units.get(name, ""), "value": value, "ci95": ci95})
+        findings.append({
+            "effect": found.effect, "confident": found.confident, "parameters": parameters,
+            "gain": {"mse_before": found.mse_before, "mse_after": found.mse_after},
+            "p_value": found.p_value, "evidence": found.evidence, "alternatives": [vars(a) for a in found.alternatives],
+        })  # fmt: skip
+    data: dict[str, Any] = jsonable({**vars(item), "findings": findings})
+    return data
+
+
+def health_to_dict(report: HealthReport) -> dict[str, Any]:
+    """A report as JSON: ``quadid.health/1`` as far as a flight in progress has it, with the loss of every rotor."""
+    data: dict[str, Any] = jsonable({
+        "schema": "quadid.health/1", "t": report.t, "verdict": report.verdict, "has_baseline": report.has_baseline,
+        "changes": [change.to_dict() for change in report.changes],
+        "score": report.score, "rotor_loss": report.rotor_loss, "rotor_interval": report.rotor_interval,
+        "mass": report.mass, "text": report.text,
+    })  # fmt: skip
+    return data
 
 
 def status_to_dict(status: SessionStatus) -> dict[str, Any]:

@@ -8,11 +8,11 @@ from typing import Any
 from quadid.online.active_set import Answer
 from quadid_node import messages
 from quadid_node.codec import set_from_dict
+from quadid_node.history import StoreError, read_history
 from quadid_node.inputs import service_class, to_message
 from quadid_node.publication import Output
 from quadid_node.rounds import WORK_SECONDS
 from quadid_node.service import Service
-from quadid_node.store_file import StoreError, read_history
 
 MOST_SETS = 100
 """Sets that one answer of `get_history` holds at most."""

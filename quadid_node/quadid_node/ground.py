@@ -16,7 +16,7 @@ from quadid.errors import QuadidError
 from quadid.online.records import Job, JobReply, unexpected
 from quadid_node.wire_format import LARGEST, ParcelError, content, pack, unpack
 from quadid_node.worker import STUDY_LIMIT, ProcessWorker, Trouble, Worker
-from quadid_node.zenoh import ROOT, ZenohError, config_of, key_of, open_session
+from quadid_node.zenoh import ROOT, config_of, key_of, wait_for_session
 
 # --- Fits on a ground machine: takes windows from services over Zenoh and answers with fits (`quadid worker`)
 #
@@ -29,7 +29,6 @@ ALIVE = f"{ROOT}/worker/*/alive"
 MOST_WAITING, MOST_BYTES = 64, 4 * LARGEST
 """Requests that wait, and their bytes in all; a usual one has some ten thousand."""
 WAIT = 0.1
-RETRY = 3.0
 
 
 @dataclass
@@ -53,7 +52,18 @@ def work(where: str, stop: Callable[[], bool], told: Callable[[str], None]) -> D
         ZenohError: a configuration that is none.
     """
     config_of(where)
-    done, session = Done(), _connected(where, stop, told)
+    said = set[str]()
+
+    def tell_once(problem: str) -> None:
+        if problem not in said:
+            told(f"{problem}; trying again")
+        said.add(problem)
+
+    def stopped_after(pause: float) -> bool:
+        time.sleep(pause)
+        return stop()
+
+    done, session = Done(), wait_for_session(where, stopped_after, tell_once)
     if session is None:
         return done
     waiting: queue.Queue[Any] = queue.Queue(MOST_WAITING)
@@ -91,19 +101,6 @@ def work(where: str, stop: Callable[[], bool], told: Callable[[str], None]) -> D
 
 def _size(query: Any) -> int:
     return len(query.payload) if query.payload is not None else 0
-
-
-def _connected(where: str, stop: Callable[[], bool], told: Callable[[str], None]) -> Any:
-    said = ""
-    while not stop():
-        try:
-            return open_session(where)
-        except ZenohError as error:
-            if str(error) != said:
-                said = str(error)
-                told(f"{said}; trying again")
-            time.sleep(RETRY)
-    return None
 
 
 def _answer(query: Any, done: Done, told: Callable[[str], None]) -> None:
@@ -195,19 +192,15 @@ class Ground:
                 self._session = None
 
     def _connect(self) -> None:
-        while not self._closed.is_set():
-            try:
-                session = open_session(self._where)
-            except ZenohError:
-                self._closed.wait(RETRY)
-                continue
-            with self._lock:
-                if self._closed.is_set():
-                    session.close()
-                    return
+        session = wait_for_session(self._where, self._closed.wait, lambda problem: None)
+        if session is None:
+            return
+        with self._lock:
+            if self._closed.is_set():
+                session.close()
+            else:
                 self._watch = session.liveliness().declare_subscriber(ALIVE, self._on_token, history=True)
                 self._session = session
-            return
 
     def _on_token(self, sample: Any) -> None:
         name = str(sample.key_expr)
@@ -325,7 +318,6 @@ def with_ground(worker: ProcessWorker, where: str, vehicle: str) -> Worker:
     """
     if not where:
         return worker
-
     try:
         return RemoteWorker(worker, Ground(where, vehicle))
     except QuadidError:

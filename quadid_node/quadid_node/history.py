@@ -1,18 +1,27 @@
-"""History of a service: parameter sets, findings and decisions in SQLite."""
+"""History of a service in SQLite: parameter sets, findings and decisions, with one writer for each vehicle.
+
+A history that cannot be written never stops a service: `Store.problem` reports it, and `Store.written` which numbered
+sets are on the disk, so that no other is published.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import json
 import math
 import os
 import sqlite3
+import stat
+import struct
 import threading
 import time
 import uuid
+import zlib
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -20,190 +29,310 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from quadid.condition.trim import FlightTrim, flight_from_dict, flight_to_dict
+from quadid.errors import QuadidError
 from quadid.online.flexible_fit import ROOM, with_room
 from quadid.online.gate import GateSettings, implausible
 from quadid.online.health_supervisor import MOST_FLIGHTS
 from quadid.online.records import Event, OnlineDiagnosis, OnlineSet, SetState
 from quadid.parameters import NOMINAL_NAMES, ParameterSet
+from quadid.sanitise import plain
 from quadid.vehicle import Vehicle
 from quadid_node.codec import diagnosis_to_dict, set_from_dict, set_to_dict
-from quadid_node.store_file import (
-    UNREADABLE,
-    HistoryLock,
-    StoreError,
-    begin_anew,
-    connect,
-    is_damage,
-    make_tables,
-    opened,
-    real,
-    set_aside,
-    text,
-)
 
-# --- The thread that brings rows of a history to the disk, in order, and knows which of them are there
+# --- The file: its tables, its versions, and what becomes of a damaged one
+
+SCHEMA = """
+CREATE TABLE IF NOT EXISTS sets (
+    vehicle TEXT NOT NULL, sequence INTEGER NOT NULL, state TEXT NOT NULL, reason TEXT NOT NULL,
+    approved_by TEXT NOT NULL, stop REAL, wall REAL NOT NULL, data TEXT NOT NULL);
+CREATE INDEX IF NOT EXISTS sets_by_number ON sets (vehicle, sequence);
+CREATE TABLE IF NOT EXISTS candidates (
+    id INTEGER PRIMARY KEY, vehicle TEXT NOT NULL, state TEXT NOT NULL, gate TEXT NOT NULL, reason TEXT NOT NULL,
+    stop REAL, wall REAL NOT NULL, data TEXT NOT NULL);
+CREATE TABLE IF NOT EXISTS events (
+    id INTEGER PRIMARY KEY, vehicle TEXT NOT NULL, level TEXT NOT NULL, kind TEXT NOT NULL, text TEXT NOT NULL,
+    t REAL, wall REAL NOT NULL, data TEXT);
+CREATE TABLE IF NOT EXISTS healthy_flights (
+    id INTEGER PRIMARY KEY, vehicle TEXT NOT NULL, wall REAL NOT NULL, data TEXT NOT NULL);
+CREATE TABLE IF NOT EXISTS decisions (
+    id INTEGER PRIMARY KEY, vehicle TEXT NOT NULL, configured TEXT NOT NULL, approval TEXT NOT NULL,
+    wall REAL NOT NULL);
+"""
+"""A file whose tables were made by another text is refused as foreign: old ones were made by exactly this one."""
+VERSION = 2
+"""2: stamps are UNIX seconds; before, seconds of a day."""
+BUSY_SECONDS = 5.0
+"""Longest wait for another program's lock [s]."""
+LARGEST_NUMBER = 1 << 53
+"""Numbers of sets stay below: JSON and floating point hold them exactly."""
+_SHOWN = ("sets", "candidates", "events")
+UNREADABLE = (ValueError, TypeError, LookupError, OverflowError, RecursionError, QuadidError)
+"""Errors of rows that this program has not written."""
+
+
+class StoreError(QuadidError):
+    """A history that another service writes, or that is not there."""
+
+
+def connect(path: Path, read_only: bool = False) -> sqlite3.Connection:
+    """Opens the file; for writing in WAL mode, every transaction on the disk before it counts.
+
+    Raises:
+        StoreError: a history of a newer version: it is not damaged, and nothing in it is changed.
+        sqlite3.Error: it cannot be opened.
+    """
+    name = f"{path.absolute().as_uri()}?mode=ro" if read_only else path
+    db = sqlite3.connect(name, uri=read_only, timeout=BUSY_SECONDS)
+    try:
+        db.execute("PRAGMA trusted_schema = OFF")
+        (version,) = db.execute("PRAGMA user_version").fetchone()
+        if not 0 <= version <= VERSION:
+            raise StoreError(
+                f"the history {path} has version {version}", f"up to {VERSION}",
+                "use the version of quadid that wrote it, or another history",
+            )  # fmt: skip
+        if not read_only:
+            db.execute("PRAGMA journal_mode = WAL")
+            db.execute("PRAGMA synchronous = FULL")
+    except BaseException:
+        db.close()
+        raise
+    return db
+
+
+def make_tables(path: Path) -> None:
+    """Makes what tables are missing.
+
+    Raises:
+        sqlite3.Error: the file is damaged, or cannot be written now.
+        StoreError: it is of another version of this program.
+    """
+    with contextlib.closing(connect(path)) as db:
+        check_tables(db)
+        if db.execute("PRAGMA quick_check(1)").fetchone()[0] != "ok":
+            raise sqlite3.DatabaseError("malformed: its pages do not add up")
+        db.executescript(SCHEMA)
+        db.execute(f"PRAGMA user_version = {VERSION}")
+        db.commit()
+        (highest,) = db.execute("SELECT max(sequence) FROM sets").fetchone()
+        if not isinstance(highest, int | None) or (highest or 0) >= LARGEST_NUMBER:
+            raise sqlite3.DatabaseError(f"malformed: set number {highest!r}")
+
+
+def check_tables(db: sqlite3.Connection) -> None:
+    """Raises DatabaseError where a file holds what computes: triggers, views, and tables of ours made in another way.
+
+    What a view, an index or the condition of a column computes may never end, and may take all memory.
+    """
+    made = _made()
+    for kind, name, table, page, sql in db.execute(
+        "SELECT type, name, lower(tbl_name), rootpage, sql FROM sqlite_master"
+    ):
+        if kind not in ("table", "index") or not page:
+            raise sqlite3.DatabaseError(f"malformed: {plain(str(name), 40)} is no table that a history has")
+        if (table, "table") in made and sql != made.get((name, kind)):
+            raise sqlite3.DatabaseError(f"malformed: {plain(str(name), 40)} is not as a history has it")
+
+
+@lru_cache(maxsize=1)
+def _made() -> dict[tuple[str, str], str]:
+    """SQL that makes each table and index, by its name and kind."""
+    with contextlib.closing(sqlite3.connect(":memory:")) as db:
+        db.executescript(SCHEMA)
+        return {(name, kind): sql for name, kind, sql in db.execute("SELECT name, type, sql FROM sqlite_master")}
+
+
+def make_usable(path: Path) -> str:
+    """Makes what tables are missing; a damaged file gets another name and a new one begins.
+
+    Returns:
+        What was done to a damaged file, for people; empty for a sound one, or one that had only been removed.
+
+    Raises:
+        As `make_tables`, but not for damage.
+    """
+    try:
+        make_tables(path)
+        return ""
+    except sqlite3.DatabaseError as error:
+        if not is_damage(error):
+            raise
+        damage = error
+    name = f"{path.name}.damaged-{time.strftime('%Y%m%dT%H%M%S')}"
+    taken = sum(p.name.startswith(name) for p in path.parent.iterdir())
+    aside = path.with_name(f"{name}-{taken}" if taken else name)
+    for suffix in ("", "-wal", "-shm"):
+        with contextlib.suppress(FileNotFoundError):
+            Path(f"{path}{suffix}").rename(f"{aside}{suffix}")
+    make_tables(path)
+    return f"the history was damaged ({damage}); it was set aside as {aside.name}, a new one begins"
+
+
+def is_damage(error: sqlite3.Error) -> bool:
+    """Whether an error says that the file is no sound database, not that it cannot be reached now."""
+    told = str(error)
+    return "malformed" in told or "not a database" in told or "no such table" in told
+
+
+# --- Reading, without touching the file
+
+
+@contextlib.contextmanager
+def opened(path: Path) -> Iterator[sqlite3.Connection]:
+    """A history to read, checked; raises StoreError where it is none, or what is done with it fails."""
+    if not path.is_file():
+        raise StoreError(f"no history {path}", "a history that a service has written", "use --history")
+    try:
+        with contextlib.closing(connect(path, read_only=True)) as db:
+            check_tables(db)
+            for table in _SHOWN:  # rows that share pages would make a small file large
+                if db.execute(f"PRAGMA quick_check({table})").fetchone()[0] != "ok":
+                    raise sqlite3.DatabaseError("malformed: its pages do not add up")
+            yield db
+    except (sqlite3.Error, *UNREADABLE) as error:
+        raise StoreError(
+            f"{path} cannot be read ({error})", "a history that a service has written", "use --history"
+        ) from error
+
+
+def read_history(
+    path: Path, vehicle: str, candidates: int = 0, events: int = 0, sets: int = -1
+) -> dict[str, list[dict[str, Any]]]:  # fmt: skip
+    """Reads a history without touching it: sets, newest candidates and events, and the names of all vehicles.
+
+    Args:
+        path: database file.
+        vehicle: name of the vehicle.
+        candidates: newest candidates to return; events: newest events; sets: newest sets, -1: all.
+
+    Raises:
+        StoreError: no such file, or not a history.
+    """
+
+    def newest(columns: str, table: str, most: int) -> list[dict[str, Any]]:
+        cursor = db.execute(
+            f"SELECT {columns} FROM {table} WHERE vehicle = ? ORDER BY rowid DESC LIMIT ?", (vehicle, most)
+        )
+        names, out = [c[0] for c in cursor.description], []
+        for row in cursor:
+            entry = dict(zip(names, row, strict=True))
+            entry |= dict(json.loads(entry.pop("data", "{}")))
+            out.append(entry)
+        return out[::-1]
+
+    with opened(path) as db:
+        names = " UNION ".join(f"SELECT vehicle FROM {table}" for table in _SHOWN)
+        return {
+            "sets": newest("wall, data", "sets", sets),
+            "candidates": newest("wall, data", "candidates", candidates),
+            "events": newest("wall, t, level, kind, text", "events", events),
+            "vehicles": [{"name": name} for (name,) in db.execute(names)],
+        }
+
+
+# --- The right to write: one service a vehicle, by whatever name the file is called
 #
-# A slow, full or locked disk never holds up a sample: rows wait here, and are tried again until they can be written.
+# The lock lies on the database itself (a byte of the file beyond any content, one a vehicle), so that links, bind
+# mounts and cleaners change nothing.  It belongs to an open file description: other locks of this process, as
+# SQLite's, and their end leave it alone.
+
+_FIRST = 1 << 60
+"""First byte of the locks: SQLite's lie at 2^30."""
+_LOCK = getattr(fcntl, "F_OFD_SETLK", fcntl.F_SETLK)
+_File = tuple[int, int]
+"""Device and inode."""
+_guard = threading.Lock()
+_locked: dict[_File, tuple[int, set[str]]] = {}
+"""Files with a lock of this process: descriptor and vehicles; each is opened once, since closing a second descriptor
+would take SQLite's own locks of it away."""
 
 
-MOST_WAITING = 5000
-"""Rows kept while the disk cannot take them; beyond, the oldest that pass are lost, and that is said."""
-PRUNE_EVERY = 1000
-AGAIN = 1.0
-"""Time after which rows that could not be written are tried again [s]."""
-_UNFIT = (OverflowError, UnicodeError, sqlite3.ProgrammingError, sqlite3.InterfaceError, sqlite3.IntegrityError)
-"""What SQLite raises for a row that it will never take."""
+class HistoryLock:
+    """The right to write a vehicle's rows into the file that stands under a name."""
 
+    def __init__(self, path: Path, vehicle: str) -> None:
+        """Takes the lock; makes the file where there is none.
 
-class Row(NamedTuple):
-    """A statement with its values.
-
-    Attributes:
-        number: of the set which may be published once the row is on the disk; 0 for none.
-        passes: the row may be lost where there are too many; others tell what is in force and what people decided.
-    """
-
-    statement: str
-    values: tuple[Any, ...]
-    number: int = 0
-    passes: bool = False
-
-
-class HistoryWriter:
-    """Writes rows behind the caller's back.
-
-    Attributes:
-        problem: why nothing is written at the moment, or empty.
-    """
-
-    def __init__(
-        self, path: Path, kept: Mapping[str, int], standing: Callable[[], list[Row]], notes: list[str],
-        lock: HistoryLock,
-    ) -> None:  # fmt: skip
-        """Begins to write.
-
-        Args:
-            path: database with its tables made.
-            kept: rows that stay, by table.
-            standing: the rows with which a new file begins.
-            notes: gets what people should know of what is past: a damaged file set aside, a row that was no row.
-            lock: the right to write; it follows the file that stands under the name.
+        Raises:
+            StoreError: another service has it, or the file has a second name.
+            OSError: the file cannot be written.
         """
-        self._lock = lock
-        self._path, self._kept, self._standing, self._notes = path, kept, standing, notes
-        self.problem = ""
-        self._rows: list[Row] = []
-        self._written: set[int] = set()
-        self._lost: set[int] = set()
-        self._changed = threading.Condition()
-        self._closing = False
-        self._since_pruned = 0
-        self._thread = threading.Thread(target=self._run, name="history", daemon=True)
-        self._thread.start()
+        self._path, self._vehicle = path, vehicle
+        self._file: _File | None = None
+        self._take()
 
-    def put(self, row: Row) -> None:
-        """Takes a row; never waits."""
-        with self._changed:
-            self._rows.append(row)
-            if len(self._rows) > MOST_WAITING:
-                at = next((k for k, waiting in enumerate(self._rows) if waiting.passes), 0)
-                self._lost.add(self._rows.pop(at).number)
-                self.problem = f"{self._path}: the disk takes nothing, entries are lost"
-            self._changed.notify_all()
+    def moved(self) -> bool:
+        """True if another file stands under the name now than before; then that one is locked.
 
-    def is_written(self, number: int) -> bool:
-        """Whether the row of that set is on the disk."""
-        return number in self._written
-
-    def is_lost(self, number: int) -> bool:
-        """Whether the row of that set will never be on the disk."""
-        return number in self._lost
-
-    def flush(self, seconds: float) -> bool:
-        """Waits until everything is on the disk; False when it is not after so long [s]."""
-        with self._changed:
-            return self._changed.wait_for(lambda: not self._rows, seconds)
-
-    def close(self, seconds: float) -> None:
-        """Writes what waits, at most for `seconds`."""
-        with self._changed:
-            self._closing = True
-            self._changed.notify_all()
-        self._thread.join(seconds)
-
-    def _run(self) -> None:
-        while True:
-            with self._changed:
-                self._changed.wait_for(lambda: self._rows or self._closing)
-                batch, closing = list(self._rows), self._closing
-            if batch:
-                self._attempt(batch)
-            if closing and not self._rows:
-                return
-            if self.problem:
-                time.sleep(0.2 if closing else AGAIN)
-
-    def _attempt(self, batch: list[Row]) -> None:
-        """One transaction for all rows that wait; they leave the queue only when it is on the disk."""
+        Raises:
+            StoreError: another service has that one.
+            OSError: it cannot be written.
+        """
         try:
-            unfit = self._commit(batch)
-        except (sqlite3.Error, OSError, StoreError) as error:
-            self.problem = f"{self._path} cannot be written ({error}): kept in memory until it can"
-            if isinstance(error, sqlite3.Error) and is_damage(error):
-                self._replace(error)
-            return
-        except Exception as error:  # noqa: BLE001 - whatever it is, a history that nobody writes must be said
-            self.problem = f"the history of {self._path} is not written ({type(error).__name__}: {error})"
-            return
-        with self._changed:
-            done = {id(row) for row in batch}
-            self._rows = [row for row in self._rows if id(row) not in done]
-            refused = {id(row) for row, _ in unfit}
-            self._written |= {row.number for row in batch if row.number and id(row) not in refused}
-            self._lost |= {row.number for row, _ in unfit}
-            self._notes += [f"an entry that no history can hold was left out ({why})" for _, why in unfit]
-            self.problem = ""
-            self._changed.notify_all()
+            found = self._path.stat()
+        except FileNotFoundError:
+            found = None
+        if found is not None and (found.st_dev, found.st_ino) == self._file:
+            return False
+        self.close()
+        self._take()
+        return True
 
-    def _commit(self, batch: list[Row]) -> list[tuple[Row, str]]:
-        """Writes and commits; returns the rows that can never be written, with the reason."""
-        unfit = []
-        self._lock.moved()
-        with contextlib.closing(connect(self._path)) as db, db:
-            for row in batch:
-                try:
-                    added = db.execute(row.statement, row.values).rowcount
-                except _UNFIT as error:
-                    unfit.append((row, f"{type(error).__name__}: {error}"))
-                else:
-                    if not added:
-                        unfit.append((row, f"number {row.number} stands for another set already"))
-            self._since_pruned += len(batch)
-            if self._since_pruned >= PRUNE_EVERY:
-                self._since_pruned = 0
-                for table, kept in self._kept.items():
-                    db.execute(f"DELETE FROM {table} WHERE id <= (SELECT max(id) FROM {table}) - ?", (kept,))
-            if self._lock.moved():
-                raise sqlite3.OperationalError("another file stands there now")
-        return unfit
+    def close(self) -> None:
+        """Lets others write."""
+        with _guard:
+            file, self._file = self._file, None
+            if file is not None:
+                descriptor, vehicles = _locked[file]
+                vehicles.remove(self._vehicle)
+                fcntl.fcntl(descriptor, _LOCK, self._byte(fcntl.F_UNLCK))
+                _close_unused(file)
 
-    def _replace(self, error: sqlite3.Error) -> None:
-        """After damage while running: a new file that begins with what stands."""
-        try:
-            note = begin_anew(self._path, error)
-        except (sqlite3.Error, OSError, StoreError) as failure:
-            self.problem = f"{self._path} cannot be written ({failure}): kept in memory until it can"
-            return
-        self._notes += [note] if note else []
-        standing = self._standing()
-        with self._changed:
-            self._rows[:0] = [row for row in standing if row not in self._rows]
+    def _take(self) -> None:
+        opened = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_NONBLOCK, 0o644)
+        found = os.fstat(opened)
+        file = (found.st_dev, found.st_ino)
+        with _guard:
+            descriptor, vehicles = _locked.setdefault(file, (opened, set()))
+            if descriptor != opened:
+                os.close(opened)
+            try:
+                if not stat.S_ISREG(found.st_mode):
+                    raise OSError(0, "not a regular file")
+                if found.st_nlink > 1:
+                    raise StoreError(
+                        f"the history {self._path} has {found.st_nlink} names (hard links): by each it would be "
+                        "another database",
+                        "one name", "remove the other names, or copy the file instead of linking it",
+                    )  # fmt: skip
+                if self._vehicle in vehicles:
+                    raise BlockingIOError
+                fcntl.fcntl(descriptor, _LOCK, self._byte(fcntl.F_WRLCK))
+                vehicles.add(self._vehicle)
+                self._file = file
+            except BlockingIOError as error:
+                raise StoreError(
+                    f"another service writes the history of '{self._vehicle[:80]}' in {self._path}",
+                    "one service a vehicle", "stop the other one, give another history, or start as observer",
+                ) from error  # fmt: skip
+            finally:
+                _close_unused(file)
+
+    def _byte(self, kind: int) -> bytes:
+        """A `struct flock` of the byte that stands for the vehicle."""
+        return struct.pack("hhqqi", kind, os.SEEK_SET, _FIRST + zlib.crc32(self._vehicle.encode()), 1, 0)
+
+
+def _close_unused(file: _File) -> None:
+    descriptor, vehicles = _locked[file]
+    if not vehicles:
+        del _locked[file]
+        os.close(descriptor)
 
 
 # --- The set that a history says is in force: one rule for the service that takes it up and for all who read it
 #
 # Nothing that a file says is believed: a set of an earlier run must be one that this run could have estimated.
-
 
 _FORCE = "state IN ('accepted', 'rolled_back')"
 _SAME_MASS = 1e-6
@@ -305,17 +434,7 @@ def why_none(found: OnlineSet, number: int, gate: GateSettings, vehicle: Vehicle
     return implausible(ParameterSet(bounded, found.parameters.covariance), gate) or ""
 
 
-# --- The history of a vehicle in SQLite (WAL): every candidate, decision, reason and event; one writer per vehicle
-#
-# Nothing here stops a service that runs: a history that cannot be written is said so in `problem`, and `written` tells
-# which numbered sets are on the disk, so that no other is published.  At the start a history that another program holds
-# is waited for, then refused: without it nobody knows which numbers are taken.
-
-
-KEPT: Mapping[str, int] = MappingProxyType({"candidates": 20_000, "events": 20_000})
-"""Rows kept; older ones are forgotten, numbered sets and decisions never."""
-LARGEST_NUMBER = 1 << 53
-"""Numbers of sets stay below: JSON and floating point hold them exactly."""
+# --- What an earlier run left
 
 
 def default_path() -> Path:
@@ -358,11 +477,55 @@ class Restored:
     decided: str = "a person decided so in an earlier run"
 
 
+# --- The history of one vehicle, open for writing
+#
+# One thread brings rows to the disk, in order: a slow, full or locked disk never holds up a sample.  It opens the file
+# for each transaction, so that between two of them the file is whole without its log, whoever copies, moves or cleans.
+
+KEPT: Mapping[str, int] = MappingProxyType({"candidates": 20_000, "events": 20_000})
+"""Rows kept; older ones are forgotten, numbered sets and decisions never."""
+MOST_WAITING = 5000
+"""Rows kept while the disk cannot take them; beyond, the oldest that pass are lost, and that is reported."""
+PRUNE_EVERY = 1000
+AGAIN = 1.0
+"""Time after which rows that could not be written are tried again [s]."""
+_UNFIT = (OverflowError, UnicodeError, sqlite3.ProgrammingError, sqlite3.InterfaceError, sqlite3.IntegrityError)
+"""Errors of SQLite for a row that it will never take."""
+
+
+class Row(NamedTuple):
+    """A row that is to be written.
+
+    Attributes:
+        table: where it belongs; values: by column.
+        number: of the set which may be published once the row is on the disk; 0 for none.
+        passes: the row may be lost where there are too many; others hold what is in force and what people decided.
+    """
+
+    table: str
+    values: dict[str, Any]
+    number: int = 0
+    passes: bool = False
+
+    def insert(self, db: sqlite3.Connection) -> str:
+        """Writes the row; returns why no history can hold it, or nothing."""
+        another = "SELECT 1 FROM sets WHERE vehicle = :vehicle AND sequence = :sequence AND data != :data"
+        try:
+            if self.number and db.execute(another, self.values).fetchone():
+                return f"number {self.number} stands for another set already"
+            names = tuple(self.values)
+            db.execute(f"INSERT INTO {self.table} ({', '.join(names)}) VALUES (:{', :'.join(names)})", self.values)
+        except _UNFIT as error:
+            return f"{type(error).__name__}: {error}"
+        return ""
+
+
 class Store:
     """History of one vehicle, open for writing.
 
     Attributes:
-        notes: what people should know: a damaged history set aside, a row refused.
+        notes: what people should know of what is past: a damaged history set aside, a row refused.
+        problem: why nothing is written at the moment, or empty.
         boot_id: of this run; stands with every set that it numbers.
     """
 
@@ -378,62 +541,100 @@ class Store:
             StoreError: name or path is none, another program writes this vehicle's history or holds the file, the file
                 has a second name, or it is of a newer version.
         """
-        self.path, self.vehicle, self.boot_id = real(path), text(vehicle), uuid.uuid4().hex
+        try:
+            vehicle.encode()
+            self.path = Path(os.path.realpath(path))
+        except UnicodeEncodeError as error:
+            raise StoreError(f"the name {vehicle!r} is no text", "a name in UTF-8", "give another --id") from error
+        except ValueError as error:
+            raise StoreError(f"{str(path)!r} names no file ({error})", "a path", "give another --history") from error
+        self.vehicle, self.boot_id, self._kept = vehicle, uuid.uuid4().hex, kept
         self._boots: dict[int, str] = {}
         self.notes: list[str] = []
-        self._problem = ""
-        self._lock: HistoryLock | None = None
-        self._writer: HistoryWriter | None = None
+        self.problem = ""
         self._unread = False
         self._standing: dict[str, Row] = {}
         self._flights: deque[Row] = deque(maxlen=MOST_FLIGHTS)
+        self._rows: list[Row] = []
+        self._written: set[int] = set()
+        self._lost: set[int] = set()
+        self._changed = threading.Condition()
+        self._closing, self._since_pruned = False, 0
+        self._lock: HistoryLock | None = None
+        self._writer = threading.Thread(target=self._run, name="history", daemon=True)
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            self._lock = HistoryLock(self.path, self.vehicle)
+            self._lock = HistoryLock(self.path, vehicle)
         except OSError as error:
-            why = f"{self.path} cannot be written ({error.strerror})"
-            self._problem = f"{why}: nothing of this run is kept or published"
-        if self._lock is not None:
-            self._prepare(self._lock)
-            self._writer = HistoryWriter(self.path, kept, self._begins_with, self.notes, self._lock)
-            self._writer.problem, self._problem = self._problem, ""
+            self.problem = f"{self.path} cannot be written ({error.strerror}): nothing of this run is kept or published"
+            return
+        try:
+            if note := make_usable(self.path):
+                self.notes.append(note)
+                self._unread = True
+                self._lock.moved()
+        except (sqlite3.Error, StoreError) as error:
+            if isinstance(error, sqlite3.Error) and "locked" not in str(error):
+                self.problem = f"{self.path} cannot be written ({error})"
+            else:
+                self._lock.close()
+                if isinstance(error, StoreError):
+                    raise
+                raise StoreError(
+                    f"another program holds the history {self.path} ({error})",
+                    "a history that can be written", "end that program, or use another history",
+                ) from error  # fmt: skip
+        self._writer.start()
 
-    @property
-    def problem(self) -> str:
-        """Why nothing is written at the moment, or empty."""
-        return self._writer.problem or self._problem if self._writer is not None else self._problem
+    # --- what an earlier run left
 
     def restore(self, gate: GateSettings | None = None, vehicle: Vehicle | None = None) -> Restored:
         """What the last run left; a set is taken up again when this `gate` and `vehicle` could have let it pass."""
+        gate = gate or GateSettings()
         if self._lock is None or not self.path.is_file() or not self.path.stat().st_size:
             return Restored(None, first_number())
         try:
             with contextlib.closing(connect(self.path)) as db:
-                return self._restored(db, gate or GateSettings(), vehicle)
+                return self._restored(db, gate, vehicle)
         except sqlite3.Error as error:
             self.notes.append(f"the last set cannot be read back ({error})")
             self._unread = True
-            approval, decided = self._decided(None, gate or GateSettings())
+            approval, decided = self._decided(None, gate)
             return Restored(None, first_number(), approval=approval, decided=decided)
 
     def _restored(self, db: sqlite3.Connection, gate: GateSettings, vehicle: Vehicle | None) -> Restored:
-        (highest,) = db.execute("SELECT max(sequence) FROM sets WHERE vehicle = ?", (self.vehicle,)).fetchone()
+        def taken_up(found: StoredSet) -> OnlineSet | None:
+            """The set; one that no fresh estimate could be is left out, and reported."""
+            if found.why_none:
+                self.notes.append(f"a set of the history is no set and is not taken up again ({found.why_none})")
+                return None
+            if found.item is not None:
+                self._boots[found.item.sequence] = found.boot_id
+            return found.item
 
-        def newest(which: str) -> OnlineSet | None:
-            return self._taken_up(stored(db, self.vehicle, which, gate, vehicle))
+        def first_with(which: str) -> OnlineSet | None:
+            return taken_up(stored(db, self.vehicle, which, gate, vehicle))
 
-        last = self._taken_up(in_force(db, self.vehicle, gate, vehicle))
-        approved = newest("approved_by NOT IN ('auto', '') AND state != 'stale' ORDER BY rowid DESC")
-        first = newest("state = 'accepted' ORDER BY rowid")
+        last = taken_up(in_force(db, self.vehicle, gate, vehicle))
+        approved = first_with("approved_by NOT IN ('auto', '') AND state != 'stale' ORDER BY rowid DESC")
+        first = first_with("state = 'accepted' ORDER BY rowid")
         for item in (first, approved, last):
             if item is not None:
                 self._stands(item)
-        row = db.execute(
-            "SELECT configured, approval FROM decisions WHERE vehicle = ? ORDER BY id DESC LIMIT 1", (self.vehicle,)
-        ).fetchone()
-        approval, decided = self._decided(row, gate)
-        number = first_number(int(highest or 0))
-        return Restored(last, number, approved or first, approval, self._healthy(db), decided)
+        healthy = []
+        for (data,) in db.execute(
+            "SELECT data FROM (SELECT * FROM healthy_flights WHERE vehicle = ? ORDER BY id DESC LIMIT ?) ORDER BY id",
+            (self.vehicle, MOST_FLIGHTS),
+        ):
+            try:
+                healthy.append(flight_from_dict(json.loads(data)))
+                self._flights.append(self._flight_row(healthy[-1]))
+            except UNREADABLE as error:
+                self.notes.append(f"a healthy flight of the history cannot be read back ({error})")
+        decision = "SELECT configured, approval FROM decisions WHERE vehicle = ? ORDER BY id DESC LIMIT 1"
+        approval, decided = self._decided(db.execute(decision, (self.vehicle,)).fetchone(), gate)
+        (highest,) = db.execute("SELECT max(sequence) FROM sets WHERE vehicle = ?", (self.vehicle,)).fetchone()
+        return Restored(last, first_number(highest or 0), approved or first, approval, tuple(healthy), decided)
 
     def _decided(self, row: tuple[Any, Any] | None, gate: GateSettings) -> tuple[str, str]:
         """Approval by the newest row of what people decided, and why: manual where that cannot be read."""
@@ -442,39 +643,83 @@ class Store:
             return "manual", "what people decided in earlier runs cannot be read"
         if row is None or row[0] != gate.approval:
             return "", ""
-        self._standing["decision"] = self._decision_row(gate.approval, row[1])
+        self._standing["decision"] = self._row("decisions", configured=row[0], approval=row[1])
         return str(row[1]), Restored.decided
 
-    def _healthy(self, db: sqlite3.Connection) -> tuple[FlightTrim, ...]:
-        """Trims of the newest healthy flights; a row that is none is left out, and said."""
-        rows = db.execute(
-            "SELECT data FROM healthy_flights WHERE vehicle = ? ORDER BY id DESC LIMIT ?", (self.vehicle, MOST_FLIGHTS)
-        ).fetchall()
-        out = []
-        for (data,) in reversed(rows):
-            try:
-                out.append(flight_from_dict(json.loads(data)))
-                self._flights.append(self._flight_row(out[-1]))
-            except UNREADABLE as error:
-                self.notes.append(f"a healthy flight of the history cannot be read back ({error})")
-        return tuple(out)
-
-    def _taken_up(self, found: StoredSet) -> OnlineSet | None:
-        """The set; one that no fresh estimate could be is left out, and said."""
-        if not found.why_none:
-            if found.item is not None:
-                self._boots[found.item.sequence] = found.boot_id
-            return found.item
-        self.notes.append(f"a set of the history is no set and is not taken up again ({found.why_none})")
-        return None
+    # --- what is journalled
 
     def numbered(self, item: OnlineSet) -> None:
         """Journals a set that was put in force, rolled back to, restored, or waits for approval."""
         self._put(self._stands(item))
 
+    def candidate(self, item: OnlineSet) -> None:
+        """Journals an estimate and what the gate said of it."""
+        self._put(self._row(
+            "candidates", passes=True, state=item.state.value, gate=item.check, reason=item.reason, stop=item.stop,
+            data=json.dumps(set_to_dict(item, covariance=False)),
+        ))  # fmt: skip
+
+    def event(self, item: Event, data: str | None = None) -> None:
+        """Journals an event, with JSON that belongs to it."""
+        self._put(self._row(
+            "events", passes=True, level=item.level, kind=item.kind, text=item.text, t=item.t, data=data
+        ))  # fmt: skip
+
+    def diagnosis(self, item: OnlineDiagnosis) -> None:
+        """Journals findings."""
+        quiet = item.verdict == "nothing_found"
+        empty = "the simulation agrees with the flight" if quiet else "a change without a known cause"
+        text = "; ".join(f"{f.effect}: {f.evidence}" for f in item.findings) or empty
+        event = Event(item.t, "info" if quiet else "warning", "diagnosis", text)
+        self.event(event, json.dumps(diagnosis_to_dict(item)))
+
+    def healthy_flight(self, flight: FlightTrim) -> None:
+        """Journals a flight that later ones are compared with."""
+        self._flights.append(self._flight_row(flight))
+        self._put(self._flights[-1])
+
+    def decision(self, configured: str, approval: str) -> None:
+        """Journals that approval is now auto or manual by a person's decision, where it was `configured` otherwise."""
+        self._standing["decision"] = self._row("decisions", configured=configured, approval=approval)
+        self._put(self._standing["decision"])
+
+    def written(self, number: int) -> bool:
+        """Whether the set of that number is on the disk."""
+        return number in self._written
+
+    def lost(self, number: int) -> bool:
+        """Whether it will never be there: no history can hold it."""
+        return number in self._lost
+
+    def flush(self, seconds: float) -> bool:
+        """Waits until everything is on the disk; False when it is not after so long [s]."""
+        with self._changed:
+            return self._lock is not None and self._changed.wait_for(lambda: not self._rows, seconds)
+
+    def close(self, seconds: float = 1.5) -> None:
+        """Writes what waits, at most for `seconds`, and lets others write."""
+        with self._changed:
+            self._closing = True
+            self._changed.notify_all()
+        if self._lock is not None:
+            self._writer.join(seconds)
+            self._lock.close()
+            self._lock = None
+
+    def _row(self, table: str, number: int = 0, passes: bool = False, **values: Any) -> Row:
+        return Row(table, {"vehicle": self.vehicle, "wall": time.time(), **values}, number, passes)
+
+    def _flight_row(self, flight: FlightTrim) -> Row:
+        return self._row("healthy_flights", data=json.dumps(flight_to_dict(flight)))
+
     def _stands(self, item: OnlineSet) -> Row:
         """The row of a set, kept where a new file would have to begin with it; what `_restored` looks for."""
-        row, state = self._row(item), item.state.value
+        state = item.state.value
+        data = {**set_to_dict(item), "boot_id": self._boots.get(item.sequence, self.boot_id)}
+        row = self._row(
+            "sets", item.sequence, sequence=item.sequence, state=state, reason=item.reason,
+            approved_by=item.approved_by, stop=item.stop, data=json.dumps(data),
+        )  # fmt: skip
         if state == "accepted":
             self._standing.setdefault("first", row)
         if state != "stale" and item.approved_by not in ("auto", ""):
@@ -485,110 +730,75 @@ class Store:
             self._standing["told"] = row
         return row
 
-    def _begins_with(self) -> list[Row]:
-        """Sets in force and what they are measured from, in the order of their numbers; decisions; healthy flights."""
-        rows = {id(row): row for row in (*self._standing.values(), *self._flights)}
-        return sorted(rows.values(), key=lambda row: row.number)
-
-    def written(self, number: int) -> bool:
-        """Whether the set of that number is on the disk."""
-        return self._writer is not None and self._writer.is_written(number)
-
-    def lost(self, number: int) -> bool:
-        """Whether it will never be there: no history can hold it."""
-        return self._writer is not None and self._writer.is_lost(number)
-
-    def _row(self, item: OnlineSet) -> Row:
-        values = (self.vehicle, item.sequence, item.state.value, item.reason, item.approved_by, item.stop, time.time())
-        data = json.dumps({**set_to_dict(item), "boot_id": self._boots.get(item.sequence, self.boot_id)})
-        another = "SELECT 1 FROM sets WHERE vehicle = ? AND sequence = ? AND data != ?"
-        statement = f"INSERT INTO sets SELECT ?, ?, ?, ?, ?, ?, ?, ? WHERE NOT EXISTS ({another})"
-        return Row(statement, (*values, data, self.vehicle, item.sequence, data), item.sequence)
-
-    def candidate(self, item: OnlineSet) -> None:
-        """Journals an estimate and what the gate said of it."""
-        row = (self.vehicle, item.state.value, item.check, item.reason, item.stop, time.time())
-        data = json.dumps(set_to_dict(item, covariance=False))
-        names = "vehicle, state, gate, reason, stop, wall, data"
-        self._put(Row(f"INSERT INTO candidates ({names}) VALUES (?, ?, ?, ?, ?, ?, ?)", (*row, data), passes=True))
-
-    def event(self, item: Event) -> None:
-        """Journals an event."""
-        self._event(item.level, item.kind, item.text, item.t, None)
-
-    def diagnosis(self, item: OnlineDiagnosis) -> None:
-        """Journals findings."""
-        quiet = item.verdict == "nothing_found"
-        empty = "the simulation agrees with the flight" if quiet else "a change without a known cause"
-        text = "; ".join(f"{f.effect}: {f.evidence}" for f in item.findings) or empty
-        self._event("info" if quiet else "warning", "diagnosis", text, item.t, json.dumps(diagnosis_to_dict(item)))
-
-    def healthy_flight(self, flight: FlightTrim) -> None:
-        """Journals a flight that later ones are compared with."""
-        self._flights.append(self._flight_row(flight))
-        self._put(self._flights[-1])
-
-    def _flight_row(self, flight: FlightTrim) -> Row:
-        values = (self.vehicle, time.time(), json.dumps(flight_to_dict(flight)))
-        return Row("INSERT INTO healthy_flights (vehicle, wall, data) VALUES (?, ?, ?)", values)
-
-    def decision(self, configured: str, approval: str) -> None:
-        """Journals that approval is now auto or manual by a person's decision, where it was `configured` otherwise."""
-        self._standing["decision"] = self._decision_row(configured, approval)
-        self._put(self._standing["decision"])
-
-    def _decision_row(self, configured: str, approval: str) -> Row:
-        values = (self.vehicle, configured, approval, time.time())
-        return Row("INSERT INTO decisions (vehicle, configured, approval, wall) VALUES (?, ?, ?, ?)", values)
-
-    def flush(self, seconds: float) -> bool:
-        """Waits until everything is on the disk; False when it is not after so long [s]."""
-        return self._writer is not None and self._writer.flush(seconds)
-
-    def close(self, seconds: float = 1.5) -> None:
-        """Writes what waits, at most for `seconds`, and lets others write."""
-        if self._writer is not None:
-            self._writer.close(seconds)
-        if self._lock is not None:
-            self._lock.close()
-            self._lock = None
-
-    # --- writing
-
-    def _event(self, level: str, kind: str, text: str, t: float, data: str | None) -> None:
-        names = "vehicle, level, kind, text, t, wall, data"
-        row = (self.vehicle, level, kind, text, t, time.time(), data)
-        self._put(Row(f"INSERT INTO events ({names}) VALUES (?, ?, ?, ?, ?, ?, ?)", row, passes=True))
+    # --- the thread that writes
 
     def _put(self, row: Row) -> None:
-        if self._writer is not None:
-            self._writer.put(row)
+        """Takes a row; never waits."""
+        with self._changed:
+            if self._lock is None:
+                return
+            self._rows.append(row)
+            if len(self._rows) > MOST_WAITING:
+                at = next((k for k, waiting in enumerate(self._rows) if waiting.passes), 0)
+                self._lost.add(self._rows.pop(at).number)
+                self.problem = f"{self.path}: the disk takes nothing, entries are lost"
+            self._changed.notify_all()
 
-    def _prepare(self, lock: HistoryLock) -> None:
-        """Makes the tables; sets a damaged file aside, and one whose numbers are used up."""
+    def _run(self) -> None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._rows or self._closing)
+                batch, closing = list(self._rows), self._closing
+            if batch:
+                self._attempt(batch)
+            if closing and not (self._rows and self._lock):
+                return
+            if self.problem:
+                time.sleep(0.2 if closing else AGAIN)
+
+    def _attempt(self, batch: list[Row]) -> None:
+        """One transaction for all rows that wait; they leave the queue only when it is on the disk."""
         try:
-            make_tables(self.path)
-            self._check_numbers()
-        except sqlite3.DatabaseError as error:
-            if is_damage(error):
-                self.notes.append(set_aside(self.path, error))
-                self._unread = True
-                lock.moved()
-            elif "locked" in str(error):
-                self.close()
-                raise StoreError(
-                    f"another program holds the history {self.path} ({error})",
-                    "a history that can be written", "end that program, or use another history",
-                ) from error  # fmt: skip
-            else:
-                self._problem = f"{self.path} cannot be written ({error})"
-        except StoreError:
-            self.close()
-            raise
+            refused = self._commit(batch)
+        except Exception as error:  # noqa: BLE001 - whatever it is, a history that nobody writes must be reported
+            self.problem = f"{self.path} cannot be written ({error}): kept in memory until it can"
+            if isinstance(error, sqlite3.Error) and is_damage(error):
+                self._begin_anew()
+            return
+        with self._changed:
+            done = {id(row) for row in batch}
+            self._rows = [row for row in self._rows if id(row) not in done]
+            self._written |= {row.number for row in batch if row.number and id(row) not in refused}
+            self._lost |= {row.number for row in batch if id(row) in refused}
+            self.notes += [f"an entry that no history can hold was left out ({why})" for why in refused.values()]
+            self.problem = ""
+            self._changed.notify_all()
 
-    def _check_numbers(self) -> None:
-        """Raises DatabaseError where a number stands that this program never gives."""
-        with contextlib.closing(connect(self.path)) as db:
-            (highest,) = db.execute("SELECT max(sequence) FROM sets").fetchone()
-        if not isinstance(highest, int | None) or (highest or 0) >= LARGEST_NUMBER:
-            raise sqlite3.DatabaseError(f"malformed: set number {highest!r}")
+    def _commit(self, batch: list[Row]) -> dict[int, str]:
+        """Writes and commits; returns why rows can never be written, by the id of the row."""
+        lock = self._lock
+        if lock is None:
+            raise StoreError(f"the history {self.path} is closed")
+        lock.moved()
+        with contextlib.closing(connect(self.path)) as db, db:
+            refused = {id(row): why for row in batch if (why := row.insert(db))}
+            self._since_pruned += len(batch)
+            if self._since_pruned >= PRUNE_EVERY:
+                self._since_pruned = 0
+                for table, kept in self._kept.items():
+                    db.execute(f"DELETE FROM {table} WHERE id <= (SELECT max(id) FROM {table}) - ?", (kept,))
+            if self._lock is not lock or lock.moved():
+                raise sqlite3.OperationalError("another file stands there now")
+        return refused
+
+    def _begin_anew(self) -> None:
+        """After damage while running: a new file begins with what is in force and decided, and what that rests on."""
+        try:
+            note = make_usable(self.path)
+        except (sqlite3.Error, OSError, StoreError) as failure:
+            self.problem = f"{self.path} cannot be written ({failure}): kept in memory until it can"
+            return
+        self.notes += [note] if note else []
+        standing = {id(row): row for row in (*self._standing.values(), *self._flights)}.values()
+        with self._changed:
+            self._rows[:0] = [row for row in sorted(standing, key=lambda row: row.number) if row not in self._rows]

@@ -10,11 +10,12 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from quadid.chi_square import Z95
+from quadid.condition.changes import Change
+from quadid.condition.watch import HealthReport
 from quadid.online.records import OnlineDiagnosis, OnlineFinding, OnlineSet, Phase, SessionStatus, SetState
 from quadid.parameters import NOMINAL_NAMES
 from quadid_node.inputs import stamp
 from quadid_node.service import SILENT_ERROR, SILENT_WARNING, Health, lag
-from quadid_node.vehicle_health import health_message
 
 Message = dict[str, Any]
 
@@ -40,6 +41,7 @@ PHASES = {
     Phase.WAITING: 0, Phase.COLLECTING: 1, Phase.NOT_EXCITED: 2, Phase.FITTING: 3, Phase.CANDIDATE: 4,
     Phase.PENDING: 4, Phase.ACCEPTED: 4, Phase.FAILED: 5, Phase.BLOCKED: 6, Phase.NOT_FLYING: 6,
 }  # fmt: skip
+HEALTH_VERDICTS = {"unchanged": 0, "changed": 1, "unknown": 2}
 VERDICTS = {"nothing_found": 0, "explained": 1, "partly_explained": 2, "unknown": 3}
 OK, WARN, ERROR = b"\x00", b"\x01", b"\x02"
 
@@ -123,6 +125,43 @@ def _finding(finding: OnlineFinding) -> Message:
         "alternatives_mse": [a.mse_after for a in finding.alternatives],
         "evidence": finding.evidence,
     }
+
+
+def health_message(report: HealthReport, vehicle: str) -> Message:
+    """quadid_msgs/Health of a report."""
+    mass, low, high = report.mass
+    return {
+        "header": {"stamp": stamp(report.t), "frame_id": BODY_FRAME},
+        "vehicle_id": vehicle,
+        "verdict": HEALTH_VERDICTS[report.verdict],
+        "has_baseline": report.has_baseline,
+        "score": report.score,
+        "rotor_loss": list(report.rotor_loss),
+        "rotor_loss_lower": [low for low, _ in report.rotor_interval],
+        "rotor_loss_upper": [high for _, high in report.rotor_interval],
+        "mass": mass, "mass_lower": low, "mass_upper": high,
+        "changes": [_change(change) for change in report.changes],
+        "text": report.text,
+    }  # fmt: skip
+
+
+def _change(change: Change) -> Message:
+    """quadid_msgs/Finding of a change; what belongs to fits is NaN."""
+    intervals = [ci or (value, value) for _, _, value, ci in change.parameters]
+    return {
+        "effect": change.effect,
+        "confident": change.confident,
+        "parameter_names": [name for name, *_ in change.parameters],
+        "parameter_units": [unit or "1" for _, unit, *_ in change.parameters],
+        "parameter_values": [float(value) for _, _, value, _ in change.parameters],
+        "ci95_lower": [low for low, _ in intervals],
+        "ci95_upper": [high for _, high in intervals],
+        "mse_before": math.nan, "mse_after": math.nan, "gain_ci95": [math.nan, math.nan],
+        "p_value": change.p_value,
+        "alternatives": [rival.effects[0] for rival in change.rivals],
+        "alternatives_mse": [math.nan] * len(change.rivals),
+        "evidence": change.evidence,
+    }  # fmt: skip
 
 
 RESULTS: Mapping[str, Callable[[Any, str, str], Message]] = {

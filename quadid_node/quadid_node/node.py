@@ -45,6 +45,7 @@ from quadid_node.recorder import WRITTEN, Beginning, Recorder
 from quadid_node.rounds import ROUND_SECONDS, STEP_SECONDS, WORK_SECONDS, Rounds
 from quadid_node.service import Service
 from quadid_node.worker import ProcessWorker
+from quadid_node.zenoh import ZenohLink
 
 CATCHING_UP, BACKLOG = 10.0, 2.0
 """A step lasts longer in proportion, up to so many times, when there is a backlog of more than this much data [s]."""
@@ -84,7 +85,7 @@ class IdentifyNode(PollingNode, LifecycleNode):
         self._neighbours: Neighbours | None = None
         self._intake = Intake()
         self._bond: Bond | None = None
-        self._zenoh: Any = None
+        self._zenoh: ZenohLink | None = None
         self._open: list[tuple[Callable[[Any], Any], Any]] = []
         self._speaker = Speaker(self)
         self._change_state = self._service_change_state.callback
@@ -187,8 +188,6 @@ class IdentifyNode(PollingNode, LifecycleNode):
             self._recorder = Recorder(Path(values["record"]), beginning, preset.inputs)
         self._hint = preset.motor_hint
         if values["zenoh"]:
-            from quadid_node.zenoh import ZenohLink
-
             self._zenoh = ZenohLink(values["zenoh"], self._id, self._service)
         self._speaker.open(self._observer)
         commands = Commands(self._id, lambda: self._service if self._active else None, self._put)

@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import contextlib
 import os
+import pickle
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from queue import SimpleQueue
+from typing import Any, Protocol
 
 from quadid.online.records import UNEXPECTED, Job, JobReply
 from quadid.vehicle import Vehicle
-from quadid_node.worker_main import READY, THREADS, frame, unframe
+from quadid_node.worker_main import READY, THREADS
 
 # --- Whether a child that starts gets anywhere: compiling may take long on a slow machine, standing still may not
 
@@ -71,7 +74,6 @@ BACKOFF = (0.2, 1.0, 5.0, 20.0, 60.0)
 CALM = 60.0
 """Failures this long ago [s] are forgiven."""
 MEMORY_MB = 1000
-_PIPE_BYTES = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -156,7 +158,7 @@ class ProcessWorker:
         self._vehicle, self._memory, self._clock = vehicle, memory_mb, clock
         self._name, self._limit = name, limit
         self._child: subprocess.Popen[bytes] | None = None
-        self._out, self._in = bytearray(), bytearray()
+        self._asked, self._heard = SimpleQueue[Any](), SimpleQueue[Any]()
         self._request: Job | None = None
         self._tries = self._failures = self.restarts = 0
         self._since = self._last_failure = -1e9
@@ -181,12 +183,11 @@ class ProcessWorker:
             self._give()
 
     def poll(self) -> list[JobReply | Trouble]:
-        """Moves bytes, checks on the child, restarts it when it is time; never blocks."""
+        """Takes answers, checks on the child, restarts it when it is time; never blocks."""
         replies: list[JobReply | Trouble] = []
         if self.state == "resting" and self._clock() >= self._since:
             self._start()
         if self._child is not None:
-            self._pump()
             replies.extend(self._received())
             self._check(replies)
         told, self._told = self._told, []
@@ -214,42 +215,25 @@ class ProcessWorker:
             [sys.executable, "-P", "-m", "quadid_node.worker_main", str(self._memory)],
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment, start_new_session=True,
         )  # fmt: skip
-        for pipe in (self._child.stdin, self._child.stdout):
-            assert pipe is not None
-            os.set_blocking(pipe.fileno(), False)
-            _widen(pipe.fileno())
-        self._in.clear()
-        self._out = bytearray(frame(self._vehicle))
+        self._asked, self._heard = SimpleQueue(), SimpleQueue()
+        self._asked.put(self._vehicle)
+        talk = (self._child, self._asked, self._heard)
+        threading.Thread(target=_talk, args=talk, name=self._name, daemon=True).start()
         self.state, self._since = "starting", self._clock()
         self._warm_up = WarmUp(self._child.pid, self._clock)
 
     def _give(self) -> None:
-        assert self._request is not None
-        self._out += frame(self._request)
+        self._asked.put(self._request)
         self.state, self._since = "busy", self._clock()
-
-    def _pump(self) -> None:
-        """Writes and reads what goes without waiting."""
-        assert self._child is not None
-        assert self._child.stdin is not None
-        assert self._child.stdout is not None
-        with contextlib.suppress(BlockingIOError, BrokenPipeError):
-            while self._out:
-                sent = os.write(self._child.stdin.fileno(), self._out)
-                del self._out[:sent]
-        with contextlib.suppress(BlockingIOError):
-            while data := os.read(self._child.stdout.fileno(), _PIPE_BYTES):
-                self._in += data
 
     def _received(self) -> list[JobReply]:
         replies: list[JobReply] = []
-        while (item := unframe(self._in)) is not None:
+        while not self._heard.empty():
+            item, self.state = self._heard.get(), "idle"
             if item == READY:
-                self.state = "idle"
                 if self._request is not None:
                     self._give()
-            elif isinstance(item, JobReply):
-                self.state = "idle"
+            else:
                 replies.append(item)
                 if self._request is not None and item.number != self._request.number:
                     self._give()  # what was asked while this one took too long
@@ -290,17 +274,17 @@ class ProcessWorker:
         child, self._child = self._child, None
         if child is None:
             return
-        for pipe in (child.stdin, child.stdout):
-            if pipe is not None:
-                with contextlib.suppress(OSError):
-                    pipe.close()
         child.kill()
         child.wait()
+        self._asked.put(None)
 
 
-def _widen(descriptor: int) -> None:
-    """A pipe that holds a whole request, where the system allows it."""
-    import fcntl
-
-    with contextlib.suppress(OSError, AttributeError):
-        fcntl.fcntl(descriptor, fcntl.F_SETPIPE_SZ, _PIPE_BYTES)
+def _talk(child: subprocess.Popen[bytes], asked: SimpleQueue[Any], heard: SimpleQueue[Any]) -> None:
+    """Gives a child one item after another and takes its answers, until it ends; a thread may wait for it."""
+    assert child.stdin is not None
+    assert child.stdout is not None
+    with contextlib.suppress(OSError, EOFError, pickle.UnpicklingError), child.stdout, child.stdin:
+        while (item := asked.get()) is not None:
+            pickle.dump(item, child.stdin, pickle.HIGHEST_PROTOCOL)
+            child.stdin.flush()
+            heard.put(pickle.load(child.stdout))

@@ -1,4 +1,4 @@
-"""The background process: reads requests from its input, writes replies to its output, in length-prefixed pickles.
+"""The background process: reads requests from its input, writes replies to its output, as pickles.
 
 Started by `worker.ProcessWorker`; it lowers its priority, leaves a core to others, bounds its memory, warms the
 kernels, says that it is ready, and ends when its input ends.
@@ -10,34 +10,34 @@ import os
 import pickle
 import resource
 import signal
-import struct
 import sys
-from typing import Any, BinaryIO
 
 NICE = 15
 THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
-READY = b"ready"
+READY = "ready"
 _PR_SET_PDEATHSIG = 1
-_LENGTH = struct.Struct("<Q")
 
 
 def main() -> None:
     """Serves requests until the input ends."""
-    channel = os.fdopen(os.dup(1), "wb")
+    answers = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # whatever prints must not end up between replies
     requests = os.fdopen(os.dup(0), "rb")
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     _behave(int(sys.argv[1]))
     from quadid.online.window_fit import warm_up
 
+    def answer(item: object) -> None:
+        pickle.dump(item, answers, pickle.HIGHEST_PROTOCOL)
+        answers.flush()
+
     try:
-        vehicle = _read(requests)
-        if vehicle is None:
-            return
-        warm_up(vehicle)
-        _write(channel, READY)
-        while (job := _read(requests)) is not None:
-            _write(channel, job.run())
+        warm_up(pickle.load(requests))
+        answer(READY)
+        while True:
+            answer(pickle.load(requests).run())
+    except (EOFError, pickle.UnpicklingError):  # the parent has ended
+        return
     except MemoryError:
         sys.exit("the fit process needs more memory than it may have")  # one line; the parent says what follows
 
@@ -63,39 +63,6 @@ def _end_with_parent() -> None:
     import ctypes
 
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-
-
-def _read(stream: BinaryIO) -> Any:
-    head = stream.read(_LENGTH.size)
-    if len(head) < _LENGTH.size:
-        return None
-    (length,) = _LENGTH.unpack(head)
-    body = stream.read(length)
-    return pickle.loads(body) if len(body) == length else None
-
-
-def _write(stream: BinaryIO, item: object) -> None:
-    stream.write(frame(item))
-    stream.flush()
-
-
-def frame(item: object) -> bytes:
-    """A pickle with its length before it."""
-    body = pickle.dumps(item, protocol=pickle.HIGHEST_PROTOCOL)
-    return _LENGTH.pack(len(body)) + body
-
-
-def unframe(buffer: bytearray) -> object | None:
-    """Takes one complete item off the front of a buffer; None when it is not complete yet."""
-    if len(buffer) < _LENGTH.size:
-        return None
-    (length,) = _LENGTH.unpack_from(buffer)
-    end = _LENGTH.size + length
-    if len(buffer) < end:
-        return None
-    item: object = pickle.loads(bytes(buffer[_LENGTH.size : end]))
-    del buffer[:end]
-    return item
 
 
 if __name__ == "__main__":

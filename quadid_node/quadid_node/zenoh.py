@@ -13,10 +13,9 @@ from typing import Any
 import zenoh
 
 from quadid.errors import QuadidError
-from quadid_node.codec import diagnosis_to_dict, set_to_dict, status_to_dict
+from quadid_node.codec import diagnosis_to_dict, health_to_dict, set_to_dict, status_to_dict
 from quadid_node.publication import Output
 from quadid_node.service import Health, Service
-from quadid_node.vehicle_health import health_to_dict
 
 # --- Opens Zenoh sessions: peers of this network, a locator, or a configuration file with TLS and access control
 
@@ -30,6 +29,10 @@ class ZenohError(QuadidError):
     """A Zenoh configuration or connection that cannot be used."""
 
 
+RETRY = 3.0
+"""Pause between two attempts to open a session [s]."""
+
+
 def open_session(where: str) -> Any:
     """Opens a Zenoh session.
 
@@ -40,11 +43,7 @@ def open_session(where: str) -> Any:
     Raises:
         ZenohError: no such file, not a configuration, or nothing listens there.
     """
-    return connect(where, config_of(where))
-
-
-def connect(where: str, config: Any) -> Any:
-    """Opens a session with a configuration that was read before, see `open_session`; raises ZenohError."""
+    config = config_of(where)
     try:
         return zenoh.open(config)
     except zenoh.ZError as error:
@@ -52,6 +51,19 @@ def connect(where: str, config: Any) -> Any:
             f"Zenoh at {where}: {str(error).splitlines()[0]:.120}", "a router that lets us in",
             "check locator and certificates",
         ) from error  # fmt: skip
+
+
+def wait_for_session(
+    where: str, wait: Callable[[float], bool], told: Callable[[str], None], retry: float = RETRY
+) -> Any:  # fmt: skip
+    """Opens a session as soon as somebody listens there; None once `wait`, given a pause [s], says to stop."""
+    while True:
+        try:
+            return open_session(where)
+        except ZenohError as error:
+            told(str(error))
+        if wait(retry):
+            return None
 
 
 def config_of(where: str) -> Any:
@@ -105,7 +117,6 @@ RESULTS: Mapping[str, Callable[[Any], dict[str, Any]]] = {
 KINDS = (*RESULTS, "health")
 COMMANDS = ("approve", "rollback", "fit_now")
 MOST_COMMANDS = 16
-RETRY = 3.0
 REPEAT = 5
 """Every so many reports of health the set in force and the last diagnosis are told again."""
 _JSON = zenoh.Encoding.APPLICATION_JSON
@@ -120,19 +131,19 @@ class ZenohLink:
         problem: why nothing is told at the moment, or empty.
     """
 
-    def __init__(self, where: str, vehicle: str, service: Service | None = None, retry: float = RETRY) -> None:
+    def __init__(self, where: str, vehicle: str, service: Service, retry: float = RETRY) -> None:
         """Begins to connect.
 
         Args:
             where: see `open_session`.
             vehicle: name of the vehicle.
-            service: takes commands; None refuses them.
+            service: takes commands.
             retry: pause between two attempts [s].
 
         Raises:
             ZenohError: a configuration that is none.
         """
-        self._where, self._config = where, config_of(where)
+        config_of(where)
         self._vehicle, self._service = vehicle, service
         self._latest: dict[str, bytes] = {}
         self._commands: queue.Queue[tuple[str, Any]] = queue.Queue(MOST_COMMANDS)
@@ -141,24 +152,22 @@ class ZenohLink:
         self._reports = 0
         self._lock, self._closed = threading.Lock(), threading.Event()
         self.problem = f"Zenoh at {where}: connecting"
-        threading.Thread(target=self._keep_connecting, args=(retry,), name="zenoh", daemon=True).start()
+        threading.Thread(target=self._connect, args=(where, retry), name="zenoh", daemon=True).start()
 
-    def _keep_connecting(self, retry: float) -> None:
-        while not self._closed.is_set():
-            try:
-                session = connect(self._where, self._config)
-            except ZenohError as error:
-                self.problem = str(error)
-                self._closed.wait(retry)
-                continue
-            with self._lock:
-                self._declare(session)
+    def _connect(self, where: str, retry: float) -> None:
+        def told(problem: str) -> None:
+            self.problem = problem
+
+        session = wait_for_session(where, self._closed.wait, told, retry)
+        if session is None:
             return
+        with self._lock:
+            if self._closed.is_set():
+                session.close()
+            else:
+                self._declare(session)
 
     def _declare(self, session: Any) -> None:
-        if self._closed.is_set():
-            session.close()
-            return
         self._session, self.problem = session, ""
         self._publishers = {kind: session.declare_publisher(key_of(self._vehicle, kind)) for kind in KINDS}
         self._open = [
@@ -211,19 +220,17 @@ class ZenohLink:
                     self._publishers[kind].put(self._latest[kind], encoding=_JSON)
 
     def _carry_out(self, name: str, asked: str) -> tuple[bool, str]:
-        if self._service is None:
-            return False, "this service takes no commands"
         number = re.fullmatch(r"sequence=(\d{1,18})", asked)
-        if name == "approve" and number is None:
-            return False, "say which set: approve?sequence=N"
-        calls: dict[str, Callable[[], Any]] = {
-            "approve": lambda: self._service.approve("zenoh", int(number[1])),  # type: ignore[union-attr, index]
-            "rollback": lambda: self._service.roll_back("zenoh"),  # type: ignore[union-attr]
-            "fit_now": lambda: self._service.session.fit_now(),  # type: ignore[union-attr]
-        }
-        if name not in calls:
+        if name == "approve":
+            if number is None:
+                return False, "say which set: approve?sequence=N"
+            answer = self._service.approve("zenoh", int(number[1]))
+        elif name == "rollback":
+            answer = self._service.roll_back("zenoh")
+        elif name == "fit_now":
+            answer = self._service.session.fit_now()
+        else:
             return False, f"unknown command; use one of {', '.join(COMMANDS)}"
-        answer = calls[name]()
         return answer.done, answer.text
 
     def _put(self, kind: str, data: dict[str, Any]) -> None:

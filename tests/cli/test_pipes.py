@@ -7,8 +7,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from quadid_node.history import read_history
 from quadid_node.mavlink_wire import read_key
-from quadid_node.store_file import read_history
 from quadid_node.zenoh import config_of
 from quadid_replay import open_log
 

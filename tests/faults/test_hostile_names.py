@@ -10,8 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from quadid_node.history import Store
-from quadid_node.store_file import read_history
+from quadid_node.history import Store, read_history
 from quadid_replay import open_log
 from quadid_replay.schemas import schema_text
 

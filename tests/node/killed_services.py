@@ -64,9 +64,9 @@ def serve(path: Path, die: str, after: int) -> None:
     """Publishes without end, and prints the numbers."""
     store = Store(path, "pelican")
     service = Service(Vehicle.shipped("pelican"), SessionSettings(window=5.0, diagnose=0.0), InlineWorker(), store)
-    commit, commits = history_writer.HistoryWriter._commit, 0
+    commit, commits = history_writer.Store._commit, 0
 
-    def dying(self: history_writer.HistoryWriter, batch: Any) -> Any:
+    def dying(self: history_writer.Store, batch: Any) -> Any:
         nonlocal commits
         commits += 1
         if die == "before" and commits == after:
@@ -76,7 +76,7 @@ def serve(path: Path, die: str, after: int) -> None:
             os.kill(os.getpid(), signal.SIGKILL)
         return out
 
-    history_writer.HistoryWriter._commit = dying  # type: ignore[method-assign]
+    history_writer.Store._commit = dying  # type: ignore[method-assign]
     published = 0
     for k in range(10**6):
         service.session._outbox.act(*service.session.active_set.accept(online_set(TRUE), "auto", float(k), float(k)))

@@ -13,8 +13,8 @@ from typing import Any
 
 import pytest
 from pymavlink import mavutil
+from quadid_node.history import read_history
 from quadid_node.mavlink_link import MavlinkLink
-from quadid_node.store_file import read_history
 
 from tests.node.mavlink_ends import Sender, accepted, free_port
 from tests.node.peers import Process

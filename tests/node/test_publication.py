@@ -11,10 +11,9 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from quadid_node.history import LARGEST_NUMBER, Restored, Row, Store
+from quadid_node.history import LARGEST_NUMBER, Restored, Row, Store, StoreError, connect, read_history
 from quadid_node.publication import MOST_WAITING, Output, Publication
 from quadid_node.service import Service
-from quadid_node.store_file import StoreError, connect, read_history
 from quadid_node.worker import InlineWorker
 
 from quadid.online import SessionSettings, SetState
@@ -199,7 +198,7 @@ def test_a_rollback_is_never_on_the_disk_without_the_mode_that_it_sets(tmp_path:
     store._put = noted  # type: ignore[method-assign]
     assert service.roll_back("bob").done
     service.close()
-    kinds = [row.statement.split()[2] for row in rows]
+    kinds = [row.table for row in rows]
     assert {"decisions", "sets"} <= set(kinds)
     seen = set[tuple[bool, str]]()
     for cut in range(len(rows)):  # the kill leaves the first rows
@@ -207,7 +206,7 @@ def test_a_rollback_is_never_on_the_disk_without_the_mode_that_it_sets(tmp_path:
             for table in ("sets", "decisions"):
                 db.execute(f"DELETE FROM {table}")
             for row in rows[: cut + 1]:
-                db.execute(row.statement, row.values)
+                assert not row.insert(db)
         again = Store(path, "pelican")
         restored = again.restore()
         again.close()
@@ -229,41 +228,18 @@ def test_a_row_that_never_reaches_the_disk_holds_up_no_later_set(tmp_path: Path,
     happened(23, "a set whose reason no history can hold: not published, said; the next one is")
 
 
-def test_two_services_that_reach_one_history_by_two_links_never_give_one_number_twice(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, happened: Happened
-) -> None:
-    """Each had a lock beside its own name for the file; begun in one millisecond, they numbered alike."""
-    monkeypatch.setattr(time, "time_ns", lambda: 1_800_000_000_000 * 10**6)
-    path, soft, hard = tmp_path / "h.sqlite", tmp_path / "a" / "soft.sqlite", tmp_path / "hard.sqlite"
-    one = service_with(Store(path, "pelican"))
-    soft.parent.mkdir()
-    soft.symlink_to(path)
-    with pytest.raises(StoreError, match="another service writes the history"):
-        Store(soft, "pelican")
-    hard.hardlink_to(path)
-    with pytest.raises(StoreError, match="has 2 names"):
-        Store(hard, "pelican")
-    first = accept(one)
-    assert [o.item.sequence for o in said(one, 1.5) if isinstance(o, Publish)] == [first.sequence]
-    assert numbers_of(path) == [first.sequence]
-    one.close()
-    with pytest.raises(StoreError, match="has 2 names"):
-        Store(path, "pelican")
-    hard.unlink()
-    Store(path, "pelican").close()
-    happened(23, "a second service on one history by a symbolic or a hard link: refused, the first one's rows stay")
-
-
-@pytest.mark.parametrize("name", ["", ":memory:", "loop", "fifo"])
+@pytest.mark.parametrize("name", ["", ":memory:", "loop", "fifo", "file/h.sqlite"])
 def test_a_history_that_is_no_file_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
     """The first was a ValueError; the second a database in memory, of which nothing was ever kept."""
     monkeypatch.chdir(tmp_path)
     Path("loop").symlink_to("loop")
     os.mkfifo("fifo")
+    Path("file").write_text("no folder")
     store = Store(Path(name), "pelican")
     store.numbered(replace(online_set(TRUE), sequence=7))
     assert store.flush(1.0) == store.written(7) == (name == ":memory:")
     assert bool(store.problem) != store.written(7)
+    assert store.restore().item is None or store.written(7)
     store.close()
 
 
@@ -367,7 +343,7 @@ def test_a_history_whose_numbers_are_used_up_is_set_aside(tmp_path: Path, number
 def test_a_history_held_at_the_start_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, happened: Happened
 ) -> None:
-    import quadid_node.store_file as files
+    import quadid_node.history as files
 
     path = tmp_path / "h.sqlite"
     Store(path, "pelican").close()
@@ -383,15 +359,9 @@ def test_a_history_held_at_the_start_is_refused(
     happened(25, "history held exclusively at the start: waited for, then refused with the fix; no number is given")
 
 
-def test_outputs_that_need_no_row_wait_for_nothing() -> None:
-    class Never:
-        def written(self, number: int) -> bool:
-            return False
-
-        def lost(self, number: int) -> bool:
-            return False
-
-    publication = Publication(Never())
+def test_outputs_that_need_no_row_wait_for_nothing(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    publication = Publication(Store(tmp_path / "file" / "h.sqlite", "pelican"))  # writes nothing
     refused = Publish("candidate", replace(online_set(TRUE, SetState.REJECTED), sequence=0))
     warning = Event(1.0, "warning", "change", "thrust stepped")
     assert publication.take([refused, warning]) == [refused, warning]

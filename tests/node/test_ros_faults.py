@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from quadid_node.store_file import read_history
+from quadid_node.history import read_history
 from quadid_replay import write_mcap
 
 from tests.faults.evidence import Happened

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from quadid_node.store_file import read_history
+from quadid_node.history import read_history
 from quadid_replay import write_mcap
 
 from quadid.vehicle import Vehicle

@@ -198,10 +198,10 @@ def test_a_router_that_comes_late_is_found_and_a_wrong_configuration_told(tmp_pa
         fleet.close()
     link.close()
     with pytest.raises(ZenohError, match="no Zenoh configuration"):
-        ZenohLink(str(tmp_path / "none.json5"), "quad1")
+        ZenohLink(str(tmp_path / "none.json5"), "quad1", service())
     (tmp_path / "bad.json5").write_text("{ mode: ")
     with pytest.raises(ZenohError, match="is no Zenoh configuration"):
-        ZenohLink(str(tmp_path / "bad.json5"), "quad1")
+        ZenohLink(str(tmp_path / "bad.json5"), "quad1", service())
 
 
 def test_findings_cross_too(net: Net) -> None:

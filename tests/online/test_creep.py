@@ -9,7 +9,7 @@ import math
 from collections.abc import Iterator
 
 import pytest
-from quadid_node.store_file import read_history
+from quadid_node.history import read_history
 
 from quadid.online import SetState
 from quadid.parameters import NOMINAL_NAMES

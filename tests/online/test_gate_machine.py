@@ -24,10 +24,9 @@ from hypothesis.stateful import (
     rule,
     run_state_machine_as_test,
 )
-from quadid_node.history import Store
+from quadid_node.history import Store, read_history
 from quadid_node.publication import Output
 from quadid_node.service import Service
-from quadid_node.store_file import read_history
 from quadid_node.worker import Trouble
 
 from quadid.data.window import Sample

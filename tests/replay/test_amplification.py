@@ -18,7 +18,7 @@ from pathlib import Path
 import lz4.frame  # type: ignore[import-untyped]
 import pytest
 import zstandard
-from quadid_node.store_file import make_tables
+from quadid_node.history import make_tables
 from quadid_replay import reading
 from quadid_replay.schemas import schema_text
 
