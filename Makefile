@@ -149,6 +149,9 @@ pytest: $(MESSAGES)
 	$(BIN)/quadid warmup
 	MAKEFLAGS= $(BIN)/pytest -n 4 $(XDIST) -m "not browser and not slow"
 
+.PHONY: pictures
+pictures: test-browser ## reports as pictures at several widths, dark and light, in browser-out/, to be looked at
+
 test-browser: $(DEV) ## the report in headless Chromium (Debian: apt-get install chromium); screenshots in browser-out/
 	$(BIN)/pytest -m browser tests/browser
 

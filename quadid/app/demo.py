@@ -124,4 +124,5 @@ def html(shown: Shown, seed: int, command: str = LIBRARY) -> str:
             shown.hidden.maps(),
         ),
     ]  # fmt: skip
+    page["diagnoses"][1]["missing"] = None if shown.hidden.forces is None else shown.hidden.forces.section()
     return render(page)

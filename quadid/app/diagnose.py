@@ -127,9 +127,9 @@ class Diagnosed(Fitted):
         ]
         logs = [quality(log) for log in self.logs]
         warnings = self.result["warnings"]
-        return render(
-            diagnose_page(self.result, self.nominal.name, self.sets, self.noise, logs, rows, warnings, self.maps())
-        )
+        page = diagnose_page(self.result, self.nominal.name, self.sets, self.noise, logs, rows, warnings, self.maps())
+        page["missing"] = None if self.forces is None else self.forces.section()
+        return render(page)
 
     def maps(self) -> dict[str, ResidualMap]:
         """What every cause looks like in the residual of the diagnosed logs, by name of the effect."""

@@ -41,14 +41,14 @@ class Inspected(Outcome):
 
     @property
     def heading(self) -> str:
-        """Name, format, length, and when it flies."""
-        from quadid.report.tables import heading
+        """Name, format, length, when it flies, and whether the log can be used."""
+        from quadid.report.tables import heading, usability
 
-        return heading(self.found)
+        return f"{heading(self.found)}\n{usability(self.found).text}"
 
     @property
     def sentences(self) -> list[str]:
-        """What the checks found, what is missing, and whether the log can be used."""
+        """What the checks found, and what is missing."""
         from quadid.report.tables import sentences
 
         return [cell.text for cell in sentences(self.found)]

@@ -11,7 +11,7 @@ import numpy as np
 
 from quadid.app.logs import Log, free_name
 from quadid.data.window import Window, beginning
-from quadid.types import FloatArray
+from quadid.types import FloatArray, JsonDict
 from quadid.vehicle import Vehicle
 
 if TYPE_CHECKING:
@@ -33,6 +33,7 @@ class MissingForces:
         parts: by model, the stretches of every log.
         flights: the noise at which models are compared.
         flown: windows of every log.
+        extends: the last model has effects that the first one lacks.
     """
 
     models: tuple[str, ...]
@@ -41,13 +42,14 @@ class MissingForces:
     parts: Mapping[str, Sequence[Sequence[Missing]]]
     flights: Vehicles
     flown: Sequence[Sequence[Window]]
+    extends: bool
 
     def result(self) -> dict[str, Any]:
         """The entry ``missing`` of contract §7; what all training logs miss first."""
         train = [i for i, role in enumerate(self.roles) if role == "train"]
         return {
             **self._entry(train),
-            "statement": self.statement(train),
+            "statement": self.statement(),
             "sets": [
                 {"log": log.recording.name, "role": role, **self._entry([i])}
                 for i, (log, role) in enumerate(zip(self.logs, self.roles, strict=True))
@@ -70,23 +72,38 @@ class MissingForces:
                 moment |= {"of": _by_axis(control_size(parts)), "of_what": "rms control moment"}
         return {"force": force, "moment": moment}
 
-    def statement(self, which: Sequence[int]) -> str:
-        """One sentence: what the last model misses, as shares of weight and control moment."""
+    @property
+    def deciding(self) -> list[int]:
+        """Places of the logs that judge the models: those that were not fitted, else all."""
+        return [i for i, role in enumerate(self.roles) if role == "validate"] or list(range(len(self.logs)))
+
+    def statement(self) -> str:
+        """One sentence: what the models miss on the deciding logs, as shares of weight and of control moment."""
         from quadid.estimate.missing import control_size, size
 
-        parts = [part for i in which for part in self.parts[self.models[-1]][i]]
-        force, moment = (size(parts, is_force)[0] for is_force in (True, False))
-        control = control_size(parts)
-        shares = [
-            f"{100.0 * m / c:.2g} % of the {axis} moment" for m, c, axis in
-            zip(moment, control, ("roll", "pitch", "yaw"), strict=True)
-        ]  # fmt: skip
-        total = float(np.linalg.norm(force))
-        share = 100.0 * total / parts[0].weight
-        return (
-            f"Acting on the vehicle and missing in the simulation: {total:.2g} N, {share:.2g} % of the weight; "
-            f"{', '.join(shares)} that the rotors make (rms)."
+        each = []
+        for model in self.models:
+            parts = [part for i in self.deciding for part in self.parts[model][i]]
+            force, moment = (size(parts, is_force)[0] for is_force in (True, False))
+            total, weight = float(np.linalg.norm(force)), parts[0].weight
+            shares = ", ".join(f"{100.0 * share:.2g}" for share in moment / control_size(parts))
+            each.append((f"{total:.2g} N ({100.0 * total / weight:.2g} % of the weight)", f"{shares} %"))
+        (force_then, moment_then), (force_now, moment_now) = each[0], each[-1]
+        unseen = "unseen flights" if "validate" in self.roles else "these flights"
+        start = (
+            f"On {unseen} the simulation misses {force_then} and {moment_then} of the rms roll, pitch and yaw moment"
         )
+        if not self.extends:
+            return f"{start} of the rotors."
+        return f"{start} of the rotors; with what was found {force_now} and {moment_now}."
+
+    def section(self) -> JsonDict:
+        """Part of a page: what is missing on the last deciding log over time, and its size by axis on all of them."""
+        from quadid.report.fit_pages import missing_section
+
+        shown = self.deciding[-1]
+        parts = {model: self.parts[model][shown] for model in self.models}
+        return missing_section(self._entry(self.deciding), self.logs[shown].recording.name, parts)
 
     def taken(self, without: FloatArray) -> float:
         """Share of the squared missing force and moment of a model that the last one takes away.
@@ -96,9 +113,8 @@ class MissingForces:
         """
         from quadid.estimate.missing import removed
 
-        unseen = [i for i, role in enumerate(self.roles) if role == "validate"] or list(range(len(self.logs)))
-        before = [part for i in unseen for part in self.flights.missing(self.flown[i], without)]
-        return removed(before, [part for i in unseen for part in self.parts[self.models[-1]][i]])
+        before = [part for i in self.deciding for part in self.flights.missing(self.flown[i], without)]
+        return removed(before, [part for i in self.deciding for part in self.parts[self.models[-1]][i]])
 
     def save(self, folder: str | Path = ".") -> list[Path]:
         """Writes ``LOG.missing.csv`` for every log: force [N] and moment [N m] of every model, with their sigma."""
@@ -144,7 +160,9 @@ def missing_forces(
     if not all(np.isfinite(p.force_sigma).all() for found in parts.values() for log in found for p in log):
         return None
     roles = ["train"] * len(train) + ["validate"] * len(held)
-    return MissingForces(tuple(models), logs, roles, parts, flights, flown)
+    first, *_, last = models.values() if len(models) > 1 else [next(iter(models.values()))] * 2
+    extends = not np.array_equal(first[6:], last[6:])
+    return MissingForces(tuple(models), logs, roles, parts, flights, flown, extends)
 
 
 def _seen(window: Window) -> bool:

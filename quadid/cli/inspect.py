@@ -9,7 +9,7 @@ import typer
 
 from quadid.app.logs import parse_columns, write_text
 from quadid.cli.options import Columns, JsonTarget, Preset, Start, Stop
-from quadid.report.tables import Cell, heading, sentences
+from quadid.report.tables import Cell, heading, sentences, usability
 from quadid.sanitise import LONGEST_LINE, plain
 
 if TYPE_CHECKING:
@@ -54,11 +54,12 @@ def inspect(
 
 
 def show(done: Inspected, quiet: bool) -> None:
-    """Prints the tables, then what the checks found and what is missing."""
+    """Prints whether the log can be used, the tables, then what the checks found and what is missing."""
     from quadid.cli import terminal
 
     console = terminal.console(quiet)
     terminal.print_cell(console, Cell(heading(done.found), "title"))
+    terminal.print_cell(console, usability(done.found))
     for warning in done.warnings:
         terminal.print_cell(console, Cell(f"note: {plain(warning, LONGEST_LINE)}", "fair"))
     terminal.print_tables(console, done.tables())

@@ -197,8 +197,6 @@ def conclude(
     print_tables(out, done.tables())
     if done.verdict is not None:
         print_verdict(out, done.verdict)
-    if done.result.get("missing"):
-        out.print(done.result["missing"]["statement"], soft_wrap=True)
     for key, label in (("vehicle_file", "Vehicle file"), ("prediction_file", "Prediction file"), ("report", "Report")):
         if done.result.get(key):
             out.print(f"{label}: {done.result[key]}", soft_wrap=True)

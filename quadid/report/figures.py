@@ -4,15 +4,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from scipy.signal import welch
+from scipy.stats import chi2
 
+from quadid.chi_square import Z95
 from quadid.errors import ParameterError
 from quadid.identification.result import ScoredSet
-from quadid.identification.score import SetScore
+from quadid.identification.score import SCORE_SECONDS, SetScore
 from quadid.model.rollout import CHANNEL_NAMES, CHANNEL_UNITS
 from quadid.types import FloatArray, IndexArray, JsonDict
+
+if TYPE_CHECKING:
+    from quadid.estimate.missing import Missing
 
 # --- Pieces of a page: sections, tables, and figures as plain Plotly descriptions without colours
 #
@@ -111,6 +117,10 @@ WHOLE_POINTS = 800
 """Points a trace over a whole log keeps at most."""
 DETAIL_POINTS = 600
 DETAIL_SECONDS = 12.0
+SPECTRUM_ROWS = 200
+"""Samples of a stretch whose spectra are averaged, at most."""
+VISIBLE = 0.01
+"""Share of weight and of rotor moment that a picture of what is missing shows at least."""
 MOST_LOGS = 4
 """Logs that get pictures; the others are in the tables."""
 BUDGET = 90_000
@@ -129,7 +139,9 @@ def channel_figures(
         labels: what the two simulations are called.
     """
     series = scored.fitted.series
-    share = min(1.0, BUDGET / (3 * series.measured.shape[1] * logs * (WHOLE_POINTS + 2 * DETAIL_POINTS)))
+    share = min(
+        1.0, BUDGET / (3 * series.measured.shape[1] * logs * (WHOLE_POINTS + 2 * DETAIL_POINTS + SPECTRUM_ROWS))
+    )
     whole = thinned(series.measured, int(share * WHOLE_POINTS))
     detail = liveliest(series.t, series.measured, int(share * DETAIL_POINTS))
     out = []
@@ -142,7 +154,7 @@ def channel_figures(
             ]
             shown = views if len(whole) > len(detail) else views[1:]
             residual = {"label": "Residual, every sample", **_stack(scored, detail, here, labels, residual=True)}
-            shown = [*shown, residual]
+            shown = [*shown, residual, _spectra(scored, here, labels)]
             out.append({"id": f"{prefix}-{key}", "title": title, "views": shown, "height": 130 * len(here) + 70})
     return out
 
@@ -180,6 +192,89 @@ def _stack(
     last = "y" if len(channels) == 1 else f"y{len(channels)}"
     layout["xaxis"] = axis("time [s]", anchor=last)
     return {"x": short(t), "data": data, "layout": layout}
+
+
+def _spectra(scored: ScoredSet, channels: Sequence[int], labels: tuple[str, str]) -> JsonDict:
+    """Amplitude spectra of the residuals (Welch); the band holds those of white noise of the same size.
+
+    The simulation starts anew every `SCORE_SECONDS`, so slower errors than that do not show.
+    """
+    after, before = scored.fitted.series, scored.initial.series
+    step = float(np.median(np.diff(after.t)))
+    rows = min(max(round(2.0 * SCORE_SECONDS / step), 8), SPECTRUM_ROWS, len(after.t))
+    parts = len(after.t) // rows
+    low, high = np.sqrt(chi2.ppf((0.025, 0.975), 2 * parts) / (2 * parts))
+    data, layout = [], dict[str, Any]()
+    for i, c in enumerate(channels):
+        place = "" if i == 0 else str(i + 1)
+        where = {"xaxis": "x", "yaxis": f"y{place}"}
+        residuals = np.nan_to_num([after.measured[:, c] - s.simulated[:, c] for s in (before, after)])
+        f, power = welch(residuals, 1.0 / step, nperseg=rows, noverlap=0)
+        f, (then, now) = f[1:], np.sqrt(power[:, 1:])
+        white = np.full(len(f), np.sqrt(power[1, 1:].mean()))
+        band = {**where, "edge": True, "showlegend": False, "hoverinfo": "skip"}
+        data += [
+            trace("floor", "white noise", f, high * white, **band),
+            trace("floor", "white noise", f, low * white, fill="tonexty", **band),
+            trace("before", labels[0], f, then, legendgroup="before", showlegend=i == 0, **where),
+            trace("after", labels[1], f, now, legendgroup="after", showlegend=i == 0, **where),
+        ]
+        share = 1.0 / len(channels)
+        layout[f"yaxis{place}"] = {
+            "domain": [1.0 - (i + 1) * share + 0.03, 1.0 - i * share - 0.01],
+            **axis(f"{LABELS.get(CHANNEL_NAMES[c], CHANNEL_NAMES[c])} [{CHANNEL_UNITS[c]}/√Hz]", type="log"),
+        }
+    layout["xaxis"] = axis("frequency [Hz]", anchor="y" if len(channels) == 1 else f"y{len(channels)}")
+    return {"label": "Spectrum of the residual", "data": data, "layout": layout}
+
+
+def missing_figures(parts: Mapping[str, Sequence[Missing]], prefix: str) -> list[JsonDict]:
+    """Force [N] and moment [N m] that each model misses on one log, over time with 95 % bands, body axes.
+
+    An axis shows `VISIBLE` of the weight, or of the rms rotor moment, at least: what is missing by less looks like it.
+
+    Args:
+        parts: stretches of the log by model, the nominal one first.
+        prefix: makes the figures' identifiers unique.
+    """
+    roles = ("before", "after") if len(parts) > 1 else ("after",)
+    labels = MODELS if len(parts) > 1 else ("missing in the simulation",)
+    first = next(iter(parts.values()))
+    control = np.concatenate([p.control for p in first]).std(axis=0)
+    out = []
+    for key, sign, of in (("force", "F", np.full(3, first[0].weight)), ("moment", "M", control)):
+        drawn = []
+        for role, label, stretches in zip(roles, labels, parts.values(), strict=True):
+            t, value, sigma = (_joined([getattr(p, n) for p in stretches]) for n in ("t", key, f"{key}_sigma"))
+            rows = np.unique(np.linspace(0, len(t) - 1, WHOLE_POINTS // 2).astype(int))
+            drawn.append((role, label, t[rows], value[rows], Z95 * sigma[rows]))
+        reach = np.max([np.nanmax(np.abs(value) + width, axis=0) for *_, value, width in drawn], axis=0)
+        reach = np.maximum(reach.max() if key == "force" else reach, VISIBLE * of)
+        data, layout = [], dict[str, Any]()
+        for i, letter in enumerate("xyz"):
+            place = "" if i == 0 else str(i + 1)
+            where = {"xaxis": "x", "yaxis": f"y{place}"}
+            for role, label, t, value, width in drawn:
+                band = {**where, "edge": True, "showlegend": False, "hoverinfo": "skip", "legendgroup": role}
+                data += [
+                    trace(role, label, t, value[:, i] + width[:, i], **band),
+                    trace(role, label, t, value[:, i] - width[:, i], fill="tonexty", **band),
+                    trace(role, label, t, value[:, i], solid=True, showlegend=i == 0, legendgroup=role, **where),
+                ]
+            layout[f"yaxis{place}"] = {
+                "domain": [0.70 - i / 3, 0.99 - i / 3],
+                **axis(f"{sign}{letter} [{'N' if key == 'force' else 'N m'}]", range=[-reach[i], reach[i]]),
+            }
+        layout["xaxis"] = axis("time [s]", anchor="y3")
+        out.append(figure(f"{prefix}-{key}", f"Missing {key}", data, layout, 460))
+    return out
+
+
+def _joined(stretches: Sequence[FloatArray]) -> FloatArray:
+    """Stretches of a log as one array, with a hole (not a number) between them, so that no line bridges a gap."""
+    first, *others = stretches
+    hole = np.full((1, *first.shape[1:]), np.nan)
+    return np.concatenate([first, *(part for other in others for part in (hole, other))])
 
 
 def _focus(measured: FloatArray) -> tuple[float, float]:

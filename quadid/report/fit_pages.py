@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from itertools import groupby
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.signal import welch
@@ -33,6 +33,7 @@ from quadid.report.figures import (
     figure,
     gain_figure,
     measures,
+    missing_figures,
     parameter_figure,
     rows_of,
     section,
@@ -62,6 +63,9 @@ from quadid.rotation import euler
 from quadid.types import FloatArray, Json, JsonDict
 from quadid.vehicle import Vehicle
 
+if TYPE_CHECKING:
+    from quadid.estimate.missing import Missing
+
 # --- What a log tells of its flight beside the outputs: flight modes, and the spectrum of its vibration
 
 
@@ -82,12 +86,24 @@ def flight_section(recording: Recording, vehicle: Vehicle, place: int) -> dict[s
     """
     spans = flying_spans(recording, vehicle)
     drawn, said = _vibration(recording, vehicle, spans, f"log{place}-vibration") if spans else (None, "")
-    modes = mode_rows(recording)
-    if drawn is None and not modes:
+    modes, rotors = mode_rows(recording), _rotor_figure(recording, vehicle, f"log{place}-rotors")
+    figures = [f for f in (rotors, drawn) if f is not None]
+    if not figures and not modes:
         return None
-    figures = [] if drawn is None else [drawn]
     tables = [rows_of(("flight mode", "from (s)", "to (s)"), modes)] if modes else []
-    return section(f"flight-{place}", f"Flight of {recording.name}", said, figures, tables)
+    return section(f"flight-{place}", f"Flight of {recording.name}", said, figures, tables, folded=True)
+
+
+def _rotor_figure(recording: Recording, vehicle: Vehicle, identifier: str) -> JsonDict | None:
+    """The rotor signal over the whole log, as it was read; None where there is none."""
+    rotors, _ = rotor_channel(recording, vehicle)
+    if rotors is None or len(rotors.t) < 2:
+        return None
+    rows = thinned(rotors.values, WHOLE_POINTS)
+    t = rotors.t[rows] - recording.first_imu_time
+    data = [trace(f"unit{i}", f"rotor {i + 1}", t, column) for i, column in enumerate(rotors.values[rows].T)]
+    layout = {"xaxis": axis("time [s]"), "yaxis": axis(f"{rotors.name.replace('_', ' ')} [{CHANNELS[rotors.name][1]}]")}
+    return figure(identifier, "Rotor signals", data, layout, 280)
 
 
 def mode_rows(recording: Recording) -> list[list[str]]:
@@ -274,9 +290,10 @@ def parameter_row(
 
 
 def set_sections(entries: Sequence[Json], sets: Sequence[ScoredSet]) -> list[dict[str, Any]]:
-    """The logs of a result with their figures; the first few logs only get figures."""
+    """The logs of a result with their figures, unseen ones first; the first few logs only get figures."""
     out, shown = [], min(len(sets), MOST_LOGS)
-    for i, (entry, scored) in enumerate(zip(entries, sets, strict=True)):
+    ordered = sorted(zip(entries, sets, strict=True), key=lambda pair: pair[0]["role"] == "train")
+    for i, (entry, scored) in enumerate(ordered):
         figures = (
             [error_figure(scored, f"log{i}-error"), *channel_figures(scored, f"log{i}", shown)] if i < MOST_LOGS else []
         )
@@ -312,13 +329,16 @@ def noise_table(noise: NoiseModel) -> JsonDict:
 
 def correlation_section(parameters: ParameterSet) -> dict[str, Any]:
     """Correlations of the parameters: near 1 or -1, the flight hardly separates two of them."""
-    correlation, names = parameters.correlation, list(parameters.names)
-    rows = [
-        [name, *(f"{correlation[i, j]:+.2f}" if i != j else "1" for j in range(len(names)))]
-        for i, name in enumerate(names)
-    ]
+    names, values = list(parameters.names), parameters.correlation
+    text = [[f"{v:+.2f}" for v in row] for row in values]
+    data = [{
+        "role": "measured", "name": "correlation", "type": "heatmap", "x": names, "y": names,
+        "z": values.round(3).tolist(), "zmin": -1, "zmax": 1, "text": text, "texttemplate": "%{text}",
+        "hoverinfo": "skip", "showscale": False,
+    }]  # fmt: skip
+    layout = {"xaxis": {"type": "category"}, "yaxis": {"type": "category", "autorange": "reversed"}}
     intro = "Near +1 or -1 the flight hardly separates two parameters: fly what moves one of them alone."
-    return section("correlations", "Correlations", intro, tables=[rows_of(["", *names], rows)])
+    return section("correlations", "Correlations", intro, [figure("correlations", "Correlations", data, layout, 320)])
 
 
 # --- The page of a diagnosis, and the part that other pages take from it
@@ -347,7 +367,11 @@ def diagnose_verdict(result: Json) -> Verdict:
     held_out = v.get("on") == HELD_OUT
     where = "held-out blocks of the same flight" if held_out else "unseen flights"
     change = _change(v, bool(result["findings"]))
-    details: tuple[str, ...] = (f"The error on {where} {change} noise variances (1 is the noise floor).",)
+    missing = (result.get("missing") or {}).get("statement")
+    details: tuple[str, ...] = (
+        *([missing] if missing else []),
+        f"The error on {where} {change} noise variances (1 is the noise floor).",
+    )
     deciding = v.get("deciding")
     if result["findings"] and deciding and deciding["seconds"] != SCORE_SECONDS:
         details = (
@@ -508,6 +532,47 @@ def _noise_sentence(gain: Json, floor: float, name: str) -> str:
     without, having = (percent(s) for s in shares if s is not None)
     return (
         f"Share of the error that is sensor noise, which no model can remove: {without} without {name}, {having} with."
+    )
+
+
+def missing_section(
+    missing: Json, log: str, parts: Mapping[str, Sequence[Missing]]
+) -> dict[str, Any]:  # fmt: skip
+    """The missing force and moment as part of a page: over time on one log, and by axis over the deciding logs.
+
+    Args:
+        missing: ``force`` and ``moment`` of contract §7, over the deciding logs.
+        log: name of the one that is drawn.
+        parts: its stretches by model.
+    """
+    models = list(parts)
+    head = [
+        "",
+        *(f"{'without' if m == 'nominal' else 'with'} the findings" if len(models) > 1 else "rms" for m in models),
+    ]
+    rows = []
+    for key in ("force", "moment"):
+        entry = missing[key]
+        for a in "xyz":
+            of = entry["of"] if key == "force" else entry["of"][a]
+            cells = [f"{number(entry[m][a], 2)} {unit(entry['unit'])}, {percent(entry[m][a] / of)}" for m in models]
+            rows.append((f"{key} {a}", *cells, f"{number(of, 3)} {unit(entry['unit'])} ({entry['of_what']})"))
+    table = rows_of(
+        [*head, "of"],
+        rows,
+        "Size by axis (rms, body axes), with its share",
+        classes=["", *["number"] * len(models), ""],
+    )
+    intro = (
+        f"{log}, estimated with random forces in the model, in body axes; the band holds the true one in 95 of 100 "
+        "moments."
+    )
+    return section(
+        "missing",
+        "What acts on the vehicle and the simulation lacks",
+        intro,
+        missing_figures(parts, "missing"),
+        [table],
     )
 
 

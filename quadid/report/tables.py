@@ -314,14 +314,22 @@ def parameter_outlook_table(found: Inspection) -> TextTable:
 
 
 def sentences(found: Inspection) -> list[Cell]:
-    """What the checks found, what is missing, and whether the log can be used, a sentence each."""
+    """What the checks found and what is missing, a sentence each, what is wrong first."""
     out = []
     for check in found.checks:
         fix = f". Fix: {_clean(check.fix)}" if check.fix else ""
         out.append(Cell(f"{_spaced(check.name)}: {_clean(check.message)}{fix}", _INSPECT_TABLES_TONES[check.verdict]))
     out += [Cell(f"missing: {m.channel}: {_clean(m.why)}. To get it: {_clean(m.how)}", "fair") for m in found.missing]
-    usable = "usable for identification" if found.usable else "not usable for identification as it is"
-    return [*out, Cell(usable, "good" if found.usable else "poor")]
+    return out
+
+
+def usability(found: Inspection) -> Cell:
+    """The verdict of an inspection, with the first reason against the log."""
+    wrong = [c for c in found.checks if c.verdict == "error"]
+    if found.usable:
+        return Cell("usable for identification", "good")
+    why = f": {_spaced(wrong[0].name)}, {_clean(wrong[0].message)}" if wrong else ""
+    return Cell(f"not usable for identification as it is{why}", "poor")
 
 
 def heading(found: Inspection) -> str:

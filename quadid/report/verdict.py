@@ -130,14 +130,15 @@ def identify_verdict(result: Json) -> Verdict:
     if before and not known and len(before) == len(parameters):
         headline = f"All {len(before)} parameters known from earlier flights; {match}."
     rest = f"Determined by the sigmas of the vehicle file, not by this flight: {', '.join(before)}."
-    details = (*([rest] if before else []), *lacking, *_details(known, judged))
+    missing = (result.get("missing") or {}).get("statement")
+    details = (*([rest] if before else []), *lacking, *([missing] if missing else []), *_details(known, judged))
     if not ratio <= ROUGH:
         headline = f"Not to be used yet: {match}."
         found = (
             "The fit bends the parameters to make up for missing physics; they can be wrong even where the interval is "
             "narrow."
         )
-        details = (found, *_details(known, judged)[1:]) if known else details
+        details = (found, *([missing] if missing else []), *_details(known, judged)[1:]) if known else details
     steps = _next_steps(result, open_ones, stuck, ratio)
     return Verdict(level, headline, details, (_TOGETHER, *steps) if before and ratio <= ROUGH else steps)
 

@@ -5,13 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from quadid.estimate.missing import Missing
 from quadid.report.figures import (
     BUDGET,
+    VISIBLE,
     WHOLE_POINTS,
     channel_figures,
     error_over_time,
     gain_figure,
     liveliest,
+    missing_figures,
     parameter_figure,
     short,
 )
@@ -37,12 +40,51 @@ def test_thinning_keeps_the_peak_of_the_liveliest_channel() -> None:
 
 def test_residuals_are_measured_less_simulated() -> None:
     log = scored("small", rows=100)
-    view = channel_figures(log, "x")[0]["views"][-1]
-    assert view["label"].startswith("Residual")
+    view = next(v for v in channel_figures(log, "x")[0]["views"] if v["label"].startswith("Residual"))
     assert [line["role"] for line in view["data"][:2]] == ["before", "after"]
     after = log.fitted.series
     expected = after.measured[:, 0] - after.simulated[:, 0]
     assert np.asarray(view["data"][1]["y"], dtype=float) == pytest.approx(expected, abs=0.01)
+
+
+def test_the_spectrum_of_white_residuals_lies_in_its_band_and_that_of_a_tone_does_not() -> None:
+    log = scored("tone", rows=10_000)
+    log.initial.series.simulated[:, 0] += 3.0 * np.sin(2.0 * np.pi * 5.0 * log.initial.series.t)
+    view = channel_figures(log, "x")[0]["views"][-1]
+    high, low, before, after = (np.asarray(line["y"], dtype=float) for line in view["data"][:4])
+    assert np.mean((low <= after) & (after <= high)) == pytest.approx(0.95, abs=0.08)
+    peak = int(np.argmax(before))
+    assert view["data"][2]["x"][peak] == pytest.approx(5.0, abs=0.5)
+    assert before[peak] > 5.0 * high[peak]
+
+
+def missing(size: float, rows: int = 100) -> Missing:
+    """A stretch on which a model misses a force of this size [N] and as large a moment [N m]."""
+    t, acted = 0.02 * np.arange(rows), np.full((rows, 3), size)
+    control = np.outer(np.sin(0.3 * np.arange(rows)), np.ones(3))
+    return Missing(t, acted, 0.1 * acted, acted, 0.1 * acted, control, 10.0, np.full(6, 0.1))
+
+
+def test_what_is_missing_is_drawn_with_its_band_for_every_model_and_axis() -> None:
+    force, moment = missing_figures({"nominal": [missing(0.5)], "extended": [missing(0.001)]}, "m")
+    lines = force["views"][0]["data"]
+    assert [line["role"] for line in lines] == ["before"] * 3 + ["after"] * 3 + ["before"] * 3 + ["after"] * 3 + [
+        "before"] * 3 + ["after"] * 3  # fmt: skip
+    upper, lower, value = (np.asarray(line["y"], dtype=float) for line in lines[:3])
+    assert value == pytest.approx(0.5)
+    assert (upper - lower) / 2.0 == pytest.approx(1.96 * 0.05, rel=0.01)
+    assert moment["views"][0]["layout"]["yaxis"]["title"]["text"] == "Mx [N m]"
+
+
+def test_a_model_that_misses_next_to_nothing_looks_like_it() -> None:
+    (force, _) = missing_figures({"nominal": [missing(1e-6)]}, "m")
+    low, high = force["views"][0]["layout"]["yaxis2"]["range"]
+    assert (low, high) == (-VISIBLE * 10.0, VISIBLE * 10.0)
+
+
+def test_no_line_bridges_a_gap_of_the_log() -> None:
+    (force, _) = missing_figures({"nominal": [missing(0.5, 40), missing(0.5, 40)]}, "m")
+    assert force["views"][0]["data"][2]["y"].count(None) == 1
 
 
 def test_a_runaway_guess_is_clipped_but_marked_by_leaving_the_picture() -> None:

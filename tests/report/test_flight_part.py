@@ -44,9 +44,10 @@ def test_the_rotors_are_placed_in_it_or_said_to_be_beyond_it() -> None:
     quick = fly(PELICAN, seconds=20.0, seed=3, log_rate=500.0).recording
     shown = flight_section(quick, PELICAN, 1)
     assert shown is not None
-    (line,) = shown["figures"][0]["views"][0]["layout"]["shapes"]
+    assert [f["title"] for f in shown["figures"]] == ["Rotor signals", "Vibration in the air"]
+    (line,) = shown["figures"][1]["views"][0]["layout"]["shapes"]
     assert line["x0"] == pytest.approx(turns, rel=0.02)
-    assert not section["figures"][0]["views"][0]["layout"]["shapes"]
+    assert not section["figures"][1]["views"][0]["layout"]["shapes"]
 
 
 def test_modes_are_told_from_the_first_imu_sample_on() -> None:

@@ -45,10 +45,13 @@
   function painted(trace, view) {
     const out = Object.assign(view.x && !trace.x ? { x: view.x } : {}, trace);
     if ((trace.mode || "").includes("lines")) out.line = line(trace.role);
+    if (trace.solid) out.line = { ...out.line, dash: "solid" };
+    if (trace.edge) Object.assign(out, { line: { width: 0 }, fillcolor: trace.fill ? colour(trace.role) + "33" : undefined });
     if ((trace.mode || "").includes("markers")) out.marker = marker(trace.role);
     if ((trace.mode || "") === "lines+markers") Object.assign(out.marker, { symbol: trace.role === "before" ? "circle-open" : "circle", size: 7 });
     if (trace.error_y) out.error_y = Object.assign({ color: out.marker.color, thickness: 1.2, width: 0 }, trace.error_y);
     if (trace.error_x) out.error_x = Object.assign({ color: colour(trace.role), thickness: 2, width: 5 }, trace.error_x);
+    if (trace.type === "heatmap") out.colorscale = [[0, colour("before")], [0.5, colour("card")], [1, colour("after")]];
     if (trace.type === "bar") out.marker = { color: colour(trace.role) };
     return out;
   }
@@ -83,6 +86,11 @@
 
   const boxes = () => document.querySelectorAll(".plot");
   const redraw = () => boxes().forEach((box) => { if (box.dataset.drawn) draw(box); });
+
+  // A phone shows the verdict, what is missing and the parameters; the rest unfolds where it is touched.
+  if (window.matchMedia("(max-width: 640px)").matches) {
+    document.querySelectorAll("main details").forEach((part) => { part.open = Boolean(part.closest("#missing")) && part.parentElement.id === "missing"; });
+  }
 
   const seen = new IntersectionObserver((entries) => {
     for (const entry of entries) {
