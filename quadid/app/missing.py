@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from quadid.app.logs import Log, free_name
-from quadid.data.window import Window, beginning
+from quadid.data.window import Channel, Recording, Window, beginning
 from quadid.types import FloatArray, JsonDict
 from quadid.vehicle import Vehicle
 
@@ -117,18 +117,50 @@ class MissingForces:
         return removed(before, [part for i in self.deciding for part in self.parts[self.models[-1]][i]])
 
     def save(self, folder: str | Path = ".") -> list[Path]:
-        """Writes ``LOG.missing.csv`` for every log: force [N] and moment [N m] of every model, with their sigma."""
+        """Writes ``LOG.missing.csv`` for every log: force [N], moment [N m], innovations of every model, with sigma."""
+        from quadid.model.rollout import CHANNEL_NAMES
+
         out: list[Path] = []
         for i, log in enumerate(self.logs):
-            columns, table = ["t"], [np.concatenate([p.t for p in self.parts[self.models[0]][i]])[:, None]]
+            columns, table = ["t"], [self._joined(i, self.models[0], "t")[:, None]]
             for model in self.models:
-                for name in ("force", "force_sigma", "moment", "moment_sigma"):
-                    columns += [f"{model}/{name}_{axis}" for axis in AXES]
-                    table.append(np.concatenate([getattr(p, name) for p in self.parts[model][i]]))
+                for name, axes in (("force", AXES), ("moment", AXES), ("innovation", CHANNEL_NAMES[:12])):
+                    for part in (name, f"{name}_sigma"):
+                        columns += [f"{model}/{part}_{axis}" for axis in axes]
+                        table.append(self._joined(i, model, part))
             path = free_name(folder, log.name, "missing.csv", out)
             np.savetxt(path, np.concatenate(table, axis=1), "%.8g", ",", header=",".join(columns), comments="")
             out.append(path)
         return out
+
+    def wrenches(self, i: int) -> dict[str, tuple[FloatArray, FloatArray]]:
+        """Missing force and moment of log `i`, and their sigma, by topic: times, shape (n,), and rows of six."""
+        t = self._joined(i, self.models[0], "t")
+        return {
+            f"missing/{model}{'/sigma' * bool(end)}": (
+                t, np.hstack([self._joined(i, model, f"force{end}"), self._joined(i, model, f"moment{end}")])
+            )
+            for model in self.models for end in ("", "_sigma")
+        }  # fmt: skip
+
+    def innovations(self, i: int) -> dict[str, Recording]:
+        """Innovations of gyro and accelerometer of log `i` by model."""
+        from quadid.estimate.kalman import ACCEL, GYRO
+
+        t, out = self._joined(i, self.models[0], "t"), {}
+        for model in self.models:
+            values = self._joined(i, model, "innovation")
+            found = {n: values[:, at : at + 3] for n, at in (("gyro", GYRO), ("accel", ACCEL))}
+            known = {n: np.isfinite(v).all(axis=1) for n, v in found.items()}
+            channels = {
+                n: Channel(n, t[known[n]], v[known[n]], "innovation") for n, v in found.items() if known[n].any()
+            }
+            out[f"innovation/{model}"] = Recording(self.logs[i].name, "series", channels)
+        return out
+
+    def _joined(self, i: int, model: str, name: str) -> FloatArray:
+        """One field of all stretches of log `i`, one after the other."""
+        return np.concatenate([getattr(part, name) for part in self.parts[model][i]])
 
 
 def _by_axis(values: FloatArray) -> dict[str, float]:

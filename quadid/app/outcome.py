@@ -7,7 +7,7 @@ import importlib.metadata
 import json
 import platform
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,7 +20,7 @@ from quadid.app.logs import LONGEST, Log, free_name, open_recording, parse_part,
 from quadid.app.missing import MissingForces
 from quadid.data.resample import sample_period
 from quadid.data.window import Channel, Recording, beginning
-from quadid.errors import ParameterError, QuadidError, nearest
+from quadid.errors import QuadidError
 from quadid.jsonable import jsonable
 from quadid.report.verdict import Verdict
 from quadid.types import FloatArray, Json
@@ -155,50 +155,8 @@ def data_frame(records: list[dict[str, Any]], columns: Sequence[str] = ()) -> pd
 # --- Simulated against measured outputs of scored logs as files, for PlotJuggler, Foxglove and programs of one's own
 
 
-KINDS = ("mcap", "csv")
 _CHANNELS = {"gyro": 0, "attitude": 3, "accel": 6, "velocity": 9, "position": 12}
 """First of the three columns of each channel in a `quadid.identification.score.Series`."""
-
-
-def check_kinds(kinds: Iterable[str]) -> None:
-    """Raises ParameterError for a form that is not written."""
-    for kind in kinds:
-        if kind not in KINDS:
-            raise ParameterError(f"--series {kind}", ", ".join(KINDS), nearest(kind, KINDS))
-
-
-def save_series(sets: Sequence[ScoredSet], logs: Sequence[Log], folder: str | Path, kinds: Sequence[str]) -> list[Path]:
-    """Writes ``LOG.simulated.KIND`` for every log: measured, and both simulations, which start anew every second.
-
-    Args:
-        sets: scored logs.
-        logs: the same ones, as loaded.
-        folder: where to.
-        kinds: of `KINDS`.
-
-    Returns:
-        Absolute paths.
-
-    Raises:
-        ParameterError: another kind.
-        LogError: a file that cannot be written.
-    """
-    check_kinds(kinds)
-    out: list[Path] = []
-    for scored, log in zip(sets, logs, strict=True):
-        measured = scored.fitted.series.measured
-        parts = {
-            name: _recording(log.name, scored.fitted.series.t, values)
-            for name, values in (
-                ("measured", measured), ("simulated", scored.fitted.series.simulated),
-                ("before", scored.initial.series.simulated),
-            )
-        }  # fmt: skip
-        for kind in kinds:
-            path = free_name(folder, log.name, f"simulated.{kind}", out)
-            write_compared(path, parts, round(1e9 * (log.recording.epoch or 0.0)))
-            out.append(path)
-    return out
 
 
 def _recording(name: str, t: FloatArray, values: FloatArray) -> Recording:
@@ -253,10 +211,31 @@ class Fitted(Reported):
         """The logs that were fitted."""
         return [log for log, s in zip(self.logs, self.sets, strict=True) if s.role == "train"]
 
-    def save_series(self, folder: str | Path = ".", kinds: Sequence[str] = ("mcap",)) -> list[Path]:
-        """Writes measured and simulated outputs of every log as mcap or csv, and what is missing as csv."""
-        missing = [] if self.forces is None else self.forces.save(folder)
-        return [*save_series(self.sets, self.logs, folder, kinds), *missing]
+    def save_series(self, folder: str | Path = ".") -> list[Path]:
+        """Writes what was measured, simulated and is missing over time, as CSV and MCAP; returns absolute paths.
+
+        ``LOG.simulated.csv`` and ``.mcap`` hold the measurement and both simulations, which start anew every second;
+        the MCAP also what is missing and innovations, which are in ``LOG.missing.csv``.
+
+        Raises:
+            LogError: a file that cannot be written.
+        """
+        Path(folder).mkdir(parents=True, exist_ok=True)
+        out: list[Path] = []
+        for i, (scored, log) in enumerate(zip(self.sets, self.logs, strict=True)):
+            t, measured = scored.fitted.series.t, scored.fitted.series.measured
+            columns = (
+                ("measured", measured), ("simulated", scored.fitted.series.simulated),
+                ("before", scored.initial.series.simulated),
+            )  # fmt: skip
+            parts = {name: _recording(log.name, t, values) for name, values in columns}
+            epoch = round(1e9 * (log.recording.epoch or 0.0))
+            table, bag = (free_name(folder, log.name, f"simulated.{kind}", out) for kind in ("csv", "mcap"))
+            write_compared(table, parts, epoch)
+            beside = {} if self.forces is None else self.forces.innovations(i)
+            write_compared(bag, parts | beside, epoch, None if self.forces is None else self.forces.wrenches(i))
+            out += [table, bag]
+        return [*out, *([] if self.forces is None else self.forces.save(folder))]
 
 
 def known(vehicle: Vehicle) -> str:

@@ -15,7 +15,7 @@ def diagnose(
     validate: options.Validate = None,
     seed: options.Seed = 1,
     report: options.ReportFile = None,
-    series: options.SeriesKinds = None,
+    series: options.SeriesFolder = None,
     rate: options.Rate = GRID,
     start: options.Start = None,
     stop: options.Stop = None,
@@ -27,12 +27,12 @@ def diagnose(
 ) -> None:
     """Name what the simulation gets wrong, extend the model by it, and measure the gain on data the fit did not see."""
     from quadid.app import diagnose as work
-    from quadid.app.outcome import check_kinds
     from quadid.cli import terminal
 
-    check_kinds(series or ())
     terminal.check_file(json, "--json")
     terminal.check_file(report, "--report")
+    if series is not None:
+        terminal.out_folder(series)
     described = load_vehicle(vehicle)
     read = options.reader(described, rate, start, stop, preset, unchecked, columns)
     folder = terminal.out_folder(out)

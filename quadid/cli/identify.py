@@ -10,7 +10,6 @@ import typer
 from quadid.app import identify as work
 from quadid.app.identify import OPTIMIZERS, Identified, check_optimizer
 from quadid.app.logs import GRID, OutputError, file_name, load_vehicle
-from quadid.app.outcome import check_kinds
 from quadid.cli import options
 from quadid.cli.explaining import explained
 from quadid.vehicle import Vehicle
@@ -25,7 +24,7 @@ def identify(
     ] = OPTIMIZERS[0],
     seed: options.Seed = 1,
     report: options.ReportFile = None,
-    series: options.SeriesKinds = None,
+    series: options.SeriesFolder = None,
     rate: options.Rate = GRID,
     start: options.Start = None,
     stop: options.Stop = None,
@@ -39,9 +38,10 @@ def identify(
     from quadid.cli import terminal
 
     check_optimizer(optimizer)
-    check_kinds(series or ())
     terminal.check_file(json, "--json")
     terminal.check_file(report, "--report")
+    if series is not None:
+        terminal.out_folder(series)
     described = load_vehicle(vehicle)
     read = options.reader(described, rate, start, stop, preset, unchecked, columns)
     target = fitted_path(terminal.out_folder(out), described, vehicle)

@@ -72,12 +72,12 @@ Columns = Annotated[
     typer.Option("--columns", metavar="NAME=C", help="What a CSV calls a column, as gyro_x=p,gyro_y=q; repeatable."),
 ]
 Unchecked = Annotated[bool, typer.Option("--unchecked", help="Use logs even when their units or frames look wrong.")]
-SeriesKinds = Annotated[
-    list[str] | None,
+SeriesFolder = Annotated[
+    Path | None,
     typer.Option(
         "--series",
-        metavar="mcap|csv",
-        help="Write simulated against measured of every log into --out, for PlotJuggler and Foxglove; repeatable.",
+        metavar="DIR",
+        help="Write measured, simulated, innovations and what is missing over time into this folder, as CSV and MCAP.",
     ),
 ]
 ReportFile = Annotated[

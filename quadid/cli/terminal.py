@@ -171,7 +171,7 @@ def print_verdict(console: Console, verdict: Verdict) -> None:
 
 def conclude(
     done: Outcome, json: str | None, report: Path | None = None, files: Mapping[str, Path] | None = None,
-    series: Sequence[str] | None = None,
+    series: Path | None = None,
 ) -> None:  # fmt: skip
     """Writes what a command gives beside what it prints, names that in its JSON, and prints the result.
 
@@ -180,7 +180,7 @@ def conclude(
         json: where its JSON goes, as `write_json`.
         report: where its HTML report goes.
         files: where its ``vehicle``, and its ``prediction``, go.
-        series: forms of simulated against measured, written beside the vehicle file.
+        series: folder for measured, simulated and missing over time.
     """
     whole: Any = done  # which of these a command offers depends on its result
     for name, path in (files or {}).items():
@@ -188,8 +188,8 @@ def conclude(
     if report is not None:
         done.result["report"] = str(report.absolute())
         whole.report(report, command_line())
-    if series and files:
-        done.result["series"] = [str(path) for path in whole.save_series(files["vehicle"].parent, series)]
+    if series is not None:
+        done.result["series"] = [str(path) for path in whole.save_series(series)]
     write_json(done.result, json)
     out = console(quiet=json == "-")
     if done.heading:
@@ -201,7 +201,7 @@ def conclude(
         if done.result.get(key):
             out.print(f"{label}: {done.result[key]}", soft_wrap=True)
     for path in done.result.get("series", ()):
-        out.print(f"Simulated against measured: {path}", soft_wrap=True)
+        out.print(f"Over time: {path}", soft_wrap=True)
     warn(done.warnings)
 
 

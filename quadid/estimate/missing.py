@@ -46,6 +46,9 @@ class Missing:
         control: rotor moments [N m] at each time, shape (n, 3).
         weight: [N].
         times: correlation times of the random force and moment [s], shape (6,).
+        innovation: of gyro, attitude (rotation vector), accelerometer, velocity, in their units, shape (n, 12); not a
+            number where not measured.
+        innovation_sigma: its standard deviation, shape (n, 12).
     """
 
     t: FloatArray
@@ -56,6 +59,8 @@ class Missing:
     control: FloatArray
     weight: float
     times: FloatArray
+    innovation: FloatArray
+    innovation_sigma: FloatArray
 
 
 def smoothed(found: Estimate) -> list[Missing]:
@@ -84,6 +89,8 @@ def _smoothed(problem: Problem, z: FloatArray, psi: FloatArray) -> list[Missing]
                 control,
                 track.mass * GRAVITY,
                 psi[k.TIME + np.array([0, 0, 1, 2, 2, 3])],
+                np.where(g.S > 0.0, g.nu, np.nan),
+                np.sqrt(g.S),
             )  # fmt: skip
         )
     return out

@@ -257,9 +257,22 @@ def write_recording(writer: TopicWriter, recording: Recording, epoch_ns: int = 0
     write_recordings(writer, {"": recording}, epoch_ns)
 
 
-def write_recordings(writer: TopicWriter, recordings: Mapping[str, Recording], epoch_ns: int = 0) -> None:
-    """Writes recordings to an open writer, in time order, each with its name before its topics; see `write_mcap`."""
+def write_recordings(
+    writer: TopicWriter, recordings: Mapping[str, Recording], epoch_ns: int = 0,
+    wrenches: Mapping[str, tuple[FloatArray, FloatArray]] | None = None,
+) -> None:  # fmt: skip
+    """Writes recordings to an open writer, in time order, each with its name before its topics; see `write_mcap`.
+
+    Args:
+        writer: open.
+        recordings: by name.
+        epoch_ns: added to recording time [ns].
+        wrenches: by topic, times [s] and force [N] and moment [N m] in FRD, shapes (n,) and (n, 6).
+    """
     each = [(name, s) for name, recording in recordings.items() for s in _all_series(writer, recording, epoch_ns)]
+    for topic, (times, rows) in (wrenches or {}).items():
+        both = np.hstack([flip_body(rows[:, :3]), flip_body(rows[:, 3:])])
+        each.append(("", _blocks(writer, topic, "geometry_msgs/msg/WrenchStamped", times, both, _wrench, epoch_ns)))
     for which, row in in_time_order([t for _, (t, _) in each]):
         name, (t, message) = each[which]
         topic, kind, data = message(row)
@@ -321,6 +334,11 @@ def _imu_message(blocks: list[list[float]]) -> dict[str, Any]:
         "linear_acceleration": _xyz(v[25:28]),
         "linear_acceleration_covariance": v[28:37],
     }
+
+
+def _wrench(blocks: list[list[float]]) -> dict[str, Any]:
+    (v,) = blocks
+    return {"header": _BODY, "wrench": {"force": _xyz(v[:3]), "torque": _xyz(v[3:])}}
 
 
 def _xyz(v: list[float]) -> dict[str, float]:
@@ -675,13 +693,17 @@ def _tlog_battery(battery: Channel | None) -> list[_TlogSeries]:
 # --- Writes recordings of one flight side by side, such as measured and simulated, for viewers that draw curves
 
 
-def write_compared(path: str | Path, recordings: Mapping[str, Recording], epoch_ns: int = 0) -> None:
+def write_compared(
+    path: str | Path, recordings: Mapping[str, Recording], epoch_ns: int = 0,
+    wrenches: Mapping[str, tuple[FloatArray, FloatArray]] | None = None,
+) -> None:  # fmt: skip
     """Writes recordings under their names: topics ``simulated/imu`` in MCAP, columns ``simulated/p`` in CSV.
 
     Args:
         path: ends in .mcap (ENU, FLU) or .csv (NED, FRD).
         recordings: by name.
         epoch_ns: added to recording time in MCAP, so that stamps count from the UNIX epoch [ns].
+        wrenches: forces and moments beside them in MCAP, as `write_recordings` takes them.
 
     Raises:
         LogError: another suffix, nothing to write, or a file that cannot be written.
@@ -689,7 +711,7 @@ def write_compared(path: str | Path, recordings: Mapping[str, Recording], epoch_
     kind = Path(path).suffix.lower()
     if kind == ".mcap":
         with TopicWriter(path) as writer:
-            write_recordings(writer, recordings, epoch_ns)
+            write_recordings(writer, recordings, epoch_ns, wrenches)
         return
     if kind != ".csv":
         raise LogError(f"cannot tell the format of '{path}'", ".mcap, .csv")

@@ -20,7 +20,7 @@ def result(quadid: Cli, flights: Flights, tmp_path_factory: pytest.TempPathFacto
     folder = tmp_path_factory.mktemp("series")
     run = quadid(
         "identify", flights.train, "--validate", flights.unseen, "--vehicle", "pelican", "--out", folder,
-        "--series", "csv", "--series", "mcap", "--json", "-",
+        "--series", folder / "over" / "time", "--json", "-",
     )  # fmt: skip
     assert run.code == 0, run.err
     return dict(run.data)
@@ -64,18 +64,33 @@ def test_the_mcap_holds_the_same_in_the_frames_of_ros(result: dict[str, Any]) ->
     pitch: dict[str, list[float]] = {which: [] for which in ("measured", "simulated", "before")}
     with Path(result["series"][1]).open("rb") as stream:
         reader = make_reader(stream, validate_crcs=True, decoder_factories=[DecoderFactory()])
-        stamps = []
+        stamps, topics, force = [], set(), []
         for _, channel, message, decoded in reader.iter_decoded_messages():
             stamps.append(message.log_time)
             which, _, topic = channel.topic.partition("/")
+            topics.add(channel.topic)
             if topic == "imu":
                 pitch[which].append(decoded.angular_velocity.y)
+            if channel.topic == "missing/nominal":
+                force.append(decoded.wrench.force.z)
     assert stamps == sorted(stamps)
     for which, values in pitch.items():
         np.testing.assert_allclose(values, -rows[:, names.index(f"{which}/q")], rtol=1e-12)
+    assert {"innovation/nominal/imu", "missing/nominal", "missing/nominal/sigma"} <= topics
+    names, rows = table(Path(result["series"][-2]))
+    np.testing.assert_allclose(force, -rows[:, names.index("nominal/force_z")], rtol=1e-6, atol=1e-12)
 
 
-def test_another_form_is_refused_before_anything_is_read(inside: Cli) -> None:
-    line = one_line(inside("diagnose", "none.mcap", "--vehicle", "pelican", "--series", "mcp"), 2)
-    assert "--series mcp" in line
-    assert "mcap" in line.partition("fix")[2]
+def test_innovations_of_an_exact_model_are_white_and_as_large_as_stated(result: dict[str, Any]) -> None:
+    names, rows = table(Path(result["series"][-1]))
+    for rate in RATES:
+        found, sigma = (rows[:, names.index(f"nominal/{name}_{rate}")] for name in ("innovation", "innovation_sigma"))
+        whitened = found / sigma
+        assert np.nanmean(whitened**2) == pytest.approx(1.0, abs=0.1)
+        assert abs(np.nanmean(whitened[1:] * whitened[:-1])) < 0.08
+
+
+def test_a_file_where_the_folder_should_be_is_refused_before_anything_is_read(inside: Cli, tmp_path: Path) -> None:
+    (tmp_path / "taken").write_text("")
+    line = one_line(inside("diagnose", "none.mcap", "--vehicle", "pelican", "--series", tmp_path / "taken"), 2)
+    assert "taken" in line
