@@ -244,7 +244,9 @@ def test_a_fleet_is_read_on_a_phone(chromium: Browser, fleet_page: Path, shots: 
         assert page.evaluate("document.documentElement.scrollHeight") < 4000
         page.screenshot(path=shots / f"fleet_page-{width}-folded.png", full_page=True)
         assert not page.locator("#logs table").first.is_visible()
-        page.locator("#logs summary").first.click()
+        if width == 390:
+            page.locator("#logs > details > summary").click()
+        page.locator("#logs details details summary").first.click()
         assert page.locator("#logs table").first.is_visible()
         one.unfold()
         rows = page.locator("#logs tbody tr").count()
