@@ -168,6 +168,10 @@ poisoning: venv ## every sensor wrong by a factor, at once or slowly: what is pu
 fuzz: $(DEV) ## mutated logs of seven formats through their readers for an hour; goes on where it stopped, into docs/results/fuzz.md
 	OPENBLAS_NUM_THREADS=1 nice -n 19 $(BIN)/python -m tests.fuzz
 
+.PHONY: ros-load
+ros-load: $(MESSAGES) ## the ROS node at load 10: backlog and errors with the streams of three presets (half an hour; MINUTES=10)
+	$(STUDY) quadid_evaluation.studies.ros_load --minutes $(or $(MINUTES),10) --out docs/results
+
 .PHONY: soak
 soak: $(MESSAGES) ## a day of flight at accelerated time, an hour in real time, into docs/results/soak.md (hours)
 	$(STUDY) quadid_evaluation.studies.soak --out docs/results

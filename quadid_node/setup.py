@@ -1,4 +1,4 @@
-"""The ament_python side of quadid_node, for colcon; pip installs the same package from the root of the checkout."""
+"""The ament_python side of quadid_node, for colcon; elsewhere pip installs it with the core, from the root."""
 
 from glob import glob
 

@@ -37,8 +37,9 @@ def test_nodes_get_ready_and_end(
         ready = sum(line.count("ready: identifies") for line in said)
         return [actions.EmitEvent(event=launch.events.Shutdown())] if ready == len(nodes) else []
 
-    def exited(event: Any, context: Any) -> None:
+    def exited(event: Any, context: Any) -> Any:
         ended.append(event.returncode)
+        return [actions.EmitEvent(event=launch.events.Shutdown())]
 
     file = Path(__file__).resolve().parents[1] / "launch" / f"{name}.launch.py"
     arguments = {**given, "vehicle": "pelican", "history": "none"}

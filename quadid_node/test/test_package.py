@@ -28,7 +28,7 @@ def test_every_ros_package_that_is_imported_is_named() -> None:
             roots |= {name.split(".")[0] for name in names}
     used = {name for name in roots if name.endswith(ROS) or name.startswith(LIBRARIES)}
     assert {"rclpy", "launch_ros"} <= used
-    used |= {"bond"}  # imported by its name, where it is installed
+    used |= {"bond", "quadid"}  # imported by its name, where it is installed; the core
     missing = used - depends("exec_depend")
     assert not missing, f"package.xml: name {sorted(missing)} as exec_depend"
     debian = {name.removeprefix("python3-") for name in depends("exec_depend") if name.startswith("python3-")}

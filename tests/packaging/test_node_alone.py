@@ -31,6 +31,13 @@ def test_the_list_is_that_of_the_core_without_what_the_node_never_uses(
     assert core["numpy"].specifier.contains("1.26.4")
 
 
+def test_the_page_names_all_that_is_left_out(repository: Path) -> None:
+    page = (repository / "docs" / "using-with-ros.md").read_text(encoding="utf-8")
+    (line,) = [line for line in page.splitlines() if line.startswith("For plots")]
+    named = line.split("pip install ", 1)[1].split("`")[0].replace('"', "").replace("[distributed]", "").split()
+    assert {*named} == LEFT_OUT
+
+
 def test_all_that_the_node_imports_comes_without_what_is_left_out() -> None:
     code = f"""
 import importlib, pkgutil, sys

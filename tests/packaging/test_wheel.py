@@ -62,9 +62,10 @@ def test_one_version_everywhere(repository: Path) -> None:
 
     version = tomllib.loads((repository / "pyproject.toml").read_text(encoding="utf-8"))["project"]["version"]
     assert quadid.__version__ == version
-    for manifest in ("msgs/package.xml", "quadid_node/package.xml"):
-        assert ElementTree.parse(repository / manifest).findtext("version") == version, manifest
-    assert f'version="{version}"' in (repository / "quadid_node" / "setup.py").read_text(encoding="utf-8")
+    for package in ("core", "msgs", "quadid_node"):
+        assert ElementTree.parse(repository / package / "package.xml").findtext("version") == version, package
+    for package in ("core", "quadid_node"):
+        assert f'version="{version}"' in (repository / package / "setup.py").read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize("package", PACKAGES)

@@ -11,17 +11,19 @@ from pathlib import Path
 import pytest
 
 DEBIANS = Path("/usr/bin/python3")
+COLCON = "colcon-core colcon-ros colcon-python-setup-py colcon-recursive-crawl colcon-package-selection 'setuptools<80'"
 SHOW = "import sys, numpy, pydantic; print(pydantic.VERSION, numpy.__version__, sys.prefix)"
 
 
 def page_lines(repository: Path) -> list[str]:
-    """The lines of the page that make the environment and install into it."""
+    """The lines of the page that make the environment, install into it and build."""
     text = (repository / "docs" / "using-with-ros.md").read_text(encoding="utf-8")
     (block,) = re.findall(r"^```\n(.*?python3 -m venv.*?)^```", text.split("## Run")[0], re.S | re.M)
-    return [line for line in block.splitlines() if line.startswith(("python3 -m venv", "venv/bin/pip"))]
+    return [line for line in block.splitlines() if line.startswith(("python3 -m venv", "venv/bin/"))]
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(3600)
 def test_the_environment_beside_debians_packages(tmp_path: Path, repository: Path) -> None:
     """Debian's pydantic 1.10, which cannot be uninstalled, stays; the environment has the version that quadid needs."""
     python = DEBIANS if DEBIANS.exists() else Path(sys.executable)
@@ -40,13 +42,17 @@ def test_the_environment_beside_debians_packages(tmp_path: Path, repository: Pat
     (tmp_path / "src").mkdir()
     (tmp_path / "src" / "quadid").symlink_to(repository)
     before = run(f"{python} -c '{SHOW}'", may_fail=True)
-    lines = page_lines(repository)
-    assert len(lines) == 3
-    for line in lines:
+    make, install, build = page_lines(repository)
+    for line in (make, install):
         assert "--break-system-packages" not in line
         run(line)
+    run(f"venv/bin/pip install {COLCON}")  # in ROS, colcon is apt's
+    assert build.startswith("venv/bin/python -m colcon build && source install/setup.bash")
+    run("venv/bin/python -m colcon build --packages-select quadid")  # the other two need ROS
     version, _, prefix = run(f"venv/bin/python -c '{SHOW}'").split()
     assert int(version.split(".")[0]) >= 2
     assert Path(prefix) == tmp_path / "venv"
-    assert "pelican" in run("venv/bin/quadid vehicles")
+    assert "pelican" in run(". install/local_setup.sh && quadid vehicles")
+    assert run(". install/local_setup.sh && command -v quadid") == str(tmp_path / "install/quadid/bin/quadid")
+    assert "not found" in run("venv/bin/pip show quadid 2>&1 || true"), "installed once"
     assert run(f"{python} -c '{SHOW}'", may_fail=True) == before, "Debian's own packages are as they were"

@@ -1,4 +1,4 @@
-"""The checkout as source of a colcon workspace: two packages, laid out as `ros2 run` and `ros2 launch` expect them."""
+"""The checkout as source of a colcon workspace: three packages, laid out as `ros2 run` and `ros2 launch` want them."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def assert_layout(prefix: Path, package: Path) -> None:
 
 
 @pytest.mark.parametrize("depth", ["root", "workspace"])
-def test_colcon_finds_exactly_two_packages(depth: str, tmp_path: Path, repository: Path) -> None:
+def test_colcon_finds_exactly_three_packages(depth: str, tmp_path: Path, repository: Path) -> None:
     base = repository
     if depth == "workspace":
         base = tmp_path / "ws"
@@ -53,7 +53,35 @@ def test_colcon_finds_exactly_two_packages(depth: str, tmp_path: Path, repositor
         (base / "src" / "quadid").symlink_to(repository)
     listed = colcon(tmp_path, "list", "--base-paths", str(base)).splitlines()
     found = {line.split("\t")[0]: line.split("\t")[2] for line in listed}
-    assert found == {"quadid_msgs": "(ros.ament_cmake)", "quadid_node": "(ros.ament_python)"}
+    ours = {"quadid": "(ros.ament_python)", "quadid_msgs": "(ros.ament_cmake)", "quadid_node": "(ros.ament_python)"}
+    assert found == ours
+
+
+@pytest.mark.parametrize("options", [[], ["--symlink-install"]], ids=["copied", "symlinked"])
+def test_the_core_builds_whole_and_brings_its_command(options: list[str], tmp_path: Path, repository: Path) -> None:
+    """All that is tracked is there, as in the wheel; the command runs from the workspace, not from this environment."""
+    before = sorted(path.name for path in (repository / "core").iterdir())
+    colcon(tmp_path, "build", *options, "--base-paths", str(repository / "core"))
+    assert sorted(path.name for path in (repository / "core").iterdir()) == before, "the build left something there"
+    prefix = tmp_path / "install" / "quadid"
+    assert (prefix / "share/ament_index/resource_index/packages/quadid").is_file()
+    (built,) = (prefix / "lib").glob("python*/site-packages")
+    place = tmp_path / "build" / "quadid" if options else built
+    command = [sys.executable, str(prefix / "bin" / "quadid"), "vehicles"]
+    paths = os.pathsep.join([str(place), str(built)])
+    environment = {**os.environ, "PYTHONPATH": paths}
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+    assert "pelican" in done.stdout, done.stderr
+    where = [sys.executable, "-c", "import quadid, quadid_command; print(quadid.__file__)"]
+    told = subprocess.run(where, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True).stdout
+    assert told.startswith(str(place))
+    folders = {"quadid": "quadid", "replay/quadid_replay": "quadid_replay", "aliases": ""}
+    folders |= {"evaluation/quadid_evaluation": "quadid_evaluation", "msgs/msg": "quadid_replay/schemas/quadid_msgs"}
+    for folder, name in folders.items():
+        listed = subprocess.run(["git", "ls-files", folder], cwd=repository, capture_output=True, text=True, check=True)
+        for path in map(Path, listed.stdout.split()):
+            if path.name != "COLCON_IGNORE" and not (repository / path).is_dir():
+                assert (place / name / path.relative_to(folder)).is_file(), path
 
 
 @pytest.mark.parametrize("options", [[], ["--symlink-install"]], ids=["copied", "symlinked"])
@@ -77,8 +105,9 @@ def test_colcon_runs_the_tests_of_the_node(tmp_path: Path, repository: Path) -> 
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(3600)
 def test_whole_workspace_builds(tmp_path: Path, repository: Path) -> None:
-    """Messages and node by one `colcon build`, as in a ROS installation; about a minute."""
+    """Core, messages and node by one `colcon build`, as in a ROS installation; about a minute."""
     colcon(
         tmp_path,
         *("build", "--base-paths", str(repository), "--cmake-args", "-DBUILD_TESTING=OFF", "-Wno-dev"),

@@ -1,0 +1,1 @@
+../aliases/quadid_command.py

@@ -1,0 +1,308 @@
+"""`make ros-load`: the ROS node on a loaded machine, with the streams of three presets in real time.
+
+A simulated flight is published as ROS, PX4's bridge and MAVROS publish it, while busy loops keep the machine at a load.
+Told are the largest backlog of the status and the errors of the sets on the parameter topic.  px4_msgs and mavros_msgs
+are built with the fields that the node reads (cmake, a compiler).
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from quadid_node.inputs import message_class, to_message
+from quadid_node.publish import LATCHED_QOS
+from quadid_replay import write_mcap
+from quadid_replay.frames import flip_attitude, flip_body
+from quadid_replay.motors import RPM
+
+from quadid.data.window import Recording
+from quadid.flight import fly
+from quadid.parameters import NOMINAL_NAMES
+from quadid.vehicle import Vehicle
+from quadid_evaluation.studies.page import put_section
+
+ROOT = Path(__file__).resolve().parents[3]
+SOURCES = ("canonical", "px4", "mavros")
+GUESS = 1.15
+"""The first guess of every parameter is so many times its true value."""
+RATE = 200.0
+"""Of every channel [Hz]."""
+MESSAGES = {
+    "px4_msgs": {
+        "SensorCombined": "uint64 timestamp\nfloat32[3] gyro_rad\nuint32 gyro_integral_dt\n"
+        "float32[3] accelerometer_m_s2",
+        "VehicleAttitude": "uint64 timestamp\nuint64 timestamp_sample\nfloat32[4] q",
+        "EscReport": "uint64 timestamp\nint32 esc_rpm\nuint8 actuator_function",
+        "EscStatus": "uint64 timestamp\nuint8 esc_count\nEscReport[8] esc",
+        "ActuatorMotors": "uint64 timestamp\nfloat32[12] control",
+        "VehicleAttitudeSetpoint": "uint64 timestamp\nfloat32[4] q_d\nfloat32[3] thrust_body",
+        "VehicleLocalPosition": "uint64 timestamp\nuint64 timestamp_sample\nbool xy_valid\nbool v_xy_valid\n"
+        "float32 x\nfloat32 y\nfloat32 z\nfloat32 vx\nfloat32 vy\nfloat32 vz",
+        "BatteryStatus": "uint64 timestamp\nfloat32 voltage_v",
+    },
+    "mavros_msgs": {
+        "ESCTelemetryItem": "int32 rpm",
+        "ESCTelemetry": "std_msgs/Header header\nESCTelemetryItem[] esc_telemetry",
+        "ESCStatusItem": "int32 rpm",
+        "ESCStatus": "std_msgs/Header header\nESCStatusItem[] esc_status",
+        "RCOut": "std_msgs/Header header\nuint16[] channels",
+        "AttitudeTarget": "std_msgs/Header header\ngeometry_msgs/Quaternion orientation\nfloat32 thrust",
+    },
+}  # fmt: skip
+"""Fields that the node reads, by package and type."""
+NEEDED = ("std_msgs", "geometry_msgs")
+PACKAGE = """<package format="3"><name>{name}</name><version>0.0.0</version><description>fields in use</description>
+<maintainer email="nobody@example.org">nobody</maintainer><license>Apache-2.0</license>
+<buildtool_depend>ament_cmake</buildtool_depend><buildtool_depend>rosidl_default_generators</buildtool_depend>{depends}
+<exec_depend>rosidl_default_runtime</exec_depend><member_of_group>rosidl_interface_packages</member_of_group>
+<export><build_type>ament_cmake</build_type></export></package>"""
+CMAKE = """cmake_minimum_required(VERSION 3.16)
+project({name})
+find_package(ament_cmake REQUIRED)
+find_package(rosidl_default_generators REQUIRED)
+find_package(std_msgs REQUIRED)
+find_package(geometry_msgs REQUIRED)
+file(GLOB messages RELATIVE "${{CMAKE_CURRENT_SOURCE_DIR}}" "msg/*.msg")
+rosidl_generate_interfaces(${{PROJECT_NAME}} ${{messages}} DEPENDENCIES std_msgs geometry_msgs)
+ament_package()
+"""
+
+
+def built(scratch: Path) -> dict[str, str]:
+    """Builds the message packages; returns the variables with which Python imports them."""
+    environment = {k: v for k, v in os.environ.items() if k not in ("CMAKE_PREFIX_PATH", "PYTHONPATH", "ROS_DISTRO")}
+    environment |= {"AMENT_PREFIX_PATH": sys.prefix, "PATH": f"{sys.prefix}/bin:{os.environ['PATH']}"}
+    cmake, prefix = shutil.which("cmake", path=environment["PATH"]), scratch / "prefix"
+    if cmake is None:
+        raise SystemExit("cmake is not installed")
+    for name, messages in MESSAGES.items():
+        source, build = scratch / name, scratch / name / "build"
+        (source / "msg").mkdir(parents=True)
+        for kind, text in messages.items():
+            (source / "msg" / f"{kind}.msg").write_text(f"{text}\n", encoding="utf-8")
+        depends = "".join(f"<depend>{other}</depend>" for other in NEEDED)
+        (source / "package.xml").write_text(PACKAGE.format(name=name, depends=depends), encoding="utf-8")
+        (source / "CMakeLists.txt").write_text(CMAKE.format(name=name), encoding="utf-8")
+        for arguments in (
+            ["-S", source, "-B", build, "-Wno-dev", "-DBUILD_TESTING=OFF", f"-DCMAKE_PREFIX_PATH={sys.prefix}",
+             f"-DCMAKE_INSTALL_PREFIX={prefix}", f"-DPython3_EXECUTABLE={sys.executable}",
+             f"-DCMAKE_PROJECT_INCLUDE={ROOT / 'tools' / 'wheel_targets.cmake'}"],
+            ["--build", build, "--parallel", "2"],
+            ["--install", build],
+        ):  # fmt: skip
+            subprocess.run([cmake, *map(str, arguments)], env=environment, check=True, stdout=subprocess.DEVNULL)
+    (packages,) = prefix.glob("lib/python*/site-packages")
+    libraries = f"{prefix / 'lib'}:{os.environ.get('LD_LIBRARY_PATH', '')}"
+    return {**os.environ, "PYTHONPATH": str(packages), "LD_LIBRARY_PATH": libraries}
+
+
+Row = tuple[float, str, str, Callable[[float], dict[str, Any]]]
+"""Time in the flight [s], topic, type, and the message of an absolute time [s]."""
+
+
+def _header(t: float) -> dict[str, Any]:
+    ns = round(t * 1e9)
+    return {"stamp": {"sec": ns // 10**9, "nanosec": ns % 10**9}, "frame_id": "base_link"}
+
+
+def _xyz(values: Any) -> dict[str, float]:
+    return dict(zip("xyz", map(float, values), strict=True))
+
+
+def px4(recording: Recording) -> Iterator[Row]:
+    """Messages as the uXRCE-DDS bridge publishes them, with ESCs that report."""
+    gyro, accel, attitude, rotors = (recording.channels[c] for c in ("gyro", "accel", "attitude", "rotor_speed"))
+    for k, t in enumerate(gyro.t):
+        yield t, "fmu/out/sensor_combined", "px4_msgs/SensorCombined", lambda at, k=k: {
+            "timestamp": round(at * 1e6), "gyro_rad": gyro.values[k], "accelerometer_m_s2": accel.values[k],
+        }  # fmt: skip
+    for k, t in enumerate(attitude.t):
+        yield t, "fmu/out/vehicle_attitude", "px4_msgs/VehicleAttitude", lambda at, k=k: {
+            "timestamp": round(at * 1e6), "timestamp_sample": round(at * 1e6), "q": attitude.values[k],
+        }  # fmt: skip
+    for k, t in enumerate(rotors.t):
+        yield t, "fmu/out/esc_status", "px4_msgs/EscStatus", lambda at, k=k: {
+            "timestamp": round(at * 1e6), "esc_count": rotors.values.shape[1],
+            "esc": [{"esc_rpm": round(w / RPM), "actuator_function": 101 + i} for i, w in enumerate(rotors.values[k])]
+            + [{}] * (8 - rotors.values.shape[1]),
+        }  # fmt: skip
+
+
+def mavros(recording: Recording) -> Iterator[Row]:
+    """Messages as MAVROS publishes them, with telemetry of the ESCs."""
+    gyro, accel, attitude, rotors = (recording.channels[c] for c in ("gyro", "accel", "attitude", "rotor_speed"))
+    rates, forces, turned = flip_body(gyro.values), flip_body(accel.values), flip_attitude(attitude.values)
+    absent = [-1.0] + [0.0] * 8
+    for k, t in enumerate(gyro.t):
+        yield t, "mavros/imu/data_raw", "sensor_msgs/Imu", lambda at, k=k: {
+            "header": _header(at), "orientation_covariance": absent,
+            "angular_velocity": _xyz(rates[k]), "linear_acceleration": _xyz(forces[k]),
+        }  # fmt: skip
+    for k, t in enumerate(attitude.t):
+        yield t, "mavros/imu/data", "sensor_msgs/Imu", lambda at, k=k: {
+            "header": _header(at), "orientation": dict(zip("wxyz", map(float, turned[k]), strict=True)),
+        }  # fmt: skip
+    for k, t in enumerate(rotors.t):
+        yield t, "mavros/esc_telemetry/telemetry", "mavros_msgs/ESCTelemetry", lambda at, k=k: {
+            "header": _header(at), "esc_telemetry": [{"rpm": round(w / RPM)} for w in rotors.values[k]],
+        }  # fmt: skip
+
+
+def publish(stack: str, recording: Recording) -> None:
+    """Publishes the messages of a stack, each when its time has come."""
+    import rclpy
+    from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
+
+    qos = QoSProfile(depth=100, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.BEST_EFFORT)
+    rclpy.init()
+    node, publishers = rclpy.create_node("stack"), dict[str, Any]()
+    rows = sorted({"px4": px4, "mavros": mavros}[stack](recording), key=lambda row: row[0])
+    for _, topic, kind, _ in rows:
+        if topic not in publishers:
+            publishers[topic] = node.create_publisher(message_class(kind), topic, qos)
+    time.sleep(3.0)  # subscribers find them
+    begin = time.time() - rows[0][0]
+    for t, topic, kind, fields in rows:
+        time.sleep(max(begin + t - time.time(), 0.0))
+        publishers[topic].publish(to_message(kind, fields(begin + t)))
+    time.sleep(0.5)
+    node.destroy_node()
+    rclpy.shutdown()
+
+
+class Seen(NamedTuple):
+    """What one run showed.
+
+    Attributes:
+        first: from the first message to the first set [s]; NaN for none.
+        sets: published.
+        errors: largest relative error of each nominal parameter over all sets, shape (6,); NaN for none.
+        backlog: largest of the status [s].
+        fits: done.
+        load: mean of the machine's load over the last minute, while it flew.
+    """
+
+    first: float
+    sets: int
+    errors: np.ndarray[Any, np.dtype[np.float64]]
+    backlog: float
+    fits: int
+    load: float
+
+
+def run(source: str, log: Path, guess: Path, seconds: float, environment: dict[str, str]) -> Seen:
+    """One node beside one stream; listens to both until the stream ends."""
+    import rclpy
+    from quadid_msgs.msg import FitStatus, ParameterSet
+    from rclpy.executors import SingleThreadedExecutor
+
+    folder = log.parent / source
+    folder.mkdir()
+    said = folder / "node.txt"
+    context = rclpy.Context()
+    context.init()
+    ear = rclpy.create_node("ear", context=context)
+    executor = SingleThreadedExecutor(context=context)
+    executor.add_node(ear)
+    sets, statuses, loads = list[tuple[float, Any]](), list[Any](), list[float]()
+    ear.create_subscription(
+        ParameterSet, "quadid/parameters",
+        lambda m: sets.append((time.monotonic(), m)) if m.state == ParameterSet.STATE_ACCEPTED else None, LATCHED_QOS,
+    )  # fmt: skip
+    ear.create_subscription(FitStatus, "quadid/status", statuses.append, 10)
+    given = (f"source:={source}", f"vehicle:={guess}", f"history:={folder / 'history.sqlite'}", "diagnose:=0.0")
+    node = [sys.executable, "-m", "quadid_node.identify", "--ros-args", *(a for g in given for a in ("-p", g))]
+    player = [sys.executable, "-m", "quadid_node.replay_node", str(log)]
+    if source != "canonical":
+        player = [sys.executable, "-m", __spec__.name, "--publish", source, "--seconds", str(seconds)]
+    with ExitStack() as ends:
+        out = ends.enter_context(said.open("w"))
+        service = subprocess.Popen(node, stdout=out, stderr=out, env=environment)
+        ends.callback(service.kill)
+        while "ready: identifies" not in said.read_text():
+            if service.poll() is not None:
+                raise SystemExit(f"the node ended:\n{said.read_text()}")
+            executor.spin_once(timeout_sec=0.5)
+        stream = subprocess.Popen(player, env=environment, stdout=out, stderr=out)
+        ends.callback(stream.kill)
+        while not statuses or not statuses[-1].header.stamp.sec:
+            executor.spin_once(timeout_sec=0.1)
+        begin = time.monotonic()
+        statuses.clear()
+        while stream.poll() is None:
+            executor.spin_once(timeout_sec=0.5)
+            loads.append(os.getloadavg()[0])
+        service.terminate()
+        service.wait(60.0)
+    executor.shutdown()
+    ear.destroy_node()
+    context.shutdown()
+    true = Vehicle.shipped("pelican").parameters
+    errors = [[abs(v / true[n].initial - 1.0) for n, v in zip(m.names, m.values, strict=True)] for _, m in sets]
+    return Seen(
+        sets[0][0] - begin if sets else math.nan, len(sets),
+        np.max(errors, axis=0) if errors else np.full(len(NOMINAL_NAMES), np.nan),
+        max(s.backlog for s in statuses), statuses[-1].fits, float(np.mean(loads)),
+    )  # fmt: skip
+
+
+def flight(seconds: float) -> Recording:
+    """The flight that every stack publishes."""
+    return fly(Vehicle.shipped("pelican"), seconds=seconds, seed=1, log_rate=RATE).recording
+
+
+def main() -> None:
+    """Runs every preset and writes the page."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--minutes", type=float, default=10.0, help="of flight, for each preset")
+    parser.add_argument("--load", type=float, default=10.0, help="busy loops are added until the machine has it")
+    parser.add_argument("--out", type=Path, default=Path("docs/results"))
+    parser.add_argument("--publish", choices=SOURCES[1:], help=argparse.SUPPRESS)
+    parser.add_argument("--seconds", type=float, help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.publish:
+        publish(options.publish, flight(options.seconds))
+        return
+    seconds = 60.0 * options.minutes
+    lines = [
+        f"{options.minutes:g} min of flight a preset, {RATE:g} Hz a channel, {os.cpu_count()} processors,"
+        f" first guess {GUESS - 1:+.0%}.", "",
+        "| preset | load | largest backlog | fits | sets | first set | largest error of b, d, J_xx, J_yy, J_zz, J_r |",
+        "|---|---|---|---|---|---|---|",
+    ]  # fmt: skip
+    os.environ["ROS_DOMAIN_ID"] = str(1 + os.getpid() % 100)
+    with tempfile.TemporaryDirectory() as scratch, ExitStack() as ends:
+        log, guess = Path(scratch, "flight.mcap"), Path(scratch, "guess.yaml")
+        write_mcap(log, flight(seconds))
+        pelican = Vehicle.shipped("pelican")
+        guesses = {n: p.initial * GUESS for n, p in pelican.parameters.items()}
+        guess.write_text(Vehicle(**{**pelican.model_dump(), "parameters": guesses}).to_yaml(), encoding="utf-8")
+        environment = built(Path(scratch))
+        for _ in range(math.ceil(max(options.load - os.getloadavg()[0], 0.0))):
+            ends.callback(subprocess.Popen([sys.executable, "-c", "while True: pass"]).kill)
+        for source in SOURCES:
+            seen = run(source, log, guess, seconds, environment)
+            errors = ", ".join(f"{100 * e:.2g}" for e in seen.errors)
+            lines.append(
+                f"| {source} | {seen.load:.1f} | {seen.backlog:.2f} s | {seen.fits} | {seen.sets} |"
+                f" {seen.first:.0f} s | {errors} % |"
+            )
+            print(lines[-1], flush=True)
+    title, name = "The ROS node on a loaded machine", f"load {options.load:g}, {options.minutes:g} minutes"
+    put_section(options.out / "ros-load.md", title, name, "\n".join(lines))
+
+
+if __name__ == "__main__":
+    main()
