@@ -15,7 +15,7 @@ from quadid.data.faults import at_limit
 from quadid.data.resample import copied, true_runs
 from quadid.data.window import Window, as_recording
 from quadid.model.layout import ThrustModel
-from quadid.online.grid_buffer import Cut, Rows
+from quadid.online.grid_buffer import Rows, WindowCut
 from quadid.rotation import down, integrated, turn
 from quadid.types import FloatArray
 from quadid.vehicle import GRAVITY, Vehicle
@@ -246,7 +246,7 @@ class Quality:
     carried: bool = False
 
 
-def judge(cut: Cut, vehicle: Vehicle, thrust: ThrustModel, known: bool) -> Quality:
+def judge(cut: WindowCut, vehicle: Vehicle, thrust: ThrustModel, known: bool) -> Quality:
     """Judges the windows of one fit.
 
     Args:
@@ -285,7 +285,7 @@ def _broken(window: Window) -> str:
     return ""
 
 
-def mistake(cut: Cut, vehicle: Vehicle, known: bool) -> str:
+def mistake(cut: WindowCut, vehicle: Vehicle, known: bool) -> str:
     """Names the wrong unit or frame, or the wrong order of rotors, that would be fitted into the parameters.
 
     Args:
@@ -308,7 +308,7 @@ def _wrong_unit(window: Window) -> str:
     return ""
 
 
-def _wrong_order(cut: Cut, vehicle: Vehicle) -> str:
+def _wrong_order(cut: WindowCut, vehicle: Vehicle) -> str:
     rate = min((1.0 / (cut.spacing * window.dt) for window in cut.windows), default=0.0)
     lagged = lagged_of(cut.windows, vehicle, rate)
     check = motor_order_check(lagged, vehicle, better_order(lagged, vehicle))

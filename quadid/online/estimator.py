@@ -19,7 +19,7 @@ from quadid.online.active_set import ActiveSet
 from quadid.online.flexible_fit import with_room
 from quadid.online.fusion import DRIFT, Fusion, WindowEstimate
 from quadid.online.gate import Case
-from quadid.online.grid_buffer import Cut
+from quadid.online.grid_buffer import WindowCut
 from quadid.online.records import OnlineSet
 from quadid.online.window_fit import FitReply, FitRequest, prior_of
 from quadid.parameters import NOMINAL_NAMES, ParameterSet, Status
@@ -146,7 +146,7 @@ class Estimator:
         self.fusion.forget()
         self.start, self.rows, self._search, self.learned = math.nan, 0, True, False
 
-    def request(self, number: int, cut: Cut, start: float, stop: float) -> FitRequest:
+    def request(self, number: int, cut: WindowCut, start: float, stop: float) -> FitRequest:
         """The fit of a window."""
         measure = len(self.fusion.windows) % NOISE_EVERY == 0
         return FitRequest(

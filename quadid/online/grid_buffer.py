@@ -85,8 +85,8 @@ LONGEST_GYRO_GAP = 3
 
 
 @dataclass(frozen=True)
-class Cut:
-    """What a window time holds.
+class WindowCut:
+    """Result of cutting one window.
 
     Attributes:
         windows: stretches without gaps, in order.
@@ -155,7 +155,7 @@ class GridBuffer:
         inside = np.abs(t[1:] - near) <= 1.0
         return float(t[1:][inside][np.argmin((left + right)[inside])]) if inside.any() else near
 
-    def cut(self, start: float, stop: float) -> Cut:
+    def cut(self, start: float, stop: float) -> WindowCut:
         """Windows of the rows with start <= t < stop."""
         blocks = self._reaching(start, stop)
         problem = blocks[-1].problem if blocks else ""  # what lacked before and came passes by itself
@@ -170,7 +170,7 @@ class GridBuffer:
         gaps = max(len(windows) - 1, 0)
         reason, blocked = self._incomplete(seconds, stop - start, problem, blocks)
         spacing = max((b.spacing for b in blocks), default=1.0)
-        return Cut(tuple(windows), seconds, gaps, reason, blocked, spacing)
+        return WindowCut(tuple(windows), seconds, gaps, reason, blocked, spacing)
 
     def _incomplete(self, seconds: float, wanted: float, problem: str, blocks: list[Rows]) -> tuple[str, bool]:
         if seconds >= COMPLETE * wanted - 0.5 * self._step:

@@ -7,7 +7,7 @@ from collections.abc import Generator
 
 from quadid.online.checks import Quality, judge, mistake
 from quadid.online.estimator import Estimator
-from quadid.online.grid_buffer import Cut, GridBuffer
+from quadid.online.grid_buffer import GridBuffer, WindowCut
 from quadid.online.records import MOST_ERRORS, Outbox, Phase
 from quadid.online.settings import SessionSettings
 from quadid.online.supervisor import Supervisor
@@ -38,7 +38,7 @@ class WindowSupervisor:
         """Cuts the rows of `store`, which are of `vehicle`."""
         self._vehicle, self._store, self._settings = vehicle, store, settings
         self._outbox, self._supervisor = outbox, supervisor
-        self.cut, self.quality = Cut((), 0.0, 0), Quality()
+        self.cut, self.quality = WindowCut((), 0.0, 0), Quality()
         self._last_fit, self._asked_now, self.errors = -math.inf, False, 0
 
     def fit_now(self) -> None:

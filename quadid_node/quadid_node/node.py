@@ -40,9 +40,9 @@ from quadid_node.node_parameters import (
 )
 from quadid_node.polling import PollingNode
 from quadid_node.publication import Output
-from quadid_node.publish import Neighbours, Offer, Speaker
+from quadid_node.publish import GraphMonitor, Offer, Publishers
 from quadid_node.recorder import WRITTEN, Beginning, Recorder
-from quadid_node.rounds import ROUND_SECONDS, STEP_SECONDS, WORK_SECONDS, Rounds
+from quadid_node.rounds import ROUND_SECONDS, STEP_SECONDS, WORK_SECONDS, Scheduler
 from quadid_node.service import Service
 from quadid_node.worker import ProcessWorker
 from quadid_node.zenoh import ZenohLink
@@ -82,15 +82,15 @@ class IdentifyNode(PollingNode, LifecycleNode):
         self._id, self._problem, self._reads_back = "", "", False
         self._service: Service | None = None
         self._recorder: Recorder | None = None
-        self._neighbours: Neighbours | None = None
+        self._graph: GraphMonitor | None = None
         self._intake = Intake()
         self._bond: Bond | None = None
         self._zenoh: ZenohLink | None = None
         self._open: list[tuple[Callable[[Any], Any], Any]] = []
-        self._speaker = Speaker(self)
+        self._outputs = Publishers(self)
         self._change_state = self._service_change_state.callback
         self._service_change_state.callback = self._on_change_state
-        self._rounds, self._report_at = Rounds(self._round), 0.0
+        self._scheduler, self._report_at = Scheduler(self._round), 0.0
         self._active = False
         self.create_timer(STEP_SECONDS, self._step, clock=RosClock(clock_type=ClockType.STEADY_TIME))
 
@@ -170,7 +170,7 @@ class IdentifyNode(PollingNode, LifecycleNode):
         self._id = vehicle_id(values["vehicle_id"], self.get_namespace(), vehicle)
         self._observer = bool(values["observer"])
         inputs = {self.resolve_topic_name(entry.topic): entry.type.replace("/", "/msg/") for entry in preset.inputs}
-        self._neighbours = Neighbours(inputs, self._offers_on, self.unbroken, lambda text: self._log("error", text))
+        self._graph = GraphMonitor(inputs, self._offers_on, self.unbroken, lambda text: self._log("error", text))
         self._subscribe(preset, vehicle)
         self._given = values
         keeps = not self._observer and values["history"] != "none"
@@ -189,7 +189,7 @@ class IdentifyNode(PollingNode, LifecycleNode):
         self._hint = preset.motor_hint
         if values["zenoh"]:
             self._zenoh = ZenohLink(values["zenoh"], self._id, self._service)
-        self._speaker.open(self._observer)
+        self._outputs.open(self._observer)
         commands = Commands(self._id, lambda: self._service if self._active else None, self._put)
         for name, kind, answer in commands.offered():
             self._open.append((self.destroy_service, self.create_service(kind, f"quadid/{name}", answer)))
@@ -245,13 +245,13 @@ class IdentifyNode(PollingNode, LifecycleNode):
         self._active = False
         gc.unfreeze()
         self._break_bond()
-        self._rounds.drop()
+        self._scheduler.drop()
         self._intake.clear()
         self.destroy_polled()
         for destroy, item in reversed(self._open):
             destroy(item)
         self._open.clear()
-        self._speaker.close()
+        self._outputs.close()
         if self._zenoh is not None:
             self._zenoh.close()
             self._zenoh = None
@@ -268,7 +268,7 @@ class IdentifyNode(PollingNode, LifecycleNode):
     def _step(self) -> None:
         """Goes on with the round, for longer when the session is far behind its data."""
         behind = self._service.session.backlog / BACKLOG if self._service is not None else 1.0
-        self._rounds.step(WORK_SECONDS * min(max(behind, 1.0), CATCHING_UP))
+        self._scheduler.step(WORK_SECONDS * min(max(behind, 1.0), CATCHING_UP))
 
     def _round(self) -> Iterator[None]:
         """All there is to do again and again: take in what has arrived, write it down, report, work on it."""
@@ -283,13 +283,13 @@ class IdentifyNode(PollingNode, LifecycleNode):
 
     def _take_in(self, service: Service) -> Iterator[None]:
         """Gives the service what has arrived since the last round, topic by topic."""
-        waiting, neighbours = self._intake.take(), self._neighbours
-        if neighbours is None:
+        waiting, graph = self._intake.take(), self._graph
+        if graph is None:
             return
         for topic, publishers in self.publisher_counts().items():
-            neighbours.count(topic, publishers)
+            graph.count(topic, publishers)
         yield
-        if not self._active or neighbours.paused:
+        if not self._active or graph.paused:
             return
         for items in self._intake.read(waiting, self._recorder.take if self._recorder is not None else None):
             service.push_all(items)
@@ -302,7 +302,7 @@ class IdentifyNode(PollingNode, LifecycleNode):
         for outputs in service.pieces() if self._active else [service.idle()]:
             self._put(outputs)
             yield
-            if self._rounds.overdue or not self._active:
+            if self._scheduler.overdue or not self._active:
                 return
 
     def _put(self, outputs: list[Output]) -> None:
@@ -310,7 +310,7 @@ class IdentifyNode(PollingNode, LifecycleNode):
         for output in outputs:
             if output.topic == "event":
                 self._log(output.level, output.text)
-            elif self._service is not None and not self._speaker.silent and output.topic in messages.RESULTS:
+            elif self._service is not None and not self._outputs.silent and output.topic in messages.RESULTS:
                 self._send(output.topic, messages.RESULTS[output.topic](output, self._id, self._service.boot_id))
                 if self._zenoh is not None:
                     self._zenoh.publish(output)
@@ -320,7 +320,7 @@ class IdentifyNode(PollingNode, LifecycleNode):
     def _send(self, topic: str, fields: messages.Message) -> None:
         """Publishes a message, with the time by the node's clock where it has a field for it."""
         published = {"published": self._now()} if topic in messages.PUBLISHED else {}
-        self._speaker.publish(topic, {**fields, **published})
+        self._outputs.publish(topic, {**fields, **published})
 
     def _now(self) -> messages.Message:
         stamp = self.get_clock().now().to_msg()
@@ -328,7 +328,7 @@ class IdentifyNode(PollingNode, LifecycleNode):
 
     def _claim_topic(self) -> None:
         """Looks after the topic of parameter sets; once it is ours, says what is in force."""
-        if not self._speaker.step(self._active) or self._service is None:
+        if not self._outputs.step(self._active) or self._service is None:
             return
         if self._service.published is not None:
             self._put([Publish("parameters", self._service.published)])
@@ -355,17 +355,17 @@ class IdentifyNode(PollingNode, LifecycleNode):
         if not self._active:
             idle = f"{self._state}: {IDLE.get(self._state, 'changes its state').format(name=name)}"
         status, health, notes = messages.idle_status(self._id, idle), None, dict[str, str]()
-        if self._service is not None and self._neighbours is not None:
-            self._neighbours.look(self._speaker.deaf())
+        if self._service is not None and self._graph is not None:
+            self._graph.look(self._outputs.deaf())
             self._claim_topic()
-            self._neighbours.note(self._speaker.ours, self._speaker.problem)
+            self._graph.note(self._outputs.ours, self._outputs.problem)
             health = self._service.health()
             if self._zenoh is not None:
                 self._zenoh.report(health)
-                self._neighbours.note("zenoh", self._zenoh.problem)
+                self._graph.note("zenoh", self._zenoh.problem)
                 if self._active:
                     self._zenoh.attend()
-            notes = dict(self._neighbours.notes)
+            notes = dict(self._graph.notes)
             if self._active:
                 status = messages.fit_status(health.status, self._id, health.fit_seconds)
             if "no rotor speeds" in status["reason"]:

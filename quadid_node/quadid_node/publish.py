@@ -39,8 +39,8 @@ BESIDE = "another service publishes parameter sets too: one of the two stops in 
 STRANGER = "someone else publishes parameter sets on our topic: check sequence and log_hash"
 
 
-class Claim:
-    """One topic that one service may publish on.
+class TopicOwnership:
+    """Ownership of one topic that one service may publish on.
 
     Attributes:
         publisher: ours; None while another one is there.
@@ -133,7 +133,7 @@ LATCHED = ("diagnosis", "vehicle_health")
 """Topics whose last message is for late joiners too, as is that of the parameters."""
 
 
-class Speaker:
+class Publishers:
     """Publishes for one vehicle.
 
     Attributes:
@@ -145,7 +145,7 @@ class Speaker:
         self._node = node
         self.ours = node.resolve_topic_name(TOPICS["parameters"][0])
         self._publishers = {topic: self._create(topic, USUAL_QOS, node.create_publisher) for topic in ALWAYS}
-        self._claim: Claim | None = None
+        self._ownership: TopicOwnership | None = None
 
     def open(self, observer: bool) -> None:
         """Offers the results too; an observer none of them."""
@@ -153,7 +153,7 @@ class Speaker:
         for topic in TOPICS.keys() - {"parameters", *ALWAYS}:
             self._publishers[topic] = self._create(topic, LATCHED_QOS if topic in LATCHED else USUAL_QOS, managed)
         if not observer:
-            self._claim = Claim(
+            self._ownership = TopicOwnership(
                 lambda: self._node.count_publishers(self.ours), self._kin, self._claimed,
                 self._node.destroy_lifecycle_publisher,
             )  # fmt: skip
@@ -161,34 +161,34 @@ class Speaker:
     @property
     def silent(self) -> bool:
         """Whether results stay unsaid: an observer, or another service speaks for this vehicle."""
-        return self._claim is None or self._claim.publisher is None
+        return self._ownership is None or self._ownership.publisher is None
 
     @property
     def problem(self) -> str:
         """Who else publishes parameter sets, or empty."""
-        return self._claim.problem if self._claim is not None else ""
+        return self._ownership.problem if self._ownership is not None else ""
 
     def step(self, wanted: bool = True) -> bool:
         """Looks who else publishes parameter sets; True when the topic has just become ours, if it is `wanted`."""
-        if self._claim is None:
+        if self._ownership is None:
             return False
-        if self._claim.publisher is not None:
-            self._claim.publisher.assert_liveliness()
-        return self._claim.step(wanted)
+        if self._ownership.publisher is not None:
+            self._ownership.publisher.assert_liveliness()
+        return self._ownership.step(wanted)
 
     def publish(self, topic: str, fields: Message) -> None:
         """Publishes a message given as a dictionary; parameter sets only while the topic is ours."""
         publisher = self._publishers.get(topic)
-        if topic == "parameters" and self._claim is not None:
-            publisher = self._claim.publisher
+        if topic == "parameters" and self._ownership is not None:
+            publisher = self._ownership.publisher
         if publisher is not None:
             publisher.publish(to_message(TOPICS[topic][1], fields))
 
     def deaf(self) -> dict[str, bool]:
         """For each topic of ours: whether somebody subscribes with a QoS that is not offered, and hears nothing."""
         published = dict(self._publishers)
-        if self._claim is not None and self._claim.publisher is not None:
-            published["parameters"] = self._claim.publisher
+        if self._ownership is not None and self._ownership.publisher is not None:
+            published["parameters"] = self._ownership.publisher
         return {p.topic_name: self._unheard(p) for p in published.values()}
 
     def _unheard(self, publisher: Any) -> bool:
@@ -198,9 +198,9 @@ class Speaker:
 
     def close(self) -> None:
         """Takes the publishers of results away."""
-        if self._claim is not None:
-            self._claim.let_go()
-            self._claim = None
+        if self._ownership is not None:
+            self._ownership.let_go()
+            self._ownership = None
         for topic in self._publishers.keys() - {*ALWAYS}:
             self._node.destroy_lifecycle_publisher(self._publishers.pop(topic))
 
@@ -234,8 +234,8 @@ class Offer(NamedTuple):
     heard: bool
 
 
-class Neighbours:
-    """What is wrong on the topics.
+class GraphMonitor:
+    """Monitors the graph: reports what is wrong on the topics.
 
     Attributes:
         notes: by topic.

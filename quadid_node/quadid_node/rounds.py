@@ -19,11 +19,11 @@ WORK_SECONDS = 0.0015
 """No piece of a round begins later than this in a step [s]."""
 
 
-class Rounds:
-    """One round after the other."""
+class Scheduler:
+    """Does one round after the other."""
 
     def __init__(self, begin: Callable[[], Iterator[None]], clock: Callable[[], float] = time.monotonic) -> None:
-        """Has done nothing yet.
+        """Starts with a round that is due.
 
         Args:
             begin: begins a round; it is done to the end piece by piece.

@@ -10,7 +10,7 @@ import pytest
 from quadid.checks import inspect
 from quadid.data.faults import at_limit, data_faults
 from quadid.online.checks import judge
-from quadid.online.grid_buffer import Cut
+from quadid.online.grid_buffer import WindowCut
 from quadid.vehicle import Vehicle
 from tests.faults.evidence import Happened
 from tests.online.driving import flight
@@ -30,7 +30,9 @@ def test_three_places_agree_on_a_saturated_sensor(share: float, happened: Happen
     window = replace(made.window, gyro=np.clip(made.window.gyro, -top, top))
     assert any(end.axis == 1 for end in at_limit(clipped))
     assert any("saturated" in c.name for c in inspect(recording, PELICAN).checks)
-    assert "saturated" in judge(Cut((window,), len(window) * window.dt, 0), PELICAN, thrust_of(2.33e-5), True).fault
+    assert (
+        "saturated" in judge(WindowCut((window,), len(window) * window.dt, 0), PELICAN, thrust_of(2.33e-5), True).fault
+    )
     assert [f for f in data_faults([window]) if f.kind == "saturated"]
     happened(6, f"gyro clipped at {share:.0%} of its peak: inspection, online window and diagnosis name it by one rule")
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import random
 
 import pytest
-from quadid_node.publish import BESIDE, FOUND_WITHIN, OBSERVES, STRANGER, YOUNG, Claim
+from quadid_node.publish import BESIDE, FOUND_WITHIN, OBSERVES, STRANGER, YOUNG, TopicOwnership
 
 SETTLED = FOUND_WITHIN + 2.0
 """By then [s] a service that sees no other one speaks."""
@@ -19,7 +19,7 @@ class Topic:
         self.publishers: dict[int, str] = {}
         self._next = 0
 
-    def service(self) -> Claim:
+    def service(self) -> TopicOwnership:
         """A service that looks at this topic; its own publisher it always sees."""
         mine: set[int] = set()
 
@@ -38,21 +38,21 @@ class Topic:
             mine.discard(number)
             del self.publishers[number]
 
-        return Claim(count, kin, create, destroy, lambda: self.now)
+        return TopicOwnership(count, kin, create, destroy, lambda: self.now)
 
     def stranger(self, name: str = "someone") -> int:
         self._next += 1
         self.publishers[self._next] = name
         return self._next
 
-    def run(self, seconds: float, *services: Claim) -> None:
+    def run(self, seconds: float, *services: TopicOwnership) -> None:
         for _ in range(round(seconds)):
             self.now += 1.0
             for service in services:
                 service.step()
 
 
-def speaking(*services: Claim) -> int:
+def speaking(*services: TopicOwnership) -> int:
     return sum(s.publisher is not None for s in services)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from quadid_node.publish import Neighbours, Offer
+from quadid_node.publish import GraphMonitor, Offer
 
 IMU, JOINTS = "sensor_msgs/msg/Imu", "sensor_msgs/msg/JointState"
 GOOD = Offer(IMU, True)
@@ -16,14 +16,14 @@ class Topic:
         self.offers: list[Offer] = [GOOD]
         self.lines: list[str] = []
         self.unbroken = 0.0
-        self.neighbours = Neighbours(
+        self.graph = GraphMonitor(
             {"/imu": IMU}, lambda topic: self.offers, lambda topic: self.unbroken, self.lines.append
         )
 
     def look(self, *offers: Offer, deaf: bool = False) -> dict[str, str]:
         self.offers = [*offers]
-        self.neighbours.look({"/candidate": deaf})
-        return self.neighbours.notes
+        self.graph.look({"/candidate": deaf})
+        return self.graph.notes
 
 
 @pytest.fixture
@@ -49,31 +49,31 @@ def test_what_is_wrong_is_told_once_and_taken_back(topic: Topic, offers: list[Of
 
 
 def test_two_publishers_pause_at_once_and_one_goes_on(topic: Topic) -> None:
-    topic.neighbours.count("/imu", 1)
-    assert not topic.neighbours.paused
-    topic.neighbours.count("/imu", 2)
-    assert topic.neighbours.paused
+    topic.graph.count("/imu", 1)
+    assert not topic.graph.paused
+    topic.graph.count("/imu", 2)
+    assert topic.graph.paused
     topic.look(GOOD, GOOD)
-    assert topic.neighbours.paused
+    assert topic.graph.paused
     topic.look(GOOD)
-    assert not topic.neighbours.paused
+    assert not topic.graph.paused
 
 
 def test_a_publisher_that_is_listed_but_not_heard_does_not_pause(topic: Topic) -> None:
     """One that was killed is listed until its lease ends."""
-    topic.neighbours.count("/imu", 2)
-    assert topic.neighbours.paused
+    topic.graph.count("/imu", 2)
+    assert topic.graph.paused
     topic.unbroken = 1.1
     assert topic.look(GOOD, GOOD) == {"/imu": "2 publishers on one topic, only one publishes"}
-    assert not topic.neighbours.paused
+    assert not topic.graph.paused
     topic.unbroken = 0.02
-    topic.neighbours.count("/imu", 2)
-    assert topic.neighbours.paused
+    topic.graph.count("/imu", 2)
+    assert topic.graph.paused
 
 
 def test_two_types_on_a_topic_do_not_pause(topic: Topic) -> None:
     topic.look(GOOD, Offer(JOINTS, True))
-    assert not topic.neighbours.paused
+    assert not topic.graph.paused
 
 
 def test_a_subscriber_that_hears_nothing_is_named_while_it_is_there(topic: Topic) -> None:

@@ -1,20 +1,20 @@
-"""Rounds are done in steps that end in time, whole, and one begins when it is due."""
+"""Scheduler are done in steps that end in time, whole, and one begins when it is due."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 
 import pytest
-from quadid_node.rounds import STEPS, WORK_SECONDS, Rounds
+from quadid_node.rounds import STEPS, WORK_SECONDS, Scheduler
 
 
 class Work:
-    """Rounds of so many pieces, each of which takes so long [s]."""
+    """Scheduler of so many pieces, each of which takes so long [s]."""
 
     def __init__(self, pieces: int, lasting: float) -> None:
         self.now, self.begun, self.done = 0.0, 0, 0
         self._pieces, self._lasting = pieces, lasting
-        self.rounds = Rounds(self._round, lambda: self.now)
+        self.rounds = Scheduler(self._round, lambda: self.now)
 
     def _round(self) -> Iterator[None]:
         self.begun += 1

@@ -12,7 +12,7 @@ from quadid.online import FitReply, FitRequest, Session, SessionSettings
 from quadid.online.estimator import Estimator
 from quadid.online.flexible_fit import with_room
 from quadid.online.fusion import WindowEstimate
-from quadid.online.grid_buffer import Cut
+from quadid.online.grid_buffer import WindowCut
 from quadid.parameters import Status
 from quadid.vehicle import GRAVITY, ParameterPrior, Vehicle
 from tests.online.driving import drive, events, flight, published, samples
@@ -44,7 +44,7 @@ def test_where_the_coupling_is_free_yaw_claims_no_more_than_the_vehicle_file() -
     sure = WindowEstimate(0.0, 10.0, off, np.diag(np.full(6, 1e6)), np.zeros(6), 900.0, 900.0, nothing_left_out())
     theta = layout.initial(model)
     theta[:6] = np.exp(off)
-    asked = learner.request(1, Cut((flight(24.0, 5, effects=LAGGING).window.slice(0, 500),), 10.0, 0), 0.0, 10.0)
+    asked = learner.request(1, WindowCut((flight(24.0, 5, effects=LAGGING).window.slice(0, 500),), 10.0, 0), 0.0, 10.0)
     learner.take(asked, FitReply(1, excitation=np.full(6, 0.01), excited=True, estimate=sure, theta=theta))
     found = learner.parameters()
     assert found is not None

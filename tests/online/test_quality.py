@@ -12,7 +12,7 @@ from quadid.checks.findings import CheckResult
 from quadid.data.window import Window
 from quadid.model.layout import Layout, ThrustModel
 from quadid.online.checks import Quality, judge, mistake
-from quadid.online.grid_buffer import Cut
+from quadid.online.grid_buffer import WindowCut
 from quadid.vehicle import GRAVITY, Vehicle
 from tests.faults.evidence import Happened
 from tests.online.driving import flight
@@ -29,7 +29,7 @@ def thrust_of(b: float) -> ThrustModel:
 
 
 def verdict(window: Window, known: bool = True) -> Quality:
-    return judge(Cut((window,), len(window) * window.dt, 0), PELICAN, thrust_of(B), known)
+    return judge(WindowCut((window,), len(window) * window.dt, 0), PELICAN, thrust_of(B), known)
 
 
 def changed(window: Window, name: str, values: np.ndarray) -> Window:
@@ -134,7 +134,7 @@ def test_a_wrong_order_of_rotors_is_named_where_their_readings_are_quick_enough(
     window = made.window.slice(0, 500)
     swapped = changed(window, "rotor_speed", window.rotor_speed[:, [1, 0, 2, 3]])
     for every in (1, 2):
-        cut = Cut((swapped,), 10.0, 0, spacing=float(every))
+        cut = WindowCut((swapped,), 10.0, 0, spacing=float(every))
         named = mistake(cut, PELICAN, known=False)
         assert named.startswith("motor order:") == (every == 1)
         rotors = made.recording.channels["rotor_speed"]
@@ -142,4 +142,4 @@ def test_a_wrong_order_of_rotors_is_named_where_their_readings_are_quick_enough(
         log = inspect(replace(made.recording, channels={**made.recording.channels, "rotor_speed": slow}), PELICAN)
         (check,) = [c for c in log.checks if c.name == "motor_order"]
         assert (check.verdict is CheckResult.ERROR) == (every == 1)
-    assert mistake(Cut((swapped,), 10.0, 0), PELICAN, known=True) == ""
+    assert mistake(WindowCut((swapped,), 10.0, 0), PELICAN, known=True) == ""

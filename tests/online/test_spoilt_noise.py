@@ -10,7 +10,7 @@ from quadid.data.window import Window
 from quadid.identification.noise_model import NoiseModel
 from quadid.model.layout import Layout
 from quadid.online.estimator import Estimator
-from quadid.online.grid_buffer import Cut
+from quadid.online.grid_buffer import WindowCut
 from quadid.online.window_fit import FitReply, FitRequest
 from quadid.parameters import NOMINAL_NAMES
 from quadid.vehicle import Vehicle
@@ -52,10 +52,10 @@ def test_a_spoilt_noise_is_found_anew_and_the_fit_done(windows: tuple[Window, ..
 
 def test_the_learner_takes_the_noise_that_was_found_anew(windows: tuple[Window, ...]) -> None:
     learner = Estimator(PELICAN, 60.0, 0)
-    learner.take(learner.request(1, Cut(windows, 10.0, 0), 0.0, 10.0), fitted(windows, None, search=True))
+    learner.take(learner.request(1, WindowCut(windows, 10.0, 0), 0.0, 10.0), fitted(windows, None, search=True))
     (good,) = learner.noises.values()
     learner.noises[len(good.white)] = spoilt(len(good.white))
-    asked = learner.request(2, Cut(windows, 10.0, 0), 0.0, 10.0)
+    asked = learner.request(2, WindowCut(windows, 10.0, 0), 0.0, 10.0)
     assert asked.noise is not None
     assert asked.noise.white[0] == 3.0
     learner.take(asked, asked.answer())

@@ -47,7 +47,7 @@ class ProbeNode(quadid_node.node.IdentifyNode):
         return noted
 
     def _step(self) -> None:
-        resting, begin, cpu = self._rounds.resting, time.monotonic(), time.thread_time()
+        resting, begin, cpu = self._scheduler.resting, time.monotonic(), time.thread_time()
         super()._step()
         if self.idle and not resting:
             self.cpu.append(time.thread_time() - cpu)

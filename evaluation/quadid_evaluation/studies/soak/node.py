@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import quadid_node.node
 from quadid_node.identify import main
-from quadid_node.publish import Speaker
+from quadid_node.publish import Publishers
 from quadid_node.service import Service
 
 from quadid_evaluation.studies.soak import memory
@@ -46,7 +46,7 @@ class CountingNode(quadid_node.node.IdentifyNode):
 
         return counted
 
-    def _report(self, service: Service, speaker: Speaker) -> Iterator[None]:
+    def _report(self, service: Service, speaker: Publishers) -> Iterator[None]:
         yield from super()._report(service, speaker)
         if time.monotonic() - self.noted >= EVERY and self.late:
             self.note()
