@@ -118,8 +118,6 @@ class Session:
                 self._outbox.say(self.resampler.time.newest, "warning", "clock", text)
         self.resampler.notices.clear()
 
-    push_block = push
-
     def deliver(self, reply: JobReply) -> None:
         """Takes the answer to a running job; an answer to any other is ignored."""
         if self._waiting is not None and reply.number == self._waiting.number:

@@ -292,7 +292,8 @@ class IdentifyNode(PollingNode, LifecycleNode):
         if not self._active or graph.paused:
             return
         for items in self._intake.read(waiting, self._recorder.take if self._recorder is not None else None):
-            service.push_all(items)
+            for item in items:
+                service.push(item)
             yield
             if not self._active:
                 return

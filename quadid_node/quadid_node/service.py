@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import time
 import uuid
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -138,24 +138,12 @@ class Service:
         """Whether fits can begin at once."""
         return self._worker.ready
 
-    def push(self, sample: Sample) -> None:
-        """Takes one sample."""
-        self.push_block(sample.block)
-
-    def push_block(self, block: Block) -> None:
-        """Takes messages as if their samples were pushed one by one."""
-        now = self._clock()
+    def push(self, messages: Block | Sample) -> None:
+        """Takes messages; their portions change nothing."""
+        now, block = self._clock(), messages if isinstance(messages, Block) else messages.block
         for name, _ in block.columns:
             self._arrived[name] = now
         self.session.push(block)
-
-    def push_all(self, items: Iterable[Sample | Block]) -> None:
-        """Takes samples and messages in order."""
-        for item in items:
-            if isinstance(item, Block):
-                self.push_block(item)
-            else:
-                self.push(item)
 
     def step(self, seconds: float = math.inf) -> list[Output]:
         """Moves everything on by what there is to do; never waits.

@@ -172,7 +172,7 @@ def test_blocks_of_messages_give_what_samples_give() -> None:
     t = np.array([s.t for s in stream[::4]])
     names = [s.channel for s in stream[:4]]
     columns = tuple((name, np.array([s.values for s in stream[k::4]])) for k, name in enumerate(names))
-    session.push_block(Block(t, columns))
+    session.push(Block(t, columns))
     assert told(answered(session, tells())) == told(plain)
 
 

@@ -144,7 +144,8 @@ def _fly_through(log: Path, folder: Path) -> None:
                 continue
             stamps[0] = nanoseconds * 1e-9 - EPOCH
             for items in intake.read(intake.take()):
-                service.push_all(items)
+                for item in items:
+                    service.push(item)
             for output in [o for _ in range(5) for o in service.step()]:
                 if output.topic == "parameters":
                     messages.RESULTS[output.topic](output, vehicle.name, service.boot_id)

@@ -91,7 +91,7 @@ class Flown:
         """Flies once; what it reports."""
         out: list[Action] = []
         for block in hover_blocks(PELICAN, self._begin, seconds, self._rng, wrong, ONSET):
-            self._session.push_block(block)
+            self._session.push(block)
             out += self._session.poll()
             while (job := self._session.running) is not None:
                 self._session.deliver(job.run())

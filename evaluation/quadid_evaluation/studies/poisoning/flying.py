@@ -84,7 +84,7 @@ def fly_online(session: Session, recording: Recording, start: float, stop: float
             a, b = int(place[k]), int(place[k + 1])
             channel = recording.channels[name]
             if b > a:
-                session.push_block(Block(channel.t[a:b], ((name, channel.values[a:b]),)))
+                session.push(Block(channel.t[a:b], ((name, channel.values[a:b]),)))
         _answer(session, sets)
     return sets
 

@@ -130,7 +130,7 @@ class _Tally:
         begin = time.thread_time()
         for batch in self._flight:
             for block in batch:
-                service.push_block(Block(block.t + shift, block.columns))
+                service.push(Block(block.t + shift, block.columns))
             self._note(service.step())
             while service.session.running is not None:
                 self._note(service.step())
