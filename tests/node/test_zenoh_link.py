@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -17,6 +19,7 @@ from quadid.cli.watch import snapshot, table
 from quadid.online.records import OnlineDiagnosis, OnlineFinding
 from quadid_node import zenoh as zenoh_fleet
 from tests.faults.evidence import Happened
+from tests.node.peers import Process
 from tests.node.zenoh_net import Net, accepted, free_port, service, until
 from tests.online.test_gate import TRUE, online_set
 
@@ -258,3 +261,58 @@ def test_a_watcher_is_not_filled_up_nor_upset_by_strangers(monkeypatch: pytest.M
     session.take(_Heard("quadid/v0/parameters", _Bytes(b'{"a": 1}')))
     assert fleet.latest["v0"]["parameters"] == {"a": 1}, "who is known goes on"
     happened(16, f"300 values of 256 KiB from strangers: {held >> 20} MiB kept; a number of 4000 digits is shown")
+
+
+# --- `quadid watch`, run as a user runs it, through a router with TLS
+
+
+def quadid(*arguments: str) -> Process:
+    return Process(str(Path(sys.executable).with_name("quadid")), *arguments, COLUMNS="160")
+
+
+def test_quadid_watch_shows_the_fleet_and_carries_commands(net: Net) -> None:
+    """The command itself, a process of its own: live view, JSON, approval, and a vehicle that is not there."""
+    owned = service()
+    owned.session.active_set.approval = "manual"
+    owned.session.active_set.hold(online_set(TRUE), 30.0)
+    link = ZenohLink(net.client("quad1"), "quad1", owned)
+    link.publish(accepted(2))
+    link.report(owned.health())
+    where = ("watch", "--zenoh", net.client("watch"))
+    with link_attended(link):
+        with quadid(*where, "--seconds", "3") as live:
+            assert live.child.wait(60) == 0, live.text
+        assert "quad1" in live.text
+        assert "waiting: no samples yet" in live.text
+        assert "J_xx" in live.text
+        with quadid(*where, "--json", "-") as once:
+            assert once.child.wait(60) == 0
+        assert json.loads(once.text)["vehicles"]["quad1"]["parameters"]["sequence"] == 2
+        with quadid(*where, "--approve", "quad1", "--json", "-") as approve:
+            assert approve.child.wait(60) == 0, approve.text
+        assert "approved, in force as set" in json.loads(approve.text)["text"]
+        with quadid(*where, "--rollback", "quad9") as nobody:
+            assert nobody.child.wait(60) == 3
+        assert "no answer from 'quad9'" in nobody.text
+    with quadid("watch", "--zenoh", "nowhere.json5") as wrong:
+        assert wrong.child.wait(60) == 2
+    assert "no Zenoh configuration" in wrong.text
+
+
+@contextlib.contextmanager
+def link_attended(link: ZenohLink) -> Iterator[None]:
+    """A thread that does what the loop of `quadid serve` does for its link."""
+    over = threading.Event()
+
+    def attend() -> None:
+        while not over.wait(0.02):
+            link.attend()
+
+    thread = threading.Thread(target=attend)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()
+        link.close()
