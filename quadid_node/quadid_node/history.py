@@ -527,6 +527,7 @@ class Store:
         notes: what people should know of what is past: a damaged history set aside, a row refused.
         problem: why nothing is written at the moment, or empty.
         boot_id: of this run; stands with every set that it numbers.
+        written: numbers of the sets that are on the disk; lost: of those that never will be.
     """
 
     def __init__(self, path: Path, vehicle: str, kept: Mapping[str, int] = KEPT) -> None:
@@ -556,8 +557,8 @@ class Store:
         self._standing: dict[str, Row] = {}
         self._flights: deque[Row] = deque(maxlen=MOST_FLIGHTS)
         self._rows: list[Row] = []
-        self._written: set[int] = set()
-        self._lost: set[int] = set()
+        self.written: set[int] = set()
+        self.lost: set[int] = set()
         self._changed = threading.Condition()
         self._closing, self._since_pruned = False, 0
         self._lock: HistoryLock | None = None
@@ -573,17 +574,16 @@ class Store:
                 self.notes.append(note)
                 self._unread = True
                 self._lock.moved()
-        except (sqlite3.Error, StoreError) as error:
-            if isinstance(error, sqlite3.Error) and "locked" not in str(error):
-                self.problem = f"{self.path} cannot be written ({error})"
-            else:
+        except StoreError:
+            self._lock.close()
+            raise
+        except sqlite3.Error as error:
+            self.problem = f"{self.path} cannot be written ({error})"
+            if "locked" in str(error):
                 self._lock.close()
-                if isinstance(error, StoreError):
-                    raise
-                raise StoreError(
-                    f"another program holds the history {self.path} ({error})",
-                    "a history that can be written", "end that program, or use another history",
-                ) from error  # fmt: skip
+                found = f"another program holds the history {self.path} ({error})"
+                fix = "end that program, or use another history"
+                raise StoreError(found, "a history that can be written", fix) from error
         self._writer.start()
 
     # --- what an earlier run left
@@ -683,14 +683,6 @@ class Store:
         self._standing["decision"] = self._row("decisions", configured=configured, approval=approval)
         self._put(self._standing["decision"])
 
-    def written(self, number: int) -> bool:
-        """Whether the set of that number is on the disk."""
-        return number in self._written
-
-    def lost(self, number: int) -> bool:
-        """Whether it will never be there: no history can hold it."""
-        return number in self._lost
-
     def flush(self, seconds: float) -> bool:
         """Waits until everything is on the disk; False when it is not after so long [s]."""
         with self._changed:
@@ -740,7 +732,7 @@ class Store:
             self._rows.append(row)
             if len(self._rows) > MOST_WAITING:
                 at = next((k for k, waiting in enumerate(self._rows) if waiting.passes), 0)
-                self._lost.add(self._rows.pop(at).number)
+                self.lost.add(self._rows.pop(at).number)
                 self.problem = f"{self.path}: the disk takes nothing, entries are lost"
             self._changed.notify_all()
 
@@ -768,8 +760,8 @@ class Store:
         with self._changed:
             done = {id(row) for row in batch}
             self._rows = [row for row in self._rows if id(row) not in done]
-            self._written |= {row.number for row in batch if row.number and id(row) not in refused}
-            self._lost |= {row.number for row in batch if id(row) in refused}
+            self.written |= {row.number for row in batch if row.number and id(row) not in refused}
+            self.lost |= {row.number for row in batch if id(row) in refused}
             self.notes += [f"an entry that no history can hold was left out ({why})" for why in refused.values()]
             self.problem = ""
             self._changed.notify_all()

@@ -53,9 +53,9 @@ class Publication:
         store, out = self._store, list[Output]()
         while store is not None and self._waiting:
             output = self._waiting[0]
-            if not isinstance(output, Publish) or store.written(output.item.sequence):
+            if not isinstance(output, Publish) or output.item.sequence in store.written:
                 out.append(output)
-            elif not store.lost(output.item.sequence):
+            elif output.item.sequence not in store.lost:
                 break
             del self._waiting[0]
         return out

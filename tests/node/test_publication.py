@@ -237,9 +237,9 @@ def test_a_history_that_is_no_file_is_said(tmp_path: Path, monkeypatch: pytest.M
     Path("file").write_text("no folder")
     store = Store(Path(name), "pelican")
     store.numbered(replace(online_set(TRUE), sequence=7))
-    assert store.flush(1.0) == store.written(7) == (name == ":memory:")
-    assert bool(store.problem) != store.written(7)
-    assert store.restore().item is None or store.written(7)
+    assert store.flush(1.0) == (7 in store.written) == (name == ":memory:")
+    assert bool(store.problem) != (7 in store.written)
+    assert store.restore().item is None or 7 in store.written
     store.close()
 
 
