@@ -80,7 +80,7 @@ reproduce: venv ## the paper's tables and figures, into docs/results
 
 STUDY = OPENBLAS_NUM_THREADS=1 $(BIN)/python -m
 
-.PHONY: findings autopilot peers health health-hours truth filter-error cases campaign ablation foreign paper-scale excite optimisers subspace control kernel-speed bench
+.PHONY: findings mpc autopilot peers health health-hours truth filter-error cases campaign ablation foreign paper-scale excite optimisers subspace control kernel-speed bench
 truth: venv ## errors against their bound, coverage, bias with noise, status (an hour)
 	$(STUDY) quadid_evaluation.studies.truth --out docs/results
 
@@ -102,6 +102,9 @@ peers: dev ## other programs beside ours on the same data (mujoco.sysid, sysid.t
 autopilot: venv ## ArduCopter's and others' flights through the online session, replayed and live in real time (half an hour)
 	$(STUDY) quadid_evaluation.studies.autopilot --out docs/results
 	$(STUDY) quadid_evaluation.studies.autopilot --live --out docs/results
+
+mpc: dev ## a predictive controller with guesses and with the identified file, on a fast circle (two minutes)
+	$(BIN)/python examples/casadi_mpc.py
 
 campaign: venv ## blinded campaign of hidden effects (hours)
 	$(STUDY) quadid_evaluation.studies.campaign --out docs/results

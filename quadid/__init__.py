@@ -55,6 +55,8 @@ _PUBLIC = {
     "ParameterSet": "quadid.parameters",
 }
 """Public names and where they are defined."""
+_EXTRAS = ("jax", "symbolic")
+"""Modules that need an extra package; imported when they are used."""
 __all__ = [*_PUBLIC, "excite"]
 
 install()
@@ -63,6 +65,8 @@ install()
 def __getattr__(name: str) -> Any:
     if name == "excite":
         return importlib.import_module("quadid.app.excite").propose
+    if name in _EXTRAS:
+        return importlib.import_module(f"quadid.{name}")
     if name in _PUBLIC:
         return getattr(importlib.import_module(_PUBLIC[name]), name)
     raise AttributeError(f"module 'quadid' has no attribute '{name}'")

@@ -582,6 +582,14 @@ class Vehicle(Strict):
             )
         return cls.from_yaml((folder / f"{name}.yaml").read_text(encoding="utf-8"), f"{name}.yaml")
 
+    @classmethod
+    def named(cls, name: str | Path) -> Vehicle:
+        """Loads a vehicle file, or a shipped vehicle where there is no such file; raises VehicleError."""
+        path = Path(name)
+        if path.is_file():
+            return cls.from_yaml(path.read_text(encoding="utf-8"), path.name)
+        return cls.shipped(str(name))
+
     def to_yaml(self) -> str:
         """Writes the vehicle as YAML that `from_yaml` reads back."""
         data = self.model_dump(mode="json", exclude_none=True)

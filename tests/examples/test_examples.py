@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import re
 import subprocess
@@ -15,9 +16,9 @@ import pytest
 from quadid_replay import write_csv, write_mcap
 
 from quadid.errors import WindowError
-from quadid.flight import fly
+from quadid.flight import TruthParameters, fly
 from quadid.model.step import simulate
-from quadid.vehicle import GRAVITY, Vehicle
+from quadid.vehicle import GRAVITY, ParameterPrior, Vehicle
 
 
 def run(
@@ -102,3 +103,19 @@ def test_simulate_hovers_falls_and_starts_where_it_is_told() -> None:
     np.testing.assert_allclose(fall.position[:, 0], fall.t, rtol=1e-9)
     with pytest.raises(WindowError, match="rotor speeds of shape"):
         simulate(pelican, hover[:, :3], 0.02)
+
+
+def test_the_identified_vehicle_flies_closer_to_the_circle(repository: Path) -> None:
+    """The controller of the example, with the guesses of the file and with what a diagnosis finds."""
+    pytest.importorskip("casadi")
+    spec = importlib.util.spec_from_file_location("casadi_mpc", repository / "examples" / "casadi_mpc.py")
+    assert spec is not None
+    assert spec.loader is not None
+    example = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(example)
+    guess = Vehicle.shipped("pelican")
+    truth = {n: ParameterPrior(initial=v) for n, v in TruthParameters.of(guess).as_dict().items()}
+    found = guess.model_copy(update={"parameters": truth, "effects": example.HIDDEN})
+    missed = [example.circled(v, guess, example.WEIGHTS["firm"], 1.6) for v in (guess, found)]
+    far = [float(np.sqrt(np.mean(m[20:] ** 2))) for m in missed]
+    assert far[1] < 0.6 * far[0]
