@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Generator
 from dataclasses import dataclass
 
@@ -11,11 +10,10 @@ import numpy as np
 from quadid.online.change_detection import CHUNK, ChangeDetector, ChangePoint
 from quadid.online.checks import Quality, judge
 from quadid.online.estimator import Estimator
-from quadid.online.fault_isolation import PULL, ChangeReply, ChangeRequest
+from quadid.online.fault_isolation import ChangeReply, ChangeRequest, carried
 from quadid.online.fusion import DRIFT
 from quadid.online.grid_buffer import GridBuffer
-from quadid.online.records import OnlineAlternative, OnlineFinding
-from quadid.vehicle import GRAVITY, Vehicle
+from quadid.vehicle import Vehicle
 
 AFTER_CHANGE = 3.0
 """Data that a change is explained from [s]."""
@@ -104,20 +102,5 @@ class ChangeSupervisor:
         if not request.windows:
             return ChangeReply(request.number, "too little data after the change")
         if not estimator.learned:
-            weight = request.vehicle.mass * GRAVITY
-            return ChangeReply(request.number, finding=_unlearned(request.change, request.time, weight))
+            return ChangeReply(request.number, finding=carried(request))
         return None
-
-
-def _unlearned(change: ChangePoint, time: float, weight: float) -> OnlineFinding | None:
-    """What a step of thrust means before anything was learned: mass or thrust, not to be told apart."""
-    if change.channel != "thrust":
-        return None
-    fraction = float(np.expm1(-change.size))
-    rivals = tuple(OnlineAlternative(effect, math.nan) for effect in (PULL, "thrust_drop"))
-    return OnlineFinding(
-        "mass_change", {"time": time, "fraction": fraction}, {"time": 0.5, "fraction": abs(fraction / change.errors)},
-        {"time": "s", "fraction": ""}, math.nan, math.nan, math.nan, rivals,
-        f"thrust per weight stepped by {change.size:+.1%} before the vehicle was known: {fraction * weight:+.2f} N "
-        "to hold it up, of a payload, of a steady pull, or of thrust that was lost", False,
-    )  # fmt: skip

@@ -109,8 +109,24 @@ def _explain(request: ChangeRequest) -> ChangeReply:
         or not np.isfinite(nothing.deviance)
         or drop < exceeded(1e-3 / len(outcomes), max(len(best.cause.names), 1))
     ):
-        return ChangeReply(request.number, "no known cause explains it")
+        return ChangeReply(request.number, "no known cause explains it", carried(request))
     return ChangeReply(request.number, finding=_finding(request, nothing, outcomes))
+
+
+def carried(request: ChangeRequest) -> OnlineFinding | None:
+    """What a step of thrust means where no fit can say what it is: a force; None for a step of a moment."""
+    change = request.change
+    if change.channel != "thrust":
+        return None
+    fraction = float(np.expm1(-change.size))
+    newtons = fraction * request.vehicle.mass * GRAVITY
+    return OnlineFinding(
+        "mass_change", {"time": request.time, "fraction": fraction},
+        {"time": 0.5, "fraction": abs(fraction / change.errors)}, {"time": "s", "fraction": ""}, np.nan, np.nan, np.nan,
+        tuple(OnlineAlternative(effect, np.nan) for effect in (PULL, "thrust_drop")),
+        f"thrust per weight stepped by {change.size:+.1%}: {newtons:+.2f} N to hold the vehicle up, of a payload, of a "
+        "steady pull, or of thrust that was lost: not told apart", False,
+    )  # fmt: skip
 
 
 def _causes(request: ChangeRequest) -> list[_Cause]:

@@ -12,7 +12,7 @@ from quadid.model.layout import LOSS, Layout
 from quadid.online.change_detection import ChangeDetector, ChangePoint
 from quadid.online.fault_isolation import ChangeRequest
 from quadid.online.grid_buffer import Rows
-from quadid.vehicle import Vehicle
+from quadid.vehicle import GRAVITY, Vehicle
 from tests.online.driving import flight
 
 PELICAN = Vehicle.shipped("pelican")
@@ -112,6 +112,16 @@ def test_no_cause_is_invented() -> None:
     reply = explained("excited", (), ChangePoint(40.0, "pitch moment", 0.05, 8.0)).answer()
     assert reply.finding is None
     assert "no known cause" in reply.problem
+
+
+def test_a_step_of_thrust_that_no_fit_explains_is_a_force_and_nothing_is_ruled_out() -> None:
+    reply = explained("excited", (), ChangePoint(40.0, "thrust", -0.17, 30.0)).answer()
+    assert "no known cause" in reply.problem
+    assert reply.finding is not None
+    assert not reply.finding.confident
+    told = {reply.finding.effect, *(a.effect for a in reply.finding.alternatives)}
+    assert told == {"mass_change", "steady_pull", "thrust_drop"}
+    assert f"{np.expm1(0.17) * PELICAN.mass * GRAVITY:+.2f} N to hold" in reply.finding.evidence
 
 
 def test_a_rotor_that_recovers_is_said_to() -> None:
