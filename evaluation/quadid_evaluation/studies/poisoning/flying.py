@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.signal import butter, sosfiltfilt
 
 from quadid.data.window import Block, Recording
 from quadid.online import Job, Publish, Session
 from quadid.online.records import OnlineSet
 from quadid.types import FloatArray
 
+Spoil = Callable[[Recording], Recording]
 MUST = ("b", "J_xx", "J_yy")
 STEP = 0.1
 """Data are handed over in pieces of this length [s]."""
@@ -52,6 +55,62 @@ class Poison:
         return replace(
             recording, channels={**recording.channels, self.channel: replace(channel, values=np.asarray(values))}
         )
+
+
+def scaled(channel: str, factor: float, column: int | None = None) -> Spoil:
+    """A channel, or one column of it, wrong by a factor from the beginning."""
+    return Poison(channel, column, factor, -np.inf, 0.0).spoil
+
+
+def changed(channel: str, change: Callable[[FloatArray], FloatArray]) -> Spoil:
+    """A channel whose values, shape (n, k), something was done to."""
+
+    def spoil(recording: Recording) -> Recording:
+        old = recording.channels[channel]
+        new = replace(old, values=np.asarray(change(old.values)))
+        return replace(recording, channels={**recording.channels, channel: new})
+
+    return spoil
+
+
+def supported(newtons: float, b: float) -> Spoil:
+    """Something holds the vehicle up by a force [N], down where negative; it flies the same motion."""
+
+    def less(speed: FloatArray) -> FloatArray:
+        return np.asarray(np.sqrt(np.maximum(speed**2 - newtons / speed.shape[1] / b, 1.0)))
+
+    return changed("rotor_speed", less)
+
+
+def leaking(source: int, into: int, share: float) -> Spoil:
+    """A share of one axis of the gyro is in another."""
+
+    def mixed(gyro: FloatArray) -> FloatArray:
+        out = gyro.copy()
+        out[:, into] += share * gyro[:, source]
+        return out
+
+    return changed("gyro", mixed)
+
+
+def about_the_mean(factor: float) -> Spoil:
+    """An accelerometer's scale that a bias hides at 1 g."""
+    return changed("accel", lambda force: force.mean(axis=0) + factor * (force - force.mean(axis=0)))
+
+
+def smoothed(cutoff: float, rate: float = 50.0) -> Spoil:
+    """A gyro smoothed forwards and backwards below a frequency [Hz]."""
+    return changed("gyro", lambda g: sosfiltfilt(butter(2, cutoff, fs=rate, output="sos"), g, axis=0))
+
+
+def late(channel: str, seconds: float) -> Spoil:
+    """A channel whose stamps are late [s]."""
+
+    def spoil(recording: Recording) -> Recording:
+        old = recording.channels[channel]
+        return replace(recording, channels={**recording.channels, channel: replace(old, t=old.t + seconds)})
+
+    return spoil
 
 
 def turned(q: FloatArray, factor: FloatArray) -> FloatArray:

@@ -30,6 +30,7 @@ def page(cells: list[Cell], done: list[Cell], healthy: list[tuple[float, dict[st
     titles = {
         "in flight": "Poison after 60 s, with a set in force; the vehicle file has bare guesses",
         "from take-off": "Poison from take-off; the history has a set of a healthy flight",
+        "first flight": "Faults from take-off of a first flight: nothing to compare with; alone, in pairs and triples",
     }
     for when, title in titles.items():
         lines += [f"## {title}", "", *_table([c for c in cells if c["when"] == when], done), ""]
