@@ -9,9 +9,11 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable
 
+from quadid.sanitise import one_line
+
 
 class QuadidError(Exception):
-    """Base of all errors raised on purpose.
+    """Base of all errors raised on purpose; each is one line of printable text, whatever it quotes.
 
     Attributes:
         found: what was met, as text.
@@ -22,6 +24,7 @@ class QuadidError(Exception):
     exit_code = 2
 
     def __init__(self, found: str, allowed: str = "", fix: str = "") -> None:
+        found, allowed, fix = map(one_line, (found, allowed, fix))
         fix = "" if allowed and fix == _one_of(allowed) else fix  # what is allowed is stated once
         self.found, self.allowed, self.fix = found, allowed, fix
         parts = [found]

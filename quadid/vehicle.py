@@ -10,10 +10,20 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, ValidationError, field_validator, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    PrivateAttr,
+    ValidationError,
+    field_validator,
+    model_validator,
+)
 
 from quadid.effects import EFFECTS, known_keys, rotor_drag_losses
 from quadid.errors import ParameterError, VehicleError, nearest
+from quadid.files import unwaited
 from quadid.parameters import INERTIAS, MAY_VANISH, NOMINAL_NAMES, VANISHED, impossible_inertia
 from quadid.sanitise import LONGEST_LINE, LONGEST_NAME, plain
 from quadid.types import FloatArray
@@ -24,9 +34,19 @@ from quadid.yaml_text import read_mapping
 
 DEFAULT_BOUND_FACTOR = 4.0
 """A bare initial guess may be wrong by this factor each way."""
-PositiveFloat = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
-Spread = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
-Coordinate = Annotated[float, Field(allow_inf_nan=False)]
+_LARGEST = 1e30
+"""Numbers of a vehicle are smaller, and positive ones larger than its reciprocal [SI]: so products are finite."""
+
+
+def _possible(value: float) -> float:
+    if not abs(value) < _LARGEST:
+        raise ValueError(f"{value:g} is no number of a vehicle, all of which are below {_LARGEST:g} in SI units")
+    return value
+
+
+PositiveFloat = Annotated[float, Field(gt=1.0 / _LARGEST), AfterValidator(_possible)]
+Spread = Annotated[float, Field(ge=0.0), AfterValidator(_possible)]
+Coordinate = Annotated[float, AfterValidator(_possible)]
 Angle = Annotated[float, Field(ge=-6.3, le=6.3, allow_inf_nan=False)]
 
 MIXERS: dict[str, tuple[tuple[float, ...], ...]] = {
@@ -167,7 +187,7 @@ class Stabiliser(Strict):
         rate: how often it runs [Hz]; None for once a log row.
     """
 
-    gains: dict[str, float]
+    gains: dict[str, Coordinate]
     rate: PositiveFloat | None = None
 
 
@@ -274,7 +294,7 @@ class ResidualTerm(Strict):
 
     acts_on: str
     product: tuple[str, ...] = Field(default=(), max_length=MOST_FACTORS)
-    value: Annotated[float, Field(allow_inf_nan=False)]
+    value: Coordinate
 
     @field_validator("acts_on")
     @classmethod
@@ -396,15 +416,15 @@ class Vehicle(Strict):
     """
 
     name: str = Field(max_length=LONGEST_NAME)
-    mass: PositiveFloat
+    mass: Annotated[float, Field(gt=0.0, allow_inf_nan=False)]  # `impossible_size` says what is possible
     mass_sigma: Spread = 0.0
     arm_sigma: Spread = 0.0
     thrust_stand: tuple[ThrustPoint, ...] = ()
     rotors: tuple[Rotor, ...] = Field(min_length=3, max_length=MOST_ROTORS)
     command: Command = Command()
     parameters: dict[str, ParameterPrior]
-    effects: dict[str, dict[str, float]] = Field(default_factory=dict)
-    reference_voltage: float | None = Field(default=None, gt=0.0)
+    effects: dict[str, dict[str, Coordinate]] = Field(default_factory=dict)
+    reference_voltage: PositiveFloat | None = None
     noise: Noise = Noise()
     stabiliser: Stabiliser | None = None
     mounting: Mounting = Mounting()
@@ -610,7 +630,8 @@ class Vehicle(Strict):
     def save(self, path: str | Path) -> Path:
         """Writes the vehicle file; returns its absolute path."""
         target = Path(path).absolute()
-        target.write_text(self.to_yaml(), encoding="utf-8")
+        with open(target, "w", encoding="utf-8", opener=unwaited) as file:
+            file.write(self.to_yaml())
         return target
 
 

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import errno
 import math
 import os
 import re
-import stat
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,6 +18,7 @@ from quadid_replay import open_log
 from quadid.data.resample import linear
 from quadid.data.window import Recording, Window
 from quadid.errors import LogError, QuadidError, VehicleError
+from quadid.files import read_regular, unwaited
 from quadid.sanitise import LONGEST_NAME
 from quadid.types import FloatArray, IntArray
 from quadid.vehicle import MOST_FLIGHTS, FittedFlight, Vehicle
@@ -35,27 +34,19 @@ class OutputError(QuadidError):
     """A place that cannot be written to."""
 
 
-def read_regular(path: str | Path, most: int = 1 << 20) -> bytes:
-    """Reads at most `most` bytes of a file.
-
-    Raises:
-        OSError: it cannot be read, or is a pipe, a device or a folder, which may have no end and need never begin.
-    """
-    with open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK)) as file:
-        if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
-            raise OSError(errno.EINVAL, "it is no regular file", str(path))
-        return file.read(most)
-
-
 def write_text(path: str | Path, text: str) -> Path:
-    """Writes a file whole or not at all; returns its absolute path."""
+    """Writes a file whole or not at all; into a pipe or device where one stands there. Returns its absolute path."""
     target = Path(path).absolute()
-    part = target.with_name(f".{target.name}.{os.getpid()}.part")
+    there = target.exists() and not target.is_file()
+    part = target if there else target.with_name(f".{os.getpid()}.{file_name(target.name)}.part")
     try:
-        part.write_text(text, encoding="utf-8")
-        os.replace(part, target)
+        with open(part, "w", encoding="utf-8", errors="replace", opener=unwaited) as file:
+            file.write(text)
+        if not there:
+            os.replace(part, target)
     except OSError as error:
-        part.unlink(missing_ok=True)
+        if not there:
+            part.unlink(missing_ok=True)
         raise OutputError(
             f"{target} cannot be written ({error.strerror})", fix="check permissions and free space"
         ) from error
@@ -63,8 +54,9 @@ def write_text(path: str | Path, text: str) -> Path:
 
 
 def file_name(name: str) -> str:
-    """A vehicle's name as part of a file name: letters, digits and ``-_+.`` only."""
-    return "".join(c if c.isalnum() or c in "-_+." else "_" for c in name).lstrip(".")[:100] or "vehicle"
+    """A vehicle's name as part of a file name: letters, digits and ``-_+.`` only, at most 100 bytes."""
+    kept = "".join(c if c.isalnum() or c in "-_+." else "_" for c in name).lstrip(".")
+    return kept.encode()[:100].decode(errors="ignore") or "vehicle"
 
 
 def free_name(folder: str | Path, name: str, ending: str, taken: Sequence[Path]) -> Path:

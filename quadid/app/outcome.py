@@ -6,6 +6,7 @@ import datetime
 import importlib.metadata
 import json
 import platform
+import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from html import escape
@@ -109,7 +110,7 @@ class Outcome(ABC):
         """The result as JSON text; with `path` also written there."""
         text = json_text(self.result)
         if path is not None:
-            Path(path).write_text(text, encoding="utf-8")
+            write_text(path, text)
         return text
 
     def to_frame(self) -> pd.DataFrame:
@@ -140,7 +141,16 @@ def number_rows(found: Sequence[Json]) -> Iterator[tuple[Json, tuple[Any, ...]]]
 
 def json_text(result: Any) -> str:
     """A result as JSON for people and programs; numbers that JSON has no word for become null."""
-    return json.dumps(jsonable(result), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+    text = json.dumps(jsonable(result), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+    return text if text.isascii() else _UNSHOWN.sub(_escaped, text)
+
+
+_UNSHOWN = re.compile(r"[^\x20-\x7e\n]")
+
+
+def _escaped(found: re.Match[str]) -> str:
+    """A character that prints, or JSON's escape of it: a terminal acts on some, and no file holds a surrogate."""
+    return found[0] if found[0].isprintable() else json.dumps(found[0])[1:-1]
 
 
 def data_frame(records: list[dict[str, Any]], columns: Sequence[str] = ()) -> pd.DataFrame:

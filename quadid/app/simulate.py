@@ -9,9 +9,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from quadid.app.identify import check_seed
-from quadid.app.logs import as_vehicle, read_regular, write_recording
+from quadid.app.logs import as_vehicle, write_recording
 from quadid.effects import EFFECTS
 from quadid.errors import ParameterError, QuadidError, nearest
+from quadid.files import read_regular
 from quadid.parameters import NOMINAL_UNITS
 from quadid.rotation import down
 from quadid.vehicle import Vehicle

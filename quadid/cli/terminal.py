@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import shlex
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -20,7 +20,7 @@ from quadid.cli.compiling import prepare
 from quadid.errors import QuadidError
 from quadid.report.tables import SPACE, Cell, TextTable
 from quadid.report.verdict import Verdict
-from quadid.sanitise import one_line
+from quadid.sanitise import one_line, plain
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -39,14 +39,21 @@ def console(quiet: bool = False, stderr: bool = False) -> Console:
         quiet: print nothing (stdout carries JSON).
         stderr: print on stderr instead of stdout.
 
-    Nothing is markup.  Colours follow the terminal and ``NO_COLOR``; a pipe gets plain text that is not broken at 80
-    columns.
+    Nothing is markup, and nothing that is printed holds characters that a terminal acts on, whoever named it.  Colours
+    follow the terminal and ``NO_COLOR``; a pipe gets plain text that is not broken at 80 columns.
     """
-    from rich.console import Console
+    from rich.console import Console, ConsoleOptions, RenderableType
+    from rich.segment import Segment
+
+    class Plain(Console):
+        def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterable[Segment]:
+            for part in super().render(renderable, options):
+                lines = "\n".join(plain(line, len(line)) for line in part.text.split("\n"))
+                yield part if part.control else Segment(lines, part.style)
 
     stream = sys.stderr if stderr else sys.stdout
     width = None if stream.isatty() or "COLUMNS" in os.environ else _PIPE_WIDTH
-    return Console(stderr=stderr, quiet=quiet, width=width, highlight=False, markup=False)
+    return Plain(stderr=stderr, quiet=quiet, width=width, highlight=False, markup=False)
 
 
 def warn(messages: tuple[str, ...] | list[str]) -> None:

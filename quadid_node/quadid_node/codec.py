@@ -31,21 +31,22 @@ def set_to_dict(item: OnlineSet, covariance: bool = True) -> dict[str, Any]:
 
 
 def set_from_dict(data: Mapping[str, Any]) -> OnlineSet:
-    """The set of `set_to_dict`; raises KeyError, TypeError or ValueError for what is none."""
+    """The set of `set_to_dict`; raises KeyError, TypeError or ValueError for what is none, or fits into no message."""
     parameters = []
     for p in data["parameters"]:
         values = [_float(v) for v in (p["value"], p["sigma"], *p["ci95"], p["initial"], *p["bounds"])]
+        relative = p.get("relative_to")
         parameters.append(Parameter(
-            str(p["name"]), str(p["unit"]), values[0], values[1], values[4], (values[5], values[6]),
-            Status(p["status"]), p.get("relative_to"), (values[2], values[3]),
+            text(p["name"]), text(p["unit"]), values[0], values[1], values[4], (values[5], values[6]),
+            Status(p["status"]), relative if relative is None else text(relative), (values[2], values[3]),
         ))  # fmt: skip
     covariance = np.array(data.get("covariance") or np.diag([p.sigma**2 for p in parameters]), dtype=np.float64)
     found = ParameterSet(tuple(parameters), covariance)
     return OnlineSet(
-        int(data["sequence"]), SetState(data["state"]), str(data["reason"]), found,
-        _float(data["start"]), _float(data["stop"]), int(data["samples"]), _float(data["mse"]),
-        _float(data["mse_held_out"]), str(data["input_hash"]), str(data["approved_by"]), str(data["check"]),
-        _float(data.get("mass")), str(data.get("outdated", "")), str(data.get("outdated_code", "")),
+        int(data["sequence"]), SetState(data["state"]), text(data["reason"]), found,
+        _time(data["start"]), _time(data["stop"]), _count(data["samples"]), _float(data["mse"]),
+        _float(data["mse_held_out"]), text(data["input_hash"]), text(data["approved_by"]), text(data["check"]),
+        _float(data.get("mass")), text(data.get("outdated", "")), text(data.get("outdated_code", "")),
         _reference(data.get("reference", "none")),
     )  # fmt: skip
 
@@ -91,6 +92,28 @@ def _reference(value: object) -> Reference:
         if value == known:
             return known  # type: ignore[no-any-return]
     raise ValueError(f"a set with reference {str(value)[:40]!r}; allowed: {', '.join(get_args(Reference))}")
+
+
+def text(value: object) -> str:
+    """Text that UTF-8 has; a half of a surrogate pair ends whoever sends it."""
+    found = str(value)
+    found.encode()
+    return found
+
+
+def _count(value: Any) -> int:
+    """Of 32 bits, as the message has it."""
+    if not 0 <= int(value) < 1 << 32:
+        raise ValueError(f"a set of {str(value)[:40]} samples")
+    return int(value)
+
+
+def _time(value: float | None) -> float:
+    """A stamp [s]; the message has 32 bits for seconds."""
+    t = _float(value)
+    if abs(t) >= 1 << 31:
+        raise ValueError(f"a set of the time {t:g}")
+    return t
 
 
 def _float(value: float | None) -> float:

@@ -10,8 +10,9 @@ import sys
 import time
 from pathlib import Path
 
+from quadid.files import read_regular
 from quadid.online.records import Job, JobReply
-from quadid_node.wire_format import ParcelError, pack, unpack
+from quadid_node.wire_format import LARGEST, ParcelError, pack, unpack
 
 MOST = 8
 """Newest inputs kept: a minute of flight takes less than a mebibyte."""
@@ -39,7 +40,7 @@ def keep(history: Path, job: Job) -> str:
 
 def repeat(path: Path) -> JobReply:
     """Does the job of a kept input again; raises ParcelError for a file that holds none, OSError."""
-    reply: JobReply = unpack(path.read_bytes()).run()
+    reply: JobReply = unpack(read_regular(path, LARGEST)).run()
     return reply
 
 

@@ -20,8 +20,8 @@ from pymavlink import mavutil
 from pymavlink.dialects.v20 import ardupilotmega
 from quadid_replay.mavlink_messages import extend_dialect, two_rows
 
-from quadid.app.logs import read_regular
 from quadid.errors import QuadidError
+from quadid.files import read_regular
 
 # --- Time stamps of signatures over a restart, as the MAVLink specification asks: what was sent before it is a replay
 
@@ -55,7 +55,7 @@ class SigningMemory:
         self._saved: dict[Any, int] = {}
         self.problem = ""
         try:
-            kept = json.loads(path.read_text(encoding="ascii"))
+            kept = json.loads(read_regular(path))
             streams = {tuple(int(n) for n in name.split(".")): int(stamp) for name, stamp in kept["streams"].items()}
             newest = int(kept["newest"])
         except FileNotFoundError:

@@ -136,9 +136,12 @@ def _check_seconds(t: FloatArray, origin: str) -> None:
 
 def _header(path: Path, columns: Mapping[str, str]) -> tuple[list[str], str]:
     with path.open("rb") as file:
-        line = header_line(file.read(HEAD_BYTES))
+        head = file.read(HEAD_BYTES)
+    line = header_line(head)
     if line is None:
         raise LogError(f"{path.name}: no header row", "t, then column names such as p,q,r,ax,ay,az,w1")
+    if len(head) == HEAD_BYTES and head.endswith(line.encode()):
+        raise LogError(f"{path.name}: its header row is longer than {HEAD_BYTES >> 10} KiB", "fewer columns")
     delimiter = max(",;\t", key=line.count)
     names = [cell.strip().strip('"') for cell in line.split(delimiter)]
     names = _renamed(names, columns, path.name)

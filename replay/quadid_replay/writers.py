@@ -17,6 +17,7 @@ from pymavlink.dialects.v20 import ardupilotmega
 from quadid.data.resample import linear
 from quadid.data.window import Channel, Recording, Window, as_recording
 from quadid.errors import LogError
+from quadid.files import unwaited
 from quadid.rotation import conjugate, rotated
 from quadid.types import FloatArray
 from quadid_replay.csv_reader import EULER, GROUPS
@@ -72,7 +73,7 @@ def union_rows(channels: Sequence[Channel | None]) -> tuple[FloatArray, list[Flo
 def open_for_writing(path: str | Path) -> BinaryIO:
     """Opens a file for writing; raises LogError with the reason when it cannot be."""
     try:
-        return Path(path).open("wb")
+        return open(path, "wb", opener=unwaited)
     except OSError as error:
         raise LogError(
             f"cannot write {path} ({error.strerror})", "a file in a folder that exists", "create the folder first"

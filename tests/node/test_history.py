@@ -578,6 +578,9 @@ HOSTILE_SETS = {
     "a number beyond 64 bits": with_all(sequence=2**64), "another set's number": with_all(sequence=8),
     "a negative deviation": with_first(sigma=-2e-4),
     "a covariance of no numbers": with_all(covariance=[[math.nan] * 6] * 6),
+    "a time that no message holds": with_all(stop=1e300), "more samples than a message holds": with_all(samples=2**40),
+    "fewer samples than none": with_all(samples=-4), "half a character": with_all(reason="\ud800"),
+    "half a character in a unit": with_first(unit="\udcff"),
     "a parameter twice": with_all(parameters=2 * set_to_dict(online_set(TRUE))["parameters"], covariance=None),
 }  # fmt: skip
 

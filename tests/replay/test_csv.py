@@ -125,6 +125,7 @@ def test_columns_nobody_knows_are_reported(tmp_path: Path) -> None:
         ("t,p,q,r\n", "no usable row"),
         ("t,p,q,r\nx,y,z,w\n", "column t holds 'x', no number"),
         ("t,p,q,r\nnan,1,2,3\n", "no usable flight data"),
+        (f"t,p,q,r,{','.join(f'c{k}' for k in range(20_000))}\n0,1,2,3\n", "header row is longer than 64 KiB"),
     ],
 )
 def test_what_is_wrong_is_said_with_what_is_allowed(tmp_path: Path, text: str, expected: str) -> None:

@@ -1,0 +1,31 @@
+"""Files of users: opened without waiting for what is none, a pipe that nobody writes or reads."""
+
+from __future__ import annotations
+
+import errno
+import os
+import stat
+from pathlib import Path
+
+
+def unwaited(name: str, flags: int) -> int:
+    """Opens as `open` does (its argument ``opener``), but never waits for the other end of a pipe.
+
+    Raises:
+        OSError: a pipe to be written that nobody reads.
+    """
+    descriptor = os.open(name, flags | os.O_NONBLOCK, 0o666)
+    os.set_blocking(descriptor, True)
+    return descriptor
+
+
+def read_regular(path: str | Path, most: int = 1 << 20) -> bytes:
+    """Reads at most `most` bytes of a file.
+
+    Raises:
+        OSError: it cannot be read, or is a pipe, a device or a folder, which may have no end and need never begin.
+    """
+    with open(path, "rb", opener=unwaited) as file:
+        if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+            raise OSError(errno.EINVAL, "it is no regular file", str(path))
+        return file.read(most)
