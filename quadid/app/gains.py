@@ -13,10 +13,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from quadid.app.export import UnprovenError
-from quadid.app.logs import as_vehicle, file_name, open_recording, read_regular, write_text
+from quadid.app.logs import as_vehicle, file_name, open_recording, write_text
 from quadid.app.outcome import LIBRARY, Reported, provenance
 from quadid.chi_square import Z95
 from quadid.errors import LogError, ParameterError, nearest
+from quadid.files import read_regular
 from quadid.model.rate_loop import AxisPlant, Loops, RateGains, design, slowed, with_rate
 from quadid.report.autopilots import AUTOPILOTS, AXES, Autopilot, authority, hover, moments
 from quadid.report.programs import Facts
