@@ -66,14 +66,13 @@ def serve(
     from quadid_node.stopping import Stop
 
     stop = Stop()
-    from quadid_node.ground import with_ground
+    from quadid_node.ground import fit_worker
     from quadid_node.history import Store, default_path
     from quadid_node.mavlink_link import MavlinkLink
     from quadid_node.mavlink_wire import memory_path, read_key
     from quadid_node.serve import Outlet, run
     from quadid_node.service import Service
     from quadid_node.settings import session_settings
-    from quadid_node.worker import ProcessWorker
     from quadid_node.zenoh import ZenohLink
 
     from quadid.app.logs import load_vehicle
@@ -91,7 +90,7 @@ def serve(
         secret = read_key(key) if key is not None else None
         kept = memory_path((file or default_path()).parent, secret) if secret is not None else None
         link = opened.enter_context(closing(MavlinkLink(mavlink, len(described.rotors), system, secret, memory=kept)))
-        worker = opened.enter_context(closing(with_ground(ProcessWorker(described), ground or "", known)))
+        worker = opened.enter_context(closing(fit_worker(described, known, ground or "")))
         service = opened.enter_context(closing(Service(described, settings, worker, store)))
         outlets: list[Outlet] = [_Console(terminal.console(quiet=json == "-"), link)]
         if zenoh is not None:

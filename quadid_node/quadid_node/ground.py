@@ -12,10 +12,10 @@ from typing import Any
 
 import zenoh
 
-from quadid.errors import QuadidError
 from quadid.online.records import Job, JobReply, unexpected
+from quadid.vehicle import Vehicle
 from quadid_node.wire_format import LARGEST, ParcelError, content, pack, unpack
-from quadid_node.worker import STUDY_LIMIT, ProcessWorker, Trouble, Worker
+from quadid_node.worker import MEMORY_MB, STUDY_LIMIT, ProcessWorker, Trouble, Worker
 from quadid_node.zenoh import ROOT, config_of, key_of, wait_for_session
 
 # --- Fits on a ground machine: takes windows from services over Zenoh and answers with fits (`quadid worker`)
@@ -310,16 +310,18 @@ class RemoteWorker:
 # --- Who fits for a service: the child process on board, or a ground machine where one is asked for
 
 
-def with_ground(worker: ProcessWorker, where: str, vehicle: str) -> Worker:
-    """The worker itself, or, with a place on Zenoh, one that lets ground machines there fit for `vehicle`.
+def fit_worker(vehicle: Vehicle, name: str, where: str = "", memory_mb: int = MEMORY_MB) -> Worker:
+    """The child process on board; with a place on Zenoh, one that lets ground machines there fit as well.
+
+    Args:
+        vehicle: whose model is warmed up.
+        name: of the vehicle on Zenoh.
+        where: see `zenoh.open_session`; empty: no ground machine is asked.
+        memory_mb: most memory of the child [MiB]; 0 for no limit.
 
     Raises:
         ZenohError: a configuration that is none.
     """
-    if not where:
-        return worker
-    try:
-        return RemoteWorker(worker, Ground(where, vehicle))
-    except QuadidError:
-        worker.close()
-        raise
+    ground = Ground(where, name) if where else None
+    local = ProcessWorker(vehicle, memory_mb)
+    return RemoteWorker(local, ground) if ground is not None else local

@@ -26,7 +26,7 @@ from quadid.vehicle import Vehicle
 from quadid_node import messages
 from quadid_node.bond import Bond, bond_of
 from quadid_node.commands import Commands
-from quadid_node.ground import with_ground
+from quadid_node.ground import fit_worker
 from quadid_node.history import Store, default_path
 from quadid_node.inputs import DEPTH, Chooser, Decoder, Intake, Source, best_ranks, deserializer, message_class, source
 from quadid_node.node_parameters import (
@@ -44,7 +44,6 @@ from quadid_node.publish import GraphMonitor, Offer, Publishers
 from quadid_node.recorder import WRITTEN, Beginning, Recorder
 from quadid_node.rounds import ROUND_SECONDS, STEP_SECONDS, WORK_SECONDS, Scheduler
 from quadid_node.service import Service
-from quadid_node.worker import ProcessWorker
 from quadid_node.zenoh import ZenohLink
 
 CATCHING_UP, BACKLOG = 10.0, 2.0
@@ -175,9 +174,8 @@ class IdentifyNode(PollingNode, LifecycleNode):
         self._given = values
         keeps = not self._observer and values["history"] != "none"
         store = Store(Path(values["history"] or default_path()), self._id) if keeps else None
-        worker = ProcessWorker(vehicle, values["worker_memory"])
         try:
-            fits = with_ground(worker, values["ground_worker"], self._id)
+            fits = fit_worker(vehicle, self._id, values["ground_worker"], values["worker_memory"])
         except QuadidError:
             if store is not None:
                 store.close()
@@ -193,19 +191,22 @@ class IdentifyNode(PollingNode, LifecycleNode):
         commands = Commands(self._id, lambda: self._service if self._active else None, self._put)
         for name, kind, answer in commands.offered():
             self._open.append((self.destroy_service, self.create_service(kind, f"quadid/{name}", answer)))
-        self._warm_up(worker, values["warm_up"])
+        self._warm_up(self._service, values["warm_up"])
         history = str(store.path) if store is not None else "none"
         self._read_back({**values, "vehicle_id": self._id, "history": history, "approval": self._service.approval})
 
-    def _warm_up(self, worker: ProcessWorker, seconds: float) -> None:
+    def _warm_up(self, service: Service, seconds: float) -> None:
         """Waits until a fit could begin at once; raises QuadidError after so many seconds."""
         begin = time.monotonic()
         told = begin
-        while not worker.poll_ready() and not self._stopping():
+        while not service.ready and not self._stopping():
+            self._put(service.idle())
             now = time.monotonic()
             if now - begin > seconds:
                 fix = "run 'quadid warmup' once, which compiles for every later start, or set warm_up higher"
-                raise QuadidError(f"the fit process is not warm after {seconds:g} s ({worker.state})", fix=fix)
+                raise QuadidError(
+                    f"the fit process is not warm after {seconds:g} s ({service.health().worker})", fix=fix
+                )
             if now - told >= TOLD_SECONDS:
                 told = now
                 self._log("info", f"{IDLE['configuring']}: {now - begin:.0f} s of {seconds:g} s")

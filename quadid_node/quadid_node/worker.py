@@ -197,11 +197,6 @@ class ProcessWorker:
         """A child of its own for diagnoses."""
         return ProcessWorker(self._vehicle, self._memory, self._clock, "diagnosis", STUDY_LIMIT)
 
-    def poll_ready(self) -> bool:
-        """Polls while nothing was submitted yet; what is told waits for the next `poll`."""
-        self._told = [item for item in self.poll() if isinstance(item, Trouble)]
-        return self.ready
-
     def close(self) -> None:
         """Ends the child."""
         self._end_child()

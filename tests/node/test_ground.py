@@ -98,7 +98,7 @@ def ground_machine(router: str) -> Iterator[Start]:
 @pytest.fixture
 def worker(router: str) -> Iterator[RemoteWorker]:
     local = ProcessWorker(PELICAN)
-    assert until(local.poll_ready, START)
+    assert until(lambda: local.poll() == [] and local.ready, START)
     remote = RemoteWorker(local, Ground(router, "quad1"))
     yield remote
     remote.close()
