@@ -296,6 +296,27 @@ def test_a_history_of_a_newer_version_is_refused_and_not_touched(
     happened(12, f"a history of version {VERSION + 1}: refused with the fix, not a byte changed")
 
 
+def test_a_history_of_an_earlier_version_is_read_as_it_is(tmp_path: Path) -> None:
+    """Sets once had no mass, reference, run, or reason to be out of date; some have no covariance."""
+    path = tmp_path / "h.sqlite"
+    filled(path).close()
+    later = ("mass", "outdated", "outdated_code", "reference", "boot_id", "covariance")
+    with closing(sqlite3.connect(path)) as db, db:
+        for (data,) in db.execute("SELECT data FROM sets").fetchall():
+            old = {name: value for name, value in json.loads(data).items() if name not in later}
+            db.execute("UPDATE sets SET data = ? WHERE data = ?", (json.dumps(old), data))
+        db.execute(f"PRAGMA user_version = {VERSION - 1}")
+    store = Store(path, "pelican")
+    restored = store.restore(vehicle=PELICAN)
+    store.close()
+    assert not store.notes
+    assert restored.item is not None
+    assert restored.item.parameters.covariance[0, 0] == restored.item.parameters["b"].sigma ** 2
+    assert (restored.item.reference, restored.item.outdated) == ("none", "")
+    with closing(sqlite3.connect(path)) as db:
+        assert db.execute("PRAGMA user_version").fetchone() == (VERSION,)
+
+
 @pytest.mark.parametrize("damage", ["garbage", "x'ff'", "'yes'"])
 def test_after_a_history_that_cannot_be_read_approval_is_manual_for_good(
     tmp_path: Path, damage: str, happened: Happened
