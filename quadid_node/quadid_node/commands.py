@@ -8,7 +8,7 @@ from typing import Any
 from quadid.online.active_set import Answer
 from quadid_node import messages
 from quadid_node.codec import set_from_dict
-from quadid_node.history import StoreError, read_history
+from quadid_node.history import UNREADABLE, read_history
 from quadid_node.inputs import service_class, to_message
 from quadid_node.publication import Output
 from quadid_node.rounds import WORK_SECONDS
@@ -61,10 +61,10 @@ class Commands:
         most = min(request.most or MOST_SETS, MOST_SETS)
         try:
             sets = read_history(service.history, self._vehicle, sets=most)["sets"]
-        except StoreError as error:
-            response.message = str(error)
+            found = [messages.parameter_set(set_from_dict(r), self._vehicle, str(r.get("boot_id", ""))) for r in sets]
+        except UNREADABLE as error:
+            response.message = f"the history {service.history} cannot be read ({error})"
             return response
-        found = [messages.parameter_set(set_from_dict(r), self._vehicle, str(r.get("boot_id", ""))) for r in sets]
         response.sets = [to_message(messages.PARAMETER_SET, fields) for fields in found]
         response.success, response.message = True, f"the newest {len(found)} sets of {service.history}"
         return response

@@ -14,10 +14,12 @@ from collections.abc import Callable, Iterator
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from quadid_node.codec import set_from_dict, set_to_dict
+from quadid_node.commands import Commands
 from quadid_node.history import VERSION, Store, StoreError, read_history
 from quadid_node.publication import Output
 from quadid_node.service import Service
@@ -631,6 +633,20 @@ def test_a_set_that_no_fit_of_this_vehicle_made_is_left_out_and_said(
     assert "is no set and is not taken up again" in store.notes[0]
     store.close()
     happened(25 if what in HOSTILE_TO_A_VEHICLE else 12, f"a stored set with {what}: '{store.notes[0][50:140]}'")
+
+
+@pytest.mark.parametrize("what", ["a list", "no interval", "a number"])
+def test_get_history_of_rows_that_none_wrote_is_an_answer(tmp_path: Path, what: str) -> None:
+    """The error went through the callback, which ends a node."""
+    service = Service(PELICAN, SessionSettings(), InlineWorker(), Store(tmp_path / "h.sqlite", "v"))
+    with closing(sqlite3.connect(tmp_path / "h.sqlite")) as db, db:
+        row = ("v", 7, "accepted", "", "auto", 1.0, 1.0, HOSTILE_SETS[what])
+        db.execute("INSERT INTO sets VALUES (?, ?, ?, ?, ?, ?, ?, ?)", row)
+    answer = SimpleNamespace(success=False, message="")
+    Commands("v", lambda: service, lambda outputs: None)._history(SimpleNamespace(most=0), answer)
+    service.close()
+    assert not answer.success
+    assert "cannot be read" in answer.message
 
 
 ENDLESS = "WITH RECURSIVE c(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM c)"
