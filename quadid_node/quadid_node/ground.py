@@ -139,14 +139,18 @@ MOST_ANSWERS, MOST_GROUNDS = 8, 256
 
 
 class Ground:
-    """The way to ground machines: a Zenoh session that is opened in the background, and who is there."""
+    """The way to ground machines: a Zenoh session that is opened in the background.
+
+    Attributes:
+        alive: names of the ground machines that live.
+    """
 
     def __init__(self, where: str, vehicle: str, clock: Callable[[], float] = time.monotonic) -> None:
         """Begins to connect; raises ZenohError for a configuration that is none."""
         config_of(where)
         self._where, self._key, self._clock = where, key_of(vehicle, "work/fit"), clock
         self._session: Any = None
-        self._alive: set[str] = set()
+        self.alive: set[str] = set()
         self._rests_until = -1e9
         self._closed, self._lock = threading.Event(), threading.Lock()
         threading.Thread(target=self._connect, name="ground", daemon=True).start()
@@ -154,17 +158,7 @@ class Ground:
     @property
     def there(self) -> bool:
         """Whether a ground machine can be asked."""
-        return self._session is not None and bool(self._alive) and self._clock() >= self._rests_until
-
-    @property
-    def count(self) -> int:
-        """Ground machines that live."""
-        return len(self._alive)
-
-    @property
-    def vanished(self) -> bool:
-        """Whether no ground machine lives any more."""
-        return not self._alive
+        return self._session is not None and bool(self.alive) and self._clock() >= self._rests_until
 
     def ask(self, request: Job, answers: queue.Queue[tuple[int, Any]], seconds: float) -> None:
         """Sends a request; what comes back is put into `answers` with its number, None for a refusal."""
@@ -205,9 +199,9 @@ class Ground:
     def _on_token(self, sample: Any) -> None:
         name = str(sample.key_expr)
         if sample.kind != zenoh.SampleKind.PUT:
-            self._alive.discard(name)
-        elif len(self._alive) < MOST_GROUNDS:
-            self._alive.add(name)
+            self.alive.discard(name)
+        elif len(self.alive) < MOST_GROUNDS:
+            self.alive.add(name)
 
 
 class RemoteWorker:
@@ -261,8 +255,8 @@ class RemoteWorker:
             number, data = self._answers.get_nowait()
             if self._asked is not None and number == self._asked.number:
                 self._take(data, out)
-        if self._asked is not None and (self._ground.vanished or self._clock() > self._until):
-            self._fall_back("vanished" if self._ground.vanished else "does not answer")
+        if self._asked is not None and (not self._ground.alive or self._clock() > self._until):
+            self._fall_back("does not answer" if self._ground.alive else "vanished")
         self._tell_changes()
         told, self._told = self._told, []
         return [*out, *told]
