@@ -183,6 +183,7 @@ def diagnose(
     }  # fmt: skip
     result["warnings"] = [*result.get("warnings", []), *given.warnings]
     result["seed"] = seed
+    advance("scores", 0.0)
     sets = [
         scored(log, role, fit, model.theta) for role, part in (("train", train), ("validate", held)) for log in part
     ]
@@ -190,8 +191,9 @@ def diagnose(
         {"log": s.log, "role": s.role, "mse": {"nominal": s.initial.mse, "extended": s.fitted.mse, "noise_floor": 1.0}}
         for s in sets
     ]
-    forces = missing_forces(train, held, fit.vehicle, {"nominal": fit.theta, "extended": model.theta})
+    forces = missing_forces(train, held, fit.vehicle, {"nominal": fit.theta, "extended": model.theta}, advance)
     result["missing"] = None if forces is None else forces.result()
+    advance("gain of each cause", 0.0)
     layout = Layout(fit.vehicle)
     for entry in result["findings"]:
         names = [n for c in model.causes if c.effect == entry["effect"] for n in c.names]

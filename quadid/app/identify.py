@@ -236,12 +236,13 @@ def identify(
     begin = time.perf_counter()
     fit = search(optimizer, windows, described, seed, advance, out_of_reach(train))
     seconds = time.perf_counter() - begin
+    advance("scores", 0.0)
     autopilot = find_autopilot(windows, described)
     sets = [scored(log, role, fit, autopilot) for role, part in (("train", train), ("validate", held)) for log in part]
     result = identify_result(fit, optimizer, seed, seconds, sets, None, given.warnings)
     for entry, log in zip(result["sets"], (*train, *held), strict=True):
         entry["seconds"] = log.grid.seconds_used
-    forces = missing_forces(train, held, fit.vehicle, {"nominal": fit.theta})
+    forces = missing_forces(train, held, fit.vehicle, {"nominal": fit.theta}, advance)
     result["missing"] = None if forces is None else forces.result()
     done = Identified(result, fit, sets, [*train, *held], forces)
     result["verdict"] = done.verdict.level

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -168,8 +168,9 @@ def _by_axis(values: FloatArray) -> dict[str, float]:
 
 
 def missing_forces(
-    train: Sequence[Log], held: Sequence[Log], vehicle: Vehicle, models: Mapping[str, FloatArray]
-) -> MissingForces | None:
+    train: Sequence[Log], held: Sequence[Log], vehicle: Vehicle, models: Mapping[str, FloatArray],
+    advance: Callable[[str, float], None],
+) -> MissingForces | None:  # fmt: skip
     """Missing force and moment of parameter vectors, all at the noise of the first on the training logs.
 
     None where a log lacks the gyro or the accelerometer, without which no force and moment is seen, and where a model
@@ -180,6 +181,7 @@ def missing_forces(
         held: logs that were not.
         vehicle: geometry and mass.
         models: parameter vectors by name, the nominal one first.
+        advance: called with a stage and a share done.
     """
     from quadid.estimate.missing import Vehicles
 
@@ -187,8 +189,13 @@ def missing_forces(
     flown = [beginning(log.windows, min(SECONDS, ROWS * log.windows[0].dt))[0] for log in logs]
     if not all(windows and all(_seen(w) for w in windows) for windows in flown):
         return None
+    stage, steps = "what is missing", 1 + len(models) * len(flown)
+    advance(stage, 0.0)
     flights = Vehicles([w for windows in flown[: len(train)] for w in windows], vehicle, next(iter(models.values())))
-    parts = {name: [flights.missing(windows, theta) for windows in flown] for name, theta in models.items()}
+    parts: dict[str, list[list[Missing]]] = {name: [] for name in models}
+    for done, (name, windows) in enumerate(((n, w) for n in models for w in flown), 1):
+        advance(stage, done / steps)
+        parts[name].append(flights.missing(windows, models[name]))
     if not all(np.isfinite(p.force_sigma).all() for found in parts.values() for log in found for p in log):
         return None
     roles = ["train"] * len(train) + ["validate"] * len(held)

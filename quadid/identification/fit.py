@@ -117,17 +117,21 @@ def fit(
     short, first = reweighted_fit(short, theta, free, iterations=10, robust=options.robust)
     # Where channels cannot show how the vehicle turns, longer segments and other models cannot be compared either.
     comparable = not set(INERTIAS) & set(out_of_reach or ())
+    report("polish", 0.2)
     quick = fast_motion(windows, short, first.theta, free.names) if restless(short, first) else None
     if quick is not None:
         # Longer segments would only let the missing moments in again, and what these leave is no measure of the noise.
+        report("noise", 0.0)
         starts = [quick.found.theta, first.theta]
         noise = flexible_fit(windows, short, starts, free, typical, FAR_ITERATIONS).noise
+        report("intervals", 0.0)
         found = fast_fit(quick, free.names, options.robust, comparable)
     else:
         noise = flexible_fit(windows, short, [first.theta], free).noise
-        report("polish", 0.4)
+        report("noise and polish", 0.4)
         final = Shooting.cut(windows, vehicle, FIT_SECONDS, noise, short.layout)
         result = polish(final, first.theta, free, robust=options.robust)
+        report("noise and polish", 0.6)
         noise = with_memory(windows, final, result.theta, free.names)
         final = final.with_noise(noise)
         theta, states = result.theta, result.states
@@ -135,6 +139,7 @@ def fit(
         result = polish(final, theta, free, states=states, robust=options.robust)
         if not np.isfinite(result.cost):
             final, result = short, first
+        report("intervals", 0.0)
         judge = first if comparable else None
         found = _finish(final, result, free, default_prior(short, free), result.simulated, options.robust, judge)
         found = replace(found, warnings=(*found.warnings, *_warnings(found)))

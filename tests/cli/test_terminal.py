@@ -44,7 +44,7 @@ def test_a_terminal_gets_progress_and_no_color_is_respected(flights: Flights, tm
     arguments = ["identify", str(flights.train), "--vehicle", "pelican", "--out", str(tmp_path)]
     shown = on_a_terminal(arguments, tmp_path)
     assert " % " in shown
-    assert "left" in shown
+    assert "what is missing" in shown
     assert COLOUR.search(shown)
     assert not COLOUR.search(on_a_terminal(["inspect", str(flights.train)], tmp_path, NO_COLOR="1"))
     assert COLOUR.search(on_a_terminal(["inspect", str(flights.train)], tmp_path))
