@@ -78,6 +78,8 @@ class Model:
         return ""
 
     def _not_usable(self, message: Any) -> str:
+        if not len(message.names) == len(message.values) == len(message.units) == len(message.status):
+            return "its arrays differ in length"
         found = dict(zip(message.names, zip(message.values, message.units, message.status, strict=True), strict=True))
         for name, unit in UNITS.items():
             value, given, status = found.get(name, (math.nan, "", ParameterSet.STATUS_PRIOR_DOMINATED))

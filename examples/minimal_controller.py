@@ -25,7 +25,8 @@ class Controller(Node):
         ours = s.schema_version == ParameterSet.SCHEMA_VERSION and abs(s.mass - MASS) <= 0.02 * MASS
         if not (in_force and ours and s.sequence > self.sequence):
             return
-        value, unit, status = next(v for n, *v in zip(s.names, s.values, s.units, s.status, strict=True) if n == "J_xx")
+        known = [v for n, *v in zip(s.names, s.values, s.units, s.status, strict=False) if n == "J_xx"]
+        value, unit, status = known[0] if known else (self.J_xx, "", ParameterSet.STATUS_UNRELIABLE)
         if unit == "kg m^2" and status == ParameterSet.STATUS_IDENTIFIED and abs(value - self.J_xx) <= STEP * self.J_xx:
             self.J_xx, self.sequence = value, s.sequence
             self.get_logger().info(f"set {s.sequence}: J_xx = {value:.4g}, roll rate gain = {20.0 * value:.4g}")

@@ -292,8 +292,6 @@ def source(name: str) -> Source:
 # stream and its recording give the same numbers bit for bit.  Out: dictionaries of `messages` become messages.
 
 
-FEWEST = 2
-"""Fewer messages than these are quicker read one by one."""
 _BEHIND = {"pose_attitude": 5}
 """The attitude of a pose stands behind a topic of its own, as when reading logs."""
 
@@ -408,65 +406,54 @@ class Decoder:
 
     def take(self, messages: Sequence[bytes]) -> Iterator[Sample | Block]:
         """Yields what may be used now of messages in order, at once where only numbers differ between them."""
-        block = self._block(messages) if len(messages) >= FEWEST else None
-        if block is None:
-            for data in messages:
-                yield from self.samples(data)
-        elif block.columns:
-            yield block
+        read = self._one(messages[0]) if len(messages) == 1 else self._many(messages)
+        if read is None:
+            for part in (messages[: len(messages) // 2], messages[len(messages) // 2 :]) if len(messages) > 1 else ():
+                yield from self.take(part)
+            return
+        t, told = many_seconds(read[0]), list[tuple[str, int, FloatArray]]()
+        self.pace.stamped(t)
+        self._deny(name for name, _ in read[1])
+        for name, values in read[1]:
+            channel, convert = SIGNALS[name]
+            if channel in self._ranks:
+                width = self._rotors if channel in ("motor_command", "rotor_speed") else None
+                told.append((channel, self._ranks[channel] + _BEHIND.get(name, 0), convert(values)[:, :width]))
+        used = [self._chooser.settled(channel, rank, float(t.max())) for channel, rank, _ in told]
+        if None in used:
+            for k, at in enumerate(t.tolist()):
+                for channel, rank, values in told:
+                    yield from self._chooser.take(Sample(at, channel, tuple(values[k].tolist())), rank)
+            return
+        columns = tuple((channel, values) for (channel, _, values), use in zip(told, used, strict=True) if use)
+        for channel, _ in columns:
+            self._chooser.used(channel, float(t[-1]))
+        if columns:
+            yield Block(t, columns)
 
-    def _block(self, messages: Sequence[bytes]) -> Block | None:
-        """The messages as one block, the numbers of `samples` to the bit; None where each must be looked at."""
+    def _many(self, messages: Sequence[bytes]) -> tuple[IntArray, list[tuple[str, FloatArray]]] | None:
+        """Stamps [ns] and signals of messages of one layout; None where they must be looked at in smaller parts."""
         read = self._layout.read_many(messages) if self._layout is not None else None
         told = self._columns.pick(read.blocks, read.extra) if read is not None else None
         if read is None or told is None:
             return None
         ns = read.seconds * 10**9 + read.nanoseconds
-        if not (ns > 0).all():
-            return None
-        t = many_seconds(ns)
-        self.pace.stamped(t)
-        self._deny(name for name, _ in told)
-        columns = []
-        for name, values in told:
-            channel, convert = SIGNALS[name]
-            rank = self._ranks.get(channel)
-            if rank is None:
-                continue
-            used = self._chooser.settled(channel, rank + _BEHIND.get(name, 0), float(t.max()))
-            if used is None:
-                return None
-            if used:
-                width = self._rotors if channel in ("motor_command", "rotor_speed") else None
-                columns.append((channel, convert(values)[:, :width]))
-        for channel, _ in columns:
-            self._chooser.used(channel, float(t[-1]))
-        return Block(t, tuple(columns))
+        return (ns, told) if (ns > 0).all() else None
 
-    def samples(self, data: bytes) -> Iterator[Sample]:
-        """Yields the samples of one message that may be used now."""
+    def _one(self, data: bytes) -> tuple[IntArray, list[tuple[str, FloatArray]]] | None:
+        """Stamp [ns] and signals of one message; None, and counted, where it has none."""
         try:
             message = self._read(data)
             signals = self._kind.signals(message.blocks, message.extra)
+            told = [(name, np.array([values], dtype=np.float64)) for name, values in signals]
+            ns = np.array([message.seconds * 10**9 + message.nanoseconds], dtype=np.int64)
         except Exception:  # noqa: BLE001 - a decoder of untrusted bytes raises anything; it is counted and reported
             self.failed, self._failed_at = self.failed + 1, self.pace.looked
-            return
-        ns = message.seconds * 10**9 + message.nanoseconds
-        if ns <= 0:
+            return None
+        if ns[0] <= 0:
             self.unstamped, self._unstamped_at = self.unstamped + 1, self.pace.looked
-            return
-        t = seconds(ns)
-        self.pace.stamped(np.array([t]))
-        self._deny(name for name, _ in signals)
-        for name, values in signals:
-            channel, convert = SIGNALS[name]
-            rank = self._ranks.get(channel)
-            if rank is None:
-                continue
-            numbers = tuple(convert(np.array([values]))[0].tolist())
-            if channel in ("motor_command", "rotor_speed"):
-                numbers = numbers[: self._rotors]
-            yield from self._chooser.take(Sample(t, channel, numbers), rank + _BEHIND.get(name, 0))
+            return None
+        return ns, told
 
     def _deny(self, told: Iterable[str]) -> None:
         """Notes which signals the newest messages say to have none of."""
@@ -503,7 +490,7 @@ def _filled(message: Any, fields: Mapping[str, Any]) -> Any:
         if isinstance(value, Mapping):
             _filled(getattr(message, name), value)
         elif isinstance(value, list) and value and isinstance(value[0], Mapping):
-            cls = message_class(kinds[name].removeprefix("sequence<").rstrip(">"))
+            cls = message_class(kinds[name].removeprefix("sequence<").split("[")[0].rstrip(">"))
             setattr(message, name, [_filled(cls(), item) for item in value])
         else:
             setattr(message, name, value)

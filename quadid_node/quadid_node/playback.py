@@ -14,7 +14,7 @@ from mcap_ros2._dynamic import generate_dynamic
 from quadid_replay.mcap_file import McapFile
 from quadid_replay.ros_messages import type_name
 
-from quadid.data.window import Recording, Sample
+from quadid.data.window import Block, Recording, Sample
 from quadid.errors import LogError
 from quadid_node.inputs import Chooser, Decoder, best_ranks, seconds, source
 
@@ -76,4 +76,5 @@ def arrivals(path: Path, preset: str, rotors: int) -> Iterator[Sample]:
             ) from error
         decoders[number] = Decoder(entry, chooser, rotors, decode)
     for number, _, data in file.messages(decoders.keys()):
-        yield from decoders[number].samples(data)
+        for item in decoders[number].take([data]):
+            yield from item.samples() if isinstance(item, Block) else [item]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 from pathlib import Path
 from typing import Any
 
@@ -30,16 +31,19 @@ def test_nodes_get_ready_and_end(
     monkeypatch.setenv("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
     monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     monkeypatch.setenv("ROS_LOG_DIR", str(tmp_path))
-    said, ended = list[str](), list[int]()
+    said, ended, running = list[str](), list[int](), set[int]()
 
-    def heard(event: Any) -> Any:
+    def heard(event: Any) -> None:
         said.append(event.text.decode())
-        ready = sum(line.count("ready: identifies") for line in said)
-        return [actions.EmitEvent(event=launch.events.Shutdown())] if ready == len(nodes) else []
+        running.add(event.pid)
+        if sum(line.count("ready: identifies") for line in said) == len(nodes):
+            while running:  # not launch's own end, which kills what has not ended after some seconds
+                os.kill(running.pop(), signal.SIGINT)
 
     def exited(event: Any, context: Any) -> Any:
         ended.append(event.returncode)
-        return [actions.EmitEvent(event=launch.events.Shutdown())]
+        over = len(ended) == len(nodes) or event.returncode
+        return [actions.EmitEvent(event=launch.events.Shutdown())] if over else []
 
     file = Path(__file__).resolve().parents[1] / "launch" / f"{name}.launch.py"
     arguments = {**given, "vehicle": "pelican", "history": "none"}

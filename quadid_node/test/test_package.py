@@ -7,6 +7,7 @@ import xml.etree.ElementTree as ET
 from pathlib import Path
 
 import pytest
+import yaml
 
 PACKAGE = Path(__file__).resolve().parents[1]
 ROS = ("_msgs", "_interfaces", "_srvs")
@@ -40,6 +41,14 @@ def test_every_ros_package_that_is_imported_is_named() -> None:
 def test_a_launch_file_has_what_ros2_launch_calls(file: Path) -> None:
     tree = ast.parse(file.read_text(encoding="utf-8"))
     assert "generate_launch_description" in {n.name for n in tree.body if isinstance(n, ast.FunctionDef)}
+
+
+def test_the_configuration_of_rosdoc2_is_where_the_manifest_says() -> None:
+    export = ET.parse(PACKAGE / "package.xml").find("export")
+    assert export is not None
+    about, given = yaml.safe_load_all((PACKAGE / (export.findtext("rosdoc2") or "")).read_text(encoding="utf-8"))
+    assert about == {"type": "rosdoc2 config", "version": 1}
+    assert (PACKAGE / given["settings"]["python_source"] / "__init__.py").is_file()
 
 
 def test_the_manifest_is_valid_by_its_schema() -> None:

@@ -52,6 +52,7 @@ def test_a_good_set_is_applied(model: Any) -> None:
         (replace(GOOD, mass=1.5), {}, "rests on a mass of 1.5 kg"),
         (replace(GOOD, mass=float("nan")), {}, "rests on a mass of nan kg"),
         (GOOD, {"units": ["1"] * 6}, "wanted 'N s^2"),
+        (GOOD, {"units": []}, "differ in length"),
         (replace(GOOD, parameters=parameter_set(scaled(J_xx=float("inf")))), {}, "J_xx = inf"),
         (replace(GOOD, parameters=parameter_set(scaled(b=2.2))), {}, "b would change"),
         (replace(GOOD, parameters=parameter_set(TRUE, J_yy=Status.RATIO_ONLY)), {}, "do not determine J_yy"),

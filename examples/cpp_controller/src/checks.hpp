@@ -1,4 +1,5 @@
-// Which parameter sets a controller may apply: the checks of docs/using-with-ros.md, without ROS' client library.
+// Which parameter sets a controller may apply: the checks of docs/using-with-ros.md,
+// without ROS' client library.
 #pragma once
 
 #include <cmath>
@@ -28,11 +29,19 @@ struct Model
 inline std::string objection(const Set & set, const Model & model, double & value)
 {
   if (set.schema_version != Set::SCHEMA_VERSION) {return "another schema";}
-  if (set.state != Set::STATE_ACCEPTED && set.state != Set::STATE_ROLLED_BACK) {return "not in force: " + set.reason;}
+  if (set.state != Set::STATE_ACCEPTED && set.state != Set::STATE_ROLLED_BACK) {
+    return "not in force: " + set.reason;
+  }
   if (set.sequence <= model.sequence) {return "not newer than the set in use";}
-  if (set.out_of_date) {return "out of date (" + set.out_of_date_code + "): " + set.out_of_date_reason;}
+  if (set.out_of_date) {
+    return "out of date (" + set.out_of_date_code + "): " + set.out_of_date_reason;
+  }
   if (!(std::abs(set.mass / model.mass - 1.0) <= 0.02)) {return "rests on another mass";}
-  for (std::size_t i = 0; i < set.names.size(); ++i) {
+  const auto size = set.names.size();
+  if (set.values.size() != size || set.units.size() != size || set.status.size() != size) {
+    return "its arrays differ in length";
+  }
+  for (std::size_t i = 0; i < size; ++i) {
     if (set.names[i] != model.name) {continue;}
     if (set.status[i] != Set::STATUS_IDENTIFIED) {return model.name + " is not identified";}
     if (set.units[i] != model.unit) {return model.name + " is in " + set.units[i];}

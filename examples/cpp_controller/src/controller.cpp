@@ -1,4 +1,4 @@
-// ros2 run quadid_cpp_controller controller: a gain that follows the roll inertia on quadid/parameters.
+// ros2 run quadid_cpp_controller controller: a gain that follows the roll inertia.
 #include <chrono>
 #include <memory>
 
@@ -14,10 +14,12 @@ public:
   {
     // The lease tells a dead or hanging identification from a quiet one.
     auto qos = rclcpp::QoS(1).reliable().transient_local();
-    qos.liveliness(rclcpp::LivelinessPolicy::ManualByTopic).liveliness_lease_duration(std::chrono::seconds(8));
+    qos.liveliness(rclcpp::LivelinessPolicy::ManualByTopic);
+    qos.liveliness_lease_duration(std::chrono::seconds(8));
     rclcpp::SubscriptionOptions options;
     options.event_callbacks.liveliness_callback = [this](rclcpp::QOSLivelinessChangedInfo & event) {
-        RCLCPP_INFO(get_logger(), "identification is %s", event.alive_count > 0 ? "alive" : "dead, or hangs");
+        const auto * state = event.alive_count > 0 ? "alive" : "dead, or hangs";
+        RCLCPP_INFO(get_logger(), "identification is %s", state);
       };
     subscription_ = create_subscription<quadid_example::Set>(
       "quadid/parameters", qos, [this](const quadid_example::Set & set) {on_set(set);}, options);
@@ -29,12 +31,14 @@ private:
     double value{};
     const auto why = quadid_example::objection(set, model_, value);
     if (!why.empty()) {
-      RCLCPP_WARN(get_logger(), "set %lu not applied: %s", static_cast<unsigned long>(set.sequence), why.c_str());
+      const auto number = std::to_string(set.sequence);
+      RCLCPP_WARN(get_logger(), "set %s not applied: %s", number.c_str(), why.c_str());
       return;
     }
     model_.value = value;
     model_.sequence = set.sequence;
-    RCLCPP_INFO(get_logger(), "%s = %.4g, roll rate gain = %.4g", model_.name.c_str(), value, 20.0 * value);
+    const auto * name = model_.name.c_str();
+    RCLCPP_INFO(get_logger(), "%s = %.4g, roll rate gain = %.4g", name, value, 20.0 * value);
   }
 
   quadid_example::Model model_;
