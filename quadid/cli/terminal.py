@@ -114,6 +114,11 @@ def check_file(path: Path | str | None, option: str) -> None:
     if path is None or str(path) == "-":
         return
     file = Path(path)
+    if option == "--report" and file.suffix.lower() not in (".html", ".htm") and not file.is_dir():
+        raise OutputError(
+            f"{option} {file}: a report is an HTML page", "a name that ends in .html",
+            f"{file.stem}.html; a browser prints it to PDF, in eight pages at most",
+        )  # fmt: skip
     if file.is_dir():
         raise OutputError(f"{option} {file} is a directory", "a file name", f"name a file in it: {file / 'result'}")
     folder = file.absolute().parent

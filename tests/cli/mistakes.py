@@ -280,6 +280,7 @@ MISTAKES = (
         lambda p: (*fit(lambda p: p.log)(p), "--json", p.folder / "no" / "r.json"),
         "no folder",
     ),
+    Mistake("a report as PDF", lambda p: (*fit(lambda p: p.log)(p), "--report", p.folder / "r.pdf"), "HTML page"),
     Mistake("a horizon of 0", lambda p: ("score", p.log, "--vehicle", "pelican", "--horizons", "0"), "horizons"),
     Mistake("a port of 99999", lambda p: ("serve", "--vehicle", "pelican", "--mavlink", "udpin:0.0.0.0:99999"), "port"),
     Mistake("a command misspelt", lambda p: ("identfy", p.log), "identify|No such command"),
