@@ -24,6 +24,8 @@ ENOUGH = 0.1
 """Gain in -2 ln L that no step is worth taking for."""
 ALL_NOISE, NO_NOISE = np.ones(k.N_NOISE, dtype=np.bool_), np.zeros(k.N_NOISE, dtype=np.bool_)
 """Which noise numbers a step may change."""
+ROUNDS = 4
+"""Most times that the noise of rotor speeds is taken out anew."""
 CHANCE = 4.0
 """Standard errors of the kurtosis beyond which innovations have outliers."""
 PATIENCE = 8
@@ -77,22 +79,52 @@ def estimate(problem: Problem, seed: int = 0, particles: int = 64, iterations: i
     # 1. Search with random forces held large, so that no flight diverges from a bad guess.
     if iterations > 0:
         z = swarm_search(part, z, psi, particles, iterations, seed)
-    z, _, _, _ = scoring(part, z, psi, NEAR, NO_NOISE)
+    z = scoring(part, z, psi, NEAR, NO_NOISE)[0]
     problem, z = problem.based_on(z)
     # 2. Let them shrink: noise and physics together, until the likelihood stays; near it, over all flights.
     part = problem.liveliest(NEAR_SECONDS)
     if part is not problem:
-        z, psi, _, _ = scoring(part, z, psi, MOST, ALL_NOISE)
-    z, psi, value, gains = scoring(problem, z, psi, MOST, ALL_NOISE)
-    information, _, left = problem.normal_equations(z, psi, gains)
+        z, psi, *_ = scoring(part, z, psi, MOST, ALL_NOISE)
+    z, psi, value, gains, information = scoring(problem, z, psi, MOST, ALL_NOISE)
     # 3. Where innovations have outliers, their density has tails.
-    tail = tails(left)
+    tail = tails([whitened(g) for g in gains])
     if np.any(tail > 0.0):
         problem = replace(problem, tail=tail)
-        z, psi, value, gains = scoring(problem, z, psi, MOST, ALL_NOISE)
-        information, _, left = problem.normal_equations(z, psi, gains)
-    # 4. Intervals from the information of this likelihood.
-    return Estimate(problem, z, psi, np.asarray(np.linalg.inv(information)), value, tuple(left))
+        z, psi, value, gains, information = scoring(problem, z, psi, MOST, ALL_NOISE)
+    # 4. Noise of logged rotor speeds makes inertias too large by as much as it explains.
+    for _ in range(ROUNDS):
+        problem = problem.unbiased(z, psi, gains)
+        taken, wide = problem.explained(z)
+        if (taken @ wide) @ np.linalg.solve(information, taken @ wide) < ENOUGH:
+            break
+        before = z
+        z, psi, value, gains, information = scoring(problem, z, psi, MOST, ALL_NOISE)
+        if (z - before) @ information @ (z - before) < ENOUGH:
+            break
+    # 5. A loop faster than the log answers a random moment within a step: by half of what it may, give or take as much.
+    within = problem.within_a_step(z, gains)
+    inverse = np.linalg.inv(information)
+    z = z + 0.5 * inverse @ within.sum(axis=0)
+    # 6. Intervals: score over slope, and how well the noise of rotor speeds and that answer are known.
+    by_square = taken @ wide * _of_square(problem, z, psi)
+    score = information + (wide.T * taken) @ wide + 0.25 * within.T @ within + np.outer(by_square, by_square)
+    covariance = inverse @ score @ inverse
+    return Estimate(problem, z, psi, np.asarray(covariance), value, tuple(whitened(g) for g in gains))
+
+
+def _of_square(problem: Problem, z: FloatArray, psi: FloatArray) -> float:
+    """Relative standard deviation of the variance of rotor speeds: none at its floor, no more than its bounds leave."""
+    low, high = problem.noise_bounds[k.ROTOR]
+    if psi[k.ROTOR] <= 1.01 * low:
+        return 0.0
+    known = np.linalg.inv(problem.noise_information(z, psi) + 0.5 * np.diag(problem.noise_curvature(psi)))
+    return float(min(2.0 * np.sqrt(known[k.ROTOR, k.ROTOR]), (high / psi[k.ROTOR]) ** 2 / np.sqrt(12.0)))
+
+
+def whitened(gains: Gains) -> FloatArray:
+    """Innovations of a pass over their standard deviations, shape (n, M); 0 where not measured."""
+    seen = gains.S > 0.0
+    return np.where(seen, gains.nu * np.sqrt(gains.w / np.where(seen, gains.S, 1.0)), 0.0)
 
 
 def tails(whitened: Sequence[FloatArray]) -> FloatArray:
@@ -135,7 +167,7 @@ def swarm_search(
 
 def scoring(
     problem: Problem, z: FloatArray, psi: FloatArray, turns: int, noise: BoolArray
-) -> tuple[FloatArray, FloatArray, float, list[Gains]]:
+) -> tuple[FloatArray, FloatArray, float, list[Gains], FloatArray]:
     """Fisher scoring of physics and noise, whose information has no common part.
 
     Physics by sensitivities of the innovations under the gains of this turn; the noise numbers' logarithms, those that
@@ -143,13 +175,13 @@ def scoring(
     not help is damped (Levenberg-Marquardt).
 
     Returns:
-        Scaled parameters, noise numbers, objective, gains there.
+        Scaled parameters, noise numbers, objective, gains there; information (P, P) before the last step.
     """
     low, high = np.log(problem.noise_bounds.T)
     value, gains = problem.passes(z, psi)
     curvature, at, damping = np.eye(len(psi)), np.full(len(psi), np.inf), 0.0
     for _ in range(turns):
-        information, gradient, _ = problem.normal_equations(z, psi, gains)
+        information, gradient = problem.normal_equations(z, psi, gains)
         log, slope, free = np.log(psi), np.zeros(len(psi)), np.zeros(len(psi), dtype=np.bool_)
         if noise.any():
             slope = problem.score(z, psi, gains) * psi
@@ -172,7 +204,7 @@ def scoring(
         z, psi, value, gains = moved, changed, better, renewed
         if expected < ENOUGH:
             break
-    return z, psi, value, gains
+    return z, psi, value, gains, information
 
 
 def _damped(curvature: FloatArray, slope: FloatArray, damping: float) -> FloatArray:

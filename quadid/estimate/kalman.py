@@ -14,6 +14,8 @@ One step:
     v' = R (F / m + f) + g                                                                                    (3)
     a(t + h) = exp(-h / T) a(t) + w,  w ~ N(0, sigma^2 (1 - exp(-2 h / T))),  for a of f, alpha, e            (4)
     P <- F P F' + G Q G'                                                                                      (5)
+where Q holds, beside the w, the noise of logged rotor speeds, which acts as forces and moments that change with every
+sample;
 and for every scalar measurement y = h(x) + N(0, r):
     S = H P H' + r,  K = P H' / S,  x <- x + K nu,  P <- P - K S K'                                           (6)
 backwards (Bryson & Frazier; de Jong 1989; no inverse of P, which random forces of size zero leave singular):
@@ -49,8 +51,8 @@ B, D, JX, JY, JZ, JR, TRIM, GYRO_BIAS, ACCEL_BIAS, DRAG, DAMP, CG, DELAY, N_PHYS
     0, 1, 2, 3, 4, 5, 6, 9, 12, 15, 17, 20, 22, 23,
 )  # fmt: skip
 # Noise: white of every scalar measurement; standard deviations of f (horizontal, vertical), alpha (roll and pitch,
-# yaw), e (tilt, heading); correlation times of f, f, alpha, alpha, e [s].
-SIGMA, TIME, N_NOISE = M, M + 6, M + 11
+# yaw), e (tilt, heading) and of logged rotor speeds [rad/s]; correlation times of f, f, alpha, alpha, e [s].
+SIGMA, ROTOR, TIME, N_NOISE = M, M + 6, M + 7, M + 12
 _GROUP = np.array([0, 0, 1, 2, 2, 3, 4, 4, 5])
 """Which standard deviation belongs to each Gauss-Markov state from FO on …"""
 _CLOCK = np.array([0, 0, 1, 2, 2, 3, 4, 4, 4])
@@ -74,6 +76,9 @@ class Track(NamedTuple):
         piece: integral up to there of each moment, and its polynomial from there, shape (pieces, MOMENTS, 4).
         mass: [kg].
         rotors: number of rotors.
+        waver: see `track.wavering`.
+        period: time between rotor samples [s].
+        speed_noise: least and most standard deviation of a logged rotor speed [rad/s].
         still: standard deviation of a velocity that nobody measures [m/s]; 0: velocity plays no part.
         beyond: what a larger model adds: to rate, rotation vector and velocity at the end of each step, to the
             measurements at its begin, shape (n, 9 + M); no rows: nothing.  See `whole_model`.
@@ -87,6 +92,9 @@ class Track(NamedTuple):
     piece: FloatArray
     mass: float
     rotors: int
+    waver: FloatArray
+    period: float
+    speed_noise: tuple[float, float]
     still: float
     beyond: FloatArray
 
@@ -465,6 +473,27 @@ def _kick(h, air, i, turn, G):  # type: ignore[no-untyped-def]
 
 
 @nb.njit(**_FAST)
+def _wavering(track, row, h, out):  # type: ignore[no-untyped-def]
+    """Writes what rotor speeds of noise 1 rad/s make of the specific thrust and the angular accelerations of a step.
+
+    Variances, shape (4,).  A sample acts for `period`, so its noise adds up over longer steps as a random walk does.
+    """
+    for i in range(4):
+        out[i] = 2.0 * (row[0] + row[MOMENTS]) * track.period / h * track.waver[i]
+
+
+@nb.njit(**_FAST)
+def _push(h, air, i, turn, G):  # type: ignore[no-untyped-def]
+    """Writes the column of G of rotor noise `i` of `_wavering`, constant over the step."""
+    G[:] = 0.0
+    if i > 0:
+        G[TH + i - 1], G[OM + i - 1] = 0.5 * h * h, h
+    elif air:
+        for j in range(3):
+            G[VE + j] = h * turn[j, 2]
+
+
+@nb.njit(**_FAST)
 def _places(channel, slope, where, what):  # type: ignore[no-untyped-def]
     """Writes the non-zero places and values of H of one scalar measurement; returns how many there are."""
     axis = channel % 3
@@ -548,7 +577,7 @@ def kalman(track: Track, p: FloatArray, psi: FloatArray, tail: FloatArray, store
     x, after = _start(track, p), np.empty(N_MEAN)
     P, FP, F, turn = np.zeros((N, N)), np.zeros((N, N)), np.zeros((N, N)), np.zeros((3, 3))
     dx, PH, G, nu = np.empty(N), np.empty(N), np.empty(N), np.zeros(M)
-    where, what = np.zeros(7, dtype=np.int64), np.zeros(7)
+    where, what, loose = np.zeros(7, dtype=np.int64), np.zeros(7), np.empty(4)
     for i in range(3):
         P[TH + i, TH + i], P[OM + i, OM + i] = 0.09, 1.0
         P[VE + i, VE + i] = max(track.still, 1.0) ** 2 if air else 0.0
@@ -620,6 +649,14 @@ def kalman(track: Track, p: FloatArray, psi: FloatArray, tail: FloatArray, store
             for a in range(N):
                 if G[a] != 0.0:
                     for b in range(N):
+                        P[a, b] += q * G[a] * G[b]
+        _wavering(track, g.table[k], h, loose)
+        for i in range(4):
+            _push(h, air, i, turn, G)
+            q = psi[ROTOR] ** 2 * loose[i]
+            for a in range(FO):
+                if G[a] != 0.0:
+                    for b in range(FO):
                         P[a, b] += q * G[a] * G[b]
     return total, g
 
@@ -732,9 +769,21 @@ def replay(track: Track, p: FloatArray, psi: FloatArray, g: Gains, table: FloatA
 
 
 @nb.njit(**_FAST)
+def _quadratic(G, l, L):  # type: ignore[no-untyped-def]
+    """G' l and G' L G of a column with few entries."""
+    along, spread = 0.0, 0.0
+    for a in range(N):
+        if G[a] != 0.0:
+            along += G[a] * l[a]
+            for b in range(N):
+                spread += G[a] * L[a, b] * G[b]
+    return along, spread
+
+
+@nb.njit(**_FAST)
 def backward(
     track: Track, p: FloatArray, psi: FloatArray, g: Gains, smooth: bool
-) -> tuple[FloatArray, FloatArray, FloatArray]:
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Smoother and score, Eqs. 7 to 9.
 
     Args:
@@ -746,7 +795,7 @@ def backward(
 
     Returns:
         Derivative of -2 ln L by the noise numbers, shape (N_NOISE,); smoothed f, alpha, e, shape (n, 9), and their
-        variances, shape (n, 9).
+        variances, shape (n, 9); sum of G' N G Q over each rotor noise of `_wavering`, shape (4,).
     """
     n = len(track.t)
     air = track.still > 0.0 or track.seen[:, 3].any()
@@ -755,6 +804,7 @@ def backward(
     NK, G, turn, F = np.empty(N), np.empty(N), np.zeros((3, 3)), np.zeros((N, N))
     c, after, before = _constants(p, track), np.empty(N_MEAN), -1.0
     where, what, keep = np.zeros(7, dtype=np.int64), np.zeros(7), np.empty(9)
+    loose, borrowed = np.empty(4), np.zeros(4)
     for k in range(n - 1, -1, -1):
         if k + 1 < n:
             h = track.t[k + 1] - track.t[k]
@@ -764,18 +814,17 @@ def backward(
             after[:] = g.mean[k]
             _advance(c, g.table[k], h, keep, air, after)
             _transition(c, g.table[k], h, keep, air, g.mean[k], after, F, turn)
+            _wavering(track, g.table[k], h, loose)
+            for i in range(4):
+                _push(h, air, i, turn, G)
+                along, spread = _quadratic(G, l, L)
+                score[ROTOR] -= (along * along - spread) * 2.0 * psi[ROTOR] * loose[i]
+                borrowed[i] += spread * psi[ROTOR] ** 2 * loose[i]
             for i in range(9):
                 # d / d sigma^2 through Q, d / d T through Q and F, Eq. 9.
                 _kick(h, air, i, turn, G)
-                by_q = 0.0
-                along = 0.0
-                for a in range(N):
-                    if G[a] != 0.0:
-                        along += G[a] * l[a]
-                        for b in range(N):
-                            if G[b] != 0.0:
-                                by_q -= G[a] * L[a, b] * G[b]
-                by_q += along * along
+                along, spread = _quadratic(G, l, L)
+                by_q = along * along - spread
                 s, T = psi[SIGMA + _GROUP[i]], psi[TIME + _CLOCK[i]]
                 score[SIGMA + _GROUP[i]] -= by_q * 2.0 * s * (1.0 - keep[i] ** 2)
                 fade = keep[i] * h / (T * T)
@@ -840,4 +889,4 @@ def backward(
     for i in range(9):
         s = psi[SIGMA + _GROUP[i]]
         score[SIGMA + _GROUP[i]] -= (l[FO + i] ** 2 - L[FO + i, FO + i]) * 2.0 * s
-    return score, mean, variance
+    return score, mean, variance, borrowed

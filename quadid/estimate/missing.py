@@ -73,7 +73,7 @@ def _smoothed(problem: Problem, z: FloatArray, psi: FloatArray) -> list[Missing]
     _, gains = problem.passes(z, psi)
     for j, (track, g) in enumerate(zip(problem.tracks, gains, strict=True)):
         p = problem.physics(z, j)
-        _, mean, variance = k.backward(track, p, psi, g, True)
+        _, mean, variance, _ = k.backward(track, p, psi, g, True)
         sigma = np.sqrt(np.maximum(variance, 0.0))
         scale = np.concatenate([np.full(3, track.mass), p[k.JX : k.JX + 3]])
         square = 0.5 * (g.table[:, 1:4] + g.table[:, k.MOMENTS + 1 : k.MOMENTS + 4])
@@ -107,13 +107,13 @@ class Vehicles:
         """Estimates the noise numbers beside a parameter vector of `quadid.model`, from its liveliest minute."""
         self.vehicle = vehicle
         problem, z = self._settled(windows, theta, None)
-        _, self.psi, _, _ = scoring(problem.liveliest(NEAR_SECONDS), z, problem.first_noise(), MOST, ALL_NOISE)
+        _, self.psi, *_ = scoring(problem.liveliest(NEAR_SECONDS), z, problem.first_noise(), MOST, ALL_NOISE)
 
     def missing(self, windows: Sequence[Window], theta: FloatArray) -> list[Missing]:
         """Missing force and moment of a parameter vector on these flights, which need not be those of the noise."""
         problem, z = self._settled(windows, theta, self.psi)
         part = problem.liveliest(NEAR_SECONDS)
-        _, psi, _, _ = scoring(part, z, self.psi, RESIZING, _SIZES)
+        _, psi, *_ = scoring(part, z, self.psi, RESIZING, _SIZES)
         return _smoothed(problem, z, psi)
 
     def _settled(
@@ -131,7 +131,7 @@ class Vehicles:
                 _, gains = problem.passes(z, noise)
                 problem = problem.beside([m.beyond(t, problem.physics(z, j), g.mean) for j, (m, t, g) in
                                           enumerate(zip(models, problem.tracks, gains, strict=True))])  # fmt: skip
-        z, _, _, _ = scoring(problem, z, noise, TRIMMING, NO_NOISE)
+        z, *_ = scoring(problem, z, noise, TRIMMING, NO_NOISE)
         return problem, z
 
 

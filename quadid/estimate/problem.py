@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TypeVar
 
@@ -12,6 +12,7 @@ import numpy as np
 
 from quadid.estimate import kalman as k
 from quadid.estimate.kalman import Gains, Track
+from quadid.estimate.track import quantum, wavering
 from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray
 from quadid.vehicle import GRAVITY, Vehicle
@@ -53,6 +54,15 @@ WHITE = np.repeat([0.02, 0.003, 0.2, 0.05], 3)
 """First guess of the sensors' white noise."""
 STRETCH, SETTLED, NUDGE = 400, 30, 1e-3
 """Rows that stand for a flight where only variances matter, those until they are stationary, and a small change."""
+PAST = 3
+"""Samples from which rotor moments are foreseen."""
+WAVER = 0.005
+"""Prior of the noise of logged rotor speeds, as a share of hover speed."""
+ACTS = np.array([
+    [1.0, 0.0, 0.0, 0.0, 0.0, 0.0], [1.0, 0.0, -1.0, 0.0, 0.0, 0.0], [1.0, 0.0, 0.0, -1.0, 0.0, 0.0],
+    [0.0, 1.0, 0.0, 0.0, -1.0, 0.0],
+])  # fmt: skip
+"""Powers of the six in what rotors make of specific thrust and of the angular accelerations."""
 LEAST = 1e-2
 """A random force this small against its prior is none."""
 
@@ -81,15 +91,9 @@ def cut(track: Track, first: int, last: int) -> Track:
 
 def floor_of(tracks: Sequence[Track]) -> FloatArray:
     """Least white noise of every scalar measurement, shape (M,): the step of its numbers / sqrt 12."""
-    out = np.full(k.M, 1e-5)
     columns = [0, 1, 2, 4, 5, 6, 7, 8, 9, 10, 11, 12]
-    for channel, column in enumerate(columns):
-        for track in tracks:
-            values = np.unique(track.y[track.seen[:, channel // 3], column])
-            if len(values) > 1:
-                steps = np.diff(values)
-                out[channel] = max(out[channel], float(np.min(steps[steps > 1e-9], initial=np.inf)) / np.sqrt(12.0))
-    return np.where(np.isfinite(out), out, 1e-5)
+    steps = [[quantum(t.y[t.seen[:, m // 3], column]) for t in tracks] for m, column in enumerate(columns)]
+    return np.asarray(np.maximum(np.max(steps, axis=1), 1e-5))
 
 
 @dataclass(frozen=True)
@@ -103,6 +107,7 @@ class Problem:
         base: physics vector of what is not free, shape (N_PHYSICS,).
         tail: see `kalman.kalman`.
         control: see `control_moment`; unit of what is random.
+        borrowed: see `unbiased`, shape (4,).
     """
 
     tracks: tuple[Track, ...]
@@ -111,6 +116,7 @@ class Problem:
     base: FloatArray
     tail: FloatArray
     control: FloatArray
+    borrowed: FloatArray = field(default_factory=lambda: np.zeros(4))
 
     @classmethod
     def of(cls, tracks: Sequence[Track], vehicle: Vehicle, names: Sequence[str] = ()) -> Problem:
@@ -138,7 +144,7 @@ class Problem:
     def based_on(self, z: FloatArray) -> tuple[Problem, FloatArray]:
         """The problem whose control moment, and so its priors, is that at z instead of the guess; and z there."""
         base = self.physics(z, 0)
-        new = replace(self, base=base, control=control_moment(self.tracks, base))
+        new = replace(self._wavering(base), base=base, control=control_moment(self.tracks, base))
         return new, np.asarray(z * self.size / new.size)
 
     def liveliest(self, seconds: float) -> Problem:
@@ -193,16 +199,68 @@ class Problem:
         return self.prior[0].copy()
 
     def penalty(self, z: FloatArray) -> float:
-        """-2 ln of the prior of the physics."""
+        """-2 ln of the prior of the physics, less what noise of the rotor speeds explains (`unbiased`)."""
         mean, sigma = self.prior
-        return float(np.sum(((z - mean) / sigma) ** 2))
+        return float(np.sum(((z - mean) / sigma) ** 2) - np.sum(self.explained(z)[0]))
+
+    def unbiased(self, z: FloatArray, psi: FloatArray, gains: Sequence[Gains]) -> Problem:
+        """The problem whose objective has its minimum at the truth although logged rotor speeds are noisy.
+
+        The same noise is in an innovation and in its derivative by the physics.  It makes the slope of the sum of
+        squares, by every parameter, that of sum G' N G Q (`kalman.backward`) with N frozen; that sum is taken off, so
+        that inertias are not too large (corrected score: Nakamura 1990, doi:10.1093/biomet/77.1.127).
+        """
+        p = self.physics(z, 0)
+        found = [
+            k.backward(t, self.physics(z, j), psi, g, False)[3]
+            for j, (t, g) in enumerate(zip(self.tracks, gains, strict=True))
+        ]
+        amounts = np.sum(found, axis=0) / np.exp(2.0 * ACTS @ np.log(p[:6]))
+        return replace(self._wavering(p), borrowed=amounts)
+
+    def _wavering(self, p: FloatArray) -> Problem:
+        """The problem whose rotor noise acts as at physics p; it does not change with the point that is tried."""
+        new = wavering(self.vehicle, p[:6])
+        return replace(self, tracks=tuple(t._replace(waver=new) for t in self.tracks))
+
+    def explained(self, z: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """What is taken off at z, shape (4,), and half its logarithm's derivative, shape (4, P)."""
+        places = [place for _, place, _ in self.entries]
+        wide = np.column_stack([ACTS, np.zeros((4, k.N_PHYSICS - 6))])[:, places]
+        return self.borrowed * np.exp(2.0 * ACTS @ np.log(self.physics(z, 0)[:6])), wide
+
+    def within_a_step(self, z: FloatArray, gains: Sequence[Gains]) -> FloatArray:
+        """Slope of half the objective if rotors answer random moments as soon as they act, by control axis, (3, P).
+
+        How rotor moments answer an innovation of the gyro in the step after it is found by regression beside the past.
+        Half as much is answered within the step by a loop faster than the log (a random walk's mean against its end),
+        nothing by one as slow: the log does not tell which.
+        """
+        out, wide = np.zeros((3, len(z))), self.explained(z)[1]
+        for j, (track, g) in enumerate(zip(self.tracks, gains, strict=True)):
+            p, h = self.physics(z, j), np.diff(track.t)
+            half = 0.5 * (g.table[:, 1:4] + g.table[:, k.MOMENTS + 1 : k.MOMENTS + 4])
+            a = half[:, [1, 0, 2]] * [-p[k.B] / p[k.JX], p[k.B] / p[k.JY], p[k.D] / p[k.JZ]]
+            rows = np.arange(PAST, len(h))
+            # The sample before is left out: its noise is in the innovation.
+            past = [a[rows - lag] for lag in range(2, PAST + 1)] + [
+                track.y[rows - lag, :3] for lag in range(1, PAST + 1)
+            ]
+            for i in range(3):
+                seen = np.all(g.S[np.stack([rows - lag for lag in range(PAST + 1)]), i] > 0.0, axis=0)
+                beside = np.column_stack([g.nu[rows, i], *past, np.ones(len(rows))])[seen]
+                if len(beside) > 4 * beside.shape[1]:
+                    answer = float(np.linalg.lstsq(beside, a[rows[seen], i], rcond=None)[0][0])
+                    out[i] -= 0.5 * min(answer, 0.0) * float(np.sum(h[rows[seen]])) * wide[i + 1]
+        return out
 
     @cached_property
     def noise_scale(self) -> FloatArray:
-        """Prior size of f, alpha, e, shape (6,)."""
+        """Prior size of f, alpha, e and of the noise of rotor speeds, shape (7,)."""
         tilt = float(np.sqrt(np.mean(self.control[:2] ** 2)))
         return np.array([
-            FORCE[0] * GRAVITY, FORCE[1] * GRAVITY, MOMENT * tilt, MOMENT * self.control[2], TILT, TILT
+            FORCE[0] * GRAVITY, FORCE[1] * GRAVITY, MOMENT * tilt, MOMENT * self.control[2], TILT, TILT,
+            WAVER * self.vehicle.hover_speed(float(self.base[k.B])),
         ])  # fmt: skip
 
     @cached_property
@@ -211,6 +269,8 @@ class Problem:
         out = np.empty((k.N_NOISE, 2))
         out[: k.M, 0], out[: k.M, 1] = floor_of(self.tracks), 100.0 * WHITE
         out[k.SIGMA : k.TIME, 0], out[k.SIGMA : k.TIME, 1] = LEAST * self.noise_scale, 100.0 * self.noise_scale
+        out[k.ROTOR, 0] = max(out[k.ROTOR, 0], *(t.speed_noise[0] for t in self.tracks))
+        out[k.ROTOR, 1] = max(out[k.ROTOR, 0], min(t.speed_noise[1] for t in self.tracks))
         step = max(float(np.median(np.diff(t.t))) for t in self.tracks)
         long = max(float(t.t[-1] - t.t[0]) for t in self.tracks)
         out[k.TIME :] = SHORTEST * step, max(LONGEST * long, 4.0 * SHORTEST * step)
@@ -219,7 +279,7 @@ class Problem:
     def first_noise(self) -> FloatArray:
         """Noise numbers where the search begins: random forces large, twice their prior."""
         out = np.concatenate([WHITE, 2.0 * self.noise_scale, np.full(5, MEMORY)])
-        out[k.SIGMA + 4 : k.TIME] = 0.25 * TILT
+        out[k.SIGMA + 4 : k.ROTOR] = 0.25 * TILT
         return np.asarray(np.clip(out, *self.noise_bounds.T))
 
     def noise_penalty(self, psi: FloatArray) -> tuple[float, FloatArray]:
@@ -311,16 +371,17 @@ class Problem:
 
     def normal_equations(
         self, z: FloatArray, psi: FloatArray, gains: Sequence[Gains], nudge: float = 1e-5
-    ) -> tuple[FloatArray, FloatArray, list[FloatArray]]:
+    ) -> tuple[FloatArray, FloatArray]:
         """Information (P, P) and gradient (P,) of the likelihood in scaled parameters, gains frozen, prior included.
 
-        Sensitivities are differences of innovations, one replay a parameter.  Also whitened innovations by flight.
+        Sensitivities are differences of innovations, one replay a parameter.
         """
         mean, sigma = self.prior
         # Expected information of a Student-t density against that of a Gaussian as wide.
         expected = np.repeat(np.sqrt((1.0 + self.tail) / (1.0 + 3.0 * self.tail)), 3)
-        information, gradient = np.diag(1.0 / sigma**2), (z - mean) / sigma**2
-        left = []
+        taken, wide = self.explained(z)
+        information = np.diag(1.0 / sigma**2) - (wide.T * taken) @ wide
+        gradient = (z - mean) / sigma**2 - taken @ wide
         for j, (track, g) in enumerate(zip(self.tracks, gains, strict=True)):
             mine = [i for i, (_, _, where) in enumerate(self.entries) if where in (-1, j)]
             plain = self._whitened(track, g, z, psi, j)
@@ -329,8 +390,10 @@ class Problem:
             gradient[mine] += J.reshape(len(mine), -1) @ plain.ravel()
             J *= expected
             information[np.ix_(mine, mine)] += J.reshape(len(mine), -1) @ J.reshape(len(mine), -1).T
-            left.append(plain)
-        return information, gradient, left
+        # What noise of rotor speeds explains is no information, but there is never less than the prior's.
+        own, turned = np.linalg.eigh(sigma[:, None] * information * sigma - np.eye(len(z)))
+        turned = turned / sigma[:, None]
+        return np.diag(1.0 / sigma**2) + (turned * np.maximum(own, 0.0)) @ turned.T, gradient
 
     def _several(self, j: int, points: Sequence[FloatArray], psi: FloatArray, g: Gains) -> list[FloatArray]:
         return _each(lambda i: self._whitened(self.tracks[j], g, points[i], psi, j), len(points))

@@ -14,6 +14,8 @@ from quadid.vehicle import Vehicle
 
 STILL = 3.0
 """Standard deviation of a velocity that nobody measures [m/s], where air matters."""
+LAGS = 4
+"""Samples of all rotors from which the next one is foreseen."""
 TOGETHER = 1e-4
 """Measurements closer than this are taken at one time [s]."""
 _COLUMNS = (("gyro", 0, 3), ("attitude", 3, 7), ("accel", 7, 10), ("velocity", 10, 13))
@@ -80,10 +82,40 @@ def _track(
             at = np.searchsorted(t, times + 0.5 * TOGETHER, side="right") - 1
             y[at, first:last], seen[at, group] = values, True
     piece_t, piece = _pieces(rotor_t, speed, slope, held, vehicle)
+    new = _new(speed)
     still = STILL if air and not seen[:, 3].any() else 0.0
+    between = np.diff(rotor_t[new]) if new.sum() > 1 else np.diff(rotor_t)
     return Track(
-        t, y, seen, 0.5 * period, piece_t, piece, vehicle.mass, len(vehicle.rotors), still, np.empty((0, 9 + M))
-    )
+        t, y, seen, 0.5 * period, piece_t, piece, vehicle.mass, len(vehicle.rotors), wavering(vehicle, vehicle.initial),
+        float(np.median(between)), _speed_noise(speed[new]), still, np.empty((0, 9 + M)),
+    )  # fmt: skip
+
+
+def wavering(vehicle: Vehicle, six: FloatArray) -> FloatArray:
+    """Variances of the specific thrust and the angular accelerations for a variance 1 of every rotor's thrust / b.
+
+    Shape (4,): thrust, roll, pitch, yaw, by the nominal six; to be multiplied with a sum over rotors.
+    """
+    x, y = vehicle.rotor_positions[:, :2].T
+    unit = six[[0, 0, 0, 1]] / [vehicle.mass, *six[2:5]]
+    return np.asarray(np.array([1.0, np.mean(y**2), np.mean(x**2), 1.0]) * unit**2)
+
+
+def quantum(values: FloatArray) -> float:
+    """Standard deviation of rounding: the least step between numbers / sqrt 12; 0 where all are the same."""
+    steps = np.diff(np.unique(values))
+    least = float(np.min(steps[steps > 1e-9], initial=np.inf))
+    return least / np.sqrt(12.0) if np.isfinite(least) else 0.0
+
+
+def _speed_noise(speed: FloatArray) -> tuple[float, float]:
+    """Least and most noise of rotor samples: rounding; what a line through all rotors' past leaves of the next."""
+    if len(speed) < 8 * LAGS * speed.shape[1]:
+        return quantum(speed), np.inf
+    earlier = [speed[LAGS - i : len(speed) - i] for i in range(1, LAGS + 1)]
+    past = np.column_stack([*earlier, np.ones(len(speed) - LAGS)])
+    left = speed[LAGS:] - past @ np.linalg.lstsq(past, speed[LAGS:], rcond=None)[0]
+    return quantum(speed), float(np.sqrt(np.mean(left**2)))
 
 
 def _pieces(

@@ -14,7 +14,7 @@ from quadid.vehicle import Vehicle
 PELICAN = Vehicle.shipped("pelican")
 ROWS, STEP = 40, 0.02
 NOISE = np.array([*[0.02] * 3, *[0.003] * 3, *[0.2] * 3, *[0.05] * 3, 0.4, 0.3, 0.1, 0.2, 0.004, 0.003,
-                  0.2, 0.3, 0.1, 0.15, 0.5])  # fmt: skip
+                  2.0, 0.2, 0.3, 0.1, 0.15, 0.5])  # fmt: skip
 
 
 def physics() -> FloatArray:
@@ -52,11 +52,20 @@ def matrices() -> tuple[FloatArray, FloatArray, FloatArray]:
     F[k.VE : k.VE + 3, k.TH : k.TH + 3], F[k.VE : k.VE + 3, k.OM : k.OM + 3] = h * lean, 0.5 * h * h * lean
     F[range(k.FO, k.N), range(k.FO, k.N)] = keep
     G[range(k.FO, k.N), range(9)] = 1.0
+    # Noise of every rotor speed, constant over the step: thrust and moments of 2 b omega n.
+    (x, y), b = PELICAN.rotor_positions[:, :2].T, PELICAN.initial[0]
+    up = np.stack([-b / PELICAN.mass * np.ones(4), -b / PELICAN.initial[2] * y, b / PELICAN.initial[3] * x,
+                   PELICAN.initial[1] / PELICAN.initial[4] * PELICAN.spins])  # fmt: skip
+    act = np.zeros((k.N, 4))
+    act[k.VE + 2, 0] = h
+    for i in range(3):
+        act[k.OM + i, 1 + i], act[k.TH + i, 1 + i] = h, 0.5 * h * h
+    act = 2.0 * PELICAN.hover_speed() * NOISE[k.ROTOR] * act @ up
     H = np.zeros((k.M, k.N))
     for i in range(3):
         H[k.GYRO + i, k.OM + i] = H[k.ATTITUDE + i, k.TH + i] = H[k.ATTITUDE + i, k.AE + i] = 1.0
         H[k.ACCEL + i, k.FO + i] = H[k.VELOCITY + i, k.VE + i] = 1.0
-    return F, G @ np.diag(sigma**2 * (1.0 - keep**2)) @ G.T, H
+    return F, G @ np.diag(sigma**2 * (1.0 - keep**2)) @ G.T + act @ act.T, H
 
 
 def measured(track: Track) -> tuple[FloatArray, FloatArray]:

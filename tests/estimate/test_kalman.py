@@ -31,7 +31,7 @@ def test_smoother_is_batch_least_squares() -> None:
     track = tiny_flight()
     mean, variance = batch(track)
     _, gains = k.kalman(track, physics(), NOISE, GAUSS, True)
-    _, found, spread = k.backward(track, physics(), NOISE, gains, True)
+    _, found, spread, _ = k.backward(track, physics(), NOISE, gains, True)
     np.testing.assert_allclose(found, mean[:, k.FO :], atol=1e-9)
     np.testing.assert_allclose(spread, variance[:, k.FO :], rtol=1e-6)
 
@@ -43,7 +43,7 @@ def test_smoother_needs_no_attitude() -> None:
     seen[:, 1] = False
     track = track._replace(seen=seen)
     _, gains = k.kalman(track, physics(), NOISE, GAUSS, True)
-    _, found, spread = k.backward(track, physics(), NOISE, gains, True)
+    _, found, spread, _ = k.backward(track, physics(), NOISE, gains, True)
     assert (spread[:, : k.AE - k.FO] > 0.0).all()
     assert np.abs(found[0, : k.AE - k.FO]).max() > 0.0
 
@@ -68,6 +68,22 @@ def test_score_is_the_slope_of_the_likelihood() -> None:
         assert score[i] == pytest.approx((up - down) / 2e-4, rel=2e-2, abs=0.3), i
 
 
+def test_what_noise_of_rotor_speeds_explains_is_the_slope_of_the_variances() -> None:
+    """The sum of G' N G Q is the derivative of sum ln S by ln Q."""
+    track, p = flown()
+    borrowed = k.backward(track, p, NOISE, k.kalman(track, p, NOISE, GAUSS, True)[1], False)[3]
+
+    def heights(speed: float) -> float:
+        psi = NOISE.copy()
+        psi[k.ROTOR] = speed
+        S = k.kalman(track, p, psi, GAUSS, True)[1].S
+        return float(np.sum(np.log(S[S > 0.0])))
+
+    up, down = (heights(NOISE[k.ROTOR] * np.exp(step)) for step in (1e-4, -1e-4))
+    assert np.all(borrowed > 0.0)
+    assert borrowed.sum() == pytest.approx((up - down) / 4e-4, rel=1e-3)
+
+
 def test_random_forces_of_size_zero_change_nothing() -> None:
     track, p = flown()
     still, other = NOISE.copy(), NOISE.copy()
@@ -76,7 +92,7 @@ def test_random_forces_of_size_zero_change_nothing() -> None:
     value, gains = k.kalman(track, p, still, GAUSS, True)
     assert value == k.kalman(track, p, other, GAUSS, False)[0]
     assert not gains.mean[:, k.FO + 1 : k.AE + 1].any()
-    _, force, spread = k.backward(track, p, still, gains, True)
+    _, force, spread, _ = k.backward(track, p, still, gains, True)
     assert not force[:, :6].any()
     assert not spread[:, :6].any()
 
