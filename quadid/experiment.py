@@ -1,7 +1,8 @@
 """A manoeuvre that reveals most: candidate movements are flown in simulation, weighed, chosen and put in a row.
 
-The flights are those of the simulated vehicle with the parameters believed so far; what counts of them is the Fisher
-information that a log of them would carry.
+The flights are those of the simulated vehicle with the parameters believed so far; movements are chosen by the Fisher
+information that a log of them would carry.  What is promised is what a fit makes of a log of the whole manoeuvre
+(`AsLogged`), where there is a log, since intervals also hold what the information does not know of.
 """
 
 from __future__ import annotations
@@ -13,8 +14,12 @@ from typing import Any
 import numpy as np
 import yaml
 
+from quadid.data.grid import to_windows
+from quadid.data.window import Recording, Window
 from quadid.errors import NotIdentifiableError
+from quadid.estimate import missing
 from quadid.flight import Flight, FlightError, Segment, TruthParameters, fly
+from quadid.flight.sensors import SensorNoise
 from quadid.identification.excitation import excitation
 from quadid.identification.global_search import Progress as Advance
 from quadid.identification.noise_model import NoiseModel
@@ -40,6 +45,8 @@ thrust."""
 SWEEP = (0.5, 3.5)
 """Frequencies of sweeps of one axis at a time [Hz], lowest and highest."""
 ROUNDS = 3
+FASTEST = 500.0
+"""Rate of logs that simulated flights are thinned from [Hz]."""
 
 
 @dataclass(frozen=True)
@@ -133,6 +140,48 @@ class TrialFlights:
         if safe is None:
             raise FlightError("a movement exceeds the limits at any amplitude tried", "a wider limit")
         return safe
+
+
+class AsLogged:
+    """Flies manoeuvres as they would be logged: random forces and sensor noise found so far, the log's own rates."""
+
+    def __init__(
+        self, simulator: TrialFlights, recording: Recording, rate: float, windows: Sequence[Window], theta: FloatArray
+    ) -> None:
+        """Finds the random forces.
+
+        Args:
+            simulator: what is believed of the vehicle, with the noise that was found.
+            recording: a log of the vehicle; each channel will come as often as there.
+            rate: of its grid [Hz].
+            windows: of all logs so far.
+            theta: parameters identified from them, shape (L,).
+        """
+        vehicle = simulator.vehicle
+        parts = missing.Vehicles(windows, vehicle, theta).missing(windows, theta)
+        force, moment = (missing.size(parts, is_force)[0][:2] for is_force in (True, False))
+        push, turn = (float(np.sqrt(np.mean(a**2))) for a in (force / vehicle.mass, moment / theta[2:4]))
+        self.gusts = {"push": push, "turn": turn, "time": float(parts[0].times[0])}
+        white = NoiseModel.guess(9).white if simulator.noise is None else simulator.noise.white
+        gyro, attitude, accel = (float(np.mean(white[i : i + 3])) for i in (0, 3, 6))
+        self._noise = SensorNoise(gyro=gyro, attitude=attitude, accel=accel)
+        self._simulator, self._recording = simulator, recording
+        self._rate = FASTEST / max(round(FASTEST / rate), 1)
+
+    def windows(self, segments: Sequence[Segment], seconds: float, profile: str = "scripted") -> list[Window]:
+        """One flight, logged; raises FlightError when it ends on the ground."""
+        simulator = self._simulator
+        flown = fly(
+            simulator.vehicle, simulator.truth, seconds, simulator.seed, profile, effects=simulator.vehicle.effects,
+            outside={"gusts": self.gusts}, segments=segments if profile == "scripted" else None, noise=self._noise,
+            log_rate=self._rate,
+        ).recording  # fmt: skip
+        channels = {}
+        for name, channel in flown.channels.items():
+            there = self._recording.channels.get(name, channel)
+            rows = slice(None, None, max(round(self._rate * float(np.median(np.diff(there.t)))), 1))
+            channels[name] = replace(channel, t=channel.t[rows], values=channel.values[rows])
+        return to_windows(replace(flown, channels=channels), simulator.vehicle, self._rate)
 
 
 def peaks(flight: Flight) -> Limits:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,7 +21,8 @@ from quadid.vehicle import Vehicle
 
 if TYPE_CHECKING:
     from quadid.experiment import Proposal
-    from quadid.identification.noise_model import NoiseModel
+    from quadid.flight import Segment
+    from quadid.identification.fit import Fit
     from quadid.report.manoeuvres import Plan
 
 MOST_SECONDS = 600.0
@@ -101,8 +102,8 @@ def check_limits(seconds: float, tilt: float, rate_limit: float, height: tuple[f
 
 def knowledge(
     vehicle: Vehicle, windows: Sequence[Window], seed: int, advance: Advance
-) -> tuple[Vehicle, FloatArray, NoiseModel | None]:
-    """What is known so far: vehicle with believed values, information (6, 6) of the log parameters, sensor noise.
+) -> tuple[Vehicle, FloatArray, Fit | None]:
+    """What is known so far: vehicle with believed values, information (6, 6) of the log parameters, fit of the logs.
 
     Without logs that is the vehicle file: its sigma, else half of its bounds on the log scale.
     """
@@ -110,7 +111,7 @@ def knowledge(
 
     if windows:
         fit = search("pso_polish", windows, vehicle, seed, advance)
-        return fitted_vehicle(fit), np.asarray(np.linalg.inv(fit.uncertainty.covariance), dtype=np.float64), fit.noise
+        return fitted_vehicle(fit), np.asarray(np.linalg.inv(fit.uncertainty.covariance), dtype=np.float64), fit
     sigma = np.array([vehicle.parameters[name].log_sigma for name in NOMINAL_NAMES])
     return vehicle, np.diag(1.0 / sigma**2), None
 
@@ -137,7 +138,8 @@ def propose(
         ParameterError: limits that nobody can fly.
         NotIdentifiableError: no movement stays within the limits, or too little data.
     """
-    from quadid.experiment import Limits, TrialFlights, design_manoeuvre, manoeuvre_file
+    from quadid.experiment import AsLogged, Limits, TrialFlights, design_manoeuvre, manoeuvre_file
+    from quadid.identification.optimal_input import halfwidths
     from quadid.report.programs import Facts
 
     check_limits(seconds, tilt, rate_limit, height, battery)
@@ -146,9 +148,23 @@ def propose(
     described = as_vehicle(vehicle)
     given = read(logs, described)
     windows = [w for log in given for w in log.windows]
-    believed, known, noise = knowledge(described, windows, seed, advance)
-    proposal = design_manoeuvre(TrialFlights(believed, noise, seed), known, limits, seconds, advance)
-    plan = _plan(believed.name, proposal, tilt, height, battery)
+    believed, known, before = knowledge(described, windows, seed, advance)
+    simulator = TrialFlights(believed, None if before is None else before.noise, seed)
+    proposal = design_manoeuvre(simulator, known, limits, seconds, advance)
+    if before is not None:
+        as_logged = AsLogged(simulator, given[-1].recording, given[-1].grid.rate, windows, before.theta)
+
+        def promised(segments: Sequence[Segment], profile: str = "scripted") -> FloatArray:
+            flown = as_logged.windows(segments, proposal.seconds, profile)
+            covariance = search("pso_polish", [*windows, *flown], described, seed, advance).uncertainty.covariance
+            # What was known stays known, whatever noise the fit of one more flight finds.
+            return np.minimum(proposal.now, halfwidths(np.linalg.inv(covariance)))
+
+        proposal = replace(
+            proposal, pilot=promised((), "gentle"), after=promised(proposal.segments),
+            swept=promised(proposal.sweeps) if proposal.sweeps else proposal.swept,
+        )  # fmt: skip
+    plan = made_into_plan(believed.name, proposal, tilt, height, battery)
     result = {
         **_result(believed.name, proposal, tilt, rate_limit),
         "envelope": dict(plan.envelope),
@@ -160,14 +176,14 @@ def propose(
     return Proposed(result, proposal, manoeuvre_file(believed.name, proposal), plan, hover)
 
 
-def _plan(vehicle: str, proposal: Proposal, tilt: float, height: tuple[float, float], battery: float) -> Plan:
+def made_into_plan(vehicle: str, proposal: Proposal, tilt: float, height: tuple[float, float], battery: float) -> Plan:
     """The manoeuvre with its envelope; raises ParameterError where it needs more height than there is."""
     from quadid.report.manoeuvres import Plan
 
     sideways, up, down = proposal.room.tolist()
     if up + down > height[1] - height[0]:
         raise ParameterError(
-            f"--height {height[0]:g}:{height[1]:g}", f"at least {up + down:.0f} m, which the manoeuvre needs",
+            f"--height {height[0]:g}:{height[1]:g}", f"at least {up + down:.2g} m, which the manoeuvre needs",
             "a wider --height, or a smaller --tilt",
         )  # fmt: skip
     envelope = {

@@ -286,9 +286,10 @@ def _shape(segment: Segment, rng: np.random.Generator, t: FloatArray) -> FloatAr
     lines = np.arange(np.ceil(f0 * span), np.floor(f1 * span) + 1) / span
     if len(lines) == 0:
         lines = np.array([f0])
-    # Schroeder phases keep the peak of a multisine low
-    k = np.arange(len(lines))
-    angles = 2.0 * np.pi * np.outer(t, lines) - np.pi * k * (k + 1) / len(lines)
+    # Schroeder phases keep the peak of a multisine low.  Those of two axes differ by a turn over all lines, so that
+    # their product has no mean: a tilt in step with the heading would push the vehicle away.
+    k, n = np.arange(len(lines)), len(lines)
+    angles = 2.0 * np.pi * (np.outer(t, lines) + AXES.index(segment.axis) * k / n) - np.pi * k * (k + 1) / n
     return np.asarray(np.sin(angles).sum(axis=1) * np.sqrt(2.0 / len(lines)))
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -11,7 +12,9 @@ import numpy as np
 import pytest
 import yaml
 
-from quadid.app.excite import propose
+from quadid.app.excite import made_into_plan, propose
+from quadid.errors import ParameterError
+from quadid.flight import Segment, fly
 from quadid.parameters import NOMINAL_NAMES
 from quadid.vehicle import GRAVITY, Vehicle
 from tests.cli.conftest import Cli, Flights, one_line
@@ -39,8 +42,10 @@ def test_a_manoeuvre_from_a_log_keeps_limits_and_promises(inside: Cli, flights: 
     assert made.code == 0, made.err
     both = inside("identify", flights.train, flown, "--vehicle", "pelican", "--out", tmp_path, "--json", "-")
     for promised, got in zip(result["parameters"], both.data["parameters"], strict=True):
-        half = math.sqrt(got["ci95"][1] / got["ci95"][0]) - 1.0
-        assert half == pytest.approx(promised["manoeuvre"], rel=0.25), got["name"]
+        ratio = (math.sqrt(got["ci95"][1] / got["ci95"][0]) - 1.0) / promised["manoeuvre"]
+        # Where half as fast a grid gives another J_r beyond chance, `identify` adds the difference; by chance it does
+        # so on one flight of the manoeuvre and not on the next.
+        assert 0.75 < ratio < (3.0 if got["name"] == "J_r" else 1.25), (got["name"], ratio)
 
 
 def test_without_a_log_the_vehicle_file_says_what_is_known(inside: Cli, tmp_path: Path) -> None:
@@ -105,8 +110,17 @@ def test_throttle_at_hover_follows_the_thrust_curve() -> None:
     assert proposed.hover_throttle == pytest.approx(hover)
 
 
-def test_too_little_height_or_time_is_refused(inside: Cli, tmp_path: Path) -> None:
+def test_too_little_height_is_refused() -> None:
+    pelican = Vehicle.shipped("pelican")
+    rising = Segment("throttle", "multisine", 0.0, 6.0, 0.15, 0.3, 1.0)
+    flight = fly(pelican, seconds=6.5, profile="scripted", segments=[rising])
+    proposal = replace(propose(vehicle=pelican, seconds=6.5).proposal, flight=flight)
+    assert proposal.room[1:].sum() > 0.2
+    with pytest.raises(ParameterError, match="which the manoeuvre needs"):
+        made_into_plan("pelican", proposal, 25.0, (10.0, 10.05), 40.0)
+
+
+def test_too_little_time_is_refused(inside: Cli, tmp_path: Path) -> None:
     short = ("excite", "--vehicle", "pelican", "--seconds", "13", "--out", tmp_path)
-    assert "which the manoeuvre needs" in one_line(inside(*short, "--height", "10:10.05"), 2)
     # Four sweeps do not fit into so short a time.
     assert "--seconds" in one_line(inside(*short, "--format", "ardupilot-sid"), 2)

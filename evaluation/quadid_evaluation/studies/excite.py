@@ -55,7 +55,8 @@ def run(seed: int, seconds: float) -> tuple[FloatArray, FloatArray, bool]:
     truth = draw_truth(CRAFT, seed)
     vehicle = poor_guess(CRAFT, truth.as_dict(), seed)
     first = fly(CRAFT, truth, seconds, seed, "gentle").window
-    believed, known, noise = knowledge(vehicle, [first], seed, quiet)
+    believed, known, before = knowledge(vehicle, [first], seed, quiet)
+    noise = None if before is None else before.noise
     proposal = design_manoeuvre(TrialFlights(believed, noise, seed), known, LIMITS, seconds, quiet)
     length = proposal.seconds
     flown = fly(CRAFT, truth, length, seed + 1, "scripted", segments=proposal.segments)
