@@ -304,6 +304,8 @@ _MOTION = 0.03
 """Rotation rate [rad/s] an axis must have, as standard deviation, to be checked."""
 _STEP = 0.1
 """Attitudes are compared over steps of at least this [s]: noise and repeated readings matter little then."""
+_STEPPED = 8.0
+"""Standard errors of a step of the gyro's bias."""
 _JUMP = 8.0
 """An attitude step of so many times the usual one, beside half as much of the gyro's, is no motion."""
 _FARTHEST, _LAG, _TOO_LATE = 0.3, 0.02, 0.08
@@ -450,6 +452,8 @@ def gyro_check(recording: Recording) -> Check:
     for name, q in _attitude_readings(attitude.values):
         measured, derived = _moving_rates(gyro, attitude.t, q)
         if len(measured) < 20:
+            if name == "as given":  # as much noise moves every reading of it: no other is more likely for it
+                break
             continue
         fit = _fit_without_jumps(measured, derived)
         if best is None or _likely(name, fit) > _likely(*best):
@@ -457,7 +461,33 @@ def gyro_check(recording: Recording) -> Check:
     if best is None:
         return Check("gyro_attitude", CheckResult.UNKNOWN, "too little rotation to compare gyro and attitude")
     late = _apart(gyro, attitude, best[1].r2) if best[0] == "as given" else None
-    return late or _judge_rates(*best)
+    return late or _bias_step(gyro, attitude) or _judge_rates(*best)
+
+
+def _bias_step(gyro: Channel, attitude: Channel) -> Check | None:
+    """An error where the gyro follows the attitude, or both stand still, but for one step of its bias."""
+    t = attitude.t
+    measured, derived = _moving_rates(gyro, t, attitude.values)
+    n = len(measured)
+    if n < 20 or fit_axes(measured, derived).r2 >= _CLEAR:
+        return None
+    apart = measured - derived
+    count = np.arange(5, n - 4)[:, None]
+    before = np.cumsum(apart, axis=0)[4 : n - 5] / count
+    size = (apart.sum(axis=0) - before * count) / (n - count) - before
+    share = size**2 * count * (n - count) / n
+    k, axis = (int(i) for i in np.unravel_index(np.argmax(share), share.shape))
+    after = np.arange(n) >= count[k, 0]
+    left = measured - np.outer(after, np.where(np.arange(3) == axis, size[k], 0.0))
+    fit, noise = fit_axes(left, derived), float(np.var((left - derived)[:, axis]))
+    still = np.max(np.std(left, axis=0)) < _MOTION
+    if share[k, axis] < _STEPPED**2 * noise or not (still or (fit.straight and fit.r2 >= _CLEAR)):
+        return None
+    return Check(
+        "gyro_attitude", CheckResult.ERROR,
+        f"the gyro's bias about {_AXES[axis]} stepped by {size[k, axis]:+.2g} rad/s; without that the attitude agrees",
+        "use the flight before it, and calibrate the gyro at rest", {"step": float(size[k, axis])},
+    )  # fmt: skip
 
 
 def _apart(gyro: Channel, attitude: Channel, now: float) -> Check | None:

@@ -12,12 +12,12 @@ from quadid.checks.findings import CheckResult
 from quadid.checks.motion import attitude_check, gravity_check, velocity_check
 from quadid.checks.rotors import better_order, lagged_of, motor_order_check
 from quadid.data.faults import at_limit
-from quadid.data.resample import copied, true_runs
+from quadid.data.resample import copied, moving_mean, true_runs
 from quadid.data.window import Window, as_recording
 from quadid.model.layout import ThrustModel
 from quadid.online.grid_buffer import Rows, WindowCut
 from quadid.rotation import down, integrated, turn
-from quadid.types import FloatArray
+from quadid.types import FloatArray, IndexArray
 from quadid.vehicle import GRAVITY, Vehicle
 
 # --- Do the sensors agree?  Factors of channels against each other, from physics that needs no model of the vehicle
@@ -218,7 +218,11 @@ def _gyro_factors(axis: int, told: _Fading) -> list[Factor]:
 
 
 STUCK_SECONDS = 1.0
-"""A sensor that repeats itself to the bit for longer than this [s] is stuck."""
+"""A sensor that repeats itself to the bit for longer than this [s] is stuck, if the vehicle moves meanwhile:"""
+TURNED, BIAS = 0.02, 0.02
+"""by gyro and attitude [rad], beside this much bias of the gyro [rad/s],"""
+LIFTED = 0.02
+"""or by the scatter of the thrust, as a share of it."""
 THRUST_KNOWN = (0.4, 4.0)
 """Mean thrust over weight of a flying vehicle whose thrust coefficient is known."""
 THRUST_GUESSED = (0.2, 5.0)
@@ -276,13 +280,32 @@ def _broken(window: Window) -> str:
         values = getattr(window, name)
         if values is None:
             continue
-        rows = values[np.isfinite(values).all(axis=1)]
-        first, end = true_runs(copied(rows))
-        if np.max(end - first, initial=0) > still:
-            return f"{name} is stuck: it repeated the same value for more than {STUCK_SECONDS:g} s"
-        if name in ("gyro", "accel") and (ends := at_limit(rows)):
+        here = np.flatnonzero(np.isfinite(values).all(axis=1))
+        for first, end in zip(*true_runs(copied(values[here])), strict=True):
+            if end - first > still and _moves(window, name, here[first : end + 1]):
+                return f"{name} is stuck: it repeated the same value for more than {STUCK_SECONDS:g} s"
+        if name in ("gyro", "accel") and (ends := at_limit(values[here])):
             return f"{name} axis {'xyz'[ends[0].axis]} is saturated at {ends[0].level:.4g}: widen its range"
     return ""
+
+
+def _moves(window: Window, name: str, rows: IndexArray) -> bool:
+    """Whether the others say that a sensor which repeats itself ought not to; coarse ones do so in a calm hover."""
+    gyro, q = (None if v is None else v[rows] for v in (window.gyro, window.attitude))
+    if name in ("gyro", "attitude"):
+        if gyro is None or q is None:
+            return True
+        turned = np.cumsum(gyro[:-1], axis=0) * window.dt
+        apart = np.abs(turned - turn(np.broadcast_to(q[0], q[1:].shape), q[1:]))
+        return bool(np.nanmax(apart) > TURNED + BIAS * window.dt * len(rows))
+    if gyro is not None and (name == "accel" and copied(gyro).mean() < 0.5 or np.nanstd(gyro, axis=0).max() > MOVING):
+        return True  # one chip reads both: where one has noise, so has the other
+    lift = np.sum(window.rotor_speed[rows] ** 2, axis=1)
+    if name == "rotor_speed":
+        if window.accel is None:
+            return False
+        lift = moving_mean(window.accel[rows, 2:], max(round(TURN / window.dt), 1))[:, 0]
+    return bool(np.nanstd(lift) > LIFTED * abs(np.nanmean(lift)))
 
 
 def mistake(cut: WindowCut, vehicle: Vehicle, known: bool) -> str:

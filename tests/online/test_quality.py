@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 from quadid.checks import inspect
 from quadid.checks.findings import CheckResult
 from quadid.data.window import Window
+from quadid.flight import fly
 from quadid.model.layout import Layout, ThrustModel
 from quadid.online.checks import Quality, judge, mistake
 from quadid.online.grid_buffer import WindowCut
@@ -87,6 +89,42 @@ def test_a_stuck_sensor_is_named(name: str, happened: Happened) -> None:
     values[200:280] = values[200]
     assert f"{name} is stuck" in verdict(changed(window, name, values)).fault
     happened(6, f"{name} stuck for 1.6 s in flight: the window is refused and the sensor named")
+
+
+def test_coarse_sensors_may_repeat_themselves_in_a_calm_hover() -> None:
+    window = fly(PELICAN, seconds=11.0, seed=5, profile="hover", noise_scale=0.0).window
+    steps = {"gyro": 0.005, "accel": 0.05, "rotor_speed": 5.0}
+    for name, step in steps.items():
+        window = changed(window, name, np.round(getattr(window, name) / step) * step)
+        assert np.all(getattr(window, name)[100:160] == getattr(window, name)[100])
+    assert verdict(window) == Quality()
+
+
+@pytest.mark.parametrize("name", ["gyro", "accel", "attitude"])
+def test_a_sensor_stuck_in_gentle_flight_is_named(name: str) -> None:
+    window = flight(30.0, 3, "gentle").window.slice(0, 511)
+    values = getattr(window, name).copy()
+    values[100:500] = values[100]
+    assert f"{name} is stuck" in verdict(changed(window, name, values)).fault
+
+
+@pytest.mark.parametrize(("profile", "axis", "step"), [("hover", 2, 0.2), ("hover", 0, -0.2), ("gentle", 0, 0.1)])
+def test_a_step_of_the_gyros_bias_is_called_one(profile: str, axis: int, step: float) -> None:
+    window = flight(30.0, 3, profile).window.slice(0, 511)
+    assert window.gyro is not None
+    gyro = window.gyro.copy()
+    gyro[250:, axis] += step
+    fault = verdict(changed(window, "gyro", gyro)).fault
+    told = re.search(r"bias about ([xyz]) stepped by (\S+) rad/s", fault)
+    assert told is not None, fault
+    assert told[1] == "xyz"[axis]
+    assert float(told[2]) == pytest.approx(step, rel=0.1)
+
+
+def test_noise_of_an_attitude_is_no_wrong_frame() -> None:
+    """Once the attitude read backwards stood just above the motion that is judged, and as given just below."""
+    for seed, start in ((1, 4500), (6, 4500), (7, 500), (7, 750)):
+        assert verdict(flight(120.0, seed, "gentle").window.slice(start, start + 511)) == Quality()
 
 
 def test_a_saturated_gyro_is_named(happened: Happened) -> None:
