@@ -40,7 +40,7 @@ def serve(log: Path, vehicle: Path, seconds: float) -> Outcome:
             stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
         )  # fmt: skip
         said, ready = list[str](), threading.Event()
-        listener = threading.Thread(target=_listen, args=(served, said, ready), daemon=True)
+        listener = threading.Thread(target=listen, args=(served, said, ready), daemon=True)
         listener.start()
         try:
             ready.wait(WARM)
@@ -50,17 +50,20 @@ def serve(log: Path, vehicle: Path, seconds: float) -> Outcome:
             served.terminate()
             served.wait(30)
         listener.join(5)
-        told = subprocess.run(
-            [*command, "history", "--vehicle", str(vehicle), "--history", str(history), "--candidates", "10000",
-             "--events", "10000", "--json", "-"],
-            capture_output=True, text=True, check=True,
-        )  # fmt: skip
+        return stored(vehicle, history, said, time.monotonic() - begin)
+
+
+def stored(vehicle: Path, history: Path, said: list[str], seconds: float) -> Outcome:
+    """What a service that has ended left in its history; `said`: its lines; `seconds`: how long it ran."""
+    told = subprocess.run(
+        [str(Path(sys.executable).with_name("quadid")), "history", "--vehicle", str(vehicle), "--history", str(history),
+         "--candidates", "10000", "--events", "10000", "--json", "-"],
+        capture_output=True, text=True, check=True,
+    )  # fmt: skip
     found = json.loads(told.stdout)
     last = [line for line in said if " | Hz: " in line][-1:]
-    return Outcome(
-        found["sets"], found["candidates"], found["events"], last[0].split(" | Hz: ")[0] if last else "",
-        time.monotonic() - begin,
-    )  # fmt: skip
+    status = last[0].split(" | Hz: ")[0] if last else ""
+    return Outcome(found["sets"], found["candidates"], found["events"], status, seconds)
 
 
 def _free_port() -> int:
@@ -69,7 +72,8 @@ def _free_port() -> int:
         return int(probe.getsockname()[1])
 
 
-def _listen(served: subprocess.Popen[str], said: list[str], ready: threading.Event) -> None:
+def listen(served: subprocess.Popen[str], said: list[str], ready: threading.Event) -> None:
+    """Keeps the lines of a service, and notes when it is ready."""
     assert served.stdout is not None
     for line in served.stdout:
         said.append(line.rstrip())
