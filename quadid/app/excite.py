@@ -158,7 +158,7 @@ def propose(
             flown = as_logged.windows(segments, proposal.seconds, profile)
             covariance = search("pso_polish", [*windows, *flown], described, seed, advance).uncertainty.covariance
             # What was known stays known, whatever noise the fit of one more flight finds.
-            return np.minimum(proposal.now, halfwidths(np.linalg.inv(covariance)))
+            return np.minimum(proposal.now, halfwidths(np.asarray(np.linalg.inv(covariance), dtype=np.float64)))
 
         proposal = replace(
             proposal, pilot=promised((), "gentle"), after=promised(proposal.segments),
