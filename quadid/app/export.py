@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from quadid.app.logs import as_vehicle, file_name, write_text
+from quadid.app.logs import as_vehicle, file_name, write_texts
 from quadid.effects import EFFECTS
 from quadid.errors import QuadidError
 from quadid.vehicle import Vehicle
@@ -35,8 +35,8 @@ class Exported:
         return "\n".join(self.texts.values())
 
     def save(self, folder: str | Path = ".") -> list[Path]:
-        """Writes the files; returns their absolute paths."""
-        return [write_text(Path(folder) / name, text) for name, text in self.texts.items()]
+        """Writes the files into a folder, or a single one under a file name; returns their absolute paths."""
+        return write_texts(folder, self.texts)
 
 
 class UnprovenError(QuadidError):

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from quadid.app.export import UnprovenError
-from quadid.app.logs import as_vehicle, file_name, open_recording, write_text
+from quadid.app.logs import as_vehicle, file_name, open_recording, write_texts
 from quadid.app.outcome import LIBRARY, Reported, provenance
 from quadid.chi_square import Z95
 from quadid.errors import LogError, ParameterError, nearest
@@ -92,10 +92,10 @@ class Gains(Reported):
         return gains_tables(self.result)
 
     def save(self, folder: str | Path = ".") -> Path:
-        """Writes the proposed parameters in the autopilot's own form; returns the absolute path."""
+        """Writes the proposed parameters in the autopilot's own form, into a folder or a file; returns the path."""
         ending, line = _FILES[self.result["format"]]
         text = "".join(line.format(**g) for g in self.result["gains"])
-        return write_text(Path(folder) / f"{file_name(self.result['vehicle'])}.gains{ending}", text)
+        return write_texts(folder, {f"{file_name(self.result['vehicle'])}.gains{ending}": text})[0]
 
     def records(self) -> list[dict[str, Any]]:
         """One row a gain."""

@@ -19,7 +19,7 @@ from quadid.app.outcome import LIBRARY, Advance, Fitted, known, provenance, qual
 from quadid.data.window import Window
 from quadid.errors import NotIdentifiableError, ParameterError, nearest
 from quadid.model.layout import Layout, with_reference_voltage
-from quadid.parameters import ParameterSet
+from quadid.parameters import NOMINAL_NAMES, ParameterSet
 from quadid.report.verdict import Verdict, identify_verdict
 from quadid.sanitise import LONGEST_LINE, plain
 from quadid.types import FloatArray
@@ -57,18 +57,23 @@ def check_seed(seed: int) -> None:
 
 def search(
     name: str, windows: Sequence[Window], vehicle: Vehicle, seed: int, advance: Advance,
-    out_of_reach: Mapping[str, str] | None = None,
+    out_of_reach: Mapping[str, str] | None = None, names: Sequence[str] | None = None,
 ) -> Fit:  # fmt: skip
     """Identifies the parameters with the search called `name`.
 
     The sensor noise, which decides intervals and scores, always comes from the standard fit; with the other searches
     the parameters are where that search ended, not where the standard fit ends.  Parameters `out_of_reach` of the
     channels, with the reason, keep the file's value.
+
+    Raises:
+        ParameterError: another search with `names` to free.
     """
     from quadid.identification.fit import FitOptions, fit, fit_at
 
-    if name == "pso_polish":
-        return fit(windows, vehicle, FitOptions(seed=seed), progress=advance, out_of_reach=out_of_reach)
+    if name == OPTIMIZERS[0]:
+        return fit(windows, vehicle, FitOptions(seed=seed), names, advance, out_of_reach)
+    if names is not None:
+        raise ParameterError(f"free or fix with {name}, which fits the six", OPTIMIZERS[0], "leave optimizer out")
 
     from quadid.identification.identifiability import final_answer
     from quadid.identification.shooting_objective import BoxProblem
@@ -136,8 +141,13 @@ class Identified(Fitted):
     def records(self) -> list[dict[str, Any]]:
         """One row a parameter."""
         return [
-            {**{k: v for k, v in p.items() if k != "ci95"}, "low": p["ci95"][0], "high": p["ci95"][1]}
-            for p in self.result["parameters"]
+            {
+                **{k: v for k, v in p.items() if k != "ci95"},
+                "sigma": fitted.sigma,
+                "low": p["ci95"][0],
+                "high": p["ci95"][1],
+            }
+            for p, fitted in zip(self.result["parameters"], self.parameters, strict=True)
         ]
 
     def sample(self, n: int, seed: int = 0) -> tuple[FloatArray, dict[str, str]]:
@@ -206,7 +216,9 @@ class UnansweredError(NotIdentifiableError):
 
 def identify(
     logs: Given, validate: Given = (), *, vehicle: str | Path | Vehicle | None = None, optimizer: str = OPTIMIZERS[0],
-    seed: int = 1, advance: Advance = silent,
+    seed: int = 1, free: Sequence[str] = (), fix: Sequence[str] = (),
+    bounds: Mapping[str, tuple[float, float]] | None = None, priors: Mapping[str, tuple[float, float]] | None = None,
+    effects: Mapping[str, Mapping[str, float]] | None = None, advance: Advance = silent,
 ) -> Identified:  # fmt: skip
     """Fits the parameters to logs, and scores the fit on them and on others.
 
@@ -216,13 +228,18 @@ def identify(
         vehicle: initial guess and known effects; default that of the first loaded log.
         optimizer: one of `OPTIMIZERS`.
         seed: of all random numbers.
+        free: numbers of known effects to fit beside the six, as ``motor_lag.tau``, from their present values.
+        fix: parameters of the six that keep the file's value.
+        bounds: of parameters of the six, instead of the file's.
+        priors: value and standard deviation of parameters of the six, instead of the file's.
+        effects: known effects, beside or instead of the file's.
         advance: told how far the fit is.
 
     Raises:
         UnansweredError: the data reveal no parameter.
         NotIdentifiableError: too little data.
         LogError: a log that does not fit the vehicle.
-        ParameterError: an unknown search.
+        ParameterError: an unknown search, parameter or effect, or nothing left to fit.
     """
     from quadid.identification.controller_gains import find_autopilot
     from quadid.identification.result import answered, identify_result
@@ -232,9 +249,10 @@ def identify(
     given = settled(logs, validate, vehicle)
     train, held = given.train, given.held
     windows = [w for log in train for w in log.windows]
-    described = with_reference_voltage(given.vehicle, windows)
+    described = stated(with_reference_voltage(given.vehicle, windows), bounds or {}, priors or {}, effects or {})
+    names = freed(described, free, fix)
     begin = time.perf_counter()
-    fit = search(optimizer, windows, described, seed, advance, out_of_reach(train))
+    fit = search(optimizer, windows, described, seed, advance, out_of_reach(train), names)
     seconds = time.perf_counter() - begin
     advance("scores", 0.0)
     autopilot = find_autopilot(windows, described)
@@ -249,6 +267,57 @@ def identify(
     if not answered(fit.parameters):
         raise UnansweredError(done)
     return done
+
+
+def stated(
+    vehicle: Vehicle, bounds: Mapping[str, tuple[float, float]], priors: Mapping[str, tuple[float, float]],
+    effects: Mapping[str, Mapping[str, float]],
+) -> Vehicle:  # fmt: skip
+    """The vehicle with bounds, priors and effects that a caller states; checked as a file is.
+
+    Raises:
+        ParameterError: a name that is none of the six.
+        VehicleError: what no vehicle can have.
+    """
+    if not (bounds or priors or effects):
+        return vehicle
+    values = dict(vehicle.parameters)
+    for name in (*bounds, *priors):
+        if name not in NOMINAL_NAMES:
+            raise ParameterError(f"unknown parameter '{name}'", ", ".join(NOMINAL_NAMES), nearest(name, NOMINAL_NAMES))
+    for name, (low, high) in bounds.items():
+        values[name] = values[name].model_copy(update={"bounds": (float(low), float(high))})
+    for name, (value, sigma) in priors.items():
+        values[name] = values[name].model_copy(update={"initial": float(value), "sigma": float(sigma)})
+    known = {name: {k: float(v) for k, v in numbers.items()} for name, numbers in effects.items()}
+    changed = vehicle.model_copy(update={"parameters": values, "effects": {**vehicle.effects, **known}})
+    return Vehicle.from_yaml(changed.to_yaml(), f"{vehicle.name}, as stated")
+
+
+def freed(vehicle: Vehicle, free: Sequence[str], fix: Sequence[str]) -> list[str] | None:
+    """Names to fit: the six without `fix`, and `free`; None for the six.
+
+    Raises:
+        ParameterError: an unknown name, an effect that the vehicle does not have, or nothing left.
+    """
+    if not free and not fix:
+        return None
+    layout = Layout(vehicle)
+    for name in fix:
+        if name not in NOMINAL_NAMES:
+            raise ParameterError(f"fix '{name}'", ", ".join(NOMINAL_NAMES), nearest(name, NOMINAL_NAMES))
+    added = [layout.entry(name).name for name in free if name not in NOMINAL_NAMES]
+    for name in added:
+        effect = name.split(".")[0]
+        if effect not in vehicle.effects:
+            raise ParameterError(
+                f"free '{name}': the vehicle has no {effect}", "numbers of its effects",
+                f"begin somewhere: effects={{'{effect}': {{...}}}}",
+            )  # fmt: skip
+    names = [*(name for name in NOMINAL_NAMES if name not in fix), *added]
+    if not names:
+        raise ParameterError("every parameter is fixed", "at least one to fit", "fix fewer")
+    return names
 
 
 def out_of_reach(logs: Sequence[Log]) -> dict[str, str]:

@@ -8,7 +8,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import quadid_replay
@@ -24,8 +24,23 @@ from quadid.types import FloatArray, IntArray
 from quadid.vehicle import MOST_FLIGHTS, FittedFlight, Vehicle
 
 if TYPE_CHECKING:
+    import pandas as pd
+
     from quadid.checks.motion import Spans
     from quadid.data.grid import GridReport
+
+
+# --- pandas, where it is installed
+
+
+def import_pandas() -> Any:
+    """The module pandas; raises QuadidError where it is not installed."""
+    try:
+        import pandas
+    except ImportError as error:
+        raise QuadidError("pandas is not installed", fix="pip install pandas, or use .records()") from error
+    return pandas
+
 
 # --- Files written whole or not at all; files of users read without waiting for one that is none
 
@@ -51,6 +66,22 @@ def write_text(path: str | Path, text: str) -> Path:
             f"{target} cannot be written ({error.strerror})", fix="check permissions and free space"
         ) from error
     return target
+
+
+def write_texts(place: str | Path, texts: Mapping[str, str]) -> list[Path]:
+    """Writes texts by file name into a folder, or the only one under the name that `place` is; returns absolute paths.
+
+    A place is a file name where it has a suffix and is no folder.
+
+    Raises:
+        OutputError: several texts for one file, or a place that cannot be written to.
+    """
+    where = Path(place)
+    if where.is_dir() or not where.suffix:
+        return [write_text(where / name, text) for name, text in texts.items()]
+    if len(texts) != 1:
+        raise OutputError(f"{where} is one file, this holds {len(texts)} files", "a folder", f"{where.parent}")
+    return [write_text(where, text) for text in texts.values()]
 
 
 def file_name(name: str) -> str:
@@ -222,6 +253,19 @@ class Log:
         if described == self.vehicle:
             return self
         return _read(self.path, self.recording, described, self.grid.rate, self.cut)
+
+    def to_frame(self) -> pd.DataFrame:
+        """What is used, on the grid, as a pandas data frame: a row a time [s], columns as in a CSV (SI, FRD, NED)."""
+        from quadid_replay.writers import column_names, recording_of, union_rows
+
+        recording = recording_of(self.windows)
+        layout = column_names(recording)
+        t, columns = union_rows([recording.channels[name] for name in layout])
+        pandas = import_pandas()
+        return pandas.DataFrame(
+            np.column_stack([c for c in columns if c is not None]), index=pandas.Index(t, name="t"),
+            columns=[column for names in layout.values() for column in names],
+        )  # fmt: skip
 
     def __repr__(self) -> str:
         used, whole = self.grid.seconds_used, self.grid.seconds_log

@@ -17,7 +17,7 @@ import numpy as np
 from quadid_replay import write_compared
 from quadid_replay.frames import from_euler
 
-from quadid.app.logs import LONGEST, Log, free_name, open_recording, parse_part, write_text
+from quadid.app.logs import LONGEST, Log, free_name, import_pandas, open_recording, parse_part, write_text
 from quadid.app.missing import MissingForces
 from quadid.data.resample import sample_period
 from quadid.data.window import Channel, Recording, beginning
@@ -154,12 +154,16 @@ def _escaped(found: re.Match[str]) -> str:
 
 
 def data_frame(records: list[dict[str, Any]], columns: Sequence[str] = ()) -> pd.DataFrame:
-    """Rows as a data frame, without rows with these columns; raises QuadidError where pandas is not installed."""
-    try:
-        import pandas
-    except ImportError as error:
-        raise QuadidError("pandas is not installed", fix="pip install pandas, or use .records()") from error
-    return pandas.DataFrame(records) if records else pandas.DataFrame(columns=list(columns))
+    """Rows as a data frame, found by their names where they have some; without rows with these columns.
+
+    Raises:
+        QuadidError: pandas is not installed.
+    """
+    pandas = import_pandas()
+    frame = pandas.DataFrame(records) if records else pandas.DataFrame(columns=list(columns))
+    if "name" in frame:
+        frame.index = pandas.Index(frame["name"].to_numpy())
+    return frame
 
 
 # --- Simulated against measured outputs of scored logs as files, for PlotJuggler, Foxglove and programs of one's own

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 from collections.abc import Callable
@@ -214,6 +215,56 @@ def test_drawn_vehicles_have_the_covariance_and_fly(logs: dict[str, str]) -> Non
         batch.advance(state, np.full(4, fit.vehicle.hover_speed()), 0.01)
     assert np.isfinite(state.position).all()
     assert np.unique(state.velocity[:, 2]).size == 20
+
+
+def test_what_a_caller_frees_fixes_and_states_is_fitted_so(tmp_path: Path) -> None:
+    late = quadid.simulate(seconds=20.0, effects=["motor_lag:tau=0.04"]).save(tmp_path / "late.csv")
+    fit = quadid.identify(
+        late, vehicle="pelican", free=["motor_lag.tau"], effects={"motor_lag": {"tau": 0.02}}, fix=["J_r"],
+        bounds={"J_xx": (5e-3, 3e-2)}, priors={"d": (5e-7, 1e-8)},
+    )  # fmt: skip
+    assert fit.parameters.names == ("b", "d", "J_xx", "J_yy", "J_zz", "motor_lag.tau")
+    low, high = fit.parameters["motor_lag.tau"].ci95
+    assert low < 0.04 < high
+    assert high - low < 0.004
+    assert fit.vehicle.effects["motor_lag"]["tau"] == pytest.approx(fit.parameters["motor_lag.tau"].value, rel=1e-5)
+    assert fit.vehicle.parameters["J_r"].initial == 3e-5
+    assert fit.vehicle.parameters["J_r"].sigma is None
+    assert fit.vehicle.parameters["J_xx"].bounds == (5e-3, 3e-2)
+    assert fit.to_frame().loc["d", "low"] < 4.96e-7 < fit.to_frame().loc["d", "high"]
+    frame = quadid.load(late, "pelican").to_frame()
+    assert frame.index.name == "t"
+    assert {"p", "ax", "qw", "w1"} <= set(frame)
+    assert len(frame) == 1000
+
+
+@pytest.mark.parametrize(
+    ("stated", "found"),
+    [
+        ({"fix": ["J_q"]}, "did you mean 'J_r'"),
+        ({"free": ["motor_lag.tau"]}, "the vehicle has no motor_lag"),
+        ({"free": ["motor_lg.tau"]}, "did you mean 'motor_lag.tau'"),
+        ({"bounds": {"b": (3e-5, 4e-5)}}, "outside bounds"),
+        ({"priors": {"J": (1.0, 0.1)}}, "unknown parameter 'J'"),
+        ({"effects": {"motor_lag": {"tu": 1.0}}}, "did you mean 'tau'"),
+        ({"fix": ["b", "d", "J_xx", "J_yy", "J_zz", "J_r"]}, "every parameter is fixed"),
+        ({"fix": ["d"], "optimizer": "least_squares"}, "free or fix with least_squares"),
+    ],
+)
+def test_what_cannot_be_stated_is_refused(stated: dict[str, Any], found: str, logs: dict[str, str]) -> None:
+    with pytest.raises(QuadidError, match=re.escape(found)):
+        quadid.identify(logs["good"], vehicle="pelican", **stated)
+
+
+def test_a_file_name_is_a_file_and_a_folder_a_folder(tmp_path: Path) -> None:
+    exported = quadid.export("pelican", "rotorpy")
+    assert exported.save(tmp_path / "mine.py") == [tmp_path / "mine.py"]
+    assert (tmp_path / "mine.py").is_file()
+    assert exported.save(tmp_path)[0].parent == tmp_path
+    two = quadid.export("pelican", "ardupilot")
+    assert len(two.texts) == 2
+    with pytest.raises(QuadidError, match="holds 2 files"):
+        two.save(tmp_path / "mine.param")
 
 
 def test_what_was_not_measured_is_never_drawn_without_width() -> None:

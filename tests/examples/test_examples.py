@@ -10,6 +10,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from quadid_replay import write_csv, write_mcap
 
 from quadid.errors import WindowError
 from quadid.flight import TruthParameters, fly
+from quadid.model.layout import Layout
 from quadid.model.step import simulate
 from quadid.vehicle import GRAVITY, ParameterPrior, Vehicle
 
@@ -32,6 +34,16 @@ def run(
     )  # fmt: skip
     assert done.returncode == code, done.stderr
     return done
+
+
+def module(repository: Path, name: str) -> Any:
+    """An example as a module."""
+    spec = importlib.util.spec_from_file_location(name, repository / "examples" / f"{name}.py")
+    assert spec is not None
+    assert spec.loader is not None
+    out = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(out)
+    return out
 
 
 def test_identify_in_ten_lines(repository: Path, tmp_path: Path) -> None:
@@ -108,14 +120,24 @@ def test_simulate_hovers_falls_and_starts_where_it_is_told() -> None:
 def test_the_identified_vehicle_flies_closer_to_the_circle(repository: Path) -> None:
     """The controller of the example, with the guesses of the file and with what a diagnosis finds."""
     pytest.importorskip("casadi")
-    spec = importlib.util.spec_from_file_location("casadi_mpc", repository / "examples" / "casadi_mpc.py")
-    assert spec is not None
-    assert spec.loader is not None
-    example = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(example)
+    example = module(repository, "casadi_mpc")
     guess = Vehicle.shipped("pelican")
     truth = {n: ParameterPrior(initial=v) for n, v in TruthParameters.of(guess).as_dict().items()}
     found = guess.model_copy(update={"parameters": truth, "effects": example.HIDDEN})
     missed = [example.circled(v, guess, example.WEIGHTS["firm"], 1.6) for v in (guess, found)]
     far = [float(np.sqrt(np.mean(m[20:] ** 2))) for m in missed]
     assert far[1] < 0.6 * far[0]
+
+
+def test_a_policy_learns_over_the_vehicles_of_a_fit(repository: Path) -> None:
+    env_checker = pytest.importorskip("gymnasium.utils.env_checker")
+    example = module(repository, "gym_hover")
+    vehicle = Vehicle.shipped("pelican")
+    thetas = np.repeat(Layout(vehicle).initial(vehicle)[None], 5, axis=0)
+    thetas[:, :6] *= np.exp(0.1 * np.random.default_rng(0).standard_normal((5, 6)))
+    env = example.Hover(vehicle, thetas)
+    env_checker.check_env(env, skip_render_check=True)
+    first, again = (example.flown(env, np.zeros((4, 12)), 3) for _ in range(2))
+    assert first == again
+    _, curve = example.learn(env, 18)
+    assert np.mean(curve[-3:]) > 1.5 * curve[0]
