@@ -57,6 +57,16 @@ def test_colcon_finds_exactly_three_packages(depth: str, tmp_path: Path, reposit
     assert found == ours
 
 
+@pytest.mark.parametrize("package", ["core", "msgs", "quadid_node", "examples/cpp_controller"])
+def test_a_manifest_is_valid_and_warns_of_nothing(package: str, repository: Path) -> None:
+    parsed = pytest.importorskip("catkin_pkg.package", reason="comes with the ros extra")
+    warnings = list[str]()
+    found = parsed.parse_package(str(repository / package), warnings=warnings)
+    found.validate(warnings=warnings)
+    assert warnings == []
+    assert found.licenses == ["Apache-2.0"]
+
+
 @pytest.mark.parametrize("options", [[], ["--symlink-install"]], ids=["copied", "symlinked"])
 def test_the_core_builds_whole_and_brings_its_command(options: list[str], tmp_path: Path, repository: Path) -> None:
     """All that is tracked is there, as in the wheel; the command runs from the workspace, not from this environment."""
