@@ -27,6 +27,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.task import Future
 
 from quadid.errors import QuadidError
+from quadid.sanitise import one_line
 from quadid_node import messages
 from quadid_node.inputs import message_class, service_class, to_message
 from quadid_node.messages import PARAMETER_SET, SCHEMA_VERSION, TOPICS
@@ -162,6 +163,7 @@ class BridgeNode(Node):
         return self.get_parameter(name).value
 
     def _say(self, text: str, level: bytes = b"\x00") -> None:
+        text = one_line(text)
         if text != self._said:
             self._said, self._level = text, level
             if level == b"\x00":

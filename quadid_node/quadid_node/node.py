@@ -22,6 +22,7 @@ from rclpy.qos import HistoryPolicy, QoSCompatibility, QoSProfile, ReliabilityPo
 from quadid.app.logs import load_vehicle
 from quadid.errors import QuadidError
 from quadid.online import Publish
+from quadid.sanitise import one_line
 from quadid.vehicle import Vehicle
 from quadid_node import messages
 from quadid_node.bond import Bond, bond_of
@@ -339,7 +340,7 @@ class IdentifyNode(PollingNode, LifecycleNode):
 
     def _log(self, level: str, text: str) -> None:
         """One call a level: rclpy remembers the level of each line of code and refuses another."""
-        log = self.get_logger()
+        log, text = self.get_logger(), one_line(text)
         if level == "info":
             log.info(text)
         elif level == "warning":

@@ -18,11 +18,11 @@ from quadid_replay.mcap_file import read_metadata
 from quadid_replay.schemas import has_definition, whole_text
 
 from quadid.condition.trim import flight_from_dict, flight_to_dict
-from quadid.errors import LogError, QuadidError
+from quadid.errors import LogError
 from quadid.online import OnlineSet, SessionSettings
 from quadid.vehicle import Vehicle
 from quadid_node.codec import set_from_dict, set_to_dict
-from quadid_node.history import Restored
+from quadid_node.history import UNREADABLE, Restored
 from quadid_node.inputs import Input
 
 RECORD = "quadid.session"
@@ -103,7 +103,7 @@ def read_beginning(path: Path) -> Beginning | None:
         )  # fmt: skip
         settings = SessionSettings.model_validate_json(found["settings"])
         return Beginning(Vehicle.from_yaml(found["vehicle"], path.name), settings, found["source"], restored)
-    except (KeyError, TypeError, ValueError, QuadidError) as error:
+    except UNREADABLE as error:
         raise LogError(f"{path.name}: what its session began with cannot be read ({error})") from error
 
 

@@ -20,6 +20,7 @@ from mcap.records import Channel, Chunk, Metadata, Schema
 from mcap.stream_reader import get_chunk_data_stream
 from mcap.summary import Summary
 
+from quadid.files import read_regular
 from quadid.sanitise import plain
 from quadid_replay.schemas import has_definition, schema_text
 
@@ -59,10 +60,13 @@ _RECORD = struct.Struct("<BQ")
 
 
 def read_metadata(path: Path) -> dict[str, dict[str, str]]:
-    """Metadata records before the first message, by name; empty for a file without any, damaged or no MCAP at all."""
+    """Metadata records before the first message, by name; empty for a file without any, damaged or no MCAP at all.
+
+    They are sought in the first `LARGEST` bytes, and in this process.
+    """
     found: dict[str, dict[str, str]] = {}
     try:
-        with path.open("rb") as file:
+        with BytesIO(read_regular(path, LARGEST)) as file:
             if file.read(len(MAGIC)) != MAGIC:
                 return {}
             while len(head := file.read(_RECORD.size)) == _RECORD.size:

@@ -19,6 +19,7 @@ from quadid.app.simulate import read_manoeuvre
 from quadid.errors import QuadidError
 from quadid.vehicle import Vehicle
 from quadid_node import failures
+from tests.faults.evidence import Happened
 
 READERS: dict[str, Callable[[Path], object]] = {
     "vehicle file": lambda path: load_vehicle(str(path)),
@@ -37,19 +38,21 @@ WRITERS: dict[str, Callable[[Path], object]] = {
 
 
 @pytest.mark.parametrize("what", READERS)
-def test_what_is_no_file_is_refused(what: str, tmp_path: Path) -> None:
+def test_what_is_no_file_is_refused(what: str, tmp_path: Path, happened: Happened) -> None:
     os.mkfifo(tmp_path / "pipe.yaml")
     for path in (tmp_path / "pipe.yaml", Path("/dev/zero"), tmp_path):
         with pytest.raises((QuadidError, OSError), match="regular file|[Ii]s a directory|no history|no Zenoh"):
             READERS[what](path)
+    happened(35, f"a pipe, /dev/zero and a folder as {what}: refused at once")
 
 
 @pytest.mark.parametrize("what", WRITERS)
-def test_a_pipe_that_nobody_reads_is_not_waited_for_and_stays(what: str, tmp_path: Path) -> None:
+def test_a_pipe_that_nobody_reads_is_not_waited_for_and_stays(what: str, tmp_path: Path, happened: Happened) -> None:
     os.mkfifo(tmp_path / "pipe")
     with pytest.raises((QuadidError, OSError), match="No such device"):
         WRITERS[what](tmp_path / "pipe")
     assert (tmp_path / "pipe").is_fifo()
+    happened(35, f"a {what} to a pipe that nobody reads: refused at once, the pipe is there")
 
 
 def test_a_pipe_that_is_read_gets_the_result_and_no_device_becomes_a_file(tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ def test_settings_of_numba_that_lie_in_the_folder_are_refused(tmp_path: Path, ha
     assert done.returncode == 2
     assert ".numba_config.yaml in this folder" in done.stderr
     assert done.stderr.count("\n") == 1
-    happened(25, f"a .numba_config.yaml in the folder we stand in: '{done.stderr.strip()[:80]}'")
+    happened(34, f"a .numba_config.yaml in the folder we stand in: '{done.stderr.strip()[:80]}'")
 
 
 @pytest.mark.parametrize("module", ["identify", "replay_node"])
@@ -31,7 +31,7 @@ def test_so_does_the_ros_node(tmp_path: Path, module: str, happened: Happened) -
     assert done.returncode == 2
     assert ".numba_config.yaml in this folder" in done.stderr
     assert done.stderr.count("\n") == 1
-    happened(25, f"the same before the ROS node's {module}: '{done.stderr.strip()[:80]}'")
+    happened(34, f"the same before the ROS node's {module}: '{done.stderr.strip()[:80]}'")
 
 
 def test_modules_that_lie_in_the_folder_are_not_imported(tmp_path: Path, happened: Happened) -> None:
@@ -40,7 +40,7 @@ def test_modules_that_lie_in_the_folder_are_not_imported(tmp_path: Path, happene
     done = subprocess.run([QUADID, "vehicles"], cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert not (tmp_path / "ran").exists()
-    happened(25, "numpy.py, yaml.py, typer.py and json.py in the folder we stand in: not run")
+    happened(34, "numpy.py, yaml.py, typer.py and json.py in the folder we stand in: not run")
 
 
 PLANTED = ("html", "multiprocessing", "runpy", "numpy", "distributed", "json", "pickle", "socket", "sitecustomize")
@@ -63,7 +63,7 @@ def test_fleet_in_a_folder_with_modules_runs_none_of_them(planted: Path, happene
     done = subprocess.run(command, cwd=planted, capture_output=True, text=True, check=False)
     assert not (planted / "ran").exists()
     assert (planted / "out").is_dir(), done.stderr
-    happened(25, f"`quadid fleet .` in a folder with {', '.join(PLANTED)}: its workers run none of them")
+    happened(34, f"`quadid fleet .` in a folder with {', '.join(PLANTED)}: its workers run none of them")
 
 
 START = """

@@ -90,4 +90,37 @@ FAULTS: dict[int, Fault] = {
         "vehicle file with duplicate keys, merge bombs, deep nesting, 20,000 digits, `1:30`, mass 1e308",
         "one line with key, cause and fix",
     ),
+    33: Fault(
+        "names of strangers (line breaks, quotes, markup, U+2028, bidi) in scripts that fly, exports and pages",
+        "text in the language of each file; what does not print is refused",
+    ),
+    34: Fault(
+        "modules or `.numba_config.yaml` in the folder a command, a library or the ROS node runs in",
+        "not imported; numba's settings refused",
+    ),
+    35: Fault(
+        "small files that point to themselves (MCAP index, SQLite overflow chains), pipes and devices as files",
+        "limits of what is read; no wait for a pipe, no device replaced",
+    ),
+    36: Fault(
+        "export from a history of a set that was withdrawn, is stale, or rests on another mass",
+        "only when insisted, and said at the file's top",
+    ),
+    37: Fault("one weak rotor or one wrong rotor speed on a first flight, rotor 1 too", "the set waits; b is the mean"),
+    38: Fault("payload taken up or dropped in flight", "named; sets wait for a person (`mass`)"),
+    39: Fault(
+        "tether or support, accelerometer scale under a bias, gyro leaks, smoothing, lateness; several at once",
+        "waits, or within 5 %",
+    ),
+    40: Fault("first flight with nothing to compare a set with", "`reference: none` in the message"),
+    41: Fault("GPS lock or loss, attitude or accelerometer that begins or ends in flight", "fits go on"),
+    42: Fault("one early or late stamp, a channel with another clock, stamps that race", "itself lost; named; bounded"),
+    43: Fault(
+        "MAVLink: stall of the service with a second sender, flood of another system, storm of requests",
+        "the vehicle stays the vehicle, and loses no frame; what is sent is bounded",
+    ),
+    44: Fault(
+        "history with two hard links, a lost lock file, of a newer version, unreadable, or filled by a stranger",
+        "one writer; refused unchanged; approval manual; shown as text or refused",
+    ),
 }

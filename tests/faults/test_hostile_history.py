@@ -56,4 +56,4 @@ def test_a_history_of_a_stranger_is_shown_as_text_or_refused_in_one_line(
         assert shown.out.count("evil") >= 4
     else:
         assert shown.err.count("\n") == 1
-    happened(20, f"stored sets with {what}: `quadid history` ends with {shown.code}, no control character")
+    happened(44, f"stored sets with {what}: `quadid history` ends with {shown.code}, no control character")

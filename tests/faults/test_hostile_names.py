@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import struct
+import xml.etree.ElementTree as ET
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -30,6 +31,7 @@ from tests.report.test_page import EVIL, page, scored
 
 __all__ = ["inside"]
 MEGABYTE = 1 << 20
+MARKED = "x"
 HOSTILE = "<script>alert(1)</script>\x1b[31m\x00'; DROP TABLE sets; --\u202e"
 NAME = HOSTILE * (MEGABYTE // len(HOSTILE) + 1)
 
@@ -142,3 +144,35 @@ def test_packed_lengths_are_true() -> None:
     """A ULog record's length is two bytes: more than that cannot be written."""
     with pytest.raises(struct.error):
         Ulog().record("I", bytes(1 << 16))
+
+
+@pytest.mark.parametrize("name", ["x\nimport os", "x\u2028y", "x\u202ey", "x\u200by", "x\x85y", "x\x1b[31m", "x\x00y"])
+def test_a_name_that_does_not_print_makes_no_script(name: str, tmp_path: Path, inside: Cli, happened: Happened) -> None:
+    file = tmp_path / "evil.yaml"
+    named = Vehicle.shipped("pelican_x").to_yaml().replace("name: pelican_x", f"name: {json.dumps(name)}", 1)
+    file.write_text(named)
+    for command in (
+        ("excite", "--vehicle", file, "--seconds", "12", "--format", "ardupilot-lua", "--out", tmp_path),
+        ("export", "--vehicle", file, "--format", "gazebo", "--out", tmp_path),
+    ):
+        run = inside(*command)
+        assert run.code == 2
+        assert "does not print" in run.err
+        assert run.err.count("\n") == 1
+    assert list(tmp_path.iterdir()) == [file]
+    happened(33, f"vehicle named {name!a}: '{run.err.strip()[:90]}', nothing written")
+
+
+def test_a_name_full_of_markup_is_a_name(tmp_path: Path, inside: Cli, happened: Happened) -> None:
+    name = """a'b" canonical_link="x"/> @NAME@ {{ v }} --><x/> ]]> \\ ${y} `z` <!-- %s"""
+    file = tmp_path / "evil.yaml"
+    file.write_text(Vehicle.shipped("pelican_x").model_copy(update={"name": name}).to_yaml())
+    done = inside("export", "--vehicle", file, "--format", "gazebo", "--out", tmp_path, "--json", "-")
+    assert done.code == 0, done.err
+    text = Path(done.data["files"][0]).read_text(encoding="utf-8")
+    (model,) = ET.fromstring(text).iter("model")
+    assert model.attrib["name"] == name
+    assert MARKED not in {element.tag for element in ET.fromstring(text).iter()}
+    done = inside("export", "--vehicle", file, "--format", "rotorpy", "--out", tmp_path, "--json", "-")
+    compile(Path(done.data["files"][0]).read_text(encoding="utf-8"), "x", "exec")
+    happened(33, f"vehicle named {name[:30]}…: the same name in SDF by an XML parser, and a module that compiles")

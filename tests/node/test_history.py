@@ -230,7 +230,7 @@ def test_a_second_service_is_refused_whatever_is_done_to_the_file(tmp_path: Path
     assert "third" in lines(path)
     store.close()
     assert not another_process(path)
-    happened(21, f"a second service on a history whose file is {how}: refused")
+    happened(44, f"a second service on a history whose file is {how}: refused")
 
 
 def test_a_file_that_another_service_put_there_is_not_written(tmp_path: Path) -> None:
@@ -263,7 +263,7 @@ def test_two_names_of_one_file_are_refused_at_the_start(tmp_path: Path, happened
     for name in (path, hard):
         with pytest.raises(StoreError, match="remove the other names"):
             Store(name, "pelican")
-    happened(21, "a history with two hard links: refused at the start; a service that runs goes on, no row is lost")
+    happened(44, "a history with two hard links: refused at the start; a service that runs goes on, no row is lost")
 
 
 def test_a_first_start_and_another_vehicles_sets_are_nothing_unread(tmp_path: Path) -> None:
@@ -295,7 +295,7 @@ def test_a_history_of_a_newer_version_is_refused_and_not_touched(
             opens()
     assert path.read_bytes() == before
     assert [p.name for p in tmp_path.iterdir() if "damaged" in p.name] == []
-    happened(12, f"a history of version {VERSION + 1}: refused with the fix, not a byte changed")
+    happened(44, f"a history of version {VERSION + 1}: refused with the fix, not a byte changed")
 
 
 def test_a_history_of_an_earlier_version_is_read_as_it_is(tmp_path: Path) -> None:
@@ -348,7 +348,7 @@ def test_after_a_history_that_cannot_be_read_approval_is_manual_for_good(
     last = service()
     assert last.session.active_set.approval == "auto"
     last.close()
-    happened(12, f"what people decided cannot be read ({damage}): approval is manual until a person says auto")
+    happened(44, f"what people decided cannot be read ({damage}): approval is manual until a person says auto")
 
 
 # --- Disks and damage

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -85,3 +86,11 @@ def test_other_files_have_no_beginning_and_damage_is_told(tmp_path: Path) -> Non
         pass
     with pytest.raises(LogError, match="cannot be read"):
         read_beginning(path)
+    for restored in ("[" * 100_000, '{"item": null, "next_sequence": 1e999, "baseline": null}', '"x"', "[]"):
+        told = {"vehicle": PELICAN.to_yaml(), "settings": "{}", "source": "canonical", "restored": restored}
+        with TopicWriter(path, {RECORD: told}):
+            pass
+        with pytest.raises(LogError, match="cannot be read"):
+            read_beginning(path)
+    os.mkfifo(tmp_path / "pipe.mcap")
+    assert read_beginning(tmp_path / "pipe.mcap") is None

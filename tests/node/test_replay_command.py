@@ -18,6 +18,7 @@ from quadid_replay.mcap_file import McapFile
 from quadid.cli.main import app_main as main
 from quadid.online.records import OnlineSet, SetState
 from quadid.vehicle import Vehicle
+from tests.faults.evidence import Happened
 from tests.online.driving import flight
 from tests.online.test_gate import TRUE, online_set
 
@@ -186,7 +187,7 @@ DOUBTFUL = {
 
 @pytest.mark.parametrize("case", list(DOUBTFUL))
 def test_a_set_that_is_not_in_force_is_exported_only_when_insisted(
-    case: str, tmp_path: Path, run: Callable[..., Ran]
+    case: str, tmp_path: Path, run: Callable[..., Ran], happened: Happened
 ) -> None:
     items, why = DOUBTFUL[case]
     path = history_of(tmp_path / "h.sqlite", *items)
@@ -211,6 +212,7 @@ def test_a_set_that_is_not_in_force_is_exported_only_when_insisted(
     item = store.restore(vehicle=Vehicle.shipped("pelican")).item
     store.close()
     assert item is None or item.outdated or case == "not confirmed since a restart"
+    happened(36, f"export of a set {case}: '{refused.err.strip()[:100]}'")
 
 
 def test_a_set_in_force_is_exported_without_a_word(tmp_path: Path, run: Callable[..., Ran]) -> None:

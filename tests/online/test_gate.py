@@ -207,6 +207,17 @@ def test_what_the_six_leave_out_of_the_thrust_waits_for_a_person(values: tuple[f
     assert (vague.state, vague.check) == (SetState.REJECTED, "sensors")
 
 
+def test_what_sensors_and_thrust_are_off_by_is_added_up() -> None:
+    sensors, thrust = (Factor("accelerometer times turn", 1.03, 0.005),), np.array([[-0.03] * 4, [0.004] * 4])
+    assert decide(good(doubts=sensors), GateSettings()).state is ACCEPTED
+    assert decide(good(left_out=thrust), GateSettings()).state is ACCEPTED
+    for sign in (1.0, -1.0):  # one may hide the other: no sign makes them cancel
+        both = good(doubts=sensors, left_out=thrust * [[sign], [1.0]])
+        decision = decide(both, GateSettings())
+        assert (decision.state, decision.check) == (SetState.PENDING, "sensors")
+        assert "b w^2" in decision.reason
+
+
 def test_a_set_that_rests_on_another_mass_waits_for_a_person() -> None:
     decision = decide(good(loaded="the mass changed by +20 %"), GateSettings())
     assert (decision.state, decision.check) == (SetState.PENDING, "mass")

@@ -13,6 +13,7 @@ from quadid.online import Session, SessionSettings
 from quadid.online.records import OnlineSet, SetState
 from quadid.types import FloatArray
 from quadid.vehicle import GRAVITY, ParameterPrior, Vehicle
+from tests.faults.evidence import Happened
 from tests.online.driving import drive, flight, published, samples
 from tests.online.made_up import GATE, PELICAN, QUICK, between, light_flight, tells, works
 from tests.online.test_gate import TRUE, online_set
@@ -59,7 +60,7 @@ def about_the_mean(factor: float) -> Callable[[FloatArray], FloatArray]:
     ],
 )
 def test_what_one_number_cannot_say_waits_for_a_person(
-    name: str, change: Callable[[FloatArray], FloatArray], check: str, word: str
+    name: str, change: Callable[[FloatArray], FloatArray], check: str, word: str, happened: Happened
 ) -> None:
     session, sets = flown(with_channel(flight(SECONDS, 3).recording, name, change))
     assert not sets
@@ -67,10 +68,11 @@ def test_what_one_number_cannot_say_waits_for_a_person(
     assert waits is not None, session.status().reason
     assert waits.check == check
     assert word in waits.reason
+    happened(37 if "rotor" in word else 39, f"first flight, {name}: nothing published; '{waits.reason[:100]}'")
 
 
 @pytest.mark.parametrize("rotor", [1, 3])
-def test_a_weak_rotor_moves_b_by_its_share_whichever_it_is(rotor: int) -> None:
+def test_a_weak_rotor_moves_b_by_its_share_whichever_it_is(rotor: int, happened: Happened) -> None:
     made = flight(SECONDS, 3, "excited", (("weak_rotor", "rotor", float(rotor)), ("weak_rotor", "loss", 0.12)))
     session, sets = flown(made.recording)
     assert not sets
@@ -78,6 +80,7 @@ def test_a_weak_rotor_moves_b_by_its_share_whichever_it_is(rotor: int) -> None:
     assert waits is not None
     assert f"rotor {rotor}" in waits.reason
     assert off(waits, "b") == pytest.approx(-0.03, abs=0.01), "the mean of the rotors"
+    happened(37, f"rotor {rotor} 12 % weak on a first flight: waits with b {off(waits, 'b'):+.1%}")
 
 
 def test_a_thrust_curve_that_the_vehicle_file_lacks_waits_and_one_that_it_has_is_published() -> None:
@@ -94,12 +97,27 @@ def test_a_thrust_curve_that_the_vehicle_file_lacks_waits_and_one_that_it_has_is
     assert all(abs(off(s, n)) < 0.05 for s in accepted for n in ("b", "J_xx", "J_yy"))
 
 
-def test_three_sensors_each_within_its_limit_do_not_move_a_set_by_seven_per_cent() -> None:
+def test_three_sensors_each_within_its_limit_do_not_move_a_set_by_seven_per_cent(happened: Happened) -> None:
     made = flight(SECONDS, 3).recording
     for name, factor in (("accel", 1.04), ("gyro", 0.97), ("rotor_speed", 0.985)):
         made = with_channel(made, name, lambda v, k=factor: v * k)  # type: ignore[misc]
     assert not flown(made)[1]
     assert not flown(made, online_set(TRUE, sigma=0.001))[1]
+    happened(
+        39, "accelerometer x 1.04, gyro x 0.97, rotor speeds x 0.985: nothing published, with a history or without"
+    )
+
+
+def test_a_support_beside_two_sensors_within_their_limits_waits(happened: Happened) -> None:
+    """Each alone is within its limit; b was published 7 % and the inertias 5 % high."""
+    made = with_channel(flight(SECONDS, 3).recording, "rotor_speed", supported(0.04))
+    for name, factor in (("accel", 1.03), ("gyro", 1.025)):
+        made = with_channel(made, name, lambda v, k=factor: v * k)  # type: ignore[misc]
+    session, sets = flown(made)
+    assert not sets
+    happened(
+        39, f"support 4 %, accelerometer x 1.03, gyro x 1.025: nothing published; '{session.status().reason[:90]}'"
+    )
 
 
 def test_an_attitude_that_comes_late_leaves_the_inertias_alone() -> None:
@@ -109,7 +127,7 @@ def test_an_attitude_that_comes_late_leaves_the_inertias_alone() -> None:
     assert all(abs(off(s, n)) < 0.05 for s in sets for n in ("b", "J_xx", "J_yy"))
 
 
-def test_a_set_says_what_it_was_compared_with() -> None:
+def test_a_set_says_what_it_was_compared_with(happened: Happened) -> None:
     """The first flight of a vehicle whose file guesses has nothing to be compared with."""
     stream = between(light_flight(60.0), 0.0, 12.0)
     knows = PELICAN.parameters | {"b": ParameterPrior(initial=TRUE["b"], sigma=TRUE["b"] * 0.02)}
@@ -122,6 +140,7 @@ def test_a_set_says_what_it_was_compared_with() -> None:
     assert reference(PELICAN) == "none"
     assert reference(measured) == "vehicle_file"
     assert reference(PELICAN, online_set(TRUE)) == "history"
+    happened(40, "first flight: none; with a b of known deviation: vehicle_file; with an earlier set: history")
     manual = Session(PELICAN, QUICK.model_copy(update={"gate": GATE.model_copy(update={"approval": "manual"})}))
     works(manual, stream, tells())
     assert manual.approve("ann").done

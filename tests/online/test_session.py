@@ -82,7 +82,9 @@ def test_hover_publishes_nothing() -> None:
 
 
 @pytest.mark.parametrize("fraction", [0.15, -0.12])
-def test_a_change_of_mass_is_found_within_five_seconds_and_what_is_learned_waits_for_a_person(fraction: float) -> None:
+def test_a_change_of_mass_is_found_within_five_seconds_and_what_is_learned_waits_for_a_person(
+    fraction: float, happened: Happened
+) -> None:
     at = 22.3
     made = flight(46.0, 8, "excited", (("mass_change", "time", at), ("mass_change", "fraction", fraction)))
     session = Session(PELICAN, SessionSettings(gate=GateSettings(windows=2)))
@@ -103,6 +105,7 @@ def test_a_change_of_mass_is_found_within_five_seconds_and_what_is_learned_waits
     assert int(told[1]) / 100.0 == pytest.approx(fraction, abs=0.02)
     assert waits.start >= at, "nothing from before the change"
     assert waits.parameters["b"].value == pytest.approx(made.truth.parameters.b / (1.0 + fraction), rel=0.01)
+    happened(38, f"mass {fraction:+.0%} in flight: named as {finding.values['fraction']:+.1%}; '{waits.reason[:90]}'")
     assert session.approve("ann").done
     assert session.active_set.load == 1.0, "who approved it has judged the mass"
 

@@ -239,7 +239,7 @@ def test_a_small_file_costs_no_more_than_its_limits(
     seconds = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
     assert seconds < SECONDS + STARTING
     assert {*os.listdir(tmp_path)} == kept
-    happened(5, f"{kind} ({size >> 10} kB): {seconds:.1f} s of processor time with the start; '{said[:100]}'")
+    happened(35, f"{kind} ({size >> 10} kB): {seconds:.1f} s of processor time with the start; '{said[:100]}'")
 
 
 ROWS = {

@@ -54,7 +54,7 @@ SINGLE: dict[str, Spoil] = {
     **{f"accelerometer scale {f:g} under a bias": about_the_mean(f) for f in (0.9, 1.06, 1.12, 1.3)},
     "leak p to q 15 %": leaking(0, 1, 0.15), "leak q to p 5 %": leaking(1, 0, 0.05),
     "leak r to p 15 %": leaking(2, 0, 0.15),
-    "gyro smoothed 3 Hz": smoothed(3.0), "gyro smoothed 5 Hz": smoothed(5.0),
+    **{f"gyro smoothed {f:g} Hz": smoothed(f) for f in (3.0, 4.0, 4.5, 5.0)},
     "attitude 100 ms late": late("attitude", 0.1), "attitude 50 ms late": late("attitude", 0.05),
     "rotor 1 x 0.95": scaled("rotor_speed", 0.95, 0), "rotor 1 x 0.9": scaled("rotor_speed", 0.9, 0),
     "rotor 3 x 1.1": scaled("rotor_speed", 1.1, 2),
@@ -125,7 +125,14 @@ class Study:
         """The cell with what was published."""
         fresh = [s for s in sets if not s.outdated and s.state.value in ("accepted", "rolled_back")]
         worst = {n: max((self.error(s)[n] for s in fresh), key=abs, default=None) for n in MUST}
-        return {**cell, "sets": len(fresh), "worst": worst, "says": session.status().reason, "known": known}
+        return {
+            **cell,
+            "flown": time.strftime("%Y-%m-%d"),
+            "sets": len(fresh),
+            "worst": worst,
+            "says": session.status().reason,
+            "known": known,
+        }
 
 
 def main() -> None:

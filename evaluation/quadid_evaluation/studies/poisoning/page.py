@@ -20,9 +20,10 @@ def page(cells: list[Cell], done: list[Cell], healthy: list[tuple[float, dict[st
         f"`make poisoning` (`python -m quadid_evaluation.studies.poisoning`), {time.strftime('%Y-%m-%d')}, "
         f"flight of seed {seed}, "
         f"{os.cpu_count()} cores: a simulated Pelican with one channel multiplied by a factor, at once or over a ramp, "
-        "and an online session with default settings but a fit every 2 s.", "",
+        "or with other faults from take-off, and an online session with default settings but a fit every 2 s.", "",
         f"* Cases with no published error of b, J_xx or J_yy above {GOAL:.0%}: **{held} of {len(done)}** flown "
-        f"({len(cells)} in all); largest error: **{max(worst, default=0.0):.1%}**.",
+        f"({len(cells)} in all); largest error: **{max(worst, default=0.0):.1%}**. In {sum(w > 0.0 for w in worst)} "
+        "something was accepted.",
         f"* Without poison: {len(healthy)} sets in the first 60 s, the first after {first[0]:.0f} s of flight.", "",
         "Largest error [%] of b, J_xx and J_yy among sets accepted after the poison began, over all factors; `–`: none "
         "was accepted. Channels without an accepted set are left out; `poisoning.json` has every case.", "",
@@ -33,7 +34,10 @@ def page(cells: list[Cell], done: list[Cell], healthy: list[tuple[float, dict[st
         "first flight": "Faults from take-off of a first flight: nothing to compare with; alone, in pairs and triples",
     }
     for when, title in titles.items():
-        lines += [f"## {title}", "", *_table([c for c in cells if c["when"] == when], done), ""]
+        asked, flown = ([c for c in part if c["when"] == when] for part in (cells, done))
+        days = sorted({d.get("flown", "2026-11-24") for d in flown})
+        told = f"{len(flown)} of {len(asked)} cases flown, {' to '.join(dict.fromkeys(days[:1] + days[-1:]))}."
+        lines += [f"## {title}", "", told, "", *_table(asked, done), ""]
     return "\n".join(lines) + "\n"
 
 
