@@ -220,7 +220,7 @@ def _too_far(off: FloatArray, sigma: FloatArray, settings: GateSettings) -> tupl
 def _unproven(case: Case, settings: GateSettings) -> str | None:
     """Open questions before anything is published: agreement of sensors, thrust against speed."""
     for f in case.doubts:
-        if _too_far(*_together(f, case), settings)[1]:
+        if _too_far(np.array([f.off]), np.array([f.sigma]), settings)[1]:
             return f"{f}, wanted +- {0.5 * settings.width / Z95:.3f}: whether the sensors agree is not known yet"
     if _too_far(case.left_out[0], case.left_out[1], settings)[1]:
         half = Z95 * float(case.left_out[1].max())
@@ -328,8 +328,8 @@ CHECKS: tuple[tuple[str, Check], ...] = (
 """Name and function of every check, in the order in which they are asked."""
 JUDGED: tuple[tuple[str, Check], ...] = (
     ("mass", lambda case, _: case.loaded or None),
-    ("sensors", _doubtful),
     ("thrust", _left_out),
+    ("sensors", _doubtful),
     ("reference", _reference),
 )
 """Checks that no further flight settles: a person decides."""
