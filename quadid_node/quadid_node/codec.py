@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any, get_args
+from typing import Any
 
+import msgspec
 import numpy as np
 
 from quadid.chi_square import Z95
 from quadid.condition.watch import HealthReport
 from quadid.jsonable import jsonable
-from quadid.online.records import OnlineDiagnosis, OnlineSet, Reference, SessionStatus, SetState
-from quadid.parameters import NOMINAL_NAMES, Parameter, ParameterSet, Status
+from quadid.online.records import OnlineDiagnosis, OnlineSet, SessionStatus
+from quadid.parameters import NOMINAL_NAMES
 
 
 def set_to_dict(item: OnlineSet, covariance: bool = True) -> dict[str, Any]:
@@ -31,24 +32,21 @@ def set_to_dict(item: OnlineSet, covariance: bool = True) -> dict[str, Any]:
 
 
 def set_from_dict(data: Mapping[str, Any]) -> OnlineSet:
-    """The set of `set_to_dict`; raises KeyError, TypeError or ValueError for what is none, or fits into no message."""
-    parameters = []
-    for p in data["parameters"]:
-        values = [_float(v) for v in (p["value"], p["sigma"], *p["ci95"], p["initial"], *p["bounds"])]
-        relative = p.get("relative_to")
-        parameters.append(Parameter(
-            text(p["name"]), text(p["unit"]), values[0], values[1], values[4], (values[5], values[6]),
-            Status(p["status"]), relative if relative is None else text(relative), (values[2], values[3]),
-        ))  # fmt: skip
-    covariance = np.array(data.get("covariance") or np.diag([p.sigma**2 for p in parameters]), dtype=np.float64)
-    found = ParameterSet(tuple(parameters), covariance)
-    return OnlineSet(
-        int(data["sequence"]), SetState(data["state"]), text(data["reason"]), found,
-        _time(data["start"]), _time(data["stop"]), _count(data["samples"]), _float(data["mse"]),
-        _float(data["mse_held_out"]), text(data["input_hash"]), text(data["approved_by"]), text(data["check"]),
-        _float(data.get("mass")), text(data.get("outdated", "")), text(data.get("outdated_code", "")),
-        _reference(data.get("reference", "none")),
-    )  # fmt: skip
+    """The set of `set_to_dict`, by the types of the records.
+
+    Raises:
+        ValueError, LookupError or TypeError: what is none, or fits into no message: text that UTF-8 has not (it ends
+            whoever sends it), samples beyond 32 bits, times whose seconds are.
+    """
+    msgspec.json.encode(data)
+    found = _with_nan(data)
+    parameters = found["parameters"]
+    covariance = data.get("covariance") or np.diag([p["sigma"] ** 2 for p in parameters])
+    found["parameters"] = {"parameters": parameters, "covariance": covariance}
+    made: OnlineSet = msgspec.convert(found, OnlineSet, dec_hook=lambda _, rows: np.array(rows, dtype=np.float64))
+    if not 0 <= made.samples < 1 << 32 or any(abs(t) >= 1 << 31 for t in (made.start, made.stop)):
+        raise ValueError(f"a set of {made.samples} samples from {made.start:g} to {made.stop:g} s")
+    return made
 
 
 def diagnosis_to_dict(item: OnlineDiagnosis) -> dict[str, Any]:
@@ -87,13 +85,6 @@ def status_to_dict(status: SessionStatus) -> dict[str, Any]:
     return data
 
 
-def _reference(value: object) -> Reference:
-    for known in get_args(Reference):
-        if value == known:
-            return known  # type: ignore[no-any-return]
-    raise ValueError(f"a set with reference {str(value)[:40]!r}; allowed: {', '.join(get_args(Reference))}")
-
-
 def text(value: object) -> str:
     """Text that UTF-8 has; a half of a surrogate pair ends whoever sends it."""
     found = str(value)
@@ -101,20 +92,10 @@ def text(value: object) -> str:
     return found
 
 
-def _count(value: Any) -> int:
-    """Of 32 bits, as the message has it."""
-    if not 0 <= int(value) < 1 << 32:
-        raise ValueError(f"a set of {str(value)[:40]} samples")
-    return int(value)
-
-
-def _time(value: float | None) -> float:
-    """A stamp [s]; the message has 32 bits for seconds."""
-    t = _float(value)
-    if abs(t) >= 1 << 31:
-        raise ValueError(f"a set of the time {t:g}")
-    return t
-
-
-def _float(value: float | None) -> float:
-    return math.nan if value is None else float(value)
+def _with_nan(value: Any) -> Any:
+    """Data of JSON with NaN for null."""
+    if isinstance(value, Mapping):
+        return {name: _with_nan(inner) for name, inner in value.items()}
+    if isinstance(value, list):
+        return [_with_nan(inner) for inner in value]
+    return math.nan if value is None else value

@@ -1,20 +1,17 @@
-"""Requests and answers of fits as bytes between machines: MessagePack of plain data, read by the types of our records.
+"""Requests and answers of fits as bytes between machines: MessagePack, read by the types that the records declare.
 
-What comes over a network names no function and no class: it is one of the kinds below, and every field has the type
-that its record declares.  Sizes are checked before memory is taken, so that a few bytes never make gigabytes.
+What comes over a network names no function and no class: it is one of the kinds below.  Numbers of arrays travel in one
+block beside the record, so that a record is small, and few bytes never make gigabytes.
 """
 
 from __future__ import annotations
 
 import math
-import types
-import typing
-from collections.abc import Callable, Mapping
-from dataclasses import fields, is_dataclass
-from functools import lru_cache
-from typing import Any, Literal
+import zlib
+from collections.abc import Mapping
+from typing import Any
 
-import msgpack
+import msgspec
 import numpy as np
 
 from quadid.errors import QuadidError
@@ -25,14 +22,20 @@ from quadid.vehicle import Vehicle
 
 LARGEST = 1 << 24
 """Parcels beyond this are refused [bytes]; a minute of flight at 50 Hz has less than one mebibyte."""
-MOST_ITEMS, LONGEST_TEXT, MOST_AXES = 4096, 1 << 16, 3
-"""Entries of one list or map, characters of one text, axes of one array: declared sizes beyond are refused unread."""
-MOST_IN_ALL = 1 << 16
-"""Lists, maps and their entries in one parcel: an empty map is one byte that takes 64 of memory."""
-KINDS: Mapping[str, type] = types.MappingProxyType({
-    kind.__name__: kind
-    for kind in (FitRequest, FitReply, ChangeRequest, ChangeReply, DiagnosisRequest, DiagnosisReply)
-})  # fmt: skip
+LARGEST_RECORD = 1 << 18
+"""A record without its numbers has at most so many [bytes]: an empty map is one byte that takes 64 of memory."""
+MOST_AXES = 3
+
+
+def _tag(kind: type) -> str:
+    """Name of a kind with a checksum of its fields and their types: another version's is refused."""
+    schema = msgspec.json.encode(msgspec.json.schema(kind, schema_hook=lambda _: {"type": "object"}))
+    return f"{kind.__name__} {zlib.crc32(schema):08x}"
+
+
+KINDS: Mapping[str, type] = {
+    _tag(kind): kind for kind in (FitRequest, FitReply, ChangeRequest, ChangeReply, DiagnosisRequest, DiagnosisReply)
+}
 
 
 class ParcelError(QuadidError):
@@ -41,10 +44,22 @@ class ParcelError(QuadidError):
 
 def pack(item: object) -> bytes:
     """A request or an answer as bytes; raises ParcelError for anything else."""
-    kind = type(item).__name__
-    if KINDS.get(kind) is not type(item):
-        raise ParcelError(f"a parcel with a {kind}", ", ".join(KINDS))
-    return bytes(msgpack.packb([kind, _encoded(item, type(item))], use_bin_type=True))
+    numbers: list[bytes] = []
+
+    def plain(value: Any) -> Any:
+        if isinstance(value, Vehicle):
+            return value.model_dump_json(exclude_unset=True)  # a default that is given is more than a default
+        if isinstance(value, np.generic):
+            return value.item()
+        numbers.append(np.ascontiguousarray(value, dtype="<f8").tobytes())
+        return value.shape, value.flags.writeable
+
+    tag = next((tag for tag, kind in KINDS.items() if kind is type(item)), None)
+    if tag is None:
+        raise ParcelError(f"a parcel with a {type(item).__name__}", ", ".join(KINDS))
+    record = msgspec.msgpack.encode(item, enc_hook=plain)
+    parcel: bytes = msgspec.msgpack.encode((tag, record, b"".join(numbers)))
+    return parcel
 
 
 def content(payload: Any) -> bytes:
@@ -58,113 +73,33 @@ def unpack(data: bytes) -> Any:
     """The request or answer in bytes.
 
     Raises:
-        ParcelError: too large, damaged, of another kind, or with a field of another type.
+        ParcelError: too large, damaged, of another kind or version, or with a field of another type.
     """
     if len(data) > LARGEST:
         raise ParcelError(f"a parcel of {len(data)} bytes", f"at most {LARGEST}")
-    left = MOST_IN_ALL
+    numbers = np.empty(0)
 
-    def counted(found: Any) -> Any:
-        nonlocal left
-        left -= 1 + len(found)
-        if left < 0:
-            raise ParcelError(f"a parcel of more than {MOST_IN_ALL} entries", "what the record declares")
-        return found
+    def record_of(kind: Any, value: Any) -> Any:
+        nonlocal numbers
+        if kind is Vehicle:
+            return Vehicle.model_validate_json(value)
+        shape, writable = msgspec.convert(value, tuple[tuple[int, ...], bool])
+        count = math.prod(shape)
+        if len(shape) > MOST_AXES or min(shape, default=0) < 0 or count > numbers.size:
+            raise ParcelError(f"an array of shape {shape} in {numbers.size} numbers", f"up to {MOST_AXES} axes")
+        found, numbers = numbers[:count].reshape(shape), numbers[count:]  # each number is used once
+        return found.copy() if writable else found
 
     try:
-        kind, content = msgpack.unpackb(
-            data, raw=False, strict_map_key=True, max_array_len=MOST_ITEMS, max_map_len=MOST_ITEMS,
-            max_str_len=LONGEST_TEXT, max_bin_len=LARGEST, max_ext_len=0, list_hook=counted, object_hook=counted,
-        )  # fmt: skip
-        if not isinstance(kind, str) or kind not in KINDS:
-            raise ParcelError(f"a parcel of kind {str(kind)[:60]!r}", ", ".join(KINDS))
-        return _decoded(content, KINDS[kind], kind)
+        tag, record, block = msgspec.msgpack.decode(data, type=tuple[str, bytes, bytes])
+        if tag not in KINDS or len(record) > LARGEST_RECORD:
+            raise ParcelError(f"a parcel of kind {tag[:60]!r} with {len(record)} bytes", ", ".join(KINDS))
+        numbers = np.frombuffer(block, "<f8")
+        item: Any = msgspec.msgpack.decode(record, type=KINDS[tag], dec_hook=record_of)
+        if numbers.size:
+            raise ParcelError(f"{numbers.size} numbers that belong to no array", "a whole parcel")
     except ParcelError:
         raise
     except Exception as error:
         raise ParcelError(f"damaged parcel ({type(error).__name__})", "a whole one, of the same version") from error
-
-
-@lru_cache(maxsize=64)
-def _hints(kind: type) -> dict[str, Any]:
-    hints = typing.get_type_hints(kind)
-    return {f.name: hints[f.name] for f in fields(kind) if f.init}
-
-
-def _encoded(value: Any, kind: Any) -> Any:
-    """Plain data of a value of a declared type."""
-    kind = _of_union(kind, value)
-    if value is None:
-        return None
-    if kind is Vehicle:
-        return value.model_dump_json(exclude_unset=True)  # a default that is given is more than a default
-    if _is_array(kind):
-        array = np.ascontiguousarray(value, dtype="<f8")
-        return [list(array.shape), array.tobytes(), bool(value.flags.writeable)]
-    if is_dataclass(kind):
-        return {name: _encoded(getattr(value, name), hint) for name, hint in _hints(typing.cast("type", kind)).items()}
-    origin, inner = typing.get_origin(kind), typing.get_args(kind)
-    if origin is tuple:
-        return [_encoded(v, inner[0] if inner[-1] is Ellipsis else inner[k]) for k, v in enumerate(value)]
-    if origin is not None and origin is not Literal:
-        return {str(name): _encoded(v, inner[1]) for name, v in value.items()}
-    return value if origin is Literal else _PLAIN[kind](value)
-
-
-_PLAIN: dict[Any, Callable[[Any], Any]] = {int: int, float: float, str: str, bool: bool}
-
-
-def _decoded(data: Any, kind: Any, where: str) -> Any:
-    """A value of a declared type; raises ParcelError where the data are of another."""
-    if data is None and type(None) in typing.get_args(kind):
-        return None
-    kind = _of_union(kind, data)
-    origin, inner = typing.get_origin(kind), typing.get_args(kind)
-    if kind is Vehicle and isinstance(data, str):
-        return Vehicle.model_validate_json(data)
-    if _is_array(kind):
-        return _array(data, where)
-    if is_dataclass(kind) and isinstance(data, dict):
-        hints = _hints(typing.cast("type", kind))
-        if data.keys() != hints.keys():
-            raise ParcelError(f"{where} with other fields", "a parcel of the same version")
-        made = {name: _decoded(data[name], hint, f"{where}.{name}") for name, hint in hints.items()}
-        return typing.cast("type", kind)(**made)
-    if origin is tuple and isinstance(data, list):
-        if inner[-1] is not Ellipsis and len(data) != len(inner):
-            raise ParcelError(f"{where} of {len(data)} entries", f"{len(inner)}")
-        return tuple(
-            _decoded(v, inner[0] if inner[-1] is Ellipsis else inner[k], f"{where}[{k}]") for k, v in enumerate(data)
-        )
-    if origin is Literal and data in inner:
-        return data
-    if origin not in (None, tuple, Literal) and isinstance(data, dict):
-        return {name: _decoded(v, inner[1], f"{where}.{name}"[:80]) for name, v in data.items()}
-    if kind in _PLAIN and (type(data) is kind or (kind is float and type(data) is int)):
-        return _PLAIN[kind](data)
-    raise ParcelError(f"{where} that is a {type(data).__name__}", "what the record declares")
-
-
-def _array(data: Any, where: str) -> np.ndarray[Any, Any]:
-    """An array from shape, bytes and whether it may be written; its size is that of the bytes, whatever it claims."""
-    if not (isinstance(data, list) and len(data) == 3 and isinstance(data[0], list) and isinstance(data[1], bytes)):
-        raise ParcelError(f"{where} that is no array", "shape, bytes and whether it may be written")
-    shape, content, writable = data
-    if len(shape) > MOST_AXES or not all(type(n) is int and 0 <= n <= LARGEST for n in shape):
-        raise ParcelError(f"{where} of a shape that is none", f"up to {MOST_AXES} axes")
-    if math.prod(shape) * 8 != len(content):
-        raise ParcelError(f"{where} of shape {shape} in {len(content)} bytes", "8 bytes a number")
-    found = np.frombuffer(content, "<f8").reshape(shape)
-    return found.copy() if writable is True else found
-
-
-def _is_array(kind: Any) -> bool:
-    return kind is np.ndarray or typing.get_origin(kind) is np.ndarray
-
-
-def _of_union(kind: Any, value: Any) -> Any:
-    """The type beside None of an optional one."""
-    if typing.get_origin(kind) not in (typing.Union, types.UnionType):
-        return kind
-    (only,) = (part for part in typing.get_args(kind) if part is not type(None))
-    return only
+    return item

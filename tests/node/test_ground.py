@@ -18,14 +18,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import msgpack
 import numpy as np
 import pytest
 import zenoh
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from msgspec.msgpack import decode, encode
 from quadid_node.ground import Ground, RemoteWorker, work
-from quadid_node.wire_format import LARGEST, ParcelError, pack, unpack
+from quadid_node.wire_format import KINDS, LARGEST, LARGEST_RECORD, ParcelError, pack, unpack
 from quadid_node.worker import InlineWorker, ProcessWorker, Trouble
 from quadid_node.zenoh import Fleet, ZenohLink
 
@@ -289,23 +289,33 @@ def test_a_pickle_is_no_parcel(item: object) -> None:
         pack(item)
 
 
+REQUEST = next(tag for tag, kind in KINDS.items() if kind is FitRequest)
+
+
+def parcel(record: object, numbers: bytes = b"", tag: str = REQUEST) -> bytes:
+    """Bytes of a parcel, whatever is in it."""
+    return bytes(encode((tag, record if isinstance(record, bytes) else encode(record), numbers)))
+
+
 def spoilt(request: FitRequest, **fields: Any) -> bytes:
-    kind, content = msgpack.unpackb(pack(request))
-    return bytes(msgpack.packb([kind, {**content, **fields}]))
+    """A request with other fields."""
+    _, record, numbers = decode(pack(request))
+    return parcel({**decode(record), **fields}, numbers)
 
 
 def test_a_few_bytes_never_take_much_memory(request_: FitRequest, happened: Happened) -> None:
     huge = 2**31 - 1
+    nested = b"\xdc\x0f\xff" + (b"\xdc\x0f\xff" + b"\x80" * 4095) * 4095
     claims = [
-        b"\xdd" + huge.to_bytes(4, "big"), b"\xdf" + huge.to_bytes(4, "big"), b"\xdb" + huge.to_bytes(4, "big"),
-        b"\xc6" + huge.to_bytes(4, "big"), b"\xc9" + huge.to_bytes(4, "big") + b"\x01",
-        b"\x92\xa8FitReply" + (b"\xdc\x0f\xff" + (b"\xdc\x0f\xff" + b"\x80" * 4095) * 4095)[: LARGEST - 10],
-        b"\xdc\x0f\xff" * 5000, b"\xdd\x00\x0f\xff\xff" * (1 << 20), b"\x91" * 100_000,
-        spoilt(request_, theta=[[1 << 20, 1 << 20, 8], b"", False]), spoilt(request_, theta=[[huge], bytes(8), True]),
-        spoilt(request_, theta=[[0] * 30, b"", False]), spoilt(request_, theta=[[-1, -1], bytes(8), False]),
-        spoilt(request_, number=1 << 62, theta=[[1.5], bytes(8), False]), spoilt(request_, windows=[None] * 4000),
-        spoilt(request_, number="9" * 60_000), spoilt(request_, vehicle="{" * 60_000), spoilt(request_, more=1),
-        spoilt(request_, seed=True), spoilt(request_, start=None), bytes(msgpack.packb(["FitRequest", {}])),
+        *(bytes([code]) + huge.to_bytes(4, "big") + b"\x01" for code in (0xDD, 0xDF, 0xDB, 0xC6, 0xC9)),
+        b"\x93\xa8FitReply" + nested[: LARGEST - 10], b"\xdc\x0f\xff" * 5000, b"\xdd\x00\x0f\xff\xff" * (1 << 20),
+        b"\x91" * 100_000, parcel(nested[: LARGEST - 100]), parcel(nested[:LARGEST_RECORD]), parcel({}),
+        spoilt(request_, theta=[[1 << 20, 1 << 20, 8], False]), spoilt(request_, theta=[[huge], True]),
+        spoilt(request_, theta=[[0] * 30, False]), spoilt(request_, theta=[[-1, -1], False]),
+        spoilt(request_, theta=[[1.5], False]), spoilt(request_, theta=nested[: 1 << 17]),
+        spoilt(request_, windows=[None] * 4000), spoilt(request_, number="9" * 60_000),
+        spoilt(request_, vehicle="{" * 60_000), spoilt(request_, seed=True), spoilt(request_, start=None),
+        parcel(decode(pack(request_))[1], tag="FitRequest 00000000"), parcel(decode(pack(request_))[1], bytes(8)),
     ]  # fmt: skip
     tracemalloc.start()
     try:
