@@ -38,7 +38,7 @@ def set_from_dict(data: Mapping[str, Any]) -> OnlineSet:
         ValueError, LookupError or TypeError: what is none, or fits into no message: text that UTF-8 has not (it ends
             whoever sends it), samples beyond 32 bits, times whose seconds are.
     """
-    msgspec.json.encode(data)
+    msgspec.json.encode(data)  # raises for such text
     found = _with_nan(data)
     parameters = found["parameters"]
     covariance = data.get("covariance") or np.diag([p["sigma"] ** 2 for p in parameters])
@@ -83,13 +83,6 @@ def status_to_dict(status: SessionStatus) -> dict[str, Any]:
     excitation = dict(zip(NOMINAL_NAMES, status.excitation.tolist(), strict=True))
     data: dict[str, Any] = jsonable({**vars(status), "phase": status.phase.name.lower(), "excitation": excitation})
     return data
-
-
-def text(value: object) -> str:
-    """Text that UTF-8 has; a half of a surrogate pair ends whoever sends it."""
-    found = str(value)
-    found.encode()
-    return found
 
 
 def _with_nan(value: Any) -> Any:

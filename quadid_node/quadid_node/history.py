@@ -24,8 +24,9 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
+import msgspec
 import numpy as np
 
 from quadid.condition.trim import FlightTrim, flight_from_dict, flight_to_dict
@@ -37,7 +38,7 @@ from quadid.online.records import Event, OnlineDiagnosis, OnlineSet, SetState
 from quadid.parameters import NOMINAL_NAMES, ParameterSet
 from quadid.sanitise import plain
 from quadid.vehicle import Vehicle
-from quadid_node.codec import diagnosis_to_dict, set_from_dict, set_to_dict, text
+from quadid_node.codec import diagnosis_to_dict, set_from_dict, set_to_dict
 
 # --- The file: its tables, its versions, and what becomes of a damaged one
 
@@ -209,39 +210,40 @@ def read_history(
         StoreError: no such file, or not a history.
     """
 
-    def newest(columns: str, table: str, most: int) -> list[tuple[Any, ...]]:
+    def newest(kind: Any, columns: str, table: str, most: int) -> list[Any]:
         rows = db.execute(
             f"SELECT {columns} FROM {table} WHERE vehicle = ? ORDER BY rowid DESC LIMIT ?", (vehicle, most)
         )
-        return rows.fetchall()[::-1]
+        return [msgspec.convert(row, kind) for row in rows.fetchall()[::-1]]
 
     with opened(path) as db:
         names = " UNION ".join(f"SELECT vehicle FROM {table}" for table in _SHOWN)
         return {
-            "sets": [_set(*row) for row in newest("wall, data", "sets", sets)],
-            "candidates": [_set(*row) for row in newest("wall, data", "candidates", candidates)],
-            "events": [_event(*row) for row in newest("wall, t, level, kind, text", "events", events)],
+            "sets": [_set(*row) for row in newest(_SET, "wall, data", "sets", sets)],
+            "candidates": [_set(*row) for row in newest(_SET, "wall, data", "candidates", candidates)],
+            "events": [e._asdict() for e in newest(_Event, "wall, t, level, kind, text", "events", events)],
             "vehicles": [{"name": name} for (name,) in db.execute(names)],
         }
 
 
-def _set(wall: Any, data: Any) -> dict[str, Any]:
+_WALL = Annotated[float, msgspec.Meta(ge=0.0, lt=1e11)]
+"""UNIX seconds that every calendar has."""
+_SET = tuple[_WALL, str]
+
+
+class _Event(NamedTuple):
+    wall: _WALL
+    t: float | None
+    level: str
+    kind: str
+    text: str
+
+
+def _set(wall: float, data: str) -> dict[str, Any]:
     """A set as the service would read it back; raises one of `UNREADABLE` for what is none."""
     found = json.loads(data)
-    boot = {"boot_id": text(found["boot_id"])} if "boot_id" in found else {}
-    return {"wall": _date(wall), **set_to_dict(set_from_dict(found), "covariance" in found), **boot}
-
-
-def _event(wall: Any, t: Any, level: Any, kind: Any, said: Any) -> dict[str, Any]:
-    time = None if t is None else float(t)
-    return {"wall": _date(wall), "t": time, "level": text(level), "kind": text(kind), "text": text(said)}
-
-
-def _date(wall: Any) -> float:
-    """UNIX seconds of a row, which every calendar has."""
-    if not 0.0 <= float(wall) < 1e11:
-        raise ValueError(f"a row of the time {str(wall)[:40]}")
-    return float(wall)
+    boot = {"boot_id": str(found["boot_id"])} if "boot_id" in found else {}
+    return {"wall": wall, **set_to_dict(set_from_dict(found), "covariance" in found), **boot}
 
 
 # --- The right to write: one service a vehicle, by whatever name the file is called
@@ -413,7 +415,7 @@ def stored(db: sqlite3.Connection, name: str, which: str, gate: GateSettings, ve
     try:
         data = json.loads(row[0])
         found = set_from_dict(data)
-        return StoredSet(found, why_none(found, row[1], gate, vehicle), boot_id=text(data.get("boot_id", "")))
+        return StoredSet(found, why_none(found, row[1], gate, vehicle), boot_id=str(data.get("boot_id", "")))
     except UNREADABLE as error:
         return StoredSet(found, f"{type(error).__name__}: {str(error)[:120]}")
 
