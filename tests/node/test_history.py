@@ -493,7 +493,7 @@ def test_damage_while_running_sets_the_file_aside_and_the_new_one_has_the_set_in
     for k in range(10):
         store.event(Event(float(k), "info", "test", "after"))
     assert store.flush(60.0), store.problem
-    assert lines(path) == ["after"] * 10
+    assert lines(path).count("after") == 10
     assert until(lambda: not store.problem)
     aside = [p for p in tmp_path.iterdir() if ".damaged-" in p.name and not p.name.endswith(("-wal", "-shm"))]
     if damage != "removed":
