@@ -47,6 +47,7 @@ def _possible(value: float) -> float:
 PositiveFloat = Annotated[float, Field(gt=1.0 / _LARGEST), AfterValidator(_possible)]
 Spread = Annotated[float, Field(ge=0.0), AfterValidator(_possible)]
 Coordinate = Annotated[float, AfterValidator(_possible)]
+Correlation = Annotated[float, Field(ge=-1.0, le=1.0, allow_inf_nan=False)]
 Angle = Annotated[float, Field(ge=-6.3, le=6.3, allow_inf_nan=False)]
 
 MIXERS: dict[str, tuple[tuple[float, ...], ...]] = {
@@ -191,6 +192,38 @@ class Stabiliser(Strict):
     rate: PositiveFloat | None = None
 
 
+class RandomInput(Strict):
+    """A first-order Gauss-Markov process: standard deviation `sigma`, and correlation time `time` [s]."""
+
+    sigma: Spread
+    time: PositiveFloat
+
+
+class RandomForces(Strict):
+    """What acts on the vehicle at random, beyond its model, in body axes.
+
+    Attributes:
+        horizontal, vertical: specific force along x and y, along z, sigma in m/s^2.
+        roll_pitch, yaw: angular acceleration about x and y, about z, sigma in rad/s^2.
+    """
+
+    horizontal: RandomInput
+    vertical: RandomInput
+    roll_pitch: RandomInput
+    yaw: RandomInput
+
+    @property
+    def numbers(self) -> FloatArray:
+        """Standard deviations and correlation times in the order of the attributes, shape (2, 4)."""
+        parts = (self.horizontal, self.vertical, self.roll_pitch, self.yaw)
+        return np.array([[p.sigma for p in parts], [p.time for p in parts]])
+
+    @property
+    def each_axis(self) -> FloatArray:
+        """The same of force x, y, z and angular acceleration x, y, z, shape (2, 6)."""
+        return self.numbers[:, [0, 0, 1, 2, 2, 3]]
+
+
 class Mounting(Strict):
     """The IMU in the body: rotation (roll, pitch, yaw) [rad] and position from the geometric centre, FRD [m]."""
 
@@ -265,15 +298,16 @@ def impossible_hover(low: float, high: float) -> str:
 
 # --- Terms beyond the catalogue: forces and moments, each a coefficient times a printed product of known signals
 #
-# They belong to a file that predicts, never to the physics: a residual term is called by its formula, not by a cause.
+# A residual term is called by its formula, not by a cause.  Those that a diagnosis learns are products of motions and
+# rotor speeds, never of the rotors' own thrust or torque (`quadid.estimate.residual`), so that the file may fly.
 
 
 SIGNALS: dict[str, str] = {
     "v_x": "m/s", "v_y": "m/s", "v_z": "m/s", "p": "rad/s", "q": "rad/s", "r": "rad/s", "g_x": "", "g_y": "",
-    "g_z": "", "T": "N", "tau_x": "N m", "tau_y": "N m", "tau_z": "N m", "V": "m/s",
+    "g_z": "", "T": "N", "W": "rad/s", "V": "m/s",
 }  # fmt: skip
 """What may be multiplied, with units, all in body axes (FRD): velocity through the air, rates, direction of gravity,
-thrust of all rotors, their moments, airspeed.  In the order of `quadid.model.body_kernel`, after the number one."""
+thrust and speeds of all rotors together, airspeed.  In the order of `quadid.model.body_kernel`, after the one."""
 TARGETS: dict[str, str] = {
     "force_x": "N", "force_y": "N", "force_z": "N", "moment_x": "N m", "moment_y": "N m", "moment_z": "N m",
 }  # fmt: skip
@@ -321,18 +355,6 @@ class ResidualTerm(Strict):
     def formula(self) -> str:
         """As printed: ``moment_x += -1.2e-05 v_y T``."""
         return " ".join([f"{self.acts_on} += {self.value:.4g}", *self.product])
-
-    def typical(self, weight: float, arm: float) -> float:
-        """Coefficient with which the term matters on a vehicle of `weight` [N] and `arm` [m].
-
-        A twentieth of its weight, for moments at its arm, when rates, velocities and directions are one, the rotors
-        carry the weight and their moments are a tenth of it at the arm (a hundredth in yaw).
-        """
-        size = 0.05 * weight * (arm if self.acts_on.startswith("moment") else 1.0)
-        usual = {"T": weight, "tau_x": 0.1 * weight * arm, "tau_y": 0.1 * weight * arm, "tau_z": 0.01 * weight * arm}
-        for name in self.product:
-            size /= usual.get(name, 1.0)
-        return size
 
 
 # --- What shows that the values of a vehicle file predict, and which flights they were fitted to
@@ -408,7 +430,9 @@ class Vehicle(Strict):
         mounting: the IMU in the body; its position is the effect `imu_lever_arm`.
         columns: names in a CSV for those of the contract, such as {p: gyro_x}.
         mixer: from logged mixer inputs to rotors, a name of `MIXERS` or a matrix with a row a rotor; or None.
-        residual: forces and moments beyond the catalogue, of a file that predicts.
+        residual: forces and moments beyond the catalogue.
+        random: what acts at random beyond all of these, as a fit found it; None where nobody looked.
+        correlation: of values that have a sigma, name -> name -> correlation; pairs that are not there have none.
         mass_sigma: standard deviation of the mass [kg]; 0 takes it for exact.
         arm_sigma: standard deviation of the arm [m], common to all rotors; 0 takes positions for exact.
         proof: what shows that the values predict; None for values that nobody fitted.
@@ -431,6 +455,8 @@ class Vehicle(Strict):
     columns: dict[str, str] = Field(default_factory=dict, max_length=64)
     mixer: str | tuple[tuple[Coordinate, ...], ...] | None = None
     residual: tuple[ResidualTerm, ...] = Field(default=(), max_length=MOST_TERMS)
+    random: RandomForces | None = None
+    correlation: dict[str, dict[str, Correlation]] = Field(default_factory=dict)
     proof: Proof | None = None
     _remark: str = PrivateAttr("")
 
@@ -446,6 +472,14 @@ class Vehicle(Strict):
         if missing:
             raise ValueError(f"parameters lack {', '.join(missing)}; add an initial guess for each")
         return {k: v if isinstance(v, dict | ParameterPrior) else {"initial": v} for k, v in value.items()}
+
+    @field_validator("correlation", mode="after")
+    @classmethod
+    def _known_pairs(cls, value: dict[str, dict[str, float]]) -> dict[str, dict[str, float]]:
+        for name in (n for one, others in value.items() for n in (one, *others)):
+            if name not in NOMINAL_NAMES:
+                raise ValueError(f"unknown parameter '{name}'; {nearest(name, NOMINAL_NAMES)}")
+        return value
 
     @field_validator("effects", mode="before")
     @classmethod
@@ -558,6 +592,17 @@ class Vehicle(Strict):
         return np.array([self.parameters[n].initial for n in NOMINAL_NAMES])
 
     @property
+    def covariance(self) -> FloatArray:
+        """Covariance of the six by their sigmas and correlations, shape (6, 6); zero where there is no sigma."""
+        sigma = np.array([self.parameters[n].sigma or 0.0 for n in NOMINAL_NAMES])
+        out = np.diag(sigma**2)
+        for one, others in self.correlation.items():
+            for other, value in others.items():
+                i, j = NOMINAL_NAMES.index(one), NOMINAL_NAMES.index(other)
+                out[i, j] = out[j, i] = value * sigma[i] * sigma[j]
+        return out
+
+    @property
     def bounds(self) -> FloatArray:
         """Where to look for the six: the file's bounds, else a factor of 4 each way, shape (6, 2)."""
         return np.array([self.parameters[n].limits for n in NOMINAL_NAMES])
@@ -613,7 +658,7 @@ class Vehicle(Strict):
     def to_yaml(self) -> str:
         """Writes the vehicle as YAML that `from_yaml` reads back."""
         data = self.model_dump(mode="json", exclude_none=True)
-        for name in ("mass_sigma", "arm_sigma", "thrust_stand", "residual", "columns"):
+        for name in ("mass_sigma", "arm_sigma", "thrust_stand", "residual", "columns", "correlation"):
             if not data[name]:
                 del data[name]
         if self.mounting == Mounting():
@@ -654,6 +699,8 @@ def _valid_keys(path: tuple[int | str, ...]) -> list[str]:
     models: dict[str, type[BaseModel]] = {
         "rotors": Rotor, "thrust_stand": ThrustPoint, "mounting": Mounting,
         "command": Command, "parameters": ParameterPrior, "noise": Noise, "stabiliser": Stabiliser, "proof": Proof,
+        "random": RandomForces,
     }  # fmt: skip
     model = models.get(str(path[0]), Vehicle) if path else Vehicle
+    model = RandomInput if model is RandomForces and len(path) > 1 else model
     return list(model.model_fields)

@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from quadid.app.identify import OPTIMIZERS, check_seed, origin_remark, out_of_reach, proven, search
+from quadid.app.identify import OPTIMIZERS, check_seed, out_of_reach, proven, search
 from quadid.app.logs import Given, Log, file_name, settled
-from quadid.app.missing import MissingForces, missing_forces
+from quadid.app.missing import Beside, MissingForces, missing_forces
 from quadid.app.outcome import LIBRARY, NUMBER_COLUMNS, Advance, Fitted, number_rows, provenance, quality, silent
 from quadid.effects import EFFECTS
 from quadid.model.layout import Layout, with_reference_voltage
@@ -28,13 +28,16 @@ if TYPE_CHECKING:
     from quadid.report.tables import TextTable
 
 
+LEAST_REMOVED = 0.3
+"""Share of the squared missing force and moment that confident findings must take to explain a flight in part."""
+
+
 @dataclass(frozen=True, repr=False)
 class Diagnosed(Fitted):
     """What a diagnosis found.
 
     Attributes:
-        result: of the form ``quadid.diagnose/1``; ``vehicle_file`` and ``prediction_file`` are None until
-            files are written.
+        result: of the form ``quadid.diagnose/1``; ``vehicle_file`` is None until a file is written.
         found: the diagnosis itself.
         sets: logs scored without and with the findings.
         noise: estimated sensor noise.
@@ -50,31 +53,17 @@ class Diagnosed(Fitted):
     nominal: Vehicle
     search: Search
     forces: MissingForces | None = None
+    beside: Beside | None = None
 
     @property
     def vehicle(self) -> Vehicle:
         """The fitted vehicle with the findings in it; ``vehicle.save("mine.yaml")`` writes it."""
-        vehicle = Vehicle.from_yaml(self.found.vehicle_yaml, self.found.vehicle_name)
         unseen = self.result["validation"]
         sets = [
             {"log": log.name, "role": s.role, "mse": {"fitted": unseen["mse_extended"]}}
             for log, s in zip(self.logs, self.sets, strict=True)
         ]
-        return proven(vehicle, self.verdict, sets, self.train).with_remark(origin_remark(self.train))
-
-    @property
-    def prediction(self) -> Vehicle | None:
-        """The same physics with residual terms, where those predict better; else None."""
-        if self.found.prediction is None:
-            return None
-        wiser = self.vehicle.model_copy(update={"residual": self.found.prediction.terms})
-        remark = "Residual terms predict better; the physical values are those of the other file."
-        return wiser.with_remark(f"{origin_remark(self.train)}\n{remark}")
-
-    @property
-    def prediction_file_name(self) -> str:
-        """``pelican+motor_lag+prediction.yaml``."""
-        return f"{file_name(self.found.vehicle_name)}+prediction.yaml"
+        return proven(self.found.vehicle, self.verdict, sets, self.train, self.beside)
 
     @property
     def file_name(self) -> str:
@@ -163,6 +152,8 @@ def diagnose(
     """
     from quadid.diagnosis.attribution import NominalFit
     from quadid.diagnosis.pipeline import diagnose as diagnose_windows
+    from quadid.diagnosis.result import Explanation
+    from quadid.identification.result import with_values
 
     check_seed(seed)
     given = settled(logs, validate, vehicle)
@@ -177,6 +168,16 @@ def diagnose(
     nominal = NominalFit(fit.vehicle, fit.theta, fit.noise)
     found, selection = diagnose_windows(windows, described, unseen, seed, advance, nominal=nominal)
     found, model = _within_reach(found, unreachable), selection.model
+    forces = missing_forces(train, held, fit.vehicle, {"nominal": fit.theta, "extended": model.theta}, advance)
+    removed = None if forces is None else _removed(forces, found, selection, fit.vehicle)
+    if found.verdict is Explanation.PARTLY_EXPLAINED and removed is not None and removed < LEAST_REMOVED:
+        told = (
+            f"the causes take only {100.0 * removed:.0f} % off the squared missing force and moment: none is confident"
+        )
+        doubted = tuple(replace(f, confident=False) for f in found.findings)
+        found = replace(found, verdict=Explanation.UNKNOWN, findings=doubted, warnings=(*found.warnings, told))
+    physical = with_values(fit.vehicle, found.parameters, [c.effect for c in model.causes], model.theta)
+    found = replace(found, vehicle=physical)
     result, (before, after) = found.to_dict(), found.validation.deciding
     result["validation"]["deciding"] = {
         "seconds": selection.shooting.seconds, "mse_nominal": before, "mse_extended": after
@@ -191,15 +192,30 @@ def diagnose(
         {"log": s.log, "role": s.role, "mse": {"nominal": s.initial.mse, "extended": s.fitted.mse, "noise_floor": 1.0}}
         for s in sets
     ]
-    forces = missing_forces(train, held, fit.vehicle, {"nominal": fit.theta, "extended": model.theta}, advance)
     result["missing"] = None if forces is None else forces.result()
+    result["removed"] = removed
     advance("gain of each cause", 0.0)
-    layout = Layout(fit.vehicle)
     for entry in result["findings"]:
         names = [n for c in model.causes if c.effect == entry["effect"] for n in c.names]
-        taken = None if forces is None else forces.taken(layout.without(model.theta, names))
+        taken = None if forces is None else forces.taken(Layout(fit.vehicle).without(model.theta, names))
         entry["gain"]["missing_removed"] = taken
-    return Diagnosed(result, found, sets, fit.noise, [*train, *held], described, selection, forces)
+    advance("random forces", 0.0)
+    beside = None if forces is None else forces.beside(physical, terms=True)
+    result["residual"] = None
+    if beside is not None and beside.terms:
+        result["residual"] = {"terms": [t.formula for t in beside.terms], "missing_removed": beside.removed}
+        result["missing"]["statement"] += f" {beside.sentence}"
+    return Diagnosed(result, found, sets, fit.noise, [*train, *held], described, selection, forces, beside)
+
+
+def _removed(forces: MissingForces, found: Diagnosis, selection: Search, vehicle: Vehicle) -> float:
+    """Share of the squared missing force and moment that the confident findings take, on flights that were not fitted.
+
+    Of a diagnosis without any, that of all findings.
+    """
+    trusted = {f.effect for f in found.findings if f.confident} or {f.effect for f in found.findings}
+    doubtful = [n for c in selection.model.causes if c.effect not in trusted for n in c.names]
+    return forces.removed(Layout(vehicle).without(selection.model.theta, doubtful))
 
 
 def scored(log: Log, role: str, fit: Fit, extended: FloatArray) -> ScoredSet:

@@ -14,7 +14,7 @@ import numpy as np
 from quadid_evaluation.optimisers.minimise import minimise
 
 from quadid.app.logs import Given, Log, file_name, remembered, settled
-from quadid.app.missing import MissingForces, missing_forces
+from quadid.app.missing import Beside, MissingForces, missing_forces
 from quadid.app.outcome import LIBRARY, Advance, Fitted, known, provenance, quality, silent, told
 from quadid.data.window import Window
 from quadid.errors import NotIdentifiableError, ParameterError, nearest
@@ -103,6 +103,7 @@ class Identified(Fitted):
     sets: list[ScoredSet]
     logs: list[Log]
     forces: MissingForces | None = None
+    beside: Beside | None = None
 
     @property
     def parameters(self) -> ParameterSet:
@@ -114,8 +115,7 @@ class Identified(Fitted):
         """The vehicle with what was found; ``vehicle.save("mine.yaml")`` writes it."""
         from quadid.identification.result import fitted_vehicle
 
-        vehicle = proven(fitted_vehicle(self.fit), self.verdict, self.result["sets"], self.train)
-        return vehicle.with_remark(origin_remark(self.train))
+        return proven(fitted_vehicle(self.fit), self.verdict, self.result["sets"], self.train, self.beside)
 
     @property
     def file_name(self) -> str:
@@ -242,7 +242,7 @@ def identify(
         ParameterError: an unknown search, parameter or effect, or nothing left to fit.
     """
     from quadid.identification.controller_gains import find_autopilot
-    from quadid.identification.result import answered, identify_result
+    from quadid.identification.result import answered, fitted_vehicle, identify_result
 
     check_optimizer(optimizer)
     check_seed(seed)
@@ -262,7 +262,9 @@ def identify(
         entry["seconds"] = log.grid.seconds_used
     forces = missing_forces(train, held, fit.vehicle, {"nominal": fit.theta}, advance)
     result["missing"] = None if forces is None else forces.result()
-    done = Identified(result, fit, sets, [*train, *held], forces)
+    advance("random forces", 0.0)
+    beside = None if forces is None else forces.beside(fitted_vehicle(fit), terms=False)
+    done = Identified(result, fit, sets, [*train, *held], forces, beside)
     result["verdict"] = done.verdict.level
     if not answered(fit.parameters):
         raise UnansweredError(done)
@@ -345,19 +347,25 @@ def scored(log: Log, role: str, fit: Fit, autopilot: Autopilot | None) -> Scored
 
 def origin_remark(logs: Sequence[Log]) -> str:
     """What a fitted vehicle file was made from."""
-    lines = [f"Fitted by quadid {__version__}; `initial` is the fitted value, `sigma` its standard deviation. From:"]
+    lines = [f"Fitted by quadid {__version__}; `initial` with a `sigma` was fitted, without it was not. From:"]
     lines += [f"  {log.recording.name}  sha256 {log.recording.sha256 or 'unknown'}" for log in logs]
     return "\n".join(plain(line, LONGEST_LINE) for line in lines)
 
 
-def proven(vehicle: Vehicle, verdict: Verdict, sets: Sequence[Mapping[str, Any]], train: Sequence[Log]) -> Vehicle:
-    """The vehicle with the proof of its values; values of a red fit become guesses without `sigma`.
+def proven(
+    vehicle: Vehicle, verdict: Verdict, sets: Sequence[Mapping[str, Any]], train: Sequence[Log],
+    beside: Beside | None,
+) -> Vehicle:  # fmt: skip
+    """The vehicle with what was found beside its values, their proof, and where it all comes from.
+
+    Values of a red fit become guesses without `sigma`.
 
     Args:
         vehicle: with what was found.
         verdict: on the result.
         sets: its scored logs, as in ``quadid.identify/1``.
         train: the logs that were fitted.
+        beside: what acts beside its values; None keeps what its file has.
     """
     unseen = [s for s in sets if s["role"] == "validate"]
     errors = [s["mse"]["fitted"] for s in unseen]
@@ -366,7 +374,9 @@ def proven(vehicle: Vehicle, verdict: Verdict, sets: Sequence[Mapping[str, Any]]
         error=max(errors) if errors and all(math.isfinite(e) for e in errors) else None,
         fitted=remembered(train, vehicle),
     )  # fmt: skip
-    values = dict(vehicle.parameters)
+    whole = vehicle if beside is None else beside.in_vehicle(vehicle)
+    update: dict[str, Any] = {"proof": proof}
     if verdict.level == "poor":
-        values = {n: p.model_copy(update={"sigma": None}) for n, p in values.items()}
-    return vehicle.model_copy(update={"proof": proof, "parameters": values})
+        guesses = {n: p.model_copy(update={"sigma": None}) for n, p in vehicle.parameters.items()}
+        update |= {"parameters": guesses, "correlation": {}}
+    return whole.model_copy(update=update).with_remark(origin_remark(train))

@@ -11,8 +11,9 @@ import numpy as np
 
 from quadid.app.logs import Log, free_name
 from quadid.data.window import Channel, Recording, Window, beginning
+from quadid.model.layout import Layout
 from quadid.types import FloatArray, JsonDict
-from quadid.vehicle import Vehicle
+from quadid.vehicle import RandomForces, ResidualTerm, Vehicle
 
 if TYPE_CHECKING:
     from quadid.estimate.missing import Missing, Vehicles
@@ -105,6 +106,39 @@ class MissingForces:
         parts = {model: self.parts[model][shown] for model in self.models}
         return missing_section(self._entry(self.deciding), self.logs[shown].recording.name, parts)
 
+    def beside(self, vehicle: Vehicle, terms: bool) -> Beside:
+        """What acts beside the values of a vehicle file: terms beyond the catalogue, and what remains, at random.
+
+        Terms are kept where they take a part of what is missing off flights that were not fitted.
+
+        Args:
+            vehicle: the file.
+            terms: whether they are looked for.
+        """
+        from quadid.estimate.missing import random_forces, removed
+        from quadid.estimate.residual import LEAST, learn
+
+        def seen(vehicle: Vehicle) -> list[list[Missing]]:
+            theta = Layout(vehicle).initial(vehicle)
+            return [self.flights.missing(windows, theta, vehicle) for windows in self.flown]
+
+        def of(found: Sequence[Sequence[Missing]], role: str) -> list[Missing]:
+            return [part for parts, own in zip(found, self.roles, strict=True) if own == role for part in parts]
+
+        before = seen(vehicle)
+        if not _finite(before):
+            return Beside((), None, None)
+        flown = all(w.velocity is not None for windows in self.flown for w in windows)
+        others = [parts for parts, own in zip(before, self.roles, strict=True) if own == "validate"]
+        found = learn(of(before, "train"), others, flown) if terms else ()
+        if found:
+            after = seen(vehicle.model_copy(update={"residual": (*vehicle.residual, *found)}))
+            judge = "validate" if "validate" in self.roles else "train"
+            share = removed(of(before, judge), of(after, judge)) if _finite(after) else 0.0
+            if share >= LEAST:
+                return Beside(found, share, random_forces(of(after, "train")))
+        return Beside((), None, random_forces(of(before, "train")))
+
     def taken(self, without: FloatArray) -> float:
         """Share of the squared missing force and moment of a model that the last one takes away.
 
@@ -113,8 +147,19 @@ class MissingForces:
         """
         from quadid.estimate.missing import removed
 
-        before = [part for i in self.deciding for part in self.flights.missing(self.flown[i], without)]
-        return removed(before, [part for i in self.deciding for part in self.parts[self.models[-1]][i]])
+        return removed(self._unseen(without), self._parts(self.models[-1]))
+
+    def removed(self, theta: FloatArray) -> float:
+        """Share of what the first model misses that this parameter vector takes away, on the same logs."""
+        from quadid.estimate.missing import removed
+
+        return removed(self._parts(self.models[0]), self._unseen(theta))
+
+    def _parts(self, model: str) -> list[Missing]:
+        return [part for i in self.deciding for part in self.parts[model][i]]
+
+    def _unseen(self, theta: FloatArray) -> list[Missing]:
+        return [part for i in self.deciding for part in self.flights.missing(self.flown[i], theta)]
 
     def save(self, folder: str | Path = ".") -> list[Path]:
         """Writes ``LOG.missing.csv`` for every log: force [N], moment [N m], innovations of every model, with sigma."""
@@ -163,6 +208,39 @@ class MissingForces:
         return np.concatenate([getattr(part, name) for part in self.parts[model][i]])
 
 
+@dataclass(frozen=True)
+class Beside:
+    """What acts beside the values of a vehicle file.
+
+    Attributes:
+        terms: beyond the catalogue.
+        removed: share of the squared missing force and moment that they take off unseen flights, off the training
+            flights where there are no others; None without terms.
+        random: what remains, at random; None where no finite answer is found.
+    """
+
+    terms: tuple[ResidualTerm, ...]
+    removed: float | None
+    random: RandomForces | None
+
+    @property
+    def sentence(self) -> str:
+        """What the terms are worth."""
+        return (
+            f"Terms beyond the catalogue take {100.0 * (self.removed or 0.0):.2g} % off its squares: "
+            f"{'; '.join(t.formula for t in self.terms)}."
+        )
+
+    def in_vehicle(self, vehicle: Vehicle) -> Vehicle:
+        """The vehicle with it; what was not found stays as it is."""
+        told = {"residual": (*vehicle.residual, *self.terms), "random": self.random or vehicle.random}
+        return vehicle.model_copy(update=told)
+
+
+def _finite(found: Sequence[Sequence[Missing]]) -> bool:
+    return all(np.isfinite(p.force_sigma).all() and np.isfinite(p.sizes).all() for parts in found for p in parts)
+
+
 def _by_axis(values: FloatArray) -> dict[str, float]:
     return {axis: float(v) for axis, v in zip(AXES, values, strict=True)}
 
@@ -196,7 +274,7 @@ def missing_forces(
     for done, (name, windows) in enumerate(((n, w) for n in models for w in flown), 1):
         advance(stage, done / steps)
         parts[name].append(flights.missing(windows, models[name]))
-    if not all(np.isfinite(p.force_sigma).all() for found in parts.values() for log in found for p in log):
+    if not all(_finite(found) for found in parts.values()):
         return None
     roles = ["train"] * len(train) + ["validate"] * len(held)
     first, *_, last = models.values() if len(models) > 1 else [next(iter(models.values()))] * 2

@@ -41,8 +41,6 @@ def diagnose(
         with terminal.progress() as advance:
             done = work.diagnose(train, held, seed=seed, advance=advance)
     files = {"vehicle": free_path(folder / done.file_name, vehicle)}
-    if done.prediction is not None:
-        files["prediction"] = free_path(folder / done.prediction_file_name, vehicle)
     terminal.conclude(done, json, report, files, series)
 
 

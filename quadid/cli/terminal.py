@@ -189,7 +189,7 @@ def conclude(
         done: the result; its warnings go to stderr.
         json: where its JSON goes, as `write_json`.
         report: where its HTML report goes.
-        files: where its ``vehicle``, and its ``prediction``, go.
+        files: where its ``vehicle`` goes.
         series: folder for measured, simulated and missing over time.
     """
     whole: Any = done  # which of these a command offers depends on its result
@@ -207,7 +207,9 @@ def conclude(
     print_tables(out, done.tables())
     if done.verdict is not None:
         print_verdict(out, done.verdict)
-    for key, label in (("vehicle_file", "Vehicle file"), ("prediction_file", "Prediction file"), ("report", "Report")):
+    for sentence in done.sentences:
+        out.print(sentence, soft_wrap=True)
+    for key, label in (("vehicle_file", "Vehicle file"), ("report", "Report")):
         if done.result.get(key):
             out.print(f"{label}: {done.result[key]}", soft_wrap=True)
     for path in done.result.get("series", ()):

@@ -21,7 +21,6 @@ from quadid.diagnosis.segment_schedule import LINEAR_MISFIT
 from quadid.diagnosis.selection import Search, from_everything, pruned, select
 from quadid.diagnosis.unmodelled_moments import Held, held_by_fast_motion, refitted
 from quadid.effects import EFFECTS
-from quadid.errors import NotIdentifiableError
 from quadid.identification.covariance import SPREAD_LIMIT, parameter_set
 from quadid.identification.fit import SWARM_SECONDS, FitOptions, check_windows
 from quadid.identification.gauss_newton import polish
@@ -31,7 +30,6 @@ from quadid.identification.noise_estimation import FAR_ITERATIONS, flexible_fit,
 from quadid.identification.noise_memory import with_memory
 from quadid.identification.noise_model import NoiseModel
 from quadid.identification.reliability import reliability
-from quadid.identification.residual_prediction import POOR, learn_prediction
 from quadid.identification.result import with_values
 from quadid.identification.shooting import Shooting
 from quadid.model.layout import with_reference_voltage
@@ -56,7 +54,7 @@ LEAST_OF_EXPLAINED = 1e-3
 
 def diagnose(
     windows: Sequence[Window], vehicle: Vehicle, validation: Sequence[Window] = (), seed: int = 0,
-    progress: Progress | None = None, swarm: bool = False, nominal: NominalFit | None = None, predict: bool = True,
+    progress: Progress | None = None, swarm: bool = False, nominal: NominalFit | None = None,
 ) -> tuple[Diagnosis, Search]:  # fmt: skip
     """Says what the simulation of `vehicle` gets wrong on `windows`, why, and what a better one gains.
 
@@ -68,7 +66,6 @@ def diagnose(
         progress: called with a stage and a fraction.
         swarm: search globally first, for poor initial guesses.
         nominal: identification of `windows` that errors are stated with; by default that of the selection.
-        predict: learn residual terms where much is left; the answer is the same without, but for its `prediction`.
 
     Raises:
         WindowError, NotIdentifiableError: as `quadid.identification.fit.fit`.
@@ -110,18 +107,9 @@ def diagnose(
         *reasons, *([] if moved is None else [moved]),
     ]  # fmt: skip
     physical = with_values(vehicle, parameters, [c.effect for c in model.causes], model.theta)
-    prediction = None
-    if predict and model.lin.reduced_chi_square > POOR:
-        report("prediction", 0.0)
-        try:
-            prediction = learn_prediction(windows, physical, validation)
-        except NotIdentifiableError as error:
-            warnings.append(f"no residual terms could be learnt: {error}")
-    if prediction is not None:
-        warnings.append(prediction.sentence)
     result = Diagnosis(
-        verdict, findings, outcome, left, parameters, physical.to_yaml(),
-        "+".join([vehicle.name, *dict.fromkeys(f.effect for f in findings)]), tuple(warnings), prediction,
+        verdict, findings, outcome, left, parameters, physical,
+        "+".join([vehicle.name, *dict.fromkeys(f.effect for f in findings)]), tuple(warnings),
     )  # fmt: skip
     report("done", 1.0)
     return result, search

@@ -15,11 +15,11 @@ from quadid.diagnosis.model import Model
 from quadid.diagnosis.residual_tests import Remainder
 from quadid.diagnosis.selection import Search
 from quadid.effects import EFFECTS
-from quadid.identification.residual_prediction import Prediction
 from quadid.identification.result import parameter_entry
 from quadid.identification.shooting import Shooting
 from quadid.jsonable import jsonable
 from quadid.parameters import Parameter
+from quadid.vehicle import Vehicle
 
 STEP_SIGMA = 3e-4
 """Standard deviation [s] added to lags and delays: commands and samples of a loop at 1 kHz keep whole steps, and stamps
@@ -101,8 +101,7 @@ class Finding:
 class Diagnosis:
     """Outcome of a diagnosis; `to_dict` gives the JSON of contract §7 but for the file name.
 
-    `parameters` are the nominal six beside the findings.  The vehicle file holds physical
-    values; `prediction` is what predicts better, if anything does.
+    `parameters` are the nominal six beside the findings.
     """
 
     verdict: Explanation
@@ -110,10 +109,14 @@ class Diagnosis:
     validation: Validation
     remainder: Remainder
     parameters: tuple[Parameter, ...]
-    vehicle_yaml: str
+    vehicle: Vehicle
     vehicle_name: str
     warnings: tuple[str, ...] = field(default_factory=tuple)
-    prediction: Prediction | None = None
+
+    @property
+    def vehicle_yaml(self) -> str:
+        """The extended vehicle as a file."""
+        return self.vehicle.to_yaml()
 
     @property
     def unexplained(self) -> dict[str, float]:
@@ -146,8 +149,6 @@ class Diagnosis:
             "unexplained": self.unexplained,
             "unexplained_follows": self.unexplained_follows,
             "vehicle_file": None,
-            "prediction": None if self.prediction is None else self.prediction.to_dict(),
-            "prediction_file": None,
             "warnings": list(self.warnings),
         }
 

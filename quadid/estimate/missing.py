@@ -9,7 +9,7 @@ miss what a wrong one does.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -21,14 +21,18 @@ from quadid.estimate.problem import Problem
 from quadid.estimate.track import from_window
 from quadid.estimate.whole_model import WholeModel
 from quadid.model.layout import Layout
+from quadid.rotation import conjugate, rotated
 from quadid.types import FloatArray
-from quadid.vehicle import GRAVITY, Vehicle
+from quadid.vehicle import GRAVITY, RandomForces, RandomInput, Vehicle
 
 ROUNDS = 2
 """Filter passes between which effects are simulated anew along the filtered states."""
 RESIZING = 10
 """Most steps to the size of the random forces."""
 _SIZES = (np.arange(k.N_NOISE) >= k.SIGMA) & (np.arange(k.N_NOISE) < k.SIGMA + 4)
+MOTIONS = ("v_x", "v_y", "v_z", "p", "q", "r")
+FACTORS = (*MOTIONS, "W", "V")
+"""Signals of `quadid.vehicle.SIGNALS` beside what is missing: none is the rotors' own thrust or torque."""
 TRIMMING = 3
 """Steps that trim moment and biases of a flight take: the likelihood is nearly a parabola in them."""
 
@@ -44,8 +48,10 @@ class Missing:
         moment: smoothed random moment [N m], shape (n, 3).
         moment_sigma: its standard deviation, shape (n, 3).
         control: rotor moments [N m] at each time, shape (n, 3).
+        factors: values of `FACTORS` at each time, shape (n, 8); a velocity that nobody measured is about zero.
         weight: [N].
-        times: correlation times of the random force and moment [s], shape (6,).
+        sizes: standard deviations of the random specific force and angular acceleration [m/s^2, rad/s^2], shape (6,).
+        times: their correlation times [s], shape (6,).
         innovation: of gyro, attitude (rotation vector), accelerometer, velocity, in their units, shape (n, 12); not a
             number where not measured.
         innovation_sigma: its standard deviation, shape (n, 12).
@@ -57,10 +63,20 @@ class Missing:
     moment: FloatArray
     moment_sigma: FloatArray
     control: FloatArray
+    factors: FloatArray
     weight: float
+    sizes: FloatArray
     times: FloatArray
     innovation: FloatArray
     innovation_sigma: FloatArray
+
+    def rows(self, first: int, last: int) -> Missing:
+        """Rows `first` to before `last`."""
+        names = (
+            "t", "force", "force_sigma", "moment", "moment_sigma", "control", "factors", "innovation",
+            "innovation_sigma",
+        )  # fmt: skip
+        return replace(self, **{name: getattr(self, name)[first:last] for name in names})
 
 
 def smoothed(found: Estimate) -> list[Missing]:
@@ -78,6 +94,10 @@ def _smoothed(problem: Problem, z: FloatArray, psi: FloatArray) -> list[Missing]
         scale = np.concatenate([np.full(3, track.mass), p[k.JX : k.JX + 3]])
         square = 0.5 * (g.table[:, 1:4] + g.table[:, k.MOMENTS + 1 : k.MOMENTS + 4])
         control = square[:, [1, 0, 2]] * [-p[k.B], p[k.B], p[k.D]]
+        wind = problem.vehicle.effects.get("wind", {})
+        air = g.mean[:, 7:10] - [wind.get("north", 0.0), wind.get("east", 0.0), 0.0]
+        body = rotated(conjugate(g.mean[:, :4]), air)
+        speeds = 0.5 * (g.table[:, 5] + g.table[:, k.MOMENTS + 5])
         acted, spread = scale * mean[:, :6], scale * sigma[:, :6]
         out.append(
             Missing(
@@ -87,7 +107,9 @@ def _smoothed(problem: Problem, z: FloatArray, psi: FloatArray) -> list[Missing]
                 acted[:, 3:],
                 spread[:, 3:],
                 control,
+                np.column_stack([body, g.mean[:, 4:7], speeds, np.linalg.norm(body, axis=1)]),
                 track.mass * GRAVITY,
+                psi[k.SIGMA + np.array([0, 0, 1, 2, 2, 3])],
                 psi[k.TIME + np.array([0, 0, 1, 2, 2, 3])],
                 np.where(g.S > 0.0, g.nu, np.nan),
                 np.sqrt(g.S),
@@ -106,33 +128,60 @@ class Vehicles:
     def __init__(self, windows: Sequence[Window], vehicle: Vehicle, theta: FloatArray) -> None:
         """Estimates the noise numbers beside a parameter vector of `quadid.model`, from its liveliest minute."""
         self.vehicle = vehicle
-        problem, z = self._settled(windows, theta, None)
+        problem, z = settled(windows, vehicle, theta, None)
         _, self.psi, *_ = scoring(problem.liveliest(NEAR_SECONDS), z, problem.first_noise(), MOST, ALL_NOISE)
 
-    def missing(self, windows: Sequence[Window], theta: FloatArray) -> list[Missing]:
-        """Missing force and moment of a parameter vector on these flights, which need not be those of the noise."""
-        problem, z = self._settled(windows, theta, self.psi)
+    def missing(self, windows: Sequence[Window], theta: FloatArray, vehicle: Vehicle | None = None) -> list[Missing]:
+        """Missing force and moment of a parameter vector on these flights, which need not be those of the noise.
+
+        Args:
+            windows: the flights.
+            theta: full parameter vector.
+            vehicle: whose vector that is, where it is not that of the noise.
+        """
+        problem, z = settled(windows, vehicle or self.vehicle, theta, self.psi)
         part = problem.liveliest(NEAR_SECONDS)
         _, psi, *_ = scoring(part, z, self.psi, RESIZING, _SIZES)
         return _smoothed(problem, z, psi)
 
-    def _settled(
-        self, windows: Sequence[Window], theta: FloatArray, psi: FloatArray | None
-    ) -> tuple[Problem, FloatArray]:
-        """The problem with fixed physics, effects simulated along its filtered states, and trim and biases."""
-        neutral = Layout(self.vehicle).neutral()
-        plain = bool(np.all(theta[6:] == neutral[6:]))
-        tracks = [from_window(w, self.vehicle, air=not plain) for w in windows]
-        problem = Problem.fixed(tracks, self.vehicle, theta[:6])
-        z, noise = problem.start(), problem.first_noise() if psi is None else psi
-        if not plain:
-            models = [WholeModel(w, self.vehicle, theta) for w in windows]
-            for _ in range(ROUNDS):
-                _, gains = problem.passes(z, noise)
-                problem = problem.beside([m.beyond(t, problem.physics(z, j), g.mean) for j, (m, t, g) in
-                                          enumerate(zip(models, problem.tracks, gains, strict=True))])  # fmt: skip
-        z, *_ = scoring(problem, z, noise, TRIMMING, NO_NOISE)
-        return problem, z
+
+def settled(
+    windows: Sequence[Window], vehicle: Vehicle, theta: FloatArray, psi: FloatArray | None
+) -> tuple[Problem, FloatArray]:
+    """The problem of a model with fixed physics, and trim and biases of each flight, fitted.
+
+    Args:
+        windows: the flights.
+        vehicle: geometry and mass.
+        theta: full parameter vector; effects are simulated along the filtered states.
+        psi: noise numbers; None: the first guess.
+    """
+    air = _has_effects(vehicle, theta)
+    problem = Problem.fixed([from_window(w, vehicle, air=air) for w in windows], vehicle, theta[:6])
+    z, noise = problem.start(), problem.first_noise() if psi is None else psi
+    problem = simulated_along(problem, windows, theta, z, noise)
+    z, *_ = scoring(problem, z, noise, TRIMMING, NO_NOISE)
+    return problem, z
+
+
+def simulated_along(
+    problem: Problem, windows: Sequence[Window], theta: FloatArray, z: FloatArray, psi: FloatArray
+) -> Problem:
+    """The problem with what effects of a full parameter vector add along its filtered states."""
+    if not _has_effects(problem.vehicle, theta):
+        return problem
+    models = [WholeModel(w, problem.vehicle, theta) for w in windows]
+    for _ in range(ROUNDS):
+        _, gains = problem.passes(z, psi)
+        problem = problem.beside([
+            m.beyond(t, problem.physics(z, j), g.mean)
+            for j, (m, t, g) in enumerate(zip(models, problem.tracks, gains, strict=True))
+        ])  # fmt: skip
+    return problem
+
+
+def _has_effects(vehicle: Vehicle, theta: FloatArray) -> bool:
+    return bool(np.any(theta[6:] != Layout(vehicle).neutral()[6:]))
 
 
 def size(parts: Sequence[Missing], force: bool) -> tuple[FloatArray, FloatArray]:
@@ -150,6 +199,18 @@ def size(parts: Sequence[Missing], force: bool) -> tuple[FloatArray, FloatArray]
     spread = Z95 * np.sqrt(np.mean(4.0 * value**2 * sigma**2 + 2.0 * sigma**4, axis=0) / independent)
     interval = np.sqrt(np.maximum([square - spread, square + spread], 0.0))
     return np.sqrt(square), interval
+
+
+def random_forces(parts: Sequence[Missing]) -> RandomForces:
+    """Random force and moment of flights together: mean squares, and the correlation times of the first."""
+    seconds = [float(m.t[-1] - m.t[0]) for m in parts]
+    sizes = np.sqrt(np.average([m.sizes**2 for m in parts], axis=0, weights=seconds))
+    inputs = [RandomInput(sigma=_short(sizes[i]), time=_short(parts[0].times[i])) for i in (0, 2, 3, 5)]
+    return RandomForces(horizontal=inputs[0], vertical=inputs[1], roll_pitch=inputs[2], yaw=inputs[3])
+
+
+def _short(value: float) -> float:
+    return float(f"{value:.4g}")
 
 
 def control_size(parts: Sequence[Missing]) -> FloatArray:

@@ -32,7 +32,7 @@ _CHUNK = 256
 
 
 class OpenLoop:
-    """Runs of one window, from every n-th row with a measured rate.
+    """Runs of one window, from every row with a measured rate.
 
     Attributes:
         window: the data.
@@ -42,12 +42,12 @@ class OpenLoop:
         rows: where runs start, shape (starts,).
     """
 
-    def __init__(self, window: Window, vehicle: Vehicle, longest: int, every: int = 1) -> None:
+    def __init__(self, window: Window, vehicle: Vehicle, longest: int) -> None:
         """Finds the starts; raises WindowError when rotor columns do not match the vehicle."""
         self.window, self.longest = window, longest
         self.known, self.padded = _finite(window), _padded(window)
         self._rollout = Rollout(self.padded, vehicle)
-        self.rows = np.flatnonzero(self.known["gyro"][: max(len(window) - longest, 0)])[::every]
+        self.rows = np.flatnonzero(self.known["gyro"][: max(len(window) - longest, 0)])
 
     def counted(self, rows: IndexArray, at: IndexArray) -> BoolArray:
         """Which quantities of runs from `rows` count `at` samples after the start, shape (rows, at, 4).

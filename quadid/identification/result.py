@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-from quadid.identification.identifiability import Fit
+from quadid.identification.identifiability import Fit, possible_moments
 from quadid.identification.prediction import SUM_TO, HorizonScore
 from quadid.identification.score import SetScore
 from quadid.model.layout import Layout
@@ -19,6 +19,8 @@ from quadid.vehicle import ParameterPrior, Vehicle
 
 NOTHING_NEW = 0.9
 """Share of the information that the prior brings, above which the data add nothing."""
+CORRELATED = 0.01
+"""Least correlation that a file tells."""
 _DIGITS = 7
 """Significant digits of a fitted vehicle file; far below any interval."""
 
@@ -122,18 +124,26 @@ def answered(parameters: ParameterSet) -> bool:
 
 
 def fitted_vehicle(fit: Fit) -> Vehicle:
-    """The vehicle with fitted values as initial guess, their standard deviations, fitted effects."""
+    """The vehicle with fitted values as initial guess, their standard deviations and correlations, fitted effects."""
     effects = [p.name.split(".")[0] for p in fit.parameters if p.name not in NOMINAL_NAMES]
-    return with_values(fit.vehicle, fit.parameters, effects, fit.theta)
+    out = with_values(fit.vehicle, fit.parameters, effects, fit.theta)
+    names, found = fit.parameters.names, fit.parameters.correlation
+    known = [i for i, n in enumerate(names) if n in NOMINAL_NAMES and out.parameters[n].sigma is not None]
+    together = {
+        names[i]: {names[j]: round(float(found[i, j]), 3) for j in known if j < i and abs(found[i, j]) >= CORRELATED}
+        for i in known
+    }  # fmt: skip
+    return out.model_copy(update={"correlation": {one: others for one, others in together.items() if others}})
 
 
 def with_values(
     vehicle: Vehicle, parameters: Iterable[Parameter], effects: Iterable[str] = (), theta: FloatArray | None = None
 ) -> Vehicle:
-    """The vehicle with these nominal values as initial guess; bounds are kept unless a value lies outside.
+    """The vehicle with the identified nominal values as initial guess, their bounds kept unless a value lies outside.
 
-    Only values that this flight or an earlier one measured carry their standard deviation: a guess, or a number of a
-    model that misses the flight, never becomes a sharp prior of the next fit.
+    Any other value stays as the vehicle has it, without a standard deviation: a guess, or a number of a model that
+    misses the flight, never becomes a sharp prior of the next fit.  A moment of inertia that no rigid body has beside
+    those identified moves as far as it must.
 
     Args:
         vehicle: the vehicle.
@@ -141,21 +151,23 @@ def with_values(
         effects: which it has besides, or with other numbers.
         theta: full parameter vector that holds the numbers of these.
     """
-    priors = {p.name: _prior(vehicle.parameters[p.name], p) for p in parameters if p.name in NOMINAL_NAMES}
+    nominal = [p for p in parameters if p.name in NOMINAL_NAMES]
+    kept = {p.name: vehicle.parameters[p.name].initial for p in nominal if p.status is not Status.IDENTIFIED}
+    written, _ = possible_moments(tuple(replace(p, value=kept.get(p.name, p.value)) for p in nominal))
+    priors = {p.name: _prior(vehicle.parameters[p.name], p) for p in written}
     found = {name: dict(values) for name, values in vehicle.effects.items()}
     if theta is not None:
         layout = Layout(vehicle)
         for name in effects:
             found[name] = {k: _rounded(v) for k, v in layout.read_effect(theta, name).items() if math.isfinite(v)}
-    return vehicle.model_copy(update={"parameters": {**vehicle.parameters, **priors}, "effects": found})
+    told = {"parameters": {**vehicle.parameters, **priors}, "effects": found, "correlation": {}}
+    return vehicle.model_copy(update=told)
 
 
 def _prior(given: ParameterPrior, p: Parameter) -> ParameterPrior:
-    value = _rounded(p.value)
-    measured = p.status is Status.IDENTIFIED or (p.status is Status.PRIOR_DOMINATED and p.measured_before)
-    known = measured and math.isfinite(p.sigma) and p.sigma > 0.0
-    given_bounds = given.bounds if measured else given.limits  # what is not known does not move the next fit's box
-    bounds = given_bounds and (min(given_bounds[0], value), max(given_bounds[1], value))
+    value = given.initial if p.value == given.initial else _rounded(p.value)
+    known = p.status is Status.IDENTIFIED and math.isfinite(p.sigma) and p.sigma > 0.0
+    bounds = given.bounds and (min(given.bounds[0], value), max(given.bounds[1], value))
     return ParameterPrior(initial=value, bounds=bounds, sigma=_rounded(p.sigma) if known else None)
 
 

@@ -29,7 +29,7 @@ from quadid.model.work_array import (
 # Factors: `quadid.vehicle.SIGNALS`, in this order; 0 stands for the constant one.
 
 
-N_SIGNALS = 15
+N_SIGNALS = 13
 
 
 @nb.njit(**exact)
@@ -56,12 +56,9 @@ def residual_signals(s: FloatArray, signals: FloatArray) -> None:
         signals[1, lane], signals[2, lane], signals[3, lane] = u, v, w
         signals[4, lane], signals[5, lane], signals[6, lane] = s[X_P + lane], s[X_Q + lane], s[X_R + lane]
         signals[7, lane], signals[8, lane], signals[9, lane] = gx, gy, gz
-        b, d = 0.5 * s[C_B + lane], 0.5 * s[C_D + lane]
-        signals[10, lane] = b * (s[A_S2 + lane] + s[A_S2 + HALF + lane])
-        signals[11, lane] = -b * (s[A_Y2 + lane] + s[A_Y2 + HALF + lane])
-        signals[12, lane] = b * (s[A_X2 + lane] + s[A_X2 + HALF + lane])
-        signals[13, lane] = d * (s[A_Z2 + lane] + s[A_Z2 + HALF + lane])
-        signals[14, lane] = math.sqrt(u * u + v * v + w * w)
+        signals[10, lane] = 0.5 * s[C_B + lane] * (s[A_S2 + lane] + s[A_S2 + HALF + lane])
+        signals[11, lane] = 0.5 * (s[A_S1 + lane] + s[A_S1 + HALF + lane])
+        signals[12, lane] = math.sqrt(u * u + v * v + w * w)
 
 
 @nb.njit(**jit)

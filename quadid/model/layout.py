@@ -107,9 +107,9 @@ class Layout:
                       p.typical, p.sign) for i in range(self.rotors)
             )  # fmt: skip
         entries.extend(
-            Entry(f"residual.{i + 1}", LOSS + 2 * self.rotors + i, term.unit, 0.0, -math.inf, math.inf,
-                  term.typical(vehicle.mass * GRAVITY, vehicle.arm)) for i, term in enumerate(vehicle.residual)
-        )  # fmt: skip
+            Entry(f"residual.{i + 1}", LOSS + 2 * self.rotors + i, term.unit, 0.0, -math.inf, math.inf, 1.0)
+            for i, term in enumerate(vehicle.residual)
+        )
         self.entries = {e.name: e for e in entries}
 
     def entry(self, name: str) -> Entry:

@@ -207,12 +207,7 @@ def _residual(s: Scene) -> None:
     """Terms beyond the catalogue: products of signals before battery, ground and centre of gravity."""
     if not s.residual:
         return
-    pull = [(x, y, f) for (x, y, _), f in zip(s.hubs, s.thrust, strict=True)]
-    turned = (
-        -sum(y * f for _, y, f in pull), sum(x * f for x, _, f in pull),
-        sum(k * t for k, t in zip(s.spins, s.torque, strict=True)),
-    )  # fmt: skip
-    signals = [1.0, *s.air, *s.rate, *s.down, sum(s.thrust), *turned, _speed(s)]
+    signals = [1.0, *s.air, *s.rate, *s.down, sum(s.thrust), sum(s.omega), _speed(s)]
     for i, (target, factors) in enumerate(s.residual):
         value = s.th[ix.LOSS + 2 * len(s.omega) + i]
         for k in factors:

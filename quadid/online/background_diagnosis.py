@@ -60,7 +60,7 @@ class DiagnosisRequest(Job):
         """Diagnoses the windows."""
         from quadid.diagnosis import diagnose  # a large import that only the process which diagnoses needs
 
-        result, _ = diagnose(self.windows, self.vehicle, seed=self.seed, swarm=True, predict=False)
+        result, _ = diagnose(self.windows, self.vehicle, seed=self.seed, swarm=True)
         findings = tuple(_online(f, self.slow) for f in result.findings)
         return DiagnosisReply(self.number, "", findings, result.verdict.value)
 

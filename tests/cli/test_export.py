@@ -13,8 +13,9 @@ import numpy as np
 import pytest
 
 from quadid.app.init import init as begin
+from quadid.errors import VehicleError
 from quadid.report.programs import FORMATS, export
-from quadid.vehicle import GRAVITY, Command, ParameterPrior, Proof, ResidualTerm, Vehicle
+from quadid.vehicle import GRAVITY, Command, ParameterPrior, Proof, RandomForces, RandomInput, ResidualTerm, Vehicle
 from tests.cli.conftest import Cli, one_line
 
 SPEED = 900.0
@@ -188,6 +189,28 @@ def test_every_form_from_the_command_line(inside: Cli, tmp_path: Path, form: str
     assert any("max_speed" in text for text in result["warnings"]) == (form in ("px4", "ardupilot"))
 
 
+def test_random_forces_survive_the_own_form_and_their_keys_are_named(inside: Cli, tmp_path: Path) -> None:
+    random = {
+        "horizontal": {"sigma": 0.31, "time": 0.5}, "vertical": {"sigma": 0.1, "time": 0.4},
+        "roll_pitch": {"sigma": 2.0, "time": 0.2}, "yaw": {"sigma": 0.3, "time": 1.5},
+    }  # fmt: skip
+    file = tmp_path / "mine.yaml"
+    text = Vehicle.shipped("pelican").to_yaml()
+    file.write_text(text + f"random: {json.dumps(random)}\n", encoding="utf-8")
+    run = inside("export", "--vehicle", file, "--format", "yaml", "--out", tmp_path / "out", "--json", "-")
+    written = Path(run.data["files"][0]).read_text(encoding="utf-8")
+    again = Vehicle.from_yaml(written).random
+    assert again is not None
+    assert again.model_dump() == random
+    assert "roll_pitch: {sigma: 2.0, time: 0.2}" in written
+    for slip, told in (("vertikal", "did you mean 'vertical'"), ("sgima", "did you mean 'sigma'")):
+        broken = {**random, "vertikal": random["yaw"]} if slip == "vertikal" else {**random, "yaw": {"sgima": 1.0}}
+        with pytest.raises(VehicleError, match=told):
+            Vehicle.from_yaml(text + f"random: {json.dumps(broken)}\n")
+    with pytest.raises(VehicleError, match=r"random\.yaw\.time"):
+        Vehicle.from_yaml(text + f"random: {json.dumps({**random, 'yaw': {'sigma': 0.1, 'time': 0.0}})}\n")
+
+
 def test_unknown_form(inside: Cli, tmp_path: Path) -> None:
     assert "did you mean 'px4'?" in one_line(
         inside("export", "--vehicle", "pelican", "--format", "px5", "--out", tmp_path), 2
@@ -278,6 +301,24 @@ def test_isaac_lab_ranges_are_the_intervals(vehicle: Vehicle) -> None:
     thrust, moment = _wrench(vehicle, speeds)
     force = np.array(space["ALLOCATION_MATRIX"]) @ (2.3e-5 * speeds**2)
     np.testing.assert_allclose(force, [0.0, 0.0, thrust, *moment * [1.0, -1.0, -1.0]], rtol=1e-6, atol=1e-9)
+
+
+def test_isaac_lab_randomises_over_what_acts_at_random(vehicle: Vehicle) -> None:
+    random = RandomForces(
+        horizontal=RandomInput(sigma=0.3, time=0.5), vertical=RandomInput(sigma=0.1, time=0.4),
+        roll_pitch=RandomInput(sigma=2.0, time=0.2), yaw=RandomInput(sigma=0.5, time=1.5),
+    )  # fmt: skip
+    gusty = vehicle.model_copy(update={"random": random})
+    facts: dict[str, Any] = {}
+    text = next(iter(export(gusty, "isaac-lab", "x").values()))
+    exec(text.replace("from isaaclab_contrib.actuators import ThrusterCfg", "ThrusterCfg = dict"), facts)
+    J = [vehicle.parameters[n].initial for n in ("J_xx", "J_yy", "J_zz")]
+    np.testing.assert_allclose(facts["RANDOM_FORCE_STD"], vehicle.mass * np.array([0.3, 0.3, 0.1]), rtol=1e-6)
+    np.testing.assert_allclose(facts["RANDOM_TORQUE_STD"], np.array(J) * [2.0, 2.0, 0.5], rtol=1e-6)
+    assert facts["RANDOM_FORCE_TIME"] == (0.5, 0.5, 0.4)
+    assert facts["RANDOM_TORQUE_TIME"] == (0.2, 0.2, 1.5)
+    assert "RANDOM" not in next(iter(export(vehicle, "isaac-lab", "x").values()))
+    assert "random" in "".join(export(gusty, "px4", "x").values()).split("no place here")[1].split("\n")[0]
 
 
 def test_px4_hover_is_what_px4_itself_learned_in_a_recorded_flight(data_dir: Path) -> None:

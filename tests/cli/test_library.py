@@ -28,7 +28,7 @@ from quadid.jsonable import jsonable
 from quadid.vehicle import Vehicle
 from tests.cli.conftest import Cli, Flights, one_line
 
-WRITTEN = ("vehicle_file", "prediction_file", "report", "files", "file", "log", "manoeuvre_file")
+WRITTEN = ("vehicle_file", "report", "files", "file", "log", "manoeuvre_file")
 """Paths of files, which only a command writes."""
 
 
@@ -347,8 +347,8 @@ def test_a_healthy_flight_has_a_table_of_changes_without_rows() -> None:
         (lambda log: quadid.diagnose(log, vehicle="pelican", seed=cast(int, 1.5)), "seed 1.5"),
         (lambda log: quadid.score(log, vehicle="pelican", horizons=cast(list[int], [1.5])), "horizons [1.5]"),
         (
-            lambda log: quadid.score(log, vehicle="pelican", horizons=cast(list[int], "1,10")),
-            "horizons ['1', ',', '1', '0']",
+            lambda log: quadid.score(log, vehicle="pelican", horizons="1;10"),
+            "--horizons 1;10",
         ),
         (lambda log: compare(log, vehicle="pelican", seeds=range(0)), "no seed"),
         (lambda log: compare(log, vehicle="pelican", budget=3), "budget 3"),

@@ -31,6 +31,14 @@ def test_a_red_fit_writes_guesses(logs: tuple[Path, Path], tmp_path: Path) -> No
     file = fit.vehicle.save(tmp_path / "red.yaml")
     again = Vehicle.from_yaml(file.read_text(encoding="utf-8"))
     assert all(p.sigma is None for p in again.parameters.values())
+    # What is not identified is as the former file has it.
+    former, doubtful = (
+        Vehicle.shipped("pelican").parameters,
+        {p.name for p in fit.parameters if p.status != "identified"},
+    )
+    assert doubtful
+    assert {n: again.parameters[n] for n in doubtful} == {n: former[n] for n in doubtful}
+    assert again.random is not None
     assert again.proof is not None
     assert again.proof.unseen == (unseen.name,)
     with pytest.raises(QuadidError, match="--anyway"):
@@ -88,7 +96,9 @@ def test_a_prior_that_decides_is_named(flown: tuple[Path, Path, Path]) -> None:
     # The next file rests on both flights and says so.
     assert second.vehicle.proof is not None
     assert [flight.log for flight in second.vehicle.proof.fitted] == ["6.csv", "5.csv"]
-    assert second.vehicle.parameters["b"].sigma is not None
+    # What this flight did not identify stays as the former file has it, and only that file knows how sure it was.
+    former, written = Vehicle.from_yaml(fitted.read_text(encoding="utf-8")).parameters["b"], second.vehicle.parameters
+    assert written["b"] == former.model_copy(update={"sigma": None})
 
 
 def test_a_file_is_not_proven_on_its_own_flight(flown: tuple[Path, Path, Path]) -> None:

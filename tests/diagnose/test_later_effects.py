@@ -41,7 +41,7 @@ def diagnosed(craft: Vehicle, extras: tuple[str, ...], hidden: dict[str, dict[st
     truth, seconds = draw_truth(craft, SEED), 60.0 if "weak_rotor" in hidden else 40.0
     train, unseen = (fly(craft, truth, seconds, SEED + k, effects=hidden, extras=extras).window for k in range(2))
     vehicle = craft.model_copy(update={"parameters": guessed(truth, SEED).parameters})
-    return diagnose([train], vehicle, [unseen], seed=SEED, predict=False)[0]
+    return diagnose([train], vehicle, [unseen], seed=SEED)[0]
 
 
 @pytest.mark.parametrize("case", FLOWN)

@@ -31,7 +31,7 @@ def test_lag_drag_and_its_moment_of_a_crazyflie_seen_through_its_commands(data_d
     folder = data_dir / "crazyflie_rpm"
     vehicle = Vehicle.from_yaml((folder / "vehicle_pwm.yaml").read_text(encoding="utf-8"))
     train = windows_of(folder, vehicle, "figure8_22_pwm")
-    found, _ = diagnose(train, vehicle, windows_of(folder, vehicle, "figure8_35_pwm"), predict=False)
+    found, _ = diagnose(train, vehicle, windows_of(folder, vehicle, "figure8_35_pwm"))
     values = {f.effect: {p.name: p.value for p in f.parameters} for f in found.findings}
     assert {"rotor_drag", "rotor_drag_moment"} <= set(values), values
     late = values.get("motor_lag", {}).get("tau", 0.0) + values.get("command_delay", {}).get("delay", 0.0)
@@ -42,7 +42,7 @@ def test_lag_drag_and_its_moment_of_a_crazyflie_seen_through_its_commands(data_d
 def test_inertias_beside_causes_that_leave_much_are_identified_only_where_estimates_agree(data_dir: Path) -> None:
     """A half of the Iris's flight in which little rolls: causes are found, but the model still misses it."""
     vehicle = Vehicle.from_yaml((data_dir / "iris" / "vehicle.yaml").read_text(encoding="utf-8"))
-    found, _ = diagnose(windows_of(data_dir / "iris", vehicle, "pitch_yaw"), vehicle, predict=False)
+    found, _ = diagnose(windows_of(data_dir / "iris", vehicle, "pitch_yaw"), vehicle)
     assert found.findings
     for p in found.parameters:
         if p.name in IRIS_J:
@@ -75,7 +75,7 @@ def test_a_healthy_crazyflie_has_no_strong_rotor_and_its_thrust_coefficient(data
     folder = data_dir / "crazyflie_rpm"
     vehicle = Vehicle.from_yaml((folder / "vehicle.yaml").read_text(encoding="utf-8"))
     train = windows_of(folder, vehicle, "figure8_22", "figure8_34")
-    found, _ = diagnose(train, vehicle, windows_of(folder, vehicle, "figure8_30"), predict=False)
+    found, _ = diagnose(train, vehicle, windows_of(folder, vehicle, "figure8_30"))
     assert not any(f.effect == "weak_rotor" and f.confident for f in found.findings)
     b = next(p for p in found.parameters if p.name == "b")
     assert b.status is not Status.IDENTIFIED or b.ci95[0] < 3.811e-8 and b.ci95[1] > 3.589e-8

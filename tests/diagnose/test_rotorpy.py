@@ -16,7 +16,7 @@ SECONDS = 12.0
 
 def diagnosed(flight: RotorpyFlight) -> tuple[dict[str, dict[str, float]], dict[str, float], Diagnosis]:
     """Findings by effect, fitted nominal parameters, and the whole result."""
-    result, _ = diagnose([flight.window], flight.vehicle, predict=False)
+    result, _ = diagnose([flight.window], flight.vehicle)
     findings = {f.effect: {p.name: p.value for p in f.parameters} for f in result.findings}
     fitted = Vehicle.from_yaml(result.vehicle_yaml)
     return findings, {name: p.initial for name, p in fitted.parameters.items()}, result

@@ -30,7 +30,7 @@ def diagnosed(seed: int = SEED, **effects: dict[str, float]) -> Diagnosis:
     """
     truth = draw_truth(PELICAN, seed)
     window = fly(PELICAN, truth, 60.0, seed, effects=effects, outside=GUSTS).window
-    return diagnose([window], guessed(truth, seed), predict=False)[0]
+    return diagnose([window], guessed(truth, seed))[0]
 
 
 def errors(found: Diagnosis, seed: int = SEED) -> dict[str, float]:

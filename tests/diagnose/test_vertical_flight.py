@@ -43,7 +43,7 @@ def climbing(hidden: dict[str, dict[str, float]], seed: int) -> Window:
 def test_in_climbs_and_descents_what_was_hidden_is_named_alone_with_its_size(case: str) -> None:
     hidden = HIDDEN[case]
     vehicle = PELICAN.model_copy(update={"parameters": guessed(draw_truth(PELICAN, SEED), SEED).parameters})
-    found = diagnose([climbing(hidden, SEED)], vehicle, [climbing(hidden, SEED + 1)], seed=SEED, predict=False)[0]
+    found = diagnose([climbing(hidden, SEED)], vehicle, [climbing(hidden, SEED + 1)], seed=SEED)[0]
     assert sorted(confident(found)) == sorted(hidden), found.to_dict()
     for effect, values in hidden.items():
         for name, value in values.items():

@@ -35,7 +35,28 @@ def test_only_identified_values_are_written_with_a_sigma(found: Fit) -> None:
     assert written["b"].sigma is None
     assert written["d"].sigma is None
     assert written["J_xx"].sigma is not None
-    assert written["b"].initial == pytest.approx(b, rel=1e-6)
+    given = found.vehicle.parameters
+    for name in ("b", "d"):  # as the former file has them
+        assert (written[name].initial, written[name].bounds) == (given[name].initial, given[name].bounds)
+    assert written["J_xx"].initial == pytest.approx(found.parameters["J_xx"].value, rel=1e-6)
+    # Correlations are those between what has a sigma, in and out of the file.
+    file = Vehicle.from_yaml(fitted_vehicle(doubtful).to_yaml())
+    assert not {"b", "d"} & {n for one, others in file.correlation.items() for n in (one, *others)}
+    known = [found.parameters.names.index(n) for n in ("J_xx", "J_yy")]
+    expected = found.parameters.covariance[np.ix_(known, known)]
+    np.testing.assert_allclose(file.covariance[2:4, 2:4], expected, atol=0.012 * expected[0, 0])
+
+
+def test_a_guess_beside_identified_moments_stays_a_rigid_body(found: Fit) -> None:
+    J_zz = found.vehicle.parameters["J_zz"].initial
+    small = changed(
+        found, J_xx=(0.1 * J_zz, Status.IDENTIFIED), J_yy=(0.1 * J_zz, Status.IDENTIFIED),
+        J_zz=(J_zz, Status.UNRELIABLE),
+    )  # fmt: skip
+    written = Vehicle.from_yaml(fitted_vehicle(small).to_yaml()).parameters
+    assert written["J_zz"].initial == pytest.approx(0.2 * J_zz)
+    assert written["J_zz"].sigma is None
+    assert written["J_xx"].sigma is not None
 
 
 def test_what_no_channel_shows_keeps_the_guess_without_a_sigma(found: Fit) -> None:
@@ -54,7 +75,8 @@ def test_a_guess_that_no_rigid_body_has_is_moved_and_said(found: Fit) -> None:
     assert moved.parameters["J_xx"] == wrong.parameters["J_xx"]
     assert any(w.startswith("J_zz: moved from") for w in moved.warnings)
     text = fitted_vehicle(moved).to_yaml()
-    assert Vehicle.from_yaml(text, "moved").parameters["J_zz"].initial == pytest.approx(moved.parameters["J_zz"].value)
+    guess = found.vehicle.parameters["J_zz"].initial
+    assert Vehicle.from_yaml(text, "moved").parameters["J_zz"].initial == pytest.approx(guess)
 
 
 def test_identified_values_that_no_rigid_body_has_are_not_left_identified(found: Fit) -> None:

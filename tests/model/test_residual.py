@@ -12,7 +12,6 @@ from quadid.vehicle import SIGNALS, TARGETS, ResidualTerm, Vehicle
 from tests.model.test_lanes import noisy_window
 
 PELICAN = Vehicle.shipped("pelican")
-SIGNAL_SIZES = {"T": 12.0, "tau_x": 0.3, "tau_y": 0.3, "tau_z": 0.05}
 
 
 def with_terms(*terms: tuple[str, tuple[str, ...], float]) -> Vehicle:
@@ -68,6 +67,7 @@ def test_a_term_survives_the_vehicle_file_and_says_its_formula() -> None:
     [
         ("{acts_on: moment_w, value: 1.0}", "moment_"),
         ("{acts_on: moment_x, product: [v_w], value: 1.0}", "v_"),
+        ("{acts_on: moment_x, product: [tau_x], value: -1.0}", "signal 'tau_x' is none of"),
         ("{acts_on: moment_x, product: [p, q, r, p], value: 1.0}", "residual"),
         ("{acts_on: moment_x, product: [p], value: .nan}", "residual"),
     ],

@@ -47,7 +47,7 @@ CASES = {"nominal": {}, **EFFECT, "all": ALL}
 RESIDUAL = (
     ResidualTerm(acts_on="force_y", product=("v_y", "V"), value=-0.02),
     ResidualTerm(acts_on="moment_x", product=("p", "T", "g_z"), value=1e-4),
-    ResidualTerm(acts_on="moment_z", product=("tau_x", "tau_z"), value=0.01),
+    ResidualTerm(acts_on="moment_z", product=("r", "W"), value=-1e-6),
 )
 
 

@@ -227,7 +227,7 @@ def _own(flown: Protocol, seed: int, advance: Advance) -> tuple[Fit, Diagnosis, 
 
     train, unseen = flown.sets[0], [w for windows in flown.sets[1:] for w in windows]
     found = fit(train, flown.vehicle, FitOptions(seed=seed), progress=lambda stage, share: advance(stage, share))
-    diagnosis, search = diagnose(train, flown.vehicle, unseen, seed, advance, predict=False)
+    diagnosis, search = diagnose(train, flown.vehicle, unseen, seed, advance)
     # One noise for all columns: that which the better model leaves.
     noise = search.shooting.noise
     return replace(found, noise=noise), diagnosis, search.model.theta, noise

@@ -48,7 +48,7 @@ def study(case: Case) -> Record:
     key = {"group": case.group, "number": case.number, "effects": list(case.expected)}
     try:
         window, _, vehicle = flown(case)
-        found, search = diagnose([window], vehicle, seed=case.seed, predict=False)
+        found, search = diagnose([window], vehicle, seed=case.seed)
     except (FlightError, QuadidError) as error:
         return key | {"verdict": "failed", "note": str(error)}
     key |= {"verdict": found.verdict.value, "named": [f.effect for f in found.findings if f.confident]}

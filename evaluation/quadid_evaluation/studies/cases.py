@@ -43,7 +43,7 @@ def row(folder: Path, answer: dict[str, Any]) -> tuple[bool, str]:
     """Diagnoses one case; returns whether it is right and its table row."""
     vehicle = Vehicle.from_yaml((folder / "vehicle.yaml").read_text(encoding="utf-8"))
     train, held = (windows(folder / f"{flight}.csv", vehicle) for flight in ("train", "validate"))
-    found, _ = diagnose(train, vehicle, held, predict=False)
+    found, _ = diagnose(train, vehicle, held)
     truth = {name: answer["truth"].get(name, {}) for name in answer["effects"]}
     named = ", ".join(
         " ".join([f.effect, *(f"{values[k]:.4g}" for k in truth.get(f.effect, {}) if k in values)])

@@ -81,7 +81,7 @@ def ask(flight: Flight, given: Given, variant: str, memory: Memory) -> Answer:
     memory.asked = 0
     try:
         seed = 0 if flight.case is None else flight.case.seed
-        found, _ = diagnose(train, vehicle, held, seed, predict=False)
+        found, _ = diagnose(train, vehicle, held, seed)
     except QuadidError as error:
         return Answer(flight.name, variant, f"refused: {error}", (), (), None, math.nan, math.nan, memory.asked, {})
     named = tuple(f.effect for f in found.findings if f.confident)

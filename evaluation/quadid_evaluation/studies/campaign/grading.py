@@ -59,7 +59,7 @@ def run(case: Case) -> Graded:
         return _failed(case, f"not flown: {error}")
     began = time.perf_counter()
     try:
-        found, search = diagnose([train], vehicle, [validate], seed=case.seed, predict=False)
+        found, search = diagnose([train], vehicle, [validate], seed=case.seed)
     except QuadidError as error:
         return _failed(case, f"refused: {error}")
     seconds = time.perf_counter() - began

@@ -83,8 +83,6 @@ def measured(one: FlightSet, data: Path) -> Row:
     except QuadidError as error:
         return Row(None, None, {}, time.perf_counter() - begin, str(error))
     files = {"physical file": found.vehicle}
-    if found.prediction is not None:
-        files["prediction file"] = found.prediction
     prediction: dict[str, list[float]] = {}
     soon: dict[str, float] = {}
     velocity = (float("nan"), float("nan"))
@@ -94,7 +92,7 @@ def measured(one: FlightSet, data: Path) -> Row:
         soon = {name: _share(new, v, SOON)[3] for name, v in files.items()}
         velocity = velocity_against_position(new)
     first, second = ({key: r[key] for key in _KEPT if key in r} for r in (identified, found.result))
-    terms = () if found.prediction is None else tuple(t.formula for t in found.prediction.residual)
+    terms = tuple(t.formula for t in found.vehicle.residual)
     return Row(first, second, prediction, time.perf_counter() - begin, terms=terms, soon=soon, velocity=velocity)
 
 

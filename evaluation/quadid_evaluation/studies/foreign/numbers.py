@@ -66,7 +66,7 @@ def of_rotorpy() -> Iterator[Number]:
         ("RotorPy, no aerodynamics, lag 5 ms", hummingbird(tau_m=0.005), {"seed": 2, "aero": False}),
     ):
         flight = fly(truth, ROTORPY_SECONDS, **options)  # type: ignore[arg-type]
-        found, _ = diagnose([flight.window], flight.vehicle, predict=False)
+        found, _ = diagnose([flight.window], flight.vehicle)
         yield from _beside(name, found.parameters, {ours: truth[theirs] for ours, theirs in ROTORPY_NAMES.items()})
 
 
@@ -78,7 +78,7 @@ def of_cases(data: Path) -> Iterator[Number]:
             place = data / folder / answer["case"]
             vehicle = Vehicle.from_yaml((place / "vehicle.yaml").read_text(encoding="utf-8"))
             train, other = (windows(place / f"{flight}.csv", vehicle) for flight in ("train", "validate"))
-            found, _ = diagnose(train, vehicle, other, predict=False)
+            found, _ = diagnose(train, vehicle, other)
             yield from _beside(f"{folder} {answer['case']}", found.parameters, answer["nominal"])
 
 
