@@ -80,12 +80,15 @@ reproduce: venv ## the paper's tables and figures, into docs/results
 
 STUDY = OPENBLAS_NUM_THREADS=1 $(BIN)/python -m
 
-.PHONY: findings mpc autopilot peers health health-hours truth filter-error cases campaign ablation foreign paper-scale excite optimisers subspace control kernel-speed bench
+.PHONY: findings mpc autopilot peers health health-hours truth filter-error bands cases campaign ablation foreign paper-scale excite optimisers subspace control kernel-speed bench
 truth: venv ## errors against their bound, coverage, bias with noise, status (an hour)
 	$(STUDY) quadid_evaluation.studies.truth --out docs/results
 
 filter-error: venv ## the filter-error estimator beside today's fit: coverage, recorded vehicles, a fast loop, speed (an hour)
 	$(STUDY) quadid_evaluation.studies.filter_error --out docs/results
+
+bands: venv ## coverage of predicted bands on recorded flights that were not fitted (ten minutes)
+	$(STUDY) quadid_evaluation.studies.bands --out docs/results
 
 cases: venv ## the independent simulated cases, diagnosed
 	$(STUDY) quadid_evaluation.studies.cases

@@ -202,3 +202,32 @@ def stabilise_rows(
     for k in range(reference.shape[0]):
         write_rotation(attitude[k, 0], attitude[k, 1], attitude[k, 2], attitude[k, 3], matrix)
         stabilise(gains, mixer, reference[k], matrix, rate[k], dt[k], integral, command[k])
+
+
+@_kernel
+def stabilise_each(
+    gains: FloatArray,
+    mixer: FloatArray,
+    reference: FloatArray,
+    attitude: FloatArray,
+    rate: FloatArray,
+    dt: float,
+    integral: FloatArray,
+    command: FloatArray,
+) -> None:
+    """One step of the stabilisers of many vehicles, in place.
+
+    Args:
+        gains: `pack_gains`.
+        mixer: `mixer_matrix`.
+        reference: roll, pitch, yaw [rad], throttle 0..1, shape (n, 4).
+        attitude: measured unit quaternions, body to world, scalar first, shape (n, 4).
+        rate: measured body rates [rad/s], shape (n, 3).
+        dt: time since the last step [s].
+        integral: integral torques [N m], shape (n, 3); updated.
+        command: rotor speeds [rad/s], shape (n, rotors); written.
+    """
+    matrix = np.empty((3, 3))
+    for k in range(reference.shape[0]):
+        write_rotation(attitude[k, 0], attitude[k, 1], attitude[k, 2], attitude[k, 3], matrix)
+        stabilise(gains, mixer, reference[k], matrix, rate[k], dt, integral[k], command[k])

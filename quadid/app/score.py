@@ -2,21 +2,29 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from quadid.app.logs import Given, fitted_before, settled
+from quadid.app.logs import Given, Log, fitted_before, settled
+from quadid.app.missing import ROWS, SECONDS
 from quadid.app.outcome import Outcome
+from quadid.data.window import Window, beginning
+from quadid.errors import NotIdentifiableError, ParameterError
 from quadid.model.layout import Layout
 from quadid.report.verdict import Verdict, score_verdict
+from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 
 if TYPE_CHECKING:
     from quadid.report.tables import TextTable
 
 HORIZONS = (1, 10, 50)
+OPEN = 0.1
+"""Longest horizon with bands [s] while rotor speeds are those of the log: what was flown in closed loop answers the
+disturbances to come."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -37,10 +45,15 @@ class Scored(Outcome):
         return score_verdict(self.result)
 
     def tables(self) -> list[TextTable]:
-        """Errors after every horizon, pooled and a log."""
-        from quadid.report.tables import horizon_table
+        """Errors after every horizon, pooled and a log; what lies inside the predicted bands."""
+        from quadid.report.tables import coverage_table, horizon_table
 
-        return [horizon_table(self.result)]
+        return [horizon_table(self.result), coverage_table(self.result)]
+
+    @property
+    def sentences(self) -> list[str]:
+        """What the bands rest on."""
+        return [self.result["bands"]]
 
     def records(self) -> list[dict[str, Any]]:
         """One row a log and horizon, the pooled ones with the log None."""
@@ -49,20 +62,21 @@ class Scored(Outcome):
 
 
 def score(
-    logs: Given, *, vehicle: str | Path | Vehicle | None = None, horizons: Sequence[int] = HORIZONS,
-    rate: float | None = None,
+    logs: Given, *, vehicle: str | Path | Vehicle | None = None, horizons: str | Sequence[int | str] = HORIZONS,
+    rate: float | None = None, closed_loop: bool = False,
 ) -> Scored:  # fmt: skip
     """Open-loop prediction error after h samples: every sample starts one run from the measured state.
 
     Args:
         logs: a log or several, as paths or from `load`.
         vehicle: whose values are scored as they are; default that of the first loaded log.
-        horizons: samples of the grid after the start of each run.
+        horizons: samples of the grid after the start of each run, or times, as ``0.1s``.
         rate: of the grid [Hz]; None for each log's own, whatever it was loaded with.
+        closed_loop: bands are predicted with the autopilot in the loop, as the vehicle file or the logs know it.
 
     Raises:
         LogError: a log that does not fit the vehicle.
-        ParameterError: horizons that are no positive numbers.
+        ParameterError: horizons that are no positive numbers, or times on logs of several rates.
     """
     from quadid.identification.open_loop import QUANTITIES, no_change
     from quadid.identification.prediction import horizon_scores
@@ -73,13 +87,16 @@ def score(
     described, opened = given.vehicle, [log.at(rate) for log in given.train]
     theta = Layout(described).initial(described)
     windows = [w for log in opened for w in log.windows]
-    pooled, each = horizon_scores([log.windows for log in opened], described, theta, list(horizons))
+    asked = horizons.split(",") if isinstance(horizons, str) else horizons
+    steps = [samples(h, windows) for h in asked]
+    pooled, each = horizon_scores([log.windows for log in opened], described, theta, steps)
     files = [(log.recording.name, log.grid.gaps, one) for log, one in zip(opened, each, strict=True)]
     result = score_result(described.name, pooled, files)
     wanted = [int(h) for h in result["horizons"]]
     result["noise_floor"] = {str(h): prediction_floor(windows, h) for h in wanted}
     result["no_change"] = {str(h): no_change(windows, described, h) for h in wanted}
     result["units"] = dict(QUANTITIES)
+    result["coverage"], result["bands"] = coverage(opened, described, theta, wanted, closed_loop)
     result["verdict"] = score_verdict(result).level
     seen = [
         f"{log.name}: the vehicle file was fitted to this flight, so these errors are no proof"
@@ -87,3 +104,79 @@ def score(
         if fitted_before(described, log)
     ]
     return Scored(result, (*seen, *(text for log in opened for text in log.warnings)))
+
+
+def samples(horizon: int | str, windows: Sequence[Window]) -> int:
+    """Samples of the grid that a horizon stands for: a number of them, or a time as ``0.1s``.
+
+    Raises:
+        ParameterError: neither, or a time on grids of several rates.
+    """
+    if not isinstance(horizon, str):
+        return horizon
+    text = horizon.strip()
+    try:
+        if not text.endswith("s"):
+            return int(text)
+        seconds = float(text[:-1])
+        if not 0.0 < seconds < math.inf:
+            raise ValueError(text)
+    except ValueError as error:
+        raise ParameterError(
+            f"--horizons {text}", "whole numbers of samples, or times in seconds", "for example --horizons 1,10,0.5s"
+        ) from error
+    steps = {round(w.dt, 9) for w in windows}
+    if len(steps) > 1:
+        rates = ", ".join(f"{1.0 / step:.4g}" for step in sorted(steps))
+        raise ParameterError(f"--horizons {text} on logs of {rates} Hz", "one rate", "give --rate, or samples")
+    return max(round(seconds / windows[0].dt), 1)
+
+
+def coverage(
+    logs: Sequence[Log], vehicle: Vehicle, theta: FloatArray, wanted: Sequence[int], closed_loop: bool
+) -> tuple[dict[str, dict[str, dict[str, float] | None] | None], str]:
+    """Shares of outcomes inside the predicted bands by horizon and quantity, and what the bands rest on.
+
+    Args:
+        logs: the logs.
+        vehicle: the vehicle.
+        theta: its full parameter vector.
+        wanted: samples ahead.
+        closed_loop: simulate with the autopilot in the loop instead of taking the logged rotor speeds.
+    """
+    from quadid.estimate.forecast import BANDS, Forecast
+    from quadid.identification.controller_gains import find_autopilot
+
+    total: dict[int, dict[str, FloatArray]] = {}
+    reasons = []
+    autopilot = find_autopilot([w for log in logs for w in log.windows], vehicle) if closed_loop else None
+    for log in logs:
+        windows, _ = beginning(log.windows, min(SECONDS, ROWS * log.windows[0].dt))
+        near = [h for h in wanted if autopilot is not None or h * windows[0].dt <= OPEN + 1e-9]
+        if not near:
+            continue
+        try:
+            forecast = Forecast(windows, vehicle, theta, vehicle.random)
+        except NotIdentifiableError as error:
+            reasons.append(f"{log.name}: none, {error}")
+            continue
+        found = forecast.covered(near) if autopilot is None else forecast.covered_in_loop(near, autopilot)
+        for h, by_quantity in found.items():
+            sums = total.setdefault(h, {})
+            for name, counts in by_quantity.items():
+                sums[name] = sums.get(name, 0.0) + counts
+    out: dict[str, dict[str, dict[str, float] | None] | None] = {}
+    for h in wanted:
+        out[str(h)] = None if h not in total else {
+            name: dict(zip(BANDS, (c[:-1] / c[-1]).tolist(), strict=True)) if c[-1] else None
+            for name, c in total[h].items()
+        }  # fmt: skip
+    source = "of the vehicle file" if vehicle.random is not None else "found in the first third of each log"
+    told = [f"Bands: random forces {source}; sensor noise, trim and biases from the first third of each log"]
+    if autopilot is not None:
+        told.append(f"autopilot in the loop, its gains {autopilot.source}")
+    elif closed_loop:
+        told.append("no autopilot is known: neither gains in the vehicle file nor references that show them in the log")
+    if any(h not in total for h in wanted):
+        told.append(f"none beyond {OPEN:g} s from logged rotor speeds, which already answer the future")
+    return out, f"{'; '.join([*told, *reasons])}."

@@ -8,16 +8,22 @@ from typing import Annotated
 import typer
 
 from quadid.cli import options
-from quadid.errors import ParameterError
 
 
 def score(
     logs: options.Logs,
     vehicle: options.VehicleName,
     horizons: Annotated[
-        str, typer.Option("--horizons", metavar="H,H,...", help="Samples after the start of each run.")
+        str,
+        typer.Option("--horizons", metavar="H,H,...", help="Samples after the start of each run, or times, as 0.1s."),
     ] = "1,10,50",
     rate: options.OwnRate = None,
+    closed_loop: Annotated[
+        bool,
+        typer.Option(
+            "--closed-loop", help="Predict bands with the autopilot in the loop: gains of the file, or found."
+        ),
+    ] = False,
     start: options.Start = None,
     stop: options.Stop = None,
     preset: options.Preset = "auto",
@@ -32,18 +38,6 @@ def score(
     from quadid.cli import terminal
 
     terminal.check_file(json, "--json")
-    wanted = parse_horizons(horizons)
     read = options.reader(load_vehicle(vehicle), rate, start, stop, preset, unchecked, columns)
-    done = work.score(read(logs), horizons=wanted, rate=rate)
+    done = work.score(read(logs), horizons=horizons, rate=rate, closed_loop=closed_loop)
     terminal.conclude(done, json)
-
-
-def parse_horizons(text: str) -> list[int]:
-    """Reads ``1,10,50``; raises ParameterError for anything but whole numbers."""
-
-    try:
-        return [int(part) for part in text.split(",")]
-    except ValueError as error:
-        raise ParameterError(
-            f"--horizons {text}", "whole numbers of samples", "for example --horizons 1,10,50"
-        ) from error

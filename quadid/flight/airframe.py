@@ -227,7 +227,8 @@ def derivative(
         power: factor on thrust and drag torque of all rotors (battery, thrust drop).
         mass_factor: present mass / original mass.
         changed: 0 before, 1 after `mass_change`; selects the inertia.
-        push: outside disturbance: specific force in world axes [m/s^2], angular acceleration in body axes [rad/s^2].
+        push: outside disturbance: specific force in world axes [m/s^2], angular acceleration and specific force in
+            body axes [rad/s^2], [m/s^2].
         body: mass and geometry.
         air: aerodynamics.
         odd: effects outside the catalogue.
@@ -271,9 +272,9 @@ def derivative(
 
     mass = body.mass * mass_factor
     # specific force, body axes
-    f_x = force_x / mass + r00 * push[0] + r10 * push[1] + r20 * push[2]
-    f_y = force_y / mass + r01 * push[0] + r11 * push[1] + r21 * push[2]
-    f_z = force_z / mass + r02 * push[0] + r12 * push[1] + r22 * push[2]
+    f_x = force_x / mass + r00 * push[0] + r10 * push[1] + r20 * push[2] + push[6]
+    f_y = force_y / mass + r01 * push[0] + r11 * push[1] + r21 * push[2] + push[7]
+    f_z = force_z / mass + r02 * push[0] + r12 * push[1] + r22 * push[2] + push[8]
     if odd.load_share != 0.0:
         pull = odd.load_share * GRAVITY
         pull_n, pull_e = pull * y[21], pull * y[22]

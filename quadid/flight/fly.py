@@ -14,13 +14,13 @@ from quadid.flight import sensors
 from quadid.flight.airframe import STATES
 from quadid.flight.loop import Plan, Track, quaternion_of, supply
 from quadid.flight.march import CRASHED, march
-from quadid.flight.outside import LogRows, Scene, apply_outside, check_outside, distort_log
+from quadid.flight.outside import LogRows, Scene, apply_outside, check_outside, distort_log, random_forces
 from quadid.flight.pilot import PILOT_STEP, Pilot, Segment, band_noise, default_gains, scripted, stick_profile
 from quadid.flight.sensors import SensorNoise, coloured
 from quadid.flight.setup import Effects, Setup, TruthParameters, prepare
 from quadid.rotation import continuous_sign
 from quadid.types import FloatArray
-from quadid.vehicle import Vehicle
+from quadid.vehicle import RandomForces, Vehicle
 
 # --- From what was flown to what a log of it holds, with the truth beside it
 
@@ -345,6 +345,7 @@ def fly(
     gains: Mapping[str, float] | None = None,
     segments: Sequence[Segment] | None = None,
     extras: Sequence[str] = (),
+    random: RandomForces | None = None,
 ) -> Flight:
     """Flies the closed loop at 1 kHz and logs it.
 
@@ -365,6 +366,7 @@ def fly(
         gains: of the stabiliser; default the vehicle file's, else `default_gains`.
         segments: the manoeuvre of profile ``scripted``.
         extras: optional channels to log: velocity, position, battery.
+        random: forces and moments that act at random beside all of these.
 
     Raises:
         ParameterError: unknown names, impossible rates or values.
@@ -385,7 +387,7 @@ def fly(
         gains = default_gains(vehicle) if vehicle.stabiliser is None else vehicle.stabiliser.gains
     height = altitude if altitude is not None else (0.6 if setup.air.ground_radius != 0.0 else 30.0)
     sticks = _sticks(profile, seed, plan, segments, height)
-    flown = _march(plan, setup, outside, gains, height, sticks, sensor, streams, seed)
+    flown = _march(plan, setup, outside, random, gains, height, sticks, sensor, streams, seed)
     window = write_window(flown, extras)
     assert window.attitude_reference is not None
     return Flight(
@@ -402,6 +404,7 @@ def _march(
     plan: Plan,
     setup: Setup,
     outside: Effects,
+    random: RandomForces | None,
     gains: Mapping[str, float],
     altitude: float,
     sticks: FloatArray,
@@ -414,8 +417,10 @@ def _march(
     white = sensor.attitude * streams["attitude"].standard_normal((controls, 3))
     slow = coloured(streams["attitude_slow"], controls, sensor.attitude_slow, sensor.attitude_time, step)
     arrival = plan.start + step * np.arange(controls, dtype=np.float64) + setup.delay
-    scene = Scene(setup, plan, arrival, np.zeros((1, 6)))
+    scene = Scene(setup, plan, arrival, np.zeros((1, 9)))
     apply_outside(scene, outside, seed)
+    if random is not None:
+        random_forces(scene, random, np.random.default_rng([seed, 0x4F0C]))
     pilot, trim = _pilot(setup, gains, altitude)
     track = _empty_track(plan, len(setup.vehicle.rotors))
     outcome, end = march(

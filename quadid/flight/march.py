@@ -76,7 +76,7 @@ def march(
         gyro_noise: shape (control instants, 3) [rad/s].
         tilt_noise: AHRS error as body rotation vector, shape (control instants, 3) [rad].
         arrival: when each command reaches the rotors [s], non-decreasing, shape (control instants,).
-        pushes: disturbance, see `airframe.derivative`: shape (1, 6) for a constant one, or one row a step.
+        pushes: disturbance, see `airframe.derivative`: shape (1, 9) for a constant one, or one row a step.
         efficiency: factors on thrust and drag torque, shape (rotors, 2).
         y: state at the start, shape (33,); in place.
         omega: rotor speeds at the start [rad/s]; in place.

@@ -16,7 +16,7 @@ from quadid.flight.loop import OnBoard, Plan, Track
 from quadid.flight.setup import Setup, vehicle_scales
 from quadid.rotation import continuous_sign
 from quadid.types import FloatArray
-from quadid.vehicle import GRAVITY, Vehicle
+from quadid.vehicle import GRAVITY, RandomForces, Vehicle
 
 # --- Outside effects that act in flight: structure, propulsion, environment, on-board software
 
@@ -29,8 +29,8 @@ class Scene:
         setup: constants of the kernel.
         plan: clock.
         arrival: when each command reaches the rotors [s].
-        pushes: disturbance a step: specific force, world [m/s^2], and angular acceleration, body [rad/s^2]; shape
-            (steps, 6), or (1, 6) while there is none.
+        pushes: disturbance a step: specific force, world [m/s^2], angular acceleration and specific force, body
+            [rad/s^2], [m/s^2]; shape (steps, 9), or (1, 9) while there is none.
     """
 
     setup: Setup
@@ -46,7 +46,7 @@ class Scene:
     def push(self, columns: slice, values: FloatArray) -> None:
         """Adds a disturbance given at every step to some columns of `pushes`."""
         if len(self.pushes) != self.plan.steps:
-            self.pushes = np.zeros((self.plan.steps, 6))
+            self.pushes = np.zeros((self.plan.steps, 9))
         self.pushes[:, columns] += values
 
 
@@ -131,6 +131,16 @@ def gusts(scene: Scene, v: Values, rng: np.random.Generator) -> None:
     turn = lfilter([1.0], [1.0, -quick], lfilter([1.0], [1.0, -quick], rng.standard_normal((n, 3)), axis=0), axis=0)
     scene.push(slice(0, 3), v["push"] * push * np.array([1.0, 1.0, 0.5]))
     scene.push(slice(3, 6), v["turn"] * turn / np.std(turn) * np.array([1.0, 1.0, 0.3]))
+
+
+def random_forces(scene: Scene, random: RandomForces, rng: np.random.Generator) -> None:
+    """Random specific force and angular acceleration of a vehicle file, first order along the body axes."""
+    sizes, times = random.each_axis
+    for column, size, time in zip((6, 7, 8, 3, 4, 5), sizes, times, strict=True):
+        pole = float(np.exp(-scene.plan.dt / time))
+        noise = size * np.sqrt(1.0 - pole**2) * rng.standard_normal(scene.plan.steps)
+        noise[0] = size * rng.standard_normal()  # begins as it goes on
+        scene.push(slice(column, column + 1), lfilter([1.0], [1.0, -pole], noise)[:, None])
 
 
 def transverse_flow(scene: Scene, v: Values, rng: np.random.Generator) -> None:

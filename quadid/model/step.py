@@ -31,7 +31,7 @@ from quadid.model.work_array import (
     X_VN,
 )
 from quadid.types import FloatArray
-from quadid.vehicle import Vehicle
+from quadid.vehicle import RandomForces, Vehicle
 
 # --- The identified vehicle as a simulator to be stepped, one vehicle or a batch of them
 #
@@ -63,6 +63,11 @@ class RandomInputs:
     force_time: float = 1.0
     turn: tuple[float, float, float] = (0.0, 0.0, 0.0)
     turn_time: float = 1.0
+
+    @property
+    def each_axis(self) -> FloatArray:
+        """Standard deviations and correlation times of force x, y, z and turn x, y, z, shape (2, 6)."""
+        return np.array([[*self.force, *self.turn], np.repeat([self.force_time, self.turn_time], 3)])
 
     def __post_init__(self) -> None:
         for name in ("force", "turn"):
@@ -153,8 +158,8 @@ class Simulator:
     """
 
     def __init__(
-        self, vehicle: Vehicle, theta: FloatArray | None = None, *, random: RandomInputs | None = None, seed: int = 0,
-        span: float = math.inf,
+        self, vehicle: Vehicle, theta: FloatArray | None = None, *, random: RandomInputs | RandomForces | None = None,
+        seed: int = 0, span: float = math.inf,
     ) -> None:  # fmt: skip
         """Prepares the simulation.
 
@@ -162,7 +167,7 @@ class Simulator:
             vehicle: as read from a (fitted, extended) vehicle file.
             theta: full parameter vectors of a batch instead of the file's values, shape (vehicles, size), see
                 `quadid.model.layout.Layout`.
-            random: random inputs; none by default.
+            random: random inputs, such as `vehicle.random`; none by default.
             seed: decides them.
             span: length of the flight [s], over which `battery_sag` takes its share.
 
@@ -194,7 +199,7 @@ class Simulator:
     def start(
         self, *, attitude: FloatArray = LEVEL, rate: FloatArray = STILL, velocity: FloatArray = STILL,
         position: FloatArray = STILL, rotor_speed: FloatArray | float | None = None, time: float = 0.0,
-        dt: float = 0.005,
+        inputs: FloatArray | float = 0.0, dt: float = 0.005,
     ) -> State:  # fmt: skip
         """Returns a state to start from; each argument for one vehicle, or with a row a vehicle.
 
@@ -205,6 +210,7 @@ class Simulator:
             position: [m], NED.
             rotor_speed: [rad/s]; hover by default.
             time: [s].
+            inputs: random specific force [m/s^2] and angular acceleration [rad/s^2] that act already, body, 6 numbers.
             dt: step that is meant to be made [s]; `step` may be given another.
 
         Raises:
@@ -212,12 +218,12 @@ class Simulator:
         """
         n, rotors, blocks = self.vehicles, len(self.vehicle.rotors), len(self._theta)
         speed = self.vehicle.hover_speed() if rotor_speed is None else rotor_speed
-        wanted = ((attitude, 4), (rate, 3), (velocity, 3), (position, 3), (speed, rotors))
+        wanted = ((attitude, 4), (rate, 3), (velocity, 3), (position, 3), (speed, rotors), (inputs, TURNS))
         try:
             given = [np.broadcast_to(np.asarray(v, dtype=np.float64), (n, width)) for v, width in wanted]
         except ValueError as error:
             shapes = ", ".join(str(np.shape(v)) for v, _ in wanted)
-            raise WindowError(f"shapes {shapes}", f"4, 3, 3, 3, {rotors}, or with {n} rows") from error
+            raise WindowError(f"shapes {shapes}", f"4, 3, 3, 3, {rotors}, {TURNS}, or with {n} rows") from error
         motion = np.concatenate([given[0] / np.linalg.norm(given[0], axis=1)[:, None], *given[1:4]], axis=1)
         rot = self._settle(dt)
         late = math.ceil(max(float(self._theta[..., ix.ATT_DELAY].max()), 0.0) / dt) + 2
@@ -231,7 +237,7 @@ class Simulator:
         rot[:, :, R_SPEED : R_SPEED + LANES] = speeds
         memory = (
             moving[:, STATE:], rot, np.repeat(speeds[:, None], self._delayed, axis=1),
-            np.zeros((blocks, TURNS, LANES)), np.repeat(rows[:, None, :7], late, axis=1),
+            _in_lanes(given[5], blocks), np.repeat(rows[:, None, :7], late, axis=1),
         )  # fmt: skip
         return State(time, 0, n, np.concatenate([m.reshape(blocks, -1) for m in memory], axis=1), rotors, dt)
 
@@ -312,8 +318,8 @@ class Simulator:
         self._constants = constants[:1] if self._alike else constants
         self._delayed = math.floor(max(float(self._theta[..., ix.DELAY].max()), 0.0) / dt) + 2
         if self.random is not None:
-            keep = np.exp(-dt / np.repeat([self.random.force_time, self.random.turn_time], 3))
-            size = np.concatenate([self.random.force, self.random.turn])
+            size, time = self.random.each_axis
+            keep = np.exp(-dt / time)
             self._walk = np.array([keep, size * np.sqrt(1.0 - keep**2)])
         self._dt = dt
         return rot

@@ -214,6 +214,22 @@ def horizon_table(result: Json) -> TextTable:
     return TextTable(title, columns, tuple(rows))
 
 
+def coverage_table(result: Json) -> TextTable:
+    """Shares of outcomes inside the predicted bands of 50, 80 and 95 %.
+
+    Args:
+        result: of the form ``quadid.score/1``.
+    """
+    bands = ("50", "80", "95")
+    columns = (Column("after", right=True), Column("of"), *(Column(f"{band} % band", right=True) for band in bands))
+    rows = []
+    for horizon, quantities in result["coverage"].items():
+        for name, shares in (quantities or {"": None}).items():
+            told = ["–"] * len(bands) if shares is None else [f"{100.0 * shares[band]:.0f} %" for band in bands]
+            rows.append((horizon, name, *told))
+    return TextTable("Outcomes inside the predicted bands, n samples after a filtered state", columns, tuple(rows))
+
+
 def _error(value: float | None) -> str:
     return "ran away" if value == math.inf else number(value)
 

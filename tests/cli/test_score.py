@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 import yaml
 
-from quadid.vehicle import Vehicle
-from tests.cli.conftest import Cli, Flights, table, write_table
+import quadid
+from quadid.vehicle import Stabiliser, Vehicle
+from tests.cli.conftest import Cli, Flights, one_line, table, write_table
 
 QUANTITIES = ["position", "velocity", "rotation", "rate"]
 
@@ -18,7 +19,7 @@ QUANTITIES = ["position", "velocity", "rotation", "rate"]
 def test_json_has_exactly_the_keys_of_the_contract(inside: Cli, flights: Flights) -> None:
     result = inside("score", flights.train, flights.unseen, "--vehicle", "pelican", "--json", "-").data
     keys = ["schema", "vehicle", "samples", "gaps", "horizons", "sum", "files"]
-    assert list(result) == [*keys, "noise_floor", "no_change", "units", "verdict"]
+    assert list(result) == [*keys, "noise_floor", "no_change", "units", "coverage", "bands", "verdict"]
     assert result["schema"] == "quadid.score/1"
     assert list(result["horizons"]) == ["1", "10", "50"]
     assert all(list(h) == QUANTITIES for h in result["horizons"].values())
@@ -80,9 +81,56 @@ def test_rate_and_horizons_are_options(inside: Cli, flights: Flights) -> None:
     result = inside(
         "score", flights.unseen, "--vehicle", "pelican", "--rate", "25", "--horizons", "5,60", "--json", "-"
     ).data
-    assert list(result["horizons"]) == ["5", "60"]
+    assert list(result["horizons"]) == list(result["coverage"]) == ["5", "60"]
     assert result["sum"]["to"] == 50
     assert 600 < result["samples"] < 750 - 60
+
+
+def test_a_horizon_may_be_a_time(inside: Cli, flights: Flights) -> None:
+    score = ("score", flights.unseen, "--vehicle", "pelican", "--json", "-")
+    one, other = (inside(*score, "--horizons", h).data for h in ("0.1s,0.5s", "5,25"))
+    assert one == other
+    assert list(one["horizons"]) == ["5", "25"]
+    line = one_line(inside("score", flights.train, flights.unseen, "--vehicle", "pelican", "--horizons", "-1s"), 2)
+    assert "--horizons -1s" in line
+    slow = quadid.load(flights.unseen, vehicle="pelican", rate=25.0)
+    assert list(quadid.score(slow, horizons=["0.2s"], rate=25.0).result["horizons"]) == ["5"]
+
+
+def test_bands_are_predicted_up_to_a_tenth_of_a_second_and_the_reason_stands_below(
+    inside: Cli, flights: Flights
+) -> None:
+    run = inside("score", flights.unseen, "--vehicle", "pelican", "--horizons", "1,5,10")
+    assert "already answer the future" in run.out
+    assert "found in the first third of each log" in run.out
+    coverage = inside("score", flights.unseen, "--vehicle", "pelican", "--horizons", "1,5,10", "--json", "-").data
+    coverage = coverage["coverage"]
+    assert coverage["10"] is None, "0.2 s at 50 Hz"
+    for h in ("1", "5"):
+        for quantity in ("velocity", "rotation", "rate"):
+            shares = coverage[h][quantity]
+            assert list(shares) == ["50", "80", "95"]
+            assert 0.0 <= shares["50"] <= shares["80"] <= shares["95"] <= 1.0
+    short = inside("score", f"{flights.unseen}@0:4", "--vehicle", "pelican", "--horizons", "1", "--json", "-").data
+    assert short["coverage"] == {"1": None}
+    assert "6 s with gyro" in short["bands"]
+
+
+def test_the_autopilot_in_the_loop_predicts_further(inside: Cli, flights: Flights, tmp_path: Path) -> None:
+    asked = ("--horizons", "5,25", "--closed-loop", "--json", "-")
+    found = inside("score", flights.train, "--vehicle", "pelican", *asked).data
+    assert "its gains identified" in found["bands"]
+    assert 0.5 < found["coverage"]["25"]["rate"]["95"] <= 1.0
+    gains = Stabiliser(gains=dict(flights.train_flight.gains))
+    known = Vehicle.shipped("pelican").model_copy(update={"stabiliser": gains}).save(tmp_path / "known.yaml")
+    assert "its gains given" in inside("score", flights.train, "--vehicle", known, *asked).data["bands"]
+    names, rows = table(flights.unseen)
+    keep = [i for i, name in enumerate(names) if not name.endswith("_ref") and name != "throttle"]
+    log = write_table(tmp_path / "bare.csv", [names[i] for i in keep], rows[:, keep])
+    bare = inside("score", log, "--vehicle", "pelican", *asked).data
+    assert "no autopilot is known" in bare["bands"]
+    assert bare["coverage"]["25"] is None
+    assert bare["coverage"]["5"] is not None
 
 
 def test_tables_name_units(inside: Cli, flights: Flights) -> None:

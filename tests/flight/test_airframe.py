@@ -37,7 +37,7 @@ def slope(setup: Setup, y: FloatArray, omega: FloatArray) -> FloatArray:
     """Derivative of the state at given rotor speeds."""
     wrench, dy = np.zeros(7), np.zeros(STATES)
     rotor_wrench(omega, setup.efficiency, 0, setup.body, wrench)
-    derivative(y, omega, wrench, 1.0, 1.0, 0, np.zeros(6), setup.body, setup.air, setup.odd, dy)
+    derivative(y, omega, wrench, 1.0, 1.0, 0, np.zeros(9), setup.body, setup.air, setup.odd, dy)
     return dy
 
 
@@ -47,7 +47,7 @@ def step(setup: Setup, y: FloatArray, omega: FloatArray, h: float, steps: int) -
     level, still, work = omega.copy(), np.zeros(len(omega)), np.zeros((5, STATES))
     for _ in range(steps):
         advance(
-            y, speed, level, still, setup.efficiency, np.ones(3), 1.0, 0, np.zeros(6),
+            y, speed, level, still, setup.efficiency, np.ones(3), 1.0, 0, np.zeros(9),
             setup.drive, setup.body, setup.air, setup.odd, h, work,
         )  # fmt: skip
     return y
