@@ -13,9 +13,9 @@ from quadid.app.logs import as_vehicle, write_recording
 from quadid.effects import EFFECTS
 from quadid.errors import ParameterError, QuadidError, nearest
 from quadid.files import read_regular
-from quadid.parameters import NOMINAL_UNITS
+from quadid.parameters import NOMINAL_UNITS, Parameter, ParameterSet, Status
 from quadid.rotation import down
-from quadid.vehicle import Vehicle
+from quadid.vehicle import ParameterPrior, Vehicle
 from quadid.yaml_text import read_value
 
 if TYPE_CHECKING:
@@ -26,6 +26,10 @@ LONGEST = 3600.0
 """Longest flight [s]: every step of it is held in memory."""
 WIDEST = 0.9
 """Largest fraction by which true parameters leave those of the type."""
+
+
+MOST_DRAWS = 1000
+"""Vehicles of one call."""
 
 
 class SimulateError(QuadidError):
@@ -52,7 +56,7 @@ class Simulated:
 def simulate(
     vehicle: str | Path | Vehicle = "pelican", *, seconds: float = 500.0, seed: int = 1, effects: Sequence[str] = (),
     profile: str = "excited", manoeuvre: str | Path | None = None, noise: float = 1.0, rate: float = 50.0,
-    extras: Sequence[str] = (), spread: float = 0.0,
+    extras: Sequence[str] = (), spread: float = 0.0, random: bool = False,
 ) -> Simulated:  # fmt: skip
     """Flies the closed-loop vehicle, controlled at 1 kHz, and logs it.
 
@@ -67,6 +71,7 @@ def simulate(
         rate: of the log [Hz].
         extras: velocity, position or battery are logged as well.
         spread: true parameters are drawn within this fraction of the type.
+        random: the vehicle's random forces act, too.
 
     Raises:
         SimulateError: a length or a manoeuvre that cannot be flown.
@@ -89,9 +94,82 @@ def simulate(
     flown = profile if segments is None else "scripted"
     flight = fly(
         described, truth, seconds, seed, flown, effects={**described.effects, **named}, outside=outside,
-        noise_scale=noise, log_rate=rate, segments=segments, extras=extras,
+        noise_scale=noise, log_rate=rate, segments=segments, extras=extras, random=described.random if random else None,
     )  # fmt: skip
-    return Simulated(summary(flight, seed, flown), flight)
+    result = summary(flight, seed, flown)
+    if described.residual:
+        terms = "; ".join(term.formula for term in described.residual)
+        result["warnings"] = [f"residual terms are no part of the flown vehicle: {terms}"]
+    return Simulated(result, flight)
+
+
+@dataclass(frozen=True)
+class Draw:
+    """One of several vehicles that a vehicle file may stand for.
+
+    Attributes:
+        seed: of its flight.
+        vehicle: with its values.
+        flown: its flight; None where it did not last.
+        failed: why it did not last; empty where it did.
+    """
+
+    seed: int
+    vehicle: Vehicle
+    flown: Simulated | None
+    failed: str = ""
+
+    @property
+    def entry(self) -> dict[str, Any]:
+        """One draw of ``quadid.simulate/1``; its ``log`` is None until written."""
+        values = {name: prior.initial for name, prior in self.vehicle.parameters.items()}
+        head = {"seed": self.seed, "diverged": self.failed or None}
+        return {**({"log": None, "parameters": values} if self.flown is None else self.flown.result), **head}
+
+
+def simulate_draws(vehicle: str | Path | Vehicle, draws: int, seed: int = 1, **how: Any) -> list[Draw]:
+    """Flies several vehicles that the file may stand for, each under random forces of its own.
+
+    Values are drawn from the file's standard deviations, those without one with the floor of `ParameterSet.sample`.
+
+    Args:
+        vehicle: as `simulate`.
+        draws: number of vehicles.
+        seed: decides the values; the flights have this and the following seeds.
+        how: further arguments of `simulate`.
+
+    Raises:
+        ParameterError: an impossible number of draws; else as `simulate`, but for vehicles that do not last.
+    """
+    from quadid.flight import FlightError
+
+    if not 1 <= draws <= MOST_DRAWS:
+        raise ParameterError(f"{draws} draws", f"1 to {MOST_DRAWS}")
+    check_seed(seed)
+    described = as_vehicle(vehicle)
+    values, _ = believed(described).sample(draws, seed)
+    out = []
+    for i, row in enumerate(values):
+        priors = {n: ParameterPrior(initial=float(v)) for n, v in zip(NOMINAL_UNITS, row, strict=True)}
+        one = described.model_copy(update={"parameters": priors})
+        try:
+            out.append(Draw(seed + i, one, simulate(one, seed=seed + i, random=True, **how)))
+        except FlightError as error:
+            out.append(Draw(seed + i, one, None, error.found))
+    return out
+
+
+def believed(vehicle: Vehicle) -> ParameterSet:
+    """The values of a vehicle file with their standard deviations."""
+    priors = {name: vehicle.parameters[name] for name in NOMINAL_UNITS}
+    listed = [
+        Parameter(
+            name, NOMINAL_UNITS[name], prior.initial, prior.sigma or 0.0, prior.initial, prior.limits,
+            Status.IDENTIFIED if prior.sigma else Status.PRIOR_DOMINATED,
+        )
+        for name, prior in priors.items()
+    ]  # fmt: skip
+    return ParameterSet(tuple(listed), vehicle.covariance)
 
 
 def check_suffix(path: str | Path) -> None:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from quadid.app.simulate import SimulateError, check_suffix
+from quadid.app.simulate import Draw, SimulateError, check_suffix, simulate_draws
 from quadid.app.simulate import simulate as fly
 from quadid.cli.options import JsonTarget, Seed, VehicleName
 from quadid.data.window import Recording
@@ -51,13 +51,30 @@ def simulate(
             "--spread", metavar="F", min=0.0, max=0.9, help="Draw the true parameters within this fraction of the type."
         ),
     ] = 0.0,
+    draws: Annotated[
+        int | None,
+        typer.Option(
+            "--draws",
+            metavar="N",
+            help="Fly N vehicles within the file's uncertainty, each under its random forces; logs get numbers.",
+        ),
+    ] = None,
     json: JsonTarget = None,
 ) -> None:
     """Fly the closed-loop vehicle, controlled at 1 kHz, and log it at 50 Hz."""
-    from quadid.cli.terminal import check_file, write_json
+    from quadid.cli.terminal import check_file, warn, write_json
 
     check_target(out)
     check_file(json, "--json")
+    if draws is not None:
+        if out.startswith(LIVE):
+            raise SimulateError(f"--draws {draws} to {out}", "a file", "leave one of them out")
+        how: dict[str, Any] = {
+            "seconds": seconds, "effects": effect or (), "profile": profile, "manoeuvre": manoeuvre, "noise": noise,
+            "rate": rate, "extras": extra or (), "spread": spread,
+        }  # fmt: skip
+        several(out, simulate_draws(vehicle, draws, seed, **how), json)
+        return
     done = fly(
         vehicle, seconds=seconds, seed=seed, effects=effect or (), profile=profile, manoeuvre=manoeuvre, noise=noise,
         rate=rate, extras=extra or (), spread=spread,
@@ -70,6 +87,27 @@ def simulate(
     write_json({**done.result, "log": log}, json)
     if json != "-":
         typer.echo(f"{done.flight.vehicle.name}: {done.result['rows']} rows at {rate:g} Hz flown and logged to {out}")
+    warn(done.result.get("warnings", []))
+
+
+def several(out: str, draws: Sequence[Draw], json: str | None) -> None:
+    """Writes the logs of several draws as ``OUT-1``, ``OUT-2`` and so on, and says which did not last."""
+    from quadid.cli.terminal import write_json
+    from quadid.flight import FlightError
+
+    target, entries = Path(out), []
+    for i, draw in enumerate(draws, 1):
+        entries.append(draw.entry)
+        path = target.with_name(f"{target.stem}-{i}{target.suffix}")
+        if draw.flown is not None:
+            entries[-1]["log"] = str(draw.flown.save(path))
+        if json != "-":
+            typer.echo(f"{path.name}: diverged, {draw.failed}" if draw.failed else f"{path.name}: flown")
+    lost = sum(bool(draw.failed) for draw in draws)
+    result = {"schema": "quadid.simulate/1", "vehicle": draws[0].vehicle.name, "diverged": lost, "draws": entries}
+    write_json(result, json)
+    if lost == len(draws):
+        raise FlightError(f"all {lost} vehicles diverged", fix="another manoeuvre, or gains that fit the vehicle")
 
 
 def check_target(out: str) -> None:

@@ -221,6 +221,7 @@ class Facts:
         left = [name for name in self.vehicle.effects if name not in used]
         left += [number for name in self.vehicle.effects if name in used for number in self._optional(name, used)]
         left += [f"residual ({t.formula})" for t in self.vehicle.residual if "residual" not in used]
+        left += ["random"] if self.vehicle.random is not None and "random" not in used else []
         lines = [f"NOT PROVEN: {self.unproven}."] if self.unproven else []
         lines += [
             f"Written by quadid from {self.source} ({self.vehicle.name}); SI units.",
@@ -431,7 +432,14 @@ def isaac_lab(facts: Facts) -> dict[str, Any]:
     arms, none = facts.arms_flu, np.zeros(len(facts.rotors))
     twist = facts.torque_per_thrust * np.array([r.turn_flu for r in facts.rotors])
     allocation = np.array([none, none, none + 1.0, arms[:, 1], -arms[:, 0], twist])
-    return {"allocation": allocation, "turn": 2.0 * math.pi, "spread": Z95 * facts.vehicle.mass_sigma}
+    told = {"allocation": allocation, "turn": 2.0 * math.pi, "spread": Z95 * facts.vehicle.mass_sigma}
+    if facts.vehicle.random is None:
+        return told
+    size, time = facts.vehicle.random.each_axis
+    return told | {
+        "random_force": facts.vehicle.mass * size[:3], "random_times": time,
+        "random_torque": np.diag(facts.inertia) * size[3:],
+    }  # fmt: skip
 
 
 # --- Every form by name: whose it is, which effects it carries, its templates, and what only it wants to know
@@ -465,7 +473,7 @@ class Form(NamedTuple):
         return {*kinds, *self.program.lower().split(", "), *self.program.lower().replace(",", "").split()}
 
 
-ALL = (*EFFECTS, *(f"{e.name}.{p.name}" for e in EFFECTS.values() for p in e.parameters), "residual")
+ALL = (*EFFECTS, *(f"{e.name}.{p.name}" for e in EFFECTS.values() for p in e.parameters), "residual", "random")
 """Everything that a vehicle file holds."""
 _BODY = ("cg_offset", "product_of_inertia")
 _LAGS = ("motor_lag", "motor_lag.tau_down")
@@ -504,7 +512,7 @@ FORMS: dict[str, Form] = {
         {".params.toml": "drone_models.toml"},
         drone_models,
     ),
-    "isaac-lab": Form("Isaac Lab", (*_BODY, *_LAGS), {"_isaaclab.py": "isaac_lab.py"}, isaac_lab),
+    "isaac-lab": Form("Isaac Lab", (*_BODY, *_LAGS, "random"), {"_isaaclab.py": "isaac_lab.py"}, isaac_lab),
 }
 FORMATS = tuple(FORMS)
 
