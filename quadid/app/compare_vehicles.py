@@ -12,7 +12,7 @@ import numpy as np
 
 from quadid.app.logs import Given, Log, as_vehicle, fitted_before, listed, read
 from quadid.app.outcome import LIBRARY, Reported, provenance
-from quadid.app.score import HORIZONS
+from quadid.app.score import HORIZONS, ahead
 from quadid.chi_square import Z95
 from quadid.errors import LogError
 from quadid.identification.open_loop import QUANTITIES
@@ -74,7 +74,7 @@ class Compared(Reported):
 
 
 def compare_vehicles(
-    a: str | Path | Vehicle, b: str | Path | Vehicle, on: Given, *, horizons: Sequence[int] = HORIZONS,
+    a: str | Path | Vehicle, b: str | Path | Vehicle, on: Given, *, horizons: str | Sequence[int | str] = HORIZONS,
     rate: float | None = None, seed: int = 0,
 ) -> Compared:  # fmt: skip
     """Predicts the same flights with two vehicle files, from the same starts.
@@ -86,7 +86,7 @@ def compare_vehicles(
         a: a shipped name, a YAML file or a `Vehicle`; its values are taken as they are.
         b: likewise.
         on: a log or several, as paths or from `load`.
-        horizons: samples of the grid after the start of each run.
+        horizons: samples of the grid after the start of each run, or times, as ``0.1s``.
         rate: of the grid [Hz]; None for each log's own.
         seed: decides the draws.
 
@@ -100,7 +100,8 @@ def compare_vehicles(
     pair = [as_vehicle(v) for v in (a, b)]
     opened = [[log.at(rate) for log in read(on, vehicle)] for vehicle in pair]
     both = list(zip(pair, opened, strict=True))
-    found = [[start_errors(log.windows, vehicle, horizons) for log in logs] for vehicle, logs in both]
+    steps = ahead(horizons, [w for log in opened[0] for w in log.windows])
+    found = [[start_errors(log.windows, vehicle, steps) for log in logs] for vehicle, logs in both]
     if [[len(w) for w in log] for log in found[0]] != [[len(w) for w in log] for log in found[1]]:
         raise LogError(
             "the two vehicles read these logs on different grids", "the same meaning of the rotor columns",
@@ -108,17 +109,17 @@ def compare_vehicles(
         )  # fmt: skip
     blocks = []
     for k, log in enumerate(opened[0]):
-        size = max(max(horizons), round(BLOCK / log.windows[0].dt))
+        size = max(max(steps), round(BLOCK / log.windows[0].dt))
         for one, two in zip(found[0][k], found[1][k], strict=True):
             errors = np.stack([one, two])
             blocks += [errors[:, i : i + size] for i in range(0, errors.shape[1], size)]
     if len(blocks) < FEWEST_BLOCKS:
         raise LogError(
-            f"{len(blocks)} stretches of {max(horizons)} samples", f"at least {FEWEST_BLOCKS} for an interval",
+            f"{len(blocks)} stretches of {max(steps)} samples", f"at least {FEWEST_BLOCKS} for an interval",
             "use longer flights, or shorter horizons",
         )  # fmt: skip
     total, drawn = _means(blocks, seed)
-    wanted = tuple(dict.fromkeys(horizons))
+    wanted = tuple(dict.fromkeys(steps))
     entries = {
         str(h): {name: _entry(total[:, i, q], drawn[:, :, i, q]) for q, name in enumerate(QUANTITIES)}
         for i, h in enumerate(wanted)

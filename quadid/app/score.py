@@ -87,8 +87,7 @@ def score(
     described, opened = given.vehicle, [log.at(rate) for log in given.train]
     theta = Layout(described).initial(described)
     windows = [w for log in opened for w in log.windows]
-    asked = horizons.split(",") if isinstance(horizons, str) else horizons
-    steps = [samples(h, windows) for h in asked]
+    steps = ahead(horizons, windows)
     pooled, each = horizon_scores([log.windows for log in opened], described, theta, steps)
     files = [(log.recording.name, log.grid.gaps, one) for log, one in zip(opened, each, strict=True)]
     result = score_result(described.name, pooled, files)
@@ -104,6 +103,11 @@ def score(
         if fitted_before(described, log)
     ]
     return Scored(result, (*seen, *(text for log in opened for text in log.warnings)))
+
+
+def ahead(horizons: str | Sequence[int | str], windows: Sequence[Window]) -> list[int]:
+    """Samples of the grid that horizons stand for, as ``1,10,0.5s`` or one by one; raises as `samples`."""
+    return [samples(h, windows) for h in (horizons.split(",") if isinstance(horizons, str) else horizons)]
 
 
 def samples(horizon: int | str, windows: Sequence[Window]) -> int:

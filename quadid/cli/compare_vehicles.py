@@ -15,7 +15,8 @@ def compare_vehicles(
     b: Annotated[str, typer.Argument(metavar="B", help="The other one.")],
     on: Annotated[list[str], typer.Option("--on", metavar="LOG", help="A flight to predict; repeatable.")],
     horizons: Annotated[
-        str, typer.Option("--horizons", metavar="H,H,...", help="Samples after the start of each run.")
+        str,
+        typer.Option("--horizons", metavar="H,H,...", help="Samples after the start of each run, or times, as 0.1s."),
     ] = "1,10,50",
     rate: options.OwnRate = None,
     seed: options.Seed = 0,
@@ -29,11 +30,10 @@ def compare_vehicles(
     from quadid.app import compare_vehicles as work
     from quadid.app.logs import load_vehicle
     from quadid.cli import terminal
-    from quadid.cli.score import parse_horizons
 
     terminal.check_file(json, "--json")
     terminal.check_file(report, "--report")
     one, two = load_vehicle(a), load_vehicle(b)
     logs = options.reader(one, rate, None, None, preset, unchecked, None)(on)
-    done = work.compare_vehicles(one, two, logs, horizons=parse_horizons(horizons), rate=rate, seed=seed)
+    done = work.compare_vehicles(one, two, logs, horizons=horizons, rate=rate, seed=seed)
     terminal.conclude(done, json, report)

@@ -62,7 +62,8 @@ def missing(size: float, rows: int = 100) -> Missing:
     """A stretch on which a model misses a force of this size [N] and as large a moment [N m]."""
     t, acted = 0.02 * np.arange(rows, dtype=np.float64), np.full((rows, 3), size)
     control = np.outer(np.sin(0.3 * np.arange(rows)), np.ones(3))
-    return Missing(t, acted, 0.1 * acted, acted, 0.1 * acted, control, 10.0, np.full(6, 0.1), *np.ones((2, rows, 12)))
+    return Missing(t, acted, 0.1 * acted, acted, 0.1 * acted, control, np.zeros((rows, 8)), 10.0, *np.full((2, 6), 0.1),
+                   *np.ones((2, rows, 12)))  # fmt: skip
 
 
 def test_what_is_missing_is_drawn_with_its_band_for_every_model_and_axis() -> None:
