@@ -77,8 +77,8 @@ class Forecast:
             for numbers, at in zip(random.numbers, (k.SIGMA, k.TIME), strict=True):
                 psi[at : at + 4], free[at : at + 4] = numbers, False
             psi = np.clip(psi, *problem.noise_bounds.T)
-        z, psi, _, _ = scoring(problem.liveliest(NEAR_SECONDS), z, psi, MOST, free)
-        z, _, value, _ = scoring(problem, z, psi, TRIMMING, NO_NOISE)
+        z, psi, *_ = scoring(problem.liveliest(NEAR_SECONDS), z, psi, MOST, free)
+        z, _, value, *_ = scoring(problem, z, psi, TRIMMING, NO_NOISE)
         if not np.isfinite(value):
             raise NotIdentifiableError("the filter has no finite answer on this flight", "a model that follows it")
         # 2. The whole flight; predictions begin after that part.
