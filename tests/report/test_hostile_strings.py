@@ -77,6 +77,7 @@ def hostile_vehicle(text: str, full_speed: float | None) -> Vehicle:
     vehicle = Vehicle.model_construct(**{
         **{name: getattr(cross, name) for name in Vehicle.model_fields},
         "name": text, "mixer": text, "columns": {text: text}, "residual": (term,), "proof": proof,
+        "correlation": {text: {text: 0.5}},
         "effects": {"motor_lag": {"tau": 0.03}} | ({} if full_speed else {text: {text: 1.0}}),
         "command": Command.model_construct(kind=text, sampling=text, max_speed=full_speed, range=(1000.0, 2000.0)),
         "parameters": {**cross.parameters, "b": sigma},
@@ -143,7 +144,7 @@ def check_yaml(text: str) -> None:
     known = {"mass", "inertia", "tbm_fr", "tbm_bl", "tbm_br", "tbm_fl", "motor_omega_min", "motor_omega_max",
              "motor_tau", "thrust_map", "kappa", "thrust_min", "thrust_max", "rotors_config", "aero_coeff_1",
              "aero_coeff_3", "aero_coeff_h"}  # fmt: skip
-    assert set(data) in (known, {*Vehicle.model_fields} - {"reference_voltage", "stabiliser", "mounting",
+    assert set(data) in (known, {*Vehicle.model_fields} - {"reference_voltage", "stabiliser", "mounting", "random",
                                                             "mass_sigma", "arm_sigma", "thrust_stand"})  # fmt: skip
     assert all(line[:1] != "#" or line.isprintable() for line in re.split("[\n\r\x85\u2028\u2029]", text))
 
