@@ -91,9 +91,11 @@ class ChangeSupervisor:
         if self.seen is None or tick < self.seen.at + AFTER_CHANGE - _EPS:
             return None
         cut = self._store.cut(self.seen.at + 0.1, tick - _EPS)
+        before = self._store.span(self.seen.at - ASK_FLYING, self.seen.at - 0.1) if estimator.flexible else None
+        speed = None if before is None else np.sqrt(np.nanmean(before.columns["rotor_speed"] ** 2, axis=0))
         return ChangeRequest(
             number, estimator.model, cut.windows, self.seen.at, tick, estimator.theta, estimator.z_sigma,
-            estimator.noise_of(cut.windows), self.seen.change, stamp,
+            estimator.noise_of(cut.windows), self.seen.change, stamp, speed,
         )  # fmt: skip
 
     @staticmethod

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from quadid.identification.noise_model import NoiseModel
 from quadid.identification.priors import Prior, posterior_covariance
 from quadid.identification.shooting import Shooting
 from quadid.model import layout as ix
-from quadid.model.layout import LOSS, Layout
+from quadid.model.layout import LOSS, Layout, ThrustModel
 from quadid.online.change_detection import ChangePoint
 from quadid.online.records import Job, JobReply, OnlineAlternative, OnlineFinding
 from quadid.parameters import NOMINAL_NAMES
@@ -57,6 +57,7 @@ class ChangeRequest(Job):
         noise: sensor noise.
         change: what was seen, at session time.
         time: when, refined; in the time of the stream's stamps [s].
+        speed: of each rotor before the change [rad/s], shape (rotors,), where effects were fitted along; else None.
     """
 
     reply = ChangeReply
@@ -66,10 +67,36 @@ class ChangeRequest(Job):
     noise: NoiseModel | None
     change: ChangePoint
     time: float
+    speed: FloatArray | None = None
 
     def answer(self) -> ChangeReply:
-        """Fits every look-alike to the data after the change."""
-        return _explain(self)
+        """Fits every look-alike to the data after the change.
+
+        Effects that were fitted along to quiet flight are hardly known, though held: a thrust curve that is too flat
+        makes every loss too small.  So the plain law is asked, too, and whichever leaves less is believed.
+        """
+        return min((_explain(r) for r in (self, *self._plain())), key=_left)
+
+    def _plain(self) -> tuple[ChangeRequest, ...]:
+        """The same with the vehicle file's own effects, and the thrust before the change as it was found."""
+        if self.speed is None or not self.speed.all():
+            return ()
+        layout = Layout(self.vehicle)
+        theta, given = layout.initial(self.vehicle), self.vehicle.parameters
+        # Before the change thrust and moments were in balance: rotors that turned otherwise gave otherwise.
+        total, arms = ThrustModel(layout, self.theta).total(self.speed[None]), self.vehicle.torque_arms
+        balance = np.column_stack([np.ones(layout.rotors), arms / np.abs(arms).max(axis=0)])
+        each = np.linalg.pinv(balance.T)[:, 0] * total / self.speed**2
+        theta[0] = np.median(each)
+        theta[LOSS : LOSS + layout.rotors] = 1.0 - each / theta[0]
+        sigma = np.array([given[name].log_sigma for name in NOMINAL_NAMES])
+        sigma[0] = self.z_sigma[0]
+        return (replace(self, theta=theta, z_sigma=sigma, speed=None),)
+
+
+def _left(reply: ChangeReply) -> float:
+    mse = np.nan if reply.finding is None else reply.finding.mse_after
+    return float(mse) if np.isfinite(mse) else np.inf
 
 
 @dataclass(frozen=True)

@@ -134,3 +134,20 @@ def test_a_rotor_that_recovers_is_said_to() -> None:
     assert (reply.finding.effect, reply.finding.values["rotor"]) == ("weak_rotor", 3.0)
     assert reply.finding.values["loss"] == pytest.approx(-0.1 / 0.9, rel=0.15)
     assert "recovered" in reply.finding.evidence
+
+
+def test_a_thrust_curve_made_up_from_quiet_flight_does_not_make_a_loss_small() -> None:
+    """Once recorded losses of 15.5 % were told as 5 to 6 %: hover had been explained by a dead speed of -560 rad/s."""
+    weak = (("weak_rotor", "rotor", 3.0), ("weak_rotor", "loss", 0.1))
+    request = explained("excited", weak, ChangePoint(40.0, "thrust", -0.025, 30.0))
+    hover, entry = PELICAN.hover_speed(request.theta[0]), Layout(PELICAN).entry("thrust_curve.dead_speed")
+    made_up = request.theta.copy()
+    made_up[entry.index] = -hover
+    made_up[0] *= 0.25  # so that it carries the same weight at the same speed
+    known = replace(request, theta=made_up, speed=np.full(4, hover))
+    held = replace(known, speed=None).answer().finding
+    assert held is None or held.values.get("loss", 0.0) < 0.07
+    finding = known.answer().finding
+    assert finding is not None
+    assert (finding.effect, finding.values["rotor"]) == ("weak_rotor", 3.0)
+    assert finding.values["loss"] == pytest.approx(0.1, rel=0.15)
