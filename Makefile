@@ -100,6 +100,10 @@ DATA ?= $(or $(QUADID_DATA),../shared/data)
 findings: venv ## every input on which the product failed once: answers now, right or wrong (a minute; DATA=DIR)
 	$(STUDY) quadid_evaluation.studies.findings --data $(DATA)
 
+.PHONY: judging
+judging: venv ## one mistake at a time on right logs of many vehicles: the first line that each is answered with (5 min)
+	$(STUDY) quadid_evaluation.studies.judging --data $(DATA)
+
 peers: dev ## other programs beside ours on the same data (mujoco.sysid, sysid.tools' recipe, Kalman filters; hours)
 	$(STUDY) quadid_evaluation.studies.peers --out docs/results
 autopilot: venv ## ArduCopter's and others' flights through the online session, replayed and live in real time (half an hour)

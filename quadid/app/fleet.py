@@ -171,8 +171,8 @@ def health_trend(
 
     Returns:
         A row a flight, in the order of time: unit, log, started, baseline (whether it is part of it), and, for the
-        others, score, verdict, baseline_lacking, p_value and changes as in ``quadid.health/1``; none for vehicles with
-        too few flights.
+        others, score, verdict, baseline_lacking, unfamiliar, p_value and changes as in ``quadid.health/1``; none for
+        vehicles with too few flights.
     """
     flown = {row["log"]: flight_from_dict(json.loads(row["trim"])) for row in trims}
     by_unit: dict[str, list[HealthRow]] = {}
@@ -196,6 +196,8 @@ def _trend(
         row = {"unit": unit, "log": log["name"], "started": log["started"], "baseline": k < count}
         if k >= count:
             found = assess([flown[log["name"]]], baseline, vehicle).to_dict()
-            row |= {key: found[key] for key in ("score", "verdict", "baseline_lacking", "p_value", "changes")}
+            row |= {
+                key: found[key] for key in ("score", "verdict", "baseline_lacking", "unfamiliar", "p_value", "changes")
+            }
         rows.append(row)
     return rows

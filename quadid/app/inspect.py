@@ -27,7 +27,7 @@ from quadid.parameters import NOMINAL_UNITS
 from quadid.vehicle import Vehicle
 
 if TYPE_CHECKING:
-    from quadid.checks import Inspection
+    from quadid.checks import Check, Inspection
     from quadid.checks.motion import Spans
     from quadid.report.tables import TextTable
 
@@ -102,9 +102,23 @@ def inspect(
     found = replace(inspect_recording(cut.of(whole), described), zero=whole.first_imu_time)
     flown = flown_parts(whole, found.flying, cut)
     if described is not None:
-        found = replace(found, excitation=_excitation(whole, described, cut, flown))
+        refused = _refused(whole, described, cut, flown) if found.usable else ()
+        rows = _excitation(whole, described, cut, flown)
+        found = replace(found, excitation=rows, checks=(*found.checks, *refused))
     use = names_of(cut, flown)
     return Inspected({**found.to_dict(), "use": use, "log": str(cut.path.resolve()), "files": []}, found)
+
+
+def _refused(recording: Recording, vehicle: Vehicle, cut: LogPart, flown: Spans) -> tuple[Check, ...]:
+    """An error with the reason for which `identify` would not fit the log; none where it would."""
+    from quadid.checks import Check, CheckResult
+    from quadid.identification.fit import check_windows
+
+    try:
+        check_windows(gridded(recording, vehicle, None, cut, flown)[0])
+    except QuadidError as error:
+        return (Check("data", CheckResult.ERROR, error.found, error.fix or f"allowed: {error.allowed}"),)
+    return ()
 
 
 def _excitation(recording: Recording, vehicle: Vehicle, cut: LogPart, flown: Spans) -> tuple[dict[str, Any], ...]:

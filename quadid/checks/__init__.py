@@ -16,6 +16,7 @@ from quadid.checks.motion import (
     attitude_check,
     channel_facts,
     gravity_check,
+    gyro_source_check,
     position_checks,
     timing_checks,
     velocity_check,
@@ -24,14 +25,13 @@ from quadid.checks.motion import flying_spans as flying_spans
 from quadid.checks.motion import proposed_cuts as proposed_cuts
 from quadid.checks.rotors import (
     Lagged,
-    better_order,
+    better_description,
     geometry_check,
     hover_check,
     lagged_motion,
     mass_check,
     motor_order_check,
     readings_check,
-    reordered,
     rotor_speed_check,
     rotor_timing_check,
 )
@@ -98,11 +98,11 @@ class Log:
 Stage = Callable[[Log], Sequence[Check | None]]
 
 
-def _kinematics(log: Log) -> list[Check]:
+def _kinematics(log: Log) -> list[Check | None]:
     """Units and frames, without any rotor."""
     return [
         gravity_check(log.recording, log.spans), attitude_check(log.recording), velocity_check(log.recording),
-        *position_checks(log.read),
+        *position_checks(log.read), gyro_source_check(log.recording),
     ]  # fmt: skip
 
 
@@ -116,30 +116,29 @@ def _readings(log: Log) -> list[Check | None]:
     return [dead, log.hover]
 
 
-def _time_and_order(log: Log) -> list[Check]:
-    """Time and order of the motors: an order is only judged, and advised, of a signal in time."""
+def _time_order_balance(log: Log) -> list[Check]:
+    """Time, order and spins of the motors, and rotors one by one.
+
+    Another order is only judged, and advised, of a signal that is in time with it and in balance: else the time is
+    wrong, or a rotor.
+    """
     if log.vehicle is None:
         return []
-    vehicle, lagged = log.vehicle, log.lagged
-    time = rotor_timing_check(log.recording, vehicle, log.spans)
-    order = better_order(lagged, vehicle)
-    if order:
-        other = rotor_timing_check(log.recording, reordered(vehicle, order), log.spans)
-        own, its = (check.numbers.get("correlation", 0.0) for check in (time, other))
-        if other.verdict is CheckResult.OK and its > own:
-            return [motor_order_check(lagged, vehicle, order)]
-        if time.verdict is CheckResult.ERROR:
-            return [time]
-        return [
-            Check("motor_order", CheckResult.UNKNOWN, "no order of the motors explains the motion at one lag"),
-            time,
-        ]
-    return [time] if time.verdict is CheckResult.ERROR else [motor_order_check(lagged, vehicle, order), time]
-
-
-def _balance(log: Log) -> list[Check]:
-    """Rotors one by one."""
-    return [] if log.vehicle is None else [rotor_speed_check(log.recording, log.vehicle, log.spans)]
+    recording, vehicle, spans, lagged = log.recording, log.vehicle, log.spans, log.lagged
+    time, other = rotor_timing_check(recording, vehicle, spans), better_description(lagged, vehicle)
+    balance = rotor_speed_check(recording, vehicle, spans)
+    if other is not None:
+        again = rotor_timing_check(recording, other.vehicle, spans)
+        own, its = (check.numbers.get("correlation", 0.0) for check in (time, again))
+        fits = again.verdict is CheckResult.OK and its >= own - 1e-9
+        if fits and rotor_speed_check(recording, other.vehicle, spans).verdict is not CheckResult.ERROR:
+            return [motor_order_check(lagged, vehicle, other)]
+    if CheckResult.ERROR in (time.verdict, balance.verdict):
+        return [check for check in (time, balance) if check.verdict is CheckResult.ERROR][:1]
+    if other is not None:
+        strange = "no order of the motors explains the motion at one lag"
+        return [Check("motor_order", CheckResult.UNKNOWN, strange), time, balance]
+    return [motor_order_check(lagged, vehicle, None), time, balance]
 
 
 def _vehicle_file(log: Log) -> list[Check | None]:
@@ -151,4 +150,4 @@ def _vehicle_file(log: Log) -> list[Check | None]:
     return [mass, geometry_check(log.lagged, log.vehicle)]
 
 
-STAGES: tuple[Stage, ...] = (_kinematics, _readings, _time_and_order, _balance, _vehicle_file)
+STAGES: tuple[Stage, ...] = (_kinematics, _readings, _time_order_balance, _vehicle_file)

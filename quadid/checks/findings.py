@@ -16,8 +16,8 @@ from quadid.parameters import NOMINAL_NAMES
 
 
 FATAL = (
-    "gravity", "gyro_attitude", "velocity_attitude", "position_velocity", "rotor_speed", "hover", "motor_order",
-    "rotor_timing",
+    "gravity", "gyro_attitude", "gyro_source", "saturated", "velocity_attitude", "position_velocity", "rotor_speed",
+    "hover", "motor_order", "rotor_timing",
 )  # fmt: skip
 """Checks whose error means that nothing may be fitted to the log."""
 
@@ -74,8 +74,9 @@ class Check:
     """One question put to the data.
 
     Attributes:
-        name: of the check: gravity, gyro_attitude, velocity_attitude, position_velocity, rotor_speed, hover,
-            motor_order, rotor_timing, geometry, mass, clock, timing.
+        name: of the check: gravity, gyro_attitude, gyro_source, attitude_steps, velocity_attitude, position_velocity,
+            rotor_speed, hover, motor_order, rotor_timing, geometry, mass, clock, timing, stuck, saturated,
+            data (what `identify` would refuse).
         verdict: the answer.
         message: one sentence with numbers and units.
         fix: what to do, empty when nothing.

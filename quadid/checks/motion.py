@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from itertools import permutations, product
 from typing import NamedTuple
@@ -11,11 +13,11 @@ import numpy as np
 from quadid.checks.findings import ChannelFacts, Check, CheckResult
 from quadid.data.faults import at_limit
 from quadid.data.grid import GAP, holes, longest_step
-from quadid.data.resample import copied, linear, measured_period, moving_mean, sample_period, true_runs
+from quadid.data.resample import copied, fresh_rows, linear, measured_period, moving_mean, sample_period, true_runs
 from quadid.data.rotor_signal import rotor_channel
 from quadid.data.window import CHANNELS, Channel, Recording
 from quadid.model.layout import ThrustModel
-from quadid.rotation import conjugate, rotated, turn
+from quadid.rotation import conjugate, euler, rotated, turn
 from quadid.types import BoolArray, FloatArray
 from quadid.vehicle import GRAVITY, Vehicle
 
@@ -34,6 +36,10 @@ _CARRIES = 0.9
 """… from when the rotors first carry this fraction of what they usually do; below, the ground still has its share."""
 _IDLE = 0.15
 """Commands that never exceed this fraction of full are idling motors."""
+_CONTACT, _CARRIED, _STILL = 0.3, 0.75, 0.15
+"""For this long [s] rotors give less than this share of what is felt, and rates [rad/s] are below the last."""
+_RARELY = 0.3
+"""Rotors that give so little for more of the flight have speeds that are wrong."""
 _NOTHING = 0.1
 """A rotor below this share of the median speed of all is ignored."""
 _GROUND = 3.0
@@ -68,6 +74,9 @@ def flying_spans(recording: Recording, vehicle: Vehicle | None) -> Spans:
         if felt is not None and on.any():
             inside = (t >= t[on][0]) & (t <= t[on][-1])
             on |= inside & (felt < _FALLING)
+            inside = (t > t[on][0] + _SHORTEST) & (t < t[on][-1] - _SHORTEST)
+            usual = float(np.median((thrust / np.maximum(felt, 0.1))[on]))
+            on[inside] &= ~_stands(t[inside], thrust[inside] / usual, felt[inside], channels.get("gyro"))
         carried = t[on & (thrust > _CARRIES * np.median(thrust[on]))] if on.any() else t[on]
         return tuple(later for span in _spans(t, on) if (later := _from_carried(span, carried)))
     if "accel" in channels and len(channels["accel"].t) > 10:
@@ -83,14 +92,26 @@ def proposed_cuts(spans: Spans, first: float, last: float) -> Spans:
         first: sample that is used when nothing is cut [s].
         last: sample, likewise [s].
     """
-    flights: list[tuple[float, float]] = []
+    flights, joined = _joined(spans, _SHORTEST), _joined(spans, _GROUND)
+    apart, whole = _trimmed(flights, first, last), sum(b - a for a, b in joined)
+    if len(flights) > len(joined) and sum(b - a for a, b in apart) > 0.5 * whole:
+        return apart  # between them it stood somewhere
+    return () if last - first - whole < _GROUND else _trimmed(joined, first, last)
+
+
+def _joined(spans: Spans, most: float) -> list[tuple[float, float]]:
+    """Spans with those less than `most` [s] apart as one."""
+    out: list[tuple[float, float]] = []
     for a, b in spans:
-        if flights and a - flights[-1][1] < _GROUND:
-            flights[-1] = (flights[-1][0], b)
+        if out and a - out[-1][1] < most:
+            out[-1] = (out[-1][0], b)
         else:
-            flights.append((a, b))
-    if last - first - sum(b - a for a, b in flights) < _GROUND:
-        return ()
+            out.append((a, b))
+    return out
+
+
+def _trimmed(flights: Sequence[tuple[float, float]], first: float, last: float) -> Spans:
+    """Flights that are long enough, without the time next to the ground [s after `first`, to a tenth]."""
     cuts = [
         (0.0 if a - first < _MARGIN else a + _MARGIN - first, (b if last - b < _MARGIN else b - _MARGIN) - first)
         for a, b in flights
@@ -101,6 +122,27 @@ def proposed_cuts(spans: Spans, first: float, last: float) -> Spans:
 def within(t: FloatArray, spans: Spans) -> BoolArray:
     """Which of the times [s], shape (n,), lie in one of the spans."""
     return np.asarray(np.any([np.zeros(len(t), dtype=bool), *((t >= a) & (t <= b) for a, b in spans)], axis=0))
+
+
+def _stands(t: FloatArray, thrust: FloatArray, felt: FloatArray, gyro: Channel | None) -> BoolArray:
+    """Times at which something else carries the vehicle: its weight is felt, its rotors give less, it does not turn.
+
+    Args:
+        t: times (n,).
+        thrust: over what usually carries the weight (n,).
+        felt: specific force [g] (n,).
+        gyro: rates; without them nothing is found.
+    """
+    if gyro is None or len(t) < 3:
+        return np.zeros(len(t), dtype=bool)
+    width = max(1, round(_CONTACT / sample_period(t)))
+    fresh = np.append(~copied(gyro.values), True)  # a gyro that is stuck does not show that nothing turns
+    turning = np.interp(t, gyro.t, np.where(fresh, np.linalg.norm(gyro.values, axis=1), 1.0))
+    load, still = moving_mean(thrust / np.maximum(felt, 0.1), width), moving_mean(turning, width) < _STILL
+    if np.mean(load < _CARRIED) > _RARELY:  # then speeds disagree with the thrust, and nothing follows from them
+        return np.zeros(len(t), dtype=bool)
+    stands = (load < _CARRIED) & still & (np.abs(felt - 1.0) < 0.15)
+    return np.asarray(moving_mean(stands.astype(np.float64), 2 * width) > 0.0)
 
 
 def _thrust(channel: Channel, vehicle: Vehicle | None, felt: FloatArray | None) -> tuple[FloatArray, float]:
@@ -182,6 +224,8 @@ _STUCK = 0.5
 """An IMU channel that does not change for this long [s] in flight is stuck."""
 FILLED = 1.5
 """Rows for each measured one above which it is reported."""
+_CLIPPED = 0.05
+"""Share of clipped rates from which inertias come out wrong: 2 % too large at 0.06, 8 % at 0.16."""
 _UNSTEADY = 0.25
 """Jitter above which the log's timing is worth a warning."""
 
@@ -237,8 +281,12 @@ def timing_checks(recording: Recording, facts: tuple[ChannelFacts, ...]) -> list
         facts: of its channels.
     """
     checks = [_clock_check(recording, facts)]
+    coarse = attitude_steps_check(recording)
+    checks += [] if coarse is None else [coarse]
     for f in facts:
         rows = (f.count - 1) / max(f.last - f.first, 1e-9)
+        if f.name == "attitude" and coarse is not None:
+            continue  # a value that rests between its steps is no interpolated one
         if not f.gaps and rows > FILLED * f.rate:
             message = f"{f.name}: {rows:.3g} rows a second were interpolated between samples at {f.rate:.3g} Hz"
             checks.append(
@@ -269,8 +317,11 @@ def timing_checks(recording: Recording, facts: tuple[ChannelFacts, ...]) -> list
                 Check("stuck", CheckResult.WARNING, message, "check this sensor or topic", {"stuck_s": f.stuck})
             )
         if f.name in ("gyro", "accel") and f.saturated:
-            message = f"{f.name}: {f.saturated} samples at the limit of its range"
-            checks.append(Check("saturated", CheckResult.WARNING, message, "choose a larger range or fly more gently"))
+            share = f.saturated / f.count
+            verdict = CheckResult.ERROR if f.name == "gyro" and share > _CLIPPED else CheckResult.WARNING
+            message = f"{f.name}: {f.saturated} samples ({share:.2g} of all) at the limit of its range"
+            fix = "choose a larger range or fly more gently"
+            checks.append(Check("saturated", verdict, message, fix, {"share": share}))
     return checks
 
 
@@ -310,6 +361,10 @@ _JUMP = 8.0
 """An attitude step of so many times the usual one, beside half as much of the gyro's, is no motion."""
 _FARTHEST, _LAG, _TOO_LATE = 0.3, 0.02, 0.08
 """Gyro and attitude are compared at times so far apart at most [s], in these steps; more than the last is an error."""
+_DERIVED = 0.05
+"""A gyro this near to the change of attitude, beside what changes from row to row but one, was made of it."""
+_COARSE, _LEVELS, _EQUAL = 0.005, 0.2, 1e-6
+"""Steps of the attitude [rad] that are named, levels for each sample below which it comes in steps, and what is one."""
 _REVERSED = 0.7
 """Correlation below the negative of which a vertical signal points up."""
 _RESTING = 50
@@ -402,16 +457,44 @@ def gravity_check(recording: Recording, spans: Spans) -> Check:
             return check(CheckResult.ERROR, f"{message}: gravity is missing", fix)
         if not 0.5 < length / GRAVITY < 2.0:
             return check(CheckResult.ERROR, f"{message}: this is no specific force in m/s^2", "log raw acceleration")
-    if z > -0.5 * length and _attitude_explains(accel, recording.channels.get("attitude"), inside):
+    flown = z > 0.5 * length and bool(spans) and _turns(recording.channels.get("gyro"), spans)
+    if z > -0.5 * length and not flown and _attitude_explains(accel, recording.channels.get("attitude"), inside):
         return check(CheckResult.UNKNOWN, f"{message}; its attitude says that the vehicle lies or turns so")
     if not spans and abs(z) < 0.8 * length:
         return check(CheckResult.UNKNOWN, f"{message}; the vehicle does not fly in this log")
     if z > 0.5 * length:
         turned = f"{message}: z points up (FLU, as ROS has it) or the sign is reversed"
-        return check(CheckResult.ERROR, turned, "turn body vectors to FRD: negate y and z")
+        return check(CheckResult.ERROR, turned, _downwards(recording, accel, inside))
     if z > -0.5 * length:
         return check(CheckResult.ERROR, f"{message}: gravity is not along z", "check the axes of the IMU")
     return check(CheckResult.OK, message)
+
+
+def _downwards(recording: Recording, accel: Channel, inside: BoolArray) -> str:
+    """What to turn where the specific force points up: what gyro, attitude and velocity agree with."""
+    attitude, velocity = recording.channels.get("attitude"), recording.channels.get("velocity")
+    body = "turn body vectors to FRD: negate y and z"
+    if attitude is None or len(attitude.t) < 2 or gyro_check(recording).verdict is not CheckResult.OK:
+        return body
+    if float(np.median(_in_world(accel, attitude)[inside, 2])) < 0.0:
+        return f"{body}, and turn the attitude with them"
+    fixes = {
+        "negate y and z of the accelerometer alone": replace(accel, values=accel.values * [1.0, -1.0, -1.0]),
+        "turn all of it to FRD and NED: this is ROS' FLU and ENU": accel,
+    }
+    if velocity is not None and len(velocity.t) >= FEWEST_SAMPLES:
+        tried = {fix: _velocity_gains(trial, attitude, velocity) for fix, trial in fixes.items()}
+        fits = {fix: fit_axes(derived[:, :2], gained[:, :2]) for fix, (gained, derived) in tried.items()}
+        clear = [fix for fix, fit in fits.items() if fit.straight and fit.r2 > _CLEAR]
+        if len(clear) == 1:
+            return clear[0]
+    return " or ".join(fixes)
+
+
+def _turns(gyro: Channel | None, spans: Spans) -> bool:
+    """Tests for a vehicle that moves while its rotors carry it, as none does that lies on its back."""
+    inside = np.zeros(0, dtype=bool) if gyro is None else within(gyro.t, spans)
+    return gyro is not None and bool(inside.any() and np.max(np.std(gyro.values[inside], axis=0)) > _MOTION)
 
 
 def _reads_gravity_at_rest(values: FloatArray) -> bool:
@@ -429,7 +512,9 @@ def _attitude_explains(accel: Channel, attitude: Channel | None, inside: BoolArr
 
 def attitude_check(recording: Recording) -> Check:
     """Attitude against gyro (axes, signs, degrees for radians) and against gravity (a world with z down)."""
-    rates = gyro_check(recording)
+    rates, coarse = gyro_check(recording), attitude_steps_check(recording)
+    if coarse is not None and rates.numbers.get("r2", 1.0) < _CLEAR:
+        rates = Check(rates.name, CheckResult.UNKNOWN, f"{coarse.message}: too coarse to compare with the gyro")
     accel, attitude = recording.channels.get("accel"), recording.channels.get("attitude")
     if rates.verdict is CheckResult.ERROR or accel is None or attitude is None or len(attitude.t) < 2:
         return rates
@@ -439,7 +524,7 @@ def attitude_check(recording: Recording) -> Check:
     return Check(
         rates.name, CheckResult.ERROR,
         f"the attitude turns what the accelerometer reads to point down ({down:.3g} m/s^2): its world has z up",
-        "convert attitude, velocity and position to NED; ROS uses east, north, up (ENU)",
+        "convert attitude, velocity and position to NED; ROS uses east, north, up (ENU)", {"down": down},
     )  # fmt: skip
 
 
@@ -448,6 +533,12 @@ def gyro_check(recording: Recording) -> Check:
     gyro, attitude = recording.channels.get("gyro"), recording.channels.get("attitude")
     if gyro is None or attitude is None or min(len(gyro.t), len(attitude.t)) < 20:
         return Check("gyro_attitude", CheckResult.UNKNOWN, "needs gyro and attitude")
+    if (period := measured_period(gyro.t, gyro.values)) > _STEP:
+        slow = f"gyro at {1.0 / period:.2g} Hz is too slow to compare with the attitude"
+        return Check("gyro_attitude", CheckResult.UNKNOWN, slow)
+    if measured_period(attitude.t, attitude.values) > 0.5 * _STEP:  # slow readings may be written again and again
+        fresh = fresh_rows(attitude.values)
+        attitude = replace(attitude, t=attitude.t[fresh], values=attitude.values[fresh])
     best: tuple[str, AxisMap] | None = None
     for name, q in _attitude_readings(attitude.values):
         measured, derived = _moving_rates(gyro, attitude.t, q)
@@ -461,7 +552,7 @@ def gyro_check(recording: Recording) -> Check:
     if best is None:
         return Check("gyro_attitude", CheckResult.UNKNOWN, "too little rotation to compare gyro and attitude")
     late = _apart(gyro, attitude, best[1].r2) if best[0] == "as given" else None
-    return late or _bias_step(gyro, attitude) or _judge_rates(*best)
+    return late or _angle_rates(gyro, attitude) or _bias_step(gyro, attitude) or _judge_rates(*best)
 
 
 def _bias_step(gyro: Channel, attitude: Channel) -> Check | None:
@@ -487,6 +578,83 @@ def _bias_step(gyro: Channel, attitude: Channel) -> Check | None:
         "gyro_attitude", CheckResult.ERROR,
         f"the gyro's bias about {_AXES[axis]} stepped by {size[k, axis]:+.2g} rad/s; without that the attitude agrees",
         "use the flight before it, and calibrate the gyro at rest", {"step": float(size[k, axis])},
+    )  # fmt: skip
+
+
+def _angle_rates(gyro: Channel, attitude: Channel) -> Check | None:
+    """An error where the gyro holds the rates of roll, pitch and yaw angle, not those about the body's axes.
+
+    Both differ by a part that grows with tilt; what the gyro differs from the body's rates is compared with it.
+    """
+    t, q = _strided(attitude)
+    measured, turned = _rates(gyro, t, q)
+    keep = usable_steps(t, gyro.t)
+    angles = np.diff(np.unwrap(euler(q), axis=0), axis=0)[keep] / np.diff(t)[keep, None]
+    measured, turned, angles = _without_jumps(measured, turned, angles)
+    apart, missed = angles - turned, measured - turned
+    size = float(np.sum(apart**2))
+    if len(apart) < FEWEST_SAMPLES or float(np.mean(apart**2)) < _MOTION**2:
+        return None
+    like = float(np.sum(apart * missed))
+    if like < 0.5 * size or like**2 < _CLEAR * size * float(np.sum(missed**2)):
+        return None
+    return Check(
+        "gyro_attitude", CheckResult.ERROR,
+        "gyro holds the rates of roll, pitch and yaw angle (Euler rates), not those about the body's axes",
+        "log the gyro; or p = phi' - psi' sin(theta), q = theta' cos(phi) + psi' sin(phi) cos(theta), "
+        "r = psi' cos(phi) cos(theta) - theta' sin(phi)", {"share": like / size},
+    )  # fmt: skip
+
+
+def gyro_source_check(recording: Recording) -> Check | None:
+    """A warning where the gyro is the attitude, differentiated, an error where its noise rules; else None.
+
+    Noise of the attitude is then that of the gyro, row by row: their difference is far below what changes from one
+    row to the next but one, which is what a sensor of its own and a central difference leave.
+    """
+    gyro, attitude = recording.channels.get("gyro"), recording.channels.get("attitude")
+    if gyro is None or attitude is None or min(len(gyro.t), len(attitude.t)) < FEWEST_SAMPLES:
+        return None
+    fresh = fresh_rows(attitude.values)
+    t, q = attitude.t[fresh], attitude.values[fresh]
+    inside = (t >= gyro.t[0]) & (t <= gyro.t[-1])
+    t, q = t[inside], q[inside]
+    if len(t) < FEWEST_SAMPLES or np.min(np.diff(t)) <= 0.0:
+        return None
+    rates = turn(q[:-1], q[1:]) / np.diff(t)[:, None]
+    bends = float(np.median(np.linalg.norm(np.diff(rates, 2, axis=0), axis=1)))
+    at_rows = linear(gyro.t, gyro.values, t)
+    missed = (at_rows[:-1] - rates, at_rows[1:] - rates, at_rows[1:-1] - 0.5 * (rates[1:] + rates[:-1]))
+    least = min(float(np.median(np.linalg.norm(rows, axis=1))) for rows in missed)
+    if least >= _DERIVED * bends:
+        return None
+    noisy = bends > 0.5 * float(np.median(np.linalg.norm(rates, axis=1)))
+    return Check(
+        "gyro_source", CheckResult.ERROR if noisy else CheckResult.WARNING,
+        "gyro is the attitude, differentiated: it measures nothing by itself" + ", and is mostly noise" * noisy,
+        "log the gyro; noise and delay of the attitude are in both", {"missed_rad_s": least, "bends_rad_s": bends},
+    )  # fmt: skip
+
+
+def _quantum(values: FloatArray) -> float:
+    """Step between the levels of a coarse signal, shape (n,), in its unit; 0 where nearly every sample has its own."""
+    levels = np.unique(values)
+    steps = np.diff(levels)[np.diff(levels) > _EQUAL]
+    return 0.0 if not len(steps) or len(steps) > _LEVELS * len(values) else float(np.min(steps))
+
+
+def attitude_steps_check(recording: Recording) -> Check | None:
+    """A warning where roll, pitch and heading come in steps that are coarse beside usual noise; None for fine ones."""
+    attitude = recording.channels.get("attitude")
+    if attitude is None or len(attitude.t) < FEWEST_SAMPLES:
+        return None
+    step = min(_quantum(column) for column in euler(attitude.values)[:, :2].T)
+    if step < _COARSE:
+        return None
+    return Check(
+        "attitude_steps", CheckResult.WARNING,
+        f"attitude comes in steps of {np.degrees(step):.2g} deg ({attitude.source})",
+        "log it with more digits, as quaternion", {"step_rad": step},
     )  # fmt: skip
 
 
@@ -522,18 +690,24 @@ def _moving_rates(gyro: Channel, t: FloatArray, q: FloatArray) -> tuple[FloatArr
     motion = np.maximum((4.0 * np.var(longer, axis=0) - total) / 3.0, 0.0)
     if max(np.max(np.sqrt(motion)), np.max(np.std(measured, axis=0))) < _MOTION:
         return longer[:0], longer[:0]
-    if np.sum(motion) > 0.8 * np.sum(total):
+    if np.sum(motion) > 0.8 * np.sum(total) or len(t) < 20 * 4 * stride:
         return measured, derived
     return _rates(gyro, t[:: 4 * stride], q[:: 4 * stride])
 
 
-def _without_jumps(measured: FloatArray, derived: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _without_jumps(measured: FloatArray, derived: FloatArray, *more: FloatArray) -> tuple[FloatArray, ...]:
     """Rates without rows in which the attitude jumps and the gyro does not: an estimator reset its heading there."""
     if not len(derived):
-        return measured, derived
+        return measured, derived, *more
     turned, felt = (np.linalg.norm(rows, axis=1) for rows in (derived, measured))
     jumps = (turned > _JUMP * np.median(turned)) & (felt < 0.5 * _JUMP * np.median(felt))
-    return measured[~jumps], derived[~jumps]
+    return tuple(rows[~jumps] for rows in (measured, derived, *more))
+
+
+def _strided(attitude: Channel) -> tuple[FloatArray, FloatArray]:
+    """Times and attitudes about `_STEP` apart."""
+    stride = max(1, round(_STEP / sample_period(attitude.t)))
+    return attitude.t[::stride], attitude.values[::stride]
 
 
 def _likely(reading: str, fit: AxisMap) -> float:
@@ -634,9 +808,9 @@ def _in_world(accel: Channel, attitude: Channel) -> FloatArray:
 
 
 def usable_steps(t: FloatArray, other: FloatArray) -> BoolArray:
-    """Tells which steps of `t` have no gap, neither in `t` nor in the other channel's times."""
+    """Tells which steps of `t` have no gap, neither in `t` nor, as long as a quarter of one, in the other's times."""
     steps = np.diff(t)
-    longest = GAP * sample_period(other)
+    longest = max(GAP * sample_period(other), 0.25 * float(np.median(steps)) if len(steps) else 0.0)
     holes = np.flatnonzero(np.diff(other) > longest)
     following = np.searchsorted(other[holes + 1], t[:-1], "right")
     spoiled = np.append(other[holes], np.inf)[following] < t[1:]

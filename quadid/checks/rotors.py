@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from functools import partial
-from itertools import permutations
+from itertools import combinations, permutations
 from typing import NamedTuple
 
 import numpy as np
@@ -377,10 +377,16 @@ _LEAST_RATE = 30.0
 """Slower rotor readings [Hz] miss the motion that distinguishes orders."""
 _LAGS = 5
 """Motors answer late: torque up to this many rows earlier is tried."""
-_SETTLED, _MARGIN = 0.25, 0.15
-"""Mean correlation that settles an order, and by how much another order must be better."""
+_SETTLED = 0.25
+"""Correlation in roll and pitch that settles an order."""
+_GAIN, _SPIN_GAIN, _CHANGE = 0.3, 0.15, 0.1
+"""Likelihood that another order or frame, or other spins, must gain for each sample; what each change costs."""
 _MOST_ROTORS = 6
-"""Beyond this only turns and mirror images of the order are tried, not all permutations."""
+"""Beyond this turns, mirror images and exchanges of the order are tried, not all permutations."""
+_CANCELS = 1e-3
+"""Power of a torque, beside that of its rotors one by one, below which it is rounding."""
+_TURNED = math.radians(20.0)
+"""A smaller turn of the frame is none."""
 
 
 def hover_check(recording: Recording, vehicle: Vehicle, spans: Spans) -> Check:
@@ -433,17 +439,29 @@ Lagged = list[tuple[FloatArray, FloatArray, FloatArray]]
 """Thrust over b (n, rotors), angular acceleration (n, 3) and rotors' own (n, rotors), for each lag of the motors."""
 
 
-def motor_order_check(lagged: Lagged | str, vehicle: Vehicle, order: tuple[int, ...] | None) -> Check:
+def motor_order_check(lagged: Lagged | str, vehicle: Vehicle, other: Other | None) -> Check:
     """Correlates roll, pitch and yaw torque with angular acceleration.
 
     Args:
         lagged: of `lagged_motion`.
         vehicle: whose geometry and order are judged.
-        order: the better one that `better_order` found, if any.
+        other: what explains the motion better, of `better_description`, if anything does.
     """
     if isinstance(lagged, str):
         return Check("motor_order", CheckResult.UNKNOWN, lagged)
-    return _judge_order(lagged, vehicle, order)
+    if _still(lagged):
+        return Check("motor_order", CheckResult.UNKNOWN, "too little rotation to check the motor order")
+    own = _described(lagged, vehicle)
+    numbers = {f"correlation_{axis}": float(c) for axis, c in zip(("roll", "pitch", "yaw"), own, strict=True)}
+    numbers |= {} if other is None else {"turned_rad": other.turned}
+    check = partial(Check, "motor_order", numbers=numbers)
+    text = f"correlation of torque and angular acceleration: roll {own[0]:.2f}, pitch {own[1]:.2f}, yaw {own[2]:.2f}"
+    if other is not None:
+        r, p, y = other.correlation
+        return check(CheckResult.ERROR, f"{text}; {other.told} ({r:.2f}, {p:.2f}, {y:.2f})", other.fix)
+    if min(own[0], own[1]) > _SETTLED:
+        return check(CheckResult.OK, text)
+    return check(CheckResult.UNKNOWN, f"{text}: too weak to judge")
 
 
 def lagged_motion(recording: Recording, vehicle: Vehicle, spans: Spans) -> Lagged | str:
@@ -496,15 +514,61 @@ def _fast_motion(
     return acted, gained, spun
 
 
-def better_order(lagged: Lagged | str, vehicle: Vehicle) -> tuple[int, ...] | None:
-    """The order of the log's columns with which torque follows the motion much better; None for none."""
+class Other(NamedTuple):
+    """A vehicle that explains the motion much better: what differs, what to do, correlations, its turn [rad]."""
+
+    vehicle: Vehicle
+    told: str
+    fix: str
+    correlation: FloatArray
+    turned: float
+
+
+def better_description(lagged: Lagged | str, vehicle: Vehicle) -> Other | None:
+    """The order of the log's columns, spins or turn of the frame with which torque follows the motion much better.
+
+    The gain is that of a likelihood, sum of -log(1 - correlation^2) over roll, pitch and yaw, less `_CHANGE` for each
+    thing that is changed; None where nothing gains enough, or the better correlation is weak, too.
+    """
     if isinstance(lagged, str) or _still(lagged):
         return None
-    orders = _orders(len(vehicle.rotors))
-    means = _correlations(lagged, vehicle, orders).mean(axis=1)
-    best = int(np.argmax(means))
-    own = float(means[orders.index(tuple(range(len(vehicle.rotors))))])
-    return orders[best] if means[best] - own > _MARGIN and means[best] > _SETTLED else None
+    grams = [_Gram.of(rows) for rows in lagged]
+    rotors = tuple(range(len(vehicle.rotors)))
+    turned, angle = _turned(grams, vehicle)
+    named: list[tuple[float, Vehicle, tuple[int, ...], float, FloatArray]] = []
+    for described, orders in ((vehicle, _orders(len(rotors))), (turned, [rotors] if abs(angle) > _TURNED else [])):
+        for sign in (1.0, -1.0):
+            for order, axes in _best(grams, described, orders, sign):
+                cost = _CHANGE * (_moved(order) + (sign < 0.0) + 1.5 * (described is turned))
+                named.append((float(_gain(axes)) - cost, described, order, sign, axes))
+    own = next(
+        gain for gain, described, order, sign, _ in named if described is vehicle and order == rotors and sign > 0.0
+    )
+    gain, described, order, sign, axes = max(named, key=lambda one: one[0])
+    least = _SPIN_GAIN if described is vehicle and order == rotors else _GAIN
+    if gain - own < least or float(np.mean(axes[:2])) < _SETTLED:
+        axes = _described(lagged, vehicle)
+        right, reversed_ = (_yaw_explained(lagged, vehicle, turns) for turns in (1.0, -1.0))
+        if min(axes[0], axes[1]) < _SETTLED or axes[2] > _SETTLED or reversed_ < max(_SETTLED, right + _SPIN_GAIN):
+            return None
+        described, order, sign, axes = vehicle, rotors, -1.0, np.array([axes[0], axes[1], reversed_])
+    told, fix = [], []
+    if described is turned:
+        degrees = math.degrees(angle)
+        told.append(f"the vehicle answers as if its rotors stood {degrees:+.0f} deg further about z")
+        fix.append(f"turn the rotor positions of the vehicle file by {degrees:+.0f} deg (x towards y)")
+    if order != rotors:
+        columns = ", ".join(str(i + 1) for i in order)
+        told.append(f"much better with the log's columns in the order {columns}")
+        fix.append(f"reorder the rotors of the vehicle file to take columns {columns}")
+    if sign < 0.0:
+        told.append("yaw is reversed")
+        fix.append("negate the spins in the vehicle file")
+    new = reordered(described, order) if order != rotors else described
+    if sign < 0.0:
+        spun = tuple(r.model_copy(update={"spin": -r.spin}) for r in new.rotors)
+        new = new.model_copy(update={"rotors": spun})
+    return Other(new, " and ".join(told), " and ".join(fix), axes, angle if described is turned else 0.0)
 
 
 def reordered(vehicle: Vehicle, order: tuple[int, ...]) -> Vehicle:
@@ -516,25 +580,79 @@ def _still(lagged: Lagged) -> bool:
     return float(np.max(np.std(lagged[0][1], axis=0))) < 0.05
 
 
-def _judge_order(lagged: Lagged, vehicle: Vehicle, order: tuple[int, ...] | None) -> Check:
-    if _still(lagged):
-        return Check("motor_order", CheckResult.UNKNOWN, "too little rotation to check the motor order")
-    own = _correlations(lagged, vehicle, [tuple(range(len(vehicle.rotors)))])[0]
-    numbers = {f"correlation_{axis}": float(c) for axis, c in zip(("roll", "pitch", "yaw"), own, strict=True)}
-    check = partial(Check, "motor_order", numbers=numbers)
-    text = f"correlation of torque and angular acceleration: roll {own[0]:.2f}, pitch {own[1]:.2f}, yaw {own[2]:.2f}"
-    if order:
-        mean = float(_correlations(lagged, vehicle, [order]).mean())
-        columns = ", ".join(str(i + 1) for i in order)
-        better = f"{text}; much better ({mean:.2f} on average) with the log's columns in the order {columns}"
-        return check(CheckResult.ERROR, better, f"reorder the rotors of the vehicle file to take columns {columns}")
-    right, reversed_ = (_yaw_explained(lagged, vehicle, sign) for sign in (1.0, -1.0))
-    if own[2] < -_SETTLED or (own[2] < _SETTLED < reversed_ and reversed_ - right > _MARGIN):
-        turned = f"{text}: yaw is reversed (with the other spins {reversed_:.2f}, drag and spin-up of the rotors)"
-        return check(CheckResult.ERROR, turned, "negate the spins in the vehicle file")
-    if min(own[0], own[1]) > _SETTLED:
-        return check(CheckResult.OK, text)
-    return check(CheckResult.UNKNOWN, f"{text}: too weak to judge")
+class _Gram(NamedTuple):
+    """Products of the rotors' thrusts, (n, n), of thrusts and motion, (n, 3), and power of the motion, (3,)."""
+
+    thrust: FloatArray
+    motion: FloatArray
+    power: FloatArray
+
+    @classmethod
+    def of(cls, rows: tuple[FloatArray, FloatArray, FloatArray]) -> _Gram:
+        """Products of one lag's rows."""
+        thrust, motion, _ = rows
+        return cls(thrust.T @ thrust, thrust.T @ motion, np.sum(motion**2, axis=0))
+
+
+def _described(lagged: Lagged, vehicle: Vehicle) -> FloatArray:
+    """Correlation of the vehicle as it is described, in roll, pitch and yaw, at its best lag, shape (3,)."""
+    grams = [_Gram.of(rows) for rows in lagged]
+    return _best(grams, vehicle, [tuple(range(len(vehicle.rotors)))], 1.0)[0][1]
+
+
+def _best(
+    grams: Sequence[_Gram], vehicle: Vehicle, orders: Sequence[tuple[int, ...]], sign: float
+) -> list[tuple[tuple[int, ...], FloatArray]]:
+    """Orders with their correlations at their best lag; of many rotors also what exchanges of two lead to."""
+    if not orders:
+        return []
+    found = _correlations(grams, vehicle, orders, sign)
+    out = list(zip(orders, found, strict=True))
+    while len(orders) > 1 and len(vehicle.rotors) > _MOST_ROTORS:
+        order, axes = max(out, key=lambda one: _gain(one[1]))
+        near = [_exchanged(order, i, j) for i, j in combinations(range(len(order)), 2)]
+        closer = list(zip(near, _correlations(grams, vehicle, near, sign), strict=True))
+        out += closer
+        if max(_gain(one[1]) for one in closer) < _gain(axes) + 1e-3:
+            break
+    return out
+
+
+def _moved(order: tuple[int, ...]) -> float:
+    """What an order costs beside its spins: two motors exchanged, or any other way of counting, less than a muddle."""
+    moved = sum(k != place for k, place in enumerate(order))
+    simple = moved == 2 or len(order) <= _MOST_ROTORS or order in _orders(len(order))
+    return 0.0 if not moved else 1.2 if simple else 1.2 + 0.1 * moved
+
+
+def _exchanged(order: tuple[int, ...], i: int, j: int) -> tuple[int, ...]:
+    new = list(order)
+    new[i], new[j] = new[j], new[i]
+    return tuple(new)
+
+
+def _gain(correlation: FloatArray) -> FloatArray:
+    """Likelihood by which correlations (…, 3) explain the motion; a negative one counts against; shape (…,)."""
+    bounded = np.clip(correlation, -0.999, 0.999)
+    return np.asarray(-np.sum(np.log1p(-np.sign(bounded) * bounded**2), axis=-1))
+
+
+def _correlations(
+    grams: Sequence[_Gram], vehicle: Vehicle, orders: Sequence[tuple[int, ...]], sign: float
+) -> FloatArray:
+    """Correlation of torque and angular acceleration at each order's best lag, shape (orders, 3); spins times `sign`.
+
+    Orders in which the rotors' torques cancel, by commands that a mixer makes of four, explain nothing.
+    """
+    arms = vehicle.torque_arms[np.argsort(orders, axis=1)] * [1.0, 1.0, sign]
+    found = []
+    for gram in grams:
+        along = np.einsum("ora,ra->oa", arms, gram.motion)
+        power = np.einsum("ora,rq,oqa->oa", arms, gram.thrust, arms, optimize=True)
+        least = _CANCELS * np.einsum("ora,r->oa", arms**2, np.diag(gram.thrust)) + 1e-300
+        found.append(along / np.sqrt(np.maximum(power, least) * np.maximum(gram.power, 1e-300)))
+    at_lag = np.array(found)
+    return np.asarray(at_lag[_gain(at_lag).argmax(axis=0), np.arange(len(orders))])
 
 
 def _yaw_explained(lagged: Lagged, vehicle: Vehicle, sign: float) -> float:
@@ -553,24 +671,33 @@ def _yaw_explained(lagged: Lagged, vehicle: Vehicle, sign: float) -> float:
     return float(torque @ motion[:, 2] / max(norm, 1e-300))
 
 
+def _turned(grams: Sequence[_Gram], vehicle: Vehicle) -> tuple[Vehicle, float]:
+    """The vehicle with its frame turned about z as roll and pitch answer, and by how much [rad].
+
+    With A the least-squares map from torque over b to inertia times acceleration, A = k R(alpha).
+    """
+    arms, inertia = vehicle.torque_arms[:, :2], vehicle.initial[2:4]
+    best, angle = 0.0, 0.0
+    for gram in grams:
+        cross = arms.T @ gram.motion[:, :2] * inertia
+        a = np.linalg.lstsq(arms.T @ gram.thrust @ arms, cross, rcond=None)[0]
+        explained = float(np.sum(a * cross / (gram.power[:2] * inertia**2 + 1e-300)))
+        if explained > best:
+            best, angle = explained, math.atan2(a[0, 1] - a[1, 0], a[0, 0] + a[1, 1])
+    cos, sin = math.cos(angle), math.sin(angle)
+    rotors = tuple(
+        r.model_copy(update={"position": (cos * x - sin * y, sin * x + cos * y, z)})
+        for r in vehicle.rotors for x, y, z in (r.position,)
+    )  # fmt: skip
+    return vehicle.model_copy(update={"rotors": rotors}), angle
+
+
 def _orders(rotors: int) -> list[tuple[int, ...]]:
     own = tuple(range(rotors))
     if rotors <= _MOST_ROTORS:
         return list(permutations(own))
     turns = [own[i:] + own[:i] for i in range(rotors)]
     return turns + [turn[::-1] for turn in turns]
-
-
-def _correlations(lagged: Lagged, vehicle: Vehicle, orders: list[tuple[int, ...]]) -> FloatArray:
-    """Correlation of torque and angular acceleration at each order's best lag, shape (orders, 3)."""
-    arms = vehicle.torque_arms[np.argsort(orders, axis=1)]
-    found = []
-    for squares, motion, _ in lagged:
-        torque = np.einsum("nr,ora->noa", squares, arms, optimize=True)
-        norm = np.linalg.norm(torque, axis=0) * np.linalg.norm(motion, axis=0)
-        found.append(np.einsum("noa,na->oa", torque, motion) / np.maximum(norm, 1e-300))
-    at_lag = np.array(found)
-    return np.asarray(at_lag[at_lag.mean(axis=2).argmax(axis=0), np.arange(len(orders))])
 
 
 # --- Mass and rotor positions against what the flight shows, as far as physics reveals them
@@ -584,7 +711,6 @@ _KNOWN = 0.1
 """Relative standard deviation up to which a parameter counts as known."""
 _MASS_OFF, _ARM_OFF = 0.08, 0.2
 """Relative differences that are reported: of mass; of arm, whose effect slow motors weaken."""
-_TURNED = math.radians(20.0)
 _EXPLAINED = 0.1
 """Share of the variance of roll, and of pitch, that rotor torques must explain before geometry is judged by them."""
 
@@ -659,12 +785,6 @@ def geometry_check(lagged: Lagged | str, vehicle: Vehicle) -> Check:
     angle = math.atan2(a[0, 1] - a[1, 0], a[0, 0] + a[1, 1])
     scale = 0.5 * math.hypot(a[0, 1] - a[1, 0], a[0, 0] + a[1, 1])
     numbers = {"turned_rad": angle, "explained": float(np.min(share))}
-    if abs(angle) > _TURNED:
-        degrees = math.degrees(angle)
-        return Check(
-            name, CheckResult.ERROR, f"the vehicle answers as if its rotors stood {degrees:+.0f} deg further about z",
-            f"turn the rotor positions of the vehicle file by {degrees:+.0f} deg (x towards y)", numbers,
-        )  # fmt: skip
     return _judge_scale(vehicle, scale, numbers)
 
 

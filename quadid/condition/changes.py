@@ -319,6 +319,8 @@ _SURE = 0.75
 """A change is named with confidence where explanations that hold it have this much of the probability."""
 _UNEXPLAINED = 1e-3
 """An explanation, be it that nothing changed, that leaves a rest less probable than this explains nothing."""
+_LIVELIER, _LIVELY = 3.0, 0.3
+"""Flights that turn so many times more than any of the baseline, and by more than this [rad/s], are of another kind."""
 _RIVALS = 3
 ENOUGH = 5
 """Baseline flights that a verdict of no change needs, unless it would be the same with as many."""
@@ -394,6 +396,7 @@ class Health:
         healthy: the baseline's trim and spread.
         flights: trims of the flights in question.
         baseline: trims of the baseline flights.
+        unfamiliar: why the flights are of a kind that no baseline flight is; the verdict is unknown then.  Else empty.
     """
 
     verdict: str
@@ -406,6 +409,7 @@ class Health:
     healthy: Healthy
     flights: tuple[FlightTrim, ...]
     baseline: tuple[FlightTrim, ...]
+    unfamiliar: str = ""
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data of the form ``quadid.health/1``, without the names of files."""
@@ -416,6 +420,7 @@ class Health:
             "schema": "quadid.health/1",
             "verdict": self.verdict,
             "baseline_lacking": self.lacking,
+            "unfamiliar": self.unfamiliar,
             "changes": [change.to_dict() for change in self.changes],
             "score": self.score,
             "p_value": self.p_value,
@@ -444,14 +449,23 @@ def assess(flights: Sequence[FlightTrim], baseline: Sequence[FlightTrim], vehicl
     rest = exact(change) - (found[0].hypothesis.effect @ found[0].value if named else 0.0)
     p_rest = p_healthy(rest, deviation, healthy.freedom)
     unexplained = p_rest < _UNEXPLAINED
-    lacking = 0 if named or unexplained else _lacking(change, healthy, len(flights), vehicle)
-    verdict = "unknown" if unexplained or lacking else "changed" if named else "unchanged"
-    changes = () if unexplained else _changes(found, vehicle, verdict == "changed")
+    unfamiliar = _unfamiliar(flights, baseline)
+    lacking = 0 if named or unexplained or unfamiliar else _lacking(change, healthy, len(flights), vehicle)
+    verdict = "unknown" if unexplained or lacking or unfamiliar else "changed" if named else "unchanged"
+    changes = () if unexplained else _changes(found, vehicle, verdict == "changed", not unfamiliar)
     score = float(np.sqrt((far**2).sum()))
     return Health(
         verdict, lacking, changes, score, p_rest if unexplained else p_value, trim, far, healthy, tuple(flights),
-        tuple(baseline),
+        tuple(baseline), unfamiliar,
     )  # fmt: skip
+
+
+def _unfamiliar(flights: Sequence[FlightTrim], baseline: Sequence[FlightTrim]) -> str:
+    """Why the flights are of a kind that no baseline flight is; empty where they are not, or rates are not known."""
+    now, known = (max(flight.turning for flight in part) for part in (flights, baseline))
+    if not now > max(_LIVELIER * known, _LIVELY):  # also of NaN
+        return ""
+    return f"these flights turn by {now:.2g} rad/s (rms), the baseline flights by {known:.2g} rad/s at most"
 
 
 def _lacking(change: FloatArray, healthy: Healthy, flights: int, vehicle: Vehicle) -> int:
@@ -479,18 +493,37 @@ def changes_of(
     return _changes(compare(exact(change), healthy, flights, offered), vehicle, changed)
 
 
-def _changes(found: Sequence[Explained], vehicle: Vehicle, changed: bool) -> tuple[Change, ...]:
-    """The best explanation as changes, largest first, with the explanations that lost."""
+def _changes(found: Sequence[Explained], vehicle: Vehicle, changed: bool, steady: bool = True) -> tuple[Change, ...]:
+    """The best explanation as changes, largest first, with the explanations that lost.
+
+    Of two rotors on one axis only the yaw trim tells which one is weak; where it does not, or the flights are no
+    `steady` ones, as motion moves that trim most, both are named.
+    """
     shares = np.exp([one.log_evidence - found[0].log_evidence for one in found])
     shares /= shares.sum()
     best, lost = found[0], _rivals(found, shares)
+
+    def held(*rotors: int) -> float:
+        """Probability of the explanations that hold one of these rotors."""
+        return float(sum(s for e, s in zip(found, shares, strict=True) if {*rotors} & {*e.hypothesis.rotors}))
+
     if best.hypothesis.kind == "weak_rotor":
         out = []
         for k, rotor in enumerate(best.hypothesis.rotors):
-            sure = float(sum(s for one, s in zip(found, shares, strict=True) if rotor in one.hypothesis.rotors))
-            out.append(_weak_rotor(best, k, sure, changed, lost))
+            partner, sure = _coaxial(vehicle, rotor), held(rotor)
+            if partner is not None and partner not in best.hypothesis.rotors and not (steady and sure > _SURE):
+                out.append(_weak_rotor(best, k, held(rotor, partner), changed, lost, partner))
+            else:
+                out.append(_weak_rotor(best, k, sure, changed, lost))
         return tuple(sorted(out, key=lambda c: -abs(c.parameters[1][2])))
     return _changes_of_mass(best, vehicle, float(shares[0]), changed, lost)
+
+
+def _coaxial(vehicle: Vehicle, rotor: int) -> int | None:
+    """The rotor above or below another one; None for none."""
+    away = np.linalg.norm(vehicle.rotor_positions[:, :2] - vehicle.rotor_positions[rotor, :2], axis=1)
+    near = [k for k in np.flatnonzero(away < 0.1 * vehicle.arm).tolist() if k != rotor]
+    return int(near[0]) if near else None
 
 
 def _rivals(found: Sequence[Explained], shares: FloatArray) -> tuple[Rival, ...]:
@@ -519,16 +552,20 @@ def _added(one: Explained, k: int) -> tuple[float, tuple[float, float]]:
     return value / (1.0 - value), (low / (1.0 - low), high / (1.0 - high))
 
 
-def _weak_rotor(one: Explained, k: int, share: float, changed: bool, lost: tuple[Rival, ...]) -> Change:
+def _weak_rotor(
+    one: Explained, k: int, share: float, changed: bool, lost: tuple[Rival, ...], partner: int | None = None
+) -> Change:
     rotor = one.hypothesis.rotors[k] + 1
     loss, loss_ci = _interval(one, 2 * k)
     drag, drag_ci = _interval(one, 2 * k + 1)
+    which = f"{rotor}" if partner is None else f"{rotor} or {partner + 1}"
     sentence = (
-        f"For the same command rotor {rotor} produces {_less(loss)} thrust and {_less(drag)} drag torque than in the "
+        f"For the same command rotor {which} produces {_less(loss)} thrust and {_less(drag)} drag torque than in the "
         "baseline."
     )
     parameters = (
         ("rotor", "", float(rotor), None), ("loss", "", loss, loss_ci), ("drag_loss", "", drag, drag_ci),
+        *(() if partner is None else (("or_rotor", "", float(partner + 1), None),)),
     )  # fmt: skip
     return Change("weak_rotor", parameters, one.p_value, share, changed and share > _SURE, lost, sentence)
 

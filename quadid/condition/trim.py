@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from quadid.checks.motion import flying_spans
-from quadid.data.resample import linear, sample_period
+from quadid.data.resample import linear, moving_mean, sample_period
 from quadid.data.rotor_signal import rotor_signal
 from quadid.data.window import Channel, Recording
 from quadid.errors import NotIdentifiableError
@@ -32,6 +33,8 @@ BLOCK = 1.0
 """Trims are means over this long [s]."""
 _CLIMB_OUT = 1.5
 """Seconds after take-off and before landing that are no steady flight."""
+_TURN = 0.2
+"""Rates are averaged over this long [s], so that a propeller that shakes is no livelier flight."""
 _FEWEST = 5
 """A flight with fewer blocks shows no trim."""
 _AIR_SLOPE = 0.02
@@ -49,6 +52,7 @@ class FlightTrim(NamedTuple):
         wander: standard deviation of means of three seconds about the flight's, shape (4,).
         seconds: of steady flight.
         channels: what the effort and the motion were taken from, for people.
+        turning: root mean square of the rates in steady flight, averaged over `_TURN` [rad/s]; NaN without a gyro.
     """
 
     name: str
@@ -58,6 +62,7 @@ class FlightTrim(NamedTuple):
     wander: FloatArray
     seconds: float
     channels: str
+    turning: float = math.nan
 
 
 def trim_directions(vehicle: Vehicle) -> FloatArray:
@@ -106,8 +111,18 @@ def flight_trim(recording: Recording, vehicle: Vehicle) -> FlightTrim:
     parts = [mean + rest[places].mean(axis=0) for places in _parts(edges)]
     return FlightTrim(
         recording.name, mean, np.array(parts), (load / total[:, None]).mean(axis=0), wander(rest),
-        len(edges) * BLOCK, f"{rotors.source}; {from_what}; {moved}",
+        len(edges) * BLOCK, f"{rotors.source}; {from_what}; {moved}", _turning(recording, edges),
     )  # fmt: skip
+
+
+def _turning(recording: Recording, edges: FloatArray) -> float:
+    """How much the vehicle turns in the blocks that begin at `edges`, see `FlightTrim.turning`."""
+    gyro = recording.channels.get("gyro")
+    if gyro is None or len(gyro.t) < 2:
+        return math.nan
+    rates = moving_mean(gyro.values, max(1, round(_TURN / sample_period(gyro.t))))
+    squares, enough = _block_means(gyro.t, rates**2, edges)
+    return float(np.sqrt(squares[enough].sum(axis=1).mean())) if enough.any() else math.nan
 
 
 def wander(rest: FloatArray) -> FloatArray:
@@ -284,4 +299,6 @@ def flight_from_dict(data: Mapping[str, Any]) -> FlightTrim:
     if shares.ndim != 1 or not all(np.isfinite(v).all() for v in (mean, parts, shares, wander)):
         raise ValueError("numbers that are not finite")
     seconds = float(data["seconds"])
-    return FlightTrim(str(data["name"]), mean, parts, shares, wander, seconds, str(data["channels"]))
+    turning = data.get("turning")
+    turns = math.nan if turning is None else float(turning)
+    return FlightTrim(str(data["name"]), mean, parts, shares, wander, seconds, str(data["channels"]), turns)

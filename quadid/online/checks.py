@@ -10,7 +10,7 @@ import numpy as np
 
 from quadid.checks.findings import CheckResult
 from quadid.checks.motion import attitude_check, gravity_check, velocity_check
-from quadid.checks.rotors import better_order, lagged_of, motor_order_check
+from quadid.checks.rotors import better_description, lagged_of, motor_order_check
 from quadid.data.faults import at_limit
 from quadid.data.resample import copied, moving_mean, true_runs
 from quadid.data.window import Window, as_recording
@@ -334,7 +334,7 @@ def _wrong_unit(window: Window) -> str:
 def _wrong_order(cut: WindowCut, vehicle: Vehicle) -> str:
     rate = min((1.0 / (cut.spacing * window.dt) for window in cut.windows), default=0.0)
     lagged = lagged_of(cut.windows, vehicle, rate)
-    check = motor_order_check(lagged, vehicle, better_order(lagged, vehicle))
+    check = motor_order_check(lagged, vehicle, better_description(lagged, vehicle))
     return f"motor order: {check.message}; {check.fix}" if check.verdict is CheckResult.ERROR else ""
 
 

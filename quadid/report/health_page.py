@@ -127,11 +127,16 @@ _STEPS = {
 }
 
 
+def _which(change: Json) -> str:
+    """The weak rotor, and the one on its axis where the data do not tell which: ``2 or 6``."""
+    return " or ".join(str(int(p["value"])) for p in change["parameters"] if p["name"] in ("rotor", "or_rotor"))
+
+
 def change_words(change: Json) -> str:
     """A change in a few words: ``rotor 3: 21 % less thrust``."""
     effect = change["effect"]
     if effect == "weak_rotor":
-        return f"rotor {change_value(change, 'rotor'):.0f}: {100.0 * change_value(change, 'loss'):.0f} % less thrust"
+        return f"rotor {_which(change)}: {100.0 * change_value(change, 'loss'):.0f} % less thrust"
     if effect == "cg_offset":
         x, y = (1e3 * change_value(change, axis) for axis in "xy")
         along, across = "forward" if x > 0.0 else "backward", "right" if y > 0.0 else "left"
@@ -144,7 +149,7 @@ def change_words(change: Json) -> str:
 
 def has_changed(result: Json) -> bool:
     """Whether a result of the form ``quadid.health/1`` shows a change, be it one without a name."""
-    return result["verdict"] != "unchanged" and not result["baseline_lacking"]
+    return result["verdict"] != "unchanged" and not result["baseline_lacking"] and not result["unfamiliar"]
 
 
 def rival_words(rival: Json) -> str:
@@ -161,6 +166,11 @@ def health_verdict(result: Json) -> Verdict:
     against = f"{n} baseline flight{'s' * (n != 1)}, score {result['score']:.1f}"
     details = [f"A healthy flight would look this different {_how_often(result['p_value'])} ({against})."]
     suspects = ", ".join(change_words(c) for c in changes)
+    if reason := result["unfamiliar"]:
+        likely = [f"If anything, {suspects}."] if suspects else []
+        headline = "Not known: no baseline flight is of this kind."
+        step = "Compare a hover with hovers, or record healthy flights of this kind for the baseline."
+        return Verdict("fair", headline, (f"{reason[:1].upper()}{reason[1:]}.", *likely, *details), (step,))
     if more := result["baseline_lacking"]:
         flights = "baseline flight does" if n == 1 else "baseline flights do"
         headline = f"{n} {flights} not show whether the vehicle has changed."
@@ -201,7 +211,7 @@ def _how_often(p_value: float) -> str:
 
 def _step(change: Json) -> str:
     text = _STEPS[change["effect"]]
-    return text.format(rotor=f"{change_value(change, 'rotor'):.0f}") if "{rotor}" in text else text
+    return text.format(rotor=_which(change)) if "{rotor}" in text else text
 
 
 def change_table(changes: Sequence[Json]) -> TextTable:
@@ -217,8 +227,8 @@ def change_table(changes: Sequence[Json]) -> TextTable:
         other = rival_words(rival) if rival else ""
         name = Cell(c["effect"].replace("_", " "), "poor" if c["confident"] else "fair")
         for p in c["parameters"]:
-            if p["name"] == "rotor":
-                name = Cell(f"{name.text} {p['value']:.0f}", name.tone)
+            if p["name"] in ("rotor", "or_rotor"):
+                name = Cell(f"weak rotor {_which(c)}", name.tone)
                 continue
             low, high = p["ci95"]
             row = (f"{p['name']} = {p['value']:.3g} {p['unit']}".rstrip(), f"{low:.3g} .. {high:.3g}")
@@ -259,7 +269,7 @@ def health_page(result: Json, picture: str, provenance: Sequence[Json], history:
         history: figures of the baseline and the flights in question.
     """
     n, m = len(result["logs"]), len(result["baseline"])
-    intro = _INTROS["lacking" if result["baseline_lacking"] else result["verdict"]]
+    intro = _INTROS["lacking" if result["baseline_lacking"] or result["unfamiliar"] else result["verdict"]]
     caption = (
         "From above, nose up. Dashed: the command of each rotor in the baseline flights. Filled, with its change: now. "
         "Red: damaged; yellow: suspected."

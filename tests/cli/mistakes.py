@@ -139,6 +139,27 @@ class Place:
         columns = np.column_stack([rows[:, keep], *np.degrees(angles)])
         return self.write([*(names[i] for i in keep), "phi", "theta", "psi"], columns)
 
+    def euler_rates(self) -> Path:
+        """The flight with the rates of roll, pitch and yaw angle in place of those about the body's axes."""
+        names, rows = self.table()
+        w, x, y, z, p, q, r = (rows[:, names.index(n)] for n in ("qw", "qx", "qy", "qz", "p", "q", "r"))
+        roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
+        pitch = np.arcsin(np.clip(2 * (w * y - z * x), -1, 1))
+        heading = (q * np.sin(roll) + r * np.cos(roll)) / np.cos(pitch)
+        new = rows.copy()
+        new[:, names.index("p")] = p + heading * np.sin(pitch)
+        new[:, names.index("q")] = q * np.cos(roll) - r * np.sin(roll)
+        new[:, names.index("r")] = heading
+        return self.write(names, new)
+
+    def clipped(self) -> Path:
+        """The flight with rates that end at one standard deviation."""
+        names, rows = self.table()
+        places = [names.index(n) for n in ("p", "q", "r")]
+        most = np.std(rows[:, places], axis=0)
+        rows[:, places] = np.clip(rows[:, places], -most, most)
+        return self.write(names, rows)
+
     def commas(self) -> Path:
         """The flight with decimal commas, separated by semicolons."""
         text = self.write(*self.table(), separator=";").read_text()
@@ -235,6 +256,8 @@ MISTAKES = (
     Mistake("rotor speeds 60 ms late", fit(lambda p: p.late("w1 w2 w3 w4", 3)), "lags its effect"),
     Mistake("gyro 160 ms late", fit(lambda p: p.late("p q r", 8)), "gyro comes 160 ms after the attitude"),
     Mistake("attitude 160 ms late", fit(lambda p: p.late("qw qx qy qz", 8)), "attitude comes 160 ms after the gyro"),
+    Mistake("rates of Euler angles as gyro", fit(lambda p: p.euler_rates()), "rates of roll, pitch and yaw"),
+    Mistake("a gyro that is clipped", fit(lambda p: p.clipped()), "limit of its range"),
     Mistake("one rotor column four times", fit(lambda p: p.moved("w2 w3 w4", "w1 w1 w1")), "the same"),
     Mistake("squared rotor speeds", fit(lambda p: p.of_rotors(np.square)), "squared"),
     Mistake("rotor speeds in steps", fit(lambda p: p.of_rotors(lambda w: 50.0 * np.round(w / 50.0))), "steps of 50", 0),

@@ -267,7 +267,7 @@ def test_a_wrong_arm_is_named_with_the_factor_where_inertia_is_known(
 
 @pytest.mark.parametrize("degrees", [45.0, -45.0, 30.0])
 def test_a_frame_turned_about_z_is_named_with_the_angle(clean: Recording, degrees: float, happened: Happened) -> None:
-    found = check(inspect(clean, known(PELICAN, turn=np.radians(degrees))), "geometry")
+    found = check(inspect(clean, known(PELICAN, turn=np.radians(degrees))), "motor_order")
     assert found.verdict is CheckResult.ERROR
     assert np.degrees(found.numbers["turned_rad"]) == pytest.approx(-degrees, abs=5.0)
     happened(10, f"rotor positions turned by {degrees:+.0f} deg (X for +): '{found.message}'")

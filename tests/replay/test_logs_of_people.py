@@ -7,14 +7,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from quadid_replay import open_log
+from quadid_replay import open_log, write_csv
 from quadid_replay.columns import RawChannel, clean_channel
 from quadid_replay.motors import frame_of, in_pulses, motor_columns, no_multirotor
 from quadid_replay.vehicle_from_log import vehicle_text
 
 import quadid
+from quadid.app.logs import LogPart, check_conventions
 from quadid.checks import Check, CheckResult, inspect
 from quadid.data.window import Channel, Recording
+from quadid.errors import LogError
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 
@@ -185,3 +187,62 @@ def test_motors_by_function() -> None:
     assert motor_columns([103, 0, 101, 102]) == [2, 3, 0]
     assert motor_columns([101, 103]) == []
     assert motor_columns([0, 0]) == []
+
+
+def test_a_ground_contact_inside_the_flight_is_left_out(flight: Recording) -> None:
+    """Two seconds on the ground at 60 % of hover thrust, between two parts of a flight."""
+    t = flight.channels["gyro"].t
+    down = (t > 14.0) & (t < 16.0)
+    rng = np.random.default_rng(1)
+    still = {
+        "gyro": 0.003 * rng.standard_normal((len(t), 3)),
+        "accel": [0.0, 0.0, -9.81] + 0.05 * rng.standard_normal((len(t), 3)),
+        "rotor_speed": np.sqrt(0.6) * np.median(flight.channels["rotor_speed"].values) * np.ones((len(t), 4)),
+    }
+    made = flight
+    for name, values in still.items():
+        made = with_channel(made, name, np.where(down[:, None], values, flight.channels[name].values))
+    found = inspect(made, Vehicle.shipped("pelican")).flying
+    assert len(found) == 2
+    assert found[0][1] == pytest.approx(14.0, abs=0.5)
+    assert found[1][0] == pytest.approx(16.0, abs=0.8)
+    assert len(inspect(flight, Vehicle.shipped("pelican")).flying) == 1
+
+
+@pytest.mark.parametrize(("sigmas", "verdict_"), [(2.1, CheckResult.WARNING), (1.2, CheckResult.ERROR)])
+def test_a_clipped_gyro_is_an_error_where_inertias_come_out_wrong(
+    flight: Recording, sigmas: float, verdict_: CheckResult
+) -> None:
+    rates = flight.channels["gyro"].values
+    most = np.array([sigmas * np.std(rates[:, 0]), np.inf, np.inf])
+    assert verdict(with_channel(flight, "gyro", np.clip(rates, -most, most)), "saturated").verdict is verdict_
+
+
+def test_what_to_turn_is_what_the_attitude_and_the_velocity_agree_with(flight: Recording) -> None:
+    accel = flight.channels["accel"].values * [1.0, -1.0, -1.0]
+    assert verdict(with_channel(flight, "accel", accel), "gravity").fix == "negate y and z of the accelerometer alone"
+
+
+def test_an_attitude_in_a_world_with_z_up_is_refused_where_logs_are_loaded(flight: Recording, tmp_path: Path) -> None:
+    """`inspect` named it, but `load` let it through: its check carried no number."""
+    q = flight.channels["attitude"].values
+    up = np.column_stack([-q[:, 1], q[:, 0], -q[:, 3], q[:, 2]])  # turned by 180 deg about the world's x
+    others = {n: flight.channels[n].values * [1.0, -1.0, -1.0] for n in ("velocity", "position")}
+    made = with_channel(flight, "attitude", up)
+    for name, values in others.items():
+        made = with_channel(made, name, values)
+    with pytest.raises(LogError, match="z up"):
+        check_conventions(made, Vehicle.shipped("pelican"), LogPart(tmp_path))
+
+
+def test_a_gyro_of_a_few_readings_a_second_is_not_compared_with_the_attitude(flight: Recording) -> None:
+    gyro = flight.channels["gyro"]
+    slow = replace(flight, channels={**flight.channels, "gyro": Channel("gyro", gyro.t[::12], gyro.values[::12])})
+    assert "too slow to compare" in verdict(slow, "gyro_attitude").message
+
+
+def test_a_second_of_flight_is_not_usable_as_identify_refuses_it(flight: Recording, tmp_path: Path) -> None:
+    write_csv(tmp_path / "flight.csv", flight)
+    found = quadid.inspect(tmp_path / "flight.csv", vehicle="pelican", start=5.0, stop=6.5).found
+    assert not found.usable
+    assert "longest stretch" in next(c for c in found.checks if c.name == "data").message

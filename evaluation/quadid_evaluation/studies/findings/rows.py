@@ -179,6 +179,17 @@ LOGS: tuple[Finding, ...] = (
     ),
 )  # fmt: skip
 _HEXA = "vehicles/2_hexa_wrong_logs"
+_X8 = "vehicles/5_x8_feedback_and_health"
+
+
+def compared(log: str) -> Callable[[Path, Path], Sequence[str | Path]]:
+    """Compares a flight of the folder with its five healthy ones."""
+    return lambda folder, out: [
+        "health", folder / log, *(part for k in range(5) for part in ("--baseline", folder / f"healthy{k}.csv")),
+        "--vehicle", folder / "vehicle.yaml",
+    ]  # fmt: skip
+
+
 VEHICLES: tuple[Finding, ...] = (
     Finding(_HEXA, "as it flew", inspect("clean.csv", "vehicle.yaml"), usable),
     Finding(_HEXA, "position upwards", inspect("position_up.csv", "vehicle.yaml"), says("points up")),
@@ -192,6 +203,15 @@ VEHICLES: tuple[Finding, ...] = (
             says("columns 3, 2, 1, 4, 5, 6")),
     Finding(_HEXA, "frames of zeros", changed("clean.csv", "vehicle.yaml", dropped),
             lambda a: usable(a) and channel(a, "rotor_speed")["dropped"].get("impossible_rotor_speed", 0) > 10),
+    Finding(
+        _X8, "rotor 6 of 8 weak, hover", compared("damaged_hover.csv"),
+        lambda a: a[2].get("verdict") == "changed" and "rotor 6: 14 % less" in a[1],
+    ),
+    Finding(
+        _X8, "the same, flown hard", compared("damaged_agile.csv"),
+        lambda a: a[2].get("verdict") == "unknown" and "rotor 2 or 6" in a[1] and bool(a[2]["unfamiliar"]),
+        lambda a: str(a[2].get("unfamiliar")),
+    ),
     *(
         Finding(f"vehicles/{name}", "as it flew", inspect("train.csv", "vehicle.yaml"), usable)
         for name in ("1_nano_lag_beside_delay", "3_hexb_intervals", "5_x8_feedback_and_health", "6_bob_gyro_scale")

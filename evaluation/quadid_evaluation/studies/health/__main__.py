@@ -1,6 +1,6 @@
 """Health of recorded and simulated vehicles, into a result page.
 
-python -m quadid_evaluation.studies.health --out docs/results [--parts recorded few limits kinds features fleet
+python -m quadid_evaluation.studies.health --out docs/results [--parts recorded command few limits kinds features fleet
 simulated]
 """
 
@@ -12,10 +12,10 @@ from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
 
-from quadid_evaluation.studies.health import features, few, fleet, kinds, limits, recorded, simulated
+from quadid_evaluation.studies.health import command, features, few, fleet, kinds, limits, recorded, simulated
 from quadid_evaluation.studies.page import put_section
 
-PARTS = ("recorded", "few", "limits", "kinds", "features", "fleet", "simulated")
+PARTS = ("recorded", "command", "few", "limits", "kinds", "features", "fleet", "simulated")
 TITLE = "Health: what changed in this vehicle"
 
 
@@ -33,6 +33,7 @@ def main() -> None:
     judged = cache(lambda: recorded.judge(flights()))
     makers: dict[str, Callable[[], str]] = {
         "recorded": lambda: _recorded(judged(), chosen.out / "health-score.png"),
+        "command": lambda: _command(flights(), chosen.data / "crazypad"),
         "few": lambda: _few(flights()),
         "limits": lambda: f"## What the spread of healthy flights allows\n{limits.text(judged())}",
         "kinds": lambda: f"## Propeller or weight\n{kinds.text(judged())}",
@@ -56,6 +57,15 @@ def _recorded(judged: Sequence[recorded.Judged], picture: Path) -> str:
         f"flights of its airframe ({each}). Brackets: exact binomial 95 % intervals.\n\n"
         f"{recorded.table(judged)}\n\n"
         f"![Score against millimetres cut]({picture.name})"
+    )
+
+
+def _command(flights: Sequence[recorded.Flown], folder: Path) -> str:
+    return (
+        f"## The command, three baseline flights\n`quadid health` with the shipped vehicle and {command.BASELINES} "
+        "healthy flights of the airframe, drawn once; all other flights are in question. The comparison's priors were "
+        "chosen with both airframes at hand: neither row is of an airframe that nobody had seen.\n\n"
+        + command.text(flights, folder)
     )
 
 

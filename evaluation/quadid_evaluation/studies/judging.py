@@ -1,0 +1,431 @@
+"""`make judging`: single mistakes on logs of many vehicles, and the first line that each is answered with.
+
+Every log is right as it is.  One thing is made wrong at a time: axes, signs, units, time, motors, the vehicle file.  A
+cell is `right` where the first line names the mistake, `silent` where nothing is said, else it is the wrong line.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import re
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from itertools import permutations
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from quadid_replay import open_log
+
+import quadid
+from quadid.app.logs import LogPart, check_conventions, load_vehicle
+from quadid.checks import CheckResult, inspect
+from quadid.data.window import Channel, Recording
+from quadid.errors import LogError
+from quadid.rotation import conjugate, continuous_sign, euler, exponential, product
+from quadid.types import FloatArray
+from quadid.vehicle import Rotor, Vehicle
+from quadid_evaluation.studies.page import put_section
+
+Log = tuple[Recording, Vehicle]
+TITLE = "Mistakes by vehicle"
+
+
+class Mistake(NamedTuple):
+    """One thing made wrong: its name, how, and what the first line must contain (a regular expression)."""
+
+    name: str
+    made: Callable[[Recording, Vehicle], Log]
+    named: str
+
+
+# --- Vehicles: simulated ones of four forms, and recorded flights
+
+
+SIMULATED = ("pelican", "pelican_x", "hexacopter", "x8", "crazyflie")
+RECORDED = {
+    "crazyflie_rpm": ("crazyflie_rpm/figure8_27.csv", "crazyflie_rpm/vehicle.yaml"),
+    "brushed": ("brushed/jana00.csv", "brushed/vehicle.yaml"),
+    "nanodrone": ("nanodrone/random_run1.csv", "nanodrone/vehicle.yaml"),
+    "ardupilot": ("ardupilot_sitl/quad_sq.bin", "ardupilot_sitl/quad_sq.yaml"),
+    "iris": ("iris/sideways.csv", "iris/vehicle.yaml"),
+    "mujoco hexa": ("findings/vehicles/2_hexa_wrong_logs/clean.csv",
+                    "findings/vehicles/2_hexa_wrong_logs/vehicle.yaml"),
+    "mujoco x8": ("findings/vehicles/5_x8_feedback_and_health/train.csv",
+                  "findings/vehicles/5_x8_feedback_and_health/vehicle.yaml"),
+}  # fmt: skip
+
+
+def described(name: str) -> Vehicle:
+    """A shipped vehicle, or a Pelican with two rotors on each arm."""
+    if name != "x8":
+        return Vehicle.shipped(name)
+    four = Vehicle.shipped("pelican_x")
+    below = tuple(Rotor(position=(*r.position[:2], 0.05), spin=-r.spin) for r in four.rotors)
+    return four.model_copy(update={"name": "x8", "mass": 2.0 * four.mass, "rotors": (*four.rotors, *below)})
+
+
+def flown(name: str, data: Path) -> Log:
+    """A right log and its vehicle: flown here for 40 s, or recorded."""
+    if name in RECORDED:
+        log, file = (data / part for part in RECORDED[name])
+        vehicle = load_vehicle(str(file))
+        return open_log(log, "auto", vehicle.columns), vehicle
+    vehicle = described(name)
+    flight = quadid.simulate(vehicle, seconds=30.0, seed=7, extras=("velocity", "position")).flight
+    return flight.recording, vehicle
+
+
+# --- Ways to spoil a channel
+
+
+def changed(recording: Recording, **values: FloatArray) -> Recording:
+    """A recording with other numbers in some channels."""
+    new = {n: replace(recording.channels[n], values=v) for n, v in values.items() if n in recording.channels}
+    return replace(recording, channels={**recording.channels, **new})
+
+
+def values(recording: Recording, name: str) -> FloatArray:
+    """Numbers of a channel; one row where it is absent."""
+    channel = recording.channels.get(name)
+    return np.zeros((1, 3)) if channel is None else channel.values
+
+
+def scaled(name: str, factor: float | Sequence[float]) -> Callable[[Recording, Vehicle], Log]:
+    """A channel, times a factor or one for each column; raises KeyError where there is none."""
+    return lambda r, v: (changed(r, **{name: r.channels[name].values * np.asarray(factor)}), v)
+
+
+def columns(name: str, order: Sequence[int]) -> Callable[[Recording, Vehicle], Log]:
+    """A channel with its columns in another order."""
+    return lambda r, v: (changed(r, **{name: values(r, name)[:, list(order)]}), v)
+
+
+def late(names: str, seconds: float) -> Callable[[Recording, Vehicle], Log]:
+    """Channels with stamps so much later."""
+
+    def made(r: Recording, v: Vehicle) -> Log:
+        new = {n: replace(c, t=c.t + seconds) for n, c in r.channels.items() if n in names.split()}
+        return replace(r, channels={**r.channels, **new}), v
+
+    return made
+
+
+def held(names: str, rate: float) -> Callable[[Recording, Vehicle], Log]:
+    """Channels that change at a lower rate [Hz] and are repeated between."""
+
+    def made(r: Recording, v: Vehicle) -> Log:
+        new = {}
+        for n in names.split():
+            if n in r.channels:
+                c = r.channels[n]
+                at = np.searchsorted(c.t, np.floor((c.t - c.t[0]) * rate + 1e-6) / rate + c.t[0] - 1e-9)
+                new[n] = c.values[np.clip(at, 0, len(c.t) - 1)]
+        return changed(r, **new), v
+
+    return made
+
+
+def attitude(change: Callable[[FloatArray], FloatArray]) -> Callable[[Recording, Vehicle], Log]:
+    """A recording whose attitude is changed, where it has one."""
+    return lambda r, v: (changed(r, attitude=change(values(r, "attitude"))) if "attitude" in r.channels else r, v)
+
+
+def of_euler(angles: FloatArray) -> FloatArray:
+    """Quaternions of roll, pitch and yaw [rad], all (n, ·)."""
+    roll, pitch, yaw = (exponential(np.eye(3)[k] * angles[:, k : k + 1]) for k in range(3))
+    return product(product(yaw, pitch), roll)
+
+
+def enu(r: Recording, v: Vehicle) -> Log:
+    """World axes east, north, up; the body stays forward, right, down."""
+    swap = np.array([0.0, np.sqrt(0.5), np.sqrt(0.5), 0.0])
+    q = product(np.broadcast_to(swap, values(r, "attitude").shape), values(r, "attitude"))
+    world = {n: values(r, n)[:, [1, 0, 2]] * [1.0, 1.0, -1.0] for n in ("velocity", "position")}
+    return changed(r, attitude=q, **world), v
+
+
+def flu(r: Recording, v: Vehicle) -> Log:
+    """Body axes forward, left, up in gyro, accelerometer and attitude."""
+    turned = {n: values(r, n) * [1.0, -1.0, -1.0] for n in ("gyro", "accel")}
+    half = np.array([0.0, 1.0, 0.0, 0.0])
+    q = product(values(r, "attitude"), np.broadcast_to(half, values(r, "attitude").shape))
+    return changed(r, attitude=q, **turned), v
+
+
+def ros(r: Recording, v: Vehicle) -> Log:
+    """World east, north, up and body forward, left, up."""
+    return flu(*enu(r, v))
+
+
+def euler_rates(r: Recording, v: Vehicle) -> Log:
+    """The gyro holds rates of roll, pitch and yaw angle."""
+    c = r.channels["gyro"]
+    q = r.channels["attitude"]
+    angles = np.column_stack([np.interp(c.t, q.t, column) for column in np.unwrap(euler(q.values), axis=0).T])
+    roll, pitch = angles[:, 0], angles[:, 1]
+    p, q_, r_ = c.values.T
+    heading = (q_ * np.sin(roll) + r_ * np.cos(roll)) / np.cos(pitch)
+    return changed(
+        r, gyro=np.column_stack([p + heading * np.sin(pitch), q_ * np.cos(roll) - r_ * np.sin(roll), heading])
+    ), v
+
+
+def differentiated(r: Recording, v: Vehicle) -> Log:
+    """The gyro is the change of roll, pitch and yaw from row to row."""
+    c, q = r.channels["gyro"], r.channels["attitude"]
+    angles = np.column_stack([np.interp(c.t, q.t, column) for column in np.unwrap(euler(q.values), axis=0).T])
+    return changed(r, gyro=np.gradient(angles, c.t, axis=0)), v
+
+
+def turned_rates(r: Recording, v: Vehicle) -> Log:
+    """The gyro is the turn of the attitude from row to row."""
+    q = r.channels["attitude"]
+    t, first = np.unique(q.t, return_index=True)
+    whole = continuous_sign(q.values[first])
+    rates = 2.0 * product(conjugate(whole[:-1]), np.diff(whole, axis=0))[:, 1:] / np.diff(t)[:, None]
+    gyro = Channel("gyro", t[1:], rates, "made")
+    return replace(r, channels={**r.channels, "gyro": gyro}), v
+
+
+def clipped(r: Recording, v: Vehicle) -> Log:
+    """The gyro ends at 1.5 standard deviations."""
+    g = values(r, "gyro")
+    most = 1.5 * np.std(g)
+    return changed(r, gyro=np.clip(g, -most, most)), v
+
+
+def gravity_out(r: Recording, v: Vehicle) -> Log:
+    """Linear acceleration in place of specific force, as an estimator makes it."""
+    c, q = r.channels["accel"], r.channels["attitude"]
+    near = np.clip(np.searchsorted(q.t, c.t), 0, len(q.t) - 1)
+    w, x, y, z = q.values[near].T
+    down = np.column_stack([2 * (x * z - w * y), 2 * (y * z + w * x), w * w - x * x - y * y + z * z])
+    return changed(r, accel=c.values + 9.80665 * down), v
+
+
+def rotor_name(r: Recording) -> str:
+    """The rotor channel that a log has."""
+    return "rotor_speed" if "rotor_speed" in r.channels else "motor_command"
+
+
+def of_rotors(change: Callable[[FloatArray], FloatArray]) -> Callable[[Recording, Vehicle], Log]:
+    """A recording whose rotor columns are changed."""
+    return lambda r, v: (changed(r, **{rotor_name(r): change(values(r, rotor_name(r)).copy())}), v)
+
+
+def squared(r: Recording, v: Vehicle) -> Log:
+    """Squares of rotor speeds."""
+    return changed(r, rotor_speed=r.channels["rotor_speed"].values ** 2), v
+
+
+def exchanged(a: int, b: int) -> Callable[[Recording, Vehicle], Log]:
+    """Two rotor columns exchanged (counted from 0)."""
+
+    def change(w: FloatArray) -> FloatArray:
+        w[:, [a, b]] = w[:, [b, a]]
+        return w
+
+    return of_rotors(change)
+
+
+def rotor_late(seconds: float) -> Callable[[Recording, Vehicle], Log]:
+    """The rotor signal stamped so much later."""
+    return lambda r, v: late(rotor_name(r), seconds)(r, v)
+
+
+def rotor_held(rate: float) -> Callable[[Recording, Vehicle], Log]:
+    """The rotor signal held at a lower rate [Hz]."""
+    return lambda r, v: held(rotor_name(r), rate)(r, v)
+
+
+def one_rotor(rotor: int, change: Callable[[FloatArray], FloatArray | float]) -> Callable[[Recording, Vehicle], Log]:
+    """One rotor column changed."""
+
+    def changed_one(w: FloatArray) -> FloatArray:
+        w[:, rotor] = change(w[:, rotor])
+        return w
+
+    return of_rotors(changed_one)
+
+
+def spun(*rotors: int) -> Callable[[Recording, Vehicle], Log]:
+    """A vehicle file with the spins of some rotors the other way; of all without numbers."""
+
+    def made(r: Recording, v: Vehicle) -> Log:
+        new = tuple(
+            Rotor(position=x.position, spin=-x.spin) if not rotors or k in rotors else x for k, x in enumerate(v.rotors)
+        )
+        return r, v.model_copy(update={"rotors": new})
+
+    return made
+
+
+def placed(turn: Callable[[float, float], tuple[float, float]]) -> Callable[[Recording, Vehicle], Log]:
+    """A vehicle file with rotors at other places."""
+
+    def made(r: Recording, v: Vehicle) -> Log:
+        new = tuple(Rotor(position=(*turn(*x.position[:2]), x.position[2]), spin=x.spin) for x in v.rotors)
+        return r, v.model_copy(update={"rotors": new})
+
+    return made
+
+
+def heavier(r: Recording, v: Vehicle) -> Log:
+    """A vehicle file with 1.3 times the mass."""
+    return r, v.model_copy(update={"mass": 1.3 * v.mass})
+
+
+ORDER = "reorder the rotors|in the order"
+LATE_ROTORS = "lags its effect|rotor speeds are late|not in time with the gyro"
+MISTAKES: tuple[Mistake, ...] = (
+    Mistake("none", lambda r, v: (r, v), "^$"),
+    Mistake("gyro in deg/s", scaled("gyro", 180.0 / np.pi), "deg/s"),
+    Mistake("acceleration in g", scaled("accel", 1.0 / 9.80665), "in g"),
+    Mistake("acceleration reversed", scaled("accel", -1.0), "sign is reversed|points up"),
+    Mistake("gravity taken out", gravity_out, "gravity is missing"),
+    Mistake("body FLU", flu, "FLU"),
+    Mistake("gyro FLU alone", scaled("gyro", (1.0, -1.0, -1.0)), "gyro axes differ"),
+    Mistake("accelerometer FLU alone", scaled("accel", (1.0, -1.0, -1.0)), "points up"),
+    Mistake("pitch rate reversed", scaled("gyro", (1.0, -1.0, 1.0)), "gyro axes differ"),
+    Mistake("gyro x and y exchanged", columns("gyro", (1, 0, 2)), "gyro axes differ"),
+    Mistake("world ENU", enu, "ENU"),
+    Mistake("world ENU, body FLU", ros, "ENU|FLU"),
+    Mistake("quaternion scalar last", attitude(lambda q: q[:, [1, 2, 3, 0]]), "scalar last"),
+    Mistake("attitude inverse", attitude(conjugate), "world to body"),
+    Mistake("vz up", scaled("velocity", (1.0, 1.0, -1.0)), "points up"),
+    Mistake("z up", scaled("position", (1.0, 1.0, -1.0)), "points up"),
+    Mistake("vx, vy exchanged", columns("velocity", (1, 0, 2)), "world axes"),
+    Mistake("Euler rates as gyro", euler_rates, "rates of roll, pitch and yaw"),
+    Mistake("differentiated Euler angles as gyro", differentiated, "rates of roll, pitch and yaw|differentiated"),
+    Mistake("differentiated quaternion as gyro", turned_rates, "differentiated"),
+    Mistake("gyro 100 ms late", late("gyro", 0.1), "gyro comes"),
+    Mistake("gyro 200 ms late", late("gyro", 0.2), "gyro comes"),
+    Mistake("attitude 100 ms late", late("attitude", 0.1), "attitude comes"),
+    Mistake("attitude 200 ms late", late("attitude", 0.2), "attitude comes"),
+    Mistake("attitude in steps of 1 deg", attitude(
+        lambda q: of_euler(np.radians(np.round(np.degrees(euler(q)))))), "in steps"),
+    Mistake("attitude in steps of 5 deg", attitude(
+        lambda q: of_euler(np.radians(5.0 * np.round(np.degrees(euler(q)) / 5.0)))), "in steps"),
+    Mistake("attitude held at 10 Hz", held("attitude", 10.0), "^$|attitude.*Hz"),
+    Mistake("gyro clipped", clipped, "limit of its range"),
+    Mistake("rotors in rpm", scaled("rotor_speed", 30.0 / np.pi), "in rpm"),
+    Mistake("rotors in rev/s", scaled("rotor_speed", 0.5 / np.pi), "in rev/s"),
+    Mistake("rotors electrical", scaled("rotor_speed", 7.0), "electrical"),
+    Mistake("rotors squared", squared, "squared"),
+    Mistake("rotor 2 dead", one_rotor(1, lambda w: 0.0), "rotor 2 reads nothing"),
+    Mistake("rotor 2 stuck", one_rotor(1, lambda w: float(np.median(w))), "rotor 2 holds"),
+    Mistake("rotor 2 at half speed", one_rotor(1, lambda w: 0.5 * w), "rotor 2 reads"),
+    Mistake("one column for all", of_rotors(lambda w: np.repeat(w[:, :1], w.shape[1], axis=1)), "are the same"),
+    Mistake("rotors 30 ms late", rotor_late(0.03), LATE_ROTORS),
+    Mistake("rotors 60 ms late", rotor_late(0.06), LATE_ROTORS),
+    Mistake("rotors 120 ms late", rotor_late(0.12), LATE_ROTORS),
+    Mistake("rotors held at 10 Hz", rotor_held(10.0), "too slow|Hz"),
+    Mistake("motors 1, 2 exchanged", exchanged(0, 1), ORDER),
+    Mistake("motors 1, 3 exchanged", exchanged(0, 2), ORDER),
+    Mistake("motors 2, 4 exchanged", exchanged(1, 3), ORDER),
+    Mistake("motors one place on", of_rotors(lambda w: np.roll(w, 1, axis=1)), ORDER),
+    Mistake("motors backwards", of_rotors(lambda w: w[:, ::-1]), ORDER),
+    Mistake("spins reversed", spun(), "negate the spins"),
+    Mistake("spin of rotor 1 reversed", spun(0), "spin of rotor 1|negate"),
+    Mistake("frame turned by 45 deg", placed(
+        lambda x, y: ((x - y) * 0.70710678, (x + y) * 0.70710678)), "turn the rotor positions"),
+    Mistake("positions mirrored", placed(lambda x, y: (x, -y)), f"{ORDER}|mirror"),
+    Mistake("arms 1.35 times", placed(lambda x, y: (1.35 * x, 1.35 * y)), "arm"),
+    Mistake("mass 1.3 times", heavier, "mass|weigh"),
+)  # fmt: skip
+
+
+def orders(rotors: int) -> Iterator[Mistake]:
+    """All orders of so many motors but the right one."""
+    for order in permutations(range(rotors)):
+        if order != tuple(range(rotors)):
+            name = "".join(str(k + 1) for k in order)
+            yield Mistake(f"order {name}", of_rotors(lambda w, o=order: w[:, list(o)]), ORDER)  # type: ignore[misc]
+
+
+# --- The table
+
+
+def said(recording: Recording, vehicle: Vehicle) -> list[str]:
+    """What a user is told, first line first: the refusal of `load`, else errors and then warnings of `inspect`."""
+    found = inspect(recording, vehicle)
+    lines = [
+        f"{check.message}; {check.fix}"
+        for wanted in (CheckResult.ERROR, CheckResult.WARNING)
+        for check in found.checks
+        if check.verdict is wanted
+    ]
+    try:
+        check_conventions(recording, vehicle, LogPart(Path("log")))
+    except LogError as error:
+        lines = [f"refused: {error.found}; {error.fix}", *lines]
+    return lines
+
+
+def judged(log: Log, mistake: Mistake, usual: Sequence[str]) -> tuple[str, str]:
+    """Whether a mistake is named, and the first line that the right log is not answered with."""
+    known = {re.sub(r"[-0-9.e]+", "", line) for line in usual}
+    lines = [line for line in said(*mistake.made(*log)) if re.sub(r"[-0-9.e]+", "", line) not in known]
+    first = lines[0] if lines else ""
+    if re.search(mistake.named, first):
+        return "right", first
+    return ("WRONG" if first else "silent"), first
+
+
+def cells(name: str, data: Path, parts: Sequence[str] = (), every: bool = False) -> Iterator[tuple[str, str, str]]:
+    """Mistake, verdict and first line for a vehicle; mistakes on channels that its log lacks are left out."""
+    log = flown(name, data)
+    usual = said(*log)
+    more = orders(len(log[1].rotors)) if every and len(log[1].rotors) == 4 else ()
+    for mistake in (*MISTAKES, *more):
+        if parts and not any(part in mistake.name for part in parts):
+            continue
+        try:
+            yield mistake.name, *judged(log, mistake, usual)
+        except (KeyError, IndexError):
+            continue
+
+
+def main() -> int:
+    """Prints or writes the table; the number of wrong cells is the exit code."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--data", type=Path, default=Path(os.environ.get("QUADID_DATA", "../shared/data")))
+    parser.add_argument("--out", type=Path, help="folder of the page; printed without")
+    parser.add_argument("--vehicles", nargs="*", default=[*SIMULATED, *RECORDED])
+    parser.add_argument("--orders", action="store_true", help="all orders of four motors, too")
+    parser.add_argument("names", nargs="*", help="parts of mistakes; all without")
+    given = parser.parse_args()
+    table: dict[str, dict[str, tuple[str, str]]] = {}
+    for vehicle in given.vehicles:
+        for mistake, verdict, line in cells(vehicle, given.data, given.names, given.orders):
+            table.setdefault(mistake, {})[vehicle] = verdict, line
+    text = _text(table, given.vehicles)
+    print(text)
+    if given.out is not None:
+        put_section(given.out / "judging.md", TITLE, "table", text)
+    return min(sum(v == "WRONG" for row in table.values() for v, _ in row.values()), 99)
+
+
+def _text(table: dict[str, dict[str, tuple[str, str]]], vehicles: Sequence[str]) -> str:
+    lines = [f"| mistake | {' | '.join(vehicles)} |", "|---" * (len(vehicles) + 1) + "|"]
+    for mistake, row in table.items():
+        lines.append(f"| {mistake} | {' | '.join(row.get(v, ('–', ''))[0] for v in vehicles)} |")
+    wrong = [
+        f"* {mistake}, {vehicle}: {line.replace('|', '/')[:200]}"
+        for mistake, row in table.items() for vehicle, (verdict, line) in row.items() if verdict == "WRONG"
+    ]  # fmt: skip
+    count = {
+        v: sum(cell[0] == v for row in table.values() for cell in row.values()) for v in ("right", "silent", "WRONG")
+    }
+    return "\n".join(
+        ["`make judging`: one mistake at a time on logs that are right; the first line that a user reads. *right*: it "
+         "names the mistake; *silent*: nothing is said; –: the log has no such channel or rotor. "
+         f"{count['right']} right, {count['silent']} silent, {count['WRONG']} wrong.", "", *lines, "", *wrong]
+    )  # fmt: skip
+
+
+if __name__ == "__main__":
+    sys.exit(main())
