@@ -8,7 +8,7 @@ from quadid_evaluation.studies.rotorpy_flight import RotorpyFlight, fly, humming
 
 from quadid.diagnosis.pipeline import diagnose
 from quadid.diagnosis.result import Diagnosis, Explanation
-from quadid.vehicle import GRAVITY, Vehicle
+from quadid.vehicle import GRAVITY
 
 pytest.importorskip("rotorpy", reason="pip install rotorpy (extra dev)")
 SECONDS = 12.0
@@ -18,8 +18,7 @@ def diagnosed(flight: RotorpyFlight) -> tuple[dict[str, dict[str, float]], dict[
     """Findings by effect, fitted nominal parameters, and the whole result."""
     result, _ = diagnose([flight.window], flight.vehicle)
     findings = {f.effect: {p.name: p.value for p in f.parameters} for f in result.findings}
-    fitted = Vehicle.from_yaml(result.vehicle_yaml)
-    return findings, {name: p.initial for name, p in fitted.parameters.items()}, result
+    return findings, {p.name: p.value for p in result.parameters}, result
 
 
 def check_nominal(fitted: dict[str, float], truth: dict[str, float]) -> None:
