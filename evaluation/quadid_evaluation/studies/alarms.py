@@ -1,0 +1,217 @@
+"""`make alarms`: false alarms on healthy flights in wind, and how soon a payload and a weak rotor are named.
+
+    python -m quadid_evaluation.studies.alarms --hours 6 --out docs/results
+
+Alarms are those of the watch for sudden changes, which knows the vehicle as a session does after its first set, and
+faults that the checks of a window find (stuck, frame, motor order), every second.  Detections are named by the fit that
+a session asks for three seconds after the change.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import os
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import numpy as np
+from scipy.stats import chi2
+
+from quadid.flight import Flight, draw_truth, fly
+from quadid.identification.noise_model import NoiseModel
+from quadid.model.layout import Layout, ThrustModel
+from quadid.online.change_detection import CHUNK, ChangeDetector, ChangePoint
+from quadid.online.change_supervisor import AFTER_CHANGE, ASK_FLYING
+from quadid.online.checks import judge
+from quadid.online.fault_isolation import ChangeRequest
+from quadid.online.grid_buffer import Rows, WindowCut
+from quadid.online.records import OnlineFinding
+from quadid.parameters import NOMINAL_NAMES
+from quadid.vehicle import Vehicle
+from quadid_evaluation.studies.page import put_section
+
+SECONDS, AT = 300.0, 40.3
+"""Length of a healthy flight [s]; moment of a change [s]."""
+VEHICLES, PROFILES = ("pelican", "hexacopter", "crazyflie"), ("hover", "gentle", "excited")
+AIR = {
+    "calm": 0.0, "light": 0.3, "gusty": 0.6, "rough": 0.9,
+}  # fmt: skip
+"""Turbulence of Dryden's form: specific force, rms [m/s^2]; moments come with it, and 3 m/s of wind for each 0.3."""
+KNOWN = 0.02
+"""How well the vehicle is known: error and standard deviation of log parameters."""
+SIGMA = np.array([0.001, 0.006, KNOWN, KNOWN, KNOWN, 0.05])
+SENSORS = ("rotor_speed", "gyro", "accel", "attitude")
+CHANGES: dict[str, dict[str, dict[str, float]]] = {
+    "+15 % mass": {"mass_change": {"time": AT, "fraction": 0.15}},
+    "-13 % mass": {"mass_change": {"time": AT, "fraction": -0.13}},
+}
+LOSS = 0.12
+"""Loss of a rotor that is looked for."""
+NOISE = NoiseModel(np.repeat([0.021, 0.003, 0.21], 3), np.repeat([0.0, 0.003, 0.0], 3))
+
+
+@dataclass(frozen=True)
+class Seen:
+    """A change that was seen at `t` [s], and what it was."""
+
+    t: float
+    change: ChangePoint
+
+
+def flown(vehicle: Vehicle, seed: int, profile: str, air: float, seconds: float, **changes: dict[str, float]) -> Flight:
+    """One flight of an individual vehicle with motor lag, rotor drag and inflow, in wind of strength `air`."""
+    effects = {
+        "motor_lag": {"tau": 0.03}, "rotor_drag": {"k_x": 0.25, "k_y": 0.25}, "axial_inflow": {"k_z": 0.2},
+        "wind": {"north": 10.0 * air, "east": 0.0}, **changes,
+    }  # fmt: skip
+    gusts = {"gusts": {"push": air, "turn": 1.3 * air, "time": 0.6}} if air else {}
+    truth = draw_truth(vehicle, seed)
+    return fly(vehicle, truth, seconds, seed, profile, effects=effects, outside=gusts)
+
+
+def watched(vehicle: Vehicle, flight: Flight, seed: int) -> Iterator[Seen]:
+    """Sudden changes that a session would see, which knows the vehicle to `KNOWN`."""
+    window, truth, rng = flight.window, flight.truth.parameters, np.random.default_rng(seed)
+    inertia = np.array([truth.J_xx, truth.J_yy, truth.J_zz]) * np.exp(KNOWN * rng.standard_normal(3))
+    detector, rows = ChangeDetector(vehicle), round(CHUNK / window.dt)
+    for k in range(0, len(window) - rows, rows):
+        part = {n: getattr(window, n)[k : k + rows] for n in SENSORS}
+        detector.add(Rows(window.t[k : k + rows], part, window.sampling, ""))
+        change = detector.look(truth.b, inertia, np.full(2, np.sqrt(2.0) * KNOWN))
+        if change is not None:
+            yield Seen(float(window.t[k + rows - 1]), change)
+            detector.restart()
+
+
+def faults(vehicle: Vehicle, flight: Flight) -> Iterator[str]:
+    """What the checks find wrong with the windows of a healthy flight, before and after the vehicle is known."""
+    window, layout = flight.window, Layout(vehicle)
+    theta = layout.initial(vehicle)
+    theta[: len(NOMINAL_NAMES)] = list(flight.truth.parameters.as_dict().values())
+    thrust, second = ThrustModel(layout, theta), round(1.0 / window.dt)
+    for known, length in ((False, 10.0), (True, ASK_FLYING)):
+        rows = round(length / window.dt)
+        for k in range(0, len(window) - rows, second):
+            part = window.slice(k, k + rows)
+            quality = judge(WindowCut((part,), length, 0), vehicle, thrust, known)
+            if quality.fault or quality.grounded:
+                yield (quality.fault or quality.grounded).split(":")[0].split(" (")[0]
+
+
+def named(vehicle: Vehicle, flight: Flight, seen: Seen) -> OnlineFinding | None:
+    """What a session says of a change `AFTER_CHANGE` [s] after it."""
+    window, theta = flight.window, Layout(vehicle).initial(vehicle)
+    theta[: len(NOMINAL_NAMES)] = list(flight.truth.parameters.as_dict().values())
+    first = int(np.searchsorted(window.t, seen.change.time + 0.1))
+    part = window.slice(first, first + round(AFTER_CHANGE / window.dt))
+    request = ChangeRequest(
+        1, vehicle, (part,), part.t0, part.t0 + AFTER_CHANGE, theta, SIGMA, NOISE, seen.change, seen.change.time
+    )
+    return request.answer().finding
+
+
+def upper(count: int, hours: float) -> float:
+    """One-sided 95 % upper bound of a rate an hour (Poisson)."""
+    return float(chi2.ppf(0.95, 2 * (count + 1))) / 2.0 / hours
+
+
+def healthy(hours: float, seed: int) -> str:
+    """Alarms on healthy flights, as Markdown."""
+    lines, total, flights = [], Counter[str](), 0
+    each = max(round(hours * 3600.0 / SECONDS / len(VEHICLES) / len(PROFILES) / len(AIR)), 1)
+    for (air, strength), profile in itertools.product(AIR.items(), PROFILES):
+        alarms, said = Counter[str](), Counter[str]()
+        for name, k in itertools.product(VEHICLES, range(each)):
+            vehicle = Vehicle.shipped(name)
+            flight = flown(vehicle, seed + k, profile, strength, SECONDS)
+            alarms += Counter(s.change.channel for s in watched(vehicle, flight, k))
+            said += Counter(faults(vehicle, flight))
+        total += alarms + Counter({"windows refused": said.total()})
+        flights += each * len(VEHICLES)
+        texts = "; ".join(f"{what} ({n})" for what, n in (alarms + said).items())
+        lines.append(f"| {air} | {profile} | {each * len(VEHICLES) * SECONDS / 3600.0:.2f} | {alarms.total()} | "
+                     f"{said.total()} | {texts} |")  # fmt: skip
+        print(lines[-1], flush=True)
+    flew, refused = flights * SECONDS / 3600.0, total.pop("windows refused", 0)
+    head = (
+        f"## Healthy flights\n`make alarms`, seed {seed}. {', '.join(VEHICLES)}; individuals "
+        f"known to {KNOWN:.0%}, with motor lag, rotor drag and inflow. **{total.total()} false changes in {flew:.1f} "
+        f"h, at most {upper(total.total(), flew):.2f} an hour (95 %); {refused} windows refused.**\n\n"
+        "| air | flight | hours | changes | windows refused | what |\n|---|---|---|---|---|---|"
+    )
+    return "\n".join([head, *lines])
+
+
+def detections(each: int, seed: int) -> str:
+    """How soon changes are named, as Markdown."""
+    pelican, lines = Vehicle.shipped("pelican"), []
+    cases = [*((what, "mass_change") for what in CHANGES), (f"-{LOSS:.0%} of a rotor", "weak_rotor")]
+    for (what, effect), profile, air in itertools.product(cases, ("hover", "excited"), ("calm", "light", "gusty")):
+        soon, right, sizes = [], 0, []
+        for k in range(each):
+            rotor = k % 4 + 1
+            flight = _changed(pelican, seed + k, profile, AIR[air], what, rotor)
+            seen = next((s for s in watched(pelican, flight, k) if s.t > AT), None)
+            if seen is None:
+                continue
+            soon.append(max(seen.t, seen.change.time + AFTER_CHANGE) - AT)
+            found = named(pelican, flight, seen)
+            if found is None:
+                continue
+            told = {found.effect, *(a.effect for a in found.alternatives)} if profile == "hover" else {found.effect}
+            right += effect in told and (effect != "weak_rotor" or found.values.get("rotor") == rotor)
+            sizes.append(found.values.get("fraction", found.values.get("loss", np.nan)))
+        times = f"{np.median(soon):.1f}" if soon else ""
+        size = f"{np.nanmedian(sizes):+.0%}" if len(sizes) and np.isfinite(sizes).any() else ""
+        within = sum(s <= 5.0 for s in soon)
+        lines.append(f"| {what} | {profile} | {air} | {within} of {each} | {times} | {right} | {size} |")
+        print(lines[-1], flush=True)
+    head = (
+        f"## Changes\n`make alarms`, seed {seed}. Seen and named within 5 s; median delay; "
+        "named rightly (in hover the cause is among the alternatives; a rotor by its number); median size.\n\n"
+        "| change | flight | air | within 5 s | delay [s] | right | size |\n|---|---|---|---|---|---|---|"
+    )
+    return "\n".join([head, *lines])
+
+
+def _changed(vehicle: Vehicle, seed: int, profile: str, air: float, what: str, rotor: int) -> Flight:
+    """A flight on which something changes at `AT`.
+
+    A rotor that lost a share of its thrust and torque is logged as a sound one that turns as much faster: so fast its
+    controller would make it turn, at once.
+    """
+    if what in CHANGES:
+        return flown(vehicle, seed, profile, air, AT + 8.0, **CHANGES[what])
+    flight = flown(vehicle, seed, profile, air, AT + 8.0)
+    speed = flight.window.rotor_speed.copy()
+    speed[flight.window.t > AT, rotor - 1] /= np.sqrt(1.0 - LOSS)
+    return replace(flight, window=replace(flight.window, rotor_speed=speed))
+
+
+def main() -> None:
+    """Measures, prints and writes the page."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, help="folder of the result page; default: print only")
+    parser.add_argument("--hours", type=float, default=6.0, help="of healthy flight")
+    parser.add_argument("--each", type=int, default=4, help="flights of every change")
+    parser.add_argument("--seed", type=int, default=500)
+    parser.add_argument("--parts", nargs="+", choices=("healthy", "changes"), default=("healthy", "changes"))
+    given = parser.parse_args()
+    makers = {
+        "healthy": lambda: healthy(given.hours, given.seed),
+        "changes": lambda: detections(given.each, given.seed),
+    }
+    for part in given.parts:
+        text = makers[part]()
+        print(text)
+        if given.out is not None:
+            put_section(given.out / "alarms.md", "False alarms, and changes that are seen", part, text)
+
+
+if __name__ == "__main__":
+    main()
