@@ -33,7 +33,7 @@ BANDS: Mapping[str, float] = {"50": 0.67449, "80": 1.28155, "95": Z95}
 """Half-widths of the bands in standard deviations, by per cent."""
 LEARNING = 1.0 / 3.0
 """Share of a flight, its first, from which noise, trim and biases are learnt; what comes after it is predicted."""
-SHORTEST = 6.0
+SHORTEST = 3.0
 """Shortest stretch of flight that has such a share and something after it [s]."""
 PHASES = 6
 """Passes that begin their predictions at different rows."""

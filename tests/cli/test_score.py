@@ -10,6 +10,7 @@ import pytest
 import yaml
 
 import quadid
+from quadid.estimate import forecast
 from quadid.vehicle import Stabiliser, Vehicle
 from tests.cli.conftest import Cli, Flights, one_line, table, write_table
 
@@ -98,7 +99,7 @@ def test_a_horizon_may_be_a_time(inside: Cli, flights: Flights) -> None:
 
 
 def test_bands_are_predicted_up_to_a_tenth_of_a_second_and_the_reason_stands_below(
-    inside: Cli, flights: Flights
+    inside: Cli, flights: Flights, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run = inside("score", flights.unseen, "--vehicle", "pelican", "--horizons", "1,5,10")
     assert "already answer the future" in run.out
@@ -111,9 +112,10 @@ def test_bands_are_predicted_up_to_a_tenth_of_a_second_and_the_reason_stands_bel
             shares = coverage[h][quantity]
             assert list(shares) == ["50", "80", "95"]
             assert 0.0 <= shares["50"] <= shares["80"] <= shares["95"] <= 1.0
-    short = inside("score", f"{flights.unseen}@0:4", "--vehicle", "pelican", "--horizons", "1", "--json", "-").data
+    monkeypatch.setattr(forecast, "SHORTEST", 60.0)
+    short = inside("score", flights.unseen, "--vehicle", "pelican", "--horizons", "1", "--json", "-").data
     assert short["coverage"] == {"1": None}
-    assert "6 s with gyro" in short["bands"]
+    assert "60 s with gyro" in short["bands"]
 
 
 def test_the_autopilot_in_the_loop_predicts_further(inside: Cli, flights: Flights, tmp_path: Path) -> None:

@@ -84,5 +84,5 @@ def test_half_a_second_ahead_with_the_autopilot_in_the_loop() -> None:
 
 def test_too_short_a_flight_is_refused() -> None:
     flight = flown(1)
-    with pytest.raises(NotIdentifiableError, match="6 s with gyro"):
-        Forecast([flight.window.slice(0, 250)], PELICAN, Layout(PELICAN).initial(PELICAN), None)
+    with pytest.raises(NotIdentifiableError, match="3 s with gyro"):
+        Forecast([flight.window.slice(0, 125)], PELICAN, Layout(PELICAN).initial(PELICAN), None)
