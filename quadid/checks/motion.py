@@ -94,7 +94,7 @@ def proposed_cuts(spans: Spans, first: float, last: float) -> Spans:
     """
     flights, joined = _joined(spans, _SHORTEST), _joined(spans, _GROUND)
     apart, whole = _trimmed(flights, first, last), sum(b - a for a, b in joined)
-    if len(flights) > len(joined) and sum(b - a for a, b in apart) > 0.5 * whole:
+    if len(flights) > len(joined) and sum(b - a for a, b in apart) > 0.7 * whole:
         return apart  # between them it stood somewhere
     return () if last - first - whole < _GROUND else _trimmed(joined, first, last)
 
