@@ -22,7 +22,7 @@ _COLUMNS = (("gyro", 0, 3), ("attitude", 3, 7), ("accel", 7, 10), ("velocity", 1
 
 
 def from_window(window: Window, vehicle: Vehicle, air: bool = False) -> Track:
-    """A window on a uniform grid; NaN rows are no measurements.
+    """A window on a uniform grid, a row each; NaN rows are no measurements.
 
     Args:
         window: the data.
@@ -36,7 +36,15 @@ def from_window(window: Window, vehicle: Vehicle, air: bool = False) -> Track:
             good = np.isfinite(values).all(axis=1)
             channels[name] = window.t[good], values[good]
     return _track(
-        channels, window.t, window.rotor_speed, window.rotor_slope, window.sampling == "held", window.dt, vehicle, air
+        channels,
+        window.t,
+        window.t,
+        window.rotor_speed,
+        window.rotor_slope,
+        window.sampling == "held",
+        window.dt,
+        vehicle,
+        air,
     )
 
 
@@ -60,7 +68,7 @@ def from_recording(recording: Recording, vehicle: Vehicle, air: bool = False) ->
             rows = (channel.t >= rotor.t[0]) & (channel.t <= rotor.t[-1]) & _new(channel.values)
             channels[name] = channel.t[rows], channel.values[rows]
     period = sample_period(recording.channels["accel"].t) if "accel" in recording.channels else 0.02
-    return _track(channels, rotor.t, rotor.values, None, rotor.sampling == "held", period, vehicle, air)
+    return _track(channels, np.empty(0), rotor.t, rotor.values, None, rotor.sampling == "held", period, vehicle, air)
 
 
 def _new(values: FloatArray) -> BoolArray:
@@ -69,11 +77,11 @@ def _new(values: FloatArray) -> BoolArray:
 
 
 def _track(
-    channels: dict[str, tuple[FloatArray, FloatArray]], rotor_t: FloatArray, speed: FloatArray,
+    channels: dict[str, tuple[FloatArray, FloatArray]], rows: FloatArray, rotor_t: FloatArray, speed: FloatArray,
     slope: FloatArray | None, held: bool, period: float, vehicle: Vehicle, air: bool,
 ) -> Track:  # fmt: skip
-    """Merges channels onto one rising axis of times."""
-    every = np.unique(np.concatenate([t for t, _ in channels.values()]))
+    """Merges channels onto one rising axis of times, with `rows` whether or not something was measured then."""
+    every = np.unique(np.concatenate([rows, *(t for t, _ in channels.values())]))
     t = every[np.concatenate([[True], np.diff(every) > TOGETHER])]
     y, seen = np.zeros((len(t), 13)), np.zeros((len(t), 4), dtype=np.bool_)
     for group, (name, first, last) in enumerate(_COLUMNS):

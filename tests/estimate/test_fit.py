@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -103,3 +104,21 @@ def test_the_model_with_the_cause_misses_less_on_another_flight() -> None:
     assert 0.1 < removed(before, between) < 0.95
     # What is missing without it: drag of 0.4 1/s at a few m/s.
     assert np.all(size(before, force=True)[0][:2] > 0.01 * before[0].weight)
+
+
+def test_rows_without_a_measurement_are_rows_of_the_whole_model_too() -> None:
+    """A gyro at half the grid's rate leaves every other row empty; the effects' table ended in a traceback there."""
+    window = fly(PELICAN, draw_truth(PELICAN, 3), 10.0, 3, effects={"rotor_drag": {"k_x": 0.4, "k_y": 0.4}}).window
+    empty = {}
+    for name in ("gyro", "accel", "attitude"):
+        values = getattr(window, name).copy()
+        values[1::2] = np.nan
+        empty[name] = values
+    sparse = replace(window, velocity=None, position=None, **empty)
+    layout = Layout(PELICAN)
+    theta = layout.initial(PELICAN)
+    for axis in "xy":
+        theta[layout.entry(f"rotor_drag.k_{axis}").index] = 0.4
+    (found,) = Vehicles([sparse], PELICAN, theta).missing([sparse], theta)
+    assert len(found.t) == len(window)
+    assert np.isfinite(found.force_sigma).all()
