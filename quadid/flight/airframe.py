@@ -131,6 +131,7 @@ class Oddity(NamedTuple):
 
 STATES = 33
 RIGID_STATES = 21
+PUSHES = 9
 
 
 @kernel

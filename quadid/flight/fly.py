@@ -11,7 +11,7 @@ from quadid.attitude_controller import mixer_matrix, pack_gains
 from quadid.data.window import Channel, Recording, Window
 from quadid.errors import ParameterError, QuadidError
 from quadid.flight import sensors
-from quadid.flight.airframe import STATES
+from quadid.flight.airframe import PUSHES, STATES
 from quadid.flight.loop import Plan, Track, quaternion_of, supply
 from quadid.flight.march import CRASHED, march
 from quadid.flight.outside import LogRows, Scene, apply_outside, check_outside, distort_log, random_forces
@@ -417,7 +417,7 @@ def _march(
     white = sensor.attitude * streams["attitude"].standard_normal((controls, 3))
     slow = coloured(streams["attitude_slow"], controls, sensor.attitude_slow, sensor.attitude_time, step)
     arrival = plan.start + step * np.arange(controls, dtype=np.float64) + setup.delay
-    scene = Scene(setup, plan, arrival, np.zeros((1, 9)))
+    scene = Scene(setup, plan, arrival, np.zeros((1, PUSHES)))
     apply_outside(scene, outside, seed)
     if random is not None:
         random_forces(scene, random, np.random.default_rng([seed, 0x4F0C]))

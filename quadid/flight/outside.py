@@ -12,6 +12,7 @@ from scipy.signal import cont2discrete, lfilter
 
 from quadid.errors import ParameterError, nearest
 from quadid.flight import sensors
+from quadid.flight.airframe import PUSHES
 from quadid.flight.loop import OnBoard, Plan, Track
 from quadid.flight.setup import Setup, vehicle_scales
 from quadid.rotation import continuous_sign
@@ -46,7 +47,7 @@ class Scene:
     def push(self, columns: slice, values: FloatArray) -> None:
         """Adds a disturbance given at every step to some columns of `pushes`."""
         if len(self.pushes) != self.plan.steps:
-            self.pushes = np.zeros((self.plan.steps, 9))
+            self.pushes = np.zeros((self.plan.steps, PUSHES))
         self.pushes[:, columns] += values
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from quadid.errors import ParameterError
-from quadid.flight.airframe import STATES, Oddity
+from quadid.flight.airframe import PUSHES, STATES, Oddity
 from quadid.flight.loop import EPSILON, NO_TIME, Track, apply_due, power_at, quaternion_of, supply
 from quadid.flight.rotors import advance
 from quadid.flight.setup import Effects, TruthParameters, prepare
@@ -119,6 +119,6 @@ class SteppedFlight:
         powers = np.array([power_at(now + share * h, self._dropped, s.events) for share in (0.0, 0.5, 1.0)])
         advance(
             self._y, self.rotor_speed, self._level, self._slope, s.efficiency, powers, self._mass, self._changed,
-            np.zeros(6), s.drive, s.body, s.air, Oddity(), h, np.zeros((5, max(STATES, len(self.rotor_speed)))),
+            np.zeros(PUSHES), s.drive, s.body, s.air, Oddity(), h, np.zeros((5, max(STATES, len(self.rotor_speed)))),
         )  # fmt: skip
         self.time = now + h

@@ -55,7 +55,7 @@ def test_each_flight_is_compared_with_the_first_ones_of_its_vehicle() -> None:
 
 def test_a_flight_that_few_baseline_flights_cannot_judge_is_no_change() -> None:
     logs, _ = fleet()
-    row = {"unit": "a", "log": "a/8.mcap", "baseline": False, "verdict": "unknown", "changes": []}
+    row = {"unit": "a", "log": "a/8.mcap", "baseline": False, "verdict": "unknown", "changes": [], "unfamiliar": ""}
     for lacking, changed in ((2, False), (0, True)):
         verdict = fleet_verdict(summarise(logs, [], []), [{**row, "baseline_lacking": lacking}])
         assert verdict.headline.endswith("vehicles have changed.") == changed

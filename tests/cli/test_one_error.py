@@ -30,8 +30,8 @@ def test_on_an_unseen_flight(flown: tuple[Log, Log]) -> None:
     assert stated["mse_nominal"] == fit.result["sets"][1]["mse"]["fitted"] > 10.0
     assert stated["mse_extended"] == pytest.approx(1.0, abs=0.1)
     assert stated["deciding"]["seconds"] == found.result["findings"][0]["gain"]["seconds"] != 1.0
-    assert f"falls from {stated['mse_nominal']:.3g} to" in found.verdict.details[0]
-    assert f"In simulations of {stated['deciding']['seconds']:g} s" in found.verdict.details[1]
+    assert f"falls from {stated['mse_nominal']:.3g} to" in found.verdict.details[1]
+    assert f"In simulations of {stated['deciding']['seconds']:g} s" in found.verdict.details[2]
 
 
 def test_blocks_left_out_are_called_that_and_lie_near_the_fitted_flight(flown: tuple[Log, Log]) -> None:
@@ -40,7 +40,7 @@ def test_blocks_left_out_are_called_that_and_lie_near_the_fitted_flight(flown: t
     assert_alike(fit, found)
     stated, fitted = found.result["validation"], found.result["sets"][0]["mse"]
     assert stated["on"] == "held-out blocks"
-    assert "held-out blocks of the same flight" in found.verdict.details[0]
+    assert "held-out blocks of the same flight" in found.verdict.details[1]
     # The weak rotor turns the vehicle, so the nominal numbers come from fast motion, and minimise neither.
     assert stated["mse_nominal"] / fitted["nominal"] == pytest.approx(1.0, abs=0.05)
     assert 1.0 < stated["mse_extended"] / fitted["extended"] < 1.1

@@ -71,7 +71,7 @@ def test_wrong_effects_are_named() -> None:
         check_effects({"motor_lag": {"taw": 0.1}}, 4)
     with pytest.raises(ParameterError, match="1 to 4"):
         check_effects({"weak_rotor": {"rotor": 5.0, "loss": 0.1}}, 4)
-    with pytest.raises(ParameterError, match="weak_rotor.loss_2 = 0.9 ; allowed: -0.6 to 0.6"):
+    with pytest.raises(ParameterError, match="weak_rotor.loss_2 = 0.9; allowed: -0.6 to 0.6"):
         check_effects({"weak_rotor": {"loss_2": 0.9}}, 4)
     with pytest.raises(ParameterError, match="0 to 0.3"):
         check_effects({"motor_lag": {"tau": 3.0}}, 4)

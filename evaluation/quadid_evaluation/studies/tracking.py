@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import solve_continuous_are
 
-from quadid.flight.airframe import STATES, Air, Body, Oddity, derivative, orthonormalise, rotor_wrench
+from quadid.flight.airframe import PUSHES, STATES, Air, Body, Oddity, derivative, orthonormalise, rotor_wrench
 from quadid.flight.jit import kernel
 from quadid.types import FloatArray
 from quadid.vehicle import GRAVITY
@@ -110,7 +110,7 @@ def track(
     """
     n, rotors = ref.position.shape[0], unmix.shape[0]
     path, commands = np.full((n, 3), np.nan), np.full((n, rotors), np.nan)
-    y, dy, wrench, push = np.zeros(STATES), np.zeros(STATES), np.zeros(7), np.zeros(6)
+    y, dy, wrench, push = np.zeros(STATES), np.zeros(STATES), np.zeros(7), np.zeros(PUSHES)
     y[0:3], y[3:6] = ref.position[0], ref.velocity[0]
     y[6:15] = desired_frame(ref.acceleration[0] - np.array([0.0, 0.0, GRAVITY]), ref.yaw[0]).copy().reshape(9)
     y[15:18] = ref.rate[0]
