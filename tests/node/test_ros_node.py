@@ -181,7 +181,7 @@ def test_two_vehicles_in_two_namespaces_do_not_mix(tmp_path: Path) -> None:
     logs = {}
     for name, effects in (("quad1", ()), ("quad2", heavy)):
         logs[name] = tmp_path / f"{name}.mcap"
-        write_mcap(logs[name], flight(14.0, 6, "excited", effects).recording)
+        write_mcap(logs[name], flight(30.0, 6, "excited", effects).recording)
     history = tmp_path / "h.sqlite"
     with Ear() as ear, node(history, "quad1") as first, node(history, "quad2") as second:
         sets = {n: ear.sets(f"/{n}/quadid/parameters") for n in logs}
