@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from quadid.errors import QuadidError
-from quadid.model.terms import LEFT_OUT, Frame
+from quadid.model.terms import Frame, runge_kutta
 from quadid.vehicle import Vehicle
 
 try:
@@ -65,11 +65,7 @@ class JaxModel:
 
     def step(self, x: Any, u: Any, dt: float, theta: Any = None, t: Any = 0.0, voltage: Any = 1.0) -> Any:
         """States `dt` [s] later, by one classical Runge-Kutta step; arguments as for `derivative`."""
-        k1 = self.derivative(x, u, theta, t, voltage)
-        k2 = self.derivative(x + 0.5 * dt * k1, u, theta, t + 0.5 * dt, voltage)
-        k3 = self.derivative(x + 0.5 * dt * k2, u, theta, t + 0.5 * dt, voltage)
-        k4 = self.derivative(x + dt * k3, u, theta, t + dt, voltage)
-        return x + dt / 6.0 * (k1 + 2.0 * (k2 + k3) + k4)
+        return runge_kutta(lambda x, t: self.derivative(x, u, theta, t, voltage), x, t, dt)
 
 
 def model(vehicle: str | Path | Vehicle, *, span: float = math.inf) -> JaxModel:
@@ -84,5 +80,4 @@ def model(vehicle: str | Path | Vehicle, *, span: float = math.inf) -> JaxModel:
         VehicleError: no such vehicle.
     """
     frame = Frame(vehicle if isinstance(vehicle, Vehicle) else Vehicle.named(vehicle), span)
-    left_out = tuple(name for name in frame.vehicle.effects if name in LEFT_OUT)
-    return JaxModel(frame.states, tuple(map(float, frame.theta)), left_out, frame)
+    return JaxModel(frame.states, tuple(map(float, frame.theta)), frame.left_out, frame)

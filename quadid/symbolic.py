@@ -19,7 +19,7 @@ from typing import Any
 
 from quadid.errors import QuadidError
 from quadid.model.layout import Layout
-from quadid.model.terms import LEFT_OUT, Frame
+from quadid.model.terms import Frame, runge_kutta
 from quadid.vehicle import Vehicle
 
 try:
@@ -71,12 +71,9 @@ class SymbolicModel:
 
     def step(self, dt: float) -> Any:
         """CasADi function from the same to the states `dt` [s] later, by one classical Runge-Kutta step."""
-        f, rest = self.function(), (self.u, self.p)
-        k1 = f(self.x, *rest, self.t, self.v)
-        k2 = f(self.x + 0.5 * dt * k1, *rest, self.t + 0.5 * dt, self.v)
-        k3 = f(self.x + 0.5 * dt * k2, *rest, self.t + 0.5 * dt, self.v)
-        k4 = f(self.x + dt * k3, *rest, self.t + dt, self.v)
-        return self._named("step", [self.x + dt / 6.0 * (k1 + 2.0 * (k2 + k3) + k4)], ["next"])
+        f = self.function()
+        later = runge_kutta(lambda x, t: f(x, self.u, self.p, t, self.v), self.x, self.t, dt)
+        return self._named("step", [later], ["next"])
 
     def _named(self, name: str, out: list[Any], names: list[str]) -> Any:
         symbols, missing = [self.x, self.u, self.p, self.t, self.v], math.nan
@@ -106,5 +103,4 @@ def model(vehicle: str | Path | Vehicle, free: Sequence[str] = (), *, span: floa
         th[entry.index] = p[i]
     rates = frame.derivative(_Symbols, casadi.vertsplit(x), casadi.vertsplit(u), th, t, v)
     values = tuple(float(frame.theta[e.index]) for e in entries)
-    left_out = tuple(name for name in described.effects if name in LEFT_OUT)
-    return SymbolicModel(frame.states, tuple(free), values, left_out, x, u, p, t, v, casadi.vertcat(*rates))
+    return SymbolicModel(frame.states, tuple(free), values, frame.left_out, x, u, p, t, v, casadi.vertcat(*rates))

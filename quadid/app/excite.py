@@ -103,7 +103,7 @@ def check_limits(seconds: float, tilt: float, rate_limit: float, height: tuple[f
 def knowledge(
     vehicle: Vehicle, windows: Sequence[Window], seed: int, advance: Advance
 ) -> tuple[Vehicle, FloatArray, Fit | None]:
-    """What is known so far: vehicle with believed values, information (6, 6) of the log parameters, fit of the logs.
+    """State of knowledge: vehicle with believed values, information (6, 6) of the log parameters, fit of the logs.
 
     Without logs that is the vehicle file: its sigma, else half of its bounds on the log scale.
     """

@@ -80,7 +80,7 @@ class Gains(Reported):
 
     @property
     def verdict(self) -> Verdict:
-        """What can be promised, and what limits it."""
+        """Promises, and their limits."""
         from quadid.report.gains_page import gains_verdict
 
         return gains_verdict(self.result)
@@ -318,7 +318,7 @@ def _promises(loops: Loops) -> Json:
 
 
 def _remedy(plant: AxisPlant, phase_margin: float) -> str:
-    """What would make the loop faster."""
+    """Remedies for a loop that is too slow."""
     hz = 1.0 / (2.0 * math.pi * max(float(plant.delay[0] + plant.lag[0]), 1e-3))
     phases = plant.phases(hz, with_rate(plant, 1.0, math.inf, False))
     largest = max(("delay", "motor lag", "gyro filter"), key=lambda name: phases[name])

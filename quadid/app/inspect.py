@@ -48,7 +48,7 @@ class Inspected(Outcome):
 
     @property
     def sentences(self) -> list[str]:
-        """What the checks found, and what is missing."""
+        """Findings of the checks, then missing channels."""
         from quadid.report.tables import sentences
 
         return [cell.text for cell in sentences(self.found)]

@@ -14,6 +14,7 @@ beside these loops, and lends margin.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -108,6 +109,10 @@ class Margins(NamedTuple):
     gain: FloatArray
     crossover: FloatArray
 
+    def keep(self, phase: float) -> bool:
+        """True where every variant keeps this phase margin [deg] and `GAIN_MARGIN`."""
+        return bool(self.phase.min() >= phase and self.gain.min() >= GAIN_MARGIN)
+
 
 def margins(loop: ComplexArray) -> Margins:
     """Margins of open loops at the frequencies `_HZ`, shape (variants, n)."""
@@ -187,9 +192,8 @@ def with_rate(plant: AxisPlant, p: float, cutoff: float, derivative: bool) -> Ra
     return RateGains(p, p * p / INTEGRAL, p * d, cutoff)
 
 
-def _largest(allowed: object, low: float, high: float) -> float:
+def _largest(allowed: Callable[[float], bool], low: float, high: float) -> float:
     """Largest number up to which something is allowed, by halving on the log scale."""
-    assert callable(allowed)
     for _ in range(24):
         middle = math.sqrt(low * high)
         low, high = (middle, high) if allowed(middle) else (low, middle)
@@ -217,8 +221,7 @@ def design(
         return Loops(plant, with_rate(plant, p, cutoff, derivative), 0.0, on_error)
 
     def keeps(p: float) -> bool:
-        m = loops(p).margins()
-        return bool(m.phase.min() >= phase_margin and m.gain.min() >= GAIN_MARGIN)
+        return loops(p).margins().keep(phase_margin)
 
     if not keeps(_GAINS[0]):
         raise ParameterError(f"a phase margin of {phase_margin:g} deg", "what the loop can keep", "ask for less")
@@ -232,11 +235,7 @@ def with_attitude(loops: Loops, phase_margin: float) -> Loops:
     def around(a: float) -> Loops:
         return Loops(loops.plant, loops.rate, a, loops._on_error)
 
-    def keeps(a: float) -> bool:
-        m = around(a).margins(True)
-        return bool(m.phase.min() >= least and m.gain.min() >= GAIN_MARGIN)
-
-    return around(_largest(keeps, 1e-3 * loops.rate.p, loops.rate.p))
+    return around(_largest(lambda a: around(a).margins(True).keep(least), 1e-3 * loops.rate.p, loops.rate.p))
 
 
 def slowed(loops: Loops, bandwidth: float, phase_margin: float, derivative: bool) -> Loops:

@@ -331,6 +331,11 @@ class Frame:
             *(turning if self.lagging else ()),
         ]  # fmt: skip
 
+    @property
+    def left_out(self) -> tuple[str, ...]:
+        """Effects of the file that these equations do not have."""
+        return tuple(name for name in self.vehicle.effects if name in LEFT_OUT)
+
     def _volts(self, th: Sequence[Scalar]) -> bool:
         """Whether the supply voltage counts; a symbol does."""
         return not (isinstance(th[ix.EXPONENT], float) and th[ix.EXPONENT] == 0.0)
@@ -352,3 +357,12 @@ def _turned(s: Scene) -> Three:
         (ixy * x + (jxx * jzz - jxz * jxz) * y + iyz * z) / det - th[ix.MQ] * q,
         (ixz * x + iyz * y + (jxx * jyy - jxy * jxy) * z) / det - th[ix.NR] * r,
     )
+
+
+def runge_kutta(rates: Callable[[Any, Any], Any], x: Any, t: Any, dt: float) -> Any:
+    """States `dt` [s] after `x` at `t`, by one classical Runge-Kutta step of ``rates(x, t)``."""
+    k1 = rates(x, t)
+    k2 = rates(x + 0.5 * dt * k1, t + 0.5 * dt)
+    k3 = rates(x + 0.5 * dt * k2, t + 0.5 * dt)
+    k4 = rates(x + dt * k3, t + dt)
+    return x + dt / 6.0 * (k1 + 2.0 * (k2 + k3) + k4)

@@ -17,7 +17,7 @@ from quadid.types import Json, JsonDict
 
 
 def gains_verdict(result: Json) -> Verdict:
-    """What can be promised over the intervals, and what limits it."""
+    """Promises over the intervals, and their limits."""
     rates = {a["axis"]: a["rate"] for a in result["axes"]}
     least = min(r["phase_margin_least"] for r in rates.values())
     bands = ", ".join(f"{name} {r['bandwidth']:.2g} Hz" for name, r in rates.items())

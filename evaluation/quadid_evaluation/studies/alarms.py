@@ -43,7 +43,7 @@ AIR = {
 }  # fmt: skip
 """Turbulence of Dryden's form: specific force, rms [m/s^2]; moments come with it, and 3 m/s of wind for each 0.3."""
 KNOWN = 0.02
-"""How well the vehicle is known: error and standard deviation of log parameters."""
+"""Prior knowledge of the vehicle: error and standard deviation of log parameters."""
 SIGMA = np.array([0.001, 0.006, KNOWN, KNOWN, KNOWN, 0.05])
 SENSORS = ("rotor_speed", "gyro", "accel", "attitude")
 CHANGES: dict[str, dict[str, dict[str, float]]] = {
@@ -89,7 +89,7 @@ def watched(vehicle: Vehicle, flight: Flight, seed: int) -> Iterator[Seen]:
 
 
 def faults(vehicle: Vehicle, flight: Flight) -> Iterator[str]:
-    """What the checks find wrong with the windows of a healthy flight, before and after the vehicle is known."""
+    """Complaints of the checks about the windows of a healthy flight, before and after the vehicle is known."""
     window, layout = flight.window, Layout(vehicle)
     theta = layout.initial(vehicle)
     theta[: len(NOMINAL_NAMES)] = list(flight.truth.parameters.as_dict().values())
@@ -104,7 +104,7 @@ def faults(vehicle: Vehicle, flight: Flight) -> Iterator[str]:
 
 
 def named(vehicle: Vehicle, flight: Flight, seen: Seen) -> OnlineFinding | None:
-    """What a session says of a change `AFTER_CHANGE` [s] after it."""
+    """Report of a session on a change, `AFTER_CHANGE` [s] after it."""
     window, theta = flight.window, Layout(vehicle).initial(vehicle)
     theta[: len(NOMINAL_NAMES)] = list(flight.truth.parameters.as_dict().values())
     first = int(np.searchsorted(window.t, seen.change.time + 0.1))
@@ -148,7 +148,7 @@ def healthy(hours: float, seed: int) -> str:
 
 
 def detections(each: int, seed: int) -> str:
-    """How soon changes are named, as Markdown."""
+    """Delays until changes are named, as Markdown."""
     pelican, lines = Vehicle.shipped("pelican"), []
     cases = [*((what, "mass_change") for what in CHANGES), (f"-{LOSS:.0%} of a rotor", "weak_rotor")]
     for (what, effect), profile, air in itertools.product(cases, ("hover", "excited"), ("calm", "light", "gusty")):

@@ -350,7 +350,7 @@ def orders(rotors: int) -> Iterator[Mistake]:
 
 
 def said(recording: Recording, vehicle: Vehicle) -> list[str]:
-    """What a user is told, first line first: the refusal of `load`, else errors and then warnings of `inspect`."""
+    """Lines that a user reads, in their order: the refusal of `load`, else errors and then warnings of `inspect`."""
     found = inspect(recording, vehicle)
     lines = [
         f"{check.message}; {check.fix}"
@@ -366,7 +366,7 @@ def said(recording: Recording, vehicle: Vehicle) -> list[str]:
 
 
 def judged(log: Log, mistake: Mistake, usual: Sequence[str]) -> tuple[str, str]:
-    """Whether a mistake is named, and the first line that the right log is not answered with."""
+    """Grade of an answer: the mistake is named or not; and the first line that the right log is not answered with."""
     known = {re.sub(r"[-0-9.e]+", "", line) for line in usual}
     lines = [line for line in said(*mistake.made(*log)) if re.sub(r"[-0-9.e]+", "", line) not in known]
     first = lines[0] if lines else ""

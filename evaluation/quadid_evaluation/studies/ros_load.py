@@ -184,7 +184,7 @@ def publish(stack: str, recording: Recording) -> None:
 
 
 class Seen(NamedTuple):
-    """What one run showed.
+    """Figures of one run.
 
     Attributes:
         first: from the first message to the first set [s]; NaN for none.

@@ -54,7 +54,7 @@ def serve(log: Path, vehicle: Path, seconds: float) -> Outcome:
 
 
 def stored(vehicle: Path, history: Path, said: list[str], seconds: float) -> Outcome:
-    """What a service that has ended left in its history; `said`: its lines; `seconds`: how long it ran."""
+    """Record that an ended service left in its history; `said`: its lines; `seconds`: how long it ran."""
     told = subprocess.run(
         [str(Path(sys.executable).with_name("quadid")), "history", "--vehicle", str(vehicle), "--history", str(history),
          "--candidates", "10000", "--events", "10000", "--json", "-"],
