@@ -16,7 +16,7 @@ from quadid.identification.composite_likelihood import with_second_cut
 from quadid.identification.covariance import SPREAD_LIMIT, parameter_set, uncertainty
 from quadid.identification.fast_motion import MOST_SEGMENTS, FastMotion, fast_motion, with_moments
 from quadid.identification.gauss_newton import Convergence, Polished, polish
-from quadid.identification.global_search import Progress, swarm_search
+from quadid.identification.global_search import SWARM_SECONDS, Progress, swarm_search
 from quadid.identification.identifiability import Fit as Fit
 from quadid.identification.identifiability import final_answer, on_bounds
 from quadid.identification.long_logs import spread
@@ -34,7 +34,6 @@ from quadid.parameters import INERTIAS, NOMINAL_NAMES
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 
-SWARM_SECONDS = 0.2
 FIT_SECONDS = 1.0
 WHITE_SHARE = 0.5
 """Fast motion alone decides where less than this share of what short segments leave of roll or pitch rate is white

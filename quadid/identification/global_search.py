@@ -16,6 +16,8 @@ from quadid.types import FloatArray
 
 Progress = Callable[[str, float], None]
 
+SWARM_SECONDS = 0.2
+"""Length of the segments that the swarm simulates [s]."""
 RESOLUTION = 0.5
 """Differences of the swarm's cost, a sum of squares over the noise, below which particles are equally good."""
 SWARM_SEGMENTS = 100
