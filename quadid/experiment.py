@@ -20,10 +20,9 @@ from quadid.errors import NotIdentifiableError
 from quadid.estimate import missing
 from quadid.flight import Flight, FlightError, Segment, TruthParameters, fly
 from quadid.flight.sensors import SensorNoise
-from quadid.identification.excitation import excitation
-from quadid.identification.global_search import Progress as Advance
-from quadid.identification.noise_model import NoiseModel
-from quadid.identification.optimal_input import d_optimal, halfwidths
+from quadid.identification.excitation import d_optimal, excitation, halfwidths
+from quadid.identification.noise import NoiseModel
+from quadid.identification.search import Progress as Advance
 from quadid.parameters import NOMINAL_NAMES
 from quadid.rotation import down
 from quadid.types import FloatArray

@@ -49,7 +49,7 @@ MOVED = {
     "quadid.model.rotor_kernel": "quadid.model.lag_kernel",
     "quadid.model.kernel": "quadid.model.needs_kernel",
     "quadid.model.body_kernel": "quadid.model.residual_kernel",
-    "quadid.model.step": "quadid.model.simulate",
+    "quadid.model.step": "quadid.model.simulate quadid.model.step_kernel",
     "quadid.model.layout": "quadid.model.supply quadid.model.thrust",
     "quadid.data.mounting": "quadid.mounting",
     "quadid.online.stream": "quadid.online.channel_buffer quadid.online.clock "
@@ -63,6 +63,27 @@ MOVED = {
     "quadid.data.window": "quadid.window",
     "quadid.cli.terminal": "quadid_cli.failure quadid_cli.output quadid_cli.tables",
     "quadid.cli.fleet_run": "quadid_cli.fleet_cluster quadid_cli.fleet_folder quadid_cli.fleet_store",
+    "quadid.identification.problem": "quadid.identify.parameterization quadid.identify.segment_cost "
+    "quadid.identify.segment_jacobian quadid.identify.shooting quadid.identify.priors",
+    "quadid.identification.elimination": "quadid.identify.elimination_kernel quadid.identify.schur_complement",
+    "quadid.identification.gauss_newton": "quadid.identify.box_qp",
+    "quadid.identification.search": "quadid.identify.global_search quadid.identify.shooting_objective",
+    "quadid.identification.noise": "quadid.identify.process_noise quadid.identify.noise_model",
+    "quadid.identification.noise_fit": "quadid.identify.noise_spectrum quadid.identify.noise_estimation "
+    "quadid.identify.noise_memory",
+    "quadid.identification.fast_motion": "quadid.identify.torque_coherence",
+    "quadid.identification.uncertainty": "quadid.identify.covariance quadid.identify.composite_likelihood "
+    "quadid.identify.scale_uncertainty",
+    "quadid.identification.reliability": "quadid.identify.richardson",
+    "quadid.identification.fit": "quadid.identify.identifiability quadid.identify.long_logs",
+    "quadid.identification.excitation": "quadid.identify.optimal_input",
+    "quadid.identification.predict": "quadid.identify.open_loop quadid.identify.prediction "
+    "quadid.identify.prediction_floor",
+    "quadid.diagnosis.hypotheses": "quadid.diagnose.candidates quadid.diagnose.cross_validation quadid.diagnose.model",
+    "quadid.diagnosis.evidence": "quadid.diagnose.log_evidence quadid.diagnose.score_test quadid.diagnose.plausibility",
+    "quadid.diagnosis.search": "quadid.diagnose.segment_schedule quadid.diagnose.selection",
+    "quadid.diagnosis.residual_tests": "quadid.diagnose.residual_regressors",
+    "quadid.model.closed_loop": "quadid.model.closed_loop_kernel",
     "quadid_node.inputs": "quadid_node.chooser quadid_node.convert quadid_node.intake quadid_node.pace "
     "quadid_node.presets quadid_node.stamps",
     "quadid_node.publish": "quadid_node.claim quadid_node.neighbours quadid_node.speaker",

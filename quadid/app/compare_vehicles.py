@@ -15,15 +15,14 @@ from quadid.app.outcome import LIBRARY, Reported, provenance
 from quadid.app.score import HORIZONS, ahead
 from quadid.chi_square import Z95
 from quadid.errors import LogError
-from quadid.identification.open_loop import QUANTITIES
-from quadid.identification.prediction import start_errors
+from quadid.identification.predict import QUANTITIES, start_errors
 from quadid.parameters import NOMINAL_UNITS
+from quadid.report.verdict import Verdict
 from quadid.types import FloatArray, Json
 from quadid.vehicle import Vehicle
 
 if TYPE_CHECKING:
     from quadid.report.tables import TextTable
-    from quadid.report.verdict import Verdict
 
 BLOCK = 1.0
 """Least length of a block of starts that is drawn as one [s]: runs that overlap err alike."""

@@ -20,9 +20,9 @@ from quadid.vehicle import Vehicle
 
 if TYPE_CHECKING:
     from quadid.diagnosis import Diagnosis
-    from quadid.diagnosis.selection import Search
-    from quadid.identification.identifiability import Fit
-    from quadid.identification.noise_model import NoiseModel
+    from quadid.diagnosis.search import Search
+    from quadid.identification.fit import Fit
+    from quadid.identification.noise import NoiseModel
     from quadid.identification.result import ScoredSet
     from quadid.report.residual_maps import ResidualMap
     from quadid.report.tables import TextTable

@@ -28,7 +28,7 @@ from quadid.version import __version__
 
 if TYPE_CHECKING:
     from quadid.identification.controller_gains import Autopilot
-    from quadid.identification.identifiability import Fit
+    from quadid.identification.fit import Fit
     from quadid.identification.result import ScoredSet
     from quadid.report.tables import TextTable
 
@@ -75,8 +75,8 @@ def search(
     if names is not None:
         raise ParameterError(f"free or fix with {name}, which fits the six", OPTIMIZERS[0], "leave optimizer out")
 
-    from quadid.identification.identifiability import final_answer
-    from quadid.identification.shooting_objective import BoxProblem
+    from quadid.identification.fit import final_answer
+    from quadid.identification.search import BoxProblem
 
     standard = fit(windows, vehicle, FitOptions(seed=seed), progress=lambda stage, share: advance("noise", share))
     advance(name, 0.0)

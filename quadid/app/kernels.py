@@ -101,8 +101,7 @@ def _statistics() -> None:
     import numpy as np
 
     from quadid.flight.pilot import default_gains
-    from quadid.identification.elimination import Reduced, StatePrior, Whitening
-    from quadid.identification.elimination_kernel import reduce_segments
+    from quadid.identification.elimination import Reduced, StatePrior, Whitening, reduce_segments
     from quadid.model.closed_loop import ClosedLoop
     from quadid.model.layout import Layout
     from quadid.model.simd import LANES, aligned
@@ -153,8 +152,8 @@ def _simulation_kernels() -> list[Any]:
 
 
 def _statistics_kernels() -> list[Any]:
-    from quadid.identification.elimination_kernel import _reduce_on_disk
-    from quadid.model.closed_loop_kernel import fly_closed_loop
+    from quadid.identification.elimination import _reduce_on_disk
+    from quadid.model.closed_loop import fly_closed_loop
 
     return [_reduce_on_disk, fly_closed_loop]
 

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from quadid.checks import Inspection
-    from quadid.identification.identifiability import Fit
+    from quadid.identification.fit import Fit
     from quadid.identification.result import ScoredSet
     from quadid.report.tables import TextTable
 

@@ -78,9 +78,7 @@ def score(
         LogError: a log that does not fit the vehicle.
         ParameterError: horizons that are no positive numbers, or times on logs of several rates.
     """
-    from quadid.identification.open_loop import QUANTITIES, no_change
-    from quadid.identification.prediction import horizon_scores
-    from quadid.identification.prediction_floor import prediction_floor
+    from quadid.identification.predict import QUANTITIES, horizon_scores, no_change, prediction_floor
     from quadid.identification.result import score_result
 
     given = settled(logs, (), vehicle)

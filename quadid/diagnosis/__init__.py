@@ -2,4 +2,4 @@
 
 from quadid.diagnosis.pipeline import diagnose as diagnose
 from quadid.diagnosis.result import Diagnosis as Diagnosis
-from quadid.diagnosis.selection import Search as Search
+from quadid.diagnosis.search import Search as Search

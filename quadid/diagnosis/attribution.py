@@ -20,16 +20,21 @@ from typing import NamedTuple
 import numpy as np
 
 from quadid.data.window import Window
-from quadid.diagnosis.candidates import Candidate
-from quadid.diagnosis.cross_validation import block_labels, paired_gain, steps_without, sum_by_block
-from quadid.diagnosis.model import Model, free_names
+from quadid.diagnosis.hypotheses import (
+    Candidate,
+    Model,
+    block_labels,
+    free_names,
+    paired_gain,
+    steps_without,
+    sum_by_block,
+)
 from quadid.effects import EFFECTS
 from quadid.identification.gauss_newton import polish
-from quadid.identification.noise_model import NoiseModel
-from quadid.identification.priors import default_prior, posterior_covariance
+from quadid.identification.noise import NoiseModel
+from quadid.identification.problem import Shooting, default_prior, posterior_covariance
 from quadid.identification.reliability import MISFIT
 from quadid.identification.score import Tally, mse_score, scored_problem, settle_states, tallied
-from quadid.identification.shooting import Shooting
 from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle

@@ -10,28 +10,22 @@ import numpy as np
 from quadid.data.faults import data_faults, without_copies
 from quadid.data.window import Window
 from quadid.diagnosis.attribution import NominalFit, stated_errors, worths
-from quadid.diagnosis.candidates import Candidate, candidates
-from quadid.diagnosis.cross_validation import BLOCKS
-from quadid.diagnosis.log_evidence import better
-from quadid.diagnosis.model import Model, free_names, refit, without
-from quadid.diagnosis.plausibility import impossible_causes, late_unknown, slight_causes
+from quadid.diagnosis.evidence import better, impossible_causes, late_unknown, slight_causes
+from quadid.diagnosis.hypotheses import BLOCKS, Candidate, Model, candidates, free_names, refit, without
 from quadid.diagnosis.residual_tests import Remainder, inconstant_causes, remainder
 from quadid.diagnosis.result import Diagnosis, Explanation, describe
-from quadid.diagnosis.segment_schedule import LINEAR_MISFIT
-from quadid.diagnosis.selection import Search, from_everything, pruned, select
+from quadid.diagnosis.search import LINEAR_MISFIT, Search, from_everything, pruned, select
 from quadid.diagnosis.unmodelled_moments import Held, held_by_fast_motion, refitted
 from quadid.effects import EFFECTS
-from quadid.identification.covariance import SPREAD_LIMIT, parameter_set
-from quadid.identification.fit import SWARM_SECONDS, FitOptions, check_windows
+from quadid.identification.fit import FitOptions, check_windows, on_bounds, possible_moments, tied
 from quadid.identification.gauss_newton import polish
-from quadid.identification.global_search import Progress, swarm_search
-from quadid.identification.identifiability import on_bounds, possible_moments, tied
-from quadid.identification.noise_estimation import FAR_ITERATIONS, flexible_fit, residual_noise
-from quadid.identification.noise_memory import with_memory
-from quadid.identification.noise_model import NoiseModel
+from quadid.identification.noise import NoiseModel
+from quadid.identification.noise_fit import FAR_ITERATIONS, flexible_fit, residual_noise, with_memory
+from quadid.identification.problem import Shooting
 from quadid.identification.reliability import reliability
 from quadid.identification.result import with_values
-from quadid.identification.shooting import Shooting
+from quadid.identification.search import SWARM_SECONDS, Progress, swarm_search
+from quadid.identification.uncertainty import SPREAD_LIMIT, parameter_set
 from quadid.model.layout import with_reference_voltage
 from quadid.parameters import INERTIAS, NOMINAL_NAMES, UNKNOWN, Parameter, unreliable
 from quadid.types import FloatArray

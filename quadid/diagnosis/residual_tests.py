@@ -1,28 +1,259 @@
-"""What remains after the named causes: is it noise, and does it contradict them?
-
-Two looks: does the residual follow anything the vehicle did (`residual_regressors`), and does its power stand above the
-noise?  For the second, the whitened residual of each segment, initial state eliminated, is taken apart into cosine
-modes.  Pure noise leaves every mode with the power that the elimination itself leaves it, which is computed with the
-same projection on drawn noise.  Modes that stand above the noise model by more than chance are structure, at a
-frequency, in a channel.  The noise model is that of a flexible fit, flat below 3 Hz, so slow structure cannot hide
-in it.
-"""
+"""Tests of what remains after the named causes: is it noise, what does it follow, does it contradict them?"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from quadid.diagnosis.candidates import Candidate
-from quadid.diagnosis.model import Model
-from quadid.diagnosis.residual_regressors import Follows, follows, strongest
+from quadid.diagnosis.hypotheses import Candidate, Gain, Model, held_out, paired_gain
 from quadid.effects import EFFECTS
-from quadid.identification.noise_estimation import SPECTRUM_SECONDS
-from quadid.identification.noise_spectrum import LEAST_LEFT, SMOOTH, band_power, mode_power
-from quadid.identification.shooting import Shooting
+from quadid.identification.elimination import freed
+from quadid.identification.noise_fit import LEAST_LEFT, SMOOTH, SPECTRUM_SECONDS, band_power, mode_power
+from quadid.identification.problem import Columns, Shooting
 from quadid.model.rollout import CHANNEL_NAMES
+from quadid.rotation import product
 from quadid.types import FloatArray
+
+# --- What remains, held against generic causes: does the residual follow anything that the vehicle did?
+#
+# A spectrum sees structure only where it stands above the noise.  Something that follows a command, a motion or the
+# time is seen far below that.  Each probe is a signal (an input, its square, its change, a predicted motion, a slow
+# function of time) acting at a site: as a moment, a force, an error of the gyro or of the attitude.  Its whitened
+# response, less what initial states and free parameters take up, is fitted on all blocks but one and judged on that
+# one, so a probe that follows only noise loses.
+#
+# No signal may share noise with the residual: motions are the predicted ones, and inputs are those of the step before a
+# sample, because a controller's command answers to the noise of the sample that it was worked out from; so are specific
+# forces, which follow the command at once.
+
+
+ERRORS = 2.5
+"""Standard errors of a gain on unseen blocks above which a site counts as structured."""
+_RIDGE = 1e-6
+"""Prior precision of a probe, relative to its information: keeps signals finite that double one another."""
+WAVES = 4
+"""Half waves over the log, for what comes and goes slowly."""
+_AXES = "xyz"
+
+
+@dataclass(frozen=True)
+class Site:
+    """Where a probe acts.
+
+    Attributes:
+        name: for people.
+        channels: residual channels that it moves, with how often the signal is integrated before it shows there.
+        group: sites that cannot be distinguished from afar; only the best of a group counts.
+    """
+
+    name: str
+    channels: tuple[tuple[int, int], ...]
+    group: str
+
+
+@dataclass(frozen=True)
+class Follows:
+    """What the residual follows at one site.
+
+    Attributes:
+        site: where.
+        gain: deviance that all signals together take away on unseen blocks.
+        alone: what every signal alone takes away, chi-square with one degree of freedom.
+    """
+
+    site: Site
+    gain: Gain
+    alone: Mapping[str, float]
+
+    @property
+    def signal(self) -> str:
+        """The one that does most alone."""
+        return max(self.alone, key=lambda name: self.alone[name])
+
+    @property
+    def significant(self) -> bool:
+        """Whether the gain stands above its own error."""
+        return self.gain.total > ERRORS * self.gain.error
+
+
+SITES = tuple(
+    site
+    for i, axis in enumerate(_AXES)
+    for site in (
+        Site(f"moment {axis}", ((i, 1), (3 + i, 2)), f"rotation {axis}"),
+        Site(f"gyro {axis}", ((i, 0),), f"rotation {axis}"),
+        Site(f"attitude {axis}", ((3 + i, 0),), f"rotation {axis}"),
+        Site(f"force {axis}", ((6 + i, 0),), f"force {axis}"),
+    )
+)
+
+
+def strongest(found: Sequence[Follows]) -> tuple[Follows, ...]:
+    """The best site of each group, best first."""
+    best: dict[str, Follows] = {}
+    for f in sorted(found, key=lambda f: -f.gain.total):
+        best.setdefault(f.site.group, f)
+    return tuple(best.values())
+
+
+def follows(shooting: Shooting, model: Model) -> tuple[Follows, ...]:
+    """Holds what `model` leaves against all signals at every site."""
+    parts = list(shooting.columns(model.theta, model.free, model.states))
+    named = [signals(part) for part in parts]
+    names = tuple(named[0])
+    # Scaled over all windows alike, so that one coefficient means the same in each.
+    stacked = [np.stack(list(s.values()), axis=-1) for s in named]
+    scale = np.sqrt(np.mean(np.concatenate([np.mean(s**2, axis=(1,)) for s in stacked]), axis=0))
+    stacked = [s / np.where(scale > 0.0, scale, 1.0) for s in stacked]
+    prepared = [_prepared(p, s) for p, s in zip(parts, stacked, strict=True)]
+    return tuple(_judge(site, names, prepared, model) for site in SITES)
+
+
+@dataclass(frozen=True)
+class _Prepared:
+    """What all sites of one window share.
+
+    Attributes:
+        part: its segments.
+        integrated: signals (segments, length, n), as they are, integrated once and twice.
+        beside: parameters and, last, the residual, less what initial states take up, shape (segments, length, channels,
+            P + 1).
+        own: products of the parameters with these, (segments, P, P + 1).
+    """
+
+    part: Columns
+    integrated: tuple[FloatArray, FloatArray, FloatArray]
+    beside: FloatArray
+    own: FloatArray
+
+
+def _prepared(part: Columns, signal: FloatArray) -> _Prepared:
+    once = part.window.dt * np.cumsum(signal, axis=1)
+    rows = np.concatenate([part.parameters, part.residual.reshape(len(signal), -1, 1)], axis=2)
+    rows = rows - part.basis @ (_t(part.basis) @ rows)
+    integrated = (signal, once, part.window.dt * np.cumsum(once, axis=1))
+    return _Prepared(part, integrated, rows.reshape(*part.residual.shape, -1), _t(rows[..., :-1]) @ rows)
+
+
+def _judge(site: Site, names: tuple[str, ...], prepared: list[_Prepared], model: Model) -> Follows:
+    pieces = [_products(site, p) for p in prepared]
+    gram, grad = (np.concatenate([p[i] for p in pieces]) for i in (0, 1))
+    own = model.lin.gram.shape[1]
+    total, slope = gram.sum(axis=0), grad.sum(axis=0)
+    sizes = np.diag(total)[own:]
+    precision = np.concatenate([model.prior.precision, _RIDGE * sizes + 1e-9])
+    both = replace(model.lin, gram=gram, grad=grad)
+    none = replace(model.lin, gram=gram[:, :own, :own], grad=grad[:, :own])
+    gain = paired_gain(held_out(none, precision[:own]).block, held_out(both, precision).block)
+    each = freed(
+        (sizes + precision[own:])[:, None, None], total[own:, None, :own],
+        total[:own, :own] + np.diag(precision[:own]), slope[own:, None], slope[:own],
+    )  # fmt: skip
+    return Follows(site, gain, dict(zip(names, each.tolist(), strict=True)))
+
+
+def _products(site: Site, p: _Prepared) -> tuple[FloatArray, FloatArray]:
+    """Products of parameters and probes of each segment, initial states eliminated: gram and gradient."""
+    count, length, n = p.integrated[0].shape
+    moved = [c for c, _ in site.channels]
+    each = [p.part.whiten(p.integrated[order], channel) for channel, order in site.channels]
+    x = np.stack(each, axis=2).reshape(count, -1, n)
+    basis = p.part.basis.reshape(*p.beside.shape[:3], -1)[:, :, moved].reshape(count, x.shape[1], -1)
+    inside = _t(basis) @ x
+    cross = _t(x) @ p.beside[:, :, moved].reshape(count, x.shape[1], -1)
+    probes = _t(x) @ x - _t(inside) @ inside
+    gram = np.block([[p.own[..., :-1], _t(cross[..., :-1])], [cross[..., :-1], probes]])
+    return gram, np.concatenate([p.own[..., -1], cross[..., -1]], axis=1)
+
+
+def _t(a: FloatArray) -> FloatArray:
+    return a.transpose(0, 2, 1)
+
+
+def signals(part: Columns) -> dict[str, FloatArray]:
+    """Signals at the samples of every segment, each of shape (segments, length), not yet scaled.
+
+    Args:
+        part: one window's segments with their prediction.
+    """
+    out = {f"{name} input": s[part.rows - 1] for name, s in _inputs(part).items()}
+    out |= _motions(part)
+    first, last = part.window.log_span
+    share = (part.window.t[part.rows] - first) / max(last - first, part.window.dt)
+    out["constant"] = np.ones_like(share)
+    for n in range(1, WAVES + 1):
+        out[f"time, {n} half waves"] = np.cos(n * np.pi * share)
+    return out
+
+
+def _inputs(part: Columns) -> dict[str, FloatArray]:
+    """Rotor commands, by row of the window: thrust and differences of squared speeds, their shapes."""
+    square = part.window.rotor_speed**2
+    mean = square.mean(axis=1)
+    # Principal differences between rotors stand for the moments, whatever the geometry.
+    apart = square - mean[:, None]
+    apart = apart - apart.mean(axis=0)
+    axes = np.linalg.svd(apart, full_matrices=False)[2][: min(3, square.shape[1] - 1)]
+    level = float(mean.mean())
+    thrust = mean / level - 1.0
+    basic = {"thrust": thrust}
+    for i, axis in enumerate(axes):
+        basic[f"moment {i + 1}"] = apart @ axis / level
+    out = dict(basic)
+    for name, s in basic.items():
+        change = np.diff(s, prepend=s[0])
+        out[f"changing {name}"] = change
+        out[f"|changing {name}|"] = np.abs(change)
+        out[f"squared {name}"] = s**2
+        out[f"cubed {name}"] = s**3
+    return out
+
+
+def _motions(part: Columns) -> dict[str, FloatArray]:
+    """Predicted rates, tilt and specific force, and products of them."""
+    window = part.window
+    p, q, r = (_predicted(part, window.gyro, i, i) for i in range(3))
+    f_x, f_y, f_z = (_before(_predicted(part, window.accel, i, 6 + i)) for i in range(3))
+    out = {"p": p, "q": q, "r": r, "p|p|": p * np.abs(p), "q|q|": q * np.abs(q), "r|r|": r * np.abs(r)}
+    out |= {"p q": p * q, "q r": q * r, "r p": r * p, "|p|": np.abs(p), "|q|": np.abs(q)}
+    lift = f_z - np.mean(f_z)
+    out |= {"a_x": f_x, "a_y": f_y, "a_z": lift, "a_z squared": lift**2, "a_x a_z": f_x * lift, "a_y a_z": f_y * lift}
+    if window.attitude is not None:
+        w, x, y, z = _predicted_attitude(part, window.attitude)
+        out |= {"pitched": 2.0 * (x * z - w * y), "rolled": 2.0 * (y * z + w * x)}
+        out |= {"heading north": w * w + x * x - y * y - z * z, "heading east": 2.0 * (x * y + w * z)}
+    return out
+
+
+def _before(signal: FloatArray) -> FloatArray:
+    """The signal one step before; at the first sample of a segment, there."""
+    return np.concatenate([signal[:, :1], signal[:, :-1]], axis=1)
+
+
+def _predicted(part: Columns, measured: FloatArray | None, axis: int, channel: int) -> FloatArray:
+    """Predicted value of a channel; where nothing was measured, 0, as its residual."""
+    value = part.base[:, :, channel]
+    return value if measured is None else value + np.nan_to_num(measured[part.rows][..., axis])
+
+
+def _predicted_attitude(part: Columns, measured: FloatArray) -> FloatArray:
+    """Predicted quaternion, shape (4, segments, length): the measured one turned by its residual, a body rotation."""
+    error = 0.5 * part.base[:, :, 3:6].reshape(-1, 3)
+    turned = product(np.nan_to_num(measured[part.rows.ravel()]), np.column_stack([np.ones(len(error)), error]))
+    return turned.T.reshape(4, *part.rows.shape)
+
+
+# --- What remains after the named causes: is it noise, and does it contradict them?
+#
+# Two looks: does the residual follow anything the vehicle did (`residual_regressors`), and does its power stand above
+# the noise?  For the second, the whitened residual of each segment, initial state eliminated, is taken apart into
+# cosine modes.  Pure noise leaves every mode with the power that the elimination itself leaves it, which is computed
+# with the same projection on drawn noise.  Modes that stand above the noise model by more than chance are structure,
+# at a frequency, in a channel.  The noise model is that of a flexible fit, flat below 3 Hz, so slow structure cannot
+# hide in it.
+
 
 ALARM = 5.0
 """Standard errors above the floor that count as structure; calibrated on flights without effects."""
@@ -99,11 +330,11 @@ def remainder(shooting: Shooting, model: Model, seed: int = 0) -> Remainder:
     for c in range(found.shape[0]):
         if 3 <= c < 6 or not np.isfinite(found[c]).all() or segments[c] < 5:
             continue
-        out.append(_judge(CHANNEL_NAMES[c], found[c], null[c], segments[c], rate))
+        out.append(_residual_tests_judge(CHANNEL_NAMES[c], found[c], null[c], segments[c], rate))
     return Remainder(tuple(out), follows(shooting, model), model.rows)
 
 
-def _judge(name: str, found: FloatArray, null: FloatArray, segments: int, rate: float) -> Structure:
+def _residual_tests_judge(name: str, found: FloatArray, null: FloatArray, segments: int, rate: float) -> Structure:
     spacing = 0.5 * rate / len(found)
     # The noise spectrum came from the data: a line of vibration narrower than it resolves is noise.
     resolved = SMOOTH / (2.0 * SPECTRUM_SECONDS)

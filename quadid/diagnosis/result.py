@@ -10,13 +10,12 @@ from typing import Any
 
 from quadid.chi_square import Z95, survival
 from quadid.diagnosis.attribution import Benefit, Validation, Worth
-from quadid.diagnosis.candidates import Candidate
-from quadid.diagnosis.model import Model
+from quadid.diagnosis.hypotheses import Candidate, Model
 from quadid.diagnosis.residual_tests import Remainder
-from quadid.diagnosis.selection import Search
+from quadid.diagnosis.search import Search
 from quadid.effects import EFFECTS
+from quadid.identification.problem import Shooting
 from quadid.identification.result import parameter_entry
-from quadid.identification.shooting import Shooting
 from quadid.jsonable import jsonable
 from quadid.parameters import Parameter
 from quadid.vehicle import Vehicle

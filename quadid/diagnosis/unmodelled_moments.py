@@ -15,17 +15,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from quadid.data.window import Window
-from quadid.diagnosis.model import Model, fit_model, free_names, without
-from quadid.diagnosis.plausibility import impossible_causes
-from quadid.diagnosis.segment_schedule import Stage
-from quadid.diagnosis.selection import Search, pruned
+from quadid.diagnosis.evidence import impossible_causes
+from quadid.diagnosis.hypotheses import Model, fit_model, free_names, without
+from quadid.diagnosis.search import Search, Stage, pruned
 from quadid.effects import EFFECTS
-from quadid.identification.covariance import SPREAD_LIMIT
 from quadid.identification.fast_motion import MOST_SEGMENTS, fast_motion
 from quadid.identification.fit import YAW, fast_fit, restless
 from quadid.identification.gauss_newton import polish
-from quadid.identification.noise_estimation import residual_noise
-from quadid.identification.shooting import Shooting
+from quadid.identification.noise_fit import residual_noise
+from quadid.identification.problem import Shooting
+from quadid.identification.uncertainty import SPREAD_LIMIT
 from quadid.model.layout import Layout
 from quadid.parameters import INERTIAS, NOMINAL_NAMES, UNKNOWN, Parameter, ParameterSet
 from quadid.types import FloatArray

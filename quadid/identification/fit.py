@@ -5,34 +5,225 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from quadid.chi_square import Z95
 from quadid.data.window import Window
 from quadid.errors import NotIdentifiableError, WindowError
-from quadid.identification.composite_likelihood import with_second_cut
-from quadid.identification.covariance import SPREAD_LIMIT, parameter_set, uncertainty
 from quadid.identification.fast_motion import MOST_SEGMENTS, FastMotion, fast_motion, with_moments
 from quadid.identification.gauss_newton import Convergence, Polished, polish
-from quadid.identification.global_search import SWARM_SECONDS, Progress, swarm_search
-from quadid.identification.identifiability import Fit as Fit
-from quadid.identification.identifiability import final_answer, on_bounds
-from quadid.identification.long_logs import spread
-from quadid.identification.noise_estimation import FAR_ITERATIONS, flexible_fit, reweighted_fit
-from quadid.identification.noise_memory import with_memory
-from quadid.identification.noise_model import NoiseModel
-from quadid.identification.parameterization import Free
+from quadid.identification.noise import NoiseModel
+from quadid.identification.noise_fit import FAR_ITERATIONS, flexible_fit, reweighted_fit, with_memory
 from quadid.identification.particle_swarm import SwarmOptions
-from quadid.identification.priors import Prior, default_prior, posterior_covariance
+from quadid.identification.problem import Free, Prior, Shooting, default_prior, posterior_covariance
 from quadid.identification.reliability import reliability
-from quadid.identification.scale_uncertainty import with_scale_uncertainty
 from quadid.identification.score import settle_states
-from quadid.identification.shooting import Shooting
-from quadid.parameters import INERTIAS, NOMINAL_NAMES
+from quadid.identification.search import SWARM_SECONDS, Progress, swarm_search
+from quadid.identification.uncertainty import (
+    SPREAD_LIMIT,
+    Uncertainty,
+    parameter_set,
+    uncertainty,
+    with_scale_uncertainty,
+    with_second_cut,
+)
+from quadid.model.layout import Layout
+from quadid.parameters import (
+    INERTIAS,
+    NOMINAL_NAMES,
+    UNKNOWN,
+    Parameter,
+    ParameterSet,
+    Status,
+    at_bound,
+    impossible_inertia,
+)
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
+
+# --- The answer of an identification: what these data cannot show keeps its guess, and guesses belong to a rigid body
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Result of an identification.
+
+    Attributes:
+        vehicle: the vehicle as given.
+        theta: full parameter vector.
+        parameters: free parameters with intervals and status.
+        noise: estimated sensor noise, in which errors are stated.
+        uncertainty: covariance of the scaled parameters.
+        outcome: how the polish ended.
+        evaluations: parameter vectors simulated by search and fits (finite differences included); the noise's apart.
+        warnings: for the user.
+    """
+
+    vehicle: Vehicle
+    theta: FloatArray
+    parameters: ParameterSet
+    noise: NoiseModel
+    uncertainty: Uncertainty
+    outcome: Convergence
+    evaluations: int
+    warnings: tuple[str, ...] = ()
+
+    def of(self, names: Sequence[str]) -> Fit:
+        """The same for some of its parameters, which come first; others were fitted along and are neutral again."""
+        if len(names) == len(self.parameters):
+            return self
+        theta, layout = self.theta.copy(), Layout(self.vehicle)
+        for p in self.parameters.parameters[len(names) :]:
+            theta[layout.entry(p.name).index] = p.initial
+        return replace(
+            self,
+            theta=theta,
+            parameters=self.parameters.first(len(names)),
+            uncertainty=self.uncertainty.first(len(names)),
+        )
+
+
+def final_answer(fit: Fit, out_of_reach: Mapping[str, str]) -> Fit:
+    """The fit as every command, the library and the node give it.
+
+    Args:
+        fit: of all parameters together, so that those kept do not suffer from wrong guesses of the others.
+        out_of_reach: parameters that the channels of the log cannot show, and why, in words.
+    """
+    return possible_inertia(mask_unidentifiable(fit, out_of_reach))
+
+
+def mask_unidentifiable(fit: Fit, reasons: Mapping[str, str]) -> Fit:
+    """The fit with parameters that these data cannot identify reset to the vehicle file's values.
+
+    Args:
+        fit: of all parameters together, so that those kept do not suffer from wrong guesses of the others.
+        reasons: why, by parameter, in words.
+
+    Returns:
+        The fit with the status ``prior_dominated``, the prior's interval and a warning for every name in `reasons`.
+    """
+    names = [n for n in fit.parameters.names if n in reasons]
+    if not names:
+        return fit
+    layout = Layout(fit.vehicle)
+    theta, covariance = fit.theta.copy(), np.array(fit.parameters.covariance)
+    rows = []
+    for j, p in enumerate(fit.parameters):
+        if p.name in reasons:
+            spread = float(fit.uncertainty.prior_sigma[j])
+            theta[layout.entry(p.name).index] = p.initial
+            covariance[j, :], covariance[:, j] = 0.0, 0.0
+            covariance[j, j] = (spread * p.initial) ** 2
+            ci = (p.initial * math.exp(-Z95 * spread), p.initial * math.exp(Z95 * spread))
+            p = replace(p, value=p.initial, sigma=spread * p.initial, ci95=ci, relative_to=None, prior_share=1.0,
+                        status=Status.PRIOR_DOMINATED)  # fmt: skip
+        rows.append(p)
+    why = {reason: ", ".join(n for n in names if reasons[n] == reason) for reason in dict.fromkeys(reasons.values())}
+    reset = [f"{who}: the vehicle file's values are kept, because {reason}" for reason, who in why.items() if who]
+    kept = [w for w in fit.warnings if not w.startswith(tuple(f"{n} = " for n in names))]
+    return replace(fit, theta=theta, parameters=ParameterSet(tuple(rows), covariance), warnings=(*reset, *kept))
+
+
+def possible_inertia(fit: Fit) -> Fit:
+    """The fit with moments of inertia that a rigid body can have; see `possible_moments`."""
+    parameters, remark = possible_moments(tuple(fit.parameters))
+    if remark is None:
+        return fit
+    theta, layout = fit.theta.copy(), Layout(fit.vehicle)
+    for p in parameters:
+        theta[layout.entry(p.name).index] = p.value
+    return replace(
+        fit, theta=theta, parameters=ParameterSet(parameters, np.array(fit.parameters.covariance)),
+        warnings=(*fit.warnings, remark),
+    )  # fmt: skip
+
+
+def possible_moments(parameters: tuple[Parameter, ...]) -> tuple[tuple[Parameter, ...], str | None]:
+    """Parameters with guessed moments of inertia moved to where a rigid body can have them beside those identified.
+
+    Each principal moment lies between the difference and the sum of the other two; what breaks that by more than a
+    vehicle file may is moved there, with a remark.  Where identified ones alone are impossible, the largest is
+    not to be used, and is moved as a guess is.
+    """
+    values = {p.name: p for p in parameters if p.name in INERTIAS}
+    if len(values) < len(INERTIAS) or impossible_inertia([values[n].value for n in INERTIAS]) is None:
+        return parameters, None
+    movable = [n for n in INERTIAS if values[n].status in UNKNOWN]
+    if not movable:
+        movable = [max(INERTIAS, key=lambda n: values[n].value)]
+    name = max(movable, key=lambda n: values[n].sigma / values[n].value)
+    one, two = (values[n].value for n in INERTIAS if n != name)
+    old = values[name]
+    value = min(max(old.value, abs(one - two)), one + two)
+    status = old.status if old.status in UNKNOWN else Status.UNRELIABLE
+    moved = replace(old, value=value, status=status, relative_to=None)
+    remark = (
+        f"{name}: moved from {old.value:.4g} to {value:.4g} {old.unit}, because no rigid body has the former beside "
+        "the other two moments of inertia"
+    )
+    return tuple(moved if p.name == name else p for p in parameters), remark
+
+
+def on_bounds(parameters: Iterable[Parameter]) -> list[str]:
+    """Which parameters rest on a bound, and which nominal ones have an interval that reaches one, in words."""
+    out = []
+    for p in parameters:
+        low, high = p.bounds
+        if at_bound(p.value, low, high):
+            out.append(f"{p.name} = {p.value:.4g} {p.unit} rests on its bound [{low:.4g}, {high:.4g}]")
+        elif p.name in NOMINAL_NAMES and p.status is Status.UNRELIABLE and not (low <= p.ci95[0] and p.ci95[1] <= high):
+            out.append(f"the interval of {p.name} reaches its bound [{low:.4g}, {high:.4g}]: check what is assumed")
+    return out
+
+
+def tied(parameters: Sequence[Parameter], names: Sequence[str]) -> tuple[Parameter, ...]:
+    """Parameters; of two `names` those that are identified are known relative to the other one only."""
+    other = dict(zip(names, reversed(names), strict=True))
+    return tuple(
+        replace(p, status=Status.RATIO_ONLY, relative_to=other[p.name])
+        if p.name in other and p.status is Status.IDENTIFIED
+        else p
+        for p in parameters
+    )
+
+
+# --- A log of many hours: as much of it as the parameters need, so that memory and time do not grow with the log
+
+
+MOST_SECONDS = 3600.0
+"""Longest flight that is fitted whole [s]: an excited hour leaves some tenths of a per cent at worst."""
+STRETCH = 60.0
+"""Length of the stretches that are taken of a longer one [s]; each loses half a segment at its ends."""
+
+
+def spread(windows: Sequence[Window]) -> tuple[list[Window], tuple[str, ...]]:
+    """Stretches spread evenly over a flight that is longer than needed, and a sentence for people; else all of it."""
+    total = sum(len(w) * w.dt for w in windows)
+    if total <= MOST_SECONDS:
+        return list(windows), ()
+    share, due, count = MOST_SECONDS / total, 1.0, 0
+    kept = []
+    for w in windows:
+        pieces = max(round(len(w) * w.dt / STRETCH), 1)
+        count += pieces
+        for k in range(pieces):
+            if due >= 1.0:
+                kept.append(w.slice(k * len(w) // pieces, (k + 1) * len(w) // pieces))
+                due -= 1.0
+            due += share
+    return kept, (
+        f"{total / 3600.0:.1f} h of flight are more than the parameters need: they come from {len(kept)} of {count} "
+        f"stretches of {STRETCH:.3g} s, spread evenly",
+    )  # fmt: skip
+
+
+# --- The fit
+
 
 FIT_SECONDS = 1.0
 WHITE_SHARE = 0.5

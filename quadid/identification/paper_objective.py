@@ -14,7 +14,7 @@ import numpy as np
 from quadid.data.window import Window
 from quadid.errors import NotIdentifiableError
 from quadid.identification.controller_gains import Autopilot
-from quadid.identification.parameterization import Free
+from quadid.identification.problem import Free
 from quadid.model.closed_loop import ClosedLoop, kinematic_acceleration
 from quadid.model.layout import Layout
 from quadid.parameters import NOMINAL_NAMES

@@ -9,8 +9,8 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
-from quadid.identification.identifiability import Fit, possible_moments
-from quadid.identification.prediction import SUM_TO, HorizonScore
+from quadid.identification.fit import Fit, possible_moments
+from quadid.identification.predict import SUM_TO, HorizonScore
 from quadid.identification.score import SetScore
 from quadid.model.layout import Layout
 from quadid.parameters import INERTIAS, NOMINAL_NAMES, UNKNOWN, Parameter, ParameterSet, Status, impossible_inertia

@@ -14,9 +14,8 @@ import numpy as np
 from quadid.data.window import Window
 from quadid.errors import NotIdentifiableError
 from quadid.identification.initial_states import InitialStates
-from quadid.identification.noise_model import NoiseModel
-from quadid.identification.segment_cost import Linearised
-from quadid.identification.shooting import Shooting
+from quadid.identification.noise import NoiseModel
+from quadid.identification.problem import Linearised, Shooting
 from quadid.model.rollout import CHANNEL_NAMES, CHANNEL_UNITS
 from quadid.rotation import euler, product
 from quadid.types import FloatArray

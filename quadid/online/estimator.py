@@ -10,9 +10,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from quadid.data.window import Window
-from quadid.identification.covariance import Uncertainty, parameter_set
-from quadid.identification.noise_model import NoiseModel
-from quadid.identification.parameterization import Free
+from quadid.identification.noise import NoiseModel
+from quadid.identification.problem import Free
+from quadid.identification.uncertainty import Uncertainty, parameter_set
 from quadid.model.layout import LOSS, B, D, Layout, ThrustModel
 from quadid.model.rollout import channels_of
 from quadid.online.active_set import ActiveSet

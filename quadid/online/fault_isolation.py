@@ -10,9 +10,8 @@ from quadid.chi_square import exceeded, survival
 from quadid.effects import NEVER
 from quadid.identification.gauss_newton import polish
 from quadid.identification.initial_states import InitialStates
-from quadid.identification.noise_model import NoiseModel
-from quadid.identification.priors import Prior, posterior_covariance
-from quadid.identification.shooting import Shooting
+from quadid.identification.noise import NoiseModel
+from quadid.identification.problem import Prior, Shooting, posterior_covariance
 from quadid.model import layout as ix
 from quadid.model.layout import LOSS, Layout, ThrustModel
 from quadid.online.change_detection import ChangePoint

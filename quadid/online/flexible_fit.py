@@ -24,14 +24,12 @@ import numpy as np
 
 from quadid.data.window import Sampling, Window
 from quadid.effects import EFFECTS
-from quadid.identification.covariance import variance_ratio
+from quadid.identification.elimination import eliminated
 from quadid.identification.gauss_newton import Polished, polish, robust_weights
-from quadid.identification.noise_estimation import residual_noise
-from quadid.identification.noise_model import NoiseModel
-from quadid.identification.parameterization import Free
-from quadid.identification.priors import Prior, posterior_covariance, prior_terms
-from quadid.identification.schur_complement import eliminated
-from quadid.identification.shooting import Shooting
+from quadid.identification.noise import NoiseModel
+from quadid.identification.noise_fit import residual_noise
+from quadid.identification.problem import Free, Prior, Shooting, posterior_covariance, prior_terms
+from quadid.identification.uncertainty import variance_ratio
 from quadid.model.layout import B, ThrustModel
 from quadid.online.fusion import WindowEstimate
 from quadid.parameters import NOMINAL_NAMES

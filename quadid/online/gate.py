@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from quadid.chi_square import Z95
-from quadid.identification.covariance import PRIOR_SHARE
+from quadid.identification.uncertainty import PRIOR_SHARE
 from quadid.online.checks import Factor
 from quadid.online.records import WAITS, OnlineSet, SetState
 from quadid.parameters import MAY_VANISH, NOMINAL_NAMES, UNKNOWN, ParameterSet, Status, at_bound, impossible_inertia

@@ -9,7 +9,7 @@ import numpy as np
 
 from quadid.effects import EFFECTS
 from quadid.identification.gauss_newton import Polished
-from quadid.identification.shooting import Shooting
+from quadid.identification.problem import Shooting
 from quadid.online.flexible_fit import EFFECT_WIDTH, moving_names
 
 TRIFLE = 0.01

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from quadid.identification.noise_model import SHAPE_POINTS, NoiseModel
+from quadid.identification.noise import SHAPE_POINTS, NoiseModel
 from quadid.model.layout import Layout
 from quadid.online.fusion import WindowEstimate
 from quadid.parameters import NOMINAL_NAMES

@@ -9,15 +9,12 @@ import numpy as np
 
 from quadid.data.window import Window
 from quadid.identification.excitation import bounds_of
-from quadid.identification.fit import SWARM_SECONDS
 from quadid.identification.gauss_newton import Polished, polish, robust_weights
-from quadid.identification.global_search import swarm_search
-from quadid.identification.noise_estimation import residual_noise, reweighted_fit
-from quadid.identification.noise_model import NoiseModel
-from quadid.identification.parameterization import Free
+from quadid.identification.noise import NoiseModel
+from quadid.identification.noise_fit import residual_noise, reweighted_fit
 from quadid.identification.particle_swarm import SwarmOptions
-from quadid.identification.priors import Prior
-from quadid.identification.shooting import Shooting
+from quadid.identification.problem import Free, Prior, Shooting
+from quadid.identification.search import SWARM_SECONDS, swarm_search
 from quadid.model.layout import Layout
 from quadid.model.rollout import channels_of
 from quadid.online.flexible_fit import (

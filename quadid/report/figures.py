@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from scipy.signal import welch
@@ -12,13 +12,11 @@ from scipy.stats import chi2
 
 from quadid.chi_square import Z95
 from quadid.errors import ParameterError
+from quadid.estimate.missing import Missing
 from quadid.identification.result import ScoredSet
 from quadid.identification.score import SCORE_SECONDS, SetScore
 from quadid.model.rollout import CHANNEL_NAMES, CHANNEL_UNITS
 from quadid.types import FloatArray, IndexArray, JsonDict
-
-if TYPE_CHECKING:
-    from quadid.estimate.missing import Missing
 
 # --- Pieces of a page: sections, tables, and figures as plain Plotly descriptions without colours
 #

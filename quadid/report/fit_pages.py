@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from itertools import groupby
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from scipy.signal import welch
@@ -17,8 +17,9 @@ from quadid.data.resample import sample_period
 from quadid.data.rotor_signal import rotor_channel
 from quadid.data.window import CHANNELS, Channel, Recording, Window
 from quadid.effects import EFFECTS
+from quadid.estimate.missing import Missing
 from quadid.identification.excitation import Excitation
-from quadid.identification.noise_model import NoiseModel
+from quadid.identification.noise import NoiseModel
 from quadid.identification.result import ScoredSet
 from quadid.identification.score import SCORE_SECONDS
 from quadid.model.rollout import CHANNEL_NAMES, CHANNEL_UNITS
@@ -62,9 +63,6 @@ from quadid.report.verdict import (
 from quadid.rotation import euler
 from quadid.types import FloatArray, Json, JsonDict
 from quadid.vehicle import Vehicle
-
-if TYPE_CHECKING:
-    from quadid.estimate.missing import Missing
 
 # --- What a log tells of its flight beside the outputs: flight modes, and the spectrum of its vibration
 

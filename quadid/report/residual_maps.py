@@ -16,10 +16,9 @@ import numpy as np
 from quadid.chi_square import Z95
 from quadid.data.window import Window, beginning
 from quadid.effects import EFFECTS, NEVER
-from quadid.identification.noise_model import NoiseModel
+from quadid.identification.noise import NoiseModel
+from quadid.identification.problem import Linearised, Shooting
 from quadid.identification.score import SCORE_SECONDS, covering, settle_states
-from quadid.identification.segment_cost import Linearised
-from quadid.identification.shooting import Shooting
 from quadid.model.layout import Layout
 from quadid.model.rollout import CHANNEL_NAMES, CHANNEL_UNITS
 from quadid.report.figures import axis, figure, level, trace

@@ -10,7 +10,7 @@ from html import escape
 from typing import Literal, NamedTuple
 
 from quadid.checks import Inspection
-from quadid.identification.open_loop import QUANTITIES
+from quadid.identification.predict import QUANTITIES
 from quadid.report.figures import rows_of
 from quadid.report.verdict import digits, parameter_name, percent, relative_halfwidth, status_words
 from quadid.sanitise import LONGEST_LINE, plain

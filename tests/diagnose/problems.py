@@ -9,14 +9,13 @@ from typing import Any
 import numpy as np
 
 from quadid.data.window import Window
-from quadid.diagnosis.candidates import Candidate, candidates
-from quadid.diagnosis.model import Model, fit_model
+from quadid.diagnosis.hypotheses import Candidate, Model, candidates, fit_model
 from quadid.flight import draw_truth, fly
-from quadid.identification.fit import SWARM_SECONDS
 from quadid.identification.gauss_newton import polish
-from quadid.identification.noise_estimation import flexible_fit, reweighted_fit
-from quadid.identification.noise_model import NoiseModel
-from quadid.identification.shooting import Shooting
+from quadid.identification.noise import NoiseModel
+from quadid.identification.noise_fit import flexible_fit, reweighted_fit
+from quadid.identification.problem import Shooting
+from quadid.identification.search import SWARM_SECONDS
 from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray
 from tests.identify.flights import PELICAN, guessed

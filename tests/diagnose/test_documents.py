@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from quadid.diagnosis import log_evidence
-from quadid.diagnosis.cross_validation import BLOCKS
+from quadid.diagnosis import evidence as log_evidence
+from quadid.diagnosis.hypotheses import BLOCKS
 from quadid.diagnosis.pipeline import SHARE_TO_NAME
 from quadid.effects import EFFECTS
 

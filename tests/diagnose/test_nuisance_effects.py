@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from quadid.diagnosis.attribution import ordinary
-from quadid.diagnosis.candidates import candidates
+from quadid.diagnosis.hypotheses import candidates
 from tests.diagnose.problems import clean
 
 

@@ -8,13 +8,12 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
-from quadid.diagnosis.candidates import candidates
-from quadid.diagnosis.model import Model, Start, extend, free_names, without
+from quadid.diagnosis.evidence import impossible_causes, late_unknown, slight_causes
+from quadid.diagnosis.hypotheses import Model, Start, candidates, extend, free_names, without
 from quadid.diagnosis.pipeline import _nominal_parameters
-from quadid.diagnosis.plausibility import impossible_causes, late_unknown, slight_causes
 from quadid.diagnosis.residual_tests import inconstant_causes, remainder
 from quadid.diagnosis.result import Explanation
-from quadid.identification.identifiability import possible_moments
+from quadid.identification.fit import possible_moments
 from quadid.identification.result import with_values
 from quadid.parameters import Status
 from quadid.vehicle import Vehicle

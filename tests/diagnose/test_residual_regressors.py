@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from quadid.diagnosis import residual_regressors
-from quadid.diagnosis.residual_regressors import SITES, Follows, follows, signals, strongest
+from quadid.diagnosis import residual_tests as residual_regressors
+from quadid.diagnosis.residual_tests import SITES, Follows, follows, signals, strongest
 from quadid.flight import draw_truth, fly
-from quadid.identification.segment_jacobian import Columns
+from quadid.identification.problem import Columns
 from quadid.types import FloatArray
 from tests.diagnose.problems import SEED, Problem, clean, fitted, window_with
 from tests.identify.flights import PELICAN

@@ -8,13 +8,11 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from quadid.diagnosis.cross_validation import Gain
-from quadid.diagnosis.model import Model
+from quadid.diagnosis.hypotheses import Gain, Model
 from quadid.diagnosis.pipeline import judge
-from quadid.diagnosis.residual_regressors import SITES, Follows
-from quadid.diagnosis.residual_tests import ALARM, Remainder, Structure, remainder
+from quadid.diagnosis.residual_tests import ALARM, SITES, Follows, Remainder, Structure, remainder
 from quadid.diagnosis.result import Explanation
-from quadid.identification.noise_spectrum import mode_power
+from quadid.identification.noise_fit import mode_power
 from quadid.types import FloatArray
 from tests.diagnose.problems import Problem, clean, fitted, window_with
 

@@ -7,9 +7,10 @@ from typing import Any
 
 import pytest
 
-from quadid.diagnosis import pipeline, selection
-from quadid.diagnosis.candidates import Candidate, candidates
-from quadid.diagnosis.log_evidence import better
+from quadid.diagnosis import pipeline
+from quadid.diagnosis import search as selection
+from quadid.diagnosis.evidence import better
+from quadid.diagnosis.hypotheses import Candidate, candidates
 from tests.diagnose.hidden import answer, of_class, require_named, require_nothing, single
 
 

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from quadid.diagnosis.model import Model, Start, extend, fit_model
-from quadid.diagnosis.score_test import Everything, Score
+from quadid.diagnosis.evidence import Everything, Score
+from quadid.diagnosis.hypotheses import Model, Start, extend, fit_model
 from tests.diagnose.problems import Problem, cause, clean, fitted, window_with
 
 SMALL = {

@@ -6,9 +6,9 @@ from functools import lru_cache
 
 import pytest
 
-from quadid.diagnosis.model import extend
-from quadid.diagnosis.segment_schedule import CLEAN_MISFIT, LINEAR_MISFIT, USUAL_SECONDS, Stage
-from quadid.identification.shooting import Shooting
+from quadid.diagnosis.hypotheses import extend
+from quadid.diagnosis.search import CLEAN_MISFIT, LINEAR_MISFIT, USUAL_SECONDS, Stage
+from quadid.identification.problem import Shooting
 from tests.diagnose.problems import Problem, cause, clean, fitted, window_with
 
 SECONDS = (4.0, 2.0, 1.0, 0.5, 0.2)

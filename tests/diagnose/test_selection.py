@@ -8,10 +8,9 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
-from quadid.diagnosis.log_evidence import better, relevant
-from quadid.diagnosis.model import Model, extend, without
-from quadid.diagnosis.score_test import Everything
-from quadid.diagnosis.selection import pruned, select
+from quadid.diagnosis.evidence import Everything, better, relevant
+from quadid.diagnosis.hypotheses import Model, extend, without
+from quadid.diagnosis.search import pruned, select
 from tests.diagnose.problems import Problem, cause, clean, fitted, window_with
 
 LAG = 0.03

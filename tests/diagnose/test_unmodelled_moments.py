@@ -7,11 +7,12 @@ import pytest
 
 from quadid.data.window import Window
 from quadid.diagnosis import Diagnosis, diagnose
-from quadid.diagnosis.model import Model, fit_model
+from quadid.diagnosis.hypotheses import Model, fit_model
 from quadid.diagnosis.unmodelled_moments import held_by_fast_motion
 from quadid.flight import draw_truth, fly
 from quadid.identification import fit as fitting
-from quadid.identification.shooting import Shooting
+from quadid.identification.problem import Shooting
+from quadid.identification.search import SWARM_SECONDS
 from quadid.parameters import UNKNOWN, Status
 from quadid.vehicle import Vehicle
 from tests.diagnose.problems import cause, clean, fitted, window_with
@@ -70,7 +71,7 @@ def test_nor_does_it_beside_a_cause_that_is_found(seed: int) -> None:
 
 def held(window: Window, shooting: Shooting, model: Model) -> object:
     """What is held of a model."""
-    short = Shooting.cut([window], shooting.vehicle, fitting.SWARM_SECONDS, shooting.noise, shooting.layout)
+    short = Shooting.cut([window], shooting.vehicle, SWARM_SECONDS, shooting.noise, shooting.layout)
     return held_by_fast_motion([window], short, model)
 
 

@@ -12,8 +12,8 @@ import numpy as np
 from scipy.linalg import solve_triangular
 from scipy.spatial.transform import Rotation
 
-from quadid.identification.noise_model import SLOW_TIME, NoiseModel
-from quadid.identification.parameterization import Free
+from quadid.identification.noise import SLOW_TIME, NoiseModel
+from quadid.identification.problem import Free
 from quadid.model.rollout import Rollout, Segments
 from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray

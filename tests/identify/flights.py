@@ -10,7 +10,7 @@ import numpy as np
 
 from quadid.data.window import Window
 from quadid.flight import Flight, TruthParameters, draw_truth, fly
-from quadid.identification.shooting import Shooting
+from quadid.identification.problem import Shooting
 from quadid.model.layout import Layout
 from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray

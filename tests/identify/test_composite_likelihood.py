@@ -9,14 +9,13 @@ import numpy as np
 import pytest
 
 from quadid.data.window import Window
-from quadid.identification import composite_likelihood
 from quadid.identification import fit as fitting
-from quadid.identification.composite_likelihood import BothCuts, with_second_cut
+from quadid.identification import uncertainty as composite_likelihood
 from quadid.identification.fit import FitOptions, fit
 from quadid.identification.gauss_newton import polish
-from quadid.identification.noise_model import NoiseModel
-from quadid.identification.priors import default_prior
-from quadid.identification.shooting import Shooting
+from quadid.identification.noise import NoiseModel
+from quadid.identification.problem import Shooting, default_prior
+from quadid.identification.uncertainty import BothCuts, with_second_cut
 from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray, IntArray
 from tests.identify.flights import PELICAN, at_truth, flown, values_of, with_noise

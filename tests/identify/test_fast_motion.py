@@ -12,10 +12,8 @@ import quadid
 from quadid.data.window import Window
 from quadid.flight import draw_truth, fly
 from quadid.identification import fit as fitting
-from quadid.identification.fit import FitOptions, fit
-from quadid.identification.identifiability import Fit
-from quadid.identification.noise_model import NoiseModel
-from quadid.identification.process_noise import likeliest
+from quadid.identification.fit import Fit, FitOptions, fit
+from quadid.identification.noise import NoiseModel, likeliest
 from quadid.parameters import Status
 from quadid.types import FloatArray
 from tests.identify.flights import PELICAN, guessed

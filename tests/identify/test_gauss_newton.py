@@ -22,10 +22,15 @@ from quadid.identification.gauss_newton import (
     robust_weights,
 )
 from quadid.identification.initial_states import InitialStates
-from quadid.identification.parameterization import Free
-from quadid.identification.priors import PRIOR_SIGMA_LINEAR, default_prior, prior_terms
-from quadid.identification.segment_cost import Linearised
-from quadid.identification.shooting import MEASURED, Shooting
+from quadid.identification.problem import (
+    MEASURED,
+    PRIOR_SIGMA_LINEAR,
+    Free,
+    Linearised,
+    Shooting,
+    default_prior,
+    prior_terms,
+)
 from quadid.model.layout import Layout
 from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray

@@ -7,8 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from quadid.identification.fit import FitOptions, fit
-from quadid.identification.identifiability import Fit, final_answer, possible_inertia
+from quadid.identification.fit import Fit, FitOptions, final_answer, fit, possible_inertia
 from quadid.identification.result import fitted_vehicle, parameter_entry
 from quadid.parameters import INERTIAS, ParameterSet, Status, at_bound, impossible_inertia
 from quadid.vehicle import ParameterPrior, Vehicle

@@ -13,8 +13,7 @@ from quadid.data.window import Window
 from quadid.errors import WindowError
 from quadid.flight import fly
 from quadid.flight.pilot import default_gains
-from quadid.identification.fit import FitOptions, fit
-from quadid.identification.identifiability import Fit
+from quadid.identification.fit import Fit, FitOptions, fit
 from quadid.identification.score import mse_score
 from quadid.model.layout import Layout
 from quadid.model.rollout import Rollout, Segments

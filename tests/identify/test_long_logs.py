@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from quadid.flight import draw_truth
-from quadid.identification import long_logs
+from quadid.identification import fit as long_logs
 from quadid.identification.fit import FitOptions, fit
 from tests.identify.flights import PELICAN, flown, guessed, values_of
 

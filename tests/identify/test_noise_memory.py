@@ -12,8 +12,8 @@ import quadid
 from quadid.flight import fly
 from quadid.flight.sensors import SensorNoise
 from quadid.identification.fit import FitOptions, fit
-from quadid.identification.noise_memory import MEMORY_SECONDS, attitude_memory
-from quadid.identification.noise_model import ATTITUDE, SLOW_TIME
+from quadid.identification.noise import ATTITUDE, SLOW_TIME
+from quadid.identification.noise_fit import MEMORY_SECONDS, attitude_memory
 from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle

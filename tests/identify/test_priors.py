@@ -10,8 +10,7 @@ import yaml
 
 from quadid.errors import VehicleError
 from quadid.flight import draw_truth, fly
-from quadid.identification.fit import FitOptions, fit
-from quadid.identification.identifiability import Fit
+from quadid.identification.fit import Fit, FitOptions, fit
 from quadid.parameters import NOMINAL_NAMES, Status
 from quadid.vehicle import ParameterPrior, ThrustPoint, Vehicle
 from tests.identify.flights import PELICAN, flown, guessed

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from quadid.flight import draw_truth, fly
-from quadid.identification.fit import FitOptions, fit
-from quadid.identification.identifiability import Fit
+from quadid.identification.fit import Fit, FitOptions, fit
 from quadid.parameters import NOMINAL_NAMES, Status
 from tests.identify.flights import PELICAN, flown, guessed
 

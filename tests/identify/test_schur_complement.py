@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from quadid.identification.schur_complement import eliminated, freed
+from quadid.identification.elimination import eliminated, freed
 
 
 @pytest.mark.parametrize(("stay", "go"), [(1, 4), (3, 2), (3, 0), (0, 2)])

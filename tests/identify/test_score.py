@@ -7,9 +7,8 @@ import pytest
 
 from quadid.errors import NotIdentifiableError, ParameterError
 from quadid.flight import Flight, SensorNoise, fly
-from quadid.identification.noise_model import NoiseModel
-from quadid.identification.open_loop import OpenLoop, true_rate
-from quadid.identification.prediction import horizon_scores
+from quadid.identification.noise import NoiseModel
+from quadid.identification.predict import OpenLoop, horizon_scores, true_rate
 from quadid.identification.score import mse_score
 from quadid.model import layout as ix
 from quadid.model.layout import Layout

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from quadid.identification.covariance import Uncertainty, parameter_set
-from quadid.identification.parameterization import Free
+from quadid.identification.problem import Free
+from quadid.identification.uncertainty import Uncertainty, parameter_set
 from quadid.model.layout import Layout
 from quadid.parameters import ParameterSet, Status
 from tests.identify.flights import PELICAN

@@ -10,7 +10,7 @@ import pytest
 
 import quadid
 from quadid.data.window import Window
-from quadid.identification.torque_coherence import LEAST, undecided
+from quadid.identification.fast_motion import LEAST, undecided
 from quadid.parameters import Status
 from quadid.types import FloatArray
 from tests.identify.flights import PELICAN

@@ -9,10 +9,9 @@ import pytest
 
 from quadid.data.window import Recording
 from quadid.flight import fly
-from quadid.identification.elimination import Reduced, StatePrior, Whitening
-from quadid.identification.elimination_kernel import reduce_segments
-from quadid.identification.noise_model import NoiseModel
-from quadid.identification.shooting import Shooting
+from quadid.identification.elimination import Reduced, StatePrior, Whitening, reduce_segments
+from quadid.identification.noise import NoiseModel
+from quadid.identification.problem import Shooting
 from quadid.model.layout import Layout
 from quadid.model.rollout import Rollout
 from quadid.online import FitReply, FitRequest, GateSettings, Session, SessionSettings

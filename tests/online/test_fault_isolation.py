@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from quadid.identification.noise_model import NoiseModel
+from quadid.identification.noise import NoiseModel
 from quadid.model.layout import LOSS, Layout
 from quadid.online.change_detection import ChangeDetector, ChangePoint
 from quadid.online.fault_isolation import ChangeRequest

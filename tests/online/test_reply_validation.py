@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from quadid.identification.noise_model import NoiseModel
+from quadid.identification.noise import NoiseModel
 from quadid.online import FitReply, FitRequest, Session
 from quadid.online.background_diagnosis import _is_wrong_scale
 from quadid.online.records import Job, JobReply, OnlineFinding

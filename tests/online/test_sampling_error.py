@@ -10,7 +10,7 @@ import pytest
 import quadid.online.flexible_fit as flexible_fit_room
 from quadid.data.window import Sampling, Window
 from quadid.identification.gauss_newton import polish
-from quadid.identification.shooting import Shooting
+from quadid.identification.problem import Shooting
 from quadid.model.layout import Layout
 from quadid.online.flexible_fit import LASTING, ORDER, alike, flexible_fit, halved, reduced, sampling_error, widened
 from quadid.online.fusion import Fusion, WindowEstimate

@@ -7,7 +7,7 @@ import pytest
 
 from quadid.data.grid import to_windows
 from quadid.data.window import Window
-from quadid.identification.noise_model import NoiseModel
+from quadid.identification.noise import NoiseModel
 from quadid.model.layout import Layout
 from quadid.online.estimator import Estimator
 from quadid.online.grid_buffer import WindowCut

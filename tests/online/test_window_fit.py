@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from quadid.flight import TruthParameters
-from quadid.identification.noise_model import NoiseModel
-from quadid.identification.shooting import Shooting
+from quadid.identification.noise import NoiseModel
+from quadid.identification.problem import Shooting
 from quadid.model.layout import Layout
 from quadid.online import SessionSettings
 from quadid.online.grid_buffer import SHORTEST

@@ -14,7 +14,7 @@ from quadid_evaluation.paper.comparison import METHODS, Scores, Tried, check_met
 
 from quadid.errors import NotIdentifiableError, ParameterError
 from quadid.flight import fly
-from quadid.identification.noise_model import NoiseModel
+from quadid.identification.noise import NoiseModel
 from quadid.identification.score import mse_score
 from quadid.model.layout import Layout
 from quadid.parameters import NOMINAL_NAMES

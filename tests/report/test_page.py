@@ -69,7 +69,7 @@ def result(sets: list[ScoredSet]) -> dict[str, Any]:
 
 def page(sets: list[ScoredSet]) -> str:
     """The page of an identification from logs with nasty names."""
-    from quadid.identification.noise_model import NoiseModel
+    from quadid.identification.noise import NoiseModel
 
     quality = [
         {

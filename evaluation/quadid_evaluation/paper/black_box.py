@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from quadid.data.window import Window
-from quadid.identification.noise_model import NoiseModel
+from quadid.identification.noise import NoiseModel
 from quadid.identification.score import SCORE_SECONDS, expected_squares, scored_problem
 from quadid.model.layout import Layout
 from quadid.rotation import conjugate, product

@@ -32,7 +32,7 @@ from quadid_evaluation.paper.subspace import METHODS as BLACK_BOXES
 
 if TYPE_CHECKING:
     from quadid.identification.controller_gains import Autopilot
-    from quadid.identification.noise_model import NoiseModel
+    from quadid.identification.noise import NoiseModel
 
 OBJECTIVES = ("shooting", "closed_loop")
 """What optimisers may be asked to minimise."""
@@ -120,7 +120,7 @@ class Judge:
     def problem(self, objective: str) -> Problem:
         """The problem that optimisers solve; raises NotIdentifiableError where the data do not hold what it needs."""
         from quadid.identification.paper_objective import PaperProblem
-        from quadid.identification.shooting_objective import BoxProblem
+        from quadid.identification.search import BoxProblem
 
         if objective == "shooting":
             return BoxProblem(self.train, self.vehicle)

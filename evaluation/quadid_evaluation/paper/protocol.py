@@ -12,8 +12,8 @@ if TYPE_CHECKING:
     from quadid.app.outcome import Advance
     from quadid.data.window import Window
     from quadid.diagnosis import Diagnosis
-    from quadid.identification.identifiability import Fit
-    from quadid.identification.noise_model import NoiseModel
+    from quadid.identification.fit import Fit
+    from quadid.identification.noise import NoiseModel
     from quadid.identification.paper_objective import PaperProblem, PaperScore
     from quadid.types import FloatArray
     from quadid.vehicle import Vehicle

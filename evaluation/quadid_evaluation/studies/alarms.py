@@ -23,7 +23,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from quadid.flight import Flight, draw_truth, fly
-from quadid.identification.noise_model import NoiseModel
+from quadid.identification.noise import NoiseModel
 from quadid.model.layout import Layout, ThrustModel
 from quadid.online.change_detection import CHUNK, ChangeDetector, ChangePoint
 from quadid.online.change_supervisor import AFTER_CHANGE, ASK_FLYING

@@ -25,16 +25,14 @@ from scipy import stats
 
 from quadid.chi_square import Z95
 from quadid.diagnosis import Diagnosis, Search, diagnose
-from quadid.diagnosis import log_evidence as rule
-from quadid.diagnosis.candidates import Candidate, candidates
-from quadid.diagnosis.cross_validation import Gain, paired_gain
-from quadid.diagnosis.model import Model, extend
+from quadid.diagnosis import evidence as rule
+from quadid.diagnosis.evidence import Everything
+from quadid.diagnosis.hypotheses import Candidate, Gain, Model, candidates, extend, paired_gain
 from quadid.diagnosis.residual_tests import ALARM
 from quadid.diagnosis.result import FoundParameter
-from quadid.diagnosis.score_test import Everything
 from quadid.errors import QuadidError
 from quadid.flight import FlightError
-from quadid.identification.shooting import Shooting
+from quadid.identification.problem import Shooting
 from quadid_evaluation.studies.campaign import Case, cases, flown
 from quadid_evaluation.studies.page import put_section
 

@@ -20,8 +20,7 @@ import numpy as np
 from quadid.flight import TruthParameters, draw_truth, fly
 from quadid.flight.airframe import Oddity
 from quadid.flight.setup import Setup, prepare
-from quadid.identification.fit import FitOptions, fit
-from quadid.identification.identifiability import Fit
+from quadid.identification.fit import Fit, FitOptions, fit
 from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle

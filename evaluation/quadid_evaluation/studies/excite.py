@@ -25,8 +25,8 @@ from quadid.app.excite import knowledge
 from quadid.data.window import Window
 from quadid.experiment import Limits, Proposal, TrialFlights, design_manoeuvre
 from quadid.flight import Flight, draw_truth, fly
+from quadid.identification.excitation import halfwidths
 from quadid.identification.fit import FitOptions, fit
-from quadid.identification.optimal_input import halfwidths
 from quadid.identification.result import fitted_vehicle
 from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray

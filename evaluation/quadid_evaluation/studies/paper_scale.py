@@ -21,8 +21,7 @@ import numpy as np
 
 from quadid.data.window import Window
 from quadid.flight import draw_truth, fly
-from quadid.identification.fit import FitOptions, fit
-from quadid.identification.identifiability import Fit
+from quadid.identification.fit import Fit, FitOptions, fit
 from quadid.identification.particle_swarm import SwarmOptions
 from quadid.identification.score import mse_score
 from quadid.model.layout import Layout

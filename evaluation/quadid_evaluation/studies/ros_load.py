@@ -21,11 +21,14 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import rclpy
 from quadid_node.inputs import message_class, to_message
 from quadid_node.publish import LATCHED_QOS
 from quadid_replay import write_mcap
 from quadid_replay.frames import flip_attitude, flip_body
 from quadid_replay.motors import RPM
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 
 from quadid.data.window import Recording
 from quadid.flight import fly
@@ -163,8 +166,6 @@ def mavros(recording: Recording) -> Iterator[Row]:
 
 def publish(stack: str, recording: Recording) -> None:
     """Publishes the messages of a stack, each when its time has come."""
-    import rclpy
-    from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 
     qos = QoSProfile(depth=100, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.BEST_EFFORT)
     rclpy.init()
@@ -205,9 +206,7 @@ class Seen(NamedTuple):
 
 def run(source: str, log: Path, seconds: float, environment: dict[str, str]) -> Seen:
     """One node beside one stream; listens to both until the stream ends."""
-    import rclpy
     from quadid_msgs.msg import FitStatus, ParameterSet
-    from rclpy.executors import SingleThreadedExecutor
 
     folder = log.parent / source
     folder.mkdir()

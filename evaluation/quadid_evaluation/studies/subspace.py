@@ -20,7 +20,7 @@ import numpy as np
 from scipy.linalg import expm
 
 from quadid.flight import fly
-from quadid.identification.noise_model import NoiseModel
+from quadid.identification.noise import NoiseModel
 from quadid.types import ComplexArray, FloatArray
 from quadid.vehicle import Vehicle
 from quadid_evaluation.paper.black_box import BlackBox, score_black_box

@@ -77,7 +77,7 @@ def _scaling(r: Result) -> list[str]:
     return [
         *rows, "",
         f"Exponents: processor time {e['fit_processor']:.2f}, memory {e['peak_mb']:.2f}. Of more than an hour, a fit "
-        "uses stretches spread evenly (`quadid/identification/long_logs.py`).", "",
+        "uses stretches spread evenly (`quadid/identification/fit.py`).", "",
         "![](speed-scaling.png)",
     ]  # fmt: skip
 

@@ -9,11 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from quadid.identification.fit import SWARM_SECONDS
-from quadid.identification.global_search import SWARM_SEGMENTS, Projected
 from quadid.identification.particle_swarm import Swarm, SwarmOptions
-from quadid.identification.shooting import Shooting
-from quadid.identification.shooting_objective import BoxProblem
+from quadid.identification.problem import Shooting
+from quadid.identification.search import SWARM_SECONDS, SWARM_SEGMENTS, BoxProblem, Projected
 from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle

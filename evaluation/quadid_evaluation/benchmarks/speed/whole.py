@@ -15,12 +15,11 @@ from quadid_replay import open_log
 
 from quadid.diagnosis import diagnose
 from quadid.flight import draw_truth, fly
-from quadid.identification.fit import SWARM_SECONDS, FitOptions, fit
-from quadid.identification.global_search import Projected
-from quadid.identification.identifiability import Fit
-from quadid.identification.noise_estimation import flexible_names
+from quadid.identification.fit import Fit, FitOptions, fit
+from quadid.identification.noise_fit import flexible_names
 from quadid.identification.particle_swarm import SwarmOptions
-from quadid.identification.shooting import Shooting
+from quadid.identification.problem import Shooting
+from quadid.identification.search import SWARM_SECONDS, Projected
 from quadid.model.layout import Layout
 from quadid.online.window_fit import FitRequest
 from quadid.parameters import NOMINAL_NAMES

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from quadid.data.window import Window
-from quadid.identification.shooting import Shooting
+from quadid.identification.problem import Shooting
 from quadid.model.rollout import Rollout
 from quadid_evaluation.studies.ablation.variants import modules
 
@@ -20,7 +20,7 @@ FITS = (
     "fast_motion", "fast_fit", "mse_score", "reliability", "follows",
 )  # fmt: skip
 """Functions that the diagnosis calls, of `quadid.identify`, which no variant changes, but for the last one …"""
-NUMBERS = ("quadid.diagnosis.residual_regressors", "quadid.diagnosis.cross_validation")
+NUMBERS = ("quadid.diagnosis.residual_tests", "quadid.diagnosis.hypotheses")
 """… whose answer depends on numbers of these modules, and on nothing else that a variant changes."""
 
 

@@ -13,14 +13,12 @@ from typing import Any
 
 import quadid.diagnosis
 from quadid.diagnosis.attribution import stated_errors
-from quadid.diagnosis.candidates import candidates
-from quadid.diagnosis.cross_validation import paired_gain
-from quadid.diagnosis.log_evidence import RELEVANT
-from quadid.diagnosis.model import Model, fit_model
+from quadid.diagnosis.evidence import RELEVANT
+from quadid.diagnosis.hypotheses import Model, candidates, fit_model, paired_gain
 from quadid.diagnosis.pipeline import SHARE_TO_NAME
-from quadid.diagnosis.segment_schedule import LINEAR_MISFIT
-from quadid.identification.noise_estimation import flexible_fit
-from quadid.identification.shooting import Shooting
+from quadid.diagnosis.search import LINEAR_MISFIT
+from quadid.identification.noise_fit import flexible_fit
+from quadid.identification.problem import Shooting
 from quadid_evaluation.studies.ablation.house import measured
 
 

@@ -10,11 +10,10 @@ import numpy as np
 from quadid.data.window import Window
 from quadid.diagnosis import Diagnosis, Search, diagnose
 from quadid.diagnosis.attribution import block_deviance
-from quadid.diagnosis.candidates import Candidate, candidates
-from quadid.diagnosis.model import Model, Start, extend, fit_model
+from quadid.diagnosis.hypotheses import Candidate, Model, Start, candidates, extend, fit_model
 from quadid.errors import QuadidError
 from quadid.flight import FlightError
-from quadid.identification.shooting import Shooting
+from quadid.identification.problem import Shooting
 from quadid_evaluation.studies.campaign.hidden_cases import Case, flown
 
 WITH_ORACLE = ("single", "pair", "look_alike")

@@ -16,7 +16,7 @@ import quadid
 from quadid.app.logs import load_vehicle
 from quadid.data.window import Window
 from quadid.errors import QuadidError
-from quadid.identification.open_loop import QUANTITIES, mean_errors, no_change
+from quadid.identification.predict import QUANTITIES, mean_errors, no_change
 from quadid.model.layout import Layout
 from quadid.vehicle import Vehicle
 from quadid_evaluation.studies.foreign.learning import (

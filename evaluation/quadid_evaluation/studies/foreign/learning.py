@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from quadid.data.window import Window
-from quadid.identification.open_loop import lengths
+from quadid.identification.predict import lengths
 from quadid.types import FloatArray
 
 BINS = 10

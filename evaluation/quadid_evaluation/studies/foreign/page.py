@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from quadid.identification.open_loop import QUANTITIES
+from quadid.identification.predict import QUANTITIES
 from quadid_evaluation.studies.foreign.numbers import Number, of_set, table
 from quadid_evaluation.studies.foreign.sets import SETS, FlightSet
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from quadid.data.window import Window
 from quadid.flight import draw_truth, fly
-from quadid.identification.noise_model import NoiseModel
+from quadid.identification.noise import NoiseModel
 from quadid.model.layout import Layout
 from quadid.model.rollout import NUMBERS, Rollout, Segments
 from quadid.parameters import NOMINAL_NAMES

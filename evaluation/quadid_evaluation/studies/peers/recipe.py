@@ -19,7 +19,7 @@ import quadid
 from quadid.app.logs import load_vehicle
 from quadid.data.resample import linear
 from quadid.data.window import Recording
-from quadid.identification.open_loop import mean_errors, no_change
+from quadid.identification.predict import mean_errors, no_change
 from quadid.model.layout import Layout
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle

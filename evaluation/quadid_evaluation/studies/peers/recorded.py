@@ -14,7 +14,7 @@ import numpy as np
 import quadid
 from quadid.app.logs import Log, load_vehicle
 from quadid.data.window import Window
-from quadid.identification.open_loop import mean_errors, no_change
+from quadid.identification.predict import mean_errors, no_change
 from quadid.model.layout import Layout
 from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray

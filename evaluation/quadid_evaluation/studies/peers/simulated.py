@@ -13,7 +13,7 @@ import numpy as np
 from quadid.data.window import Window
 from quadid.flight import SensorNoise, TruthParameters, draw_truth, fly
 from quadid.identification.fit import FitOptions, fit
-from quadid.identification.open_loop import mean_errors, no_change
+from quadid.identification.predict import mean_errors, no_change
 from quadid.model.layout import Layout
 from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray

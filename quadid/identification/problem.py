@@ -1,33 +1,228 @@
-"""Multiple shooting: short segments, each with its own initial state, which is eliminated exactly.
+"""Problem of a fit: free parameters with priors, and windows cut into short segments (multiple shooting).
 
-For every segment the residual is linearised in its initial state a and the free parameters z, weighted and whitened:
-``r(a, z) = r0 + A da + B dz``.  Minimising over da leaves ``r' = P r0 + P B dz`` with P the projector onto the
-complement of A.  All later steps (Gauss-Newton, covariance, excitation, score tests, cross-validation) are linear
-algebra on the small matrices ``B' P B``, ``B' P r0``, ``r0' P r0`` of each segment.
+Every segment has an initial state of its own, which is eliminated exactly.  The residual is linearised in the initial
+state a and the free parameters z, weighted and whitened: ``r(a, z) = r0 + A da + B dz``.  Minimising over da leaves
+``r' = P r0 + P B dz`` with P the projector onto the complement of A.  All later steps (Gauss-Newton, covariance,
+excitation, score tests, cross-validation) are linear algebra on the small matrices ``B' P B``, ``B' P r0``,
+``r0' P r0`` of each segment.
 
-A problem is frozen: noise and weights are replaced (`with_noise`, …), initial states are values of their own.
+A problem is frozen: noise and weights are replaced (`with_noise`, ...), initial states are values of their own.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from quadid.data.window import Window
 from quadid.effects import EFFECTS
-from quadid.identification.elimination import Reduced, StatePrior
-from quadid.identification.elimination_kernel import reduce_segments
-from quadid.identification.initial_states import InitialStates, Starts
-from quadid.identification.noise_model import NoiseModel
-from quadid.identification.parameterization import Free as Free
-from quadid.identification.segment_cost import Linearised as Linearised
-from quadid.identification.segment_jacobian import Columns
-from quadid.model.layout import Layout, places
+from quadid.identification.elimination import Reduced, StatePrior, reduce_segments
+from quadid.identification.initial_states import InitialStates, Starts, frozen
+from quadid.identification.noise import NoiseModel
+from quadid.model.layout import Entry, Layout, places
 from quadid.model.rollout import Rollout, Segments, packed, packing, shared_rollout
-from quadid.types import FloatArray, IndexArray, check_shapes
+from quadid.parameters import NOMINAL_NAMES
+from quadid.types import BoolArray, FloatArray, IndexArray, IntArray, check_shapes
 from quadid.vehicle import Vehicle
+
+
+@dataclass(frozen=True)
+class Free:
+    """The free parameters of a problem and how they are scaled.
+
+    Nominal parameters are searched on the log scale, effects in units of their typical size.
+
+    Attributes:
+        entries: in vector order.
+    """
+
+    entries: tuple[Entry, ...]
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """Dotted names."""
+        return tuple(e.name for e in self.entries)
+
+    @cached_property
+    def index(self) -> IndexArray:
+        """Places in the full vector."""
+        return np.array([e.index for e in self.entries], dtype=np.intp)
+
+    @cached_property
+    def is_log(self) -> BoolArray:
+        """True for parameters on the log scale."""
+        return np.array([e.name in NOMINAL_NAMES for e in self.entries], dtype=bool)
+
+    @cached_property
+    def scale(self) -> FloatArray:
+        """Size of one unit of a linear parameter."""
+        return np.array([e.typical for e in self.entries])
+
+    @cached_property
+    def bounds(self) -> tuple[FloatArray, FloatArray]:
+        """Lower and upper bounds of the values, shapes (parameters,)."""
+        return np.array([e.lower for e in self.entries]), np.array([e.upper for e in self.entries])
+
+    @cached_property
+    def _origin(self) -> FloatArray:
+        return np.where(self.is_log, 1.0, 0.0)
+
+    def scaled(self, values: FloatArray) -> FloatArray:
+        """Scaled parameters of values, last axis of both (parameters,)."""
+        return self.difference(values, self._origin)
+
+    def unscaled(self, z: FloatArray) -> FloatArray:
+        """Values of scaled parameters, last axis of both (parameters,)."""
+        return self.shifted(self._origin, z)
+
+    def shifted(self, values: FloatArray, z: FloatArray) -> FloatArray:
+        """Values moved by the scaled step `z`, bounds or not, last axis of all (parameters,)."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            return np.where(self.is_log, values * np.exp(z), values + z * self.scale)
+
+    def placed(self, theta: FloatArray, z: FloatArray) -> FloatArray:
+        """Full vector `theta` with the free entries replaced by scaled parameters `z`."""
+        out = theta.copy()
+        out[self.index] = self.unscaled(z)
+        return out
+
+    def step(self, theta: FloatArray, moved: FloatArray) -> FloatArray:
+        """The scaled step that leads from full vector `theta` to `moved`, shape (parameters,)."""
+        return self.difference(moved[self.index], theta[self.index])
+
+    def difference(self, values: FloatArray, start: FloatArray) -> FloatArray:
+        """The scaled step that leads from values `start` to `values`, shape (parameters,)."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.where(self.is_log, np.log(values / start), (values - start) / self.scale)
+
+    def from_neutral(self, theta: FloatArray) -> FloatArray:
+        """How far effects are from neutral at `theta`, in typical sizes, shape (parameters,)."""
+        return np.asarray((theta[self.index] - np.array([e.neutral for e in self.entries])) / self.scale)
+
+    def move(self, theta: FloatArray, z: FloatArray) -> FloatArray:
+        """Returns `theta` moved by the scaled step `z`, clamped to the bounds."""
+        out = theta.copy()
+        out[self.index] = np.minimum(np.maximum(self.shifted(out[self.index], z), self.bounds[0]), self.bounds[1])
+        return out
+
+    def jacobian(self, theta: FloatArray) -> FloatArray:
+        """Derivative of the parameters to z at `theta`, shape (parameters,)."""
+        return np.where(self.is_log, theta[self.index], self.scale)
+
+
+_LONGEST_STEP = np.array([0.5] * 3 + [10.0] * 3 + [15.0] * 3 + [50.0] * 3)
+"""Longest step of an initial state: rad, rad/s, m/s, m."""
+
+
+@dataclass(frozen=True)
+class Linearised:
+    """Per-segment quadratic model of the cost in the free parameters, initial states eliminated.
+
+    Attributes:
+        gram: shape (segments, P, P); grad: (segments, P); cost: (segments,), all for scaled parameters z:
+            ``cost(z) = cost + 2 grad z + z gram z``.
+        occam: what freeing unmeasured initial velocities costs, shape (segments,): the log-determinant that turns the
+            profile deviance into the marginal one; added when models are compared, zero where velocity matters not.
+        rows: independent residuals of each segment, measured samples less fitted initial-state directions.
+        residuals: predicted - measured at the linearisation point, channel units, (segments, length, channels).
+        weights: 1 where measured (times robust weight), 0 elsewhere, same shape.
+        back: what gives the initial-state steps back: (offset (segments, k), slope (segments, k, P)).
+        window: index of the window of each segment; time: its first scored time [s].
+        states: initial states it was linearised at.
+        n_pre: rows between the start of the simulation and the segment.
+    """
+
+    gram: FloatArray
+    grad: FloatArray
+    cost: FloatArray
+    occam: FloatArray
+    rows: FloatArray
+    residuals: FloatArray
+    weights: FloatArray
+    back: tuple[FloatArray, FloatArray]
+    window: IndexArray
+    time: FloatArray
+    states: InitialStates
+    n_pre: int
+
+    @cached_property
+    def information(self) -> FloatArray:
+        """Of all segments on the scaled parameters, shape (P, P), read-only."""
+        return frozen(self.gram.sum(axis=0))
+
+    @cached_property
+    def gradient(self) -> FloatArray:
+        """Half the slope of the cost of all segments, shape (P,), read-only."""
+        return frozen(self.grad.sum(axis=0))
+
+    @cached_property
+    def total_cost(self) -> float:
+        """Cost of all segments."""
+        return float(self.cost.sum())
+
+    @cached_property
+    def total_rows(self) -> float:
+        """Independent residuals of all segments."""
+        return float(self.rows.sum())
+
+    @property
+    def spacing(self) -> float:
+        """Time from one segment to the next [s]; 1 s where there is one only."""
+        return float(np.median(np.diff(self.time))) if len(self.time) > 1 else 1.0
+
+    @property
+    def reduced_chi_square(self) -> float:
+        """Cost per independent residual; 1 at the noise floor."""
+        return self.total_cost / max(self.total_rows, 1.0)
+
+    def stepped(self, z: FloatArray | None = None) -> InitialStates:
+        """Initial states after the scaled parameter step `z`, or with parameters held."""
+        offset, slope = self.back
+        da = -(offset if z is None else offset + slope @ z)
+        limit = _LONGEST_STEP[: da.shape[1]]
+        return self.states.stepped(self.n_pre, np.clip(da, -limit, limit))
+
+
+@dataclass(frozen=True)
+class Columns:
+    """One window, cut into segments.
+
+    Attributes:
+        window: its data.
+        rows: row of the window of each sample, shape (segments, length).
+        basis: orthonormal whitened directions of the initial state, shape (segments, length * channels, k); channel c
+            of sample i at row i * channels + c.
+        residual: whitened, shape (segments, length, channels).
+        complete: channels of a segment that were measured throughout, shape (segments, channels).
+        parameters: whitened directions of the free parameters, shape (segments, length * channels, P).
+        base: residual predicted - measured in channel units, shape (segments, length, channels).
+        weights: 1 where measured, 0 elsewhere, same shape.
+        noise: what whitens.
+    """
+
+    window: Window
+    rows: IntArray
+    basis: FloatArray
+    residual: FloatArray
+    complete: BoolArray
+    parameters: FloatArray
+    base: FloatArray
+    weights: FloatArray
+    noise: NoiseModel
+
+    @property
+    def projected(self) -> FloatArray:
+        """What `parameters` do that the initial state cannot undo, shape (segments, length, channels, P)."""
+        flat = self.parameters - self.basis @ (self.basis.transpose(0, 2, 1) @ self.parameters)
+        return flat.reshape(*self.weights.shape, -1)
+
+    def whiten(self, rows: FloatArray, channel: int) -> FloatArray:
+        """Weights and whitens changes of one channel, shape (segments, length, columns)."""
+        return self.noise.channel_whitened(channel, rows, self.weights[:, :, channel], self.window.dt)
+
 
 LEAD_SECONDS = 0.2
 """Stretch before a segment in which filters and delays settle."""
@@ -293,3 +488,58 @@ class Shooting:
 def _uses(places: tuple[int, ...], theta: FloatArray, free: Free) -> bool:
     """Whether any of these entries acts at `theta` or may, being free."""
     return bool(np.isin(free.index, places).any() or theta[list(places)].any())
+
+
+# --- Priors on the free parameters, and normal equations of data and prior
+
+
+PRIOR_SIGMA_LINEAR = 10.0
+"""Weak prior of an effect parameter: this many typical sizes."""
+
+
+@dataclass(frozen=True)
+class Prior:
+    """Gaussian prior on the scaled parameters: ``mean`` of the parameter, ``sigma`` in scaled units, shapes (P,)."""
+
+    mean: FloatArray
+    sigma: FloatArray
+
+    @property
+    def precision(self) -> FloatArray:
+        """Of each scaled parameter, shape (P,)."""
+        return np.asarray(1.0 / self.sigma**2)
+
+
+def default_prior(shooting: Shooting, free: Free) -> Prior:
+    """Prior of each free parameter: thrust stand, else the file's (`ParameterPrior.log_sigma`); weak on effects."""
+    mean, sigma = [], []
+    stand = shooting.vehicle.stand_thrust
+    for e in free.entries:
+        known = shooting.vehicle.parameters.get(e.name)
+        if e.name == "b" and stand is not None:
+            mean.append(stand[0])
+            sigma.append(stand[1])
+        elif known is not None:
+            mean.append(known.initial)
+            sigma.append(known.log_sigma)
+        else:
+            mean.append(e.neutral)
+            sigma.append(PRIOR_SIGMA_LINEAR)
+    return Prior(np.array(mean), np.array(sigma))
+
+
+def prior_terms(free: Free, prior: Prior, theta: FloatArray) -> tuple[FloatArray, FloatArray, float]:
+    """Precision (P,), gradient (P,) and cost of the prior at `theta`, in scaled parameters."""
+    z = free.difference(theta[free.index], prior.mean)
+    return prior.precision, prior.precision * z, float(np.sum(prior.precision * z * z))
+
+
+def normal_equations(lin: Linearised, free: Free, prior: Prior, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Of data and prior at `theta`: h (P, P) and g (P,) of the cost ``2 g z + z h z`` of a scaled step z."""
+    precision, pull, _ = prior_terms(free, prior, theta)
+    return lin.information + np.diag(precision), lin.gradient + pull
+
+
+def posterior_covariance(information: FloatArray, prior: Prior) -> FloatArray:
+    """Covariance (P, P) of the scaled parameters, given their information from data, (P, P), and the prior."""
+    return np.asarray(np.linalg.inv(information + np.diag(prior.precision)))

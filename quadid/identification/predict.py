@@ -1,25 +1,33 @@
-"""Open-loop runs of the simulation, each from a measured state, driven by the logged rotor speeds.
+"""Prediction by the simulation alone: open-loop runs, each from a measured state, driven by the logged rotor speeds.
 
-Rotor speeds are held over each sample; runs never cross a gap.  Rates are compared as the gyro would read them: bias,
-scale and misalignment of the model are taken off the measured rate at the start and put on the predicted one; a delay
-of the attitude likewise.
+Every sample starts one run.  Rotor speeds are held over each sample; runs never cross a gap.  Rates are compared as the
+gyro would read them: bias, scale and misalignment of the model are taken off the measured rate at the start and put on
+the predicted one; a delay of the attitude likewise.  Errors are Euclidean for vectors and the angle of the relative
+rotation (q and -q alike), as in the IDSIA nano-drone benchmark.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from numbers import Integral
 
 import numpy as np
 
 from quadid.data.window import Window
+from quadid.errors import NotIdentifiableError, ParameterError
 from quadid.identification.initial_states import retract
 from quadid.model import layout as ix
+from quadid.model.layout import Layout
 from quadid.model.rollout import Rollout, Segments
 from quadid.model.simd import LANES
 from quadid.model.work_array import N_STATE
 from quadid.types import BoolArray, FloatArray, IndexArray
-from quadid.vehicle import Vehicle
+from quadid.vehicle import GRAVITY, Vehicle
+
+# --- Runs
+
 
 QUANTITIES: dict[str, str] = {"position": "m", "velocity": "m/s", "rotation": "rad", "rate": "rad/s"}
 """What is predicted, with units."""
@@ -235,3 +243,178 @@ def true_rate(measured: FloatArray, theta: FloatArray) -> FloatArray:
     mounting = np.eye(3) + cross + 0.5 * cross @ cross  # to second order, as the kernel has it
     sensor = (measured - theta[[ix.GBX, ix.GBY, ix.GBZ]]) / (1.0 + theta[[ix.GSX, ix.GSY, ix.GSZ]])
     return np.asarray(np.linalg.solve(mounting, sensor.T).T)
+
+
+# --- Scores: errors by samples after the start
+
+
+HORIZONS = (1, 10, 50)
+SUM_TO = 50
+"""The summed score adds the mean errors of the first fifty samples."""
+LONGEST = 2000
+
+
+@dataclass(frozen=True)
+class HorizonScore:
+    """Pooled errors of all starts.
+
+    Attributes:
+        samples: number of starts.
+        mean: mean error by sample after the start, shape (longest, 4), columns as `QUANTITIES`; row h - 1 is h samples
+            on; NaN for what the log lacks.
+        horizons: those asked for.
+    """
+
+    samples: int
+    mean: FloatArray
+    horizons: tuple[int, ...]
+
+    def at(self, horizon: int) -> dict[str, float]:
+        """Mean error after `horizon` samples by quantity; NaN for what the log lacks."""
+        return dict(zip(QUANTITIES, self.mean[horizon - 1].tolist(), strict=True))
+
+    @property
+    def sum(self) -> dict[str, float]:
+        """Sum of the mean errors after 1, 2, … `SUM_TO` samples, by quantity."""
+        return dict(zip(QUANTITIES, self.mean[:SUM_TO].sum(axis=0).tolist(), strict=True))
+
+
+def horizon_scores(
+    files: Sequence[Sequence[Window]], vehicle: Vehicle, theta: FloatArray, horizons: Sequence[int] = HORIZONS
+) -> tuple[HorizonScore, list[HorizonScore]]:
+    """Scores `theta` on several files.
+
+    Args:
+        files: windows of each file, on the file's grid.
+        vehicle: geometry and mass.
+        theta: full parameter vector, shape (size,); see `Layout.initial` for that of a vehicle file.
+        horizons: samples after the start, 1 to `LONGEST`.
+
+    Returns:
+        The score pooled over all starts, and that of each file (with no samples where no run fits).
+
+    Raises:
+        ParameterError: impossible horizons.
+        NotIdentifiableError: no run fits into any file, or there is no gyro.
+    """
+    wanted = _checked(horizons)
+    longest = max(*wanted, SUM_TO)
+    tallies = [_tally(windows, vehicle, theta, longest) for windows in files]
+    pooled, starts = np.sum([sums for sums, _ in tallies], axis=0), sum(count for _, count in tallies)
+    if starts == 0:
+        raise NotIdentifiableError(
+            f"no run of {longest} samples fits: measured rate, and no gap for {longest} samples after it",
+            f"stretches longer than {longest} samples with gyro", "log without gaps, or ask for a lower --rate",
+        )  # fmt: skip
+    return _score(pooled, starts, wanted), [_score(*tally, wanted) for tally in tallies]
+
+
+def _checked(horizons: Sequence[int]) -> tuple[int, ...]:
+    """The horizons, each once; raises ParameterError for what is none."""
+    wanted = tuple(dict.fromkeys(horizons))
+    if not wanted or not all(isinstance(h, Integral) and 1 <= h <= LONGEST for h in wanted):
+        raise ParameterError(f"horizons {list(horizons)}", f"whole numbers of samples from 1 to {LONGEST}")
+    return wanted
+
+
+def start_errors(windows: Sequence[Window], vehicle: Vehicle, horizons: Sequence[int]) -> list[FloatArray]:
+    """Errors of every run, for pairs of models from the same starts.
+
+    Args:
+        windows: of one file.
+        vehicle: its values, effects included, are taken as they are.
+        horizons: samples after the start, 1 to `LONGEST`.
+
+    Returns:
+        Of each window, shape (starts, horizons, 4), columns as `QUANTITIES`; NaN for what was not measured.
+
+    Raises:
+        ParameterError: impossible horizons.
+    """
+    wanted = _checked(horizons)
+    theta = Layout(vehicle).initial(vehicle)[None]
+    return [lengths(OpenLoop(w, vehicle, max(wanted)).misses(theta, np.array(wanted))[0]) for w in windows]
+
+
+def _score(sums: FloatArray, starts: int, horizons: tuple[int, ...]) -> HorizonScore:
+    total, count = sums
+    mean = np.divide(total, count, out=np.full_like(total, np.nan), where=count > 0)
+    mean.setflags(write=False)
+    return HorizonScore(starts, mean, horizons)
+
+
+def _tally(windows: Sequence[Window], vehicle: Vehicle, theta: FloatArray, longest: int) -> tuple[FloatArray, int]:
+    """Summed errors of all runs and their counts, shape (2, longest, 4), and the number of runs."""
+    sums, starts, at = np.zeros((2, longest, 4)), 0, 1 + np.arange(longest)
+    for window in windows:
+        for rows, misses in OpenLoop(window, vehicle, longest).parts(theta[None], at):
+            errors = lengths(misses[0])
+            known = ~np.isnan(errors)
+            sums += np.where(known, errors, 0.0).sum(axis=0), known.sum(axis=0)
+            starts += len(rows)
+    return sums, starts
+
+
+# --- The least error that a prediction from a measured state can have: what sensor noise alone makes of a perfect
+# model
+#
+# A run starts from a measured attitude, rate, velocity and position, each with its noise, and is compared with measured
+# ones.  Over a time T an error of the rate grows into one of the attitude (T), a tilt error accelerates the vehicle
+# sideways (g T), and so on; damping is left out, so that at long horizons the floor is rather too high than too low.
+
+
+ORDER = 4
+"""Differences of this order leave white noise and take smooth motion away."""
+MEAN_LENGTH = math.sqrt(8.0 / math.pi)
+"""Mean length of a vector of three Gaussian components over their standard deviation."""
+
+
+def prediction_floor(windows: Sequence[Window], samples: int) -> dict[str, float]:
+    """Mean error `samples` after the start that sensor noise alone makes, by quantity; NaN for what the logs lack.
+
+    Args:
+        windows: of one or more files, on one grid.
+        samples: after the start.
+    """
+    sigma = {name: white_noise([_vectors(w, name) for w in windows]) for name in QUANTITIES}
+    t = samples * windows[0].dt
+    position, velocity, rotation, rate = (sigma[name] for name in QUANTITIES)
+    sideways = 2.0 / 3.0  # of three components two feel a tilt
+    from_tilt, from_rate = GRAVITY * t * rotation, GRAVITY * t**2 * rate / 2.0
+    grown = {
+        "rate": 2.0 * rate**2,
+        "rotation": 2.0 * rotation**2 + (rate * t) ** 2,
+        "velocity": 2.0 * velocity**2 + sideways * (from_tilt**2 + from_rate**2),
+        "position": 2.0 * position**2
+        + (velocity * t) ** 2
+        + sideways * ((from_tilt * t / 2.0) ** 2 + (from_rate * t / 3.0) ** 2),
+    }
+    return {name: MEAN_LENGTH * math.sqrt(grown[name]) for name in QUANTITIES}
+
+
+def white_noise(series: Sequence[FloatArray]) -> float:
+    """Standard deviation of the white noise of a component, from differences of order `ORDER`; NaN without data.
+
+    Args:
+        series: samples (n, 3) of each window; robust against the few rows in which the motion itself is not smooth.
+    """
+    parts = [np.abs(np.diff(values, ORDER, axis=0)).ravel() for values in series if len(values) > ORDER]
+    differences = np.concatenate([np.zeros(0), *parts])
+    if len(differences) == 0:
+        return math.nan
+    return float(1.4826 * np.median(differences) / math.sqrt(math.comb(2 * ORDER, ORDER)))
+
+
+def _vectors(window: Window, quantity: str) -> FloatArray:
+    """Measured rows of a quantity, (n, 3); an attitude as the turns from its first row on, summed up."""
+    values = {
+        "position": window.position, "velocity": window.velocity, "rotation": window.attitude, "rate": window.gyro,
+    }[quantity]  # fmt: skip
+    if values is None:
+        return np.zeros((0, 3))
+    known = values[np.isfinite(values).all(axis=1)]
+    if quantity != "rotation":
+        return known
+    w, v = known[:, :1], known[:, 1:]
+    turned = w[:-1] * v[1:] - w[1:] * v[:-1] - np.cross(v[:-1], v[1:])
+    return np.cumsum(2.0 * turned, axis=0)

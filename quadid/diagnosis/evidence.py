@@ -1,0 +1,319 @@
+"""Evidence: what a move of the search promises, which of two models is better, which numbers are possible."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from quadid.chi_square import Z95, exceeded
+from quadid.diagnosis.attribution import UNTIDY, untidy_sized
+from quadid.diagnosis.hypotheses import Candidate, Model, free_names, paired_gain, taken_out_causes, unset_times
+from quadid.effects import EFFECTS
+from quadid.identification.elimination import eliminated, freed
+from quadid.identification.problem import Linearised, Shooting, prior_terms
+from quadid.parameters import Parameter, Status, at_bound
+from quadid.types import BoolArray, FloatArray, IndexArray
+
+# --- The one score: is model B better than model A?
+#
+# Twice the logarithm of the marginal likelihood by Laplace's approximation, with the priors that exist: on parameters
+# those of the fit, on models that a cause is absent until proven (`FALSE_ALARM` shared by all that were tried).  Where
+# the model leaves more than noise, or noise with a memory, squared errors are worth less than their size: deviances
+# are divided by the ratio of the scores' true variance to that which the model counts on (Godambe, Ann. Math. Stat. 31
+# (1960) 1208; as magnitude adjustment of a composite likelihood in Ribatet, Cooley and Davison, Statistica Sinica 22
+# (2012) 813).  A cause must besides be of use: on blocks of data that its fit did not see it has to gain a share of
+# the noise.
+
+
+FALSE_ALARM = 1e-3
+"""Prior probability that a flight has any cause to be named, shared by all that are tried: that of a false alarm."""
+RELEVANT = 0.002
+"""Share of the noise that a cause must take away on unseen blocks.  Less is of no use to anybody, and within what the
+time step of a simulation or of an autopilot's own filter can imitate: nulls reach 0.0008."""
+
+
+def better(b: Model, a: Model) -> bool:
+    """Whether `b` is better than `a`: more likely, and of models of which one contains the other also of use."""
+    more, less = {c.label for c in b.causes}, {c.label for c in a.causes}
+    if more < less:
+        return not better(a, b)
+    if less < more and not relevant(a, b):
+        return False
+    return advantage(b, a) > 0.0
+
+
+def advantage(b: Model, a: Model) -> float:
+    """Twice the log evidence of `b` less that of `a`, times the calibration, between models of the same data and noise.
+
+    Each model pays for what only it has by the calibration of its own scores: where a parameter's scores vary much more
+    than the deviance counts on, that is no reason to count less what the other model explains.
+    """
+    return a.deviance - b.deviance + _cost(a, b) - _cost(b, a)
+
+
+def _cost(model: Model, other: Model) -> float:
+    """Deviance that the causes and parameters which only `model` has must take away for it to be as likely."""
+    own = np.array([n not in other.free.names for n in model.free.names])
+    present = {c.label for c in other.causes}
+    prior = sum(2.0 * np.log(model.tried[c.label] / FALSE_ALARM) for c in model.causes if c.label not in present)
+    if not own.any():
+        return float(prior)
+    ratio = calibration(model, own)
+    gram = model.lin.information / np.sqrt(np.outer(model.prior.precision, model.prior.precision))
+    wide = np.eye(len(gram)) + gram / ratio
+    occam = np.linalg.slogdet(wide)[1] - np.linalg.slogdet(wide[np.ix_(~own, ~own)])[1]
+    return ratio * float(occam + prior)
+
+
+def calibration(model: Model, own: BoolArray) -> float:
+    """By how much scores of the parameters `own` of `model` vary more than its deviance counts on, or 1."""
+    return max(float(np.mean(model.inflation[own])), 1.0)
+
+
+def relevant(small: Model, large: Model) -> bool:
+    """Whether what `large` has more gains enough on unseen blocks, and half of that where the best of them is missing.
+
+    It is missing in the fit as well: what a single stretch determines, such as a step near the end, gains elsewhere by
+    keeping that stretch apart.
+    """
+    gain = paired_gain(small.held_out, large.held_out)
+    best = int(np.argmax(gain.blocks))
+    least = min(gain.total, 2.0 * float(small.rest[best] - large.rest[best]))
+    return least > RELEVANT * small.rows
+
+
+def worth_a_refit(tests: int, rows: float) -> float:
+    """Predicted fall of the deviance below which a cause cannot win: half of what it must gain."""
+    return 0.5 * max(exceeded(FALSE_ALARM / tests, 1), RELEVANT * rows)
+
+
+# --- Score tests: what each move of the selection should bring, from one linearisation of everything
+#
+# One Jacobian of the whole catalogue, with initial states eliminated segment by segment, gives the predicted deviance
+# of every model that adds a cause, drops one or puts one in another's place, by linear algebra (Rao, Proc. Camb. Phil.
+# Soc. 44 (1948) 50).  Causes that begin at an unknown time are scanned over all segment boundaries by sums from the
+# end.
+
+
+@dataclass(frozen=True)
+class Score:
+    """Linear prediction for one move.
+
+    Attributes:
+        candidate: the cause that comes in.
+        drop: predicted fall of the deviance on the fitted data, negative for a rise.
+        time: best moment of onset [s] for timed causes.
+        trials: how many alternatives were looked at: causes, and onsets of them.
+        gone: the cause that leaves; None: none does.
+    """
+
+    candidate: Candidate
+    drop: float
+    time: float | None = None
+    trials: int = 1
+    gone: Candidate | None = None
+
+
+class _Own(NamedTuple):
+    """The model's own parameters: their information and gradient, prior included, (o, o) and (o,), and columns.
+
+    The gradient counts although it is small at an optimum: only with it is the quadratic a sum of squares, which no
+    step can bring below zero, and a fit that stopped short of its optimum promises no more than there is to gain.
+    """
+
+    h: FloatArray
+    g: FloatArray
+    place: IndexArray
+
+    @property
+    def fall(self) -> float:
+        """Fall of the deviance when they alone follow."""
+        return float(self.g @ np.linalg.solve(self.h, self.g))
+
+
+@dataclass(frozen=True)
+class Everything:
+    """The current model linearised with every candidate's entries free.
+
+    Attributes:
+        model: the current model; listed: the candidates; lin: the linearisation; place: column of each entry.
+    """
+
+    model: Model
+    listed: Sequence[Candidate]
+    lin: Linearised
+    place: dict[str, int]
+
+    @classmethod
+    def of(cls, shooting: Shooting, model: Model, listed: Sequence[Candidate]) -> Everything:
+        """Linearises `model` with all of `listed` free, but for refinements of what it has not."""
+        there = {c.label for c in model.causes}
+        some = [c for c in listed if not c.refines or c.requires in there]
+        names = list(dict.fromkeys([*model.free.names, *(n for c in some for n in c.names)]))
+        theta = unset_times(model.theta, model.effects)
+        lin = shooting.linearise(theta, shooting.free(names), model.states)
+        return cls(model, listed, lin, {n: i for i, n in enumerate(names)})
+
+    def loss(self, gone: Candidate) -> float:
+        """Predicted rise of the deviance when `gone`, and what requires it, is dropped."""
+        _, own, risen = self._left(gone)
+        return risen - own.fall + self._unspent()
+
+    def scores(self, gone: Candidate | None = None) -> list[Score]:
+        """What each candidate that is not in the model would do, in the place of `gone` if given; best first."""
+        lin, own, risen = self._left(gone)
+        risen += self._unspent()
+        present = set(self.model.free.names)
+        there = {name for c in self.model.causes if c is not gone for name in (c.effect, c.label)}
+        out = []
+        for candidate in self.listed:
+            if present.intersection(candidate.names) or (candidate.requires and candidate.requires not in there):
+                continue
+            mine = np.array([self.place[n] for n in candidate.names])
+            found = (_score if candidate.timed is None else _scan)(candidate, lin, own, mine)
+            out.append(replace(found, drop=found.drop - risen, trials=found.trials * len(self.listed), gone=gone))
+        return sorted(out, key=lambda s: -s.drop)
+
+    def _unspent(self) -> float:
+        """Fall of the deviance that the fit of the model itself left undone."""
+        return self._left(None)[1].fall
+
+    def _left(self, gone: Candidate | None) -> tuple[Linearised, _Own, float]:
+        """The quadratic, the model's parameters and the rise of the deviance where `gone` is neutral."""
+        model = self.model
+        stays = np.isin(model.free.names, free_names(taken_out_causes(model.causes, gone)))
+        place = np.array([self.place[n] for n in model.free.names])
+        z = np.zeros(len(self.place))
+        z[place[~stays]] = -model.free.from_neutral(model.theta)[~stays]
+        moved = self.lin.gram @ z
+        lin = replace(self.lin, grad=self.lin.grad + moved)
+        precision, pull, _ = prior_terms(model.free, model.prior, model.theta)
+        place = place[stays]
+        h = lin.information[np.ix_(place, place)] + np.diag(precision[stays])
+        own = _Own(h, lin.gradient[place] + pull[stays], place)
+        return lin, own, float(np.sum(2.0 * self.lin.grad @ z + moved @ z))
+
+
+def missed(model: Model, least: float) -> tuple[Candidate, ...]:
+    """Causes of `model` whose loss, one after the other, the rest could not make up for: at least `least` of deviance.
+
+    Half of them at most are let go: the linear picture does not hold for all at once.
+    """
+    h = model.lin.information + np.diag(model.prior.precision)
+    z, place = model.free.from_neutral(model.theta), {n: i for i, n in enumerate(model.free.names)}
+    kept, alive = list(model.causes), np.ones(len(place), dtype=bool)
+    for _ in range(max(len(kept) // 2, 1)):
+        losses = []
+        for cause in kept:
+            if any(cause.carries(c) for c in kept):
+                continue
+            mine = np.array([place[n] for n in cause.names])
+            rest = np.flatnonzero(alive & ~np.isin(np.arange(len(z)), mine))
+            left = eliminated(h[np.ix_(mine, mine)], h[np.ix_(mine, rest)], h[np.ix_(rest, rest)])
+            losses.append((float(z[mine] @ left.h @ z[mine]), cause, mine))
+        if not losses:
+            break
+        loss, cause, mine = min(losses, key=lambda item: item[0])
+        if loss > least:
+            break
+        kept.remove(cause)
+        alive[mine] = False
+    return tuple(kept)
+
+
+def _fall(h_mm: FloatArray, h_mo: FloatArray, g_m: FloatArray, own: _Own) -> FloatArray:
+    """Predicted fall of the deviance with candidates' parameters free, the model's own refitted, shape (n,).
+
+    Args:
+        h_mm: products of the parameters with themselves, (n, m, m).
+        h_mo: and with those of the model, (n, m, o).
+        g_m: gradient of the parameters (n, m).
+        own: the model's parameters.
+    """
+    # Directions the model's own parameters already explain carry no information; keep them finite.
+    kept = np.eye(h_mm.shape[-1]) * (1e-9 * h_mm + 1e-2)
+    return own.fall + freed(h_mm + kept, h_mo, own.h, g_m, own.g)
+
+
+def _score(candidate: Candidate, lin: Linearised, own: _Own, mine: IndexArray) -> Score:
+    h, g = lin.information, lin.gradient
+    drop = _fall(h[np.ix_(mine, mine)][None], h[np.ix_(mine, own.place)][None], g[mine][None], own)
+    return Score(candidate, float(drop[0]))
+
+
+def _scan(candidate: Candidate, lin: Linearised, own: _Own, mine: IndexArray) -> Score:
+    """Scans the onset over segment boundaries: sums from the end turn the whole-log column into masked ones."""
+    order = np.argsort(lin.time, kind="stable")
+    from_end = slice(None, None, -1)
+    h_mm = np.cumsum(lin.gram[order[:, None, None], mine[:, None], mine][from_end], axis=0)[from_end]
+    h_mo = np.cumsum(lin.gram[order[:, None, None], mine[:, None], own.place][from_end], axis=0)[from_end]
+    g_m = np.cumsum(lin.grad[order][:, mine][from_end], axis=0)[from_end]
+    margin = max(len(order) // 40, 3)
+    tried = slice(margin, len(order) - margin)
+    drop = _fall(h_mm[tried], h_mo[tried], g_m[tried], own)
+    if not len(drop):
+        return Score(candidate, -np.inf)
+    best = int(np.argmax(drop))
+    return Score(candidate, float(drop[best]), float(lin.time[order[margin + best]]), len(order))
+
+
+# --- Numbers that no vehicle has: what carries them fits, but stands for something else
+#
+# A fit takes whatever lowers its cost.  Air that pushes, drag that acts a foot above the vehicle, an accelerometer off
+# by half of gravity may all be near enough to something that the catalogue lacks; their names are then wrong.  The
+# selection prefers causes whose numbers are possible; where none is, the finding is listed without confidence.
+
+
+LIKELY_SENSOR = 10.0
+"""Typical sizes beyond which an error of a sensor is not believed."""
+WRONG_SIGN = 0.1
+"""Share of its typical size by which a number that cannot be negative may be, for what a fit lays beside the truth."""
+
+
+def impossible_causes(model: Model) -> dict[str, str]:
+    """Causes of `model` with a number that no vehicle has, and which, by label."""
+    reasons = {c.label: impossible(model, c) for c in model.causes}
+    return {label: reason for label, reason in reasons.items() if reason}
+
+
+def late_unknown(model: Model, parameters: Sequence[Parameter]) -> dict[str, str]:
+    """Lags and delays of `model` that rotation shows beside moments of inertia which are not to be used, by label.
+
+    What is late in rotation is weaker too: a lag beside one inertia is a delay beside another.
+    """
+    turning = [p for p in parameters if p.name in ("J_xx", "J_yy")]
+    if not all(p.status is Status.UNRELIABLE for p in turning):
+        return {}
+    reason = f"{' and '.join(p.name for p in turning)}, beside which rotation shows it, are not to be used"
+    return {c.label: reason for c in model.causes if c.family == "late" and EFFECTS[c.effect].turns}
+
+
+def slight_causes(model: Model) -> dict[str, str]:
+    """Causes of `model` that something on any vehicle passes for while they are small, by label, and what.
+
+    Air gets thinner in a climb, rotors carry otherwise in it, and motors warm up: from one part of a flight to the next
+    thrust differs, and a step at the border takes that up.  A tilted vertical of the attitude pushes as a wind does.
+    """
+    step = f"parts of a flight differ by as much on any vehicle, {UNTIDY:g} of what it typically is"
+    push = "in still air, a vertical of the attitude that is off by a degree does the same"
+    small = [c for c in model.causes if untidy_sized(model, c)]
+    return {c.label: push if c.timed is None else step for c in small if c.timed is not None or c.effect == "wind"}
+
+
+def impossible(model: Model, cause: Candidate) -> str:
+    """Which number of `cause` no vehicle has; empty when all are possible."""
+    sigma = dict(zip(model.free.names, model.uncertainty.sigma, strict=True))
+    for e in model.numbers(cause).entries:
+        value = float(model.theta[e.index])
+        size, shown = (value - e.neutral) / e.typical, f"{e.name} = {value:.3g} {e.unit}".rstrip()
+        if EFFECTS[cause.effect].sized and abs(size) > LIKELY_SENSOR:
+            return f"{shown} is more than a sensor that works can have ({LIKELY_SENSOR * e.typical:.3g} {e.unit})"
+        if e.sign > 0 and size + Z95 * sigma[e.name] < -WRONG_SIGN:
+            return f"{shown} cannot be negative"
+        bound = e.lower if value - e.lower <= e.upper - value else e.upper
+        if at_bound(value, e.lower, e.upper) and bound != e.neutral:
+            return f"{shown} rests on its bound ({bound:.3g} {e.unit})"
+    return ""

@@ -1,0 +1,376 @@
+"""Uncertainty of a fit: autocorrelated residuals, a second cut, scale of mass and arm; intervals and status."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from quadid.chi_square import Z95
+from quadid.identification.elimination import eliminated
+from quadid.identification.gauss_newton import Polished, polish
+from quadid.identification.problem import Free, Linearised, Prior, Shooting, posterior_covariance
+from quadid.parameters import MAY_VANISH, NOMINAL_NAMES, Parameter, ParameterSet, Status, at_bound
+from quadid.types import FloatArray, IndexArray
+from quadid.vehicle import Vehicle
+
+# --- Covariance, corrected for autocorrelation, and status
+
+
+LAG_SECONDS = 2.0
+"""Scores of segments up to this far apart may be correlated."""
+NOT_NOTHING = 1.0 / 3.0
+"""Relative standard deviation above which what may vanish is not distinguished from zero."""
+KNOWN = 0.03
+"""A log-scale standard deviation below this is identified whatever its correlations."""
+RATIO_SIGMA = 0.05
+RATIO_GAIN = 0.25
+"""A ratio is known when its standard deviation is below RATIO_SIGMA and below RATIO_GAIN of the parameter's own."""
+PRIOR_SHARE = 0.5
+"""A parameter whose posterior is wider than this share of its prior is prior-dominated."""
+SPREAD_LIMIT = 0.1
+"""Spread of estimates of one parameter (log scale) beyond which none of them is to be used."""
+
+
+@dataclass(frozen=True)
+class Uncertainty:
+    """Covariance of the scaled parameters.
+
+    Attributes:
+        covariance: posterior with prior, corrected, shape (P, P).
+        inflation: factor on each standard deviation from autocorrelated or excess residuals, shape (P,).
+        prior_sigma: standard deviation of the prior, shape (P,).
+        grown: factor on each standard deviation from what estimates differ by, see `reliability`, shape (P,); None: not
+            compared.
+        spread: what has to stay below `SPREAD_LIMIT`, shape (P,).
+    """
+
+    covariance: FloatArray
+    inflation: FloatArray
+    prior_sigma: FloatArray
+    grown: FloatArray | None = None
+    spread: FloatArray | None = None
+
+    @property
+    def sigma(self) -> FloatArray:
+        """Standard deviation of each scaled parameter, shape (P,)."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)))
+
+    @property
+    def prior_share(self) -> FloatArray:
+        """Share of the information on each parameter that the prior brings, shape (P,)."""
+        return np.asarray(np.minimum((self.from_noise / (self.inflation * self.prior_sigma)) ** 2, 1.0))
+
+    @property
+    def from_noise(self) -> FloatArray:
+        """Standard deviation of each scaled parameter without what estimates differ by, shape (P,)."""
+        return self.sigma if self.grown is None else self.sigma / self.grown
+
+    def first(self, n: int) -> Uncertainty:
+        """Of the first `n` parameters."""
+        grown, spread = (None if a is None else a[:n] for a in (self.grown, self.spread))
+        return Uncertainty(self.covariance[:n, :n], self.inflation[:n], self.prior_sigma[:n], grown, spread)
+
+    def differing(self, steps: Sequence[FloatArray]) -> Uncertainty:
+        """Intervals that hold other estimates too, which lie `steps` away, each of shape (P,); they count as spread."""
+        if not steps:
+            return self
+        farthest = np.max(np.abs(steps), axis=0)
+        return self.widened(farthest, farthest)
+
+    def widened(self, by: FloatArray, spread: FloatArray) -> Uncertainty:
+        """With standard deviations `by` added, and `spread` to what has to stay below its limit, both shape (P,)."""
+        grow = np.hypot(1.0, by / np.maximum(self.sigma, 1e-300))
+        grown = grow if self.grown is None else grow * self.grown
+        spread = spread if self.spread is None else np.hypot(self.spread, spread)
+        return replace(self, covariance=self.covariance * np.outer(grow, grow), grown=grown, spread=spread)
+
+
+def uncertainty(lin: Linearised, prior: Prior, information: FloatArray | None = None) -> Uncertainty:
+    """Posterior covariance, widened where the segment scores are larger or more correlated than modelled.
+
+    The widening is the ratio of the heteroscedasticity- and autocorrelation-consistent ("sandwich") variance (Newey and
+    West, Econometrica 55 (1987) 703) to the model's; it is applied only where it exceeds its own sampling error, so
+    that well-modelled data keep the efficient interval.
+
+    Args:
+        lin: linearisation at the optimum.
+        prior: what is known of the parameters beforehand.
+        information: of the data, shape (P, P), where more was used than `lin`; by default its own.
+    """
+    covariance = posterior_covariance(lin.information, prior)
+    inflation = np.ones(len(prior.sigma))
+    if len(lin.grad) >= 10:
+        ratio, lags = variance_ratio(lin, covariance)
+        sampling = math.sqrt(2.0 / len(lin.grad) * (1.0 + 4.0 / 3.0 * lags))
+        inflation = np.where(ratio > 1.0 + 2.0 * sampling, np.sqrt(np.maximum(ratio, 1.0)), 1.0)
+    if information is not None:
+        covariance = posterior_covariance(information, prior)
+    return Uncertainty(covariance * np.outer(inflation, inflation), inflation, prior.sigma)
+
+
+def variance_ratio(lin: Linearised, covariance: FloatArray) -> tuple[FloatArray, int]:
+    """True variance of each parameter over that in `covariance` (P, P), shape (P,), and the number of lags used.
+
+    The true one is the "sandwich" of `score_products`.
+    """
+    meat, lags = score_products(lin)
+    return np.asarray(np.diag(covariance @ meat @ covariance) / np.diag(covariance)), lags
+
+
+def score_products(lin: Linearised) -> tuple[FloatArray, int]:
+    """Bartlett-weighted (P, P) sum of score products over segments of the same window, and the number of lags used."""
+    step = lin.spacing
+    lags = max(int(round(LAG_SECONDS / max(step, 1e-6))), 1)
+    scores = lin.grad - lin.grad.mean(axis=0)
+    meat = scores.T @ scores
+    for lag in range(1, min(lags, len(scores) - 1) + 1):
+        near = (lin.window[lag:] == lin.window[:-lag]) & (lin.time[lag:] - lin.time[:-lag] < (lag + 0.5) * step)
+        cross = scores[lag:][near].T @ scores[:-lag][near]
+        meat += (1.0 - lag / (lags + 1.0)) * (cross + cross.T)
+    return meat, lags
+
+
+def parameter_set(free: Free, theta: FloatArray, initial: FloatArray, unc: Uncertainty) -> ParameterSet:
+    """Parameters with units, intervals (log scale for nominal ones) and status."""
+    scale, at = free.jacobian(theta), theta[free.index]
+    sigma = unc.sigma * scale
+    low, high = (free.shifted(at, z) for z in (-Z95 * unc.sigma, Z95 * unc.sigma))
+    out = []
+    for j, e in enumerate(free.entries):
+        value, ci = float(at[j]), (float(low[j]), float(high[j]))
+        status, partner = _status(j, free, unc, value, ci)
+        guess = float(initial[e.index])
+        loose = 0.98 * min(math.log(e.upper / guess), math.log(guess / e.lower)) if free.is_log[j] else 0.0
+        out.append(
+            Parameter(
+                e.name, e.unit, value, float(sigma[j]), guess, (e.lower, e.upper), status, partner, ci,
+                float(unc.prior_share[j]), float(unc.prior_sigma[j]) < loose,
+            )
+        )  # fmt: skip
+    return ParameterSet(tuple(out), unc.covariance * np.outer(scale, scale))
+
+
+def _status(
+    j: int, free: Free, unc: Uncertainty, value: float, ci: tuple[float, float]
+) -> tuple[Status, str | None]:  # fmt: skip
+    sigma, entry = unc.sigma, free.entries[j]
+    if at_bound(value, entry.lower, entry.upper):
+        return Status.UNRELIABLE, None
+    if unc.from_noise[j] > PRIOR_SHARE * unc.prior_sigma[j] or (entry.name == MAY_VANISH and sigma[j] > NOT_NOTHING):
+        return Status.PRIOR_DOMINATED, None
+    if free.is_log[j] and not (entry.lower <= ci[0] and ci[1] <= entry.upper):  # then the bound affects the value
+        return Status.UNRELIABLE, None
+    limit = SPREAD_LIMIT if free.is_log[j] else SPREAD_LIMIT * max(1.0, abs(value) / entry.typical)
+    if unc.spread is not None and unc.spread[j] > limit:
+        return Status.UNRELIABLE, None
+    if not free.is_log[j] or sigma[j] <= KNOWN:
+        return Status.IDENTIFIED, None
+    best, partner = math.inf, None
+    for k in range(len(sigma)):
+        if k == j or (free.is_log[k] and sigma[k] <= 0.3 * sigma[j]):
+            continue
+        if free.is_log[k]:
+            left = unc.covariance[j, j] + unc.covariance[k, k] - 2.0 * unc.covariance[j, k]
+        else:  # an effect's number, were it known
+            left = unc.covariance[j, j] - unc.covariance[j, k] ** 2 / unc.covariance[k, k]
+        spread = math.sqrt(max(left, 0.0))
+        if spread < best:
+            best, partner = spread, free.entries[k].name
+    if best <= min(RATIO_SIGMA, RATIO_GAIN * sigma[j]):
+        return Status.RATIO_ONLY, partner
+    return Status.IDENTIFIED, None
+
+
+# --- Parameters from two cuts of the same flight, the second half a segment later
+#
+# What happens across the borders of segments is lost with their initial states.  The second cut has its borders where
+# the first has the middle of its segments, so that each holds what the other loses.  Both see the same noise; what
+# their scores share where segments overlap decides how much is gained (a composite likelihood with its Godambe
+# information; Varin, Reid and Firth, Statistica Sinica 21 (2011) 5).
+
+
+FEWEST_SEGMENTS = 10
+"""Segments of the second cut below which it is not made."""
+LEAST_OF_FIRST = 0.9
+"""Share of the segments of the first cut that the second must have: many short windows lose more than is gained."""
+ITERATIONS = 8
+"""Linearisations the second cut may take; it begins at the optimum of the first."""
+WORSE = 1.2
+"""Cost per row of the second cut over that of the first beyond which it went astray: both see the same data."""
+MOST_COMPARED = 120
+"""Segments of the second cut, the most informative, from which follows what both share."""
+SINGULAR = 1e-12
+"""Share of information below which a direction counts as not known."""
+
+
+@dataclass(frozen=True)
+class BothCuts:
+    """Estimate from two cuts together.
+
+    Attributes:
+        theta: full parameter vector.
+        information: of the data on the scaled parameters, shape (P, P).
+        simulated: parameter vectors simulated for the second cut.
+    """
+
+    theta: FloatArray
+    information: FloatArray
+    simulated: int
+
+
+def with_second_cut(shooting: Shooting, found: Polished, free: Free, prior: Prior, robust: bool) -> BothCuts | None:
+    """Fits the second cut from the optimum of the first, and goes where both together fit best.
+
+    Args:
+        shooting: the first cut.
+        found: its optimum.
+        free: parameters to move.
+        prior: of those; counts once.
+        robust: down-weight outliers of the second cut too.
+
+    Returns:
+        None where there are too few segments, where random moments rule, or one of the cuts has no good fit.
+    """
+    second = shooting.between()
+    enough = max(FEWEST_SEGMENTS, LEAST_OF_FIRST * shooting.count)
+    if second.count < enough or shooting.noise.moments is not None or not np.isfinite(found.cost):
+        return None
+    other = polish(second, found.theta, free, prior, iterations=ITERATIONS, robust=robust)
+    if not other.cost * found.lin.total_rows < WORSE * found.cost * other.lin.total_rows:
+        return None
+    precision = np.diag(prior.precision)
+    h_one, h_other = found.lin.information, other.lin.information
+    away = free.step(found.theta, other.theta)
+    step = np.linalg.solve(h_one + h_other + 2.0 * precision, (h_other + precision) @ away)
+    h = 0.5 * (h_one + h_other)
+    information = _information(h, *_shared(shooting, second, found, other, free))
+    return BothCuts(free.move(found.theta, np.asarray(step)), information, other.simulated)
+
+
+def _shared(
+    first: Shooting, second: Shooting, found: Polished, other: Polished, free: Free
+) -> tuple[FloatArray, FloatArray]:
+    """Covariance of the score of the second cut, and of that with the score of the first, both (P, P).
+
+    From the most informative segments; exact for white noise, and nearly for the slow noise of an attitude, whose
+    whitening begins anew with each segment.
+    """
+    p = len(free.entries)
+    own, cross = np.zeros((p, p)), np.zeros((p, p))
+    cuts = zip((first, second), (found.states, other.states), _compared(first, second, other), strict=True)
+    columns = (cut.taking(some).columns(other.theta, free, states.taking(some)) for cut, states, some in cuts)
+    for before, after in zip(*columns, strict=True):
+        a, b = before.projected, after.projected
+        place = {int(start): i for i, start in enumerate(before.rows[:, 0])}
+        half, length = a.shape[1] // 2, a.shape[1]
+        own += _products(b, b)
+        begin = [place[int(start) - half] for start in after.rows[:, 0]]
+        cross += _products(b[:, : length - half], a[begin, half:])
+        goes_on = [j for j, start in enumerate(after.rows[:, 0]) if int(start) + length - half in place]
+        end = [place[int(after.rows[j, 0]) + length - half] for j in goes_on]
+        cross += _products(b[goes_on, length - half :], a[end, :half])
+    return own, 0.5 * (cross + cross.T)
+
+
+def _compared(first: Shooting, second: Shooting, other: Polished) -> tuple[list[IndexArray], list[IndexArray]]:
+    """Places, window by window, of segments of the first cut that overlap the most informative of the second; these."""
+    known = np.diagonal(other.lin.gram, axis1=1, axis2=2)
+    total = known.sum(axis=0)
+    weight = np.sum(known / np.where(total > 0.0, total, 1.0), axis=1)
+    chosen = np.zeros(len(weight), dtype=bool)
+    chosen[np.argsort(-weight, kind="stable")[:MOST_COMPARED]] = True
+    later = [np.flatnonzero(chosen[other.lin.window == w]) for w in range(len(second.rollouts))]
+    one, left = [], list(zip(second.rollouts, later, strict=True))
+    for rollout, segments in zip(first.rollouts, first.segments, strict=True):
+        places = left.pop(0)[1] if left and left[0][0] is rollout else np.zeros(0, dtype=np.intp)
+        both = np.union1d(places, places + 1)
+        one.append(both[both < len(segments.starts)])
+    return one, later
+
+
+def _products(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Sum of the products (P, P) of columns (segments, rows, channels, P)."""
+    return np.asarray(a.reshape(-1, a.shape[-1]).T @ b.reshape(-1, b.shape[-1]))
+
+
+def _information(h: FloatArray, own: FloatArray, shared: FloatArray) -> FloatArray:
+    """Information (P, P) of the mean of both scores, given that of one cut, `h`: between once and twice as much.
+
+    Args:
+        h: information of one cut.
+        own: the part of it that was compared.
+        shared: what the other cut's score shares with that part.
+    """
+    size = _sizes(own)
+    white = _root(own / np.outer(size, size), -0.5)
+    common, turn = np.linalg.eigh(white @ (shared / np.outer(size, size)) @ white)
+    gain = 2.0 / (1.0 + np.clip(common, 0.0, 1.0))
+    size = _sizes(h)
+    root = size[:, None] * (_root(h / np.outer(size, size), 0.5) @ turn)
+    return np.asarray((root * gain) @ root.T)
+
+
+def _sizes(matrix: FloatArray) -> FloatArray:
+    return np.sqrt(np.where(np.diag(matrix) > 0.0, np.diag(matrix), 1.0))
+
+
+def _root(matrix: FloatArray, power: float) -> FloatArray:
+    """Symmetric power of a positive semi-definite matrix."""
+    values, vectors = np.linalg.eigh(matrix)
+    return np.asarray((vectors * np.maximum(values, SINGULAR) ** power) @ vectors.T)
+
+
+# --- What an uncertain mass or arm does to the result
+#
+# Motion shows ratios only.  Scaling mass, b, d, all inertias and J_r by one factor leaves every motion as it is; so
+# does scaling the arm, d, all inertias and J_r.  The logarithms of both factors are nuisance parameters with a known
+# spread; they are marginalised from the Gaussian posterior, so that what is known of one inertia from elsewhere (CAD,
+# a swing test) tightens the others and b as well.
+
+
+def with_scale_uncertainty(
+    vehicle: Vehicle, free: Free, prior: Prior, theta: FloatArray, unc: Uncertainty
+) -> tuple[FloatArray, Uncertainty]:
+    """Posterior of the parameters when mass and arm are known to `Vehicle.mass_sigma` and `Vehicle.arm_sigma` only.
+
+    Args:
+        vehicle: the vehicle file.
+        free: free parameters.
+        prior: their prior.
+        theta: full vector at the posterior's mode for exact mass and arm.
+        unc: its covariance (P, P), scaled parameters.
+
+    Returns:
+        Full vector and covariance; as given where mass and arm are taken for exact.
+    """
+    spread = np.array([vehicle.mass_sigma / vehicle.mass, vehicle.arm_sigma / vehicle.arm])
+    some = spread > 0.0
+    if not some.any():
+        return theta, unc
+    directions = _directions(free, theta)[:, some]
+    p = np.diag(prior.precision)
+    values, vectors = np.linalg.eigh(np.linalg.inv(unc.covariance) - p)
+    h = (vectors * np.maximum(values, 0.0)) @ vectors.T
+    reach = h @ directions
+    left = eliminated(h, reach, directions.T @ reach + np.diag(spread[some] ** -2.0))
+    covariance = np.asarray(np.linalg.inv(left.h + p))
+    start = theta.copy()
+    start[free.index] = prior.mean
+    pull = p @ free.step(theta, start)
+    # At the mode the data pull exactly against the prior; the part of that pull along the scales is worth less now.
+    step = covariance @ (left.gain @ (directions.T @ pull))
+    return free.move(theta, step), replace(unc, covariance=covariance)
+
+
+def _directions(free: Free, theta: FloatArray) -> FloatArray:
+    """How each scaled parameter goes with the logarithm of mass and of arm, shape (P, 2)."""
+    out = np.zeros((len(free.entries), 2))
+    for j, e in enumerate(free.entries):
+        if e.name in NOMINAL_NAMES:
+            out[j] = (1.0, 0.0 if e.name == "b" else 1.0)
+        elif e.unit == "kg m^2":
+            out[j] = theta[e.index] / e.typical
+    return out
