@@ -14,8 +14,8 @@ from quadid.cli.options import Columns, JsonTarget, Preset, Rate, Seed, VehicleN
 from quadid.errors import QuadidError
 
 if TYPE_CHECKING:
-    from quadid_node.publication import Output
-    from quadid_node.recorder import Beginning
+    from quadid_node.messages import Output
+    from quadid_node.recording import Beginning
     from quadid_node.service import Service
 
     from quadid.app.outcome import Advance
@@ -68,7 +68,7 @@ def replay(
     json: JsonTarget = None,
 ) -> None:
     """Drive the online session from a log: the sets, findings and reasons that a live service would have published."""
-    from quadid_node.playback import arrivals, stream
+    from quadid_node.recording import arrivals, stream
     from quadid_node.service import Service
     from quadid_node.settings import session_settings
     from quadid_node.worker import InlineWorker
@@ -120,7 +120,7 @@ def _pace(speed: str) -> float:
 
 def _beginning(log: Path, vehicle: str) -> Beginning:
     """What the session of a node's recording began with; raises ReplayError when there is none, or of another one."""
-    from quadid_node.recorder import read_beginning
+    from quadid_node.recording import read_beginning
 
     found = read_beginning(log)
     if found is None:
@@ -186,7 +186,7 @@ def summary(
     recording: Recording, service: Service, outputs: Sequence[Output], candidates: bool = False
 ) -> dict[str, Any]:
     """The replay as JSON, of the form ``quadid.replay/1``; times [s, UNIX], or since boot in a log that has no more."""
-    from quadid_node.codec import diagnosis_to_dict, set_to_dict, status_to_dict
+    from quadid_node.messages import diagnosis_to_dict, set_to_dict, status_to_dict
 
     sets = [o.item for o in outputs if o.topic == "parameters"]
     estimates = [o.item for o in outputs if o.topic == "candidate"]

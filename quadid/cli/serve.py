@@ -14,8 +14,8 @@ from quadid.cli.replay import parse_pairs
 
 if TYPE_CHECKING:
     from quadid_node.mavlink_link import MavlinkLink
-    from quadid_node.publication import Output
-    from quadid_node.service import Health, Service
+    from quadid_node.messages import Health, Output
+    from quadid_node.service import Service
     from rich.console import Console
 
 SAY_EVERY = 10.0
@@ -63,14 +63,13 @@ def serve(
     json: JsonTarget = None,
 ) -> None:
     """Identify a flying vehicle over MAVLink; publish parameters, findings and health as component 191."""
-    from quadid_node.stopping import Stop
+    from quadid_node.process import Stop
 
     stop = Stop()
     from quadid_node.ground import fit_worker
     from quadid_node.history import Store, default_path
-    from quadid_node.mavlink_link import MavlinkLink
+    from quadid_node.mavlink_link import MavlinkLink, Outlet, run
     from quadid_node.mavlink_wire import memory_path, read_key
-    from quadid_node.serve import Outlet, run
     from quadid_node.service import Service
     from quadid_node.settings import session_settings
     from quadid_node.zenoh import ZenohLink
@@ -144,7 +143,7 @@ class _Console:
 
 def summary(service: Service, link: MavlinkLink, name: str) -> dict[str, Any]:
     """How it ended, of the form ``quadid.serve/1``."""
-    from quadid_node.codec import set_to_dict, status_to_dict
+    from quadid_node.messages import set_to_dict, status_to_dict
 
     health, traffic = service.health(), link.traffic()
     force = service.published

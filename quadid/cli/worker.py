@@ -20,7 +20,7 @@ def worker(
     json: JsonTarget = None,
 ) -> None:
     """Fit windows on this machine for vehicles' services; they fit on board whenever this one is gone."""
-    from quadid_node.stopping import Stop
+    from quadid_node.process import Stop
 
     stop = Stop()
     from quadid_node.ground import work

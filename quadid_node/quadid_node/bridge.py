@@ -31,7 +31,7 @@ from quadid.sanitise import one_line
 from quadid_node import messages
 from quadid_node.inputs import message_class, service_class, to_message
 from quadid_node.messages import PARAMETER_SET, SCHEMA_VERSION, TOPICS
-from quadid_node.transport import without_shared_memory
+from quadid_node.process import without_shared_memory
 
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL, reliability=ReliabilityPolicy.RELIABLE)
 SAME_MASS = 0.02

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import queue
-import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -16,7 +15,7 @@ from quadid.online.records import Job, JobReply, unexpected
 from quadid.vehicle import Vehicle
 from quadid_node.wire_format import LARGEST, ParcelError, content, pack, unpack
 from quadid_node.worker import MEMORY_MB, STUDY_LIMIT, ProcessWorker, Trouble, Worker
-from quadid_node.zenoh import ROOT, config_of, key_of, wait_for_session
+from quadid_node.zenoh import ROOT, LateSession, config_of, key_of, wait_for_session
 
 # --- Fits on a ground machine: takes windows from services over Zenoh and answers with fits (`quadid worker`)
 #
@@ -147,13 +146,11 @@ class Ground:
 
     def __init__(self, where: str, vehicle: str, clock: Callable[[], float] = time.monotonic) -> None:
         """Begins to connect; raises ZenohError for a configuration that is none."""
-        config_of(where)
-        self._where, self._key, self._clock = where, key_of(vehicle, "work/fit"), clock
+        self._key, self._clock = key_of(vehicle, "work/fit"), clock
         self._session: Any = None
         self.alive: set[str] = set()
         self._rests_until = -1e9
-        self._closed, self._lock = threading.Event(), threading.Lock()
-        threading.Thread(target=self._connect, name="ground", daemon=True).start()
+        self._late = LateSession(where, self._declare)
 
     @property
     def there(self) -> bool:
@@ -179,22 +176,12 @@ class Ground:
 
     def close(self) -> None:
         """Leaves."""
-        self._closed.set()
-        with self._lock:
-            if self._session is not None:
-                self._session.close()
-                self._session = None
+        self._late.close()
+        self._session = None
 
-    def _connect(self) -> None:
-        session = wait_for_session(self._where, self._closed.wait, lambda problem: None)
-        if session is None:
-            return
-        with self._lock:
-            if self._closed.is_set():
-                session.close()
-            else:
-                self._watch = session.liveliness().declare_subscriber(ALIVE, self._on_token, history=True)
-                self._session = session
+    def _declare(self, session: Any) -> None:
+        self._watch = session.liveliness().declare_subscriber(ALIVE, self._on_token, history=True)
+        self._session = session
 
     def _on_token(self, sample: Any) -> None:
         name = str(sample.key_expr)

@@ -38,7 +38,7 @@ from quadid.online.records import Event, OnlineDiagnosis, OnlineSet, SetState
 from quadid.parameters import NOMINAL_NAMES, ParameterSet
 from quadid.sanitise import plain
 from quadid.vehicle import Vehicle
-from quadid_node.codec import diagnosis_to_dict, set_from_dict, set_to_dict
+from quadid_node.messages import diagnosis_to_dict, set_from_dict, set_to_dict
 
 # --- The file: its tables, its versions, and what becomes of a damaged one
 

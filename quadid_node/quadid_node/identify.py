@@ -6,8 +6,7 @@ import contextlib
 import importlib
 import sys
 
-from quadid_node.stopping import Stop, end_middleware
-from quadid_node.transport import without_shared_memory
+from quadid_node.process import Stop, end_middleware, without_shared_memory
 
 SPIN_SECONDS = 0.2
 """Longest wait before signals are looked at [s]; the executor of these wheels needs a limit to deliver anything."""

@@ -1,4 +1,4 @@
-"""MAVLink link of the service: requests messages, decodes them, sends results as component 191."""
+"""MAVLink link of the service: requests and decodes messages, sends results as component 191, and serves."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from quadid_replay.mavlink_messages import ESC_GROUPS, PREFERENCE, READERS, Reading, boot_seconds, boot_stamp
 from quadid_replay.message_times import BootClock
@@ -19,7 +19,8 @@ from quadid.data.window import Sample
 from quadid.online.records import OnlineSet
 from quadid_node.inputs import Chooser
 from quadid_node.mavlink_wire import LinkError, Source, Wire, dialect, message_id, sender
-from quadid_node.publication import Output
+from quadid_node.messages import Health, Output
+from quadid_node.service import Service
 
 # --- Which output drives which rotor of a live vehicle: asked of the autopilot, taken over once, never changed in use
 
@@ -604,3 +605,60 @@ class MavlinkLink:
         for k in range(min(len(plain) // _TEXT + 1, 256)):  # the last one is short, be it empty
             piece = plain[k * _TEXT : (k + 1) * _TEXT]
             self._send(dialect.MAVLink_statustext_message(severity, piece, self._text, k))
+
+
+# --- The service without ROS: a MAVLink link in, MAVLink and Zenoh out, until someone says stop
+
+
+IDLE = 0.005
+"""Pause when nothing arrives [s]."""
+WORK_SECONDS = 0.02
+"""No piece of the session's work begins later than this in a step [s]."""
+
+
+class Outlet(Protocol):
+    """Somewhere results go."""
+
+    def publish(self, output: Output) -> None:
+        """Tells a result."""
+
+    def report(self, health: Health) -> None:
+        """Tells once a second how things are."""
+
+    def attend(self) -> None:
+        """Carries out what was asked through it."""
+
+
+def run(
+    service: Service, link: MavlinkLink, outlets: list[Outlet], stop: Callable[[], bool],
+    clock: Callable[[], float] = time.monotonic,
+) -> None:  # fmt: skip
+    """Serves until `stop` says so.
+
+    Args:
+        service: of the vehicle.
+        link: where samples come from and results go.
+        outlets: where results go as well.
+        stop: asked often.
+        clock: seconds, monotonic.
+    """
+    reported = clock()
+    while not stop():
+        busy = False
+        for sample in link.receive():
+            busy = True
+            service.push(sample)
+        for output in service.step(WORK_SECONDS):
+            link.publish(output)
+            for outlet in outlets:
+                outlet.publish(output)
+        link.step()
+        for outlet in outlets:
+            outlet.attend()
+        if clock() - reported >= 1.0:
+            reported = clock()
+            health = service.health()
+            for outlet in outlets:
+                outlet.report(health)
+        if not busy:
+            time.sleep(IDLE)

@@ -1,21 +1,78 @@
-"""What the service publishes, as plain dictionaries with the fields of quadid_msgs: for ROS topics and for MCAP alike.
+"""What the service hands out, for others: messages with the fields of quadid_msgs, and JSON.
 
-Times inside are stamps; `stamps.stamp` turns them into the two integers of builtin_interfaces/Time.
+Messages are plain dictionaries, for ROS topics and for MCAP alike; times inside are stamps.  JSON is what the history
+keeps, Zenoh carries and the commands print.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import Any
+
+import msgspec
+import numpy as np
 
 from quadid.chi_square import Z95
 from quadid.condition.changes import Change
 from quadid.condition.watch import HealthReport
-from quadid.online.records import OnlineDiagnosis, OnlineFinding, OnlineSet, Phase, SessionStatus, SetState
+from quadid.jsonable import jsonable
+from quadid.online.records import (
+    Event,
+    HealthyFlight,
+    OnlineDiagnosis,
+    OnlineFinding,
+    OnlineSet,
+    Phase,
+    Publish,
+    SessionStatus,
+    SetState,
+)
 from quadid.parameters import NOMINAL_NAMES
 from quadid_node.inputs import stamp
-from quadid_node.service import SILENT_ERROR, SILENT_WARNING, Health, lag
+
+Output = Publish | OnlineDiagnosis | HealthReport | HealthyFlight | Event
+"""What a service hands out; its `topic` says which it is, and is what the tables of the links are keyed by."""
+SILENT_WARNING, SILENT_ERROR = 1.0, 5.0
+"""A channel that was there and is silent for this long [s] is worth a warning, an error."""
+BEHIND = 2.0
+"""From this far behind the data [s] on people are told, at every doubling."""
+
+
+def lag(seconds: float) -> str:
+    """Message about a session that is so far behind its data [s]; empty where it is not."""
+    if seconds < BEHIND:
+        return ""
+    return f"{seconds:.0f} s behind the data, the machine is too slow: fits are left out, changes come first"
+
+
+@dataclass(frozen=True)
+class Feed:
+    """How one channel arrives.
+
+    Attributes:
+        rate: samples a second over the last two seconds [Hz].
+        silence: since its last sample, up to when the service looked for samples last [s].
+    """
+
+    rate: float
+    silence: float
+
+
+@dataclass(frozen=True)
+class Health:
+    """Snapshot for monitoring: session, channels, worker, history, how long the last fit took [s]."""
+
+    status: SessionStatus
+    feeds: dict[str, Feed]
+    worker: str
+    restarts: int
+    history: str
+    fit_seconds: float
+
+
+# --- Messages
 
 Message = dict[str, Any]
 
@@ -106,25 +163,36 @@ def diagnosis(item: OnlineDiagnosis, vehicle: str) -> Message:
     }
 
 
-def _finding(finding: OnlineFinding) -> Message:
-    values = finding.values
-    half = {n: Z95 * finding.sigma.get(n, math.nan) for n in values}
+def _finding(found: OnlineFinding | Change) -> Message:
+    """quadid_msgs/Finding; what belongs to fits is NaN for a change since healthy flights."""
+    nan = math.nan
+    if isinstance(found, Change):
+        rows = [(name, unit, value, ci or (value, value)) for name, unit, value, ci in found.parameters]
+        before, after, rivals = nan, nan, [(rival.effects[0], nan) for rival in found.rivals]
+    else:
+        rows = [(n, found.units.get(n), v, interval(v, found.sigma.get(n, nan))) for n, v in found.values.items()]
+        before, after, rivals = found.mse_before, found.mse_after, [(a.effect, a.mse_after) for a in found.alternatives]
     return {
-        "effect": finding.effect,
-        "confident": finding.confident,
-        "parameter_names": list(values),
-        "parameter_units": [finding.units.get(n) or "1" for n in values],
-        "parameter_values": list(values.values()),
-        "ci95_lower": [v - half[n] for n, v in values.items()],
-        "ci95_upper": [v + half[n] for n, v in values.items()],
-        "mse_before": finding.mse_before,
-        "mse_after": finding.mse_after,
-        "gain_ci95": [math.nan, math.nan],
-        "p_value": finding.p_value,
-        "alternatives": [a.effect for a in finding.alternatives],
-        "alternatives_mse": [a.mse_after for a in finding.alternatives],
-        "evidence": finding.evidence,
+        "effect": found.effect,
+        "confident": found.confident,
+        "parameter_names": [name for name, *_ in rows],
+        "parameter_units": [unit or "1" for _, unit, *_ in rows],
+        "parameter_values": [float(value) for _, _, value, _ in rows],
+        "ci95_lower": [low for *_, (low, _) in rows],
+        "ci95_upper": [high for *_, (_, high) in rows],
+        "mse_before": before,
+        "mse_after": after,
+        "gain_ci95": [nan, nan],
+        "p_value": found.p_value,
+        "alternatives": [effect for effect, _ in rivals],
+        "alternatives_mse": [mse for _, mse in rivals],
+        "evidence": found.evidence,
     }
+
+
+def interval(value: float, sigma: float) -> tuple[float, float]:
+    """95 % interval of a value with a standard deviation."""
+    return value - Z95 * sigma, value + Z95 * sigma
 
 
 def health_message(report: HealthReport, vehicle: str) -> Message:
@@ -140,27 +208,8 @@ def health_message(report: HealthReport, vehicle: str) -> Message:
         "rotor_loss_lower": [low for low, _ in report.rotor_interval],
         "rotor_loss_upper": [high for _, high in report.rotor_interval],
         "mass": mass, "mass_lower": low, "mass_upper": high,
-        "changes": [_change(change) for change in report.changes],
+        "changes": [_finding(change) for change in report.changes],
         "text": report.text,
-    }  # fmt: skip
-
-
-def _change(change: Change) -> Message:
-    """quadid_msgs/Finding of a change; what belongs to fits is NaN."""
-    intervals = [ci or (value, value) for _, _, value, ci in change.parameters]
-    return {
-        "effect": change.effect,
-        "confident": change.confident,
-        "parameter_names": [name for name, *_ in change.parameters],
-        "parameter_units": [unit or "1" for _, unit, *_ in change.parameters],
-        "parameter_values": [float(value) for _, _, value, _ in change.parameters],
-        "ci95_lower": [low for low, _ in intervals],
-        "ci95_upper": [high for _, high in intervals],
-        "mse_before": math.nan, "mse_after": math.nan, "gain_ci95": [math.nan, math.nan],
-        "p_value": change.p_value,
-        "alternatives": [rival.effects[0] for rival in change.rivals],
-        "alternatives_mse": [math.nan] * len(change.rivals),
-        "evidence": change.evidence,
     }  # fmt: skip
 
 
@@ -233,25 +282,18 @@ def diagnostics(
     worker = entry(name, "worker", hardware, worker_level, health.worker, {"restarts": health.restarts})
     history_level = OK if health.history in ("", "none kept") else ERROR
     history = entry(name, "history", hardware, history_level, health.history or "written", {})
-    entries = [session, _inputs(health, name, hardware, notes, hints), worker, history]
-    return {"header": {"stamp": now, "frame_id": ""}, "status": entries}
-
-
-def _inputs(health: Health, name: str, hardware: str, notes: dict[str, str], hints: dict[str, str]) -> Message:
-    level, message = OK, "data arrive"
-    worst = max(health.feeds.items(), key=lambda item: item[1].silence, default=None)
-    if worst is None:
-        level, message = WARN, "nothing arrives yet"
-    elif worst[1].silence > SILENT_WARNING:
-        level = ERROR if worst[1].silence > SILENT_ERROR else WARN
-        message = f"{worst[0]} is silent for {worst[1].silence:.0f} s"
-    troubles = [f"{topic}: {why}" for topic, why in [*notes.items(), *hints.items()]]
-    if troubles:
-        message = "; ".join(troubles if level == OK else [message, *troubles])
+    worst, silence = max(((n, feed.silence) for n, feed in health.feeds.items()), key=lambda f: f[1], default=("", 0.0))
+    level, arrive = (OK, "data arrive") if health.feeds else (WARN, "nothing arrives yet")
+    if silence > SILENT_WARNING:
+        level, arrive = ERROR if silence > SILENT_ERROR else WARN, f"{worst} is silent for {silence:.0f} s"
+    if troubles := [f"{topic}: {why}" for topic, why in [*notes.items(), *hints.items()]]:
+        arrive = "; ".join(troubles if level == OK else [arrive, *troubles])
         level = ERROR if notes else max(level, WARN)
-    values: dict[str, Any] = {f"{k} [Hz]": f"{feed.rate:.1f}" for k, feed in health.feeds.items()}
-    values |= {f"dropped: {reason}": count for reason, count in health.status.faults.items()}
-    return entry(name, "inputs", hardware, level, message, values)
+    inputs = entry(name, "inputs", hardware, level, arrive, {
+        **{f"{k} [Hz]": f"{feed.rate:.1f}" for k, feed in health.feeds.items()},
+        **{f"dropped: {reason}": count for reason, count in status.faults.items()},
+    })  # fmt: skip
+    return {"header": {"stamp": now, "frame_id": ""}, "status": [session, inputs, worker, history]}
 
 
 def entry(name: str, part: str, hardware: str, level: bytes, message: str, values: dict[str, Any]) -> Message:
@@ -261,3 +303,85 @@ def entry(name: str, part: str, hardware: str, level: bytes, message: str, value
         "level": level, "name": f"{name.lstrip('/')}: {part}", "message": message, "hardware_id": hardware,
         "values": pairs,
     }  # fmt: skip
+
+
+# --- JSON
+
+
+def set_to_dict(item: OnlineSet, covariance: bool = True) -> dict[str, Any]:
+    """A set; times are stamps [s], parameters as in `quadid identify`'s JSON, with standard deviation and bounds."""
+    parameters = [
+        {
+            "name": p.name, "unit": p.unit, "value": p.value, "sigma": p.sigma, "ci95": p.ci95, "initial": p.initial,
+            "bounds": p.bounds, "status": p.status, **({"relative_to": p.relative_to} if p.relative_to else {}),
+        }
+        for p in item.parameters
+    ]  # fmt: skip
+    data: dict[str, Any] = jsonable({
+        **vars(item), "parameters": parameters, **({"covariance": item.parameters.covariance} if covariance else {}),
+    })  # fmt: skip
+    return data
+
+
+def set_from_dict(data: Mapping[str, Any]) -> OnlineSet:
+    """The set of `set_to_dict`, by the types of the records.
+
+    Raises:
+        ValueError, LookupError or TypeError: what is none, or fits into no message: text that UTF-8 has not (it ends
+            whoever sends it), samples beyond 32 bits, times whose seconds are.
+    """
+    msgspec.json.encode(data)  # raises for such text
+    found = _with_nan(data)
+    parameters = found["parameters"]
+    covariance = data.get("covariance") or np.diag([p["sigma"] ** 2 for p in parameters])
+    found["parameters"] = {"parameters": parameters, "covariance": covariance}
+    made: OnlineSet = msgspec.convert(found, OnlineSet, dec_hook=lambda _, rows: np.array(rows, dtype=np.float64))
+    if not 0 <= made.samples < 1 << 32 or any(abs(t) >= 1 << 31 for t in (made.start, made.stop)):
+        raise ValueError(f"a set of {made.samples} samples from {made.start:g} to {made.stop:g} s")
+    return made
+
+
+def diagnosis_to_dict(item: OnlineDiagnosis) -> dict[str, Any]:
+    """A diagnosis; times are stamps [s], findings as in `quadid diagnose`'s JSON."""
+    nan = math.nan
+    findings = [
+        {
+            "effect": found.effect, "confident": found.confident,
+            "parameters": [
+                {"name": n, "unit": found.units.get(n, ""), "value": v, "ci95": interval(v, found.sigma.get(n, nan))}
+                for n, v in found.values.items()
+            ],
+            "gain": {"mse_before": found.mse_before, "mse_after": found.mse_after},
+            "p_value": found.p_value, "evidence": found.evidence, "alternatives": [vars(a) for a in found.alternatives],
+        }
+        for found in item.findings
+    ]  # fmt: skip
+    data: dict[str, Any] = jsonable({**vars(item), "findings": findings})
+    return data
+
+
+def health_to_dict(report: HealthReport) -> dict[str, Any]:
+    """A report as JSON: ``quadid.health/1`` as far as a flight in progress has it, with the loss of every rotor."""
+    data: dict[str, Any] = jsonable({
+        "schema": "quadid.health/1", "t": report.t, "verdict": report.verdict, "has_baseline": report.has_baseline,
+        "changes": [change.to_dict() for change in report.changes],
+        "score": report.score, "rotor_loss": report.rotor_loss, "rotor_interval": report.rotor_interval,
+        "mass": report.mass, "text": report.text,
+    })  # fmt: skip
+    return data
+
+
+def status_to_dict(status: SessionStatus) -> dict[str, Any]:
+    """What a session is doing."""
+    excitation = dict(zip(NOMINAL_NAMES, status.excitation.tolist(), strict=True))
+    data: dict[str, Any] = jsonable({**vars(status), "phase": status.phase.name.lower(), "excitation": excitation})
+    return data
+
+
+def _with_nan(value: Any) -> Any:
+    """Data of JSON with NaN for null."""
+    if isinstance(value, Mapping):
+        return {name: _with_nan(inner) for name, inner in value.items()}
+    if isinstance(value, list):
+        return [_with_nan(inner) for inner in value]
+    return math.nan if value is None else value

@@ -6,6 +6,7 @@ Callbacks convert, call and publish; everything else is in `service` and in the 
 from __future__ import annotations
 
 import gc
+import math
 import time
 import traceback
 from collections.abc import Callable, Iterator
@@ -16,35 +17,37 @@ from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock as RosClock
 from rclpy.clock_type import ClockType
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import HistoryPolicy, QoSCompatibility, QoSProfile, ReliabilityPolicy, qos_check_compatible
+from rclpy.subscription import Subscription
 
 from quadid.app.logs import load_vehicle
 from quadid.errors import QuadidError
 from quadid.online import Publish
+from quadid.online.active_set import Answer
 from quadid.sanitise import one_line
 from quadid.vehicle import Vehicle
 from quadid_node import messages
-from quadid_node.bond import Bond, bond_of
-from quadid_node.commands import Commands
 from quadid_node.ground import fit_worker
 from quadid_node.history import Store, default_path
-from quadid_node.inputs import DEPTH, Chooser, Decoder, Intake, Source, best_ranks, deserializer, message_class, source
-from quadid_node.node_parameters import (
-    PARAMETERS,
-    READ_BACK,
-    as_declared,
-    check_change,
-    descriptor,
-    read_settings,
-    vehicle_id,
-)
-from quadid_node.polling import PollingNode
-from quadid_node.publication import Output
-from quadid_node.publish import GraphMonitor, Offer, Publishers
-from quadid_node.recorder import WRITTEN, Beginning, Recorder
-from quadid_node.rounds import ROUND_SECONDS, STEP_SECONDS, WORK_SECONDS, Scheduler
-from quadid_node.service import Service
+from quadid_node.inputs import (
+    DEPTH,
+    Chooser,
+    Decoder,
+    Intake,
+    Source,
+    best_ranks,
+    deserializer,
+    message_class,
+    service_class,
+    source,
+    to_message,
+)  # fmt: skip
+from quadid_node.publish import NO_SUBSCRIPTION_EVENTS, Bond, GraphMonitor, Offer, Publishers, bond_of
+from quadid_node.recording import WRITTEN, Beginning, Recorder
+from quadid_node.service import ROUND_SECONDS, STEP_SECONDS, WORK_SECONDS, Scheduler, Service
+from quadid_node.settings import PARAMETERS, READ_BACK, as_declared, check_change, descriptor, read_settings, vehicle_id
 from quadid_node.zenoh import ZenohLink
 
 CATCHING_UP, BACKLOG = 10.0, 2.0
@@ -53,6 +56,9 @@ REPORT_SECONDS = 1.0
 """Status and health are told this often [s]."""
 TOLD_SECONDS = 5.0
 """So often [s] `configure` logs that it waits for the fit process."""
+MOST_SETS = 100
+"""Sets that one answer of `get_history` holds at most."""
+INACTIVE = "the node is not active; fix: activate it (ros2 lifecycle set)"
 SENSOR_QOS = QoSProfile(depth=DEPTH, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.BEST_EFFORT)
 Return = TransitionCallbackReturn
 IDLE = {
@@ -62,6 +68,64 @@ IDLE = {
     "finalized": "shut down for good; next: start the process again",
 }
 """Messages of a node that is not active, by its state."""
+
+
+class PollingNode(Node):
+    """Takes the messages of some topics when it wants them, instead of being woken for each.
+
+    Polled subscriptions are kept from the executor; all others it serves as ever.
+    """
+
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        """As the class that follows."""
+        self._polled: list[Subscription[Any]] = []
+        self._broken_at: dict[str, float] = {}
+        super().__init__(*arguments, **options)
+
+    @property
+    def subscriptions(self) -> Iterator[Subscription[Any]]:
+        """What the executor waits for."""
+        return (s for s in super().subscriptions if s not in self._polled)
+
+    def poll(self, kind: Any, topic: str, qos: Any) -> Callable[[], bytes | None]:
+        """Subscribes to a topic; returns what gives its next serialized message that waits, None when there is none."""
+        subscription = self.create_subscription(
+            kind, topic, lambda message: None, qos, raw=True, event_callbacks=NO_SUBSCRIPTION_EVENTS
+        )
+        self._polled.append(subscription)
+        handle, name, last = subscription.handle, subscription.topic_name, None
+
+        def take() -> bytes | None:
+            nonlocal last
+            with handle:
+                taken = handle.take_message(kind, True)
+            if taken is None:
+                return None
+            number = taken[1]["publication_sequence_number"]
+            if number is None or last is None or number != last + 1:
+                self._broken_at[name] = time.monotonic()
+            last = number
+            return bytes(taken[0])
+
+        return take
+
+    def unbroken(self, topic: str) -> float:
+        """For how long [s] the messages of a polled topic have been one publisher's, each numbered one above the last.
+
+        Publishers number their own messages, so two that are heard break each other's row; so does a loss.
+        """
+        return time.monotonic() - self._broken_at.get(topic, -math.inf)
+
+    def publisher_counts(self) -> dict[str, int]:
+        """How many publishers send to each polled topic now; one is counted before its first message can be taken."""
+        return {s.topic_name: s.get_publisher_count() for s in self._polled}
+
+    def destroy_polled(self) -> None:
+        """Ends all polled subscriptions."""
+        for subscription in self._polled:
+            self.destroy_subscription(subscription)
+        self._polled.clear()
+        self._broken_at.clear()
 
 
 class IdentifyNode(PollingNode, LifecycleNode):
@@ -86,7 +150,7 @@ class IdentifyNode(PollingNode, LifecycleNode):
         self._intake = Intake()
         self._bond: Bond | None = None
         self._zenoh: ZenohLink | None = None
-        self._open: list[tuple[Callable[[Any], Any], Any]] = []
+        self._offered: list[Any] = []
         self._outputs = Publishers(self)
         self._change_state = self._service_change_state.callback
         self._service_change_state.callback = self._on_change_state
@@ -189,9 +253,15 @@ class IdentifyNode(PollingNode, LifecycleNode):
         if values["zenoh"]:
             self._zenoh = ZenohLink(values["zenoh"], self._id, self._service)
         self._outputs.open(self._observer)
-        commands = Commands(self._id, lambda: self._service if self._active else None, self._put)
-        for name, kind, answer in commands.offered():
-            self._open.append((self.destroy_service, self.create_service(kind, f"quadid/{name}", answer)))
+        by, trigger = "ros service", service_class("std_srvs/Trigger")
+        for name, kind, answer in (
+            ("fit_now", trigger, self._command(lambda service, _: service.session.fit_now())),
+            ("rollback", trigger, self._command(lambda service, _: service.roll_back(by))),
+            ("approve", service_class("quadid_msgs/Approve"),
+             self._command(lambda service, request: service.approve(by, request.sequence))),
+            ("get_history", service_class("quadid_msgs/GetHistory"), self._on_get_history),
+        ):  # fmt: skip
+            self._offered.append(self.create_service(kind, f"quadid/{name}", answer))
         self._warm_up(self._service, values["warm_up"])
         history = str(store.path) if store is not None else "none"
         self._read_back({**values, "vehicle_id": self._id, "history": history, "approval": self._service.approval})
@@ -250,9 +320,8 @@ class IdentifyNode(PollingNode, LifecycleNode):
         self._scheduler.drop()
         self._intake.clear()
         self.destroy_polled()
-        for destroy, item in reversed(self._open):
-            destroy(item)
-        self._open.clear()
+        while self._offered:
+            self.destroy_service(self._offered.pop())
         self._outputs.close()
         if self._zenoh is not None:
             self._zenoh.close()
@@ -274,41 +343,31 @@ class IdentifyNode(PollingNode, LifecycleNode):
 
     def _round(self) -> Iterator[None]:
         """All there is to do again and again: take in what has arrived, write it down, report, work on it."""
-        if self._service is not None:
-            yield from self._take_in(self._service)
-        while self._recorder is not None and self._recorder.write(WRITTEN):
+        service, graph, recorder = self._service, self._graph, self._recorder
+        # What has arrived since the last round, topic by topic; while two publish an input it is forgotten.
+        waiting = self._intake.take()
+        for topic, publishers in self.publisher_counts().items() if graph is not None else ():
+            graph.count(topic, publishers)
+        yield
+        if service is not None and graph is not None and self._active and not graph.paused:
+            for items in self._intake.read(waiting, recorder.take if recorder is not None else None):
+                for item in items:
+                    service.push(item)
+                yield
+                if not self._active:
+                    break
+        while recorder is not None and recorder.write(WRITTEN):
             yield
         self._report_if_due()
         yield
-        if self._service is not None:
-            yield from self._work(self._service)
-
-    def _take_in(self, service: Service) -> Iterator[None]:
-        """Gives the service what has arrived since the last round, topic by topic."""
-        waiting, graph = self._intake.take(), self._graph
-        if graph is None:
-            return
-        for topic, publishers in self.publisher_counts().items():
-            graph.count(topic, publishers)
-        yield
-        if not self._active or graph.paused:
-            return
-        for items in self._intake.read(waiting, self._recorder.take if self._recorder is not None else None):
-            for item in items:
-                service.push(item)
-            yield
-            if not self._active:
-                return
-
-    def _work(self, service: Service) -> Iterator[None]:
-        """Works on what was taken in, until that is done or the round lasts too long."""
-        for outputs in service.pieces() if self._active else [service.idle()]:
+        # Work on it, until that is done or the round lasts too long.
+        for outputs in () if service is None else service.pieces() if self._active else [service.idle()]:
             self._put(outputs)
             yield
             if self._scheduler.overdue or not self._active:
                 return
 
-    def _put(self, outputs: list[Output]) -> None:
+    def _put(self, outputs: list[messages.Output]) -> None:
         """Publishes what the service hands out, and tells its events."""
         for output in outputs:
             if output.topic == "event":
@@ -378,6 +437,37 @@ class IdentifyNode(PollingNode, LifecycleNode):
         hints = self._intake.troubles()
         report = messages.diagnostics(health, name, self._id, self._now(), notes, hints, idle, self._problem)
         self._send("diagnostics", report)
+
+    def _command(self, do: Callable[[Service, Any], Answer]) -> Callable[[Any, Any], Any]:
+        """A callback of a ROS service that carries out what a person asks of the service."""
+
+        def carry_out(request: Any, response: Any) -> Any:
+            service = self._service if self._active else None
+            if service is None:
+                response.success, response.message = False, INACTIVE
+                return response
+            answer = do(service, request)
+            response.success, response.message = answer.done, answer.text
+            self._put(service.step(WORK_SECONDS))
+            if hasattr(response, "in_force"):
+                response.in_force = service.session.status().in_force
+            return response
+
+        return carry_out
+
+    def _on_get_history(self, request: Any, response: Any) -> Any:
+        if self._service is None or not self._active:
+            response.message = INACTIVE
+            return response
+        try:
+            found = self._service.stored_sets(min(request.most or MOST_SETS, MOST_SETS))
+        except QuadidError as error:
+            response.message = str(error)
+            return response
+        response.sets = [to_message(messages.PARAMETER_SET, fields) for fields in found]
+        response.success = True
+        response.message = f"the newest {len(found)} sets of {self.get_parameter('history').value}"
+        return response
 
     def _on_set(self, changes: list[Any]) -> SetParametersResult:
         if self._service is None or self._reads_back:

@@ -1,15 +1,20 @@
-"""Publication over ROS: publishers, ownership of topics, and other nodes of the graph."""
+"""Publication over ROS: publishers, ownership of topics, other nodes of the graph, and the bond."""
 
 from __future__ import annotations
 
 import math
 import random
 import time
+import uuid
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
 from rclpy.duration import Duration, Infinite
+from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.lifecycle import LifecycleNode
+from rclpy.node import Node
 from rclpy.qos import (
     DurabilityPolicy,
     LivelinessPolicy,
@@ -20,9 +25,13 @@ from rclpy.qos import (
 )
 
 from quadid.sanitise import plain
-from quadid_node.inputs import message_class, to_message
+from quadid_node.inputs import MessageTypeError, message_class, to_message
 from quadid_node.messages import TOPICS, Message
-from quadid_node.polling import NO_PUBLISHER_EVENTS
+
+# An event that the events executor watches outlives its topic's end, and takes the process down with it
+# (ros2/rclpy issue 1644); rclpy asks for some by default.  What they would tell is looked for in the graph instead.
+NO_SUBSCRIPTION_EVENTS = SubscriptionEventCallbacks(use_default_callbacks=False)
+NO_PUBLISHER_EVENTS = PublisherEventCallbacks(use_default_callbacks=False)
 
 # --- The right to publish the parameter sets of one vehicle: who comes second observes until the first is gone
 
@@ -297,3 +306,59 @@ class GraphMonitor:
         for topic, found in deaf.items():
             why = "asks for a QoS that is not offered here, and receives nothing" if found else ""
             self.note(f"{topic}, its subscriber", why)
+
+
+# --- Bond with a lifecycle manager (nav2): heartbeats on the topic `bond` from activation to deactivation
+
+
+TOPIC, TYPE = "bond", "bond/Status"
+PERIOD, TIMEOUT = 0.25, 4.0
+"""Between two heartbeats, and after which the other side takes this one for dead [s]: as nav2's own nodes have them."""
+GOODBYE = 1.0
+"""The end of the bond waits so long to be received [s]; then the other side's timeout tells it."""
+
+
+class Bond:
+    """This side of one bond, named like the node, by the protocol of bondcpp.
+
+    The node does nothing when the manager's side breaks: it acknowledges, and goes on as it is.
+    """
+
+    def __init__(self, node: Node) -> None:
+        """Begins to send heartbeats; raises MessageTypeError where the package `bond` is not installed."""
+        self._node, self._kind, self._me = node, message_class(TYPE), uuid.uuid4().hex
+        self._publisher = node.create_publisher(self._kind, TOPIC, 5, event_callbacks=NO_PUBLISHER_EVENTS)
+        self._subscription = node.create_subscription(
+            self._kind, TOPIC, self._hear, 100, event_callbacks=NO_SUBSCRIPTION_EVENTS
+        )
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._timer = node.create_timer(PERIOD, lambda: self._say(True), clock=steady)
+
+    def _say(self, active: bool) -> None:
+        status = self._kind(id=self._node.get_name(), instance_id=self._me, active=active)
+        status.header.stamp = self._node.get_clock().now().to_msg()
+        status.heartbeat_period, status.heartbeat_timeout = PERIOD, TIMEOUT
+        self._publisher.publish(status)
+
+    def _hear(self, status: Any) -> None:
+        ours = status.id == self._node.get_name() and status.instance_id != self._me
+        if ours and not status.active and not self._timer.is_canceled():
+            self._timer.cancel()
+            self._say(False)
+
+    def close(self) -> None:
+        """Breaks the bond: the other side is told."""
+        self._timer.cancel()
+        self._say(False)
+        self._publisher.wait_for_all_acked(Duration(seconds=GOODBYE))
+        self._node.destroy_timer(self._timer)
+        self._node.destroy_subscription(self._subscription)
+        self._node.destroy_publisher(self._publisher)
+
+
+def bond_of(node: Node) -> Bond | None:
+    """A bond, where the package `bond` is installed; None elsewhere: then the manager needs `bond_timeout: 0.0`."""
+    try:
+        return Bond(node)
+    except MessageTypeError:
+        return None

@@ -9,61 +9,84 @@ import math
 import time
 import uuid
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import replace
 
 from quadid.data.window import Block, Sample
 from quadid.online import Job, Session, SessionSettings
 from quadid.online.active_set import Answer
-from quadid.online.records import Action, Event, OnlineSet, SessionStatus, SetState
+from quadid.online.records import (
+    Action,
+    Event,
+    OnlineSet,
+    Publish,
+    SetState,
+)
 from quadid.vehicle import Vehicle
-from quadid_node.failures import keep
-from quadid_node.history import Restored, Store
-from quadid_node.publication import Output, Publication
+from quadid_node.history import UNREADABLE, Restored, Store, StoreError, read_history
+from quadid_node.messages import BEHIND, Feed, Health, Message, Output, lag, parameter_set, set_from_dict
+from quadid_node.wire_format import keep
 from quadid_node.worker import Trouble, Worker
 
-SILENT_WARNING, SILENT_ERROR = 1.0, 5.0
-"""A channel that was there and is silent for this long [s] is worth a warning, an error."""
+# --- On the disk before on the wire: numbered sets, and what is said of them, wait until their row is committed
+
+
+OF_SETS = ("accepted", "rollback")
+"""Kinds of events that say which set is in force."""
+MOST_WAITING = 64
+"""Outputs that wait for the disk; beyond, the oldest are never published, but the newest set in force always is."""
+
+
+class Publication:
+    """Hands outputs out, in order, once they may be published.
+
+    Attributes:
+        in_force: the set that was handed out last for the parameter topic; None before the first.
+    """
+
+    def __init__(self, store: Store | None) -> None:
+        """Asks `store` which sets are on the disk; without one nothing waits."""
+        self._store = store
+        self._waiting: list[Output] = []
+        self.in_force: OnlineSet | None = None
+
+    def take(self, outputs: list[Output]) -> list[Output]:
+        """Takes further outputs; returns those that may be published now."""
+        free = list[Output]()
+        for output in outputs:
+            waits = isinstance(output, Publish) and output.item.sequence > 0
+            waits |= output.topic == "event" and output.kind in OF_SETS and bool(self._waiting)
+            (self._waiting if waits and self._store is not None else free).append(output)
+        out = [*self._released(), *free]
+        while len(self._waiting) > MOST_WAITING:  # the oldest but the newest set in force
+            newest = next((o for o in reversed(self._waiting) if o.topic == "parameters"), None)
+            self._waiting.remove(next(o for o in self._waiting if o is not newest))
+        for output in out:
+            if output.topic == "parameters":
+                self.in_force = output.item
+        return out
+
+    def _released(self) -> list[Output]:
+        """What waits up to the first set that is not on the disk yet; one that never will be holds up no other."""
+        store, out = self._store, list[Output]()
+        while store is not None and self._waiting:
+            output = self._waiting[0]
+            if not isinstance(output, Publish) or output.item.sequence in store.written:
+                out.append(output)
+            elif output.item.sequence not in store.lost:
+                break
+            del self._waiting[0]
+        return out
+
+
+# --- The service of one vehicle
+
+
 DECISION_SECONDS = 2.0
 """How long a person's decision waits to be on the disk before it is answered [s]."""
 PATIENCE = 1.0
-"""A session this far behind its data [s] waits no longer for a fit that takes as long, and begins no other,"""
-BEHIND = 2.0
-"""... and from here on people are told, at every doubling."""
+"""A session this far behind its data [s] waits no longer for a fit that takes as long, and begins no other."""
 RATE_MEMORY = 2.0
 """Time over which data rates are measured [s]."""
-
-
-def lag(seconds: float) -> str:
-    """Message about a session that is so far behind its data [s]; empty where it is not."""
-    if seconds < BEHIND:
-        return ""
-    return f"{seconds:.0f} s behind the data, the machine is too slow: fits are left out, changes come first"
-
-
-@dataclass(frozen=True)
-class Feed:
-    """How one channel arrives.
-
-    Attributes:
-        rate: samples a second over the last two seconds [Hz].
-        silence: since its last sample, up to when the service looked for samples last [s].
-    """
-
-    rate: float
-    silence: float
-
-
-@dataclass(frozen=True)
-class Health:
-    """Everything a monitor wants: session, channels, worker, history, how long the last fit took [s]."""
-
-    status: SessionStatus
-    feeds: dict[str, Feed]
-    worker: str
-    restarts: int
-    history: str
-    fit_seconds: float
 
 
 class Service:
@@ -129,11 +152,6 @@ class Service:
         return self.session.active_set.approval
 
     @property
-    def history(self) -> Path | None:
-        """File of the history; None: none is kept."""
-        return self._store.path if self._store is not None else None
-
-    @property
     def ready(self) -> bool:
         """Whether fits can begin at once."""
         return self._worker.ready
@@ -194,20 +212,28 @@ class Service:
         return self._journalled(self._tidy())
 
     def _tidy(self) -> list[Output]:
-        outputs: list[Output] = self._history_notes()
+        outputs = list[Output]()
+        if self._store is not None:  # a damaged history set aside, a row refused
+            notes = self._store.notes[self._noted :]
+            self._noted += len(notes)
+            outputs += [self._event("error", "history", note) for note in notes]
         studied = self._studying.poll() if self._studying is not None else []
         for item in (*self._worker.poll(), *studied):
             if isinstance(item, Trouble):
-                outputs.append(self._trouble(item))
+                outputs.append(self._event(item.level, "worker", item.text))
                 continue
             if self.session.running is not None and item.number == self.session.running.number:
                 self._fit_seconds = self._clock() - self._fit_began
             job = next((job for job in self._jobs.values() if job.number == item.number), None)
             if item.is_unexpected and job is not None:
                 kept = keep(self._store.path, job) if self._store is not None else "without a history nothing is kept"
-                outputs.append(self._trouble(Trouble("error", f"{item.problem}; {kept}")))
+                outputs.append(self._event("error", "worker", f"{item.problem}; {kept}"))
             self.session.deliver(item)
-        return [*outputs, *self._history_trouble()]
+        if self._store is not None and self._store.problem != self._problem:
+            self._problem = self._store.problem
+            level = "error" if self._problem else "info"
+            outputs.append(self._event(level, "history", self._problem or "the history is written again"))
+        return outputs
 
     def _keep_up(self) -> list[Event]:
         """Lets a live session that is behind its data shed work, and tells so; a replay waits for every fit."""
@@ -221,10 +247,10 @@ class Service:
             session.go_on()
         if behind >= self._tell_at:
             self._tell_at = 2.0 * behind
-            return [Event(session.status().t, "warning", "behind", lag(behind))]
+            return [self._event("warning", "behind", lag(behind))]
         if behind < PATIENCE and self._tell_at > BEHIND:
             self._tell_at = BEHIND
-            return [Event(session.status().t, "info", "behind", "caught up with the data")]
+            return [self._event("info", "behind", "caught up with the data")]
         return []
 
     def _journalled(self, outputs: list[Output]) -> list[Output]:
@@ -234,8 +260,17 @@ class Service:
             self._approval = approval
             if self._store is not None:
                 self._store.decision(self._configured, approval)
-        for output in outputs:
-            self._journal(output)
+        for output in outputs if self._store is not None else ():
+            if output.topic == "event":
+                self._store.event(output)
+            elif output.topic == "diagnosis":
+                self._store.diagnosis(output)
+            elif output.topic == "healthy_flight":
+                self._store.healthy_flight(output.trim)
+            elif output.topic == "candidate":
+                self._store.candidate(output.item)
+            if output.topic == "parameters" or (output.topic == "candidate" and output.item.state is SetState.PENDING):
+                self._store.numbered(output.item)
         decided, self._decided = self._decided, []
         return [*decided, *self._publication.take(outputs)]
 
@@ -262,8 +297,19 @@ class Service:
         text = f"{answer.text}; NOT on the disk, and published only when it is: {self._store.problem or 'slow disk'}"
         return replace(answer, text=text)
 
+    def stored_sets(self, most: int) -> list[Message]:
+        """The newest sets of the history as quadid_msgs/ParameterSet; raises StoreError where there is none to read."""
+        if self._store is None:
+            raise StoreError("no history is kept: history:=none, or an observer")
+        path, name = self._store.path, self._store.vehicle
+        try:
+            rows = read_history(path, name, sets=most)["sets"]
+            return [parameter_set(set_from_dict(row), name, str(row.get("boot_id", ""))) for row in rows]
+        except UNREADABLE as error:
+            raise StoreError(f"the history {path} cannot be read ({error})") from error
+
     def health(self) -> Health:
-        """What a monitor wants to know."""
+        """Snapshot for monitoring."""
         now = self._clock()
         feeds = {name: Feed(self._rate(name, now), max(self._looked - at, 0.0)) for name, at in self._arrived.items()}
         restarts = getattr(self._worker, "restarts", 0)
@@ -286,33 +332,64 @@ class Service:
             self._counted[name] = (now, count)
         return self._rates.get(name, 0.0)
 
-    def _trouble(self, item: Trouble) -> Event:
-        return Event(self.session.status().t, item.level, "worker", item.text)
+    def _event(self, level: str, kind: str, text: str) -> Event:
+        return Event(self.session.status().t, level, kind, text)
 
-    def _history_notes(self) -> list[Output]:
-        """What the history has told since the last call: a damaged one set aside."""
-        notes = self._store.notes[self._noted :] if self._store is not None else []
-        self._noted += len(notes)
-        return [Event(self.session.status().t, "error", "history", note) for note in notes]
 
-    def _history_trouble(self) -> list[Event]:
-        problem = self._store.problem if self._store is not None else ""
-        if problem == self._problem:
-            return []
-        self._problem = problem
-        level, text = ("error", problem) if problem else ("info", "the history is written again")
-        return [Event(self.session.status().t, level, "history", text)]
+# --- What a node does again and again, cut into pieces and done in steps that keep nobody waiting for long
 
-    def _journal(self, output: Output) -> None:
-        if self._store is None:
-            return
-        if output.topic == "event":
-            self._store.event(output)
-        elif output.topic == "diagnosis":
-            self._store.diagnosis(output)
-        elif output.topic == "healthy_flight":
-            self._store.healthy_flight(output.trim)
-        elif output.topic == "candidate":
-            self._store.candidate(output.item)
-        if output.topic == "parameters" or (output.topic == "candidate" and output.item.state is SetState.PENDING):
-            self._store.numbered(output.item)
+
+STEP_SECONDS = 0.0125
+"""A step is taken this often [s]."""
+STEPS = 8
+"""Steps from the beginning of a round to that of the next."""
+ROUND_SECONDS = STEPS * STEP_SECONDS
+"""Messages are taken from the middleware this often [s]: rows of the grid wait five times as long for late channels."""
+WORK_SECONDS = 0.0015
+"""No piece of a round begins later than this in a step [s]."""
+
+
+class Scheduler:
+    """Does one round after the other."""
+
+    def __init__(self, begin: Callable[[], Iterator[None]], clock: Callable[[], float] = time.monotonic) -> None:
+        """Starts with a round that is due.
+
+        Args:
+            begin: begins a round; it is done to the end piece by piece.
+            clock: seconds, monotonic.
+        """
+        self._begin, self._clock = begin, clock
+        self._round: Iterator[None] | None = None
+        self._steps = STEPS
+
+    @property
+    def overdue(self) -> bool:
+        """Whether the round lasts twice as long as it should, and work that can wait should be left to the next."""
+        return self._steps >= 2 * STEPS
+
+    @property
+    def resting(self) -> bool:
+        """Whether there is nothing to do until the next round."""
+        return self._round is None and self._steps + 1 < STEPS
+
+    def step(self, seconds: float = WORK_SECONDS) -> None:
+        """Goes on with the round, or begins the next one when its time has come.
+
+        Args:
+            seconds: no piece begins later than this [s]; one always does.
+        """
+        end = self._clock() + seconds
+        self._steps += 1
+        if self._round is None:
+            if self._steps < STEPS:
+                return
+            self._round, self._steps = self._begin(), 0
+        for _ in self._round:
+            if self._clock() >= end:
+                return
+        self._round = None
+
+    def drop(self) -> None:
+        """Forgets the round that is being done."""
+        self._round = None

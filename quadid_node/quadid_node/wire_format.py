@@ -1,22 +1,31 @@
-"""Requests and answers of fits as bytes between machines: MessagePack, read by the types that the records declare.
+"""Requests and answers of fits as bytes, between machines and on the disk.
 
-What comes over a network names no function and no class: it is one of the kinds below.  Numbers of arrays travel in one
-block beside the record, so that a record is small, and few bytes never make gigabytes.
+MessagePack, read by the types that the records declare.  What comes over a network names no function and no class: it
+is one of the kinds below.  Numbers of arrays travel in one block beside the record, so that a record is small, and few
+bytes never make gigabytes.
+
+python -m quadid_node.wire_format FILE  # does a job that failed and was kept again, and prints what becomes of it
 """
 
 from __future__ import annotations
 
+import contextlib
 import math
+import sys
+import time
 import zlib
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import msgspec
 import numpy as np
 
 from quadid.errors import QuadidError
+from quadid.files import read_regular
 from quadid.online.background_diagnosis import DiagnosisReply, DiagnosisRequest
 from quadid.online.fault_isolation import ChangeReply, ChangeRequest
+from quadid.online.records import Job, JobReply
 from quadid.online.window_fit import FitReply, FitRequest
 from quadid.vehicle import Vehicle
 
@@ -103,3 +112,40 @@ def unpack(data: bytes) -> Any:
     except Exception as error:
         raise ParcelError(f"damaged parcel ({type(error).__name__})", "a whole one, of the same version") from error
     return item
+
+
+# --- Inputs of jobs that failed by an error of this program, kept beside the history so that the error can be repeated
+
+
+MOST = 8
+"""Newest inputs kept: a minute of flight takes less than a mebibyte."""
+SUFFIX = ".job"
+
+
+def folder_of(history: Path) -> Path:
+    """The folder beside a history."""
+    return history.with_name(f"{history.name}.failures")
+
+
+def keep(history: Path, job: Job) -> str:
+    """Keeps the input of a job, and the newest `MOST` of all; returns where, or why not, for people."""
+    path = folder_of(history) / f"{time.time_ns():020d}-{type(job).__name__}{SUFFIX}"
+    try:
+        path.parent.mkdir(exist_ok=True)
+        path.write_bytes(pack(job))
+        for old in sorted(path.parent.glob(f"*{SUFFIX}"))[:-MOST]:
+            with contextlib.suppress(FileNotFoundError):
+                old.unlink()
+    except (OSError, ParcelError) as error:
+        return f"its input could not be kept ({error})"
+    return f"its input is in {path}"
+
+
+def repeat(path: Path) -> JobReply:
+    """Does the job of a kept input again; raises ParcelError for a file that holds none, OSError."""
+    reply: JobReply = unpack(read_regular(path, LARGEST)).run()
+    return reply
+
+
+if __name__ == "__main__":
+    sys.stdout.write(f"{repeat(Path(sys.argv[1]))}\n")

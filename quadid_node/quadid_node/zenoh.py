@@ -13,9 +13,8 @@ from typing import Any
 import zenoh
 
 from quadid.errors import QuadidError
-from quadid_node.codec import diagnosis_to_dict, health_to_dict, set_to_dict, status_to_dict
-from quadid_node.publication import Output
-from quadid_node.service import Health, Service
+from quadid_node.messages import Health, Output, diagnosis_to_dict, health_to_dict, set_to_dict, status_to_dict
+from quadid_node.service import Service
 
 # --- Opens Zenoh sessions: peers of this network, a locator, or a configuration file with TLS and access control
 
@@ -64,6 +63,47 @@ def wait_for_session(
             told(str(error))
         if wait(retry):
             return None
+
+
+class LateSession:
+    """A session that is opened in the background, as soon as somebody listens there; routers that go come back."""
+
+    def __init__(
+        self, where: str, opened: Callable[[Any], None], told: Callable[[str], None] = lambda problem: None,
+        retry: float = RETRY,
+    ) -> None:  # fmt: skip
+        """Begins to connect.
+
+        Args:
+            where: see `open_session`.
+            opened: gets the session, once, under `lock`.
+            told: takes why there is none yet.
+            retry: pause between two attempts [s].
+
+        Raises:
+            ZenohError: a configuration that is none.
+        """
+        config_of(where)
+        self.lock, self._closed, self._session = threading.Lock(), threading.Event(), None
+
+        def connect() -> None:
+            session = wait_for_session(where, self._closed.wait, told, retry)
+            with self.lock:
+                if session is not None and self._closed.is_set():
+                    session.close()
+                elif session is not None:
+                    self._session = session
+                    opened(session)
+
+        threading.Thread(target=connect, name="zenoh", daemon=True).start()
+
+    def close(self) -> None:
+        """Leaves; a session that comes later is closed at once."""
+        self._closed.set()
+        with self.lock:
+            if self._session is not None:
+                self._session.close()
+                self._session = None
 
 
 def config_of(where: str) -> Any:
@@ -143,32 +183,16 @@ class ZenohLink:
         Raises:
             ZenohError: a configuration that is none.
         """
-        config_of(where)
         self._vehicle, self._service = vehicle, service
         self._latest: dict[str, bytes] = {}
         self._commands: queue.Queue[tuple[str, Any]] = queue.Queue(MOST_COMMANDS)
         self._publishers: dict[str, Any] = {}
-        self._session: Any = None
         self._reports = 0
-        self._lock, self._closed = threading.Lock(), threading.Event()
         self.problem = f"Zenoh at {where}: connecting"
-        threading.Thread(target=self._connect, args=(where, retry), name="zenoh", daemon=True).start()
-
-    def _connect(self, where: str, retry: float) -> None:
-        def told(problem: str) -> None:
-            self.problem = problem
-
-        session = wait_for_session(where, self._closed.wait, told, retry)
-        if session is None:
-            return
-        with self._lock:
-            if self._closed.is_set():
-                session.close()
-            else:
-                self._declare(session)
+        self._session = LateSession(where, self._declare, lambda problem: setattr(self, "problem", problem), retry)
 
     def _declare(self, session: Any) -> None:
-        self._session, self.problem = session, ""
+        self.problem = ""
         self._publishers = {kind: session.declare_publisher(key_of(self._vehicle, kind)) for kind in KINDS}
         self._open = [
             session.declare_queryable(key_of(self._vehicle, "*"), self._on_query),
@@ -207,14 +231,11 @@ class ZenohLink:
 
     def close(self) -> None:
         """Leaves."""
-        self._closed.set()
-        with self._lock:
-            if self._session is not None:
-                self._session.close()
+        self._session.close()
 
     def _repeat(self) -> None:
         """Tells again what a crowded network may have lost, since it never waits for one."""
-        with self._lock:
+        with self._session.lock:
             for kind in ("parameters", "diagnosis", "vehicle_health"):
                 if kind in self._latest and kind in self._publishers:
                     self._publishers[kind].put(self._latest[kind], encoding=_JSON)
@@ -235,7 +256,7 @@ class ZenohLink:
 
     def _put(self, kind: str, data: dict[str, Any]) -> None:
         payload = json.dumps({"vehicle": self._vehicle, **data}).encode()
-        with self._lock:
+        with self._session.lock:
             self._latest[kind] = payload
             if kind in self._publishers:
                 self._publishers[kind].put(payload, encoding=_JSON)

@@ -10,6 +10,7 @@ from types import SimpleNamespace
 import pytest
 from quadid_node.history import read_history
 from quadid_node.mavlink_wire import SigningMemory, read_key
+from quadid_node.wire_format import repeat
 from quadid_node.zenoh import config_of
 from quadid_replay import open_log
 from quadid_replay.writers import open_for_writing
@@ -18,7 +19,6 @@ from quadid.app.logs import load_vehicle, write_text
 from quadid.app.simulate import read_manoeuvre
 from quadid.errors import QuadidError
 from quadid.vehicle import Vehicle
-from quadid_node import failures
 from tests.faults.evidence import Happened
 
 READERS: dict[str, Callable[[Path], object]] = {
@@ -28,7 +28,7 @@ READERS: dict[str, Callable[[Path], object]] = {
     "log": open_log,
     "history that is shown": lambda path: read_history(path, "pelican"),
     "configuration of Zenoh": lambda path: config_of(str(path)),
-    "kept input of a failed fit": failures.repeat,
+    "kept input of a failed fit": repeat,
 }
 WRITERS: dict[str, Callable[[Path], object]] = {
     "result": lambda path: write_text(path, "{}"),

@@ -9,8 +9,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from quadid_node.codec import set_to_dict
 from quadid_node.history import Store
+from quadid_node.messages import set_to_dict
 
 from tests.cli.conftest import Cli, inside
 from tests.faults.evidence import Happened

@@ -5,10 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from quadid_node.failures import MOST, folder_of, keep, repeat
 from quadid_node.history import Store
 from quadid_node.service import Service
-from quadid_node.wire_format import ParcelError
+from quadid_node.wire_format import MOST, ParcelError, folder_of, keep, repeat
 from quadid_node.worker import InlineWorker, Trouble
 
 from quadid.online import FitReply, FitRequest

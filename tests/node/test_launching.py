@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 import yaml
 from quadid_node.launching import ARGUMENTS, NODE_ARGUMENTS, fleet, parameters, truth
-from quadid_node.node_parameters import PARAMETERS
+from quadid_node.settings import PARAMETERS
 
 from tests.node.launch_stand_in import GroupAction, Node, launched
 

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 from quadid_node.history import Restored
 from quadid_node.inputs import source
-from quadid_node.playback import arrivals, stream
-from quadid_node.recorder import RECORD, Beginning, Recorder, read_beginning
+from quadid_node.recording import RECORD, Beginning, Recorder, arrivals, read_beginning, stream
 from quadid_replay import TopicWriter, open_log, write_mcap
 from quadid_replay.mcap_file import McapFile, read_metadata
 

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 import yaml
 from quadid_node.inputs import DECIDE, SILENT, Chooser, source, stamp
-from quadid_node.node_parameters import PARAMETERS, check_change, read_settings, vehicle_id
-from quadid_node.playback import base_seconds, stream
+from quadid_node.recording import base_seconds, stream
+from quadid_node.settings import PARAMETERS, check_change, read_settings, vehicle_id
 from quadid_replay import open_log, write_mcap
 from quadid_replay.ros_messages import TYPES
 
@@ -31,9 +31,9 @@ def test_everything_but_the_nodes_imports_without_ros() -> None:
         "        if name.split('.')[0] in ('rclpy', 'quadid_msgs', 'sensor_msgs', 'std_srvs', 'rcl_interfaces'):\n"
         "            raise ModuleNotFoundError(name)\n"
         "sys.meta_path.insert(0, Block())\n"
-        "import quadid_node.service, quadid_node.history, quadid_node.worker, quadid_node.inputs, quadid_node.inputs\n"
-        "import quadid_node.node_parameters, quadid_node.playback, quadid_node.mavlink_link, quadid_node.zenoh\n"
-        "import quadid_node.serve, quadid.cli.replay, quadid.cli.serve, quadid.cli.watch, quadid.cli.history\n"
+        "import quadid_node.service, quadid_node.history, quadid_node.worker, quadid_node.inputs, quadid_node.zenoh\n"
+        "import quadid_node.settings, quadid_node.recording, quadid_node.mavlink_link, quadid_node.process\n"
+        "import quadid.cli.replay, quadid.cli.serve, quadid.cli.watch, quadid.cli.history\n"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import pytest
-from quadid_node.stopping import end_middleware
+from quadid_node.process import end_middleware
 
 from tests.node.peers import Ear, Process, node
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 from quadid_node.inputs import deserializer, message_class
-from quadid_node.topic_player import QOS
+from quadid_node.replay_node import QOS
 from quadid_replay import TopicWriter
 from quadid_replay.writers import write_recording
 

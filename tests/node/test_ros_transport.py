@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 
 import pytest
-from quadid_node.transport import without_shared_memory
+from quadid_node.process import without_shared_memory
 
 from tests.node.peers import node
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import pytest
-from quadid_node.rounds import STEPS, WORK_SECONDS, Scheduler
+from quadid_node.service import STEPS, WORK_SECONDS, Scheduler
 
 
 class Work:

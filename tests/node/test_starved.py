@@ -6,10 +6,8 @@ import math
 from collections.abc import Sequence
 
 import pytest
-from quadid_node.codec import set_to_dict
-from quadid_node.messages import diagnostics, fit_status
-from quadid_node.publication import Output
-from quadid_node.service import BEHIND, PATIENCE, Service
+from quadid_node.messages import BEHIND, Output, diagnostics, fit_status, set_to_dict
+from quadid_node.service import PATIENCE, Service
 from quadid_node.worker import InlineWorker, Trouble
 
 from quadid.data.window import Sample

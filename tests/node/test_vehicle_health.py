@@ -10,10 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from quadid_evaluation.studies.health.flights import Wrong, hover_blocks
-from quadid_node.codec import health_to_dict
 from quadid_node.history import Store
-from quadid_node.messages import health_message
-from quadid_node.publication import Output
+from quadid_node.messages import Output, health_message, health_to_dict
 from quadid_node.service import Service
 from quadid_node.worker import InlineWorker
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from quadid_node.playback import stream
+from quadid_node.recording import stream
 from quadid_replay import open_log
 
 from quadid.online.change_detection import CHUNK, ChangeDetector

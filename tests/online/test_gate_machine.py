@@ -25,7 +25,7 @@ from hypothesis.stateful import (
     run_state_machine_as_test,
 )
 from quadid_node.history import Store, read_history
-from quadid_node.publication import Output
+from quadid_node.messages import Output
 from quadid_node.service import Service
 from quadid_node.worker import Trouble
 

@@ -13,7 +13,7 @@ from packaging.requirements import Requirement
 LEFT_OUT = {"jinja2", "plotly", "matplotlib", "cma", "dask", "pandas", "pyarrow"}
 """Plots, reports, other optimisers, many logs at once."""
 IMPORTED = (*sorted(LEFT_OUT), "distributed")
-NEEDS_ROS = ("quadid_node.node", "quadid_node.polling", "quadid_node.publish", "quadid_node.topic_player")
+NEEDS_ROS = ("quadid_node.node", "quadid_node.publish", "quadid_node.replay_node")
 
 
 @pytest.fixture(scope="module")

@@ -10,10 +10,9 @@ from collections.abc import Callable
 
 import rclpy
 from quadid_node.inputs import message_class, source
-from quadid_node.node import SENSOR_QOS
-from quadid_node.polling import PollingNode
-from quadid_node.rounds import ROUND_SECONDS
-from quadid_node.stopping import Stop
+from quadid_node.node import SENSOR_QOS, PollingNode
+from quadid_node.process import Stop
+from quadid_node.service import ROUND_SECONDS
 from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future

@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from quadid_node.inputs import Chooser, Decoder, Intake, best_ranks, deserializer, source
-from quadid_node.rounds import ROUND_SECONDS
-from quadid_node.service import Service
+from quadid_node.service import ROUND_SECONDS, Service
 from quadid_node.worker import InlineWorker
 from quadid_replay import write_mcap
 from quadid_replay.mcap_file import McapFile

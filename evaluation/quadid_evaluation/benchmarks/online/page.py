@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
-from quadid_node.rounds import ROUND_SECONDS, STEP_SECONDS, WORK_SECONDS
+from quadid_node.service import ROUND_SECONDS, STEP_SECONDS, WORK_SECONDS
 
 from quadid.online.stream import SETTLE
 from quadid.parameters import NOMINAL_NAMES

@@ -17,9 +17,8 @@ from typing import Any
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-from quadid_node.codec import set_to_dict
-from quadid_node.playback import stream
-from quadid_node.publication import Output
+from quadid_node.messages import Output, set_to_dict
+from quadid_node.recording import stream
 from quadid_node.service import Service
 from quadid_node.settings import session_settings
 from quadid_node.worker import InlineWorker

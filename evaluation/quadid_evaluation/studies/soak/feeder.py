@@ -10,8 +10,8 @@ import sys
 import time
 
 import rclpy
-from quadid_node.stopping import Stop
-from quadid_node.topic_player import Stopped, epoch_of
+from quadid_node.process import Stop
+from quadid_node.replay_node import Stopped, epoch_of
 from quadid_replay.writers import write_recording
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions

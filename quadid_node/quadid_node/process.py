@@ -1,4 +1,7 @@
-"""SIGINT and SIGTERM: noted from the first moment on, ignored while everything is put away."""
+"""The process around a node: signals that end it, and how the middleware carries messages and ends.
+
+Fast DDS is the middleware of these wheels, and of Jazzy by default.
+"""
 
 from __future__ import annotations
 
@@ -8,10 +11,11 @@ import signal
 from types import FrameType
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
+_CHOSEN_BY_USER = ("FASTDDS_BUILTIN_TRANSPORTS", "FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PROFILES_FILE")
 
 
 class Stop:
-    """Says whether the process was asked to end."""
+    """Notes SIGINT and SIGTERM from the first moment on; true once one has come."""
 
     def __init__(self, nothing_open: bool = False) -> None:
         """Takes the signals over.
@@ -44,6 +48,17 @@ class Stop:
         self._asked = True
         if self._nothing_open:
             os._exit(0)
+
+
+def without_shared_memory() -> None:
+    """Lets messages travel over UDP alone, also between processes of one machine; to be called before `rclpy.init`.
+
+    The shared memory of Fast DDS 2.14 is a port that a peer takes down when a reader is late or a process was killed.
+    The messages in it are lost, and a participant that ends just then dies by SIGSEGV (in
+    ``SharedMemChannelResource::release``).  Whoever has chosen a transport or a profile keeps it.
+    """
+    if not any(os.environ.get(name) for name in _CHOSEN_BY_USER):
+        os.environ["FASTDDS_BUILTIN_TRANSPORTS"] = "UDPv4"
 
 
 def end_middleware() -> None:

@@ -1,29 +1,34 @@
-"""Records what the node takes in, so that a replay repeats the run bit for bit.
+"""Recordings of what a node takes in, and logs as the streams that they once were.
 
 Other recorders hear a stream of their own: DDS may lose a message on the way to them and not on the way here, and their
-order of arrival is another.  This one writes the messages that the session was given, in that order, and in front of
-them what the session began with.
+order of arrival is another.  The `Recorder` writes the messages that the session was given, in that order, and in front
+of them what the session began with, so that a replay repeats the run bit for bit.
 """
 
 from __future__ import annotations
 
 import json
+import re
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+from mcap_ros2._dynamic import generate_dynamic
 from quadid_replay import TopicWriter
-from quadid_replay.mcap_file import read_metadata
+from quadid_replay.mcap_file import McapFile, read_metadata
+from quadid_replay.ros_messages import type_name
 from quadid_replay.schemas import has_definition, whole_text
 
 from quadid.condition.trim import flight_from_dict, flight_to_dict
+from quadid.data.window import Block, Recording, Sample
 from quadid.errors import LogError
 from quadid.online import OnlineSet, SessionSettings
 from quadid.vehicle import Vehicle
-from quadid_node.codec import set_from_dict, set_to_dict
 from quadid_node.history import UNREADABLE, Restored
-from quadid_node.inputs import Input
+from quadid_node.inputs import Chooser, Decoder, Input, best_ranks, seconds, source
+from quadid_node.messages import set_from_dict, set_to_dict
 
 RECORD = "quadid.session"
 WRITTEN = 32
@@ -47,7 +52,18 @@ class Recorder:
 
     def __init__(self, path: Path, beginning: Beginning, inputs: Sequence[Input]) -> None:
         """Begins a recording of `inputs`; raises LogError when it cannot be written or a type has no definition."""
-        self._writer = TopicWriter(path, {RECORD: _to_strings(beginning)}, CHUNK_BYTES)
+        left = beginning.restored
+        record = {
+            "vehicle": beginning.vehicle.to_yaml(),
+            "settings": beginning.settings.model_dump_json(),
+            "source": beginning.source,
+            "restored": json.dumps({
+                **vars(left), "item": left.item and set_to_dict(left.item),
+                "baseline": left.baseline and set_to_dict(left.baseline),
+                "healthy": list(map(flight_to_dict, left.healthy)),
+            }),
+        }  # fmt: skip
+        self._writer = TopicWriter(path, {RECORD: record}, CHUNK_BYTES)
         self._last = 0
         self._waiting: list[tuple[str, str, bytes, int]] = []
         for entry in inputs:
@@ -107,23 +123,71 @@ def read_beginning(path: Path) -> Beginning | None:
         raise LogError(f"{path.name}: what its session began with cannot be read ({error})") from error
 
 
-def _to_strings(beginning: Beginning) -> Mapping[str, str]:
-    left = beginning.restored
-    restored = {
-        "item": set_to_dict(left.item) if left.item is not None else None,
-        "next_sequence": left.next_sequence,
-        "approval": left.approval,
-        "baseline": set_to_dict(left.baseline) if left.baseline is not None else None,
-        "healthy": list(map(flight_to_dict, left.healthy)),
-        "decided": left.decided,
-    }
-    return {
-        "vehicle": beginning.vehicle.to_yaml(),
-        "settings": beginning.settings.model_dump_json(),
-        "source": beginning.source,
-        "restored": json.dumps(restored),
-    }
-
-
 def _set(data: object) -> OnlineSet | None:
     return set_from_dict(data) if isinstance(data, Mapping) else None
+
+
+# --- Logs as streams, with the stamps a live service would have seen: in general in time order, a recording of the node
+# itself in the order in which the messages came
+
+
+_BASE = re.compile(r"times count from UNIX time (\d+) s")
+
+
+def base_seconds(recording: Recording) -> int:
+    """UNIX time that the recording's times count from [s]; 0 when they are no UNIX times."""
+    for note in recording.warnings:
+        found = _BASE.search(note)
+        if found is not None:
+            return int(found[1])
+    return 0
+
+
+def stream(recording: Recording) -> Iterator[Sample]:
+    """Yields all samples in time order, at equal times by channel; absolute where the log's times are.
+
+    Times are brought back to whole nanoseconds, as they came in headers, so that a replayed log gives the numbers of
+    the live run bit for bit.
+    """
+    base = base_seconds(recording) * 10**9
+    names = list(recording.channels)
+    if not names:
+        return
+    times = [recording.channels[n].t for n in names]
+    which = np.concatenate([np.full(len(t), i) for i, t in enumerate(times)])
+    rows = np.concatenate([np.arange(len(t)) for t in times])
+    order = np.argsort(np.concatenate(times), kind="stable")
+    for i, row in zip(which[order].tolist(), rows[order].tolist(), strict=True):
+        channel = recording.channels[names[i]]
+        ns = round(float(channel.t[row]) * 1e9) + base
+        yield Sample(seconds(ns), names[i], tuple(channel.values[row].tolist()))
+
+
+def arrivals(path: Path, preset: str, rotors: int) -> Iterator[Sample]:
+    """Yields the samples of a node's recording as the node's session got them: the same numbers in the same order.
+
+    Args:
+        path: the recording.
+        preset: whose topic names and types it holds.
+        rotors: of the vehicle.
+
+    Raises:
+        LogError: a message definition that cannot be used.
+    """
+    file, inputs = McapFile(path), source(preset).inputs
+    chooser = Chooser(best_ranks(inputs))
+    decoders = {}
+    for number, topic in file.topics.items():
+        entry = next((e for e in inputs if e.topic == topic.name and e.type == type_name(topic.type)), None)
+        if entry is None:
+            continue
+        try:
+            decode = generate_dynamic(topic.type, topic.definition)[topic.type]
+        except Exception as error:
+            raise LogError(
+                f"{path.name}: the definition of {topic.type} is damaged ({type(error).__name__})"
+            ) from error
+        decoders[number] = Decoder(entry, chooser, rotors, decode)
+    for number, _, data in file.messages(decoders.keys()):
+        for item in decoders[number].take([data]):
+            yield from item.samples() if isinstance(item, Block) else [item]
