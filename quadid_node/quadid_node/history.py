@@ -38,7 +38,7 @@ from quadid.online.records import Event, OnlineDiagnosis, OnlineSet, SetState
 from quadid.parameters import NOMINAL_NAMES, ParameterSet
 from quadid.sanitise import plain
 from quadid.vehicle import Vehicle
-from quadid_node.messages import diagnosis_to_dict, set_from_dict, set_to_dict
+from quadid_node.messages import Output, diagnosis_to_dict, set_from_dict, set_to_dict
 
 # --- The file: its tables, its versions, and what becomes of a damaged one
 
@@ -663,6 +663,19 @@ class Store:
         return str(row[1]), Restored.decided
 
     # --- what is journalled
+
+    def journal(self, output: Output) -> None:
+        """Journals what a service hands out."""
+        if output.topic == "event":
+            self.event(output)
+        elif output.topic == "diagnosis":
+            self.diagnosis(output)
+        elif output.topic == "healthy_flight":
+            self.healthy_flight(output.trim)
+        elif output.topic == "candidate":
+            self.candidate(output.item)
+        if output.topic == "parameters" or (output.topic == "candidate" and output.item.state is SetState.PENDING):
+            self.numbered(output.item)
 
     def numbered(self, item: OnlineSet) -> None:
         """Journals a set that was put in force, rolled back to, restored, or waits for approval."""

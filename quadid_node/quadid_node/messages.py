@@ -170,7 +170,7 @@ def _finding(found: OnlineFinding | Change) -> Message:
         rows = [(name, unit, value, ci or (value, value)) for name, unit, value, ci in found.parameters]
         before, after, rivals = nan, nan, [(rival.effects[0], nan) for rival in found.rivals]
     else:
-        rows = [(n, found.units.get(n), v, interval(v, found.sigma.get(n, nan))) for n, v in found.values.items()]
+        rows = [(n, found.units.get(n, ""), v, interval(v, found.sigma.get(n, nan))) for n, v in found.values.items()]
         before, after, rivals = found.mse_before, found.mse_after, [(a.effect, a.mse_after) for a in found.alternatives]
     return {
         "effect": found.effect,

@@ -346,8 +346,9 @@ class IdentifyNode(PollingNode, LifecycleNode):
         service, graph, recorder = self._service, self._graph, self._recorder
         # What has arrived since the last round, topic by topic; while two publish an input it is forgotten.
         waiting = self._intake.take()
-        for topic, publishers in self.publisher_counts().items() if graph is not None else ():
-            graph.count(topic, publishers)
+        if graph is not None:
+            for topic, publishers in self.publisher_counts().items():
+                graph.count(topic, publishers)
         yield
         if service is not None and graph is not None and self._active and not graph.paused:
             for items in self._intake.read(waiting, recorder.take if recorder is not None else None):

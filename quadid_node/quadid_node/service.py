@@ -19,7 +19,6 @@ from quadid.online.records import (
     Event,
     OnlineSet,
     Publish,
-    SetState,
 )
 from quadid.vehicle import Vehicle
 from quadid_node.history import UNREADABLE, Restored, Store, StoreError, read_history
@@ -260,17 +259,9 @@ class Service:
             self._approval = approval
             if self._store is not None:
                 self._store.decision(self._configured, approval)
-        for output in outputs if self._store is not None else ():
-            if output.topic == "event":
-                self._store.event(output)
-            elif output.topic == "diagnosis":
-                self._store.diagnosis(output)
-            elif output.topic == "healthy_flight":
-                self._store.healthy_flight(output.trim)
-            elif output.topic == "candidate":
-                self._store.candidate(output.item)
-            if output.topic == "parameters" or (output.topic == "candidate" and output.item.state is SetState.PENDING):
-                self._store.numbered(output.item)
+        for output in outputs:
+            if self._store is not None:
+                self._store.journal(output)
         decided, self._decided = self._decided, []
         return [*decided, *self._publication.take(outputs)]
 
