@@ -112,6 +112,8 @@ MOVED = {
     "quadid_replay.ros_messages": "quadid_replay.cdr_blocks quadid_replay.mcap_decode "
     "quadid_replay.mcap_messages quadid_replay.signal_columns",
     "quadid_replay.columns": "quadid_replay.clocks",
+    "quadid_replay.formats": "quadid_replay.recognise",
+    "quadid_replay.opening": "quadid_replay.answer quadid_replay.reader_process quadid_replay.reading",
     "quadid_replay.writers": "quadid_replay.compared_writer quadid_replay.csv_writer "
     "quadid_replay.mcap_writer quadid_replay.tlog_writer quadid_replay.topic_writer quadid_replay.writing",
     "quadid_replay.dataflash": "quadid_replay.dataflash_index quadid_replay.dataflash_reader",

@@ -331,7 +331,7 @@ def load(
         VehicleError: no such vehicle.
         NotIdentifiableError: no rotor signal that means anything.
     """
-    from quadid_replay.reading import start as start_reading
+    from quadid_replay.opening import start as start_reading
 
     start_reading()
     described = as_vehicle(vehicle)

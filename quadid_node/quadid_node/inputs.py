@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from quadid_replay.presets import PRESETS
-from quadid_replay.ros_messages import SIGNALS, TYPES, BlockReader, Read, SignalColumns
+from quadid_replay.ros_messages import SIGNALS, TYPES, MessageReader
 
 from quadid.data.window import Block, Sample
 from quadid.errors import QuadidError, nearest
@@ -358,7 +358,7 @@ class Decoder:
         """
         kind = TYPES[entry.type]
         self._frame, self._mounted = "", mounted
-        self._kind, self._columns = kind, SignalColumns(kind)
+        self._kind = kind
         self._ranks = dict(entry.channels)
         self._chooser, self._rotors = chooser, rotors
         self.failed = self.unstamped = 0
@@ -366,25 +366,13 @@ class Decoder:
         self.pace = Pace()
         self._deniable, self._denied = _DENIABLE.get(entry.type, {}), list[str]()
 
-        self._layout: BlockReader | None = None
-        if kind.stamp is None:
+        def noted(data: bytes) -> Any:
+            """Decodes a message of another layout, as is one of another frame."""
+            message = decode(data)
+            self._frame = message.header.frame_id if kind.stamp is None else ""
+            return message
 
-            def noted(data: bytes) -> Any:
-                """Decodes a message of another layout, as is one of another frame."""
-                message = decode(data)
-                self._frame = message.header.frame_id
-                return message
-
-            self._layout = BlockReader(noted, kind.blocks, kind.extra)
-            self._read = self._layout.read
-        else:
-            stamp = kind.stamp
-
-            def read(data: bytes) -> Read:
-                message = decode(data)
-                return Read(*stamp(message), kind.blocks(message), kind.extra(message))
-
-            self._read = read
+        self._reader = MessageReader(kind, noted)
 
     @property
     def trouble(self) -> str:
@@ -406,7 +394,7 @@ class Decoder:
 
     def take(self, messages: Sequence[bytes]) -> Iterator[Sample | Block]:
         """Yields what may be used now of messages in order, at once where only numbers differ between them."""
-        read = self._one(messages[0]) if len(messages) == 1 else self._many(messages)
+        read = self._read(messages)
         if read is None:
             for part in (messages[: len(messages) // 2], messages[len(messages) // 2 :]) if len(messages) > 1 else ():
                 yield from self.take(part)
@@ -431,29 +419,22 @@ class Decoder:
         if columns:
             yield Block(t, columns)
 
-    def _many(self, messages: Sequence[bytes]) -> tuple[IntArray, list[tuple[str, FloatArray]]] | None:
-        """Stamps [ns] and signals of messages of one layout; None where they must be looked at in smaller parts."""
-        read = self._layout.read_many(messages) if self._layout is not None else None
-        told = self._columns.pick(read.blocks, read.extra) if read is not None else None
-        if read is None or told is None:
-            return None
-        ns = read.seconds * 10**9 + read.nanoseconds
-        return (ns, told) if (ns > 0).all() else None
-
-    def _one(self, data: bytes) -> tuple[IntArray, list[tuple[str, FloatArray]]] | None:
-        """Stamp [ns] and signals of one message; None, and counted, where it has none."""
+    def _read(self, messages: Sequence[bytes]) -> tuple[IntArray, list[tuple[str, FloatArray]]] | None:
+        """Stamps [ns] and signals of messages; None where they must be looked at in smaller parts, and of a single one
+        that cannot be used, which is counted."""
         try:
-            message = self._read(data)
-            signals = self._kind.signals(message.blocks, message.extra)
-            told = [(name, np.array([values], dtype=np.float64)) for name, values in signals]
-            ns = np.array([message.seconds * 10**9 + message.nanoseconds], dtype=np.int64)
+            read = self._reader.read(messages)
+            told = [] if read is None else self._kind.signals(read.blocks, read.extra)
         except Exception:  # noqa: BLE001 - a decoder of untrusted bytes raises anything; it is counted and reported
             self.failed, self._failed_at = self.failed + 1, self.pace.looked
             return None
-        if ns[0] <= 0:
-            self.unstamped, self._unstamped_at = self.unstamped + 1, self.pace.looked
+        if read is None or any(np.any(known) and not np.all(known) for _, _, known in told):
             return None
-        return ns, told
+        if (read.ns <= 0).any():
+            if len(messages) == 1:
+                self.unstamped, self._unstamped_at = self.unstamped + 1, self.pace.looked
+            return None
+        return read.ns, [(name, values) for name, values, known in told if np.all(known)]
 
     def _deny(self, told: Iterable[str]) -> None:
         """Notes which signals the newest messages say to have none of."""

@@ -467,7 +467,7 @@ def _parameters(header: _Header) -> dict[str, float]:
 def _channels(header: _Header, decoded: Decoded, clock: LogClock) -> list[RawChannel]:
     names = header.definitions["I"].names
     table = np.array(decoded.rows, dtype=np.float64).reshape(-1, decoded.width)
-    t, _ = clock.times(np.unwrap(table[:, names.index("time")], period=2.0**32) * 1e-6)  # 71.6 minutes of 32 bits
+    t = clock.times(np.unwrap(table[:, names.index("time")], period=2.0**32) * 1e-6)  # 71.6 minutes of 32 bits
     out: list[RawChannel] = []
 
     def columns(name: str, count: int) -> FloatArray | None:

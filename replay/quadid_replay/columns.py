@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from array import array
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -28,14 +29,6 @@ CONFIRMATIONS = 3
 """How many further stamps must agree before a new time base is believed; a single wild stamp moves nothing."""
 PAUSE = 1.0
 """Recording time [s] put between the last sample before a reboot and the first one after it."""
-
-
-def _alone(raw: FloatArray) -> bool:
-    """Tells whether the first stamp is far from the second and the next ones follow that: it is wild, no time base."""
-    if len(raw) <= 1 + CONFIRMATIONS:
-        return False
-    steps = np.diff(raw[: 2 + CONFIRMATIONS])
-    return not -STEP_BACK < steps[0] < STEP_AHEAD and bool(np.all(np.abs(steps[1:]) < STEP_BACK))
 
 
 class WrapCounter:
@@ -84,11 +77,32 @@ class LogClock:
         self._newest: float | None = None
         self._suspects: list[float] = []
 
-    def time(self, raw: float) -> float | None:
-        """Returns recording time, or None for a stamp that is refused or still waits for confirmation."""
-        if raw != raw or raw in (float("inf"), float("-inf")):
+    def times(self, raw: FloatArray) -> FloatArray:
+        """Maps stamps [s] in file order, shape (n,); NaN for one that is refused or still waits for confirmation."""
+        out = np.full(len(raw), np.nan)
+        begin = 0
+        if self._newest is None and len(raw) > 1 + CONFIRMATIONS:
+            # The first stamp is far from the second, which others follow: it is wild, and no time base.
+            steps = np.diff(raw[: 2 + CONFIRMATIONS])
+            begin = int(not -STEP_BACK < steps[0] < STEP_AHEAD and bool(np.all(np.abs(steps[1:]) < STEP_BACK)))
+            self.wild += begin
+        if not self._suspects and begin < len(raw):
+            # All stamps up to the first that does not follow the newest one before it.
+            first = raw[begin] if self._newest is None else self._newest
+            newest = np.maximum.accumulate(np.concatenate([[first], raw[begin:]]))
+            follows = (newest[:-1] - STEP_BACK < raw[begin:]) & (raw[begin:] < newest[:-1] + STEP_AHEAD)
+            plain = len(follows) if follows.all() else int(np.argmin(follows))
+            if plain:
+                out[begin : begin + plain] = raw[begin : begin + plain] + self._offset
+                begin, self._newest = begin + plain, float(newest[plain])
+        for k in range(begin, len(raw)):  # the others one by one: each may begin or confirm a new time base
+            out[k] = self._time(float(raw[k]))
+        return out
+
+    def _time(self, raw: float) -> float:
+        if not math.isfinite(raw):
             self.wild += 1
-            return None
+            return math.nan
         if self._newest is None:
             self._newest = raw
             return raw
@@ -99,48 +113,14 @@ class LogClock:
             return raw + self._offset
         return self._suspect(raw)
 
-    def times(self, raw: FloatArray) -> tuple[FloatArray, BoolArray]:
-        """Maps many stamps in file order; returns recording times (NaN where refused) and which were accepted."""
-        if len(raw) and self._newest is None and bool(np.isfinite(raw).all()):
-            newest = np.maximum.accumulate(raw)
-            steps = raw[1:] - newest[:-1]
-            if len(raw) < 2 or (steps.min() > -STEP_BACK and steps.max() < STEP_AHEAD):
-                self._newest = float(newest[-1])
-                return raw, np.ones(len(raw), dtype=np.bool_)
-        first = 1 if self._newest is None and _alone(raw) else 0
-        self.wild += first
-        mapped = [None] * first + [self.time(float(stamp)) for stamp in raw[first:]]
-        out = np.array([np.nan if t is None else t for t in mapped], dtype=np.float64)
-        return out, np.isfinite(out)
-
-    def in_order(self, raw: FloatArray) -> FloatArray:
-        """Maps stamps as `time` does one by one; NaN where refused."""
-        plain = self.plain_times(raw)
-        if plain is not None:
-            return plain
-        times = [self.time(stamp) for stamp in raw.tolist()]
-        return np.array([np.nan if t is None else t for t in times], dtype=np.float64)
-
-    def plain_times(self, raw: FloatArray) -> FloatArray | None:
-        """Maps stamps as `time` does one by one; None, and nothing has changed, unless all follow without a step."""
-        if self._suspects or not len(raw) or not np.isfinite(raw).all():
-            return None
-        first = raw[0] if self._newest is None else self._newest
-        newest = np.maximum.accumulate(np.concatenate([[first], raw]))
-        before = newest[:-1]
-        if not np.all((before - STEP_BACK < raw) & (raw < before + STEP_AHEAD)):
-            return None
-        self._newest = float(newest[-1])
-        return raw + self._offset
-
-    def _suspect(self, raw: float) -> float | None:
+    def _suspect(self, raw: float) -> float:
         """Collects stamps of a possible new time base and moves to it when enough agree."""
         if self._suspects and abs(raw - self._suspects[-1]) > STEP_BACK:
             self.wild += len(self._suspects)
             self._suspects.clear()
         self._suspects.append(raw)
         if len(self._suspects) <= CONFIRMATIONS:
-            return None
+            return math.nan
         assert self._newest is not None
         base = min(self._suspects)
         if base < self._newest:
@@ -190,10 +170,9 @@ class RawChannel(NamedTuple):
 
     Attributes:
         name: key of `quadid.data.window.CHANNELS`.
-        t: times [s] in file order, shape (n,).
+        t: times [s] in file order, NaN where the clock refused the stamp, shape (n,).
         values: shape (n, columns).
         source: topic, message or column names, for people.
-        refused: samples whose stamp the clock refused.
         spikes: readings that the reader dropped as such.
     """
 
@@ -201,12 +180,49 @@ class RawChannel(NamedTuple):
     t: FloatArray
     values: FloatArray
     source: str
-    refused: int = 0
     spikes: int = 0
 
 
+class Source(NamedTuple):
+    """One way to make a channel of a log.
+
+    Attributes:
+        channel: as of `RawChannel`.
+        records: name of the records that tell it; empty where columns have names of their own.
+        columns: of these, in order.
+        convert: rows (n, columns) to core units and frames; not finite where they tell nothing.
+        note: for people, behind the name of the records.
+    """
+
+    channel: str
+    records: str
+    columns: tuple[str, ...]
+    convert: Callable[[FloatArray], FloatArray] = np.asarray
+    note: str = ""
+
+
+def channels_of(
+    sources: Iterable[Source], rows: Callable[[Source], tuple[FloatArray, FloatArray] | None], advantage: float = 1.3
+) -> list[RawChannel]:
+    """Makes the channels of a log: of several sources of one the first, or another that is `advantage` times faster.
+
+    Args:
+        sources: in order of preference.
+        rows: times (n,), NaN where refused, and columns (n, k) of a source; None where the log has no such.
+        advantage: as of `fastest_first`.
+    """
+    found: dict[str, list[RawChannel]] = {}
+    for source in sources:
+        if (told := rows(source)) is not None:
+            name = f"{source.records}{source.note and f' {source.note}'}" or " ".join(source.columns)
+            with np.errstate(invalid="ignore"):  # what is no number is dropped further on
+                entry = RawChannel(source.channel, told[0], source.convert(told[1]), name)
+            found.setdefault(source.channel, []).append(entry)
+    return [entry for entries in found.values() for entry in fastest_first(entries, advantage)]
+
+
 class Columns:
-    """Times and values of one signal, appended sample by sample as packed doubles.
+    """Times and values of one signal, appended as packed doubles.
 
     Args:
         width: number of values a sample.
@@ -214,31 +230,15 @@ class Columns:
 
     def __init__(self, width: int) -> None:
         self.width = width
-        self.refused = 0
         self._t = array("d")
         self._values = array("d")
 
-    def __len__(self) -> int:
-        return len(self._t)
-
-    def add(self, t: float | None, values: Sequence[float]) -> None:
-        """Appends one sample; a time of None (refused by the clock) is counted and dropped."""
-        if t is None:
-            self.refused += 1
-            return
-        if len(values) != self.width:
-            raise ValueError(f"{len(values)} values for {self.width} columns")
-        self._t.append(t)
-        self._values.extend(values)
-
-    def add_many(self, t: FloatArray, values: FloatArray) -> None:
+    def add(self, t: FloatArray, values: FloatArray) -> None:
         """Appends samples: times (n,), NaN where refused, and values (n, width)."""
         if values.shape != (len(t), self.width):
             raise ValueError(f"values of shape {values.shape} for {len(t)} times and {self.width} columns")
-        known = ~np.isnan(t)
-        self.refused += len(t) - int(np.count_nonzero(known))
-        self._t.frombytes(t[known].tobytes())
-        self._values.frombytes(values[known].tobytes())
+        self._t.frombytes(t.tobytes())
+        self._values.frombytes(values.tobytes())
 
     def arrays(self) -> tuple[FloatArray, FloatArray]:
         """Returns times (n,) and values (n, width), as added."""
@@ -271,13 +271,14 @@ def _running_median(values: FloatArray) -> FloatArray:
 def clean_channel(raw: RawChannel) -> Channel | None:
     """Makes a channel of raw samples: drops and counts what cannot be used.
 
-    Dropped: values or times that are not finite or absurd, single impossible rotor speeds, repeated stamps, samples
-    running backwards, quaternions that are none.
+    Dropped: refused stamps, values that are not finite or absurd, single impossible rotor speeds, repeated stamps,
+    samples running backwards, quaternions that are none.
     Returns None when nothing remains.
     """
-    t, values = raw.t, raw.values
-    faults = {"bad_stamp": raw.refused}
-    finite = np.isfinite(t) & np.isfinite(values).all(axis=1)
+    stamped = np.isfinite(raw.t)
+    t, values = (raw.t, raw.values) if stamped.all() else (raw.t[stamped], raw.values[stamped])
+    faults = {"bad_stamp": len(stamped) - len(t)}
+    finite = np.isfinite(values).all(axis=1)
     faults["not_finite"] = int(np.count_nonzero(~finite))
     absurd = finite & (np.abs(values) > _ABSURD).any(axis=1)
     faults["absurd"] = int(np.count_nonzero(absurd))
@@ -337,15 +338,19 @@ def assemble(
 def fastest_first(raw: Sequence[RawChannel], advantage: float = 1.3) -> list[RawChannel]:
     """Orders sources of one channel: as given, but one that is `advantage` times faster than the best goes first."""
     best: list[RawChannel] = []
+    single: list[RawChannel] = []
     for entry in raw:
-        if len(entry.t) < 2:
-            continue
-        period = sample_period(np.sort(entry.t))
-        if best and not period * advantage < sample_period(np.sort(best[0].t)):
+        if np.count_nonzero(np.isfinite(entry.t)) < 2:
+            single.append(entry)
+        elif best and not _period(entry) * advantage < _period(best[0]):
             best.append(entry)
         else:
             best.insert(0, entry)
-    return best
+    return best + single
+
+
+def _period(entry: RawChannel) -> float:
+    return sample_period(np.sort(entry.t[np.isfinite(entry.t)]))
 
 
 def fault_warnings(channels: Mapping[str, Channel]) -> list[str]:

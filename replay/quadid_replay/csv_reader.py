@@ -17,8 +17,8 @@ from quadid.errors import LogError, nearest
 from quadid.sanitise import plain
 from quadid.types import FloatArray
 from quadid_replay.columns import LogClock, RawChannel, assemble
+from quadid_replay.formats import HEAD_BYTES, header_line
 from quadid_replay.frames import from_euler
-from quadid_replay.recognise import HEAD_BYTES, header_line
 
 GROUPS: dict[str, tuple[str, ...]] = {
     "gyro": ("p", "q", "r"),
@@ -62,17 +62,15 @@ def read_csv(path: Path, columns: Mapping[str, str] | None = None) -> Recording:
         notes.append(f"columns not used: {plain(', '.join(ignored))} ({nearest(ignored[0], _known())})")
     _check_seconds(table[:, names.index("t")], path.name)
     clock = LogClock()
-    t, accepted = clock.times(table[:, names.index("t")])
-    refused = len(t) - int(np.count_nonzero(accepted))
-    t, rows = t[accepted], table[accepted]
+    t = clock.times(table[:, names.index("t")])
     raw = []
     for name, group in layout.items():
-        values = rows[:, [names.index(c) for c in group]]
+        values = table[:, [names.index(c) for c in group]]
         blank = np.isnan(values).all(axis=1)  # an empty cell means: nothing measured in this row
         if group == EULER:
             _check_radians(values, path.name)
             values = from_euler(values)
-        raw.append(RawChannel(name, t[~blank], values[~blank], " ".join(group), refused))
+        raw.append(RawChannel(name, t[~blank], values[~blank], " ".join(group)))
     recording = assemble(path.name, "csv", raw, clock, notes)
     return replace(recording, grid=_uniform_step(recording.channels))
 

@@ -8,15 +8,14 @@ import struct
 from array import array
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from pymavlink.DFReader import FORMAT_TO_STRUCT, DFFormat, null_term
 
 from quadid.data.window import Recording
-from quadid.types import BoolArray, FloatArray, IntArray
-from quadid_replay.columns import LogClock, RawChannel, assemble, fastest_first, spikes
+from quadid.types import FloatArray, IntArray
+from quadid_replay.columns import LogClock, RawChannel, Source, assemble, channels_of, spikes
 from quadid_replay.flight_modes import ARDUCOPTER, mode_changes
 from quadid_replay.frames import from_euler
 
@@ -192,32 +191,39 @@ def _meaning(description: DFFormat) -> tuple[str, str, list[str]]:
 # since boot.
 
 
-_ATTITUDE = ("Roll", "Pitch", "Yaw")
-_GYRO, _ACCEL = ("GyrX", "GyrY", "GyrZ"), ("AccX", "AccY", "AccZ")
-_RATES = ("R", "P", "Y")
-_QUATERNIONS = ("XKQ", "XKQ1", "NKQ1")
-_QUATERNION = ("Q1", "Q2", "Q3", "Q4")
 _FIRMWARE = re.compile(r"(?:Ardu|APM:)(\w+) V(\d+)\.(\d+)")
 _OUTPUTS = ("RCOU", "RCO2", "RCO3")
 """Outputs 1 to 14, and those behind."""
 _OUTPUT = re.compile(r"Ch?(\d{1,2})")
-_VELOCITY, _POSITION = ("VN", "VE", "VD"), ("PN", "PE", "PD")
+_EKF = ("XKF1", "NKF1", "EKF1")
 
 
-_STAMPED = (
-    "IMU", "GYR", "ACC", "ATT", "ANG", "RATE", "XKF1", "NKF1", "EKF1", "BAT", "CURR", *_OUTPUTS, "ESC", "CTUN",
-    "MODE",
-    *_QUATERNIONS,
-)  # fmt: skip
+def _from_degrees(angles: FloatArray) -> FloatArray:
+    return from_euler(np.radians(angles))
 
 
-class _Source(NamedTuple):
-    """Records of one kind: recording times (NaN where refused), which rows to use, and how many stamps were refused."""
+def _volts(volts: FloatArray) -> FloatArray:
+    """Battery voltage [V]; old CURR counts centivolts, and a monitor that is not there says zero."""
+    if not len(volts) or np.max(volts) <= 0.0:
+        return np.full_like(volts, np.nan)
+    return volts * 0.01 if np.median(volts) > 100.0 else volts
 
-    name: str
-    t: FloatArray
-    rows: BoolArray
-    refused: int
+
+SOURCES = (
+    *(Source("gyro", name, ("GyrX", "GyrY", "GyrZ"), note="instance 0") for name in ("IMU", "GYR")),
+    # The rate controller's input: at the loop's rate where the IMU is logged slowly.
+    Source("gyro", "RATE", ("R", "P", "Y"), np.radians, "(degrees/s, filtered on board)"),
+    *(Source("accel", name, ("AccX", "AccY", "AccZ"), note="instance 0") for name in ("IMU", "ACC")),
+    *(Source("attitude", name, ("Roll", "Pitch", "Yaw"), _from_degrees, "(degrees)") for name in ("ATT", "ANG")),
+    *(Source("attitude", name, ("Q1", "Q2", "Q3", "Q4")) for name in ("XKQ", "XKQ1", "NKQ1")),
+    *(Source("velocity", name, ("VN", "VE", "VD"), note="VN VE VD") for name in _EKF),
+    *(Source("position", name, ("PN", "PE", "PD"), note="PN PE PD") for name in _EKF),
+    *(Source("battery", name, ("Volt",), _volts, "Volt") for name in ("BAT", "CURR")),
+)
+"""In order of preference."""
+
+_STAMPED = (*dict.fromkeys(source.records for source in SOURCES), *_OUTPUTS, "ESC", "CTUN", "MODE")
+"""Records whose stamps are used."""
 
 
 def read_dataflash(path: Path) -> Recording:
@@ -232,13 +238,12 @@ def read_dataflash(path: Path) -> Recording:
     names, values = _parameters(index)
     parameters = dict(zip(names, values, strict=True))
     notes = _damage(index)
+    sources = SOURCES
+    if parameters.get("AHRS_EKF_TYPE") == 2.0:
+        sources = tuple(sorted(SOURCES, key=lambda source: source.records != "NKF1"))
     raw = [
-        *fastest_first([*_vectors(index, times, "gyro", _GYRO, ("IMU", "GYR")), *_rates(index, times)]),
-        *fastest_first(_vectors(index, times, "accel", _ACCEL, ("IMU", "ACC"))),
-        *_attitude(index, times),
+        *channels_of(sources, lambda source: _rows(index, times, source.records, source.columns)),
         *_reference(index, times),
-        *_states(index, times, parameters),
-        *_battery(index, times),
     ]
     firmware = _firmware(index)
     if other := no_multirotor(parameters, firmware=firmware[1] if firmware else ""):
@@ -287,7 +292,7 @@ def _recording_times(index: DataflashIndex, clock: LogClock) -> dict[str, FloatA
     if not stamps:
         return {}
     order = np.argsort(np.concatenate([index.rows(name) for name in stamps]), kind="stable")
-    mapped, _ = clock.times(np.concatenate(list(stamps.values()))[order])
+    mapped = clock.times(np.concatenate(list(stamps.values()))[order])
     unsorted = np.empty_like(mapped)
     unsorted[order] = mapped
     ends = np.cumsum([len(s) for s in stamps.values()])
@@ -301,111 +306,42 @@ def _parameters(index: DataflashIndex) -> tuple[list[str], list[float]]:
     return index.text("PARM", "Name"), index.column("PARM", "Value").tolist()
 
 
-def _source(index: DataflashIndex, times: dict[str, FloatArray], name: str, columns: tuple[str, ...]) -> _Source | None:
-    """Returns the rows of instance 0 (of batteries the first) with an accepted stamp; None when columns are missing."""
+def _rows(
+    index: DataflashIndex, times: dict[str, FloatArray], name: str, columns: tuple[str, ...]
+) -> tuple[FloatArray, FloatArray] | None:
+    """Times and columns of instance 0 (of batteries the first); None when columns are missing."""
     if name not in times or not index.has(name, *columns):
         return None
-    rows = np.isfinite(times[name])
+    t, rows = times[name], np.ones(len(times[name]), dtype=np.bool_)
     for instance in ("I", "Instance", "Inst", "C"):
         if index.has(name, instance):
             number = index.column(name, instance)
             rows &= number == (np.min(number, initial=255) if name == "BAT" else 0)
-    return _Source(name, times[name][rows], rows, int(np.count_nonzero(~np.isfinite(times[name]))))
-
-
-def _stack(index: DataflashIndex, source: _Source, columns: tuple[str, ...]) -> FloatArray:
-    return np.column_stack([index.column(source.name, column)[source.rows] for column in columns])
-
-
-def _vectors(
-    index: DataflashIndex, times: dict[str, FloatArray], channel: str, columns: tuple[str, ...], names: tuple[str, ...]
-) -> list[RawChannel]:
-    out = []
-    for name in names:
-        source = _source(index, times, name, columns)
-        if source is not None:
-            t = source.t
-            if index.has(name, "SampleUS"):  # the raw sensor's own clock is finer than the time of writing
-                sample = index.column(name, "SampleUS")[source.rows] * 1e-6
-                t = (
-                    t + (sample - sample[:1]) - (t - t[:1])
-                    if np.abs((sample - sample[:1]) - (t - t[:1])).max(initial=0.0) < 0.1
-                    else t
-                )
-            out.append(RawChannel(channel, t, _stack(index, source, columns), f"{name} instance 0", source.refused))
-    return out
-
-
-def _rates(index: DataflashIndex, times: dict[str, FloatArray]) -> list[RawChannel]:
-    """The rate controller's input: filtered on board, but at the loop's rate where the IMU is logged slowly."""
-    source = _source(index, times, "RATE", _RATES)
-    if source is None:
-        return []
-    rates = np.radians(_stack(index, source, _RATES))
-    return [RawChannel("gyro", source.t, rates, "RATE (degrees/s, filtered on board)", source.refused)]
-
-
-def _attitude(index: DataflashIndex, times: dict[str, FloatArray]) -> list[RawChannel]:
-    out = []
-    for name in ("ATT", "ANG"):
-        source = _source(index, times, name, _ATTITUDE)
-        if source is not None:
-            angles = np.radians(_stack(index, source, _ATTITUDE))
-            out.append(RawChannel("attitude", source.t, from_euler(angles), f"{name} (degrees)", source.refused))
-    for name in _QUATERNIONS:
-        source = _source(index, times, name, _QUATERNION)
-        if source is not None:
-            out.append(RawChannel("attitude", source.t, _stack(index, source, _QUATERNION), name, source.refused))
-    return fastest_first(out)
+    values = np.stack([index.column(name, column)[rows] for column in columns], axis=1)
+    t = t[rows]
+    stamped = np.flatnonzero(np.isfinite(t))
+    if index.has(name, "SampleUS") and len(stamped):  # the raw sensor's own clock is finer than the time of writing
+        sample = index.column(name, "SampleUS")[rows] * 1e-6
+        later = (sample - sample[stamped[0]]) - (t - t[stamped[0]])
+        t = t + later if np.abs(later[stamped]).max() < 0.1 else t
+    return t, values
 
 
 def _reference(index: DataflashIndex, times: dict[str, FloatArray]) -> list[RawChannel]:
     """Desired angles of ANG or ATT with the last throttle output of CTUN."""
     columns = ("DesRoll", "DesPitch", "DesYaw")
-    desired, throttle = _source(index, times, "ANG", columns) or _source(index, times, "ATT", columns), None
     column, unit = ("ThO", 1.0) if index.has("CTUN", "ThO") else ("ThrOut", 1e-3)
-    if index.has("CTUN", column):
-        throttle = _source(index, times, "CTUN", (column,))
-    if desired is None or throttle is None or len(throttle.t) == 0:
+    throttle = _rows(index, times, "CTUN", (column,))
+    name, desired = next(((n, rows) for n in ("ANG", "ATT") if (rows := _rows(index, times, n, columns))), ("", None))
+    if desired is None or throttle is None:
         return []
-    level = _stack(index, throttle, (column,))[:, 0] * unit
-    latest = np.searchsorted(throttle.t, desired.t, side="right") - 1
+    t, angles = desired[0], np.radians(desired[1])
+    written, level = (part[np.isfinite(throttle[0])] for part in throttle)
+    latest = np.searchsorted(written, t, side="right") - 1
     known = latest >= 0
-    angles = np.radians(_stack(index, desired, columns)[known])
     angles[:, 2] = np.remainder(angles[:, 2] + np.pi, 2.0 * np.pi) - np.pi
-    values = np.column_stack([angles, level[latest[known]]])
-    return [
-        RawChannel(
-            "attitude_reference", desired.t[known], values, f"{desired.name} Des*, CTUN {column}", desired.refused
-        )
-    ]
-
-
-def _states(index: DataflashIndex, times: dict[str, FloatArray], parameters: dict[str, float]) -> list[RawChannel]:
-    names = ["XKF1", "NKF1", "EKF1"]
-    if parameters.get("AHRS_EKF_TYPE") == 2.0:
-        names = ["NKF1", "XKF1", "EKF1"]
-    out = []
-    for channel, columns in (("velocity", _VELOCITY), ("position", _POSITION)):
-        for name in names:
-            source = _source(index, times, name, columns)
-            if source is not None:
-                values = _stack(index, source, columns)
-                out.append(RawChannel(channel, source.t, values, f"{name} {' '.join(columns)}", source.refused))
-    return out
-
-
-def _battery(index: DataflashIndex, times: dict[str, FloatArray]) -> list[RawChannel]:
-    out = []
-    for name in ("BAT", "CURR"):
-        source = _source(index, times, name, ("Volt",))
-        if source is not None:
-            volts = _stack(index, source, ("Volt",))
-            if len(volts) and np.median(volts) > 100.0:  # old CURR counts centivolts
-                volts = volts * 0.01
-            if len(volts) and np.max(volts) > 0.0:
-                out.append(RawChannel("battery", source.t, volts, f"{name} Volt", source.refused))
-    return out
+    values = np.hstack([angles[known], level[latest[known]] * unit])
+    return [RawChannel("attitude_reference", t[known], values, f"{name} Des*, CTUN {column}")]
 
 
 def _outputs(
@@ -415,15 +351,18 @@ def _outputs(
     for name in _OUTPUTS:
         columns = index.formats[name].columns if name in index.formats else ()
         place |= {int(m[1]) - 1: (name, m[0]) for c in columns if (m := _OUTPUT.fullmatch(c)) and 0 < int(m[1]) <= ESCS}
-    told = {name: _source(index, times, name, ()) for name, _ in place.values()}
+    told = {
+        name: _rows(index, times, name, tuple(c for n, c in place.values() if n == name)) for name, _ in place.values()
+    }  # fmt: skip
     first = next(iter(told.values()), None)
     if first is None:
         return []
-    pulses = np.full((len(first.t), 1 + max(place)), np.nan)
-    for output, (name, column) in place.items():
-        if (source := told[name]) is not None:
-            _, here, there = np.intersect1d(first.t, source.t, return_indices=True)  # of one moment
-            pulses[here, output] = _stack(index, source, (column,))[there, 0]
+    pulses = np.full((len(first[0]), 1 + max(place)), np.nan)
+    for name, rows in told.items():
+        if rows is not None:
+            _, here, there = np.intersect1d(first[0], rows[0], return_indices=True)  # of one moment
+            outputs = [output for output, (n, _) in place.items() if n == name]
+            pulses[here[:, None], outputs] = rows[1][there]
     found = motor_outputs(parameters, frame_rotors(_frame(index)), pulses.shape[1], "RCOU", ardupilot=True)
     notes += [found.problem] if found.problem else []
     motors = [] if found.problem else found.columns or active_outputs(in_pulses(pulses)[0])
@@ -434,7 +373,7 @@ def _outputs(
         return []
     values, how = in_pulses(pulses[:, motors])
     label = " ".join([*dict.fromkeys(place[k][0] for k in motors), *(place[k][1] for k in motors)])
-    return [RawChannel("motor_command", first.t, values, f"{label}{how and f' ({how})'}", first.refused)]
+    return [RawChannel("motor_command", first[0], values, f"{label}{how and f' ({how})'}")]
 
 
 def _frame(index: DataflashIndex) -> str:

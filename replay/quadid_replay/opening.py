@@ -1,27 +1,62 @@
-"""The one door for logs: `open_log`."""
+"""Opens logs: every log is read in a child process of its own, so that no file can take more than it is allowed, or the
+caller down.
+
+The child has limits of processor time, time by the clock, memory, files open and bytes written, which the kernel
+holds, whatever the format; readers need no such guards of their own.  It is forked by a process that stands ready
+(`python -m quadid_replay.opening FD`), one for each program that reads logs, from its first log on, so that a small log
+pays for a fork and not for an interpreter.  That process only imports readers and forks; it never looks into a log.
+"""
 
 from __future__ import annotations
 
+import atexit
+import contextlib
+import errno
+import gc
+import json
+import math
+import os
+import resource
+import selectors
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import traceback
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any, Literal, NamedTuple
 
-from quadid.data.window import Recording
-from quadid.errors import LogError
-from quadid_replay.formats import kind_of, parts_of
+import msgspec
+import numpy as np
+import numpy.ma
+
+from quadid.data.window import CHANNELS, Channel, Recording
+from quadid.errors import LogError, QuadidError
+from quadid.sanitise import LONGEST_LINE, plain
+from quadid_replay.formats import kind_of, parts_of, read_here, reader_of
 from quadid_replay.presets import AUTO, preset_rank
-from quadid_replay.reading import read_in_child
 
 LARGE = 4 << 20
 """Files of this size [bytes] are looked at for missing parts; of small ones a file system may store nothing apart."""
 _STORED = 0.02
 """A large file of which less than this share is stored holds nothing but zeros: its copy was not finished."""
+MEMORY, SECONDS = "QUADID_READ_MEMORY_MB", "QUADID_READ_SECONDS"
+"""Environment variables that override the limits."""
+LARGEST_MEMORY_MB = 8192
+LEAST_MEMORY_MB, MEMORY_A_MIB = 768.0, 16.0
+LEAST_SECONDS, SECONDS_A_MIB = 10.0, 4.0
+STANDING = 20.0
+"""Times the limit of processor time that a reader may take by the clock: a busy machine is no fault of the log."""
+OPEN_FILES = 512
+"""Files that a child may have open at once: a recording of rosbag2 is in some tens."""
+_MIB = 1 << 20
+_STATUS_BYTES = 4
 
 
 def open_log(path: str | Path, preset: str = AUTO, columns: Mapping[str, str] | None = None) -> Recording:
     """Reads a flight log of any known format into core units and frames (SI, world NED, body FRD).
-
-    It is read in a child process with limited memory and time, see `quadid_replay.reading`; here only its first bytes
-    are looked at.
 
     Args:
         path: the file, whose format is told by its content and never by its suffix, or the folder of a rosbag2
@@ -44,4 +79,407 @@ def open_log(path: str | Path, preset: str = AUTO, columns: Mapping[str, str] | 
             f"{file.name}: {size >> 20} MiB of which {stored >> 20} MiB are stored", "a whole file",
             "copy it again: the copy or the logger stopped before the end",
         )  # fmt: skip
-    return read_in_child(file, kind.name, size, preset, columns)
+    allowed = limits(size)
+    request = {
+        "format": kind.name, "path": str(file.absolute()), "preset": preset, "columns": dict(columns or {}),
+        "memory": allowed.memory, "seconds": allowed.seconds,
+    }  # fmt: skip
+    ours, theirs = socket.socketpair()
+    with ours:
+        with theirs:
+            _PROCESS.ask(theirs)
+        ours.settimeout(STANDING * allowed.seconds + LEAST_SECONDS)  # the child's own clock stops it before
+        try:
+            ours.sendall(json.dumps(request).encode() + b"\n")
+            with ours.makefile("rb") as stream:
+                answer = memoryview(stream.read(allowed.memory * _MIB))
+        except TimeoutError as error:
+            raise _stopped(file, -signal.SIGALRM, allowed) from error
+        except ConnectionError as error:
+            raise _stopped(file, -signal.SIGKILL, allowed) from error
+    if len(answer) == allowed.memory * _MIB:
+        raise _limited(file, "memory", allowed)
+    try:
+        ended = os.waitstatus_to_exitcode(int.from_bytes(answer[-_STATUS_BYTES:], "little")) if len(answer) else 1
+        if ended:
+            raise _stopped(file, ended, allowed)
+        result = unpack(answer[:-_STATUS_BYTES])
+    except ValueError as error:
+        raise LogError(
+            f"{file.name}: what its reader returned is no recording ({plain(str(error))})", "a log",
+            "try again, or report it with the file",
+        ) from error  # fmt: skip
+    if isinstance(result, str):
+        raise _limited(file, result, allowed)
+    return result
+
+
+# --- Limits, and why there is no answer
+
+
+class Limits(NamedTuple):
+    """What reading one log may take: memory [MiB], processor time [s]."""
+
+    memory: int
+    seconds: float
+
+
+def limits(size: int) -> Limits:
+    """Limits for a file of `size` bytes: 768 MiB and 16 times its size, at most half of this machine's memory and
+    8 GiB; 10 s and 4 s a MiB of processor time.
+
+    Raises:
+        LogError: an environment variable that is no positive number.
+    """
+    machine = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // _MIB
+    memory = _given(MEMORY, min(machine / 2, LARGEST_MEMORY_MB, LEAST_MEMORY_MB + MEMORY_A_MIB * size / _MIB))
+    return Limits(int(memory), _given(SECONDS, LEAST_SECONDS + SECONDS_A_MIB * size / _MIB))
+
+
+def _given(name: str, otherwise: float) -> float:
+    text = os.environ.get(name, "")
+    if not text:
+        return otherwise
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
+    if not 0.0 < value < 1e6:
+        raise LogError(f"{name}={text[:40]!r}", "a positive number", f"unset {name} or correct it")
+    return value
+
+
+_BY_SIGNAL = {
+    signal.SIGXCPU: "seconds", signal.SIGALRM: "standing", signal.SIGXFSZ: "written",
+    signal.SIGABRT: "memory",  # how Python ends where there is not even enough for an error
+}  # fmt: skip
+_BY_ERROR: dict[int, Literal["written", "open files"]] = {errno.EFBIG: "written", errno.EMFILE: "open files"}
+
+
+def _stopped(path: Path, ended: int, allowed: Limits) -> LogError:
+    """Why there is no answer, by how the child ended: minus the signal that ended it, as in `subprocess`."""
+    if -ended in _BY_SIGNAL:
+        return _limited(path, _BY_SIGNAL[signal.Signals(-ended)], allowed)
+    how = signal.Signals(-ended).name if ended < 0 else f"exit code {ended}"
+    return LogError(
+        f"{path.name}: its reader ended with {how}", f"logs that are read within {allowed.memory} MiB of memory",
+        f"copy the file again, allow more with {MEMORY}, or report it with the file",
+    )  # fmt: skip
+
+
+def _limited(path: Path, name: str, allowed: Limits) -> LogError:
+    """That reading met a limit: seconds (of the processor), standing (by the clock), memory, written, open files."""
+    slow = "logs that are read faster", f"cut it into parts, or allow more time with {SECONDS}"
+    only_read = "logs that are only read", "cut it into parts, or copy it again"
+    found, fits, fix = {
+        "seconds": (f"takes longer than {math.ceil(allowed.seconds)} s of processor time", *slow),
+        "standing": (f"takes longer than {math.ceil(STANDING * allowed.seconds)} s by the clock", *slow),
+        "memory": (
+            f"takes more than {allowed.memory} MiB of memory", "logs that fit",
+            f"cut it into parts or drop topics that are not needed, or allow more with {MEMORY}",
+        ),
+        "written": ("writes files", *only_read),
+        "open files": ("opens too many files", *only_read),
+    }[name]  # fmt: skip
+    return LogError(f"{path.name}: reading it {found}", fits, fix)
+
+
+# --- The answer of a child: a recording, or the reason why there is none
+#
+# It is data and nothing else, for the process that wrote it has read a stranger's file: msgpack of these types, the
+# numbers of the channels as little-endian doubles, all of it checked once more by the one that asked.
+
+
+_DOUBLE = "<f8"
+
+
+class BadAnswerError(ValueError):
+    """An answer that is none: sizes that do not fit, numbers that are not finite, a name that is not known."""
+
+
+class ReaderError(LogError):
+    """A reader that failed on a log in a way that it should have reported; a fault of the program."""
+
+
+class _Channel(msgspec.Struct):
+    name: str
+    source: str
+    faults: dict[str, int]
+    columns: int
+    t: memoryview
+    values: memoryview
+
+
+class _Recording(msgspec.Struct, tag=True):
+    name: str
+    format: str
+    breaks: tuple[float, ...]
+    warnings: tuple[str, ...]
+    sha256: str
+    grid: float | None
+    autopilot: dict[str, float]
+    epoch: float | None
+    modes: tuple[tuple[float, str], ...]
+    channels: list[_Channel]
+
+
+class _Refused(msgspec.Struct, tag=True):
+    """Why there is no recording, as of `LogError`."""
+
+    parts: tuple[str, str, str]
+
+
+class _Fault(msgspec.Struct, tag=True):
+    """How the reader failed."""
+
+    what: str
+
+
+class _Limit(msgspec.Struct, tag=True):
+    """The limit that the reader met and noticed."""
+
+    name: Literal["memory", "written", "open files"]
+
+
+def pack(told: Recording | _Refused | _Fault | _Limit) -> bytes:
+    """A recording, or what there is instead, as an answer."""
+    if not isinstance(told, Recording):
+        return msgspec.msgpack.encode(told)
+    channels = [
+        _Channel(
+            c.name, _text(c.source), dict(c.faults), c.values.shape[1],
+            *(memoryview(np.ascontiguousarray(a, _DOUBLE)).cast("B") for a in (c.t, c.values)),
+        ) for c in told.channels.values()
+    ]  # fmt: skip
+    return msgspec.msgpack.encode(_Recording(
+        _text(told.name), told.format, told.breaks, tuple(map(_text, told.warnings)), told.sha256, told.grid,
+        dict(told.autopilot), told.epoch, told.modes, channels,
+    ))  # fmt: skip
+
+
+def unpack(answer: memoryview) -> Recording | str:
+    """Checks an answer; returns the recording, or the name of the limit that its reader met.
+
+    Raises:
+        LogError: the refusal that the answer holds.
+        ReaderError: the failure that it holds.
+        BadAnswerError: anything that is no answer.
+    """
+    try:
+        told = msgspec.msgpack.decode(answer, type=_Recording | _Refused | _Fault | _Limit)
+    except (msgspec.DecodeError, RecursionError) as error:
+        raise BadAnswerError(str(error)) from error
+    if isinstance(told, _Limit):
+        return told.name
+    if isinstance(told, _Refused):
+        raise LogError(*map(_text, told.parts))
+    if isinstance(told, _Fault):
+        raise ReaderError(_text(told.what), "", "report it with the file: the reader of this format failed on it")
+    _finite([*told.breaks, *(t for t, _ in told.modes), *(v for v in (told.grid, told.epoch) if v is not None)])
+    channels = {}
+    for c in told.channels:
+        if c.name not in CHANNELS or min([c.columns, *c.faults.values()]) < 0:
+            raise BadAnswerError("a channel that is not known, or a count that is none")
+        try:
+            t, values = np.frombuffer(c.t, _DOUBLE), np.frombuffer(c.values, _DOUBLE)
+            values = values.reshape(len(t), c.columns)
+            channels[c.name] = Channel(
+                c.name, _finite(t), _finite(values), _text(c.source), {_text(r): n for r, n in c.faults.items()}
+            )
+        except (ValueError, QuadidError) as error:
+            raise BadAnswerError(f"sizes that do not fit ({error})") from error
+    return Recording(
+        _text(told.name), _text(told.format), channels, told.breaks, tuple(map(_text, told.warnings)),
+        _text(told.sha256), told.grid, {_text(name): value for name, value in told.autopilot.items()}, told.epoch,
+        tuple((t, _text(mode)) for t, mode in told.modes),
+    )  # fmt: skip
+
+
+def _finite(numbers: Any) -> Any:
+    if not np.isfinite(numbers).all():
+        raise BadAnswerError("numbers that are not finite")
+    return numbers
+
+
+def _text(value: str) -> str:
+    return plain(value, LONGEST_LINE)
+
+
+# --- The process that stands ready, as the program sees it
+
+
+class _Process:
+    """The process that forks what reads logs; started when first asked, and again if it was lost."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._control: socket.socket | None = None
+        self._process: subprocess.Popen[bytes] | None = None
+
+    def ask(self, answer: socket.socket) -> None:
+        """Hands over the socket on which a request and its answer go."""
+        with self._lock:
+            try:
+                socket.send_fds(self._control or self._start(), [b"\0"], [answer.fileno()])
+            except OSError:
+                self._stop()
+                socket.send_fds(self._start(), [b"\0"], [answer.fileno()])
+
+    def start(self) -> None:
+        """Starts the process, where there is none, without waiting for it: who calls has other things to import."""
+        with self._lock:
+            if self._control is None:
+                self._start()
+
+    def stop(self) -> None:
+        """Ends the process and all that it reads; the next log starts another."""
+        with self._lock:
+            self._stop()
+
+    def forget(self) -> None:
+        """In a forked process: the parent's process is not this one's."""
+        if self._control is not None:
+            self._control.close()
+        if self._process is not None:
+            self._process.returncode = 0  # not ours to wait for
+        self.__init__()  # type: ignore[misc]
+
+    def _start(self) -> socket.socket:
+        self._control, theirs = socket.socketpair()
+        # Nothing leads to the folder we stand in by an empty name, and NumPy starts no threads.
+        path = [os.path.abspath(part) for part in os.environ.get("PYTHONPATH", "").split(os.pathsep) if part]
+        with theirs:
+            self._process = subprocess.Popen(
+                [sys.executable, "-P", "-m", "quadid_replay.opening", str(theirs.fileno())],
+                stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, pass_fds=[theirs.fileno()], start_new_session=True,
+                env={**os.environ, "PYTHONPATH": os.pathsep.join(path), "OPENBLAS_NUM_THREADS": "1"},
+            )  # fmt: skip
+        return self._control
+
+    def _stop(self) -> None:
+        if self._control is not None and self._process is not None:
+            self._control.close()
+            self._process.wait()
+        self._control = self._process = None
+
+
+_PROCESS = _Process()
+start, stop = _PROCESS.start, _PROCESS.stop
+atexit.register(stop)
+os.register_at_fork(after_in_child=_PROCESS.forget)
+
+
+# --- The process that stands ready, and the children that it forks
+#
+# A request comes as one byte with a socket beside it; on that socket follow a line of JSON from the program, the
+# answer of the child, and at last its wait status in four bytes.
+
+
+class _Child(NamedTuple):
+    """A child that reads, the socket its answer goes to, and a pipe that ends when it does."""
+
+    pid: int
+    answer: socket.socket
+    alive: int
+
+
+def serve(control: socket.socket) -> None:
+    """Takes requests until the program that makes them ends; its children end with it."""
+    children: set[_Child] = set()
+    with selectors.DefaultSelector() as ready:
+        ready.register(control, selectors.EVENT_READ)
+        while True:
+            for key, _ in ready.select():
+                if key.fileobj is control:
+                    said, sockets, _, _ = socket.recv_fds(control, 1, 1)
+                    if not said:
+                        for child in children:
+                            os.kill(child.pid, signal.SIGKILL)
+                        return
+                    child = _begin(socket.socket(fileno=sockets[0]))
+                    children.add(child)
+                    ready.register(child.alive, selectors.EVENT_READ, child)
+                    ready.register(child.answer, selectors.EVENT_READ, child)
+                elif key.fileobj == key.data.alive:
+                    _, status = os.waitpid(key.data.pid, 0)
+                    with contextlib.suppress(OSError):  # who asked has gone
+                        key.data.answer.sendall(status.to_bytes(_STATUS_BYTES, "little"))
+                        key.data.answer.shutdown(socket.SHUT_RDWR)  # also for copies that a fork elsewhere has made
+                    with contextlib.suppress(KeyError):
+                        ready.unregister(key.data.answer)
+                    ready.unregister(key.data.alive)
+                    key.data.answer.close()
+                    os.close(key.data.alive)
+                    children.remove(key.data)
+                elif key.data in children:  # whoever asked has hung up
+                    ready.unregister(key.data.answer)
+                    os.kill(key.data.pid, signal.SIGKILL)
+
+
+def _begin(answer: socket.socket) -> _Child:
+    """Forks a child for the request on this socket."""
+    with answer.makefile("rb", buffering=0) as stream:  # nothing behind the line is taken
+        request = json.loads(stream.readline() or b'{"format": ""}')
+    with contextlib.suppress(Exception):  # the child meets it again, and says so
+        reader_of(request["format"])  # imported once, here
+    gc.freeze()
+    alive, ends_with_child = os.pipe()
+    pid = os.fork()
+    if pid == 0:
+        try:
+            _read(answer, **request)
+        finally:
+            os._exit(1)
+    os.close(ends_with_child)
+    return _Child(pid, answer, alive)
+
+
+def _read(
+    answer: socket.socket, format: str, path: str = "", preset: str = "", columns: dict[str, str] | None = None,
+    memory: int = 0, seconds: float = 0.0,
+) -> None:  # fmt: skip
+    """Runs the child.  It never returns."""
+    nothing = os.open(os.devnull, os.O_RDWR)
+    for stream in range(3):  # whatever a library prints
+        os.dup2(nothing, stream)
+    processor = math.ceil(seconds)
+    for limit, soft, hard in (
+        (resource.RLIMIT_DATA, memory * _MIB, memory * _MIB), (resource.RLIMIT_FSIZE, 0, 0),
+        (resource.RLIMIT_CORE, 0, 0), (resource.RLIMIT_NOFILE, OPEN_FILES, OPEN_FILES),
+        (resource.RLIMIT_CPU, processor, processor + 5),
+    ):  # fmt: skip
+        resource.setrlimit(limit, (soft, hard))
+    signal.setitimer(signal.ITIMER_REAL, STANDING * seconds)
+    file = Path(path)
+    try:
+        try:
+            told = pack(read_here(file, preset, columns))
+        except QuadidError as error:
+            noticed = _BY_ERROR.get(getattr(error.__cause__, "errno", 0) or 0)
+            told = pack(
+                _Limit(noticed) if noticed else _Refused((_text(error.found), _text(error.allowed), _text(error.fix)))
+            )
+        except MemoryError:
+            raise
+        except Exception as error:  # noqa: BLE001 - the reader of a stranger's file: told, with the place it is met at
+            where = " < ".join(f"{f.filename}:{f.lineno}" for f in traceback.extract_tb(error.__traceback__)[:-4:-1])
+            what = f"{file.name}: its reader failed ({type(error).__name__}: {error}) at {where}"
+            told = pack(_Fault(_text(what)))
+        answer.sendall(told)
+    except MemoryError:
+        answer.sendall(pack(_Limit("memory")))
+    os._exit(0)
+
+
+def main() -> None:
+    """Serves on the socket whose number is given."""
+    for number in (signal.SIGALRM, signal.SIGXCPU, signal.SIGCHLD, signal.SIGPIPE):  # who started us may ignore them
+        signal.signal(number, signal.SIG_DFL)
+    signal.pthread_sigmask(signal.SIG_SETMASK, [])
+    signal.signal(signal.SIGPIPE, signal.SIG_IGN)
+    with socket.socket(fileno=int(sys.argv[1])) as control:
+        serve(control)
+
+
+if __name__ == "__main__":
+    main()

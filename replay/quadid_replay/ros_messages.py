@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import struct
-from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -21,105 +21,81 @@ from quadid_replay.motors import RPM, motor_columns
 #
 # The library (`mcap_ros2`) decodes or encodes the first message of a topic; where its runs of doubles stand is found
 # by looking for them in the bytes.  As long as nothing else in the message but stamp and numbers changes, later
-# messages are read and written at those places; any other message goes the library's way.  No layout is assumed that
-# the library did not show.
+# messages are read and written at those places, many at once; any other message goes the library's way.  No layout is
+# assumed that the library did not show.
 
 
-Blocks = list[Sequence[float]]
 _LITTLE_ENDIAN = b"\x00\x01"
 _STAMP = struct.Struct("<iI")
 _STAMP_AT, _AFTER_STAMP = 4, 12
 
 
 class Read(NamedTuple):
-    """A message: stamp of its header as seconds and nanoseconds, its runs of numbers, and what else was noted of it."""
+    """What n messages hold: stamps [ns], zero for none, shape (n,); runs of numbers, shapes (n, size); and what else
+    was noted of all of them."""
 
-    seconds: int
-    nanoseconds: int
-    blocks: Blocks
-    extra: Any
-
-
-class ReadMany(NamedTuple):
-    """Messages: stamps (n,) as seconds and nanoseconds, runs of numbers (n, size), and what else was noted of all."""
-
-    seconds: IntArray
-    nanoseconds: IntArray
+    ns: IntArray
     blocks: list[FloatArray]
     extra: Any
 
 
-class BlockReader:
+class MessageReader:
     """Reads the messages of one topic.
 
     Args:
+        kind: their type.
         decode: the library's decoder: bytes to message.
-        blocks: runs of doubles of a decoded message, in the order in which they stand.
-        extra: what else to note of a message (constant while nothing but numbers changes).
     """
 
-    def __init__(
-        self,
-        decode: Callable[[bytes], Any],
-        blocks: Callable[[Any], Blocks],
-        extra: Callable[[Any], Any] = lambda message: None,
-    ) -> None:
-        self._decode, self._blocks, self._extra = decode, blocks, extra
-        self._places: list[tuple[struct.Struct, int, int]] | None = None
-        self._frame: list[tuple[int, int | None, bytes]] = []
-        self._many: np.dtype[np.void] = np.dtype([])
+    def __init__(self, kind: MessageType, decode: Callable[[bytes], Any]) -> None:
+        self._kind, self._decode = kind, decode
+        self._layout: np.dtype[np.void] | None = None
+        self._same: list[tuple[int, int, bytes]] = []
         self._noted: Any = None
-        self._size = 0
 
-    def read(self, data: bytes) -> Read:
-        """Reads one message; raises what the library raises on damaged data."""
-        if self._places is not None and all(data[a:b] == same for a, b, same in self._frame):
-            seconds, nanoseconds = _STAMP.unpack_from(data, _STAMP_AT)
-            return Read(seconds, nanoseconds, [s.unpack_from(data, at) for s, at, _ in self._places], self._noted)
-        message = self._decode(data)
-        blocks = self._blocks(message)
-        extra = self._extra(message)
-        self._learn(data, blocks, extra)
-        stamp = message.header.stamp
-        return Read(stamp.sec, stamp.nanosec, blocks, extra)
+    def read(self, messages: Sequence[bytes]) -> Read | None:
+        """Reads messages; None for several that have not the layout last learnt: their halves are to be read then.
 
-    def read_many(self, messages: Sequence[bytes]) -> ReadMany | None:
-        """Reads messages as `read` does one after the other; None when not all of them have the layout last learnt."""
-        if self._places is None or {*map(len, messages)} != {self._size}:
+        Raises:
+            Exception: a single message that cannot be decoded: what the library raises, of `UNDECODABLE`.
+        """
+        if self._layout is not None and {*map(len, messages)} == {self._layout.itemsize}:
+            data = b"".join(messages)
+            rows = np.frombuffer(data, dtype=np.uint8).reshape(len(messages), -1)
+            if all(rows[:, begin:end].tobytes() == same * len(messages) for begin, end, same in self._same):
+                read = np.frombuffer(data, dtype=self._layout)
+                ns = read["seconds"].astype(np.int64) * 10**9 + read["nanoseconds"]
+                blocks = [read[f"block {k}"].astype(np.float64) for k in range(len(self._same) - 1)]
+                return Read(ns, blocks, self._noted)
+        if len(messages) > 1:
             return None
-        data = b"".join(messages)
-        rows = np.frombuffer(data, dtype=np.uint8).reshape(len(messages), self._size)
-        for begin, end, same in self._frame:
-            if same and rows[:, begin:end].tobytes() != same * len(messages):
-                return None
-        read = np.frombuffer(data, dtype=self._many)
-        blocks = [read[f"block {k}"].astype(np.float64) for k in range(len(self._places))]
-        return ReadMany(
-            read["seconds"].astype(np.int64), read["nanoseconds"].astype(np.int64), blocks, self._noted
-        )  # fmt: skip
+        message = self._decode(messages[0])
+        runs, extra = self._kind.blocks(message), self._kind.extra(message)
+        if self._kind.stamp is None:
+            self._learn(messages[0], runs, extra)
+            stamp = message.header.stamp
+            ns = stamp.sec * 10**9 + stamp.nanosec
+        else:
+            ns = self._kind.stamp(message)
+        return Read(np.array([ns], dtype=np.int64), [np.array([run], dtype=np.float64) for run in runs], extra)
 
-    def _learn(self, data: bytes, blocks: Blocks, extra: Any) -> None:
-        self._places, self._frame = None, []
+    def _learn(self, data: bytes, runs: Runs, extra: Any) -> None:
+        self._layout = None
         if data[:2] != _LITTLE_ENDIAN:
             return
-        places, begin = [], _AFTER_STAMP
-        frame: list[tuple[int, int | None, bytes]] = []
-        for block in blocks:
-            packed = struct.pack(f"<{len(block)}d", *block)
+        places, begin, same = [], _AFTER_STAMP, []
+        for run in runs:
+            packed = struct.pack(f"<{len(run)}d", *run)
             at = data.find(packed, begin)
             if at < 0:
                 return
-            places.append((struct.Struct(f"<{len(block)}d"), at, at + len(packed)))
-            frame.append((begin, at, data[begin:at]))
+            places.append((f"block {len(places)}", ("<f8", (len(run),)), at))
+            same.append((begin, at, data[begin:at]))
             begin = at + len(packed)
-        self._frame = [*frame, (begin, None, data[begin:])]
-        self._places, self._noted, self._size = places, extra, len(data)
-        self._many = np.dtype({
-            "names": ["seconds", "nanoseconds", *(f"block {k}" for k in range(len(places)))],
-            "formats": ["<i4", "<u4", *(("<f8", ((b - a) // 8,)) for _, a, b in places)],
-            "offsets": [_STAMP_AT, _STAMP_AT + 4, *(a for _, a, _ in places)],
-            "itemsize": len(data),
-        })  # fmt: skip
+        self._same, self._noted = [*same, (begin, len(data), data[begin:])], extra
+        fields = [("seconds", "<i4", _STAMP_AT), ("nanoseconds", "<u4", _STAMP_AT + 4), *places]
+        names, formats, offsets = zip(*fields, strict=True)
+        self._layout = np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": len(data)})
 
 
 class BlockWriter:
@@ -157,8 +133,14 @@ class BlockWriter:
 # --- What each ROS 2 message type tells: runs of numbers, the signals in them, and how those become the core's
 
 
-Signals = list[tuple[str, Sequence[float]]]
+Runs = list[Sequence[float]]
+Signals = list[tuple[str, FloatArray, Any]]
+"""Names, values (n, size), and whether the messages tell the signal: of each a mask (n,), or of all one truth."""
 _LAST_NUMBER = re.compile(r"(\d{1,9})\D*$", re.ASCII)
+UNDECODABLE = (
+    McapError, struct.error, ValueError, LookupError, TypeError, AttributeError, RecursionError, OverflowError,
+)  # fmt: skip
+"""What the library and the types' functions raise on damaged data."""
 
 
 @dataclass(frozen=True)
@@ -166,18 +148,23 @@ class MessageType:
     """How to read one type.
 
     Attributes:
-        blocks: runs of doubles of a decoded message.
-        signals: names and values in those runs; the second argument is what `extra` noted.
-        extra: what else to note of a message.
-        stamp: seconds and nanoseconds, for types without a header.
-        deciding: run and place of the numbers that decide, by being -1 or NaN, which signals a message has.
+        blocks: runs of doubles of a decoded message, in the order in which they stand.
+        signals: the signals of n messages, of their runs (n, size) and what `extra` noted.
+        extra: what else to note of a message (constant while nothing but numbers changes).
+        stamp: nanoseconds, for types without a header, which have no layout to be learnt.
     """
 
-    blocks: Callable[[Any], Blocks]
-    signals: Callable[[Blocks, Any], Signals]
+    blocks: Callable[[Any], Runs]
+    signals: Callable[[list[FloatArray], Any], Signals]
     extra: Callable[[Any], Any] = lambda message: None
-    stamp: Callable[[Any], tuple[int, int]] | None = None
-    deciding: tuple[tuple[int, int], ...] = ()
+    stamp: Callable[[Any], int] | None = None
+
+
+def _runs(*names: str, some: bool = False) -> Callable[[list[FloatArray], Any], Signals]:
+    """Signals that are whole runs; where a type may hold `some` of them only, an empty one is not told."""
+    return lambda runs, extra: [
+        (n, run, run.shape[1] > 0 or not some) for n, run in zip(names, runs, strict=True)
+    ]  # fmt: skip
 
 
 def _vector(v: Any) -> list[float]:
@@ -188,11 +175,11 @@ def _quaternion(q: Any) -> list[float]:
     return [q.x, q.y, q.z, q.w]
 
 
-def _wxyz(q: Sequence[float]) -> tuple[float, ...]:
-    return (q[3], q[0], q[1], q[2])
+def _wxyz(q: FloatArray) -> FloatArray:
+    return q[:, [3, 0, 1, 2]]
 
 
-def _imu_block(m: Any) -> Blocks:
+def _imu_block(m: Any) -> Runs:
     return [
         [
             *_quaternion(m.orientation), *m.orientation_covariance,
@@ -202,17 +189,13 @@ def _imu_block(m: Any) -> Blocks:
     ]  # fmt: skip
 
 
-def _imu_signals(blocks: Blocks, extra: Any) -> Signals:
+def _imu_signals(runs: list[FloatArray], extra: Any) -> Signals:
     """REP-145: a covariance that begins with -1 says that the quantity is absent."""
-    (v,) = blocks
-    out: Signals = []
-    if v[16] != -1.0:
-        out.append(("body_rate", v[13:16]))
-    if v[28] != -1.0:
-        out.append(("body_force", v[25:28]))
-    if v[4] != -1.0:
-        out.append(("attitude", _wxyz(v[:4])))
-    return out
+    (v,) = runs
+    return [
+        ("body_rate", v[:, 13:16], v[:, 16] != -1.0), ("body_force", v[:, 25:28], v[:, 28] != -1.0),
+        ("attitude", _wxyz(v[:, :4]), v[:, 4] != -1.0),
+    ]  # fmt: skip
 
 
 def _pose(p: Any) -> list[float]:
@@ -223,22 +206,19 @@ def _twist(t: Any) -> list[float]:
     return [*_vector(t.linear), *_vector(t.angular)]
 
 
-def _odometry_block(m: Any) -> Blocks:
+def _odometry_block(m: Any) -> Runs:
     return [[*_pose(m.pose.pose), *m.pose.covariance, *_twist(m.twist.twist), *m.twist.covariance]]
 
 
-def _odometry_signals(blocks: Blocks, extra: Any) -> Signals:
-    (v,) = blocks
-    out: Signals = [("pose_attitude", _wxyz(v[3:7]))]
-    if v[0] == v[0]:  # NaN: this message tells no position; likewise below
-        out.append(("position", v[:3]))
-    if v[43] != v[43]:
-        return out
-    if extra:
-        out.append(("velocity", v[43:46]))
-    else:
-        out.append(("body_velocity", (*_wxyz(v[3:7]), *v[43:46])))
-    return out
+def _odometry_signals(runs: list[FloatArray], in_world: Any) -> Signals:
+    (v,) = runs
+    q, velocity = _wxyz(v[:, 3:7]), v[:, 43:46]
+    if not in_world:
+        velocity = np.hstack([q, velocity])
+    return [
+        ("pose_attitude", q, True), ("position", v[:, :3], ~np.isnan(v[:, 0])),  # NaN: it tells no position; likewise
+        ("velocity" if in_world else "body_velocity", velocity, ~np.isnan(v[:, 43])),
+    ]  # fmt: skip
 
 
 def _joint_order(m: Any) -> tuple[int, ...] | None:
@@ -253,22 +233,18 @@ def _joint_order(m: Any) -> tuple[int, ...] | None:
     return tuple(sorted(range(len(numbers)), key=numbers.__getitem__))
 
 
-def _joint_signals(blocks: Blocks, extra: Any) -> Signals:
-    named = zip(("rotor_speed", "motor_command"), blocks, strict=True)
-    return [(name, [run[i] for i in extra] if extra else run) for name, run in named if len(run)]
+def _joint_signals(runs: list[FloatArray], order: Any) -> Signals:
+    ordered = [run[:, order] if order and run.shape[1] else run for run in runs]
+    return _runs("rotor_speed", "motor_command", some=True)(ordered, None)
 
 
-def _microseconds(stamp: float) -> tuple[int, int]:
-    return int(stamp) // 1_000_000, int(stamp) % 1_000_000 * 1000
-
-
-def _px4_stamp(m: Any) -> tuple[int, int]:
-    return _microseconds(getattr(m, "timestamp_sample", 0) or m.timestamp)
+def _px4_stamp(m: Any) -> int:
+    return int(getattr(m, "timestamp_sample", 0) or m.timestamp) * 1000
 
 
 def _px4(name: str, values: Callable[[Any], Sequence[float]], published: bool = False) -> MessageType:
-    stamp = (lambda m: _microseconds(m.timestamp)) if published else _px4_stamp
-    return MessageType(lambda m: [values(m)], lambda blocks, extra: [(name, blocks[0])], stamp=stamp)
+    stamp = (lambda m: int(m.timestamp) * 1000) if published else _px4_stamp
+    return MessageType(lambda m: [values(m)], _runs(name), stamp=stamp)
 
 
 def _px4_speeds(m: Any) -> list[float]:
@@ -285,17 +261,13 @@ def _px4_speeds(m: Any) -> list[float]:
 
 
 def _escs(name: str) -> MessageType:
-    return MessageType(
-        lambda m: [[abs(e.rpm) * RPM for e in getattr(m, name)]], lambda blocks, extra: [("rotor_speed", blocks[0])]
-    )
+    return MessageType(lambda m: [[abs(e.rpm) * RPM for e in getattr(m, name)]], _runs("rotor_speed"))
 
 
 def _actuators(speed: str) -> MessageType:
     """mav_msgs (RotorS: angular_velocities) and actuator_msgs (Gazebo: velocity), both with `normalized`."""
-    return MessageType(
-        lambda m: [list(getattr(m, speed)), list(m.normalized)],
-        lambda blocks, extra: [(n, b) for n, b in zip(("rotor_speed", "motor_command"), blocks, strict=True) if len(b)],
-    )
+    told = _runs("rotor_speed", "motor_command", some=True)
+    return MessageType(lambda m: [list(getattr(m, speed)), list(m.normalized)], told)
 
 
 def _set_if(valid: bool, values: list[float]) -> list[float]:
@@ -303,49 +275,43 @@ def _set_if(valid: bool, values: list[float]) -> list[float]:
 
 
 TYPES: dict[str, MessageType] = {
-    "sensor_msgs/Imu": MessageType(_imu_block, _imu_signals, deciding=((0, 4), (0, 16), (0, 28))),
+    "sensor_msgs/Imu": MessageType(_imu_block, _imu_signals),
     "geometry_msgs/QuaternionStamped": MessageType(
-        lambda m: [_quaternion(m.quaternion)], lambda b, extra: [("attitude", _wxyz(b[0]))]
+        lambda m: [_quaternion(m.quaternion)], lambda runs, extra: [("attitude", _wxyz(runs[0]), True)]
     ),
-    "sensor_msgs/JointState": MessageType(
-        lambda m: [list(m.velocity), list(m.effort)], _joint_signals, _joint_order
-    ),
+    "sensor_msgs/JointState": MessageType(lambda m: [list(m.velocity), list(m.effort)], _joint_signals, _joint_order),
     "nav_msgs/Odometry": MessageType(
-        _odometry_block, _odometry_signals, extra=lambda m: m.child_frame_id == m.header.frame_id,
-        deciding=((0, 0), (0, 43)),
+        _odometry_block, _odometry_signals, extra=lambda m: m.child_frame_id == m.header.frame_id
     ),
     "geometry_msgs/PoseStamped": MessageType(
-        lambda m: [_pose(m.pose)], lambda b, extra: [("position", b[0][:3]), ("pose_attitude", _wxyz(b[0][3:]))]
+        lambda m: [_pose(m.pose)],
+        lambda runs, extra: [("position", runs[0][:, :3], True), ("pose_attitude", _wxyz(runs[0][:, 3:]), True)],
     ),
     "geometry_msgs/TwistStamped": MessageType(
-        lambda m: [_twist(m.twist)], lambda b, extra: [("velocity", b[0][:3])]
+        lambda m: [_twist(m.twist)], lambda runs, extra: [("velocity", runs[0][:, :3], True)]
     ),
-    "sensor_msgs/BatteryState": MessageType(lambda m: [[m.voltage]], lambda b, extra: [("battery", b[0])]),
+    "sensor_msgs/BatteryState": MessageType(lambda m: [[m.voltage]], _runs("battery")),
     "quadid_msgs/AttitudeCommand": MessageType(
-        lambda m: [[m.roll, m.pitch, m.yaw, m.throttle]], lambda b, extra: [("euler_reference", b[0])]
+        lambda m: [[m.roll, m.pitch, m.yaw, m.throttle]], _runs("euler_reference")
     ),
-    "quadid_msgs/MotorCommand": MessageType(lambda m: [list(m.values)], lambda b, extra: [("motor_command", b[0])]),
-    "mavros_msgs/RCOut": MessageType(
-        lambda m: [[float(c) for c in m.channels]], lambda b, extra: [("outputs", b[0])]
-    ),
+    "quadid_msgs/MotorCommand": MessageType(lambda m: [list(m.values)], _runs("motor_command")),
+    "mavros_msgs/RCOut": MessageType(lambda m: [[float(c) for c in m.channels]], _runs("outputs")),
     "mavros_msgs/ESCStatus": _escs("esc_status"),
     "mavros_msgs/ESCTelemetry": _escs("esc_telemetry"),
     "mavros_msgs/AttitudeTarget": MessageType(
-        lambda m: [[*_wxyz(_quaternion(m.orientation)), m.thrust]], lambda b, extra: [("quaternion_reference", b[0])]
+        lambda m: [[m.orientation.w, *_vector(m.orientation), m.thrust]], _runs("quaternion_reference")
     ),
     "mav_msgs/Actuators": _actuators("angular_velocities"),
     "actuator_msgs/Actuators": _actuators("velocity"),
     "px4_msgs/SensorCombined": MessageType(
-        lambda m: [list(m.gyro_rad), list(m.accelerometer_m_s2)],
-        lambda b, extra: [("gyro", b[0]), ("accel", b[1])],
-        stamp=lambda m: _microseconds(m.timestamp - 0.5 * m.gyro_integral_dt),  # a mean counts at its middle
+        lambda m: [list(m.gyro_rad), list(m.accelerometer_m_s2)], _runs("gyro", "accel"),
+        stamp=lambda m: int(m.timestamp - 0.5 * m.gyro_integral_dt) * 1000,  # a mean counts at its middle
     ),
     "px4_msgs/VehicleAttitude": _px4("frd_attitude", lambda m: list(m.q)),
     "px4_msgs/VehicleAttitudeSetpoint": _px4("frd_reference", lambda m: [*m.q_d, -m.thrust_body[2]], True),
     "px4_msgs/VehicleLocalPosition": MessageType(
         lambda m: [_set_if(m.xy_valid, [m.x, m.y, m.z]), _set_if(m.v_xy_valid, [m.vx, m.vy, m.vz])],
-        lambda b, extra: [("ned_position", b[0]), ("ned_velocity", b[1])],
-        stamp=_px4_stamp,
+        _runs("ned_position", "ned_velocity"), stamp=_px4_stamp,
     ),
     "px4_msgs/BatteryStatus": _px4("battery", lambda m: [m.voltage_v], True),
     "px4_msgs/ActuatorMotors": _px4("actuator_motors", lambda m: list(m.control), True),
@@ -404,97 +370,11 @@ def type_name(schema: str) -> str:
     return schema.replace("/msg/", "/")
 
 
-# --- Signals of many messages at once: which columns of their numbers are which signal
+# --- From the messages of a log to columns of numbers
 #
-# The type's own `signals` says so of one message.  It holds for all that have runs of the same lengths, as long as the
-# numbers that decide which signals a message tells say the same.
+# Messages are taken in batches.  Those of a topic that keeps its layout are read at once; where it changes within a
+# batch, each half is read by itself, down to a single message, which the library decodes and the layout is learnt from.
 
-
-Places = tuple[str, list[tuple[int, int]]]
-"""A signal, and where each of its numbers stands: run and place in it."""
-UNDECODABLE = (
-    McapError, struct.error, ValueError, LookupError, TypeError, AttributeError, RecursionError, OverflowError,
-)  # fmt: skip
-"""What the library and the types' functions raise on damaged data."""
-
-
-class _Number(float):
-    """A number of a message that knows where it stands: run of numbers and place in it."""
-
-    at: tuple[int, int]
-
-    @classmethod
-    def placed(cls, value: float, at: tuple[int, int]) -> _Number:
-        """A number and where it stands."""
-        number = cls(value)
-        number.at = at
-        return number
-
-
-class SignalColumns:
-    """The columns of one message type; what the type's `signals` says is asked once for each kind of message met."""
-
-    def __init__(self, kind: MessageType) -> None:
-        self._kind = kind
-        self._known: dict[Hashable, list[Places] | None] = {}
-
-    def pick(self, blocks: list[FloatArray], extra: Hashable) -> list[tuple[str, FloatArray]] | None:
-        """Names and values (n, size) of the signals; None where the messages must be looked at one by one.
-
-        Args:
-            blocks: runs of numbers of n messages, shapes (n, length).
-            extra: what was noted of all of them.
-        """
-        told = []
-        for run, column in self._kind.deciding:
-            values = blocks[run][:, column]
-            if (values == values[0]).all():  # as nearly always
-                told.append((bool(values[0] == -1.0), False))
-                continue
-            absent, unknown = values == -1.0, np.isnan(values)
-            if (absent != absent[0]).any() or (unknown != unknown[0]).any():
-                return None
-            told.append((bool(absent[0]), bool(unknown[0])))
-        met = (*(block.shape[1] for block in blocks), extra, *told)
-        if met not in self._known:
-            self._known[met] = self._places(blocks, extra)
-        places = self._known[met]
-        return None if places is None else [(name, _taken(blocks, at)) for name, at in places]
-
-    def _places(self, blocks: list[FloatArray], extra: Hashable) -> list[Places] | None:
-        """Where the first message's signals stand; None where they are not simply numbers of the message."""
-        first: Blocks = [
-            [_Number.placed(value, (run, column)) for column, value in enumerate(block[0])]
-            for run, block in enumerate(blocks)
-        ]
-        try:
-            told = self._kind.signals(first, extra)
-        except UNDECODABLE:
-            return None
-        out: list[Places] = []
-        for name, picked in told:
-            at = [one.at for one in picked if isinstance(one, _Number)]
-            if len(at) != len(picked):
-                return None
-            out.append((name, at))
-        return out
-
-
-def _taken(blocks: list[FloatArray], at: list[tuple[int, int]]) -> FloatArray:
-    if len({run for run, _ in at}) == 1:
-        return blocks[at[0][0]][:, [column for _, column in at]]
-    columns = [blocks[run][:, column] for run, column in at]
-    return np.stack(columns, axis=1) if columns else np.empty((len(blocks[0]), 0))
-
-
-# --- From the messages of an MCAP to columns of numbers
-#
-# Messages are taken in batches.  Those of a topic that keeps its layout (`BlockReader`) are read at once,
-# column by column; where it changes within a batch, each half is read by itself, down to a single message, which the
-# library decodes and the layout is learnt from.
-
-
-ColumnsOf = dict[tuple[int, str], Columns]
 
 BATCH, BATCH_BYTES = 8192, 8 << 20
 """Messages in a batch at most, and bytes of their payloads at which it ends."""
@@ -502,32 +382,7 @@ _EPOCH_NS = 10**17
 """Log times above this [ns, 1973] count from the UNIX epoch; recording time then counts from the log's first second."""
 _OTHER_CLOCK = 3600.0
 """Stamps this far [s] from the log time belong to another clock (boot or simulation time)."""
-_LARGEST_BASE = 1 << 62
-
-
-class Source(NamedTuple):
-    """A topic that is read: its description, its type, the library's decoder, the reader of its layout if any, and
-    which columns of many messages are which signal."""
-
-    topic: Topic
-    kind: MessageType
-    decode: Callable[[bytes], Any]
-    layout: BlockReader | None
-    columns: SignalColumns
-
-    def read(self, data: bytes) -> Read:
-        """Reads one message; raises what the library raises on damaged data."""
-        if self.layout is not None:
-            return self.layout.read(data)
-        message = self.decode(data)
-        assert self.kind.stamp is not None
-        return Read(*self.kind.stamp(message), self.kind.blocks(message), self.kind.extra(message))
-
-
-def source_of(topic: Topic, kind: MessageType, decode: Callable[[bytes], Any]) -> Source:
-    """The reader of a topic; messages without a header have no layout that could be learnt."""
-    layout = BlockReader(decode, kind.blocks, kind.extra) if kind.stamp is None else None
-    return Source(topic, kind, decode, layout, SignalColumns(kind))
+_LARGEST_NS = 1 << 62
 
 
 class Stamps:
@@ -536,50 +391,53 @@ class Stamps:
     def __init__(self) -> None:
         self.clock = LogClock()
         self.base_ns: int | None = None
-        self._offsets: dict[str, float] = {}
+        self._offsets: dict[bool, float] = {}
 
-    def time(self, group: str, seconds: int, nanoseconds: int, log_time: int) -> float | None:
-        """Returns recording time of a stamp; log time stands in for a stamp of zero."""
+    def times(self, headed: BoolArray, stamps: IntArray, logged: Sequence[int]) -> FloatArray:
+        """Recording times [s] of messages in file order, shape (n,); NaN for those refused.
+
+        Args:
+            headed: whether the stamp stands in a header; the others are PX4's, of a clock of their own, shape (n,).
+            stamps: [ns], shape (n,); log time stands in for zero.
+            logged: log times [ns].
+        """
+        log_ns = np.minimum(np.array(logged, dtype=np.uint64), _LARGEST_NS).astype(np.int64)
         if self.base_ns is None:
-            self.base_ns = log_time // 10**9 * 10**9 if log_time > _EPOCH_NS else 0
-        logged = (log_time - self.base_ns) * 1e-9
-        if seconds == 0 and nanoseconds == 0:
-            return self.clock.time(logged)
-        stamped = (seconds * 10**9 + nanoseconds - self.base_ns) * 1e-9
-        offset = self._offsets.get(group)
-        if offset is None:
-            # Boot or simulation time beside a log on UNIX time: the first message tells the distance.
-            offset = logged - stamped if abs(logged - stamped) > _OTHER_CLOCK else 0.0
-            self._offsets[group] = offset
-        return self.clock.time(stamped + offset)
+            self.base_ns = int(log_ns[0]) // 10**9 * 10**9 if log_ns[0] > _EPOCH_NS else 0
+        since, times = (log_ns - self.base_ns) * 1e-9, (stamps - self.base_ns) * 1e-9
+        for group in (True, False):
+            its = np.flatnonzero((headed == group) & (stamps != 0))
+            if len(its) and group not in self._offsets:
+                # Boot or simulation time beside a log on UNIX time: the first message tells the distance.
+                ahead = float(since[its[0]] - times[its[0]])
+                self._offsets[group] = ahead if abs(ahead) > _OTHER_CLOCK else 0.0
+            times[its] += self._offsets.get(group, 0.0)
+        return self.clock.times(np.where(stamps == 0, since, times))
 
-    def times(self, groups: Sequence[str], stamps: IntArray, logged: Sequence[int]) -> FloatArray:
-        """As `time` for many stamps (n, 2), seconds and nanoseconds, in file order; NaN for those refused."""
-        plain = self._plain_times(groups, stamps)
-        if plain is not None:
-            return plain
-        pairs = stamps.tolist()
-        each = [self.time(g, s, ns, log) for g, (s, ns), log in zip(groups, pairs, logged, strict=True)]
-        return np.array([np.nan if t is None else t for t in each], dtype=np.float64)
 
-    def _plain_times(self, groups: Sequence[str], stamps: IntArray) -> FloatArray | None:
-        """None, and nothing has changed, unless every stamp follows plainly on a clock that is known."""
-        if self.base_ns is None or self.base_ns > _LARGEST_BASE or not np.all(np.any(stamps != 0, axis=1)):
-            return None
-        known = set(groups)
-        if not known <= self._offsets.keys() or np.any(np.abs(stamps[:, 0]) > _LARGEST_BASE // 10**9):
-            return None
-        offset = np.array([self._offsets[g] for g in groups]) if len(known) > 1 else self._offsets[groups[0]]
-        stamped = (stamps[:, 0] * 10**9 + stamps[:, 1] - self.base_ns) * 1e-9
-        return self.clock.plain_times(np.asarray(stamped + offset, dtype=np.float64))
+class Source(NamedTuple):
+    """A topic that is read: its description, its type, and what reads its messages."""
+
+    topic: Topic
+    kind: MessageType
+    reader: MessageReader
 
 
 class Decoded(NamedTuple):
     """Columns by topic and signal, the clock, and how many messages could not be decoded."""
 
-    columns: ColumnsOf
+    columns: dict[tuple[int, str], Columns]
     stamps: Stamps
     failed: int
+
+
+class _Part(NamedTuple):
+    """Samples of one signal in a batch: which messages, and values (n, size)."""
+
+    key: tuple[int, str]
+    order: int
+    rows: IndexArray
+    values: FloatArray
 
 
 def decode_messages(messages: Iterable[Message], sources: Mapping[int, Source]) -> Decoded:
@@ -587,12 +445,33 @@ def decode_messages(messages: Iterable[Message], sources: Mapping[int, Source]) 
 
     Args:
         messages: of the topics in `sources`, in file order.
-        sources: readers by channel id.
+        sources: what reads them, by channel id.
     """
-    columns: ColumnsOf = {}
+    columns: dict[tuple[int, str], Columns] = {}
     stamps, failed = Stamps(), 0
     for batch in _batches(messages):
-        failed += _add_batch(batch, sources, columns, stamps)
+        numbers = np.array([number for number, _, _ in batch])
+        stamped, decoded = np.zeros(len(batch), np.int64), np.zeros(len(batch), np.bool_)
+        parts: list[_Part] = []
+        for number in dict.fromkeys(numbers.tolist()):
+            rows = np.flatnonzero(numbers == number)
+            for some, read in _read(sources[number].reader, rows, [batch[row][2] for row in rows]):
+                stamped[some], decoded[some] = read.ns, True
+                for order, (name, values, known) in enumerate(sources[number].kind.signals(read.blocks, read.extra)):
+                    here = np.broadcast_to(known, len(some))
+                    parts.append(_Part((number, name), order, some[here], values[here]))
+        headed = np.isin(numbers, [number for number, source in sources.items() if source.kind.stamp is None])
+        times = np.full(len(batch), np.nan)
+        if decoded.any():
+            logged = [batch[row][1] for row in np.flatnonzero(decoded)]
+            times[decoded] = stamps.times(headed[decoded], stamped[decoded], logged)
+        failed += len(batch) - int(np.count_nonzero(decoded))
+        for part in sorted((p for p in parts if len(p.rows)), key=lambda p: (p.rows[0], p.order)):
+            width = part.values.shape[1]
+            if width == 0 or (kept := columns.setdefault(part.key, Columns(width))).width != width:
+                failed += len(part.rows)
+            else:
+                kept.add(times[part.rows], part.values)
     return Decoded(columns, stamps, failed)
 
 
@@ -609,59 +488,15 @@ def _batches(messages: Iterable[Message]) -> Iterator[list[Message]]:
         yield batch
 
 
-class _Part(NamedTuple):
-    """Samples of one signal in a batch: which messages, and values (n, size)."""
-
-    key: tuple[int, str]
-    order: int
-    rows: IndexArray
-    values: FloatArray
-
-
-def _add_batch(batch: list[Message], sources: Mapping[int, Source], columns: ColumnsOf, stamps: Stamps) -> int:
-    """Adds the numbers of a batch to the columns; returns how many messages could not be decoded."""
-    numbers = np.array([number for number, _, _ in batch])
-    stamped, decoded = np.zeros((len(batch), 2), np.int64), np.ones(len(batch), np.bool_)
-    parts: list[_Part] = []
-    for number in dict.fromkeys(numbers.tolist()):
-        source, rows = sources[number], np.flatnonzero(numbers == number)
-        parts += _read(number, source, rows, [batch[row][2] for row in rows], stamped, decoded)
-    groups = ["header" if sources[number].layout is not None else "px4" for number in numbers[decoded].tolist()]
-    times = np.full(len(batch), np.nan)
-    if groups:
-        logged = [batch[row][1] for row in np.flatnonzero(decoded)]
-        times[decoded] = stamps.times(groups, stamped[decoded], logged)
-    failed = len(batch) - int(np.count_nonzero(decoded))
-    for part in sorted(parts, key=lambda p: (p.rows[0], p.order)):
-        kept = columns.get(part.key)
-        if part.values.shape[1] == 0 or (kept is not None and kept.width != part.values.shape[1]):
-            failed += len(part.rows)
-            continue
-        if kept is None:
-            kept = columns[part.key] = Columns(part.values.shape[1])
-        kept.add_many(times[part.rows], part.values)
-    return failed
-
-
-def _read(
-    number: int, source: Source, rows: IndexArray, data: list[bytes], stamped: IntArray, decoded: BoolArray
-) -> list[_Part]:
-    """Reads messages of a topic, the `rows` of a batch; `decoded` becomes False where that is not possible."""
-    read = source.layout.read_many(data) if source.layout is not None else None
-    signals = None if read is None else source.columns.pick(read.blocks, read.extra)
-    if read is not None and signals is not None:
-        stamped[rows, 0], stamped[rows, 1] = read.seconds, read.nanoseconds
-    elif len(rows) > 1:
-        half = len(rows) // 2
-        first = _read(number, source, rows[:half], data[:half], stamped, decoded)
-        return first + _read(number, source, rows[half:], data[half:], stamped, decoded)
-    else:
-        try:
-            message = source.read(data[0])
-            told = source.kind.signals(message.blocks, message.extra)
-            signals = [(name, np.array(values, dtype=np.float64)[None]) for name, values in told]
-            stamped[rows] = message.seconds, message.nanoseconds
-        except UNDECODABLE:
-            decoded[rows] = False
-            return []
-    return [_Part((number, name), order, rows, values) for order, (name, values) in enumerate(signals)]
+def _read(reader: MessageReader, rows: IndexArray, data: list[bytes]) -> Iterator[tuple[IndexArray, Read]]:
+    """Reads messages of a topic, the `rows` of a batch; those that cannot be decoded do not come back."""
+    try:
+        read = reader.read(data)
+    except UNDECODABLE:
+        return
+    if read is not None:
+        yield rows, read
+        return
+    half = len(data) // 2
+    yield from _read(reader, rows[:half], data[:half])
+    yield from _read(reader, rows[half:], data[half:])

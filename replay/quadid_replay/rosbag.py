@@ -21,7 +21,7 @@ from quadid_replay.columns import Columns, RawChannel, assemble, fastest_first
 from quadid_replay.mcap_file import McapFile, Message, Part, Topic, in_log_time, usable_definition
 from quadid_replay.motors import active_outputs
 from quadid_replay.presets import AUTO, preset_rank
-from quadid_replay.ros_messages import SIGNALS, TYPES, Source, decode_messages, source_of, type_name
+from quadid_replay.ros_messages import SIGNALS, TYPES, MessageReader, Source, decode_messages, type_name
 
 # --- Folders that `ros2 bag record` makes: which files of them are read, in which order
 
@@ -261,7 +261,7 @@ def _sources(bag: Bag, preset: str, notes: list[str]) -> dict[int, Source]:
         except Exception as error:  # noqa: BLE001 - the parser of untrusted definitions raises anything; it is reported
             notes.append(f"{topic.name}: its message definition is damaged ({type(error).__name__}): not used")
             continue
-        sources[number] = source_of(topic, kind, decode)
+        sources[number] = Source(topic, kind, MessageReader(kind, decode))
     return sources
 
 
@@ -287,7 +287,7 @@ def _channels(columns: dict[tuple[int, str], Columns], sources: dict[int, Source
         rank += 5 if signal == "pose_attitude" else 0
         with np.errstate(over="ignore", invalid="ignore"):  # damaged numbers are dropped further on
             converted = convert(values)
-        ranked.setdefault(channel, []).append((rank, RawChannel(channel, t, converted, source, kept.refused)))
+        ranked.setdefault(channel, []).append((rank, RawChannel(channel, t, converted, source)))
     out = []
     for entries in ranked.values():
         ordered = [entry for _, entry in sorted(entries, key=lambda pair: pair[0])]

@@ -305,12 +305,8 @@ class Told(NamedTuple):
     messages: Messages
 
 
-class Signal(NamedTuple):
-    """Times [s] of n samples, shape (n,), their values, shape (n, columns), and how many the clock refused."""
-
-    t: FloatArray
-    values: FloatArray
-    refused: int
+Signal = tuple[FloatArray, FloatArray]
+"""Times [s] of n samples, NaN where refused, shape (n,), and their values, shape (n, columns)."""
 
 
 @dataclass(frozen=True)
@@ -429,7 +425,7 @@ def _signals(batches: list[_Batch], clock: LogClock) -> tuple[dict[tuple[str, st
     position[in_file[placing.order]] = np.arange(len(which))
     known = ~np.isnan(placing.time)
     t = np.full(len(which), np.nan)
-    t[known] = clock.in_order(placing.time[known])
+    t[known] = clock.times(placing.time[known])
     own = placing.boot[~stamps.servo & ~np.isnan(placing.boot)]
     backwards = int(np.count_nonzero(own < np.concatenate([[0.0], own[:-1]]) - _BACKWARDS))
 
@@ -468,11 +464,8 @@ def _signal(signal: str, parts: list[_Part], t: FloatArray) -> Signal:
     width = _WIDTH.get(signal, 3)
     t = t[position]
     if signal in ("esc", "servo"):
-        t, values = _rounds(t, places, values, width)
-    elif values.shape[1] < width:
-        values = np.pad(values, ((0, 0), (0, width - values.shape[1])))
-    known = ~np.isnan(t)
-    return Signal(t, values, 0) if known.all() else Signal(t[known], values[known], int(np.count_nonzero(~known)))
+        return _rounds(t, places, values, width)
+    return t, np.pad(values, ((0, 0), (0, width - values.shape[1])))
 
 
 def _rounds(t: FloatArray, places: IntArray, values: FloatArray, width: int) -> tuple[FloatArray, FloatArray]:
@@ -516,7 +509,7 @@ def read_tlog(path: Path) -> Recording:
             f"{path.name}: {len(frames.start)} MAVLink frames but no measurements of a vehicle",
             "IMU, attitude, servo or ESC messages", "ask the autopilot for them (SR*_RAW_SENS, SR*_EXTRA1, MAV_*_MODE)",
         )  # fmt: skip
-    who = max(vehicles, key=lambda key: sum(len(s.t) for s in vehicles[key].signals.values()))
+    who = max(vehicles, key=lambda key: sum(len(t) for t, _ in vehicles[key].signals.values()))
     notes = _notes(frames, len(which) - int(np.count_nonzero(whole)))
     if vehicles[who].backwards > _MOST_BACKWARDS:
         raise LogError(
@@ -573,9 +566,9 @@ def _channels(vehicle: VehicleLog, notes: list[str]) -> list[RawChannel]:
     for channel, messages in PREFERENCE.items():
         found = []
         for message in messages:
-            for (signal, source), (t, values, refused) in vehicle.signals.items():
+            for (signal, source), (t, values) in vehicle.signals.items():
                 if signal == channel and source.split(" ")[0] == message:
-                    found.append(RawChannel(channel, t, values, source, refused))
+                    found.append(RawChannel(channel, t, values, source))
         raw += fastest_first(found, 2.0)
     return raw + _motors(vehicle, notes)
 
@@ -588,12 +581,12 @@ def _motors(vehicle: VehicleLog, notes: list[str]) -> list[RawChannel]:
     rotors = vehicle.rotors or px4_rotor_count(vehicle.parameters) or MULTIROTORS.get(vehicle.kind, 0)
     notes += [vehicle.changed] if vehicle.changed else []
     raw: list[RawChannel] = []
-    for (signal, source), (t, values, refused) in vehicle.signals.items():
+    for (signal, source), (t, values) in vehicle.signals.items():
         if signal == "esc":
             turning = (np.nan_to_num(values) != 0.0).any(axis=0)
             found = esc_columns(vehicle.parameters, rotors, turning, source, vehicle.ardupilot)
             notes += [found.problem] if found.problem else []
-            raw.append(RawChannel("rotor_speed", t, values[:, found.columns], f"{source} (rpm)", refused))
+            raw.append(RawChannel("rotor_speed", t, values[:, found.columns], f"{source} (rpm)"))
         elif signal in ("servo", "actuator"):
             told = np.flatnonzero(np.isfinite(values).any(axis=0))
             values = values[:, : told.max(initial=-1) + 1]
@@ -604,5 +597,5 @@ def _motors(vehicle: VehicleLog, notes: list[str]) -> list[RawChannel]:
             motors = found.columns or guessed
             which = " ".join(str(i + 1) for i in motors) + how if signal == "servo" else "(normalized)"
             if motors:
-                raw.append(RawChannel("motor_command", t, values[:, motors], f"{source} {which}", refused))
+                raw.append(RawChannel("motor_command", t, values[:, motors], f"{source} {which}"))
     return sorted(raw, key=lambda r: "ACTUATOR" not in r.source)

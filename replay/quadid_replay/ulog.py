@@ -20,7 +20,7 @@ from quadid.data.window import Recording
 from quadid.errors import LogError
 from quadid.sanitise import plain
 from quadid.types import FloatArray, IntArray
-from quadid_replay.columns import LogClock, RawChannel, assemble, fastest_first
+from quadid_replay.columns import LogClock, RawChannel, Source, assemble, channels_of, fastest_first
 from quadid_replay.flight_modes import PX4, mode_changes
 from quadid_replay.frames import to_euler
 
@@ -246,7 +246,46 @@ _TOPICS = frozenset((
     "vehicle_attitude_setpoint", "vehicle_local_position", "battery_status", "actuator_motors", "actuator_outputs",
     "esc_status", "vehicle_status", "vehicle_torque_setpoint", "vehicle_thrust_setpoint",
 ))  # fmt: skip
-_XYZ = ("xyz[0]", "xyz[1]", "xyz[2]")
+
+
+def _numbered(name: str, count: int) -> tuple[str, ...]:
+    return tuple(f"{name}[{i}]" for i in range(count))
+
+
+def _increments(rows: FloatArray) -> FloatArray:
+    """Mean rates of increments and the interval [us] that each is of."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return rows[:, :3] / (rows[:, 3:] * 1e-6)
+
+
+def _reference(rows: FloatArray) -> FloatArray:
+    return np.column_stack([to_euler(rows[:, :4]), -rows[:, 4]])
+
+
+def _volts(rows: FloatArray) -> FloatArray:
+    return rows if np.any(rows > 0.0) else np.full_like(rows, np.nan)
+
+
+_XYZ = _numbered("xyz", 3)
+SOURCES = (
+    Source("gyro", "sensor_combined", (*_numbered("gyro_rad", 3), "gyro_integral_dt"), lambda rows: rows[:, :3]),
+    Source("gyro", "vehicle_imu", (*_numbered("delta_angle", 3), "delta_angle_dt"), _increments),
+    Source("gyro", "vehicle_angular_velocity", _XYZ, note="(filtered on board)"),
+    Source(
+        "accel", "sensor_combined", (*_numbered("accelerometer_m_s2", 3), "accelerometer_integral_dt"),
+        lambda rows: rows[:, :3],
+    ),
+    Source("accel", "vehicle_imu", (*_numbered("delta_velocity", 3), "delta_velocity_dt"), _increments),
+    Source("accel", "vehicle_acceleration", _XYZ, note="(filtered on board)"),
+    Source("attitude", "vehicle_attitude", _numbered("q", 4)),
+    Source("attitude_reference", "vehicle_attitude_setpoint", (*_numbered("q_d", 4), "thrust_body[2]"), _reference),
+    Source("velocity", "vehicle_local_position", ("vx", "vy", "vz")),
+    Source("position", "vehicle_local_position", ("x", "y", "z")),
+    Source("battery", "battery_status", ("voltage_v",), _volts),
+)  # fmt: skip
+"""In order of preference."""
+_VALID = {"vx": "v_xy_valid", "x": "xy_valid"}
+"""Fields that say whether another is known."""
 _UAVCAN_OUTPUTS = 3
 """UAVCAN_ENABLE from which motors are on it."""
 _FEWEST_COMPARED = 20
@@ -256,11 +295,10 @@ _ALLOCATED_ALIKE = 0.005
 
 
 class _Log(NamedTuple):
-    """Topic instances by (name, instance), parameters, and the clock that counts wild stamps."""
+    """Topic instances by (name, instance), and parameters."""
 
     topics: dict[tuple[str, int], dict[str, NDArray[Any]]]
     parameters: dict[str, float]
-    clock: LogClock
 
 
 def read_ulog(path: Path) -> Recording:
@@ -272,21 +310,13 @@ def read_ulog(path: Path) -> Recording:
     records = collect_records(path, _TOPICS)
     log = _load(path, records)
     notes = _notes(records, path.stat().st_size)
-    raw = [
-        *fastest_first(_gyro(log), 2.0),
-        *fastest_first(_accel(log), 2.0),
-        *_simple(log, "attitude", "vehicle_attitude", tuple(f"q[{i}]" for i in range(4))),
-        *_reference(log),
-        *_simple(log, "velocity", "vehicle_local_position", ("vx", "vy", "vz"), "v_xy_valid"),
-        *_simple(log, "position", "vehicle_local_position", ("x", "y", "z"), "xy_valid"),
-        *_battery(log),
-    ]
+    raw = channels_of(SOURCES, lambda source: _rows(log, source), 2.0)
     if other := no_multirotor(log.parameters):
         notes.append(other)
     else:
         raw += fastest_first([*_actuator_motors(log), *_actuator_outputs(log), *_allocated(log)], 2.0)
         raw += _esc(log, notes)
-    recording = assemble(path.name, "ulog", raw, log.clock, notes, log.parameters)
+    recording = assemble(path.name, "ulog", raw, LogClock(), notes, log.parameters)
     return replace(recording, modes=_modes(log))
 
 
@@ -294,8 +324,7 @@ def _modes(log: _Log) -> tuple[tuple[float, str], ...]:
     key = ("vehicle_status", 0)
     if not _has(log, key, "nav_state"):
         return ()
-    t, accepted = LogClock().times(log.topics[key]["timestamp"].astype(np.float64) * 1e-6)
-    return mode_changes(np.where(accepted, t, np.nan), log.topics[key]["nav_state"].astype(np.float64), PX4)
+    return mode_changes(_times(log.topics[key], "timestamp"), log.topics[key]["nav_state"].astype(np.float64), PX4)
 
 
 def _notes(records: UlogRecords, size: int) -> list[str]:
@@ -321,23 +350,41 @@ def _load(path: Path, records: UlogRecords) -> _Log:
     parameters = {
         str(k): float(v) for k, v in ulog.initial_parameters.items() if isinstance(v, int | float)
     }  # fmt: skip
-    return _Log(topics, parameters, LogClock())
+    return _Log(topics, parameters)
 
 
 def _raw(
-    log: _Log, channel: str, key: tuple[str, int], values: FloatArray, stamp: str = "timestamp_sample", note: str = ""
-) -> RawChannel:
-    """Makes a channel of one topic instance; stamps far from their neighbours are refused.
+    log: _Log, channel: str, key: tuple[str, int], values: FloatArray, note: str = ""
+) -> RawChannel:  # fmt: skip
+    source = f"{key[0]}{f' {key[1]}' if key[1] else ''}{f' ({note})' if note else ''}"
+    return RawChannel(channel, _times(log.topics[key], "timestamp"), values, source)
+
+
+def _times(data: dict[str, NDArray[Any]], stamp: str = "timestamp_sample") -> FloatArray:
+    """Times [s] of a topic; NaN for stamps far from their neighbours.
 
     A ULog is written by one boot, so each topic has its own clock and a step back is damage, not a reboot.
     """
-    data = log.topics[key]
     raw = data[stamp if stamp in data and np.any(data[stamp]) else "timestamp"].astype(np.float64) * 1e-6
-    t, accepted = LogClock().times(raw)
-    accepted &= t == raw
-    log.clock.wild += int(np.count_nonzero(~accepted))
-    source = f"{key[0]}{f' {key[1]}' if key[1] else ''}{f' ({note})' if note else ''}"
-    return RawChannel(channel, t[accepted], values[accepted], source)
+    return np.where(LogClock().times(raw) == raw, raw, np.nan)
+
+
+def _rows(log: _Log, source: Source) -> tuple[FloatArray, FloatArray] | None:
+    """Times and columns of a topic's first instance; a mean over an interval before its stamp counts at the middle."""
+    key, first = (source.records, 0), source.columns[0]
+    if not _has(log, key, *source.columns):
+        return None
+    data = log.topics[key]
+    t, values = _times(data), _stack(data, source.columns)
+    if first in _VALID and _has(log, key, _VALID[first]):
+        values[data[_VALID[first]] == 0] = np.nan
+    if source.columns[-1].endswith("_dt"):
+        t = t - 0.5e-6 * values[:, -1]
+    if source.channel == "accel" and _has(log, key, "accelerometer_timestamp_relative"):
+        relative = data["accelerometer_timestamp_relative"].astype(np.float64) * 1e-6
+        t = t + relative
+        values[np.abs(relative) >= 1.0] = np.nan  # a huge one marks an invalid sample
+    return t, values
 
 
 def _stack(data: dict[str, NDArray[Any]], columns: tuple[str, ...]) -> FloatArray:
@@ -347,71 +394,6 @@ def _stack(data: dict[str, NDArray[Any]], columns: tuple[str, ...]) -> FloatArra
 
 def _has(log: _Log, key: tuple[str, int], *columns: str) -> bool:
     return key in log.topics and "timestamp" in log.topics[key] and all(c in log.topics[key] for c in columns)
-
-
-def _simple(log: _Log, channel: str, topic: str, columns: tuple[str, ...], valid: str = "") -> list[RawChannel]:
-    key = (topic, 0)
-    if not _has(log, key, *columns):
-        return []
-    values = _stack(log.topics[key], columns)
-    if valid and _has(log, key, valid):
-        values[log.topics[key][valid] == 0] = np.nan
-        if np.isnan(values).all():
-            return []
-    return [_raw(log, channel, key, values)]
-
-
-def _gyro(log: _Log) -> list[RawChannel]:
-    out = _means(log, "gyro", "sensor_combined", "gyro_rad", "gyro_integral_dt")
-    out += _means(log, "gyro", "vehicle_imu", "delta_angle", "delta_angle_dt")
-    for entry in _simple(log, "gyro", "vehicle_angular_velocity", _XYZ):
-        out.append(entry._replace(source="vehicle_angular_velocity (filtered on board)"))
-    return out
-
-
-def _accel(log: _Log) -> list[RawChannel]:
-    out = _means(log, "accel", "sensor_combined", "accelerometer_m_s2", "accelerometer_integral_dt")
-    out += _means(log, "accel", "vehicle_imu", "delta_velocity", "delta_velocity_dt")
-    for entry in _simple(log, "accel", "vehicle_acceleration", _XYZ):
-        out.append(entry._replace(source="vehicle_acceleration (filtered on board)"))
-    return out
-
-
-def _means(log: _Log, channel: str, topic: str, field: str, interval: str) -> list[RawChannel]:
-    """Means over an interval [us] that ends at the stamp count at its middle; increments are divided by it first."""
-    key = (topic, 0)
-    columns = tuple(f"{field}[{i}]" for i in range(3))
-    if not _has(log, key, *columns, interval):
-        return []
-    data = log.topics[key]
-    width = data[interval].astype(np.float64) * 1e-6
-    values = _stack(data, columns)
-    if field.startswith("delta"):
-        with np.errstate(divide="ignore", invalid="ignore"):
-            values = values / width[:, None]
-    shift = -0.5 * width
-    if channel == "accel" and _has(log, key, "accelerometer_timestamp_relative"):
-        relative = data["accelerometer_timestamp_relative"].astype(np.float64) * 1e-6
-        shift = np.where(np.abs(relative) < 1.0, shift + relative, np.nan)  # a huge one marks an invalid sample
-    entry = _raw(log, channel, key, np.column_stack([values, shift]))
-    return [entry._replace(t=entry.t + entry.values[:, 3], values=entry.values[:, :3])]
-
-
-def _reference(log: _Log) -> list[RawChannel]:
-    key = ("vehicle_attitude_setpoint", 0)
-    columns = tuple(f"q_d[{i}]" for i in range(4))
-    if not _has(log, key, *columns, "thrust_body[2]"):
-        return []
-    throttle = -_stack(log.topics[key], ("thrust_body[2]",))
-    values = np.column_stack([to_euler(_stack(log.topics[key], columns)), throttle])
-    return [_raw(log, "attitude_reference", key, values, "timestamp")]
-
-
-def _battery(log: _Log) -> list[RawChannel]:
-    key = ("battery_status", 0)
-    if not _has(log, key, "voltage_v") or not np.any(log.topics[key]["voltage_v"] > 0.0):
-        return []
-    return [_raw(log, "battery", key, _stack(log.topics[key], ("voltage_v",)), "timestamp")]
 
 
 def _actuator_motors(log: _Log) -> list[RawChannel]:
@@ -431,7 +413,7 @@ def _motor_command(log: _Log, key: tuple[str, int], thrust: FloatArray, how: str
         rest = 1.0 - factor
         thrust = (np.sqrt(rest**2 + 4.0 * factor * np.maximum(thrust, 0.0)) - rest) / (2.0 * factor)
         how += f", THR_MDL_FAC {factor:g} undone"
-    return _raw(log, "motor_command", key, thrust, "timestamp", how)
+    return _raw(log, "motor_command", key, thrust, note=how)
 
 
 def _allocated(log: _Log) -> list[RawChannel]:
@@ -484,10 +466,10 @@ def _actuator_outputs(log: _Log) -> list[RawChannel]:
         for bank in PX4_BANKS:
             motors = px4_motor_outputs(log.parameters, bank)
             if motors and len(active_outputs(pulses[:, motors])) == len(motors):
-                return [_raw(log, "motor_command", key, values[:, motors], "timestamp", f"{how or 'us'}, {bank}")]
+                return [_raw(log, "motor_command", key, values[:, motors], note=f"{how or 'us'}, {bank}")]
         motors = active_outputs(pulses)
         if motors and (not count or len(motors) >= count):
-            return [_raw(log, "motor_command", key, values[:, : count or len(motors)], "timestamp", how or "us")]
+            return [_raw(log, "motor_command", key, values[:, : count or len(motors)], note=how or "us")]
     return []
 
 
@@ -508,4 +490,4 @@ def _esc(log: _Log, notes: list[str]) -> list[RawChannel]:
         notes.append(problem)
         return []
     values = np.abs(_stack(data, tuple(f"esc[{k}].esc_rpm" for k in columns))) * RPM
-    return [_raw(log, "rotor_speed", key, values, "timestamp", "rpm")]
+    return [_raw(log, "rotor_speed", key, values, note="rpm")]

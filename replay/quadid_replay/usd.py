@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import struct
 import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,7 @@ from quadid.data.window import Recording
 from quadid.errors import LogError
 from quadid.sanitise import plain
 from quadid.types import FloatArray, IntArray
-from quadid_replay.columns import LogClock, RawChannel, assemble
+from quadid_replay.columns import LogClock, Source, assemble, channels_of
 from quadid_replay.frames import GRAVITY, flip_body, from_euler
 from quadid_replay.motors import RPM
 
@@ -161,14 +161,6 @@ FULL_SCALE = 65535.0
 """The firmware's full motor command."""
 
 
-class Source(NamedTuple):
-    """How a channel is made of variables: its name, the variables in order, and the conversion of rows (n, k)."""
-
-    channel: str
-    variables: tuple[str, ...]
-    convert: Callable[[FloatArray], FloatArray]
-
-
 def _axes(prefix: str, names: str) -> tuple[str, ...]:
     return tuple(f"{prefix}{name}" for name in names.split())
 
@@ -203,23 +195,23 @@ def _reference(rows: FloatArray) -> FloatArray:
 
 
 SOURCES: tuple[Source, ...] = (
-    Source("gyro", _axes("gyro.", "x y z"), lambda rows: flip_body(np.deg2rad(rows))),
-    Source("gyro", _axes("controller.r_", "roll pitch yaw"), lambda rows: rows * np.array([1.0, 1.0, -1.0])),
-    Source("accel", _axes("acc.", "x y z"), lambda rows: flip_body(rows * GRAVITY)),
-    Source("accel_z", ("controller.accelz",), _scaled(-GRAVITY)),
-    Source("accel_world", _axes("stateEstimate.", "ax ay az"), _specific_force),
-    Source("attitude", _axes("stateEstimate.", "qw qx qy qz"), _quaternion),
-    Source("attitude", _axes("stateEstimate.", "roll pitch yaw"), _attitude),
-    Source("attitude", _axes("stabilizer.", "roll pitch yaw"), _attitude),
-    Source("velocity", _axes("stateEstimate.", "vx vy vz"), _level),
-    Source("position", _axes("stateEstimate.", "x y z"), _level),
-    Source("rotor_speed", _axes("rpm.", "m1 m2 m3 m4"), _scaled(RPM)),
-    Source("motor_command", _axes("motor.", "m1 m2 m3 m4"), _scaled(1.0 / FULL_SCALE)),
-    Source("motor_command", _axes("pwm.", "m1_pwm m2_pwm m3_pwm m4_pwm"), _scaled(1.0 / FULL_SCALE)),
-    Source("mixer_input", _axes("controller.cmd_", "thrust roll pitch yaw"), _scaled(1.0 / FULL_SCALE)),
-    Source("attitude_reference", (*_axes("controller.", "roll pitch yaw"), "controller.actuatorThrust"), _reference),
-    Source("battery", ("pm.vbatMV",), _scaled(1e-3)),
-    Source("battery", ("pm.vbat",), _scaled(1.0)),
+    Source("gyro", "", _axes("gyro.", "x y z"), lambda rows: flip_body(np.deg2rad(rows))),
+    Source("gyro", "", _axes("controller.r_", "roll pitch yaw"), lambda rows: rows * np.array([1.0, 1.0, -1.0])),
+    Source("accel", "", _axes("acc.", "x y z"), lambda rows: flip_body(rows * GRAVITY)),
+    Source("accel_z", "", ("controller.accelz",), _scaled(-GRAVITY)),
+    Source("accel_world", "", _axes("stateEstimate.", "ax ay az"), _specific_force),
+    Source("attitude", "", _axes("stateEstimate.", "qw qx qy qz"), _quaternion),
+    Source("attitude", "", _axes("stateEstimate.", "roll pitch yaw"), _attitude),
+    Source("attitude", "", _axes("stabilizer.", "roll pitch yaw"), _attitude),
+    Source("velocity", "", _axes("stateEstimate.", "vx vy vz"), _level),
+    Source("position", "", _axes("stateEstimate.", "x y z"), _level),
+    Source("rotor_speed", "", _axes("rpm.", "m1 m2 m3 m4"), _scaled(RPM)),
+    Source("motor_command", "", _axes("motor.", "m1 m2 m3 m4"), _scaled(1.0 / FULL_SCALE)),
+    Source("motor_command", "", _axes("pwm.", "m1_pwm m2_pwm m3_pwm m4_pwm"), _scaled(1.0 / FULL_SCALE)),
+    Source("mixer_input", "", _axes("controller.cmd_", "thrust roll pitch yaw"), _scaled(1.0 / FULL_SCALE)),
+    Source("attitude_reference", "", _axes("controller.", "roll pitch yaw actuatorThrust"), _reference),
+    Source("battery", "", ("pm.vbatMV",), _scaled(1e-3)),
+    Source("battery", "", ("pm.vbat",)),
 )
 """In order of preference: of several sources of one channel the first that a log holds is taken."""
 
@@ -232,34 +224,30 @@ def read_usd(path: Path) -> Recording:
     """
     records = collect_usd_records(path.read_bytes(), path.name)
     clock = LogClock()
-    raw: list[RawChannel] = []
-    left: list[str] = []
     tables = {  # the others are events, such as a change of mode
         title: table for title, table in records.tables.items()
         if title == "fixedFrequency" or any(_holds(table, s) for s in SOURCES)
     }  # fmt: skip
     times = _on_one_clock(tables, records.places, clock)
-    for title, table in tables.items():
-        t = times[title]
-        accepted = np.isfinite(t)
-        rows, refused = table[accepted], len(t) - int(np.count_nonzero(accepted))
-        used = {"id", "t"}
-        for source in SOURCES:
-            if _holds(rows, source) and source.channel not in {entry.name for entry in raw}:
-                with np.errstate(invalid="ignore"):  # what is no number is dropped further on
-                    values = np.column_stack([rows[v].astype(np.float64) for v in source.variables])
-                shown = " ".join(source.variables)
-                raw.append(RawChannel(source.channel, t[accepted], source.convert(values), shown, refused))
-                used |= set(source.variables)
-        left += [name for name in table.dtype.names or () if name not in used]
+
+    def rows(source: Source) -> tuple[FloatArray, FloatArray] | None:
+        title = next((title for title, table in tables.items() if _holds(table, source)), None)
+        if title is None:
+            return None
+        with np.errstate(invalid="ignore"):
+            values = np.column_stack([tables[title][v].astype(np.float64) for v in source.columns])
+        return times[title], values
+
+    raw = channels_of(SOURCES, rows, math.inf)
+    used = {"id", "t", *(variable for entry in raw for variable in entry.source.split())}
+    left = [name for table in tables.values() for name in table.dtype.names or () if name not in used]
     if not raw:
         raise LogError(
             f"{path.name}: none of its variables is known ({plain(', '.join(left))[:120] or 'no record'})",
             "motor.m1 … m4 or controller.cmd_thrust, cmd_roll, cmd_pitch, cmd_yaw; gyro.x y z; acc.x y z; pm.vbatMV",
             "list them in the µSD card's config.txt",
         )
-    notes = [*records.notes, *_partial(left)]
-    return assemble(path.name, "usdlog", raw, clock, notes)
+    return assemble(path.name, "usdlog", raw, clock, [*records.notes, *_partial(left)])
 
 
 def _on_one_clock(
@@ -270,13 +258,13 @@ def _on_one_clock(
         return {}
     order = np.argsort(np.concatenate([places[title] for title in tables]))
     mapped = np.empty(len(order))
-    mapped[order] = clock.times(np.concatenate([table["t"] for table in tables.values()])[order] * 1e-6)[0]
+    mapped[order] = clock.times(np.concatenate([table["t"] for table in tables.values()])[order] * 1e-6)
     ends = np.cumsum([len(table) for table in tables.values()])
     return dict(zip(tables, np.split(mapped, ends[:-1]), strict=True))
 
 
 def _holds(table: NDArray[np.void], source: Source) -> bool:
-    return set(source.variables) <= set(table.dtype.names or ())
+    return set(source.columns) <= set(table.dtype.names or ())
 
 
 _PARTIAL: Mapping[str, tuple[str, ...]] = {

@@ -9,7 +9,7 @@ import subprocess
 import sys
 
 import pytest
-from quadid_replay.recognise import FORMATS, LogFormat
+from quadid_replay.formats import FORMATS, LogFormat
 
 import quadid
 from quadid import old_paths

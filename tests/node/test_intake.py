@@ -11,7 +11,6 @@ from mcap_ros2._dynamic import generate_dynamic, serialize_dynamic
 from quadid_node.inputs import MEMORY, SLICE, Chooser, Decoder, Input, Intake, best_ranks, source
 from quadid_replay import write_mcap
 from quadid_replay.mcap_file import McapFile
-from quadid_replay.ros_messages import TYPES, SignalColumns
 from quadid_replay.schemas import schema_text
 
 from quadid.data.window import Block, Sample
@@ -21,11 +20,6 @@ from quadid.vehicle import Vehicle
 Message = tuple[str, bytes]
 SECONDS = 3.0
 INPUTS = source("canonical").inputs
-SIZES = {
-    "sensor_msgs/Imu": [37], "geometry_msgs/QuaternionStamped": [4], "sensor_msgs/JointState": [4, 0],
-    "nav_msgs/Odometry": [85], "quadid_msgs/AttitudeCommand": [4], "quadid_msgs/MotorCommand": [6],
-}  # fmt: skip
-"""Numbers in each message type, run by run."""
 
 
 @pytest.fixture(scope="module")
@@ -164,28 +158,3 @@ def test_messages_that_cannot_be_read_are_named_as_long_as_they_come(messages: l
         assert reader.trouble == f"{reader.failed} messages could not be read"
     reader.pace.look(3.0 * MEMORY, 2.9 * MEMORY, 1)
     assert (reader.failed, reader.trouble) == (3, "")
-
-
-@pytest.mark.parametrize("kind", sorted(SIZES))
-@pytest.mark.parametrize("seed", range(4))
-def test_columns_are_the_signals_of_each_message(kind: str, seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    runs = [rng.normal(size=(5, n)) for n in SIZES[kind]]
-    if seed and kind == "sensor_msgs/Imu":
-        runs[0][:, [4, 16, 28][seed - 1]] = -1.0
-    if seed == 1 and kind == "nav_msgs/Odometry":
-        runs[0][:, 0] = np.nan
-    extra = bool(seed % 2) and ((2, 0, 3, 1) if kind == "sensor_msgs/JointState" else True)
-    told = SignalColumns(TYPES[kind]).pick(runs, extra)
-    assert told is not None
-    for row in range(5):
-        expected = TYPES[kind].signals([run[row].tolist() for run in runs], extra)
-        assert [name for name, _ in told] == [name for name, _ in expected]
-        for (_, values), (_, numbers) in zip(told, expected, strict=True):
-            assert np.array_equal(values[row], np.array(numbers), equal_nan=True)
-
-
-def test_messages_that_tell_different_signals_are_no_columns() -> None:
-    run = np.zeros((3, 37))
-    run[1, 16] = -1.0
-    assert SignalColumns(TYPES["sensor_msgs/Imu"]).pick([run], None) is None

@@ -19,7 +19,7 @@ import lz4.frame  # type: ignore[import-untyped]
 import pytest
 import zstandard
 from quadid_node.history import make_tables
-from quadid_replay import reading
+from quadid_replay import opening
 from quadid_replay.schemas import schema_text
 
 from quadid.cli.main import app_main
@@ -227,11 +227,11 @@ def test_a_small_file_costs_no_more_than_its_limits(
     monkeypatch.setenv("QUADID_READ_SECONDS", str(SECONDS))
     monkeypatch.setenv("QUADID_READ_MEMORY_MB", str(MEMORY))
     kept = {*os.listdir(tmp_path)}
-    reading.stop()
+    opening.stop()
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     monkeypatch.setattr(sys, "argv", ["quadid", "inspect", str(path), "--vehicle", "pelican"])
     code = app_main()
-    reading.stop()  # what its children took counts from now on
+    opening.stop()  # what its children took counts from now on
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     (said,) = capfd.readouterr().err.strip().splitlines()
     assert code == 2, said

@@ -13,7 +13,7 @@ from quadid_replay import ros_messages as mcap_decode
 from quadid_replay import write_mcap
 from quadid_replay.formats import read_here
 from quadid_replay.mcap_file import Topic
-from quadid_replay.ros_messages import MessageType, Read, Source, decode_messages, source_of
+from quadid_replay.ros_messages import MessageReader, MessageType, Source, decode_messages
 from quadid_replay.schemas import schema_text
 
 from quadid.data.window import Recording
@@ -31,12 +31,12 @@ def both_ways(path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Recording | 
     by the library when batches are as large as they are.
     """
     decodings = 0
-    read = Source.read
+    learn = MessageReader._learn
 
-    def watched(source: Source, data: bytes) -> Read:
+    def watched(reader: MessageReader, *told: Any) -> None:
         nonlocal decodings
         decodings += 1
-        return read(source, data)
+        learn(reader, *told)
 
     def recording() -> Recording | str:
         try:
@@ -45,7 +45,7 @@ def both_ways(path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Recording | 
             return str(error)
 
     with monkeypatch.context() as patch:
-        patch.setattr(Source, "read", watched)
+        patch.setattr(MessageReader, "_learn", watched)
         whole = recording()
     for size in (1, 7, 100):
         with monkeypatch.context() as patch:
@@ -170,7 +170,6 @@ def test_types_without_a_layout_are_read_one_by_one() -> None:
     def unread(data: bytes) -> Any:
         raise ValueError(data)
 
-    kind = MessageType(lambda m: [[0.0]], lambda b, extra: [("battery", b[0])], stamp=lambda m: (1, 0))
-    source = source_of(Topic("t", "k", "", "cdr"), kind, unread)
-    assert source.layout is None
+    kind = MessageType(lambda m: [[0.0]], lambda runs, extra: [("battery", runs[0], True)], stamp=lambda m: 1)
+    source = Source(Topic("t", "k", "", "cdr"), kind, MessageReader(kind, unread))
     assert decode_messages([(1, 0, b"x")], {1: source}).failed == 1

@@ -10,16 +10,18 @@ import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import cast
 
+import msgspec
 import numpy as np
 import pytest
-import quadid_replay.reading
-from quadid_replay import answer, open_log, write_csv, write_mcap, write_tlog
+import quadid_replay.opening
+from quadid_replay import open_log, write_csv, write_mcap, write_tlog
 from quadid_replay.formats import read_here
-from quadid_replay.reading import Limits, limits
+from quadid_replay.opening import BadAnswerError, Limits, limits, pack, unpack
 
 from quadid.data.window import Recording
 from quadid.errors import LogError
@@ -62,7 +64,7 @@ def test_a_folder_may_take_what_its_files_may(tmp_path: Path, monkeypatch: pytes
         allowed.append(size)
         return limits(size)
 
-    monkeypatch.setattr(quadid_replay.reading, "limits", noted)
+    monkeypatch.setattr(quadid_replay.opening, "limits", noted)
     assert open_log(folder).channels
     assert allowed == [sum(file.stat().st_size for file in folder.glob("*.mcap"))]
 
@@ -125,38 +127,33 @@ def test_a_reading_process_that_was_killed_is_started_again(tmp_path: Path) -> N
     write_csv(tmp_path / "a.csv", full_recording(1.0, 50.0))
     for _ in range(2):
         assert open_log(tmp_path / "a.csv").channels
-        process = quadid_replay.reading._PROCESS._process
+        process = quadid_replay.opening._PROCESS._process
         assert process is not None
         process.kill()
         process.wait()
 
 
-def _changed(line: dict[str, object], numbers: bytes) -> memoryview:
-    return memoryview(json.dumps(line).encode() + b"\n" + numbers)
-
-
 def test_an_answer_is_checked_at_the_door() -> None:
     recording = full_recording(0.1, 50.0)
-    whole = b"".join(answer.pack(recording))
-    head, _, numbers = whole.partition(b"\n")
-    line = json.loads(head)
-    found = answer.unpack(memoryview(whole))
-    assert isinstance(found, Recording)
-    assert list(found.channels) == list(recording.channels)
+    whole = pack(recording)
+    same(recording, cast(Recording, unpack(memoryview(whole))))
+    line = msgspec.msgpack.decode(whole)
     first = line["channels"][0]
-    bad: list[memoryview] = [
-        memoryview(b""), memoryview(b"\x80\x04."), memoryview(b"[]\n"), memoryview(whole[:-8]),
-        memoryview(whole + bytes(8)), _changed(line, np.full(len(numbers) // 8, np.nan).tobytes()),
-        _changed({**line, "channels": [["os", *first[1:]], *line["channels"][1:]]}, numbers),
-        _changed({**line, "channels": [[*first[:3], -1, 1 << 60], *line["channels"][1:]]}, numbers),
-        _changed({**line, "channels": [[*first[:3], 1 << 39, 1 << 39], *line["channels"][1:]]}, numbers),
-        _changed({**line, "epoch": "now"}, numbers), _changed({**line, "warnings": [["x"]]}, numbers),
-        _changed({k: v for k, v in line.items() if k != "modes"}, numbers),
-    ]  # fmt: skip
-    for one in bad:
-        with pytest.raises(answer.BadAnswerError):
-            answer.unpack(one)
-    told = answer.unpack(_changed({**line, "warnings": ["a\x1b[2Jb\nc" + "x" * 10_000]}, numbers))
+
+    def changed(channel: Mapping[str, object] | None = None, **fields: object) -> bytes:
+        channels = [{**first, **(channel or {})}, *line["channels"][1:]]
+        return msgspec.msgpack.encode({**line, "channels": channels, **fields})
+
+    not_finite = np.full(len(first["values"]) // 8, np.nan).tobytes()
+    for bad in (
+        b"", b"\x80\x04.", whole[:-8], whole + bytes(8), changed({"values": not_finite}), changed({"name": "os"}),
+        changed({"columns": 1 << 60}), changed({"columns": -2}), changed({"t": first["t"][:-8]}),
+        changed({"t": first["t"][:-3]}), changed({"faults": {"x": -1}}), changed(epoch="now"), changed(epoch=np.inf),
+        changed(warnings=[["x"]]), changed(breaks=[np.nan]), changed(modes=None),
+    ):  # fmt: skip
+        with pytest.raises(BadAnswerError):
+            unpack(memoryview(bad))
+    told = unpack(memoryview(changed(warnings=["a\x1b[2Jb\nc" + "x" * 10_000])))
     assert isinstance(told, Recording)
     assert told.warnings[0].startswith("a?[2Jb?c")
     assert len(told.warnings[0]) <= 2000
@@ -206,7 +203,7 @@ def extended(tmp_path_factory: pytest.TempPathFactory, repository: Path) -> Path
     reader, line = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
     (folder / "quadid_replay" / "xyz_reader.py").write_text(reader)
     (folder / "quadid_replay" / "harm_reader.py").write_text(HARMFUL)
-    table = folder / "quadid_replay" / "recognise.py"
+    table = folder / "quadid_replay" / "formats.py"
     added = f'    {line.strip()},\n    LogFormat("harm", b"HARM", "harm_reader:read_harm"),\n'
     table.write_text(table.read_text().replace("FORMATS = (\n", f"FORMATS = (\n{added}"))
     return folder
