@@ -99,34 +99,28 @@ class MessageReader:
 
 
 class BlockWriter:
-    """Writes messages of one topic that differ in stamp and numbers only.
+    """Writes messages of one topic that differ in stamp and one run of doubles only.
 
     Args:
         encode: the library's encoder: message to bytes.
-        build: makes a message of runs of doubles; its stamp does not matter.
-        sizes: lengths of the runs.
+        build: makes a message of the doubles; its stamp does not matter.
+        size: how many they are.
+
+    Raises:
+        ValueError: the numbers do not stand together in this message.
     """
 
-    def __init__(
-        self, encode: Callable[[Any], bytes], build: Callable[[list[list[float]]], Any], sizes: Sequence[int]
-    ) -> None:
-        marks = [[1.0 + 0.001 * (100 * i + k) for k in range(n)] for i, n in enumerate(sizes)]
-        self._bytes = bytearray(encode(build(marks)))
-        self._places = []
-        begin = _AFTER_STAMP
-        for block in marks:
-            packed = struct.pack(f"<{len(block)}d", *block)
-            at = self._bytes.find(packed, begin)
-            if at < 0:
-                raise ValueError("the numbers do not stand together in this message")
-            self._places.append((struct.Struct(f"<{len(block)}d"), at))
-            begin = at + len(packed)
+    def __init__(self, encode: Callable[[Any], bytes], build: Callable[[list[float]], Any], size: int) -> None:
+        marks = [1.0 + 0.001 * k for k in range(size)]
+        self._bytes, self._numbers = bytearray(encode(build(marks))), struct.Struct(f"<{size}d")
+        self._at = self._bytes.find(self._numbers.pack(*marks), _AFTER_STAMP)
+        if self._at < 0:
+            raise ValueError("the numbers do not stand together in this message")
 
-    def write(self, nanoseconds: int, *blocks: Sequence[float]) -> bytes:
+    def write(self, nanoseconds: int, values: Sequence[float]) -> bytes:
         """Returns the message with this stamp [ns] and these numbers."""
         _STAMP.pack_into(self._bytes, _STAMP_AT, nanoseconds // 1_000_000_000, nanoseconds % 1_000_000_000)
-        for (layout, at), block in zip(self._places, blocks, strict=True):
-            layout.pack_into(self._bytes, at, *block)
+        self._numbers.pack_into(self._bytes, self._at, *values)
         return bytes(self._bytes)
 
 

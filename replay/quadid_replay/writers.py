@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import struct
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import SimpleNamespace, TracebackType
-from typing import Any, BinaryIO, TypeAlias
+from typing import Any, BinaryIO, NamedTuple, TypeAlias
 
 import numpy as np
 import yaml
@@ -184,10 +185,6 @@ class TopicWriter:
             self._encoders[kind] = serialize_dynamic(kind, _definition(kind))[kind]
         return self._encoders[kind]
 
-    def blocks(self, kind: str, build: Callable[[list[list[float]]], Any], sizes: Sequence[int]) -> BlockWriter:
-        """Returns a fast writer for messages that differ in stamp and runs of doubles only; see `BlockWriter`."""
-        return BlockWriter(self.encoder(kind), build, sizes)
-
     def close(self) -> None:
         """Writes index and footer; the file is readable without `close` too, but as a damaged one."""
         if self._open:
@@ -231,10 +228,23 @@ def _definition(kind: str) -> str:
 # --- Writes a recording as the canonical MCAP: topics, types, frames and units of the contract (ENU, FLU, SI)
 
 
-_Series = tuple[FloatArray, Callable[[int], tuple[str, str, bytes]]]
 _ABSENT = -1.0
 _STAMP = {"sec": 0, "nanosec": 0}
 _MAP, _BODY = {"stamp": _STAMP, "frame_id": "map"}, {"stamp": _STAMP, "frame_id": "base_link"}
+
+
+class _Series(NamedTuple):
+    """Messages of one topic: type, times [s] (n,), rows of numbers (n, k), and what makes a message of such a row.
+
+    A type whose numbers are no doubles is `plain`: its messages are encoded one by one, with their stamp.
+    """
+
+    topic: str
+    kind: str
+    t: FloatArray
+    rows: FloatArray
+    build: Callable[[list[float]], dict[str, Any]]
+    plain: bool = False
 
 
 def write_mcap(file: str | Path | BinaryIO, source: Source, epoch_ns: int = 0) -> None:
@@ -270,181 +280,119 @@ def write_recordings(
         epoch_ns: added to recording time [ns].
         wrenches: by topic, times [s] and force [N] and moment [N m] in FRD, shapes (n,) and (n, 6).
     """
-    each = [(name, s) for name, recording in recordings.items() for s in _all_series(writer, recording, epoch_ns)]
+    each = [
+        s._replace(topic=f"{name}/{s.topic}" if name else s.topic)
+        for name, recording in recordings.items() for s in _all_series(recording, epoch_ns)
+    ]  # fmt: skip
     for topic, (times, rows) in (wrenches or {}).items():
         both = np.hstack([flip_body(rows[:, :3]), flip_body(rows[:, 3:])])
-        each.append(("", _blocks(writer, topic, "geometry_msgs/msg/WrenchStamped", times, both, _wrench, epoch_ns)))
-    for which, row in in_time_order([t for _, (t, _) in each]):
-        name, (t, message) = each[which]
-        topic, kind, data = message(row)
-        writer.write_cdr(f"{name}/{topic}" if name else topic, kind, data, _stamp(t[row], epoch_ns))
+        each.append(_Series(topic, "geometry_msgs/msg/WrenchStamped", times, both, _wrench))
+    encoders = [writer.encoder(s.kind) for s in each]
+    blocks = [
+        None if s.plain else BlockWriter(encode, s.build, s.rows.shape[1])
+        for s, encode in zip(each, encoders, strict=True)
+    ]  # fmt: skip
+    for which, row in in_time_order([s.t for s in each]):
+        s, block = each[which], blocks[which]
+        ns, values = epoch_ns + round(float(s.t[row]) * 1e9), s.rows[row].tolist()
+        if block is None:
+            stamp = {"sec": ns // 10**9, "nanosec": ns % 10**9}
+            message = s.build(values)
+            data = encoders[which]({**message, "header": {**message["header"], "stamp": stamp}})
+        else:
+            data = block.write(ns, values)
+        writer.write_cdr(s.topic, s.kind, data, ns)
 
 
-def _all_series(writer: TopicWriter, recording: Recording, epoch_ns: int) -> list[_Series]:
+def _all_series(recording: Recording, epoch_ns: int) -> Iterator[_Series]:
     channels = recording.channels
     first = min((float(c.t[0]) for c in channels.values()), default=0.0)
     if epoch_ns + round(first * 1e9) < 0:
         raise LogError(f"times begin at {first:.3f} s", "times from 0 s on", "give an epoch that makes stamps positive")
-    return [
-        *_imu(writer, channels.get("gyro"), channels.get("accel"), epoch_ns),
-        *_attitude(writer, channels.get("attitude"), epoch_ns),
-        *_rotor_speeds(writer, channels.get("rotor_speed"), epoch_ns),
-        *_motor_command(writer, channels.get("motor_command"), epoch_ns),
-        *_command(writer, channels.get("attitude_reference"), epoch_ns),
-        *_odometry(writer, recording, epoch_ns),
-        *_battery(writer, channels.get("battery"), epoch_ns),
-    ]
+    # One IMU message a stamp; what was not measured there says so in its covariance (REP-145).
+    t, measured = union_rows([channels.get("gyro"), channels.get("accel")])
+    if len(t):
+        rows = np.zeros((len(t), 37))
+        rows[:, 3] = 1.0
+        rows[:, [4, 16, 28]] = _ABSENT
+        for at, values in zip((13, 25), measured, strict=True):
+            if values is not None:
+                there = np.isfinite(values).all(axis=1)
+                rows[there, at + 3] = 0.0
+                rows[there, at : at + 3] = flip_body(values[there])
+        yield _Series("imu", "sensor_msgs/msg/Imu", t, rows, _imu)
+    if (c := channels.get("attitude")) is not None:
+        rows = flip_attitude(c.values)[:, [1, 2, 3, 0]]
+        yield _Series(
+            "attitude", "geometry_msgs/msg/QuaternionStamped", c.t, rows,
+            lambda v: {"header": _MAP, "quaternion": _named("xyzw", v)},
+        )  # fmt: skip
+    if (c := channels.get("rotor_speed")) is not None:
+        names = [f"rotor_{i + 1}" for i in range(c.values.shape[1])]
+        yield _Series(
+            "rotor_speeds", "sensor_msgs/msg/JointState", c.t, c.values,
+            lambda v: {"header": _BODY, "name": names, "position": [], "velocity": v, "effort": []},
+        )  # fmt: skip
+    if (c := channels.get("motor_command")) is not None:
+        kind = 1 if np.nanmedian(np.abs(c.values)) > 100.0 else 0  # KIND_PWM, KIND_NORMALIZED
+        yield _Series(
+            "motor_command", "quadid_msgs/msg/MotorCommand", c.t, c.values,
+            lambda v: {"header": _BODY, "kind": kind, "values": v},
+        )  # fmt: skip
+    if (c := channels.get("attitude_reference")) is not None:
+        rows = np.column_stack([to_euler(flip_attitude(from_euler(c.values[:, :3]))), c.values[:, 3]])
+        yield _Series(
+            "command", "quadid_msgs/msg/AttitudeCommand", c.t, rows,
+            lambda v: {"header": _MAP, **_named(("roll", "pitch", "yaw", "throttle"), v)},
+        )  # fmt: skip
+    # Pose in the world; twist in the body where there is an attitude, else in the world (child frame = frame).
+    t, (position, velocity) = union_rows([channels.get("position"), channels.get("velocity")])
+    if len(t):
+        rows = np.zeros((len(t), 85))
+        rows[:, :3] = np.nan if position is None else flip_world(position)
+        rows[:, 6] = 1.0
+        world = np.full((len(t), 3), np.nan) if velocity is None else flip_world(velocity)
+        if (c := channels.get("attitude")) is not None:
+            q = linear(c.t, c.values, t)
+            q = flip_attitude(q / np.linalg.norm(q, axis=1, keepdims=True))
+            rows[:, 3:7] = q[:, [1, 2, 3, 0]]
+            world = rotated(conjugate(q), world)
+        rows[:, 43:46] = world
+        child = "map" if c is None else "base_link"
+        yield _Series("odom", "nav_msgs/msg/Odometry", t, rows, lambda v: _odometry(v, child))
+    if (c := channels.get("battery")) is not None:
+        unknown = ("temperature", "current", "charge", "capacity", "design_capacity", "percentage")
+        yield _Series(
+            "battery", "sensor_msgs/msg/BatteryState", c.t, c.values,
+            lambda v: {"header": _BODY, "voltage": v[0], **dict.fromkeys(unknown, math.nan), "present": True},
+            plain=True,
+        )  # fmt: skip
 
 
-def _stamp(t: float, epoch_ns: int) -> int:
-    return epoch_ns + round(float(t) * 1e9)
+def _named(names: Iterable[str], values: list[float]) -> dict[str, float]:
+    return dict(zip(names, values, strict=True))
 
 
-def _blocks(
-    writer: TopicWriter, topic: str, kind: str, t: FloatArray, rows: FloatArray, build: Callable[[Any], Any], epoch: int
-) -> _Series:
-    """One run of doubles a message."""
-    layout = writer.blocks(kind, build, [rows.shape[1]])
-    return t, lambda row: (topic, kind, layout.write(_stamp(t[row], epoch), rows[row].tolist()))
-
-
-def _imu(writer: TopicWriter, gyro: Channel | None, accel: Channel | None, epoch: int) -> list[_Series]:
-    """One message a stamp; what was not measured there says so in its covariance (REP-145)."""
-    t, (rate, force) = union_rows([gyro, accel])
-    if len(t) == 0:
-        return []
-    rows = np.zeros((len(t), 37))
-    rows[:, 3] = 1.0
-    rows[:, 4] = _ABSENT  # no orientation
-    for at, values in ((13, rate), (25, force)):
-        measured = np.zeros(len(t), dtype=np.bool_) if values is None else np.isfinite(values).all(axis=1)
-        rows[~measured, at + 3] = _ABSENT
-        if values is not None:
-            rows[measured, at : at + 3] = flip_body(values[measured])
-    return [_blocks(writer, "imu", "sensor_msgs/msg/Imu", t, rows, _imu_message, epoch)]
-
-
-def _imu_message(blocks: list[list[float]]) -> dict[str, Any]:
-    (v,) = blocks
+def _imu(v: list[float]) -> dict[str, Any]:
     return {
         "header": _BODY,
-        "orientation": dict(zip("xyzw", v[:4], strict=True)),
-        "orientation_covariance": v[4:13],
-        "angular_velocity": _xyz(v[13:16]),
-        "angular_velocity_covariance": v[16:25],
-        "linear_acceleration": _xyz(v[25:28]),
-        "linear_acceleration_covariance": v[28:37],
-    }
+        "orientation": _named("xyzw", v[:4]), "orientation_covariance": v[4:13],
+        "angular_velocity": _named("xyz", v[13:16]), "angular_velocity_covariance": v[16:25],
+        "linear_acceleration": _named("xyz", v[25:28]), "linear_acceleration_covariance": v[28:37],
+    }  # fmt: skip
 
 
-def _wrench(blocks: list[list[float]]) -> dict[str, Any]:
-    (v,) = blocks
-    return {"header": _BODY, "wrench": {"force": _xyz(v[:3]), "torque": _xyz(v[3:])}}
+def _wrench(v: list[float]) -> dict[str, Any]:
+    return {"header": _BODY, "wrench": {"force": _named("xyz", v[:3]), "torque": _named("xyz", v[3:])}}
 
 
-def _xyz(v: list[float]) -> dict[str, float]:
-    return dict(zip("xyz", v, strict=True))
-
-
-def _attitude(writer: TopicWriter, attitude: Channel | None, epoch: int) -> list[_Series]:
-    if attitude is None:
-        return []
-    rows = flip_attitude(attitude.values)[:, [1, 2, 3, 0]]
-    return [
-        _blocks(
-            writer, "attitude", "geometry_msgs/msg/QuaternionStamped", attitude.t, rows,
-            lambda b: {"header": _MAP, "quaternion": dict(zip("xyzw", b[0], strict=True))}, epoch,
-        )
-    ]  # fmt: skip
-
-
-def _rotor_speeds(writer: TopicWriter, speed: Channel | None, epoch: int) -> list[_Series]:
-    if speed is None:
-        return []
-    names = [f"rotor_{i + 1}" for i in range(speed.values.shape[1])]
-    return [
-        _blocks(
-            writer, "rotor_speeds", "sensor_msgs/msg/JointState", speed.t, speed.values,
-            lambda b: {"header": _BODY, "name": names, "position": [], "velocity": b[0], "effort": []}, epoch,
-        )
-    ]  # fmt: skip
-
-
-def _motor_command(writer: TopicWriter, command: Channel | None, epoch: int) -> list[_Series]:
-    if command is None:
-        return []
-    kind = 1 if np.nanmedian(np.abs(command.values)) > 100.0 else 0  # KIND_PWM, KIND_NORMALIZED
-    return [
-        _blocks(
-            writer, "motor_command", "quadid_msgs/msg/MotorCommand", command.t, command.values,
-            lambda b: {"header": _BODY, "kind": kind, "values": b[0]}, epoch,
-        )
-    ]  # fmt: skip
-
-
-def _command(writer: TopicWriter, reference: Channel | None, epoch: int) -> list[_Series]:
-    if reference is None:
-        return []
-    angles = to_euler(flip_attitude(from_euler(reference.values[:, :3])))
-    rows = np.column_stack([angles, reference.values[:, 3]])
-    return [
-        _blocks(
-            writer, "command", "quadid_msgs/msg/AttitudeCommand", reference.t, rows,
-            lambda b: {"header": _MAP, **dict(zip(("roll", "pitch", "yaw", "throttle"), b[0], strict=True))}, epoch,
-        )
-    ]  # fmt: skip
-
-
-def _odometry(writer: TopicWriter, recording: Recording, epoch: int) -> list[_Series]:
-    """Pose in the world; twist in the body where there is an attitude, else in the world (child frame = frame)."""
-    channels = recording.channels
-    t, (position, velocity) = union_rows([channels.get("position"), channels.get("velocity")])
-    attitude = channels.get("attitude")
-    if len(t) == 0:
-        return []
-    rows = np.zeros((len(t), 85))
-    rows[:, :3] = np.nan if position is None else flip_world(position)
-    rows[:, 6] = 1.0
-    world = np.full((len(t), 3), np.nan) if velocity is None else flip_world(velocity)
-    if attitude is not None:
-        q = linear(attitude.t, attitude.values, t)
-        q = flip_attitude(q / np.linalg.norm(q, axis=1, keepdims=True))
-        rows[:, 3:7] = q[:, [1, 2, 3, 0]]
-        world = rotated(conjugate(q), world)
-    rows[:, 43:46] = world
-    child = "base_link" if attitude is not None else "map"
-    return [
-        _blocks(writer, "odom", "nav_msgs/msg/Odometry", t, rows, lambda b: _odometry_message(b, child), epoch)
-    ]  # fmt: skip
-
-
-def _odometry_message(blocks: list[list[float]], child: str) -> dict[str, Any]:
-    (v,) = blocks
-    orientation = dict(zip("xyzw", v[3:7], strict=True))
+def _odometry(v: list[float], child: str) -> dict[str, Any]:
+    pose = {"position": _named("xyz", v[:3]), "orientation": _named("xyzw", v[3:7])}
+    twist = {"linear": _named("xyz", v[43:46]), "angular": _named("xyz", v[46:49])}
     return {
-        "header": _MAP,
-        "child_frame_id": child,
-        "pose": {"pose": {"position": _xyz(v[:3]), "orientation": orientation}, "covariance": v[7:43]},
-        "twist": {"twist": {"linear": _xyz(v[43:46]), "angular": _xyz(v[46:49])}, "covariance": v[49:85]},
-    }
-
-
-def _battery(writer: TopicWriter, battery: Channel | None, epoch: int) -> list[_Series]:
-    if battery is None:
-        return []
-    encode = writer.encoder("sensor_msgs/msg/BatteryState")
-    nan = float("nan")
-
-    def message(row: int) -> tuple[str, str, bytes]:
-        ns = _stamp(battery.t[row], epoch)
-        fields = {
-            "header": {"stamp": {"sec": ns // 10**9, "nanosec": ns % 10**9}, "frame_id": "base_link"},
-            "voltage": float(battery.values[row, 0]), "temperature": nan, "current": nan, "charge": nan,
-            "capacity": nan, "design_capacity": nan, "percentage": nan, "present": True,
-        }  # fmt: skip
-        return "battery", "sensor_msgs/msg/BatteryState", encode(fields)
-
-    return [(battery.t, message)]
+        "header": _MAP, "child_frame_id": child,
+        "pose": {"pose": pose, "covariance": v[7:43]}, "twist": {"twist": twist, "covariance": v[49:85]},
+    }  # fmt: skip
 
 
 # --- Writes a recording as CSV of the contract; every number is written so that it reads back to the same bits
@@ -508,7 +456,8 @@ _TYPES = {3: 15, 4: 2, 6: 13, 8: 14, 10: 35, 12: 29}  # rotors to MAV_TYPE
 _GENERIC_AUTOPILOT, _ACTIVE = 0, 4
 _LONGEST_MS = 2**32
 _GYRO_BITS, _ACCEL_BITS = 0x38, 0x07
-_TlogSeries = tuple[FloatArray, Callable[[int], list[Any]]]
+_Messages = tuple[FloatArray, Callable[[int], list[Any]]]
+"""Times [s], and the messages of a row."""
 
 
 def write_tlog(file: str | Path | BinaryIO, source: Source) -> None:
@@ -546,18 +495,7 @@ def mavlink_messages(recording: Recording) -> Iterator[tuple[float, Any]]:
     first, last = min(c.t[0] for c in channels.values()), max(c.t[-1] for c in channels.values())
     if first < 0.0 or last * 1e3 >= _LONGEST_MS:
         raise LogError(f"times from {first:.3f} to {last:.3f} s", "0 to 49 days, as boot clocks count")
-    motors = channels.get("rotor_speed") or channels.get("motor_command")
-    rotors = motors.values.shape[1] if motors is not None else 4
-    series = [
-        _heartbeats(float(first), float(last), rotors, channels.get("rotor_speed") is not None),
-        *_tlog_imu(channels.get("gyro"), channels.get("accel")),
-        *_tlog_attitude(channels.get("attitude")),
-        *_escs(channels.get("rotor_speed")),
-        *_outputs(channels.get("motor_command")),
-        *_reference(channels.get("attitude_reference")),
-        *_local_position(channels.get("position"), channels.get("velocity")),
-        *_tlog_battery(channels.get("battery")),
-    ]
+    series = [*_mavlink_series(channels, float(first), float(last))]
     for which, row in in_time_order([t for t, _ in series]):
         t, messages = series[which]
         for message in messages(row):
@@ -572,123 +510,106 @@ def _us(t: float) -> int:
     return round(float(t) * 1e6)
 
 
-def _heartbeats(first: float, last: float, rotors: int, escs: bool) -> _TlogSeries:
-    t = np.arange(first, last + 1.0, 1.0)
-    kind = _TYPES.get(rotors, 2)
+def _mavlink_series(channels: Mapping[str, Channel], first: float, last: float) -> Iterator[_Messages]:
+    motors = channels.get("rotor_speed") or channels.get("motor_command")
+    rotors = motors.values.shape[1] if motors is not None else 4
+    seconds = np.arange(first, last + 1.0, 1.0)
 
-    def messages(row: int) -> list[Any]:
-        out = [dialect.MAVLink_heartbeat_message(kind, _GENERIC_AUTOPILOT, 0, 0, _ACTIVE, 3)]
-        if escs:
-            zeros = [0, 0, 0, 0]
-            for index in range(0, rotors, 4):
-                out.append(dialect.MAVLink_esc_info_message(index, _us(t[row]), 0, rotors, 0, 0, zeros, zeros, zeros))
-        return out
+    def heartbeat(row: int) -> list[Any]:
+        zeros = [0, 0, 0, 0]
+        escs = range(0, rotors, 4) if "rotor_speed" in channels else ()
+        return [dialect.MAVLink_heartbeat_message(_TYPES.get(rotors, 2), _GENERIC_AUTOPILOT, 0, 0, _ACTIVE, 3)] + [
+            dialect.MAVLink_esc_info_message(i, _us(seconds[row]), 0, rotors, 0, 0, zeros, zeros, zeros) for i in escs
+        ]
 
-    return t, messages
+    yield seconds, heartbeat
 
+    imu, (force, rate) = union_rows([channels.get("accel"), channels.get("gyro")])
 
-def _tlog_imu(gyro: Channel | None, accel: Channel | None) -> list[_TlogSeries]:
-    t, (rate, force) = union_rows([gyro, accel])
-    if len(t) == 0:
-        return []
-
-    def messages(row: int) -> list[Any]:
+    def highres_imu(row: int) -> list[Any]:
         updated, fields = 0, [0.0] * 6
         for values, place, bits in ((force, 0, _ACCEL_BITS), (rate, 3, _GYRO_BITS)):
             if values is not None and np.isfinite(values[row]).all():
                 updated |= bits
                 fields[place : place + 3] = values[row].tolist()
-        rest = [0.0] * 7
-        return [dialect.MAVLink_highres_imu_message(_us(t[row]), *fields, *rest, updated)]
+        return [dialect.MAVLink_highres_imu_message(_us(imu[row]), *fields, *[0.0] * 7, updated)]
 
-    return [(t, messages)]
+    if len(imu):
+        yield imu, highres_imu
+
+    for name, build in _CHANNELS.items():
+        if (channel := channels.get(name)) is not None:
+            yield channel.t, build(channel)
+
+    # One LOCAL_POSITION_NED a time; NaN stands for what was not measured there.
+    local, states = union_rows([channels.get("position"), channels.get("velocity")])
+
+    def local_position(row: int) -> list[Any]:
+        numbers = [v for part in states for v in ([math.nan] * 3 if part is None else part[row].tolist())]
+        return [dialect.MAVLink_local_position_ned_message(_ms(local[row]), *numbers)]
+
+    if len(local):
+        yield local, local_position
 
 
-def _tlog_attitude(attitude: Channel | None) -> list[_TlogSeries]:
-    if attitude is None:
-        return []
-    return [
-        (attitude.t, lambda row: [_quaternion_message(_ms(attitude.t[row]), attitude.values[row].tolist())])
+def _attitude(c: Channel) -> Callable[[int], list[Any]]:
+    return lambda row: [
+        dialect.MAVLink_attitude_quaternion_message(_ms(c.t[row]), *c.values[row].tolist(), 0.0, 0.0, 0.0)
     ]  # fmt: skip
 
 
-def _quaternion_message(ms: int, q: list[float]) -> Any:
-    return dialect.MAVLink_attitude_quaternion_message(ms, *q, 0.0, 0.0, 0.0)
-
-
-def _escs(speed: Channel | None) -> list[_TlogSeries]:
-    if speed is None:
-        return []
-    width = speed.values.shape[1]
+def _escs(c: Channel) -> Callable[[int], list[Any]]:
+    width, zeros = c.values.shape[1], [0.0] * 4
 
     def messages(row: int) -> list[Any]:
-        rpm = [round(w / RPM) for w in speed.values[row].tolist()] + [0] * (-width % 4)
-        zeros = [0.0, 0.0, 0.0, 0.0]
+        rpm = [round(w / RPM) for w in c.values[row].tolist()] + [0] * (-width % 4)
         return [
-            dialect.MAVLink_esc_status_message(i, _us(speed.t[row]), rpm[i : i + 4], zeros, zeros)
+            dialect.MAVLink_esc_status_message(i, _us(c.t[row]), rpm[i : i + 4], zeros, zeros)
             for i in range(0, width, 4)
         ]
 
-    return [(speed.t, messages)]
+    return messages
 
 
-def _outputs(command: Channel | None) -> list[_TlogSeries]:
+def _outputs(c: Channel) -> Callable[[int], list[Any]]:
     """Pulse widths as SERVO_OUTPUT_RAW, normalized commands as ACTUATOR_OUTPUT_STATUS."""
-    if command is None:
-        return []
-    width = command.values.shape[1]
-    pwm = bool(np.nanmedian(np.abs(command.values)) > 100.0)
-
-    def messages(row: int) -> list[Any]:
-        values = command.values[row].tolist()
-        if pwm:
-            pulses = [round(v) for v in values] + [0] * (16 - width)
-            return [dialect.MAVLink_servo_output_raw_message(_us(command.t[row]) % 2**32, 0, *pulses)]
-        padded = values + [0.0] * (32 - width)
-        return [dialect.MAVLink_actuator_output_status_message(_us(command.t[row]), width, padded)]
-
-    return [(command.t, messages)]
-
-
-def _reference(reference: Channel | None) -> list[_TlogSeries]:
-    if reference is None:
-        return []
-    q = from_euler(reference.values[:, :3])
-
-    def messages(row: int) -> list[Any]:
-        throttle = float(reference.values[row, 3])
-        return [
-            dialect.MAVLink_attitude_target_message(_ms(reference.t[row]), 0, q[row].tolist(), 0.0, 0.0, 0.0, throttle)
+    width = c.values.shape[1]
+    if np.nanmedian(np.abs(c.values)) > 100.0:
+        return lambda row: [
+            dialect.MAVLink_servo_output_raw_message(
+                _us(c.t[row]) % 2**32, 0, *(round(v) for v in c.values[row].tolist()), *[0] * (16 - width)
+            )
         ]
-
-    return [(reference.t, messages)]
-
-
-def _local_position(position: Channel | None, velocity: Channel | None) -> list[_TlogSeries]:
-    """One LOCAL_POSITION_NED a time; NaN stands for what was not measured there."""
-    t, (place, speed) = union_rows([position, velocity])
-    if len(t) == 0:
-        return []
-    nan = [float("nan")] * 3
-
-    def messages(row: int) -> list[Any]:
-        xyz = nan if place is None else place[row].tolist()
-        v = nan if speed is None else speed[row].tolist()
-        return [dialect.MAVLink_local_position_ned_message(_ms(t[row]), *xyz, *v)]
-
-    return [(t, messages)]
+    return lambda row: [
+        dialect.MAVLink_actuator_output_status_message(
+            _us(c.t[row]), width, [*c.values[row].tolist(), *[0.0] * (32 - width)]
+        )
+    ]
 
 
-def _tlog_battery(battery: Channel | None) -> list[_TlogSeries]:
+def _reference(c: Channel) -> Callable[[int], list[Any]]:
+    q = from_euler(c.values[:, :3])
+    return lambda row: [
+        dialect.MAVLink_attitude_target_message(
+            _ms(c.t[row]), 0, q[row].tolist(), 0.0, 0.0, 0.0, float(c.values[row, 3])
+        )
+    ]
+
+
+def _voltage(c: Channel) -> Callable[[int], list[Any]]:
     """The whole pack's voltage as if of one cell [mV]."""
-    if battery is None:
-        return []
+    return lambda row: [
+        dialect.MAVLink_battery_status_message(
+            0, 0, 0, 32767, [min(round(float(c.values[row, 0]) * 1e3), 65534)] + [65535] * 9, -1, -1, -1, -1
+        )
+    ]
 
-    def messages(row: int) -> list[Any]:
-        cells = [min(round(float(battery.values[row, 0]) * 1e3), 65534)] + [65535] * 9
-        return [dialect.MAVLink_battery_status_message(0, 0, 0, 32767, cells, -1, -1, -1, -1)]
 
-    return [(battery.t, messages)]
+_CHANNELS: dict[str, Callable[[Channel], Callable[[int], list[Any]]]] = {
+    "attitude": _attitude, "rotor_speed": _escs, "motor_command": _outputs, "attitude_reference": _reference,
+    "battery": _voltage,
+}  # fmt: skip
+"""What makes the messages of a channel's rows."""
 
 
 # --- Writes recordings of one flight side by side, such as measured and simulated, for viewers that draw curves
