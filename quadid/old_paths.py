@@ -108,7 +108,6 @@ MOVED = {
     "quadid_replay.mcap_file": "quadid_replay.bag_topics quadid_replay.mcap_metadata quadid_replay.mcap_order "
     "quadid_replay.mcap_records",
     "quadid_replay.blackbox": "quadid_replay.blackbox_frames quadid_replay.blackbox_reader",
-    "quadid_replay.message_times": "quadid_replay.boot_clock quadid_replay.tlog_times",
     "quadid_replay.ros_messages": "quadid_replay.cdr_blocks quadid_replay.mcap_decode "
     "quadid_replay.mcap_messages quadid_replay.signal_columns",
     "quadid_replay.columns": "quadid_replay.clocks",
@@ -117,8 +116,8 @@ MOVED = {
     "quadid_replay.writers": "quadid_replay.compared_writer quadid_replay.csv_writer "
     "quadid_replay.mcap_writer quadid_replay.tlog_writer quadid_replay.topic_writer quadid_replay.writing",
     "quadid_replay.dataflash": "quadid_replay.dataflash_index quadid_replay.dataflash_reader",
-    "quadid_replay.mavlink_messages": "quadid_replay.esc_messages quadid_replay.frame_numbers "
-    "quadid_replay.tlog_messages",
+    "quadid_replay.mavlink_messages": "quadid_replay.boot_clock quadid_replay.esc_messages "
+    "quadid_replay.frame_numbers quadid_replay.message_times quadid_replay.tlog_messages quadid_replay.tlog_times",
     "quadid_replay.tlog": "quadid_replay.mavlink_decode quadid_replay.mavlink_frames "
     "quadid_replay.tlog_reader quadid_replay.tlog_vehicle",
     "quadid_replay.ulog": "quadid_replay.px4_allocation quadid_replay.ulog_check quadid_replay.ulog_reader",

@@ -10,8 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
-from quadid_replay.mavlink_messages import ESC_GROUPS, PREFERENCE, READERS, Reading, boot_seconds, boot_stamp
-from quadid_replay.message_times import BootClock
+from quadid_replay.mavlink_messages import ESC_GROUPS, PREFERENCE, READERS, BootClock, Reading, boot_seconds, boot_stamp
 from quadid_replay.motors import ESCS, MOTOR_FUNCTION, Outputs, changed_functions, esc_columns, motor_outputs
 
 from quadid.condition.watch import HealthReport

@@ -361,3 +361,17 @@ def fault_warnings(channels: Mapping[str, Channel]) -> list[str]:
         if parts:
             out.append(f"{channel.name}: dropped samples: {', '.join(parts)}")
     return out
+
+
+def mode_changes(t: FloatArray, numbers: FloatArray, names: dict[int, str]) -> tuple[tuple[float, str], ...]:
+    """When the mode changed [s], and what to.
+
+    Args:
+        t: times of the records [s], NaN where refused, shape (n,).
+        numbers: of the modes, shape (n,).
+        names: by number; one without a name keeps its number.
+    """
+    known = np.isfinite(t) & np.isfinite(numbers)
+    t, numbers = t[known], numbers[known]
+    first = np.flatnonzero(np.diff(numbers, prepend=np.nan) != 0.0)
+    return tuple((float(t[i]), names.get(int(numbers[i]), f"mode {int(numbers[i])}")) for i in first)

@@ -15,8 +15,7 @@ from pymavlink.DFReader import FORMAT_TO_STRUCT, DFFormat, null_term
 
 from quadid.data.window import Recording
 from quadid.types import FloatArray, IntArray
-from quadid_replay.columns import LogClock, RawChannel, Source, assemble, channels_of, spikes
-from quadid_replay.flight_modes import ARDUCOPTER, mode_changes
+from quadid_replay.columns import LogClock, RawChannel, Source, assemble, channels_of, mode_changes, spikes
 from quadid_replay.frames import from_euler
 
 # isort: off
@@ -222,6 +221,13 @@ SOURCES = (
 )
 """In order of preference."""
 
+ARDUCOPTER = {
+    0: "Stabilize", 1: "Acro", 2: "AltHold", 3: "Auto", 4: "Guided", 5: "Loiter", 6: "RTL", 7: "Circle", 9: "Land",
+    11: "Drift", 13: "Sport", 14: "Flip", 15: "AutoTune", 16: "PosHold", 17: "Brake", 18: "Throw", 19: "Avoid ADSB",
+    20: "Guided NoGPS", 21: "SmartRTL", 22: "FlowHold", 23: "Follow", 24: "ZigZag", 25: "SystemID", 26: "Autorotate",
+    27: "Auto RTL", 28: "Turtle",
+}  # fmt: skip
+"""Names of ArduCopter's flight modes."""
 _STAMPED = (*dict.fromkeys(source.records for source in SOURCES), *_OUTPUTS, "ESC", "CTUN", "MODE")
 """Records whose stamps are used."""
 

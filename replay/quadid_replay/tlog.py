@@ -21,13 +21,14 @@ from quadid_replay.mavlink_messages import (
     PREFERENCE,
     READERS,
     STATE_MESSAGES,
-    Reading,
+    Placing,
+    Stamps,
     boot_seconds,
     extend_dialect,
+    place,
     two_rows,
     unix_seconds,
 )
-from quadid_replay.message_times import Stamps, place
 from quadid_replay.motors import (
     ESCS,
     MOST_ROTORS,
@@ -291,22 +292,11 @@ def _whole(kind: str) -> str:
 
 
 _INVALID, _ARDUPILOT = 8, 3
-_BACKWARDS = 0.5
-"""Boot time that falls by more than this [s] is counted."""
 _EPOCH_US = 1e14
 """SYSTEM_TIME tells the date where it counts more than this [us]."""
 _WIDTH = {"esc": ESCS, "servo": ESCS, "actuator": 32, "attitude": 4, "attitude_reference": 4, "battery": 1}
-
-
-class Told(NamedTuple):
-    """Messages of one kind, and which frames of the log they are, rising, shape (n,)."""
-
-    which: IntArray
-    messages: Messages
-
-
-Signal = tuple[FloatArray, FloatArray]
-"""Times [s] of n samples, NaN where refused, shape (n,), and their values, shape (n, columns)."""
+Told: TypeAlias = Mapping[str, tuple[IntArray, Messages]]
+"""Messages by name, and which frames of the log they are, rising, shape (n,)."""
 
 
 @dataclass(frozen=True)
@@ -315,7 +305,7 @@ class VehicleLog:
 
     Attributes:
         clock: of the log.
-        signals: by channel and message.
+        signals: by channel and message, times [s] of n samples, NaN where refused, and values (n, columns).
         parameters: of the autopilot, by name.
         changed: which of them that name a motor change within the log; empty for none.
         ardupilot: whether it calls itself one.
@@ -326,7 +316,7 @@ class VehicleLog:
     """
 
     clock: LogClock
-    signals: Mapping[tuple[str, str], Signal]
+    signals: Mapping[tuple[str, str], tuple[FloatArray, FloatArray]]
     parameters: Mapping[str, float]
     changed: str
     ardupilot: bool
@@ -336,71 +326,81 @@ class VehicleLog:
     backwards: int
 
 
-class _Batch(NamedTuple):
-    """Messages of one kind that tell something: n frames, and of all messages of the kind which tell each reading."""
-
-    which: IntArray
-    readings: list[tuple[Reading, BoolArray]]
-    rows: IntArray
-    stamps: Stamps
-
-
-class _Part(NamedTuple):
-    """What messages of one kind tell of a signal: n places in the order of their times, first columns, values."""
-
-    position: IntArray
-    place: IntArray
-    values: FloatArray
-
-
-def vehicle_log(told: Mapping[str, Told], received: FloatArray) -> VehicleLog:
+def vehicle_log(told: Told, received: FloatArray) -> VehicleLog:
     """Gathers what a vehicle tells.
 
     Args:
-        told: its messages, by name.
+        told: its messages.
         received: receive times of all frames of the log [s, UNIX].
     """
-    beats = told.get("HEARTBEAT")
-    escs = told.get("ESC_INFO")
+    _, beats = told.get("HEARTBEAT", (None, None))
+    _, escs = told.get("ESC_INFO", (None, None))
+    _, parameters = told.get("PARAM_VALUE", (None, None))
+    names, values = ([], []) if parameters is None else (list(parameters.param_id), parameters.param_value.tolist())
+    rotors = 0 if escs is None else int(escs.count.max())
     clock = LogClock()
-    batches = [b for b in (_batch(name, told, received) for name in READERS if name in told) if len(b.which)]
-    signals, heard, backwards = _signals(batches, clock) if batches else ({}, False, 0)
-    names, values = _parameters(told)
-    rotors = 0 if escs is None else int(escs.messages.count.max())
+    signals, placing = _signals(told, received, clock)
     return VehicleLog(
         clock, signals, dict(zip(names, values, strict=True)), changed_within(names, values),
-        beats is not None and int(beats.messages.autopilot[-1]) == _ARDUPILOT,
-        0 if beats is None else int(beats.messages.type[-1]), rotors if rotors <= MOST_ROTORS else 0, heard, backwards,
+        beats is not None and int(beats.autopilot[-1]) == _ARDUPILOT, 0 if beats is None else int(beats.type[-1]),
+        rotors if rotors <= MOST_ROTORS else 0, placing.waited < len(placing.time), placing.backwards,
     )  # fmt: skip
 
 
-def _parameters(told: Mapping[str, Told]) -> tuple[list[str], list[float]]:
-    if "PARAM_VALUE" not in told:
-        return [], []
-    m = told["PARAM_VALUE"].messages
-    return list(m.param_id), m.param_value.tolist()
+def _signals(
+    told: Told, received: FloatArray, clock: LogClock
+) -> tuple[dict[tuple[str, str], tuple[FloatArray, FloatArray]], Placing]:
+    """Signals in the order in which they are first told, and the times of all messages that tell one."""
+    frames: list[IntArray] = []
+    stamps: list[Stamps] = []
+    parts: dict[tuple[str, str], list[tuple[IntArray, IntArray, FloatArray]]] = {}  # frames, first columns, values
+    for name, read in READERS.items():
+        which, m = told.get(name, (np.empty(0, dtype=np.int64), None))
+        if not len(which):
+            continue
+        sensible: BoolArray | bool = True
+        if name == "RAW_IMU":  # elsewhere than in ArduPilot it counts in sensor units
+            at, beats = told.get("HEARTBEAT", (which[:0], None))
+            autopilot = np.empty(0) if beats is None else beats.autopilot
+            sensible = _latest(at, autopilot, which, _INVALID) == _ARDUPILOT
+        readings = read(m)
+        known = [np.broadcast_to(r.known & sensible, len(which)) for r in readings]
+        for reading, tells in zip(readings, known, strict=True):
+            values = np.empty((len(which), len(reading.values)))
+            for column, value in enumerate(reading.values):
+                values[:, column] = value
+            places = np.broadcast_to(reading.place, len(which))
+            if tells.any():
+                key = reading.signal, reading.source
+                parts.setdefault(key, []).append((which[tells], places[tells], values[tells]))
+        some = np.any(known, axis=0)
+        frames.append(which[some])
+        boot, unix = (np.broadcast_to(seconds(m), len(which))[some] for seconds in (boot_seconds, unix_seconds))
+        servo = np.full(len(boot), name == "SERVO_OUTPUT_RAW")
+        stamps.append(Stamps(received[which[some]], boot, unix - _unix_offset(told, which[some]), servo))
+    if not frames:
+        return {}, Placing(np.empty(0), 0, 0)
+    every = np.concatenate(frames)
+    order = np.argsort(every)
+    every = every[order]
+    placing = place(Stamps(*(np.concatenate(column)[order] for column in zip(*stamps, strict=True))))
+    timed = np.isfinite(placing.time)
+    t = np.full(len(every), np.nan)
+    t[timed] = clock.times(placing.time[timed])
+    signals = {}
+    for key in sorted(parts, key=lambda key: min(which[0] for which, _, _ in parts[key])):
+        which, places, values = (np.concatenate(column) for column in zip(*parts[key], strict=True))
+        in_file = np.argsort(which, kind="stable")
+        at, places, values = t[np.searchsorted(every, which[in_file])], places[in_file], values[in_file]
+        width = _WIDTH.get(key[0], 3)
+        if key[0] in ("esc", "servo"):
+            signals[key] = _rounds(at, places, values, width)
+        else:
+            signals[key] = at, np.pad(values, ((0, 0), (0, width - values.shape[1])))
+    return signals, placing
 
 
-def _batch(name: str, told: Mapping[str, Told], received: FloatArray) -> _Batch:
-    which, m = told[name]
-    readings = [(r, np.broadcast_to(r.known, len(which))) for r in READERS[name](m)]
-    known = np.any([k for _, k in readings], axis=0)
-    if name == "RAW_IMU" and "HEARTBEAT" in told:  # elsewhere than in ArduPilot it counts in sensor units
-        beats = told["HEARTBEAT"]
-        known = known & (_latest(beats.which, beats.messages.autopilot, which, _INVALID) == _ARDUPILOT)
-    elif name == "RAW_IMU":
-        known = np.zeros(len(which), dtype=np.bool_)
-    rows = np.flatnonzero(known)
-    which = which[rows]
-    unix = np.broadcast_to(unix_seconds(m), len(known))[rows]
-    stamps = Stamps(
-        received[which], np.broadcast_to(boot_seconds(m), len(known))[rows], unix - _unix_offset(told, which),
-        np.full(len(rows), name == "SERVO_OUTPUT_RAW"),
-    )  # fmt: skip
-    return _Batch(which, readings, rows, stamps)
-
-
-def _unix_offset(told: Mapping[str, Told], which: IntArray) -> FloatArray:
+def _unix_offset(told: Told, which: IntArray) -> FloatArray:
     """UNIX time of boot [s] as the last SYSTEM_TIME before each frame says; NaN before the first."""
     if "SYSTEM_TIME" not in told:
         return np.full(len(which), np.nan)
@@ -413,59 +413,6 @@ def _unix_offset(told: Mapping[str, Told], which: IntArray) -> FloatArray:
 def _latest(at: IntArray, values: FloatArray, which: IntArray, otherwise: float) -> FloatArray:
     """The value of the last of the frames `at` before each of `which`."""
     return np.asarray(np.concatenate([[otherwise], values])[np.searchsorted(at, which)], dtype=np.float64)
-
-
-def _signals(batches: list[_Batch], clock: LogClock) -> tuple[dict[tuple[str, str], Signal], bool, int]:
-    """Signals in the order in which they are first told; whether one is before the log ends; falls of boot time."""
-    which = np.concatenate([b.which for b in batches])
-    in_file = np.argsort(which)
-    stamps = Stamps(*(np.concatenate(column)[in_file] for column in zip(*(b.stamps for b in batches), strict=True)))
-    placing = place(stamps)
-    position = np.empty(len(which), dtype=np.int64)
-    position[in_file[placing.order]] = np.arange(len(which))
-    known = ~np.isnan(placing.time)
-    t = np.full(len(which), np.nan)
-    t[known] = clock.times(placing.time[known])
-    own = placing.boot[~stamps.servo & ~np.isnan(placing.boot)]
-    backwards = int(np.count_nonzero(own < np.concatenate([[0.0], own[:-1]]) - _BACKWARDS))
-
-    parts: dict[tuple[str, str], list[_Part]] = {}
-    first: dict[tuple[str, str], tuple[int, int]] = {}
-    for batch, its in zip(batches, np.split(position, np.cumsum([len(b.which) for b in batches])[:-1]), strict=True):
-        for number, (reading, tells) in enumerate(batch.readings):
-            key = reading.signal, reading.source
-            part = _part(reading, tells, batch.rows, its)
-            if len(part.position):
-                parts.setdefault(key, []).append(part)
-                first[key] = min(first.get(key, (len(t), 0)), (int(part.position.min()), number))
-    signals = {key: _signal(key[0], parts[key], t) for key in sorted(parts, key=first.__getitem__)}
-    return signals, placing.waited < len(t), backwards
-
-
-def _part(reading: Reading, tells: BoolArray, rows: IntArray, position: IntArray) -> _Part:
-    values = np.empty((len(tells), len(reading.values)))
-    for column, value in enumerate(reading.values):
-        values[:, column] = value
-    places = np.broadcast_to(reading.place, len(tells))
-    if len(rows) == len(tells) and tells.all():
-        return _Part(position, places, values)
-    here = tells[rows]
-    rows = rows[here]
-    return _Part(position[here], places[rows], values[rows])
-
-
-def _signal(signal: str, parts: list[_Part], t: FloatArray) -> Signal:
-    """The rows of a signal in the order of their times, zeros in columns that its messages lack."""
-    position, places, values = parts[0]
-    if len(parts) > 1 or np.any(position[1:] < position[:-1]):
-        position, places, values = (np.concatenate(column) for column in zip(*parts, strict=True))
-        order = np.argsort(position)
-        position, places, values = position[order], places[order], values[order]
-    width = _WIDTH.get(signal, 3)
-    t = t[position]
-    if signal in ("esc", "servo"):
-        return _rounds(t, places, values, width)
-    return t, np.pad(values, ((0, 0), (0, width - values.shape[1])))
 
 
 def _rounds(t: FloatArray, places: IntArray, values: FloatArray, width: int) -> tuple[FloatArray, FloatArray]:
@@ -545,7 +492,7 @@ def _vehicles(frames: Frames, which: IntArray) -> dict[tuple[int, int], VehicleL
         told = {}
         for number in np.unique(message):
             kind, of_it = _WANTED[int(number)], its[message == number]
-            told[kind.msgname] = Told(of_it, decode(frames, kind, of_it))
+            told[kind.msgname] = of_it, decode(frames, kind, of_it)
         out[int(one) >> 8, int(one) & 0xFF] = vehicle_log(told, frames.received)
     return out
 

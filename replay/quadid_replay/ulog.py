@@ -20,8 +20,7 @@ from quadid.data.window import Recording
 from quadid.errors import LogError
 from quadid.sanitise import plain
 from quadid.types import FloatArray, IntArray
-from quadid_replay.columns import LogClock, RawChannel, Source, assemble, channels_of, fastest_first
-from quadid_replay.flight_modes import PX4, mode_changes
+from quadid_replay.columns import LogClock, RawChannel, Source, assemble, channels_of, fastest_first, mode_changes
 from quadid_replay.frames import to_euler
 
 # isort: off
@@ -284,6 +283,12 @@ SOURCES = (
     Source("battery", "battery_status", ("voltage_v",), _volts),
 )  # fmt: skip
 """In order of preference."""
+_MODES = {
+    0: "Manual", 1: "Altitude", 2: "Position", 3: "Mission", 4: "Hold", 5: "Return", 10: "Acro", 12: "Descend",
+    13: "Termination", 14: "Offboard", 15: "Stabilized", 17: "Takeoff", 18: "Land", 19: "Follow", 20: "Precision land",
+    21: "Orbit", 22: "VTOL takeoff",
+}  # fmt: skip
+"""Names of flight modes: nav_state of vehicle_status."""
 _VALID = {"vx": "v_xy_valid", "x": "xy_valid"}
 """Fields that say whether another is known."""
 _UAVCAN_OUTPUTS = 3
@@ -324,7 +329,7 @@ def _modes(log: _Log) -> tuple[tuple[float, str], ...]:
     key = ("vehicle_status", 0)
     if not _has(log, key, "nav_state"):
         return ()
-    return mode_changes(_times(log.topics[key], "timestamp"), log.topics[key]["nav_state"].astype(np.float64), PX4)
+    return mode_changes(_times(log.topics[key], "timestamp"), log.topics[key]["nav_state"].astype(np.float64), _MODES)
 
 
 def _notes(records: UlogRecords, size: int) -> list[str]:

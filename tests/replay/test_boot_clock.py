@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from quadid_replay.message_times import FARTHEST, BootClock, Placed
+from quadid_replay.mavlink_messages import FARTHEST, BootClock, Placed
 
 
 def play(speed: Callable[[float], float], stamped: float = 0.02, phase: float = 0.0) -> tuple[list[float], list[float]]:

@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from quadid_replay import open_log
-from quadid_replay.flight_modes import ARDUCOPTER, mode_changes
+from quadid_replay.columns import mode_changes
+from quadid_replay.dataflash import ARDUCOPTER
 
 from quadid.data.window import Channel
 from quadid.flight import fly
