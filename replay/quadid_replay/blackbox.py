@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import math
+import re
 import struct
 from array import array
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
 
@@ -93,54 +96,37 @@ def extended(value: int, bits: int) -> int:
     return value - (1 << bits) if value >> (bits - 1) else value
 
 
-def _tag2_3s32(r: Reader, count: int) -> list[int]:
-    lead = r.byte()
-    kind = lead >> 6
-    if kind == 0:
-        return [extended(lead >> 4, 2), extended(lead >> 2, 2), extended(lead, 2)]
-    if kind == 1:
-        second = r.byte()
-        return [extended(lead, 4), extended(second >> 4, 4), extended(second, 4)]
-    if kind == 2:
-        return [extended(lead, 6), extended(r.byte(), 6), extended(r.byte(), 6)]
-    return [r.little(1 + (lead >> 2 * i & 3)) for i in range(3)]
+def _split(r: Reader, value: int, more: int, widths: Sequence[int], most: int = 16) -> list[int]:
+    """Signed numbers of at most `most` bits, highest first, in `value` and `more` bytes behind it, filled from the end."""
+    for _ in range(more):
+        value = value << 8 | r.byte()
+    out = []
+    for bits in reversed(widths):
+        out.append(extended(value, min(bits, most)) if bits else 0)
+        value >>= bits
+    return out[::-1]
 
 
-def _tag2_3svariable(r: Reader, count: int) -> list[int]:
-    lead = r.byte()
-    kind = lead >> 6
-    if kind == 0:
-        return [extended(lead >> 4, 2), extended(lead >> 2, 2), extended(lead, 2)]
-    if kind == 1:
-        second = r.byte()
-        return [extended(lead >> 1, 5), extended((lead & 1) << 4 | second >> 4, 5), extended(second, 4)]
-    if kind == 2:
-        second, third = r.byte(), r.byte()
-        return [
-            extended((lead & 0x3F) << 2 | second >> 6, 8), extended((second & 0x3F) << 1 | third >> 7, 7),
-            extended(third, 7),
-        ]  # fmt: skip
-    return [r.little(1 + (lead >> 2 * i & 3)) for i in range(3)]
+def _three(widths: Sequence[Sequence[int]], most: int) -> Callable[[Reader, int], list[int]]:
+    """Three numbers; the first byte's highest bits say how many bytes follow, and so how wide they are; 3: they are
+    little-endian, of one to four bytes each."""
+
+    def decode(r: Reader, count: int) -> list[int]:
+        lead = r.byte()
+        more = lead >> 6
+        if more == 3:
+            return [r.little(1 + (lead >> 2 * i & 3)) for i in range(3)]
+        return _split(r, lead & 0x3F, more, widths[more], most)
+
+    return decode
 
 
 def _tag8_4s16(r: Reader, count: int) -> list[int]:
     """Four numbers of 0, 4, 8 or 16 bits, packed nibble by nibble, highest first."""
-    selector, out = r.byte(), []
-    nibbles: list[int] = []
-
-    def take(n: int) -> int:
-        value = 0
-        for _ in range(n):
-            if not nibbles:
-                b = r.byte()
-                nibbles.extend((b >> 4, b & 0xF))
-            value = value << 4 | nibbles.pop(0)
-        return value
-
-    for i in range(4):
-        bits = (0, 4, 8, 16)[selector >> 2 * i & 3]
-        out.append(extended(take(bits // 4), bits) if bits else 0)
-    return out
+    selector = r.byte()
+    widths = [(0, 4, 8, 16)[selector >> 2 * i & 3] for i in range(4)]
+    unused = sum(widths) % 8  # half of the last byte
+    return _split(r, 0, (sum(widths) + unused) // 8, [*widths, unused])[:4]
 
 
 def _tag8_8svb(r: Reader, count: int) -> list[int]:
@@ -151,7 +137,8 @@ def _tag8_8svb(r: Reader, count: int) -> list[int]:
 
 
 _GROUPS: Mapping[int, tuple[int, Callable[[Reader, int], list[int]]]] = {
-    6: (8, _tag8_8svb), 7: (3, _tag2_3s32), 8: (4, _tag8_4s16), 10: (3, _tag2_3svariable),
+    6: (8, _tag8_8svb), 7: (3, _three(((2, 2, 2), (4, 4, 4), (8, 8, 8)), 6)), 8: (4, _tag8_4s16),
+    10: (3, _three(((2, 2, 2), (5, 5, 4), (8, 7, 7)), 8)),
 }  # fmt: skip
 """Encodings of several fields at once: most fields in a group, and decoder."""
 _SINGLE: Mapping[int, Callable[[Reader], int]] = {
@@ -185,12 +172,6 @@ class FrameDefinition:
                 same += 1
             out += decode(r, same)[:same]
         return out
-
-
-def known_encodings(definition: FrameDefinition) -> bool:
-    """Tells whether all encodings and predictors are known."""
-    known = set(_SINGLE) | set(_GROUPS)
-    return set(definition.encodings) <= known and set(definition.predictors) <= {*range(12)}
 
 
 @dataclass
@@ -344,7 +325,7 @@ def number(text: str) -> float:
     return float(text)
 
 
-# --- Betaflight blackbox logs (.bbl, .bfl): headers, gyro, accelerometer, motors, eRPM and battery
+# --- Headers, gyro, accelerometer, motors, eRPM and battery
 #
 # Betaflight's body axes are x forward, y left, z up, as ROS'; motors count rear right, front right, rear left, front
 # left.  Attitude is not logged.  Of several logs in a file the longest is read.
@@ -374,11 +355,15 @@ def read_blackbox(path: Path) -> Recording:
         LogError: a header that is damaged or of another dialect, or no frame that can be read.
     """
     data = path.read_bytes()
-    starts = _starts(data)
+    starts = [found.start() for found in islice(re.finditer(re.escape(MAGIC), data), 64)]
     best: tuple[_Header, Decoded] | None = None
     for start, stop in zip(starts, [*starts[1:], len(data)], strict=True):
         header = _header(data, start, stop, path.name)
-        decoded = decode_frames(data, header.end, stop, header.definitions, _constants(header))
+        constants = {
+            4: int(_value(header.values, "minthrottle", 1150.0)), 8: 1500,
+            9: int(_value(header.values, "vbatref", 0.0)), 11: int(_value(header.values, "motorOutput", 0.0)),
+        }  # fmt: skip
+        decoded = decode_frames(data, header.end, stop, header.definitions, constants)
         if best is None or len(decoded.rows) * best[1].width > len(best[1].rows) * decoded.width:
             best = header, decoded
     assert best is not None
@@ -390,15 +375,9 @@ def read_blackbox(path: Path) -> Recording:
     if not best[1].ended:
         notes.append("no end-of-log mark: power was cut or the file is not whole; everything before is used")
     clock = LogClock()
-    return assemble(path.name, "blackbox", _channels(*best, clock), clock, notes, _parameters(best[0]))
-
-
-def _starts(data: bytes) -> list[int]:
-    out, at = [], data.find(MAGIC)
-    while at >= 0:
-        out.append(at)
-        at = data.find(MAGIC, at + 1)
-    return out[:64]
+    values = best[0].values
+    kept = {name: _value(values, name, math.nan) for name in _KEPT if name in values}
+    return assemble(path.name, "blackbox", _channels(*best, clock), clock, notes, kept)
 
 
 def _header(data: bytes, start: int, stop: int, origin: str) -> _Header:
@@ -424,7 +403,7 @@ def _header(data: bytes, start: int, stop: int, origin: str) -> _Header:
                     signs = ["0" if name in ("loopIteration", "time") else "1" for name in names]
                 if len({len(names), *map(len, parts)}) == 1 and len(names) <= _MOST_FIELDS:
                     definition = FrameDefinition(tuple(names), parts[0], parts[1], tuple(sign == "1" for sign in signs))
-                    if known_encodings(definition):
+                    if {*definition.encodings} <= {*_SINGLE, *_GROUPS} and {*definition.predictors} <= {*range(12)}:
                         definitions[kind] = definition
     except (KeyError, ValueError) as error:
         raise _bad_header(origin, str(error)) from error
@@ -441,16 +420,6 @@ def _bad_header(origin: str, why: str) -> LogError:
     )  # fmt: skip
 
 
-def _constants(header: _Header) -> dict[int, int]:
-    values = header.values
-    return {
-        4: int(_value(values, "minthrottle", 1150.0)),
-        8: 1500,
-        9: int(_value(values, "vbatref", 0.0)),
-        11: int(_value(values, "motorOutput", 0.0)),
-    }
-
-
 def _value(values: dict[str, str], name: str, otherwise: float) -> float:
     """First number of a header entry."""
     try:
@@ -458,10 +427,6 @@ def _value(values: dict[str, str], name: str, otherwise: float) -> float:
     except (KeyError, ValueError):
         return otherwise
     return found if np.isfinite(found) and abs(found) < 1e9 else otherwise
-
-
-def _parameters(header: _Header) -> dict[str, float]:
-    return {name: _value(header.values, name, float("nan")) for name in _KEPT if name in header.values}
 
 
 def _channels(header: _Header, decoded: Decoded, clock: LogClock) -> list[RawChannel]:
