@@ -97,7 +97,7 @@ def extended(value: int, bits: int) -> int:
 
 
 def _split(r: Reader, value: int, more: int, widths: Sequence[int], most: int = 16) -> list[int]:
-    """Signed numbers of at most `most` bits, highest first, in `value` and `more` bytes behind it, filled from the end."""
+    """Signed numbers of at most `most` bits, highest first, that end where `value` and `more` bytes behind it do."""
     for _ in range(more):
         value = value << 8 | r.byte()
     out = []

@@ -16,8 +16,8 @@ from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.reader import SeekingReader
-from mcap.records import Channel, Chunk, Metadata, Schema
-from mcap.stream_reader import get_chunk_data_stream
+from mcap.records import Channel, Chunk, Header, Metadata, Schema
+from mcap.stream_reader import StreamReader, get_chunk_data_stream
 from mcap.summary import Summary
 
 from quadid.files import read_regular
@@ -57,6 +57,7 @@ MAGIC = b"\x89MCAP0\r\n"
 LARGEST = 1 << 22
 """Metadata beyond this are not ours [bytes]."""
 _RECORD = struct.Struct("<BQ")
+_DAMAGE = (McapError, zstandard.ZstdError, struct.error, ValueError, RuntimeError, EOFError)
 
 
 def read_metadata(path: Path) -> dict[str, dict[str, str]]:
@@ -66,19 +67,13 @@ def read_metadata(path: Path) -> dict[str, dict[str, str]]:
     """
     found: dict[str, dict[str, str]] = {}
     try:
-        with BytesIO(read_regular(path, LARGEST)) as file:
-            if file.read(len(MAGIC)) != MAGIC:
-                return {}
-            while len(head := file.read(_RECORD.size)) == _RECORD.size:
-                kind, length = _RECORD.unpack(head)
-                if kind not in (Opcode.HEADER, Opcode.METADATA) or length > LARGEST:
-                    break
-                body = file.read(length)
-                if kind == Opcode.METADATA:
-                    record = Metadata.read(ReadDataStream(BytesIO(body)))
-                    found[record.name] = record.metadata
-    except (OSError, McapError, struct.error, ValueError):
-        return found
+        for record in StreamReader(BytesIO(read_regular(path, LARGEST)), record_size_limit=LARGEST).records:
+            if isinstance(record, Metadata):
+                found[record.name] = record.metadata
+            elif not isinstance(record, Header):
+                break
+    except (OSError, *_DAMAGE):
+        pass
     return found
 
 
@@ -125,7 +120,6 @@ def _log_time(message: Message) -> int:
 
 _MESSAGE = struct.Struct("<HIQQ")
 _FOOTER = struct.Struct("<BQQQI")
-_DAMAGE = (McapError, zstandard.ZstdError, struct.error, ValueError, RuntimeError, EOFError)
 
 
 class McapFile:

@@ -69,7 +69,7 @@ def frame_of(parameters: Mapping[str, float], arm: float) -> Frame | None:
         name = "QUAD/BF_X_REV" if parameters["yaw_motors_reversed"] else "QUAD/BF_X"
         return _numbered(name, "Betaflight", arm)
     kind = _CLASSES.get(_whole(parameters, "FRAME_CLASS"), "")
-    name = f"{kind}/{_TYPES.get(_whole(parameters, 'FRAME_TYPE'), '')}"
+    name = f"{kind}/{_TYPES.get(_whole(parameters, 'FRAME_TYPE', -1), '')}"
     return _px4(parameters) or (_numbered(name, "ArduPilot", arm) if name in ARDUPILOT else None)
 
 
@@ -92,11 +92,6 @@ def _px4(parameters: Mapping[str, float]) -> Frame | None:
             return None
         rotors.append(Place(entry[0], entry[1], entry[2], CCW if entry[3] > 0.0 else CW))
     return Frame(f"PX4 geometry of {count} rotors", tuple(rotors), scaled=False)
-
-
-def _whole(parameters: Mapping[str, float], name: str) -> int:
-    value = parameters.get(name, -1.0)
-    return int(value) if abs(value) < 1e6 else -1
 
 
 # --- Which logged outputs are motors, and rows of rotor speeds from telemetry that comes one motor at a time
@@ -179,7 +174,7 @@ def motor_outputs(
     order = list(_TRICOPTER) if tricopter else list(range(rotors or len(motors)))
     told = bool(motors) and set(motors) == set(order)
     against = [] if told else [
-        f"{name} {_whole_or_zero(parameters, name)}" for name, output, motor in said
+        f"{name} {_whole(parameters, name)}" for name, output, motor in said
         if motor != (output if output in order else None) and (ardupilot or motor in order)
     ]  # fmt: skip
     if against:
@@ -250,7 +245,7 @@ def changed_functions(names: Sequence[str], values: Sequence[float]) -> str:
     given: dict[str, list[int]] = {}
     for name, value in zip(names, values, strict=True):
         if MOTOR_FUNCTION.fullmatch(name):
-            function = _whole_or_zero({name: value}, name)
+            function = _whole({name: value}, name)
             seen = given.setdefault(name, [])
             if function not in seen[-1:]:
                 seen.append(function)
@@ -279,7 +274,7 @@ def px4_motor_outputs(parameters: Mapping[str, float], bank: str) -> list[int]:
         parameters: PX4 parameters of the log.
         bank: the beginning of their names.
     """
-    return motor_columns([_whole_or_zero(parameters, f"{bank}_FUNC{output}") for output in range(1, 17)])
+    return motor_columns([_whole(parameters, f"{bank}_FUNC{output}") for output in range(1, 17)])
 
 
 def motor_columns(functions: Sequence[int]) -> list[int]:
@@ -293,8 +288,8 @@ def motor_columns(functions: Sequence[int]) -> list[int]:
 
 def px4_rotor_count(parameters: Mapping[str, float]) -> int:
     """Returns the number of rotors that CA_ROTOR_COUNT, else MAV_TYPE, tells; 0 when neither does."""
-    count = _whole_or_zero(parameters, "CA_ROTOR_COUNT")
-    return count if 0 < count <= MOST_ROTORS else MULTIROTORS.get(_whole_or_zero(parameters, "MAV_TYPE"), 0)
+    count = _whole(parameters, "CA_ROTOR_COUNT")
+    return count if 0 < count <= MOST_ROTORS else MULTIROTORS.get(_whole(parameters, "MAV_TYPE"), 0)
 
 
 def _driven(name: str, value: float) -> tuple[int, int | None]:
@@ -302,13 +297,13 @@ def _driven(name: str, value: float) -> tuple[int, int | None]:
     match = MOTOR_FUNCTION.fullmatch(name)
     assert match is not None
     motors = _ARDUPILOT_MOTORS if match[1] else _PX4_MOTORS
-    return int(match[1] or match[2]) - 1, motors.get(_whole_or_zero({name: value}, name))
+    return int(match[1] or match[2]) - 1, motors.get(_whole({name: value}, name))
 
 
-def _whole_or_zero(parameters: Mapping[str, float], name: str) -> int:
-    """A parameter as a whole number; 0, which tells nothing, where it is absent or damaged beyond any number."""
-    value = parameters.get(name, 0.0)
-    return int(value) if abs(value) < _LARGEST_WHOLE else 0
+def _whole(parameters: Mapping[str, float], name: str, otherwise: int = 0) -> int:
+    """A parameter as a whole number; `otherwise` where it is absent or damaged beyond any number."""
+    value = parameters.get(name, math.nan)
+    return int(value) if abs(value) < _LARGEST_WHOLE else otherwise
 
 
 def no_multirotor(parameters: Mapping[str, float], mav_type: int = 0, firmware: str = "") -> str:
@@ -319,9 +314,9 @@ def no_multirotor(parameters: Mapping[str, float], mav_type: int = 0, firmware: 
         mav_type: MAV_TYPE of its heartbeats; 0 for unknown.
         firmware: of ArduPilot, such as Copter or Plane; empty for unknown.
     """
-    kind = mav_type or _whole_or_zero(parameters, "MAV_TYPE")
-    airframe = _OTHER_AIRFRAMES.get(_whole_or_zero(parameters, "CA_AIRFRAME"))
-    frame = _OTHER_FRAMES.get(_whole_or_zero(parameters, "FRAME_CLASS"))
+    kind = mav_type or _whole(parameters, "MAV_TYPE")
+    airframe = _OTHER_AIRFRAMES.get(_whole(parameters, "CA_AIRFRAME"))
+    frame = _OTHER_FRAMES.get(_whole(parameters, "FRAME_CLASS"))
     which = (
         f"MAV_TYPE {kind}" if kind and kind not in MULTIROTORS
         else f"Ardu{firmware}" if firmware not in ("", "Copter")

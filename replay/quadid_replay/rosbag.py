@@ -7,8 +7,9 @@ import sqlite3
 from collections.abc import Callable, Iterator, Mapping, Set
 from dataclasses import replace
 from functools import lru_cache
+from heapq import merge
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from mcap_ros2._dynamic import generate_dynamic
@@ -18,7 +19,7 @@ from quadid.data.window import Recording
 from quadid.errors import LogError
 from quadid.sanitise import plain
 from quadid_replay.columns import Columns, RawChannel, assemble, fastest_first
-from quadid_replay.mcap_file import McapFile, Message, Part, Topic, in_log_time, usable_definition
+from quadid_replay.mcap_file import McapFile, Message, Topic, usable_definition
 from quadid_replay.motors import active_outputs
 from quadid_replay.presets import AUTO, preset_rank
 from quadid_replay.ros_messages import SIGNALS, TYPES, MessageReader, Source, decode_messages, type_name
@@ -33,7 +34,7 @@ def is_bag_folder(path: Path) -> bool:
 
 def bag_files(folder: Path) -> list[Path]:
     """The files of a recording, in the order of their numbers; raises LogError where there is none to read."""
-    files = _files(folder)
+    files = [p for end in ("mcap", "db3") for p in folder.glob(f"*.{end}") if p.is_file()]
     packed = sorted(p.name for p in folder.glob("*.zstd"))
     if packed:
         raise LogError(
@@ -42,10 +43,6 @@ def bag_files(folder: Path) -> list[Path]:
     if not files:
         raise LogError(f"{folder.name}: neither .mcap nor .db3 in it", "a folder of ros2 bag record", "check the path")
     return sorted(files, key=lambda p: [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", p.name)])
-
-
-def _files(folder: Path) -> list[Path]:
-    return [p for end in ("mcap", "db3") for p in folder.glob(f"*.{end}") if p.is_file()]
 
 
 # --- Rosbag2 beside MCAP: SQLite databases (.db3), and the folder that `ros2 bag record` makes, of either kind
@@ -154,13 +151,6 @@ class Database:
         )  # fmt: skip
 
 
-class _Member(NamedTuple):
-    """A file of a folder, and the folder's number of each of its topics."""
-
-    bag: Bag
-    numbers: dict[int, int]
-
-
 class Folder:
     """The files of one recording, joined; a topic that is in several files is one topic.
 
@@ -171,40 +161,29 @@ class Folder:
     def __init__(self, path: Path) -> None:
         self.topics: dict[int, Topic] = {}
         known: dict[tuple[str, str], int] = {}
-        self._members: list[_Member] = []
+        self._members: list[tuple[Bag, dict[int, int]]] = []
+        """Each file with the folder's number of each of its topics."""
         for file in bag_files(path):
             bag = open_bag(file)
             numbers = {}
             for number, topic in bag.topics.items():
                 numbers[number] = known.setdefault((topic.name, topic.type), len(known))
                 self.topics.setdefault(numbers[number], topic)
-            self._members.append(_Member(bag, numbers))
+            self._members.append((bag, numbers))
 
     def messages(self, wanted: Set[int]) -> Iterator[Message]:
         """Number, log time [ns] and payload over all files, in order of log time."""
-        parts: list[Part] = []
-        for member in self._members:
-            messages = self._renumbered(member, wanted)
-            first = next(messages, None)
-            if first is not None:
-                parts.append((first[1], _chain(first, messages)))
-        yield from in_log_time(sorted(parts, key=lambda part: part[0]))
+
+        def of(bag: Bag, numbers: dict[int, int]) -> Iterator[Message]:
+            inside = {own for own, number in numbers.items() if number in wanted}
+            for number, stamp, data in bag.messages(inside) if inside else ():
+                yield numbers[number], stamp, data
+
+        yield from merge(*(of(*member) for member in self._members), key=lambda message: message[1])
 
     def damage(self) -> list[str]:
         """What could not be read, of all files."""
-        return [note for member in self._members for note in member.bag.damage()]
-
-    @staticmethod
-    def _renumbered(member: _Member, wanted: Set[int]) -> Iterator[Message]:
-        inside = {own for own, number in member.numbers.items() if number in wanted}
-        if inside:
-            for number, stamp, data in member.bag.messages(inside):
-                yield member.numbers[number], stamp, data
-
-
-def _chain(first: Message, rest: Iterator[Message]) -> Iterator[Message]:
-    yield first
-    yield from rest
+        return [note for bag, _ in self._members for note in bag.damage()]
 
 
 def open_bag(path: Path) -> Bag:
