@@ -17,6 +17,7 @@ from quadid_replay import open_log
 from quadid_replay.frames import GRAVITY
 from quadid_replay.mavlink_messages import ESC_INFO, ESC_STATUS, extend_dialect
 from quadid_replay.motors import RPM
+from quadid_replay.tlog import _rounds
 
 from quadid.data.grid import grid_recording
 from quadid.errors import LogError
@@ -290,3 +291,15 @@ def test_a_vehicle_of_pulse_widths_uses_them_beside_measured_speeds(data_dir: Pa
     gridded = grid_recording(open_log(folder / "quad_sq.tlog"), vehicle(folder / "quad_sq_pwm.yaml"))
     assert gridded.report.rotor_source.startswith("SERVO_OUTPUT_RAW")
     assert gridded.windows[0].sampling == "held" or gridded.report.filtered
+
+
+def test_messages_of_a_round_make_a_row() -> None:
+    t = np.arange(7.0)
+    places = np.array([0, 4, 0, 12, 4, 2, 10])
+    values = np.arange(28.0).reshape(7, 4)
+    times, rows = _rounds(t, places, values, 12)
+    np.testing.assert_array_equal(times, [0.0, 2.0, 5.0])
+    nan = [np.nan] * 4
+    np.testing.assert_array_equal(rows[0], [0, 1, 2, 3, 4, 5, 6, 7, *nan])
+    np.testing.assert_array_equal(rows[1], [8, 9, 10, 11, 16, 17, 18, 19, *nan])
+    np.testing.assert_array_equal(rows[2], [np.nan, np.nan, 20, 21, 22, 23, *nan, 24, 25])
