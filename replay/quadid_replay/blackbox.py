@@ -333,7 +333,6 @@ def number(text: str) -> float:
 
 MAGIC = b"H Product:Blackbox"
 _DEGREE = np.pi / 180.0
-_MOST_FIELDS = 256
 _KEPT = (
     "gyro_scale", "acc_1G", "minthrottle", "vbatref", "motorOutput", "motor_poles", "maxthrottle",
     "blackbox_high_resolution", "yaw_motors_reversed",
@@ -401,7 +400,7 @@ def _header(data: bytes, start: int, stop: int, origin: str) -> _Header:
                 signs = values.get(f"Field {kind} signed", "").split(",")
                 if len(signs) != len(names):  # P frames have those of I frames
                     signs = ["0" if name in ("loopIteration", "time") else "1" for name in names]
-                if len({len(names), *map(len, parts)}) == 1 and len(names) <= _MOST_FIELDS:
+                if len({len(names), *map(len, parts)}) == 1:
                     definition = FrameDefinition(tuple(names), parts[0], parts[1], tuple(sign == "1" for sign in signs))
                     if {*definition.encodings} <= {*_SINGLE, *_GROUPS} and {*definition.predictors} <= {*range(12)}:
                         definitions[kind] = definition

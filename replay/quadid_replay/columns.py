@@ -16,7 +16,7 @@ from quadid.rotation import continuous_sign
 from quadid.types import BoolArray, FloatArray
 from quadid_replay.frames import unit_quaternions
 
-# --- Time from untrusted logs: wraps undone, reboots and clock steps found, wild stamps refused
+# --- Time from untrusted logs: reboots and clock steps found, wild stamps refused
 #
 # A log has one `LogClock`; stamps are fed in file order and come back as recording time [s], which never starts over.
 
@@ -29,33 +29,6 @@ CONFIRMATIONS = 3
 """How many further stamps must agree before a new time base is believed; a single wild stamp moves nothing."""
 PAUSE = 1.0
 """Recording time [s] put between the last sample before a reboot and the first one after it."""
-
-
-class WrapCounter:
-    """Unwraps a counter of limited width, such as 32-bit microseconds (71.6 minutes).
-
-    Args:
-        period: value at which the counter starts over, in its own unit.
-    """
-
-    def __init__(self, period: float = 2.0**32) -> None:
-        self._period = period
-        self._turns = 0
-        self._last: float | None = None
-
-    def unwrap(self, raw: float) -> float:
-        """Returns `raw` plus whole periods; a fall by more than half a period is a wrap, a smaller one is disorder."""
-        if self._last is not None:
-            if raw < self._last - 0.5 * self._period:
-                self._turns += 1
-            elif raw > self._last + 0.5 * self._period and self._turns > 0:
-                return raw + (self._turns - 1) * self._period
-        self._last = raw
-        return raw + self._turns * self._period
-
-    def unwrap_near(self, raw: float, reference: float) -> float:
-        """Returns `raw` plus the whole periods that bring it closest to a `reference` of the same unit."""
-        return raw + self._period * round((reference - raw) / self._period)
 
 
 class LogClock:

@@ -35,8 +35,6 @@ _MOTOR_LIKE = re.compile(r"(?:pwm|motor|mot|esc|rpm|cmd|servo|out|m)_?([1-9]\d?)
 _SLOWEST_ROW, _FEW_ROWS = 0.9, 20
 """Slower rows [s] say nothing about a flight; of fewer rows nothing is told."""
 _LINES = 4096
-LONGEST_LINE = 1 << 20
-"""Characters; a row of numbers has some hundreds."""
 
 
 def read_csv(path: Path, columns: Mapping[str, str] | None = None) -> Recording:
@@ -229,12 +227,7 @@ def _blocks(path: Path) -> Iterator[tuple[int, list[str], bool]]:
     lines: list[str] = []
     seen_header, first, last = False, 0, ""
     with path.open(encoding="utf-8-sig", errors="replace") as file:
-        for number, last in enumerate(iter(lambda: file.readline(LONGEST_LINE), ""), 1):
-            if len(last) == LONGEST_LINE:
-                raise LogError(
-                    f"{path.name}: line {number} is longer than {LONGEST_LINE >> 20} MiB", "one row of numbers a line",
-                    "check the export, or whether the file is text at all",
-                )  # fmt: skip
+        for number, last in enumerate(file, 1):
             if not last.strip() or last.lstrip().startswith("#"):
                 continue
             if not seen_header:

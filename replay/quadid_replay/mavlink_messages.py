@@ -12,7 +12,6 @@ from typing import Any, Generic, NamedTuple, TypeAlias, TypeVar
 import numpy as np
 
 from quadid.types import BoolArray, FloatArray, IntArray
-from quadid_replay.columns import WrapCounter
 from quadid_replay.frames import GRAVITY, from_euler, to_euler
 from quadid_replay.motors import ESCS, RPM
 
@@ -309,7 +308,7 @@ def boot_stamp(raw: float, servo: bool, newest: float | None) -> float | None:
         return None
     if newest is None or (raw != 0.0 and not servo):
         return raw
-    boot = WrapCounter(SERVO_TURN).unwrap_near(raw, newest) if servo else raw
+    boot = raw + SERVO_TURN * round((newest - raw) / SERVO_TURN) if servo else raw
     return None if raw == 0.0 and abs(boot - newest) > ZERO_IS_BOOT else boot
 
 

@@ -54,7 +54,6 @@ def bag_files(folder: Path) -> list[Path]:
 
 
 SQLITE_MAGIC = b"SQLite format 3\x00"
-_MOST_TOPICS = 5000
 _SHORTEST = 1 << 12
 _DAMAGE = (sqlite3.Error, UnicodeDecodeError)
 """The second comes where SQLite's message quotes bytes that are no text."""
@@ -130,10 +129,8 @@ class Database:
         definitions: dict[str, tuple[str, str]] = {}
         if "message_definitions" in tables:
             query = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
-            definitions = {str(k): (str(e), str(t)) for k, e, t in self._connection.execute(f"{query} LIMIT 10000")}
-        rows = self._connection.execute("SELECT id, name, type, serialization_format FROM topics").fetchmany(
-            _MOST_TOPICS
-        )
+            definitions = {str(k): (str(e), str(t)) for k, e, t in self._connection.execute(query)}
+        rows = self._connection.execute("SELECT id, name, type, serialization_format FROM topics")
         out = {}
         for number, name, kind, encoding in rows:
             if not isinstance(number, int):

@@ -57,8 +57,6 @@ _SIGNATURE = 13
 _HEAD = _STAMP + 3
 """Bytes that tell a frame's length: receive time, mark, payload length, flags."""
 _BLOCK = 1 << 18
-_MOST_FAILURES = 1_000_000
-"""So many places in a row that look like a frame and are none: this is no telemetry."""
 
 
 class Frames(NamedTuple):
@@ -108,7 +106,7 @@ def read_frames(path: Path) -> Frames:
     end = places + _STAMP + head + data[places + _STAMP + 1]
     signed = ~version_1 & (data[places + _STAMP + 2] & _SIGNED != 0)
     stop = end + 2 + _SIGNATURE * signed
-    kept, skipped, cut = _walk(places, stop, marks, len(data))
+    kept, skipped, cut = _walk(places, stop, len(data))
     start, head, end = places[kept] + _STAMP, head[kept], end[kept]
     short = np.where(head == 6, 0, 2)  # MAVLink 2 has two flags more before these
     kind = start + 5 + short
@@ -141,12 +139,11 @@ def _receive_times(data: Bytes, places: IntArray) -> IntArray:
     return time
 
 
-def _walk(places: IntArray, stops: IntArray, marks: IntArray, size: int) -> tuple[IntArray, int, bool]:
+def _walk(places: IntArray, stops: IntArray, size: int) -> tuple[IntArray, int, bool]:
     """Follows the frames from one to the next.
 
     Args:
         places: offsets where a frame may begin, rising; stops: where each ends.
-        marks: the same and places that only look like it at first sight.
         size: of the file.
 
     Returns:
@@ -175,8 +172,6 @@ def _walk(places: IntArray, stops: IntArray, marks: IntArray, size: int) -> tupl
         found = int(np.searchsorted(certain_places, offset, side="right"))
         at = int(certain[found]) if found < len(certain) else -1
         resumed = int(places[at]) if at >= 0 else size
-        if 1 + np.searchsorted(marks, resumed) - np.searchsorted(marks, offset, side="right") >= _MOST_FAILURES:
-            at, resumed = -1, size
         skipped, offset = skipped + resumed - offset, resumed
 
 

@@ -178,8 +178,6 @@ def _note_flags(found: UlogRecords, name: str, body: bytes) -> None:
 # steps that are not repeated here; such rows have no value.
 
 
-MULTIROTOR = 0
-"""CA_AIRFRAME whose rotors alone make forces and moments."""
 _DEFAULTS = {"AX": 0.0, "AY": 0.0, "AZ": -1.0, "PX": 0.0, "PY": 0.0, "PZ": 0.0, "CT": 6.5, "KM": 0.05}
 _NOTHING = 1e-3
 """Share of a torque below which a motor has no part in it."""
@@ -195,7 +193,7 @@ def allocation(parameters: Mapping[str, float]) -> FloatArray | None:
         None where these are not told, or not of a multirotor.
     """
     count = px4_rotor_count(parameters)
-    if not count or parameters.get("CA_AIRFRAME") != MULTIROTOR:
+    if not count or parameters.get("CA_AIRFRAME") != 0.0:  # a multirotor, whose rotors alone make forces and moments
         return None
     rotors = [
         {k: float(parameters.get(f"CA_ROTOR{i}_{k}", default)) for k, default in _DEFAULTS.items()}
