@@ -13,14 +13,12 @@ import numpy as np
 import pytest
 import zstandard
 from quadid_replay import open_log
-from quadid_replay import usd as usd_records
 from quadid_replay.frames import from_euler, to_euler
 from quadid_replay.motors import motor_outputs, px4_motor_outputs, px4_rotor_count
 from quadid_replay.schemas import schema_text
 
 from quadid.data.rotor_signal import rotor_signal
 from quadid.errors import LogError
-from quadid.types import BoolArray, IndexArray
 from quadid.vehicle import Vehicle
 from tests.faults.evidence import Happened
 from tests.fuzz import campaign, rosbag2_format
@@ -28,9 +26,7 @@ from tests.fuzz.seeds import mcap_of
 from tests.replay.test_dataflash import Dataflash, add_flight, flight
 from tests.replay.test_mcap import header
 from tests.replay.test_tlog import MAV, Tlog, attitude, heartbeat, raw_imu, servo
-from tests.replay.test_ulog import Ulog
 from tests.replay.test_ulog import flight as ulog_flight
-from tests.replay.test_usd import Usd, controller_log
 
 
 def opened(tmp_path: Path, data: bytes) -> Path:
@@ -83,21 +79,6 @@ def test_a_log_of_a_second_imu_only_has_no_gyro(tmp_path: Path) -> None:
     assert "gyro" not in open_log(opened(tmp_path, bytes(log.data))).channels
 
 
-def test_a_throttle_that_signals_nan_passes_without_a_warning(tmp_path: Path) -> None:
-    log = Ulog()
-    log.format("vehicle_attitude_setpoint", "uint64_t timestamp;float[4] q_d;float[3] thrust_body;")
-    log.subscribe("vehicle_attitude_setpoint")
-    signalling = np.uint32(0x7F800001).view(np.float32)
-    for row in range(10):
-        body = struct.pack("<Q6f", 1_000_000 + 20_000 * row, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-        throttle = signalling.tobytes() if row == 4 else struct.pack("<f", -0.5)
-        log.record("D", struct.pack("<H", 0) + body + throttle)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        reference = open_log(opened(tmp_path, bytes(log.data))).channels["attitude_reference"]
-    assert len(reference.t) == 9, "the sample without a throttle is dropped"
-
-
 def test_a_database_whose_schema_is_no_text_is_refused(tmp_path: Path) -> None:
     data = rosbag2_format.finish(rosbag2_format.row("topics", 1, "imu", "sensor_msgs/msg/Imu", "cdr", ""))
     damaged = data.replace(b"CREATE TABLE messages", b"CREATE TABLE\xff\xe5essages")
@@ -114,15 +95,6 @@ def test_a_topic_without_a_number_is_passed_over(tmp_path: Path) -> None:
         open_log(tmp_path / "log")
 
 
-def test_numbers_of_a_usd_log_that_signal_nan_pass_without_a_warning(tmp_path: Path) -> None:
-    data = bytearray(controller_log(20).closed())
-    at = data.rindex(struct.pack("<f", 40000.0))
-    data[at : at + 4] = struct.pack("<I", 0x7F800001)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        assert len(open_log(opened(tmp_path, bytes(data))).channels["mixer_input"].t) == 19
-
-
 def test_chunks_of_zeros_are_no_records(tmp_path: Path, happened: Happened) -> None:
     kind = "quadid_msgs/msg/MotorCommand"
     message = ("motor_command", kind, schema_text(kind), lambda ns: {"header": header(ns), "values": [0.5] * 4})
@@ -133,23 +105,6 @@ def test_chunks_of_zeros_are_no_records(tmp_path: Path, happened: Happened) -> N
     recording = open_log(hostile)
     assert any("damaged chunks" in warning for warning in recording.warnings), "before, two million records of nothing"
     happened(5, "a chunk of 15 MiB of zeros: refused as no records")
-
-
-def test_records_of_two_kinds_in_turn_take_linear_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    looked: list[int] = []
-    kept = np.flatnonzero
-
-    def counted(mask: BoolArray) -> IndexArray:
-        looked.append(len(mask))
-        return kept(mask)
-
-    monkeypatch.setattr(np, "flatnonzero", counted)
-    log = Usd(fixedFrequency="motor.m1(B)", modeChanged="mode(B)")
-    for k in range(4000):
-        log.add("fixedFrequency" if k % 2 else "modeChanged", 1000 * k, 1)
-    tables = usd_records.collect_usd_records(log.closed(), "log").tables
-    assert {name: len(table) for name, table in tables.items()} == {"fixedFrequency": 2000, "modeChanged": 2000}
-    assert sum(looked) < 100 * 4000, "each run used to look at all that follows"
 
 
 @pytest.mark.parametrize("index", [12, 13, 255])
