@@ -395,7 +395,7 @@ class Stamps:
             stamps: [ns], shape (n,); log time stands in for zero.
             logged: log times [ns].
         """
-        log_ns = np.minimum(np.array(logged, dtype=np.uint64), _LARGEST_NS).astype(np.int64)
+        log_ns = np.array([max(min(t, _LARGEST_NS), -_LARGEST_NS) for t in logged], dtype=np.int64)
         if self.base_ns is None:
             self.base_ns = int(log_ns[0]) // 10**9 * 10**9 if log_ns[0] > _EPOCH_NS else 0
         since, times = (log_ns - self.base_ns) * 1e-9, (stamps - self.base_ns) * 1e-9
