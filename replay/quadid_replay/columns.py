@@ -311,15 +311,14 @@ def assemble(
 def fastest_first(raw: Sequence[RawChannel], advantage: float = 1.3) -> list[RawChannel]:
     """Orders sources of one channel: as given, but one that is `advantage` times faster than the best goes first."""
     best: list[RawChannel] = []
-    single: list[RawChannel] = []
     for entry in raw:
         if np.count_nonzero(np.isfinite(entry.t)) < 2:
-            single.append(entry)
-        elif best and not _period(entry) * advantage < _period(best[0]):
+            continue  # a single sample is no channel
+        if best and not _period(entry) * advantage < _period(best[0]):
             best.append(entry)
         else:
             best.insert(0, entry)
-    return best + single
+    return best
 
 
 def _period(entry: RawChannel) -> float:

@@ -215,10 +215,14 @@ SOURCES = (
     *(Source("accel", name, ("AccX", "AccY", "AccZ"), note="instance 0") for name in ("IMU", "ACC")),
     *(Source("attitude", name, ("Roll", "Pitch", "Yaw"), _from_degrees, "(degrees)") for name in ("ATT", "ANG")),
     *(Source("attitude", name, ("Q1", "Q2", "Q3", "Q4")) for name in ("XKQ", "XKQ1", "NKQ1")),
+    *(
+        Source("attitude_reference", name, ("DesRoll", "DesPitch", "DesYaw", column), note=f"Des*, CTUN {column}")
+        for name in ("ANG", "ATT") for column in ("ThO", "ThrOut")
+    ),
     *(Source("velocity", name, ("VN", "VE", "VD"), note="VN VE VD") for name in _EKF),
     *(Source("position", name, ("PN", "PE", "PD"), note="PN PE PD") for name in _EKF),
     *(Source("battery", name, ("Volt",), _volts, "Volt") for name in ("BAT", "CURR")),
-)
+)  # fmt: skip
 """In order of preference."""
 
 ARDUCOPTER = {
@@ -247,10 +251,13 @@ def read_dataflash(path: Path) -> Recording:
     sources = SOURCES
     if parameters.get("AHRS_EKF_TYPE") == 2.0:
         sources = tuple(sorted(SOURCES, key=lambda source: source.records != "NKF1"))
-    raw = [
-        *channels_of(sources, lambda source: _rows(index, times, source.records, source.columns)),
-        *_reference(index, times),
-    ]
+
+    def rows(source: Source) -> tuple[FloatArray, FloatArray] | None:
+        if source.channel == "attitude_reference":
+            return _reference(index, times, source)
+        return _rows(index, times, source.records, source.columns)
+
+    raw = channels_of(sources, rows)
     firmware = _firmware(index)
     if other := no_multirotor(parameters, firmware=firmware[1] if firmware else ""):
         notes.append(other)
@@ -333,21 +340,21 @@ def _rows(
     return t, values
 
 
-def _reference(index: DataflashIndex, times: dict[str, FloatArray]) -> list[RawChannel]:
-    """Desired angles of ANG or ATT with the last throttle output of CTUN."""
-    columns = ("DesRoll", "DesPitch", "DesYaw")
-    column, unit = ("ThO", 1.0) if index.has("CTUN", "ThO") else ("ThrOut", 1e-3)
-    throttle = _rows(index, times, "CTUN", (column,))
-    name, desired = next(((n, rows) for n in ("ANG", "ATT") if (rows := _rows(index, times, n, columns))), ("", None))
+def _reference(
+    index: DataflashIndex, times: dict[str, FloatArray], source: Source
+) -> tuple[FloatArray, FloatArray] | None:
+    """Times and desired angles with the last throttle output of CTUN."""
+    desired = _rows(index, times, source.records, source.columns[:3])
+    throttle = _rows(index, times, "CTUN", source.columns[3:])
     if desired is None or throttle is None:
-        return []
+        return None
     t, angles = desired[0], np.radians(desired[1])
+    angles[:, 2] = np.remainder(angles[:, 2] + np.pi, 2.0 * np.pi) - np.pi
     written, level = (part[np.isfinite(throttle[0])] for part in throttle)
     latest = np.searchsorted(written, t, side="right") - 1
     known = latest >= 0
-    angles[:, 2] = np.remainder(angles[:, 2] + np.pi, 2.0 * np.pi) - np.pi
-    values = np.hstack([angles[known], level[latest[known]] * unit])
-    return [RawChannel("attitude_reference", t[known], values, f"{name} Des*, CTUN {column}")]
+    unit = 1.0 if source.columns[3] == "ThO" else 1e-3
+    return t[known], np.hstack([angles[known], level[latest[known]] * unit])
 
 
 def _outputs(
