@@ -20,7 +20,7 @@ from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import Any
 
-from quadid_replay.recognise import HEAD_BYTES, recognise
+from quadid_replay.formats import HEAD_BYTES, recognise
 
 from quadid.app.fleet import Job, blank, identify_one
 from quadid.app.fleet import Row as fleet_Row

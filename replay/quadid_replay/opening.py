@@ -248,7 +248,7 @@ def pack(told: Recording | _Refused | _Fault | _Limit) -> bytes:
     channels = [
         _Channel(
             c.name, _text(c.source), dict(c.faults), c.values.shape[1],
-            *(memoryview(np.ascontiguousarray(a, _DOUBLE)).cast("B") for a in (c.t, c.values)),
+            *(np.ascontiguousarray(a, _DOUBLE).data.cast("B") for a in (c.t, c.values)),
         ) for c in told.channels.values()
     ]  # fmt: skip
     return msgspec.msgpack.encode(_Recording(

@@ -83,7 +83,9 @@ class MessageReader:
         self._layout = None
         if data[:2] != _LITTLE_ENDIAN:
             return
-        places, begin, same = [], _AFTER_STAMP, []
+        places: list[tuple[str, Any, int]] = []
+        same: list[tuple[int, int, bytes]] = []
+        begin = _AFTER_STAMP
         for run in runs:
             packed = struct.pack(f"<{len(run)}d", *run)
             at = data.find(packed, begin)

@@ -384,9 +384,10 @@ def _signals(
     t[timed] = clock.times(placing.time[timed])
     signals = {}
     for key in sorted(parts, key=lambda key: min(which[0] for which, _, _ in parts[key])):
-        which, places, values = (np.concatenate(column) for column in zip(*parts[key], strict=True))
+        which, places = (np.concatenate([part[k] for part in parts[key]]) for k in (0, 1))
         in_file = np.argsort(which, kind="stable")
-        at, places, values = t[np.searchsorted(every, which[in_file])], places[in_file], values[in_file]
+        values = np.concatenate([part[2] for part in parts[key]])[in_file]
+        at, places = t[np.searchsorted(every, which[in_file])], places[in_file]
         width = _WIDTH.get(key[0], 3)
         if key[0] in ("esc", "servo"):
             signals[key] = _rounds(at, places, values, width)
