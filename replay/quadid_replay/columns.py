@@ -251,7 +251,7 @@ def clean_channel(raw: RawChannel) -> Channel | None:
     stamped = np.isfinite(raw.t)
     t, values = (raw.t, raw.values) if stamped.all() else (raw.t[stamped], raw.values[stamped])
     faults = {"bad_stamp": len(stamped) - len(t)}
-    finite: BoolArray = np.isfinite(values).all(axis=1)
+    finite = np.asarray(np.isfinite(values).all(axis=1))
     faults["not_finite"] = int(np.count_nonzero(~finite))
     absurd = finite & (np.abs(values) > _ABSURD).any(axis=1)
     faults["absurd"] = int(np.count_nonzero(absurd))

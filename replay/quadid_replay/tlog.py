@@ -387,12 +387,12 @@ def _signals(
         which, places = (np.concatenate([part[k] for part in parts[key]]) for k in (0, 1))
         in_file = np.argsort(which, kind="stable")
         values = np.concatenate([part[2] for part in parts[key]])[in_file]
-        at, places = t[np.searchsorted(every, which[in_file])], places[in_file]
+        moments, places = t[np.searchsorted(every, which[in_file])], places[in_file]
         width = _WIDTH.get(key[0], 3)
         if key[0] in ("esc", "servo"):
-            signals[key] = _rounds(at, places, values, width)
+            signals[key] = _rounds(moments, places, values, width)
         else:
-            signals[key] = at, np.pad(values, ((0, 0), (0, width - values.shape[1])))
+            signals[key] = moments, np.pad(values, ((0, 0), (0, width - values.shape[1])))
     return signals, placing
 
 
