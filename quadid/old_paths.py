@@ -27,7 +27,6 @@ ROOMS = {
 }
 """Packages that moved as they were, by their old names."""
 MOVED = {
-    "quadid.data.faults": "quadid.data_faults quadid.saturation",
     "quadid.effects": "quadid.effects.kinds quadid.effects.table",
     "quadid.flight.airframe": "quadid.flight.airframe_constants",
     "quadid.flight.setup": "quadid.flight.draw quadid.flight.truth",
@@ -51,16 +50,23 @@ MOVED = {
     "quadid.model.body_kernel": "quadid.model.residual_kernel",
     "quadid.model.step": "quadid.model.simulate quadid.model.step_kernel",
     "quadid.model.layout": "quadid.model.supply quadid.model.thrust",
-    "quadid.data.mounting": "quadid.mounting",
+    "quadid.condition.watch": "quadid.online.health_supervisor",
+    "quadid.online.change_job": "quadid.online.fault_isolation",
+    "quadid.online.changes": "quadid.online.change_detection quadid.online.change_supervisor "
+    "quadid.online.flight_state",
+    "quadid.online.fit_job": "quadid.online.flexible_fit quadid.online.lack_of_fit "
+    "quadid.online.reply_validation quadid.online.window_fit",
+    "quadid.online.fusion": "quadid.online.estimator",
+    "quadid.online.session": "quadid.online.settings quadid.online.supervisor quadid.online.window_supervisor",
     "quadid.online.stream": "quadid.online.channel_buffer quadid.online.clock "
     "quadid.online.command_reconstruction quadid.online.resampler",
     "quadid.online.checks": "quadid.online.consistency quadid.online.quality",
     "quadid.online.records": "quadid.online.jobs quadid.online.outbox",
     "quadid.online.grid_buffer": "quadid.online.rows",
     "quadid.vehicle": "quadid.provenance quadid.residual quadid.vehicle_parts quadid.vehicle_size",
-    "quadid.data.resample": "quadid.resample",
+    "quadid.data.resample": "quadid.resample quadid.data.faults quadid.data_faults quadid.saturation",
     "quadid.data.rotor_signal": "quadid.rotor_signal",
-    "quadid.data.window": "quadid.window",
+    "quadid.data.window": "quadid.window quadid.data.mounting quadid.mounting",
     "quadid.cli.terminal": "quadid_cli.failure quadid_cli.output quadid_cli.tables",
     "quadid.cli.fleet_run": "quadid_cli.fleet_cluster quadid_cli.fleet_folder quadid_cli.fleet_store",
     "quadid.identification.problem": "quadid.identify.parameterization quadid.identify.segment_cost "

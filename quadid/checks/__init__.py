@@ -35,8 +35,7 @@ from quadid.checks.rotors import (
     rotor_speed_check,
     rotor_timing_check,
 )
-from quadid.data.mounting import in_body_axes
-from quadid.data.window import Recording
+from quadid.data.window import Recording, in_body_axes
 from quadid.vehicle import Vehicle
 
 

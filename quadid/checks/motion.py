@@ -11,9 +11,17 @@ from typing import NamedTuple
 import numpy as np
 
 from quadid.checks.findings import ChannelFacts, Check, CheckResult
-from quadid.data.faults import at_limit
 from quadid.data.grid import GAP, holes, longest_step
-from quadid.data.resample import copied, fresh_rows, linear, measured_period, moving_mean, sample_period, true_runs
+from quadid.data.resample import (
+    at_limit,
+    copied,
+    fresh_rows,
+    linear,
+    measured_period,
+    moving_mean,
+    sample_period,
+    true_runs,
+)
 from quadid.data.rotor_signal import rotor_channel
 from quadid.data.window import CHANNELS, Channel, Recording
 from quadid.model.layout import ThrustModel
@@ -26,30 +34,16 @@ from quadid.vehicle import GRAVITY, Vehicle
 
 Spans = tuple[tuple[float, float], ...]
 
-_LEAST = 0.5
-"""Flying means at least this fraction of hover thrust …"""
-_FALLING = 0.8
-"""Who feels less than this share of his weight falls."""
 _OFF = 16.0
 """A thrust coefficient that is wrong by more tells nothing of the weight."""
-_CARRIES = 0.9
-"""… from when the rotors first carry this fraction of what they usually do; below, the ground still has its share."""
-_IDLE = 0.15
-"""Commands that never exceed this fraction of full are idling motors."""
-_CONTACT, _CARRIED, _STILL = 0.3, 0.75, 0.15
-"""For this long [s] rotors give less than this share of what is felt, and rates [rad/s] are below the last."""
-_RARELY = 0.3
-"""Rotors that give so little for more of the flight have speeds that are wrong."""
 _NOTHING = 0.1
 """A rotor below this share of the median speed of all is ignored."""
+_SHORTEST = 1.0
+"""Shorter spans are none [s]."""
 _GROUND = 3.0
 """Rotors that carry nothing for longer than this [s] stand on the ground; a log with more of it is worth trimming."""
 _MARGIN = 2.0
 """Left out after take-off and before landing [s]: feet, ground and the air above it push, too."""
-_FLIGHT = 5.0
-"""Shortest flight worth proposing [s]."""
-_SHORTEST, _BRIDGE = 1.0, 0.5
-"""Spans shorter than the first [s] are none; interruptions up to the second [s] do not end one."""
 
 
 def flying_spans(recording: Recording, vehicle: Vehicle | None) -> Spans:
@@ -68,16 +62,18 @@ def flying_spans(recording: Recording, vehicle: Vehicle | None) -> Spans:
         thrust, hover = _thrust(rotors, vehicle, felt)
         if hover <= 0.0:
             return ()
-        t, on = rotors.t, thrust > _LEAST * hover
+        t, on = rotors.t, thrust > 0.5 * hover  # flying carries half the weight at least
         if accel is not None and len(accel.t) > 10:
             on &= np.interp(t, accel.t, _felt(accel)) > 0.5
         if felt is not None and on.any():
             inside = (t >= t[on][0]) & (t <= t[on][-1])
-            on |= inside & (felt < _FALLING)
+            # Who feels less than this share of his weight falls.
+            on |= inside & (felt < 0.8)
             inside = (t > t[on][0] + _SHORTEST) & (t < t[on][-1] - _SHORTEST)
             usual = float(np.median((thrust / np.maximum(felt, 0.1))[on]))
             on[inside] &= ~_stands(t[inside], thrust[inside] / usual, felt[inside], channels.get("gyro"))
-        carried = t[on & (thrust > _CARRIES * np.median(thrust[on]))] if on.any() else t[on]
+        # Below, the ground still carries its share.
+        carried = t[on & (thrust > 0.9 * np.median(thrust[on]))] if on.any() else t[on]
         return tuple(later for span in _spans(t, on) if (later := _from_carried(span, carried)))
     if "accel" in channels and len(channels["accel"].t) > 10:
         return _spans(channels["accel"].t, _vibrates(channels["accel"]))
@@ -111,12 +107,12 @@ def _joined(spans: Spans, most: float) -> list[tuple[float, float]]:
 
 
 def _trimmed(flights: Sequence[tuple[float, float]], first: float, last: float) -> Spans:
-    """Flights that are long enough, without the time next to the ground [s after `first`, to a tenth]."""
+    """Flights of 5 s or more, without the time next to the ground [s after `first`, to a tenth]."""
     cuts = [
         (0.0 if a - first < _MARGIN else a + _MARGIN - first, (b if last - b < _MARGIN else b - _MARGIN) - first)
         for a, b in flights
     ]
-    return tuple((round(a, 1), round(b, 1)) for a, b in cuts if b - a >= _FLIGHT)
+    return tuple((round(a, 1), round(b, 1)) for a, b in cuts if b - a >= 5.0)
 
 
 def within(t: FloatArray, spans: Spans) -> BoolArray:
@@ -127,6 +123,8 @@ def within(t: FloatArray, spans: Spans) -> BoolArray:
 def _stands(t: FloatArray, thrust: FloatArray, felt: FloatArray, gyro: Channel | None) -> BoolArray:
     """Times at which something else carries the vehicle: its weight is felt, its rotors give less, it does not turn.
 
+    For 0.3 s they give less than three quarters of what is felt, and rates stay below 0.15 rad/s.
+
     Args:
         t: times (n,).
         thrust: over what usually carries the weight (n,).
@@ -135,13 +133,14 @@ def _stands(t: FloatArray, thrust: FloatArray, felt: FloatArray, gyro: Channel |
     """
     if gyro is None or len(t) < 3:
         return np.zeros(len(t), dtype=bool)
-    width = max(1, round(_CONTACT / sample_period(t)))
+    width = max(1, round(0.3 / sample_period(t)))
     fresh = np.append(~copied(gyro.values), True)  # a gyro that is stuck does not show that nothing turns
     turning = np.interp(t, gyro.t, np.where(fresh, np.linalg.norm(gyro.values, axis=1), 1.0))
-    load, still = moving_mean(thrust / np.maximum(felt, 0.1), width), moving_mean(turning, width) < _STILL
-    if np.mean(load < _CARRIED) > _RARELY:  # then speeds disagree with the thrust, and nothing follows from them
+    load, still = moving_mean(thrust / np.maximum(felt, 0.1), width), moving_mean(turning, width) < 0.15
+    little = load < 0.75
+    if np.mean(little) > 0.3:  # then speeds disagree with the thrust, and nothing follows from them
         return np.zeros(len(t), dtype=bool)
-    stands = (load < _CARRIED) & still & (np.abs(felt - 1.0) < 0.15)
+    stands = little & still & (np.abs(felt - 1.0) < 0.15)
     return np.asarray(moving_mean(stands.astype(np.float64), 2 * width) > 0.0)
 
 
@@ -153,7 +152,8 @@ def _thrust(channel: Channel, vehicle: Vehicle | None, felt: FloatArray | None) 
         values = np.clip((values - low) / (high - low), 0.0, None)
     values = _beside_others(values)
     thrust = np.asarray(np.sum(values**2, axis=1))
-    if channel.name == "motor_command" and np.quantile(thrust, 0.95) < _IDLE**2 * values.shape[1]:
+    # Commands that never exceed 15 % of full are idling motors.
+    if channel.name == "motor_command" and np.quantile(thrust, 0.95) < 0.15**2 * values.shape[1]:
         return thrust, 0.0
     if channel.name == "rotor_speed" and vehicle is not None and values.shape[1] == len(vehicle.rotors):
         modelled, hover = ThrustModel.stated(vehicle).total(values), vehicle.mass * GRAVITY
@@ -208,7 +208,7 @@ def _spans(t: FloatArray, on: BoolArray) -> Spans:
     spans: list[tuple[float, float]] = []
     for first, end in zip(*true_runs(on), strict=True):
         a, b = float(t[first]), float(t[end - 1])
-        if spans and a - spans[-1][1] <= _BRIDGE:
+        if spans and a - spans[-1][1] <= 0.5:  # a shorter interruption ends no span
             spans[-1] = (spans[-1][0], b)
         else:
             spans.append((a, b))
@@ -222,12 +222,6 @@ _GRID = 0.02
 """Step of the grid [s] for which gaps are reported, that of the fit."""
 _STUCK = 0.5
 """An IMU channel that does not change for this long [s] in flight is stuck."""
-FILLED = 1.5
-"""Rows for each measured one above which it is reported."""
-_CLIPPED = 0.05
-"""Share of clipped rates from which inertias come out wrong: 2 % too large at 0.06, 8 % at 0.16."""
-_UNSTEADY = 0.25
-"""Jitter above which the log's timing is worth a warning."""
 
 
 def channel_facts(recording: Recording, flying: Spans = ()) -> tuple[ChannelFacts, ...]:
@@ -287,7 +281,7 @@ def timing_checks(recording: Recording, facts: tuple[ChannelFacts, ...]) -> list
         rows = (f.count - 1) / max(f.last - f.first, 1e-9)
         if f.name == "attitude" and coarse is not None:
             continue  # a value that rests between its steps is no interpolated one
-        if not f.gaps and rows > FILLED * f.rate:
+        if not f.gaps and rows > 1.5 * f.rate:
             message = f"{f.name}: {rows:.3g} rows a second were interpolated between samples at {f.rate:.3g} Hz"
             checks.append(
                 Check("timing", CheckResult.WARNING, message, "log it at this rate, or without the interpolated rows")
@@ -304,9 +298,7 @@ def timing_checks(recording: Recording, facts: tuple[ChannelFacts, ...]) -> list
                 {"gaps": float(sum(f.gaps for f in facts)), "longest_s": worst.longest_gap},
             )
         )  # fmt: skip
-    unsteady = [
-        f for f in facts if f.name in ("gyro", "accel", "rotor_speed", "motor_command") and f.jitter > _UNSTEADY
-    ]
+    unsteady = [f for f in facts if f.name in ("gyro", "accel", "rotor_speed", "motor_command") and f.jitter > 0.25]
     for f in unsteady:
         message = f"{f.name}: steps vary by {f.jitter:.0%} of their median: stamps are unsteady or samples are lost"
         checks.append(Check("timing", CheckResult.WARNING, message, "stamp at the sensor", {"jitter": f.jitter}))
@@ -318,7 +310,8 @@ def timing_checks(recording: Recording, facts: tuple[ChannelFacts, ...]) -> list
             )
         if f.name in ("gyro", "accel") and f.saturated:
             share = f.saturated / f.count
-            verdict = CheckResult.ERROR if f.name == "gyro" and share > _CLIPPED else CheckResult.WARNING
+            # Inertias come out 2 % too large where 6 % of the rates are clipped, 8 % at 16 %.
+            verdict = CheckResult.ERROR if f.name == "gyro" and share > 0.05 else CheckResult.WARNING
             message = f"{f.name}: {f.saturated} samples ({share:.2g} of all) at the limit of its range"
             fix = "choose a larger range or fly more gently"
             checks.append(Check("saturated", verdict, message, fix, {"share": share}))
@@ -355,18 +348,10 @@ _MOTION = 0.03
 """Rotation rate [rad/s] an axis must have, as standard deviation, to be checked."""
 _STEP = 0.1
 """Attitudes are compared over steps of at least this [s]: noise and repeated readings matter little then."""
-_STEPPED = 8.0
-"""Standard errors of a step of the gyro's bias."""
 _JUMP = 8.0
 """An attitude step of so many times the usual one, beside half as much of the gyro's, is no motion."""
 _FARTHEST, _LAG, _TOO_LATE = 0.3, 0.02, 0.08
 """Gyro and attitude are compared at times so far apart at most [s], in these steps; more than the last is an error."""
-_DERIVED = 0.05
-"""A gyro this near to the change of attitude, beside what changes from row to row but one, was made of it."""
-_COARSE, _LEVELS, _EQUAL = 0.005, 0.2, 1e-6
-"""Steps of the attitude [rad] that are named, levels for each sample below which it comes in steps, and what is one."""
-_REVERSED = 0.7
-"""Correlation below the negative of which a vertical signal points up."""
 _RESTING = 50
 """Samples on the ground that tell the length of gravity."""
 _AXES = ("x", "y", "z")
@@ -572,7 +557,7 @@ def _bias_step(gyro: Channel, attitude: Channel) -> Check | None:
     left = measured - np.outer(after, np.where(np.arange(3) == axis, size[k], 0.0))
     fit, noise = fit_axes(left, derived), float(np.var((left - derived)[:, axis]))
     still = np.max(np.std(left, axis=0)) < _MOTION
-    if share[k, axis] < _STEPPED**2 * noise or not (still or (fit.straight and fit.r2 >= _CLEAR)):
+    if share[k, axis] < 8.0**2 * noise or not (still or (fit.straight and fit.r2 >= _CLEAR)):
         return None
     return Check(
         "gyro_attitude", CheckResult.ERROR,
@@ -626,7 +611,7 @@ def gyro_source_check(recording: Recording) -> Check | None:
     at_rows = linear(gyro.t, gyro.values, t)
     missed = (at_rows[:-1] - rates, at_rows[1:] - rates, at_rows[1:-1] - 0.5 * (rates[1:] + rates[:-1]))
     least = min(float(np.median(np.linalg.norm(rows, axis=1))) for rows in missed)
-    if least >= _DERIVED * bends:
+    if least >= 0.05 * bends:
         return None
     noisy = bends > 0.5 * float(np.median(np.linalg.norm(rates, axis=1)))
     return Check(
@@ -639,8 +624,8 @@ def gyro_source_check(recording: Recording) -> Check | None:
 def _quantum(values: FloatArray) -> float:
     """Step between the levels of a coarse signal, shape (n,), in its unit; 0 where nearly every sample has its own."""
     levels = np.unique(values)
-    steps = np.diff(levels)[np.diff(levels) > _EQUAL]
-    return 0.0 if not len(steps) or len(steps) > _LEVELS * len(values) else float(np.min(steps))
+    steps = np.diff(levels)[np.diff(levels) > 1e-6]  # equal but for rounding
+    return 0.0 if not len(steps) or len(steps) > 0.2 * len(values) else float(np.min(steps))
 
 
 def attitude_steps_check(recording: Recording) -> Check | None:
@@ -649,7 +634,7 @@ def attitude_steps_check(recording: Recording) -> Check | None:
     if attitude is None or len(attitude.t) < FEWEST_SAMPLES:
         return None
     step = min(_quantum(column) for column in euler(attitude.values)[:, :2].T)
-    if step < _COARSE:
+    if step < 0.005:
         return None
     return Check(
         "attitude_steps", CheckResult.WARNING,
@@ -771,7 +756,7 @@ def _level_velocity(gained: FloatArray, derived: FloatArray) -> Check:
 
 def _upwards(gained: FloatArray, derived: FloatArray) -> bool:
     """Tests for vertical changes (n,) that are clearly the reverse of what force makes (n,)."""
-    return bool(min(np.std(gained), np.std(derived)) > 0.2 and np.corrcoef(gained, derived)[0, 1] < -_REVERSED)
+    return bool(min(np.std(gained), np.std(derived)) > 0.2 and np.corrcoef(gained, derived)[0, 1] < -0.7)
 
 
 def _attitude_readings(q: FloatArray) -> list[tuple[str, FloatArray]]:
@@ -830,21 +815,14 @@ def running_integral(channel: Channel, at: FloatArray) -> FloatArray:
 
 FEWEST_SAMPLES = 20
 """Samples of each that a comparison needs."""
-FEWEST_STRETCHES = 4.0
-"""Independent stretches that it needs."""
 STRETCH = 1.0
 """Changes are compared over this time [s]: slow enough for delays and low-passes of either channel not to count."""
 CLEAR = 0.98
 """Correlation above which two changes are the same motion, seen by two channels."""
-UPWARDS = 0.8
-"""Correlation below the negative of which one of two vertical changes has the wrong sign."""
 LEAST_MOTION = 0.1
 """Change of position [m], as standard deviation, below which its noise may decide."""
 SCALE = 0.03
 """Deviation from scale 1 that matters to whoever predicts positions …"""
-SIGMAS = 4.0
-"""… when it is beyond chance by this many standard errors."""
-_PAIRS = (("horizontally", (0, 1)), ("vertically", (2,)))
 
 
 def position_checks(recording: Recording) -> list[Check]:
@@ -860,7 +838,7 @@ def position_checks(recording: Recording) -> list[Check]:
 
 def _compared(position: Channel, velocity: Channel) -> Check:
     moved, flown, independent = _changes(position, velocity)
-    if independent < FEWEST_STRETCHES:
+    if independent < 4.0:
         return Check("position_velocity", CheckResult.UNKNOWN, "too few stretches without a gap to compare")
     horizontal = fit_axes(moved[:, :2], flown[:, :2])
     if np.max(np.std(moved[:, :2], axis=0)) > LEAST_MOTION and horizontal.r2 > CLEAR**2 and not horizontal.straight:
@@ -872,10 +850,10 @@ def _compared(position: Channel, velocity: Channel) -> Check:
     numbers: dict[str, float] = {}
     scales: list[str] = []
     off: list[str] = []
-    for where, axes in _PAIRS:
+    for where, axes in (("horizontally", (0, 1)), ("vertically", (2,))):
         p, v = (x[:, axes] - x[:, axes].mean(axis=0) for x in (moved, flown))
         correlation = float(np.sum(p * v) / np.sqrt(max(np.sum(p * p) * np.sum(v * v), 1e-300)))
-        if where == "vertically" and np.max(np.std(p, axis=0)) > LEAST_MOTION and correlation < -UPWARDS:
+        if where == "vertically" and np.max(np.std(p, axis=0)) > LEAST_MOTION and correlation < -0.8:
             return Check(
                 "position_velocity", CheckResult.ERROR,
                 f"position rises where velocity falls (correlation {correlation:.2f}): one of them points up",
@@ -888,7 +866,8 @@ def _compared(position: Channel, velocity: Channel) -> Check:
         error = scale * np.sqrt(max(1.0 - correlation**2, 0.0) / (independent * len(axes)))
         numbers |= {f"scale {where}": scale, f"correlation {where}": correlation}
         scales.append(f"{scale:.3f} ± {error:.3f} {where} (correlation {correlation:.4f})")
-        if abs(scale - 1.0) > max(SCALE, SIGMAS * error):
+        # Beyond chance, and enough to matter to whoever predicts positions.
+        if abs(scale - 1.0) > max(SCALE, 4.0 * error):
             off.append(f"{abs(scale - 1.0):.1%} {'larger' if scale > 1.0 else 'smaller'} {where}")
     if not scales:
         message = "velocity does not follow the change of position clearly, or the vehicle hardly moves"

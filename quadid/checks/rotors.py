@@ -32,12 +32,8 @@ _STEP = 0.01
 """Lags are compared at multiples of this [s]; the peak is found between them."""
 _FARTHEST = 25
 _BLOCK = 15.0
-_SLOW = 0.4
-"""Motion slower than this [s] is left out, as in `_SLOW_MOTION`."""
 _CLEAR = 0.3
 """Correlation above which the peak of a block counts."""
-_WANDER, _EARLY = 0.012, 0.2
-"""Limits [s] of the spread of the lag over the flight, and of torque before its effect."""
 _LATE, _TOO_LATE = 0.015, 0.025
 """Torque after its effect [s] that is named, and that is refused."""
 
@@ -87,7 +83,7 @@ def _judge(name: str, peaks: list[_Peak]) -> Check:
         f"which wanders by {1e3 * (high - low):.0f} ms"
     )
     fix = "stamp the rotor signal by the clock that stamps the IMU, or log both on board"
-    if high - low > _WANDER:
+    if high - low > 0.012:  # [s]
         return Check(name, CheckResult.ERROR, f"{message}: the rotor signal is not in time with the gyro", fix, numbers)
     if -_TOO_LATE < lag < -_LATE:
         smoothed = f"{message}: rotor speeds are late, or the states were smoothed without a delay"
@@ -96,7 +92,7 @@ def _judge(name: str, peaks: list[_Peak]) -> Check:
         )
     if lag < -_LATE:
         return Check(name, CheckResult.ERROR, f"{message}: the rotor signal lags its effect", fix, numbers)
-    if lag > _EARLY:
+    if lag > 0.2:
         return Check(name, CheckResult.ERROR, f"{message}: no motor answers that late", fix, numbers)
     return Check(name, CheckResult.OK, message, numbers=numbers)
 
@@ -134,7 +130,7 @@ def _around(t: FloatArray, at: FloatArray) -> slice:
 def _quick(values: FloatArray, width: int) -> FloatArray:
     """Band of frequencies that both signals hold: smoothed over `width` rows, slow motion left out."""
     smooth = moving_mean(values, width)
-    return np.asarray(smooth - moving_mean(smooth, round(_SLOW / _STEP) | 1, mirrored=True))
+    return np.asarray(smooth - moving_mean(smooth, round(_SLOW_MOTION / _STEP) | 1, mirrored=True))
 
 
 def _peak(axis: int, torque: FloatArray, motion: FloatArray) -> _Peak:
@@ -159,19 +155,10 @@ def _peak(axis: int, torque: FloatArray, motion: FloatArray) -> _Peak:
 
 _BIN = 0.5
 """Means over this long [s] are compared: fast motion has passed by then."""
-_DEAD, _DEAD_SHARE, _IDLE_SHARE = 0.1, 0.05, 0.5
-"""A rotor below this share of the median speed for this share of the flight is dead; a command may rest longer."""
 _LEVELS = 40
 """Rotors that read fewer different values may be too coarse."""
 _STUCK = 1.0
 """A rotor that holds one value this long [s] while the vehicle moves is stuck."""
-_IMBALANCE, _UNBALANCED = 0.72, 0.1
-"""Mean moment of the squares about roll and pitch, over that of one hovering rotor at its arm, and how long it stands.
-
-One of four that reads half its speed makes 0.75; one that lost 45 % of its thrust, and turns faster for it, 0.64.
-"""
-_THRUST_RANGE = 1.8
-"""Thrust felt per speed squared: 90 % over 10 % quantile.  A payload of half the weight makes 1.5."""
 
 Bins = tuple[FloatArray, BoolArray]
 """Means (m, columns) and which bins hold samples (m,)."""
@@ -192,7 +179,8 @@ def readings_check(recording: Recording, vehicle: Vehicle, spans: Spans) -> Chec
     inside = within(signal.t, spans)
     if np.count_nonzero(inside) < 20:
         return None
-    most = _IDLE_SHARE if _commanded(recording, vehicle) else _DEAD_SHARE
+    # A command may rest for half of the flight, a speed for a twentieth.
+    most = 0.5 if _commanded(recording, vehicle) else 0.05
     values = signal.values[inside]
     step = _coarse(values)
     if step:
@@ -263,7 +251,7 @@ def _dead(speeds: FloatArray, most: float) -> Problem | None:
     turning = speeds[speeds > 0.0]
     if not len(turning):
         return None
-    still = _DEAD * np.median(turning)
+    still = 0.1 * np.median(turning)  # slower, a rotor stands still
     others = np.median(speeds, axis=1) > still
     share = np.mean(speeds[others] < still, axis=0) if others.any() else np.zeros(speeds.shape[1])
     if share.max() < most:
@@ -314,13 +302,16 @@ def _moves(gyro: Channel, begin: float, end: float) -> bool:
 def _unbalanced(squares: FloatArray, vehicle: Vehicle) -> Problem | None:
     """Mean roll and pitch moment of the rotors: half a second without balance turns a vehicle over.
 
-    Yaw is left free, for a vehicle may turn for long.  One rotor is named: that whose square, set to what balance
+    Of one hovering rotor's moment, a rotor of four that reads half its speed makes 0.75; one that lost 45 % of its
+    thrust, and turns faster for it, 0.64.  Yaw is left free, for a vehicle may turn for long.
+
+    One rotor is named: that whose square, set to what balance
     needs, agrees best with the others.
     """
     lever = vehicle.torque_arms[:, :2] / vehicle.arm
     share = squares / np.maximum(squares.sum(axis=1, keepdims=True), 1e-9)
-    odd = np.linalg.norm(share @ lever, axis=1) > _IMBALANCE / (len(lever) - 0.25)
-    if odd.mean() < _UNBALANCED:
+    odd = np.linalg.norm(share @ lever, axis=1) > 0.72 / (len(lever) - 0.25)
+    if odd.mean() < 0.1:
         return None
     typical = np.median(share[odd], axis=0)
     fits = []
@@ -352,7 +343,8 @@ def _against_thrust(
     if np.count_nonzero(used) < 10:
         return None
     low, high = np.quantile(force[used, 0] / total[used], [0.1, 0.9])
-    if low > 0.0 and high < _THRUST_RANGE * low:
+    # A payload of half the weight makes 1.5.
+    if low > 0.0 and high < 1.8 * low:
         return None
     ratio = float(high / low) if low > 0.0 else float("inf")
     return (
@@ -370,11 +362,8 @@ _UNITS = (
     ("ten times too low", 10.0),
 )  # fmt: skip
 """Units that speeds may be in instead of rad/s, and the factor that mends each."""
-_RATE = 50.0
 _SLOW_MOTION = 0.4
 """Motion slower than about 1/0.4 s is left out: there aerodynamics and the controller rule [s]."""
-_LEAST_RATE = 30.0
-"""Slower rotor readings [Hz] miss the motion that distinguishes orders."""
 _LAGS = 5
 """Motors answer late: torque up to this many rows earlier is tried."""
 _SETTLED = 0.25
@@ -383,10 +372,6 @@ _GAIN, _SPIN_GAIN, _CHANGE = 0.3, 0.15, 0.1
 """Likelihood that another order or frame, or other spins, must gain for each sample; what each change costs."""
 _MOST_ROTORS = 6
 """Beyond this turns, mirror images and exchanges of the order are tried, not all permutations."""
-_CANCELS = 1e-3
-"""Power of a torque, beside that of its rotors one by one, below which it is rounding."""
-_TURNED = math.radians(20.0)
-"""A smaller turn of the frame is none."""
 
 
 def hover_check(recording: Recording, vehicle: Vehicle, spans: Spans) -> Check:
@@ -473,7 +458,7 @@ def lagged_motion(recording: Recording, vehicle: Vehicle, spans: Spans) -> Lagge
         return "needs gyro and rotor signal in flight"
     try:
         signal = rotor_signal(recording, vehicle)
-        windows = to_windows(recording, vehicle, _RATE, spans[0][0], spans[-1][1])
+        windows = to_windows(recording, vehicle, 50.0, spans[0][0], spans[-1][1])
     except QuadidError as error:
         return error.found
     return lagged_of(windows, vehicle, 1.0 / measured_period(signal.t, signal.values))
@@ -481,7 +466,7 @@ def lagged_motion(recording: Recording, vehicle: Vehicle, spans: Spans) -> Lagge
 
 def lagged_of(windows: Sequence[Window], vehicle: Vehicle, rate: float) -> Lagged | str:
     """As `lagged_motion`, of windows in flight, with rotor readings at `rate` [Hz]."""
-    if rate < _LEAST_RATE:
+    if rate < 30.0:
         return f"rotor signal at {rate:.3g} Hz is too slow to check the motor order"
     thrust, b = ThrustModel.stated(vehicle), vehicle.parameters["b"].initial
     acted = [thrust.single(w.rotor_speed) / b for w in windows]
@@ -536,7 +521,8 @@ def better_description(lagged: Lagged | str, vehicle: Vehicle) -> Other | None:
     rotors = tuple(range(len(vehicle.rotors)))
     turned, angle = _turned(grams, vehicle)
     named: list[tuple[float, Vehicle, tuple[int, ...], float, FloatArray]] = []
-    for described, orders in ((vehicle, _orders(len(rotors))), (turned, [rotors] if abs(angle) > _TURNED else [])):
+    own_frame = [rotors] if abs(angle) > math.radians(20.0) else []  # a smaller turn is none
+    for described, orders in ((vehicle, _orders(len(rotors))), (turned, own_frame)):
         for sign in (1.0, -1.0):
             for order, axes in _best(grams, described, orders, sign):
                 cost = _CHANGE * (_moved(order) + (sign < 0.0) + 1.5 * (described is turned))
@@ -649,7 +635,8 @@ def _correlations(
     for gram in grams:
         along = np.einsum("ora,ra->oa", arms, gram.motion)
         power = np.einsum("ora,rq,oqa->oa", arms, gram.thrust, arms, optimize=True)
-        least = _CANCELS * np.einsum("ora,r->oa", arms**2, np.diag(gram.thrust)) + 1e-300
+        # Less power beside that of the rotors one by one is rounding.
+        least = 1e-3 * np.einsum("ora,r->oa", arms**2, np.diag(gram.thrust)) + 1e-300
         found.append(along / np.sqrt(np.maximum(power, least) * np.maximum(gram.power, 1e-300)))
     at_lag = np.array(found)
     return np.asarray(at_lag[_gain(at_lag).argmax(axis=0), np.arange(len(orders))])
@@ -709,10 +696,6 @@ def _orders(rotors: int) -> list[tuple[int, ...]]:
 
 _KNOWN = 0.1
 """Relative standard deviation up to which a parameter counts as known."""
-_MASS_OFF, _ARM_OFF = 0.08, 0.2
-"""Relative differences that are reported: of mass; of arm, whose effect slow motors weaken."""
-_EXPLAINED = 0.1
-"""Share of the variance of roll, and of pitch, that rotor torques must explain before geometry is judged by them."""
 
 
 def mass_check(recording: Recording, vehicle: Vehicle, spans: Spans, b_from_hover: float | None) -> Check | None:
@@ -734,7 +717,7 @@ def mass_check(recording: Recording, vehicle: Vehicle, spans: Spans, b_from_hove
     message = (
         f"the known thrust coefficient {b:.3g} N s^2/rad^2 carries {mass:.3g} kg, {factor:.3f} times the stated mass"
     )
-    if abs(factor - 1.0) <= max(_MASS_OFF, 3.0 * sigma):
+    if abs(factor - 1.0) <= max(0.08, 3.0 * sigma):
         return Check("mass", CheckResult.OK, message, numbers=numbers)
     fix = f"weigh the vehicle: {mass:.3g} kg would fit; or check the thrust stand and the unit of the rotor speeds"
     return Check("mass", CheckResult.WARNING, message, fix, numbers)
@@ -776,7 +759,7 @@ def geometry_check(lagged: Lagged | str, vehicle: Vehicle) -> Check:
     arms, inertia = vehicle.torque_arms[:, :2], vehicle.initial[2:4]
     fits = [_map(squares @ arms, motion[:, :2] * inertia) for squares, motion, _ in lagged]
     share, a = max(fits, key=lambda fit: float(np.min(fit[0])))
-    if float(np.min(share)) < _EXPLAINED:
+    if float(np.min(share)) < 0.1:
         axis = ("roll", "pitch")[int(np.argmin(share))]
         return Check(
             name, CheckResult.UNKNOWN,
@@ -804,7 +787,7 @@ def _judge_scale(vehicle: Vehicle, scale: float, numbers: dict[str, float]) -> C
         )
     factor = scale / thrust[0]
     numbers = {**numbers, "arm_factor": factor}
-    if abs(factor - 1.0) <= _ARM_OFF:
+    if abs(factor - 1.0) <= 0.2:
         return Check("geometry", CheckResult.OK, f"{turned}, the arm within {abs(factor - 1.0):.0%}", numbers=numbers)
     message = (
         f"roll and pitch answer {factor:.2f} times as strongly as the stated arm of {vehicle.arm:.3g} m lets expect"

@@ -26,7 +26,7 @@ def worker(
     from quadid_node.ground import work
 
     from quadid.cli import terminal
-    from quadid.online.window_fit import warm_up
+    from quadid.online.fit_job import warm_up
     from quadid.vehicle import Vehicle
 
     terminal.check_file(json, "--json")

@@ -317,10 +317,6 @@ HEALTHY_SCORE = float(np.sqrt(chdtri(len(AXES), SIGNIFICANT)))
 """The score that one healthy flight in a hundred exceeds."""
 _SURE = 0.75
 """A change is named with confidence where explanations that hold it have this much of the probability."""
-_UNEXPLAINED = 1e-3
-"""An explanation, be it that nothing changed, that leaves a rest less probable than this explains nothing."""
-_LIVELIER, _LIVELY = 3.0, 0.3
-"""Flights that turn so many times more than any of the baseline, and by more than this [rad/s], are of another kind."""
 _RIVALS = 3
 ENOUGH = 5
 """Baseline flights that a verdict of no change needs, unless it would be the same with as many."""
@@ -448,7 +444,7 @@ def assess(flights: Sequence[FlightTrim], baseline: Sequence[FlightTrim], vehicl
     named = p_value < SIGNIFICANT
     rest = exact(change) - (found[0].hypothesis.effect @ found[0].value if named else 0.0)
     p_rest = p_healthy(rest, deviation, healthy.freedom)
-    unexplained = p_rest < _UNEXPLAINED
+    unexplained = p_rest < 1e-3
     unfamiliar = _unfamiliar(flights, baseline)
     lacking = 0 if named or unexplained or unfamiliar else _lacking(change, healthy, len(flights), vehicle)
     verdict = "unknown" if unexplained or lacking or unfamiliar else "changed" if named else "unchanged"
@@ -463,7 +459,7 @@ def assess(flights: Sequence[FlightTrim], baseline: Sequence[FlightTrim], vehicl
 def _unfamiliar(flights: Sequence[FlightTrim], baseline: Sequence[FlightTrim]) -> str:
     """Why the flights are of a kind that no baseline flight is; empty where they are not, or rates are not known."""
     now, known = (max(flight.turning for flight in part) for part in (flights, baseline))
-    if not now > max(_LIVELIER * known, _LIVELY):  # also of NaN
+    if not now > max(3.0 * known, 0.3):  # also of NaN
         return ""
     return f"these flights turn by {now:.2g} rad/s (rms), the baseline flights by {known:.2g} rad/s at most"
 

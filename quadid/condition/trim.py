@@ -219,8 +219,6 @@ def _parts(edges: FloatArray) -> Sequence[IndexArray]:
 
 PRIOR_FLIGHTS = 4.0
 """Weight of the prior spread, in degrees of freedom."""
-BETWEEN = 2.0
-"""Flights differ this many times more than parts of one flight."""
 LEAST = np.array([0.005, 0.005, 0.005, 0.01])
 """Smallest prior spread of `AXES`: rotors of healthy vehicles share the load to 1 % each and better never."""
 _GROUPS = ((0, 1), (2,), (3,))
@@ -264,7 +262,8 @@ def healthy_spread(baseline: Sequence[FlightTrim]) -> Healthy:
     inner = [flight.parts - flight.parts.mean(axis=0) for flight in baseline]
     parts = sum(float(len(rows) - 1) for rows in inner)
     within = np.sqrt(sum((rows**2).sum(axis=0) for rows in inner) / max(parts, 1.0))
-    prior = np.maximum(BETWEEN * within, LEAST)
+    # Flights differ twice as much as parts of one flight.
+    prior = np.maximum(2.0 * within, LEAST)
     squares = ((means - centre) ** 2).sum(axis=0)
     freedom = _freedom(len(means))
     variance = np.zeros(len(AXES))

@@ -22,22 +22,12 @@ from quadid.vehicle import GRAVITY, Vehicle
 
 RECENT = 3
 """Seconds that are compared, as many as `FlightTrim.wander` is of."""
-SETTLING = 10
-"""Seconds of a flight before its own seconds are compared with it."""
-GUARD = 2
-"""Seconds before the recent ones that count neither as recent nor as before."""
 RARE = 1e-8
 """An alarm is a second that healthy flight has less often than this, twice in a row: 100 h hold 3.6e5 seconds."""
-LEAST_FLIGHT = 30
-"""Steady seconds that make a flight worth keeping."""
+MOST_FLIGHTS = 40
+"""Newest healthy flights that are compared with."""
 ENOUGH = 3
 """So many healthy flights before a flight is judged at all; until then each one is kept."""
-_LEAST_WANDER = np.array([0.002, 0.002, 0.002, 0.005])
-"""Smallest standard deviation of `RECENT` seconds about their flight, of `AXES`."""
-_STEADY_FORCE = 0.1
-"""A second whose specific force differs from gravity by more than this share is no steady flight."""
-_AIRBORNE = 0.5
-"""Flying is at least this share of the usual load."""
 _NO_MASS = (math.nan, math.nan, math.nan)
 """Said by one object: reports of equal content are equal."""
 
@@ -79,11 +69,38 @@ class HealthWatch:
     """
 
     def __init__(self, vehicle: Vehicle, history: Sequence[FlightTrim] = ()) -> None:
-        """Starts with the healthy flights that are known."""
-        self.history = list(history)
-        self._vehicle = vehicle
+        """Starts with the healthy flights that are known, the oldest first."""
+        self.history = list(history[-MOST_FLIGHTS:])
+        self._vehicle, self._aloft, self._grounded = vehicle, 0, 0
         self._healthy: Healthy | None = None
         self._land()
+
+    def look(self, t: float, speed: FloatArray, accel: FloatArray | None) -> HealthReport | FlightTrim | None:
+        """Looks at the rows of one second of data, in flight or not.
+
+        Args:
+            t: its end [s].
+            speed: rotor speeds [rad/s], shape (n, rotors), NaN where nothing was measured.
+            accel: specific force [m/s^2], shape (n, 3), alike; or None.
+
+        Returns:
+            A report as of `second`, the trim of a flight that has ended and is kept, or None.
+        """
+        good = np.isfinite(speed).all(axis=1)
+        if good.mean() < 0.6:  # too few rows to tell
+            return None
+        load = np.asarray((speed[good] ** 2).mean(axis=0))
+        if self.airborne(load):
+            self._grounded, self._aloft = 0, self._aloft + 1
+            felt = accel is not None and np.isfinite(accel[:, 2]).any()
+            force = -float(np.nanmean(accel[:, 2])) if accel is not None and felt else GRAVITY
+            # The climb after take-off is not judged.
+            return self.second(t, load, force) if self._aloft > 3 else None
+        self._grounded += 1
+        if self._grounded != 3:  # seconds without lift end a flight
+            return None
+        self._aloft = 0
+        return self.landed()
 
     def second(self, t: float, load: FloatArray, force: float) -> HealthReport | None:
         """Takes one second of flight.
@@ -96,7 +113,8 @@ class HealthWatch:
         Returns:
             A report on the first steady second, on an alarm, and every ten seconds between.
         """
-        if abs(force / GRAVITY - 1.0) > _STEADY_FORCE or not load.min() > 0.0:
+        # What is felt in steady flight is gravity to a tenth.
+        if abs(force / GRAVITY - 1.0) > 0.1 or not load.min() > 0.0:
             return None
         self._trims.append(trim_of_load(load, force, self._vehicle))
         self._shares.append(load / load.sum())
@@ -111,14 +129,14 @@ class HealthWatch:
         usual = self._vehicle.mass / self._vehicle.parameters["b"].initial
         if self._healthy is not None:
             usual = float(np.exp(self._healthy.mean[AXES.index("effort")]))
-        return bool(load.sum() > _AIRBORNE * usual * GRAVITY)
+        return bool(load.sum() > 0.5 * usual * GRAVITY)
 
     def landed(self) -> FlightTrim | None:
         """Ends a flight; returns its trim where it is healthy and long enough to be kept, and keeps it."""
         trims, alarmed = np.array(self._trims), self._alarm is not None
         shares = np.mean(self._shares, axis=0) if self._shares else np.empty(0)
         self._land()
-        if len(trims) < LEAST_FLIGHT or alarmed:
+        if len(trims) < 30 or alarmed:  # steady seconds that make a flight worth keeping
             return None
         mean = trims.mean(axis=0)
         parts = np.array([part.mean(axis=0) for part in np.array_split(trims, 3)])
@@ -137,7 +155,7 @@ class HealthWatch:
         if len(self.history) >= ENOUGH:
             self._healthy = healthy_spread(self.history)
             squares = np.mean([flight.wander**2 for flight in self.history], axis=0)
-            self._wander = np.maximum(np.sqrt(squares), _LEAST_WANDER)
+            self._wander = np.maximum(np.sqrt(squares), [0.002, 0.002, 0.002, 0.005])
 
     def _without_baseline(self, t: float) -> HealthReport:
         n = len(self._vehicle.rotors)
@@ -151,10 +169,10 @@ class HealthWatch:
             return None
         now = np.mean(self._trims[-RECENT:], axis=0)
         against = [self._of_history(healthy)]
-        before = len(self._trims) - RECENT - GUARD
+        before = len(self._trims) - RECENT - 2  # two seconds count neither as recent nor as before
         if before > 0:
             self._before += self._trims[before - 1]
-        if before >= SETTLING:
+        if before >= 10:
             against.append(self._of_flight(self._before / before, before, healthy))
         chances = [p_healthy(now - one.mean, one.predictive(1), one.freedom) for one in against]
         worst = int(np.argmin(chances))

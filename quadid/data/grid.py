@@ -11,7 +11,6 @@ from typing import NamedTuple
 import numpy as np
 
 from quadid.data.intersample import follow_feedback
-from quadid.data.mounting import in_body_axes
 from quadid.data.resample import (
     COINCIDENT,
     fresh_rows,
@@ -26,7 +25,7 @@ from quadid.data.resample import (
     split_stretches,
 )
 from quadid.data.rotor_signal import RotorSignal, rotor_signal
-from quadid.data.window import Recording, Sampling, Window
+from quadid.data.window import Recording, Sampling, Window, in_body_axes
 from quadid.errors import LogError, NotIdentifiableError
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
@@ -36,8 +35,6 @@ from quadid.vehicle import Vehicle
 
 GAP = 3.5
 """A step longer than this many median ones is a gap."""
-BRIDGED = 0.5
-"""A step no longer than this fraction of the grid's is never a gap: hardly anything shows of it on the grid."""
 HOLE = 1.5
 """A step longer than this many median ones, and no gap, is a hole: it is bridged and counted."""
 _FAST = 0.77
@@ -108,8 +105,8 @@ def make_plan(recording: Recording, t: FloatArray, speeds: FloatArray, sampling:
 
 
 def longest_step(t: FloatArray, grid_step: float) -> float:
-    """Returns the longest step [s] between samples at `t` that is no gap on a grid of `grid_step` [s]."""
-    return max(GAP * median(np.diff(t)), BRIDGED * grid_step)
+    """Longest step [s] between samples at `t` that is no gap on a grid of `grid_step` [s], half of which never is."""
+    return max(GAP * median(np.diff(t)), 0.5 * grid_step)
 
 
 def holes(t: FloatArray, grid_step: float) -> int:

@@ -34,24 +34,12 @@ from quadid.vehicle import Vehicle
 
 STRETCH_SECONDS = 10.0
 """Stretches compared by themselves [s], each half over the one before."""
-LEAST_STRETCHES, MOST_STRETCHES = 8, 1000
-"""More than the latter are thinned evenly: they give kp and kd to a hundredth, and memory would grow with the log."""
 NEIGHBOURS = 5
 """Frequencies over which the spectrum of the errors is smoothed."""
 FALSE_ALARM = 0.01
 """Probability of a slope in a flight without feedback; one that noise has made up is as small as the noise."""
-LEAST_RATE = 1.5
-"""Standard errors by which the share of the rate must be more than nothing; a smooth torque has one of the angle."""
-STEEPEST_PITCH = 1.2
-"""Pitch [rad] beyond which Euler's angles are left alone."""
-_UNIT = {"thrust_coefficient": 1.0, "drag_coefficient": 1.0}
-"""Torques for the squares of the speeds, where the coefficients are not known."""
 DAMPING = 0.85
 """Damping ratio of a loop whose kp cannot be distinguished from the gyro's scale: between Butterworth and critical …"""
-LEAST_DAMPING = 0.5
-"""… and the least that is believed of one whose kp can."""
-LEAST_CORRELATION = 0.5
-"""Of angular acceleration and rotor moment; below it the speeds do not determine their slope."""
 
 
 class Feedback(NamedTuple):
@@ -105,9 +93,10 @@ def find_feedback(windows: Sequence[Window]) -> Feedback | None:
     if not windows or any(w.sampling != "held" for w in windows):
         return None
     dt = windows[0].dt
-    every = max(math.ceil(2.0 * dt * sum(map(len, windows)) / STRETCH_SECONDS / MOST_STRETCHES), 1)
+    # A thousand give kp and kd to a hundredth; more are thinned evenly, as memory would grow with the log.
+    every = max(math.ceil(2.0 * dt * sum(map(len, windows)) / STRETCH_SECONDS / 1000), 1)
     spectra = np.array([spectrum for w in windows for spectrum in _spectra(w, every)])
-    if len(spectra) < LEAST_STRETCHES or not np.all(np.any(spectra != 0.0, axis=(0, 1))):
+    if len(spectra) < 8 or not np.all(np.any(spectra != 0.0, axis=(0, 1))):
         return None  # too little, or a sensor that never changes
     shares, covariance = _weighted(spectra)
     scale = 12.0 / dt**2
@@ -129,10 +118,11 @@ def _feedback(gains: FloatArray, covariance: FloatArray) -> Feedback | None:
     both = np.linalg.inv(same.T @ precision @ same)
     kp, kd = (float(k) for k in both @ same.T @ precision @ gains)
     sigma_p, sigma_d = (float(k) for k in np.sqrt(np.diag(both)))
-    strongest = (0.5 * (kd + 2.0 * sigma_d) / LEAST_DAMPING) ** 2 + 2.0 * sigma_p
+    strongest = (0.5 * (kd + 2.0 * sigma_d) / 0.5) ** 2 + 2.0 * sigma_p
     if apart < exceeded(FALSE_ALARM, 1) and 0.0 < kp < strongest:
         evidence = float(gains @ precision @ same @ both @ same.T @ precision @ gains)
-        significant = evidence > exceeded(FALSE_ALARM, 2) and kd > LEAST_RATE * sigma_d
+        # A smooth torque has a share of the angle, so that of the rate must be more than nothing.
+        significant = evidence > exceeded(FALSE_ALARM, 2) and kd > 1.5 * sigma_d
         return Feedback(kp, kd, (sigma_p, sigma_d)) if significant else None
     kd, sigma_d = float(gains[2]), float(np.sqrt(covariance[2, 2]))
     kp = (0.5 * kd / DAMPING) ** 2
@@ -157,7 +147,9 @@ def _spectra(window: Window, every: int) -> list[ComplexArray]:
     out = []
     for start in range(0, len(columns) - length + 1, every * (length // 2)):
         rows = columns[start : start + length]
-        if np.isfinite(rows).all() and np.abs(pitch[start : start + length]).max() < STEEPEST_PITCH:
+        if (
+            np.isfinite(rows).all() and np.abs(pitch[start : start + length]).max() < 1.2
+        ):  # Euler's angles go wild at 1.57
             for axis in range(2):
                 rate, *others = np.fft.rfft(taper * rows[:, axis], axis=0)[1:].T
                 out.append(np.column_stack([*(rate * (axis == i) for i in range(2)), *others]))
@@ -209,7 +201,7 @@ def _slope_of_motion(window: Window, vehicle: Vehicle, found: Feedback) -> Float
     None where the motion does not follow the speeds.
     """
     speed, middle, turn = window.rotor_speed, *_motion(window)
-    mixer = mixer_matrix(vehicle, _UNIT)
+    mixer = mixer_matrix(vehicle, {"thrust_coefficient": 1.0, "drag_coefficient": 1.0})
     torque = _torques(speed, mixer)
     effect = np.array([_effect(turn[:-1, i], torque[:-1, i]) for i in range(2)])
     if np.isnan(effect).any():
@@ -243,4 +235,4 @@ def _effect(turn: FloatArray, moment: FloatArray) -> float:
     if np.count_nonzero(known) < 2 or np.std(moment[known]) == 0.0 or np.std(turn[known]) == 0.0:
         return float("nan")
     (a, b), (_, c) = np.cov(moment[known], turn[known])
-    return float(b / a) if b > LEAST_CORRELATION * np.sqrt(a * c) else float("nan")
+    return float(b / a) if b > 0.5 * np.sqrt(a * c) else float("nan")

@@ -1,31 +1,30 @@
-"""Resampling of one channel: stretches without gaps, interpolation, holding, and one zero-phase low-pass for all.
+"""One channel by itself: what was measured, faults, stretches without gaps, interpolation, and one low-pass for all.
 
-Everything here takes plain arrays: times [s], shape (n,), and values, shape (n, columns), in any unit.  Policy (which
-channel, which rate) is in `quadid.data.grid`.
+Everything but `data_faults` takes plain arrays: times [s], shape (n,), and values, shape (n, columns), in any unit.
+Policy (which channel, which rate) is in `quadid.data.grid`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 
+from quadid.data.window import Window
 from quadid.types import BoolArray, FloatArray, IndexArray
 
 HALF_WIDTH = 4.0
 """Half-width of the low-pass kernel in steps of the new grid."""
 CUTOFF = 0.4
 """Frequency where the low-pass halves the amplitude, as a fraction of the new grid's rate (0.5 is its Nyquist)."""
-KAISER_BETA = 5.0
-"""Window of the kernel: stop band about 53 dB down."""
 COINCIDENT = 5e-3
 """Samples this close to the grid, in steps, lie on it: they are passed on bit for bit."""
 INTERPOLATED = 0.5
 """Share of moving rows on straight lines above which they were interpolated; logs as they were measured have none, a
 log whose lost rows were filled in a tenth, one brought from 10 to 100 Hz nine tenths."""
-ON_LINE, ROUNDED = 1e-3, 1e-6
-"""Share of the usual step, and of the largest value, that printed digits may put a row off its line."""
 _CHUNK = 4096
 
 
@@ -49,7 +48,8 @@ def measured_rows(t: FloatArray, values: FloatArray) -> BoolArray:
         return out
     moved = np.diff(values, axis=0)
     slope = moved / step[:, None]
-    room = ON_LINE * np.std(moved, axis=0) + ROUNDED * np.max(np.abs(values), axis=0)
+    # Printed digits may put a row off its line.
+    room = 1e-3 * np.std(moved, axis=0) + 1e-6 * np.max(np.abs(values), axis=0)
     bend: FloatArray = np.abs(np.diff(slope, axis=0)) * step[1:, None]
     on_line = np.all(bend <= room, axis=1)
     moves = np.any(moved[1:] != 0.0, axis=1)
@@ -177,8 +177,8 @@ def hold_mean(t: FloatArray, values: FloatArray, at: FloatArray, step: float) ->
 def _kernel_table() -> tuple[FloatArray, FloatArray, FloatArray]:
     """Tabulates lag [grid steps], kernel, and its running integral (0 to 1)."""
     lag = np.linspace(-HALF_WIDTH, HALF_WIDTH, 16001)
-    # Less its value at the ends, so that a sample exactly there weighs nothing.
-    window = np.i0(KAISER_BETA * np.sqrt(np.clip(1.0 - (lag / HALF_WIDTH) ** 2, 0.0, 1.0))) - 1.0
+    # Kaiser's beta of 5 has its stop band about 53 dB down.  Less its value at the ends: a sample there weighs nothing.
+    window = np.i0(5.0 * np.sqrt(np.clip(1.0 - (lag / HALF_WIDTH) ** 2, 0.0, 1.0))) - 1.0
     kernel = np.sinc(2.0 * CUTOFF * lag) * window
     area = np.concatenate([[0.0], np.cumsum(0.5 * (kernel[1:] + kernel[:-1]) * np.diff(lag))])
     return lag, kernel / area[-1], area / area[-1]
@@ -260,3 +260,111 @@ def fresh_rows(values: FloatArray) -> IndexArray:
     keep = np.repeat(run > 5.0 * usual, run)
     keep[start] = True
     return np.flatnonzero(keep)
+
+
+# --- Faults of the data themselves, seen without any model: a sensor at the end of its range, rows that are copies
+#
+# Both bend every estimate, and a cause named from them would be a stand-in.  Copies are no measurements and are left
+# out; what a saturated sensor would have shown is not known, so nothing found beside it is called confident.
+#
+# A saturated axis piles up at exactly its largest or smallest value, far more often than at the value beside it, and
+# comes back to it again and again.  Coarse steps of a converter pile up nowhere in particular, and a motor at rest
+# stays at its lowest command without coming back.
+
+
+LEAST_COPIES = 0.03
+"""Share of inertial rows that equal the row before exactly."""
+
+
+class AtLimit(NamedTuple):
+    """One end of one axis at its limit.
+
+    Attributes:
+        axis: column.
+        level: the value that is not left, in the unit of the values.
+        samples: how many are there.
+        share: of the column's finite samples.
+    """
+
+    axis: int
+    level: float
+    samples: int
+    share: float
+
+
+def at_limit(values: FloatArray) -> list[AtLimit]:
+    """Returns the ends of axes that are saturated.
+
+    Args:
+        values: shape (n, axes), any unit; rows that are not finite do not count.
+    """
+    found = []
+    for axis, column in enumerate(values.T):
+        finite = column[np.isfinite(column)]
+        levels, counts = np.unique(finite, return_counts=True)
+        if len(levels) < 3:
+            continue
+        for end, beside in ((0, 1), (-1, -2)):
+            count, share = int(counts[end]), float(counts[end] / len(finite))
+            there = finite == levels[end]
+            arrivals = np.count_nonzero(there[1:] & ~there[:-1])
+            if share > 0.005 and count >= 6 and count > 4.0 * counts[beside] and arrivals >= 3:
+                found.append(AtLimit(axis, float(levels[end]), count, share))
+    return found
+
+
+@dataclass(frozen=True)
+class DataFault:
+    """One fault of the data.
+
+    Attributes:
+        kind: ``saturated`` or ``repeated``.
+        channel: name of the channel, with its axis where there is one.
+        share: of the samples.
+        text: one sentence with what to do.
+    """
+
+    kind: str
+    channel: str
+    share: float
+    text: str
+
+
+def data_faults(windows: Sequence[Window]) -> tuple[DataFault, ...]:
+    """Looks for saturated and repeated inertial samples in `windows`; a flight without such faults gives none."""
+    out: list[DataFault] = []
+    for name, unit in (("gyro", "rad/s"), ("accel", "m/s²")):
+        parts = [values for w in windows if (values := getattr(w, name)) is not None]
+        for axis, level, _, share in at_limit(np.concatenate(parts)) if parts else ():
+            text = (
+                f"{name} {'xyz'[axis]} stays at exactly {level:.4g} {unit} in {share:.1%} of the samples: the sensor "
+                "saturates; log it with a wider range, or fly more gently"
+            )
+            out.append(DataFault("saturated", f"{name} {'xyz'[axis]}", share, text))
+        share = sum(np.count_nonzero(copied(p)) for p in parts) / max(sum(max(len(p) - 1, 0) for p in parts), 1)
+        if share >= LEAST_COPIES:
+            text = (
+                f"{share:.0%} of the {name} rows are exact copies of the row before and were left out: the sensor is "
+                "slower than the log, or the link repeats what it has; "
+                "log the sensor's own samples with their own times"
+            )
+            out.append(DataFault("repeated", name, float(share), text))
+    return tuple(out)
+
+
+def without_copies(windows: Sequence[Window]) -> list[Window]:
+    """Windows in which inertial rows that equal the row before exactly count as not measured."""
+    out = []
+    for window in windows:
+        changed = {}
+        for name in ("gyro", "accel"):
+            values = getattr(window, name)
+            if values is None:
+                continue
+            copies = np.flatnonzero(copied(values)) + 1
+            if len(copies) >= LEAST_COPIES * len(values):
+                kept = values.copy()
+                kept[copies] = np.nan
+                changed[name] = kept
+        out.append(replace(window, **changed) if changed else window)
+    return out

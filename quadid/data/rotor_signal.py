@@ -16,7 +16,6 @@ SLOWEST_RATE = 6.0
 """Below this rate [Hz] a rotor signal does not show what happened between its samples; it is refused."""
 INERTIA_RATE = 30.0
 """Rotor signal and gyro below this rate [Hz] reveal no inertia, lag or delay: the rate loop acts faster."""
-_HIGHEST_COMMAND = 1.5
 _HOW_TO_GET_MOTORS = (
     "log rotor speeds or motor outputs at 50 Hz or more: PX4 SDLOG_PROFILE high rate (actuator_motors, esc_status); "
     "ArduPilot LOG_BITMASK with RCOUT and FAST_ATTITUDE; ROS a rotor_speeds or motor_command topic; "
@@ -137,7 +136,7 @@ def _check_columns(recording: Recording, signal: RotorSignal, vehicle: Vehicle) 
 def _check_speeds(recording: Recording, speed: Channel) -> None:
     """Rotors that carry a vehicle turn at tens of rad/s at least; commands from 0 to 1 do not."""
     top = float(np.quantile(speed.values, 0.99))
-    if 0.0 < top <= _HIGHEST_COMMAND:
+    if 0.0 < top <= 1.5:
         raise LogError(
             f"{recording.name}: rotor speeds up to {top:.3g} ({speed.source}) are commands from 0 to 1, no rad/s",
             "rad/s",

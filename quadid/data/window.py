@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 
 from quadid.errors import LogError, WindowError
 from quadid.types import FloatArray
+from quadid.vehicle import Vehicle
 
 Sampling = Literal["held", "instant"]
 
@@ -168,6 +169,30 @@ class Recording:
         """Time [s] of the first gyro or accelerometer sample, else of the first of any channel: LOG@0 begins there."""
         imu = (self.channels[name].t for name in ("gyro", "accel") if name in self.channels)
         return min((float(t[0]) for t in imu if len(t)), default=self.span[0])
+
+
+def mounting_matrix(rotation: tuple[float, float, float]) -> FloatArray:
+    """Matrix (3, 3) from IMU to body axes, for roll, pitch, yaw [rad] of the IMU in the body (z-y-x)."""
+    (cr, cp, cy), (sr, sp, sy) = np.cos(rotation), np.sin(rotation)
+    return np.array([
+        [cp * cy, sr * sp * cy - cr * sy, cr * sp * cy + sr * sy],
+        [cp * sy, sr * sp * sy + cr * cy, cr * sp * sy - sr * cy],
+        [-sp, sr * cp, cr * cp],
+    ])  # fmt: skip
+
+
+def in_body_axes(recording: Recording, vehicle: Vehicle) -> Recording:
+    """The recording with gyro and accelerometer in body axes; itself where the IMU is mounted straight."""
+    rotation = vehicle.mounting.rotation
+    if not any(rotation):
+        return recording
+    turn = mounting_matrix(rotation)
+    turned = {
+        name: replace(channel, values=channel.values @ turn.T)
+        for name, channel in recording.channels.items()
+        if name in ("gyro", "accel")
+    }
+    return replace(recording, channels={**recording.channels, **turned})
 
 
 @dataclass(frozen=True)

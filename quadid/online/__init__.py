@@ -9,17 +9,20 @@ The same samples, commands and seed give the same actions bit for bit, however `
 
 What stands between samples and the parameter topic, in this order; each says why it holds something back:
 
-    resampler           a sample belongs to a channel, is finite, and in time
-    consistency         gyro, attitude and accelerometer agree; while they do not, nothing is learned
+    stream              a sample belongs to a channel, is finite, and in time
+    checks              gyro, attitude and accelerometer agree; while they do not, nothing is learned
     grid_buffer         a window has gyro, rotors and four fifths of its rows
-    quality             no sensor is stuck or saturated, units fit, the vehicle flies
-    window_fit          the motion reveals roll and pitch, or there is no estimate
-    answered            a reply can be one to its request
+    checks              no sensor is stuck or saturated, units fit, the vehicle flies
+    fit_job             the motion reveals roll and pitch, or there is no estimate; a reply can be one to its request
     fusion              the window agrees with those before it, or is left out
     gate                the fused estimate is possible, narrow, agreed upon, better than the set in force, and near it
     active_set          a person approves where that is wanted; what predicts worse than its predecessor is taken back
+
+`session` calls them in turn; `changes` looks for sudden changes beside them, and `change_job` names their cause.
 """
 
+from quadid.online.fit_job import FitReply as FitReply
+from quadid.online.fit_job import FitRequest as FitRequest
 from quadid.online.gate import GateSettings as GateSettings
 from quadid.online.records import Event as Event
 from quadid.online.records import Job as Job
@@ -30,6 +33,4 @@ from quadid.online.records import Phase as Phase
 from quadid.online.records import Publish as Publish
 from quadid.online.records import SetState as SetState
 from quadid.online.session import Session as Session
-from quadid.online.settings import SessionSettings as SessionSettings
-from quadid.online.window_fit import FitReply as FitReply
-from quadid.online.window_fit import FitRequest as FitRequest
+from quadid.online.session import SessionSettings as SessionSettings

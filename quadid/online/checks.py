@@ -11,8 +11,7 @@ import numpy as np
 from quadid.checks.findings import CheckResult
 from quadid.checks.motion import attitude_check, gravity_check, velocity_check
 from quadid.checks.rotors import better_description, lagged_of, motor_order_check
-from quadid.data.faults import at_limit
-from quadid.data.resample import copied, moving_mean, true_runs
+from quadid.data.resample import at_limit, copied, moving_mean, true_runs
 from quadid.data.window import Window, as_recording
 from quadid.model.layout import ThrustModel
 from quadid.online.grid_buffer import Rows, WindowCut
@@ -46,8 +45,6 @@ LEAD = 2.0 * TURN
 """A change of turn needs so much of the past [s]."""
 MOVING = 0.1
 """An axis that turns slower than this on average [rad/s] tells nothing: gyro noise would make the factor too small."""
-VERTICAL = 1.5
-"""Vertical velocity of a flight [m/s], as standard deviation."""
 FEWEST = 15
 """Turns that tell a factor, at least,"""
 KNOWN = 0.05
@@ -162,7 +159,8 @@ class Consistency:
         found = [f for axis, t in enumerate(self._turns) if t.seconds > FEWEST * TURN for f in _gyro_factors(axis, t)]
         if self._force.seconds > 0.0:
             # The mean of an acceleration is a change of velocity over a time.
-            sigma = math.sqrt(2.0) * VERTICAL / self._force.seconds / GRAVITY
+            # ... which stays within 1.5 m/s.
+            sigma = math.sqrt(2.0) * 1.5 / self._force.seconds / GRAVITY
             mean = float(self._force.sum) / self._force.seconds / GRAVITY
             found.append(Factor(GRAVITY_FACTOR, mean, sigma))
         return tuple(found)
@@ -218,23 +216,9 @@ def _gyro_factors(axis: int, told: _Fading) -> list[Factor]:
 
 
 STUCK_SECONDS = 1.0
-"""A sensor that repeats itself to the bit for longer than this [s] is stuck, if the vehicle moves meanwhile:"""
-TURNED, BIAS = 0.02, 0.02
-"""by gyro and attitude [rad], beside this much bias of the gyro [rad/s],"""
-LIFTED = 0.02
-"""or by the scatter of the thrust, as a share of it."""
-THRUST_KNOWN = (0.4, 4.0)
-"""Mean thrust over weight of a flying vehicle whose thrust coefficient is known."""
-THRUST_GUESSED = (0.2, 5.0)
-"""... and while it is only the vehicle file's guess."""
-RPM_SQUARED = (30.0 / np.pi) ** 2
-"""Thrust that speeds in rpm would give, over that of the same speeds in rad/s."""
-TUMBLED = 0.0
-"""Cosine of the tilt [1] below which the vehicle has tumbled or lies on its side."""
+"""A sensor that repeats itself to the bit for longer than this [s] is stuck, if the vehicle moves meanwhile."""
 IMPACT = 8.0 * GRAVITY
 """Specific force [m/s^2] that only a crash brings."""
-FLOOR_SLOPE = 0.2
-"""Specific force must follow thrust at least with this slope [1]; on the ground it does not follow at all."""
 
 
 @dataclass(frozen=True)
@@ -290,14 +274,17 @@ def _broken(window: Window) -> str:
 
 
 def _moves(window: Window, name: str, rows: IndexArray) -> bool:
-    """Whether the others say that a sensor which repeats itself ought not to; coarse ones do so in a calm hover."""
+    """Whether the others say that a sensor which repeats itself ought not to; coarse ones do so in a calm hover.
+
+    They do by gyro and attitude beside its bias, or by the scatter of the thrust as a share of it.
+    """
     gyro, q = (None if v is None else v[rows] for v in (window.gyro, window.attitude))
     if name in ("gyro", "attitude"):
         if gyro is None or q is None:
             return True
         turned = np.cumsum(gyro[:-1], axis=0) * window.dt
         apart = np.abs(turned - turn(np.broadcast_to(q[0], q[1:].shape), q[1:]))
-        return bool(np.nanmax(apart) > TURNED + BIAS * window.dt * len(rows))
+        return bool(np.nanmax(apart) > 0.02 + 0.02 * window.dt * len(rows))  # [rad], beside the gyro's bias
     if gyro is not None and (name == "accel" and copied(gyro).mean() < 0.5 or np.nanstd(gyro, axis=0).max() > MOVING):
         return True  # one chip reads both: where one has noise, so has the other
     lift = np.sum(window.rotor_speed[rows] ** 2, axis=1)
@@ -305,7 +292,7 @@ def _moves(window: Window, name: str, rows: IndexArray) -> bool:
         if window.accel is None:
             return False
         lift = moving_mean(window.accel[rows, 2:], max(round(TURN / window.dt), 1))[:, 0]
-    return bool(np.nanstd(lift) > LIFTED * abs(np.nanmean(lift)))
+    return bool(np.nanstd(lift) > 0.02 * abs(np.nanmean(lift)))
 
 
 def mistake(cut: WindowCut, vehicle: Vehicle, known: bool) -> str:
@@ -345,13 +332,14 @@ def _weight_share(window: Window, vehicle: Vehicle, thrust: ThrustModel) -> Floa
 
 def _lift(share: FloatArray, dt: float, known: bool) -> Quality:
     """Whether the rotors carry the vehicle; judged second by second, back from the end."""
-    low, high = THRUST_KNOWN if known else THRUST_GUESSED
+    # Mean thrust over weight of a flying vehicle; a thrust coefficient that is a guess leaves more room.
+    low, high = (0.4, 4.0) if known else (0.2, 5.0)
     second = max(round(1.0 / dt), 1)
     first = len(share) % second or second
     means = [float(part.mean()) for part in np.split(share, np.arange(first, len(share), second))]
     if not min(means) > low:
         return Quality(grounded=f"rotors carry {min(means):.0%} of the weight: on the ground")
-    if not max(means) < high and low < float(np.mean(means)) / RPM_SQUARED < high:
+    if not max(means) < high and low < float(np.mean(means)) / (30.0 / np.pi) ** 2 < high:
         return Quality(fault="rotor speeds look like rpm, wanted rad/s")
     if not max(means) < high:
         return Quality(grounded=f"rotors carry {max(means):.0%} of the weight: not this vehicle, or not flying")
@@ -360,7 +348,7 @@ def _lift(share: FloatArray, dt: float, known: bool) -> Quality:
 
 def _not_flying(window: Window) -> str:
     """Says why a window with turning rotors is not flight, whatever they give, or returns an empty string."""
-    if window.attitude is not None and np.any(down(window.attitude)[:, 2] < TUMBLED):
+    if window.attitude is not None and np.any(down(window.attitude)[:, 2] < 0.0):
         return "tumbled, or lying on its side"
     if window.accel is None or not np.isfinite(window.accel).any():
         return ""
@@ -390,6 +378,7 @@ def _floor(window: Window, thrust: FloatArray) -> str:
         return ""
     slope = float(x @ y) / power
     error = float(np.sqrt(np.sum((y - slope * x) ** 2) / max(len(x) - 2, 1) / power))
-    if slope + 3.0 * error < FLOOR_SLOPE and error < 0.2:
+    # On the ground it does not follow at all.
+    if slope + 3.0 * error < 0.2 and error < 0.2:
         return f"specific force follows thrust with slope {slope:.2f} only: something carries the vehicle"
     return ""

@@ -78,7 +78,7 @@ class Case:
         walked: change of torque over inertia (log) from the oldest to the newest agreeing window and its standard
             deviation, by the inertia's name.
         between_rows: relative standard deviation by what the rotors do between readings, newest window, by name.
-        left_out: of each rotor's thrust by b w^2 and standard deviations, shape (2, R) (`flexible_fit.left_out`).
+        left_out: of each rotor's thrust by b w^2 and standard deviations, shape (2, R) (`fit_job.left_out`).
         loaded: why the vehicle may have another mass than the vehicle file says, or empty.
     """
 

@@ -17,10 +17,6 @@ from quadid.types import BoolArray, FloatArray
 # --- Rows of the grid, and channels of a live stream read on them, piece by piece
 
 
-LOST = 2.05
-"""Lost packets are no gap while samples come within this many grid steps: the low-pass reaches over twice as far."""
-
-
 @dataclass(frozen=True)
 class Rows:
     """Consecutive rows of the grid.
@@ -66,8 +62,11 @@ def columns_on_grid(plan: Plan, at: FloatArray) -> Generator[None, None, dict[st
 
 
 def _mended(track: Track, step: float) -> Track:
-    """The track with stretches joined where only a few packets of a fast stream were lost."""
-    longest = LOST * step
+    """The track with stretches joined where only a few packets of a fast stream were lost.
+
+    They are no gap while samples come within two grid steps: the low-pass reaches over twice as far.
+    """
+    longest = 2.05 * step
     if len(track.stretches) < 2 or GAP * track.period >= longest:
         return track
     return replace(track, stretches=tuple(split_stretches(track.t, longest)))
@@ -80,8 +79,6 @@ SHORTEST = 2.0
 """A stretch without gaps shorter than this [s] is left out of a window."""
 COMPLETE = 0.8
 """A window needs this share of its time in usable stretches."""
-LONGEST_GYRO_GAP = 3
-"""More missing gyro rows in a row than this end a stretch."""
 
 
 @dataclass(frozen=True)
@@ -211,6 +208,6 @@ def _bridged(good: BoolArray) -> BoolArray:
     """Short holes count as good: the model simply has no measurement there."""
     out = good.copy()
     for a, b in zip(*true_runs(~good), strict=True):
-        if b - a <= LONGEST_GYRO_GAP and a > 0 and b < len(good):
+        if b - a <= 3 and a > 0 and b < len(good):
             out[a:b] = True
     return out

@@ -2,7 +2,8 @@
 
     push(sample)            buffer it
     poll() -> actions       every tick of the data's own time, in order:
-        watch for sudden changes                -> ChangeRequest, OnlineDiagnosis
+        compare the sensors with each other     -> while they disagree, nothing is learned
+        look for sudden changes                 -> ChangeRequest, OnlineDiagnosis
         compare with healthy flights            -> HealthReport, HealthyFlight
         diagnose the last minute, now and then  -> DiagnosisRequest, OnlineDiagnosis; nothing waits for it
         cut a window, judge its quality         -> what is missing, not flying, broken
@@ -10,7 +11,7 @@
         fuse, ask the gate                      -> Publish(candidate), Publish(parameters)
 
 A session stands still while a fit runs and catches up afterwards, so that nothing depends on how long a fit takes.
-Where the machine is too slow for that, whoever drives the session says so (`hurry`, `go_on`): then it goes on without
+Where the machine is too slow for that, whoever drives the session calls `hurry` and `go_on`: then it goes on without
 the reply, which is taken when it comes, no further fit begins until it has caught up, and changes are looked for.
 """
 
@@ -18,22 +19,30 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+from pydantic import BaseModel, ConfigDict, Field
 
 from quadid.condition.trim import FlightTrim
+from quadid.condition.watch import HealthWatch
 from quadid.data.window import Block, Sample
 from quadid.online.active_set import ActiveSet, Answer
 from quadid.online.background_diagnosis import DIAGNOSED_SECONDS, BackgroundDiagnosis
-from quadid.online.change_supervisor import ChangeSupervisor
-from quadid.online.checks import LEAD, Consistency, Quality
-from quadid.online.estimator import Estimator
-from quadid.online.fault_isolation import ChangeReply, ChangeRequest
-from quadid.online.grid_buffer import GridBuffer, Rows
-from quadid.online.health_supervisor import HealthSupervisor
+from quadid.online.change_job import PULL, ChangePoint, ChangeReply, ChangeRequest, carried
+from quadid.online.changes import LEAST, ChangeWatch
+from quadid.online.checks import LEAD, Consistency, Quality, judge, mistake
+from quadid.online.fit_job import FitReply, FitRequest, is_excited
+from quadid.online.fusion import Estimator
+from quadid.online.gate import GateSettings, decide
+from quadid.online.grid_buffer import GridBuffer, Rows, WindowCut
 from quadid.online.records import (
     MOST_ERRORS,
     Action,
+    HealthyFlight,
     Job,
     JobReply,
+    OnlineDiagnosis,
+    OnlineFinding,
     OnlineSet,
     Outbox,
     Phase,
@@ -42,15 +51,40 @@ from quadid.online.records import (
     SetState,
     unexpected,
 )
-from quadid.online.settings import SessionSettings
 from quadid.online.stream import LEADER, Resampler
-from quadid.online.supervisor import Supervisor
-from quadid.online.window_fit import FitReply, FitRequest, is_excited
-from quadid.online.window_supervisor import WindowSupervisor
+from quadid.parameters import NOMINAL_NAMES
 from quadid.vehicle import Vehicle
 
+WARM_UP = 0.22
+"""Flight before a window in which filters and delays settle [s]."""
+STARTING = 3.0
+"""Time from the begin of a stream [s] in which channels may still come, once the vehicle sends what was asked."""
 _EPS = 1e-6
 _DONE = object()
+
+
+class SessionSettings(BaseModel):
+    """What is learned, from how much data, and how cautiously it is published.
+
+    Attributes:
+        rate: grid rate [Hz].
+        window: flight time that one fit looks at [s].
+        refit: time between fits [s].
+        memory: time constant of forgetting [s] of excited flight; hover does not make a session forget.
+        diagnose: time between two diagnoses of the last minute [s]; 0: never. Sudden changes are looked for anyway.
+        seed: decides every random number.
+        gate: what an estimate must pass.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    rate: float = Field(default=50.0, ge=20.0, le=400.0)
+    window: float = Field(default=10.0, ge=4.0, le=60.0)
+    refit: float = Field(default=1.0, ge=0.5, le=60.0)
+    memory: float = Field(default=120.0, ge=20.0)
+    diagnose: float = Field(default=60.0, ge=0.0, le=3600.0)
+    seed: int = Field(default=0, ge=0)
+    gate: GateSettings = GateSettings()
 
 
 class Session:
@@ -80,28 +114,30 @@ class Session:
         self.settings = settings or SessionSettings()
         self.resampler = Resampler(vehicle, self.settings.rate)
         self.active_set = ActiveSet(self.settings.gate.approval, restored, next_sequence, baseline)
-        self._outbox = Outbox(self.resampler.time.stamp)
+        self._vehicle, self._outbox = vehicle, Outbox(self.resampler.time.stamp)
         studied = DIAGNOSED_SECONDS if self.settings.diagnose else 0.0
-        self._store = GridBuffer(self.settings.rate, max(self.settings.window, studied) + 10.0)
+        self._rows = GridBuffer(self.settings.rate, max(self.settings.window, studied) + 10.0)
         self._consistency = Consistency()
-        self._change_supervisor = ChangeSupervisor(vehicle, self._store)
-        self._health = HealthSupervisor(vehicle, self._store, self._outbox, healthy)
+        self._changes = ChangeWatch(vehicle, self._rows)
+        self._health, self._health_until = HealthWatch(vehicle, healthy), math.nan
         self._diagnosis = BackgroundDiagnosis(
-            vehicle, self._store, self.settings.diagnose, self.settings.seed, self._outbox.stamp
+            vehicle, self._rows, self.settings.diagnose, self.settings.seed, self._outbox.stamp
         )
         self._estimator = Estimator(vehicle, self.settings.memory, self.settings.seed)
-        self._supervisor = Supervisor(
-            self._estimator, self.active_set, self._outbox, self.settings.gate, self._consistency, self._diagnosis
-        )
-        self._windows = WindowSupervisor(vehicle, self._store, self.settings, self._outbox, self._supervisor)
+        # The walk: data read up to `_now` [s], the next tick [s], and the pieces of work that have begun.
+        self._now, self._tick_at = -math.inf, math.nan
+        self._work: Iterator[None] | None = None
+        # Jobs: the one that is waited for, its reply, one that is too late; replies up to `_outdated` are ignored.
         self._waiting: Job | None = None
         self._reply: JobReply | None = None
         self._late: Job | None = None
+        self._number = self._outdated = 0
         self._hurried, self.skipped = False, 0
-        self._outdated = 0
-        self._now, self._tick_at = -math.inf, math.nan
-        self._work: Iterator[None] | None = None
-        self._number = 0
+        # Learning: nothing before `_learn_from` [s] counts; since when [s] windows have disagreed with the estimate.
+        self._learn_from, self._disagrees_since = -math.inf, math.inf
+        self._cut, self._quality = WindowCut((), 0.0, 0), Quality()
+        self._last_fit, self._asked_now = -math.inf, False
+        self._fits = self._rejected = self._errors = 0
         if self.active_set.in_force is not None:
             self._estimator.start_from(self.active_set.in_force)
             self._outbox.act(Publish("parameters", self.active_set.in_force))
@@ -149,14 +185,14 @@ class Session:
         answer = self.active_set.roll_back(self._outbox.stamp(self._now), by)
         if answer.done:
             self._outdated, self._work = self._number, None
-            self._change_supervisor.restart()
-            self._supervisor.relearn(self._now, f"rolled back by {by}")
+            self._changes.restart()
+            self._relearn(self._now, f"rolled back by {by}")
             self._outbox.act(*answer.actions)
         return answer
 
     def fit_now(self) -> Answer:
-        """Fits what there is at the next tick, without waiting for a full window."""
-        self._windows.fit_now()
+        """Fits what there is at the next tick, without waiting for a full window, whatever failed before."""
+        self._asked_now, self._errors = True, 0
         return Answer(True, "a fit follows at the next tick of the data")
 
     # --- output
@@ -198,7 +234,7 @@ class Session:
     def status(self) -> SessionStatus:
         """What the session is doing now."""
         newest, active_set = self.resampler.time.newest, self.active_set
-        windows, cut = self._estimator.fusion.windows, self._windows.cut
+        windows, cut = self._estimator.fusion.windows, self._cut
         force, pending = active_set.in_force, active_set.pending
         return SessionStatus(
             t=self._outbox.stamp(newest),
@@ -209,8 +245,8 @@ class Session:
             window_seconds=cut.seconds,
             gaps=cut.gaps,
             mse=windows[-1].mse if windows else math.nan,
-            fits=self._supervisor.fits,
-            rejected=self._supervisor.rejected,
+            fits=self._fits,
+            rejected=self._rejected,
             in_force=force.sequence if force else 0,
             pending=pending.sequence if pending else 0,
             stale=force is not None and force.state is SetState.STALE,
@@ -250,69 +286,122 @@ class Session:
             first = float(rows.t[0])
             self._tick_at = math.floor(first / self._tick + 1.0) * self._tick
         if rows.new_clock:
-            self._supervisor.interrupted(first)
+            self._learn_only_from(first)
             self._consistency.restart()
-            self._change_supervisor.restart()
+            self._changes.restart()
             self._outbox.say(first, "info", "stream", "a stream of data begins")
-        self._store.add(rows)
+        self._rows.add(rows)
         self._now = float(rows.t[-1]) + 1.0 / self.settings.rate
 
     def _at(self, tick: float) -> Iterator[None]:
         """One tick, piece by piece: first look for sudden changes; then a fit."""
-        self._consistency.add(self._store.span(tick - self._tick - LEAD - _EPS, tick - _EPS), self._tick)
+        self._consistency.add(self._rows.span(tick - self._tick - LEAD - _EPS, tick - _EPS), self._tick)
         if self._consistency.fault:
             yield
-            # A unit, frame or motor order that is wrong has a name; which two channels it sets apart is less of a help.
-            self._supervisor.distrust(tick, self._windows.mistake(tick) or self._consistency.fault)
-            self._change_supervisor.restart()
+            self._distrust(tick)
             return
         yield
-        seen = yield from self._change_supervisor.look(tick, self._tick, self._estimator)
+        seen = yield from self._changes.look(tick, self._tick, self._estimator)
         if seen is not None:
-            self._outbox.state(Phase.CANDIDATE, f"a change of {seen.change.channel} is being looked into")
-            what = f"{seen.change.channel} stepped by {seen.change.size:+.1%} at {self._outbox.stamp(seen.at):.2f} s"
-            self._outbox.say(tick, "warning", "change", f"{what} ({seen.change.errors:.0f} standard errors)")
-        self._health.look(tick)
+            self._outbox.state(Phase.CANDIDATE, f"a change of {seen.channel} is being looked into")
+            what = f"{seen.channel} stepped by {seen.size:+.1%} at {self._outbox.stamp(seen.time):.2f} s"
+            self._outbox.say(tick, "warning", "change", f"{what} ({seen.errors:.0f} standard errors)")
+        if not tick - self._health_until < 1.0 - _EPS:
+            self._health_until = tick
+            self._compare_with_healthy_flights(tick)
         self._diagnose(tick)
         yield
-        if self._change_supervisor.seen is not None:
-            self._isolate(tick)
-        elif self._windows.due(tick):
+        if self._changes.seen is not None:
+            self._explain_change(tick)
+        elif self._asked_now or (self._errors < MOST_ERRORS and tick - self._last_fit >= self.settings.refit - _EPS):
             if self._hurried or self._late is not None or self._waiting is not None:
                 self.skipped += 1
             else:
                 yield from self._fit(tick)
 
+    def _distrust(self, tick: float) -> None:
+        """The sensors disagree: nothing is learned until they do not, and what was learned is forgotten."""
+        # A unit, frame or motor order that is wrong has a name; which two channels it sets apart is less of a help.
+        cut = self._rows.cut(tick - self.settings.window - _EPS, tick - _EPS)
+        why = mistake(cut, self._vehicle, known=False) or self._consistency.fault
+        if self._estimator.learned:
+            self._relearn(tick, "sensors disagree")
+        self._learn_only_from(tick)
+        self._outbox.note(tick, Phase.BLOCKED, why)
+        self._changes.restart()
+
+    def _compare_with_healthy_flights(self, tick: float) -> None:
+        rows = self._rows.span(tick - 1.0, tick)
+        if rows is None or "rotor_speed" not in rows.columns:
+            return
+        found = self._health.look(tick, rows.columns["rotor_speed"], rows.columns.get("accel"))
+        if isinstance(found, FlightTrim):
+            self._outbox.act(HealthyFlight(self._outbox.stamp(tick), found))
+        elif found is not None:
+            self._outbox.act(replace(found, t=self._outbox.stamp(tick)))
+            if found.verdict == "changed":
+                self._outbox.say(tick, "warning", "health", found.text)
+            elif not found.has_baseline:
+                self._outbox.say(tick, "info", "health", found.text)
+
     def _diagnose(self, tick: float) -> None:
-        """Tells what a diagnosis brought, and asks for the next one when the vehicle is known and moves."""
-        estimator, supervisor = self._estimator, self._supervisor
-        told = self._diagnosis.answer(tick, supervisor.learn_from)
+        """Publishes what a diagnosis brought, and asks for the next one when the vehicle is known and moves."""
+        estimator = self._estimator
+        told = self._diagnosis.answer(tick, self._learn_from)
         if told is not None:
             self._outbox.act(told)
         moving = estimator.learned and is_excited(estimator.excitation) and not self._hurried
-        if moving and self._change_supervisor.seen is None and self._windows.quality == Quality():
-            since = max(supervisor.learn_from, estimator.start)
-            request = self._diagnosis.ask(self._number + 1, tick, since)
+        if moving and self._changes.seen is None and self._quality == Quality():
+            request = self._diagnosis.ask(self._number + 1, tick, max(self._learn_from, estimator.start))
             if request is not None:
                 self._number = request.number
                 self._outbox.act(request)
 
-    def _isolate(self, tick: float) -> None:
-        assert self._change_supervisor.seen is not None
-        stamp = self._outbox.stamp(self._change_supervisor.seen.at)
-        request = self._change_supervisor.ask(self._number + 1, tick, self._estimator, stamp)
+    def _explain_change(self, tick: float) -> None:
+        """Asks what a change was, once there are data enough after it; answers where a fit could say nothing."""
+        assert self._changes.seen is not None
+        stamp = self._outbox.stamp(self._changes.seen.time)
+        request = self._changes.ask(self._number + 1, tick, self._estimator, stamp)
         if request is None:
             return
         self._number, self._waiting, self._late = request.number, request, None
-        self._reply = self._change_supervisor.answer_without_fit(request, self._estimator)
-        if self._reply is None:
+        if not request.windows:
+            self._reply = request.failed("too little data after the change")
+        elif not self._estimator.learned:
+            self._reply = ChangeReply(request.number, finding=carried(request))
+        else:
             self._outbox.act(request)
 
     def _fit(self, tick: float) -> Iterator[None]:
-        request = yield from self._windows.ask(self._number + 1, tick, self._estimator)
-        if request is not None:
-            self._number, self._waiting = request.number, request
-            self._outbox.act(request)
+        """Cuts the window before `tick` [s], judges it, and asks for its fit; or says why there is none."""
+        wanted = self.settings.window
+        if self._asked_now:
+            self._asked_now, wanted = False, min(4.0, wanted)  # what a person asked for needs less
+        start = max(tick - self.settings.window - WARM_UP, self._learn_from)
+        cut = self._cut = self._rows.cut(start - _EPS, tick - _EPS)
+        if cut.blocked and tick - start >= STARTING:
+            self._outbox.note(tick, Phase.BLOCKED, cut.reason)
+            return
+        if cut.blocked:
+            self._outbox.state(Phase.COLLECTING, cut.reason)
+            return
+        if cut.reason or tick - start < wanted - 0.5:
+            have = f"{max(tick - start, 0.0):.0f} of {self.settings.window:g} s of flight"
+            self._outbox.state(Phase.COLLECTING, f"{have}; {cut.reason or 'no gaps'}")
+            return
+        yield
+        self._quality = judge(cut, self._vehicle, self._estimator.thrust, self._estimator.learned)
+        if self._quality != Quality():
+            phase = Phase.BLOCKED if self._quality.fault else Phase.NOT_FLYING
+            self._outbox.note(tick, phase, self._quality.fault or self._quality.grounded)
+            return
+        yield
+        self._last_fit = tick
+        request = self._estimator.request(self._number + 1, cut, max(start, tick - self.settings.window), tick)
+        self._number, self._waiting = request.number, request
+        self._outbox.act(request)
+
+    # --- what replies bring
 
     def _apply(self) -> Iterator[None]:
         request, reply = self._waiting, self._reply
@@ -320,28 +409,153 @@ class Session:
         if request is None or request.number <= self._outdated or not request.is_answered_by(reply):
             return
         if isinstance(request, FitRequest) and (
-            self._change_supervisor.seen is not None or request.start < self._supervisor.learn_from - _EPS
+            self._changes.seen is not None or request.start < self._learn_from - _EPS
         ):
             return  # a late one, of a time before what has happened since
         if reply.is_unexpected:
             self._fail(request.stop, reply.problem)
             return
-        self._windows.errors = 0
+        self._errors = 0
         if isinstance(request, FitRequest) and isinstance(reply, FitReply):
-            yield from self._supervisor.fitted(request, reply)
+            yield from self._fitted(request, reply)
         elif isinstance(request, ChangeRequest) and isinstance(reply, ChangeReply):
-            self._change_supervisor.restart()
-            self._supervisor.changed(request, reply)
+            self._changes.restart()
+            # Where it may be the mass, the sets after it wait for a person.
+            self.active_set.load *= mass_factor(request.change, reply.finding)
+            text = reply.finding.evidence if reply.finding is not None else f"cause unknown: {reply.problem}"
+            span = request.start, request.stop
+            self._has_changed(span, "finding", text, "unknown_cause", request.start + 0.1, reply.finding)
+
+    def _fitted(self, request: FitRequest, reply: FitReply) -> Iterator[None]:
+        """Takes in the fit of a window, piece by piece: fuse it, watch the set in force, ask the gate."""
+        outbox, estimator = self._outbox, self._estimator
+        if reply.problem:
+            outbox.note(request.stop, Phase.FAILED, reply.problem)
+            return
+        if reply.estimate is None:
+            estimator.take(request, reply)
+            assert reply.excitation is not None
+            worst = sorted(zip(reply.excitation, NOMINAL_NAMES, strict=True), reverse=True)[:3]
+            known = ", ".join(f"{name} only to {min(bound, 99.0):.0%}" for bound, name in worst)
+            outbox.note(request.stop, Phase.NOT_EXCITED, f"roll and pitch move too little: {known}")
+            return
+        self._fits += 1
+        if not reply.estimate.finite:
+            # Information adds up: one such window would spoil every estimate after it.
+            outbox.note(request.stop, Phase.FAILED, "the fit of the newest window gave no numbers")
+            return
+        if reply.flexible and not estimator.flexible:
+            # From now on effects are fitted along; what was learned without them is forgotten.
+            estimator.fit_along()
+            self._disagrees_since = math.inf
+            share = f"{reply.lack.share:.0%} of what" if reply.lack is not None else "what"
+            text = f"effects that the vehicle file lacks explain {share} its model misses: every one is fitted along"
+            outbox.say(request.stop, "info", "model", text)
+        if not estimator.fusion.agrees(reply.estimate):
+            # It is left out; when one without a common sample disagrees too, the vehicle has changed.
+            since = self._disagrees_since = min(self._disagrees_since, request.stop)
+            outbox.state(Phase.CANDIDATE, "the newest window disagrees with what was known: held back")
+            if request.start >= since - _EPS:
+                text = "windows disagree with the earlier estimate for the length of a window: learning restarts"
+                self._has_changed((since, request.stop), "change", text, "disagreement", request.start)
+            return
+        self._disagrees_since = math.inf
+        estimator.take(request, reply)
+        yield
+        # The set in force is taken back when its predecessor predicts new windows better.
+        sets, new = self.active_set, reply.estimate
+        if sets.predecessor is not None:
+            loss = estimator.deviance(new, sets.in_force) - estimator.deviance(new, sets.predecessor)
+            if sets.watch(new.start, new.stop, loss) and sets.watched > self.settings.gate.watch:
+                why = f"it predicts new windows worse than its predecessor (deviance {sets.watched:.0f})"
+                outbox.act(*sets.roll_back(outbox.stamp(new.stop), "auto", why).actions)
+                self._relearn(new.stop, "a set was taken back")
+                return
+        self._judge(request, reply)
+
+    def _judge(self, request: FitRequest, reply: FitReply) -> None:
+        """Asks the gate, and publishes, holds or refuses the estimate."""
+        sets, outbox, estimator = self.active_set, self._outbox, self._estimator
+        parameters = estimator.parameters()
+        if parameters is None:
+            return
+        scale, mass, loaded = self._diagnosis.wrong_scale, estimator.vehicle.mass, ""
+        if abs(math.log(sets.load)) > LEAST:
+            changed = f"the mass changed by about {sets.load - 1.0:+.0%} in flight, as far as the thrust tells"
+            loaded = f"{changed}; b and the inertias of this set rest on {mass:g} kg"
+        case = replace(
+            estimator.case(parameters, request, reply, sets, self.settings.gate.windows),
+            unexplained=f"the diagnosis is in force: {scale}" if scale else "", doubts=self._consistency.doubts(),
+            loaded=loaded,
+        )  # fmt: skip
+        decision = decide(case, self.settings.gate)
+        mse, unseen = estimator.scores()
+        stop = outbox.stamp(request.stop)
+        item = OnlineSet(
+            0, decision.state, decision.reason, parameters, outbox.stamp(estimator.start), stop, estimator.rows, mse,
+            unseen, estimator.input_hash, check=decision.check, mass=mass, reference=sets.reference(estimator.stated),
+        )  # fmt: skip
+        if decision.state is SetState.ACCEPTED:
+            outbox.act(*sets.accept(item, "auto", stop, request.stop))
+            item = sets.in_force or item
+        elif decision.state is SetState.PENDING:
+            item = sets.hold(item, request.stop)
+        else:
+            self._rejected += 1
+        outbox.act(Publish("candidate", item))
+        force, waiting = sets.in_force, sets.pending
+        if waiting is not None and decision.state is SetState.REJECTED:
+            kept = f"set {waiting.sequence} waits for approval; a newer estimate was held back ({decision.check})"
+            outbox.state(Phase.PENDING, kept)
+            return
+        known = force is not None and force.state is not SetState.STALE
+        phase = Phase.PENDING if waiting is not None else Phase.ACCEPTED if known else Phase.CANDIDATE
+        outbox.state(phase, f"{decision.check}: {decision.reason}")
+
+    # --- what is learned no longer
+
+    def _learn_only_from(self, t: float) -> None:
+        """Nothing before `t` [s] is learned from."""
+        self._learn_from, self._disagrees_since = max(self._learn_from, t), math.inf
+
+    def _relearn(self, start: float, why: str) -> None:
+        """Forgets what was learned; learns from `start` [s] on."""
+        self._estimator.forget()
+        self._learn_only_from(start)
+        self.active_set.drop_pending()
+        self._outbox.state(Phase.COLLECTING, f"{why}: learning restarts")
+
+    def _has_changed(
+        self, span: tuple[float, float], kind: str, text: str, unexplained: str, learn_from: float,
+        finding: OnlineFinding | None = None,
+    ) -> None:  # fmt: skip
+        """Publishes what happened within `span` [s]; the set in force is out of date, learning begins anew."""
+        since, until = map(self._outbox.stamp, span)
+        explained = finding is not None and finding.confident
+        code = finding.effect if finding is not None and explained else unexplained
+        found = (finding,) if finding is not None else ()
+        self._outbox.act(OnlineDiagnosis(until, since, until, found, "explained" if explained else "unknown"))
+        self._outbox.say(span[1], "warning", kind, text)
+        self._outbox.act(*self.active_set.withdraw(text, code))
+        self._relearn(learn_from, "the vehicle has changed")
 
     def _fail(self, t: float, problem: str) -> None:
         """After an error that nobody foresaw, at `t` [s]: what was learned may be its cause and is forgotten."""
-        self._windows.errors += 1
-        left = MOST_ERRORS - self._windows.errors
+        self._errors += 1
+        left = MOST_ERRORS - self._errors
         what = "learning restarts" if left > 0 else f"{MOST_ERRORS} in a row: no more fits until fit_now or a restart"
-        self._change_supervisor.restart()
+        self._changes.restart()
         self._consistency.restart()
         self._estimator.reset()
-        self._supervisor.relearn(t, "an unexpected error")
+        self._relearn(t, "an unexpected error")
         if left >= 0:
             self._outbox.say(t, "error", "unexpected", f"{problem}; {what}")
         self._outbox.state(Phase.FAILED, f"{problem}; {what}")
+
+
+def mass_factor(change: ChangePoint, finding: OnlineFinding | None) -> float:
+    """Factor on the mass that a change may be."""
+    if finding is not None and finding.effect == "mass_change":
+        return max(1.0 + finding.values["fraction"], LEAST)
+    sure = finding is not None and finding.confident and finding.effect != PULL
+    return 1.0 if sure or change.channel != "thrust" else math.exp(-change.size)

@@ -13,10 +13,9 @@ import numpy as np
 
 from quadid.attitude_controller import mixer_matrix, pack_gains, stabilise_rows
 from quadid.data.grid import GAP, make_plan
-from quadid.data.mounting import in_body_axes
 from quadid.data.resample import HALF_WIDTH, linear, lowpass
 from quadid.data.rotor_signal import RotorSignal, rotor_channel, rotor_signal
-from quadid.data.window import CHANNELS, Block, Channel, Recording
+from quadid.data.window import CHANNELS, Block, Channel, Recording, in_body_axes
 from quadid.errors import LogError, QuadidError
 from quadid.online.grid_buffer import Rows, columns_on_grid
 from quadid.rotation import continuous_sign
@@ -47,9 +46,6 @@ PAUSE = 4.0
 DAY = 86400.0
 LARGEST = 1e11
 """Stamps beyond this [s] are no times."""
-_BASES = 64
-"""Newest time bases of which session times can be told as stamps."""
-_SLICE = 256
 
 
 class StreamClock:
@@ -64,7 +60,8 @@ class StreamClock:
     def __init__(self) -> None:
         self.newest = -math.inf
         self.steps = self.wild = 0
-        self._bases: deque[tuple[float, float]] = deque([(-math.inf, 0.0)], maxlen=_BASES)
+        # The newest of which session times can be told as stamps.
+        self._bases: deque[tuple[float, float]] = deque([(-math.inf, 0.0)], maxlen=64)
         self._suspects: list[float] = []
 
     def stamp(self, t: float) -> float:
@@ -90,7 +87,7 @@ class StreamClock:
         out = np.full(len(stamps), np.nan)
         at = 0
         while at < len(stamps):
-            t = stamps[at : at + _SLICE] + self._bases[-1][1]
+            t = stamps[at : at + 256] + self._bases[-1][1]
             reached = np.maximum.accumulate(np.concatenate([[self.newest], t]))[:-1]
             strange = ~((t > reached - STEP_BACK) & (t < reached + STEP_AHEAD))
             count = int(strange.argmax()) if strange.any() else len(t)
@@ -233,12 +230,6 @@ OLDEST = 1.0
 is a gap: what the integrals took in meanwhile nobody knows."""
 CALM = 10.0
 """Flight from which the integrals are found [s]."""
-AIRBORNE = 0.5
-"""With less thrust than this share of the weight nothing is learned, and the integrals rest at zero."""
-LANDED = 0.25
-"""With less thrust than this share of the weight for a block of rows it has landed, and the integrals begin anew."""
-MOST_RUNS = 20
-"""Runs of the stabiliser between two samples of the gyro, at most."""
 
 
 class CommandReconstruction:
@@ -304,8 +295,9 @@ class CommandReconstruction:
             t = t[torn[-1] :]
             if len(t) < 2:
                 return
-        commands = self._run(buffers, t, min(max(round(self._rate * period), 1), MOST_RUNS))
-        if commands is None or (self._settled and np.mean(commands**2) * len(self._mixer) < LANDED * self._hover):
+        commands = self._run(buffers, t, min(max(round(self._rate * period), 1), 20))
+        # With less than a quarter of the weight for a block of rows it has landed: the integrals begin anew.
+        if commands is None or (self._settled and np.mean(commands**2) * len(self._mixer) < 0.25 * self._hover):
             self.restart()
             return
         self._newest = float(t[-2])
@@ -335,7 +327,8 @@ class CommandReconstruction:
     def _settle(self, dt: FloatArray, commands: FloatArray, rate: FloatArray) -> None:
         """Adds up torques and angular momentum until they tell the integrals."""
         square = commands**2
-        if np.sum(square, axis=1).min() < AIRBORNE * self._hover:
+        # With less than half the weight nothing is learned, and the integrals rest at zero.
+        if np.sum(square, axis=1).min() < 0.5 * self._hover:
             self._begin_flight()
             return
         if self._rate_then is None:

@@ -30,10 +30,10 @@ import msgspec
 import numpy as np
 
 from quadid.condition.trim import FlightTrim, flight_from_dict, flight_to_dict
+from quadid.condition.watch import MOST_FLIGHTS
 from quadid.errors import QuadidError
-from quadid.online.flexible_fit import ROOM, with_room
+from quadid.online.fit_job import ROOM, with_room
 from quadid.online.gate import GateSettings, implausible
-from quadid.online.health_supervisor import MOST_FLIGHTS
 from quadid.online.records import Event, OnlineDiagnosis, OnlineSet, SetState
 from quadid.parameters import NOMINAL_NAMES, ParameterSet
 from quadid.sanitise import plain

@@ -24,9 +24,9 @@ import numpy as np
 from quadid.errors import QuadidError
 from quadid.files import read_regular
 from quadid.online.background_diagnosis import DiagnosisReply, DiagnosisRequest
-from quadid.online.fault_isolation import ChangeReply, ChangeRequest
+from quadid.online.change_job import ChangeReply, ChangeRequest
+from quadid.online.fit_job import FitReply, FitRequest
 from quadid.online.records import Job, JobReply
-from quadid.online.window_fit import FitReply, FitRequest
 from quadid.vehicle import Vehicle
 
 LARGEST = 1 << 24

@@ -25,7 +25,7 @@ def main() -> None:
     requests = os.fdopen(os.dup(0), "rb")
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     _behave(int(sys.argv[1]))
-    from quadid.online.window_fit import warm_up
+    from quadid.online.fit_job import warm_up
 
     def answer(item: object) -> None:
         pickle.dump(item, answers, pickle.HIGHEST_PROTOCOL)

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from quadid.online.window_fit import warm_up
+from quadid.online.fit_job import warm_up
 from quadid.vehicle import Vehicle
 from tests.conftest import THIS_MACHINE, absent
 from tests.node.peers import Ear

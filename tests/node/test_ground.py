@@ -31,7 +31,7 @@ from quadid_node.zenoh import Fleet, ZenohLink
 
 from quadid.online import FitReply, FitRequest, Session, SessionSettings
 from quadid.online.background_diagnosis import DiagnosisReply
-from quadid.online.fault_isolation import ChangeReply
+from quadid.online.change_job import ChangeReply
 from quadid.online.records import OnlineFinding
 from quadid.vehicle import Vehicle
 from quadid_node import ground

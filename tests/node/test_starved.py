@@ -141,7 +141,7 @@ def test_an_estimate_of_before_a_change_that_comes_late_is_not_taken() -> None:
             service.step()
             if late is None and service.session._late is not None:
                 late = service.session._late
-            if service.session._change_supervisor.seen is not None:
+            if service.session._changes.seen is not None:
                 break
     assert isinstance(late, FitRequest)
     fits = service.session.status().fits

@@ -17,8 +17,8 @@ from scipy.spatial.transform import Rotation
 
 from quadid.data.window import Sample
 from quadid.online import FitReply, FitRequest, GateSettings, Session, SessionSettings
-from quadid.online.fault_isolation import ChangeRequest
-from quadid.online.fusion import WindowEstimate
+from quadid.online.change_job import ChangeRequest
+from quadid.online.fit_job import WindowEstimate
 from quadid.online.records import Action, Job, JobReply
 from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray

@@ -9,8 +9,8 @@ import pytest
 
 from quadid.identification.noise import NoiseModel
 from quadid.model.layout import LOSS, Layout
-from quadid.online.change_detection import ChangeDetector, ChangePoint
-from quadid.online.fault_isolation import ChangeRequest
+from quadid.online.change_job import ChangePoint, ChangeRequest
+from quadid.online.changes import ChangeDetector
 from quadid.online.grid_buffer import Rows
 from quadid.vehicle import GRAVITY, Vehicle
 from tests.online.driving import flight

@@ -9,9 +9,8 @@ import pytest
 
 from quadid.model.layout import LOSS, Layout, ThrustModel
 from quadid.online import FitReply, FitRequest, Session, SessionSettings
-from quadid.online.estimator import Estimator
-from quadid.online.flexible_fit import with_room
-from quadid.online.fusion import WindowEstimate
+from quadid.online.fit_job import WindowEstimate, with_room
+from quadid.online.fusion import Estimator
 from quadid.online.grid_buffer import WindowCut
 from quadid.parameters import Status
 from quadid.vehicle import GRAVITY, ParameterPrior, Vehicle

@@ -12,10 +12,9 @@ import pytest
 from quadid_node.recording import stream
 from quadid_replay import open_log
 
-from quadid.online.change_detection import CHUNK, ChangeDetector
-from quadid.online.change_supervisor import ChangeSupervisor, Seen
-from quadid.online.estimator import Estimator
-from quadid.online.flight_state import FlightState, Velocity, step_beside
+from quadid.online.change_job import ChangePoint
+from quadid.online.changes import CHUNK, ChangeDetector, ChangeWatch, FlightState, Velocity, step_beside
+from quadid.online.fusion import Estimator
 from quadid.online.grid_buffer import GridBuffer, Rows
 from quadid.online.stream import Resampler
 from quadid.rotation import conjugate, rotated
@@ -53,7 +52,7 @@ def steps(
     """What is seen: when [s], channel, size; from `at` [s] on rotors give only `scale` as much for their speed."""
     vehicle = Vehicle.from_yaml(file.read_text())
     store, estimator = GridBuffer(RATE, 60.0), Estimator(vehicle, 60.0, 0)
-    supervisor, seen, first, tick = ChangeSupervisor(vehicle, store), list[tuple[float, str, float]](), 0.0, 0.0
+    supervisor, seen, first, tick = ChangeWatch(vehicle, store), list[tuple[float, str, float]](), 0.0, 0.0
     for rows in rows_of(log, file):
         if rows.fresh:
             first, tick = float(rows.t[0]), np.floor(rows.t[0] + 1.0)
@@ -64,13 +63,13 @@ def steps(
         while rows.t[-1] >= tick:
             found = _last(supervisor.look(tick, 1.0, estimator))
             if found is not None:
-                seen.append((tick - first, found.change.channel, found.change.size))
+                seen.append((tick - first, found.channel, found.size))
                 supervisor.restart()
             tick += 1.0
     return seen
 
 
-def _last(work: Iterator[None]) -> Seen | None:
+def _last(work: Iterator[None]) -> ChangePoint | None:
     try:
         while True:
             next(work)

@@ -6,7 +6,8 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from quadid.online.fusion import Fusion, WindowEstimate
+from quadid.online.fit_job import WindowEstimate
+from quadid.online.fusion import Fusion
 from tests.online.made_up import nothing_left_out
 
 P = 3

@@ -31,7 +31,7 @@ from quadid_node.worker import Trouble
 
 from quadid.data.window import Sample
 from quadid.online import FitReply, FitRequest, GateSettings, Publish, SessionSettings, SetState
-from quadid.online.fusion import WindowEstimate
+from quadid.online.fit_job import WindowEstimate
 from quadid.online.records import Job, JobReply, OnlineSet
 from quadid.parameters import NOMINAL_NAMES, impossible_inertia
 from quadid.vehicle import Vehicle

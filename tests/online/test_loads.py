@@ -11,9 +11,9 @@ import pytest
 
 from quadid.data.window import Recording
 from quadid.online import Session, SessionSettings
-from quadid.online.change_detection import ChangePoint
+from quadid.online.change_job import ChangePoint
 from quadid.online.records import OnlineFinding
-from quadid.online.supervisor import mass_factor
+from quadid.online.session import mass_factor
 from quadid.vehicle import GRAVITY
 from tests.online.driving import diagnosed, drive, events, flight, samples
 from tests.online.made_up import PELICAN

@@ -7,15 +7,26 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-import quadid.online.flexible_fit as flexible_fit_room
 from quadid.data.window import Sampling, Window
 from quadid.identification.gauss_newton import polish
 from quadid.identification.problem import Shooting
 from quadid.model.layout import Layout
-from quadid.online.flexible_fit import LASTING, ORDER, alike, flexible_fit, halved, reduced, sampling_error, widened
-from quadid.online.fusion import Fusion, WindowEstimate
+from quadid.online import fit_job
+from quadid.online.fit_job import (
+    LASTING,
+    ORDER,
+    Flexible,
+    WindowEstimate,
+    alike,
+    flexible_fit,
+    halved,
+    prior_of,
+    reduced,
+    sampling_error,
+    widened,
+)
+from quadid.online.fusion import Fusion
 from quadid.online.stream import Resampler
-from quadid.online.window_fit import prior_of
 from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
@@ -87,13 +98,13 @@ class Moved:
     def __call__(self, monkeypatch: pytest.MonkeyPatch, sampling: Sampling, spacing: float) -> FloatArray:
         own = WindowEstimate(0.0, 10.0, np.zeros(6), np.eye(6), np.zeros(6), 900.0, 300.0, nothing_left_out())
         moved = iter([replace(own, score=-shift) for shift in self.shifts])
-        monkeypatch.setattr(flexible_fit_room, "reduced", lambda *_: next(moved))
+        monkeypatch.setattr(fit_job, "reduced", lambda *_: next(moved))
         windows = (window(1.0, sampling),)
         problem = Shooting.cut(windows, PELICAN, 0.5, None, Layout(PELICAN))
         free = problem.free(list(NOMINAL_NAMES))
         start = Layout(PELICAN).initial(PELICAN)
         best = polish(problem, start, free, prior_of(PELICAN), iterations=1)
-        missed = sampling_error(own, problem, free, prior_of(PELICAN), best, spacing)
+        missed = sampling_error(own, Flexible(problem, free, prior_of(PELICAN), best), spacing)
         np.testing.assert_array_equal(missed, np.diag(np.diag(missed)))
         return np.sqrt(np.diag(missed))
 
@@ -140,11 +151,9 @@ def test_every_window_has_an_error_of_readings_and_closer_ones_a_smaller_one() -
     for sampling, order in ORDER.items():
         windows = (replace(full, sampling=sampling),)
         start = Layout(PELICAN).initial(PELICAN)
-        problem, free, prior, best = flexible_fit(windows, PELICAN, prior_of(PELICAN), start, None)
-        estimate = reduced(0.0, 6.0, problem, free, prior, best)
-        whole, half = (
-            np.sqrt(np.diag(sampling_error(estimate, problem, free, prior, best, spacing))) for spacing in (1.0, 0.5)
-        )
+        fitted = flexible_fit(windows, PELICAN, prior_of(PELICAN), start, None)
+        estimate = reduced(0.0, 6.0, fitted)
+        whole, half = (np.sqrt(np.diag(sampling_error(estimate, fitted, spacing))) for spacing in (1.0, 0.5))
         assert (whole > 0.0).all()
         assert (whole / half >= 2.0**order * (1.0 - 1e-9)).all()
         assert (whole / half <= 4.0**order * (1.0 + 1e-9)).all()

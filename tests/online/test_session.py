@@ -11,7 +11,7 @@ import pytest
 from quadid.data.window import Sample
 from quadid.identification.fit import FitOptions, fit
 from quadid.online import FitReply, FitRequest, Phase, Session, SessionSettings, SetState
-from quadid.online.fault_isolation import ChangeReply
+from quadid.online.change_job import ChangeReply
 from quadid.online.gate import GateSettings
 from quadid.online.records import Action, OnlineSet, Publish
 from quadid.parameters import NOMINAL_NAMES

@@ -11,7 +11,7 @@ import pytest
 from quadid.data.window import Sample
 from quadid.online import FitReply, FitRequest, Phase, Session
 from quadid.online.background_diagnosis import DiagnosisReply, DiagnosisRequest
-from quadid.online.fault_isolation import ChangeReply, ChangeRequest
+from quadid.online.change_job import ChangeReply, ChangeRequest
 from quadid.online.records import Action, Job, JobReply, OnlineFinding
 from tests.faults.evidence import Happened
 from tests.online.driving import EPOCH, diagnosed, events, published

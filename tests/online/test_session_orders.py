@@ -8,7 +8,7 @@ import pytest
 
 from quadid.data.window import Sample
 from quadid.online import FitRequest, Phase, Session, SessionSettings, SetState
-from quadid.online.fault_isolation import ChangeRequest
+from quadid.online.change_job import ChangeRequest
 from quadid.online.gate import Decision
 from quadid.online.records import Event, Job
 from tests.online.driving import EPOCH, diagnosed, events, published
@@ -39,7 +39,7 @@ def test_after_a_set_waits_nobody_is_told_to_keep_flying(monkeypatch: pytest.Mon
     works(session, between(FLIGHT, 0.0, 10.7, EPOCH), tells())
     waiting = session.status().pending
     refusal = Decision(SetState.REJECTED, "agreement", "2 of 3 windows agree so far: keep flying")
-    monkeypatch.setattr("quadid.online.supervisor.decide", lambda case, settings: refusal)
+    monkeypatch.setattr("quadid.online.session.decide", lambda case, settings: refusal)
     works(session, between(FLIGHT, 10.7, 14.7, EPOCH), tells())
     status = session.status()
     assert (status.phase, status.pending) == (Phase.PENDING, waiting)

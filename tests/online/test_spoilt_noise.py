@@ -9,9 +9,9 @@ from quadid.data.grid import to_windows
 from quadid.data.window import Window
 from quadid.identification.noise import NoiseModel
 from quadid.model.layout import Layout
-from quadid.online.estimator import Estimator
+from quadid.online.fit_job import FitReply, FitRequest
+from quadid.online.fusion import Estimator
 from quadid.online.grid_buffer import WindowCut
-from quadid.online.window_fit import FitReply, FitRequest
 from quadid.parameters import NOMINAL_NAMES
 from quadid.vehicle import Vehicle
 from tests.online.driving import flight

@@ -10,9 +10,9 @@ from quadid.identification.noise import NoiseModel
 from quadid.identification.problem import Shooting
 from quadid.model.layout import Layout
 from quadid.online import SessionSettings
+from quadid.online.fit_job import FIT_SECONDS, FitRequest
 from quadid.online.grid_buffer import SHORTEST
-from quadid.online.window_fit import FIT_SECONDS, FitRequest
-from quadid.online.window_supervisor import LEAD
+from quadid.online.session import WARM_UP
 from quadid.parameters import NOMINAL_NAMES
 from quadid.vehicle import Vehicle
 from tests.online.driving import flight
@@ -28,7 +28,7 @@ def cut(seconds: float) -> Shooting:
     return Shooting.cut([flight(24.0).window.slice(0, rows)], PELICAN, FIT_SECONDS)
 
 
-@pytest.mark.parametrize(("seconds", "count"), [(SHORTEST, 1), (SETTINGS.window + LEAD + STEP, 6)])
+@pytest.mark.parametrize(("seconds", "count"), [(SHORTEST, 1), (SETTINGS.window + WARM_UP + STEP, 6)])
 def test_segments_fill_a_window_and_a_short_stretch_holds_one(seconds: float, count: int) -> None:
     shooting = cut(seconds)
     assert shooting.count == count

@@ -11,7 +11,7 @@ from quadid_replay import open_log, write_csv
 
 from quadid.checks import CheckResult, inspect
 from quadid.data.grid import to_windows
-from quadid.data.mounting import mounting_matrix
+from quadid.data.window import mounting_matrix
 from quadid.errors import LogError, VehicleError
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle

@@ -25,10 +25,9 @@ from scipy.stats import chi2
 from quadid.flight import Flight, draw_truth, fly
 from quadid.identification.noise import NoiseModel
 from quadid.model.layout import Layout, ThrustModel
-from quadid.online.change_detection import CHUNK, ChangeDetector, ChangePoint
-from quadid.online.change_supervisor import AFTER_CHANGE, ASK_FLYING
+from quadid.online.change_job import ChangePoint, ChangeRequest
+from quadid.online.changes import AFTER_CHANGE, ASK_FLYING, CHUNK, ChangeDetector
 from quadid.online.checks import judge
-from quadid.online.fault_isolation import ChangeRequest
 from quadid.online.grid_buffer import Rows, WindowCut
 from quadid.online.records import OnlineFinding
 from quadid.parameters import NOMINAL_NAMES

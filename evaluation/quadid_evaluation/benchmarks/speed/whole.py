@@ -21,7 +21,7 @@ from quadid.identification.particle_swarm import SwarmOptions
 from quadid.identification.problem import Shooting
 from quadid.identification.search import SWARM_SECONDS, Projected
 from quadid.model.layout import Layout
-from quadid.online.window_fit import FitRequest
+from quadid.online.fit_job import FitRequest
 from quadid.parameters import NOMINAL_NAMES
 from quadid.vehicle import Vehicle
 from quadid_evaluation.benchmarks.speed.flights import SEED, flight, logged

@@ -14,7 +14,6 @@ from quadid.identification.noise import NoiseModel
 from quadid.identification.problem import Prior, Shooting, posterior_covariance
 from quadid.model import layout as ix
 from quadid.model.layout import LOSS, Layout, ThrustModel
-from quadid.online.change_detection import ChangePoint
 from quadid.online.records import Job, JobReply, OnlineAlternative, OnlineFinding
 from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray
@@ -22,20 +21,27 @@ from quadid.vehicle import GRAVITY
 
 SEGMENT = 0.5
 """Length of the shooting segments [s]."""
-HELD = 0.01
-"""Nominal parameters may differ this much (log scale) from what was known before the change,"""
-HELD_THRUST = 0.003
-"""... the thrust coefficient only this much."""
-LOADED = 0.05
-"""... and inertias this much where mass was taken up."""
-PENALTY = 2.0
-"""Deviance that a free number has to earn (Akaike)."""
 CLEAR = 12.0
 """Deviance by which a cause must beat its look-alikes to be named with confidence."""
 PULL = "steady_pull"
 """Not an effect of a vehicle: what holds or draws it, such as a line; in the finding as a force downwards [N]."""
-EFFECT_SIGMA = 0.3
-"""Prior of the size of a sudden change."""
+
+
+@dataclass(frozen=True)
+class ChangePoint:
+    """A step in what the rotors explain (`quadid.online.changes`).
+
+    Attributes:
+        time: when [s]; to a row in thrust, to half a second in a moment.
+        channel: thrust, roll moment or pitch moment.
+        size: share of thrust (log), or moment over half the hover moment of one side.
+        errors: its size in standard errors.
+    """
+
+    time: float
+    channel: str
+    size: float
+    errors: float
 
 
 @dataclass(frozen=True)
@@ -54,8 +60,8 @@ class ChangeRequest(Job):
     Attributes:
         theta: full vector known before; z_sigma: standard deviations of its nominal entries, log scale, shape (6,).
         noise: sensor noise.
-        change: what was seen, at session time.
-        time: when, refined; in the time of the stream's stamps [s].
+        change: what was seen.
+        time: when; in the time of the stream's stamps [s].
         speed: of each rotor before the change [rad/s], shape (rotors,), where effects were fitted along; else None.
     """
 
@@ -178,7 +184,8 @@ def _without_idle(outcomes: list[_Outcome]) -> list[_Outcome]:
             set(o.cause.names) < mine and o.deviance < outcome.deviance + CLEAR * max(o.mse, 1.0) for o in outcomes
         )
 
-    return sorted((o for o in outcomes if not idle(o)), key=lambda o: o.deviance + PENALTY * len(o.cause.names))
+    # A free number has to earn a deviance of 2 (Akaike).
+    return sorted((o for o in outcomes if not idle(o)), key=lambda o: o.deviance + 2.0 * len(o.cause.names))
 
 
 def _fit(shooting: Shooting, request: ChangeRequest, cause: _Cause, states: InitialStates | None = None) -> _Outcome:
@@ -187,12 +194,14 @@ def _fit(shooting: Shooting, request: ChangeRequest, cause: _Cause, states: Init
     theta[[ix.MASS_TIME, ix.DROP_TIME]] = -NEVER
     place = free.index[len(NOMINAL_NAMES) :]
     theta[place] += cause.start
-    known = np.hypot(request.z_sigma, HELD)
-    known[0] = np.hypot(request.z_sigma[0], HELD_THRUST)
+    # Nominal parameters may differ by 1 % from what was known before the change, b by less.
+    known = np.hypot(request.z_sigma, 0.01)
+    known[0] = np.hypot(request.z_sigma[0], 0.003)
     if cause.effect == "mass_change":
         loaded = [NOMINAL_NAMES.index(n) for n in ("J_xx", "J_yy", "J_zz")]
-        known[loaded] = np.hypot(request.z_sigma[loaded], LOADED)
-    width = EFFECT_SIGMA / free.scale[len(NOMINAL_NAMES) :] * (GRAVITY if cause.effect == PULL else 1.0)
+        # A mass that was taken up changes inertias, too.
+        known[loaded] = np.hypot(request.z_sigma[loaded], 0.05)
+    width = 0.3 / free.scale[len(NOMINAL_NAMES) :] * (GRAVITY if cause.effect == PULL else 1.0)
     if "cg_offset.x" in cause.names:
         width[-2:] = 20.0
     prior = Prior(

@@ -1,0 +1,398 @@
+"""Sudden changes, seen within seconds: effective thrust per weight, and roll and pitch moments that nothing commands.
+
+Every half second gives three numbers that need no fit: the specific force per sum of squared rotor speeds (its level is
+b / m), and the roll and pitch acceleration that the rotors do not explain.  A step in one of them is found by comparing
+means before and after every moment of the last seconds (generalised likelihood ratio for a step in a mean of unknown
+time: Basseville and Nikiforov, *Detection of Abrupt Changes*, 1993, ch. 2.4).
+
+All three also change with how the vehicle flies: thrust with rotor speed (thrust curve), climb (inflow, drag) and
+sideways speed, moments with what is commanded (b / J is not known exactly), rate and sideways speed.  A step is what
+these do not explain.  To first order in each effect of the catalogue (`quadid.model.equations`), with omega_h the hover
+speed, N rotors, f the specific force along -z, u, v, w the velocity in body axes, and M the roll moment by b omega^2
+(pitch alike, with u):
+
+    log(f / sum omega^2) = const - 2 dead_speed sum omega / sum omega^2     thrust_curve
+                           + k_z w sum omega / (N omega_h f)                axial_inflow: w < 0 in climb
+                           + k (u^2 + v^2) / f                              translational_lift
+                           + c_z |(u, v, w)| w / f                          parasitic_drag
+    p' - M / J_xx        = const + error(b / J_xx) M                        what is known of b and J
+                           - l_p p                                          rate_damping
+                           - k_y h m v / J_xx                               rotor_drag h above the centre of gravity
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Generator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from quadid.data.resample import median
+from quadid.model.layout import Layout
+from quadid.online.change_job import ChangePoint, ChangeRequest
+from quadid.online.checks import Quality, judge
+from quadid.online.fusion import DRIFT, Estimator
+from quadid.online.grid_buffer import GridBuffer, Rows
+from quadid.rotation import conjugate, rotated
+from quadid.types import BoolArray, FloatArray
+from quadid.vehicle import GRAVITY, Vehicle
+
+CHUNK = 0.5
+"""Time that gives one set of numbers [s]."""
+BASELINE = 40.0
+"""Time before a change that it is compared with, at most [s]; at least a fifth of it."""
+LOOK_BACK = 4.0
+"""A change is looked for in this much past [s]."""
+AFTER = 3
+"""Chunks after a change before it is believed."""
+SIGNIFICANT = 7.0
+"""Standard errors by which the means must differ."""
+LEAST = 0.03
+"""Smallest step worth a word: share of thrust; roll and pitch moment over what losing half the thrust would give."""
+ASTRAY = 0.5
+"""Standard deviation, an axis, of a velocity that was integrated [m/s]."""
+SETTLED = 0.01
+"""A reweighted regression is done when no coefficient moves by more than this share of its standard deviation,"""
+MOST_ROUNDS = 50
+"""... or after so many fits."""
+AFTER_CHANGE = 3.0
+"""Data that a change is explained from [s]."""
+ASK_FLYING = 2.2
+"""Flight judged before a change is looked for [s]."""
+CONFIRMED = 2
+"""Windows without a common sample that must agree before moments are judged."""
+_EPS = 1e-6
+
+
+# --- How a vehicle flies, as regressors of what a change is looked for in, and a step beside them
+
+
+class Velocity:
+    """Velocity of a vehicle, as well as it is known: measured, or integrated from the specific force.
+
+    Attributes:
+        sigma: standard deviation of the newest rows, an axis [m/s].
+    """
+
+    def __init__(self) -> None:
+        """Stands still."""
+        self._at, self.sigma = np.zeros(3), ASTRAY
+
+    def body(self, rows: Rows) -> FloatArray:
+        """Velocity in body axes [m/s] of the next rows, shape (n, 3); zero where no attitude says what is up."""
+        q, force = rows.columns.get("attitude"), rows.columns["accel"]
+        if q is None or len(rows.t) < 2:
+            return np.zeros_like(force)
+        step, known = float(rows.t[1] - rows.t[0]), np.isfinite(q).all(axis=1)
+        q = q[np.maximum.accumulate(np.where(known, np.arange(len(q)), np.argmax(known)))]
+        gain = np.nan_to_num(rotated(q, force) + [0.0, 0.0, GRAVITY]) * step
+        gained = np.cumsum(gain, axis=0) - 0.5 * gain
+        # What nobody measures is integrated, and forgotten within 40 s.
+        start = self._at * math.exp(-step * len(rows.t) / 40.0)
+        measured, self.sigma = rows.columns.get("velocity"), ASTRAY
+        if measured is not None and (here := np.isfinite(measured).all(axis=1)).any():
+            start, self.sigma = np.mean(measured[here] - gained[here], axis=0), 0.0
+        self._at = start + gain.sum(axis=0)
+        return np.nan_to_num(rotated(conjugate(q), start + gained))
+
+
+class FlightState:
+    """Regressors of one vehicle.
+
+    Attributes:
+        typical: standard deviations of the coefficients of thrust before any data, shape (4,).
+        typical_moment: of those of a moment but the first, shape (2,).
+    """
+
+    def __init__(self, vehicle: Vehicle) -> None:
+        """Sizes are those of the table of effects, for `vehicle`."""
+        layout, self._hover = Layout(vehicle), vehicle.hover_speed()
+        dead, inflow, lift, drag, damping, along, high = (
+            layout.entry(n).typical
+            for n in ("thrust_curve.dead_speed", "axial_inflow.k_z", "translational_lift.k",
+                      "parasitic_drag.beside_z", "rate_damping.l_p", "rotor_drag.k_x", "rotor_drag_moment.h_x")
+        )  # fmt: skip
+        self.typical = np.array([2.0 * dead, inflow, lift, drag])
+        self.typical_moment = np.array([damping, along * high * vehicle.mass])
+
+    def thrust(self, speed: FloatArray, velocity: FloatArray, lift: float) -> FloatArray:
+        """Regressors of log thrust per squared speed over one stretch, shape (4,).
+
+        Args:
+            speed: rotor speeds [rad/s], shape (n, rotors).
+            velocity: in body axes [m/s], shape (n, 3).
+            lift: mean specific force along -z [m/s^2].
+        """
+        total, square = speed.sum(axis=1), (speed**2).sum(axis=1)
+        flat, w = velocity[:, 0] ** 2 + velocity[:, 1] ** 2, velocity[:, 2]
+        return np.array(
+            [
+                -total.mean() / square.mean(),
+                np.mean(w * total) / (speed.shape[1] * self._hover * lift),
+                flat.mean() / lift,
+                np.mean(np.sqrt(flat + w * w) * w) / lift,
+            ]
+        )
+
+
+def step_beside(
+    y: FloatArray, x: FloatArray, typical: FloatArray, split: int, least: float, astray: FloatArray | None = None
+) -> tuple[float, float]:  # fmt: skip
+    """Step of `y` at `split` beside what regressors explain: its size in standard errors, and the step.
+
+    The coefficients are zero to within their typical sizes, or what the values before the step say; their uncertainty
+    counts as that of the step.  Every value after it must lie on the same side.
+
+    Args:
+        y: series, shape (n,).
+        x: its regressors, shape (n, k).
+        typical: standard deviations of their coefficients before any data, shape (k,).
+        split: index of the first value after the step.
+        least: smallest step; a smaller one counts as none.  No value is trusted to better than a fifth of it, because
+            what no regressor describes does not average out.
+        astray: ways in which the regressors may all be off together, each by one standard deviation, shape (n, m, k).
+    """
+    slope, centre, covariance, spread = _reweighted(y[:split], x[:split], typical, least / 5.0)
+    left, far = y - x @ slope, x[split:].mean(axis=0) - centre
+    left -= median(left[:split])
+    size, count = median(left[split:]), len(y) - split
+    if abs(size) < least or not np.all(np.sign(size) * left[split:] > 2.0 * spread):
+        return 0.0, size
+    # What no regressor describes lasts: means over as long a time scatter by more than single values would have it.
+    means = np.convolve(left[:split], np.full(count, 1.0 / count), "valid")
+    scatter = max(1.4826 * median(np.abs(means)), spread / math.sqrt(count))
+    variance = 1.25**2 * (scatter**2 + spread**2 / split) + far @ covariance @ far
+    if astray is not None:
+        variance += float(np.sum((astray[split:].mean(axis=0) @ slope) ** 2))
+    return abs(size) / math.sqrt(variance), size
+
+
+def _reweighted(
+    y: FloatArray, x: FloatArray, typical: FloatArray, least: float
+) -> tuple[FloatArray, FloatArray, FloatArray, float]:
+    """Regression with an intercept in which outliers count for next to nothing (Cauchy), however they lie.
+
+    It begins with all values counting alike, and goes on until it has settled.  Begun at zero slope, where most values
+    are of one state, as in a long climb, all others would be outliers, and what is left of that looks like a step.
+
+    Returns:
+        Coefficients, shape (k,), weighted mean of the regressors, shape (k,), covariance (k, k), and scatter of the
+        residuals, no less than `least`.
+    """
+    slope, weight = np.zeros(x.shape[1]), np.ones(len(y))
+    for done in range(MOST_ROUNDS):
+        left = y - x @ slope
+        left -= median(left)
+        spread = max(1.4826 * median(np.abs(left)), least)
+        centre = weight @ x / weight.sum()
+        weighted = (x - centre).T * (weight / spread**2)
+        covariance = np.linalg.inv(weighted @ (x - centre) + np.diag(typical**-2.0))
+        before, slope = slope, covariance @ (weighted @ y)
+        if done and np.all(np.abs(slope - before) <= SETTLED * np.sqrt(np.diag(covariance))):
+            break
+        left = y - x @ slope
+        weight = 1.0 / (1.0 + ((left - median(left)) / (2.0 * spread)) ** 2)
+    return slope, centre, covariance, spread
+
+
+# --- Numbers every half second, and the strongest step in them
+
+
+CHANNELS = ("thrust", "roll moment", "pitch moment")
+"""What may step."""
+_Series = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
+"""Values, regressors, typical sizes of their coefficients, how regressors may be off (`step_beside`)."""
+
+
+@dataclass(frozen=True)
+class _Chunk:
+    """Means over one chunk: time [s], log thrust per squared speed, its regressors; by roll and pitch the rest.
+
+    `astray`: change of the regressors of thrust by a standard deviation of each axis of velocity, shape (3, 4);
+    `sigma`: that deviation [m/s].
+    """
+
+    t: float
+    thrust: float
+    state: FloatArray
+    acceleration: FloatArray
+    moment: FloatArray
+    gyroscopic: FloatArray
+    rate: FloatArray
+    across: FloatArray
+    astray: FloatArray
+    sigma: float
+
+
+class ChangeDetector:
+    """Finds steps in the rows of one flight."""
+
+    def __init__(self, vehicle: Vehicle) -> None:
+        """Watches flights of `vehicle`."""
+        self._vehicle = vehicle
+        self._arms = vehicle.torque_arms[:, :2]
+        self._state = FlightState(vehicle)
+        self._velocity = Velocity()
+        self._chunks: deque[_Chunk] = deque(maxlen=round((BASELINE + LOOK_BACK) / CHUNK))
+
+    def restart(self) -> None:
+        """Forgets the past: a change was dealt with, or the flight was interrupted."""
+        self._chunks.clear()
+        self._velocity = Velocity()
+
+    def add(self, rows: Rows | None) -> None:
+        """Takes the rows of one chunk; an incomplete one restarts the watch."""
+        chunk = None if rows is None else self._chunk(rows)
+        if chunk is None:
+            self.restart()
+        else:
+            self._chunks.append(chunk)
+
+    def _chunk(self, rows: Rows) -> _Chunk | None:
+        gyro, accel = rows.columns.get("gyro"), rows.columns.get("accel")
+        if gyro is None or accel is None or rows.fresh:
+            return None
+        speed = rows.columns["rotor_speed"]
+        square, velocity = speed**2, self._velocity.body(rows)
+        step = float(rows.t[1] - rows.t[0]) if len(rows.t) > 1 else 0.0
+        if len(rows.t) < 4 or abs(step * len(rows.t) - CHUNK) > 1.5 * step:
+            return None
+        force = -accel[:, 2]
+        good: BoolArray = np.isfinite(force) & np.isfinite(square).all(axis=1)
+        rate: BoolArray = np.asarray(np.isfinite(gyro).all(axis=1))
+        if np.count_nonzero(good) < 0.7 * len(good) or np.count_nonzero(rate) < 0.7 * len(rate):
+            return None
+        lift, total = float(force[good].mean()), float(square[good].sum(axis=1).mean())
+        if not (lift > 0.0 and total > 0.0):
+            return None
+        t = rows.t - rows.t.mean()
+        slope = (t[rate] @ (gyro[rate, :2] - gyro[rate, :2].mean(axis=0))) / (t[rate] @ t[rate])
+        # The slope of the rate weighs the acceleration with a parabola; the moments must be weighed alike.
+        weight = np.maximum((t[-1] + 0.5 * step) ** 2 - t**2, 0.0) * good
+        weight /= weight.sum()
+        moment = weight @ np.where(good[:, None], square @ self._arms, 0.0)
+        p, q, r = gyro[rate].T
+        state, sigma = self._state.thrust(speed[good], velocity[good], lift), self._velocity.sigma
+        axes = sigma * np.eye(3)
+        astray = [self._state.thrust(speed[good], velocity[good] + axis, lift) - state for axis in axes]
+        return _Chunk(
+            float(rows.t.mean()), float(np.log(lift / total)), state, np.asarray(slope), np.asarray(moment),
+            np.array([np.mean(q * r), np.mean(p * r)]), gyro[rate, :2].mean(axis=0), velocity[:, 1::-1].mean(axis=0),
+            np.array(astray), sigma,
+        )  # fmt: skip
+
+    def look(self, b: float, inertia: FloatArray, doubt: FloatArray | None) -> ChangePoint | None:
+        """The strongest significant step of the last seconds, or None.
+
+        Args:
+            b: thrust coefficient [N s^2/rad^2].
+            inertia: J_xx, J_yy, J_zz [kg m^2].
+            doubt: standard deviations of log(b / J_xx) and log(b / J_yy); None: nothing is known of them, and moments
+                are not judged.
+        """
+        if len(self._chunks) < BASELINE / 5.0 / CHUNK + AFTER:
+            return None
+        t = np.array([c.t for c in self._chunks])
+        seen = [self._thrust()]
+        if doubt is not None:
+            seen += [self._moment(axis, b, inertia, float(doubt[axis])) for axis in (0, 1)]
+        first = max(len(t) - round(LOOK_BACK / CHUNK), round(BASELINE / 5.0 / CHUNK))
+        best: ChangePoint | None = None
+        for split in range(first, len(t) - AFTER + 1):
+            for name, (y, x, typical, astray) in zip(CHANNELS, seen, strict=False):
+                errors, size = step_beside(y, x, typical, split, LEAST, astray)
+                if errors > SIGNIFICANT and (best is None or errors > best.errors):
+                    best = ChangePoint(float(t[split]) - 0.5 * CHUNK, name, size, errors)
+        return best
+
+    def _thrust(self) -> _Series:
+        y, x = np.array([c.thrust for c in self._chunks]), np.array([c.state for c in self._chunks])
+        return y, x, self._state.typical, np.array([c.astray for c in self._chunks])
+
+    def _moment(self, axis: int, b: float, inertia: FloatArray, doubt: float) -> _Series:
+        """Roll (0) or pitch (1) acceleration that the rotors do not explain, over half the hover moment of one side."""
+        j = inertia[axis]
+        # No body couples its axes more than this (triangle inequality), whatever is guessed of its yaw inertia.
+        couple = float(np.clip((inertia[2] - inertia[1], inertia[0] - inertia[2])[axis] / j, -1.0, 1.0))
+        half = float(np.abs(self._arms[:, axis]).sum()) * 0.25 * b * self._vehicle.hover_speed(b) ** 2 / j
+        chunks = self._chunks
+        moment = b / j * np.array([c.moment[axis] for c in chunks])
+        y = np.array([c.acceleration[axis] + couple * c.gyroscopic[axis] for c in chunks]) - moment
+        beside = [(c.rate[axis], c.across[axis] / j, c.gyroscopic[axis]) for c in chunks]
+        x = np.column_stack([moment, beside])
+        astray = np.zeros((len(chunks), 1, 4))
+        astray[:, 0, 2] = [c.sigma / j / half for c in chunks]
+        return y / half, x / half, np.array([doubt, *self._state.typical_moment, 1.0]), astray
+
+
+# --- When a change is looked for, and what is asked once it was seen
+
+
+class ChangeWatch:
+    """Watches one vehicle for sudden changes.
+
+    Attributes:
+        seen: the change that is being looked into, or None.
+    """
+
+    def __init__(self, vehicle: Vehicle, rows: GridBuffer) -> None:
+        """Watches `rows`, which are of `vehicle`."""
+        self._vehicle, self._rows = vehicle, rows
+        self._detector = ChangeDetector(vehicle)
+        self._carried = 0.0
+        self.seen: ChangePoint | None = None
+
+    def restart(self) -> None:
+        """Begins anew: the stream was interrupted, or a change was dealt with."""
+        self._detector.restart()
+        self.seen = None
+
+    def look(self, tick: float, length: float, estimator: Estimator) -> Generator[None, None, ChangePoint | None]:
+        """Takes in the last `length` [s] of rows before `tick` [s], piece by piece; returns a change seen just now."""
+        for i in reversed(range(round(length / CHUNK))):
+            self._detector.add(self._rows.span(tick - (i + 1) * CHUNK - _EPS, tick - i * CHUNK - _EPS))
+        if self.seen is not None:
+            return None
+        yield
+        recent = self._rows.cut(tick - ASK_FLYING, tick - _EPS)
+        yield
+        quality = judge(recent, self._vehicle, estimator.thrust, estimator.learned)
+        # A load taken up or dropped in hover looks like a floor while the step is in what is judged, and no longer.
+        self._carried = self._carried + length if quality.carried else 0.0
+        if recent.reason or (quality != Quality() and not 0.0 < self._carried <= ASK_FLYING):
+            self._detector.restart()
+            return None
+        if quality.carried:
+            return None
+        yield
+        inertia = np.array([estimator.value(n) for n in ("J_xx", "J_yy", "J_zz")])
+        # One window may have moved too little for its own interval to be right: another has to say the same.
+        known = estimator.learned and estimator.fusion.agreement(CONFIRMED)[0] == CONFIRMED
+        doubt = np.hypot(DRIFT, estimator.torque_sigma) if known else None
+        step = self._detector.look(estimator.value("b"), inertia, doubt)
+        if step is not None and step.channel == "thrust":
+            step = replace(step, time=self._rows.onset(step.time))
+        self.seen = step
+        return step
+
+    def ask(self, number: int, tick: float, estimator: Estimator, stamp: float) -> ChangeRequest | None:
+        """The question what the change was that is `seen`, once there is enough data after it.
+
+        Args:
+            number: of the request.
+            tick: now [s].
+            estimator: what was known before.
+            stamp: time of the change as a stamp [s].
+        """
+        if self.seen is None or tick < self.seen.time + AFTER_CHANGE - _EPS:
+            return None
+        at = self.seen.time
+        cut = self._rows.cut(at + 0.1, tick - _EPS)
+        before = self._rows.span(at - ASK_FLYING, at - 0.1) if estimator.flexible else None
+        speed = None if before is None else np.sqrt(np.nanmean(before.columns["rotor_speed"] ** 2, axis=0))
+        return ChangeRequest(
+            number, estimator.model, cut.windows, at, tick, estimator.theta, estimator.z_sigma,
+            estimator.noise_of(cut.windows), self.seen, stamp, speed,
+        )  # fmt: skip
