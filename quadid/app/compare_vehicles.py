@@ -5,24 +5,24 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Annotated, Any
 
 import numpy as np
+import typer
 
-from quadid.app.logs import Given, Log, as_vehicle, fitted_before, listed, read
+from quadid.app.logs import Given, Log, as_vehicle, fitted_before, listed, load_vehicle, read
+from quadid.app.options import Described, Horizons, OwnRate, Seed, Typed
 from quadid.app.outcome import LIBRARY, Reported, provenance
 from quadid.app.score import HORIZONS, ahead
 from quadid.chi_square import Z95
 from quadid.errors import LogError
 from quadid.identification.predict import QUANTITIES, start_errors
 from quadid.parameters import NOMINAL_UNITS
-from quadid.report.verdict import Verdict
+from quadid.report.page import axis, figure, level, section, trace
+from quadid.report.tables import Column, TextTable, number
+from quadid.report.verdict import Verdict, percent
 from quadid.types import FloatArray, Json
 from quadid.vehicle import Vehicle
-
-if TYPE_CHECKING:
-    from quadid.report.tables import TextTable
 
 BLOCK = 1.0
 """Least length of a block of starts that is drawn as one [s]: runs that overlap err alike."""
@@ -46,15 +46,53 @@ class Compared(Reported):
     @property
     def verdict(self) -> Verdict:
         """Which predicts better, and by how much."""
-        from quadid.report.compare_page import compare_verdict
-
-        return compare_verdict(self.result)
+        result = self.result
+        low, high = result["ci95"]
+        span = f"Ratio of errors B / A {number(result['ratio'], 3)}, 95 % {number(low, 3)} to {number(high, 3)}"
+        names = {"a": f"A ({result['a']})", "b": f"B ({result['b']})"}
+        details = (f"{span}, over all quantities after {result['after']} samples.",)
+        if result["better"] == "neither":
+            return Verdict("fair", "Neither file predicts better on these flights", details, ())
+        better, worse = (names[k] for k in (("b", "a") if result["better"] == "b" else ("a", "b")))
+        share = abs(1.0 - (result["ratio"] if result["better"] == "b" else 1.0 / result["ratio"]))
+        return Verdict("good", f"{better} predicts better than {worse}, by {percent(share)}", details, ())
 
     def tables(self) -> list[TextTable]:
-        """Errors after every horizon, and parameters side by side."""
-        from quadid.report.compare_page import compare_tables
-
-        return compare_tables(self.result)
+        """Errors after every horizon, parameters and effects side by side."""
+        result = self.result
+        columns = (
+            Column("after", right=True), Column("quantity"), Column("A", right=True), Column("B", right=True),
+            Column("B / A", right=True), Column("95 % interval", right=True, rank=1),
+        )  # fmt: skip
+        rows = tuple(
+            (
+                after, f"{name} [{result['units'][name]}]", number(e["a"]), number(e["b"]), number(e["ratio"], 3),
+                " .. ".join(number(v, 3) for v in e["ci95"]),
+            )
+            for after, errors in result["horizons"].items() for name, e in errors.items()
+        )  # fmt: skip
+        title = (
+            f"Mean open-loop error of A ({result['a']}) and B ({result['b']}) after n samples, {result['samples']} "
+            f"runs in {result['blocks']} blocks"
+        )
+        out = [TextTable(title, columns, rows)]
+        sides = (
+            Column("parameter"), Column("A", right=True), Column("A, 95 %", right=True, rank=2),
+            Column("B", right=True), Column("B, 95 %", right=True, rank=2), Column("apart [sigma]", right=True),
+            Column("unit", rank=1),
+        )  # fmt: skip
+        ends = [
+            [" .. ".join(number(v) for v in p[k]) if p[k] else "a guess" for k in ("a_ci95", "b_ci95")]
+            for p in result["parameters"]
+        ]
+        values = tuple(
+            (p["name"], number(p["a"]), one, number(p["b"]), two, number(p["apart"], 2), p["unit"])
+            for p, (one, two) in zip(result["parameters"], ends, strict=True)
+        )
+        out.append(TextTable("Parameters side by side", sides, values))
+        heads = (Column("effect"), Column("number"), Column("A", right=True), Column("B", right=True))
+        numbers = tuple((e["effect"], e["name"], number(e["a"]), number(e["b"])) for e in result["effects"])
+        return [*out, TextTable("Effects side by side", heads, numbers)] if numbers else out
 
     def records(self) -> list[dict[str, Any]]:
         """One row a horizon and quantity."""
@@ -66,15 +104,43 @@ class Compared(Reported):
 
     def page(self, command: str = LIBRARY) -> str:
         """One page: errors, ratios with intervals, parameters."""
-        from quadid.report.compare_page import compare_page
-        from quadid.report.page import render
-
-        return render(compare_page(self.result, provenance(self.logs, command)))
+        result = self.result
+        errors, *rest = self.tables()
+        after = np.array([float(h) for h in result["horizons"]])
+        data = []
+        for role, name in zip(("measured", "before", "after", "truth"), result["units"], strict=True):
+            found = [result["horizons"][h][name] for h in result["horizons"]]
+            for key, edge in (("ratio", ""), (0, ", 95 %"), (1, ", 95 %")):
+                values = [e["ratio"] if key == "ratio" else e["ci95"][key] for e in found]
+                y = np.array([np.nan if v is None else v for v in values], dtype=np.float64)
+                if np.isfinite(y).any():
+                    more = {"line": {"dash": "dot"}, "showlegend": False} if edge else {"mode": "lines+markers"}
+                    data.append(trace(role, name + edge, after, y, **more))
+        layout = {
+            "xaxis": axis("samples after the start"), "yaxis": axis("error of B over that of A"), "shapes": [level(1.0)]
+        }  # fmt: skip
+        caption = "below 1: B predicts better; dotted: 95 % interval"
+        ratios = figure("ratios", "Errors of B over those of A", data, layout, 320, caption=caption)
+        sections = [
+            section("errors", "Errors", errors.title, [ratios], [errors.part()]),
+            *(section(f"side-{i}", t.title, "", tables=[t.part()]) for i, t in enumerate(rest)),
+        ]
+        title = f"{result['a']} and {result['b']} on the same flights"
+        return self.rendered(title, ", ".join(result["logs"]), sections, provenance(self.logs, command))
 
 
 def compare_vehicles(
-    a: str | Path | Vehicle, b: str | Path | Vehicle, on: Given, *, horizons: str | Sequence[int | str] = HORIZONS,
-    rate: float | None = None, seed: int = 0,
+    a: Annotated[
+        Described, Typed(str, typer.Argument(metavar="A", help="A shipped vehicle or a YAML file."), ..., load_vehicle)
+    ],
+    b: Annotated[Described, Typed(str, typer.Argument(metavar="B", help="The other one."), ..., load_vehicle)],
+    on: Annotated[
+        Given,
+        Typed(
+            list[str], typer.Option("--on", metavar="LOG", help="A flight to predict; repeatable."), ..., opened=True
+        ),
+    ],
+    *, horizons: Horizons = HORIZONS, rate: OwnRate = None, seed: Seed = 0,
 ) -> Compared:  # fmt: skip
     """Predicts the same flights with two vehicle files, from the same starts.
 

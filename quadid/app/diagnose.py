@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from quadid.app.identify import OPTIMIZERS, check_seed, out_of_reach, proven, search
-from quadid.app.logs import Given, Log, file_name, settled
+from quadid.app.logs import Log, file_name, settled
 from quadid.app.missing import Beside, MissingForces, missing_forces
+from quadid.app.options import Logs, OfVehicle, Seed, Validate
 from quadid.app.outcome import LIBRARY, NUMBER_COLUMNS, Advance, Fitted, number_rows, provenance, quality, silent
 from quadid.effects import EFFECTS
 from quadid.model.layout import Layout, with_reference_voltage
 from quadid.parameters import INERTIAS, Status, unreliable
-from quadid.report.verdict import Verdict
-from quadid.types import FloatArray
+from quadid.report.page import render
+from quadid.report.tables import Cell, Column, TextTable, number, parameter_table
+from quadid.report.verdict import Verdict, digits
+from quadid.types import FloatArray, Json
 from quadid.vehicle import Vehicle
 
 if TYPE_CHECKING:
@@ -25,7 +27,6 @@ if TYPE_CHECKING:
     from quadid.identification.noise import NoiseModel
     from quadid.identification.result import ScoredSet
     from quadid.report.residual_maps import ResidualMap
-    from quadid.report.tables import TextTable
 
 
 LEAST_REMOVED = 0.3
@@ -45,6 +46,7 @@ class Diagnosed(Fitted):
         search: how the causes were selected.
     """
 
+    title = "Diagnosis"
     result: dict[str, Any]
     found: Diagnosis
     sets: list[ScoredSet]
@@ -79,8 +81,6 @@ class Diagnosed(Fitted):
 
     def tables(self) -> list[TextTable]:
         """The findings, then the parameters beside them."""
-        from quadid.report.tables import finding_table, parameter_table
-
         findings, parameters = self.result["findings"], self.result.get("parameters")
         return [
             *([finding_table(findings)] if findings else []),
@@ -108,7 +108,6 @@ class Diagnosed(Fitted):
     def page(self, command: str = LIBRARY) -> str:
         """The page: findings with their pictures, parameters, residuals."""
         from quadid.report.fit_pages import diagnose_page
-        from quadid.report.page import render
 
         rows = provenance(self.logs, command) + [
             {"name": "seed", "value": str(self.result["seed"])},
@@ -134,8 +133,7 @@ class Diagnosed(Fitted):
 
 
 def diagnose(
-    logs: Given, validate: Given = (), *, vehicle: str | Path | Vehicle | None = None, seed: int = 1,
-    advance: Advance = silent,
+    logs: Logs, validate: Validate = (), *, vehicle: OfVehicle = None, seed: Seed = 1, advance: Advance = silent,
 ) -> Diagnosed:  # fmt: skip
     """Names what the simulation gets wrong, extends the model by it, and measures the gain on unseen data.
 
@@ -238,3 +236,39 @@ def _within_reach(found: Diagnosis, unreachable: Mapping[str, str]) -> Diagnosis
     told += [f"{name} is not named with confidence: {unreachable[INERTIAS[0]]}" for name in dict.fromkeys(late)]
     findings = tuple(replace(f, confident=f.confident and f.effect not in late) for f in found.findings)
     return replace(found, findings=findings, parameters=parameters, warnings=(*found.warnings, *told))
+
+
+def finding_table(findings: Sequence[Json]) -> TextTable:
+    """Every named cause with its numbers, what it gains on unseen data, and the closest rejected alternative."""
+    columns = (
+        Column("cause"), Column("value"), Column("without", right=True), Column("with", right=True),
+        Column("95 % interval", rank=2), Column("rejected alternative", rank=1),
+    )  # fmt: skip
+    rows = [row for finding in findings for row in _finding_rows(finding)]
+    runs = ", ".join(dict.fromkeys(f"{f['gain']['seconds']:g} s" for f in findings))
+    title = f"What the simulation gets wrong (error of {runs} runs in noise variances, 1 = noise floor)"
+    return TextTable(title, columns, tuple(rows))
+
+
+def _finding_rows(finding: Json) -> list[tuple[str | Cell, ...]]:
+    rival = min(finding["alternatives"], key=lambda a: a["mse_after"], default=None)
+    gain = finding["gain"]
+    first: list[str | Cell] = [
+        Cell(finding["effect"].replace("_", " "), "" if finding["confident"] else "fair"),
+        number(gain["mse_before"], 3),
+        number(gain["mse_after"], 3),
+        f"{rival['effect'].replace('_', ' ')} ({number(rival['mse_after'], 3)})" if rival else "",
+    ]  # fmt: skip
+    rows: list[tuple[str | Cell, ...]] = []
+    for p in finding["parameters"]:
+        name, before, after, other = first if not rows else ["", "", "", ""]
+        rows.append((name, *_finding_value(p, before, after), other))
+    return rows
+
+
+def _finding_value(p: Json, before: str | Cell, after: str | Cell) -> tuple[str | Cell, ...]:
+    low, high = p["ci95"] or (None, None)
+    if p["name"] == "rotor":
+        return f"rotor {p['value']:.0f}", before, after, ""
+    value = f"{p['name']} = {number(p['value'], digits(p))} {p['unit']}".rstrip()
+    return value, before, after, f"{number(low, digits(p))} .. {number(high, digits(p))}"

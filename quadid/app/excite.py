@@ -5,25 +5,32 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
+from itertools import groupby
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
+import typer
 
 from quadid.app.identify import check_seed, search
-from quadid.app.logs import Given, as_vehicle, file_name, read, write_text
-from quadid.app.outcome import Advance, silent
+from quadid.app.logs import Given, Log, as_vehicle, file_name, load_vehicle, read, write_text
+from quadid.app.options import VEHICLE, Described, Seed, Typed
+from quadid.app.outcome import LIBRARY, Advance, Reported, provenance, silent
 from quadid.data.window import Window
 from quadid.errors import ParameterError
 from quadid.parameters import NOMINAL_NAMES
-from quadid.types import FloatArray
+from quadid.report.manoeuvres import Plan, check_form, half_width, written_as
+from quadid.report.page import axis, figure, rows_of, section, trace
+from quadid.report.tables import Cell, Column, TextTable
+from quadid.report.verdict import Verdict
+from quadid.rotation import euler
+from quadid.types import FloatArray, Json
 from quadid.vehicle import Vehicle
 
 if TYPE_CHECKING:
     from quadid.experiment import Proposal
     from quadid.flight import Segment
     from quadid.identification.fit import Fit
-    from quadid.report.manoeuvres import Plan
 
 MOST_SECONDS = 600.0
 _HEIGHTS = "LOWEST:HIGHEST in m above take-off, 2 to 500"
@@ -32,27 +39,136 @@ ABORT = 1.4
 ROOM = 2.0
 """Room around the start that a script allows, in that of the simulation, and at least `LEAST_ROOM`: wind blows."""
 LEAST_ROOM = 10.0
+LEAST_GAIN = 1.1
+"""Narrower than after a gentle flight by less than this factor, an interval is not worth a manoeuvre."""
 HOVER_THROTTLE = 0.35
 """Share of full throttle at hover where the vehicle file does not know: what ArduPilot begins with (MOT_THST_HOVER)."""
 
 
-@dataclass(frozen=True)
-class Proposed:
+@dataclass(frozen=True, repr=False)
+class Proposed(Reported):
     """A manoeuvre.
 
     Attributes:
         result: of the form ``quadid.excite/1``; ``manoeuvre_file`` is None until it is written.
         proposal: the manoeuvre itself.
-        text: of its file.
+        manoeuvre: text of its file.
         plan: what scripts and instructions are made from.
         hover_throttle: share of full throttle at hover.
+        forms: what flies it is written in these as well (`quadid.report.manoeuvres.FORMS`).
+        logs: flights so far.
     """
 
     result: dict[str, Any]
     proposal: Proposal
-    text: str
+    manoeuvre: str
     plan: Plan
     hover_throttle: float
+    forms: tuple[str, ...] = ()
+    logs: tuple[Log, ...] = ()
+
+    def write(self, folder: Path, kept: str | None = None) -> list[tuple[str, Path]]:
+        """Writes the manoeuvre and what flies it."""
+        first, *others = self.save(folder, self.forms)
+        self.result["manoeuvre_file"], self.result["files"] = str(first), [str(path) for path in others]
+        return [("Manoeuvre", first), *(("To fly it", path) for path in others)]
+
+    @property
+    def warnings(self) -> list[str]:
+        """What is wrong with the logs."""
+        return [text for log in self.logs for text in log.warnings]
+
+    @property
+    def verdict(self) -> Verdict:
+        """What the flight gains beside a gentle one, and whether it is worth flying."""
+        gain, worst, seconds = self.result["gain"], self.result["worst"], self.result["seconds"]
+        gained = f"makes the interval of {worst}, the least certain parameter, {gain:.3g} times narrower"
+        if gain < LEAST_GAIN:
+            step = "Allow more --seconds, --tilt or --rate-limit."
+            return Verdict("fair", f"Hardly worth flying: {seconds:g} s {gained}.", (), (step,))
+        step = "Fly it, then fit its log together with those before."
+        return Verdict("good", f"Worth flying: {seconds:g} s {gained} than a gentle flight.", (), (step,))
+
+    def tables(self) -> list[TextTable]:
+        """Half-widths now, and after each kind of flight."""
+        keys = ("now", "gentle_flight", "manoeuvre", "one_axis_at_a_time")
+        rows = tuple((p["name"], *(half_width(p[key]) for key in keys)) for p in self.result["parameters"])
+        heads = (Column("parameter"), *(Column(key.replace("_", " "), right=True) for key in keys))
+        title = f"Relative 95 % half-width (±) before and after {self.result['seconds']:g} s"
+        return [TextTable(title, heads, rows)]
+
+    @property
+    def sentences(self) -> list[Cell]:
+        """The movements, and where they may be flown."""
+        from quadid.experiment import BLOCK
+
+        peak, room, e = (self.result[key] for key in ("peak", "room", "envelope"))
+        return [
+            Cell(f"Manoeuvre: movements of {BLOCK:g} s, amplitudes rms"),
+            *(Cell(f"  {times} × {name}: {size}") for name, times, size in grouped(self.result["movements"])),
+            Cell(
+                f"In simulation it reaches {peak['tilt_deg']:.0f} degrees and {peak['rate_deg_s']:.0f} deg/s, and "
+                f"needs {room['sideways_m']:.0f} m to each side, {room['up_m']:.1f} m upwards and "
+                f"{room['down_m']:.1f} m downwards."
+            ),
+            Cell(
+                f"Envelope: {e['lowest_m']:g} to {e['highest_m']:g} m above take-off, {e['radius_m']:g} m around the "
+                f"start, {e['abort_tilt_deg']:.0f} degrees of tilt, {e['battery_percent']:g} % of the battery left."
+            ),
+        ]
+
+    def records(self) -> list[dict[str, Any]]:
+        """One row a parameter."""
+        return list(self.result["parameters"])
+
+    def page(self, command: str = LIBRARY) -> str:
+        """The page: what it would gain, how it looks when flown, where it may be flown."""
+        result, window = self.result, self.proposal.flight.window
+        assert window.attitude is not None
+        names = [p["name"] for p in result["parameters"]]
+        bars = [
+            {"role": role, "name": label, "type": "bar", "x": names,
+             "y": [100.0 * min(p[key], 2.0) for p in result["parameters"]]}
+            for role, label, key in (
+                ("measured", "now", "now"), ("before", "after a gentle flight", "gentle_flight"),
+                ("after", "after the manoeuvre", "manoeuvre"),
+            )
+        ]  # fmt: skip
+        widths = {"yaxis": axis("half-width (%)", type="log"), "xaxis": {"type": "category"}}
+        angles = np.degrees(np.unwrap(euler(window.attitude), axis=0))
+        lines = [
+            trace(role, label, window.t - window.t0, angles[:, i])
+            for i, (role, label) in enumerate((("measured", "roll"), ("before", "pitch"), ("after", "yaw")))
+        ]
+        tilted = {"xaxis": axis("time (s)"), "yaxis": axis("angle (°)")}
+        peak, room, e = (result[key] for key in ("peak", "room", "envelope"))
+        height = f"{room['up_m'] + room['down_m']:.1f} m"
+        limits = [
+            ("height above take-off", height, f"{e['lowest_m']:g} to {e['highest_m']:g} m"),
+            ("distance from the start", f"{room['sideways_m']:.0f} m", f"{e['radius_m']:g} m"),
+            ("tilt", f"{peak['tilt_deg']:.0f}°", f"{e['abort_tilt_deg']:.0f}°"),
+            ("battery", "–", f"{e['battery_percent']:g} % left"),
+        ]
+        sections = [
+            section(
+                "gain", "What it would gain",
+                "Relative half-width of the 95 % interval, from the Fisher information of simulated flights.",
+                [figure("gain-bars", "Half-widths", bars, widths, 320)], [self.tables()[0].part()],
+            ),
+            section(
+                "manoeuvre", "The manoeuvre",
+                "Stick movements one after the other, and the attitude that the simulation flies.",
+                [figure("attitude", "Attitude", lines, tilted, 320)],
+                [rows_of(("movement", "times", "amplitude, rms"), grouped(result["movements"]))],
+            ),
+            section(
+                "envelope", "Where it may be flown",
+                "Scripts start only inside the envelope and stop outside it.",
+                tables=[rows_of(("", "needed in simulation", "envelope"), limits)],
+            ),
+        ]  # fmt: skip
+        flown = f"{result['seconds']:g} s, at most {peak['tilt_deg']:.0f}° of tilt and {peak['rate_deg_s']:.0f}°/s"
+        return self.rendered(f"What to fly next: {result['vehicle']}", flown, sections, provenance(self.logs, command))
 
     def save(self, folder: str | Path = ".", forms: Sequence[str] = ()) -> list[Path]:
         """Writes the manoeuvre, and what flies it in each of `forms` (`quadid.report.manoeuvres.FORMS`).
@@ -60,21 +176,11 @@ class Proposed:
         Raises:
             ParameterError: an unknown form.
         """
-        from quadid.report.manoeuvres import written_as
-
-        texts = {".manoeuvre.yaml": self.text}
+        texts = {".manoeuvre.yaml": self.manoeuvre}
         for form in forms:
             texts |= written_as(self.plan, form, self.hover_throttle)
         name = file_name(self.plan.vehicle)
         return [write_text(Path(folder) / f"{name}{end}", text) for end, text in texts.items()]
-
-
-def check_forms(forms: Sequence[str]) -> None:
-    """Raises ParameterError for a form that is not written."""
-    from quadid.report.manoeuvres import check_form
-
-    for form in forms:
-        check_form(form)
 
 
 def parse_height(text: str) -> tuple[float, float]:
@@ -86,8 +192,13 @@ def parse_height(text: str) -> tuple[float, float]:
         raise ParameterError(f"--height {text}", _HEIGHTS, "for example 10:40") from error
 
 
-def check_limits(seconds: float, tilt: float, rate_limit: float, height: tuple[float, float], battery: float) -> None:
-    """Raises ParameterError for a manoeuvre that nobody can fly."""
+def check_limits(
+    seconds: float, tilt: float, rate_limit: float, height: tuple[float, float], battery: float,
+    forms: Sequence[str],
+) -> None:  # fmt: skip
+    """Raises ParameterError for a manoeuvre that nobody can fly, or a form that is not written."""
+    for form in forms:
+        check_form(form)
     if not 2.0 <= height[0] < height[1] <= 500.0:
         raise ParameterError(f"--height {height[0]:g}:{height[1]:g}", _HEIGHTS, "for example 10:40")
     if not 6.5 <= seconds <= MOST_SECONDS:
@@ -117,9 +228,39 @@ def knowledge(
 
 
 def propose(
-    logs: Given = (), *, vehicle: str | Path | Vehicle = "pelican", seconds: float = 60.0, tilt: float = 25.0,
-    rate_limit: float = 150.0, height: tuple[float, float] = (10.0, 40.0), battery: float = 40.0, seed: int = 1,
-    advance: Advance = silent,
+    logs: Annotated[
+        Given,
+        Typed(list[str] | None, typer.Argument(metavar="LOG", help="Flights so far, if any."), opened=True),
+    ] = (),
+    *,
+    vehicle: Annotated[Described, Typed(str, VEHICLE, "pelican", load_vehicle)] = "pelican",
+    seconds: Annotated[float, typer.Option("--seconds", metavar="S", help="Length of the manoeuvre.")] = 60.0,
+    tilt: Annotated[float, typer.Option("--tilt", metavar="DEG", help="Largest tilt.")] = 25.0,
+    rate_limit: Annotated[float, typer.Option("--rate-limit", metavar="DEG/S", help="Largest body rate.")] = 150.0,
+    height: Annotated[
+        tuple[float, float],
+        Typed(
+            str,
+            typer.Option("--height", metavar="M:M", help="Lowest and highest height above take-off."),
+            "10:40",
+            parse_height,
+        ),
+    ] = (10.0, 40.0),
+    battery: Annotated[
+        float, typer.Option("--battery", metavar="%", help="What must remain of the battery.")
+    ] = 40.0,
+    forms: Annotated[
+        Sequence[str],
+        Typed(
+            list[str] | None,
+            typer.Option(
+                "--format",
+                metavar="NAME",
+                help="Also write what flies it: ardupilot-lua, ardupilot-sid, px4, sticks; repeatable.",
+            ),
+        ),
+    ] = (),
+    seed: Seed = 1, advance: Advance = silent,
 ) -> Proposed:  # fmt: skip
     """Proposes the manoeuvre that shrinks the intervals most, within tilt and rate limits.
 
@@ -131,6 +272,7 @@ def propose(
         rate_limit: largest body rate [degrees/s].
         height: lowest and highest above take-off [m].
         battery: what must remain [per cent].
+        forms: what flies it is written in these as well (`quadid.report.manoeuvres.FORMS`).
         seed: of all random numbers.
         advance: told how far it is.
 
@@ -142,7 +284,7 @@ def propose(
     from quadid.identification.excitation import halfwidths
     from quadid.report.programs import Facts
 
-    check_limits(seconds, tilt, rate_limit, height, battery)
+    check_limits(seconds, tilt, rate_limit, height, battery, forms)
     check_seed(seed)
     limits = Limits(math.radians(tilt), math.radians(rate_limit))
     described = as_vehicle(vehicle)
@@ -173,13 +315,11 @@ def propose(
         "logs": [str(log.path) for log in given],
     }
     hover = Facts(believed, believed.name).hover_thrust or HOVER_THROTTLE
-    return Proposed(result, proposal, manoeuvre_file(believed.name, proposal), plan, hover)
+    return Proposed(result, proposal, manoeuvre_file(believed.name, proposal), plan, hover, tuple(forms), tuple(given))
 
 
 def made_into_plan(vehicle: str, proposal: Proposal, tilt: float, height: tuple[float, float], battery: float) -> Plan:
     """The manoeuvre with its envelope; raises ParameterError where it needs more height than there is."""
-    from quadid.report.manoeuvres import Plan
-
     sideways, up, down = proposal.room.tolist()
     if up + down > height[1] - height[0]:
         raise ParameterError(
@@ -223,3 +363,13 @@ def _result(vehicle: str, proposal: Proposal, tilt: float, rate_limit: float) ->
         "worst": NOMINAL_NAMES[worst],
         "gain": float(np.log1p(proposal.pilot[worst]) / np.log1p(proposal.after[worst])),
     }
+
+
+def grouped(movements: Sequence[Json]) -> list[tuple[str, str, str]]:
+    """Movements that follow each other alike as one: name, how many times, amplitudes."""
+    each = [(m["name"], ", ".join(f"{a} {_amplitude(a, v)}" for a, v in m["amplitudes"].items())) for m in movements]
+    return [(name, str(len(list(same))), size) for (name, size), same in groupby(each)]
+
+
+def _amplitude(axis: str, value: float) -> str:
+    return f"{100.0 * value:.0f} %" if axis == "throttle" else f"{math.degrees(value):.1f}°"

@@ -4,23 +4,23 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from quadid.app.logs import as_vehicle, file_name, write_texts
+from quadid.app.logs import OutputError, as_vehicle, file_name, write_texts
+from quadid.app.outcome import Outcome
 from quadid.effects import EFFECTS
 from quadid.errors import QuadidError
+from quadid.report.programs import FORMS, form_of, refused
+from quadid.report.programs import export as written_as
+from quadid.report.tables import Cell, Column, TextTable
 from quadid.vehicle import Vehicle
-
-if TYPE_CHECKING:
-    from quadid.report.tables import TextTable
-
 
 MOST_COLUMNS = 5
 """Forms beside each other that a terminal of 80 characters has room for."""
 
 
-@dataclass(frozen=True)
-class Exported:
+@dataclass(frozen=True, repr=False)
+class Exported(Outcome):
     """Files for another program.
 
     Attributes:
@@ -37,6 +37,15 @@ class Exported:
     def save(self, folder: str | Path = ".") -> list[Path]:
         """Writes the files into a folder, or a single one under a file name; returns their absolute paths."""
         return write_texts(folder, self.texts)
+
+    def write(self, folder: Path, kept: str | None = None) -> list[tuple[str, Path]]:
+        """Writes the files; raises OutputError where one would overwrite the vehicle file that was read."""
+        for path in (folder / name for name in self.texts):
+            if kept is not None and path.exists() and Path(kept).exists() and path.samefile(kept):
+                raise OutputError(f"the export would overwrite {kept}", "another folder", "give --out")
+        files = self.save(folder)
+        self.result["files"] = [str(path) for path in files]
+        return [("Written", path) for path in files]
 
 
 class UnprovenError(QuadidError):
@@ -61,9 +70,6 @@ def export(
         UnprovenError: the values are those of a fit that nothing proves, or in doubt.
         VehicleError: no such vehicle.
     """
-    from quadid.report.programs import export as written_as
-    from quadid.report.programs import form_of, refused
-
     described, format = as_vehicle(vehicle), form_of(format)
     origin = source or (Path(vehicle).name if isinstance(vehicle, str | Path) else described.name)
     lacking = doubt or (f"not proven: {described.proof.lacking}" if described.proof and described.proof.lacking else "")
@@ -84,15 +90,30 @@ def export(
     return Exported(result, texts)
 
 
-def forms() -> list[TextTable]:
-    """What each form carries, in two tables that fit a terminal; what it does not carry is named in its file."""
-    from quadid.report.programs import FORMS
-    from quadid.report.tables import Column, TextTable
+@dataclass(frozen=True, repr=False)
+class Forms(Outcome):
+    """What each form carries; `result` has the form ``quadid.formats/1``."""
 
-    out, others = [], [name for name in FORMS if name != "yaml"]  # yaml carries all
-    for part in (others[i : i + MOST_COLUMNS] for i in range(0, len(others), MOST_COLUMNS)):
-        rows = [(effect, *("yes" if effect in FORMS[name].carried else "-" for name in part)) for effect in EFFECTS]
-        columns = (Column("effect"), *(Column(name) for name in part))
-        programs = ", ".join(FORMS[name].program for name in part)
-        out.append(TextTable(f"Effects carried to {programs}", columns, tuple(row for row in rows if "yes" in row)))
-    return out
+    result: dict[str, Any]
+
+    def tables(self) -> list[TextTable]:
+        """Tables that fit a terminal; what a form does not carry is named in its file."""
+        out, others = [], [name for name in FORMS if name != "yaml"]  # yaml carries all
+        for part in (others[i : i + MOST_COLUMNS] for i in range(0, len(others), MOST_COLUMNS)):
+            rows = [(effect, *("yes" if effect in FORMS[name].carried else "-" for name in part)) for effect in EFFECTS]
+            columns = (Column("effect"), *(Column(name) for name in part))
+            programs = ", ".join(FORMS[name].program for name in part)
+            out.append(TextTable(f"Effects carried to {programs}", columns, tuple(row for row in rows if "yes" in row)))
+        return out
+
+    @property
+    def sentences(self) -> list[Cell]:
+        """What no table shows."""
+        told = "Every form carries mass and geometry; `yaml` carries all. What a form leaves out, its file names."
+        return [Cell(told)]
+
+
+def forms() -> Forms:
+    """What each form carries."""
+    carried = {name: {"program": form.program, "effects": list(form.effects)} for name, form in FORMS.items()}
+    return Forms({"schema": "quadid.formats/1", "formats": carried})

@@ -8,25 +8,27 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
+import typer
 
 from quadid.app.export import UnprovenError
-from quadid.app.logs import as_vehicle, file_name, open_recording, write_texts
+from quadid.app.logs import as_vehicle, file_name, load_vehicle, open_recording, write_texts
+from quadid.app.options import VEHICLE, Described, Typed
 from quadid.app.outcome import LIBRARY, Reported, provenance
 from quadid.chi_square import Z95
 from quadid.errors import LogError, ParameterError, nearest
 from quadid.files import read_regular
 from quadid.model.rate_loop import AxisPlant, Loops, RateGains, design, slowed, with_rate
 from quadid.report.autopilots import AUTOPILOTS, AXES, Autopilot, authority, hover, moments
+from quadid.report.page import axis as axis_of
+from quadid.report.page import figure, section, trace
 from quadid.report.programs import Facts
-from quadid.types import Json
+from quadid.report.tables import Column, TextTable, number
+from quadid.report.verdict import Verdict
+from quadid.types import Json, JsonDict
 from quadid.vehicle import Vehicle
-
-if TYPE_CHECKING:
-    from quadid.report.tables import TextTable
-    from quadid.report.verdict import Verdict
 
 PHASE_MARGIN = 55.0
 """Default [deg]: the rate overshoots by about a seventh."""
@@ -80,16 +82,30 @@ class Gains(Reported):
 
     @property
     def verdict(self) -> Verdict:
-        """Promises, and their limits."""
-        from quadid.report.gains_page import gains_verdict
-
-        return gains_verdict(self.result)
+        """Promises over the intervals, and their limits."""
+        axes = self.result["axes"]
+        least = min(a["rate"]["phase_margin_least"] for a in axes)
+        bands = ", ".join(f"{a['axis']} {a['rate']['bandwidth']:.2g} Hz" for a in axes)
+        limits = ", ".join(f"{a['axis']} by {a['limited_by']} ({a['largest_bandwidth']:.2g} Hz)" for a in axes)
+        step = "Propellers off: check signs. Then set the gains by hand, rates before attitude, and take off with care."
+        return Verdict(
+            "fair" if self.warnings else "good",
+            f"Rate loops of {bands}, with at least {least:.0f} degrees of phase margin over the intervals",
+            (f"The bandwidth is limited: {limits}.",),
+            (step,),
+        )
 
     def tables(self) -> list[TextTable]:
-        """Gains, loops, and what they rest on."""
-        from quadid.report.gains_page import gains_tables
-
-        return gains_tables(self.result)
+        """Gains, loops before and after, and what they rest on."""
+        columns = (
+            Column("parameter"), Column("proposed", right=True), Column("now", right=True), Column("what", rank=1)
+        )  # fmt: skip
+        rows = tuple(
+            (g["name"], number(g["value"], 4), number(g["current"], 4), f"{g['axis']} {g['term']}")
+            for g in self.result["gains"]
+        )
+        chosen = TextTable(f"Gains for {self.result['program']}", columns, rows)
+        return [chosen, loop_table(self.result), used_table(self.result)]
 
     def save(self, folder: str | Path = ".") -> Path:
         """Writes the proposed parameters in the autopilot's own form, into a folder or a file; returns the path."""
@@ -101,20 +117,111 @@ class Gains(Reported):
         """One row a gain."""
         return [dict(g) for g in self.result["gains"]]
 
+    def write(self, folder: Path, kept: str | None = None) -> list[tuple[str, Path]]:
+        """Writes the proposed parameters, as `save`."""
+        path = self.save(folder)
+        self.result["file"] = str(path)
+        return [("Written", path)]
+
     def page(self, command: str = LIBRARY) -> str:
         """The page: gains, step responses with bands before and after, what limits the bandwidth."""
-        from quadid.report.gains_page import gains_page, step_figure
-        from quadid.report.page import render
+        result, (chosen, loops, used) = self.result, self.tables()
+        steps = [
+            step_figure(axis, angle, self.loops[axis], self.before.get(axis))
+            for axis in AXES
+            for angle in (False, True)
+        ]
+        taken = tuple(
+            (a["axis"], number(a["at"], 3), *(f"{v:.0f}" for v in a["phase_taken"].values())) for a in result["axes"]
+        )
+        columns = (Column("axis"), Column("at [Hz]"), *(Column(name) for name in result["axes"][0]["phase_taken"]))
+        phases = TextTable("Phase that each part takes where the fastest loop crosses 0 dB [deg]", columns, taken)
+        sections = [
+            section("gains", "Gains", chosen.title, tables=[chosen.part()]),
+            section("loops", "Loops", loops.title, steps, [loops.part()]),
+            section("limits", "What limits the bandwidth", phases.title, tables=[phases.part()]),
+            section("used", "What they rest on", "", tables=[used.part()]),
+        ]
+        subtitle = f"{result['program']}, phase margin {result['phase_margin']:g} degrees; nothing was sent"
+        return self.rendered(f"Gains for {result['vehicle']}", subtitle, sections, provenance([], command))
 
-        pairs = [(axis, angle) for axis in AXES for angle in (False, True)]
-        figures = [step_figure(axis, angle, self.loops[axis], self.before.get(axis)) for axis, angle in pairs]
-        return render(gains_page(self.result, figures, provenance([], command)))
+
+def loop_table(result: Json) -> TextTable:
+    """Promises of every loop."""
+    columns = (
+        Column("loop"), Column("bandwidth [Hz]", right=True), Column("over the intervals", right=True, rank=1),
+        Column("phase margin [deg]", right=True), Column("gain margin [dB]", right=True, rank=2),
+        Column("overshoot", right=True),
+    )  # fmt: skip
+    rows = []
+    for a in result["axes"]:
+        for when, part in (("", a), (", now", a["before"])):
+            for loop in ("rate", "attitude"):
+                r = part and part[loop]
+                if r:
+                    top = f"{100.0 * r['overshoot']:.0f} %" if math.isfinite(r["overshoot"]) else "unstable"
+                    rows.append((
+                        f"{a['axis']} {loop}{when}", number(r["bandwidth"], 3),
+                        " .. ".join(number(v, 3) for v in r["bandwidth_range"]),
+                        f"{r['phase_margin']:.0f}, least {r['phase_margin_least']:.0f}",
+                        f"{r['gain_margin']:.0f}, least {r['gain_margin_least']:.0f}", top,
+                    ))  # fmt: skip
+    return TextTable("Loops, and the least margins over the 95 % intervals", columns, tuple(rows))
+
+
+def used_table(result: Json) -> TextTable:
+    """What the gains rest on."""
+    heads = (("number", False), ("value", True), ("95 % interval", True))
+    columns = (*(Column(text, right) for text, right in heads), Column("from", rank=1))
+    rows = []
+    for u in result["used"]:
+        interval = " .. ".join(number(v) for v in u["ci95"])
+        rows.append((u["name"], f"{number(u['value'])} {u['unit']}", interval, u["source"]))
+    return TextTable("What they rest on", columns, tuple(rows))
+
+
+def step_figure(name: str, angle: bool, now: Loops, before: Loops | None) -> JsonDict:
+    """Response to a unit step with its band over the intervals, before and after."""
+    what = "attitude" if angle else "rate"
+    data = []
+    for role, label, loops in (("before", "now", before), ("after", "proposed", now)):
+        if loops is None or not loops.stable or (angle and loops.attitude == 0.0):
+            continue
+        t, y = loops.step(angle)
+        for edge, values in (("", y[0]), (", least", y.min(axis=0)), (", most", y.max(axis=0))):
+            dash = {"line": {"dash": "dot"}} if edge else {}
+            data.append(trace(role, label + edge, np.asarray(t), np.asarray(values), **dash))
+    layout = {"xaxis": axis_of("time (s)"), "yaxis": axis_of(f"{name} {what} over what is asked for")}
+    caption = "dotted: least and most over the 95 % intervals"
+    return figure(f"step-{name}-{what}", f"{name.capitalize()} {what}", data, layout, 260, caption=caption)
 
 
 def gains(
-    vehicle: str | Path | Vehicle, format: str = "px4", *, bandwidth: float | None = None,
-    phase_margin: float = PHASE_MARGIN, derivative: bool = True, motor_lag: float | None = None,
-    delay: float | None = None, current: str | Path | Mapping[str, float] | None = None, anyway: bool = False,
+    vehicle: Annotated[Described, Typed(str, VEHICLE, ..., load_vehicle)],
+    format: Annotated[str, typer.Option("--format", metavar="F", help=f"{', '.join(AUTOPILOTS)}.")] = "px4",
+    *,
+    bandwidth: Annotated[
+        float | None,
+        typer.Option("--bandwidth", metavar="HZ", help="Of roll and pitch rate; default the largest possible."),
+    ] = None,
+    phase_margin: Annotated[
+        float, typer.Option("--phase-margin", metavar="DEG", help="Least one of the rate loops, over the intervals.")
+    ] = PHASE_MARGIN,
+    derivative: Annotated[bool, typer.Option("--derivative/--no-derivative", help="Use the D term.")] = True,
+    motor_lag: Annotated[
+        float | None, typer.Option("--motor-lag", metavar="S", help="Where the vehicle file has none.")
+    ] = None,
+    delay: Annotated[
+        float | None, typer.Option("--delay", metavar="S", help="From command to rotor, where the file has none.")
+    ] = None,
+    current: Annotated[
+        str | Path | Mapping[str, float] | None,
+        Typed(
+            Path | None,
+            typer.Option("--from", metavar="LOG|PARAMS", help="Filters, loop rate and present gains of the autopilot."),
+        ),
+    ] = None,
+    anyway: Annotated[bool, typer.Option("--anyway", help="Take guesses and unproven values, too.")] = False,
 ) -> Gains:  # fmt: skip
     """Proposes rate and attitude gains from the identified vehicle; nothing is sent to a vehicle.
 
@@ -177,7 +284,7 @@ def gains(
     chosen = list({g["name"]: g for g in reversed(chosen)}.values())[::-1]  # roll and pitch share one in Betaflight
     result = {
         "schema": "quadid.gains/1", "vehicle": described.name, "format": format, "program": autopilot.program,
-        "phase_margin": phase_margin, "bandwidth": bandwidth, "gains": chosen, "axes": axes,
+        "phase_margin": phase_margin, "bandwidth": bandwidth, "gains": chosen, "axes": axes, "file": None,
         "used": [{"name": u.name, "unit": u.unit, "value": u.value, "ci95": [u.low, u.high], "source": u.source}
                  for u in used],
         "warnings": warnings + [f"{a}: the present gains are unstable" for a, b in before.items() if not b.stable],

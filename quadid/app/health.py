@@ -5,22 +5,26 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
+import typer
+from markupsafe import Markup
 
 from quadid.app.logs import Flight, Given, Log, check_conventions, listed, open_recording, parse_part, vehicle_of
+from quadid.app.options import LogNames, OfVehicle, Preset, Typed, Unchecked
 from quadid.app.outcome import LIBRARY, NUMBER_COLUMNS, Reported, number_rows, provenance
 from quadid.data.window import Recording
 from quadid.errors import LogError, NotIdentifiableError
-from quadid.report.verdict import Verdict
+from quadid.report.page import axis, figure, rows_of, section
+from quadid.report.tables import Cell, Column, TextTable
+from quadid.report.verdict import Level, Verdict
+from quadid.types import Json
 from quadid.vehicle import Vehicle
 
 if TYPE_CHECKING:
     from quadid.condition import FlightTrim
     from quadid.condition.changes import Health
-    from quadid.report.tables import TextTable
 
 LEAST_THRUST = 0.25
 """No vehicle flies on less of its baseline's thrust per command, whatever it dropped and however new its propellers."""
@@ -37,6 +41,7 @@ class HealthOutcome(Reported):
         recordings: the logs as read, those in question first.
     """
 
+    title = "Health"
     result: dict[str, Any]
     found: Health
     vehicle: Vehicle
@@ -45,14 +50,10 @@ class HealthOutcome(Reported):
     @property
     def verdict(self) -> Verdict:
         """Healthy or changed, and what to do."""
-        from quadid.report.health_page import health_verdict
-
         return health_verdict(self.result)
 
     def tables(self) -> list[TextTable]:
         """Changes, and each trim against the baseline."""
-        from quadid.report.health_page import change_table, trim_table
-
         changes = [change_table(self.result["changes"])] if self.result["changes"] else []
         return [*changes, trim_table(self.result)]
 
@@ -71,28 +72,55 @@ class HealthOutcome(Reported):
         """The page: what changed, a picture of the airframe, how far each flight is from healthy ones."""
         from quadid.condition.changes import distance
         from quadid.condition.trim import AXES
-        from quadid.report.health_page import airframe_picture, health_page, trim_figure
-        from quadid.report.page import render
 
-        found, healthy = self.found, self.found.healthy
+        result, found, healthy = self.result, self.found, self.found.healthy
         now = np.mean([flight.shares for flight in found.flights], axis=0)
-        marked = self.result["changes"] if found.verdict == "changed" else ()
+        marked = result["changes"] if found.verdict == "changed" else ()
         picture = airframe_picture(self.vehicle, now.tolist(), healthy.shares.tolist(), marked)
+        caption = (
+            "From above, nose up. Dashed: the command of each rotor in the baseline flights. Filled, with its change: "
+            "now. Red: damaged; yellow: suspected."
+        )
         rows = [
+            (
+                change_words(c), c["evidence"] + ("" if c["confident"] else " Not certain."),
+                ", ".join(map(rival_words, c["alternatives"])) or "none",
+            )
+            for c in result["changes"]
+        ]  # fmt: skip
+        changes = [rows_of(("Change", "Found", "Rejected alternatives (probability)"), rows)] if rows else []
+        intro = _INTROS["lacking" if result["baseline_lacking"] or result["unfamiliar"] else result["verdict"]]
+        flown = [
             (role, flight.name, distance(flight.mean - healthy.mean, healthy.predictive(1), healthy.freedom).tolist())
             for role, part in (("measured", found.baseline), ("after", found.flights))
             for flight in part
         ]
-        made = provenance([], command) + [
+        trims = trim_table(result)
+        sections = [
+            section("airframe", "Airframe", caption, picture=picture),
+            section("changes", "What changed", intro, tables=changes),
+            section("trim", "Trim", trims.title, [trim_figure(flown, AXES)], [trims.part()]),
+        ]
+        origin = provenance([], command) + [
             {"name": recording.name, "value": f"sha256 {recording.sha256 or 'unknown'}"}
             for recording in self.recordings
         ]
-        return render(health_page(self.result, picture, made, [trim_figure(rows, AXES)]))
+        n, m = len(result["logs"]), len(result["baseline"])
+        subtitle = f"{n} flight{'s' * (n != 1)} against {m} baseline flight{'s' * (m != 1)}"
+        return self.rendered(f"Health of {result['vehicle']}", subtitle, sections, origin)
 
 
 def health(
-    logs: Given, baseline: Given, *, vehicle: str | Path | Vehicle | None = None, preset: str = "auto",
-    unchecked: bool = False,
+    logs: LogNames,
+    baseline: Annotated[
+        Given,
+        Typed(
+            list[str],
+            typer.Option("--baseline", metavar="LOG", help="A healthy flight of this vehicle; repeatable."),
+            ...,
+        ),
+    ],
+    *, vehicle: OfVehicle = None, preset: Preset = "auto", unchecked: Unchecked = False,
 ) -> HealthOutcome:  # fmt: skip
     """Compares flights with healthy flights of the same vehicle: which rotor, mass, centre of gravity, thrust.
 
@@ -177,3 +205,272 @@ def _overlap(one: Recording, other: Recording) -> bool:
     """Whether two parts of a log share time."""
     (a, b), (c, d) = one.span, other.span
     return a < d and c < b
+
+
+# --- Health for people: verdict, tables, and the page with a picture of the airframe
+
+
+_LEVELS: dict[str, Level] = {"unchanged": "good", "changed": "poor", "unknown": "poor"}
+_WORDS = {
+    "mass_change": "mass", "cg_offset": "centre of gravity", "thrust_drop": "thrust of all rotors",
+    "weak_rotor": "rotor",
+}  # fmt: skip
+_LARGE = 0.2
+"""Change of effort (log of command per force) from which the flights may be of two vehicles."""
+_ONE_VEHICLE = "Check that all flights are of one vehicle, and their motors logged in one way."
+_INTROS = {
+    "changed": "", "unknown": "Nothing that has a name.", "lacking": "Not known. If anything:",
+    "unchanged": "Nothing beyond what healthy flights differ by. If anything:",
+}  # fmt: skip
+_STEPS = {
+    "weak_rotor": "Look at the propeller (cuts, tape, loose on its shaft) and the motor of rotor {rotor}; "
+    "exchange the propeller and fly again.",
+    "mass_change": "Look for what was added or removed; if it is meant to be there, make new baseline flights.",
+    "cg_offset": "Check that the battery sits where it did, and what hangs on the arms.",
+    "thrust_drop": "Check the battery (age, charge) and all propellers.",
+}
+
+
+def _which(change: Json) -> str:
+    """The weak rotor, and the one on its axis where the data do not tell which: ``2 or 6``."""
+    return " or ".join(str(int(p["value"])) for p in change["parameters"] if p["name"] in ("rotor", "or_rotor"))
+
+
+def change_words(change: Json) -> str:
+    """A change in a few words: ``rotor 3: 21 % less thrust``."""
+    effect = change["effect"]
+    if effect == "weak_rotor":
+        return f"rotor {_which(change)}: {100.0 * change_value(change, 'loss'):.0f} % less thrust"
+    if effect == "cg_offset":
+        x, y = (1e3 * change_value(change, axis) for axis in "xy")
+        along, across = "forward" if x > 0.0 else "backward", "right" if y > 0.0 else "left"
+        return f"centre of gravity moved {abs(x):.1f} mm {along} and {abs(y):.1f} mm to the {across}"
+    fraction = 100.0 * change_value(change, "fraction")
+    return (
+        f"{_WORDS[effect]}: {fraction:+.0f} %" if effect == "mass_change" else f"{_WORDS[effect]}: {-fraction:+.0f} %"
+    )
+
+
+def has_changed(result: Json) -> bool:
+    """Whether a result of the form ``quadid.health/1`` shows a change, be it one without a name."""
+    return result["verdict"] != "unchanged" and not result["baseline_lacking"] and not result["unfamiliar"]
+
+
+def rival_words(rival: Json) -> str:
+    """An explanation that lost, with its probability: ``rotor 3 and 4 (0.08)``."""
+    names = " and ".join(_WORDS[effect] for effect in (rival["effect"], *rival.get("with", ())))
+    rotors = " and ".join(map(str, rival.get("rotors", ())))
+    return f"{names} {rotors}".rstrip() + f" ({rival['probability']:.2f})"
+
+
+def health_verdict(result: Json) -> Verdict:
+    """Judges a result of the form ``quadid.health/1``."""
+    verdict, changes = result["verdict"], result["changes"]
+    n = len(result["baseline"])
+    against = f"{n} baseline flight{'s' * (n != 1)}, score {result['score']:.1f}"
+    details = [f"A healthy flight would look this different {_how_often(result['p_value'])} ({against})."]
+    suspects = ", ".join(change_words(c) for c in changes)
+    if reason := result["unfamiliar"]:
+        likely = [f"If anything, {suspects}."] if suspects else []
+        headline = "Not known: no baseline flight is of this kind."
+        step = "Compare a hover with hovers, or record healthy flights of this kind for the baseline."
+        return Verdict("fair", headline, (f"{reason[:1].upper()}{reason[1:]}.", *likely, *details), (step,))
+    if more := result["baseline_lacking"]:
+        flights = "baseline flight does" if n == 1 else "baseline flights do"
+        headline = f"{n} {flights} not show whether the vehicle has changed."
+        details += [f"With {more} more, spread like these, it would be a change{f': {suspects}' if suspects else ''}."]
+        step = f"Record {more} healthy flight{'s' * (more != 1)} or more, and compare again."
+        return Verdict("fair", headline, tuple(details), (*_first(result), step))
+    if verdict == "unchanged":
+        details += [f"If anything, {suspects}; that is within the spread of healthy flights."] if suspects else []
+        return Verdict("good", "The vehicle flies as it did in the baseline flights.", tuple(details), ())
+    if verdict == "unknown":
+        checks = (
+            _ONE_VEHICLE,
+            "Look the vehicle over; compare with `quadid diagnose`, which fits the motion.",
+        )
+        return Verdict("poor", "The vehicle has changed, by nothing that has a name here.", tuple(details), checks)
+    sure = [c for c in changes if c["confident"]] or changes[:1]
+    rest = [c for c in changes if c not in sure]
+    headline = f"The vehicle has changed: {'; '.join(change_words(c) for c in sure)}."
+    if not changes[0]["confident"]:
+        details.append("Other explanations are nearly as probable, see below.")
+    details += [f"Less certain: {'; '.join(change_words(c) for c in rest)}."] if rest else []
+    steps = dict.fromkeys([*_first(result), *(_step(c) for c in sure)])
+    return Verdict(_LEVELS[verdict], headline, tuple(details), tuple(steps))
+
+
+def _first(result: Json) -> tuple[str, ...]:
+    """What to check before anything else, where the change is as large as between two vehicles."""
+    (effort,) = (t["value"] - t["baseline"] for t in result["trim"] if t["name"] == "effort")
+    return (_ONE_VEHICLE,) if abs(effort) > _LARGE else ()
+
+
+def _how_often(p_value: float) -> str:
+    """``about once in 4,000 flights``; at `LEAST_CHANCE` the bound that 95 % of such draws keep to (rule of three)."""
+    from quadid.condition.changes import LEAST_CHANCE
+
+    if p_value <= LEAST_CHANCE:
+        return f"less than once in {1.0 / (3.0 * LEAST_CHANCE):,.0f} flights"
+    return f"about once in {float(f'{1.0 / p_value:.2g}'):,.0f} flights" if p_value < 0.5 else "in most flights"
+
+
+def _step(change: Json) -> str:
+    text = _STEPS[change["effect"]]
+    return text.format(rotor=_which(change)) if "{rotor}" in text else text
+
+
+def change_table(changes: Sequence[Json]) -> TextTable:
+    """What changed, with intervals and the explanations that lost."""
+    columns = (
+        Column("change"), Column("value"), Column("95 % interval"), Column("p", right=True, rank=1),
+        Column("probability", right=True, rank=2), Column("rejected alternative", rank=3),
+    )  # fmt: skip
+    rows: list[tuple[str | Cell, ...]] = []
+    for c in changes:
+        first = True
+        rival = c["alternatives"][0] if c["alternatives"] else None
+        other = rival_words(rival) if rival else ""
+        name = Cell(c["effect"].replace("_", " "), "poor" if c["confident"] else "fair")
+        for p in c["parameters"]:
+            if p["name"] in ("rotor", "or_rotor"):
+                name = Cell(f"weak rotor {_which(c)}", name.tone)
+                continue
+            low, high = p["ci95"]
+            row = (f"{p['name']} = {p['value']:.3g} {p['unit']}".rstrip(), f"{low:.3g} .. {high:.3g}")
+            more = (f"{c['p_value']:.1g}", f"{c['probability']:.2f}", other) if first else ("", "", "")
+            rows.append((name if first else "", *row, *more))
+            first = False
+    return TextTable("What changed since the baseline flights", columns, tuple(rows))
+
+
+def trim_table(result: Json) -> TextTable:
+    """Each trim of the flights in question against the baseline."""
+    columns = (
+        Column("trim"), Column("now", right=True), Column("baseline", right=True), Column("spread", right=True, rank=1),
+        Column("distance", right=True),
+    )  # fmt: skip
+    rows = tuple(
+        (
+            t["name"], f"{t['value']:.4f}", f"{t['baseline']:.4f}", f"{t['spread']:.4f}",
+            Cell(f"{t['distance']:+.1f}", "poor" if abs(t["distance"]) > 3.0 else ""),
+        )
+        for t in result["trim"]
+    )  # fmt: skip
+    title = (
+        "Trim, how the rotors share the work in steady flight: roll (left more than right), pitch (front more than "
+        "back) and yaw (one direction of spin more than the other) as parts of all command; effort, the logarithm of "
+        "command per force, from the baseline; distance in spreads (standard deviations) of healthy flights"
+    )
+    return TextTable(title, columns, rows)
+
+
+def trim_figure(rows: Sequence[tuple[str, str, Sequence[float]]], names: Sequence[str]) -> Json:
+    """Every flight's trims in healthy spreads from the baseline's mean.
+
+    Args:
+        rows: role (baseline or flight), name and distances of each flight.
+        names: of the trims.
+    """
+    data = [
+        {
+            "role": role, "name": label, "type": "scatter", "mode": "markers", "text": [n for _, n, _ in part],
+            "x": [k + 0.06 * (i - 0.5 * (len(part) - 1)) for k in range(len(names)) for i in range(len(part))],
+            "y": [float(d[k]) for k in range(len(names)) for _, _, d in part],
+        }
+        for role, label in (("measured", "baseline"), ("after", "now"))
+        for part in [[r for r in rows if r[0] == role]]
+    ]  # fmt: skip
+    layout = {
+        "xaxis": {"tickvals": list(range(len(names))), "ticktext": list(names)},
+        "yaxis": axis("healthy spreads"),
+    }
+    return figure("trims", "Every flight", data, layout, 300, caption="distance from the baseline's mean")
+
+
+# --- The airframe from above as inline SVG: every rotor with its load against the baseline, damage and shift marked
+
+
+_SIZE, _MARGIN = 420.0, 92.0
+_LARGEST = 30.0
+"""Pixels; a disc grows and shrinks with its rotor's load around `_DISC`."""
+_DISC = 44.0
+_SHIFT = 6.0
+"""A shift of the CG is drawn this many times its size."""
+
+
+def airframe_picture(
+    vehicle: Vehicle, load: Sequence[float], baseline: Sequence[float], changes: Sequence[Json]
+) -> str:
+    """SVG of the airframe, nose up.
+
+    Args:
+        vehicle: geometry.
+        load: each rotor's share of the commanded load in the flights in question.
+        baseline: the same of healthy flights.
+        changes: entries of ``quadid.health/1``.
+    """
+    scale = (0.5 * _SIZE - _MARGIN) / max(abs(c) for r in vehicle.rotors for c in r.position[:2])
+    centre = 0.5 * _SIZE
+    places = [(centre + scale * r.position[1], centre - scale * r.position[0]) for r in vehicle.rotors]
+    weak = {int(change_value(c, "rotor")) - 1: c for c in changes if c["effect"] == "weak_rotor"}
+    parts = [
+        Markup(
+            '<svg class="airframe" viewBox="0 0 {0:.0f} {0:.0f}" role="img" aria-label="Airframe from above, nose up">'
+        ).format(_SIZE),
+        *(_line(centre, centre, x, y) for x, y in places),
+        Markup('<path class="nose" d="M{0:.0f} {1:.0f} l-9 18 h18 z"/>').format(centre, centre - 30.0),
+        *(
+            _rotor(j, x, y, load[j] / baseline[j] - 1.0, weak.get(j), centre)
+            for j, (x, y) in enumerate(places)
+        ),
+        *_shift(changes, centre, scale),
+        Markup("</svg>"),
+    ]  # fmt: skip
+    return str(Markup("").join(parts))
+
+
+def change_value(change: Json, name: str) -> float:
+    """A number of a change."""
+    return float(next(p["value"] for p in change["parameters"] if p["name"] == name))
+
+
+def _line(x1: float, y1: float, x2: float, y2: float) -> str:
+    return Markup('<line class="arm" x1="{:.0f}" y1="{:.0f}" x2="{:.0f}" y2="{:.0f}"/>').format(x1, y1, x2, y2)
+
+
+def _rotor(j: int, x: float, y: float, more: float, weak: Json | None, centre: float) -> str:
+    """One rotor: its healthy disc, its disc now, its number, its load, and its loss where it is damaged."""
+    kind = "" if weak is None else " damaged" if weak["confident"] else " suspect"
+    radius = _DISC + max(-_LARGEST, min(_LARGEST, 100.0 * more))
+    out = [
+        Markup('<circle class="disc{}" cx="{:.0f}" cy="{:.0f}" r="{:.1f}"/>').format(kind, x, y, radius),
+        Markup('<circle class="healthy" cx="{:.0f}" cy="{:.0f}" r="{:.0f}"/>').format(x, y, _DISC),
+        _text(x, y - 4.0, f"M{j + 1}", "name"),
+        _text(x, y + 14.0, f"{100.0 * more:+.1f} %".replace("-", "−"), "load"),
+    ]
+    if weak is not None:
+        below = y + _DISC + _LARGEST + 12.0 if y > centre else y - _DISC - _LARGEST - 2.0
+        low, high = next(p["ci95"] for p in weak["parameters"] if p["name"] == "loss")
+        words = f"loss {100.0 * change_value(weak, 'loss'):.0f} % ({100.0 * low:.0f} … {100.0 * high:.0f})"
+        out.append(_text(x, below, words.replace("-", "−"), "loss" + kind))
+    return Markup("").join(out)
+
+
+def _text(x: float, y: float, words: str, kind: str) -> str:
+    return Markup('<text class="{}" x="{:.0f}" y="{:.0f}">{}</text>').format(kind, x, y, words)
+
+
+def _shift(changes: Sequence[Json], centre: float, scale: float) -> Sequence[str]:
+    """An arrow from the centre towards where the CG went, enlarged."""
+    found = [c for c in changes if c["effect"] == "cg_offset"]
+    if not found:
+        return ()
+    ahead, right = (change_value(found[0], axis) for axis in "xy")
+    x, y = centre + _SHIFT * scale * right, centre - _SHIFT * scale * ahead
+    words = f"CG {1e3 * (ahead**2 + right**2) ** 0.5:.1f} mm"
+    return (
+        Markup('<line class="shift" x1="{0:.0f}" y1="{0:.0f}" x2="{1:.0f}" y2="{2:.0f}"/>').format(centre, x, y),
+        Markup('<circle class="cg" cx="{:.0f}" cy="{:.0f}" r="7"/>').format(x, y),
+        _text(x, y + 24.0, words, "loss"),
+    )

@@ -7,19 +7,32 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from numbers import Integral
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
+import typer
 from quadid_evaluation.optimisers.minimise import minimise
 
-from quadid.app.logs import Given, Log, file_name, remembered, settled
+from quadid.app.logs import Log, file_name, remembered, settled
 from quadid.app.missing import Beside, MissingForces, missing_forces
-from quadid.app.outcome import LIBRARY, Advance, Fitted, known, provenance, quality, silent, told
+from quadid.app.options import Logs, OfVehicle, Seed, Validate
+from quadid.app.outcome import (
+    LIBRARY,
+    Advance,
+    Fitted,
+    UnansweredError,
+    known,
+    provenance,
+    quality,
+    silent,
+    told,
+)  # fmt: skip
 from quadid.data.window import Window
-from quadid.errors import NotIdentifiableError, ParameterError, nearest
+from quadid.errors import ParameterError, nearest
 from quadid.model.layout import Layout, with_reference_voltage
 from quadid.parameters import NOMINAL_NAMES, ParameterSet
+from quadid.report.page import render
+from quadid.report.tables import Cell, Column, TextTable, number, parameter_table
 from quadid.report.verdict import Verdict, identify_verdict
 from quadid.sanitise import LONGEST_LINE, plain
 from quadid.types import FloatArray
@@ -30,7 +43,6 @@ if TYPE_CHECKING:
     from quadid.identification.controller_gains import Autopilot
     from quadid.identification.fit import Fit
     from quadid.identification.result import ScoredSet
-    from quadid.report.tables import TextTable
 
 # --- The searches that an identification offers, behind one call
 
@@ -39,14 +51,16 @@ OPTIMIZERS = (
     "pso_polish", "pso", "initial", "quasi_newton", "least_squares", "cma_es", "l_shade", "differential_evolution",
     "pso_algorithm_1",
 )  # fmt: skip
+FITS = ("p", "q", "r", "a_z")
+"""Channels whose fit is printed."""
 BUDGET = 4000
 """Simulations of the data that any search but the standard one may spend."""
 
 
-def check_optimizer(name: str) -> None:
+def check_optimizer(optimizer: str) -> None:
     """Raises ParameterError for an unknown search, with the nearest known one."""
-    if name not in OPTIMIZERS:
-        raise ParameterError(f"unknown optimizer '{name}'", ", ".join(OPTIMIZERS), nearest(name, OPTIMIZERS))
+    if optimizer not in OPTIMIZERS:
+        raise ParameterError(f"unknown optimizer '{optimizer}'", ", ".join(OPTIMIZERS), nearest(optimizer, OPTIMIZERS))
 
 
 def check_seed(seed: int) -> None:
@@ -98,6 +112,7 @@ class Identified(Fitted):
         fit: the fit itself.
     """
 
+    title = "Identification"
     result: dict[str, Any]
     fit: Fit
     sets: list[ScoredSet]
@@ -128,15 +143,30 @@ class Identified(Fitted):
         return identify_verdict(self.result)
 
     @property
-    def heading(self) -> str:
+    def opening(self) -> list[Cell]:
         """What the values rest on."""
-        return f"{self.fit.vehicle.name}: {known(self.fit.vehicle)}, from its file. All values depend on these."
+        return [Cell(f"{self.fit.vehicle.name}: {known(self.fit.vehicle)}, from its file. All values depend on these.")]
 
     def tables(self, truth: Mapping[str, float] | None = None) -> list[TextTable]:
         """Parameters, beside the truth where a simulation knows it, and how well each log is followed."""
-        from quadid.report.tables import parameter_table, set_table
-
-        return [parameter_table(self.result["parameters"], truth), set_table(self.result["sets"])]
+        columns = (
+            Column("log"), Column("role"), Column("current", right=True), Column("fitted", right=True),
+            *(Column(f"fit {n}", right=True, rank=1) for n in FITS),
+        )  # fmt: skip
+        rows = []
+        for s in self.result["sets"]:
+            fits = [s["fit_percent"].get(n) for n in FITS]
+            rows.append(
+                (
+                    s["log"],
+                    s["role"],
+                    number(s["mse"]["initial"], 3),
+                    number(s["mse"]["fitted"], 3),
+                    *("-" if v is None or not math.isfinite(v) else f"{max(v, -999.0):.0f} %" for v in fits),
+                )
+            )
+        followed = TextTable("Error over 1 s of simulation, in noise variances (1 = noise floor)", columns, tuple(rows))
+        return [parameter_table(self.result["parameters"], truth), followed]
 
     def records(self) -> list[dict[str, Any]]:
         """One row a parameter."""
@@ -182,7 +212,6 @@ class Identified(Fitted):
         """The page: parameters, errors of every log, correlations, what the flights excite."""
         from quadid.report.figures import MOST_LOGS
         from quadid.report.fit_pages import correlation_section, flight_section, identify_page
-        from quadid.report.page import render
 
         result, fit = self.result, self.fit
         rows = provenance(self.logs, command) + [
@@ -202,21 +231,12 @@ class Identified(Fitted):
         return render(page)
 
 
-class UnansweredError(NotIdentifiableError):
-    """The data say nothing about any parameter; `outcome` holds what there is, which is the initial guess."""
-
-    def __init__(self, outcome: Identified) -> None:
-        self.outcome = outcome
-        super().__init__(
-            "the data reveal no parameter",
-            "a flight that moves in roll, pitch, yaw and height",
-            "fly what `quadid excite` proposes; results were written, but they are the initial guess",
-        )
-
-
 def identify(
-    logs: Given, validate: Given = (), *, vehicle: str | Path | Vehicle | None = None, optimizer: str = OPTIMIZERS[0],
-    seed: int = 1, free: Sequence[str] = (), fix: Sequence[str] = (),
+    logs: Logs, validate: Validate = (), *, vehicle: OfVehicle = None,
+    optimizer: Annotated[
+        str, typer.Option("--optimizer", metavar="NAME", help=f"How to search: {', '.join(OPTIMIZERS)}.")
+    ] = OPTIMIZERS[0],
+    seed: Seed = 1, free: Sequence[str] = (), fix: Sequence[str] = (),
     bounds: Mapping[str, tuple[float, float]] | None = None, priors: Mapping[str, tuple[float, float]] | None = None,
     effects: Mapping[str, Mapping[str, float]] | None = None, advance: Advance = silent,
 ) -> Identified:  # fmt: skip

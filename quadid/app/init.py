@@ -7,10 +7,15 @@ import math
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from quadid.app.logs import open_recording, write_text
+import typer
+
+from quadid.app.logs import file_name, open_recording, write_text
+from quadid.app.options import Preset, Typed
+from quadid.app.outcome import Outcome
 from quadid.errors import ParameterError, VehicleError
+from quadid.report.tables import Cell, Column, TextTable
 from quadid.vehicle import Vehicle
 
 _TEMPLATE = """\
@@ -35,26 +40,51 @@ parameters:             # first guesses, a factor of 4 each way
 """
 
 
-@dataclass(frozen=True)
-class Initial:
+@dataclass(frozen=True, repr=False)
+class Initial(Outcome):
     """A vehicle file to fill in; `result` has the form ``quadid.init/1``, its ``file`` None until it is written."""
 
     result: dict[str, Any]
-    text: str
+    content: str
 
     def __repr__(self) -> str:
-        return self.text
+        return self.content
 
     def save(self, path: str | Path) -> Path:
         """Writes the file, unless there is one; returns its absolute path."""
         if Path(path).exists():
             raise VehicleError(f"{path} is there already", "a new file", "choose another name, or remove it")
-        return write_text(path, self.text)
+        return write_text(path, self.content)
+
+    def write(self, folder: Path, kept: str | None = None) -> list[tuple[str, Path]]:
+        """Writes the file under the name of the vehicle."""
+        path = self.save(folder / f"{file_name(self.result['vehicle'])}.yaml")
+        self.result["file"] = str(path)
+        return [("Written", path)]
+
+    @property
+    def sentences(self) -> list[Cell]:
+        """What to do next."""
+        blanks = ", ".join(self.result["fill_in"])
+        fill = [Cell(f"To fill in: {blanks} (then delete the words FILL IN)")] if blanks else []
+        return [*fill, Cell(f"Next: quadid inspect LOG --vehicle {file_name(self.result['vehicle'])}.yaml")]
 
 
 def init(
-    name: str, log: str | Path | None = None, *, mass: float | None = None, arm: float | None = None,
-    preset: str = "auto",
+    name: Annotated[str, typer.Argument(metavar="NAME", help="Name of the vehicle, and of its file.")],
+    log: Annotated[
+        str | Path | None,
+        Typed(
+            str | None,
+            typer.Option("--from", metavar="LOG", help="Take geometry, frame, motor order and limits from this log."),
+        ),
+    ] = None,
+    *,
+    mass: Annotated[float | None, typer.Option("--mass", metavar="KG", min=0.001, help="Mass as it flies.")] = None,
+    arm: Annotated[
+        float | None, typer.Option("--arm", metavar="M", min=0.001, help="Distance of the rotors from the centre.")
+    ] = None,
+    preset: Preset = "auto",
 ) -> Initial:  # fmt: skip
     """A vehicle file to fill in.
 
@@ -86,6 +116,34 @@ def init(
     blanks = [line.split(":")[0].strip(" -#") for line in text.splitlines() if "FILL IN" in line]
     source = None if log is None else str(Path(log).absolute())
     return Initial({"schema": "quadid.init/1", "vehicle": name, "from": source, "fill_in": blanks, "file": None}, text)
+
+
+@dataclass(frozen=True, repr=False)
+class Shipped(Outcome):
+    """The vehicles that ship; `result` has the form ``quadid.vehicles/1``."""
+
+    result: dict[str, Any]
+
+    def tables(self) -> list[TextTable]:
+        """One row a vehicle."""
+        columns = (
+            Column("vehicle"), Column("rotors", right=True), Column("mass [kg]", right=True),
+            Column("arm [m]", right=True), Column("command", rank=1), Column("description", rank=2),
+        )  # fmt: skip
+        rows = tuple(
+            (r["name"], str(r["rotors"]), f"{r['mass']:.4g}", f"{r['arm']:.3g}", r["command"], r["description"])
+            for r in self.records()
+        )
+        return [TextTable("Vehicles that ship (--vehicle NAME)", columns, rows)]
+
+    def records(self) -> list[dict[str, Any]]:
+        """One row a vehicle."""
+        return list(self.result["vehicles"])
+
+
+def vehicles() -> Shipped:
+    """Lists the vehicles that ship."""
+    return Shipped({"schema": "quadid.vehicles/1", "vehicles": shipped()})
 
 
 def shipped() -> list[dict[str, Any]]:

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
 
 from quadid.app.logs import (
     GRID,
     LONGEST,
+    Flight,
     Log,
     LogPart,
     as_vehicle,
@@ -19,17 +21,21 @@ from quadid.app.logs import (
     names_of,
     open_recording,
     parse_part,
+    write_text,
 )
-from quadid.app.outcome import Outcome
+from quadid.app.options import Described, NamedColumns, Preset, Start, Stop, Typed
+from quadid.app.outcome import Outcome, json_text
 from quadid.data.window import Recording, beginning
 from quadid.errors import QuadidError
 from quadid.parameters import NOMINAL_UNITS
+from quadid.report.tables import Cell, Column, TextTable, Tone, number
+from quadid.report.verdict import parameter_name
+from quadid.sanitise import LONGEST_LINE, plain
 from quadid.vehicle import Vehicle
 
 if TYPE_CHECKING:
     from quadid.checks import Check, Inspection
     from quadid.checks.motion import Spans
-    from quadid.report.tables import TextTable
 
 
 @dataclass(frozen=True, repr=False)
@@ -40,18 +46,30 @@ class Inspected(Outcome):
     found: Inspection
 
     @property
-    def heading(self) -> str:
-        """Name, format, length, when it flies, and whether the log can be used."""
-        from quadid.report.tables import heading, usability
-
-        return f"{heading(self.found)}\n{usability(self.found).text}"
+    def opening(self) -> list[Cell]:
+        """Name, format, length, when it flies; then whether the log can be used, with the first reason against it."""
+        found = self.found
+        flying = ", ".join(_from_to(a, b, found) for a, b in found.flying) or "none found"
+        head = f"{_clean(found.name)}: {found.format}, {found.seconds:.1f} s, flying from-to (s): {flying}"
+        wrong = [c for c in found.checks if c.verdict == "error"]
+        why = f": {_spaced(wrong[0].name)}, {_clean(wrong[0].message)}" if wrong else ""
+        usable = Cell("usable for identification", "good")
+        return [
+            Cell(head, "title"),
+            usable if found.usable else Cell(f"not usable for identification as it is{why}", "poor"),
+        ]
 
     @property
-    def sentences(self) -> list[str]:
-        """Findings of the checks, then missing channels."""
-        from quadid.report.tables import sentences
-
-        return [cell.text for cell in sentences(self.found)]
+    def sentences(self) -> list[Cell]:
+        """What the checks found and what is missing, a sentence each."""
+        out = []
+        for check in self.found.checks:
+            fix = f". Fix: {_clean(check.fix)}" if check.fix else ""
+            out.append(Cell(f"{_spaced(check.name)}: {_clean(check.message)}{fix}", _TONES[check.verdict]))
+        missing = self.found.missing
+        return out + [
+            Cell(f"missing: {m.channel}: {_clean(m.why)}. To get it: {_clean(m.how)}", "fair") for m in missing
+        ]
 
     @property
     def warnings(self) -> list[str]:
@@ -60,10 +78,14 @@ class Inspected(Outcome):
         return [*self.found.warnings, *([left_on_ground(use)] if use else [])]
 
     def tables(self) -> list[TextTable]:
-        """Channels, checks, parameters, and what is missing."""
-        from quadid.report.tables import inspect_tables
+        """Channels, checks, and parameters."""
+        return [channel_table(self.found), check_table(self.found), parameter_outlook_table(self.found)]
 
-        return inspect_tables(self.found)
+    def write(self, folder: Path, kept: str | None = None) -> list[tuple[str, Path]]:
+        """Writes the inspection as JSON."""
+        path = folder / f"{Path(self.result['log']).name}.inspect.json"
+        self.result["files"] = [str(path)]
+        return [("Written", write_text(path, json_text(self.result)))]
 
     def records(self) -> list[dict[str, Any]]:
         """One row a channel."""
@@ -71,8 +93,28 @@ class Inspected(Outcome):
 
 
 def inspect(
-    log: str | Path | Log, vehicle: str | Path | Vehicle | None = None, *, start: float | None = None,
-    stop: float | None = None, preset: str = "auto", columns: Mapping[str, str] | None = None,
+    log: Annotated[
+        Flight,
+        Typed(
+            str,
+            typer.Argument(
+                metavar="LOG",
+                help="A flight log: ROS 2 MCAP, .tlog, DataFlash, ULog, CSV, format auto-detected. LOG@76:216: a span.",
+            ),
+            ...,
+        ),
+    ],
+    vehicle: Annotated[
+        Described | None,
+        Typed(
+            str | None,
+            typer.Option(
+                "--vehicle", metavar="V", help="A shipped name or a YAML file: checks motors and excitation too."
+            ),
+            read=as_vehicle,
+        ),
+    ] = None,
+    *, start: Start = None, stop: Stop = None, preset: Preset = "auto", columns: NamedColumns = None,
 ) -> Inspected:  # fmt: skip
     """Inspects a log, and never refuses one that can be read.
 
@@ -139,3 +181,70 @@ def _excitation(recording: Recording, vehicle: Vehicle, cut: LogPart, flown: Spa
         }
         for name, bound, alone in zip(found.names, found.bound, found.alone, strict=True)
     )
+
+
+# --- An inspection as tables for people
+
+
+_TONES: dict[str, Tone] = {"ok": "good", "warning": "fair", "error": "poor", "unknown": "dim"}
+
+
+def channel_table(found: Inspection) -> TextTable:
+    """One row a channel."""
+    columns = (
+        Column("channel"), Column("rate (Hz)", right=True), Column("samples", right=True, rank=4),
+        Column("from-to (s)", right=True, rank=3), Column("gaps", right=True),
+        Column("longest (s)", right=True, rank=5), Column("dropped", right=True, rank=2), Column("source", rank=1),
+    )  # fmt: skip
+    rows = tuple(
+        (
+            f.name,
+            number(f.rate),
+            str(f.count),
+            _from_to(f.first, f.last, found),
+            str(f.gaps),
+            f"{f.longest_gap:.3g}" if f.gaps else "",
+            str(sum(f.dropped.values()) or ""),
+            _clean(f.source),
+        )
+        for f in found.channels
+    )
+    return TextTable("Channels", columns, rows)
+
+
+def check_table(found: Inspection) -> TextTable:
+    """Verdict of every check; what was found and what to do follow as sentences."""
+    columns = (Column("check"), Column("verdict"))
+    rows = tuple((_spaced(c.name), Cell(c.verdict.value, _TONES[c.verdict.value])) for c in found.checks)
+    return TextTable("Checks", columns, rows)
+
+
+def parameter_outlook_table(found: Inspection) -> TextTable:
+    """Which parameters the log can show, and how sharply; motion says nothing where a channel lacks or is too slow."""
+    expected = {str(row["name"]): float(row["relative_sigma"]) for row in found.excitation}
+    columns = [Column("parameter"), Column("possible")]
+    if expected:
+        columns.append(Column("expected 1-sigma", right=True))
+    columns.append(Column("why", rank=1))
+    rows = []
+    for outlook in found.parameters:
+        cells = [parameter_name(outlook.parameter), "yes" if outlook.possible else "no"]
+        if expected:
+            sigma = expected.get(outlook.parameter, float("nan"))
+            excited = f"{100.0 * sigma:.2g} %" if sigma < 10.0 else "not excited"
+            cells.append(excited if outlook.possible else "")
+        rows.append((*cells, _clean(outlook.reason)))
+    return TextTable("What can be identified", tuple(columns), tuple(rows))
+
+
+def _from_to(first: float, last: float, found: Inspection) -> str:
+    """In the time of ``LOG@from:to``; a channel may begin before the IMU."""
+    return f"{first - found.zero:z.1f}-{last - found.zero:z.1f}"
+
+
+def _spaced(name: str) -> str:
+    return name.replace("_", " ")
+
+
+def _clean(text: str) -> str:
+    return plain(text, LONGEST_LINE)

@@ -9,20 +9,23 @@ import platform
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from quadid_replay import write_compared
 from quadid_replay.frames import from_euler
 
 from quadid.app.logs import LONGEST, Log, free_name, import_pandas, open_recording, parse_part, write_text
-from quadid.app.missing import MissingForces
+from quadid.app.missing import Beside, MissingForces
 from quadid.data.resample import sample_period
 from quadid.data.window import Channel, Recording, beginning
-from quadid.errors import QuadidError
+from quadid.errors import NotIdentifiableError, QuadidError
 from quadid.jsonable import jsonable
+from quadid.report.page import measures, number, render
+from quadid.report.tables import Cell, TextTable
 from quadid.report.verdict import Verdict
 from quadid.types import FloatArray, Json
 from quadid.vehicle import Vehicle
@@ -34,7 +37,6 @@ if TYPE_CHECKING:
     from quadid.checks import Inspection
     from quadid.identification.fit import Fit
     from quadid.identification.result import ScoredSet
-    from quadid.report.tables import TextTable
 
 # --- How long work reports how far it is
 
@@ -54,14 +56,16 @@ class Outcome(ABC):
     """A result that prints as its command prints it.
 
     Attributes:
+        title: what was asked for, for the page of a failure; empty where there is none.
         result: plain data of the command's JSON, without the files that only the command writes.
     """
 
+    title: ClassVar[str] = ""
     result: dict[str, Any]
 
-    @abstractmethod
     def tables(self) -> list[TextTable]:
         """The tables that the command prints, in order."""
+        return []
 
     @property
     def verdict(self) -> Verdict | None:
@@ -69,12 +73,12 @@ class Outcome(ABC):
         return None
 
     @property
-    def heading(self) -> str:
-        """What stands above the tables."""
-        return ""
+    def opening(self) -> list[Cell]:
+        """What stands above the tables, a line each."""
+        return []
 
     @property
-    def sentences(self) -> list[str]:
+    def sentences(self) -> list[Cell]:
         """What stands below the tables, a sentence each."""
         return []
 
@@ -83,28 +87,36 @@ class Outcome(ABC):
         """What a user should know, from logs and from the work itself."""
         return list(self.result.get("warnings", ()))
 
+    def write(self, folder: Path, kept: str | None = None) -> list[tuple[str, Path]]:
+        """Writes the files of the command and names them in `result`.
+
+        Args:
+            folder: for the files.
+            kept: vehicle file that was read, which is not overwritten.
+
+        Returns:
+            What each file is, and its absolute path.
+        """
+        return []
+
     def text(self, width: int = 100) -> str:
         """Tables, verdict and warnings, for a page of `width` columns."""
-        parts = [self.heading] if self.heading else []
-        parts += [table.text(width) for table in self.tables()]
-        if self.sentences:
-            parts.append("\n".join(self.sentences))
-        if self.verdict is not None:
-            parts.append("\n".join(self.verdict.lines()))
-        parts += [f"warning: {warning}" for warning in self.warnings]
-        return "\n\n".join(parts)
+        parts = ["\n".join(cell.text for cell in self.opening), *(table.text(width) for table in self.tables())]
+        parts.append("\n".join(cell.text for cell in self.sentences))
+        parts += ["\n".join(self.verdict.lines())] if self.verdict is not None else []
+        return "\n\n".join(filter(None, [*parts, *(f"warning: {warning}" for warning in self.warnings)]))
 
     def __repr__(self) -> str:
         return self.text()
 
     def _repr_html_(self) -> str:
-        parts = [f"<p><b>{escape(self.heading)}</b></p>"] if self.heading else []
+        verdict = [] if self.verdict is None else self.verdict.lines()
+        parts = [f"<p><b>{escape(cell.text)}</b></p>" for cell in self.opening]
         parts += [table.html() for table in self.tables()]
-        parts += [f"<p>{escape(line)}</p>" for line in self.sentences]
-        if self.verdict is not None:
-            head, *more = (escape(line) for line in self.verdict.lines())
-            parts.append(f"<p><b>{head}</b></p>" + "".join(f"<p>{line}</p>" for line in more))
-        return "".join([*parts, *(f"<p>warning: {escape(warning)}</p>" for warning in self.warnings)])
+        parts += [f"<p>{escape(cell.text)}</p>" for cell in self.sentences]
+        parts += [f"<p><b>{escape(line)}</b></p>" for line in verdict[:1]]
+        below = [*verdict[1:], *(f"warning: {warning}" for warning in self.warnings)]
+        return "".join([*parts, *(f"<p>{escape(line)}</p>" for line in below)])
 
     def to_json(self, path: str | Path | None = None) -> str:
         """The result as JSON text; with `path` also written there."""
@@ -122,9 +134,21 @@ class Outcome(ABC):
         """Columns of a main table that may have no row; else those of its rows."""
         return ()
 
-    @abstractmethod
     def records(self) -> list[dict[str, Any]]:
         """Rows of the main table with plain numbers."""
+        return []
+
+
+class UnansweredError(NotIdentifiableError):
+    """The data say nothing about any parameter; `outcome` holds what there is, which is the initial guess."""
+
+    def __init__(self, outcome: Outcome) -> None:
+        self.outcome = outcome
+        super().__init__(
+            "the data reveal no parameter",
+            "a flight that moves in roll, pitch, yaw and height",
+            "fly what `quadid excite` proposes; results were written, but they are the initial guess",
+        )
 
 
 NUMBER_COLUMNS = ("effect", "confident", "parameter", "unit", "value", "low", "high")
@@ -206,6 +230,13 @@ class Reported(Outcome):
         """Writes the HTML report, as `page`."""
         return write_text(path, self.page(command))
 
+    def rendered(self, title: str, subtitle: str, sections: Sequence[Json], origin: Sequence[Json]) -> str:
+        """A page of sections below the verdict; `origin` as of `provenance`."""
+        return render({
+            "title": title, "subtitle": subtitle, "verdict": None if self.verdict is None else asdict(self.verdict),
+            "sections": sections, "warnings": self.warnings, "provenance": origin,
+        })  # fmt: skip
+
 
 class Fitted(Reported):
     """A result from logs that were fitted and scored.
@@ -214,11 +245,32 @@ class Fitted(Reported):
         sets: scored logs, for pictures.
         logs: the same ones as loaded, training logs first.
         forces: what the models miss on them; None where no gyro or accelerometer shows it.
+        beside: what acts beside the values of the vehicle file.
     """
 
     sets: list[ScoredSet]
     logs: list[Log]
-    forces: MissingForces | None
+    forces: MissingForces | None = None
+    beside: Beside | None = None
+
+    @property
+    @abstractmethod
+    def vehicle(self) -> Vehicle:
+        """The vehicle with what was found; ``vehicle.save("mine.yaml")`` writes it."""
+
+    @property
+    @abstractmethod
+    def file_name(self) -> str:
+        """Name of the vehicle file."""
+
+    def write(self, folder: Path, kept: str | None = None) -> list[tuple[str, Path]]:
+        """Writes the vehicle file, under another name where it would overwrite the one that was read."""
+        path = folder / self.file_name
+        if kept is not None and path.exists() and Path(kept).exists() and path.samefile(kept):
+            path = path.with_suffix(".new.yaml")
+        path = write_text(path, self.vehicle.to_yaml())
+        self.result["vehicle_file"] = str(path)
+        return [("Vehicle file", path)]
 
     @property
     def train(self) -> list[Log]:
@@ -272,7 +324,6 @@ def failure_html(
     """The HTML report of an attempt that failed."""
     from quadid.checks import inspect
     from quadid.report.fit_pages import failure_page
-    from quadid.report.page import render
 
     rows = provenance([], command)
     read: list[tuple[Recording, Inspection | None]] = []
@@ -293,9 +344,6 @@ def failure_html(
 
 def quality(log: Log) -> dict[str, Any]:
     """What one log offered and what of it was used."""
-    from quadid.report.figures import measures
-    from quadid.report.page import number
-
     grid = log.grid
     summary = [
         f"{grid.seconds_used:.1f} of {grid.seconds_log:.1f} s used, on a {grid.rate:.4g} Hz grid",

@@ -5,21 +5,22 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Annotated, Any
 
-from quadid.app.logs import Given, Log, fitted_before, settled
+import typer
+
+from quadid.app.logs import Log, fitted_before, settled
 from quadid.app.missing import ROWS, SECONDS
+from quadid.app.options import Horizons, Logs, OfVehicle, OwnRate
 from quadid.app.outcome import Outcome
 from quadid.data.window import Window, beginning
 from quadid.errors import NotIdentifiableError, ParameterError
+from quadid.identification.predict import QUANTITIES
 from quadid.model.layout import Layout
+from quadid.report.tables import Cell, Column, TextTable, number
 from quadid.report.verdict import Verdict, score_verdict
-from quadid.types import FloatArray
+from quadid.types import FloatArray, Json
 from quadid.vehicle import Vehicle
-
-if TYPE_CHECKING:
-    from quadid.report.tables import TextTable
 
 HORIZONS = (1, 10, 50)
 OPEN = 0.1
@@ -46,14 +47,12 @@ class Scored(Outcome):
 
     def tables(self) -> list[TextTable]:
         """Errors after every horizon, pooled and a log; what lies inside the predicted bands."""
-        from quadid.report.tables import coverage_table, horizon_table
-
         return [horizon_table(self.result), coverage_table(self.result)]
 
     @property
-    def sentences(self) -> list[str]:
+    def sentences(self) -> list[Cell]:
         """What the bands rest on."""
-        return [self.result["bands"]]
+        return [Cell(self.result["bands"])]
 
     def records(self) -> list[dict[str, Any]]:
         """One row a log and horizon, the pooled ones with the log None."""
@@ -62,8 +61,13 @@ class Scored(Outcome):
 
 
 def score(
-    logs: Given, *, vehicle: str | Path | Vehicle | None = None, horizons: str | Sequence[int | str] = HORIZONS,
-    rate: float | None = None, closed_loop: bool = False,
+    logs: Logs, *, vehicle: OfVehicle = None, horizons: Horizons = HORIZONS, rate: OwnRate = None,
+    closed_loop: Annotated[
+        bool,
+        typer.Option(
+            "--closed-loop", help="Predict bands with the autopilot in the loop: gains of the file, or found."
+        ),
+    ] = False,
 ) -> Scored:  # fmt: skip
     """Open-loop prediction error after h samples: every sample starts one run from the measured state.
 
@@ -78,7 +82,7 @@ def score(
         LogError: a log that does not fit the vehicle.
         ParameterError: horizons that are no positive numbers, or times on logs of several rates.
     """
-    from quadid.identification.predict import QUANTITIES, horizon_scores, no_change, prediction_floor
+    from quadid.identification.predict import horizon_scores, no_change, prediction_floor
     from quadid.identification.result import score_result
 
     given = settled(logs, (), vehicle)
@@ -182,3 +186,52 @@ def coverage(
     if any(h not in total for h in wanted):
         told.append(f"none beyond {OPEN:g} s from logged rotor speeds, which already answer the future")
     return out, f"{'; '.join([*told, *reasons])}."
+
+
+def horizon_table(result: Json) -> TextTable:
+    """Open-loop prediction errors, pooled and for each file.
+
+    Args:
+        result: of the form ``quadid.score/1``.
+    """
+    many = len(result["files"]) > 1
+    columns = (
+        Column("log"), Column("after", right=True),
+        *(
+            Column(f"{name} [{unit}]", right=True, rank=max(2 - i, 0))
+            for i, (name, unit) in enumerate(QUANTITIES.items())
+        ),
+    )  # fmt: skip
+    rows = []
+    for entry in [*(result["files"] if many else []), result]:
+        label = entry.get("log", "all" if many else result["files"][0]["log"])
+        for horizon, errors in entry["horizons"].items():
+            rows.append((label, str(horizon), *(_error(errors[n]) for n in QUANTITIES)))
+            label = ""
+        total = entry["sum"]
+        rows.append(("", f"sum 1..{total['to']}", *(_error(total[n]) for n in QUANTITIES)))
+    last = list(result["horizons"])[-1]
+    for label, key in (("noise floor", "noise_floor"), ("no change predicted", "no_change")):
+        rows.append((label, last, *(number(result[key][last][n]) for n in QUANTITIES)))
+    title = f"Open-loop prediction error of '{result['vehicle']}' after n samples, mean of {result['samples']} runs"
+    return TextTable(title, columns, tuple(rows))
+
+
+def coverage_table(result: Json) -> TextTable:
+    """Shares of outcomes inside the predicted bands of 50, 80 and 95 %.
+
+    Args:
+        result: of the form ``quadid.score/1``.
+    """
+    bands = ("50", "80", "95")
+    columns = (Column("after", right=True), Column("of"), *(Column(f"{band} % band", right=True) for band in bands))
+    rows = []
+    for horizon, quantities in result["coverage"].items():
+        for name, shares in (quantities or {"": None}).items():
+            told = ["–"] * len(bands) if shares is None else [f"{100.0 * shares[band]:.0f} %" for band in bands]
+            rows.append((horizon, name, *told))
+    return TextTable("Outcomes inside the predicted bands, n samples after a filtered state", columns, tuple(rows))
+
+
+def _error(value: float | None) -> str:
+    return "ran away" if value == math.inf else number(value)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from quadid.cli.options import JsonTarget, OutFolder, Seed
+from quadid.app.options import JsonTarget, OutFolder, Seed
 
 if TYPE_CHECKING:
     from quadid.app.demo import Shown

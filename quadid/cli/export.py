@@ -10,8 +10,9 @@ import typer
 from quadid.app.export import export as exported
 from quadid.app.export import forms
 from quadid.app.logs import load_vehicle
-from quadid.cli.options import JsonTarget, OutFolder, shipped_names
-from quadid.report.programs import FORMATS, FORMS
+from quadid.app.options import JsonTarget, OutFolder, shipped_names
+from quadid.cli import terminal
+from quadid.report.programs import FORMATS
 from quadid.vehicle import Vehicle
 
 
@@ -45,11 +46,9 @@ def export(
     out: OutFolder = Path(),
 ) -> None:
     """Write the parameters for another program, with units and where each came from; nothing is sent to a vehicle."""
-    from quadid.cli import terminal
-
     terminal.check_file(json, "--json")
     if what:
-        listed(json)
+        terminal.conclude(forms(), json)
         return
     if vehicle is None:
         raise typer.BadParameter("no vehicle: use --vehicle, or --list", param_hint="--vehicle")
@@ -59,27 +58,7 @@ def export(
     elif name is not None:
         raise typer.BadParameter("it names sets of a history: give --history FILE too", param_hint="--id")
     done = exported(described, form, source=source, doubt=doubt, anyway=anyway)
-    folder = terminal.out_folder(out)
-    for path in (folder / file for file in done.texts):
-        if path.exists() and Path(vehicle).exists() and path.samefile(vehicle):
-            raise terminal.OutputError(f"the export would overwrite {vehicle}", "another folder", "give --out")
-    done.result["files"] = [str(path) for path in done.save(folder)]
-    terminal.write_json(done.result, json)
-    console = terminal.console(quiet=json == "-")
-    for file in done.result["files"]:
-        console.print(f"Written: {file}", soft_wrap=True)
-    terminal.warn(done.result["warnings"])
-
-
-def listed(json: str | None) -> None:
-    """Prints what each form carries."""
-    from quadid.cli import terminal
-
-    carried = {name: {"program": form.program, "effects": list(form.effects)} for name, form in FORMS.items()}
-    terminal.write_json({"schema": "quadid.formats/1", "formats": carried}, json)
-    console = terminal.console(quiet=json == "-")
-    terminal.print_tables(console, forms())
-    console.print("\nEvery form carries mass and geometry; `yaml` carries all. What a form leaves out, its file names.")
+    terminal.conclude(done, json, folder=terminal.out_folder(out), kept=vehicle)
 
 
 def _in_force(vehicle: Vehicle, history: Path, name: str) -> tuple[Vehicle, str, str]:

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 from quadid.app.logs import load_vehicle
-from quadid.cli.options import JsonTarget, shipped_names
+from quadid.app.options import JsonTarget, shipped_names
+from quadid.app.outcome import Outcome
+from quadid.cli import terminal
 from quadid.errors import VehicleError
-from quadid.report.tables import Column, TextTable, number
+from quadid.report.tables import Cell, Column, TextTable, number
 
 
 def history(
@@ -38,8 +41,6 @@ def history(
     """Show the stored parameter sets of a vehicle: what, when, from which data, who approved."""
     from quadid_node.history import StoreError, default_path, read_history, read_in_force
 
-    from quadid.cli import terminal
-
     terminal.check_file(json, "--json")
     path, name, described = file or default_path(), vehicle, None
     found = read_history(path, name, candidates, events)
@@ -58,33 +59,36 @@ def history(
     result = {
         "schema": "quadid.history/1", "vehicle": name, "history": str(path.absolute()), "in_force": force, **found,
     }  # fmt: skip
-    terminal.write_json(result, json)
-    show(result, quiet=json == "-")
+    terminal.conclude(Stored(result), json)
 
 
-def show(result: dict[str, Any], quiet: bool) -> None:
-    """Prints sets, estimates and events."""
-    from quadid.cli import terminal
-    from quadid.cli.terminal import print_tables
+@dataclass(frozen=True, repr=False)
+class Stored(Outcome):
+    """Sets, estimates and events of a vehicle; `result` has the form ``quadid.history/1``."""
 
-    console = terminal.console(quiet=quiet)
-    if not result["sets"]:
-        others = ", ".join(v["name"] for v in result["vehicles"]) or "none"
-        console.print(f"no sets of '{result['vehicle']}' yet; vehicles in this history: {others}")
-    else:
-        story = _story(result["sets"], f"Parameter sets of {result['vehicle']}")
-        print_tables(console, [story, _values(result["sets"])])
-        for item in result["sets"]:
-            old = f"; out of date: {item['outdated']}" if item.get("outdated") else ""
-            console.print(f"set {item['sequence']}: {item['reason']}{old}")
-        force = result["in_force"]
-        if force is not None:
-            doubt = f", {force['doubt']}" if force["doubt"] else ""
-            console.print(f"last in force: set {force['sequence']}{doubt}")
-    for item in result["candidates"]:
-        console.print(f"{_when(item['wall'])}  {item['state']:9} {item['check']}: {item['reason']}")
-    for item in result["events"]:
-        console.print(f"{_when(item['wall'])}  {item['level']:7} {item['kind']}: {item['text']}")
+    result: dict[str, Any]
+
+    def tables(self) -> list[TextTable]:
+        """When, by whom and from which data; then the values."""
+        sets = self.result["sets"]
+        return [_story(sets, f"Parameter sets of {self.result['vehicle']}"), _values(sets)] if sets else []
+
+    @property
+    def sentences(self) -> list[Cell]:
+        """Reasons of sets, which one was in force last, estimates and events."""
+        sets, force = self.result["sets"], self.result["in_force"]
+        old = [f"; out of date: {item['outdated']}" if item.get("outdated") else "" for item in sets]
+        told = [f"set {item['sequence']}: {item['reason']}{late}" for item, late in zip(sets, old, strict=True)]
+        if not sets:
+            others = ", ".join(v["name"] for v in self.result["vehicles"]) or "none"
+            told = [f"no sets of '{self.result['vehicle']}' yet; vehicles in this history: {others}"]
+        elif force is not None:
+            told.append(f"last in force: set {force['sequence']}{', ' * bool(force['doubt'])}{force['doubt']}")
+        for item in self.result["candidates"]:
+            told.append(f"{_when(item['wall'])}  {item['state']:9} {item['check']}: {item['reason']}")
+        for item in self.result["events"]:
+            told.append(f"{_when(item['wall'])}  {item['level']:7} {item['kind']}: {item['text']}")
+        return [Cell(text) for text in told]
 
 
 def _story(sets: Sequence[dict[str, Any]], title: str) -> TextTable:

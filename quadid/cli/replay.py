@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from quadid_replay import TopicWriter, open_log
 
-from quadid.cli.options import Columns, JsonTarget, Preset, Rate, Seed, VehicleName
+from quadid.app.options import Columns, JsonTarget, Preset, Rate, Seed, VehicleName
+from quadid.app.outcome import Outcome
 from quadid.errors import QuadidError
+from quadid.report.tables import Cell, TextTable, parameter_table
 
 if TYPE_CHECKING:
     from quadid_node.messages import Output
@@ -100,8 +103,7 @@ def replay(
     if out is not None:
         write_outputs(out, outputs, described.name)
         result["out"] = str(out.absolute())
-    terminal.write_json(result, json)
-    show(result, quiet=json == "-")
+    terminal.conclude(Replayed(result), json)
     if not result["published"]:
         raise typer.Exit(NOTHING)
 
@@ -221,23 +223,32 @@ def write_outputs(path: Path, outputs: Sequence[Output], vehicle: str) -> None:
                 writer.write(*TOPICS[output.topic], message, stamp["sec"] * 10**9 + stamp["nanosec"])
 
 
-def show(result: dict[str, Any], quiet: bool) -> None:
-    """Prints what was published, refused and found."""
-    from quadid.cli import terminal
-    from quadid.report.tables import parameter_table
+@dataclass(frozen=True, repr=False)
+class Replayed(Outcome):
+    """What a session published, refused and found; `result` has the form ``quadid.replay/1``."""
 
-    console = terminal.console(quiet=quiet)
-    for event in result["events"]:
-        if event["level"] != "info" or event["kind"] == "accepted":
-            console.print(f"{event['t'] or 0.0:9.1f} s  {event['text']}", soft_wrap=True)
-    for check, count in result["refused"].items():
-        console.print(f"{count} estimate{'s' * (count != 1)} not published: {check.replace('_', ' ')}")
-    if not result["published"]:
-        status = result["status"]
-        console.print(f"nothing published: {status['phase']}: {status['reason']}", soft_wrap=True)
-        return
-    last = result["published"][-1]
-    console.print(f"set {last['sequence']} of {result['vehicle']}, from {last['stop'] - last['start']:.0f} s")
-    terminal.print_tables(console, [parameter_table(last["parameters"])])
-    if "out" in result:
-        console.print(f"Written: {result['out']}", soft_wrap=True)
+    result: dict[str, Any]
+
+    @property
+    def opening(self) -> list[Cell]:
+        """Events, estimates that were not published, and the last set, or why there is none."""
+        result = self.result
+        events = [e for e in result["events"] if e["level"] != "info" or e["kind"] == "accepted"]
+        told = [f"{event['t'] or 0.0:9.1f} s  {event['text']}" for event in events]
+        for check, count in result["refused"].items():
+            told.append(f"{count} estimate{'s' * (count != 1)} not published: {check.replace('_', ' ')}")
+        if result["published"]:
+            last = result["published"][-1]
+            told.append(f"set {last['sequence']} of {result['vehicle']}, from {last['stop'] - last['start']:.0f} s")
+        else:
+            told.append(f"nothing published: {result['status']['phase']}: {result['status']['reason']}")
+        return [Cell(text) for text in told]
+
+    def tables(self) -> list[TextTable]:
+        """The parameters of the last set."""
+        return [parameter_table(self.result["published"][-1]["parameters"])] if self.result["published"] else []
+
+    @property
+    def sentences(self) -> list[Cell]:
+        """Where it was written."""
+        return [Cell(f"Written: {self.result['out']}")] if "out" in self.result else []

@@ -11,7 +11,7 @@ from quadid_evaluation.paper import protocol
 from quadid_evaluation.paper.protocol import Reproduced
 from quadid_evaluation.paper.result import summary
 
-from quadid.cli.options import JsonTarget, OutFolder, Seed
+from quadid.app.options import JsonTarget, OutFolder, Seed
 from quadid.types import JsonDict
 
 _FIGURES = "paper"

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from quadid.cli.options import JsonTarget, Seed, VehicleName
+from quadid.app.options import JsonTarget, Seed, VehicleName
 from quadid.cli.replay import parse_pairs
 
 if TYPE_CHECKING:

@@ -9,9 +9,9 @@ from typing import Annotated, Any
 
 import typer
 
+from quadid.app.options import JsonTarget, Seed, VehicleName
 from quadid.app.simulate import Draw, SimulateError, check_suffix, simulate_draws
 from quadid.app.simulate import simulate as fly
-from quadid.cli.options import JsonTarget, Seed, VehicleName
 from quadid.data.window import Recording
 
 LIVE = "udpout:"

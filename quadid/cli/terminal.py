@@ -10,13 +10,13 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from quadid.app.kernels import prepare
 from quadid.app.logs import OutputError as OutputError
 from quadid.app.logs import file_name as file_name
 from quadid.app.logs import write_text as write_text
 from quadid.app.outcome import Advance as Advance
 from quadid.app.outcome import Outcome, silent
 from quadid.app.outcome import json_text as json_text
-from quadid.cli.compiling import prepare
 from quadid.errors import QuadidError
 from quadid.report.tables import SPACE, Cell, TextTable
 from quadid.report.verdict import Verdict
@@ -180,8 +180,8 @@ def print_verdict(console: Console, verdict: Verdict) -> None:
 
 
 def conclude(
-    done: Outcome, json: str | None, report: Path | None = None, files: Mapping[str, Path] | None = None,
-    series: Path | None = None,
+    done: Outcome, json: str | None, report: Path | None = None, folder: Path | None = None,
+    series: Path | None = None, kept: str | None = None,
 ) -> None:  # fmt: skip
     """Writes what a command gives beside what it prints, names that in its JSON, and prints the result.
 
@@ -189,31 +189,30 @@ def conclude(
         done: the result; its warnings go to stderr.
         json: where its JSON goes, as `write_json`.
         report: where its HTML report goes.
-        files: where its ``vehicle`` goes.
+        folder: where its files go.
         series: folder for measured, simulated and missing over time.
+        kept: vehicle file that was read, which is not overwritten.
     """
     whole: Any = done  # which of these a command offers depends on its result
-    for name, path in (files or {}).items():
-        done.result[f"{name}_file"] = str(write_text(path, getattr(done, name).to_yaml()))
+    files = [] if folder is None else done.write(folder, kept)
     if report is not None:
         done.result["report"] = str(report.absolute())
-        whole.report(report, command_line())
+        files.append(("Report", whole.report(report, command_line())))
     if series is not None:
-        done.result["series"] = [str(path) for path in whole.save_series(series)]
+        written = whole.save_series(series)
+        done.result["series"] = [str(path) for path in written]
+        files += [("Over time", path) for path in written]
     write_json(done.result, json)
     out = console(quiet=json == "-")
-    if done.heading:
-        out.print(done.heading)
+    for cell in done.opening:
+        print_cell(out, cell)
     print_tables(out, done.tables())
     if done.verdict is not None:
         print_verdict(out, done.verdict)
-    for sentence in done.sentences:
-        out.print(sentence, soft_wrap=True)
-    for key, label in (("vehicle_file", "Vehicle file"), ("report", "Report")):
-        if done.result.get(key):
-            out.print(f"{label}: {done.result[key]}", soft_wrap=True)
-    for path in done.result.get("series", ()):
-        out.print(f"Over time: {path}", soft_wrap=True)
+    for cell in done.sentences:
+        print_cell(out, cell)
+    for label, path in files:
+        out.print(f"{label}: {path}", soft_wrap=True)
     warn(done.warnings)
 
 

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import time
 
-from quadid.app.kernels import PARTS
+from quadid.app.kernels import PARTS, prepare
+from quadid.app.options import JsonTarget
 from quadid.cli import terminal
-from quadid.cli.compiling import prepare
-from quadid.cli.options import JsonTarget
 
 
 def warmup(json: JsonTarget = None) -> None:
     """Compile all kernels for this machine's processor, in processes side by side; nothing to do where that is done."""
-
     begin = time.perf_counter()
     with terminal.progress(compiled=()) as advance:
         made = prepare(tuple(PARTS), advance)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from quadid.cli.options import JsonTarget
+from quadid.app.options import JsonTarget
 from quadid.errors import QuadidError
 from quadid.sanitise import plain
 

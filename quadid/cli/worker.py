@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from quadid.cli.options import JsonTarget
+from quadid.app.options import JsonTarget
 from quadid.sanitise import plain
 
 

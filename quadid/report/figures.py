@@ -1,4 +1,4 @@
-"""Figures of results: sections, tables and plots as plain descriptions without colours."""
+"""Figures of results as plain descriptions without colours."""
 
 from __future__ import annotations
 
@@ -16,87 +16,10 @@ from quadid.estimate.missing import Missing
 from quadid.identification.result import ScoredSet
 from quadid.identification.score import SCORE_SECONDS, SetScore
 from quadid.model.rollout import CHANNEL_NAMES, CHANNEL_UNITS
+from quadid.report.page import axis, figure, short, trace, upright
 from quadid.types import FloatArray, IndexArray, JsonDict
 
-# --- Pieces of a page: sections, tables, and figures as plain Plotly descriptions without colours
-#
-# The page gives every trace the colour of its role: ``measured``, ``before`` (current parameters), ``after`` (proposed
-# ones), ``truth``, ``floor``.
-
-
-def section(
-    identifier: str, title: str, intro: str = "", figures: Sequence[Mapping[str, Any]] = (),
-    tables: Sequence[Mapping[str, Any]] = (),
-    **more: Any,
-) -> JsonDict:  # fmt: skip
-    """A section of the page: what it says, then its figures and tables."""
-    return {
-        "id": identifier, "title": title, "intro": intro, "figures": list(figures), "tables": list(tables), **more,
-    }  # fmt: skip
-
-
-def rows_of(
-    head: Sequence[str], rows: Sequence[Sequence[Any]], fold: str = "", kind: str = "cards",
-    classes: Sequence[str] | None = None,
-) -> JsonDict:  # fmt: skip
-    """A table; folded under a line where one is given; `classes` are of the cells of each column.
-
-    On a phone each row is a card (`kind` ``cards``, ``cards narrow``), or a line or two (``compact``).
-    """
-    given = list(classes or ["wrap"] * len(head))
-    return {"head": list(head), "rows": [list(row) for row in rows], "fold": fold, "kind": kind, "classes": given}
-
-
-def measures(head: Sequence[str], rows: Sequence[Sequence[Any]], numbers: Sequence[int]) -> JsonDict:
-    """A narrow table in which the columns `numbers`, counted from 0, hold numbers."""
-    return rows_of(head, rows, kind="cards narrow", classes=["number" * (i in numbers) for i in range(len(head))])
-
-
-def figure(
-    identifier: str, title: str, data: Sequence[Mapping[str, Any]], layout: JsonDict, height: int, **more: Any
-) -> JsonDict:
-    """A figure of one view."""
-    views = [{"label": "", "data": list(data), "layout": layout}]
-    return {"id": identifier, "title": title, "views": views, "height": height, **more}
-
-
-def axis(text: str, **more: Any) -> JsonDict:
-    """An axis with its title."""
-    return {"title": {"text": text}, **more}
-
-
-def upright(x: float) -> JsonDict:
-    """An upright line through a figure."""
-    return {"type": "line", "x0": x, "x1": x, "y0": 0, "y1": 1, "yref": "paper", "role": "floor"}
-
-
-def level(y: float) -> JsonDict:
-    """A line across a figure at the height that all should keep to."""
-    return {"type": "line", "x0": 0, "x1": 1, "xref": "paper", "y0": y, "y1": y, "role": "floor"}
-
-
-def trace(role: str, name: str, x: FloatArray | None, y: FloatArray, **more: Any) -> JsonDict:
-    """One line of a figure; without `x` it takes that of its view.  Numbers keep what a picture can show."""
-    across = {} if x is None else {"x": short(x)}
-    return {"role": role, "name": name, **across, "y": short(y), "type": "scatter", "mode": "lines", **more}
-
-
-def short(values: FloatArray, resolution: float | None = None) -> list[float | None]:
-    """Numbers rounded to a two-thousandth of their range, so that a page stays small; None where not finite.
-
-    Args:
-        values: shape (n,).
-        resolution: smallest difference to keep, instead.
-    """
-    good = values[np.isfinite(values)]
-    if len(good) == 0:
-        return [None] * len(values)
-    finest = resolution or max(float(np.ptp(good)), 1e-3 * float(np.abs(good).max()), 1e-12) / 2000.0
-    decimals = max(0, math.ceil(-math.log10(finest)))
-    return [round(v, decimals) if math.isfinite(v) else None for v in values.tolist()]
-
-
-# --- Figures of results: channels over time, errors, parameters, gains; see `quadid.report.figures` for their form
+# --- Figures of results: channels over time, errors, parameters, gains; see `quadid.report.page` for their form
 
 
 GROUPS: dict[str, tuple[str, tuple[int, ...]]] = {
@@ -157,38 +80,61 @@ def channel_figures(
     return out
 
 
+def _stacked(panels: Sequence[tuple[str, JsonDict]], across: str) -> tuple[list[JsonDict], JsonDict]:
+    """Panels above each other with one axis across: where the lines of each go, and the layout.
+
+    Args:
+        panels: title and further settings of the vertical axis of each.
+        across: title of the common axis.
+    """
+    n = len(panels)
+    places = ["" if i == 0 else str(i + 1) for i in range(n)]
+    layout = {
+        f"yaxis{place}": {"domain": [1.0 - (i + 1) / n + 0.03, 1.0 - i / n - 0.01], **axis(title, **more)}
+        for i, (place, (title, more)) in enumerate(zip(places, panels, strict=True))
+    }
+    layout["xaxis"] = axis(across, anchor=f"y{places[-1]}")
+    return [{"xaxis": "x", "yaxis": f"y{place}"} for place in places], layout
+
+
+def _band(role: str, name: str, x: FloatArray, low: FloatArray, high: FloatArray, **where: Any) -> list[JsonDict]:
+    """A filled band without an entry in the legend."""
+    edge = {**where, "edge": True, "showlegend": False, "hoverinfo": "skip"}
+    return [trace(role, name, x, high, **edge), trace(role, name, x, low, fill="tonexty", **edge)]
+
+
+def _label(channel: int) -> str:
+    """Name of an output for people."""
+    return LABELS.get(CHANNEL_NAMES[channel], CHANNEL_NAMES[channel])
+
+
 def _stack(
     scored: ScoredSet, rows: IndexArray, channels: Sequence[int], labels: tuple[str, str], residual: bool = False
 ) -> JsonDict:
     """Channels above each other with one time axis; with `residual`: measured less simulated."""
     after, before = scored.fitted.series, scored.initial.series
     t = after.t[rows] - after.t[0]
-    data, layout = [], dict[str, Any]()
-    for i, c in enumerate(channels):
-        place = "" if i == 0 else str(i + 1)
-        where = {"xaxis": "x", "yaxis": f"y{place}", "showlegend": i == 0}
-        name, measured = CHANNEL_NAMES[c], after.measured[rows, c]
-        lines = [
-            ("before", labels[0], before.simulated[rows, c]),
-            ("after", labels[1], after.simulated[rows, c]),
-        ]
+    drawn = []
+    for c in channels:
+        measured = after.measured[rows, c]
+        lines = [("before", labels[0], before.simulated[rows, c]), ("after", labels[1], after.simulated[rows, c])]
         if residual:
             lines = [(role, label, measured - y) for role, label, y in lines]
         else:
             lines.insert(0, ("measured", "measured", measured))
-        low, high = _focus(lines[-1][2] if residual else measured)
+        drawn.append((lines, _focus(lines[-1][2] if residual else measured)))
+    panels = [
+        (f"{_label(c)} [{CHANNEL_UNITS[c]}]", {"range": list(limits)})
+        for c, (_, limits) in zip(channels, drawn, strict=True)
+    ]
+    places, layout = _stacked(panels, "time [s]")
+    data = []
+    for i, (where, (lines, (low, high))) in enumerate(zip(places, drawn, strict=True)):
         for role, label, y in lines:
             # A poor first guess may run far away; what leaves the picture need not be kept.
             inside = np.clip(y, low - 3.0 * (high - low), high + 3.0 * (high - low))
-            line = trace(role, label, None, inside, legendgroup=role, **where)
+            line = trace(role, label, None, inside, legendgroup=role, showlegend=i == 0, **where)
             data.append({**line, "y": short(inside, (high - low) / 2000.0)})
-        share = 1.0 / len(channels)
-        layout[f"yaxis{place}"] = {
-            "domain": [1.0 - (i + 1) * share + 0.03, 1.0 - i * share - 0.01],
-            **axis(f"{LABELS.get(name, name)} [{CHANNEL_UNITS[c]}]", range=[low, high]),
-        }
-    last = "y" if len(channels) == 1 else f"y{len(channels)}"
-    layout["xaxis"] = axis("time [s]", anchor=last)
     return {"x": short(t), "data": data, "layout": layout}
 
 
@@ -202,27 +148,19 @@ def _spectra(scored: ScoredSet, channels: Sequence[int], labels: tuple[str, str]
     rows = min(max(round(2.0 * SCORE_SECONDS / step), 8), SPECTRUM_ROWS, len(after.t))
     parts = len(after.t) // rows
     low, high = np.sqrt(chi2.ppf((0.025, 0.975), 2 * parts) / (2 * parts))
-    data, layout = [], dict[str, Any]()
-    for i, c in enumerate(channels):
-        place = "" if i == 0 else str(i + 1)
-        where = {"xaxis": "x", "yaxis": f"y{place}"}
+    panels = [(f"{_label(c)} [{CHANNEL_UNITS[c]}/√Hz]", {"type": "log"}) for c in channels]
+    places, layout = _stacked(panels, "frequency [Hz]")
+    data = []
+    for i, (c, where) in enumerate(zip(channels, places, strict=True)):
         residuals = np.nan_to_num([after.measured[:, c] - s.simulated[:, c] for s in (before, after)])
         f, power = welch(residuals, 1.0 / step, nperseg=rows, noverlap=0)
         f, (then, now) = f[1:], np.sqrt(power[:, 1:])
         white = np.full(len(f), np.sqrt(power[1, 1:].mean()))
-        band = {**where, "edge": True, "showlegend": False, "hoverinfo": "skip"}
         data += [
-            trace("floor", "white noise", f, high * white, **band),
-            trace("floor", "white noise", f, low * white, fill="tonexty", **band),
+            *_band("floor", "white noise", f, low * white, high * white, **where),
             trace("before", labels[0], f, then, legendgroup="before", showlegend=i == 0, **where),
             trace("after", labels[1], f, now, legendgroup="after", showlegend=i == 0, **where),
         ]
-        share = 1.0 / len(channels)
-        layout[f"yaxis{place}"] = {
-            "domain": [1.0 - (i + 1) * share + 0.03, 1.0 - i * share - 0.01],
-            **axis(f"{LABELS.get(CHANNEL_NAMES[c], CHANNEL_NAMES[c])} [{CHANNEL_UNITS[c]}/√Hz]", type="log"),
-        }
-    layout["xaxis"] = axis("frequency [Hz]", anchor="y" if len(channels) == 1 else f"y{len(channels)}")
     return {"label": "Spectrum of the residual", "data": data, "layout": layout}
 
 
@@ -248,22 +186,15 @@ def missing_figures(parts: Mapping[str, Sequence[Missing]], prefix: str) -> list
             drawn.append((role, label, t[rows], value[rows], Z95 * sigma[rows]))
         reach = np.max([np.nanmax(np.abs(value) + width, axis=0) for *_, value, width in drawn], axis=0)
         reach = np.maximum(reach.max() if key == "force" else reach, VISIBLE * of)
-        data, layout = [], dict[str, Any]()
-        for i, letter in enumerate("xyz"):
-            place = "" if i == 0 else str(i + 1)
-            where = {"xaxis": "x", "yaxis": f"y{place}"}
+        unit = "N" if key == "force" else "N m"
+        panels = [(f"{sign}{a} [{unit}]", {"range": [-reach[i], reach[i]]}) for i, a in enumerate("xyz")]
+        places, layout = _stacked(panels, "time [s]")
+        data = []
+        for i, where in enumerate(places):
             for role, label, t, value, width in drawn:
-                band = {**where, "edge": True, "showlegend": False, "hoverinfo": "skip", "legendgroup": role}
-                data += [
-                    trace(role, label, t, value[:, i] + width[:, i], **band),
-                    trace(role, label, t, value[:, i] - width[:, i], fill="tonexty", **band),
-                    trace(role, label, t, value[:, i], solid=True, showlegend=i == 0, legendgroup=role, **where),
-                ]
-            layout[f"yaxis{place}"] = {
-                "domain": [0.70 - i / 3, 0.99 - i / 3],
-                **axis(f"{sign}{letter} [{'N' if key == 'force' else 'N m'}]", range=[-reach[i], reach[i]]),
-            }
-        layout["xaxis"] = axis("time [s]", anchor="y3")
+                y, half, group = value[:, i], width[:, i], {"legendgroup": role, **where}
+                data += _band(role, label, t, y - half, y + half, **group)
+                data.append(trace(role, label, t, y, solid=True, showlegend=i == 0, **group))
         out.append(figure(f"{prefix}-{key}", f"Missing {key}", data, layout, 460))
     return out
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
-from itertools import groupby
 from typing import Any
 
 import numpy as np
@@ -15,7 +14,7 @@ from quadid.checks import Inspection
 from quadid.checks.motion import Spans, flying_spans, within
 from quadid.data.resample import sample_period
 from quadid.data.rotor_signal import rotor_channel
-from quadid.data.window import CHANNELS, Channel, Recording, Window
+from quadid.data.window import CHANNELS, Channel, Recording
 from quadid.effects import EFFECTS
 from quadid.estimate.missing import Missing
 from quadid.identification.excitation import Excitation
@@ -28,25 +27,27 @@ from quadid.report.figures import (
     MODELS,
     MOST_LOGS,
     WHOLE_POINTS,
-    axis,
     channel_figures,
     error_figure,
-    figure,
     gain_figure,
-    measures,
     missing_figures,
     parameter_figure,
+    thinned,
+)
+from quadid.report.page import (
+    axis,
+    figure,
+    fit,
+    measures,
+    number,
     rows_of,
     section,
     short,
-    thinned,
     trace,
+    unit,
     upright,
 )
-from quadid.report.manoeuvres import half_width
-from quadid.report.page import fit, number, render, unit
 from quadid.report.residual_maps import ResidualMap, map_figure
-from quadid.report.tables import Column, TextTable
 from quadid.report.verdict import (
     MOTION,
     NOISE_LEVEL,
@@ -60,7 +61,6 @@ from quadid.report.verdict import (
     relative_halfwidth,
     status_words,
 )
-from quadid.rotation import euler
 from quadid.types import FloatArray, Json, JsonDict
 from quadid.vehicle import Vehicle
 
@@ -608,99 +608,6 @@ def diagnose_page(
         "noise": noise_table(noise),
         "provenance": provenance,
     }
-
-
-# --- The page of a proposed manoeuvre: what it would gain, and how it looks when flown
-
-
-def excite_html(result: Json, window: Window) -> str:
-    """The page.
-
-    Args:
-        result: of the form ``quadid.excite/1``.
-        window: the manoeuvre as flown in simulation.
-    """
-    peak = result["peak"]
-    return render({
-        "title": f"What to fly next: {result['vehicle']}",
-        "subtitle": f"{result['seconds']:g} s, at most {peak['tilt_deg']:.0f}° of tilt and {peak['rate_deg_s']:.0f}°/s",
-        "sections": [
-            section(
-                "gain", "What it would gain",
-                "Relative half-width of the 95 % interval, from the Fisher information of simulated flights.",
-                [_bars(result)],
-                [gain_table(result).part()],
-            ),
-            section(
-                "manoeuvre", "The manoeuvre",
-                "Stick movements one after the other, and the attitude that the simulation flies.",
-                [_attitude(window)], [rows_of(("movement", "times", "amplitude, rms"), grouped(result["movements"]))],
-            ),
-            section(
-                "envelope", "Where it may be flown",
-                "Scripts start only inside the envelope and stop outside it.",
-                tables=[rows_of(("", "needed in simulation", "envelope"), _limits(result))],
-            ),
-        ],
-    })  # fmt: skip
-
-
-def gain_table(result: Json) -> TextTable:
-    """Half-widths now, and after each kind of flight."""
-    keys = ("now", "gentle_flight", "manoeuvre", "one_axis_at_a_time")
-    rows = tuple((p["name"], *(half_width(p[key]) for key in keys)) for p in result["parameters"])
-    heads = (Column("parameter"), *(Column(key.replace("_", " "), right=True) for key in keys))
-    return TextTable(f"Relative 95 % half-width (±) before and after {result['seconds']:g} s", heads, rows)
-
-
-def grouped(movements: Sequence[Json]) -> list[tuple[str, str, str]]:
-    """Movements that follow each other alike as one: name, how many times, amplitudes."""
-    each = [(m["name"], ", ".join(f"{a} {_amplitude(a, v)}" for a, v in m["amplitudes"].items())) for m in movements]
-    return [(name, str(len(list(same))), size) for (name, size), same in groupby(each)]
-
-
-def _limits(result: Json) -> list[list[str]]:
-    room, e, peak = result["room"], result["envelope"], result["peak"]
-    return [
-        [
-            "height above take-off",
-            f"{room['up_m'] + room['down_m']:.1f} m",
-            f"{e['lowest_m']:g} to {e['highest_m']:g} m",
-        ],
-        ["distance from the start", f"{room['sideways_m']:.0f} m", f"{e['radius_m']:g} m"],
-        ["tilt", f"{peak['tilt_deg']:.0f}°", f"{e['abort_tilt_deg']:.0f}°"],
-        ["battery", "–", f"{e['battery_percent']:g} % left"],
-    ]
-
-
-def _amplitude(axis: str, value: float) -> str:
-    return f"{100.0 * value:.0f} %" if axis == "throttle" else f"{math.degrees(value):.1f}°"
-
-
-def _bars(result: Json) -> dict[str, Any]:
-    names = [p["name"] for p in result["parameters"]]
-    data = [
-        {"role": role, "name": label, "type": "bar", "x": names,
-         "y": [100.0 * min(p[key], 2.0) for p in result["parameters"]]}
-        for role, label, key in (
-            ("measured", "now", "now"), ("before", "after a gentle flight", "gentle_flight"),
-            ("after", "after the manoeuvre", "manoeuvre"),
-        )
-    ]  # fmt: skip
-    layout = {"yaxis": axis("half-width (%)", type="log"), "xaxis": {"type": "category"}}
-    return figure("gain-bars", "Half-widths", data, layout, 320)
-
-
-def _attitude(window: Window) -> dict[str, Any]:
-
-    assert window.attitude is not None
-    angles = np.degrees(np.unwrap(euler(window.attitude), axis=0))
-    t = window.t - window.t0
-    data = [
-        trace(role, label, t, angles[:, i])
-        for i, (role, label) in enumerate((("measured", "roll"), ("before", "pitch"), ("after", "yaw")))
-    ]
-    return figure("attitude", "Attitude", data, {"xaxis": axis("time (s)"), "yaxis": axis("angle (°)")}, 320)
 
 
 # --- The page when there is no answer: why, what to do, and the data as they are

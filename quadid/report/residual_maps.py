@@ -21,7 +21,7 @@ from quadid.identification.problem import Linearised, Shooting
 from quadid.identification.score import SCORE_SECONDS, covering, settle_states
 from quadid.model.layout import Layout
 from quadid.model.rollout import CHANNEL_NAMES, CHANNEL_UNITS
-from quadid.report.figures import axis, figure, level, trace
+from quadid.report.page import axis, figure, level, trace
 from quadid.rotation import conjugate, rotated
 from quadid.types import BoolArray, FloatArray, IndexArray
 from quadid.vehicle import GRAVITY, Vehicle

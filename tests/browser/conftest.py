@@ -90,11 +90,8 @@ def fleet_page(tmp_path_factory: pytest.TempPathFactory) -> Path:
     import numpy as np
 
     from quadid.app.fleet import health_trend
-    from quadid.report.fleet import fleet_page as build
-    from quadid.report.fleet import summarise
-    from quadid.report.page import render
     from tests.cli.test_fleet_health import PELICAN_X, fleet
-    from tests.report.test_fleet_page import rows
+    from tests.report.test_fleet_page import rows, summed
 
     rng = np.random.default_rng(1)
     worn = 1.0 - 0.002 * np.arange(60)
@@ -103,7 +100,7 @@ def fleet_page(tmp_path_factory: pytest.TempPathFactory) -> Path:
     health = health_trend(gentle, trims, dict.fromkeys("ab", PELICAN_X.to_yaml()))
     logs += gentle
     file = tmp_path_factory.mktemp("fleet") / "fleet.html"
-    file.write_text(render(build(summarise(logs, parameters, []), logs, parameters, [], "Report of a fleet", health)))
+    file.write_text(summed(logs, parameters, health).page())
     return file
 
 

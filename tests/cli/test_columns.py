@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from quadid_replay import write_csv
 
-from quadid.report.fit_pages import grouped
+from quadid.app.excite import grouped
 from tests.cli.conftest import Cli, Flights
 
 COMMANDS = {

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from quadid.cli.main import COMMANDS, EXAMPLES, load
+from quadid.cli.commands import COMMANDS, load
 from tests.cli.conftest import Cli
 from tests.cli.followed_page import commands
 
@@ -54,7 +54,7 @@ def test_every_command_that_a_page_names_exists(repository: Path) -> None:
 def test_every_option_that_a_page_or_a_help_text_quotes_is_known(repository: Path) -> None:
     pages = [repository / "README.md", repository / "SECURITY.md", *(repository / "docs").rglob("*.md")]
     lines = [(page.name, line) for page in pages for line in commands(page)]
-    lines += [("--help", shlex.split(line)[1:]) for examples in EXAMPLES.values() for line in examples]
+    lines += [("--help", shlex.split(line)[1:]) for command in COMMANDS.values() for line in command.examples]
     assert len(lines) > 60
     for where, (name, *arguments) in lines:
         # Parsed as when called: options, their values, and what must be given.

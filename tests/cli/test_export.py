@@ -324,6 +324,6 @@ def test_isaac_lab_randomises_over_what_acts_at_random(vehicle: Vehicle) -> None
 def test_px4_hover_is_what_px4_itself_learned_in_a_recorded_flight(data_dir: Path) -> None:
     """Its THR_MDL_FAC is 0, its estimate of MPC_THR_HOVER in the air 0.48 (hover_thrust_estimate)."""
     log = data_dir / "px4" / "ascend_cubeorange_test.ulg"
-    text = export(Vehicle.from_yaml(begin("mine", log).text), "px4", "x")[".params"]
+    text = export(Vehicle.from_yaml(begin("mine", log).content), "px4", "x")[".params"]
     hover = next(float(line.split("\t")[3]) for line in text.splitlines() if "\tMPC_THR_HOVER\t" in line)
     assert hover == pytest.approx(0.482, abs=0.02)

@@ -18,8 +18,8 @@ import pytest
 from quadid_replay import write_csv, write_mcap
 
 from quadid.app.fleet import Job, Row, identify_one
-from quadid.cli import fleet_run as fleet_cluster
-from quadid.cli.fleet_run import ClusterError, cluster, find_jobs, open_store, results
+from quadid.cli import fleet as fleet_cluster
+from quadid.cli.fleet import ClusterError, cluster, find_jobs, open_store, results
 from quadid.errors import LogError, VehicleError
 from quadid.flight import fly
 from quadid.vehicle import Vehicle

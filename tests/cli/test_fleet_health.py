@@ -13,9 +13,8 @@ from quadid_replay import write_csv
 from quadid.app.fleet import BASELINE, FEWEST, Job, health_trend, identify_one
 from quadid.condition import flight_trim
 from quadid.condition.trim import flight_to_dict
-from quadid.report.fleet import fleet_page, fleet_verdict, summarise
-from quadid.report.page import render
 from quadid.vehicle import Vehicle
+from tests.report.test_fleet_page import summed
 
 PELICAN_X = Vehicle.shipped("pelican_x")
 
@@ -45,10 +44,10 @@ def test_each_flight_is_compared_with_the_first_ones_of_its_vehicle() -> None:
     changed = [row for row in rows if not row["baseline"] and row["verdict"] == "changed"]
     assert [row["log"] for row in changed] == ["a/7.mcap", "a/8.mcap"]
     assert {row["changes"][0]["parameters"][0]["value"] for row in changed} == {3}
-    verdict = fleet_verdict(summarise(logs, [], []), rows)
+    verdict = summed(logs, [], rows).verdict
     assert verdict.details[0].startswith("a has changed: rotor 3: 2")
     assert not any(text.startswith("b ") for text in verdict.details)
-    page = render(fleet_page(summarise(logs, [], []), logs, [], [], "Fleet", rows))
+    page = summed(logs, [], rows).page()
     assert "Health over flights" in page
     assert "a/7.mcap" in page
 
@@ -57,7 +56,7 @@ def test_a_flight_that_few_baseline_flights_cannot_judge_is_no_change() -> None:
     logs, _ = fleet()
     row = {"unit": "a", "log": "a/8.mcap", "baseline": False, "verdict": "unknown", "changes": [], "unfamiliar": ""}
     for lacking, changed in ((2, False), (0, True)):
-        verdict = fleet_verdict(summarise(logs, [], []), [{**row, "baseline_lacking": lacking}])
+        verdict = summed(logs, [], [{**row, "baseline_lacking": lacking}]).verdict
         assert verdict.headline.endswith("vehicles have changed.") == changed
 
 
@@ -79,4 +78,4 @@ def test_a_log_without_a_gyro_has_its_place_in_the_trend(tmp_path: Path) -> None
     trims.append({"log": row["name"], **row["trims"][0]})
     rows = health_trend([*logs, {**row, "started": 1.8e9}], trims, {"a": text})
     assert (rows[-1]["log"], rows[-1]["verdict"]) == ("a/last.mcap", "changed")
-    assert "a/last.mcap" in render(fleet_page(summarise([*logs, row], [], []), [*logs, row], [], [], "Fleet", rows))
+    assert "a/last.mcap" in summed([*logs, row], [], rows).page()

@@ -28,7 +28,7 @@ def test_a_log_of_an_autopilot_fills_it(inside: Cli, data_dir: Path, tmp_path: P
     run = inside("init", "copter", "--from", log, "--out", tmp_path, "--json", "-")
     assert run.code == 0, run.err
     text = Path(run.data["file"]).read_text(encoding="utf-8")
-    assert text == init("copter", log).text
+    assert text == init("copter", log).content
     assert len(Vehicle.from_yaml(text).rotors) >= 4
     assert "mass" in run.data["fill_in"]
 

@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Callable
+from typing import Any, cast
 
 import pytest
+from quadid_evaluation.paper.compare import Methods
 
-from quadid.cli import compare, excite, fleet, history, replay
+from quadid.app.excite import Proposed
+from quadid.app.fleet_page import Fleet
+from quadid.cli.history import Stored
+from quadid.cli.replay import Replayed
+from quadid.cli.terminal import conclude
 from quadid.parameters import NOMINAL_UNITS
 from quadid.report.tables import Column, TextTable
 
@@ -45,13 +51,17 @@ FLEET = {
     "counts": {"done": 2}, "rough": 0, "drifts": [], "outliers": [], "reasons": [], "health": [], "worked": 2,
     "logs": 2, "copies": [], "seconds": 1.0, "files": [], "report": "fleet.html",
 }  # fmt: skip
-SHOWN: dict[str, tuple[Any, dict[str, Any], tuple[str, ...]]] = {
-    "excite": (excite.show, EXCITED, ("0.569 %", "0.567 %", "0.409 %", "0.543 %")),
-    "compare": (compare.show, COMPARED, ("differential_evolution", "1.234", "2.346", "3.457", "4000", "12.3", "1/3")),
-    "fleet": (fleet.show, FLEET, ("airframe-07", "J_xx", "1.235e-05", "N s^2/rad^2", "1.2 %")),
-    "replay": (replay.show, REPLAYED, ("1.2346e-05", "7.4074e-05", "identified", "held out gain")),
-    "history": (history.show, STORED, ("operator", "rolled_back", "1.23", "1.235e-05", "7.407e-05", "predecessor")),
-}
+SHOWN: dict[str, tuple[Callable[..., Any], tuple[str, ...]]] = {
+    "excite": (lambda: conclude(Proposed(EXCITED, *[cast(Any, None)] * 4), None),
+               ("0.569 %", "0.567 %", "0.409 %", "0.543 %")),
+    "compare": (lambda: conclude(Methods(COMPARED), None),
+                ("differential_evolution", "1.234", "2.346", "3.457", "4000", "12.3", "1/3")),
+    "fleet": (lambda: conclude(Fleet(FLEET, [], []), None),
+              ("airframe-07", "J_xx", "1.235e-05", "N s^2/rad^2", "1.2 %")),
+    "replay": (lambda: conclude(Replayed(REPLAYED), None), ("1.2346e-05", "7.4074e-05", "identified", "held out gain")),
+    "history": (lambda: conclude(Stored(STORED), None),
+                ("operator", "rolled_back", "1.23", "1.235e-05", "7.407e-05", "predecessor")),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("width", [60, 80])
@@ -60,8 +70,8 @@ def test_every_value_stands_whole(
     command: str, width: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("COLUMNS", str(width))
-    show, result, values = SHOWN[command]
-    show(result, quiet=False)
+    show, values = SHOWN[command]
+    show()
     text = capsys.readouterr().out
     assert "…" not in text
     assert not [line for line in text.splitlines() if len(line) > width]

@@ -5,13 +5,11 @@ from __future__ import annotations
 import os
 import pty
 import re
-import shlex
 import subprocess
 from pathlib import Path
 
 import pytest
 
-from quadid.cli.main import COMMANDS, EXAMPLES, load
 from tests.cli.conftest import QUADID, Cli, Flights
 
 COLOUR = re.compile(r"\x1b\[[0-9;]*3[0-7]m")
@@ -69,19 +67,3 @@ def test_the_shell_completes_commands_options_and_vehicles(quadid: Cli, words: s
     count = str(len(words.split()) - 1)
     run = quadid(_QUADID_COMPLETE="complete_bash", COMP_WORDS=words, COMP_CWORD=count)
     assert expected in run.out.split()
-
-
-def test_examples_of_every_command_use_options_that_it_has(inside: Cli) -> None:
-    assert set(EXAMPLES) == set(COMMANDS)
-    for name in COMMANDS:
-        try:
-            known = {option for p in load(name).params for option in getattr(p, "opts", ())}
-        except ModuleNotFoundError:
-            continue  # not installed in this version
-        helped = inside(name, "--help").out
-        assert "--json" in known, name
-        for example in EXAMPLES[name]:
-            assert f"    {example}\n" in helped
-            words = shlex.split(example)
-            assert words[:2] == ["quadid", name]
-            assert {w for w in words if w.startswith("--")} <= known, example

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from quadid_evaluation.studies.health.flights import Wrong, hover, squared_speeds
 
+from quadid.app.health import change_words, health_verdict
 from quadid.condition import Health, assess, flight_trim, healthy_spread
 from quadid.condition import changes as change_evidence
 from quadid.condition.changes import exact, hypotheses, p_healthy, p_unchanged, rotor_effect
 from quadid.condition.trim import trim_directions, trim_of_load
 from quadid.data.window import Recording
 from quadid.errors import NotIdentifiableError
-from quadid.report.health_page import change_words, health_verdict
 from quadid.vehicle import GRAVITY, Command, Vehicle
 
 PELICAN_X, PELICAN = Vehicle.shipped("pelican_x"), Vehicle.shipped("pelican")

@@ -12,7 +12,7 @@ from quadid_node.mavlink_link import PARAMETERS as MAVLINK_NAMES
 from quadid_node.mavlink_link import REQUESTED
 from quadid_node.settings import PARAMETERS
 
-from quadid.cli.main import load
+from quadid.cli.commands import load
 from quadid.online.gate import CHECKS, GateSettings
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"

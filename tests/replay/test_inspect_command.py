@@ -9,11 +9,11 @@ from pathlib import Path
 import pytest
 from quadid_replay import write_csv
 
+from quadid.app.inspect import channel_table, parameter_outlook_table
 from quadid.checks import inspect
 from quadid.cli.main import app_main
 from quadid.data.window import Recording
 from quadid.parameters import NOMINAL_NAMES
-from quadid.report.tables import channel_table, parameter_outlook_table
 from tests.replay.synthetic import Flight
 
 
@@ -96,7 +96,8 @@ def test_a_single_sample_has_no_rate(
 ) -> None:
     (tmp_path / "one.csv").write_text("t,p,q,r\n0,0,0,0\n0.02,x,0,0\n", encoding="utf-8")
     assert run(monkeypatch, str(tmp_path / "one.csv")) == 0
-    out = " ".join(capsys.readouterr().out.split())
+    shown = capsys.readouterr()
+    out = " ".join(f"{shown.out} {shown.err}".split())
     assert "nan" not in out
     assert "one sample is too little" in out
     assert "1 line with missing" in out

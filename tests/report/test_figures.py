@@ -16,8 +16,8 @@ from quadid.report.figures import (
     liveliest,
     missing_figures,
     parameter_figure,
-    short,
 )
+from quadid.report.page import short
 from tests.report.test_page import scored
 
 

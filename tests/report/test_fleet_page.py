@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import pytest
 
-from quadid.report.fleet import DAY, fleet_page, fleet_verdict, summarise
-from quadid.report.page import render
+from quadid.app.fleet_page import DAY, Fleet, summarise
 from tests.report.test_page import EVIL
 
 
@@ -28,6 +28,11 @@ def rows(values: dict[str, np.ndarray], sigma: float = 0.01) -> tuple[list[dict[
                 "high": value + half, "status": "identified",
             })  # fmt: skip
     return logs, parameters
+
+
+def summed(logs: Sequence[Any], parameters: Sequence[Any], health: Sequence[Any] = ()) -> Fleet:
+    """The fleet of these rows."""
+    return Fleet({**summarise(logs, parameters, []), "health": list(health)}, logs, parameters)
 
 
 def test_drift_is_found_with_its_size_and_only_there() -> None:
@@ -78,11 +83,11 @@ def test_the_page_is_safe_and_says_what_to_do() -> None:
     logs, parameters = rows({EVIL: np.ones(6)})
     bad = {"name": f"{EVIL}/x.bin", "unit": EVIL, "status": "unreadable", "reason": EVIL, "started": 0.0}
     logs.append({**bad, "verdict": None, "dated_by": EVIL, "mse_initial": None, "mse_fitted": None})
-    summary = summarise(logs, parameters, [])
-    verdict = fleet_verdict(summary)
+    fleet = summed(logs, parameters)
+    verdict = fleet.verdict
     assert verdict.headline == "6 of 7 logs gave parameters."
     assert any("quadid inspect" in step for step in verdict.next_steps)
-    html = render(fleet_page(summary, logs, parameters, [], EVIL))
+    html = fleet.page(EVIL)
     assert "<script>alert(1)" not in html
     assert len(html) < 6_000_000
     for part in ("Parameters over time", "Vehicles", "Logs without an answer"):
@@ -100,8 +105,7 @@ def test_every_log_is_named_with_its_error_and_whose_date_it_has() -> None:
         "mse_fitted": None,
     }
     logs[1] = broken
-    page = fleet_page(summarise(logs, parameters, []), logs, parameters, [], "Fleet")
-    (section,) = [s for s in page["sections"] if s["id"] == "logs"]
+    (section,) = [s for s in summed(logs, parameters).sections() if s["id"] == "logs"]
     table = {row[0]: row for row in section["tables"][0]["rows"]}
     assert list(table) == ["a/1.csv", "a/2.csv", "a/0.csv"]
     assert table["a/2.csv"][1:3] == ["done", "20 → 1.02"]
@@ -113,10 +117,10 @@ def test_every_log_is_named_with_its_error_and_whose_date_it_has() -> None:
 
 def test_a_fleet_of_bad_fits_is_not_green() -> None:
     logs, parameters = rows({"a": np.ones(3)})
-    assert fleet_verdict(summarise(logs, parameters, [])).level == "good"
+    assert summed(logs, parameters).verdict.level == "good"
     for log in logs:
         log["mse_fitted"] = 50.0
-    verdict = fleet_verdict(summarise(logs, parameters, []))
+    verdict = summed(logs, parameters).verdict
     assert verdict.level == "poor"
     assert "3 answers miss much of their flights" in verdict.details[0]
 
@@ -126,7 +130,6 @@ def test_flights_are_counted_where_dates_are_those_of_copies() -> None:
     for log in logs:
         log |= {"dated_by": "file", "started": 1.6e9}
     logs.append({**logs[0], "name": "a/-.csv", "status": "unreadable"})
-    page = fleet_page(summarise(logs, parameters, []), logs, parameters, [], "Fleet")
-    (section,) = [s for s in page["sections"] if s["id"] == "over-time"]
+    (section,) = [s for s in summed(logs, parameters).sections() if s["id"] == "over-time"]
     assert "counted" in section["intro"]
     assert [trace["x"] for trace in section["figures"][0]["views"][0]["data"]] == [[1, 2, 3]]

@@ -15,9 +15,8 @@ import pytest
 from quadid.identification.result import ScoredSet
 from quadid.identification.score import ChannelScore, Series, SetScore
 from quadid.model.rollout import CHANNEL_NAMES, CHANNEL_UNITS
-from quadid.report.figures import measures
 from quadid.report.fit_pages import chance, diagnosis_part, identify_page
-from quadid.report.page import code, fit, number, packed, render
+from quadid.report.page import code, fit, measures, number, packed, render
 from tests.faults.evidence import Happened
 
 EVIL = "<script>alert(1)</script>\"'&</title>`rm`{{7*7}}"

@@ -6,15 +6,18 @@ import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
 
 from quadid.app.identify import check_seed
-from quadid.app.logs import Given, settled
-from quadid.app.outcome import Advance, silent
+from quadid.app.logs import settled
+from quadid.app.options import Logs, OfVehicle, Seed, Typed, Validate
+from quadid.app.outcome import Advance, Outcome, silent
 from quadid.data.window import Window
 from quadid.errors import NotIdentifiableError, ParameterError, QuadidError, nearest
 from quadid.parameters import NOMINAL_NAMES
+from quadid.report.tables import Cell, Column, TextTable, number
 from quadid.types import JsonDict
 from quadid.vehicle import Vehicle
 from quadid_evaluation.paper import comparison
@@ -38,6 +41,49 @@ OBJECTIVES = ("shooting", "closed_loop")
 """What optimisers may be asked to minimise."""
 
 
+@dataclass(frozen=True, repr=False)
+class Methods(Outcome):
+    """Methods beside each other; `result` has the form ``quadid.compare/1``."""
+
+    result: dict[str, Any]
+    notes: tuple[str, ...] = ()
+
+    @property
+    def warnings(self) -> list[str]:
+        """What is wrong with the logs."""
+        return list(self.notes)
+
+    def tables(self) -> list[TextTable]:
+        """One row a method."""
+        validate = self.result["validate"]
+        columns = (
+            Column("method"), *(Column(name, right=True) for name in ("train", *validate)),
+            Column("paper's MSE", right=True, rank=1), Column("evaluations", right=True),
+            Column("seconds", right=True), Column("failed", right=True), Column("remark", rank=2),
+        )  # fmt: skip
+        rows = tuple(
+            (
+                m["name"], number(m["mse"]["train"]),
+                *(number(v) for v in m["mse"]["validate"] or [None] * len(validate)),
+                number(None if m["mse_paper"] is None else m["mse_paper"]["train"]), str(m["evaluations"]),
+                number(m["seconds"], 3), f"{m['failures']}/{m['runs']}", m.get("note", m.get("stop", "")),
+            )
+            for m in self.records()
+        )  # fmt: skip
+        title = "Methods on the same data (error over 1 s of simulation, 1 = noise floor)"
+        return [TextTable(title, columns, rows)]
+
+    @property
+    def sentences(self) -> list[Cell]:
+        """What counts as failed."""
+        most = f"at most {self.result['budget']} simulations a run"
+        return [Cell(f"failed: runs that ended above 1.01 times the lowest cost of all; {most}")]
+
+    def records(self) -> list[dict[str, Any]]:
+        """One row a method."""
+        return list(self.result["methods"])
+
+
 def check_names(methods: Sequence[str] | None, objective: str) -> Sequence[str]:
     """The methods to run; raises ParameterError for an unknown method or objective."""
 
@@ -48,20 +94,40 @@ def check_names(methods: Sequence[str] | None, objective: str) -> Sequence[str]:
 
 
 def compare(
-    logs: Given, validate: Given = (), *, vehicle: str | Path | Vehicle | None = None,
-    methods: Sequence[str] | None = None, seeds: Sequence[int] = (1, 2, 3), budget: int = 4000,
-    objective: str = OBJECTIVES[0], advance: Advance = silent,
-) -> JsonDict:  # fmt: skip
-    """Runs every method and scores what it found; the result has the form ``quadid.compare/1``.
+    logs: Logs, validate: Validate = (), *, vehicle: OfVehicle = None,
+    methods: Annotated[
+        Sequence[str] | None,
+        Typed(
+            list[str] | None,
+            typer.Option("--method", metavar="NAME", help="Only this method; repeatable. Default: all ten."),
+        ),
+    ] = None,
+    seeds: Annotated[int, typer.Option("--seeds", metavar="N", min=1, help="Runs of each random method.")] = 3,
+    budget: Annotated[
+        int, typer.Option("--budget", metavar="N", min=100, help="Simulations of the data that each run may spend.")
+    ] = 4000,
+    objective: Annotated[
+        str,
+        typer.Option(
+            "--objective",
+            metavar="NAME",
+            help="What optimisers minimise: shooting (short stretches, initial states estimated) or closed_loop (the "
+            "paper's: the whole set under its stabiliser, from references and throttle).",
+        ),
+    ] = OBJECTIVES[0],
+    seed: Seed = 1, advance: Advance = silent,
+) -> Methods:  # fmt: skip
+    """Runs every method and scores what it found.
 
     Args:
         logs: a log or several to fit, as paths or from `load`.
         validate: flights that are scored only.
         vehicle: initial guess, bounds, known effects; default that of the first loaded log.
         methods: names; all by default.
-        seeds: one run of each random method a seed.
+        seeds: runs of each random method.
         budget: simulations of the data a run may spend.
         objective: one of `OBJECTIVES`.
+        seed: of the first run; the others have the following ones.
         advance: told how far it is.
 
     Raises:
@@ -72,14 +138,14 @@ def compare(
     from quadid.identification.fit import FitOptions, fit
 
     names = check_names(methods, objective)
-    if not len(seeds):
-        raise ParameterError("no seed", "one or more", "for example seeds=(1, 2, 3)")
-    for seed in seeds:
-        check_seed(seed)
+    if seeds < 1:
+        raise ParameterError("no seed", "one or more", "for example seeds=3")
+    check_seed(seed)
+    each = range(seed, seed + seeds)
     given = settled(logs, validate, vehicle)
     described, train, held = given.vehicle, given.train, given.held
     windows, unseen = [w for log in train for w in log.windows], [log.windows for log in held]
-    noise = fit(windows, described, FitOptions(seed=seeds[0]), progress=lambda _, share: advance("noise", share)).noise
+    noise = fit(windows, described, FitOptions(seed=seed), progress=lambda _, share: advance("noise", share)).noise
     judge = Judge(described, noise, windows, unseen, find_autopilot(windows, described))
     problem = judge.problem(objective)
     tried, boxes = {}, {}
@@ -88,15 +154,16 @@ def compare(
         if name in BLACK_BOXES:
             boxes[name] = judge.black_box(name)
         else:
-            tried[name] = comparison.run_optimiser(name, problem, seeds, budget, time.perf_counter)
+            tried[name] = comparison.run_optimiser(name, problem, each, budget, time.perf_counter)
     lowest = comparison.lowest_cost(list(tried.values()))
     scored = {name: judge.optimiser(m, lowest, problem) for name, m in tried.items()}
-    return {
+    result = {
         "schema": "quadid.compare/1", "vehicle": described.name, "objective": objective, "budget": budget,
-        "seeds": list(seeds), "noise_floor": 1.0, "train": [log.recording.name for log in train],
+        "seeds": list(each), "noise_floor": 1.0, "train": [log.recording.name for log in train],
         "validate": [log.recording.name for log in held],
         "methods": [scored[name] if name in scored else boxes[name] for name in names],
     }  # fmt: skip
+    return Methods(result, tuple(text for log in (*train, *held) for text in log.warnings))
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from quadid.identification.paper_objective import OUTPUT_NAMES, OUTPUT_UNITS, PaperScore
-from quadid.report.figures import LABELS, axis, liveliest, trace
+from quadid.report.figures import LABELS, liveliest
+from quadid.report.page import axis, trace
 from quadid.types import FloatArray, JsonDict
 
 if TYPE_CHECKING:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from quadid.report.figures import section
+from quadid.report.page import section
 from quadid.report.verdict import effects_words
 from quadid.types import Json
 from quadid_evaluation.paper.figures import FIGURES

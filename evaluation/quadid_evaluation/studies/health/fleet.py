@@ -17,7 +17,7 @@ from typing import Any
 
 from scipy.stats import spearmanr
 
-from quadid.report.health_page import has_changed
+from quadid.app.health import has_changed
 from quadid_evaluation.studies.health.recorded import LARGE, Flown
 
 SERIES: tuple[tuple[str, str, frozenset[int]], ...] = (

@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 from scipy.stats import binomtest, spearmanr
 
+from quadid.app.health import has_changed
 from quadid.app.logs import open_recording
 from quadid.condition import FlightTrim, Health, assess, flight_trim
 from quadid.data.window import Recording
-from quadid.report.health_page import has_changed
 from quadid.vehicle import Vehicle
 
 CRAZYFLIE = Vehicle.shipped("crazyflie")

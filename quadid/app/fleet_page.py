@@ -6,19 +6,20 @@ import math
 import shlex
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import dataclass
 from itertools import groupby
+from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy import stats
 
+from quadid.app.health import change_words, has_changed
+from quadid.app.outcome import LIBRARY, Reported, provenance
 from quadid.chi_square import Z95
-from quadid.condition.changes import HEALTHY_SCORE
-from quadid.report.figures import axis, figure, level, rows_of, section, trace
-from quadid.report.health_page import change_words, has_changed
-from quadid.report.page import number
+from quadid.report.page import axis, figure, level, number, rows_of, section, trace
 from quadid.report.page import unit as unit_text
+from quadid.report.tables import Cell, Column, TextTable
+from quadid.report.tables import number as plain_number
 from quadid.report.verdict import ROUGH, Level, Verdict, percent
 from quadid.types import Json, JsonDict
 
@@ -101,6 +102,8 @@ def _centre(rows: Sequence[Json]) -> dict[str, float]:
 
 def _drifts(series: Mapping[tuple[str, str], list[Json]]) -> list[dict[str, Any]]:
     """Parameters that rise or fall with time: Kendall's tau decides, Theil and Sen's slope says how fast."""
+    from scipy import stats
+
     fit_for = {
         key: rows for key, rows in series.items()
         if len(rows) >= FEWEST_FOR_DRIFT and len({r["started"] for r in rows}) >= FEWEST_FOR_DRIFT
@@ -190,41 +193,14 @@ FOLDED = 8
 """Tables of more rows are folded."""
 
 
-def summary_sections(summary: Json) -> list[JsonDict | None]:
-    """What `quadid.report.fleet.summarise` found, a section a kind; None for kinds without a row."""
-    return [
-        _units_table(summary),
-        _drifts_table(summary),
-        _outliers_table(summary),
-        _common_table(summary),
-        _unusable(summary),
-    ]
-
-
 def date(seconds: float) -> str:
     """A time [s since 1970] as ``2026-11-25 15:05:00``."""
     return str(np.datetime_as_string(np.datetime64(round(seconds), "s"))).replace("T", " ")
 
 
-def _section(
-    identifier: str, title: str, head: Sequence[str], rows: Sequence[Sequence[str]], intro: str = ""
-) -> JsonDict | None:  # fmt: skip
-    if not rows:
-        return None
-    fold = f"All {len(rows)}" if len(rows) > FOLDED else ""
-    return section(
-        identifier, title, intro + _left_out(rows), tables=[rows_of(head, rows[:MOST_ROWS], fold, "compact")]
-    )
-
-
-def _left_out(rows: Sequence[Any]) -> str:
-    return f" The first {MOST_ROWS} of {len(rows)}; the database has all." if len(rows) > MOST_ROWS else ""
-
-
-def _units_table(summary: Json) -> JsonDict | None:
-    """Parameters of every vehicle; the first is open."""
-    head = ("Parameter", "Median", "Unit", "Spread", "Flights")
-    tables: list[JsonDict] = []
+def summary_sections(summary: Json) -> list[JsonDict]:
+    """What `summarise` found, a section a kind; none for kinds without a row."""
+    head, tables = ("Parameter", "Median", "Unit", "Spread", "Flights"), list[JsonDict]()
     for unit in summary["units"][:MOST_ROWS]:
         rows = [
             (p["parameter"], number(p["median"]), unit_text(p["unit"]), percent(p["spread"]), str(p["flights"]))
@@ -233,49 +209,60 @@ def _units_table(summary: Json) -> JsonDict | None:
         if rows:
             title = f"{unit['unit']}: {unit['done']} of {unit['logs']} logs gave an answer"
             tables.append({**rows_of(head, rows, title, "compact"), "open": not tables})
-    intro = f"Spread between flights: robust standard deviation over the median.{_left_out(summary['units'])}"
-    return section("vehicles", "Vehicles", intro, tables=tables) if tables else None
+    spread = f"Spread between flights: robust standard deviation over the median.{_left_out(summary['units'])}"
+    parts: dict[tuple[str, str, str], tuple[Sequence[str], list[tuple[str, ...]]]] = {
+        ("drift", "Drift", "Kendall's rank test, corrected for the number of tests; slope after Theil and Sen."): (
+            ("Vehicle", "Parameter", "Change", "Rate, 95 % interval", "Chance without drift", "Flights"),
+            [
+                (
+                    d["unit"], d["parameter"],
+                    f"{100 * d['change']:+.2g} % in {d['days']:.3g} days".replace("-", "−"),
+                    f"{number(100 * d['ci95'][0], 2)} … {number(100 * d['ci95'][1], 2)} % a day",
+                    number(d["p_value"], 2), str(d["flights"]),
+                )
+                for d in summary["drifts"]
+            ],
+        ),
+        ("outliers", "Outliers", "In robust standard deviations of the vehicle."): (
+            ("Log", "Parameter", "Value", "Median of the vehicle", "Deviations"),
+            [
+                (
+                    o["log"], o["parameter"], f"{number(o['value'])} {unit_text(o['unit_of_value'])}",
+                    number(o["median"]), number(o["deviations"], 2),
+                )
+                for o in summary["outliers"]
+            ],
+        ),
+        ("common", "What the simulation gets wrong, flight after flight", ""): (
+            ("Vehicle", "Finding", "Flights", "Median", "Range"),
+            [
+                (
+                    c["unit"], c["effect"].replace("_", " "), f"{c['flights']} of {c['of']}",
+                    f"{c['parameter']} = {number(c['median'])} {c['unit_of_value']}".rstrip(),
+                    f"{number(c['lowest'])} … {number(c['highest'])}",
+                )
+                for c in summary["common"]
+            ],
+        ),
+        ("unusable", "Logs without an answer", ""): (
+            ("Outcome", "Reason", "Logs", "Which"),
+            [
+                (r["status"], r["reason"], str(r["logs"]), ", ".join(r["names"][:5]) + (" …" if r["logs"] > 5 else ""))
+                for r in summary["reasons"]
+            ],
+        ),
+    }  # fmt: skip
+    out = [section("vehicles", "Vehicles", spread, tables=tables)] if tables else []
+    for (identifier, name, intro), (columns, found) in parts.items():
+        if found:
+            fold = f"All {len(found)}" if len(found) > FOLDED else ""
+            table = rows_of(columns, found[:MOST_ROWS], fold, "compact")
+            out.append(section(identifier, name, intro + _left_out(found), tables=[table]))
+    return out
 
 
-def _drifts_table(summary: Json) -> JsonDict | None:
-    rows = [
-        (d["unit"], d["parameter"], f"{100 * d['change']:+.2g} % in {d['days']:.3g} days".replace("-", "−"),
-         f"{number(100 * d['ci95'][0], 2)} … {number(100 * d['ci95'][1], 2)} % a day", number(d["p_value"], 2),
-         str(d["flights"]))
-        for d in summary["drifts"]
-    ]  # fmt: skip
-    head = ("Vehicle", "Parameter", "Change", "Rate, 95 % interval", "Chance without drift", "Flights")
-    intro = "Kendall's rank test, corrected for the number of tests; slope after Theil and Sen."
-    return _section("drift", "Drift", head, rows, intro)
-
-
-def _outliers_table(summary: Json) -> JsonDict | None:
-    rows = [
-        (o["log"], o["parameter"], f"{number(o['value'])} {unit_text(o['unit_of_value'])}", number(o["median"]),
-         number(o["deviations"], 2))
-        for o in summary["outliers"]
-    ]  # fmt: skip
-    head = ("Log", "Parameter", "Value", "Median of the vehicle", "Deviations")
-    return _section("outliers", "Outliers", head, rows, "In robust standard deviations of the vehicle.")
-
-
-def _common_table(summary: Json) -> JsonDict | None:
-    rows = [
-        (c["unit"], c["effect"].replace("_", " "), f"{c['flights']} of {c['of']}",
-         f"{c['parameter']} = {number(c['median'])} {c['unit_of_value']}".rstrip(),
-         f"{number(c['lowest'])} … {number(c['highest'])}")
-        for c in summary["common"]
-    ]  # fmt: skip
-    head = ("Vehicle", "Finding", "Flights", "Median", "Range")
-    return _section("common", "What the simulation gets wrong, flight after flight", head, rows)
-
-
-def _unusable(summary: Json) -> JsonDict | None:
-    rows = [
-        (r["status"], r["reason"], str(r["logs"]), ", ".join(r["names"][:5]) + (" …" if r["logs"] > 5 else ""))
-        for r in summary["reasons"]
-    ]
-    return _section("unusable", "Logs without an answer", ("Outcome", "Reason", "Logs", "Which"), rows)
+def _left_out(rows: Sequence[Any]) -> str:
+    return f" The first {MOST_ROWS} of {len(rows)}; the database has all." if len(rows) > MOST_ROWS else ""
 
 
 def every_log(logs: Sequence[Json]) -> JsonDict:
@@ -309,71 +296,113 @@ MOST_POINTS = 20_000
 """Flights that all figures together show; of more, every n-th."""
 
 
-def fleet_page(
-    summary: Json, logs: Sequence[Json], parameters: Sequence[Json], provenance: Sequence[Json],
-    title: str, health: Sequence[Json] = (),
-) -> dict[str, Any]:  # fmt: skip
-    """Builds the page from `quadid.report.fleet.summarise` and the rows it was made from.
+@dataclass(frozen=True, repr=False)
+class Fleet(Reported):
+    """A fleet of flights.
 
-    `health` holds the rows of `quadid.app.fleet.health_trend`.
+    Attributes:
+        result: of the form ``quadid.fleet/1``: that of `summarise`, ``health`` of `quadid.app.fleet.health_trend`, and
+            how much was done.
+        logs, parameters: rows that it was made from.
     """
-    return {
-        "title": title,
-        "subtitle": f"{len(logs)} logs of {len(summary['units'])} vehicle{'s' * (len(summary['units']) != 1)}",
-        "verdict": asdict(fleet_verdict(summary, health)),
-        "sections": [s for s in (
-            _health(health, logs), _over_time(logs, parameters), *summary_sections(summary), every_log(logs),
-        ) if s is not None],
-        "provenance": provenance,
-    }  # fmt: skip
 
+    result: dict[str, Any]
+    logs: Sequence[Json]
+    parameters: Sequence[Json]
 
-def fleet_verdict(summary: Json, health: Sequence[Json] = ()) -> Verdict:
-    """How many logs gave an answer, which vehicles have changed by their last flight, and what needs attention."""
-    counts = summary["counts"]
-    total, done = sum(counts.values()), counts.get("done", 0)
-    last = {row["unit"]: row for row in health if not row["baseline"]}  # in the order of time
-    changed = [row for row in last.values() if has_changed(row)]
-    rough = summary["rough"]
-    fit = done - rough
-    level: Level = "good" if fit == total and not changed else "fair" if fit >= 0.5 * total else "poor"
-    gave = f"{done} of {total} logs gave parameters."
-    headline = f"{len(changed)} of {len(last)} vehicles have changed." if changed else gave
-    words = (
-        ("refused", "cannot support a fit"),
-        ("unreadable", "cannot be read or used"),
-        ("failed", "stopped this program"),
-    )
-    details = [f"{row['unit']} has changed: {_what_changed(row)}." for row in changed[:3]]
-    details += [gave] if changed else []
-    details += [f"{counts[key]} {text}." for key, text in words if counts.get(key)]
-    if copies := len(summary["copies"]):
-        told = "log is a copy of another and is" if copies == 1 else "logs are copies of others and are"
-        details.append(f"{copies} {told} not counted.")
-    if rough:
-        what = "answer misses much of its flight" if rough == 1 else "answers miss much of their flights"
-        details.append(f"{rough} {what} (error above {ROUGH:g} noise variances): not to be used.")
-    details += [
-        f"{d['unit']}: {d['parameter']} {'rose' if d['change'] > 0 else 'fell'} by {percent(abs(d['change']))} "
-        f"in {d['days']:.3g} days."
-        for d in summary["drifts"][:3]
-    ]
-    steps = ["`quadid fleet --diagnose` names what the simulation gets wrong."] if rough else []
-    if changed:
-        today = shlex.quote(changed[0]["log"])
-        steps.append(f"To see how certain this is: `quadid health {today} --baseline …` (the vehicle's first flights).")
-    if summary["drifts"]:
-        steps.append("A parameter that drifts: look for wear of propellers and motors, or a changed payload.")
-    if summary["outliers"]:
-        log = summary["outliers"][0]["log"]
-        steps.append(f"Look at the largest outlier: `quadid diagnose {log}`.")
-    if counts.get("refused") or counts.get("unreadable"):
-        steps.append("`quadid inspect LOG` names what an unusable log lacks and how to log it.")
-    if counts.get("failed"):
-        steps.append("Please report failures of this program; the last table names the logs.")
-    if not steps:
-        steps.append("Nothing to do. The tables are in SQLite and Parquet for questions of your own.")
-    return Verdict(level, headline, tuple(details), tuple(steps))
+    @property
+    def verdict(self) -> Verdict:
+        """How many logs gave an answer, which vehicles have changed by their last flight, and what needs attention."""
+        summary, health = self.result, self.result["health"]
+        counts = summary["counts"]
+        total, done = sum(counts.values()), counts.get("done", 0)
+        last = {row["unit"]: row for row in health if not row["baseline"]}  # in the order of time
+        changed = [row for row in last.values() if has_changed(row)]
+        rough = summary["rough"]
+        fit = done - rough
+        level: Level = "good" if fit == total and not changed else "fair" if fit >= 0.5 * total else "poor"
+        gave = f"{done} of {total} logs gave parameters."
+        headline = f"{len(changed)} of {len(last)} vehicles have changed." if changed else gave
+        words = (
+            ("refused", "cannot support a fit"),
+            ("unreadable", "cannot be read or used"),
+            ("failed", "stopped this program"),
+        )
+        details = [f"{row['unit']} has changed: {_what_changed(row)}." for row in changed[:3]]
+        details += [gave] if changed else []
+        details += [f"{counts[key]} {text}." for key, text in words if counts.get(key)]
+        if copies := len(summary["copies"]):
+            told = "log is a copy of another and is" if copies == 1 else "logs are copies of others and are"
+            details.append(f"{copies} {told} not counted.")
+        if rough:
+            what = "answer misses much of its flight" if rough == 1 else "answers miss much of their flights"
+            details.append(f"{rough} {what} (error above {ROUGH:g} noise variances): not to be used.")
+        details += [
+            f"{d['unit']}: {d['parameter']} {'rose' if d['change'] > 0 else 'fell'} by {percent(abs(d['change']))} "
+            f"in {d['days']:.3g} days."
+            for d in summary["drifts"][:3]
+        ]
+        steps = ["`quadid fleet --diagnose` names what the simulation gets wrong."] if rough else []
+        if changed:
+            today = shlex.quote(changed[0]["log"])
+            steps.append(
+                f"To see how certain this is: `quadid health {today} --baseline …` (the vehicle's first flights)."
+            )
+        if summary["drifts"]:
+            steps.append("A parameter that drifts: look for wear of propellers and motors, or a changed payload.")
+        if summary["outliers"]:
+            log = summary["outliers"][0]["log"]
+            steps.append(f"Look at the largest outlier: `quadid diagnose {log}`.")
+        if counts.get("refused") or counts.get("unreadable"):
+            steps.append("`quadid inspect LOG` names what an unusable log lacks and how to log it.")
+        if counts.get("failed"):
+            steps.append("Please report failures of this program; the last table names the logs.")
+        if not steps:
+            steps.append("Nothing to do. The tables are in SQLite and Parquet for questions of your own.")
+        return Verdict(level, headline, tuple(details), tuple(steps))
+
+    def tables(self) -> list[TextTable]:
+        """Parameters of every vehicle."""
+        rows = []
+        for unit in self.result["units"]:
+            for i, p in enumerate(unit["parameters"] or [None]):
+                head = (unit["unit"], str(unit["logs"]), str(unit["done"])) if i == 0 else ("", "", "")
+                tail = ("", "", "", "") if p is None else (
+                    p["parameter"], plain_number(p["median"]), p["unit"], f"{100 * p['spread']:.2g} %"
+                )  # fmt: skip
+                rows.append((*head, *tail))
+        columns = (
+            Column("vehicle"), Column("logs", right=True, rank=1), Column("answers", right=True, rank=2),
+            Column("parameter"), Column("median", right=True), Column("unit"), Column("spread", right=True),
+        )  # fmt: skip
+        return [TextTable("Vehicles", columns, tuple(rows))]
+
+    @property
+    def sentences(self) -> list[Cell]:
+        """What kept logs from an answer, and how much was done."""
+        told = [f"{r['logs']} {r['status']}: {r['reason']}" for r in self.result["reasons"][:10]]
+        done = f"{self.result['worked']} of {self.result['logs']} logs worked on in {self.result['seconds']:.1f} s"
+        return [Cell(text) for text in (*told, done)]
+
+    def records(self) -> list[dict[str, Any]]:
+        """One row a log."""
+        return [dict(row) for row in self.logs]
+
+    def write(self, folder: Path, kept: str | None = None) -> list[tuple[str, Path]]:
+        """The files that the run has written."""
+        return [("Written", Path(file)) for file in self.result["files"]]
+
+    def sections(self) -> list[JsonDict]:
+        """Health and parameters over time, what was summed up, every log."""
+        health, parameters = _health(self.result["health"], self.logs), _over_time(self.logs, self.parameters)
+        found = (health, parameters, *summary_sections(self.result), every_log(self.logs))
+        return [one for one in found if one is not None]
+
+    def page(self, command: str = LIBRARY) -> str:
+        """The page."""
+        units = len(self.result["units"])
+        subtitle = f"{len(self.logs)} logs of {units} vehicle{'s' * (units != 1)}"
+        return self.rendered("Report of a fleet", subtitle, self.sections(), provenance([], command))
 
 
 def _when(logs: Sequence[Json]) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -400,6 +429,8 @@ def _counted(time: Json) -> str:
 
 def _health(rows: Sequence[Json], logs: Sequence[Json]) -> dict[str, Any] | None:
     """Score of every flight over time, and what changed."""
+    from quadid.condition.changes import HEALTHY_SCORE
+
     judged = [row for row in rows if not row["baseline"]]
     if not judged:
         return None

@@ -1,0 +1,137 @@
+"""Options of commands, declared once: how the parameters of library functions are typed on the command line.
+
+A command is a function of the library (`quadid.cli.commands`).  A parameter annotated with an option of typer is typed
+as it is; `Typed` says how to type one to which a caller of the library gives something else; any other parameter is for
+callers only.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from importlib.resources import files
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple
+
+import typer
+from typer.models import ParameterInfo
+
+from quadid.app.logs import GRID, Given, load_vehicle, parse_columns
+from quadid.vehicle import Vehicle
+
+
+class Typed(NamedTuple):
+    """A parameter that is typed in another form than a caller of the library gives it.
+
+    Attributes:
+        kind: its type on the command line.
+        option: names, metavar and help.
+        default: on the command line; None for that of the function, `...` where it must be typed.
+        read: makes the argument from what was typed.
+        opened: names of logs, opened with the log options of the command before the function is called.
+    """
+
+    kind: Any
+    option: ParameterInfo
+    default: Any = None
+    read: Callable[[Any], Any] = lambda typed: typed
+    opened: bool = False
+
+
+def shipped_names(incomplete: str) -> list[str]:
+    """Shipped vehicles that begin so, for the shell's completion; files it completes itself."""
+    names = (Path(entry.name) for entry in files("quadid").joinpath("vehicles").iterdir())
+    return sorted(n.stem for n in names if n.suffix == ".yaml" and n.stem.startswith(incomplete))
+
+
+# --- Logs and vehicles
+
+
+_LOGS = typer.Argument(
+    metavar="LOG",
+    help="Flight logs: MCAP, .tlog, DataFlash, ULog, CSV, format auto-detected. LOG@76:216 uses seconds 76 to 216.",
+)
+Logs = Annotated[Given, Typed(list[str], _LOGS, ..., opened=True)]
+LogNames = Annotated[Given, Typed(list[str], _LOGS, ...)]
+"""Logs that the function opens itself."""
+Validate = Annotated[
+    Given,
+    Typed(
+        list[str] | None,
+        typer.Option("--validate", metavar="LOG", help="A log that is scored but not fitted; repeatable."),
+        opened=True,
+    ),
+]
+VEHICLE = typer.Option(
+    "--vehicle", metavar="V", help="A shipped name (pelican, ...) or a YAML file.", autocompletion=shipped_names
+)
+VehicleName = Annotated[str, VEHICLE]
+Described = str | Path | Vehicle
+"""A shipped name, a YAML file or the vehicle itself."""
+OfVehicle = Annotated[Described | None, Typed(str, VEHICLE, ..., load_vehicle)]
+"""The vehicle of the logs: a caller of the library may have it in a loaded log."""
+
+# --- How a log is read
+
+
+Rate = Annotated[
+    float, typer.Option("--rate", metavar="HZ", help="Rate of the uniform grid; default 50 Hz.", show_default=False)
+]
+OwnRate = Annotated[
+    float | None, typer.Option("--rate", metavar="HZ", help="Rate of the uniform grid; default the log's own.")
+]
+Start = Annotated[
+    float | None,
+    typer.Option("--start", metavar="S", help="Use every log from this many seconds after its first IMU sample."),
+]
+Stop = Annotated[
+    float | None,
+    typer.Option("--stop", metavar="S", help="Use every log up to this many seconds after its first IMU sample."),
+]
+Preset = Annotated[
+    str,
+    typer.Option(
+        "--preset", metavar="NAME", help="Topic names of ROS logs: auto, canonical, mavros, px4, ardupilot, rotors."
+    ),
+]
+Unchecked = Annotated[bool, typer.Option("--unchecked", help="Use logs even when their units or frames look wrong.")]
+_COLUMNS = typer.Option(
+    "--columns", metavar="NAME=C", help="What a CSV calls a column, as gyro_x=p,gyro_y=q; repeatable."
+)
+Columns = Annotated[list[str] | None, _COLUMNS]
+NamedColumns = Annotated[Mapping[str, str] | None, Typed(list[str] | None, _COLUMNS, read=parse_columns)]
+READING: dict[str, tuple[Any, Any]] = {
+    "rate": (Rate, GRID), "start": (Start, None), "stop": (Stop, None), "preset": (Preset, "auto"),
+    "unchecked": (Unchecked, False), "columns": (Columns, None),
+}  # fmt: skip
+"""What a command whose logs are opened for it may be asked, with defaults; arguments of `quadid.load`."""
+
+# --- The work, and where its results go
+
+
+Seed = Annotated[int, typer.Option("--seed", metavar="N", min=0, help="Seed of all random numbers.")]
+Horizons = Annotated[
+    str | Sequence[int | str],
+    Typed(
+        str,
+        typer.Option("--horizons", metavar="H,H,...", help="Samples after the start of each run, or times, as 0.1s."),
+        "1,10,50",
+    ),
+]
+JsonTarget = Annotated[
+    str | None,
+    typer.Option(
+        "--json", metavar="FILE", help="Write the result as JSON; '-' for stdout, which then carries nothing else."
+    ),
+]
+OutFolder = Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for written files.")]
+ReportFile = Annotated[
+    Path | None, typer.Option("--report", metavar="F.html", help="Write a self-contained HTML report.")
+]
+SeriesFolder = Annotated[
+    Path | None,
+    typer.Option(
+        "--series",
+        metavar="DIR",
+        help="Write measured, simulated, innovations and what is missing over time into this folder, as CSV and MCAP.",
+    ),
+]

@@ -1,0 +1,326 @@
+"""The commands: a table, and how a function of the library becomes one.
+
+Options are the parameters of the function (`quadid.app.options`), how its logs are read, and where its `Outcome` goes.
+Nothing that a command needs is imported before it is called.
+"""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, get_args
+
+import typer
+from typer.main import get_command
+from typer.models import ParameterInfo
+
+if TYPE_CHECKING:
+    from quadid.app.logs import Log
+    from quadid.app.outcome import Outcome
+    from quadid.vehicle import Vehicle
+
+READING = ("rate", "start", "stop", "preset", "unchecked", "columns")
+"""Every option of `quadid.app.options.READING`."""
+FOLDER = "Folder for written files."
+
+
+@dataclass(frozen=True)
+class Command:
+    """One command.
+
+    Attributes:
+        short: its line in `quadid --help`.
+        examples: calls that its help ends with.
+        function: ``module:name`` of a function of the library, or of the command line itself.
+        long: what the help of a function of the library begins with; others have it in their docstring.
+        reading: options of how its logs are read.
+        check: ``module:name`` of what refuses wrong arguments before any log is read.
+        out: help of ``--out``; files that are not written without it have one of their own; none has no such option.
+    """
+
+    short: str
+    examples: tuple[str, ...]
+    function: str
+    long: str = ""
+    reading: tuple[str, ...] = ()
+    check: str = ""
+    out: str = FOLDER
+
+
+COMMANDS = {
+    "demo": Command(
+        "Fly, identify and diagnose a simulated Pelican; write a report.",
+        ("quadid demo --quick --out demo-out",),
+        "quadid.cli.demo:demo",
+    ),
+    "simulate": Command(
+        "Fly the closed-loop vehicle and log it, to a file or live.",
+        (
+            "quadid simulate flight.mcap --seconds 120 --seed 3",
+            "quadid simulate late.csv --effect motor_lag:tau=0.04",
+            "quadid simulate udpout:127.0.0.1:14550 --seconds 60",
+        ),
+        "quadid.cli.simulate:simulate",
+    ),
+    "init": Command(
+        "A vehicle file to fill in, or filled in from a log.",
+        ("quadid init mine", "quadid init mine --from flight.bin --mass 1.9"),
+        "quadid.app.init:init",
+        "Write a vehicle file to fill in; with a log, filled with what the autopilot's logged parameters describe.",
+    ),
+    "vehicles": Command(
+        "The vehicles that ship.",
+        ("quadid vehicles",),
+        "quadid.app.init:vehicles",
+        "List the vehicles that ship; each name may be given to --vehicle.",
+        out="",
+    ),
+    "inspect": Command(
+        "What a log holds, whether it can be true, and what is missing.",
+        ("quadid inspect flight.bin", "quadid inspect flight.ulg@76:216 --vehicle mine.yaml --json -"),
+        "quadid.app.inspect:inspect",
+        "What a log holds: channels, rates, gaps, faults, units and frames, excitation, what is missing.",
+        out="Also write the inspection as JSON into this folder.",
+    ),
+    "identify": Command(
+        "Identify the parameters of a vehicle from its flight logs.",
+        (
+            "quadid identify flight.mcap --validate other.mcap --vehicle pelican --report report.html",
+            "quadid identify a.bin b.bin@30:90 --vehicle mine.yaml --json result.json",
+        ),
+        "quadid.app.identify:identify",
+        "Fit b, d, J_xx, J_yy, J_zz and J_r to flight logs; say how well each is known and how well they predict.",
+        READING,
+        "quadid.app.identify:check_optimizer",
+    ),
+    "score": Command(
+        "Open-loop prediction error of a vehicle file on logs.",
+        ("quadid score other.mcap --vehicle pelican.fitted.yaml --horizons 1,10,50",),
+        "quadid.app.score:score",
+        "Open-loop prediction error after h samples: every sample starts one run from the measured state.",
+        READING[1:],
+    ),
+    "compare": Command(
+        "All optimisers and subspace methods on the same data.",
+        ("quadid compare flight.mcap --validate other.mcap --vehicle pelican",),
+        "quadid_evaluation.paper.compare:compare",
+        "Set the initial guess, quasi-Newton, least squares, swarms, evolution, CVA and MOESP side by side.",
+        READING,
+        "quadid_evaluation.paper.compare:check_names",
+    ),
+    "diagnose": Command(
+        "What the simulation gets wrong, why, and the gain of correcting it.",
+        ("quadid diagnose flight.mcap --validate other.mcap --vehicle pelican --report diagnosis.html",),
+        "quadid.app.diagnose:diagnose",
+        "Name what the simulation gets wrong, extend the model by it, and measure the gain on data the fit did not "
+        "see.",
+        READING,
+    ),
+    "health": Command(
+        "What changed in the vehicle since the baseline flights.",
+        ("quadid health today.usd --baseline a.usd --baseline b.usd --vehicle crazyflie --report health.html",),
+        "quadid.app.health:health",
+        "What changed since the baseline flights: which rotor, mass, centre of gravity, thrust, how much, how sure.",
+    ),
+    "excite": Command(
+        "Which manoeuvre to fly next, and what it would gain.",
+        ("quadid excite flight.mcap --vehicle pelican",),
+        "quadid.app.excite:propose",
+        "Propose the manoeuvre that shrinks the intervals most, within limits; write it, and what flies it.",
+        ("rate", "preset", "columns", "unchecked"),
+        "quadid.app.excite:check_limits",
+    ),
+    "reproduce": Command(
+        "The paper's tables and figures.", ("quadid reproduce --out reproduce-out",), "quadid.cli.reproduce:reproduce"
+    ),
+    "replay": Command(
+        "Drive the online session from a log.",
+        ("quadid replay flight.mcap --vehicle pelican --speed max --out result.mcap",),
+        "quadid.cli.replay:replay",
+    ),
+    "serve": Command(
+        "The online service on a MAVLink link, no ROS needed.",
+        ("quadid serve --vehicle mine.yaml --mavlink udpin:0.0.0.0:14540",),
+        "quadid.cli.serve:serve",
+    ),
+    "worker": Command(
+        "Fit on this machine for services elsewhere, over Zenoh.",
+        ("quadid worker --connect tcp/192.168.1.5:7447",),
+        "quadid.cli.worker:worker",
+    ),
+    "watch": Command(
+        "Live terminal view of one or many vehicles.",
+        ("quadid watch", "quadid watch --zenoh tcp/192.168.1.5:7447"),
+        "quadid.cli.watch:watch",
+    ),
+    "history": Command(
+        "Stored parameter sets: what, when, from which data, by whom.",
+        ("quadid history --vehicle mine.yaml --events 20",),
+        "quadid.cli.history:history",
+    ),
+    "export": Command(
+        "The parameters for another program.",
+        (
+            "quadid export --vehicle pelican.fitted.yaml --format px4 --out params",
+            "quadid export --vehicle pelican --history h.sqlite --format ardupilot",
+            "quadid export --list",
+        ),
+        "quadid.cli.export:export",
+    ),
+    "compare-vehicles": Command(
+        "Two vehicle files on the same flights.",
+        ("quadid compare-vehicles old.yaml new.yaml --on flight.mcap --report compared.html",),
+        "quadid.app.compare_vehicles:compare_vehicles",
+        "Which of two vehicle files predicts the same flights better, by how much, and how they differ.",
+        ("preset", "unchecked"),
+    ),
+    "gains": Command(
+        "Rate and attitude gains from the identified vehicle.",
+        (
+            "quadid gains --vehicle mine.yaml --format px4 --report gains.html",
+            "quadid gains --vehicle mine.yaml --format ardupilot --from flight.bin --bandwidth 5",
+        ),
+        "quadid.app.gains:gains",
+        "Propose rate and attitude gains, with margins over the intervals; nothing is sent to a vehicle.",
+        out="Write the proposed parameters as a file into it.",
+    ),
+    "fleet": Command(
+        "Identify a folder of logs in parallel.",
+        (
+            "quadid fleet logs --vehicle pelican --workers 4 --out fleet-out",
+            "quadid fleet logs --scheduler tcp://10.0.0.1:8786 --diagnose",
+        ),
+        "quadid.cli.fleet:fleet",
+    ),
+    "warmup": Command("Compile now what the first fit would compile.", ("quadid warmup",), "quadid.cli.warmup:warmup"),
+}
+"""Every command, in the order of `quadid --help`."""
+
+
+def load(name: str) -> Any:
+    """Imports one command, ready to run."""
+    command = COMMANDS[name]
+    function = _imported(command.function)
+    if not command.function.startswith("quadid.cli."):
+        function = of_library(command, function)
+    alone = typer.Typer(rich_markup_mode=None, add_completion=False)
+    # A backspace character alone on a line keeps click from joining the lines.
+    examples = "\n".join(("\b", "Examples:", *(f"  {line}" for line in command.examples)))
+    alone.command(name, help=command.long or None, epilog=examples)(function)
+    return get_command(alone)
+
+
+def _imported(path: str) -> Any:
+    module, _, name = path.partition(":")
+    return getattr(importlib.import_module(module), name)
+
+
+# --- A function of the library as a command
+
+
+def of_library(command: Command, function: Callable[..., Outcome]) -> Callable[..., None]:
+    """The function with the parameters of its command, which prints and writes its outcome."""
+    from quadid.app import options
+    from quadid.app.outcome import Fitted, Reported
+
+    signature = inspect.signature(function, eval_str=True)
+    outcome: type[Outcome] = signature.return_annotation
+    typed: dict[str, options.Typed] = {}
+    shown: dict[str, tuple[Any, Any]] = {}
+    for name, parameter in signature.parameters.items():
+        for told in get_args(parameter.annotation)[1:]:
+            if isinstance(told, options.Typed):
+                typed[name], shown[name] = told, (Annotated[told.kind, told.option], told.default)
+            elif isinstance(told, ParameterInfo):
+                typed[name] = options.Typed(None, told)
+                shown[name] = parameter.annotation, ... if parameter.default is parameter.empty else parameter.default
+    shown |= {name: options.READING[name] for name in command.reading}
+    shown |= {"report": (options.ReportFile, None)} if issubclass(outcome, Reported) else {}
+    shown |= {"series": (options.SeriesFolder, None)} if issubclass(outcome, Fitted) else {}
+    shown |= {"json": (options.JsonTarget, None)}
+    if command.out:
+        asked = Annotated[Path | None, typer.Option("--out", metavar="DIR", help=command.out)]
+        shown |= {"out": (options.OutFolder, Path()) if command.out == FOLDER else (asked, None)}
+
+    def run(**given: Any) -> None:
+        _run(command, function, outcome, signature, typed, given)
+
+    parameters = [
+        inspect.Parameter(
+            n, inspect.Parameter.KEYWORD_ONLY, annotation=told,
+            default=inspect.Parameter.empty if default is ... else default,
+        )
+        for n, (told, default) in shown.items()
+    ]  # fmt: skip
+    run.__dict__["__signature__"] = inspect.Signature(parameters)
+    run.__annotations__ = {name: told for name, (told, _) in shown.items()}
+    return run
+
+
+def _run(
+    command: Command, function: Callable[..., Outcome], outcome: type[Outcome], signature: inspect.Signature,
+    typed: Mapping[str, Any], given: Mapping[str, Any],
+) -> None:  # fmt: skip
+    from quadid.app.outcome import UnansweredError, failure_html
+    from quadid.cli import terminal
+    from quadid.errors import QuadidError
+    from quadid.vehicle import Vehicle
+
+    # Places to write to are looked at before any work.
+    json, report, series, out = (given.get(name) for name in ("json", "report", "series", "out"))
+    terminal.check_file(json, "--json")
+    terminal.check_file(report, "--report")
+    folder, _ = (None if place is None else terminal.out_folder(place) for place in (out, series))
+
+    # What was not typed is as the function has it.
+    told = {name: how.read(given[name]) for name, how in typed.items() if given[name] not in (None, [])}
+    if command.check:
+        check = _imported(command.check)
+        check(**{name: told.get(name, p.default) for name, p in signature.parameters.items() if name in _names(check)})
+    vehicle = next((value for value in told.values() if isinstance(value, Vehicle)), None)
+    logs = [name for name in typed if typed[name].opened and name in told]
+    how = {name: given[name] for name in ("rate", *command.reading) if name in given}
+
+    def conclude(done: Outcome) -> None:
+        terminal.conclude(done, json, report, folder, series, given.get("vehicle"))
+
+    try:
+        if vehicle is not None:
+            told |= {name: opened(told[name], vehicle, **how) for name in logs}
+        if "advance" in signature.parameters:
+            with terminal.progress() as advance:
+                done = function(**told, advance=advance)
+        else:
+            done = function(**told)
+    except UnansweredError as error:
+        conclude(error.outcome)
+        raise
+    except QuadidError as error:
+        # The report of an attempt that failed says why, and shows the data.
+        if report is not None and vehicle is not None and outcome.title:
+            texts = [t for n in typed if typed[n].option.metavar == "LOG" for t in given[n] or ()]
+            what, preset = f"{outcome.title} of {vehicle.name}", given.get("preset", "auto")
+            text = failure_html(error, what, texts, vehicle, preset, terminal.command_line())
+            terminal.warn([f"no answer; why, and the data as they are: {terminal.write_text(report, text)}"])
+        raise
+    conclude(done)
+
+
+def _names(function: Callable[..., Any]) -> Sequence[str]:
+    return tuple(inspect.signature(function).parameters)
+
+
+def opened(texts: Sequence[str], vehicle: Vehicle, columns: Sequence[str] | None = None, **how: Any) -> list[Log]:
+    """Logs read, checked and on the grid; `how` as `quadid.load` takes it."""
+    from quadid.app import logs
+    from quadid.cli import terminal
+
+    out, named = [], logs.parse_columns(columns or [])
+    with terminal.progress(compiled=()) as advance:
+        for k, text in enumerate(texts):
+            advance(f"reading {Path(text).name}", k / len(texts))
+            out.append(logs.load(text, vehicle, columns=named, **how))
+    return out
