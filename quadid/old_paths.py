@@ -134,7 +134,8 @@ MOVED = {
     "quadid.app.excite": "quadid_cli.excite quadid_report.excite_page",
     "quadid.app.compare_vehicles": "quadid_report.compare_page",
     "quadid.report.fit_pages": "quadid_report.diagnose_page quadid_report.excitation_part "
-    "quadid_report.failure_page quadid_report.flight_part quadid_report.identify_page",
+    "quadid_report.flight_part quadid_report.identify_page",
+    "quadid.app.failure": "quadid_report.failure_page",
     "quadid.app.fleet_page": "quadid_report.fleet quadid_report.fleet_page quadid_report.fleet_summary "
     "quadid_report.fleet_tables",
     "quadid.report.tables": "quadid_report.result_tables quadid_report.text_table",

@@ -18,11 +18,11 @@ import numpy as np
 from quadid_replay import write_compared
 from quadid_replay.frames import from_euler
 
-from quadid.app.logs import LONGEST, Log, free_name, import_pandas, open_recording, parse_part, write_text
+from quadid.app.logs import LONGEST, Log, free_name, import_pandas, write_text
 from quadid.app.missing import Beside, MissingForces
 from quadid.data.resample import sample_period
 from quadid.data.window import Channel, Recording, beginning
-from quadid.errors import NotIdentifiableError, QuadidError
+from quadid.errors import NotIdentifiableError
 from quadid.jsonable import jsonable
 from quadid.report.page import measures, number, render
 from quadid.report.tables import Cell, TextTable
@@ -34,7 +34,6 @@ from quadid.version import __version__
 if TYPE_CHECKING:
     import pandas as pd
 
-    from quadid.checks import Inspection
     from quadid.identification.fit import Fit
     from quadid.identification.result import ScoredSet
 
@@ -316,30 +315,6 @@ def told(fit: Fit, logs: Sequence[Log]) -> dict[str, Any]:
 
     windows, seconds = beginning((w for log in logs for w in log.windows), LONGEST)
     return excitation_part(excitation(windows, fit.vehicle, fit.theta, fit.noise), seconds)
-
-
-def failure_html(
-    error: QuadidError, what: str, texts: Sequence[str], vehicle: Vehicle, preset: str, command: str = LIBRARY
-) -> str:
-    """The HTML report of an attempt that failed."""
-    from quadid.checks import inspect
-    from quadid.report.fit_pages import failure_page
-
-    rows = provenance([], command)
-    read: list[tuple[Recording, Inspection | None]] = []
-    for text in texts:
-        try:
-            recording = open_recording(parse_part(text).path, preset)
-        except (QuadidError, OSError) as unreadable:
-            rows.append({"name": text, "value": f"cannot be read: {unreadable}"})
-            continue
-        rows.append({"name": text, "value": f"sha256 {recording.sha256 or 'unknown'}"})
-        try:
-            read.append((recording, inspect(recording, vehicle)))
-        except QuadidError as unclear:
-            rows.append({"name": f"{text}, inspection", "value": str(unclear)})
-            read.append((recording, None))
-    return render(failure_page(what, error.found, error.fix, read, rows, error.allowed))
 
 
 def quality(log: Log) -> dict[str, Any]:

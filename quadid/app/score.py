@@ -7,16 +7,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any
 
+import numpy as np
 import typer
 
 from quadid.app.logs import Log, fitted_before, settled
 from quadid.app.missing import ROWS, SECONDS
 from quadid.app.options import Horizons, Logs, OfVehicle, OwnRate
-from quadid.app.outcome import Outcome
+from quadid.app.outcome import LIBRARY, Reported, provenance
 from quadid.data.window import Window, beginning
 from quadid.errors import NotIdentifiableError, ParameterError
 from quadid.identification.predict import QUANTITIES
 from quadid.model.layout import Layout
+from quadid.report.page import figure, section, stacked, trace
 from quadid.report.tables import Cell, Column, TextTable, number
 from quadid.report.verdict import Verdict, score_verdict
 from quadid.types import FloatArray, Json
@@ -29,11 +31,12 @@ disturbances to come."""
 
 
 @dataclass(frozen=True, repr=False)
-class Scored(Outcome):
+class Scored(Reported):
     """Prediction errors; `result` has the form ``quadid.score/1``."""
 
     result: dict[str, Any]
     notes: tuple[str, ...] = ()
+    logs: tuple[Log, ...] = ()
 
     @property
     def warnings(self) -> list[str]:
@@ -58,6 +61,33 @@ class Scored(Outcome):
         """One row a log and horizon, the pooled ones with the log None."""
         entries = [*self.result["files"], {"log": None, **self.result}]
         return [{"log": e["log"], "after": int(h), **errors} for e in entries for h, errors in e["horizons"].items()]
+
+    def page(self, command: str = LIBRARY) -> str:
+        """One page: errors over the horizon beside sensor noise and beside predicting no change, and the bands."""
+        result, (errors, inside) = self.result, self.tables()
+        steps = [int(h) for h in result["horizons"]]
+        known = [n for n in QUANTITIES if any(errors[n] is not None for errors in result["horizons"].values())]
+        places, layout = stacked([(f"{n} [{QUANTITIES[n]}]", {"type": "log"}) for n in known], "samples ahead")
+        lines = (
+            ("before", "no change predicted", result["no_change"]), ("floor", "noise floor", result["noise_floor"]),
+            ("after", "error", result["horizons"]),
+        )  # fmt: skip
+        data = [
+            trace(
+                role, label, np.array(steps, dtype=np.float64),
+                np.array([math.nan if (v := of[str(h)][name]) is None else v for h in steps], dtype=np.float64),
+                mode="lines+markers", showlegend=i == 0, legendgroup=role, **where,
+            )
+            for i, (name, where) in enumerate(zip(known, places, strict=True)) for role, label, of in lines
+        ]  # fmt: skip
+        caption = "from the measured state on; at the noise floor an error cannot be told from the sensors'"
+        drawn = figure("horizons", "Error over the horizon", data, layout, 130 * len(known) + 70, caption=caption)
+        sections = [
+            section("errors", "Prediction errors", errors.title, [drawn], [errors.part()]),
+            section("bands", "Predicted bands", result["bands"], tables=[inside.part()]),
+        ]
+        subtitle = f"{result['samples']} runs on {', '.join(log.name for log in self.logs)}"
+        return self.rendered(f"Prediction of {result['vehicle']}", subtitle, sections, provenance(self.logs, command))
 
 
 def score(
@@ -104,7 +134,7 @@ def score(
         for log in opened
         if fitted_before(described, log)
     ]
-    return Scored(result, (*seen, *(text for log in opened for text in log.warnings)))
+    return Scored(result, (*seen, *(text for log in opened for text in log.warnings)), tuple(opened))
 
 
 def ahead(horizons: str | Sequence[int | str], windows: Sequence[Window]) -> list[int]:

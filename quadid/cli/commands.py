@@ -264,7 +264,7 @@ def _run(
     command: Command, function: Callable[..., Outcome], outcome: type[Outcome], signature: inspect.Signature,
     typed: Mapping[str, Any], given: Mapping[str, Any],
 ) -> None:  # fmt: skip
-    from quadid.app.outcome import UnansweredError, failure_html
+    from quadid.app.outcome import UnansweredError
     from quadid.cli import terminal
     from quadid.errors import QuadidError
     from quadid.vehicle import Vehicle
@@ -301,6 +301,8 @@ def _run(
     except QuadidError as error:
         # The report of an attempt that failed says why, and shows the data.
         if report is not None and vehicle is not None and outcome.title:
+            from quadid.app.failure import failure_html
+
             texts = [t for n in typed if typed[n].option.metavar == "LOG" for t in given[n] or ()]
             what, preset = f"{outcome.title} of {vehicle.name}", given.get("preset", "auto")
             text = failure_html(error, what, texts, vehicle, preset, terminal.command_line())

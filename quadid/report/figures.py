@@ -16,7 +16,7 @@ from quadid.estimate.missing import Missing
 from quadid.identification.result import ScoredSet
 from quadid.identification.score import SCORE_SECONDS, SetScore
 from quadid.model.rollout import CHANNEL_NAMES, CHANNEL_UNITS
-from quadid.report.page import axis, figure, short, trace, upright
+from quadid.report.page import axis, band, figure, short, stacked, trace, upright
 from quadid.types import FloatArray, IndexArray, JsonDict
 
 # --- Figures of results: channels over time, errors, parameters, gains; see `quadid.report.page` for their form
@@ -80,29 +80,6 @@ def channel_figures(
     return out
 
 
-def _stacked(panels: Sequence[tuple[str, JsonDict]], across: str) -> tuple[list[JsonDict], JsonDict]:
-    """Panels above each other with one axis across: where the lines of each go, and the layout.
-
-    Args:
-        panels: title and further settings of the vertical axis of each.
-        across: title of the common axis.
-    """
-    n = len(panels)
-    places = ["" if i == 0 else str(i + 1) for i in range(n)]
-    layout = {
-        f"yaxis{place}": {"domain": [1.0 - (i + 1) / n + 0.03, 1.0 - i / n - 0.01], **axis(title, **more)}
-        for i, (place, (title, more)) in enumerate(zip(places, panels, strict=True))
-    }
-    layout["xaxis"] = axis(across, anchor=f"y{places[-1]}")
-    return [{"xaxis": "x", "yaxis": f"y{place}"} for place in places], layout
-
-
-def _band(role: str, name: str, x: FloatArray, low: FloatArray, high: FloatArray, **where: Any) -> list[JsonDict]:
-    """A filled band without an entry in the legend."""
-    edge = {**where, "edge": True, "showlegend": False, "hoverinfo": "skip"}
-    return [trace(role, name, x, high, **edge), trace(role, name, x, low, fill="tonexty", **edge)]
-
-
 def _label(channel: int) -> str:
     """Name of an output for people."""
     return LABELS.get(CHANNEL_NAMES[channel], CHANNEL_NAMES[channel])
@@ -127,7 +104,7 @@ def _stack(
         (f"{_label(c)} [{CHANNEL_UNITS[c]}]", {"range": list(limits)})
         for c, (_, limits) in zip(channels, drawn, strict=True)
     ]
-    places, layout = _stacked(panels, "time [s]")
+    places, layout = stacked(panels, "time [s]")
     data = []
     for i, (where, (lines, (low, high))) in enumerate(zip(places, drawn, strict=True)):
         for role, label, y in lines:
@@ -149,7 +126,7 @@ def _spectra(scored: ScoredSet, channels: Sequence[int], labels: tuple[str, str]
     parts = len(after.t) // rows
     low, high = np.sqrt(chi2.ppf((0.025, 0.975), 2 * parts) / (2 * parts))
     panels = [(f"{_label(c)} [{CHANNEL_UNITS[c]}/√Hz]", {"type": "log"}) for c in channels]
-    places, layout = _stacked(panels, "frequency [Hz]")
+    places, layout = stacked(panels, "frequency [Hz]")
     data = []
     for i, (c, where) in enumerate(zip(channels, places, strict=True)):
         residuals = np.nan_to_num([after.measured[:, c] - s.simulated[:, c] for s in (before, after)])
@@ -157,7 +134,7 @@ def _spectra(scored: ScoredSet, channels: Sequence[int], labels: tuple[str, str]
         f, (then, now) = f[1:], np.sqrt(power[:, 1:])
         white = np.full(len(f), np.sqrt(power[1, 1:].mean()))
         data += [
-            *_band("floor", "white noise", f, low * white, high * white, **where),
+            *band("floor", "white noise", f, low * white, high * white, **where),
             trace("before", labels[0], f, then, legendgroup="before", showlegend=i == 0, **where),
             trace("after", labels[1], f, now, legendgroup="after", showlegend=i == 0, **where),
         ]
@@ -188,12 +165,12 @@ def missing_figures(parts: Mapping[str, Sequence[Missing]], prefix: str) -> list
         reach = np.maximum(reach.max() if key == "force" else reach, VISIBLE * of)
         unit = "N" if key == "force" else "N m"
         panels = [(f"{sign}{a} [{unit}]", {"range": [-reach[i], reach[i]]}) for i, a in enumerate("xyz")]
-        places, layout = _stacked(panels, "time [s]")
+        places, layout = stacked(panels, "time [s]")
         data = []
         for i, where in enumerate(places):
             for role, label, t, value, width in drawn:
                 y, half, group = value[:, i], width[:, i], {"legendgroup": role, **where}
-                data += _band(role, label, t, y - half, y + half, **group)
+                data += band(role, label, t, y - half, y + half, **group)
                 data.append(trace(role, label, t, y, solid=True, showlegend=i == 0, **group))
         out.append(figure(f"{prefix}-{key}", f"Missing {key}", data, layout, 460))
     return out

@@ -196,6 +196,29 @@ def axis(text: str, **more: Any) -> JsonDict:
     return {"title": {"text": text}, **more}
 
 
+def stacked(panels: Sequence[tuple[str, JsonDict]], across: str) -> tuple[list[JsonDict], JsonDict]:
+    """Panels above each other with one axis across: where the lines of each go, and the layout.
+
+    Args:
+        panels: title and further settings of the vertical axis of each.
+        across: title of the common axis.
+    """
+    n = len(panels)
+    places = ["" if i == 0 else str(i + 1) for i in range(n)]
+    layout = {
+        f"yaxis{place}": {"domain": [1.0 - (i + 1) / n + 0.03, 1.0 - i / n - 0.01], **axis(title, **more)}
+        for i, (place, (title, more)) in enumerate(zip(places, panels, strict=True))
+    }
+    layout["xaxis"] = axis(across, anchor=f"y{places[-1]}")
+    return [{"xaxis": "x", "yaxis": f"y{place}"} for place in places], layout
+
+
+def band(role: str, name: str, x: FloatArray, low: FloatArray, high: FloatArray, **where: Any) -> list[JsonDict]:
+    """A filled band without an entry in the legend."""
+    edge = {**where, "edge": True, "showlegend": False, "hoverinfo": "skip"}
+    return [trace(role, name, x, high, **edge), trace(role, name, x, low, fill="tonexty", **edge)]
+
+
 def upright(x: float) -> JsonDict:
     """An upright line through a figure."""
     return {"type": "line", "x0": x, "x1": x, "y0": 0, "y1": 1, "yref": "paper", "role": "floor"}

@@ -67,7 +67,7 @@ def failure_page(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     from quadid_replay import write_csv
 
-    from quadid.app.outcome import failure_html
+    from quadid.app.failure import failure_html
     from quadid.errors import LogError
     from quadid.flight import fly
     from quadid.vehicle import Vehicle

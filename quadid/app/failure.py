@@ -1,0 +1,105 @@
+"""The report of an attempt that failed: why, what to do, and the data as they are."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict
+
+import numpy as np
+
+from quadid.app.logs import open_recording, parse_part
+from quadid.app.outcome import LIBRARY, provenance
+from quadid.checks import Inspection, inspect
+from quadid.data.window import CHANNELS, Channel, Recording
+from quadid.errors import QuadidError
+from quadid.report.figures import WHOLE_POINTS, thinned
+from quadid.report.page import axis, render, rows_of, section, short
+from quadid.report.verdict import Verdict
+from quadid.types import JsonDict
+from quadid.vehicle import Vehicle
+
+MOST_FIGURES = 30
+"""Channels of a log that are drawn."""
+_WORDS = {"ok": "fine", "warning": "doubtful", "error": "wrong", "unknown": "not checked"}
+
+
+def failure_html(
+    error: QuadidError, what: str, texts: Sequence[str], vehicle: Vehicle, preset: str, command: str = LIBRARY
+) -> str:
+    """The page as HTML.
+
+    Args:
+        error: why there is no answer.
+        what: what was asked for, for the title.
+        texts: logs as they were given.
+        vehicle: whose they are.
+        preset: topic names of ROS logs.
+        command: as it was typed.
+    """
+    rows, sections = provenance([], command), list[JsonDict]()
+    missing = []
+    for i, text in enumerate(texts):
+        try:
+            recording = open_recording(parse_part(text).path, preset)
+        except (QuadidError, OSError) as unreadable:
+            rows.append({"name": text, "value": f"cannot be read: {unreadable}"})
+            continue
+        rows.append({"name": text, "value": f"sha256 {recording.sha256 or 'unknown'}"})
+        sections.append(_data(recording, i))
+        try:
+            found = inspect(recording, vehicle)
+        except QuadidError as unclear:
+            rows.append({"name": f"{text}, inspection", "value": str(unclear)})
+            continue
+        sections.append(_checks(recording.name, found, i))
+        missing += [f"{m.channel}: {m.why}. To get it: {m.how}." for m in found.missing]
+    fix = error.fix[:1].upper() + error.fix[1:]
+    steps = [step for step in dict.fromkeys([fix, *missing]) if step]
+    details = (f"Needed: {error.allowed}.",) if error.allowed else ()
+    verdict = Verdict(
+        "poor", f"No answer: {error.found}.", details, tuple(steps or ["`quadid inspect LOG` shows more."])
+    )
+    return render({
+        "title": f"{what}: no answer",
+        "subtitle": "Nothing was identified. What the logs hold is shown as it was read.",
+        "verdict": asdict(verdict), "sections": sections, "provenance": rows,
+    })  # fmt: skip
+
+
+def _data(recording: Recording, place: int) -> JsonDict:
+    """Every channel as it was read."""
+    figures = [
+        _figure(name, channel, f"raw{place}-{i}")
+        for i, (name, channel) in enumerate(recording.channels.items())
+        if len(channel.t) > 1 and i < MOST_FIGURES
+    ]
+    intro = f"{recording.format}, {len(recording.channels)} channels."
+    if recording.warnings:
+        intro += " Notes: " + "; ".join(recording.warnings) + "."
+    return section(f"raw{place}", recording.name, intro, figures)
+
+
+def _figure(name: str, channel: Channel, identifier: str) -> JsonDict:
+    values = channel.values.reshape(len(channel.t), -1)
+    rows = thinned(values, WHOLE_POINTS)
+    data = [
+        {
+            "role": f"unit{i}", "name": f"{name} {i + 1}", "type": "scatter", "mode": "lines",
+            "y": short(np.asarray(values[rows, i], dtype=np.float64)),
+        }
+        for i in range(values.shape[1])
+    ]  # fmt: skip
+    t = short(np.asarray(channel.t[rows] - channel.t[0], dtype=np.float64))
+    views = [{"label": "", "x": t, "data": data, "layout": {"xaxis": axis("time [s]")}}]
+    title, caption = name.replace("_", " "), CHANNELS[name][1]
+    return {"id": identifier, "title": title, "caption": caption, "views": views, "height": 220}
+
+
+def _checks(log: str, found: Inspection, place: int) -> JsonDict:
+    """What the checks found, and what the log allows."""
+    rows = [[c.name.replace("_", " "), _WORDS[c.verdict.value], c.message, c.fix or "–"] for c in found.checks]
+    outlook = [[o.parameter, "yes" if o.possible else "no", o.reason] for o in found.parameters]
+    checks = rows_of(("Check", "Result", "Found", "What to do"), rows)
+    return section(
+        f"checks{place}", f"What {log} allows", "", (), [checks, rows_of(("Parameter", "Possible", "Why"), outlook)]
+    )
