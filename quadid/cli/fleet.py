@@ -21,7 +21,7 @@ from queue import Empty, SimpleQueue
 from typing import Annotated, Any
 
 import typer
-from quadid_replay.recognise import HEAD_BYTES, recognise
+from quadid_replay.formats import HEAD_BYTES, recognise
 
 from quadid.app.fleet import Job, Row, blank, health_trend, identify_one
 from quadid.app.fleet_page import Fleet, summarise
