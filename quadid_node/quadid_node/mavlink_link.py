@@ -11,7 +11,15 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from quadid_replay.mavlink_messages import ESC_GROUPS, PREFERENCE, READERS, BootClock, Reading, boot_seconds, boot_stamp
-from quadid_replay.motors import ESCS, MOTOR_FUNCTION, Outputs, changed_functions, esc_columns, motor_outputs
+from quadid_replay.motors import (
+    ESCS,
+    MOTOR_FUNCTION,
+    Outputs,
+    changed_functions,
+    esc_columns,
+    motor_outputs,
+    no_multirotor,
+)
 
 from quadid.condition.watch import HealthReport
 from quadid.data.window import Sample
@@ -38,12 +46,13 @@ class MotorOrder:
 
     Attributes:
         ardupilot: whether the autopilot is one.
+        kind: MAV_TYPE of its heartbeats; 0 for unknown.
         problem: what speaks against its outputs; empty for nothing.
     """
 
     def __init__(self, rotors: int) -> None:
         """Knows nothing yet of a vehicle with `rotors` rotors."""
-        self.ardupilot = False
+        self.ardupilot, self.kind = False, 0
         self.problem = ""
         self._rotors = rotors
         self._parameters: dict[str, float] = {}
@@ -111,6 +120,8 @@ class MotorOrder:
         return found.columns
 
     def _columns(self, message: str, width: int) -> Outputs:
+        if other := no_multirotor({}, self.kind):
+            return Outputs([], other, told=True)
         if message in _ESC_MESSAGES:
             return esc_columns(self._parameters, self._rotors, self._turning, message, self.ardupilot)
         return motor_outputs(self._parameters, self._rotors, width, message, self.ardupilot)
@@ -450,6 +461,7 @@ class MavlinkLink:
             self.vehicle_system, self._target = message.get_srcSystem(), message.get_srcComponent()
             self._wire.mav.srcSystem = self.vehicle_system
             self._decoder.order.ardupilot = message.autopilot == dialect.MAV_AUTOPILOT_ARDUPILOTMEGA
+            self._decoder.order.kind = message.type
 
     def _on_heartbeat(self, message: Any) -> None:
         """Notes who is heard again and again and will be answered; asks the vehicle for the parameters we lack."""

@@ -123,8 +123,8 @@ _OTHER_FRAMES = {6: "helicopter", 8: "single copter", 9: "coax copter", 11: "hel
 _OTHER_AIRFRAMES = {1: "plane", 2: "VTOL", 3: "tiltrotor", 4: "tailsitter", 5: "rover", 6: "rover", 10: "helicopter",
                     11: "helicopter", 12: "helicopter", 13: "rover", 14: "spacecraft"}  # fmt: skip
 """CA_AIRFRAME of PX4 that is no multirotor."""
-_ONESHOT125 = 8.0
-"""ESCs that take an eighth of a pulse width."""
+_SHOTS = {"OneShot125": (125.0, 250.0), "OneShot42": (42.0, 84.0), "Multishot": (5.0, 25.0)}
+"""Short pulses [us] that stand for those of 1000 and 2000, by protocol."""
 DSHOT, UAVCAN = 1999.0, 8191.0
 """Full command of these protocols, as PX4 logs it."""
 _NAMED = 4
@@ -329,10 +329,14 @@ def no_multirotor(parameters: Mapping[str, float], mav_type: int = 0, firmware: 
 
 
 def in_pulses(outputs: FloatArray) -> tuple[FloatArray, str]:
-    """Outputs (n, k) as pulse widths [us]: OneShot125's are an eighth; and what was done, for people."""
+    """Outputs (n, k) as pulse widths [us], of which shorter protocols have a part; and what was done, for people."""
     turning = outputs[outputs > 0.0]
-    if len(turning) and np.all(np.abs(np.quantile(turning, [0.05, 0.95]) * _ONESHOT125 - 1500.0) < 800.0):
-        return outputs * _ONESHOT125, "OneShot125, times 8"
+    ends = np.quantile(turning, [0.05, 0.95]) if len(turning) else np.zeros(2)
+    for name, (least, full) in _SHOTS.items():
+        slope = 1000.0 / (full - least)
+        if np.all(np.abs(1000.0 + slope * (ends - least) - 1500.0) < 800.0) and ends[1] > least:
+            pulses = np.where(outputs > 0.0, 1000.0 + slope * (outputs - least), outputs)
+            return pulses, f"{name}, {least:g} to {full:g} us"
     return outputs, ""
 
 

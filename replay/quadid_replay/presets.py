@@ -42,6 +42,7 @@ PRESETS: dict[str, dict[str, tuple[str, ...]]] = {
         "velocity": ("fmu/out/vehicle_local_position", "fmu/out/vehicle_odometry"),
         "position": ("fmu/out/vehicle_local_position", "fmu/out/vehicle_odometry"),
         "battery": ("fmu/out/battery_status",),
+        "vehicle_kind": ("fmu/out/vehicle_status",),
     },
     "ardupilot": {
         "gyro": ("ap/imu/experimental/data",),

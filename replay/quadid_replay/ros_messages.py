@@ -313,6 +313,7 @@ TYPES: dict[str, MessageType] = {
     "px4_msgs/ActuatorMotors": _px4("actuator_motors", lambda m: list(m.control), True),
     "px4_msgs/ActuatorOutputs": _px4("outputs", lambda m: list(m.output), True),
     "px4_msgs/EscStatus": _px4("rotor_speed", _px4_speeds, True),
+    "px4_msgs/VehicleStatus": _px4("vehicle_kind", lambda m: [float(m.system_type)], True),
 }  # fmt: skip
 """Message types that are read, without the ``msg`` in the middle of their name."""
 
@@ -356,9 +357,11 @@ SIGNALS: dict[str, tuple[str, Callable[[FloatArray], FloatArray]]] = {
     "frd_attitude": ("attitude", _as_is),
     "ned_position": ("position", _as_is),
     "ned_velocity": ("velocity", _as_is),
+    "vehicle_kind": ("vehicle_kind", _as_is),
     "frd_reference": ("attitude_reference", lambda c: np.column_stack([to_euler(c[:, :4]), c[:, 4]])),
 }
-"""Signals: the channel each belongs to, and what turns its columns into core units and frames."""
+"""Signals: the channel each belongs to, and what turns its columns into core units and frames; the MAV_TYPE of a
+vehicle, which is no channel, tells whether its outputs are rotors."""
 
 
 def type_name(schema: str) -> str:

@@ -20,7 +20,7 @@ from quadid.errors import LogError
 from quadid.sanitise import plain
 from quadid_replay.columns import Columns, RawChannel, assemble, fastest_first
 from quadid_replay.mcap_file import McapFile, Message, Topic, usable_definition
-from quadid_replay.motors import active_outputs
+from quadid_replay.motors import active_outputs, no_multirotor
 from quadid_replay.presets import AUTO, preset_rank
 from quadid_replay.ros_messages import SIGNALS, TYPES, MessageReader, Source, decode_messages, type_name
 
@@ -216,7 +216,14 @@ def read_mcap(path: Path, preset: str = AUTO) -> Recording:
         notes.append(f"{failed} messages could not be decoded and were dropped")
     if stamps.base_ns:
         notes.append(f"times count from UNIX time {stamps.base_ns // 10**9} s")
-    recording = assemble(path.name, "mcap", _channels(columns, sources, preset), stamps.clock, notes)
+    raw = _channels(columns, sources, preset)
+    kinds = [entry for entry in raw if entry.name == "vehicle_kind"]
+    other = no_multirotor({}, int(kinds[0].values[-1, 0])) if kinds else ""
+    if other:
+        notes.append(other)
+    unused = ("vehicle_kind", "rotor_speed", "motor_command") if other else ("vehicle_kind",)
+    raw = [entry for entry in raw if entry.name not in unused]
+    recording = assemble(path.name, "mcap", raw, stamps.clock, notes)
     return replace(recording, epoch=float(stamps.base_ns // 10**9) if stamps.base_ns else None)
 
 

@@ -538,7 +538,7 @@ def _motors(vehicle: VehicleLog, notes: list[str]) -> list[RawChannel]:
             values, how = in_pulses(values) if signal == "servo" else (values, "")
             guessed = active_outputs(values) if signal == "servo" and not found.problem else []
             motors = found.columns or guessed
-            which = " ".join(str(i + 1) for i in motors) + how if signal == "servo" else "(normalized)"
+            which = " ".join([*(str(i + 1) for i in motors), how]).strip() if signal == "servo" else "(normalized)"
             if motors:
                 raw.append(RawChannel("motor_command", t, values[:, motors], f"{source} {which}"))
     return sorted(raw, key=lambda r: "ACTUATOR" not in r.source)

@@ -76,6 +76,15 @@ def test_rotor_speeds_go_with_the_outputs_of_their_motors(first: int, esc: int) 
     assert rows["motor_command"] == (1100.0, 1200.0, 1300.0, 1400.0)
 
 
+@pytest.mark.parametrize(("kind", "motors"), [(2, True), (13, True), (0, True), (1, False), (4, False), (22, False)])
+def test_outputs_of_a_plane_are_no_rotors_on_a_live_link_either(order: MotorOrder, kind: int, motors: bool) -> None:
+    """The test of the logs: a plane's ailerons passed for rotors."""
+    order.kind = kind
+    tell(order, 33, 34, 35, 36)
+    assert take(order) == (PULSES[:4] if motors else ())
+    assert ("no multirotor" in order.problem) is not motors
+
+
 def test_another_autopilot_is_not_waited_for() -> None:
     assert take(MotorOrder(3)) == PULSES[:3]
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from quadid_replay import open_log, write_csv
 from quadid_replay.columns import RawChannel, clean_channel
-from quadid_replay.motors import frame_of, in_pulses, motor_columns, no_multirotor
+from quadid_replay.motors import active_outputs, frame_of, in_pulses, motor_columns, no_multirotor
 from quadid_replay.vehicle_from_log import vehicle_text
 
 import quadid
@@ -177,10 +177,17 @@ def test_what_is_no_multirotor(parameters: dict[str, float], kind: int, firmware
     assert (word in said) if word else said == ""
 
 
-def test_eighths_of_pulses() -> None:
-    pulses = np.array([[0.0, 1000.0, 1500.0, 1900.0]] * 30)
-    np.testing.assert_array_equal(in_pulses(pulses)[0], pulses)
-    np.testing.assert_array_equal(in_pulses(pulses / 8.0)[0], pulses)
+@pytest.mark.parametrize(("least", "full"), [(1000.0, 2000.0), (125.0, 250.0), (42.0, 84.0), (5.0, 25.0)])
+def test_short_pulses_are_those_that_they_stand_for(least: float, full: float) -> None:
+    pulses = np.array([[0.0, 1100.0, 1500.0, 1900.0]] * 30)
+    short = np.where(pulses > 0.0, least + (full - least) * (pulses - 1000.0) / 1000.0, 0.0)
+    np.testing.assert_allclose(in_pulses(short)[0], pulses, rtol=1e-12)
+    assert active_outputs(in_pulses(short + np.linspace(0.0, 0.1 * (full - least), 30)[:, None])[0]) == []
+
+
+@pytest.mark.parametrize("outputs", [[0.1, 0.5, 0.6, 0.9], [100.0, 500.0, 700.0, 1900.0], [0.0, 0.0, 0.0, 0.0]])
+def test_numbers_that_are_no_pulses_stay_as_they_are(outputs: list[float]) -> None:
+    np.testing.assert_array_equal(in_pulses(np.array([outputs] * 30))[0], [outputs] * 30)
 
 
 def test_motors_by_function() -> None:

@@ -124,6 +124,27 @@ def test_px4_topics_on_their_own_boot_clock(tmp_path: Path, suffix: str) -> None
     assert len(recording.channels["attitude"].t) == 100
 
 
+@pytest.mark.parametrize(("kind", "motors"), [(2, True), (1, False), (22, False), (0, True)])
+def test_outputs_of_a_plane_are_no_rotors_in_a_ros_log_either(tmp_path: Path, kind: int, motors: bool) -> None:
+    """The test of the other formats, by the MAV_TYPE of VehicleStatus."""
+    path, nan = tmp_path / "log", float("nan")
+    status = {"px4_msgs/msg/VehicleStatus": "uint64 timestamp\nuint8 nav_state\nuint8 system_type\n"}
+    with path.open("wb") as stream, RosWriter(stream) as writer:
+        schemas = {name: writer.register_msgdef(name, text) for name, text in {**PX4, **status}.items()}
+        for k in range(60):
+            us, ns = 5_000_000 + k * 10_000, EPOCH + k * 10_000_000
+            for topic, of, message in (
+                ("vehicle_attitude", "VehicleAttitude", {"timestamp": us, "q": [1.0, 0.0, 0.0, 0.0]}),
+                ("actuator_motors", "ActuatorMotors", {"timestamp": us, "control": [0.5] * 4 + [nan] * 8}),
+                ("vehicle_status", "VehicleStatus", {"timestamp": us, "nav_state": 2, "system_type": kind}),
+            ):
+                writer.write_message(f"/fmu/out/{topic}", schemas[f"px4_msgs/msg/{of}"], message, ns)
+    for preset in ("auto", "px4"):
+        recording = open_log(path, preset)
+        assert set(recording.channels) == {"attitude"} | ({"motor_command"} if motors else set())
+        assert any(f"MAV_TYPE {kind}, no multirotor" in w for w in recording.warnings) is not motors
+
+
 def test_stamps_of_zero_fall_back_to_log_time_and_another_clock_is_shifted(tmp_path: Path) -> None:
     for name, stamp in (("zero", lambda k: 0), ("simulated", lambda k: 2_000_000_000 + k * 10_000_000)):
         with TopicWriter(tmp_path / name) as writer:
