@@ -179,10 +179,11 @@ def test_what_is_no_multirotor(parameters: dict[str, float], kind: int, firmware
 
 @pytest.mark.parametrize(("least", "full"), [(1000.0, 2000.0), (125.0, 250.0), (42.0, 84.0), (5.0, 25.0)])
 def test_short_pulses_are_those_that_they_stand_for(least: float, full: float) -> None:
-    pulses = np.array([[0.0, 1100.0, 1500.0, 1900.0]] * 30)
+    pulses = np.hstack([np.linspace(1100.0, 1800.0, 30)[:, None] + [0.0, 20.0, 40.0, 60.0], np.zeros((30, 2))])
     short = np.where(pulses > 0.0, least + (full - least) * (pulses - 1000.0) / 1000.0, 0.0)
-    np.testing.assert_allclose(in_pulses(short)[0], pulses, rtol=1e-12)
-    assert active_outputs(in_pulses(short + np.linspace(0.0, 0.1 * (full - least), 30)[:, None])[0]) == []
+    read, _ = in_pulses(short)
+    np.testing.assert_allclose(read, pulses, rtol=1e-12)
+    assert active_outputs(read) == [0, 1, 2, 3]
 
 
 @pytest.mark.parametrize("outputs", [[0.1, 0.5, 0.6, 0.9], [100.0, 500.0, 700.0, 1900.0], [0.0, 0.0, 0.0, 0.0]])
