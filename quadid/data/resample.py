@@ -247,15 +247,16 @@ def fresh_rows(values: FloatArray) -> IndexArray:
     """Returns the rows that bring a new reading, where a log repeats each reading several times; else all rows.
 
     A slow estimate written at a fast rate is a staircase, half a step late when read as instants.  A reading counts as
-    repeated only when that is the rule (median run of equal rows at least 2); runs far longer than usual are kept, for
-    they are a signal that rests.
+    repeated only when that is the rule (median run of equal rows at least 2; of over fifty, nearly all alike); runs far
+    longer than usual are kept, for they are a signal that rests.
     """
     if len(values) < 20:
         return np.arange(len(values))
     start = np.concatenate([[0], np.flatnonzero(~copied(values)) + 1])
     run = np.diff(np.append(start, len(values)))
     usual = median(run.astype(np.float64))
-    if usual < 2.0 or len(start) < 0.02 * len(values):
+    rare = len(start) < 0.02 * len(values) and (len(start) < 20 or np.quantile(run, 0.9) > 1.5 * usual)
+    if usual < 2.0 or rare:
         return np.arange(len(values))
     keep = np.repeat(run > 5.0 * usual, run)
     keep[start] = True

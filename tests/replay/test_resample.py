@@ -149,6 +149,10 @@ def test_fresh_rows_of_a_staircase_and_of_a_resting_signal() -> None:
     assert len(fresh_rows(noise)) == 100
     resting = np.concatenate([np.zeros((60, 1)), slow])
     assert set(range(60)) <= set(fresh_rows(resting))
+    held = np.repeat(np.arange(40.0), 100)[:, None]  # 5 Hz at 500 Hz: all its rows once passed for readings
+    assert list(fresh_rows(held)) == list(range(0, 4000, 100))
+    rare = np.repeat(np.arange(30.0), np.random.default_rng(2).integers(60, 600, 30))[:, None]
+    assert len(fresh_rows(rare)) == len(rare), "commands that rarely change, at any time"
 
 
 @pytest.mark.parametrize("width", [1, 2, 24, 25])
