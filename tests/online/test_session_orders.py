@@ -11,6 +11,7 @@ from quadid.online import FitRequest, Phase, Session, SessionSettings, SetState
 from quadid.online.change_job import ChangeRequest
 from quadid.online.gate import Decision
 from quadid.online.records import Event, Job
+from tests.faults.evidence import Happened
 from tests.online.driving import EPOCH, diagnosed, events, published
 from tests.online.made_up import (
     DROPPED,
@@ -132,7 +133,7 @@ def session_start(session: Session) -> float:
     return session.resampler.time.stamp(0.0)
 
 
-def test_the_answer_to_a_fit_from_before_a_rollback_is_ignored_and_the_next_one_counts() -> None:
+def test_the_answer_to_a_fit_from_before_a_rollback_is_ignored_and_the_next_one_counts(happened: Happened) -> None:
     session = with_two_sets()
     works(session, between(FLIGHT, 13.7, 14.7), never)
     request = session.running
@@ -149,6 +150,7 @@ def test_the_answer_to_a_fit_from_before_a_rollback_is_ignored_and_the_next_one_
     assert numbers(later) == [request.number + 1, request.number + 2]
     assert session.status().fits == fits + 2
     assert len(published(later, "candidate")) == 2
+    happened(19, "rollback while a fit runs: the earlier set is in force again, the fit's answer is ignored")
 
 
 def test_a_rollback_in_the_middle_of_an_answer_drops_the_rest_of_it() -> None:
@@ -252,7 +254,7 @@ def test_a_missing_channel_is_told(missing: str, word: str) -> None:
     assert event.t == 3.0 or missing == "gyro"
 
 
-def test_the_ground_is_not_learned_from() -> None:
+def test_the_ground_is_not_learned_from(happened: Happened) -> None:
     session = Session(PELICAN, QUICK)
     actions = works(session, on_the_ground(8.0), tells())
     assert not numbers(actions)
@@ -261,6 +263,7 @@ def test_the_ground_is_not_learned_from() -> None:
     assert [e.t for e in events(actions, "not_flying")] == [4.0], "told once"
     (first,) = published(works(session, between(FLIGHT, 0.0, 10.0, 8.0), tells()))
     assert first.start >= 8.0 - 0.22 - 1e-6
+    happened(18, f"8 s on the ground, then flight: learned only from data after {first.start:g} s")
 
 
 def test_a_known_vehicle_that_its_rotors_carry_by_a_third_only_does_not_fly() -> None:
@@ -295,7 +298,7 @@ def test_a_gap_is_counted_and_a_long_one_holds_the_fits_back() -> None:
     assert session.status().fits < 6
 
 
-def test_a_reboot_begins_anew_and_mixes_nothing() -> None:
+def test_a_reboot_begins_anew_and_mixes_nothing(happened: Happened) -> None:
     session = Session(PELICAN, QUICK)
     actions = works(session, between(FLIGHT, 0.0, 6.7, 500.0), tells())
     actions += works(session, between(FLIGHT, 10.0, 20.7, -9.0), tells())
@@ -306,3 +309,4 @@ def test_a_reboot_begins_anew_and_mixes_nothing() -> None:
     assert all(a.windows[-1].t.max() - a.windows[0].t0 < 4.3 for a in asked)
     fit_of_the_new = [s.stop for s in published(actions, "candidate") if s.stop < 100.0]
     assert fit_of_the_new[0] == pytest.approx(5.0, abs=1.0), "no sooner than a window after it began"
+    happened(7, "reboot in flight online: two streams, no set mixes them")

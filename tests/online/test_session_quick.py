@@ -148,23 +148,6 @@ def test_windows_the_gate_and_memory_follow_the_settings() -> None:
     assert 1.1 < ratio < 2.0, "who forgets claims to know less"
 
 
-def test_how_it_is_polled_changes_nothing() -> None:
-    stream = between(FLIGHT, 0.0, 14.7, EPOCH)
-    plain = works(Session(PELICAN, QUICK), stream, tells())
-    session, work, late = Session(PELICAN, QUICK), tells(), list[Action]()
-    for sample in stream:  # all at once, then piece by piece with answers that come late
-        session.push(sample)
-    for k in range(4000):
-        late += session.poll(1)
-        if session.running is not None and k % 7 == 0:
-            reply = work(session.running)
-            assert reply is not None
-            session.deliver(reply)
-    assert not session.busy
-    assert told(late) == told(plain)
-    assert published(late)
-
-
 def test_blocks_of_messages_give_what_samples_give() -> None:
     stream = between(FLIGHT, 0.0, 9.7, EPOCH)
     plain = works(Session(PELICAN, QUICK), stream, tells())
