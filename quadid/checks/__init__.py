@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
-from quadid.checks.findings import FATAL as FATAL
 from quadid.checks.findings import Check as Check
 from quadid.checks.findings import CheckResult as CheckResult
 from quadid.checks.findings import Inspection as Inspection
@@ -17,7 +17,7 @@ from quadid.checks.motion import (
     channel_facts,
     gravity_check,
     gyro_source_check,
-    position_checks,
+    position_check,
     timing_checks,
     velocity_check,
 )
@@ -52,7 +52,8 @@ def inspect(recording: Recording, vehicle: Vehicle | None = None) -> Inspection:
     checks = timing_checks(recording, facts)
     log = Log(turned, vehicle, spans, recording)
     for stage in STAGES:  # each builds on the ones before it: what comes after an error is not asked
-        found = [check for check in stage(log) if check is not None]
+        asked = [question.test(log) for question in stage if vehicle is not None or not question.vehicle]
+        found = [check for check in asked if check is not None]
         checks += found
         if any(check.verdict is CheckResult.ERROR for check in found):
             break
@@ -81,72 +82,90 @@ class Log:
     spans: Spans
     read: Recording
 
+    @property
+    def known(self) -> Vehicle:
+        """The vehicle, where there is one."""
+        assert self.vehicle is not None
+        return self.vehicle
+
     @cached_property
     def hover(self) -> Check:
-        """Thrust at hover against the weight; needs the vehicle."""
-        assert self.vehicle is not None
-        return hover_check(self.recording, self.vehicle, self.spans)
+        """Thrust at hover against the weight."""
+        return hover_check(self.recording, self.known, self.spans)
 
     @cached_property
     def lagged(self) -> Lagged | str:
-        """Torque and angular acceleration at several lags, or why there are none; needs the vehicle."""
-        assert self.vehicle is not None
-        return lagged_motion(self.read, self.vehicle, self.spans)
+        """Torque and angular acceleration at several lags, or why there are none."""
+        return lagged_motion(self.read, self.known, self.spans)
+
+    @cached_property
+    def motors(self) -> dict[str, Check]:
+        """Time, order and spins of the motors, and rotors one by one.
+
+        Another order is only judged, and advised, of a signal that is in time with it and in balance: else the time is
+        wrong, or a rotor.
+        """
+        recording, vehicle, spans, lagged = self.recording, self.known, self.spans, self.lagged
+        time, other = rotor_timing_check(recording, vehicle, spans), better_description(lagged, vehicle)
+        balance = rotor_speed_check(recording, vehicle, spans)
+        if other is not None:
+            again = rotor_timing_check(recording, other.vehicle, spans)
+            own, its = (check.numbers.get("correlation", 0.0) for check in (time, again))
+            fits = again.verdict is CheckResult.OK and its >= own - 1e-9
+            if fits and rotor_speed_check(recording, other.vehicle, spans).verdict is not CheckResult.ERROR:
+                return {"motor_order": motor_order_check(lagged, vehicle, other)}
+        wrong = [check for check in (time, balance) if check.verdict is CheckResult.ERROR]
+        if wrong:
+            return {wrong[0].name: wrong[0]}
+        order = motor_order_check(lagged, vehicle, None)
+        if other is not None:
+            strange = "no order of the motors explains the motion at one lag"
+            order = Check("motor_order", CheckResult.UNKNOWN, strange)
+        return {check.name: check for check in (order, time, balance)}
 
 
-Stage = Callable[[Log], Sequence[Check | None]]
+class Question(NamedTuple):
+    """One line of the table of checks.
 
-
-def _kinematics(log: Log) -> list[Check | None]:
-    """Units and frames, without any rotor."""
-    return [
-        gravity_check(log.recording, log.spans), attitude_check(log.recording), velocity_check(log.recording),
-        *position_checks(log.read), gyro_source_check(log.recording),
-    ]  # fmt: skip
-
-
-def _readings(log: Log) -> list[Check | None]:
-    """Rotors that read nothing, or always the same; the unit of their speeds."""
-    if log.vehicle is None:
-        return []
-    dead = readings_check(log.recording, log.vehicle, log.spans)
-    if dead is not None and dead.verdict is CheckResult.ERROR:
-        return [dead]
-    return [dead, log.hover]
-
-
-def _time_order_balance(log: Log) -> list[Check]:
-    """Time, order and spins of the motors, and rotors one by one.
-
-    Another order is only judged, and advised, of a signal that is in time with it and in balance: else the time is
-    wrong, or a rotor.
+    Attributes:
+        name: of the check.
+        test: answers with verdict and sentence; None: there is nothing to say.
+        vehicle: it needs a vehicle.
+        fatal: its error means that nothing may be fitted to the log.
+        live: it is asked of the windows of a stream, too (`quadid.online.checks`).
     """
-    if log.vehicle is None:
-        return []
-    recording, vehicle, spans, lagged = log.recording, log.vehicle, log.spans, log.lagged
-    time, other = rotor_timing_check(recording, vehicle, spans), better_description(lagged, vehicle)
-    balance = rotor_speed_check(recording, vehicle, spans)
-    if other is not None:
-        again = rotor_timing_check(recording, other.vehicle, spans)
-        own, its = (check.numbers.get("correlation", 0.0) for check in (time, again))
-        fits = again.verdict is CheckResult.OK and its >= own - 1e-9
-        if fits and rotor_speed_check(recording, other.vehicle, spans).verdict is not CheckResult.ERROR:
-            return [motor_order_check(lagged, vehicle, other)]
-    if CheckResult.ERROR in (time.verdict, balance.verdict):
-        return [check for check in (time, balance) if check.verdict is CheckResult.ERROR][:1]
-    if other is not None:
-        strange = "no order of the motors explains the motion at one lag"
-        return [Check("motor_order", CheckResult.UNKNOWN, strange), time, balance]
-    return [motor_order_check(lagged, vehicle, None), time, balance]
+
+    name: str
+    test: Callable[[Log], Check | None]
+    vehicle: bool = True
+    fatal: bool = True
+    live: bool = False
 
 
-def _vehicle_file(log: Log) -> list[Check | None]:
-    """Mass and rotor positions."""
-    if log.vehicle is None:
-        return []
-    b = log.hover.numbers.get("b_from_hover")
-    mass = mass_check(log.recording, log.vehicle, log.spans, b)
-    return [mass, geometry_check(log.lagged, log.vehicle)]
-
-
-STAGES: tuple[Stage, ...] = (_kinematics, _readings, _time_order_balance, _vehicle_file)
+STAGES: tuple[tuple[Question, ...], ...] = (
+    (  # units and frames, without any rotor
+        Question("gravity", lambda log: gravity_check(log.recording, log.spans), vehicle=False, live=True),
+        Question("gyro_attitude", lambda log: attitude_check(log.recording), vehicle=False, live=True),
+        Question("velocity_attitude", lambda log: velocity_check(log.recording), vehicle=False, live=True),
+        Question("position_velocity", lambda log: position_check(log.read), vehicle=False),
+        Question("gyro_source", lambda log: gyro_source_check(log.recording), vehicle=False),
+    ),
+    # rotors that read nothing, or always the same; then the unit of their speeds
+    (Question("rotor_speed", lambda log: readings_check(log.recording, log.known, log.spans)),),
+    (Question("hover", lambda log: log.hover),),
+    (  # time, order and spins of the motors, and rotors one by one
+        Question("motor_order", lambda log: log.motors.get("motor_order")),
+        Question("rotor_timing", lambda log: log.motors.get("rotor_timing")),
+        Question("rotor_speed", lambda log: log.motors.get("rotor_speed")),
+    ),
+    (  # what the vehicle file says
+        Question(
+            "mass",
+            lambda log: mass_check(log.recording, log.known, log.spans, log.hover.numbers.get("b_from_hover")),
+            fatal=False,
+        ),
+        Question("geometry", lambda log: geometry_check(log.lagged, log.known), fatal=False),
+    ),
+)
+FATAL = {"saturated", *(question.name for stage in STAGES for question in stage if question.fatal)}
+"""Checks whose error means that nothing may be fitted to the log."""

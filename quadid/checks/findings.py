@@ -15,13 +15,6 @@ from quadid.parameters import NOMINAL_NAMES
 # --- Result of an inspection: facts of channels, checks, what is missing and how to get it
 
 
-FATAL = (
-    "gravity", "gyro_attitude", "gyro_source", "saturated", "velocity_attitude", "position_velocity", "rotor_speed",
-    "hover", "motor_order", "rotor_timing",
-)  # fmt: skip
-"""Checks whose error means that nothing may be fitted to the log."""
-
-
 class CheckResult(StrEnum):
     """Outcome of one check."""
 

@@ -825,18 +825,14 @@ SCALE = 0.03
 """Deviation from scale 1 that matters to whoever predicts positions …"""
 
 
-def position_checks(recording: Recording) -> list[Check]:
-    """Integral of the velocity against the change of position, where both are logged: scale and correlation.
+def position_check(recording: Recording) -> Check | None:
+    """Integral of the velocity against the change of position: scale and correlation; None where one is not logged.
 
     Horizontal axes together, the vertical one by itself.
     """
     position, velocity = (recording.channels.get(n) for n in ("position", "velocity"))
     if position is None or velocity is None or min(len(position.t), len(velocity.t)) < FEWEST_SAMPLES:
-        return []
-    return [_compared(position, velocity)]
-
-
-def _compared(position: Channel, velocity: Channel) -> Check:
+        return None
     moved, flown, independent = _changes(position, velocity)
     if independent < 4.0:
         return Check("position_velocity", CheckResult.UNKNOWN, "too few stretches without a gap to compare")

@@ -52,10 +52,7 @@ def rotor_timing_check(recording: Recording, vehicle: Vehicle, spans: Spans) -> 
     gyro = recording.channels.get("gyro")
     if gyro is None or not spans:
         return Check(name, CheckResult.UNKNOWN, "needs gyro and rotor signal in flight")
-    try:
-        signal = rotor_signal(recording, vehicle)
-    except QuadidError as error:
-        return Check(name, CheckResult.UNKNOWN, error.found)
+    signal = rotor_signal(recording, vehicle)
     slowest = max(measured_period(signal.t, signal.values), sample_period(gyro.t))
     if not slowest <= 1.0 / INERTIA_RATE:
         return Check(name, CheckResult.UNKNOWN, "rotor signal or gyro too slow to place them in time")
@@ -214,10 +211,7 @@ def _commanded(recording: Recording, vehicle: Vehicle) -> bool:
 def rotor_speed_check(recording: Recording, vehicle: Vehicle, spans: Spans) -> Check:
     """Each rotor against the others and all against the thrust felt; the first that cannot be true is named."""
     name = _NAME
-    try:
-        signal = rotor_signal(recording, vehicle)
-    except QuadidError as error:
-        return Check(name, CheckResult.UNKNOWN, error.found)
+    signal = rotor_signal(recording, vehicle)
     edges = _edges(spans)
     inside = within(signal.t, spans)
     if len(edges) < 4 or np.count_nonzero(inside) < 20:

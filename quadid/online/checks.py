@@ -8,8 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from quadid.checks.findings import CheckResult
-from quadid.checks.motion import attitude_check, gravity_check, velocity_check
+from quadid.checks import STAGES, CheckResult, Log
 from quadid.checks.rotors import better_description, lagged_of, motor_order_check
 from quadid.data.resample import at_limit, copied, moving_mean, true_runs
 from quadid.data.window import Window, as_recording
@@ -311,9 +310,10 @@ def mistake(cut: WindowCut, vehicle: Vehicle, known: bool) -> str:
 
 
 def _wrong_unit(window: Window) -> str:
-    recording, spans = as_recording([window]), ((window.t0, window.t0 + window.dt * len(window)),)
-    for check in (gravity_check(recording, spans), attitude_check(recording), velocity_check(recording)):
-        if check.verdict is CheckResult.ERROR:
+    recording = as_recording([window])
+    log = Log(recording, None, ((window.t0, window.t0 + window.dt * len(window)),), recording)
+    for check in (question.test(log) for stage in STAGES for question in stage if question.live):
+        if check is not None and check.verdict is CheckResult.ERROR:
             return f"{check.message}; {check.fix}; on ROS topics FLU and ENU: PX4 has FRD and NED"
     return ""
 
