@@ -177,21 +177,3 @@ def test_a_header_of_another_dialect_is_refused(tmp_path: Path) -> None:
             open_log(log(tmp_path, data))
     with pytest.raises(LogError, match="no usable flight data"):
         open_log(log(tmp_path, whole + bytes(5000)))
-
-
-def test_any_bytes_end_in_a_recording_or_one_error(tmp_path: Path) -> None:
-    data = writer.header() + b"".join(writer.frames(rows(60))) + writer.END
-    rng = Random(3)
-    for _ in range(150):
-        broken = bytearray(data)
-        for _ in range(rng.randrange(1, 6)):
-            broken[rng.randrange(30, len(broken))] = rng.randrange(256)
-        assert "\n" not in outcome(log(tmp_path, bytes(broken)))
-
-
-def outcome(path: Path) -> str:
-    """The channels read, or the error."""
-    try:
-        return " ".join(open_log(path).channels)
-    except LogError as error:
-        return str(error)

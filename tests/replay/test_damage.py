@@ -15,7 +15,7 @@ from tests.faults.evidence import Happened
 from tests.replay.synthetic import full_recording
 
 CUTS, FLIPS = 40, 60
-FORMATS = ("csv", "mcap", "tlog", "dataflash", "ulog")
+FORMATS = ("csv", "mcap", "tlog", "dataflash", "ulog", "usdlog", "blackbox")
 ROWS = {"mcap": 1, "tlog": 3, "dataflash": 3, "ulog": 4}
 """Rows of the list of faults that these formats belong to."""
 
@@ -27,6 +27,10 @@ def log(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
     path = tmp_path_factory.mktemp("logs") / "log"
     if kind == "dataflash":
         return (data_dir / "ardupilot" / "log171.bin").read_bytes()[:250_000]
+    if kind == "usdlog":
+        return (data_dir / "crazypad" / "motor_126.usd").read_bytes()
+    if kind == "blackbox":
+        return Path(__file__).with_name("golden.bbl").read_bytes()
     if kind == "ulog":
         return (data_dir / "px4" / "ascend_cubeorange_test.ulg").read_bytes()[:400_000]
     with pytest.MonkeyPatch.context() as patch:

@@ -154,18 +154,6 @@ def test_logs_that_change_on_the_way(
     assert decodings < 0.5 * len(messages)
 
 
-def test_damaged_logs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    write(tmp_path / "log", flown())
-    whole = (tmp_path / "log").read_bytes()
-    rng = np.random.default_rng(1)
-    for _ in range(12):
-        data = bytearray(whole)
-        for place in rng.integers(8, len(data), rng.integers(1, 6)):
-            data[place] ^= 1 << int(rng.integers(8))
-        (tmp_path / "damaged").write_bytes(bytes(data[: rng.integers(len(data) // 2, len(data) + 1)]))
-        both_ways(tmp_path / "damaged", monkeypatch)
-
-
 def test_types_without_a_layout_are_read_one_by_one() -> None:
     def unread(data: bytes) -> Any:
         raise ValueError(data)

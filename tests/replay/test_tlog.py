@@ -95,11 +95,6 @@ def test_our_messages_are_those_of_mavgen(generated: ModuleType, number: int) ->
     assert MAV.MAVLink(None).decode(bytearray(frames[1])).index == 4
 
 
-def test_extending_twice_changes_nothing() -> None:
-    before = MAV.mavlink_map[ESC_STATUS]
-    assert extend_dialect(ardupilotmega).mavlink_map[ESC_STATUS] is before
-
-
 @pytest.mark.parametrize("old_frames", [False, True])
 def test_units_of_an_ardupilot_log(tmp_path: Path, old_frames: bool) -> None:
     log = Tlog()

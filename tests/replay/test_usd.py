@@ -136,19 +136,6 @@ def test_a_damaged_list_of_variables_is_refused(tmp_path: Path, at: int) -> None
         open_log(write(tmp_path, bytes(data)))
 
 
-def test_every_cut_and_every_spoilt_byte_ends_in_a_recording_or_an_error(tmp_path: Path) -> None:
-    data = motor_log(5).closed()
-    generator = np.random.default_rng(1)
-    for k in range(0, len(data), 3):
-        spoilt = bytearray(data)
-        spoilt[k] = int(generator.integers(256))
-        for one in (bytes(spoilt), data[:k]):
-            try:
-                open_log(write(tmp_path, one))
-            except LogError:
-                continue
-
-
 def test_recorded_flights_of_both_kinds(data_dir: Path) -> None:
     folder = data_dir / "crazypad"
     kinds: dict[str, int] = {}
