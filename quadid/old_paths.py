@@ -33,7 +33,7 @@ MOVED = {
     "quadid.flight.outside": "quadid.flight.outside_flight quadid.flight.outside_log",
     "quadid.flight.pilot": "quadid.flight.profiles quadid.flight.stabiliser",
     "quadid.flight.fly": "quadid.flight.record",
-    "quadid.data.grid": "quadid.grid quadid.resampling_plan",
+    "quadid.data.grid": "quadid.grid quadid.resampling_plan quadid.resample quadid.data.resample",
     "quadid.condition.changes": "quadid.health.change_evidence quadid.health.hypotheses",
     "quadid.condition.trim": "quadid.health.spread quadid.health.stored quadid.health.trim_estimation",
     "quadid.checks.motion": "quadid.inspection.airborne quadid.inspection.conventions "
@@ -64,9 +64,9 @@ MOVED = {
     "quadid.online.records": "quadid.online.jobs quadid.online.outbox",
     "quadid.online.grid_buffer": "quadid.online.rows",
     "quadid.vehicle": "quadid.provenance quadid.residual quadid.vehicle_parts quadid.vehicle_size",
-    "quadid.data.resample": "quadid.resample quadid.data.faults quadid.data_faults quadid.saturation",
     "quadid.data.rotor_signal": "quadid.rotor_signal",
-    "quadid.data.window": "quadid.window quadid.data.mounting quadid.mounting",
+    "quadid.data.window": "quadid.window quadid.data.mounting quadid.mounting quadid.data.faults "
+    "quadid.data_faults quadid.saturation",
     "quadid.cli.terminal": "quadid_cli.failure quadid_cli.output quadid_cli.tables",
     "quadid.cli.fleet": "quadid_cli.fleet_cluster quadid_cli.fleet_folder quadid_cli.fleet_store",
     "quadid.identification.problem": "quadid.identify.parameterization quadid.identify.segment_cost "

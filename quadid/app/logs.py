@@ -15,7 +15,7 @@ import quadid_replay
 from numpy.typing import NDArray
 from quadid_replay import open_log
 
-from quadid.data.resample import linear
+from quadid.data.grid import linear
 from quadid.data.window import Recording, Window
 from quadid.errors import LogError, QuadidError, VehicleError
 from quadid.files import read_regular, unwaited

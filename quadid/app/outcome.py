@@ -20,8 +20,7 @@ from quadid_replay.frames import from_euler
 
 from quadid.app.logs import LONGEST, Log, free_name, import_pandas, write_text
 from quadid.app.missing import Beside, MissingForces
-from quadid.data.resample import sample_period
-from quadid.data.window import Channel, Recording, beginning
+from quadid.data.window import Channel, Recording, beginning, sample_period
 from quadid.errors import NotIdentifiableError
 from quadid.jsonable import jsonable
 from quadid.report.page import measures, number, render

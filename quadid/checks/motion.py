@@ -11,19 +11,18 @@ from typing import NamedTuple
 import numpy as np
 
 from quadid.checks.findings import ChannelFacts, Check, CheckResult
-from quadid.data.grid import GAP, holes, longest_step
-from quadid.data.resample import (
+from quadid.data.grid import GAP, holes, linear, longest_step, moving_mean, true_runs
+from quadid.data.rotor_signal import rotor_channel
+from quadid.data.window import (
+    CHANNELS,
+    Channel,
+    Recording,
     at_limit,
     copied,
     fresh_rows,
-    linear,
     measured_period,
-    moving_mean,
     sample_period,
-    true_runs,
 )
-from quadid.data.rotor_signal import rotor_channel
-from quadid.data.window import CHANNELS, Channel, Recording
 from quadid.model.layout import ThrustModel
 from quadid.rotation import conjugate, euler, rotated, turn
 from quadid.types import BoolArray, FloatArray

@@ -13,10 +13,9 @@ from scipy.optimize import nnls
 
 from quadid.checks.findings import Check, CheckResult
 from quadid.checks.motion import Spans, within
-from quadid.data.grid import to_windows
-from quadid.data.resample import linear, measured_period, moving_mean, sample_period, true_runs
+from quadid.data.grid import linear, moving_mean, to_windows, true_runs
 from quadid.data.rotor_signal import INERTIA_RATE, RotorSignal, rotor_channel, rotor_signal
-from quadid.data.window import Channel, Recording, Window
+from quadid.data.window import Channel, Recording, Window, measured_period, sample_period
 from quadid.errors import QuadidError
 from quadid.model.layout import ThrustModel, voltage_at
 from quadid.types import BoolArray, FloatArray

@@ -9,9 +9,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from quadid.checks.motion import flying_spans
-from quadid.data.resample import linear, moving_mean, sample_period
+from quadid.data.grid import linear, moving_mean
 from quadid.data.rotor_signal import rotor_signal
-from quadid.data.window import Channel, Recording
+from quadid.data.window import Channel, Recording, sample_period
 from quadid.errors import NotIdentifiableError
 from quadid.jsonable import jsonable
 from quadid.types import BoolArray, FloatArray, IndexArray

@@ -1,34 +1,196 @@
-"""Recordings to windows: channels resampled onto uniform grids."""
+"""Recordings to windows: channels onto uniform grids, by interpolation, holding, or one zero-phase low-pass."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import NamedTuple
 
 import numpy as np
 
 from quadid.data.intersample import follow_feedback
-from quadid.data.resample import (
-    COINCIDENT,
+from quadid.data.rotor_signal import RotorSignal, rotor_signal
+from quadid.data.window import (
+    Recording,
+    Sampling,
+    Window,
     fresh_rows,
-    hold_mean,
-    interpolate,
-    lowpass,
-    lowpass_span,
-    matching_rows,
+    in_body_axes,
     measured_period,
     median,
     sample_period,
-    split_stretches,
 )
-from quadid.data.rotor_signal import RotorSignal, rotor_signal
-from quadid.data.window import Recording, Sampling, Window, in_body_axes
 from quadid.errors import LogError, NotIdentifiableError
-from quadid.types import FloatArray
+from quadid.types import BoolArray, FloatArray, IndexArray
 from quadid.vehicle import Vehicle
+
+# --- One channel: stretches without gaps, interpolation, and the low-pass for all
+#
+# All of it takes plain arrays: times [s], shape (n,), and values, shape (n, columns), in any unit.
+
+
+HALF_WIDTH = 4.0
+"""Half-width of the low-pass kernel in steps of the new grid."""
+CUTOFF = 0.4
+"""Frequency where the low-pass halves the amplitude, as a fraction of the new grid's rate (0.5 is its Nyquist)."""
+COINCIDENT = 5e-3
+"""Samples this close to the grid, in steps, lie on it: they are passed on bit for bit."""
+_CHUNK = 4096
+
+
+def split_stretches(t: FloatArray, longest_step: float, breaks: Sequence[float] = ()) -> list[slice]:
+    """Cuts samples into stretches: never across a step longer than `longest_step` [s], nor across a break.
+
+    A break at time b separates samples before b from samples at or after b.
+    """
+    if len(t) == 0:
+        return []
+    cuts = np.flatnonzero(t[1:] - t[:-1] > longest_step) + 1
+    if not len(cuts) and not breaks:
+        return [slice(0, len(t))]
+    edges = np.searchsorted(t, np.asarray(breaks, dtype=np.float64), side="left")
+    inner = np.unique(np.concatenate([cuts, edges[(edges > 0) & (edges < len(t))]]))
+    bounds = [0, *(int(i) for i in inner), len(t)]
+    return [slice(a, b) for a, b in zip(bounds[:-1], bounds[1:], strict=True)]
+
+
+def matching_rows(t: FloatArray, at: FloatArray, step: float) -> IndexArray | None:
+    """Returns the index of the sample at each time of `at`, or None unless each has one within `COINCIDENT` steps."""
+    if len(t) == 0:
+        return None
+    index = np.clip(np.searchsorted(t, at - 0.5 * step), 0, len(t) - 1)
+    near = np.abs(t[index] - at) <= COINCIDENT * step
+    return index if bool(np.all(near)) else None
+
+
+def linear(t: FloatArray, values: FloatArray, at: FloatArray) -> FloatArray:
+    """Values (n, columns) of times t (n,) at other times (m,), by straight lines; beyond the ends the last value."""
+    return np.column_stack([np.interp(at, t, column) for column in values.T])
+
+
+def interpolate(t: FloatArray, values: FloatArray, at: FloatArray, smooth: bool) -> FloatArray:
+    """Interpolates one stretch at times inside it.
+
+    Args:
+        t: increasing times [s], shape (n,).
+        values: shape (n, columns).
+        at: times [s], shape (m,); NaN rows are returned outside [t[0], t[-1]].
+        smooth: cubic through four neighbours (slopes by central differences), which keeps the amplitude of motion near
+            the Nyquist frequency; else straight lines.
+    """
+    out = np.full((len(at), values.shape[1]), np.nan)
+    inside = (at >= t[0]) & (at <= t[-1])
+    if smooth and len(t) >= 4:
+        out[inside] = _hermite(t, values, at[inside])
+    else:
+        out[inside] = linear(t, values, at[inside])
+    return out
+
+
+def _hermite(t: FloatArray, values: FloatArray, at: FloatArray) -> FloatArray:
+    """Cubic Hermite interpolation with slopes by central differences at times within [t[0], t[-1]]."""
+    slopes = np.gradient(values, t, axis=0)
+    k = np.minimum(np.searchsorted(t, at, side="right") - 1, len(t) - 2)
+    step = (t[k + 1] - t[k])[:, None]
+    u = (at - t[k])[:, None] / step
+    rise, begin, end = values[k + 1] - values[k], step * slopes[k], step * slopes[k + 1]
+    bend = end + begin - 2.0 * rise
+    return np.asarray(values[k] + u * (begin + u * ((rise - begin - bend) + u * bend)))
+
+
+def moving_mean(values: FloatArray, width: int, mirrored: bool = False) -> FloatArray:
+    """Mean of `width` neighbouring rows (the middle one at index width // 2), shape as `values`: (n,) or (n, columns).
+
+    Beyond the ends the last value goes on, or the signal is mirrored.
+    """
+    before = width // 2
+    pad = [(before, width - 1 - before), *([(0, 0)] * (values.ndim - 1))]
+    padded = np.pad(values, pad, mode="symmetric" if mirrored else "edge")
+    weights = np.full(width, 1.0 / width)
+    columns = padded.reshape(len(padded), -1).T
+    return np.column_stack([np.convolve(c, weights, mode="valid") for c in columns]).reshape(values.shape)
+
+
+def hold_mean(t: FloatArray, values: FloatArray, at: FloatArray, step: float) -> FloatArray:
+    """Averages a held signal over each [at, at + step): exactly what acted on average in that step.
+
+    The sample at t_j acts until t_j+1; the last one goes on acting.
+    """
+    area = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(values[:-1] * np.diff(t)[:, None], axis=0)])
+
+    def integral(x: FloatArray) -> FloatArray:
+        row = np.clip(np.searchsorted(t, x, side="right") - 1, 0, len(t) - 1)
+        return np.asarray(area[row] + values[row] * (x - t[row])[:, None])
+
+    return (integral(at + step) - integral(at)) / step
+
+
+@lru_cache(maxsize=1)
+def _kernel_table() -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Tabulates lag [grid steps], kernel, and its running integral (0 to 1)."""
+    lag = np.linspace(-HALF_WIDTH, HALF_WIDTH, 16001)
+    # Kaiser's beta of 5 has its stop band about 53 dB down.  Less its value at the ends: a sample there weighs nothing.
+    window = np.i0(5.0 * np.sqrt(np.clip(1.0 - (lag / HALF_WIDTH) ** 2, 0.0, 1.0))) - 1.0
+    kernel = np.sinc(2.0 * CUTOFF * lag) * window
+    area = np.concatenate([[0.0], np.cumsum(0.5 * (kernel[1:] + kernel[:-1]) * np.diff(lag))])
+    return lag, kernel / area[-1], area / area[-1]
+
+
+def lowpass(t: FloatArray, values: FloatArray, at: FloatArray, step: float, held: bool) -> FloatArray:
+    """Low-passes one stretch with a symmetric kernel (no lag) and reads it at times `at`.
+
+    Kernel: Kaiser-windowed sinc, half amplitude at `CUTOFF`/step, half-width `HALF_WIDTH` steps.  Instants are weighted
+    by their share of time (trapezoidal rule, so jitter and a lost packet do no harm).  A held signal is integrated
+    exactly as the staircase it is: its sample k acts from t_k to t_k+1 and so counts at the middle of that step.
+
+    Args:
+        t: increasing times [s] of one stretch, shape (n,).
+        values: shape (n, columns).
+        at: times [s]; each must be at least `HALF_WIDTH` steps inside the stretch (see `lowpass_span`).
+        step: step of the new grid [s].
+        held: staircase or instants.
+    """
+    if len(at) == 0:
+        return np.empty((0, values.shape[1]))
+    lag, kernel, area = _kernel_table()
+    first = np.maximum(np.searchsorted(t, at - HALF_WIDTH * step) - 1, 0)
+    taps = int(np.max(np.searchsorted(t, at + HALF_WIDTH * step, side="right") - first)) + 1
+    # Only what the kernel reaches, and a sample on either side, is looked at.
+    low, high = max(int(first.min()) - 1, 0), min(int(first.max()) + taps + 1, len(t))
+    end = t[-1] + (sample_period(t) if held and len(t) > 1 else step) if high == len(t) else t[high]
+    first, t, values = first - low, t[low:high], values[low:high]
+    edges = np.append(t, end)
+    share = np.gradient(t) if len(t) > 1 else np.array([step])
+    out = np.empty((len(at), values.shape[1]))
+    for begin in range(0, len(at), _CHUNK):
+        rows = slice(begin, begin + _CHUNK)
+        index = np.minimum(first[rows, None] + np.arange(taps), len(t) - 1)
+        unique = first[rows, None] + np.arange(taps) < len(t)
+        if held:
+            upper = np.interp((at[rows, None] - edges[index]) / step, lag, area)
+            lower = np.interp((at[rows, None] - edges[index + 1]) / step, lag, area)
+            weight = (upper - lower) * unique
+        else:
+            distance = (at[rows, None] - t[index]) / step
+            weight = np.interp(distance, lag, kernel, left=0.0, right=0.0) * share[index] * unique
+        weight /= weight.sum(axis=1, keepdims=True)
+        out[rows] = np.einsum("ij,ijk->ik", weight, values[index])
+    return out
+
+
+def lowpass_span(t: FloatArray, step: float, held: bool) -> tuple[float, float]:
+    """Returns the first and last time [s] at which `lowpass` sees samples on both sides for its whole half-width."""
+    tail = sample_period(t) if held and len(t) > 1 else 0.0
+    return float(t[0]) + HALF_WIDTH * step, float(t[-1]) + tail - HALF_WIDTH * step
+
+
+def true_runs(true: BoolArray) -> tuple[IndexArray, IndexArray]:
+    """Where each run of True in an array (n,) begins, and where it has ended, shapes (runs,)."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], true, [False]]).astype(np.int8)))
+    return edges[::2], edges[1::2]
+
 
 # --- Channels on their way to the grid: what each one's samples are worth there, and how it is read at grid times
 

@@ -6,8 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from quadid.data.resample import measured_period, sample_period
-from quadid.data.window import Channel, Recording, Sampling
+from quadid.data.window import Channel, Recording, Sampling, measured_period, sample_period
 from quadid.errors import LogError, NotIdentifiableError
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle

@@ -8,13 +8,13 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from typing import Any, Literal, TypeGuard
+from typing import Any, Literal, NamedTuple, TypeGuard
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from quadid.errors import LogError, WindowError
-from quadid.types import FloatArray
+from quadid.types import BoolArray, FloatArray, IndexArray
 from quadid.vehicle import Vehicle
 
 Sampling = Literal["held", "instant"]
@@ -318,3 +318,202 @@ def beginning(windows: Iterable[Window], longest: float, least: float = 1.0) -> 
         taken.append(window if len(window) <= rows else window.slice(0, rows))
         seconds += len(taken[-1]) * window.dt
     return taken, seconds
+
+
+# --- Samples of one channel: how often, and which of them, were measured
+
+
+INTERPOLATED = 0.5
+"""Share of moving rows on straight lines above which they were interpolated; logs as they were measured have none, a
+log whose lost rows were filled in a tenth, one brought from 10 to 100 Hz nine tenths."""
+
+
+def sample_period(t: FloatArray) -> float:
+    """Returns the sample period [s]: the mean of the steps up to 1.5 times the median one; NaN below two samples."""
+    return period_of(t[1:] - t[:-1])
+
+
+def period_of(steps: FloatArray) -> float:
+    """As `sample_period`, of the steps between samples [s]."""
+    if len(steps) == 0:
+        return float("nan")
+    low, high = float(steps.min()), float(steps.max())
+    if low > 0.0 and high <= 1.5 * low:  # then the median leaves none out
+        return float(np.add.reduce(steps) / len(steps))
+    steps = steps[steps > 0.0]
+    if len(steps) == 0:
+        return float("nan")
+    return float(np.mean(steps[steps <= 1.5 * median(steps)]))
+
+
+def median(values: FloatArray) -> float:
+    """Median of finite numbers, shape (n,), n > 0: numpy's to the bit, without the checks that cost more than it."""
+    middle = len(values) // 2
+    if len(values) % 2:
+        return float(np.partition(values, middle)[middle])
+    low, high = np.partition(values, [middle - 1, middle])[middle - 1 : middle + 1]
+    return float((low + high) / 2.0)
+
+
+def copied(values: FloatArray) -> BoolArray:
+    """Which rows of (n, columns), from the second on, equal the row before exactly, shape (n - 1,)."""
+    return np.asarray(np.all(values[1:] == values[:-1], axis=1))
+
+
+def fresh_rows(values: FloatArray) -> IndexArray:
+    """Returns the rows that bring a new reading, where a log repeats each reading several times; else all rows.
+
+    A slow estimate written at a fast rate is a staircase, half a step late when read as instants.  A reading counts as
+    repeated only when that is the rule (median run of equal rows at least 2; of over fifty, nearly all alike); runs far
+    longer than usual are kept, for they are a signal that rests.
+    """
+    if len(values) < 20:
+        return np.arange(len(values))
+    start = np.concatenate([[0], np.flatnonzero(~copied(values)) + 1])
+    run = np.diff(np.append(start, len(values)))
+    usual = median(run.astype(np.float64))
+    rare = len(start) < 0.02 * len(values) and (len(start) < 20 or np.quantile(run, 0.9) > 1.5 * usual)
+    if usual < 2.0 or rare:
+        return np.arange(len(values))
+    keep = np.repeat(run > 5.0 * usual, run)
+    keep[start] = True
+    return np.flatnonzero(keep)
+
+
+def measured_rows(t: FloatArray, values: FloatArray) -> BoolArray:
+    """Rows that were measured, shape (n,); the others were put on straight lines between them before they were logged.
+
+    Measured numbers do not lie on a line with both neighbours in every column while they move; where more than
+    `INTERPOLATED` of all steps that move lead on along one, only its ends were measured.
+
+    Args:
+        t: times [s], shape (n,).
+        values: columns at these times, shape (n, k).
+    """
+    out, step = np.ones(len(t), dtype=bool), np.diff(t)
+    if len(t) < 3 or step.min() <= 0.0:
+        return out
+    moved = np.diff(values, axis=0)
+    slope = moved / step[:, None]
+    # Printed digits may put a row off its line.
+    room = 1e-3 * np.std(moved, axis=0) + 1e-6 * np.max(np.abs(values), axis=0)
+    bend: FloatArray = np.abs(np.diff(slope, axis=0)) * step[1:, None]
+    on_line = np.all(bend <= room, axis=1)
+    moves = np.any(moved[1:] != 0.0, axis=1)
+    if np.any(moves) and np.mean(on_line[moves]) > INTERPOLATED:
+        out[1:-1] = ~on_line
+    return out
+
+
+def measured_period(t: FloatArray, values: FloatArray) -> float:
+    """Period [s] at which `values` were measured, see `fresh_rows`, `measured_rows` and `sample_period`."""
+    fresh = fresh_rows(values)
+    return sample_period(t[fresh][measured_rows(t[fresh], values[fresh])])
+
+
+# --- Faults of the data themselves, seen without any model: a sensor at the end of its range, rows that are copies
+#
+# Both bend every estimate, and a cause named from them would be a stand-in.  Copies are no measurements and are left
+# out; what a saturated sensor would have shown is not known, so nothing found beside it is called confident.
+#
+# A saturated axis piles up at exactly its largest or smallest value, far more often than at the value beside it, and
+# comes back to it again and again.  Coarse steps of a converter pile up nowhere in particular, and a motor at rest
+# stays at its lowest command without coming back.
+
+
+LEAST_COPIES = 0.03
+"""Share of inertial rows that equal the row before exactly."""
+
+
+class AtLimit(NamedTuple):
+    """One end of one axis at its limit.
+
+    Attributes:
+        axis: column.
+        level: the value that is not left, in the unit of the values.
+        samples: how many are there.
+        share: of the column's finite samples.
+    """
+
+    axis: int
+    level: float
+    samples: int
+    share: float
+
+
+def at_limit(values: FloatArray) -> list[AtLimit]:
+    """Returns the ends of axes that are saturated.
+
+    Args:
+        values: shape (n, axes), any unit; rows that are not finite do not count.
+    """
+    found = []
+    for axis, column in enumerate(values.T):
+        finite = column[np.isfinite(column)]
+        levels, counts = np.unique(finite, return_counts=True)
+        if len(levels) < 3:
+            continue
+        for end, beside in ((0, 1), (-1, -2)):
+            count, share = int(counts[end]), float(counts[end] / len(finite))
+            there = finite == levels[end]
+            arrivals = np.count_nonzero(there[1:] & ~there[:-1])
+            if share > 0.005 and count >= 6 and count > 4.0 * counts[beside] and arrivals >= 3:
+                found.append(AtLimit(axis, float(levels[end]), count, share))
+    return found
+
+
+@dataclass(frozen=True)
+class DataFault:
+    """One fault of the data.
+
+    Attributes:
+        kind: ``saturated`` or ``repeated``.
+        channel: name of the channel, with its axis where there is one.
+        share: of the samples.
+        text: one sentence with what to do.
+    """
+
+    kind: str
+    channel: str
+    share: float
+    text: str
+
+
+def data_faults(windows: Sequence[Window]) -> tuple[DataFault, ...]:
+    """Looks for saturated and repeated inertial samples in `windows`; a flight without such faults gives none."""
+    out: list[DataFault] = []
+    for name, unit in (("gyro", "rad/s"), ("accel", "m/s²")):
+        parts = [values for w in windows if (values := getattr(w, name)) is not None]
+        for axis, level, _, share in at_limit(np.concatenate(parts)) if parts else ():
+            text = (
+                f"{name} {'xyz'[axis]} stays at exactly {level:.4g} {unit} in {share:.1%} of the samples: the sensor "
+                "saturates; log it with a wider range, or fly more gently"
+            )
+            out.append(DataFault("saturated", f"{name} {'xyz'[axis]}", share, text))
+        share = sum(np.count_nonzero(copied(p)) for p in parts) / max(sum(max(len(p) - 1, 0) for p in parts), 1)
+        if share >= LEAST_COPIES:
+            text = (
+                f"{share:.0%} of the {name} rows are exact copies of the row before and were left out: the sensor is "
+                "slower than the log, or the link repeats what it has; "
+                "log the sensor's own samples with their own times"
+            )
+            out.append(DataFault("repeated", name, float(share), text))
+    return tuple(out)
+
+
+def without_copies(windows: Sequence[Window]) -> list[Window]:
+    """Windows in which inertial rows that equal the row before exactly count as not measured."""
+    out = []
+    for window in windows:
+        changed = {}
+        for name in ("gyro", "accel"):
+            values = getattr(window, name)
+            if values is None:
+                continue
+            copies = np.flatnonzero(copied(values)) + 1
+            if len(copies) >= LEAST_COPIES * len(values):
+                kept = values.copy()
+                kept[copies] = np.nan
+                changed[name] = kept
+        out.append(replace(window, **changed) if changed else window)
+    return out

@@ -7,8 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from quadid.data.resample import data_faults, without_copies
-from quadid.data.window import Window
+from quadid.data.window import Window, data_faults, without_copies
 from quadid.diagnosis.attribution import NominalFit, stated_errors, worths
 from quadid.diagnosis.evidence import better, impossible_causes, late_unknown, slight_causes
 from quadid.diagnosis.hypotheses import BLOCKS, Candidate, Model, candidates, free_names, refit, without

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from quadid.data.resample import copied, sample_period
 from quadid.data.rotor_signal import rotor_signal
-from quadid.data.window import Recording, Window, in_body_axes
+from quadid.data.window import Recording, Window, copied, in_body_axes, sample_period
 from quadid.estimate.kalman import MOMENTS, M, Track
 from quadid.types import BoolArray, FloatArray
 from quadid.vehicle import Vehicle

@@ -29,7 +29,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from quadid.data.resample import median
+from quadid.data.window import median
 from quadid.model.layout import Layout
 from quadid.online.change_job import ChangePoint, ChangeRequest
 from quadid.online.checks import Quality, judge

@@ -10,8 +10,8 @@ import numpy as np
 
 from quadid.checks import STAGES, CheckResult, Log
 from quadid.checks.rotors import better_description, lagged_of, motor_order_check
-from quadid.data.resample import at_limit, copied, moving_mean, true_runs
-from quadid.data.window import Window, as_recording
+from quadid.data.grid import moving_mean, true_runs
+from quadid.data.window import Window, as_recording, at_limit, copied
 from quadid.model.layout import ThrustModel
 from quadid.online.grid_buffer import Rows, WindowCut
 from quadid.rotation import down, integrated, turn

@@ -9,8 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from quadid.data.grid import GAP, OPTIONAL, REQUIRED, Plan, Track, on_grid
-from quadid.data.resample import split_stretches, true_runs
+from quadid.data.grid import GAP, OPTIONAL, REQUIRED, Plan, Track, on_grid, split_stretches, true_runs
 from quadid.data.window import Sampling, Window
 from quadid.types import BoolArray, FloatArray
 

@@ -12,8 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from quadid.attitude_controller import mixer_matrix, pack_gains, stabilise_rows
-from quadid.data.grid import GAP, make_plan
-from quadid.data.resample import HALF_WIDTH, linear, lowpass
+from quadid.data.grid import GAP, HALF_WIDTH, linear, lowpass, make_plan
 from quadid.data.rotor_signal import RotorSignal, rotor_channel, rotor_signal
 from quadid.data.window import CHANNELS, Block, Channel, Recording, in_body_axes
 from quadid.errors import LogError, QuadidError

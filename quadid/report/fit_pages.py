@@ -11,9 +11,8 @@ import numpy as np
 from scipy.signal import welch
 
 from quadid.checks.motion import Spans, flying_spans, within
-from quadid.data.resample import sample_period
 from quadid.data.rotor_signal import rotor_channel
-from quadid.data.window import CHANNELS, Channel, Recording
+from quadid.data.window import CHANNELS, Channel, Recording, sample_period
 from quadid.effects import EFFECTS
 from quadid.estimate.missing import Missing
 from quadid.identification.excitation import Excitation

@@ -9,8 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from quadid.data.resample import sample_period
-from quadid.data.window import Channel, Recording
+from quadid.data.window import Channel, Recording, sample_period
 from quadid.errors import LogError
 from quadid.rotation import continuous_sign
 from quadid.types import BoolArray, FloatArray

@@ -14,8 +14,7 @@ from typing import Any, Protocol
 import numpy as np
 from mcap_ros2._dynamic import generate_dynamic
 
-from quadid.data.resample import fresh_rows
-from quadid.data.window import Recording
+from quadid.data.window import Recording, fresh_rows
 from quadid.errors import LogError
 from quadid.sanitise import plain
 from quadid_replay.columns import Columns, RawChannel, assemble, fastest_first

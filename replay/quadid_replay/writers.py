@@ -15,7 +15,7 @@ from mcap.writer import CompressionType, Writer
 from mcap_ros2._dynamic import serialize_dynamic
 from pymavlink.dialects.v20 import ardupilotmega
 
-from quadid.data.resample import linear
+from quadid.data.grid import linear
 from quadid.data.window import Channel, Recording, Window, as_recording
 from quadid.errors import LogError
 from quadid.files import unwaited

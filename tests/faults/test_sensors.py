@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from quadid.checks import inspect
-from quadid.data.resample import at_limit, data_faults
+from quadid.data.window import at_limit, data_faults
 from quadid.online.checks import judge
 from quadid.online.grid_buffer import WindowCut
 from quadid.vehicle import Vehicle

@@ -10,8 +10,7 @@ from typing import Any
 
 from quadid_replay import open_log
 
-from quadid.data.resample import sample_period
-from quadid.data.window import Recording
+from quadid.data.window import Recording, sample_period
 
 GOLDEN = Path(__file__).with_name("golden.json")
 PATTERNS = (

@@ -9,19 +9,8 @@ from hypothesis import strategies as st
 from scipy import ndimage
 from scipy.interpolate import CubicHermiteSpline
 
-from quadid.data.resample import (
-    fresh_rows,
-    hold_mean,
-    interpolate,
-    lowpass,
-    lowpass_span,
-    matching_rows,
-    measured_period,
-    measured_rows,
-    moving_mean,
-    sample_period,
-    split_stretches,
-)
+from quadid.data.grid import hold_mean, interpolate, lowpass, lowpass_span, matching_rows, moving_mean, split_stretches
+from quadid.data.window import fresh_rows, measured_period, measured_rows, sample_period
 from quadid.types import FloatArray
 
 STEP = 0.02

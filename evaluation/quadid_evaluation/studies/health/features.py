@@ -13,7 +13,7 @@ from scipy.special import stdtrit
 from quadid.checks.motion import flying_spans
 from quadid.condition.changes import SIGNIFICANT
 from quadid.condition.trim import trim_directions
-from quadid.data.resample import linear
+from quadid.data.grid import linear
 from quadid.data.rotor_signal import rotor_signal
 from quadid.data.window import Recording
 from quadid.types import BoolArray, FloatArray

@@ -17,7 +17,7 @@ from scipy.signal import lfilter, savgol_filter
 
 import quadid
 from quadid.app.logs import load_vehicle
-from quadid.data.resample import linear
+from quadid.data.grid import linear
 from quadid.data.window import Recording
 from quadid.identification.predict import mean_errors, no_change
 from quadid.model.layout import Layout
