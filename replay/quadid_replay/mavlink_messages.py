@@ -24,33 +24,24 @@ ESC_INFO, ESC_STATUS = 290, 291
 
 
 class _Field(NamedTuple):
-    """A field in the order of the XML: name, C type, struct code, array length (0: none), place in the payload."""
+    """A field: name, C type, array length (0: none)."""
 
     name: str
     kind: str
-    code: str
     length: int
-    order: int
 
 
-_INFO = (
-    _Field("index", "uint8_t", "B", 0, 5),
-    _Field("time_usec", "uint64_t", "Q", 0, 0),
-    _Field("counter", "uint16_t", "H", 0, 2),
-    _Field("count", "uint8_t", "B", 0, 6),
-    _Field("connection_type", "uint8_t", "B", 0, 7),
-    _Field("info", "uint8_t", "B", 0, 8),
-    _Field("failure_flags", "uint16_t", "H", 4, 3),
-    _Field("error_count", "uint32_t", "I", 4, 1),
-    _Field("temperature", "int16_t", "h", 4, 4),
-)
-_STATUS = (
-    _Field("index", "uint8_t", "B", 0, 4),
-    _Field("time_usec", "uint64_t", "Q", 0, 0),
-    _Field("rpm", "int32_t", "i", 4, 1),
-    _Field("voltage", "float", "f", 4, 2),
-    _Field("current", "float", "f", 4, 3),
-)
+_CODES = {
+    "uint8_t": "B", "uint16_t": "H", "int16_t": "h", "uint32_t": "I", "int32_t": "i", "uint64_t": "Q", "float": "f",
+}  # fmt: skip
+"""Codes of `struct` by C type."""
+_ONE = "index:uint8_t time_usec:uint64_t"
+_MESSAGES = (
+    (ESC_INFO, "ESC_INFO", 251, f"{_ONE} counter:uint16_t count:uint8_t connection_type:uint8_t info:uint8_t "
+     "failure_flags:uint16_t[4] error_count:uint32_t[4] temperature:int16_t[4]"),
+    (ESC_STATUS, "ESC_STATUS", 10, f"{_ONE} rpm:int32_t[4] voltage:float[4] current:float[4]"),
+)  # fmt: skip
+"""Number, name, seed of the checksum and fields in the order of the XML."""
 
 
 def extend_dialect(dialect: ModuleType) -> ModuleType:
@@ -59,11 +50,10 @@ def extend_dialect(dialect: ModuleType) -> ModuleType:
     The module gains ``MAVLink_esc_info_message`` and ``MAVLink_esc_status_message``, whose arguments are the fields in
     the order of the XML, and decodes both.
     """
-    for number, name, crc_extra, fields in (
-        (ESC_INFO, "ESC_INFO", 251, _INFO),
-        (ESC_STATUS, "ESC_STATUS", 10, _STATUS),
-    ):
+    for number, name, crc_extra, text in _MESSAGES:
         if number not in dialect.mavlink_map:
+            told = (field.replace("[", ":").rstrip("]").split(":") for field in text.split())
+            fields = [_Field(field, kind, int(length[0]) if length else 0) for field, kind, *length in told]
             message = _message_class(dialect, number, name, crc_extra, fields)
             dialect.mavlink_map[number] = message
             setattr(dialect, message.__name__, message)
@@ -72,10 +62,11 @@ def extend_dialect(dialect: ModuleType) -> ModuleType:
 
 
 def _message_class(dialect: ModuleType, number: int, name: str, crc_extra: int, fields: Sequence[_Field]) -> type[Any]:
-    """Builds the class that mavgen would have written."""
-    packed = sorted(fields, key=lambda f: f.order)
+    """Builds the class that mavgen would have written: on the wire wide fields come first."""
+    packed = sorted(fields, key=lambda f: -struct.calcsize(_CODES[f.kind]))
     base = dialect.MAVLink_message
-    unpacker = struct.Struct("<" + "".join(f"{f.length or ''}{f.code}" for f in packed))
+    codes = [f"{f.length or ''}{_CODES[f.kind]}" for f in packed]
+    unpacker = struct.Struct("<" + "".join(codes))
 
     def initialise(self: Any, *values: Any) -> None:
         if len(values) != len(fields):
@@ -102,16 +93,14 @@ def _message_class(dialect: ModuleType, number: int, name: str, crc_extra: int, 
         "fielddisplays_by_name": {},
         "fieldenums_by_name": {},
         "fieldunits_by_name": {},
-        "native_format": bytearray(("<" + "".join(f.code for f in packed)).encode()),
-        "orders": [f.order for f in fields],
+        "native_format": bytearray(("<" + "".join(_CODES[f.kind] for f in packed)).encode()),
+        "orders": [packed.index(f) for f in fields],
         "lengths": [f.length or 1 for f in packed],
         "array_lengths": [f.length for f in packed],
         "crc_extra": crc_extra,
         "unpacker": unpacker,
         "instance_field": "index",
-        "instance_offset": struct.calcsize(
-            "<" + "".join(f"{f.length or ''}{f.code}" for f in packed[: fields[0].order])
-        ),
+        "instance_offset": struct.calcsize("<" + "".join(codes[: packed.index(fields[0])])),
         "__init__": initialise,
         "pack": pack,
     }

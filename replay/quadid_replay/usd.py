@@ -247,7 +247,7 @@ def read_usd(path: Path) -> Recording:
             "motor.m1 … m4 or controller.cmd_thrust, cmd_roll, cmd_pitch, cmd_yaw; gyro.x y z; acc.x y z; pm.vbatMV",
             "list them in the µSD card's config.txt",
         )
-    return assemble(path.name, "usdlog", raw, clock, [*records.notes, *_partial(left)])
+    return assemble(path.name, "usdlog", raw, clock, [*records.notes, *_partial(left, {entry.name for entry in raw})])
 
 
 def _on_one_clock(
@@ -267,22 +267,13 @@ def _holds(table: NDArray[np.void], source: Source) -> bool:
     return set(source.columns) <= set(table.dtype.names or ())
 
 
-_PARTIAL: Mapping[str, tuple[str, ...]] = {
-    "attitude": _axes("stateEstimate.", "roll pitch yaw"),
-    "gyro": _axes("gyro.", "x y z"),
-    "accel": _axes("acc.", "x y z"),
-    "motor_command": _axes("motor.", "m1 m2 m3 m4"),
-}
-"""Groups of which some variables are of no use without the others."""
-
-
-def _partial(left: list[str]) -> list[str]:
-    """Says which groups of variables are incomplete, and therefore not used."""
+def _partial(left: list[str], made: set[str]) -> list[str]:
+    """Says which groups of variables are incomplete, and therefore not used, of channels that nothing else made."""
     out = []
-    for channel, group in _PARTIAL.items():
-        there = [name for name in group if name in left]
-        missing = [name for name in group if name not in left]
-        if there and missing:
+    for source in SOURCES:
+        there = [name for name in source.columns if name in left]
+        missing = [name for name in source.columns if name not in left]
+        if source.channel not in made and there and missing:
             lack, rest = (f"{', '.join(names)} {'is' if len(names) == 1 else 'are'}" for names in (missing, there))
-            out.append(f"{channel}: {lack} missing, so {rest} not used")
+            out.append(f"{source.channel}: {lack} missing, so {rest} not used")
     return out

@@ -24,7 +24,7 @@ from quadid.types import FloatArray
 from quadid_replay.csv_reader import EULER, GROUPS
 from quadid_replay.frames import flip_attitude, flip_body, flip_world, from_euler, to_euler
 from quadid_replay.mavlink_messages import extend_dialect
-from quadid_replay.motors import RPM
+from quadid_replay.motors import MULTIROTORS, RPM
 from quadid_replay.ros_messages import BlockWriter
 from quadid_replay.schemas import has_definition, schema_text
 
@@ -452,7 +452,7 @@ def write_table(file: str | Path | BinaryIO, header: Sequence[str], table: Float
 dialect = extend_dialect(ardupilotmega)
 SYSTEM, COMPONENT = 1, 1
 _UNIX_START_US = 1_600_000_000_000_000  # receive time at recording time 0
-_TYPES = {3: 15, 4: 2, 6: 13, 8: 14, 10: 35, 12: 29}  # rotors to MAV_TYPE
+_TYPES = {rotors: kind for kind, rotors in MULTIROTORS.items()}
 _GENERIC_AUTOPILOT, _ACTIVE = 0, 4
 _LONGEST_MS = 2**32
 _GYRO_BITS, _ACCEL_BITS = 0x38, 0x07
