@@ -239,6 +239,7 @@ def _facts(channel: Channel, flying: Spans) -> ChannelFacts:
     long = steps > (longest_step(channel.t, _GRID) if len(steps) else np.inf)
     usual = steps[~long]
     same = copied(channel.values)
+    first, end = true_runs(same & within(channel.t[:-1], flying) & within(channel.t[1:], flying))
     return ChannelFacts(
         name=channel.name,
         unit=CHANNELS[channel.name][1],
@@ -252,18 +253,12 @@ def _facts(channel: Channel, flying: Spans) -> ChannelFacts:
         bridged=holes(channel.t, _GRID) if len(steps) else 0,
         longest_gap=float(steps[long].max()) if long.any() else 0.0,
         repeated=float(np.mean(same)) if len(same) else 0.0,
-        stuck=_longest_rest(channel.t, same & within(channel.t[:-1], flying) & within(channel.t[1:], flying)),
+        stuck=float(np.max(channel.t[end] - channel.t[first], initial=0.0)),
         saturated=sum(end.samples for end in at_limit(channel.values))
         if channel.name in ("gyro", "accel", "motor_command")
         else 0,
         dropped=dict(channel.faults),
     )
-
-
-def _longest_rest(t: FloatArray, same: BoolArray) -> float:
-    """Returns the longest time [s] during which no column changed."""
-    first, end = true_runs(same)
-    return float(np.max(t[end] - t[first], initial=0.0))
 
 
 def timing_checks(recording: Recording, facts: tuple[ChannelFacts, ...]) -> list[Check]:
@@ -351,8 +346,6 @@ _JUMP = 8.0
 """An attitude step of so many times the usual one, beside half as much of the gyro's, is no motion."""
 _FARTHEST, _LAG, _TOO_LATE = 0.3, 0.02, 0.08
 """Gyro and attitude are compared at times so far apart at most [s], in these steps; more than the last is an error."""
-_RESTING = 50
-"""Samples on the ground that tell the length of gravity."""
 _AXES = ("x", "y", "z")
 
 
@@ -431,7 +424,9 @@ def gravity_check(recording: Recording, spans: Spans) -> Check:
     steady = float(np.linalg.norm(np.median(values, axis=0)))
     check = partial(Check, "gravity", numbers={"length": length, "z": z})
     message = f"specific force has length {length:.4g} and z {z:.4g} (medians; about 9.81 and -9.81 m/s^2 expected)"
-    if not _reads_gravity_at_rest(accel.values[~inside]):
+    # Specific force on the ground has the length that it must have, where there are samples enough to tell.
+    resting = np.linalg.norm(accel.values[~inside], axis=1)
+    if not (len(resting) >= 50 and abs(float(np.median(resting)) / GRAVITY - 1.0) < 0.1):
         for unit, factor in (("g", GRAVITY), ("milli-g (or cm/s^2)", GRAVITY * 1e-3)):
             if 0.7 < length * factor / GRAVITY < 1.6 and steady > 0.5 * length:
                 fix = f"multiply acceleration by {factor:.6g}"
@@ -481,11 +476,6 @@ def _turns(gyro: Channel | None, spans: Spans) -> bool:
     return gyro is not None and bool(inside.any() and np.max(np.std(gyro.values[inside], axis=0)) > _MOTION)
 
 
-def _reads_gravity_at_rest(values: FloatArray) -> bool:
-    """Tests that specific force on the ground, shape (n, 3), has the length that it must have [m/s^2]."""
-    return len(values) >= _RESTING and abs(float(np.median(np.linalg.norm(values, axis=1))) / GRAVITY - 1.0) < 0.1
-
-
 def _attitude_explains(accel: Channel, attitude: Channel | None, inside: BoolArray) -> bool:
     """Tests that the attitude turns the specific force of the rows `inside` to one g upwards."""
     if attitude is None or len(attitude.t) < 2:
@@ -524,7 +514,9 @@ def gyro_check(recording: Recording) -> Check:
         fresh = fresh_rows(attitude.values)
         attitude = replace(attitude, t=attitude.t[fresh], values=attitude.values[fresh])
     best: tuple[str, AxisMap] | None = None
-    for name, q in _attitude_readings(attitude.values):
+    given = attitude.values
+    readings = {"as given": given, "world to body": conjugate(given), "x y z w (scalar last)": given[:, [3, 0, 1, 2]]}
+    for name, q in readings.items():
         measured, derived = _moving_rates(gyro, attitude.t, q)
         if len(measured) < 20:
             if name == "as given":  # as much noise moves every reading of it: no other is more likely for it
@@ -570,7 +562,8 @@ def _angle_rates(gyro: Channel, attitude: Channel) -> Check | None:
 
     Both differ by a part that grows with tilt; what the gyro differs from the body's rates is compared with it.
     """
-    t, q = _strided(attitude)
+    stride = max(1, round(_STEP / sample_period(attitude.t)))
+    t, q = attitude.t[::stride], attitude.values[::stride]
     measured, turned = _rates(gyro, t, q)
     keep = usable_steps(t, gyro.t)
     angles = np.diff(np.unwrap(euler(q), axis=0), axis=0)[keep] / np.diff(t)[keep, None]
@@ -688,12 +681,6 @@ def _without_jumps(measured: FloatArray, derived: FloatArray, *more: FloatArray)
     return tuple(rows[~jumps] for rows in (measured, derived, *more))
 
 
-def _strided(attitude: Channel) -> tuple[FloatArray, FloatArray]:
-    """Times and attitudes about `_STEP` apart."""
-    stride = max(1, round(_STEP / sample_period(attitude.t)))
-    return attitude.t[::stride], attitude.values[::stride]
-
-
 def _likely(reading: str, fit: AxisMap) -> float:
     """R^2, with a bonus for axes that agree and one for taking the numbers as given."""
     return fit.r2 + (0.1 if fit.straight else 0.0) + (0.05 if reading == "as given" else 0.0)
@@ -731,7 +718,11 @@ def velocity_check(recording: Recording) -> Check:
         return Check("velocity_attitude", CheckResult.UNKNOWN, "needs accelerometer, attitude and velocity")
     gained, derived = _velocity_gains(accel, attitude, velocity)
     level = _level_velocity(gained, derived)
-    if level.verdict is CheckResult.ERROR or len(gained) < 20 or not _upwards(gained[:, 2], derived[:, 2]):
+    if level.verdict is CheckResult.ERROR or len(gained) < 20:
+        return level
+    # Vertical changes that are clearly the reverse of what the force makes.
+    up, down = gained[:, 2], derived[:, 2]
+    if not (min(np.std(up), np.std(down)) > 0.2 and np.corrcoef(up, down)[0, 1] < -0.7):
         return level
     return Check(
         "velocity_attitude", CheckResult.ERROR, "vertical velocity rises where the force pushes down: it points up",
@@ -751,20 +742,6 @@ def _level_velocity(gained: FloatArray, derived: FloatArray) -> Check:
         message = f"world axes of velocity differ from the attitude's: {fit} (R^2 {fit.r2:.2f})"
         return check(CheckResult.ERROR, message, "use NED for both; ROS' ENU swaps x and y")
     return check(CheckResult.OK, f"velocity follows tilt and thrust (scale {fit.scale:.3g}, R^2 {fit.r2:.2f})")
-
-
-def _upwards(gained: FloatArray, derived: FloatArray) -> bool:
-    """Tests for vertical changes (n,) that are clearly the reverse of what force makes (n,)."""
-    return bool(min(np.std(gained), np.std(derived)) > 0.2 and np.corrcoef(gained, derived)[0, 1] < -0.7)
-
-
-def _attitude_readings(q: FloatArray) -> list[tuple[str, FloatArray]]:
-    """Ways in which four numbers may have been meant."""
-    return [
-        ("as given", q),
-        ("world to body", conjugate(q)),
-        ("x y z w (scalar last)", q[:, [3, 0, 1, 2]]),
-    ]
 
 
 def _rates(gyro: Channel, t: FloatArray, q: FloatArray) -> tuple[FloatArray, FloatArray]:

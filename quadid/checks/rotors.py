@@ -58,15 +58,13 @@ def rotor_timing_check(recording: Recording, vehicle: Vehicle, spans: Spans) -> 
     # Rows that no block takes are not read for each: the check of a long log takes time by its length.
     width = max(3, round(2.5 * slowest / _STEP) | 1)
     peaks = [peak for times in _blocks(spans) for peak in _peaks(signal, gyro, vehicle, times, width)]
-    return _judge(name, peaks)
-
-
-def _judge(name: str, peaks: list[_Peak]) -> Check:
     if not peaks:
         return Check(name, CheckResult.UNKNOWN, "too little flight to place the rotor signal in time")
     correlation = float(np.median([p.correlation for p in peaks]))
     clear = np.array([p.lag for p in peaks if p.correlation > _CLEAR])
-    about = [_about_median([p.lag for p in peaks if p.axis == axis and p.correlation > _CLEAR]) for axis in range(2)]
+    # Lags of each axis about their own median: axes may differ, for other motion excites them.
+    by_axis = [np.array([p.lag for p in peaks if p.axis == axis and p.correlation > _CLEAR]) for axis in range(2)]
+    about = [lags - np.median(lags) for lags in by_axis if len(lags)]
     numbers = {"correlation": correlation}
     if len(clear) < max(2, len(peaks) // 2):
         message = f"torque and angular acceleration correlate by {correlation:.2f} only, at any lag"
@@ -91,11 +89,6 @@ def _judge(name: str, peaks: list[_Peak]) -> Check:
     if lag > 0.2:
         return Check(name, CheckResult.ERROR, f"{message}: no motor answers that late", fix, numbers)
     return Check(name, CheckResult.OK, message, numbers=numbers)
-
-
-def _about_median(lags: list[float]) -> FloatArray:
-    """Lags of one axis about their own median: axes may differ, for other motion excites them."""
-    return np.array(lags) - np.median(lags) if lags else np.empty(0)
 
 
 def _blocks(spans: Spans) -> list[FloatArray]:
@@ -211,7 +204,7 @@ def rotor_speed_check(recording: Recording, vehicle: Vehicle, spans: Spans) -> C
     """Each rotor against the others and all against the thrust felt; the first that cannot be true is named."""
     name = _NAME
     signal = rotor_signal(recording, vehicle)
-    edges = _edges(spans)
+    edges = np.arange(spans[0][0], spans[-1][1] + 0.5 * _BIN, _BIN) if spans else np.empty(0)
     inside = within(signal.t, spans)
     if len(edges) < 4 or np.count_nonzero(inside) < 20:
         return Check(name, CheckResult.UNKNOWN, "too little flight to compare the rotors")
@@ -224,10 +217,6 @@ def rotor_speed_check(recording: Recording, vehicle: Vehicle, spans: Spans) -> C
     if problem is not None:
         return Check(name, CheckResult.ERROR, f"{problem[0]} ({signal.source})", _FIX, problem[1])
     return Check(name, CheckResult.OK, "the rotors agree with each other and with the thrust felt")
-
-
-def _edges(spans: Spans) -> FloatArray:
-    return np.arange(spans[0][0], spans[-1][1] + 0.5 * _BIN, _BIN) if spans else np.empty(0)
 
 
 def _means(t: FloatArray, values: FloatArray, edges: FloatArray, spans: Spans) -> Bins:
