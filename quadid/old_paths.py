@@ -73,7 +73,7 @@ MOVED = {
     "quadid.identify.segment_jacobian quadid.identify.shooting quadid.identify.priors",
     "quadid.identification.elimination": "quadid.identify.elimination_kernel quadid.identify.schur_complement",
     "quadid.identification.gauss_newton": "quadid.identify.box_qp",
-    "quadid.identification.search": "quadid.identify.global_search quadid.identify.shooting_objective",
+    "quadid.identification.search": "quadid.identify.global_search",
     "quadid.identification.noise": "quadid.identify.process_noise quadid.identify.noise_model",
     "quadid.identification.noise_fit": "quadid.identify.noise_spectrum quadid.identify.noise_estimation "
     "quadid.identify.noise_memory",
@@ -85,6 +85,7 @@ MOVED = {
     "quadid.identification.excitation": "quadid.identify.optimal_input",
     "quadid.identification.predict": "quadid.identify.open_loop quadid.identify.prediction "
     "quadid.identify.prediction_floor",
+    "quadid_evaluation.optimisers.box": "quadid.identify.shooting_objective",
     "quadid.diagnosis.hypotheses": "quadid.diagnose.candidates quadid.diagnose.cross_validation quadid.diagnose.model",
     "quadid.diagnosis.evidence": "quadid.diagnose.log_evidence quadid.diagnose.score_test quadid.diagnose.plausibility",
     "quadid.diagnosis.search": "quadid.diagnose.segment_schedule quadid.diagnose.selection",

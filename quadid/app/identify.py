@@ -89,8 +89,9 @@ def search(
     if names is not None:
         raise ParameterError(f"free or fix with {name}, which fits the six", OPTIMIZERS[0], "leave optimizer out")
 
+    from quadid_evaluation.optimisers.box import BoxProblem
+
     from quadid.identification.fit import final_answer
-    from quadid.identification.search import BoxProblem
 
     standard = fit(windows, vehicle, FitOptions(seed=seed), progress=lambda stage, share: advance("noise", share))
     advance(name, 0.0)

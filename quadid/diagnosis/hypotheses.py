@@ -172,6 +172,7 @@ def held_out(lin: Linearised, prior_precision: FloatArray) -> HeldOut:
     Twice the negative logarithm of N(r; r(z), I + B V B'), with z and V mean and covariance of the parameters from the
     other blocks and B the derivative of the block's residuals r; less that of the noise alone, N(0; 0, I).
     """
+    # z: optimum of the other blocks, from their normal equations; slope: half that of the block's deviance there.
     labels = block_labels(lin)
     gram, grad, cost = (sum_by_block(a, labels) for a in (lin.gram, lin.grad, lin.cost + lin.occam))
     z = steps_without(gram, grad, prior_precision)

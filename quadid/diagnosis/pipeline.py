@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from quadid.data.window import Window, data_faults, without_copies
 from quadid.diagnosis.attribution import NominalFit, stated_errors, worths
 from quadid.diagnosis.evidence import better, impossible_causes, late_unknown, slight_causes
-from quadid.diagnosis.hypotheses import BLOCKS, Candidate, Model, candidates, free_names, refit, without
+from quadid.diagnosis.hypotheses import BLOCKS, Model, candidates, free_names, refit, without
 from quadid.diagnosis.residual_tests import Remainder, inconstant_causes, remainder
 from quadid.diagnosis.result import Diagnosis, Explanation, describe
 from quadid.diagnosis.search import LINEAR_MISFIT, Search, from_everything, pruned, select
@@ -27,7 +27,6 @@ from quadid.identification.search import SWARM_SECONDS, Progress, swarm_search
 from quadid.identification.uncertainty import SPREAD_LIMIT, parameter_set
 from quadid.model.layout import with_reference_voltage
 from quadid.parameters import INERTIAS, NOMINAL_NAMES, UNKNOWN, Parameter, unreliable
-from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 
 DECIDE_SECONDS = (4.0, 2.0, 1.0, 0.5)
@@ -68,11 +67,12 @@ def diagnose(
     faults = data_faults([*windows, *validation])
     windows, validation = without_copies(windows), without_copies(validation)
     vehicle = with_reference_voltage(vehicle, windows)
-    begun = _begin(windows, vehicle, FitOptions(seed=seed) if swarm else None, report)
-    schedule, search = _select(windows, begun, report)
+    # Which causes, and where moments that no model has rule: what fast motion shows is held, the causes refitted.
+    schedule, search = _selected(windows, vehicle, FitOptions(seed=seed) if swarm else None, report)
     held = held_by_fast_motion(windows, schedule[-1], search.model)
     if held is not None:
         schedule, search = refitted(held, schedule, search)
+    # What remains, and what each cause gains on unseen data.
     decisive, model = search.shooting, search.model
     left = remainder(decisive, model, seed)
     report("validation", 0.0)
@@ -80,12 +80,14 @@ def diagnose(
     deciding, worth = worths(decisive, search.nominal, model, fewer, validation)
     nominal = nominal or NominalFit(vehicle, search.nominal.theta, decisive.noise)
     outcome = stated_errors(nominal, model, windows, validation, deciding)
+    # The verdict; causes with numbers that no vehicle has, or of another form, count as left.
     doubts = impossible_causes(model) | inconstant_causes(model, left)
     unnamed = sum(max(w.deviance, 0.0) for w in worth if w.cause.label in doubts)
     verdict = judge(search.nominal, model, left, unnamed)
     saturated = any(f.kind == "saturated" for f in faults)
     if model.causes and (outcome.contradicted or saturated or len(doubts) == len(model.causes)):
         verdict = Explanation.UNKNOWN
+    # Parameters beside the causes, and findings; those are confident that nothing speaks against.
     doubted = {label: m for label, m in fewer.items() if label in doubts}
     parameters, reasons = _nominal_parameters(decisive, schedule[-1], model, verdict, doubted, held)
     parameters, moved = possible_moments(parameters)
@@ -149,24 +151,11 @@ def _nominal_parameters(
     return nominal, reasons
 
 
-@dataclass(frozen=True)
-class _Begun:
-    """What the selection starts from.
-
-    Attributes:
-        schedule: the lengths of segments that may decide, short ones last.
-        nominal: nominal optimum; flexible: that of the flexible fit; full vectors.
-        listed: the catalogue.
-    """
-
-    schedule: list[Shooting]
-    nominal: FloatArray
-    flexible: FloatArray
-    listed: list[Candidate]
-
-
-def _begin(windows: Sequence[Window], vehicle: Vehicle, swarm: FitOptions | None, report: Progress) -> _Begun:
-    """Fits the nominal model, estimates the noise, cuts the data into the segments of the schedule."""
+def _selected(
+    windows: Sequence[Window], vehicle: Vehicle, swarm: FitOptions | None, report: Progress
+) -> tuple[list[Shooting], Search]:
+    """Selects causes: the data cut into segments of falling length under the noise that is left, and the search."""
+    # 1. The nominal model on short segments.
     short = Shooting.cut(windows, vehicle, SWARM_SECONDS)
     free = short.free(NOMINAL_NAMES)
     start = short.layout.initial(vehicle)
@@ -177,35 +166,27 @@ def _begin(windows: Sequence[Window], vehicle: Vehicle, swarm: FitOptions | None
     typical, first = short.noise, polish(short, start, free, iterations=8)
     far = first.cost > LINEAR_MISFIT * first.lin.total_rows
     short = short.with_noise(residual_noise(short, first))
-    first = polish(short, first.theta, free, states=first.states, iterations=8)
+    nominal = polish(short, first.theta, free, states=first.states, iterations=8).theta
+    # 2. The noise floor.  Far off, what the nominal model leaves is no measure of the noise, nor its optimum a start.
     report("noise floor", 0.0)
-    # Far off, what the nominal model leaves is no measure of the noise, nor its optimum of the parameters.
-    begun = ([first.theta, start], free, typical, FAR_ITERATIONS) if far else ([first.theta], free, short.noise)
+    begun = ([nominal, start], free, typical, FAR_ITERATIONS) if far else ([nominal], free, short.noise)
     flexible = flexible_fit(windows, short, *begun)
     short = short.with_noise(flexible.noise)
+    # 3. Causes that these data could show.
+    rotors = ["readings" if vehicle.command.sampling == "instant" else "commands"]
+    if vehicle.reference_voltage is not None and all(w.battery is not None for w in windows):
+        rotors.append("battery")
+    listed = candidates(short.layout, short.has_velocity, short.channels >= 15, rotors)
+    listed = [c for c in listed if c.effect not in vehicle.effects]
+    # 4. The search; where one by one led nowhere, from everything at once it may lead somewhere.
     schedule = [Shooting.cut(windows, vehicle, t, short.noise, short.layout) for t in DECIDE_SECONDS]
     schedule = [*(s for s in schedule if s.count >= BLOCKS), short]
-    listed = candidates(short.layout, short.has_velocity, short.channels >= 15, _rotor_columns(windows, vehicle))
-    listed = [c for c in listed if c.effect not in vehicle.effects]
-    return _Begun(schedule, first.theta, flexible.theta, listed)
-
-
-def _rotor_columns(windows: Sequence[Window], vehicle: Vehicle) -> list[str]:
-    """What rotor columns are, and whether the voltage that scales commands is known."""
-    readings = vehicle.command.sampling == "instant"
-    known = vehicle.reference_voltage is not None and all(w.battery is not None for w in windows)
-    return ["readings" if readings else "commands", *(["battery"] if known else [])]
-
-
-def _select(windows: Sequence[Window], begun: _Begun, report: Progress) -> tuple[list[Shooting], Search]:
-    """Selects causes, and again when they show the noise to be less; with the schedule under the noise that is left."""
-    schedule, search = begun.schedule, select(begun.schedule, begun.nominal, begun.listed, report)
+    search = select(schedule, nominal, listed, report)
     if search.model.lin.reduced_chi_square > LINEAR_MISFIT:
-        # One by one led nowhere; from everything at once it may.
-        general = from_everything(schedule[-1], begun.flexible, begun.listed)
-        other = select(schedule, begun.nominal, begun.listed, report, general)
+        other = select(schedule, nominal, listed, report, from_everything(short, flexible.theta, listed))
         longer = other.shooting.length - search.shooting.length
         search = other if longer > 0 or (longer == 0 and better(other.model, search.model)) else search
+    # 5. Again, while causes show the noise to be less.
     while search.model.causes:
         report("noise floor", 0.5)
         before = search.shooting.noise.variance
@@ -216,11 +197,11 @@ def _select(windows: Sequence[Window], begun: _Begun, report: Progress) -> tuple
         schedule, search = _with_noise(noise, schedule, search)
         if np.all(growth > NOISE_FELL):
             break
-        again = select(schedule, begun.nominal, begun.listed, report, search.model)
+        again = select(schedule, nominal, listed, report, search.model)
         search = replace(again, rounds=(*search.rounds, *again.rounds))
+    # 6. The memory of the noise; under other noise a cause may be nothing any more.
     noise = with_memory(windows, search.shooting, search.model.theta, search.model.free.names)
     schedule, search = _with_noise(noise, schedule, search)
-    # Under other noise a cause may be nothing any more.
     return schedule, replace(search, model=pruned(search.shooting, search.model))
 
 

@@ -108,7 +108,7 @@ def follows(shooting: Shooting, model: Model) -> tuple[Follows, ...]:
     scale = np.sqrt(np.mean(np.concatenate([np.mean(s**2, axis=(1,)) for s in stacked]), axis=0))
     stacked = [s / np.where(scale > 0.0, scale, 1.0) for s in stacked]
     prepared = [_prepared(p, s) for p, s in zip(parts, stacked, strict=True)]
-    return tuple(_judge(site, names, prepared, model) for site in SITES)
+    return tuple(_followed(site, names, prepared, model) for site in SITES)
 
 
 @dataclass(frozen=True)
@@ -137,7 +137,7 @@ def _prepared(part: Columns, signal: FloatArray) -> _Prepared:
     return _Prepared(part, integrated, rows.reshape(*part.residual.shape, -1), _t(rows[..., :-1]) @ rows)
 
 
-def _judge(site: Site, names: tuple[str, ...], prepared: list[_Prepared], model: Model) -> Follows:
+def _followed(site: Site, names: tuple[str, ...], prepared: list[_Prepared], model: Model) -> Follows:
     pieces = [_products(site, p) for p in prepared]
     gram, grad = (np.concatenate([p[i] for p in pieces]) for i in (0, 1))
     own = model.lin.gram.shape[1]
@@ -330,11 +330,11 @@ def remainder(shooting: Shooting, model: Model, seed: int = 0) -> Remainder:
     for c in range(found.shape[0]):
         if 3 <= c < 6 or not np.isfinite(found[c]).all() or segments[c] < 5:
             continue
-        out.append(_residual_tests_judge(CHANNEL_NAMES[c], found[c], null[c], segments[c], rate))
+        out.append(_structure(CHANNEL_NAMES[c], found[c], null[c], segments[c], rate))
     return Remainder(tuple(out), follows(shooting, model), model.rows)
 
 
-def _residual_tests_judge(name: str, found: FloatArray, null: FloatArray, segments: int, rate: float) -> Structure:
+def _structure(name: str, found: FloatArray, null: FloatArray, segments: int, rate: float) -> Structure:
     spacing = 0.5 * rate / len(found)
     # The noise spectrum came from the data: a line of vibration narrower than it resolves is noise.
     resolved = SMOOTH / (2.0 * SPECTRUM_SECONDS)

@@ -30,11 +30,11 @@ from quadid.vehicle import Vehicle
 # Beside moments that no model has the two cannot be distinguished, so an inertia is not known better than that.
 
 
-SECONDS = 1.0
+COHERENCE_SECONDS = 1.0
 """Stretch of a spectrum."""
-BAND = (2.5, 12.5)
+COHERENCE_BAND = (2.5, 12.5)
 """Frequencies [Hz] that count: slower ones are ruled by unmodelled moments, faster ones by noise and vibration."""
-LEAST = 0.01
+LEAST_COHERENCE = 0.01
 """Smallest share distinguished from zero; also where no stretch is long enough for a spectrum."""
 
 
@@ -50,7 +50,7 @@ def undecided(windows: Sequence[Window], vehicle: Vehicle, white: FloatArray) ->
         white: standard deviation of the white noise of roll and pitch rate [rad/s], shape (2,).
     """
     dt = windows[0].dt
-    length = max(round(SECONDS / dt), 4)
+    length = max(round(COHERENCE_SECONDS / dt), 4)
     taper = np.hanning(length)[:, None]
     torque_power, motion_power, cross = (np.zeros((length // 2 + 1, 2), dtype) for dtype in (float, float, complex))
     blocks = 0
@@ -67,13 +67,13 @@ def undecided(windows: Sequence[Window], vehicle: Vehicle, white: FloatArray) ->
             cross += np.conj(t) * a
             blocks += 1
     frequency = np.fft.rfftfreq(length, dt)
-    band = (frequency >= BAND[0]) & (frequency <= BAND[1])
+    band = (frequency >= COHERENCE_BAND[0]) & (frequency <= COHERENCE_BAND[1])
     differences = np.sin(2.0 * np.pi * frequency[band] * dt)[:, None] / dt
     noise = blocks * np.sum(taper**2) * np.sum((differences * white) ** 2, axis=0)
     none = np.finfo(float).tiny
     made = np.sum(np.abs(cross[band]) ** 2 / np.maximum(torque_power[band], none), axis=0)
     motion = np.sum(motion_power[band], axis=0) - noise
-    return np.asarray(-np.log(np.clip(made / np.maximum(motion, none), LEAST, 1.0)))
+    return np.asarray(-np.log(np.clip(made / np.maximum(motion, none), LEAST_COHERENCE, 1.0)))
 
 
 def _without_gaps(values: FloatArray) -> FloatArray:
@@ -148,6 +148,7 @@ def fast_motion(
     prior = Prior(prior.mean, np.where(np.isin(free.names, late), USUAL, prior.sigma))
     theta = theta.copy()
     theta[shooting.free(late).index] = LATE_START
+    # Random moments from what a fit leaves, and the fit with these, in turns until nothing moves.
     lin, spent = shooting.linearise(theta, free), 1
     for _ in range(ROUNDS):
         shooting = shooting.with_noise(with_moments(shooting, lin))
@@ -158,6 +159,7 @@ def fast_motion(
             break
     if not np.isfinite(found.cost):
         return None
+    # Other estimates: shorter segments, nothing late, and what torque leaves undecided.
     brief = short.with_noise(shooting.noise).leaving_out(rest)
     quicker = polish(brief, theta, free, prior, iterations=8)
     own = shooting.free(names)

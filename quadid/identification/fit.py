@@ -90,57 +90,35 @@ class Fit:
 def final_answer(fit: Fit, out_of_reach: Mapping[str, str]) -> Fit:
     """The fit as every command, the library and the node give it.
 
+    Parameters that these data cannot identify keep the vehicle file's values, with the prior's interval, the status
+    ``prior_dominated`` and a warning; moments of inertia are those of a rigid body, see `possible_moments`.
+
     Args:
         fit: of all parameters together, so that those kept do not suffer from wrong guesses of the others.
         out_of_reach: parameters that the channels of the log cannot show, and why, in words.
     """
-    return possible_inertia(mask_unidentifiable(fit, out_of_reach))
-
-
-def mask_unidentifiable(fit: Fit, reasons: Mapping[str, str]) -> Fit:
-    """The fit with parameters that these data cannot identify reset to the vehicle file's values.
-
-    Args:
-        fit: of all parameters together, so that those kept do not suffer from wrong guesses of the others.
-        reasons: why, by parameter, in words.
-
-    Returns:
-        The fit with the status ``prior_dominated``, the prior's interval and a warning for every name in `reasons`.
-    """
-    names = [n for n in fit.parameters.names if n in reasons]
-    if not names:
-        return fit
-    layout = Layout(fit.vehicle)
-    theta, covariance = fit.theta.copy(), np.array(fit.parameters.covariance)
-    rows = []
-    for j, p in enumerate(fit.parameters):
-        if p.name in reasons:
+    rows, covariance, warnings = list(fit.parameters), np.array(fit.parameters.covariance), fit.warnings
+    lost = [n for n in fit.parameters.names if n in out_of_reach]
+    for j, p in enumerate(rows):
+        if p.name in lost:
             spread = float(fit.uncertainty.prior_sigma[j])
-            theta[layout.entry(p.name).index] = p.initial
             covariance[j, :], covariance[:, j] = 0.0, 0.0
             covariance[j, j] = (spread * p.initial) ** 2
             ci = (p.initial * math.exp(-Z95 * spread), p.initial * math.exp(Z95 * spread))
-            p = replace(p, value=p.initial, sigma=spread * p.initial, ci95=ci, relative_to=None, prior_share=1.0,
-                        status=Status.PRIOR_DOMINATED)  # fmt: skip
-        rows.append(p)
-    why = {reason: ", ".join(n for n in names if reasons[n] == reason) for reason in dict.fromkeys(reasons.values())}
-    reset = [f"{who}: the vehicle file's values are kept, because {reason}" for reason, who in why.items() if who]
-    kept = [w for w in fit.warnings if not w.startswith(tuple(f"{n} = " for n in names))]
-    return replace(fit, theta=theta, parameters=ParameterSet(tuple(rows), covariance), warnings=(*reset, *kept))
-
-
-def possible_inertia(fit: Fit) -> Fit:
-    """The fit with moments of inertia that a rigid body can have; see `possible_moments`."""
-    parameters, remark = possible_moments(tuple(fit.parameters))
-    if remark is None:
-        return fit
+            rows[j] = replace(p, value=p.initial, sigma=spread * p.initial, ci95=ci, relative_to=None, prior_share=1.0,
+                              status=Status.PRIOR_DOMINATED)  # fmt: skip
+    if lost:
+        reasons = dict.fromkeys(out_of_reach.values())
+        why = {reason: ", ".join(n for n in lost if out_of_reach[n] == reason) for reason in reasons}
+        reset = [f"{who}: the vehicle file's values are kept, because {reason}" for reason, who in why.items() if who]
+        warnings = (*reset, *(w for w in warnings if not w.startswith(tuple(f"{n} = " for n in lost))))
+    parameters, moved = possible_moments(tuple(rows))
+    if moved is not None:
+        warnings = (*warnings, moved)
     theta, layout = fit.theta.copy(), Layout(fit.vehicle)
     for p in parameters:
         theta[layout.entry(p.name).index] = p.value
-    return replace(
-        fit, theta=theta, parameters=ParameterSet(parameters, np.array(fit.parameters.covariance)),
-        warnings=(*fit.warnings, remark),
-    )  # fmt: skip
+    return replace(fit, theta=theta, parameters=ParameterSet(parameters, covariance), warnings=warnings)
 
 
 def possible_moments(parameters: tuple[Parameter, ...]) -> tuple[tuple[Parameter, ...], str | None]:
@@ -245,14 +223,12 @@ class FitOptions:
         particles, iterations: swarm size and most iterations; 0 iterations start from the initial guess.
         swarm: variant of the swarm.
         seed: decides every random number.
-        robust: down-weight outliers.
     """
 
     particles: int = 64
     iterations: int = 60
     swarm: SwarmOptions = field(default_factory=SwarmOptions)
     seed: int = 0
-    robust: bool = True
 
 
 LEAST_SECONDS = 2.0
@@ -295,19 +271,22 @@ def fit(
     report = progress or (lambda stage, share: None)
     check_windows(windows)
     windows, thinned = spread(windows)
+    # 1. Global search on segments so short that the simulation is nearly linear in all parameters.
     short = Shooting.cut(windows, vehicle, SWARM_SECONDS)
     free = short.free(list(names or NOMINAL_NAMES))
     theta, evaluations = short.layout.initial(vehicle), 0
     if options.iterations > 0:
         settings = replace(options.swarm, iterations=options.iterations)
         theta, evaluations = swarm_search(short, theta, free, settings, options.particles, options.seed, report)
+    # 2. Polish there, and the noise that it leaves.
     report("polish", 0.0)
     short = short.at_most(MOST_SEGMENTS)
     typical = short.noise
-    short, first = reweighted_fit(short, theta, free, iterations=10, robust=options.robust)
+    short, first = reweighted_fit(short, theta, free, iterations=10, robust=True)
     # Where channels cannot show how the vehicle turns, longer segments and other models cannot be compared either.
     comparable = not set(INERTIAS) & set(out_of_reach or ())
     report("polish", 0.2)
+    # 3. Where moments that the model lacks rule the rates, fast motion alone decides.
     quick = fast_motion(windows, short, first.theta, free.names) if restless(short, first) else None
     if quick is not None:
         # Longer segments would only let the missing moments in again, and what these leave is no measure of the noise.
@@ -315,23 +294,25 @@ def fit(
         starts = [quick.found.theta, first.theta]
         noise = flexible_fit(windows, short, starts, free, typical, FAR_ITERATIONS).noise
         report("intervals", 0.0)
-        found = fast_fit(quick, free.names, options.robust, comparable)
+        found = fast_fit(quick, free.names, comparable)
     else:
+        # 4. Else noise from a flexible fit, polish on longer segments, memory of the attitude noise, polish again.
         noise = flexible_fit(windows, short, [first.theta], free).noise
         report("noise and polish", 0.4)
         final = Shooting.cut(windows, vehicle, FIT_SECONDS, noise, short.layout)
-        result = polish(final, first.theta, free, robust=options.robust)
+        result = polish(final, first.theta, free, robust=True)
         report("noise and polish", 0.6)
         noise = with_memory(windows, final, result.theta, free.names)
         final = final.with_noise(noise)
         theta, states = result.theta, result.states
         del result  # of a long log its residuals are a large part of all memory
-        result = polish(final, theta, free, states=states, robust=options.robust)
+        result = polish(final, theta, free, states=states, robust=True)
         if not np.isfinite(result.cost):
             final, result = short, first
+        # 5. Intervals, and whether estimates agree across data and models.
         report("intervals", 0.0)
         judge = first if comparable else None
-        found = _finish(final, result, free, default_prior(short, free), result.simulated, options.robust, judge)
+        found = _finish(final, result, free, default_prior(short, free), result.simulated, judge)
         found = replace(found, warnings=(*found.warnings, *_warnings(found)))
     report("polish", 1.0)
     evaluations += first.simulated + found.evaluations
@@ -353,13 +334,12 @@ def restless(short: Shooting, plain: Polished) -> bool:
     return bool(np.isfinite(plain.cost) and np.any(white < WHITE_SHARE * short.noise.variance[:2]))
 
 
-def fast_fit(quick: FastMotion, names: Sequence[str], robust: bool = True, comparable: bool = True) -> Fit:
+def fast_fit(quick: FastMotion, names: Sequence[str], comparable: bool = True) -> Fit:
     """Estimates of `names` from fast motion, with intervals and statuses.
 
     Args:
         quick: the fit.
         names: of the vehicle's own parameters.
-        robust: down-weight outliers of the second cut.
         comparable: whether short segments and other models test the numbers.
     """
     remarks = [_QUICK]
@@ -372,23 +352,21 @@ def fast_fit(quick: FastMotion, names: Sequence[str], robust: bool = True, compa
     ]
     judge = quick.short if comparable else None
     others = [quick.prompt, quick.undecided]
-    found = _finish(quick.shooting, quick.found, quick.free, quick.prior, quick.simulated, robust, judge, others).of(
-        names
-    )
+    found = _finish(quick.shooting, quick.found, quick.free, quick.prior, quick.simulated, judge, others).of(names)
     found = replace(found, parameters=found.parameters.unreliable(YAW))
     return replace(found, warnings=(*remarks, *found.warnings, *_warnings(found)))
 
 
 def _finish(
-    shooting: Shooting, polished: Polished, free: Free, prior: Prior, evaluations: int, robust: bool = False,
-    short: Polished | None = None, others: Sequence[FloatArray] = (),
+    shooting: Shooting, polished: Polished, free: Free, prior: Prior, evaluations: int,
+    short: Polished | None, others: Sequence[FloatArray] = (),
 ) -> Fit:  # fmt: skip
     """Intervals and statuses.
 
     The fit to `short` segments tests the numbers, and so do `others`, scaled steps to other estimates.
     """
     theta, ended = polished.theta, np.isfinite(polished.cost)
-    both = with_second_cut(shooting, polished, free, prior, robust) if ended else None
+    both = with_second_cut(shooting, polished, free, prior) if ended else None
     unc = uncertainty(polished.lin, prior, None if both is None else both.information)
     if both is not None:
         theta, evaluations = both.theta, evaluations + both.simulated

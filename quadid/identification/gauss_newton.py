@@ -172,7 +172,11 @@ def polish(
     states = states or MEASURED
     settled = settled and shooting.start_of(theta, free)[0] in states.starts
     first = _descend(shooting, theta, free, prior, states, iterations, robust, tolerance, settled)
-    if first.outcome is not Convergence.ASTRAY and not (states and _worse_than_measured(shooting, free, first)):
+    lost = first.outcome is Convergence.ASTRAY
+    if states and first.outcome not in (Convergence.ASTRAY, Convergence.CONVERGED):
+        # Of an unfinished descent: its states cost more than twice what measured ones would.
+        lost = 2.0 * shooting.linearise(first.theta, free).total_cost < first.lin.total_cost
+    if not lost:
         return first
     again = _descend(shooting, first.theta, free, prior, MEASURED, iterations, robust, tolerance, False)
     best = min(again, first, key=lambda p: p.cost)
@@ -188,11 +192,13 @@ def _descend(
     if robust:
         # Initial states as measured would let every sample of a segment look like an outlier.
         lin = shooting.linearise(theta, free, lin.stepped())
-        shooting = shooting.with_robust(robust_weights(shooting, lin))
+        weights = robust_weights(shooting, lin)
+        shooting = shooting.with_robust(weights)
         lin = shooting.linearise(theta, free, lin.states)
     damping, refused, spent, outcome = 0.0, 0, 3 if robust else 1, Convergence.BUDGET
     cost = lin.total_cost + prior_terms(free, prior, theta)[2]
     while spent < iterations:
+        # (H + damping diag H) z = -g within bounds, no farther than linearisation can be trusted.
         h, g = normal_equations(lin, free, prior, theta)
         z = bounded_step(free, theta, h + damping * np.diag(np.diag(h)), g)
         z *= min(1.0, LONGEST_STEP / max(float(np.max(np.abs(z), initial=0.0)), 1e-12))
@@ -202,16 +208,22 @@ def _descend(
         spent += 1
         trial_cost = trial.total_cost + prior_terms(free, prior, moved)[2]
         # The first step also moves the initial states away from single noisy samples; it may cost a little.
-        least = cost * (1.0 + 1e-9 if settled else 1.05) + 1e-9
-        if not (trial_cost <= least and _leads_on(trial)):
+        most = cost * (1.0 + 1e-9 if settled else 1.05) + 1e-9
+        # A simulation that runs away leaves slopes beyond the digits of a float: no next step could be worked out.
+        finite = np.isfinite(trial.information).all() and np.isfinite(trial.grad).all()
+        if not (trial_cost <= most and finite and (np.diag(trial.information) >= 0.0).all()):
+            # Refused: more damping, unless initial states, moved alone, miss the cost that they were to reach.
             damping, refused = max(4.0 * damping, 1e-2), refused + 1
-            if refused == _REFUSALS and _astray(shooting, theta, free, lin):
-                outcome = Convergence.ASTRAY
-                break
+            if refused == _REFUSALS:
+                reached = shooting.linearise(theta, free, lin.stepped()).total_cost
+                if not reached <= (1.0 + _SETTLED) * lin.total_cost:
+                    outcome = Convergence.ASTRAY
+                    break
             if damping > 1e6:
                 outcome = Convergence.STUCK
                 break
             continue
+        # Accepted; done when the step or its gain is below what the data resolve.
         gain, sigma = cost - trial_cost, 1.0 / np.sqrt(np.diag(h))
         small = bool(np.all(np.abs(actual) <= tolerance * sigma)) or 0.0 <= gain < tolerance**2
         theta, lin, cost, refused = moved, trial, trial_cost, 0
@@ -220,40 +232,15 @@ def _descend(
             outcome = Convergence.CONVERGED
             break
         settled = True
-        if robust and (weights := _renewed(shooting, lin)) is not None:
-            # Costs under old and new weights cannot be compared.
-            shooting = shooting.with_robust(weights)
-            lin = shooting.linearise(theta, free, lin.states)
-            spent, cost = spent + 1, lin.total_cost + prior_terms(free, prior, theta)[2]
+        if robust:
+            # Weights follow the residuals until they stay; costs under old and new ones cannot be compared.
+            renewed = robust_weights(shooting, lin)
+            change = renewed - weights
+            if np.max(np.abs(change, out=change), initial=0.0) > _STEADY_WEIGHT:
+                weights, shooting = renewed, shooting.with_robust(renewed)
+                lin = shooting.linearise(theta, free, lin.states)
+                spent, cost = spent + 1, lin.total_cost + prior_terms(free, prior, theta)[2]
     return Polished(theta, lin, cost, spent, outcome)
-
-
-def _worse_than_measured(shooting: Shooting, free: Free, found: Polished) -> bool:
-    """Whether the states of an unfinished descent cost more than twice what measured ones would."""
-    if found.outcome is Convergence.CONVERGED:
-        return False
-    return 2.0 * shooting.linearise(found.theta, free).total_cost < found.lin.total_cost
-
-
-def _leads_on(lin: Linearised) -> bool:
-    """Whether a next step can be worked out: a simulation that runs away leaves slopes beyond the digits of a float."""
-    h = lin.information
-    return bool(np.isfinite(h).all() and np.isfinite(lin.grad).all() and (np.diag(h) >= 0.0).all())
-
-
-def _astray(shooting: Shooting, theta: FloatArray, free: Free, lin: Linearised) -> bool:
-    """Whether initial states, moved alone, miss the cost that their linearisation counts on."""
-    reached = shooting.linearise(theta, free, lin.stepped()).total_cost
-    return not reached <= (1.0 + _SETTLED) * lin.total_cost
-
-
-def _renewed(shooting: Shooting, lin: Linearised) -> FloatArray | None:
-    """New robust weights; None when they would hardly differ from those in use."""
-    weights = robust_weights(shooting, lin)
-    if shooting.robust is None:
-        return weights
-    change = weights - shooting.robust
-    return weights if np.max(np.abs(change, out=change), initial=0.0) > _STEADY_WEIGHT else None
 
 
 def bounded_step(free: Free, theta: FloatArray, h: FloatArray, g: FloatArray) -> FloatArray:
@@ -276,14 +263,9 @@ def bounded_step(free: Free, theta: FloatArray, h: FloatArray, g: FloatArray) ->
         )
     if not len(g):
         return np.zeros(0)
-    low, high = _step_limits(free, theta)
+    low, high = (free.difference(bound, theta[free.index]) for bound in free.bounds)
+    low, high = np.minimum(low, 0.0), np.maximum(high, 0.0)
     # Parameters are scaled first, so that only a true lack of information makes a direction vanish.
     scale = np.sqrt(np.where(np.diag(h) > 0.0, np.diag(h), 1.0))
     z = least_within(h / np.outer(scale, scale), g / scale, low * scale, high * scale)
     return np.clip(z / scale, low, high)
-
-
-def _step_limits(free: Free, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Smallest and largest scaled step of each parameter within its bounds, shapes (P,)."""
-    low, high = (free.difference(bound, theta[free.index]) for bound in free.bounds)
-    return np.minimum(low, 0.0), np.maximum(high, 0.0)

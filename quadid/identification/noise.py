@@ -72,6 +72,7 @@ def likeliest(residuals: FloatArray, dt: float) -> tuple[float, float]:
     usual = float(np.mean(power))
     if not LEAST_WHITE**2 < usual < np.inf:
         return LEAST_WHITE, 0.0
+    # Likelihood of independent modes with variances white + moment * level, on a grid of both.
     white = np.geomspace(max(0.05 * float(np.min(power)), LEAST_WHITE**2), usual, _WHITE)
     moment = usual / float(np.mean(levels)) * _MOMENT
     level = white[:, None, None] + moment[None, :, None] * levels
@@ -282,12 +283,14 @@ def estimate_noise(
                 left = np.count_nonzero(used) - order * np.count_nonzero(used.any(axis=1))
                 white[c] = np.sqrt(np.sum(residuals[:, :, c][used] ** 2) / max(float(left), 1.0) / freedom)
             continue
+        # What the initial state fits anyway goes first: the trend.
         r = residuals[complete, :, c]
         r = r - (r @ basis) @ basis.T
         # Trim segments with outliers: the middle 98 % of segment powers.
         power = np.sum(r * r, axis=1)
         r = r[power <= np.quantile(power, 0.98)]
         keep = 1.0 if len(r) < 50 else lower_mean(0.98, length - basis.shape[1])
+        # Rao's two quadratic forms r' I r and r' R r, set equal to their expectations.
         moments = np.array([np.mean(np.sum((r @ f) * r, axis=1)) for f in forms[:2]]) / (freedom * keep)
         var_white, var_slow = moments[0] / forms[2][0, 0], 0.0
         if c in ATTITUDE and length >= 8:

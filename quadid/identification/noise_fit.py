@@ -7,8 +7,9 @@ lacks.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 
@@ -213,8 +214,7 @@ def flexible_names(layout: Layout, shooting: Shooting) -> list[str]:
     return out + losses[1:]
 
 
-@dataclass(frozen=True)
-class Flexible:
+class Flexible(NamedTuple):
     """The flexible fit: the noise that it leaves, and its optimum, a full vector."""
 
     noise: NoiseModel
@@ -239,6 +239,7 @@ def flexible_fit(
         iterations: linearisations to spend on the short segments.
     """
     names = list(dict.fromkeys([*free.names, *flexible_names(short.layout, short)]))
+    # The best of all starts on short segments, with some drag, without which velocities show in nothing.
     drag = short.free([n for n in ("rotor_drag.k_x", "rotor_drag.k_y") if n not in free.names]).index
     few = thinned(windows, short, short.seconds, noise or short.noise, SHORT_SEGMENTS)
     wide = few.free(names)
@@ -250,15 +251,22 @@ def flexible_fit(
     first = min(tried, key=lambda p: p.cost)
     brief = residual_noise(few, first)
     longer = thinned(windows, short, SPECTRUM_SECONDS, brief, MOST_SEGMENTS)
-    # In calm flight short segments may lead flexible parameters far astray; then longer ones begin where they did.
+    # In calm flight short segments may make flexible parameters diverge; then longer ones begin where they did.
     for theta, iterations in [(first.theta, 3), *((start, FROM_START) for start in starts)]:
         found = polish(longer.at_most(LONG_SEGMENTS), theta, wide, iterations=iterations)
         second = _settled(longer, found.theta, names)
         noise = residual_noise(longer, second, len(names))
-        # Noise does not grow with the length of a segment; what does is the model losing its way.
-        if not np.any(noise.variance > GROWS * brief.variance):
-            longest, states = _longest(windows, longer.with_noise(noise), second, names)
-            return Flexible(shaped_noise(longest, second.theta, wide, states), second.theta)
+        if np.any(noise.variance > GROWS * brief.variance):
+            continue  # noise does not grow with the length of a segment; what does is the model losing its way
+        # The spectrum shows best in the longest segments that the model follows as well.
+        shown, states = longer.with_noise(noise), second.states
+        longest = thinned(windows, longer, LINE_SECONDS, noise, MOST_SEGMENTS)
+        if longest.count >= LINE_SEGMENTS:
+            fitted = _settled(longest, second.theta, names)
+            level = residual_noise(longest, fitted, len(names))
+            if not np.any(level.variance > STAYS * noise.variance):
+                shown, states = longest.with_noise(level), fitted.states
+        return Flexible(shaped_noise(shown, second.theta, wide, states), second.theta)
     return Flexible(brief, first.theta)
 
 
@@ -268,20 +276,6 @@ def _settled(shooting: Shooting, theta: FloatArray, names: Sequence[str]) -> Pol
     Two parameters move beside the initial states, so that segments are started and filters warmed up as for all.
     """
     return polish(shooting, theta, shooting.free([n for n in _SETTLING if n in names]), iterations=3)
-
-
-def _longest(
-    windows: Sequence[Window], longer: Shooting, second: Polished, names: Sequence[str]
-) -> tuple[Shooting, InitialStates]:
-    """The longest segments that the model of `second` follows as well as `longer`, and states there."""
-    out = thinned(windows, longer, LINE_SECONDS, longer.noise, MOST_SEGMENTS)
-    if out.count < LINE_SEGMENTS:
-        return longer, second.states
-    fitted = _settled(out, second.theta, names)
-    noise = residual_noise(out, fitted, len(names))
-    if np.any(noise.variance > STAYS * longer.noise.variance):
-        return longer, second.states
-    return out.with_noise(noise), fitted.states
 
 
 def thinned(windows: Sequence[Window], like: Shooting, seconds: float, noise: NoiseModel, most: int) -> Shooting:
@@ -299,9 +293,6 @@ MEMORY_SECONDS = 4.0
 """Segments of this length show the memory …"""
 MEMORY_SEGMENTS = 40
 """… and about so many of them give it precisely enough."""
-ITERATIONS = 3
-"""Linearisations from the optimum on segments of another length."""
-
 MEMORIES = np.geomspace(0.15, 10.0, 13)
 """Correlation times that are compared [s]."""
 FEWEST_SEGMENTS = 10
@@ -324,15 +315,17 @@ def with_memory(windows: Sequence[Window], problem: Shooting, theta: FloatArray,
         theta: optimum of the model, full vector.
         names: its free parameters.
     """
+    # The same model on segments of a second and of four.
     noise, free = problem.noise, problem.free(names)
     near = thinned(windows, problem, LINE_SECONDS, noise, round(MEMORY_SEGMENTS * MEMORY_SECONDS / LINE_SECONDS))
     far = thinned(windows, problem, MEMORY_SECONDS, noise, MEMORY_SEGMENTS)
     if not far.count:
         return noise
-    brief, long = (polish(s, theta, free, iterations=ITERATIONS) for s in (near, far))
+    brief, long = (polish(s, theta, free, iterations=3) for s in (near, far))
     memory = attitude_memory(long.lin.residuals, long.lin.weights, far.dt) if np.isfinite(long.cost) else None
     if memory is None:
         return noise
+    # Noise is the same in both; what grows with their length is the model.
     found, drifted = (residual_noise(*both, slow_time=memory) for both in ((near, brief), (far, long)))
     if np.any((drifted.variance / found.variance).reshape(-1, 3).mean(axis=1) > STAYS):
         return noise
@@ -362,6 +355,7 @@ def attitude_memory(residuals: FloatArray, weights: FloatArray, dt: float) -> fl
         blocks = residuals[complete, : rows * share, c].reshape(-1, rows, share).mean(axis=2)
         if np.any(blocks):
             log_likelihood += [_log_likelihood(blocks, share * dt / memory) for memory in MEMORIES]
+    # The peak, between the memories tried by a parabola.
     best = int(np.argmax(log_likelihood))
     if np.ptp(log_likelihood) == 0.0:
         return None

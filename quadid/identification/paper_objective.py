@@ -14,10 +14,7 @@ import numpy as np
 from quadid.data.window import Window
 from quadid.errors import NotIdentifiableError
 from quadid.identification.controller_gains import Autopilot
-from quadid.identification.problem import Free
 from quadid.model.closed_loop import ClosedLoop, kinematic_acceleration
-from quadid.model.layout import Layout
-from quadid.parameters import NOMINAL_NAMES
 from quadid.rotation import euler
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
@@ -51,13 +48,7 @@ class PaperScore:
 
 
 class PaperProblem:
-    """The paper's objective as a plain problem in a box: coordinates are logarithms of the six parameters.
-
-    Attributes:
-        lower: bounds of the logarithms, shape (6,).
-        upper: likewise.
-        start: the vehicle file's guess, shape (6,).
-    """
+    """The paper's objective on the windows of one set."""
 
     def __init__(self, windows: Sequence[Window], vehicle: Vehicle, autopilot: Autopilot) -> None:
         """Prepares windows that hold references.
@@ -73,25 +64,9 @@ class PaperProblem:
             )  # fmt: skip
         self._loops = [ClosedLoop(w, vehicle, autopilot.gains, autopilot.rate) for w in usable]
         self._measured = [measured_outputs(w) for w in usable]
-        layout = Layout(vehicle)
-        self._theta, self._free = layout.initial(vehicle), Free(tuple(layout.entry(n) for n in NOMINAL_NAMES))
-        self.lower, self.upper = np.log(vehicle.bounds).T
-        self.start = np.clip(self._free.scaled(vehicle.initial), self.lower, self.upper)
         rows = np.concatenate(self._measured)
         # Every output counts alike, however many of its samples are missing.
         self._weight = 1.0 / np.sqrt(np.maximum(np.count_nonzero(np.isfinite(rows), axis=0), 1) * _seen(rows))
-
-    def theta(self, point: FloatArray) -> FloatArray:
-        """Full parameter vector of a point, shape (size,)."""
-        return self._free.placed(self._theta, point)
-
-    def residual(self, points: FloatArray) -> FloatArray:
-        """Shapes (k, 6) -> (k, samples); the sum of squares is twice the mean squared error."""
-        return np.asarray(self.errors(np.array([self.theta(p) for p in points])) * np.sqrt(2.0))
-
-    def cost(self, points: FloatArray) -> FloatArray:
-        """Mean squared error over the nine outputs, Eq. (13), shapes (k, 6) -> (k,)."""
-        return self.mse(np.array([self.theta(p) for p in points]))
 
     def mse(self, thetas: FloatArray) -> FloatArray:
         """Mean squared error of full parameter vectors, shapes (m, size) -> (m,)."""

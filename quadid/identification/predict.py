@@ -18,6 +18,7 @@ import numpy as np
 from quadid.data.window import Window
 from quadid.errors import NotIdentifiableError, ParameterError
 from quadid.identification.initial_states import retract
+from quadid.identification.problem import RAN_AWAY
 from quadid.model import layout as ix
 from quadid.model.layout import Layout
 from quadid.model.rollout import Rollout, Segments
@@ -33,8 +34,6 @@ QUANTITIES: dict[str, str] = {"position": "m", "velocity": "m/s", "rotation": "r
 """What is predicted, with units."""
 _PLACES = (12, 9, 3, 0)
 """First of the three residual channels of each quantity."""
-RAN_AWAY = 1e30
-"""Misses from here on, or without a value, are infinite: the simulation has left every scale of a flight."""
 _CHUNK = 256
 """Runs rolled at once; keeps the residuals of a chunk in cache."""
 
@@ -93,7 +92,9 @@ class OpenLoop:
             segments = Segments(self.longest, 1, (rows + 1).astype(np.int64))
             blocks = self._rollout.roll(segments, theta, np.ascontiguousarray(states[rows]))[0]
             residual = np.moveaxis(blocks, 4, 1).reshape(-1, *blocks.shape[1:4])[: len(theta)]
-            found = np.stack([_three(residual[:, :, at - 1], place) for place in _PLACES], axis=3)
+            # Channels that the log lacks hold zeros, which do not count.
+            residual = np.pad(residual[:, :, at - 1], ((0, 0), (0, 0), (0, 0), (0, 15 - residual.shape[-1])))
+            found = np.stack([residual[..., place : place + 3] for place in _PLACES], axis=3)
             ran = np.where(np.abs(found) < RAN_AWAY, found, np.inf)  # a comparison with NaN is false, too
             yield rows, np.where(self.counted(rows, at)[..., None], ran, np.nan)
 
@@ -124,13 +125,6 @@ def lengths(misses: FloatArray) -> FloatArray:
     return out
 
 
-def _three(residual: FloatArray, place: int) -> FloatArray:
-    """Three channels of a residual from `place` on; zeros where it has none."""
-    if place < residual.shape[-1]:
-        return residual[..., place : place + 3]
-    return np.zeros((*residual.shape[:-1], 3))
-
-
 def mean_errors(windows: Sequence[Window], vehicle: Vehicle, theta: FloatArray, samples: int) -> dict[str, float]:
     """Mean error `samples` after every start, by quantity; NaN for what the logs lack, infinite where a run went away.
 
@@ -157,17 +151,12 @@ def no_change(windows: Sequence[Window], vehicle: Vehicle, samples: int) -> dict
 
 
 def _by_quantity(errors: Sequence[FloatArray]) -> dict[str, float]:
-    """Means over all starts of errors (starts, 4)."""
-    mean = mean_of_known(np.concatenate([np.zeros((0, 4)), *errors]))
+    """Means over all starts of errors (starts, 4), without those that are NaN; NaN where all are."""
+    rows = np.concatenate([np.zeros((0, 4)), *errors])
+    known = ~np.isnan(rows)
+    total, count = np.where(known, rows, 0.0).sum(axis=0), known.sum(axis=0)
+    mean = np.divide(total, count, out=np.full(4, np.nan), where=count > 0)
     return dict(zip(QUANTITIES, mean.tolist(), strict=True))
-
-
-def mean_of_known(errors: FloatArray) -> FloatArray:
-    """Mean over the first axis of what is not NaN; NaN where nothing is."""
-    known = ~np.isnan(errors)
-    total, count = np.where(known, errors, 0.0).sum(axis=0), known.sum(axis=0)
-    mean: FloatArray = np.divide(total, count, out=np.full(total.shape, np.nan), where=count > 0)
-    return mean
 
 
 def _padded(window: Window) -> Window:

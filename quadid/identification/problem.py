@@ -342,17 +342,14 @@ class Shooting:
         Windows of which none is kept are left out.
         """
         windows = [i for i, k in enumerate(kept) if len(k)]
+        first = np.cumsum([0, *(len(s.starts) for s in self.segments)])
+        of_all = [k + before for k, before in zip(kept, first[:-1], strict=True)]
         return replace(
             self,
             rollouts=tuple(self.rollouts[i] for i in windows),
             segments=tuple(self.segments[i].at(kept[i]) for i in windows),
-            robust=None if self.robust is None else self.robust[np.concatenate(self._of_all(kept))],
+            robust=None if self.robust is None else self.robust[np.concatenate(of_all)],
         )
-
-    def _of_all(self, kept: Sequence[IndexArray]) -> list[IndexArray]:
-        """Places of segments within their windows as places among the segments of all windows."""
-        ends = np.cumsum([len(s.starts) for s in self.segments])
-        return [k + end - len(s.starts) for k, end, s in zip(kept, ends, self.segments, strict=True)]
 
     def at_most(self, most: int) -> Shooting:
         """The same problem on at most about `most` segments, spread evenly."""
@@ -369,7 +366,10 @@ class Shooting:
 
     def start_of(self, theta: FloatArray, free: Free) -> tuple[int, int]:
         """Rows to roll before a segment and directions of its initial state that matter."""
-        warm, moves = _uses(_WARM_UP, theta, free), _uses(_AIR, theta, free)
+        # Whether any of these entries acts at `theta` or may, being free.
+        warm, moves = (
+            bool(np.isin(free.index, entries).any() or theta[list(entries)].any()) for entries in (_WARM_UP, _AIR)
+        )
         tangents = {9: 9 if moves else 6, 12: 9, 15: 12}[self.channels]
         return (self.lead if warm else 1), tangents
 
@@ -382,12 +382,16 @@ class Shooting:
         n_pre, k = self.start_of(theta, free)
         starts = self.starts(n_pre, states)
         states = (states or MEASURED).replaced(n_pre, starts)
-        weights = self._weights()
+        weights = self.robust
+        if weights is None:
+            weights = np.concatenate([self.measured_weights(i) for i in range(len(self.rollouts))])
         into = Reduced.room(self.count, k, len(free.entries), self.length, self.channels)
         place, counts = 0, [len(s.starts) for s in self.segments]
         for i, (x0, reckoned) in enumerate(zip(*starts, strict=True)):
             which = slice(place, place + counts[i])
-            prior = self._state_prior(i, x0[:, 7:10] - reckoned, k)
+            # Where velocity matters and is not measured, dead reckoning holds it.
+            known = VELOCITY_PRIOR**-2.0 if k >= 9 and self.rollouts[i].channels <= 9 else 0.0
+            prior = StatePrior(1.0 / RIDGE[:k] ** 2, known, np.ascontiguousarray(x0[:, 7:10] - reckoned))
             self._reduce(i, theta, free, x0.copy(), prior, n_pre, k, weights[which], into.part(which))
             place = which.stop
         times = [r.window.t[s.starts] for r, s in zip(self.rollouts, self.segments, strict=True)]
@@ -397,22 +401,11 @@ class Shooting:
             np.repeat(np.arange(len(counts), dtype=np.intp), counts), np.concatenate(times), states, n_pre,
         )  # fmt: skip
 
-    def _state_prior(self, i: int, away: FloatArray, k: int) -> StatePrior:
-        ridge = 1.0 / RIDGE[:k] ** 2
-        unknown = k >= 9 and self.rollouts[i].channels <= 9
-        return StatePrior(ridge, VELOCITY_PRIOR**-2.0 if unknown else 0.0, np.ascontiguousarray(away))
-
     def measured_weights(self, i: int) -> FloatArray:
         """1 where a window's segments were measured and count, 0 elsewhere, shape (segments, length, channels)."""
         weights = np.array(self.rollouts[i].valid[self.segments[i].rows][..., : self.channels], dtype=np.float64)
         weights[..., list(self.left_out)] = 0.0
         return weights
-
-    def _weights(self) -> FloatArray:
-        """1 where measured or the robust weight, 0 elsewhere, shape (segments of all windows, length, channels)."""
-        if self.robust is not None:
-            return self.robust
-        return np.concatenate([self.measured_weights(i) for i in range(len(self.rollouts))])
 
     def _directions(self, theta: FloatArray, free: Free, k: int) -> tuple[FloatArray, FloatArray, FloatArray]:
         """One lane for the base and for each direction: vectors (1 + k + P, size), offsets (…, 12), steps (k + P,)."""
@@ -483,11 +476,6 @@ class Shooting:
                 self.rollouts[i].window, self.segments[i].rows, basis, white[..., -1], np.all(weights > 0.0, axis=1),
                 flat[..., k:-1], base[..., 0], weights, self.noise,
             )  # fmt: skip
-
-
-def _uses(places: tuple[int, ...], theta: FloatArray, free: Free) -> bool:
-    """Whether any of these entries acts at `theta` or may, being free."""
-    return bool(np.isin(free.index, places).any() or theta[list(places)].any())
 
 
 # --- Priors on the free parameters, and normal equations of data and prior

@@ -8,7 +8,7 @@ intervals are widened by it, between blocks as random effects (DerSimonian and L
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -21,7 +21,7 @@ from quadid.identification.initial_states import InitialStates
 from quadid.identification.noise_fit import flexible_names
 from quadid.identification.problem import Free, Prior, Shooting, default_prior, normal_equations, posterior_covariance
 from quadid.identification.uncertainty import SPREAD_LIMIT, Uncertainty, uncertainty
-from quadid.types import FloatArray, IndexArray
+from quadid.types import FloatArray
 
 # --- The same flight on a grid twice as coarse: how much a parameter depends on what the inputs do within a row
 #
@@ -33,7 +33,6 @@ from quadid.types import FloatArray, IndexArray
 
 SHARE = 1.0 / 3.0
 """Of the difference between two grids, of which one is twice as coarse, that the finer one is off by."""
-_ITERATIONS = 4
 
 
 def on_coarse_grid(problem: Shooting, found: Polished, free: Free, prior: Prior) -> Polished | None:
@@ -50,7 +49,7 @@ def on_coarse_grid(problem: Shooting, found: Polished, free: Free, prior: Prior)
     cut = Shooting.cut(windows, problem.vehicle, problem.seconds, noise, problem.layout).leaving_out(problem.left_out)
     if not cut.count or cut.channels != problem.channels:
         return None
-    return polish(cut, found.theta, free, prior, iterations=_ITERATIONS, robust=problem.robust is not None)
+    return polish(cut, found.theta, free, prior, iterations=4)
 
 
 def coarse(window: Window) -> Window:
@@ -159,11 +158,13 @@ def reliability(problem: Shooting, found: Polished, free: Free, prior: Prior, sh
         # Sharp priors pull against a wrong mass or arm; that is settled by `with_scale_uncertainty`, and no misfit.
         prior = Prior(prior.mean, np.maximum(prior.sigma, WIDE))
         found = polish(problem, found.theta, free, prior, found.states, settled=True)
+    # Parts of the flight: steps of blocks of time from the optimum of all.
     own = uncertainty(found.lin, prior)
     between, mean = _between_blocks(found, prior, own)
     left = found.lin.reduced_chi_square
     # Beside random moments the model misses something, however well these account for it.
     misfit = problem.noise.moments is not None or left > MISFIT
+    # The same data in short segments, on a coarser grid, and in models with causes that the residual asks for.
     steps, names = [_beyond_chance(found, free, own, short, prior)], ["when shorter pieces of the flight are fitted"]
     if (rows := on_coarse_grid(problem, found, free, prior)) is not None:
         steps.append(SHARE * _beyond_chance(found, free, own, rows, prior))
@@ -186,10 +187,12 @@ def _between_blocks(found: Polished, prior: Prior, own: Uncertainty) -> tuple[Fl
         return np.zeros(p), np.zeros(p)
     steps, variances = np.empty((count, p)), np.empty((count, p))
     thin = Prior(prior.mean, np.sqrt(count) * prior.sigma)
+    # Each block's own step, and its variance.
     for k, part in enumerate(np.array_split(np.arange(len(lin.cost)), count)):
         covariance = posterior_covariance(lin.gram[part].sum(axis=0), thin)
         steps[k] = -covariance @ (lin.grad[part].sum(axis=0) - lin.gradient / count)
         variances[k] = np.diag(covariance) * own.inflation**2
+    # Variance between blocks from the excess of Q over its degrees of freedom.
     weight = 1.0 / variances
     total = weight.sum(axis=0)
     q = np.sum(weight * (steps - np.sum(weight * steps, axis=0) / total) ** 2, axis=0)
@@ -233,26 +236,25 @@ def _asked_for(few: Shooting, theta: FloatArray, states: InitialStates, free: Fr
     everything = few.free(list(dict.fromkeys([*free.names, *flexible_names(few.layout, few)])))
     lin = few.linearise(theta, everything, few.linearise(theta, everything, states).stepped())
     h, g = normal_equations(lin, everything, default_prior(few, everything), theta)
-    own = np.arange(len(free.entries))
-    none = bounded_step(free, theta, h[np.ix_(own, own)], g[own])
-    start = float(2.0 * g[own] @ none + none @ h[np.ix_(own, own)] @ none)
-    promises: list[tuple[float, float, str, list[str]]] = []
-    for name, place in _groups(everything, len(own)).items():
-        all_of_it = np.concatenate([own, place])
-        part = Free(tuple(everything.entries[int(i)] for i in all_of_it))
-        z = bounded_step(part, theta, h[np.ix_(all_of_it, all_of_it)], g[all_of_it])
-        drop = start - float(2.0 * g[all_of_it] @ z + z @ h[np.ix_(all_of_it, all_of_it)] @ z)
-        if drop > LEAST_GAIN * max(lin.reduced_chi_square, 1.0):
-            moved = float(np.max(np.abs(z[own] - none)))
-            promises.append((drop, moved, name, [everything.names[int(i)] for i in place]))
+
+    def best(place: list[int]) -> tuple[FloatArray, float]:
+        """Step within bounds with these entries free, and the cost that it leads to less the present one."""
+        at = np.ix_(place, place)
+        z = bounded_step(Free(tuple(everything.entries[i] for i in place)), theta, h[at], g[place])
+        return z, float(2.0 * g[place] @ z + z @ h[at] @ z)
+
+    # Entries of a cause are freed together; rotors are causes by themselves.
+    own = list(range(len(free.entries)))
+    causes: dict[str, list[int]] = {}
+    for i, name in enumerate(everything.names[len(own) :], len(own)):
+        causes.setdefault(name if "loss" in name else name.split(".")[0], []).append(i)
+    none, start = best(own)
+    promises: list[tuple[float, float, str]] = []
+    for name, place in causes.items():
+        z, cost = best([*own, *place])
+        if start - cost > LEAST_GAIN * max(lin.reduced_chi_square, 1.0):
+            promises.append((start - cost, float(np.max(np.abs(z[: len(own)] - none))), name))
     promises.sort(key=lambda p: -p[0])
     rest = sorted((p for p in promises[1:] if p[0] > NEAR_BEST * promises[0][0]), key=lambda p: -p[1])
-    return [(name, names) for _, _, name, names in (*promises[:1], *rest[: MOST_CAUSES - 1])]
-
-
-def _groups(everything: Free, first: int) -> Mapping[str, IndexArray]:
-    """Places of each cause's entries; rotors are causes by themselves."""
-    out: dict[str, list[int]] = {}
-    for i, name in enumerate(everything.names[first:], first):
-        out.setdefault(name if "loss" in name else name.split(".")[0], []).append(i)
-    return {name: np.array(place, dtype=np.intp) for name, place in out.items()}
+    chosen = [name for *_, name in (*promises[:1], *rest[: MOST_CAUSES - 1])]
+    return [(name, [everything.names[i] for i in causes[name]]) for name in chosen]

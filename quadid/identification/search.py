@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 
-from quadid.data.window import Window
-from quadid.errors import NotIdentifiableError
 from quadid.identification.particle_swarm import Stop, Swarm, SwarmOptions
 from quadid.identification.problem import RIDGE, Free, Shooting
 from quadid.model.simd import LANES
 from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray
-from quadid.vehicle import Vehicle
 
 Progress = Callable[[str, float], None]
 
@@ -108,49 +105,3 @@ class Projected:
             flat = flat - np.matmul(basis, np.matmul(basis.transpose(0, 2, 1), flat))
             parts.append(flat.transpose(0, 3, 1, 2).reshape(-1, flat.shape[1] * flat.shape[2])[: len(thetas)])
         return np.concatenate(parts, axis=1)
-
-
-# --- The identification as a plain problem in a box, for general optimisers
-#
-# Coordinates are logarithms of the free parameters.  The residual is that of short segments with their initial states
-# projected out at the start (variable projection), as the swarm sees it; half its sum of squares is the cost.
-
-
-SEGMENTS = 400
-"""Most segments, spread evenly."""
-
-
-class BoxProblem:
-    """Residual and cost of the paper's six parameters on flight data.
-
-    Attributes:
-        lower: bounds of the logarithms, shape (6,).
-        upper: likewise.
-        start: the vehicle file's guess, shape (6,).
-    """
-
-    def __init__(self, windows: Sequence[Window], vehicle: Vehicle) -> None:
-        """Cuts `windows` into short segments, at most about `SEGMENTS` of them.
-
-        Raises:
-            NotIdentifiableError: no stretch is long enough.
-        """
-        shooting = Shooting.cut(windows, vehicle, SWARM_SECONDS)
-        if not shooting.rollouts:
-            raise NotIdentifiableError("no stretch is long enough to be fitted", "1 s without gaps")
-        self._theta, self._free = shooting.layout.initial(vehicle), shooting.free(NOMINAL_NAMES)
-        self._projected = Projected(shooting, self._theta, self._free, SEGMENTS)
-        self.lower, self.upper = np.log(vehicle.bounds).T
-        self.start = np.clip(self._free.scaled(vehicle.initial), self.lower, self.upper)
-
-    def theta(self, point: FloatArray) -> FloatArray:
-        """Full parameter vector of a point, shape (size,)."""
-        return self._free.placed(self._theta, point)
-
-    def residual(self, points: FloatArray) -> FloatArray:
-        """Residuals in standard deviations, shapes (k, 6) -> (k, samples)."""
-        return self._projected.residuals(np.array([self.theta(p) for p in points]))
-
-    def cost(self, points: FloatArray) -> FloatArray:
-        """Half the sum of squared residuals, shapes (k, 6) -> (k,)."""
-        return 0.5 * self._projected.costs(np.array([self.theta(p) for p in points]))

@@ -122,6 +122,7 @@ def variance_ratio(lin: Linearised, covariance: FloatArray) -> tuple[FloatArray,
 
 def score_products(lin: Linearised) -> tuple[FloatArray, int]:
     """Bartlett-weighted (P, P) sum of score products over segments of the same window, and the number of lags used."""
+    # Newey and West: sum over lags l of (1 - l / (L + 1)) (s_t s_t-l' + s_t-l s_t'), s_t the score of segment t.
     step = lin.spacing
     lags = max(int(round(LAG_SECONDS / max(step, 1e-6))), 1)
     scores = lin.grad - lin.grad.mean(axis=0)
@@ -196,8 +197,6 @@ FEWEST_SEGMENTS = 10
 """Segments of the second cut below which it is not made."""
 LEAST_OF_FIRST = 0.9
 """Share of the segments of the first cut that the second must have: many short windows lose more than is gained."""
-ITERATIONS = 8
-"""Linearisations the second cut may take; it begins at the optimum of the first."""
 WORSE = 1.2
 """Cost per row of the second cut over that of the first beyond which it went astray: both see the same data."""
 MOST_COMPARED = 120
@@ -221,7 +220,7 @@ class BothCuts:
     simulated: int
 
 
-def with_second_cut(shooting: Shooting, found: Polished, free: Free, prior: Prior, robust: bool) -> BothCuts | None:
+def with_second_cut(shooting: Shooting, found: Polished, free: Free, prior: Prior) -> BothCuts | None:
     """Fits the second cut from the optimum of the first, and goes where both together fit best.
 
     Args:
@@ -229,7 +228,6 @@ def with_second_cut(shooting: Shooting, found: Polished, free: Free, prior: Prio
         found: its optimum.
         free: parameters to move.
         prior: of those; counts once.
-        robust: down-weight outliers of the second cut too.
 
     Returns:
         None where there are too few segments, where random moments rule, or one of the cuts has no good fit.
@@ -238,13 +236,15 @@ def with_second_cut(shooting: Shooting, found: Polished, free: Free, prior: Prio
     enough = max(FEWEST_SEGMENTS, LEAST_OF_FIRST * shooting.count)
     if second.count < enough or shooting.noise.moments is not None or not np.isfinite(found.cost):
         return None
-    other = polish(second, found.theta, free, prior, iterations=ITERATIONS, robust=robust)
+    other = polish(second, found.theta, free, prior, iterations=8, robust=True)
     if not other.cost * found.lin.total_rows < WORSE * found.cost * other.lin.total_rows:
         return None
+    # Both optima z = 0 and z = away meet where the sum of both quadratics, with the prior once in each, is least.
     precision = np.diag(prior.precision)
     h_one, h_other = found.lin.information, other.lin.information
     away = free.step(found.theta, other.theta)
     step = np.linalg.solve(h_one + h_other + 2.0 * precision, (h_other + precision) @ away)
+    # Godambe information of the mean of both scores.
     h = 0.5 * (h_one + h_other)
     information = _information(h, *_shared(shooting, second, found, other, free))
     return BothCuts(free.move(found.theta, np.asarray(step)), information, other.simulated)
@@ -350,6 +350,7 @@ def with_scale_uncertainty(
     some = spread > 0.0
     if not some.any():
         return theta, unc
+    # Information of the data alone; the logarithms of mass and arm beside the parameters, then eliminated.
     directions = _directions(free, theta)[:, some]
     p = np.diag(prior.precision)
     values, vectors = np.linalg.eigh(np.linalg.inv(unc.covariance) - p)

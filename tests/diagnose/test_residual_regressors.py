@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from quadid.diagnosis import residual_tests as residual_regressors
+from quadid.diagnosis import residual_tests
 from quadid.diagnosis.residual_tests import SITES, Follows, follows, signals, strongest
 from quadid.flight import draw_truth, fly
 from quadid.identification.problem import Columns
@@ -124,9 +124,9 @@ def test_signals_that_double_one_another_change_nothing(monkeypatch: pytest.Monk
     def doubled(part: Columns) -> dict[str, FloatArray]:
         return {f"{name}{again}": s for again in ("", ", again") for name, s in signals(part).items()}
 
-    monkeypatch.setattr(residual_regressors, "signals", doubled)
+    monkeypatch.setattr(residual_tests, "signals", doubled)
     twice = {f.site.name: f.gain.total for f in follows(problem.shooting, problem.nominal)}
     assert twice == pytest.approx(once, rel=0.01)
-    monkeypatch.setattr(residual_regressors, "_RIDGE", 0.0)
+    monkeypatch.setattr(residual_tests, "_RIDGE", 0.0)
     with pytest.raises(np.linalg.LinAlgError):
         follows(problem.shooting, problem.nominal)

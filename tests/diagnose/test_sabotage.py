@@ -7,8 +7,7 @@ from typing import Any
 
 import pytest
 
-from quadid.diagnosis import pipeline
-from quadid.diagnosis import search as selection
+from quadid.diagnosis import pipeline, search
 from quadid.diagnosis.evidence import better
 from quadid.diagnosis.hypotheses import Candidate, candidates
 from tests.diagnose.hidden import answer, of_class, require_named, require_nothing, single
@@ -44,7 +43,7 @@ def inverted(*arguments: Any) -> bool:
 
 
 def test_with_the_decision_inverted_a_hidden_effect_is_not_accepted(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(selection, "better", inverted)
+    monkeypatch.setattr(search, "better", inverted)
     monkeypatch.setattr(pipeline, "candidates", few)
     case = single("motor_lag")
     found, _ = answer(case)
@@ -54,9 +53,9 @@ def test_with_the_decision_inverted_a_hidden_effect_is_not_accepted(monkeypatch:
 
 def test_with_the_decision_inverted_a_null_is_given_causes(monkeypatch: pytest.MonkeyPatch) -> None:
     """Only causes that promise something are refitted; on a null none does, so that check is taken out as well."""
-    monkeypatch.setattr(selection, "better", inverted)
+    monkeypatch.setattr(search, "better", inverted)
     monkeypatch.setattr(pipeline, "candidates", few)
-    monkeypatch.setattr(selection, "worth_a_refit", lambda *_: -1e9)
+    monkeypatch.setattr(search, "worth_a_refit", lambda *_: -1e9)
     monkeypatch.setattr(pipeline, "pruned", lambda shooting, model: model)
     found, _ = answer(of_class("null", 0))
     assert found.findings

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from quadid_evaluation.optimisers.box import PaperBox
 
 from quadid.errors import NotIdentifiableError
 from quadid.identification.controller_gains import Autopilot, find_autopilot
@@ -51,7 +52,7 @@ def test_residual_and_cost_agree_and_missing_samples_do_not_count() -> None:
     assert w.gyro is not None
     gyro = w.gyro.copy()
     gyro[100:200] = np.nan
-    problem = PaperProblem([replace(w, gyro=gyro)], PELICAN, given())
+    problem = PaperBox([replace(w, gyro=gyro)], PELICAN, given())
     points = np.array([problem.start, np.log(values_of(FLIGHT.truth.parameters))])
     residual = problem.residual(points)
     assert np.isfinite(residual).all()

@@ -89,14 +89,6 @@ def test_constriction_coefficient_is_the_published_one() -> None:
     assert SwarmOptions().chi == pytest.approx(0.7298, abs=5e-5)
 
 
-def test_constriction_equals_an_inertia_swarm_with_scaled_coefficients() -> None:
-    chi = SwarmOptions().chi
-    plain = SwarmOptions("inertia", 2.05 * chi, 2.05 * chi, chi, chi, iterations=50, patience=None)
-    a = run(Swarm(*box(3, 10.0), 12, 7, SwarmOptions(iterations=50, patience=None)), rosenbrock)
-    b = run(Swarm(*box(3, 10.0), 12, 7, plain), rosenbrock)
-    np.testing.assert_allclose(a.best, b.best, rtol=1e-6)
-
-
 def algorithm_1(
     cost: Callable[[list[float]], float], lower: list[float], upper: list[float], n: int, iterations: int,
     w: tuple[float, float], c1: float, c2: float, seed: int, batch: bool,
@@ -164,18 +156,6 @@ def test_algorithm_1_line_by_line(seed: int, batch: bool) -> None:
     assert swarm.evaluations == n * (iterations + 1)
 
 
-def test_same_seed_same_swarm_and_other_seed_other_swarm() -> None:
-    def positions(seed: int) -> list[FloatArray]:
-        swarm, seen = Swarm(*box(3, 5.0), 8, seed), []
-        for _ in range(20):
-            seen.append(swarm.ask())
-            swarm.tell(rastrigin(seen[-1]))
-        return seen
-
-    np.testing.assert_array_equal(positions(3), positions(3))
-    assert not np.array_equal(positions(3), positions(4))
-
-
 def test_swarms_side_by_side_do_not_share_randomness() -> None:
     def step(swarm: Swarm) -> FloatArray:
         x = swarm.ask()
@@ -231,10 +211,6 @@ def test_stalls_on_a_plateau_and_runs_out_of_iterations_on_a_slope() -> None:
     assert (plateau.stop, plateau.iteration) == (Stop.STALLED, 7)
     slope = run(Swarm(*box(2, 1.0), 5, 0, SwarmOptions(iterations=9, tolerance=0.0)), sphere)
     assert (slope.stop, slope.iteration, slope.evaluations) == (Stop.BUDGET, 9, 50)
-
-
-def test_stop_members_read_as_sentences() -> None:
-    assert all(len(member.value.split()) > 4 for member in Stop)
 
 
 def test_initial_points_lead_the_first_batch_and_are_never_lost() -> None:

@@ -10,7 +10,7 @@ import pytest
 
 import quadid
 from quadid.data.window import Window
-from quadid.identification.fast_motion import LEAST, undecided
+from quadid.identification.fast_motion import LEAST_COHERENCE, undecided
 from quadid.parameters import Status
 from quadid.types import FloatArray
 from tests.identify.flights import PELICAN
@@ -61,7 +61,7 @@ def test_a_lag_takes_nothing_away() -> None:
 
 @pytest.mark.parametrize("seconds", [0.5, 0.9])
 def test_stretches_too_short_for_a_spectrum_decide_nothing(seconds: float) -> None:
-    assert share_open(window(0.02, seconds=seconds)) == pytest.approx(-np.log(LEAST))
+    assert share_open(window(0.02, seconds=seconds)) == pytest.approx(-np.log(LEAST_COHERENCE))
 
 
 @pytest.mark.parametrize(("name", "sure"), [("random_run3", False), ("chirp_run1", False), ("square_run3", True)])

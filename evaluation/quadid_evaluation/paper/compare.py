@@ -186,8 +186,7 @@ class Judge:
 
     def problem(self, objective: str) -> Problem:
         """The problem that optimisers solve; raises NotIdentifiableError where the data do not hold what it needs."""
-        from quadid.identification.paper_objective import PaperProblem
-        from quadid.identification.search import BoxProblem
+        from quadid_evaluation.optimisers.box import BoxProblem, PaperBox
 
         if objective == "shooting":
             return BoxProblem(self.train, self.vehicle)
@@ -196,7 +195,7 @@ class Judge:
                 "the stabiliser is not known", "references in the log, or gains in the vehicle file",
                 "give `stabiliser: {gains: ...}`, or use --objective shooting",
             )  # fmt: skip
-        return PaperProblem(self.train, self.vehicle, self.autopilot)
+        return PaperBox(self.train, self.vehicle, self.autopilot)
 
     def optimiser(self, method: Tried, lowest: float, problem: Problem) -> JsonDict:
         """One optimiser's entry of the result."""

@@ -31,7 +31,7 @@ SUCCESS = 1.01
 
 
 class Problem(Protocol):
-    """An objective in a box, as every optimiser sees it (`shooting_objective`, `paper_objective`)."""
+    """An objective in a box, as every optimiser sees it (`quadid_evaluation.optimisers.box`)."""
 
     lower: FloatArray
     upper: FloatArray

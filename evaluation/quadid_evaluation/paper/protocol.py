@@ -14,9 +14,10 @@ if TYPE_CHECKING:
     from quadid.diagnosis import Diagnosis
     from quadid.identification.fit import Fit
     from quadid.identification.noise import NoiseModel
-    from quadid.identification.paper_objective import PaperProblem, PaperScore
+    from quadid.identification.paper_objective import PaperScore
     from quadid.types import FloatArray
     from quadid.vehicle import Vehicle
+    from quadid_evaluation.optimisers.box import PaperBox
 
 VEHICLE = "pelican"
 EFFECTS = {
@@ -124,14 +125,14 @@ def reproduce(folder: Path, plan: Plan, seed: int, advance: Advance) -> Reproduc
         advance: told how far it is.
     """
     from quadid.identification.controller_gains import find_autopilot
-    from quadid.identification.paper_objective import PaperProblem
     from quadid.identification.score import mse_score
+    from quadid_evaluation.optimisers.box import PaperBox
 
     flown = fly(folder, plan, seed, advance)
     train, vehicle = flown.sets[0], flown.vehicle
     autopilot = find_autopilot(train, vehicle)
     assert autopilot is not None  # its gains are in the vehicle file
-    problems = [PaperProblem(windows, vehicle, autopilot) for windows in flown.sets]
+    problems = [PaperBox(windows, vehicle, autopilot) for windows in flown.sets]
     columns = _searches(problems[0], plan, seed, advance)
     fit, diagnosis, extended, noise = _own(flown, seed, advance)
     columns |= {"identified": Column(fit.theta, fit.evaluations), "extended": Column(extended)}
@@ -176,7 +177,7 @@ def fly(folder: Path, plan: Plan, seed: int, advance: Advance) -> Protocol:
     return Protocol(vehicle, sets, truth, perfect, logs)
 
 
-def _searches(problem: PaperProblem, plan: Plan, seed: int, advance: Advance) -> dict[str, Column]:
+def _searches(problem: PaperBox, plan: Plan, seed: int, advance: Advance) -> dict[str, Column]:
     """The paper's columns, all on its objective: initial guess, quasi-Newton, its swarm; and the swarm polished."""
     from quadid_evaluation.optimisers.minimise import minimise
 
@@ -199,7 +200,7 @@ def _searches(problem: PaperProblem, plan: Plan, seed: int, advance: Advance) ->
     return columns
 
 
-def algorithm_1(problem: PaperProblem, plan: Plan, seed: int) -> tuple[float, Column]:
+def algorithm_1(problem: PaperBox, plan: Plan, seed: int) -> tuple[float, Column]:
     """One run of the paper's Algorithm 1, the guess among its particles; returns the cost and the column.
 
     As printed (global best, inertia weight, positions clamped to the box), but that the particles of an iteration are

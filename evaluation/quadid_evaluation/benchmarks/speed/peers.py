@@ -11,13 +11,14 @@ import numpy as np
 
 from quadid.identification.particle_swarm import Swarm, SwarmOptions
 from quadid.identification.problem import Shooting
-from quadid.identification.search import SWARM_SECONDS, SWARM_SEGMENTS, BoxProblem, Projected
+from quadid.identification.search import SWARM_SECONDS, SWARM_SEGMENTS, Projected
 from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 from quadid_evaluation.benchmarks.kernel import numpy_moments, numpy_step
 from quadid_evaluation.benchmarks.speed.flights import flight
 from quadid_evaluation.benchmarks.speed.timing import interleaved
+from quadid_evaluation.optimisers.box import BoxProblem
 from quadid_evaluation.optimisers.minimise import minimise
 
 PARTICLES, ITERATIONS = 64, 4

@@ -10,7 +10,7 @@ import pytest
 
 from quadid.data.window import Window
 from quadid.identification import fit as fitting
-from quadid.identification import uncertainty as composite_likelihood
+from quadid.identification import uncertainty
 from quadid.identification.fit import FitOptions, fit
 from quadid.identification.gauss_newton import polish
 from quadid.identification.noise import NoiseModel
@@ -31,7 +31,7 @@ def both(window: Window, start: FloatArray | None = None) -> tuple[BothCuts | No
     free = shooting.free(NOMINAL_NAMES)
     prior = default_prior(shooting, free)
     one = polish(shooting, shooting.layout.initial(PELICAN) if start is None else start, free)
-    return with_second_cut(shooting, one, free, prior, robust=False), one.theta[:6], one.lin.gram.sum(axis=0)
+    return with_second_cut(shooting, one, free, prior), one.theta[:6], one.lin.gram.sum(axis=0)
 
 
 def test_two_cuts_are_nearer_to_the_truth_by_what_their_information_says() -> None:
@@ -71,8 +71,9 @@ def test_the_segments_of_the_second_cut_begin_in_the_middle_of_those_of_the_firs
     free = second.free(NOMINAL_NAMES)
     lin = second.linearise(second.layout.initial(PELICAN), free)
     assert len(lin.cost) == second.count
-    found = with_second_cut(shooting, polish(shooting, second.layout.initial(PELICAN), free), free,
-                            default_prior(shooting, free), robust=True)  # fmt: skip
+    found = with_second_cut(
+        shooting, polish(shooting, second.layout.initial(PELICAN), free), free, default_prior(shooting, free)
+    )
     assert found is not None
     assert np.isfinite(found.information).all()
 
@@ -84,8 +85,8 @@ def test_too_few_segments_or_random_moments_leave_the_result_as_it_is() -> None:
     prior = default_prior(shooting, free)
     found = polish(shooting, shooting.layout.initial(PELICAN), free)
     restless = shooting.with_noise(replace(shooting.noise, moments=(1.0, 1.0, 1.0)))
-    assert with_second_cut(restless, found, free, prior, robust=True) is None
-    assert with_second_cut(shooting, replace(found, cost=np.inf), free, prior, robust=True) is None
+    assert with_second_cut(restless, found, free, prior) is None
+    assert with_second_cut(shooting, replace(found, cost=np.inf), free, prior) is None
 
 
 def test_a_fit_narrows_what_crosses_borders_and_leaves_the_rest(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -127,7 +128,7 @@ def spiked(window: Window, rows: Sequence[int] | IntArray, size: float) -> Windo
 
 
 def test_a_second_cut_that_goes_astray_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(composite_likelihood, "WORSE", 0.5)
+    monkeypatch.setattr(uncertainty, "WORSE", 0.5)
     assert both(with_noise(flown(3, noise_scale=0.0).window, 1))[0] is None
 
 
@@ -138,7 +139,7 @@ def test_many_short_windows_are_cut_once() -> None:
     free = shooting.free(NOMINAL_NAMES)
     found = polish(shooting, shooting.layout.initial(PELICAN), free)
     assert (shooting.count, shooting.between().count) == (48, 24)
-    assert with_second_cut(shooting, found, free, default_prior(shooting, free), robust=True) is None
+    assert with_second_cut(shooting, found, free, default_prior(shooting, free)) is None
 
 
 def test_what_both_cuts_share_is_taken_where_the_flight_tells_most() -> None:
@@ -151,8 +152,8 @@ def test_what_both_cuts_share_is_taken_where_the_flight_tells_most() -> None:
     gains = []
     for most in (60, 10_000):
         with pytest.MonkeyPatch.context() as patched:
-            patched.setattr(composite_likelihood, "MOST_COMPARED", most)
-            found = with_second_cut(shooting, one, free, prior, robust=False)
+            patched.setattr(uncertainty, "MOST_COMPARED", most)
+            found = with_second_cut(shooting, one, free, prior)
         assert found is not None
         gains.append(np.diag(np.linalg.inv(found.information + np.diag(prior.sigma**-2.0))))
     assert np.all(np.abs(np.log(gains[0] / gains[1])) < 0.1)
@@ -161,7 +162,7 @@ def test_what_both_cuts_share_is_taken_where_the_flight_tells_most() -> None:
 def test_what_both_cuts_share_needs_only_some_segments(monkeypatch: pytest.MonkeyPatch) -> None:
     window = with_noise(flown(3, noise_scale=0.0).window, 1)
     whole, _, _ = both(window)
-    monkeypatch.setattr(composite_likelihood, "MOST_COMPARED", 30)
+    monkeypatch.setattr(uncertainty, "MOST_COMPARED", 30)
     some, _, _ = both(window)
     assert whole is not None
     assert some is not None

@@ -1,0 +1,93 @@
+"""The identification, and the paper's objective, as plain problems in a box, for general optimisers.
+
+Coordinates are logarithms of the free parameters.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from quadid.data.window import Window
+from quadid.errors import NotIdentifiableError
+from quadid.identification.controller_gains import Autopilot
+from quadid.identification.paper_objective import PaperProblem
+from quadid.identification.problem import Free, Shooting
+from quadid.identification.search import SWARM_SECONDS, Projected
+from quadid.model.layout import Layout
+from quadid.parameters import NOMINAL_NAMES
+from quadid.types import FloatArray
+from quadid.vehicle import Vehicle
+
+SEGMENTS = 400
+"""Most segments, spread evenly."""
+
+
+class Box:
+    """The paper's six parameters of a vehicle.
+
+    Attributes:
+        lower: bounds of the logarithms, shape (6,).
+        upper: likewise.
+        start: the vehicle file's guess, shape (6,).
+    """
+
+    def __init__(self, vehicle: Vehicle) -> None:
+        layout = Layout(vehicle)
+        self._theta, self._free = layout.initial(vehicle), Free(tuple(layout.entry(n) for n in NOMINAL_NAMES))
+        self.lower, self.upper = np.log(vehicle.bounds).T
+        self.start = np.clip(self._free.scaled(vehicle.initial), self.lower, self.upper)
+
+    def theta(self, point: FloatArray) -> FloatArray:
+        """Full parameter vector of a point, shape (size,)."""
+        return self._free.placed(self._theta, point)
+
+    def thetas(self, points: FloatArray) -> FloatArray:
+        """Full parameter vectors of points, shapes (k, 6) -> (k, size)."""
+        return np.array([self.theta(p) for p in points])
+
+
+class BoxProblem(Box):
+    """Residual and cost on flight data, as the swarm sees them.
+
+    The residual is that of short segments with their initial states projected out at the start (variable projection);
+    half its sum of squares is the cost.
+    """
+
+    def __init__(self, windows: Sequence[Window], vehicle: Vehicle) -> None:
+        """Cuts `windows` into short segments, at most about `SEGMENTS` of them.
+
+        Raises:
+            NotIdentifiableError: no stretch is long enough.
+        """
+        super().__init__(vehicle)
+        shooting = Shooting.cut(windows, vehicle, SWARM_SECONDS)
+        if not shooting.rollouts:
+            raise NotIdentifiableError("no stretch is long enough to be fitted", "1 s without gaps")
+        self._projected = Projected(shooting, self._theta, self._free, SEGMENTS)
+
+    def residual(self, points: FloatArray) -> FloatArray:
+        """Residuals in standard deviations, shapes (k, 6) -> (k, samples)."""
+        return self._projected.residuals(self.thetas(points))
+
+    def cost(self, points: FloatArray) -> FloatArray:
+        """Half the sum of squared residuals, shapes (k, 6) -> (k,)."""
+        return 0.5 * self._projected.costs(self.thetas(points))
+
+
+class PaperBox(Box, PaperProblem):
+    """The paper's objective: mean squared error over the nine outputs of the closed loop, Eq. (13)."""
+
+    def __init__(self, windows: Sequence[Window], vehicle: Vehicle, autopilot: Autopilot) -> None:
+        """Prepares the windows; raises NotIdentifiableError without references."""
+        Box.__init__(self, vehicle)
+        PaperProblem.__init__(self, windows, vehicle, autopilot)
+
+    def residual(self, points: FloatArray) -> FloatArray:
+        """Shapes (k, 6) -> (k, samples); the sum of squares is twice the mean squared error."""
+        return np.asarray(self.errors(self.thetas(points)) * np.sqrt(2.0))
+
+    def cost(self, points: FloatArray) -> FloatArray:
+        """Mean squared errors, shapes (k, 6) -> (k,)."""
+        return self.mse(self.thetas(points))
