@@ -12,7 +12,7 @@ from quadid.data.window import Channel, Recording, Window
 from quadid.errors import ParameterError, QuadidError
 from quadid.flight import sensors
 from quadid.flight.airframe import PUSHES, STATES
-from quadid.flight.loop import Plan, Track, quaternion_of, supply
+from quadid.flight.loop import Plan, Track, quaternion_of, supply, turning_at
 from quadid.flight.march import CRASHED, march
 from quadid.flight.outside import LogRows, Scene, apply_outside, check_outside, distort_log, random_forces
 from quadid.flight.pilot import PILOT_STEP, Pilot, Segment, band_noise, default_gains, scripted, stick_profile
@@ -21,9 +21,6 @@ from quadid.flight.setup import Effects, Setup, TruthParameters, prepare
 from quadid.rotation import continuous_sign
 from quadid.types import FloatArray
 from quadid.vehicle import RandomForces, Vehicle
-
-# --- From what was flown to what a log of it holds, with the truth beside it
-
 
 FULL_BATTERY = 12.4
 """Voltage at the first sample [V]; thrust goes with its square."""
@@ -136,8 +133,13 @@ def _between(rows: FloatArray, at: FloatArray) -> FloatArray:
     return np.asarray((1.0 - part) * rows[low] + part * rows[np.minimum(low + 1, len(rows) - 1)])
 
 
-def _sensor_rows(flown: Flown, rotor: FloatArray) -> LogRows:
+def write_window(flown: Flown, extras: Sequence[str]) -> Window:
+    """Logs the flight: sensors with all their errors, commands, references, and the optional channels asked for."""
+    if unknown := [name for name in extras if name not in EXTRAS]:
+        raise ParameterError(f"unknown optional channel '{unknown[0]}'", ", ".join(EXTRAS))
     plan, setup, track = flown.plan, flown.setup, flown.track
+    rotor = logged_rotors(track, plan, setup.vehicle.command.sampling, setup.reading_delay)
+    # Gyro, accelerometer and attitude at the rows, then what the logging distorts.
     steps = sensors.log_steps(plan)
     at = steps.astype(np.int64) // plan.control_every
     lagged = sensors.attitude_at(track, steps - setup.attitude_delay / plan.dt)
@@ -146,56 +148,27 @@ def _sensor_rows(flown: Flown, rotor: FloatArray) -> LogRows:
     accel = sensors.read_accel(track, plan, setup.on_board, setup.imu_cutoff, steps)
     attitude = sensors.quaternion_multiply(lagged, sensors.quaternion_exp(flown.tilt_noise[at]))
     rows = LogRows(
-        gyro=gyro + flown.gyro_noise[at],
-        accel=accel + flown.noise("accel", flown.sensor.accel, 3),
-        attitude=continuous_sign(attitude),
-        steps=steps,
-        track=track,
-        plan=plan,
-        on_board=setup.on_board,
-        thrust=np.mean((rotor / hover) ** 2, axis=1),
-    )
+        gyro + flown.gyro_noise[at], accel + flown.noise("accel", flown.sensor.accel, 3), continuous_sign(attitude),
+        steps, track, plan, setup.on_board, np.mean((rotor / hover) ** 2, axis=1),
+    )  # fmt: skip
     distort_log(rows, flown.outside, flown.seed)
-    return rows
-
-
-def _extras(flown: Flown, wanted: Sequence[str]) -> dict[str, FloatArray]:
-    for name in wanted:
-        if name not in EXTRAS:
-            raise ParameterError(f"unknown optional channel '{name}'", ", ".join(EXTRAS))
-    progress = np.arange(flown.plan.rows) / (flown.plan.rows - 1)
-    events, t = flown.setup.events, flown.plan.dt * flown.plan.log_every * np.arange(flown.plan.rows)
-    volts = FULL_BATTERY * np.sqrt(np.maximum(0.1, 1.0 - events.sag_fraction * progress))
+    # Velocity, position, and the battery, which falls over the flight and dips with the rotors' power.
+    events, t = setup.events, plan.dt * plan.log_every * np.arange(plan.rows)
+    part = np.arange(plan.rows) / (plan.rows - 1)
+    volts = FULL_BATTERY * np.sqrt(np.maximum(0.1, 1.0 - events.sag_fraction * part))
     if events.supply_exponent != 0.0:
-        hover = flown.setup.body.hover_speed
-        speeds = zip(t, flown.track.rotor, strict=True)
-        volts = FULL_BATTERY * np.array([supply(float(x), omega, hover, events) for x, omega in speeds])
-    felt = flown.track.state[:, 3:6] * flown.setup.velocity_gain
-    clean = {"velocity": felt, "position": flown.track.state[:, 0:3], "battery": volts[:, None]}
-    sigma = {"velocity": flown.sensor.velocity, "position": flown.sensor.position, "battery": flown.sensor.battery}
-    return {name: clean[name] + flown.noise(name, sigma[name], clean[name].shape[1]) for name in wanted}
-
-
-def write_window(flown: Flown, extras: Sequence[str]) -> Window:
-    """Logs the flight: sensors with all their errors, commands, references, and the optional channels asked for."""
-    sampling = flown.setup.vehicle.command.sampling
-    rotor = logged_rotors(flown.track, flown.plan, sampling, flown.setup.reading_delay)
-    rows = _sensor_rows(flown, rotor)
-    optional = _extras(flown, extras)
+        speeds = zip(t, track.rotor, strict=True)
+        volts = FULL_BATTERY * np.array([supply(float(x), w, setup.body.hover_speed, events) for x, w in speeds])
+    velocity, position = track.state[:, 3:6] * setup.velocity_gain, track.state[:, 0:3]
+    clean = {"velocity": velocity, "position": position, "battery": volts[:, None]}
+    optional = {
+        name: clean[name] + flown.noise(name, getattr(flown.sensor, name), clean[name].shape[1]) for name in extras
+    }
     return Window(
-        t0=0.0,
-        dt=flown.plan.log_every * flown.plan.dt,
-        rotor_speed=rotor,
-        gyro=rows.gyro,
-        attitude=rows.attitude,
-        accel=rows.accel,
-        attitude_reference=flown.track.reference,
-        sampling=sampling,
+        0.0, plan.log_every * plan.dt, rotor, rows.gyro, rows.attitude, rows.accel, optional.get("velocity"),
+        optional.get("position"), optional.get("battery"), track.reference, setup.vehicle.command.sampling,
         name=flown.name,
-        velocity=optional.get("velocity"),
-        position=optional.get("position"),
-        battery=optional.get("battery"),
-    )
+    )  # fmt: skip
 
 
 def true_states(flown: Flown) -> Truth:
@@ -233,7 +206,7 @@ def as_recording(window: Window, vehicle: Vehicle) -> Recording:
     return Recording(window.name, "simulated", channels, grid=window.dt)
 
 
-# --- Flies the vehicle and returns what a log of it would hold, with the truth beside it
+# --- The flight
 
 
 LEAD_IN = 5.0
@@ -293,14 +266,6 @@ def _sticks(profile: str, seed: int, plan: Plan, segments: Sequence[Segment] | N
     return sticks
 
 
-def _pilot(setup: Setup, gains: Mapping[str, float], altitude: float) -> tuple[Pilot, float]:
-    trim = setup.truth.hover_speed(len(setup.vehicle.rotors)) + setup.body.dead_speed
-    throttle = (trim / gains["max_speed"]) ** 2
-    if altitude < LOW_FLIGHT:
-        return Pilot(altitude, throttle, climb_hold=4.0, climb_brake=3.5, trim=1.0), trim
-    return Pilot(altitude, throttle), trim
-
-
 def _empty_track(plan: Plan, rotors: int) -> Track:
     k, controls = plan.steps, -(-plan.steps // plan.control_every)
     return Track(
@@ -314,13 +279,6 @@ def _empty_track(plan: Plan, rotors: int) -> Track:
     )
 
 
-def _start(altitude: float) -> FloatArray:
-    y = np.zeros(STATES)
-    y[2] = -altitude
-    y[6] = y[10] = y[14] = 1.0
-    return y
-
-
 def _streams(seed: int) -> dict[str, np.random.Generator]:
     """Independent generators, so that no effect shifts another's noise."""
     names = ("gyro", "attitude", "attitude_slow", "accel", "velocity", "position", "battery", "shake")
@@ -329,24 +287,12 @@ def _streams(seed: int) -> dict[str, np.random.Generator]:
 
 
 def fly(
-    vehicle: Vehicle,
-    truth: TruthParameters | None = None,
-    seconds: float = 120.0,
-    seed: int = 0,
-    profile: str = "excited",
-    *,
-    effects: Effects | None = None,
-    outside: Effects | None = None,
-    noise_scale: float = 1.0,
-    noise: SensorNoise | None = None,
-    log_rate: float = 50.0,
-    command_rate: float | None = None,
-    altitude: float | None = None,
-    gains: Mapping[str, float] | None = None,
-    segments: Sequence[Segment] | None = None,
-    extras: Sequence[str] = (),
-    random: RandomForces | None = None,
-) -> Flight:
+    vehicle: Vehicle, truth: TruthParameters | None = None, seconds: float = 120.0, seed: int = 0,
+    profile: str = "excited", *, effects: Effects | None = None, outside: Effects | None = None,
+    noise_scale: float = 1.0, noise: SensorNoise | None = None, log_rate: float = 50.0,
+    command_rate: float | None = None, altitude: float | None = None, gains: Mapping[str, float] | None = None,
+    segments: Sequence[Segment] | None = None, extras: Sequence[str] = (), random: RandomForces | None = None,
+) -> Flight:  # fmt: skip
     """Flies the closed loop at 1 kHz and logs it.
 
     Args:
@@ -375,6 +321,7 @@ def fly(
     truth = TruthParameters.of(vehicle) if truth is None else truth
     effects, outside = effects or {}, outside or {}
     check_outside(outside)
+    # 1. Clock, noise, and everything the vehicle is made of.
     plan = _clock(seconds, log_rate, log_rate if command_rate is None else command_rate)
     streams, rotors = _streams(seed), len(vehicle.rotors)
     sensor = (noise or SensorNoise()).scaled(noise_scale)
@@ -385,50 +332,37 @@ def fly(
     setup = prepare(vehicle, truth, effects, last, ramp, (sensor.gyro_shake, sensor.accel_shake), mode)
     if gains is None:
         gains = default_gains(vehicle) if vehicle.stabiliser is None else vehicle.stabiliser.gains
+    # 2. The sticks.
     height = altitude if altitude is not None else (0.6 if setup.air.ground_radius != 0.0 else 30.0)
     sticks = _sticks(profile, seed, plan, segments, height)
-    flown = _march(plan, setup, outside, random, gains, height, sticks, sensor, streams, seed)
-    window = write_window(flown, extras)
-    assert window.attitude_reference is not None
-    return Flight(
-        window=window,
-        recording=as_recording(window, vehicle),
-        truth=true_states(flown),
-        references=window.attitude_reference,
-        gains=dict(gains),
-        vehicle=vehicle,
-    )
-
-
-def _march(
-    plan: Plan,
-    setup: Setup,
-    outside: Effects,
-    random: RandomForces | None,
-    gains: Mapping[str, float],
-    altitude: float,
-    sticks: FloatArray,
-    sensor: SensorNoise,
-    streams: Mapping[str, np.random.Generator],
-    seed: int,
-) -> Flown:
+    # 3. Errors of gyro and attitude, delays of commands, what is outside the catalogue.
     controls, step = -(-plan.steps // plan.control_every), plan.control_every * plan.dt
     gyro_noise = sensor.gyro * streams["gyro"].standard_normal((controls, 3))
     white = sensor.attitude * streams["attitude"].standard_normal((controls, 3))
-    slow = coloured(streams["attitude_slow"], controls, sensor.attitude_slow, sensor.attitude_time, step)
+    tilt = white + coloured(streams["attitude_slow"], controls, sensor.attitude_slow, sensor.attitude_time, step)
     arrival = plan.start + step * np.arange(controls, dtype=np.float64) + setup.delay
     scene = Scene(setup, plan, arrival, np.zeros((1, PUSHES)))
     apply_outside(scene, outside, seed)
     if random is not None:
         random_forces(scene, random, np.random.default_rng([seed, 0x4F0C]))
-    pilot, trim = _pilot(setup, gains, altitude)
-    track = _empty_track(plan, len(setup.vehicle.rotors))
+    # 4. The flight, from level rest in hover; near the ground the pilot holds the altitude more firmly.
+    trim = setup.truth.hover_speed(rotors) + setup.body.dead_speed
+    pilot = Pilot(height, (trim / gains["max_speed"]) ** 2)
+    if height < LOW_FLIGHT:
+        pilot = pilot._replace(climb_hold=4.0, climb_brake=3.5, trim=1.0)
+    track = _empty_track(plan, rotors)
+    y = np.zeros(STATES)
+    y[2], y[6], y[10], y[14] = -height, 1.0, 1.0, 1.0
     outcome, end = march(
-        plan, setup.body, setup.air, setup.odd, setup.drive, setup.events, setup.on_board, pilot,
-        pack_gains(gains), mixer_matrix(setup.vehicle, gains), sticks, gyro_noise, white + slow,
-        scene.arrival, scene.pushes, setup.efficiency,
-        _start(altitude), np.full(len(setup.vehicle.rotors), trim), track,
+        plan, setup.body, setup.air, setup.odd, setup.drive, setup.events, setup.on_board, pilot, pack_gains(gains),
+        mixer_matrix(vehicle, gains), sticks, gyro_noise, tilt, scene.arrival, scene.pushes, setup.efficiency, y,
+        turning_at(np.full(rotors, trim), setup.efficiency), track,
     )  # fmt: skip
     if outcome == CRASHED:
         raise FlightError(f"the vehicle crashed at {end:.1f} s", fix="smaller effects, or gains that fit the vehicle")
-    return Flown(plan, setup, outside, track, sensor, streams, gyro_noise, white + slow, seed)
+    # 5. The log of it, and the truth beside.
+    flown = Flown(plan, setup, outside, track, sensor, streams, gyro_noise, tilt, seed)
+    window = write_window(flown, extras)
+    assert window.attitude_reference is not None
+    recording, references = as_recording(window, vehicle), window.attitude_reference
+    return Flight(window, recording, true_states(flown), references, dict(gains), vehicle)

@@ -1,4 +1,4 @@
-"""Clock, sensors and events of the closed loop: what `march` calls on its way through a flight.
+"""Clock, sensors and events of the closed loop, and the way through a step: what `march` calls.
 
 Within one step the order is that of a real autopilot: sensors are read, the stabiliser computes, the command leaves.
 Whatever is logged at an instant is therefore the value just before the command of that instant acts.
@@ -10,9 +10,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from quadid.flight.airframe import Body, orthonormalise
+from quadid.flight.airframe import STATES, Air, Body, Oddity, orthonormalise
 from quadid.flight.jit import kernel
-from quadid.flight.rotors import Drive, load_input, spin_up_kick
+from quadid.flight.rotors import Drive, advance, load_input, spin_up_kick
 from quadid.types import FloatArray
 
 SUPPLY_FALL = 0.15
@@ -223,46 +223,6 @@ def supply(t: float, omega: FloatArray, hover: float, events: Events) -> float:
 
 
 @kernel
-def apply_due(
-    now: float,
-    head: int,
-    issued: int,
-    ramp_end: float,
-    arrival: FloatArray,
-    y: FloatArray,
-    omega: FloatArray,
-    level: FloatArray,
-    slope: FloatArray,
-    memory: FloatArray,
-    changed: int,
-    track: Track,
-    body: Body,
-    drive: Drive,
-    boost: float,
-) -> tuple[int, float]:
-    """Lets every command that has reached the rotors take effect; returns the queue's head and the ramp's end."""
-    if ramp_end <= now + EPSILON:
-        slope[:] = 0.0
-        ramp_end = NO_TIME
-    while head < issued and arrival[head] <= now + EPSILON:
-        before = 0.0
-        for i in range(omega.shape[0]):
-            before += body.spins[i] * omega[i]
-        load_input(drive, track.command[head], boost, level, slope, memory)
-        if drive.ramp > 0.0:
-            ramp_end = arrival[head] + drive.ramp
-        elif drive.tau == 0.0 and drive.slew == 0.0:
-            after = 0.0
-            for i in range(omega.shape[0]):
-                omega[i] = level[i]
-                after += body.spins[i] * omega[i]
-            if body.spin_up != 0.0:
-                spin_up_kick(y, after - before, changed, body)
-        head += 1
-    return head, ramp_end
-
-
-@kernel
 def efficiencies(base: FloatArray, memory: FloatArray, drive: Drive, events: Events, t: float, out: FloatArray) -> None:
     """Writes the factors on thrust and drag torque of every rotor at time t, shape (n, 2)."""
     for i in range(base.shape[0]):
@@ -273,3 +233,126 @@ def efficiencies(base: FloatArray, memory: FloatArray, drive: Drive, events: Eve
             if events.faint_times[k, 0] <= t < events.faint_times[k, 1]:
                 out[events.faint_rotor, 0] *= 1.0 - events.faint_share
                 out[events.faint_rotor, 1] *= 1.0 - events.faint_share
+
+
+class Progress(NamedTuple):
+    """What has happened on the way.
+
+    Attributes:
+        head: first command that has not reached the rotors.
+        ramp_end: when the present ramp of the input ends [s].
+        changed: 0 before, 1 after `mass_change`; dropped: after `thrust_drop`.
+    """
+
+    head: int
+    ramp_end: float
+    changed: int
+    dropped: bool
+
+
+BEGUN = Progress(0, NO_TIME, 0, False)
+
+
+class Turning(NamedTuple):
+    """Rotors on their way, changed in place, and room for a step.
+
+    Attributes:
+        speed: [rad/s], shape (n,); level, slope: present input and its rate.
+        memory: direction of the last change of the input; phase: angle of each rotor [rad].
+        efficiency: present factors on thrust and drag torque, (n, 2).
+        work: scratch, see `advance`.
+    """
+
+    speed: FloatArray
+    level: FloatArray
+    slope: FloatArray
+    memory: FloatArray
+    phase: FloatArray
+    efficiency: FloatArray
+    work: FloatArray
+
+
+def turning_at(speed: FloatArray, efficiency: FloatArray) -> Turning:
+    """Rotors that have turned steadily at `speed` [rad/s], shape (n,)."""
+    n = len(speed)
+    work = np.zeros((5, max(STATES, n)))
+    return Turning(speed, speed.copy(), np.zeros(n), np.zeros(n), np.zeros(n), efficiency.copy(), work)
+
+
+@kernel
+def fly_on(
+    left: float, end: float, issued: int, progress: Progress, commands: FloatArray, arrival: FloatArray,
+    efficiency: FloatArray, push: FloatArray, body: Body, air: Air, odd: Oddity, drive: Drive, events: Events,
+    y: FloatArray, rotors: Turning,
+) -> Progress:  # fmt: skip
+    """Flies from time `left` to `end` [s], cut wherever something jumps: commands, ramps, mass, thrust.
+
+    Args:
+        left: time at the start [s].
+        end: time at the end [s].
+        issued: number of commands given so far.
+        progress: what has happened on the way.
+        commands: (at least issued, n) [rad/s].
+        arrival: when each reaches the rotors [s], non-decreasing.
+        efficiency: factors on thrust and drag torque, shape (n, 2).
+        push: disturbance, see `airframe.derivative`.
+        body: mass and geometry.
+        air: aerodynamics.
+        odd: effects outside the catalogue.
+        drive: from command to rotor speed.
+        events: what happens at some time.
+        y: state, shape (33,); in place.
+        rotors: in place.
+    """
+    head, ramp_end, changed, dropped = progress
+    omega, n, powers = rotors.speed, rotors.speed.shape[0], np.ones(3)
+    while end - left > EPSILON:
+        # What is due takes effect: the end of a ramp, then every command that has reached the rotors.
+        if ramp_end <= left + EPSILON:
+            rotors.slope[:] = 0.0
+            ramp_end = NO_TIME
+        boost = 1.0
+        if events.supply_exponent != 0.0:
+            boost = supply(left, omega, air.hover_sum / n, events) ** events.supply_exponent
+        while head < issued and arrival[head] <= left + EPSILON:
+            before, after = 0.0, 0.0
+            for i in range(n):
+                before += body.spins[i] * omega[i]
+            load_input(drive, commands[head], boost, rotors.level, rotors.slope, rotors.memory)
+            if drive.ramp > 0.0:
+                ramp_end = arrival[head] + drive.ramp
+            elif drive.tau == 0.0 and drive.slew == 0.0:
+                for i in range(n):
+                    omega[i] = rotors.level[i]
+                    after += body.spins[i] * omega[i]
+                if body.spin_up != 0.0:
+                    spin_up_kick(y, after - before, changed, body)
+            head += 1
+        if events.mass_time <= left + EPSILON:
+            changed = 1
+        if events.drop_time <= left + EPSILON:
+            dropped = True
+        # As far as nothing else jumps.
+        stop = min(end, ramp_end)
+        if head < issued:
+            stop = min(stop, arrival[head])
+        if changed == 0:
+            stop = min(stop, events.mass_time)
+        if not dropped:
+            stop = min(stop, events.drop_time)
+        h = end - left if end - stop < EPSILON else stop - left
+        if drive.hysteresis != 0.0 or events.faint_rotor >= 0:
+            efficiencies(efficiency, rotors.memory, drive, events, left, rotors.efficiency)
+        for i in range(3):
+            powers[i] = power_at(left + 0.5 * i * h, dropped, events)
+        for i in range(n):
+            rotors.phase[i] += 0.5 * h * omega[i]
+        mass_factor = 1.0 + events.mass_fraction if changed == 1 else 1.0
+        advance(
+            y, omega, rotors.level, rotors.slope, rotors.efficiency, powers, mass_factor, changed, push, drive, body,
+            air, odd, h, rotors.work,
+        )  # fmt: skip
+        for i in range(n):
+            rotors.phase[i] += 0.5 * h * omega[i]
+        left += h
+    return Progress(head, ramp_end, changed, dropped)

@@ -8,23 +8,21 @@ from quadid.attitude_controller import stabilise
 from quadid.flight.airframe import Air, Body, Oddity
 from quadid.flight.jit import kernel
 from quadid.flight.loop import (
-    EPSILON,
     NO_TIME,
     Events,
     OnBoard,
     Plan,
+    Progress,
     Track,
-    apply_due,
-    efficiencies,
-    power_at,
+    Turning,
+    fly_on,
     pull_attitude,
     quaternion_of,
     shake,
-    supply,
     turned,
-)
+)  # fmt: skip
 from quadid.flight.pilot import Pilot, fly_by_hand
-from quadid.flight.rotors import Drive, advance
+from quadid.flight.rotors import Drive
 from quadid.types import FloatArray
 
 FLEW, CRASHED = 0, 1
@@ -39,26 +37,10 @@ def copy_into(values: FloatArray, out: FloatArray) -> None:
 
 @kernel
 def march(
-    plan: Plan,
-    body: Body,
-    air: Air,
-    odd: Oddity,
-    drive: Drive,
-    events: Events,
-    on_board: OnBoard,
-    pilot: Pilot,
-    gains: FloatArray,
-    mixer: FloatArray,
-    sticks: FloatArray,
-    gyro_noise: FloatArray,
-    tilt_noise: FloatArray,
-    arrival: FloatArray,
-    pushes: FloatArray,
-    efficiency: FloatArray,
-    y: FloatArray,
-    omega: FloatArray,
-    track: Track,
-) -> tuple[int, float]:
+    plan: Plan, body: Body, air: Air, odd: Oddity, drive: Drive, events: Events, on_board: OnBoard, pilot: Pilot,
+    gains: FloatArray, mixer: FloatArray, sticks: FloatArray, gyro_noise: FloatArray, tilt_noise: FloatArray,
+    arrival: FloatArray, pushes: FloatArray, efficiency: FloatArray, y: FloatArray, rotors: Turning, track: Track,
+) -> tuple[int, float]:  # fmt: skip
     """Flies the closed loop.
 
     Args:
@@ -79,27 +61,21 @@ def march(
         pushes: disturbance, see `airframe.derivative`: shape (1, 9) for a constant one, or one row a step.
         efficiency: factors on thrust and drag torque, shape (rotors, 2).
         y: state at the start, shape (33,); in place.
-        omega: rotor speeds at the start [rad/s]; in place.
+        rotors: at the start; in place.
         track: written.
 
     Returns:
         `FLEW` or `CRASHED` (hit the ground, overturned or diverged), and the time of the end [s].
     """
-    rotors = omega.shape[0]
-    dt = plan.dt
-    level, slope = omega.copy(), np.zeros(rotors)
-    memory, phase, integral, trim = np.zeros(rotors), np.zeros(rotors), np.zeros(3), np.zeros(3)
+    dt, hover = plan.dt, air.hover_sum / rotors.speed.shape[0]
+    integral, trim = np.zeros(3), np.zeros(3)
     reference, measured = np.zeros(4), np.zeros(3)
-    present = efficiency.copy()
     error = np.zeros(9)
     error[0] = error[4] = error[8] = 1.0
     truth, ahrs, seen = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3))
-    force, shaken, powers = np.zeros(3), np.zeros(3), np.ones(3)
-    work = np.zeros((5, max(33, rotors)))
-    hover, trembling = air.hover_sum / rotors, np.zeros(6)
+    force, shaken, trembling = np.zeros(3), np.zeros(3), np.zeros(6)
     shaking = on_board.gyro_shake > 0.0 or on_board.accel_shake > 0.0
-    dropped, changed, head, issued, ramp_end, row = False, 0, 0, 0, NO_TIME, 0
-    mass_factor = 1.0
+    progress, issued, row = Progress(0, NO_TIME, 0, False), 0, 0
 
     for n in range(plan.steps):
         now = plan.start + n * dt
@@ -139,7 +115,7 @@ def march(
         if row < plan.rows and n == plan.first_log + row * plan.log_every:
             copy_into(y, track.state[row])
             copy_into(reference, track.reference[row])
-            copy_into(omega, track.rotor[row])
+            copy_into(rotors.speed, track.rotor[row])
             row += 1
         if n % plan.control_every == 0:
             c = n // plan.control_every
@@ -151,42 +127,14 @@ def march(
             stabilise(gains, mixer, reference, seen, measured, plan.control_every * dt, integral, track.command[c])
             issued = c + 1
 
-        # --- the step, cut wherever something jumps
-        left, end = now, now + dt
+        # --- the step
         push = pushes[min(n, pushes.shape[0] - 1)]
-        while end - left > EPSILON:
-            boost = 1.0
-            if events.supply_exponent != 0.0:
-                boost = supply(left, omega, hover, events) ** events.supply_exponent
-            head, ramp_end = apply_due(
-                left, head, issued, ramp_end, arrival, y, omega, level, slope, memory, changed, track, body, drive,
-                boost,
-            )  # fmt: skip
-            if changed == 0 and events.mass_time <= left + EPSILON:
-                changed, mass_factor = 1, 1.0 + events.mass_fraction
-            if events.drop_time <= left + EPSILON:
-                dropped = True
-            stop = min(end, ramp_end)
-            if head < issued:
-                stop = min(stop, arrival[head])
-            if changed == 0:
-                stop = min(stop, events.mass_time)
-            if not dropped:
-                stop = min(stop, events.drop_time)
-            h = end - left if end - stop < EPSILON else stop - left
-            if drive.hysteresis != 0.0 or events.faint_rotor >= 0:
-                efficiencies(efficiency, memory, drive, events, left, present)
-            powers[0] = power_at(left, dropped, events)
-            powers[1] = power_at(left + 0.5 * h, dropped, events)
-            powers[2] = power_at(left + h, dropped, events)
-            for i in range(rotors):
-                phase[i] += 0.5 * h * omega[i]
-            advance(y, omega, level, slope, present, powers, mass_factor, changed, push, drive, body, air, odd, h, work)
-            for i in range(rotors):
-                phase[i] += 0.5 * h * omega[i]
-            left += h
+        progress = fly_on(
+            now, now + dt, issued, progress, track.command, arrival, efficiency, push, body, air, odd, drive, events,
+            y, rotors,
+        )  # fmt: skip
         if shaking:
-            shake(phase, omega, on_board.shake_mode, hover, trembling)
+            shake(rotors.phase, rotors.speed, on_board.shake_mode, hover, trembling)
             for axis in range(3):
                 shaken[axis] += dt * on_board.accel_shake * trembling[3 + axis]
     return FLEW, plan.start + plan.steps * dt

@@ -132,22 +132,10 @@ def spin_up_torque(
 
 @kernel
 def advance(
-    y: FloatArray,
-    omega: FloatArray,
-    level: FloatArray,
-    slope: FloatArray,
-    efficiency: FloatArray,
-    powers: FloatArray,
-    mass_factor: float,
-    changed: int,
-    push: FloatArray,
-    drive: Drive,
-    body: Body,
-    air: Air,
-    odd: Oddity,
-    h: float,
+    y: FloatArray, omega: FloatArray, level: FloatArray, slope: FloatArray, efficiency: FloatArray, powers: FloatArray,
+    mass_factor: float, changed: int, push: FloatArray, drive: Drive, body: Body, air: Air, odd: Oddity, h: float,
     work: FloatArray,
-) -> None:
+) -> None:  # fmt: skip
     """Moves the vehicle by h with the classical Runge-Kutta scheme of order four; the input has no jump inside.
 
     Args:

@@ -6,8 +6,7 @@ import numpy as np
 
 from quadid.errors import ParameterError
 from quadid.flight.airframe import PUSHES, STATES, Oddity
-from quadid.flight.loop import EPSILON, NO_TIME, Track, apply_due, power_at, quaternion_of, supply
-from quadid.flight.rotors import advance
+from quadid.flight.loop import BEGUN, EPSILON, fly_on, quaternion_of, turning_at
 from quadid.flight.setup import Effects, TruthParameters, prepare
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
@@ -47,9 +46,8 @@ class SteppedFlight:
         speed = base.hover_speed(len(vehicle.rotors)) + self._setup.body.dead_speed
         self.rotor_speed: FloatArray = np.full(len(vehicle.rotors), speed)
         self.time = 0.0
-        self._level, self._slope = self.rotor_speed.copy(), np.zeros_like(self.rotor_speed)
-        self._waiting: list[tuple[float, FloatArray]] = []
-        self._changed, self._dropped, self._mass = 0, False, 1.0
+        self._rotors, self._progress = turning_at(self.rotor_speed, self._setup.efficiency), BEGUN
+        self._arrival, self._commands = np.zeros(0), np.zeros((0, len(vehicle.rotors)))
 
     @property
     def position(self) -> FloatArray:
@@ -93,32 +91,15 @@ class SteppedFlight:
             raise ParameterError(
                 f"command {given} for {dt} s", f"{len(self.rotor_speed)} finite rotor speeds, a positive time"
             )
-        self._waiting.append((self.time + self._setup.delay, given))
-        end = self.time + dt
+        self._arrival = np.append(self._arrival, self.time + self._setup.delay)
+        self._commands = np.concatenate([self._commands, given[None]])
+        end, s = self.time + dt, self._setup
         while end - self.time > EPSILON:
-            self._piece(end)
-
-    def _piece(self, end: float) -> None:
-        """One step that no event cuts."""
-        s, now = self._setup, self.time
-        boost = supply(now, self.rotor_speed, s.body.hover_speed, s.events) ** s.events.supply_exponent
-        while self._waiting and self._waiting[0][0] <= now + EPSILON:
-            _, goal = self._waiting.pop(0)
-            none = np.empty((0, 0))
-            due = Track(none, none, none, goal[None], none, none, none)
-            apply_due(
-                now, 0, 1, NO_TIME, np.zeros(1), self._y, self.rotor_speed, self._level, self._slope,
-                np.zeros_like(goal), self._changed, due, s.body, s.drive, boost,
+            stop = min(end, self.time + LONGEST_STEP)
+            progress = fly_on(
+                self.time, stop, len(self._arrival), self._progress, self._commands, self._arrival, s.efficiency,
+                np.zeros(PUSHES), s.body, s.air, Oddity(), s.drive, s.events, self._y, self._rotors,
             )  # fmt: skip
-        if self._changed == 0 and s.events.mass_time <= now + EPSILON:
-            self._changed, self._mass = 1, 1.0 + s.events.mass_fraction
-        self._dropped |= s.events.drop_time <= now + EPSILON
-        cuts = [end, now + LONGEST_STEP, *(at for at, _ in self._waiting[:1])]
-        cuts += [s.events.mass_time] * (self._changed == 0) + [s.events.drop_time] * (not self._dropped)
-        h = min(cuts) - now
-        powers = np.array([power_at(now + share * h, self._dropped, s.events) for share in (0.0, 0.5, 1.0)])
-        advance(
-            self._y, self.rotor_speed, self._level, self._slope, s.efficiency, powers, self._mass, self._changed,
-            np.zeros(PUSHES), s.drive, s.body, s.air, Oddity(), h, np.zeros((5, max(STATES, len(self.rotor_speed)))),
-        )  # fmt: skip
-        self.time = now + h
+            # Commands that act already are forgotten.
+            self._arrival, self._commands = self._arrival[progress.head :], self._commands[progress.head :]
+            self._progress, self.time = progress._replace(head=0), stop

@@ -26,7 +26,7 @@ def test_the_commands_of_a_flight_give_that_flight(effects: dict[str, dict[str, 
     again._y[6:15] = Rotation.from_quat(truth.quaternion[first], scalar_first=True).as_matrix().ravel()
     again.rotor_speed[:] = truth.rotor_speed[first]
     rows = flown.window.rotor_speed
-    again._level[:] = rows[first - 1]
+    again._rotors.level[:] = rows[first - 1]
     for k in range(first, 100):
         again.step(rows[k], 0.02)
     np.testing.assert_allclose(again.velocity, truth.velocity[100], atol=1e-9)
