@@ -82,16 +82,14 @@ def search(
     Raises:
         ParameterError: another search with `names` to free.
     """
-    from quadid.identification.fit import FitOptions, fit, fit_at
+    from quadid.identification.fit import FitOptions, final_answer, fit
 
     if name == OPTIMIZERS[0]:
         return fit(windows, vehicle, FitOptions(seed=seed), names, advance, out_of_reach)
     if names is not None:
         raise ParameterError(f"free or fix with {name}, which fits the six", OPTIMIZERS[0], "leave optimizer out")
 
-    from quadid_evaluation.optimisers.box import BoxProblem
-
-    from quadid.identification.fit import final_answer
+    from quadid_evaluation.optimisers.box import BoxProblem, fit_at
 
     standard = fit(windows, vehicle, FitOptions(seed=seed), progress=lambda stage, share: advance("noise", share))
     advance(name, 0.0)

@@ -1,7 +1,4 @@
-"""Identification from first guess to parameters with intervals: swarm, polish, noise, covariance.
-
-`fit_at` estimates intervals of the parameters where some other search ended.
-"""
+"""Identification from first guess to parameters with intervals: swarm, polish, noise, covariance."""
 
 from __future__ import annotations
 
@@ -19,9 +16,8 @@ from quadid.identification.gauss_newton import Convergence, Polished, polish
 from quadid.identification.noise import NoiseModel
 from quadid.identification.noise_fit import FAR_ITERATIONS, flexible_fit, reweighted_fit, with_memory
 from quadid.identification.particle_swarm import SwarmOptions
-from quadid.identification.problem import Free, Prior, Shooting, default_prior, posterior_covariance
+from quadid.identification.problem import Free, Prior, Shooting, default_prior
 from quadid.identification.reliability import reliability
-from quadid.identification.score import settle_states
 from quadid.identification.search import SWARM_SECONDS, Progress, swarm_search
 from quadid.identification.uncertainty import (
     SPREAD_LIMIT,
@@ -390,33 +386,3 @@ def _warnings(found: Fit) -> tuple[str, ...]:
             + "; quadid diagnose names the cause"
         )  # fmt: skip
     return tuple(out)
-
-
-def fit_at(
-    windows: Sequence[Window], vehicle: Vehicle, theta: FloatArray, noise: NoiseModel, evaluations: int, how: str
-) -> Fit:
-    """Wraps a parameter vector as a fit: intervals and status at `theta`, which need not be an optimum.
-
-    Args:
-        windows: training data.
-        vehicle: as given.
-        theta: full parameter vector, shape (size,).
-        noise: sensor noise.
-        evaluations: parameter vectors that the search simulated.
-        how: sentence on how it ended.
-    """
-    shooting = Shooting.cut(windows, vehicle, FIT_SECONDS, noise)
-    free = shooting.free(NOMINAL_NAMES)
-    lin = shooting.linearise(theta, free, settle_states(shooting, theta).states)
-    prior = default_prior(shooting, free)
-    unc = uncertainty(lin, prior)
-    parameters = parameter_set(free, theta, shooting.layout.initial(vehicle), unc)
-    step = posterior_covariance(lin.information, prior) @ lin.gradient
-    warnings = []
-    far = [n for n, z, s in zip(free.names, np.abs(step), unc.sigma, strict=True) if z > s]
-    if far:
-        warnings.append(
-            f"the search ended ({how}), but over whole seconds the data would still move {', '.join(far)}; "
-            "optimizer pso_polish goes all the way"
-        )
-    return Fit(vehicle, theta, parameters, noise, unc, Convergence.BUDGET, evaluations, tuple(warnings))

@@ -12,9 +12,14 @@ import numpy as np
 from quadid.data.window import Window
 from quadid.errors import NotIdentifiableError
 from quadid.identification.controller_gains import Autopilot
+from quadid.identification.fit import FIT_SECONDS, Fit
+from quadid.identification.gauss_newton import Convergence
+from quadid.identification.noise import NoiseModel
 from quadid.identification.paper_objective import PaperProblem
-from quadid.identification.problem import Free, Shooting
+from quadid.identification.problem import Free, Shooting, default_prior, posterior_covariance
+from quadid.identification.score import settle_states
 from quadid.identification.search import SWARM_SECONDS, Projected
+from quadid.identification.uncertainty import parameter_set, uncertainty
 from quadid.model.layout import Layout
 from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray
@@ -91,3 +96,33 @@ class PaperBox(Box, PaperProblem):
     def cost(self, points: FloatArray) -> FloatArray:
         """Mean squared errors, shapes (k, 6) -> (k,)."""
         return self.mse(self.thetas(points))
+
+
+def fit_at(
+    windows: Sequence[Window], vehicle: Vehicle, theta: FloatArray, noise: NoiseModel, evaluations: int, how: str
+) -> Fit:
+    """Wraps a parameter vector as a fit: intervals and status at `theta`, which need not be an optimum.
+
+    Args:
+        windows: training data.
+        vehicle: as given.
+        theta: full parameter vector, shape (size,).
+        noise: sensor noise.
+        evaluations: parameter vectors that the search simulated.
+        how: sentence on how it ended.
+    """
+    shooting = Shooting.cut(windows, vehicle, FIT_SECONDS, noise)
+    free = shooting.free(NOMINAL_NAMES)
+    lin = shooting.linearise(theta, free, settle_states(shooting, theta).states)
+    prior = default_prior(shooting, free)
+    unc = uncertainty(lin, prior)
+    parameters = parameter_set(free, theta, shooting.layout.initial(vehicle), unc)
+    step = posterior_covariance(lin.information, prior) @ lin.gradient
+    warnings = []
+    far = [n for n, z, s in zip(free.names, np.abs(step), unc.sigma, strict=True) if z > s]
+    if far:
+        warnings.append(
+            f"the search ended ({how}), but over whole seconds the data would still move {', '.join(far)}; "
+            "optimizer pso_polish goes all the way"
+        )
+    return Fit(vehicle, theta, parameters, noise, unc, Convergence.BUDGET, evaluations, tuple(warnings))
