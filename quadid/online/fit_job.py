@@ -47,13 +47,8 @@ FIT_SECONDS = 1.66
 What happens across their borders is lost with the free states there.  The time between refits is no multiple of it, so
 windows that overlap have their borders at different places, and fused they see nearly all.
 """
-SEARCH = SwarmOptions(iterations=40)
-PARTICLES = 48
-"""Swarm of the first fit: six parameters, a factor of 4 each way."""
 EXCITED = 0.02
 """A window is excited when roll and pitch inertia can be had from it alone to this relative standard deviation."""
-TIGHTEST = 0.2
-"""Smallest standard deviation (log scale) that a vehicle file's own may have as a prior online."""
 FLEXIBLE_SECONDS = 0.5
 """Length of the segments where effects are fitted along [s]."""
 EFFECT_WIDTH = 3.0
@@ -71,9 +66,6 @@ ROOM = 16.0
 
 What the nominal model made of a flight that it misses is no better guess: it may be wrong by as much.
 """
-MOVING = ("command", "rotor", "air", "body")
-"""Places of effects that move the vehicle; of sensors only what shifts their time is fitted along:"""
-TIMING = ("imu_lag", "attitude_delay")
 FEWEST_SEGMENTS = 5
 """Fewer segments do not give the noise well enough to say what is more than noise."""
 BEYOND = 2.0
@@ -262,11 +254,12 @@ def _is_estimate(estimate: WindowEstimate, vehicle: Vehicle, start: float, stop:
     return bool(values[0] >= -1e-9 * max(values[-1], 1.0))
 
 
-# --- The algorithm
+# --- The fit: segments, search, optimum, what the six leave out, what they lack
 
 
 def fit(request: FitRequest) -> FitReply:
     """Fits the nominal six to a window, and with effects where these are asked for or lacking."""
+    # 1. Segments of the window, and what the motion in them reveals, around the best estimate at hand.
     theta, noise = request.theta, request.noise
     shooting = Shooting.cut(request.windows, request.vehicle, FIT_SECONDS, noise)
     if shooting.count == 0:
@@ -282,6 +275,7 @@ def fit(request: FitRequest) -> FitReply:
         return FitReply(request.number, excitation=bounds)
     if request.flexible:
         return _flexible(request, theta if noise is not None else _search(request)[0], None if spoilt else noise)
+    # 2. Where nothing is known yet: global search, and the sensors' noise.
     sensor = None
     if request.search or noise is None or spoilt:
         theta, sensor = _search(replace(request, noise=None) if spoilt else request)
@@ -290,11 +284,12 @@ def fit(request: FitRequest) -> FitReply:
         shooting = shooting.with_noise(noise)
         if spoilt and not is_excited(bounds := bounds_of(shooting.linearise(theta, free).information)):
             return FitReply(request.number, excitation=bounds)
+    # 3. The optimum.
     result = _polish(shooting, theta, free)
     if not np.isfinite(result.cost):
         return FitReply(request.number, problem="the simulation diverges at every point tried", excitation=bounds)
     lin = result.lin
-    # The thrust that the six leave out, a thrust curve freed beside them.
+    # 4. Thrust that the six leave out, a thrust curve freed beside them.
     curved = shooting.free([*NOMINAL_NAMES, "thrust_curve.dead_speed"])
     prior = flexible_prior(prior_of(shooting.vehicle), curved, shooting)
     bent = polish(shooting, result.theta, curved, prior, result.states, iterations=3)
@@ -302,6 +297,7 @@ def fit(request: FitRequest) -> FitReply:
         request.start, request.stop, free.scaled(result.theta[free.index]), lin.information, lin.gradient,
         lin.total_cost, lin.total_rows, left_out(Flexible(shooting, curved, prior, bent)),
     )  # fmt: skip
+    # 5. Now and then: the noise that this window shows, and whether effects would explain what the six leave.
     measured = None
     if request.measure:
         measured = residual_noise(shooting, result)
@@ -337,9 +333,9 @@ def _flexible(request: FitRequest, theta: FloatArray, noise: NoiseModel | None) 
 
 
 def prior_of(vehicle: Vehicle) -> Prior:
-    """Prior of the nominal six: the vehicle file's, but not tighter than `TIGHTEST`; it knows other flights."""
+    """Prior of the nominal six: the vehicle file's, but no tighter than 20 %, as the file knows other flights only."""
     given = [vehicle.parameters[name] for name in NOMINAL_NAMES]
-    return Prior(vehicle.initial, np.array([min(max(p.log_sigma, TIGHTEST), p.log_halfwidth) for p in given]))
+    return Prior(vehicle.initial, np.array([min(max(p.log_sigma, 0.2), p.log_halfwidth) for p in given]))
 
 
 def is_excited(bounds: FloatArray) -> bool:
@@ -362,7 +358,9 @@ def _search(request: FitRequest) -> tuple[FloatArray, NoiseModel]:
     """Global search and sensor noise from short segments, all structure counted as noise."""
     short = Shooting.cut(request.windows, request.vehicle, SWARM_SECONDS, request.noise)
     free = short.free(NOMINAL_NAMES)
-    theta, _ = swarm_search(short, request.theta, free, SEARCH, PARTICLES, request.seed, lambda stage, share: None)
+    # 48 particles find six parameters that are known to a factor of 4 each way.
+    swarm = SwarmOptions(iterations=40)
+    theta, _ = swarm_search(short, request.theta, free, swarm, 48, request.seed, lambda stage, share: None)
     short, result = reweighted_fit(short, theta, free, iterations=8)
     return result.theta, residual_noise(short, result)
 
@@ -412,7 +410,9 @@ def moving_names(problem: Shooting) -> list[str]:
     known |= {n for n in ("velocity", "battery") if all(getattr(w, n) is not None for w in windows)}
     out = list(NOMINAL_NAMES)
     for effect in EFFECTS.values():
-        moves = (effect.acts in MOVING and not effect.per_log) or effect.name in TIMING
+        # Of sensors only what shifts their time is fitted along.
+        moves = effect.acts in ("command", "rotor", "air", "body") and not effect.per_log
+        moves = moves or effect.name in ("imu_lag", "attitude_delay")
         seen = known.issuperset(effect.needs) and (effect.flexible != "with_velocity" or problem.has_velocity)
         if moves and seen and effect.name != "weak_rotor":
             out += (*effect.entries, *effect.refinements)
