@@ -620,18 +620,35 @@ def _quantum(values: FloatArray) -> float:
     return 0.0 if not len(steps) or len(steps) > 0.2 * len(values) else float(np.min(steps))
 
 
+def _turn_quantum(q: FloatArray) -> float:
+    """Step of rounded quaternions, shape (n, 4), [rad]; 0 for others.
+
+    Their components are to each other as small whole numbers, also where they were made unit again.
+    """
+    q = q[np.all(q != 0.0, axis=1)]
+    q = q[:: len(q) // 500 + 1]
+    if len(q) < FEWEST_SAMPLES:
+        return 0.0
+    largest = np.max(np.abs(q), axis=1)
+    whole = np.arange(1.0, 400.0)
+    ratios = whole[:, None, None] * (q / largest[:, None])
+    found = np.all(np.abs(ratios - np.rint(ratios)) < 1e-4, axis=2)
+    rounded = found.any(axis=0)
+    return float(2.0 * np.median(largest / whole[found.argmax(axis=0)])) if rounded.mean() > 0.9 else 0.0
+
+
 def attitude_steps_check(recording: Recording) -> Check | None:
-    """A warning where roll, pitch and heading come in steps that are coarse beside usual noise; None for fine ones."""
+    """A warning where angles or quaternions come in steps that are coarse beside usual noise; None for fine ones."""
     attitude = recording.channels.get("attitude")
     if attitude is None or len(attitude.t) < FEWEST_SAMPLES:
         return None
-    step = min(_quantum(column) for column in euler(attitude.values)[:, :2].T)
+    step = max(min(_quantum(c) for c in euler(attitude.values)[:, :2].T), _turn_quantum(attitude.values))
     if step < 0.005:
         return None
     return Check(
         "attitude_steps", CheckResult.WARNING,
         f"attitude comes in steps of {np.degrees(step):.2g} deg ({attitude.source})",
-        "log it with more digits, as quaternion", {"step_rad": step},
+        "log it with more digits", {"step_rad": step},
     )  # fmt: skip
 
 

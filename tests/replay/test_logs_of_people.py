@@ -15,6 +15,7 @@ from quadid_replay.vehicle_from_log import vehicle_text
 import quadid
 from quadid.app.logs import LogPart, check_conventions
 from quadid.checks import Check, CheckResult, inspect
+from quadid.checks.motion import attitude_steps_check
 from quadid.data.window import Channel, Recording
 from quadid.errors import LogError
 from quadid.types import FloatArray
@@ -247,6 +248,18 @@ def test_a_gyro_of_a_few_readings_a_second_is_not_compared_with_the_attitude(fli
     gyro = flight.channels["gyro"]
     slow = replace(flight, channels={**flight.channels, "gyro": Channel("gyro", gyro.t[::12], gyro.values[::12])})
     assert "too slow to compare" in verdict(slow, "gyro_attitude").message
+
+
+@pytest.mark.parametrize(("digits", "said"), [(0.02, "2.3 deg"), (0.01, "1.1 deg"), (0.005, "0.57 deg"), (0.001, "")])
+@pytest.mark.parametrize("single", [False, True])
+def test_rounded_quaternions_are_named_as_such(flight: Recording, digits: float, said: str, single: bool) -> None:
+    """Only angles were: quaternions that are made unit again lie on no lattice of angles."""
+    q = np.round(flight.channels["attitude"].values / digits) * digits
+    q = q.astype(np.float32).astype(np.float64) if single else q
+    made = with_channel(flight, "attitude", q / np.linalg.norm(q, axis=1, keepdims=True))
+    found = attitude_steps_check(made)
+    assert said in found.message if found is not None else said == ""
+    assert "attitude_steps" not in names(flight)
 
 
 def test_a_second_of_flight_is_not_usable_as_identify_refuses_it(flight: Recording, tmp_path: Path) -> None:
