@@ -16,7 +16,6 @@ from quadid.app.outcome import LIBRARY, Reported, provenance
 from quadid.app.score import HORIZONS, ahead
 from quadid.chi_square import Z95
 from quadid.errors import LogError
-from quadid.identification.predict import QUANTITIES, start_errors
 from quadid.parameters import NOMINAL_UNITS
 from quadid.report.page import axis, figure, level, section, trace
 from quadid.report.tables import Column, TextTable, number
@@ -160,6 +159,8 @@ def compare_vehicles(
         ParameterError: horizons that are no positive numbers.
         VehicleError: no such vehicle.
     """
+    from quadid.identification.predict import QUANTITIES, start_errors
+
     if not listed(on):
         raise LogError("no log", "at least one flight", "name flights with --on")
     pair = [as_vehicle(v) for v in (a, b)]

@@ -7,15 +7,16 @@ import os
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from quadid.app.logs import Log, LogPart, check_conventions, on_grid, open_recording, parse_part, require_gyro
-from quadid.condition import FlightTrim, assess
-from quadid.condition.trim import flight_from_dict, flight_to_dict, flight_trim
 from quadid.data.window import Recording
 from quadid.errors import LogError, NotIdentifiableError, QuadidError
 from quadid.sanitise import one_line
 from quadid.vehicle import Vehicle
+
+if TYPE_CHECKING:
+    from quadid.condition import FlightTrim
 
 # --- What is done to one log of a fleet, wherever a worker runs: plain data in, plain data out, never an exception
 
@@ -99,6 +100,8 @@ def _opened(job: Job, cut: LogPart) -> tuple[Vehicle, Recording]:
 
 def _seen(recording: Recording, vehicle: Vehicle, doubts: Sequence[str]) -> Row:
     """What a flight shows whether or not anything can be fitted to it; its trim where it flew steadily."""
+    from quadid.condition.trim import flight_to_dict, flight_trim
+
     row: Row = {
         "vehicle": vehicle.name,
         "sha256": recording.sha256,
@@ -174,6 +177,8 @@ def health_trend(
         others, score, verdict, baseline_lacking, unfamiliar, p_value and changes as in ``quadid.health/1``; none for
         vehicles with too few flights.
     """
+    from quadid.condition.trim import flight_from_dict
+
     flown = {row["log"]: flight_from_dict(json.loads(row["trim"])) for row in trims}
     by_unit: dict[str, list[HealthRow]] = {}
     for log in sorted(logs, key=lambda row: (float(row["started"]), row["name"])):
@@ -190,6 +195,8 @@ def health_trend(
 def _trend(
     vehicle: Vehicle, unit: str, logs: Sequence[HealthRow], flown: Mapping[str, FlightTrim], count: int
 ) -> list[dict[str, Any]]:
+    from quadid.condition.changes import assess
+
     baseline = [flown[log["name"]] for log in logs[:count]]
     rows: list[dict[str, Any]] = []
     for k, log in enumerate(logs):

@@ -16,7 +16,6 @@ from quadid.app.options import Horizons, Logs, OfVehicle, OwnRate
 from quadid.app.outcome import LIBRARY, Reported, provenance
 from quadid.data.window import Window, beginning
 from quadid.errors import NotIdentifiableError, ParameterError
-from quadid.identification.predict import QUANTITIES
 from quadid.model.layout import Layout
 from quadid.report.page import figure, section, stacked, trace
 from quadid.report.tables import Cell, Column, TextTable, number
@@ -66,8 +65,9 @@ class Scored(Reported):
         """One page: errors over the horizon beside sensor noise and beside predicting no change, and the bands."""
         result, (errors, inside) = self.result, self.tables()
         steps = [int(h) for h in result["horizons"]]
-        known = [n for n in QUANTITIES if any(errors[n] is not None for errors in result["horizons"].values())]
-        places, layout = stacked([(f"{n} [{QUANTITIES[n]}]", {"type": "log"}) for n in known], "samples ahead")
+        units = result["units"]
+        known = [n for n in units if any(errors[n] is not None for errors in result["horizons"].values())]
+        places, layout = stacked([(f"{n} [{units[n]}]", {"type": "log"}) for n in known], "samples ahead")
         lines = (
             ("before", "no change predicted", result["no_change"]), ("floor", "noise floor", result["noise_floor"]),
             ("after", "error", result["horizons"]),
@@ -112,7 +112,7 @@ def score(
         LogError: a log that does not fit the vehicle.
         ParameterError: horizons that are no positive numbers, or times on logs of several rates.
     """
-    from quadid.identification.predict import horizon_scores, no_change, prediction_floor
+    from quadid.identification.predict import QUANTITIES, horizon_scores, no_change, prediction_floor
     from quadid.identification.result import score_result
 
     given = settled(logs, (), vehicle)
@@ -229,20 +229,20 @@ def horizon_table(result: Json) -> TextTable:
         Column("log"), Column("after", right=True),
         *(
             Column(f"{name} [{unit}]", right=True, rank=max(2 - i, 0))
-            for i, (name, unit) in enumerate(QUANTITIES.items())
+            for i, (name, unit) in enumerate(result["units"].items())
         ),
     )  # fmt: skip
     rows = []
     for entry in [*(result["files"] if many else []), result]:
         label = entry.get("log", "all" if many else result["files"][0]["log"])
         for horizon, errors in entry["horizons"].items():
-            rows.append((label, str(horizon), *(_error(errors[n]) for n in QUANTITIES)))
+            rows.append((label, str(horizon), *(_error(errors[n]) for n in result["units"])))
             label = ""
         total = entry["sum"]
-        rows.append(("", f"sum 1..{total['to']}", *(_error(total[n]) for n in QUANTITIES)))
+        rows.append(("", f"sum 1..{total['to']}", *(_error(total[n]) for n in result["units"])))
     last = list(result["horizons"])[-1]
     for label, key in (("noise floor", "noise_floor"), ("no change predicted", "no_change")):
-        rows.append((label, last, *(number(result[key][last][n]) for n in QUANTITIES)))
+        rows.append((label, last, *(number(result[key][last][n]) for n in result["units"])))
     title = f"Open-loop prediction error of '{result['vehicle']}' after n samples, mean of {result['samples']} runs"
     return TextTable(title, columns, tuple(rows))
 

@@ -10,10 +10,12 @@ from typing import TYPE_CHECKING, Any
 
 from quadid.app.identify import check_seed
 from quadid.app.logs import as_vehicle, write_recording
+from quadid.app.outcome import Outcome
 from quadid.effects import EFFECTS
 from quadid.errors import ParameterError, QuadidError, nearest
 from quadid.files import read_regular
 from quadid.parameters import NOMINAL_UNITS, Parameter, ParameterSet, Status
+from quadid.report.tables import Cell
 from quadid.rotation import down
 from quadid.vehicle import ParameterPrior, Vehicle
 from quadid.yaml_text import read_value
@@ -36,8 +38,8 @@ class SimulateError(QuadidError):
     """What was asked for cannot be flown or written."""
 
 
-@dataclass(frozen=True)
-class Simulated:
+@dataclass(frozen=True, repr=False)
+class Simulated(Outcome):
     """A simulated flight; `result` has the form ``quadid.simulate/1``, its ``log`` None until written."""
 
     result: dict[str, Any]
@@ -48,9 +50,33 @@ class Simulated:
         check_suffix(path)
         return write_recording(path, self.flight.recording)
 
+    @property
+    def opening(self) -> list[Cell]:
+        """What was flown, and where it was logged."""
+        r, log = self.result, f" and logged to {self.result['log']}" if self.result["log"] else ""
+        return [Cell(f"{r['vehicle']}: {r['rows']} rows at {r['rows'] / r['seconds']:.4g} Hz flown{log}")]
+
+    def records(self) -> list[dict[str, Any]]:
+        """One row a true parameter."""
+        return list(self.result["parameters"])
+
     def __repr__(self) -> str:
         r, effects = self.result, ", ".join(self.result["effects"]) or "none"
         return f"{r['vehicle']}: {r['rows']} rows, {r['seconds']:.1f} s flown; effects: {effects}"
+
+
+@dataclass(frozen=True, repr=False)
+class Drawn(Outcome):
+    """Several vehicles flown; `result` has the form ``quadid.simulate/1`` with ``draws``, whose files have `names`."""
+
+    result: dict[str, Any]
+    names: tuple[str, ...]
+
+    @property
+    def opening(self) -> list[Cell]:
+        """A line a vehicle."""
+        told = [f"diverged, {d['diverged']}" if d["diverged"] else "flown" for d in self.result["draws"]]
+        return [Cell(f"{name}: {what}") for name, what in zip(self.names, told, strict=True)]
 
 
 def simulate(

@@ -302,11 +302,12 @@ def _run(
         # The report of an attempt that failed says why, and shows the data.
         if report is not None and vehicle is not None and outcome.title:
             from quadid.app.failure import failure_html
+            from quadid.app.logs import write_text
 
             texts = [t for n in typed if typed[n].option.metavar == "LOG" for t in given[n] or ()]
             what, preset = f"{outcome.title} of {vehicle.name}", given.get("preset", "auto")
             text = failure_html(error, what, texts, vehicle, preset, terminal.command_line())
-            terminal.warn([f"no answer; why, and the data as they are: {terminal.write_text(report, text)}"])
+            terminal.warn([f"no answer; why, and the data as they are: {write_text(report, text)}"])
         raise
     conclude(done)
 

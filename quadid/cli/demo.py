@@ -21,6 +21,7 @@ def demo(
 ) -> None:
     """Fly three Pelican flights, identify on the first, validate on the others, diagnose; write logs and a report."""
     from quadid.app import demo as work
+    from quadid.app.logs import write_text
     from quadid.cli import terminal
 
     terminal.check_file(json, "--json")
@@ -29,7 +30,7 @@ def demo(
         shown = work.run(work.QUICK_SECONDS if quick else work.SECONDS, seed, folder, advance)
     page = folder / "report.html"
     result = work.summary(shown, str(page))
-    terminal.write_text(page, work.html(shown, seed, terminal.command_line()))
+    write_text(page, work.html(shown, seed, terminal.command_line()))
     terminal.write_json(result, str(folder / "result.json"))
     terminal.write_json(result, json)
     show(shown, page, quiet=json == "-")

@@ -10,8 +10,9 @@ from typing import Annotated, Any
 import typer
 
 from quadid.app.options import JsonTarget, Seed, VehicleName
-from quadid.app.simulate import Draw, SimulateError, check_suffix, simulate_draws
+from quadid.app.simulate import Draw, Drawn, SimulateError, check_suffix, simulate_draws
 from quadid.app.simulate import simulate as fly
+from quadid.cli import terminal
 from quadid.data.window import Recording
 
 LIVE = "udpout:"
@@ -62,51 +63,39 @@ def simulate(
     json: JsonTarget = None,
 ) -> None:
     """Fly the closed-loop vehicle, controlled at 1 kHz, and log it at 50 Hz."""
-    from quadid.cli.terminal import check_file, warn, write_json
-
     check_target(out)
-    check_file(json, "--json")
+    terminal.check_file(json, "--json")
+    how: dict[str, Any] = {
+        "seconds": seconds, "effects": effect or (), "profile": profile, "manoeuvre": manoeuvre, "noise": noise,
+        "rate": rate, "extras": extra or (), "spread": spread,
+    }  # fmt: skip
     if draws is not None:
         if out.startswith(LIVE):
             raise SimulateError(f"--draws {draws} to {out}", "a file", "leave one of them out")
-        how: dict[str, Any] = {
-            "seconds": seconds, "effects": effect or (), "profile": profile, "manoeuvre": manoeuvre, "noise": noise,
-            "rate": rate, "extras": extra or (), "spread": spread,
-        }  # fmt: skip
-        several(out, simulate_draws(vehicle, draws, seed, **how), json)
+        several(Path(out), simulate_draws(vehicle, draws, seed, **how), json)
         return
-    done = fly(
-        vehicle, seconds=seconds, seed=seed, effects=effect or (), profile=profile, manoeuvre=manoeuvre, noise=noise,
-        rate=rate, extras=extra or (), spread=spread,
-    )  # fmt: skip
+    done = fly(vehicle, seed=seed, **how)
     if out.startswith(LIVE):
         stream(out, done.flight.recording)
+        done.result["log"] = out
     else:
-        done.save(out)
-    log = out if out.startswith(LIVE) else str(Path(out).absolute())
-    write_json({**done.result, "log": log}, json)
-    if json != "-":
-        typer.echo(f"{done.flight.vehicle.name}: {done.result['rows']} rows at {rate:g} Hz flown and logged to {out}")
-    warn(done.result.get("warnings", []))
+        done.result["log"] = str(done.save(out))
+    terminal.conclude(done, json)
 
 
-def several(out: str, draws: Sequence[Draw], json: str | None) -> None:
+def several(target: Path, draws: Sequence[Draw], json: str | None) -> None:
     """Writes the logs of several draws as ``OUT-1``, ``OUT-2`` and so on, and says which did not last."""
-    from quadid.cli.terminal import write_json
-    from quadid.flight import FlightError
-
-    target, entries = Path(out), []
-    for i, draw in enumerate(draws, 1):
-        entries.append(draw.entry)
-        path = target.with_name(f"{target.stem}-{i}{target.suffix}")
+    paths = [target.with_name(f"{target.stem}-{i}{target.suffix}") for i in range(1, len(draws) + 1)]
+    entries = [draw.entry for draw in draws]
+    for entry, draw, path in zip(entries, draws, paths, strict=True):
         if draw.flown is not None:
-            entries[-1]["log"] = str(draw.flown.save(path))
-        if json != "-":
-            typer.echo(f"{path.name}: diverged, {draw.failed}" if draw.failed else f"{path.name}: flown")
+            entry["log"] = str(draw.flown.save(path))
     lost = sum(bool(draw.failed) for draw in draws)
     result = {"schema": "quadid.simulate/1", "vehicle": draws[0].vehicle.name, "diverged": lost, "draws": entries}
-    write_json(result, json)
+    terminal.conclude(Drawn(result, tuple(path.name for path in paths)), json)
     if lost == len(draws):
+        from quadid.flight import FlightError
+
         raise FlightError(f"all {lost} vehicles diverged", fix="another manoeuvre, or gains that fit the vehicle")
 
 
@@ -117,10 +106,8 @@ def check_target(out: str) -> None:
         if not host or not port.isdigit() or not 0 < int(port) < 65536:
             raise SimulateError(f"cannot send to '{out}'", "udpout:HOST:PORT", "for example udpout:127.0.0.1:14550")
         return
-    from quadid.cli.terminal import check_file
-
     check_suffix(out)
-    check_file(out, "OUT")
+    terminal.check_file(out, "OUT")
 
 
 def stream(address: str, recording: Recording) -> None:

@@ -11,12 +11,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from quadid.app.kernels import prepare
-from quadid.app.logs import OutputError as OutputError
-from quadid.app.logs import file_name as file_name
-from quadid.app.logs import write_text as write_text
-from quadid.app.outcome import Advance as Advance
-from quadid.app.outcome import Outcome, silent
-from quadid.app.outcome import json_text as json_text
+from quadid.app.logs import OutputError, write_text
+from quadid.app.outcome import Advance, Outcome, json_text, silent
 from quadid.errors import QuadidError
 from quadid.report.tables import SPACE, Cell, TextTable
 from quadid.report.verdict import Verdict
