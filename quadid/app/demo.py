@@ -104,25 +104,25 @@ def summary(shown: Shown, page: str) -> dict[str, Any]:
 
 def html(shown: Shown, seed: int, command: str = LIBRARY) -> str:
     """The report: identification with the truth beside it, then both diagnoses."""
-    from quadid.report.fit_pages import diagnosis_part, identify_page
+    from quadid.report.fit_pages import diagnosis_part, findings_section, identify_page
     from quadid.report.page import render
 
     done = shown.identified
     logs: Sequence[Log] = [*done.logs, *shown.hidden.logs]
     rows = [*provenance(logs, command), {"name": "seed", "value": str(seed)}]
-    page = identify_page(done.result, done.sets, done.fit.noise, [quality(log) for log in logs], rows, shown.truth)
+    hidden = shown.hidden
+    same = diagnosis_part(
+        shown.diagnosed.result, shown.diagnosed.sets, "same", TRUE_SECTION,
+        "Nothing was hidden in this vehicle, so nothing should be found.",
+    )  # fmt: skip
+    apart = diagnosis_part(
+        hidden.result, hidden.sets[-1:], "hidden", HIDDEN_SECTION,
+        f"This vehicle flew with {effects_words(HIDDEN)}, which the model lacks.", hidden.maps(),
+        None if hidden.forces is None else hidden.forces.section(),
+    )  # fmt: skip
+    page = identify_page(
+        done.result, done.sets, done.fit.noise, [quality(log) for log in logs], rows, shown.truth,
+        more=[findings_section([same, apart])], excitation=told(done.fit, done.logs[:1]),
+    )  # fmt: skip
     page["title"] = "Demonstration: a simulated Pelican"
-    page["excitation"] = told(done.fit, done.logs[:1])
-    page["diagnoses"] = [
-        diagnosis_part(
-            shown.diagnosed.result, shown.diagnosed.sets, "same", TRUE_SECTION,
-            "Nothing was hidden in this vehicle, so nothing should be found.",
-        ),
-        diagnosis_part(
-            shown.hidden.result, shown.hidden.sets[-1:], "hidden", HIDDEN_SECTION,
-            f"This vehicle flew with {effects_words(HIDDEN)}, which the model lacks.",
-            shown.hidden.maps(),
-        ),
-    ]  # fmt: skip
-    page["diagnoses"][1]["missing"] = None if shown.hidden.forces is None else shown.hidden.forces.section()
     return render(page)

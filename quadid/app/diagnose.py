@@ -115,8 +115,10 @@ class Diagnosed(Fitted):
         ]
         logs = [quality(log) for log in self.logs]
         warnings = self.result["warnings"]
-        page = diagnose_page(self.result, self.nominal.name, self.sets, self.noise, logs, rows, warnings, self.maps())
-        page["missing"] = None if self.forces is None else self.forces.section()
+        missing = None if self.forces is None else self.forces.section()
+        page = diagnose_page(
+            self.result, self.nominal.name, self.sets, self.noise, logs, rows, warnings, self.maps(), missing
+        )  # fmt: skip
         return render(page)
 
     def maps(self) -> dict[str, ResidualMap]:

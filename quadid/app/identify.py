@@ -222,11 +222,13 @@ class Identified(Fitted):
             {"name": "vehicle file", "value": result["vehicle_file"] or "not written"},
             {"name": "taken as known", "value": known(fit.vehicle)},
         ]
-        page = identify_page(result, self.sets, fit.noise, [quality(log) for log in self.logs], rows)
         flights = [flight_section(log.recording, fit.vehicle, i) for i, log in enumerate(self.logs[:MOST_LOGS])]
-        page["sections"] = [correlation_section(fit.parameters), *(f for f in flights if f is not None)]
-        page["missing"] = None if self.forces is None else self.forces.section()
-        page["excitation"] = told(fit, self.train)
+        page = identify_page(
+            result, self.sets, fit.noise, [quality(log) for log in self.logs], rows,
+            missing=None if self.forces is None else self.forces.section(),
+            more=[correlation_section(fit.parameters), *(f for f in flights if f is not None)],
+            excitation=told(fit, self.train),
+        )  # fmt: skip
         return render(page)
 
 

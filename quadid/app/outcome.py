@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
+from markupsafe import Markup
 from quadid_replay import write_compared
 from quadid_replay.frames import from_euler
 
@@ -23,10 +24,10 @@ from quadid.app.missing import Beside, MissingForces
 from quadid.data.window import Channel, Recording, beginning, sample_period
 from quadid.errors import NotIdentifiableError
 from quadid.jsonable import jsonable
-from quadid.report.page import measures, number, render
+from quadid.report.page import measures, number, part, quiet, render
 from quadid.report.tables import Cell, TextTable
 from quadid.report.verdict import Verdict
-from quadid.types import FloatArray, Json
+from quadid.types import FloatArray, Json, JsonDict
 from quadid.vehicle import Vehicle
 from quadid.version import __version__
 
@@ -316,8 +317,8 @@ def told(fit: Fit, logs: Sequence[Log]) -> dict[str, Any]:
     return excitation_part(excitation(windows, fit.vehicle, fit.theta, fit.noise), seconds)
 
 
-def quality(log: Log) -> dict[str, Any]:
-    """What one log offered and what of it was used."""
+def quality(log: Log) -> JsonDict:
+    """What one log offered and what of it was used, as part of a page."""
     grid = log.grid
     summary = [
         f"{grid.seconds_used:.1f} of {grid.seconds_log:.1f} s used, on a {grid.rate:.4g} Hz grid",
@@ -333,7 +334,8 @@ def quality(log: Log) -> dict[str, Any]:
         for c in log.recording.channels.values()
     ]  # fmt: skip
     channels = measures(("Channel", "Rate", "Samples", "Source", "Dropped"), rows, (1, 2))
-    return {"name": log.recording.name, "format": log.recording.format, "summary": summary, "channels": channels}
+    title = Markup("{} {}").format(log.recording.name, quiet(f"({log.recording.format})"))
+    return part(title, tables=[channels], lines=[f"{'; '.join(summary)}."])
 
 
 def provenance(logs: Sequence[Log], command: str = LIBRARY) -> list[dict[str, str]]:

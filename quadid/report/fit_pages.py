@@ -8,6 +8,7 @@ from dataclasses import asdict
 from typing import Any
 
 import numpy as np
+from markupsafe import Markup
 from scipy.signal import welch
 
 from quadid.checks.motion import Spans, flying_spans, within
@@ -38,6 +39,8 @@ from quadid.report.page import (
     fit,
     measures,
     number,
+    part,
+    quiet,
     rows_of,
     section,
     trace,
@@ -51,6 +54,7 @@ from quadid.report.verdict import (
     Level,
     Verdict,
     at_bounds,
+    digits,
     identify_verdict,
     parameter_name,
     percent,
@@ -86,7 +90,7 @@ def flight_section(recording: Recording, vehicle: Vehicle, place: int) -> dict[s
     if not figures and not modes:
         return None
     tables = [rows_of(("flight mode", "from (s)", "to (s)"), modes)] if modes else []
-    return section(f"flight-{place}", f"Flight of {recording.name}", said, figures, tables, folded=True)
+    return section(f"flight-{place}", f"Flight of {recording.name}", said, figures, tables, kind="folded")
 
 
 def _rotor_figure(recording: Recording, vehicle: Vehicle, identifier: str) -> JsonDict | None:
@@ -199,11 +203,9 @@ def excitation_part(found: Excitation, seconds: float) -> dict[str, Any]:
         "(Cramér–Rao bound): with all parameters unknown, and with all others known. If they differ much, the flight "
         "couples parameters."
     )
-    return {
-        "intro": intro,
-        "table": rows_of(_HEAD, rows, classes=("", "number", "number", "")),
-        "done": "Nothing more needs to be flown for these." if sharp else "",
-    }
+    table = rows_of(_HEAD, rows, classes=("", "number", "number", ""))
+    done = ["Nothing more needs to be flown for these."] if sharp else []
+    return section("excitation", "What to fly next", intro, (), [table], after=done)
 
 
 def _sigma(bound: float) -> str:
@@ -233,7 +235,8 @@ FIT_NAMES = ("p", "q", "r", "phi", "theta", "psi", "a_z")
 
 def identify_page(
     result: Json, sets: Sequence[ScoredSet], noise: NoiseModel, quality: Sequence[Json],
-    provenance: Sequence[Json], truth: Mapping[str, float] | None = None,
+    provenance: Sequence[Json], truth: Mapping[str, float] | None = None, *, missing: Json | None = None,
+    more: Sequence[Json] = (), excitation: Json | None = None,
 ) -> dict[str, Any]:  # fmt: skip
     """Builds the page of an identification.
 
@@ -241,21 +244,25 @@ def identify_page(
         result: of the form ``quadid.identify/1``.
         sets: the scored logs in the order of ``result["sets"]``.
         noise: estimated sensor noise.
-        quality: per log: name, format, summary (sentences), channels (name, rate [Hz], samples, source, faults).
+        quality: a part of the page for each log.
         provenance: rows of name and value.
         truth: true parameters, where a simulation knows them.
+        missing: of `missing_section`.
+        more: sections below the parameters.
+        excitation: of `excitation_part`.
     """
+    stuck, parameters = at_bounds(result), result["parameters"]
+    fit = section(
+        "fit", "How well the simulation predicts", _PREDICTION, (), [fit_table(result["sets"])],
+        parts=set_parts(result["sets"], sets), menu="Prediction",
+    )  # fmt: skip
+    shown = parameter_section(parameters, truth, stuck, [parameter_figure(parameters, truth)])
     return {
         "title": f"Identification of {result['vehicle']}",
         "subtitle": _subtitle(result),
         "verdict": asdict(identify_verdict(result)),
-        "parameters": [parameter_row(p, truth, at_bounds(result)) for p in result["parameters"]],
-        "parameter_figure": parameter_figure(result["parameters"], truth),
-        "fit": fit_table(result["sets"]),
-        "sets": set_sections(result["sets"], sets),
+        "sections": [s for s in (missing, shown, *more, fit, excitation, quality_section(quality, noise)) if s],
         "warnings": result["warnings"],
-        "quality": quality,
-        "noise": noise_table(noise),
         "provenance": provenance,
     }
 
@@ -267,38 +274,71 @@ def _subtitle(result: Json) -> str:
     return f"{text}; search {result['optimizer']}, {result['seconds']:.1f} s"
 
 
-def parameter_row(
-    parameter: Json, truth: Mapping[str, float] | None = None, stuck: Sequence[str] = ()
-) -> dict[str, Any]:
-    """A parameter with its margin, its reason, and the truth where known."""
-    row = {
-        "relative_to": None,
-        **parameter,
-        "title": parameter_name(parameter["name"]),
-        "status_words": status_words(parameter),
-        "margin": percent(relative_halfwidth(parameter)).replace(" ", "\u00a0"),
-        "reason": reason(parameter, stuck).replace(" %", "\u00a0%"),
-    }
+_APPLIED = "Nothing has been applied to any vehicle. The interval is where the value lies in 95 of 100 such flights."
+_PREDICTION = (
+    "The simulation runs for one second at a time from an estimated start, then is compared with the measurement. "
+    "Error: mean squared residual over that of pure sensor noise, so 1 is the best that any model can reach. Fit: 100 "
+    "% follows every move, 0 % is no better than the mean; what is mostly noise cannot come near 100 %."
+)
+_KEYS = (
+    "Drag to zoom, double-click to come back, click a name to hide it. With the keyboard: + and − zoom, ← and → move, "
+    "0 shows all."
+)
+
+
+def parameter_section(
+    parameters: Sequence[Json], truth: Mapping[str, float] | None = None, stuck: Sequence[str] = (),
+    figures: Sequence[Json] = (),
+) -> JsonDict:  # fmt: skip
+    """Every parameter with its interval, status and reason, and the truth where it is known; then pictures."""
+    head = ["Parameter", "Current", "Proposed", "95 % interval", "Unit", "Status", "Reason"]
+    classes = ["", "number", "number strong", "number", "", "", "reason"]
+    rows = []
+    for p in parameters:
+        n, margin = digits(p), percent(relative_halfwidth(p)).replace(" ", "\u00a0")
+        low, high = (number(v, n) for v in p["ci95"])
+        chip = Markup('<span class="chip {}">{}</span>').format(p["status"], status_words(p))
+        rows.append([
+            parameter_name(p["name"]), number(p["initial"]), number(p["value"], n),
+            Markup("{} … {} {}").format(low, high, quiet(f"(±{margin})", "quiet nobreak")), unit(p["unit"]), chip,
+            reason(p, stuck).replace(" %", "\u00a0%"),
+        ])  # fmt: skip
     if truth:
-        row["truth"] = truth.get(parameter["name"])
-    return row
+        head.insert(4, "Truth")
+        classes.insert(4, "number")
+        for row, p in zip(rows, parameters, strict=True):
+            row.insert(4, number(truth.get(p["name"])))
+    table = rows_of(head, rows, classes=classes)
+    below = part(figures=figures, after=[quiet(_APPLIED)])
+    return section("parameters", "Parameters", tables=[table], parts=[below], kind="plain")
 
 
-def set_sections(entries: Sequence[Json], sets: Sequence[ScoredSet]) -> list[dict[str, Any]]:
-    """The logs of a result with their figures, unseen ones first; the first few logs only get figures."""
-    out, shown = [], min(len(sets), MOST_LOGS)
+def _used(role: str) -> str:
+    return "fitted" if role == "train" else "validation"
+
+
+def set_parts(entries: Sequence[Json], sets: Sequence[ScoredSet]) -> list[JsonDict]:
+    """The first few logs of a result with their figures, unseen ones first."""
+    shown = min(len(sets), MOST_LOGS)
     ordered = sorted(zip(entries, sets, strict=True), key=lambda pair: pair[0]["role"] == "train")
-    for i, (entry, scored) in enumerate(ordered):
-        figures = (
-            [error_figure(scored, f"log{i}-error"), *channel_figures(scored, f"log{i}", shown)] if i < MOST_LOGS else []
-        )
+    out = []
+    for i, (entry, scored) in enumerate(ordered[:shown]):
         rows = [
             (n, number(e["value"], 3), unit(e["unit"]), fit(entry["fit_percent"].get(n)))
             for n, e in entry["rmse"].items()
         ]
         channels = measures(("Channel", "Root mean squared error", "Unit", "Fit"), rows, (1, 3))
-        out.append({**entry, "figures": figures, "channels": channels})
+        title = Markup("{} {}").format(entry["log"], quiet(f"({_used(entry['role'])})"))
+        figures = [error_figure(scored, f"log{i}-error"), *channel_figures(scored, f"log{i}", shown)]
+        keys, kind = [quiet(_KEYS, "quiet hint")], "folded" if i else "open"
+        out.append(part(title, "", figures, [channels], lines=keys, kind=kind))
     return out
+
+
+def quality_section(logs: Sequence[Json], noise: NoiseModel) -> JsonDict:
+    """What was used of every log, and the sensor noise."""
+    white = part("Sensor noise, estimated from the flight", tables=[noise_table(noise)])
+    return section("quality", "Data quality", parts=[*logs, white])
 
 
 def fit_table(entries: Sequence[Json]) -> JsonDict:
@@ -429,7 +469,7 @@ def _next_steps(result: Json) -> tuple[str, ...]:
 
 def diagnosis_part(
     result: Json, sets: Sequence[ScoredSet] = (), prefix: str = "d", title: str = "", intro: str = "",
-    maps: Mapping[str, ResidualMap] | None = None,
+    maps: Mapping[str, ResidualMap] | None = None, missing: Json | None = None, judged: bool = True,
 ) -> dict[str, Any]:  # fmt: skip
     """A diagnosis as part of a page: verdict, findings, pictures.
 
@@ -440,6 +480,8 @@ def diagnosis_part(
         title: heading, where a page holds several.
         intro: sentence below it.
         maps: what each cause looks like in the residual, by name of the effect.
+        missing: of `missing_section`, whose figures are shown.
+        judged: with its verdict.
     """
     findings = [
         finding_part(finding, result["validation"]["noise_floor"], f"{prefix}-{i}", (maps or {}).get(finding["effect"]))
@@ -447,24 +489,27 @@ def diagnosis_part(
     ]
     pictured = list(sets)[:MOST_LOGS] if findings else []
     logs = [
-        {
-            "log": s.log,
-            "role": s.role,
-            "figures": [
+        part(
+            Markup("{}: the simulation with and without what was found {}").format(s.log, quiet(f"({_used(s.role)})")),
+            figures=[
                 error_figure(s, f"{prefix}-log{i}-error", MODELS),
                 *channel_figures(s, f"{prefix}-log{i}", len(pictured) + 2, MODELS),
             ],
-        }
+            kind="folded",
+        )
         for i, s in enumerate(pictured)
     ]
-    return {
-        "title": title,
-        "intro": intro,
-        "verdict": asdict(diagnose_verdict(result)),
-        "findings": findings,
-        "remains": remaining(result, sets),
-        "logs": logs,
-    }
+    lacking = [] if missing is None else [part("", missing["intro"], missing["figures"])]
+    verdict = asdict(diagnose_verdict(result)) if judged else None
+    inner = [*lacking, *findings, *remaining(result, sets), *logs]
+    return part(title, lines=[intro], verdict=verdict, parts=inner, kind="chapter")
+
+
+def findings_section(diagnoses: Sequence[Json]) -> JsonDict:
+    """Diagnoses as a section of a page."""
+    return section(
+        "findings", "What the simulation gets wrong", parts=diagnoses, menu="What is wrong", kind="plain"
+    )  # fmt: skip
 
 
 _REMARKS = {
@@ -500,19 +545,34 @@ def finding_part(finding: Json, floor: float, identifier: str, seen: ResidualMap
     if finding["p_value"] is not None:
         gained.append(f"; {chance(finding['p_value'])}")
     rivals = [f"{a['effect'].replace('_', ' ')} ({_short(a['mse_after'])})" for a in finding["alternatives"]]
-    return {
-        **finding,
-        "title": name,
-        "advice": _finding_advice(finding),
-        "gained": "".join(gained) + ".",
-        "noise": _noise_sentence(gain, floor, name),
-        "rivals": f"Rejected alternatives, with the error they leave: {', '.join(rivals)}."
-        if rivals else "No other cause of the catalogue came near it.",
-        "figures": [
+    rejected = (
+        f"Rejected alternatives, with the error they leave: {', '.join(rivals)}."
+        if rivals else "No other cause of the catalogue came near it."
+    )  # fmt: skip
+    unsure = Markup("") if finding["confident"] else Markup(' <span class="chip prior_dominated">not certain</span>')
+    return part(
+        Markup("{}{}").format(name, unsure),
+        figures=[
             *([map_figure(seen, f"{identifier}-map", name)] if seen is not None else []),
             gain_figure(finding, floor, f"{identifier}-gain"),
         ],
-    }  # fmt: skip
+        lines=[
+            finding["evidence"], Markup("").join(map(_value, finding["parameters"])), _finding_advice(finding)
+        ],
+        after=[f"{''.join(gained)}. {_noise_sentence(gain, floor, name)}".rstrip(), quiet(rejected)],
+        kind="finding",
+    )  # fmt: skip
+
+
+def _value(p: Json) -> Markup:
+    """A number of a cause with its interval."""
+    if p["name"] == "rotor":
+        return Markup('<span class="value"><b>rotor {}</b></span>').format(int(p["value"]))
+    low, high = (number(v, digits(p)) for v in p["ci95"])
+    size = Markup("{} = <b>{}</b> {}").format(
+        p["name"], number(p["value"], digits(p)), unit(p["unit"]) if p["unit"] else ""
+    )
+    return Markup('<span class="value">{} {}</span>').format(size, quiet(f"({low} … {high})"))
 
 
 def _less(before: float | None, after: float | None) -> float | None:
@@ -568,10 +628,11 @@ def missing_section(
         intro,
         missing_figures(parts, "missing"),
         [table],
+        menu="What is missing",
     )
 
 
-def remaining(result: Json, sets: Sequence[ScoredSet]) -> dict[str, Any]:
+def remaining(result: Json, sets: Sequence[ScoredSet]) -> list[JsonDict]:
     """What is left: by channel, and what it follows."""
     channels = {c.name: c for s in sets[-1:] for c in s.fitted.channels}
     rows = [
@@ -583,25 +644,28 @@ def remaining(result: Json, sets: Sequence[ScoredSet]) -> dict[str, Any]:
         f"the {f['acts_on']} follows {f['signal'].rstrip(',')} ({percent(f['share'])} of the noise)"
         for f in result.get("unexplained_follows", ())
     ]
+    if not rows and not follows:
+        return [part(lines=["The rest is indistinguishable from noise."])]
     head = ("Channel", "Share of its error beyond noise", "Root mean squared error", "Unit")
-    return {"table": measures(head, rows, (1, 2)), "follows": follows}
+    tables = [measures(head, rows, (1, 2))] if rows else []
+    after = [f"What the rest follows: {'; '.join(follows)}."] if follows else []
+    return [part("What remains, and where" if rows else "", tables=tables, after=after)]
 
 
 def diagnose_page(
     result: Json, vehicle: str, sets: Sequence[ScoredSet], noise: NoiseModel, quality: Sequence[Json],
     provenance: Sequence[Json], warnings: Sequence[str] = (), maps: Mapping[str, ResidualMap] | None = None,
+    missing: Json | None = None,
 ) -> dict[str, Any]:  # fmt: skip
     """Builds the page of a diagnosis; arguments as in `diagnosis_part` and `identify_page`."""
-    part = diagnosis_part(result, sets, maps=maps)
     fitted, held = (sum(s.role == role for s in sets) for role in ("train", "validate"))
+    parameters = parameter_section(result["parameters"]) if result.get("parameters") else None
+    found = findings_section([diagnosis_part(result, sets, maps=maps, judged=False)])
     return {
         "title": f"Diagnosis of {vehicle}",
         "subtitle": f"{fitted} log{'s' * (fitted != 1)} diagnosed, {held or 'none'} held out for validation",
-        "verdict": part["verdict"],
-        "parameters": [parameter_row(p) for p in result.get("parameters", ())],
-        "diagnoses": [{**part, "verdict": None}],
+        "verdict": asdict(diagnose_verdict(result)),
+        "sections": [s for s in (missing, parameters, found, quality_section(quality, noise)) if s],
         "warnings": list(warnings),
-        "quality": quality,
-        "noise": noise_table(noise),
         "provenance": provenance,
     }

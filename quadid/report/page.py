@@ -6,7 +6,7 @@ import base64
 import hashlib
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import lru_cache
 from importlib import resources
 from typing import Any
@@ -15,7 +15,6 @@ import numpy as np
 from markupsafe import Markup, escape
 
 from quadid.report.templating import environment
-from quadid.report.verdict import digits
 from quadid.types import FloatArray, Json, JsonDict
 
 # --- One self-contained HTML page from plain data: no request leaves it, and nothing from a log is ever run
@@ -29,20 +28,26 @@ def render(page: Json) -> str:
     """Returns the HTML of a page.
 
     Args:
-        page: what the template shows; absent parts are left out.  ``title``, ``subtitle``, ``verdict`` (of
-            `quadid.report.verdict`), ``missing``, ``parameters``, ``parameter_figure``, ``diagnoses``, ``sets``,
-            ``quality``, ``noise``, ``warnings``, ``provenance``.
+        page: ``title``, and where there are any ``subtitle``, ``verdict`` (of `quadid.report.verdict`), ``sections``
+            (of `section`), ``warnings`` (sentences) and ``provenance`` (rows of name and value), which stand last.
     """
     language = environment("html")
     language.policies["json.dumps_kwargs"] = {"separators": (",", ":")}
-    language.filters |= {"number": number, "code": code, "unit": unit, "digits": digits}
-    figures = all_figures(page)
+    language.filters |= {"code": code}
+    sections = list(page.get("sections", ()))
+    if warnings := page.get("warnings"):
+        lines = Markup("").join(Markup("<li>{}</li>").format(code(line)) for line in warnings)
+        sections.append(section("warnings", "Warnings", lines=[Markup("<ul>{}</ul>").format(lines)], kind="plain"))
+    if rows := page.get("provenance"):
+        table = rows_of((), [(row["name"], row["value"]) for row in rows], "", "cards narrow", ("", "wrap"))
+        sections.append(section("provenance", "Where this comes from", tables=[table], menu="Provenance"))
+    figures = {one["id"]: one for part in sections for one in figures_of(part)}
     scripts = {
         name: closed(text) for name, text in (("plotly", _plotly() if figures else ""), ("page", _asset("page.js")))
     }
     policy = " ".join(f"'sha256-{_digest(text)}'" for text in scripts.values())
     return language.get_template("page.html.j2").render(
-        page={**_EMPTY, **page},
+        page={"subtitle": "", "verdict": None, **page, "sections": sections},
         figures=packed(figures),
         style=Markup(_asset("page.css")),
         scripts={name: Markup(text) for name, text in scripts.items()},
@@ -50,21 +55,11 @@ def render(page: Json) -> str:
     )
 
 
-_EMPTY: dict[str, Any] = {
-    "subtitle": "", "verdict": None, "missing": None, "parameters": [], "parameter_figure": None, "diagnoses": [],
-    "sets": [], "sections": [], "excitation": None, "quality": [], "noise": [], "warnings": [], "provenance": [],
-}  # fmt: skip
-
-
-def all_figures(page: Json) -> dict[str, Any]:
-    """Every figure of the page by its identifier."""
-    found = [page.get("parameter_figure")]
-    parts = [*filter(None, [page.get("missing")]), *page.get("sets", ()), *page.get("sections", ())]
-    for diagnosis in page.get("diagnoses", ()):
-        parts += [*filter(None, [diagnosis.get("missing")]), *diagnosis["findings"], *diagnosis["logs"]]
-    for part in parts:
-        found.extend(part.get("figures", ()))
-    return {figure["id"]: figure for figure in found if figure is not None}
+def figures_of(part: Json) -> Iterator[Json]:
+    """Every figure of a section, those of its parts too."""
+    yield from part["figures"]
+    for inner in part["parts"]:
+        yield from figures_of(inner)
 
 
 PACKED_FROM = 40
@@ -155,15 +150,46 @@ def _asset(name: str) -> str:
 # ones), ``truth``, ``floor``.
 
 
-def section(
-    identifier: str, title: str, intro: str = "", figures: Sequence[Mapping[str, Any]] = (),
-    tables: Sequence[Mapping[str, Any]] = (),
-    **more: Any,
+def part(
+    title: str = "", intro: str = "", figures: Sequence[Json] = (), tables: Sequence[Json] = (), *,
+    lines: Sequence[str] = (), after: Sequence[str] = (), parts: Sequence[Json] = (), verdict: Json | None = None,
+    picture: str = "", kind: str = "",
 ) -> JsonDict:  # fmt: skip
-    """A section of the page: what it says, then its figures and tables."""
+    """A part of a section, in the order in which it is shown.
+
+    Args:
+        title: heading.
+        intro: quiet sentence below it.
+        lines: paragraphs.
+        verdict: of `quadid.report.verdict`.
+        picture: SVG.
+        figures: of `figure`.
+        tables: of `rows_of`.
+        parts: inner parts.
+        after: paragraphs at the end.
+        kind: ``finding`` for a card, ``open`` or ``folded`` for what can be folded, ``chapter`` for one of several.
+    """
     return {
-        "id": identifier, "title": title, "intro": intro, "figures": list(figures), "tables": list(tables), **more,
+        "title": title, "intro": intro, "lines": list(filter(None, lines)), "verdict": verdict, "picture": picture,
+        "figures": list(figures), "tables": list(tables), "parts": list(parts), "after": list(filter(None, after)),
+        "kind": kind,
     }  # fmt: skip
+
+
+def section(
+    identifier: str, title: str, intro: str = "", figures: Sequence[Json] = (), tables: Sequence[Json] = (), *,
+    menu: str = "", **more: Any,
+) -> JsonDict:  # fmt: skip
+    """A section of the page: a `part` with its identifier and its name in the menu.
+
+    It can be folded, and is where `kind` is ``folded``; of kind ``plain`` it cannot.
+    """
+    return {"id": identifier, "menu": menu or title, **part(title, intro, figures, tables, **more)}
+
+
+def quiet(text: str, kind: str = "quiet") -> Markup:
+    """Text that stands back."""
+    return Markup('<span class="{}">{}</span>').format(kind, text)
 
 
 def rows_of(

@@ -12,7 +12,7 @@ def part(bound: list[float], alone: list[float]) -> list[str]:
     """Advice for b, d, J_zz with these bounds."""
     names = ("b", "d", "J_zz")
     found = Excitation(names, np.array(bound), np.array(alone), np.eye(3))
-    return [row[3] for row in excitation_part(found, 60.0)["table"]["rows"]]
+    return [row[3] for row in excitation_part(found, 60.0)["tables"][0]["rows"]]
 
 
 def test_each_reason_has_its_advice() -> None:
@@ -29,4 +29,4 @@ def test_a_flight_too_short_says_how_long() -> None:
 
 def test_nothing_more_when_all_are_sharp() -> None:
     found = Excitation(("b",), np.array([0.001]), np.array([0.001]), np.eye(1))
-    assert excitation_part(found, 60.0)["done"]
+    assert excitation_part(found, 60.0)["after"]

@@ -15,8 +15,8 @@ import pytest
 from quadid.identification.result import ScoredSet
 from quadid.identification.score import ChannelScore, Series, SetScore
 from quadid.model.rollout import CHANNEL_NAMES, CHANNEL_UNITS
-from quadid.report.fit_pages import chance, diagnosis_part, identify_page
-from quadid.report.page import code, fit, measures, number, packed, render
+from quadid.report.fit_pages import chance, diagnosis_part, findings_section, identify_page
+from quadid.report.page import code, fit, measures, number, packed, part, render
 from tests.faults.evidence import Happened
 
 EVIL = "<script>alert(1)</script>\"'&</title>`rm`{{7*7}}"
@@ -70,14 +70,7 @@ def page(sets: list[ScoredSet]) -> str:
     """The page of an identification from logs with nasty names."""
     from quadid.identification.noise import NoiseModel
 
-    quality = [
-        {
-            "name": EVIL,
-            "format": "mcap",
-            "summary": [EVIL],
-            "channels": measures(("Channel", "Source"), [("gyro", EVIL)], ()),
-        }
-    ]
+    quality = [part(EVIL, tables=[measures(("Channel", "Source"), [("gyro", EVIL)], ())], lines=[EVIL])]
     provenance = [{"name": EVIL, "value": EVIL}]
     return render(identify_page(result(sets), sets, NoiseModel.guess(9), quality, provenance, {"b": 1.05}))
 
@@ -207,7 +200,9 @@ def test_diagnosis_part_shows_findings_and_what_remains() -> None:
         "vehicle_file": "/x.yaml",
     }  # fmt: skip
     reader = Reader()
-    reader.feed(render({"title": "t", "diagnoses": [diagnosis_part(data, [scored("a")], "d", EVIL, EVIL)]}))
+    reader.feed(
+        render({"title": "t", "sections": [findings_section([diagnosis_part(data, [scored("a")], "d", EVIL, EVIL)])]})
+    )
     for expected in (
         "Found: motor lag",
         "0.05",
