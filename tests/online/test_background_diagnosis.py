@@ -9,7 +9,7 @@ import pytest
 
 from quadid.data.window import Sample
 from quadid.online import Job, JobReply, Session, SessionSettings
-from quadid.online.background_diagnosis import ANSWER_AFTER, DIAGNOSED_SECONDS, DiagnosisReply, DiagnosisRequest
+from quadid.online.background_diagnosis import DiagnosisReply, DiagnosisRequest
 from quadid.online.records import Action, OnlineFinding
 from quadid.vehicle import Vehicle
 from tests.online.driving import EPOCH, diagnosed, drive, flight, samples, unanswered
@@ -34,23 +34,6 @@ def before(stream: list[Sample], t: float) -> list[Sample]:
 DRAGGED = (("rotor_drag", "k_x", 0.35), ("rotor_drag", "k_y", 0.35))
 
 
-def test_it_is_asked_for_after_a_minute_of_flight_and_told_later() -> None:
-    session, stream = fly(160.0)
-    (request,) = studies(drive(session, before(stream, 80.0), diagnose=unanswered))
-    assert request.stop - request.start == pytest.approx(DIAGNOSED_SECONDS)
-    assert sum(len(w) for w in request.windows) * 0.02 == pytest.approx(DIAGNOSED_SECONDS, abs=0.1)
-    session.deliver(DiagnosisReply(request.number, "", (DRAG,), "explained"))
-    session.deliver(DiagnosisReply(99, "", (), "unknown"))
-    between = [s for s in stream if EPOCH + 80.0 <= s.t < EPOCH + 88.0]
-    assert not diagnosed(drive(session, between, diagnose=unanswered))
-    rest = drive(session, [s for s in stream if s.t >= EPOCH + 88.0], diagnose=unanswered)
-    (told,) = diagnosed(rest)
-    assert (told.verdict, told.findings) == ("explained", (DRAG,))
-    assert told.t - EPOCH == pytest.approx(request.stop - request.start, abs=6.0)
-    (again,) = studies(rest)
-    assert again.stop >= request.stop + ANSWER_AFTER
-
-
 def test_what_was_told_is_not_told_again_but_news_are() -> None:
     session, stream = fly(160.0, QUICK.model_copy(update={"diagnose": 1.0}))
     moved = replace(DRAG, values={"k_x": 0.5})
@@ -61,11 +44,6 @@ def test_what_was_told_is_not_told_again_but_news_are() -> None:
 
     told = diagnosed(drive(session, stream, diagnose=made_up))
     assert [d.findings for d in told] == [(DRAG,), (moved,)]
-
-
-def test_zero_never_asks() -> None:
-    session, stream = fly(80.0, QUICK.model_copy(update={"diagnose": 0.0}))
-    assert not studies(drive(session, stream))
 
 
 def test_an_answer_from_before_a_change_is_not_told() -> None:

@@ -196,15 +196,6 @@ def test_a_third_of_lost_packets_leaves_usable_rows(happened: Happened) -> None:
     )
 
 
-def test_a_reboot_begins_a_new_stretch(happened: Happened) -> None:
-    stream = samples(flight(6.0).recording)
-    rows, buffer = run([*[Sample(s.t + 300.0, s.channel, s.values) for s in stream], *stream])
-    assert [r.fresh for r in rows].count(True) == 2
-    assert buffer.time.steps == 1
-    assert all(np.diff(r.t).min() > 0.0 for r in rows)
-    happened(7, "stamps that fall by 300 s online: a new stretch, nothing mixed")
-
-
 def test_too_many_rotors_are_told_as_a_fault() -> None:
     stream = [
         Sample(s.t, s.channel, (*s.values, 1.0)) if s.channel == "rotor_speed" else s
