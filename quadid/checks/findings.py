@@ -94,7 +94,7 @@ class Missing:
 
 @dataclass(frozen=True)
 class Outlook:
-    """Whether the channels allow a parameter to be identified at all; excitation is another question."""
+    """Outlook of a parameter: do the channels allow it to be identified at all?  Excitation is another question."""
 
     parameter: str
     possible: bool
@@ -205,7 +205,7 @@ def _one(log_format: str, channel: str, rate: float | None, why: str) -> list[Mi
 
 
 def parameter_outlook(facts: tuple[ChannelFacts, ...]) -> tuple[Outlook, ...]:
-    """Says per parameter of the nominal model whether the channels and their rates allow it."""
+    """Outlook of each parameter of the nominal model by the channels and their rates."""
     rates = {f.name: f.rate for f in facts}
     rotor = max((rates[n] for n in ("rotor_speed", "motor_command") if n in rates), default=0.0)
     gyro = rates.get("gyro", 0.0)

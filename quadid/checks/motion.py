@@ -115,7 +115,7 @@ def _trimmed(flights: Sequence[tuple[float, float]], first: float, last: float) 
 
 
 def within(t: FloatArray, spans: Spans) -> BoolArray:
-    """Which of the times [s], shape (n,), lie in one of the spans."""
+    """True for the times [s], shape (n,), that lie in one of the spans."""
     return np.asarray(np.any([np.zeros(len(t), dtype=bool), *((t >= a) & (t <= b) for a, b in spans)], axis=0))
 
 
@@ -191,7 +191,7 @@ def _felt(accel: Channel) -> FloatArray:
 
 
 def _vibrates(accel: Channel) -> BoolArray:
-    """Tells where the accelerometer's length varies by more than at rest (0.3 m/s^2 over 25 samples)."""
+    """True where the accelerometer's length varies by more than at rest (0.3 m/s^2 over 25 samples)."""
     length = np.linalg.norm(accel.values, axis=1)
     mean, square = moving_mean(length, 25), moving_mean(length**2, 25)
     return np.asarray(np.sqrt(np.maximum(square - mean**2, 0.0)) > 0.3)
@@ -450,7 +450,7 @@ def gravity_check(recording: Recording, spans: Spans) -> Check:
 
 
 def _downwards(recording: Recording, accel: Channel, inside: BoolArray) -> str:
-    """What to turn where the specific force points up: what gyro, attitude and velocity agree with."""
+    """Advice what to turn where the specific force points up: what gyro, attitude and velocity agree with."""
     attitude, velocity = recording.channels.get("attitude"), recording.channels.get("velocity")
     body = "turn body vectors to FRD: negate y and z"
     if attitude is None or len(attitude.t) < 2 or gyro_check(recording).verdict is not CheckResult.OK:
@@ -786,7 +786,7 @@ def _in_world(accel: Channel, attitude: Channel) -> FloatArray:
 
 
 def usable_steps(t: FloatArray, other: FloatArray) -> BoolArray:
-    """Tells which steps of `t` have no gap, neither in `t` nor, as long as a quarter of one, in the other's times."""
+    """True for steps of `t` without a gap, neither in `t` nor, as long as a quarter of one, in the other's times."""
     steps = np.diff(t)
     longest = max(GAP * sample_period(other), 0.25 * float(np.median(steps)) if len(steps) else 0.0)
     holes = np.flatnonzero(np.diff(other) > longest)

@@ -587,7 +587,7 @@ def _best(
 
 
 def _moved(order: tuple[int, ...]) -> float:
-    """What an order costs beside its spins: two motors exchanged, or any other way of counting, less than a muddle."""
+    """Cost of an order beside its spins: two motors exchanged, or any other way of counting, less than a muddle."""
     moved = sum(k != place for k, place in enumerate(order))
     simple = moved == 2 or len(order) <= _MOST_ROTORS or order in _orders(len(order))
     return 0.0 if not moved else 1.2 if simple else 1.2 + 0.1 * moved

@@ -246,7 +246,7 @@ def p_unchanged(change: FloatArray, healthy: Healthy, flights: int, vehicle: Veh
 
 @dataclass(frozen=True)
 class _Question:
-    """What the evidence of draws follows from, and its bytes, the key of the cache."""
+    """Data that the evidence of draws follows from, and their bytes, the key of the cache."""
 
     key: tuple[bytes, ...]
     healthy: Healthy = field(compare=False)
@@ -377,7 +377,7 @@ class Change:
 
 @dataclass(frozen=True)
 class Health:
-    """What changed since the baseline flights.
+    """Changes since the baseline flights.
 
     Attributes:
         verdict: unchanged, changed or unknown.
@@ -465,7 +465,7 @@ def _unfamiliar(flights: Sequence[FlightTrim], baseline: Sequence[FlightTrim]) -
 
 
 def _lacking(change: FloatArray, healthy: Healthy, flights: int, vehicle: Vehicle) -> int:
-    """How many more baseline flights of the same spread would make this a change, up to `ENOUGH` in all; 0: none do."""
+    """Baseline flights of the same spread that would make this a change if added, up to `ENOUGH` in all; 0: none do."""
     for count in range(healthy.flights + 1, ENOUGH + 1):
         if p_unchanged(change, healthy.known_from(count), flights, vehicle) < SIGNIFICANT:
             return count - healthy.flights

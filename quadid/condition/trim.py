@@ -28,7 +28,7 @@ from quadid.vehicle import GRAVITY, Vehicle
 
 
 AXES = ("roll", "pitch", "yaw", "effort")
-"""What a trim consists of; effort is the logarithm of rotor thrust commanded per specific force."""
+"""Parts of a trim; effort is the logarithm of rotor thrust commanded per specific force."""
 BLOCK = 1.0
 """Trims are means over this long [s]."""
 _CLIMB_OUT = 1.5
@@ -116,7 +116,7 @@ def flight_trim(recording: Recording, vehicle: Vehicle) -> FlightTrim:
 
 
 def _turning(recording: Recording, edges: FloatArray) -> float:
-    """How much the vehicle turns in the blocks that begin at `edges`, see `FlightTrim.turning`."""
+    """Rate of turning in the blocks that begin at `edges`, see `FlightTrim.turning`."""
     gyro = recording.channels.get("gyro")
     if gyro is None or len(gyro.t) < 2:
         return math.nan
@@ -155,7 +155,7 @@ def _specific_force(recording: Recording, edges: FloatArray) -> tuple[FloatArray
 
 
 def _motion(recording: Recording, edges: FloatArray) -> tuple[FloatArray, str]:
-    """What moves a trim beside the vehicle itself, in units of its prior size: velocity, else what stands for it."""
+    """Motion that moves a trim beside the vehicle itself, over its prior size: velocity, else what stands for it."""
     velocity = _velocity(recording, edges)
     if velocity is not None:
         return velocity * _AIR_SLOPE, "motion from position or velocity"

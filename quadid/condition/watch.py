@@ -34,7 +34,7 @@ _NO_MASS = (math.nan, math.nan, math.nan)
 
 @dataclass(frozen=True)
 class HealthReport:
-    """What is known of the vehicle's health in flight.
+    """Report of the vehicle's health in flight.
 
     Attributes:
         t: time of the last second that it rests on [s].
@@ -125,7 +125,7 @@ class HealthWatch:
         return self._judged(t, self._healthy)
 
     def airborne(self, load: FloatArray) -> bool:
-        """Whether the rotors carry the vehicle, as far as the healthy flights or the first guess of b indicate."""
+        """True if the rotors carry the vehicle, as far as the healthy flights or the first guess of b indicate."""
         usual = self._vehicle.mass / self._vehicle.parameters["b"].initial
         if self._healthy is not None:
             usual = float(np.exp(self._healthy.mean[AXES.index("effort")]))

@@ -187,7 +187,7 @@ def lowpass_span(t: FloatArray, step: float, held: bool) -> tuple[float, float]:
 
 
 def true_runs(true: BoolArray) -> tuple[IndexArray, IndexArray]:
-    """Where each run of True in an array (n,) begins, and where it has ended, shapes (runs,)."""
+    """Places where each run of True in an array (n,) begins, and where it has ended, shapes (runs,)."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], true, [False]]).astype(np.int8)))
     return edges[::2], edges[1::2]
 
@@ -360,7 +360,7 @@ SHORTEST = 1.0
 
 @dataclass(frozen=True)
 class GridReport:
-    """What became of a recording on its way to windows.
+    """Account of a recording on its way to windows.
 
     Attributes:
         rate: grid rate [Hz].

@@ -1,4 +1,4 @@
-"""What a held command does within its samples where feedback that is faster than the log drives it.
+"""Course of a held command within its samples where feedback that is faster than the log drives it.
 
 A flight controller acts some hundred times a second; a log at 50 Hz keeps what its commands were on average over each
 sample.  Within the sample they follow the feedback: the angular acceleration about an axis runs on at the slope

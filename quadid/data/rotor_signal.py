@@ -1,4 +1,4 @@
-"""Which channel holds the rotor speeds, and what its numbers mean: readings, or commands, by the vehicle file."""
+"""Rotor speeds of a recording: their channel, and the meaning of its numbers, readings or commands."""
 
 from __future__ import annotations
 

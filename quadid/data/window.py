@@ -76,7 +76,7 @@ class Block:
 
 
 def _never_changes(values: ArrayLike) -> TypeGuard[FloatArray]:
-    """Whether these are rows of doubles that nobody can write to, so that they need no copy."""
+    """True if these are rows of doubles that nobody can write to, so that they need no copy."""
     if not (isinstance(values, np.ndarray) and values.dtype == np.float64 and values.flags.c_contiguous):
         return False
     owner: object = values
@@ -132,7 +132,7 @@ class Channel:
 
 @dataclass(frozen=True)
 class Recording:
-    """What a log holds, in core units and frames, each channel at its own rate.
+    """Contents of a log, in core units and frames, each channel at its own rate.
 
     Attributes:
         name: name for people (file name).
@@ -356,7 +356,7 @@ def median(values: FloatArray) -> float:
 
 
 def copied(values: FloatArray) -> BoolArray:
-    """Which rows of (n, columns), from the second on, equal the row before exactly, shape (n - 1,)."""
+    """True for rows of (n, columns), from the second on, that equal the row before exactly, shape (n - 1,)."""
     return np.asarray(np.all(values[1:] == values[:-1], axis=1))
 
 

@@ -119,7 +119,7 @@ class BackgroundDiagnosis:
             self._reply = reply
 
     def answer(self, tick: float, since: float) -> OnlineDiagnosis | None:
-        """What there is to publish of an answer, when it is time to use it; None where it was said before.
+        """Part of an answer to publish, when it is time to use it; None where it was published before.
 
         Args:
             tick: now [s].

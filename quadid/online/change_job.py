@@ -1,4 +1,4 @@
-"""What a sudden change was: look-alikes fitted to the seconds after it, everything known before held fast."""
+"""Cause of a sudden change: look-alikes fitted to the seconds after it, everything known before held fast."""
 
 from __future__ import annotations
 
@@ -146,7 +146,7 @@ def _explain(request: ChangeRequest) -> ChangeReply:
 
 
 def carried(request: ChangeRequest) -> OnlineFinding | None:
-    """What a step of thrust means where no fit can say what it is: a force; None for a step of a moment."""
+    """Finding for a step of thrust where no fit can name its cause: a force; None for a step of a moment."""
     change = request.change
     if change.channel != "thrust":
         return None

@@ -77,7 +77,7 @@ class Velocity:
     """
 
     def __init__(self) -> None:
-        """Stands still."""
+        """Starts at rest."""
         self._at, self.sigma = np.zeros(3), ASTRAY
 
     def body(self, rows: Rows) -> FloatArray:
@@ -201,7 +201,7 @@ def _reweighted(
 
 
 CHANNELS = ("thrust", "roll moment", "pitch moment")
-"""What may step."""
+"""Signals in which a step is looked for."""
 _Series = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
 """Values, regressors, typical sizes of their coefficients, how regressors may be off (`step_beside`)."""
 

@@ -70,7 +70,7 @@ class Factor:
 
     @property
     def known(self) -> bool:
-        """Whether it says anything."""
+        """True if it is known well enough to be compared."""
         return self.sigma <= KNOWN
 
     @property
@@ -111,7 +111,7 @@ class Consistency:
     """Factors of the channels of one stream."""
 
     def __init__(self) -> None:
-        """Knows nothing yet."""
+        """Starts empty."""
         self.restart()
 
     def restart(self) -> None:
@@ -166,7 +166,7 @@ class Consistency:
 
     @property
     def fault(self) -> str:
-        """Which channels contradict each other, and what is waited for; empty where none do."""
+        """Channels that contradict each other, and what is waited for; empty where none do."""
         wrong = [f for f in self.factors() if f.disagrees]
         if not wrong:
             return ""
@@ -273,7 +273,7 @@ def _broken(window: Window) -> str:
 
 
 def _moves(window: Window, name: str, rows: IndexArray) -> bool:
-    """Whether the others say that a sensor which repeats itself ought not to; coarse ones do so in a calm hover.
+    """True if the others say that a sensor which repeats itself ought not to; coarse ones do so in a calm hover.
 
     They do by gyro and attitude beside its bias, or by the scatter of the thrust as a share of it.
     """
@@ -331,7 +331,7 @@ def _weight_share(window: Window, vehicle: Vehicle, thrust: ThrustModel) -> Floa
 
 
 def _lift(share: FloatArray, dt: float, known: bool) -> Quality:
-    """Whether the rotors carry the vehicle; judged second by second, back from the end."""
+    """Verdict on whether the rotors carry the vehicle, second by second, back from the end."""
     # Mean thrust over weight of a flying vehicle; a thrust coefficient that is a guess leaves more room.
     low, high = (0.4, 4.0) if known else (0.2, 5.0)
     second = max(round(1.0 / dt), 1)
@@ -347,7 +347,7 @@ def _lift(share: FloatArray, dt: float, known: bool) -> Quality:
 
 
 def _not_flying(window: Window) -> str:
-    """Says why a window with turning rotors is not flight, whatever they give, or returns an empty string."""
+    """Reason why a window with turning rotors is not flight, whatever they give; empty where it is."""
     if window.attitude is not None and np.any(down(window.attitude)[:, 2] < 0.0):
         return "tumbled, or lying on its side"
     if window.accel is None or not np.isfinite(window.accel).any():

@@ -74,7 +74,7 @@ BEYOND = 2.0
 
 @dataclass(frozen=True)
 class WindowEstimate:
-    """What one window says.
+    """Estimate of one window: a quadratic model of its cost.
 
     Attributes:
         start, stop: its time [s].
@@ -106,12 +106,12 @@ class WindowEstimate:
 
     @property
     def optimum(self) -> FloatArray:
-        """Where its cost is least, shape (P,)."""
+        """Minimum of its cost, shape (P,)."""
         return np.asarray(self.z - np.linalg.solve(self.information, self.score))
 
     @property
     def finite(self) -> bool:
-        """Whether every number of it is one."""
+        """True if it contains finite numbers only."""
         arrays = (self.z, self.information, self.score, self.left_out)
         return math.isfinite(self.cost) and all(bool(np.isfinite(a).all()) for a in arrays)
 
@@ -123,7 +123,7 @@ class WindowEstimate:
 
 @dataclass(frozen=True)
 class LackOfFit:
-    """What the effects of the catalogue would take from the residuals, all freed at once.
+    """Part of the residuals that the effects of the catalogue would explain, all freed at once.
 
     Attributes:
         drop: of the deviance, in units of the residuals' own level.
@@ -142,7 +142,7 @@ class LackOfFit:
 
     @property
     def significant(self) -> bool:
-        """Whether it is more than a trifle (1 %), and more than noise gives (6 standard deviations)."""
+        """True if it is more than a trifle (1 %), and more than noise gives (6 standard deviations)."""
         errors = (self.drop - self.freedom) / math.sqrt(2.0 * max(self.freedom, 1))
         return self.share > 0.01 and errors > 6.0
 
@@ -208,7 +208,7 @@ class FitRequest(Job):
         return fit(self)
 
     def is_answered_by(self, reply: object) -> TypeGuard[JobReply]:
-        """Whether a reply is to this job, and of its form."""
+        """True if a reply is to this job, and of its form."""
         if not (super().is_answered_by(reply) and isinstance(reply, FitReply)):
             return False
         channels = min(map(channels_of, self.windows), default=0)
@@ -339,12 +339,12 @@ def prior_of(vehicle: Vehicle) -> Prior:
 
 
 def is_excited(bounds: FloatArray) -> bool:
-    """Whether a window reveals roll and pitch dynamics."""
+    """True if a window reveals roll and pitch dynamics."""
     return bool(np.all(bounds[ROLL_PITCH] <= EXCITED))
 
 
 def _noise_is_spoilt(shooting: Shooting, theta: FloatArray, free: Free) -> bool:
-    """Whether the motion suffices with usual noise, and the noise at hand is far above that.
+    """True if the motion suffices with usual noise, and the noise at hand is far above that.
 
     Noise once taken from bad data would call every later motion too small, and so never be measured again.
     """
@@ -453,7 +453,7 @@ def flexible_fit(
 
 
 def reduced(start: float, stop: float, fitted: Flexible, known: FloatArray | None = None) -> WindowEstimate:
-    """What a window says of the nominal six, whatever the effects are; b is that at hover.
+    """Estimate of the nominal six by a window, whatever the effects are; b is that at hover.
 
     Information counts for less where the scores of segments scatter more than the noise explains (`score_products`).
     `known`: thrust that the six leave out (`left_out`), where that was computed already.
@@ -526,7 +526,7 @@ def sampling_error(estimate: WindowEstimate, fitted: Flexible, spacing: float) -
 
 
 def alike(estimate: WindowEstimate) -> float:
-    """How many windows like this one err alike: by so much the variance of what they miss has to count in each."""
+    """Number of windows like this one that err alike: so many times the variance of what they miss counts in each."""
     return max(LASTING / (estimate.stop - estimate.start), 1.0)
 
 

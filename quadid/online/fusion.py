@@ -96,7 +96,7 @@ class Fusion:
         self._sums.clear()
 
     def agrees(self, window: WindowEstimate) -> bool:
-        """Whether a window fits the estimate from data before it, where there is one (chi-square)."""
+        """True if a window fits the estimate from data before it, where there is one (chi-square)."""
         earlier = self._before(window.start)
         if earlier is None:
             return True
@@ -166,7 +166,7 @@ class Fusion:
         return np.stack([mean, np.sqrt(np.maximum(scatter, 1.0) / weight.sum(axis=0))])
 
     def agreement(self, most: int) -> tuple[int, tuple[int, float] | None]:
-        """How many of the newest disjoint windows agree in a row with the fused estimate, `most` at most.
+        """Number of the newest disjoint windows that agree in a row with the fused estimate, `most` at most.
 
         And of the first that does not: which parameter is farthest off, and by how much, log scale.
         """
@@ -199,7 +199,7 @@ class Fusion:
         return next((s for s in reversed(self._sums) if s.stop <= start + 1e-6), None)
 
     def _alone(self, window: WindowEstimate) -> Fused:
-        """What a window says with nothing but the prior."""
+        """Estimate of a window by itself and the prior."""
         matrix = window.scale * window.information
         vector = window.scale * (window.information @ window.z - window.score)
         return self._solve(_Sum(window.stop, matrix, vector))
@@ -393,7 +393,7 @@ class Estimator:
         return parameter_set(self._free, theta, self._initial, unc)
 
     def _without_yaw(self, theta: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """What couples into yaw alone is as uncertain as before the flight where the model misses it.
+        """The estimate with what couples into yaw alone as uncertain as before the flight, where the model misses it.
 
         Roll and pitch rest on torque over inertia; d, J_zz and J_r on small couplings, which what is missed outweighs.
         Where every effect is fitted along, the coupling itself is free, and yaw knows their ratios only.
@@ -421,7 +421,7 @@ class Estimator:
     def case(
         self, parameters: ParameterSet, request: FitRequest, reply: FitReply, sets: ActiveSet, windows: int
     ) -> Case:
-        """What the gate needs to know about the present estimate; what speaks against the sensors is not in it.
+        """The case for the gate, without what speaks against the sensors.
 
         Args:
             parameters: the estimate.

@@ -22,7 +22,7 @@ MUST_BE_KNOWN = ("b", "J_xx", "J_yy")
 
 
 class GateSettings(BaseModel):
-    """How cautious the gate is.
+    """Settings of the gate: how cautious it is.
 
     Attributes:
         approval: ``auto``: what passes is published; ``manual``: it waits for a person.
@@ -59,7 +59,7 @@ class GateSettings(BaseModel):
 
 @dataclass(frozen=True)
 class Case:
-    """What the gate is told about an estimate.
+    """Case of an estimate: all that the gate judges it by.
 
     Attributes:
         parameters: the estimate.
@@ -237,7 +237,7 @@ def _doubtful(case: Case, settings: GateSettings) -> str | None:
 
 
 def _together(factor: Factor, case: Case) -> tuple[FloatArray, FloatArray]:
-    """How far off a factor is, with what thrust leaves out beside it, and the standard deviation; shapes (1,).
+    """Distance of a factor from 1, with what thrust leaves out beside it, and the standard deviation; shapes (1,).
 
     Each may be within its own limit: an accelerometer 3 % high under a gyro 2.5 % high, and a support of 4 %.
     """

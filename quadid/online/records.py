@@ -34,7 +34,7 @@ sigma, or nothing, where a wrong scale of all rotor speeds cannot be seen."""
 
 
 class Phase(StrEnum):
-    """What a session is doing; the values read as sentences."""
+    """Phases of a session; the values read as sentences."""
 
     WAITING = "waiting for data"
     COLLECTING = "collecting the first window"
@@ -196,7 +196,7 @@ class Event:
 
 @dataclass(frozen=True)
 class SessionStatus:
-    """What a session is doing.
+    """Status of a session.
 
     Attributes:
         t: newest sample [s, time of the stamps]; NaN before the first.
@@ -309,7 +309,7 @@ class Job(ABC):
         return self.reply(self.number, problem)
 
     def is_answered_by(self, reply: object) -> TypeGuard[JobReply]:
-        """Whether a reply is to this job, and of its kind."""
+        """True if a reply is to this job, and of its kind."""
         return isinstance(reply, self.reply) and reply.number == self.number
 
 

@@ -64,7 +64,7 @@ _DONE = object()
 
 
 class SessionSettings(BaseModel):
-    """What is learned, from how much data, and how cautiously it is published.
+    """Settings of a session: what is learned, from how much data, and how cautiously it is published.
 
     Attributes:
         rate: grid rate [Hz].
@@ -164,7 +164,7 @@ class Session:
             self._diagnosis.deliver(reply)
 
     def hurry(self, needed: bool) -> None:
-        """Says whether the machine is too slow at the moment: then changes come first, and no fit begins."""
+        """Notes whether the machine is too slow at the moment: then changes come first, and no fit begins."""
         self._hurried = needed
 
     def go_on(self) -> None:
@@ -209,7 +209,7 @@ class Session:
 
     @property
     def busy(self) -> bool:
-        """Whether there is a piece of work that waits for nothing."""
+        """True if there is a piece of work that waits for nothing."""
         if self._work is None and self._waiting is not None:
             return self._reply is not None
         return self._work is not None or self._tick_due or self.resampler.busy
@@ -232,7 +232,7 @@ class Session:
         return self._outbox.take()
 
     def status(self) -> SessionStatus:
-        """What the session is doing now."""
+        """Status of the session now."""
         newest, active_set = self.resampler.time.newest, self.active_set
         windows, cut = self._estimator.fusion.windows, self._cut
         force, pending = active_set.in_force, active_set.pending

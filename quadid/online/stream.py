@@ -254,7 +254,7 @@ class CommandReconstruction:
 
     @property
     def known(self) -> bool:
-        """Whether the stabiliser is known."""
+        """True if the stabiliser is known."""
         return self._gains is not None
 
     def restart(self) -> None:
@@ -576,7 +576,7 @@ class Resampler:
 
     @property
     def busy(self) -> bool:
-        """Whether there is a piece of `work`."""
+        """True if there is a piece of `work`."""
         return self._making is not None or self._is_due()
 
     def work(self) -> Rows | None:
@@ -651,7 +651,7 @@ class Resampler:
         return Rows(at, columns, plan.sampling, rotor.source, spacing=spacing)
 
     def _rotor_signal(self, recording: Recording, at: FloatArray) -> RotorSignal:
-        """What the rotors were told: as published, else references through the stabiliser; raises QuadidError."""
+        """Rotor commands or speeds: as published, else references through the stabiliser; raises QuadidError."""
         told, steered = (
             any(self._buffers[name].taken for name in names)
             for names in (("rotor_speed", "motor_command"), ("attitude_reference",))
