@@ -101,7 +101,7 @@ def ordinary(model: Model, cause: Candidate) -> bool:
 _NONE, _ALL = "no cause", "all causes"
 
 
-def worths(
+def cause_gains(
     decisive: Shooting, nominal: Model, model: Model, without: Mapping[str, Model], logs: Sequence[Window]
 ) -> tuple[tuple[float, float], tuple[Worth, ...]]:
     """Errors on unseen data in the segments that decided, and what each cause takes off them.

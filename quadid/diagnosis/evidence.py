@@ -31,8 +31,8 @@ from quadid.types import BoolArray, FloatArray, IndexArray
 FALSE_ALARM = 1e-3
 """Prior probability that a flight has any cause to be named, shared by all that are tried: that of a false alarm."""
 RELEVANT = 0.002
-"""Share of the noise that a cause must take away on unseen blocks.  Less is of no use to anybody, and within what the
-time step of a simulation or of an autopilot's own filter can imitate: nulls reach 0.0008."""
+"""Share of the noise that a cause must take away on unseen blocks.  Smaller gains are irrelevant in practice, and what
+the time step of a simulation or of an autopilot's own filter can imitate: nulls reach 0.0008."""
 
 
 def better(b: Model, a: Model) -> bool:

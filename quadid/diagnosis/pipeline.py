@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from quadid.data.window import Window, data_faults, without_copies
-from quadid.diagnosis.attribution import NominalFit, stated_errors, worths
+from quadid.diagnosis.attribution import NominalFit, cause_gains, stated_errors
 from quadid.diagnosis.evidence import better, impossible_causes, late_unknown, slight_causes
 from quadid.diagnosis.hypotheses import BLOCKS, Model, candidates, free_names, refit, without
 from quadid.diagnosis.residual_tests import Remainder, inconstant_causes, remainder
@@ -77,7 +77,7 @@ def diagnose(
     left = remainder(decisive, model, seed)
     report("validation", 0.0)
     fewer = {c.label: without(decisive, model, c) for c in model.causes}
-    deciding, worth = worths(decisive, search.nominal, model, fewer, validation)
+    deciding, worth = cause_gains(decisive, search.nominal, model, fewer, validation)
     nominal = nominal or NominalFit(vehicle, search.nominal.theta, decisive.noise)
     outcome = stated_errors(nominal, model, windows, validation, deciding)
     # The verdict; causes with numbers that no vehicle has, or of another form, count as left.

@@ -20,7 +20,7 @@ from quadid.diagnosis.hypotheses import Model, fit_model, free_names, without
 from quadid.diagnosis.search import Search, Stage, pruned
 from quadid.effects import EFFECTS
 from quadid.identification.fast_motion import MOST_SEGMENTS, fast_motion
-from quadid.identification.fit import YAW, fast_fit, restless
+from quadid.identification.fit import YAW, fast_fit, has_unmodelled_moments
 from quadid.identification.gauss_newton import polish
 from quadid.identification.noise_fit import residual_noise
 from quadid.identification.problem import Shooting
@@ -87,7 +87,7 @@ def held_by_fast_motion(windows: Sequence[Window], short: Shooting, model: Model
     """
     short = short.at_most(MOST_SEGMENTS)
     brief = polish(short, model.theta, model.free, model.prior, iterations=8)
-    if not restless(short.with_noise(residual_noise(short, brief)), brief):
+    if not has_unmodelled_moments(short.with_noise(residual_noise(short, brief)), brief):
         return None
     names = free_names(tuple(c for c in model.causes if c.family == "late" and EFFECTS[c.effect].turns))
     quick = fast_motion(windows, short, model.theta, names)

@@ -283,7 +283,7 @@ def fit(
     comparable = not set(INERTIAS) & set(out_of_reach or ())
     report("polish", 0.2)
     # 3. Where moments that the model lacks rule the rates, fast motion alone decides.
-    quick = fast_motion(windows, short, first.theta, free.names) if restless(short, first) else None
+    quick = fast_motion(windows, short, first.theta, free.names) if has_unmodelled_moments(short, first) else None
     if quick is not None:
         # Longer segments would only let the missing moments in again, and what these leave is no measure of the noise.
         report("noise", 0.0)
@@ -316,7 +316,7 @@ def fit(
     return final_answer(found, out_of_reach or {})
 
 
-def restless(short: Shooting, plain: Polished) -> bool:
+def has_unmodelled_moments(short: Shooting, plain: Polished) -> bool:
     """Whether moments that the model lacks rule the rates: as random ones they explain most of what it leaves.
 
     Turbulence, aerodynamic moments, uncalibrated rotor speeds and offsets act slowly; a model without them otherwise

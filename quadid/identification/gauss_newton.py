@@ -96,7 +96,7 @@ class Convergence(StrEnum):
     CONVERGED = "the step fell below the statistical resolution"
     BUDGET = "the iteration limit was reached before the step was small"
     STUCK = "no step reduced the cost any further"
-    ASTRAY = "the initial states went where no linear step follows them"
+    ASTRAY = "the initial states diverged from what a linear step can follow"
 
 
 LONGEST_STEP = 3.0
