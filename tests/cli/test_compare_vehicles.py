@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,9 +10,8 @@ import pytest
 import quadid
 from quadid.errors import LogError, ParameterError
 from quadid.flight import TruthParameters
-from quadid.jsonable import jsonable
 from quadid.vehicle import ParameterPrior, Vehicle
-from tests.cli.conftest import Cli, Flights
+from tests.cli.conftest import Flights
 
 PELICAN = Vehicle.shipped("pelican")
 
@@ -62,20 +59,13 @@ def test_the_interval_covers_what_other_flights_show(flights: Flights) -> None:
     assert abs(np.log(two["ratio"]) - middle) < 3.0 * width
 
 
-def test_command_and_call_agree_and_make_a_page(flights: Flights, tmp_path: Path, inside: Cli) -> None:
-    files = [near(f, effects=e).save(tmp_path / f"{n}.yaml")
-             for f, e, n in ((1.2, {}, "old"), (1.0, {"motor_lag": {"tau": 0.001}}, "new"))]  # fmt: skip
-    page, out = tmp_path / "c.html", tmp_path / "c.json"
-    run = inside("compare-vehicles", *files, "--on", flights.unseen, "--report", page, "--json", out)
-    assert run.code == 0, run.err
-    assert "predicts better than" in run.out
-    result = json.loads(out.read_text(encoding="utf-8"))
-    assert result["schema"] == "quadid.compare_vehicles/1"
-    assert result["effects"] == [{"effect": "motor_lag", "name": "tau", "a": None, "b": 0.001}]
-    made = quadid.compare_vehicles(files[0], files[1], str(flights.unseen))
-    assert {k: v for k, v in result.items() if k != "report"} == jsonable(made.result)
+def test_effects_stand_side_by_side(flights: Flights) -> None:
+    lagged = near(effects={"motor_lag": {"tau": 0.001}})
+    made = quadid.compare_vehicles(near(1.2), lagged, str(flights.unseen))
+    assert made.result["effects"] == [{"effect": "motor_lag", "name": "tau", "a": None, "b": 0.001}]
+    assert "predicts better than" in made.text()
     assert len(made.to_frame()) == 12
-    assert "Parameters side by side" in page.read_text(encoding="utf-8")
+    assert "Effects side by side" in made.page()
 
 
 def test_what_cannot_be_compared_is_refused(flights: Flights) -> None:
