@@ -137,7 +137,7 @@ def _estimate() -> None:
     problem = Problem.of([track], vehicle)
     p, psi = problem.physics(problem.start(), 0), problem.first_noise()
     _, gains = kalman.kalman(track, p, psi, problem.tail, True)
-    kalman.replay(track, p, psi, gains, gains.table, np.empty((0, kalman.M)))
+    kalman.replay(track, p, psi, gains, gains.table, np.empty((0, kalman.M)), np.empty((0, kalman.N_MEAN)))
     kalman.backward(track, p, psi, gains, True)
     kalman.single_steps(track, p, gains.mean)
     kalman.specific_force(track, p, gains.mean)

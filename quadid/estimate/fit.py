@@ -61,7 +61,8 @@ class Estimate:
                 sigma = float(np.sqrt(self.covariance[i, i]))
                 if place < k.TRIM:
                     return float(np.exp(self.z[i])), sigma
-                return float(self.z[i] * self.problem.size[i]), sigma * float(self.problem.size[i])
+                neutral = self.problem.layout.entry(name).neutral if place >= k.N_PHYSICS else 0.0
+                return neutral + float(self.z[i] * self.problem.size[i]), sigma * float(self.problem.size[i])
         raise KeyError(name)
 
 
@@ -106,18 +107,18 @@ def estimate(problem: Problem, seed: int = 0, particles: int = 64, iterations: i
     inverse = np.linalg.inv(information)
     z = z + 0.5 * inverse @ within.sum(axis=0)
     # 6. Intervals: score over slope, and how well the noise of rotor speeds and that answer are known.
-    by_square = taken @ wide * _of_square(problem, z, psi)
+    by_square = taken @ wide * _of_square(problem, z, psi, gains)
     score = information + (wide.T * taken) @ wide + 0.25 * within.T @ within + np.outer(by_square, by_square)
     covariance = inverse @ score @ inverse
     return Estimate(problem, z, psi, np.asarray(covariance), value, tuple(whitened(g) for g in gains))
 
 
-def _of_square(problem: Problem, z: FloatArray, psi: FloatArray) -> float:
+def _of_square(problem: Problem, z: FloatArray, psi: FloatArray, gains: Sequence[Gains]) -> float:
     """Relative standard deviation of the variance of rotor speeds: none at its floor, no more than its bounds leave."""
     low, high = problem.noise_bounds[k.ROTOR]
     if psi[k.ROTOR] <= 1.01 * low:
         return 0.0
-    known = np.linalg.inv(problem.noise_information(z, psi) + 0.5 * np.diag(problem.noise_curvature(psi)))
+    known = np.linalg.inv(problem.noise_information(z, psi, gains) + 0.5 * np.diag(problem.noise_curvature(psi)))
     return float(min(2.0 * np.sqrt(known[k.ROTOR, k.ROTOR]), (high / psi[k.ROTOR]) ** 2 / np.sqrt(12.0)))
 
 
@@ -178,6 +179,7 @@ def scoring(
         Scaled parameters, noise numbers, objective, gains there; information (P, P) before the last step.
     """
     low, high = np.log(problem.noise_bounds.T)
+    least, most = problem.limits
     value, gains = problem.passes(z, psi)
     curvature, at, damping = np.eye(len(psi)), np.full(len(psi), np.inf), 0.0
     for _ in range(turns):
@@ -186,15 +188,20 @@ def scoring(
         if noise.any():
             slope = problem.score(z, psi, gains) * psi
             if np.max(np.abs(log - at)) > STALE:
-                curvature, at = 2.0 * problem.noise_information(z, psi) + np.diag(problem.noise_curvature(psi)), log
+                curvature, at = (
+                    2.0 * problem.noise_information(z, psi, gains) + np.diag(problem.noise_curvature(psi)),
+                    log,
+                )
             # What rests on a bound and would go beyond stays there.
             free = noise & ~(((log <= low) & (slope > 0.0)) | ((log >= high) & (slope < 0.0)))
+        moves = ~(((z <= least) & (gradient > 0.0)) | ((z >= most) & (gradient < 0.0)))
         for _ in range(PATIENCE):
-            step, bold = _damped(information, gradient, damping), np.zeros(len(psi))
+            step, bold = np.zeros(len(z)), np.zeros(len(psi))
+            step[moves] = _damped(information[np.ix_(moves, moves)], gradient[moves], damping)
             bold[free] = _damped(curvature[np.ix_(free, free)], slope[free], damping)
             expected = -float(gradient @ step) - 0.5 * float(slope @ bold)
-            moved, changed = z + step, np.exp(np.clip(log + bold, low, high))
-            better, renewed = problem.passes(moved, changed)
+            moved, changed = np.clip(z + step, least, most), np.exp(np.clip(log + bold, low, high))
+            better, renewed = problem.passes(moved, changed, gains)
             if better < value or expected < ENOUGH:
                 break
             damping = max(4.0 * damping, 0.1)

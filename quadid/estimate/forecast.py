@@ -19,7 +19,7 @@ from quadid.errors import NotIdentifiableError
 from quadid.estimate import kalman as k
 from quadid.estimate.fit import ALL_NOISE, MOST, NEAR_SECONDS, NO_NOISE, scoring
 from quadid.estimate.kalman import Gains, Track
-from quadid.estimate.missing import TRIMMING, settled, simulated_along
+from quadid.estimate.missing import TRIMMING, settled
 from quadid.estimate.problem import Problem
 from quadid.estimate.track import from_window
 from quadid.identification.controller_gains import Autopilot
@@ -84,7 +84,8 @@ class Forecast:
         # 2. The whole flight; predictions begin after that part.
         tracks = [from_window(w, vehicle, air=t.still > 0.0) for w, t in zip(flown, problem.tracks, strict=True)]
         self.z, self.psi = z, psi
-        self.problem = simulated_along(replace(problem, tracks=tuple(tracks)), flown, theta, z, psi)
+        whole = Problem.fixed(tracks, vehicle, theta, flown)
+        self.problem = replace(whole, control=problem.control, tail=problem.tail).along(z, psi)
 
     def covered(self, samples: Sequence[int]) -> Shares:
         """How many outcomes lie inside the bands predicted from the filtered state and the logged rotor speeds.

@@ -109,6 +109,7 @@ class Gains(NamedTuple):
         mean: after the updates, shape (n, N_MEAN).
         P: columns of the covariance there that belong to f, alpha, e, shape (n, N, 9).
         table: rotor moments, see `moments`.
+        beyond: see `Track.beyond`.
     """
 
     gain: FloatArray
@@ -119,6 +120,7 @@ class Gains(NamedTuple):
     mean: FloatArray
     P: FloatArray
     table: FloatArray
+    beyond: FloatArray
 
 
 @nb.njit(**_FAST)
@@ -571,7 +573,7 @@ def kalman(track: Track, p: FloatArray, psi: FloatArray, tail: FloatArray, store
     g = Gains(
         np.zeros((rows, M, N)), np.zeros((rows, M)), np.zeros((rows, M)), np.zeros((rows, M)),
         np.zeros((rows, 3, 6)), np.zeros((rows, N_MEAN)), np.zeros((rows, N, 9)),
-        moments(track, p[DELAY]),
+        moments(track, p[DELAY]), track.beyond,
     )  # fmt: skip
     c, keep = _constants(p, track), np.empty(9)
     x, after = _start(track, p), np.empty(N_MEAN)
@@ -723,7 +725,9 @@ def specific_force(track: Track, p: FloatArray, means: FloatArray) -> FloatArray
 
 
 @nb.njit(**_FAST)
-def replay(track: Track, p: FloatArray, psi: FloatArray, g: Gains, table: FloatArray, out: FloatArray) -> float:
+def replay(
+    track: Track, p: FloatArray, psi: FloatArray, g: Gains, table: FloatArray, out: FloatArray, mean: FloatArray
+) -> float:
     """Innovations of other physics under the gains of a filter pass, whitened, and the sum of their squares.
 
     Args:
@@ -733,6 +737,7 @@ def replay(track: Track, p: FloatArray, psi: FloatArray, g: Gains, table: FloatA
         g: of the pass.
         table: moments of the rotors at these physics; see `moments`.
         out: shape (n, M), written; shape (0, M): only the sum is wanted.
+        mean: as in `Gains`, written; shape (0, N_MEAN): not wanted.
     """
     n = len(track.t)
     air = track.still > 0.0 or track.seen[:, 3].any()
@@ -758,6 +763,8 @@ def replay(track: Track, p: FloatArray, psi: FloatArray, g: Gains, table: FloatA
             if len(out) > 0:
                 out[k, m] = z
         _correct(dx, x)
+        if len(mean) > 0:
+            mean[k] = x
         if k + 1 < n:
             h = track.t[k + 1] - track.t[k]
             if abs(h - before) > 1e-12:

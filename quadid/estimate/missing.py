@@ -19,14 +19,11 @@ from quadid.estimate import kalman as k
 from quadid.estimate.fit import ALL_NOISE, MOST, NEAR_SECONDS, NO_NOISE, Estimate, scoring
 from quadid.estimate.problem import Problem
 from quadid.estimate.track import from_window
-from quadid.estimate.whole_model import WholeModel
 from quadid.model.layout import Layout
 from quadid.rotation import conjugate, rotated
 from quadid.types import FloatArray
 from quadid.vehicle import GRAVITY, RandomForces, RandomInput, Vehicle
 
-ROUNDS = 2
-"""Filter passes between which effects are simulated anew along the filtered states."""
 RESIZING = 10
 """Most steps to the size of the random forces."""
 _SIZES = (np.arange(k.N_NOISE) >= k.SIGMA) & (np.arange(k.N_NOISE) < k.SIGMA + 4)
@@ -156,32 +153,12 @@ def settled(
         theta: full parameter vector; effects are simulated along the filtered states.
         psi: noise numbers; None: the first guess.
     """
-    air = _has_effects(vehicle, theta)
-    problem = Problem.fixed([from_window(w, vehicle, air=air) for w in windows], vehicle, theta[:6])
+    air = bool(np.any(theta[6:] != Layout(vehicle).neutral()[6:]))
+    problem = Problem.fixed([from_window(w, vehicle, air=air) for w in windows], vehicle, theta, windows)
     z, noise = problem.start(), problem.first_noise() if psi is None else psi
-    problem = simulated_along(problem, windows, theta, z, noise)
+    problem = problem.along(z, noise)
     z, *_ = scoring(problem, z, noise, TRIMMING, NO_NOISE)
     return problem, z
-
-
-def simulated_along(
-    problem: Problem, windows: Sequence[Window], theta: FloatArray, z: FloatArray, psi: FloatArray
-) -> Problem:
-    """The problem with what effects of a full parameter vector add along its filtered states."""
-    if not _has_effects(problem.vehicle, theta):
-        return problem
-    models = [WholeModel(w, problem.vehicle, theta) for w in windows]
-    for _ in range(ROUNDS):
-        _, gains = problem.passes(z, psi)
-        problem = problem.beside([
-            m.beyond(t, problem.physics(z, j), g.mean)
-            for j, (m, t, g) in enumerate(zip(models, problem.tracks, gains, strict=True))
-        ])  # fmt: skip
-    return problem
-
-
-def _has_effects(vehicle: Vehicle, theta: FloatArray) -> bool:
-    return bool(np.any(theta[6:] != Layout(vehicle).neutral()[6:]))
 
 
 def size(parts: Sequence[Missing], force: bool) -> tuple[FloatArray, FloatArray]:

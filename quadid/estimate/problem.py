@@ -10,9 +10,13 @@ from typing import TypeVar
 
 import numpy as np
 
+from quadid.data.window import Window
+from quadid.effects import EFFECTS
 from quadid.estimate import kalman as k
 from quadid.estimate.kalman import Gains, Track
 from quadid.estimate.track import quantum, wavering
+from quadid.estimate.whole_model import WholeModel
+from quadid.model.layout import Layout
 from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray
 from quadid.vehicle import GRAVITY, Vehicle
@@ -29,9 +33,9 @@ PLACES: dict[str, int] = {
     **{f"cg_offset.{a}": k.CG + i for i, a in enumerate("xy")},
     "command_delay.delay": k.DELAY,
 }
-"""Entries of the physics vector by name."""
+"""Entries of the physics vector by name: those that the filter has in its own equations."""
 PER_FLIGHT = ("trim_moment", "gyro_bias", "accel_bias")
-"""Values that belong to a flight and not to the vehicle."""
+"""Values that belong to a flight and not to the vehicle, beside effects that do."""
 UPRIGHT = "accel_bias.z"
 """Told from thrust only where velocity is measured; without, it stays zero."""
 TRIMMED = tuple(name for name in PLACES if name.split(".")[0] in PER_FLIGHT and name != UPRIGHT)
@@ -63,6 +67,8 @@ ACTS = np.array([
     [0.0, 1.0, 0.0, 0.0, -1.0, 0.0],
 ])  # fmt: skip
 """Powers of the six in what rotors make of specific thrust and of the angular accelerations."""
+SETTLING = 2
+"""Times that effects are simulated anew along the states that they move."""
 LEAST = 1e-2
 """A random force this small against its prior is none."""
 
@@ -74,19 +80,25 @@ def control_moment(tracks: Sequence[Track], p: FloatArray) -> FloatArray:
     return np.asarray(np.std(arms / p[k.JX : k.JX + 3], axis=0) + 1e-3)
 
 
-def _liveliest(track: Track, share: float) -> Track:
-    """The stretch of a flight, as long as a share of its rows, with the largest rates."""
-    n = len(track.t)
-    rows = max(int(share * n), min(n, 2 * STRETCH))
-    square = np.concatenate([[0.0], np.cumsum(np.sum(track.y[:, :3] ** 2, axis=1) * track.seen[:, 0])])
-    first = int(np.argmax(square[rows:] - square[: n + 1 - rows]))
-    return cut(track, first, first + rows)
+def _of_flight(name: str) -> bool:
+    """Whether a value belongs to a flight."""
+    effect = name.split(".")[0]
+    return effect in PER_FLIGHT or (effect in EFFECTS and EFFECTS[effect].per_log)
 
 
 def cut(track: Track, first: int, last: int) -> Track:
     """Rows `first` to before `last`; rotor speeds are kept whole."""
     rows = slice(first, last)
     return track._replace(t=track.t[rows], y=track.y[rows], seen=track.seen[rows], beyond=track.beyond[rows])
+
+
+def _rows(track: Track, share: float) -> tuple[int, int]:
+    """The stretch of a flight, as long as a share of its rows, with the largest rates."""
+    n = len(track.t)
+    rows = max(int(share * n), min(n, 2 * STRETCH))
+    square = np.concatenate([[0.0], np.cumsum(np.sum(track.y[:, :3] ** 2, axis=1) * track.seen[:, 0])])
+    first = int(np.argmax(square[rows:] - square[: n + 1 - rows]))
+    return first, first + rows
 
 
 def floor_of(tracks: Sequence[Track]) -> FloatArray:
@@ -103,8 +115,10 @@ class Problem:
     Attributes:
         tracks: the flights.
         vehicle: geometry, mass, guesses and bounds.
-        names: free entries of `PLACES`; those of `PER_FLIGHT` once for every flight.
+        names: free entries of `PLACES` and of `quadid.model.layout.Layout`; those of a flight once for each.
         base: physics vector of what is not free, shape (N_PHYSICS,).
+        theta: full vector of what is not free.
+        models: one a flight, where more acts or is free than the filter has of its own.
         tail: see `kalman.kalman`.
         control: see `control_moment`; unit of what is random.
         borrowed: see `unbiased`, shape (4,).
@@ -114,32 +128,50 @@ class Problem:
     vehicle: Vehicle
     names: tuple[str, ...]
     base: FloatArray
+    theta: FloatArray
+    models: tuple[WholeModel, ...]
     tail: FloatArray
     control: FloatArray
     borrowed: FloatArray = field(default_factory=lambda: np.zeros(4))
 
     @classmethod
-    def of(cls, tracks: Sequence[Track], vehicle: Vehicle, names: Sequence[str] = ()) -> Problem:
-        """The six, trim moment, biases and `names` free, from the vehicle file's guess."""
-        base = np.zeros(k.N_PHYSICS)
-        base[:6] = vehicle.initial
+    def of(
+        cls, tracks: Sequence[Track], vehicle: Vehicle, names: Sequence[str] = (), windows: Sequence[Window] = ()
+    ) -> Problem:
+        """The six, trim moment, biases and `names` free, from the vehicle file's guess.
+
+        Args:
+            tracks: the flights.
+            vehicle: geometry, mass, guesses and bounds.
+            names: entries to free.
+            windows: of the same flights, row by row; without them `names` are of `PLACES`, the file's effects left out.
+        """
+        layout = Layout(vehicle)
+        theta = layout.initial(vehicle) if windows else layout.neutral()
+        theta[:6] = vehicle.initial
         upright = (UPRIGHT,) if any(t.seen[:, 3].any() for t in tracks) else ()
-        free, control = (*NOMINAL_NAMES, *TRIMMED, *upright, *names), control_moment(tracks, base)
-        return cls(tuple(tracks), vehicle, free, base, np.zeros(4), control)
+        return cls._beside(tracks, vehicle, theta, (*NOMINAL_NAMES, *TRIMMED, *upright, *names), windows)
 
     @classmethod
-    def fixed(cls, tracks: Sequence[Track], vehicle: Vehicle, six: FloatArray) -> Problem:
-        """Trim moment and biases free, the six as given."""
-        problem = cls.of(tracks, vehicle)
-        base = problem.base.copy()
-        base[:6] = six
-        free = tuple(n for n in problem.names if n not in NOMINAL_NAMES)
-        return replace(problem, base=base, names=free, control=control_moment(tracks, base))
+    def fixed(
+        cls, tracks: Sequence[Track], vehicle: Vehicle, theta: FloatArray, windows: Sequence[Window] = ()
+    ) -> Problem:
+        """Trim moment and biases free, beside a full parameter vector as given."""
+        upright = (UPRIGHT,) if any(t.seen[:, 3].any() for t in tracks) else ()
+        return cls._beside(tracks, vehicle, theta, (*TRIMMED, *upright), windows)
 
-    def beside(self, beyond: Sequence[FloatArray]) -> Problem:
-        """The problem with what a larger model adds on each flight, see `Track.beyond`."""
-        tracks = [track._replace(beyond=rows) for track, rows in zip(self.tracks, beyond, strict=True)]
-        return replace(self, tracks=tuple(tracks))
+    @classmethod
+    def _beside(
+        cls, tracks: Sequence[Track], vehicle: Vehicle, theta: FloatArray, names: tuple[str, ...],
+        windows: Sequence[Window],
+    ) -> Problem:  # fmt: skip
+        base = np.zeros(k.N_PHYSICS)
+        base[:6] = theta[:6]
+        wider = bool(windows) and (
+            not set(names) <= set(PLACES) or bool(np.any(theta[6:] != Layout(vehicle).neutral()[6:]))
+        )
+        models = tuple(WholeModel(w, vehicle) for w in windows) if wider else ()
+        return cls(tuple(tracks), vehicle, names, base, theta, models, np.zeros(4), control_moment(tracks, base))
 
     def based_on(self, z: FloatArray) -> tuple[Problem, FloatArray]:
         """The problem whose control moment, and so its priors, is that at z instead of the guess; and z there."""
@@ -152,13 +184,22 @@ class Problem:
         total = sum(float(track.t[-1] - track.t[0]) for track in self.tracks)
         if total <= 1.2 * seconds:
             return self
-        return replace(self, tracks=tuple(_liveliest(track, seconds / total) for track in self.tracks))
+        rows = [_rows(track, seconds / total) for track in self.tracks]
+        tracks = tuple(cut(track, *span) for track, span in zip(self.tracks, rows, strict=True))
+        models = tuple(model.cut(*span) for model, span in zip(self.models, rows, strict=True)) if self.models else ()
+        return replace(self, tracks=tracks, models=models)
+
+    @cached_property
+    def layout(self) -> Layout:
+        """Names and indices of the full vector."""
+        return Layout(self.vehicle)
 
     @cached_property
     def entries(self) -> tuple[tuple[str, int, int], ...]:
-        """Name, place in the physics vector, flight (-1: all) of every scaled parameter."""
-        common = [(n, PLACES[n], -1) for n in self.names if n.split(".")[0] not in PER_FLIGHT]
-        own = [(n, PLACES[n], j) for j in range(len(self.tracks)) for n in self.names if n.split(".")[0] in PER_FLIGHT]
+        """Name, place, flight (-1: all) of every scaled parameter; from N_PHYSICS on places are those of `theta`."""
+        places = [(n, PLACES[n] if n in PLACES else k.N_PHYSICS + self.layout.entry(n).index) for n in self.names]
+        common = [(n, place, -1) for n, place in places if not _of_flight(n)]
+        own = [(n, place, j) for j in range(len(self.tracks)) for n, place in places if _of_flight(n)]
         return tuple(common + own)
 
     @cached_property
@@ -167,10 +208,22 @@ class Problem:
         out = np.ones(len(self.entries))
         for i, (name, place, _) in enumerate(self.entries):
             effect = name.split(".")[0]
-            if place >= k.TRIM:
+            if place >= k.N_PHYSICS:
+                out[i] = self.layout.entry(name).typical
+            elif place >= k.TRIM:
                 own = {"cg_offset": OFF_CENTRE * self.vehicle.arm}
                 own |= {"trim_moment": float(self.control[place % 3])} if effect == "trim_moment" else {}
                 out[i] = (_SIZE | own)[effect]
+        return out
+
+    @cached_property
+    def limits(self) -> FloatArray:
+        """Bounds of the scaled parameters, shape (2, P); what the filter has of its own is free."""
+        out = np.tile([[-np.inf], [np.inf]], len(self.entries))
+        for i, (name, place, _) in enumerate(self.entries):
+            if place >= k.N_PHYSICS:
+                entry = self.layout.entry(name)
+                out[:, i] = (np.array([entry.lower, entry.upper]) - entry.neutral) / self.size[i]
         return out
 
     @cached_property
@@ -190,9 +243,19 @@ class Problem:
         """Physics vector of one flight at scaled parameters z."""
         p = self.base.copy()
         for (_, place, where), value, size in zip(self.entries, z, self.size, strict=True):
-            if where in (-1, flight):
+            if where in (-1, flight) and place < k.N_PHYSICS:
                 p[place] = np.exp(value) if place < k.TRIM else value * size
         return p
+
+    def vector(self, z: FloatArray, flight: int) -> FloatArray:
+        """Full vector of one flight; what the filter has of its own and frees is in both, trim and biases are not."""
+        theta, p = self.theta.copy(), self.physics(z, flight)
+        theta[:6] = p[:6]
+        for (name, place, where), value, size in zip(self.entries, z, self.size, strict=True):
+            if where in (-1, flight) and name in self.layout.entries and name.split(".")[0] not in PER_FLIGHT:
+                entry = self.layout.entry(name)
+                theta[entry.index] = p[place] if place < k.N_PHYSICS else entry.neutral + value * size
+        return theta
 
     def start(self) -> FloatArray:
         """Scaled parameters of the guess."""
@@ -225,8 +288,7 @@ class Problem:
 
     def explained(self, z: FloatArray) -> tuple[FloatArray, FloatArray]:
         """What is taken off at z, shape (4,), and half its logarithm's derivative, shape (4, P)."""
-        places = [place for _, place, _ in self.entries]
-        wide = np.column_stack([ACTS, np.zeros((4, k.N_PHYSICS - 6))])[:, places]
+        wide = np.column_stack([ACTS[:, place] if place < 6 else np.zeros(4) for _, place, _ in self.entries])
         return self.borrowed * np.exp(2.0 * ACTS @ np.log(self.physics(z, 0)[:6])), wide
 
     def within_a_step(self, z: FloatArray, gains: Sequence[Gains]) -> FloatArray:
@@ -308,15 +370,45 @@ class Problem:
         total += sum(_each(lambda j: self._pass(z, psi, j, False)[0], len(self.tracks)))
         return total if np.isfinite(total) else float(np.inf)
 
-    def passes(self, z: FloatArray, psi: FloatArray) -> tuple[float, list[Gains]]:
-        """The same, and the gains of every flight."""
-        found = _each(lambda j: self._pass(z, psi, j, True), len(self.tracks))
+    def passes(self, z: FloatArray, psi: FloatArray, near: Sequence[Gains] = ()) -> tuple[float, list[Gains]]:
+        """The same, and the gains of every flight.
+
+        Args:
+            z: scaled parameters.
+            psi: noise numbers.
+            near: gains of a pass nearby, along whose states effects are simulated first; else those without effects.
+        """
+        found = _each(lambda j: self._pass(z, psi, j, True, near[j] if near else None), len(self.tracks))
         total = self.penalty(z) + self.noise_penalty(psi)[0] + sum(value for value, _ in found)
         return (total if np.isfinite(total) else np.inf), [g for _, g in found]
 
-    def _pass(self, z: FloatArray, psi: FloatArray, j: int, store: bool) -> tuple[float, Gains]:
-        value, gains = k.kalman(self.tracks[j], self.physics(z, j), psi, self.tail, store)
+    def along(self, z: FloatArray, psi: FloatArray) -> Problem:
+        """The problem in which effects stay as simulated along the states at z."""
+        if not self.models:
+            return self
+        tracks = [t._replace(beyond=g.beyond) for t, g in zip(self.tracks, self.passes(z, psi)[1], strict=True)]
+        return replace(self, tracks=tuple(tracks), models=())
+
+    def _pass(
+        self, z: FloatArray, psi: FloatArray, j: int, store: bool, near: Gains | None = None
+    ) -> tuple[float, Gains]:
+        track, p = self.tracks[j], self.physics(z, j)
+        if self.models:
+            near = near or k.kalman(track, p, psi, self.tail, True)[1]
+            mean = near.mean
+            for _ in range(SETTLING):
+                track = track._replace(beyond=self._beyond(z, j, mean))
+                mean = np.empty_like(mean)
+                k.replay(track, p, psi, near, self._table(track, near, p), _NO_ROWS, mean)
+            track = track._replace(beyond=self._beyond(z, j, mean))
+        value, gains = k.kalman(track, p, psi, self.tail, store)
         return float(value), gains
+
+    def _beyond(self, z: FloatArray, j: int, means: FloatArray) -> FloatArray:
+        """What the whole model adds at these means of flight j."""
+        if not self.models:
+            return self.tracks[j].beyond
+        return self.models[j].beyond(self.tracks[j], self.physics(z, j), self.vector(z, j), means)
 
     def score(self, z: FloatArray, psi: FloatArray, gains: Sequence[Gains]) -> FloatArray:
         """Derivative of the objective by the noise numbers."""
@@ -325,7 +417,7 @@ class Problem:
         )
         return np.asarray(np.sum(parts, axis=0) + self.noise_penalty(psi)[1])
 
-    def noise_information(self, z: FloatArray, psi: FloatArray) -> FloatArray:
+    def noise_information(self, z: FloatArray, psi: FloatArray, gains: Sequence[Gains]) -> FloatArray:
         """Half the expected curvature of the objective by the logarithms of the noise numbers, (N_NOISE, N_NOISE).
 
         Information of Gaussian innovations, sum of (d ln S)(d ln S)' / 2 + (d nu)(d nu)' / S, by differences over a
@@ -335,7 +427,7 @@ class Problem:
         for j, track in enumerate(self.tracks):
             n, rows = len(track.t), max(STRETCH // len(self.tracks), 4 * SETTLED)
             first = max((n - rows) // 2, 0)
-            part = cut(track, first, first + rows)
+            part = cut(track._replace(beyond=gains[j].beyond), first, first + rows)
             p = self.physics(z, j)
 
             def innovations(i: int, part: Track = part, p: FloatArray = p) -> tuple[FloatArray, FloatArray]:
@@ -355,13 +447,12 @@ class Problem:
 
     def replayed(self, points: FloatArray, psi: FloatArray, gains: Sequence[Gains]) -> FloatArray:
         """Sum of squared whitened innovations of many z (m, n) under the gains of one, with their prior, shape (m,)."""
-        none = np.empty((0, k.M))
 
         def one(i: int) -> float:
             total = self.penalty(points[i])
             for j, (track, g) in enumerate(zip(self.tracks, gains, strict=True)):
-                p = self.physics(points[i], j)
-                total += float(k.replay(track, p, psi, g, self._table(track, g, p), none))
+                p, track = self.physics(points[i], j), track._replace(beyond=self._beyond(points[i], j, g.mean))
+                total += float(k.replay(track, p, psi, g, self._table(track, g, p), _NO_ROWS, _NO_MEANS))
             return total
 
         return np.array(_each(one, len(points)))
@@ -370,23 +461,23 @@ class Problem:
         return k.moments(track, p[k.DELAY]) if "command_delay.delay" in self.names else g.table
 
     def normal_equations(
-        self, z: FloatArray, psi: FloatArray, gains: Sequence[Gains], nudge: float = 1e-5
+        self, z: FloatArray, psi: FloatArray, gains: Sequence[Gains], nudge: float | FloatArray = 1e-5
     ) -> tuple[FloatArray, FloatArray]:
         """Information (P, P) and gradient (P,) of the likelihood in scaled parameters, gains frozen, prior included.
 
-        Sensitivities are differences of innovations, one replay a parameter.
+        Sensitivities are differences of innovations over `nudge`, one for all parameters or one each, shape (P,).
         """
+        steps = np.diag(np.broadcast_to(nudge, len(z)))
         mean, sigma = self.prior
         # Expected information of a Student-t density against that of a Gaussian as wide.
         expected = np.repeat(np.sqrt((1.0 + self.tail) / (1.0 + 3.0 * self.tail)), 3)
         taken, wide = self.explained(z)
         information = np.diag(1.0 / sigma**2) - (wide.T * taken) @ wide
         gradient = (z - mean) / sigma**2 - taken @ wide
-        for j, (track, g) in enumerate(zip(self.tracks, gains, strict=True)):
+        for j, g in enumerate(gains):
             mine = [i for i, (_, _, where) in enumerate(self.entries) if where in (-1, j)]
-            plain = self._whitened(track, g, z, psi, j)
-            points = [z + nudge * (np.arange(len(z)) == i) for i in mine]
-            J = np.array([(w - plain) / nudge for w in self._several(j, points, psi, g)])
+            plain, *moved = self._several(j, [z, *(z + steps[i] for i in mine)], psi, g)
+            J = np.array([(w - plain) / steps[i, i] for w, i in zip(moved, mine, strict=True)])
             gradient[mine] += J.reshape(len(mine), -1) @ plain.ravel()
             J *= expected
             information[np.ix_(mine, mine)] += J.reshape(len(mine), -1) @ J.reshape(len(mine), -1).T
@@ -396,14 +487,20 @@ class Problem:
         return np.diag(1.0 / sigma**2) + (turned * np.maximum(own, 0.0)) @ turned.T, gradient
 
     def _several(self, j: int, points: Sequence[FloatArray], psi: FloatArray, g: Gains) -> list[FloatArray]:
-        return _each(lambda i: self._whitened(self.tracks[j], g, points[i], psi, j), len(points))
+        return _each(lambda i: self._whitened(j, points[i], psi, g), len(points))
 
-    def _whitened(self, track: Track, g: Gains, z: FloatArray, psi: FloatArray, j: int) -> FloatArray:
-        out, p = np.zeros((len(track.t), k.M)), self.physics(z, j)
-        k.replay(track, p, psi, g, self._table(track, g, p), out)
+    def _whitened(self, j: int, z: FloatArray, psi: FloatArray, g: Gains) -> FloatArray:
+        """Whitened innovations of flight j at z under the gains of a point nearby, effects along the states there."""
+        track, p, mean = self.tracks[j], self.physics(z, j), g.mean
+        out = np.zeros((len(track.t), k.M))
+        for _ in range(SETTLING if self.models else 1):
+            track = track._replace(beyond=self._beyond(z, j, mean))
+            mean = np.empty_like(g.mean)
+            k.replay(track, p, psi, g, self._table(track, g, p), out, mean)
         return out
 
 
+_NO_ROWS, _NO_MEANS = np.empty((0, k.M)), np.empty((0, k.N_MEAN))
 _THREADS = ThreadPoolExecutor(max_workers=2, thread_name_prefix="filter")
 
 

@@ -3,17 +3,20 @@
 The filter carries the nominal vehicle and a few effects in its own equations.  Of any other model it takes the means:
 every filtered state is simulated by one step with `quadid.model`, all rows at once, and the difference to the filter's
 own step is added there.  The filter then runs anew, and its states change a little; a few rounds settle both
-(fixed-point iteration, as in an iterated Kalman filter).  Derivatives stay those of the filter's own equations.
+(fixed-point iteration, as in an iterated Kalman filter).  The filter's covariance is that of its own equations;
+sensitivities by any entry of the vector are those of both (`problem.Problem.normal_equations`).
 """
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import numpy as np
 
 from quadid.data.window import Window
 from quadid.estimate import kalman as k
 from quadid.estimate.kalman import Track
-from quadid.model.layout import Layout
+from quadid.model.layout import ATT_DELAY, IMU_PERIOD, Layout
 from quadid.model.rollout import Rollout, Segments
 from quadid.rotation import turn
 from quadid.types import FloatArray
@@ -24,60 +27,75 @@ IN_SENSORS = (
     "ahrs_acceleration_error", "velocity_scale",
 )  # fmt: skip
 """Effects that leave the motion alone."""
+_SETTLED = 1.0
+"""Periods of the cutoff after which a low-pass has forgotten how it began."""
 
 
 class WholeModel:
-    """A parameter vector of `quadid.model` along one window, as additions to the filter's own equations.
+    """Parameter vectors of `quadid.model` along one window, as additions to the filter's own equations."""
 
-    Attributes:
-        theta: full parameter vector.
-        motion: the same without what happens in sensors.
-    """
-
-    def __init__(self, window: Window, vehicle: Vehicle, theta: FloatArray) -> None:
-        n, zero = len(window), np.zeros((len(window), 3))
-        level = np.tile([1.0, 0.0, 0.0, 0.0], (n, 1))
+    def __init__(self, window: Window, vehicle: Vehicle) -> None:
+        zero = np.zeros((len(window), 3))
+        level = np.tile([1.0, 0.0, 0.0, 0.0], (len(window), 1))
         # Against measurements of zero, residuals are the measurements that the model predicts.
         blank = Window(
             window.t0, window.dt, window.rotor_speed, zero, level, zero, zero, zero, window.battery,
             sampling=window.sampling, rotor_slope=window.rotor_slope, log_span=window.log_span,
         )  # fmt: skip
-        self._rollout = Rollout(blank, vehicle)
-        self._height = window.position
-        layout = Layout(vehicle)
-        self.theta, self.motion = theta, theta.copy()
-        for entry in layout.entries.values():
-            if entry.name.split(".")[0] in IN_SENSORS:
-                self.motion[entry.index] = entry.neutral
+        self._window, self._vehicle, self._rollout = window, vehicle, Rollout(blank, vehicle)
+        entries = Layout(vehicle).entries.values()
+        self._sensors = [(e.index, e.neutral) for e in entries if e.name.split(".")[0] in IN_SENSORS]
 
-    def beyond(self, track: Track, p: FloatArray, means: FloatArray) -> FloatArray:
-        """`Track.beyond` at filtered means (n, N_MEAN); the filter's own physics is p."""
+    def cut(self, first: int, last: int) -> WholeModel:
+        """The same along rows `first` to before `last`."""
+        return WholeModel(self._window.slice(first, last), self._vehicle)
+
+    def beyond(self, track: Track, p: FloatArray, theta: FloatArray, means: FloatArray) -> FloatArray:
+        """`Track.beyond` of a full parameter vector at filtered means (n, N_MEAN); the filter's own physics is p.
+
+        Trim moment and biases of p are the filter's own alone.
+        """
+        own_p = p.copy()
+        own_p[k.TRIM : k.DRAG] = 0.0
+        motion = theta.copy()
+        for index, neutral in self._sensors:
+            motion[index] = neutral
+        # 1. One step of the motion from every mean, beside the filter's own.
         n = len(means)
-        rows = np.arange(1, n - 1)
-        states = np.zeros((n - 2, 13))
-        states[:, :4], states[:, 4:7], states[:, 7:10] = means[:-2, :4], means[:-2, 4:7], means[:-2, 7:10]
-        if self._height is not None:
-            states[:, 10:] = np.nan_to_num(self._height[:-2])
-        cut = Segments(1, 1, rows.astype(np.int64))
-        residual, _ = self._rollout.roll(cut, np.stack([self.motion, self.theta]), states)
-        moved, read = residual[0, :, 0, :, 0], residual[0, :, 0, :, 1]
+        late = _SETTLED * max(theta[IMU_PERIOD], 0.0) + max(theta[ATT_DELAY], 0.0)
+        sensed = not np.array_equal(theta, motion)
+        moved, *read = self._rolled([motion, theta] if sensed and late == 0.0 else [motion], means, 1)
         there = np.zeros((n, k.N_MEAN))
         there[:, 0] = 1.0
-        there[rows, :4], there[rows, 4:7], there[rows, 7:10] = _quaternion(moved[:, 3:6]), moved[:, :3], moved[:, 9:12]
-        own = k.single_steps(track, p, means)[:-2]
+        there[1:-1, :4], there[1:-1, 4:7], there[1:-1, 7:10] = _attitude(moved), moved[:, :3], moved[:, 9:12]
+        own = k.single_steps(track, own_p, means)[:-2]
         out = np.zeros((n, 9 + k.M))
-        out[rows - 1, :3] = moved[:, :3] - own[:, 4:7]
-        out[rows - 1, 3:6] = turn(own[:, :4], there[rows, :4])
-        out[rows - 1, 6:9] = moved[:, 9:12] - own[:, 7:10]
-        out[rows, 9:12] = read[:, :3] - moved[:, :3]
-        out[rows, 12:15] = turn(there[rows, :4], _quaternion(read[:, 3:6]))
-        out[rows, 15:18] = read[:, 6:9] - k.specific_force(track, p, there)[rows]
-        out[rows, 18:21] = read[:, 9:12] - moved[:, 9:12]
+        out[:-2, :3] = moved[:, :3] - own[:, 4:7]
+        out[:-2, 3:6] = turn(own[:, :4], there[1:-1, :4])
+        out[:-2, 6:9] = moved[:, 9:12] - own[:, 7:10]
+        out[1:-1, 15:18] = moved[:, 6:9] - k.specific_force(track, own_p, there)[1:-1]
+        # 2. What sensors make of it; those with a memory look back over as many steps.
+        if sensed:
+            lead = 1 + int(np.ceil(late / self._window.dt))
+            true, sensors = self._rolled([motion, theta], means, lead) if late > 0.0 else (moved, read[0])
+            out[lead:-1, 9:12] = sensors[:, :3] - true[:, :3]
+            out[lead:-1, 12:15] = turn(_attitude(true), _attitude(sensors))
+            out[lead:-1, 15:21] += sensors[:, 6:12] - true[:, 6:12]
         return out
 
+    def _rolled(self, thetas: Sequence[FloatArray], means: FloatArray, lead: int) -> list[FloatArray]:
+        """Measurements `lead` steps after every mean but the last two, a (n - 1 - lead, 12) array a vector."""
+        states = np.zeros((len(means) - 1 - lead, 13))
+        states[:, :10] = means[: len(states), :10]
+        if self._window.position is not None:
+            states[:, 10:] = np.nan_to_num(self._window.position[: len(states)])
+        cut = Segments(1, lead, np.arange(lead, len(means) - 1, dtype=np.int64))
+        residual, _ = self._rollout.roll(cut, np.stack(thetas), states, n_pre=lead)
+        return [residual[0, :, 0, :, i] for i in range(len(thetas))]
 
-def _quaternion(twice_vector: FloatArray) -> FloatArray:
-    """Unit quaternions of residuals against no rotation: twice their vector parts, shape (n, 3) to (n, 4)."""
-    half = 0.5 * twice_vector
+
+def _attitude(read: FloatArray) -> FloatArray:
+    """Unit quaternions of residuals against no rotation, which are twice their vector parts, shape (n, 4)."""
+    half = 0.5 * read[:, 3:6]
     scalar = np.sqrt(np.maximum(1.0 - np.sum(half**2, axis=1), 0.0))
     return np.column_stack([scalar, half])

@@ -102,7 +102,9 @@ def test_a_replay_of_the_same_physics_gives_the_same_innovations() -> None:
     tail = np.full(4, 0.2)
     _, g = k.kalman(track, p, NOISE, tail, True)
     out = np.zeros((len(track.t), k.M))
-    total = k.replay(track, p, NOISE, g, g.table, out)
+    mean = np.empty_like(g.mean)
+    total = k.replay(track, p, NOISE, g, g.table, out, mean)
+    np.testing.assert_allclose(mean, g.mean, atol=1e-9)
     seen = g.S > 0.0
     np.testing.assert_allclose(out[seen], (g.nu * np.sqrt(g.w / np.where(seen, g.S, 1.0)))[seen], atol=1e-9)
     assert total == pytest.approx(float(np.sum(out**2)))
@@ -155,10 +157,10 @@ def test_any_other_model_moves_the_means_as_it_says() -> None:
     wanted = simulate(vehicle, speed, dt)
     p = physics()
     p[:6] = vehicle.initial
-    whole = WholeModel(flight.window, vehicle, Layout(vehicle).initial(vehicle))
+    whole, theta = WholeModel(flight.window, vehicle), Layout(vehicle).initial(vehicle)
     track = blind(flight, vehicle)
     for _ in range(12):
-        track = track._replace(beyond=whole.beyond(track, p, still(p, track).mean))
+        track = track._replace(beyond=whole.beyond(track, p, theta, still(p, track).mean))
     mean = still(p, track).mean[1:60]
     np.testing.assert_allclose(mean[:, k.VE + 1 : k.VE + 4], wanted.velocity[:59], atol=1e-8)
     sensed = mean[:, 4:7] + track.beyond[1:60, 9:12]

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from quadid.data.window import Window
+from quadid.diagnosis import diagnose
+from quadid.effects import EFFECTS
 from quadid.estimate import kalman as k
 from quadid.estimate.fit import Estimate, estimate
 from quadid.estimate.problem import Problem
@@ -16,10 +20,11 @@ from quadid.identification.fit import FitOptions, fit
 from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
-from quadid_evaluation.studies.filter_error import loop
+from quadid_evaluation.studies.campaign.hidden_cases import cases, flown
+from quadid_evaluation.studies.filter_error import causes, loop
 from quadid_evaluation.studies.truth import poor_guess
 
-SECONDS = 60.0
+SECONDS, BRIEF = 60.0, 40.0
 GUSTS = {"gusts": {"push": 0.6, "turn": 1.0, "time": 0.5}}
 """Forces of 0.6 m/s^2, moments of 1 rad/s^2: a quarter of the control moment of these flights."""
 
@@ -59,3 +64,40 @@ def fast_loop(job: tuple[int, int, float, float]) -> FloatArray:
     today = fit([window], vehicle, FitOptions(iterations=0, seed=seed))
     old = np.array([np.log(today.theta[:6] / truth), today.uncertainty.sigma])
     return np.array([errors(of_window(window, vehicle), truth), old])
+
+
+LATE = tuple(
+    name for e in EFFECTS.values() if e.family == "late" and not e.needs for name in (*e.entries, *e.refinements)
+)
+"""Lag, lag down, delay of commands, filter of the IMU, delay of the attitude: one family of nested models."""
+
+
+def lagging(job: tuple[int, float]) -> FloatArray:
+    """One flight with a hidden motor lag [s]: errors without and with the late family free, shape (2, 2, 6)."""
+    seed, lag = job
+    craft = Vehicle.shipped("pelican")
+    truth = draw_truth(craft, seed)
+    numbers = truth.as_dict()
+    window = fly(craft, truth, SECONDS, seed, effects={"motor_lag": {"tau": lag}} if lag else {}).window
+    vehicle = poor_guess(craft, numbers, seed)
+    track = from_window(window, vehicle)
+    found = [estimate(Problem.of([track], vehicle, names, [window]), seed, iterations=0) for names in ((), LATE)]
+    return np.array([errors(one, list(numbers.values())) for one in found])
+
+
+def caused(job: tuple[str, int, bool]) -> tuple[str, bool, bool, str, str, float]:
+    """One case of the campaign: what is hidden, whether both searches are right, what they name, seconds of ours."""
+    group, number, gusty = job
+    case = cases(group, 1, number)[0]
+    if gusty:
+        case = replace(case, outside=GUSTS)
+    case = replace(case, seconds=BRIEF)
+    train, _, vehicle = flown(case)
+    begin = time.process_time()
+    _, model = causes.search([train], vehicle)
+    seconds = time.process_time() - begin
+    today, _ = diagnose([train], vehicle, seed=case.seed)
+    named = tuple(f.effect for f in today.findings if f.confident)
+    hidden = ", ".join(case.expected) or "nothing"
+    good = set(model.names) == set(case.expected), set(named) == set(case.expected)
+    return hidden, *good, ", ".join(model.names) or "nothing", ", ".join(named) or "nothing", seconds
