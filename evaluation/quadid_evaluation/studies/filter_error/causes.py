@@ -1,7 +1,7 @@
 """Causes by innovations: a score test over the catalogue, then refits compared by evidence at their own noise.
 
 One model is better than another if it is more likely by Laplace's approximation, with the priors of
-`quadid.diagnosis.log_evidence`: a cause is absent until proven, and must be of use.
+`quadid.diagnosis.evidence`: a cause is absent until proven, and must be of use.
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from quadid.data.window import Window
-from quadid.diagnosis.candidates import Candidate, candidates
-from quadid.diagnosis.log_evidence import FALSE_ALARM, RELEVANT
-from quadid.diagnosis.selection import NEAR
+from quadid.diagnosis.evidence import FALSE_ALARM, RELEVANT
+from quadid.diagnosis.hypotheses import Candidate, candidates
+from quadid.diagnosis.search import NEAR
 from quadid.estimate.fit import ALL_NOISE, MOST, NO_NOISE, scoring
 from quadid.estimate.kalman import Gains
 from quadid.estimate.problem import Problem
