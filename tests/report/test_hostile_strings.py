@@ -24,6 +24,7 @@ from lupa import lua53
 
 from quadid.experiment import Proposal, manoeuvre_file
 from quadid.report.manoeuvres import FORMS, written_as
+from quadid.report.page import part, quiet, section
 from quadid.report.page import render as page
 from quadid.report.programs import FORMATS, export
 from quadid.vehicle import Command, FittedFlight, ParameterPrior, Proof, ResidualTerm, Vehicle
@@ -229,9 +230,10 @@ def test_a_page_holds_strangers_text_as_text(kind: str) -> None:
         table: dict[str, Any] = {"kind": "", "head": [text], "rows": [[text]], "classes": [""], "fold": text}
         figure = {"id": "f", "title": text, "caption": text, "height": 100, "views": [{"label": text, "data": [
             {"type": "scatter", "name": text, "x": [1.0], "y": [1.0]}]}]}  # fmt: skip
-        section = {"id": "s", "title": text, "intro": text, "figures": [figure], "tables": [table]}
-        return tags(page({"title": text, "subtitle": text, "verdict": verdict, "sections": [section],
-                          "warnings": [text]}))  # fmt: skip
+        inner = part(text, text, lines=[text], after=[text], verdict=verdict, kind="finding")
+        whole = section("s", text, text, [figure], [table], lines=[quiet(text)], parts=[inner], menu=text)
+        return tags(page({"title": text, "subtitle": text, "verdict": verdict, "sections": [whole],
+                          "warnings": [text], "provenance": [{"name": text, "value": text}]}))  # fmt: skip
 
     plain, evil = shown("text"), shown(HOSTILE[kind])
     quotes = "code" if "`" in HOSTILE[kind] else ""
