@@ -218,7 +218,7 @@ def write_outputs(path: Path, outputs: Sequence[Output], vehicle: str) -> None:
     with TopicWriter(path) as writer:
         for output in outputs:
             if output.topic in RESULTS:
-                message = RESULTS[output.topic](output, vehicle, "")
+                message = RESULTS[output.topic].message(output, vehicle, "")
                 stamp = message["header"]["stamp"]
                 writer.write(*TOPICS[output.topic], message, stamp["sec"] * 10**9 + stamp["nanosec"])
 

@@ -13,7 +13,7 @@ import zenoh
 
 from quadid.online.records import Job, JobReply, unexpected
 from quadid.vehicle import Vehicle
-from quadid_node.wire_format import LARGEST, ParcelError, content, pack, unpack
+from quadid_node.wire_format import LARGEST, ParcelError, pack, unpack
 from quadid_node.worker import MEMORY_MB, STUDY_LIMIT, ProcessWorker, Trouble, Worker
 from quadid_node.zenoh import ROOT, LateSession, config_of, key_of, wait_for_session
 
@@ -104,7 +104,7 @@ def _size(query: Any) -> int:
 
 def _answer(query: Any, done: Done, told: Callable[[str], None]) -> None:
     try:
-        request = unpack(content(query.payload))
+        request = unpack(query.payload.to_bytes() if query.payload is not None else b"")
         if not isinstance(request, Job):
             raise ParcelError(f"a parcel with a {type(request).__name__}", "a request of a fit")
     except ParcelError as error:

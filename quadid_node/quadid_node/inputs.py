@@ -16,7 +16,7 @@ import numpy as np
 from quadid_replay.presets import PRESETS
 from quadid_replay.ros_messages import SIGNALS, TYPES, MessageReader
 
-from quadid.data.window import Block, Sample
+from quadid.data.window import Block
 from quadid.errors import QuadidError, nearest
 from quadid.sanitise import plain
 from quadid.types import FloatArray, IntArray
@@ -24,13 +24,8 @@ from quadid.types import FloatArray, IntArray
 # --- Stamps: absolute times of messages, in nanoseconds there and in seconds [s, UNIX] here, to a quarter microsecond
 
 
-def seconds(ns: int) -> float:
-    """Seconds of a stamp in nanoseconds."""
-    return ns * 1e-9
-
-
-def many_seconds(ns: IntArray) -> FloatArray:
-    """As `seconds`, for many stamps, the same numbers to the bit."""
+def seconds(ns: IntArray) -> FloatArray:
+    """Seconds of stamps in nanoseconds, shape (n,)."""
     return np.asarray(ns * 1e-9)
 
 
@@ -59,7 +54,7 @@ class Chooser:
     """Picks one source for each channel.
 
     Samples of a source that is not the best possible are held back until it is certain that no better one comes, so
-    that a channel never mixes two sources.
+    that a channel never mixes two sources.  How samples are cut into blocks changes nothing.
     """
 
     def __init__(self, best: dict[str, int]) -> None:
@@ -67,59 +62,52 @@ class Chooser:
         self._best = best
         self._chosen: dict[str, int] = {}
         self._last: dict[str, float] = {}
-        self._held: dict[str, dict[int, list[Sample]]] = {}
+        self._held: dict[str, dict[int, list[Block]]] = {}
 
-    def take(self, sample: Sample, rank: int) -> Iterator[Sample]:
+    def take(self, block: Block, rank: int) -> Iterator[Block]:
         """Yields what may be used now.
 
         Args:
-            sample: a sample.
+            block: samples of one channel.
             rank: of its source for this channel; 0 is the best.
         """
-        channel = sample.channel
+        channel, t = block.columns[0][0], block.t
         chosen = self._chosen.get(channel)
-        if chosen is not None and rank > chosen and sample.t > self._last[channel] + SILENT:
-            chosen = None  # the chosen one fell silent
-        if chosen is None and rank == self._best.get(channel, 0):
-            chosen = rank
+        if chosen is not None and rank > chosen:  # of use once the chosen one has fallen silent
+            late = np.flatnonzero(t > self._last[channel] + SILENT)
+            if not late.size:
+                return
+            block, chosen = _part(block, late[0], None), None
+            t = block.t
+        if chosen is not None or rank == self._best.get(channel, 0):
             self._held.pop(channel, None)
-        elif chosen is not None and rank < chosen:
-            chosen = rank  # a better one has come
-        if chosen is not None:
-            self._chosen[channel] = chosen
-            if rank == chosen:
-                self._last[channel] = sample.t
-                yield sample
+            self._chosen[channel], self._last[channel] = rank, float(t[-1])
+            yield block
             return
-        yield from self._hold(sample, rank)
+        # Held back, until a better one had time to show up, or too many wait.
+        by_rank = self._held.setdefault(channel, {})
+        held = by_rank.setdefault(rank, [])
+        first = min(float(blocks[0].t[0]) if blocks else float(t[0]) for blocks in by_rank.values())
+        count = sum(len(one.t) for one in held) + np.arange(1, len(t) + 1)
+        enough = np.flatnonzero((t - first >= DECIDE) | (count >= MOST_HELD))
+        stop = int(enough[0]) + 1 if enough.size else len(t)
+        held.append(_part(block, 0, stop))
+        if not enough.size:
+            return
+        best = min(by_rank)
+        released = self._held.pop(channel)[best]
+        self._chosen[channel], self._last[channel] = best, float(released[-1].t[-1])
+        yield from released
+        if stop < len(t):
+            yield from self.take(_part(block, stop, None), rank)
 
     def has(self, channel: str) -> bool:
         """Whether some source tells the channel."""
         return channel in self._chosen or channel in self._held
 
-    def settled(self, channel: str, rank: int, newest: float) -> bool | None:
-        """Whether all samples of a source up to time `newest` [s] may be used; None: to be decided one by one."""
-        chosen = self._chosen.get(channel)
-        if chosen is None or rank < chosen or (rank > chosen and newest > self._last[channel] + SILENT):
-            return None
-        return rank == chosen
 
-    def used(self, channel: str, t: float) -> None:
-        """Notes that samples up to one at `t` [s] were used, as `settled` allowed."""
-        self._last[channel] = t
-
-    def _hold(self, sample: Sample, rank: int) -> Iterator[Sample]:
-        by_rank = self._held.setdefault(sample.channel, {})
-        held = by_rank.setdefault(rank, [])
-        held.append(sample)
-        first = min(samples[0].t for samples in by_rank.values())
-        if sample.t - first < DECIDE and len(held) < MOST_HELD:
-            return
-        best = min(by_rank)
-        self._chosen[sample.channel] = best
-        samples = self._held.pop(sample.channel)[best]
-        self._last[sample.channel] = samples[-1].t
-        yield from samples
+def _part(block: Block, start: int, stop: int | None) -> Block:
+    return Block(block.t[start:stop], tuple((name, values[start:stop]) for name, values in block.columns))
 
 
 # --- Whether the messages of a topic come evenly: by when they are there, and by their stamps
@@ -300,21 +288,12 @@ class MessageTypeError(QuadidError):
     """A message type whose package is not installed."""
 
 
-def message_class(name: str) -> Any:
+def message_class(name: str, folder: str = "msg") -> Any:
     """The class of ``package/Type`` or ``package/msg/Type``.
 
     Raises:
         MessageTypeError: the package is not installed, or has no such type.
     """
-    return _interface(name, "msg")
-
-
-def service_class(name: str) -> Any:
-    """The class of the service ``package/Type``; raises MessageTypeError."""
-    return _interface(name, "srv")
-
-
-def _interface(name: str, folder: str) -> Any:
     package, kind = name.split("/")[0], name.split("/")[-1]
     apt = f"ros-jazzy-{package.replace('_', '-')}"
     try:
@@ -325,6 +304,11 @@ def _interface(name: str, folder: str) -> Any:
     except (ImportError, AttributeError) as error:
         fix = f"install the version for this ROS distribution ({apt})"
         raise MessageTypeError(f"message type {name} cannot be used ({error})", fix=fix) from error
+
+
+def service_class(name: str) -> Any:
+    """The class of the service ``package/Type``; raises MessageTypeError."""
+    return message_class(name, "srv")
 
 
 def deserializer(name: str) -> Callable[[bytes], Any]:
@@ -392,32 +376,29 @@ class Decoder:
             return f"is measured in {frame}, not base_link: say mounting: {{rotation, position}} in the vehicle file"
         return self.pace.trouble
 
-    def take(self, messages: Sequence[bytes]) -> Iterator[Sample | Block]:
+    def take(self, messages: Sequence[bytes]) -> Iterator[Block]:
         """Yields what may be used now of messages in order, at once where only numbers differ between them."""
         read = self._read(messages)
         if read is None:
             for part in (messages[: len(messages) // 2], messages[len(messages) // 2 :]) if len(messages) > 1 else ():
                 yield from self.take(part)
             return
-        t, told = many_seconds(read[0]), list[tuple[str, int, FloatArray]]()
+        t, together = seconds(read[0]), list[tuple[str, FloatArray]]()
         self.pace.stamped(t)
         self._deny(name for name, _ in read[1])
         for name, values in read[1]:
             channel, convert = SIGNALS[name]
-            if channel in self._ranks:
-                width = self._rotors if channel in ("motor_command", "rotor_speed") else None
-                told.append((channel, self._ranks[channel] + _BEHIND.get(name, 0), convert(values)[:, :width]))
-        used = [self._chooser.settled(channel, rank, float(t.max())) for channel, rank, _ in told]
-        if None in used:
-            for k, at in enumerate(t.tolist()):
-                for channel, rank, values in told:
-                    yield from self._chooser.take(Sample(at, channel, tuple(values[k].tolist())), rank)
-            return
-        columns = tuple((channel, values) for (channel, _, values), use in zip(told, used, strict=True) if use)
-        for channel, _ in columns:
-            self._chooser.used(channel, float(t[-1]))
-        if columns:
-            yield Block(t, columns)
+            if channel not in self._ranks:
+                continue
+            width = self._rotors if channel in ("motor_command", "rotor_speed") else None
+            block = Block(t, ((channel, convert(values)[:, :width]),))
+            for used in self._chooser.take(block, self._ranks[channel] + _BEHIND.get(name, 0)):
+                if used is block:
+                    together += block.columns
+                else:
+                    yield used
+        if together:
+            yield Block(t, tuple(together))
 
     def _read(self, messages: Sequence[bytes]) -> tuple[IntArray, list[tuple[str, FloatArray]]] | None:
         """Stamps [ns] and signals of messages; None where they must be looked at in smaller parts, and of a single one
@@ -541,7 +522,7 @@ class Intake:
             topic.decoder.pace.look(self._looked, before, len(taken))
         return Waiting(max(1, math.ceil((self._looked - before) / SLICE)), messages)
 
-    def read(self, waiting: Waiting, record: Record | None = None) -> Iterator[list[Sample | Block]]:
+    def read(self, waiting: Waiting, record: Record | None = None) -> Iterator[list[Block]]:
         """Reads what was taken, one topic after the other.
 
         Args:

@@ -32,7 +32,8 @@ def parameters(given: Mapping[str, str]) -> dict[str, Any]:
     Raises:
         ValueError: a truth value that is none.
     """
-    return {name: _value(name, given[name]) for name in ARGUMENTS if given.get(name)}
+    named = {name: given[name] for name in ARGUMENTS if given.get(name)}
+    return {name: truth(name, text) if name in _BOOLEAN else text for name, text in named.items()}
 
 
 def truth(name: str, text: str) -> bool:
@@ -40,10 +41,6 @@ def truth(name: str, text: str) -> bool:
     if text.lower() not in ("true", "false"):
         raise ValueError(f"{name}:={text}: true or false")
     return text.lower() == "true"
-
-
-def _value(name: str, text: str) -> str | bool:
-    return truth(name, text) if name in _BOOLEAN else text
 
 
 def fleet(namespaces: str, given: Mapping[str, str]) -> list[dict[str, str]]:

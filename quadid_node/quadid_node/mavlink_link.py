@@ -228,7 +228,8 @@ class MavlinkDecoder:
             return
         if reading.signal in ("esc", "servo"):
             self._rounds[source].row = [math.nan] * ESCS  # it is told once
-        yield from self._chooser.take(Sample(t, channel, values), rank)
+        for block in self._chooser.take(Sample(t, channel, values).block, rank):
+            yield from block.samples()
 
     def _joined(self, t: float, reading: Reading, source: str) -> tuple[float, tuple[float, ...]]:
         """The row so far of a round of messages (four ESCs or sixteen outputs each), at the time of the first."""
@@ -411,8 +412,13 @@ class MavlinkLink:
             self._second, self._left = int(now), {True: FRAMES_A_SECOND, False: OTHERS_A_SECOND}
         for message in self._wire.receive(_WANTED, self._admits, now, None if self._key else self._count):
             last, kind = self._clock(), message.get_type()
-            if kind == "HEARTBEAT":
-                self._find(message)
+            autopilot = kind == "HEARTBEAT" and message.autopilot != dialect.MAV_AUTOPILOT_INVALID
+            if autopilot and not self.vehicle_system and self._only in (0, message.get_srcSystem()):
+                # The first autopilot heard is our vehicle; we speak under its system id.
+                self.vehicle_system, self._target = message.get_srcSystem(), message.get_srcComponent()
+                self._wire.mav.srcSystem = self.vehicle_system
+                self._decoder.order.ardupilot = message.autopilot == dialect.MAV_AUTOPILOT_ARDUPILOTMEGA
+                self._decoder.order.kind = message.type
             if self._is_vehicle(message):
                 if not self._source.take(self._wire.source, self._wire.listened):
                     continue
@@ -453,16 +459,6 @@ class MavlinkLink:
             and message.get_srcComponent() == self._target
         )
 
-    def _find(self, message: Any) -> None:
-        """The first autopilot heard is our vehicle; we speak under its system id."""
-        if self.vehicle_system or message.autopilot == dialect.MAV_AUTOPILOT_INVALID:
-            return
-        if self._only in (0, message.get_srcSystem()):
-            self.vehicle_system, self._target = message.get_srcSystem(), message.get_srcComponent()
-            self._wire.mav.srcSystem = self.vehicle_system
-            self._decoder.order.ardupilot = message.autopilot == dialect.MAV_AUTOPILOT_ARDUPILOTMEGA
-            self._decoder.order.kind = message.type
-
     def _on_heartbeat(self, message: Any) -> None:
         """Notes who is heard again and again and will be answered; asks the vehicle for the parameters we lack."""
         self._wire.peers.hello(self._wire.source, self._wire.listened, self._is_vehicle(message))
@@ -481,32 +477,26 @@ class MavlinkLink:
             known = dialect.enums["MAV_RESULT"].get(message.result)
             self._requests.answered(known.name if known is not None else f"result {message.result}")
 
-    def _for_us(self, message: Any) -> bool:
-        return message.target_system in (0, self._wire.mav.srcSystem) and message.target_component in (0, COMPONENT)
-
     def _on_parameter(self, kind: str, message: Any) -> None:
-        if not self._for_us(message):
+        """Lists and reads our parameters, and refuses to set them."""
+        ours = message.target_system in (0, self._wire.mav.srcSystem) and message.target_component in (0, COMPONENT)
+        if not ours:
             return
-        entries = parameters_of(self._set)
         if kind == "PARAM_REQUEST_LIST":
             self._list_due = True
             return
-        names = [name for name, _ in entries]
-        wanted = str(message.param_id)
-        index = getattr(message, "param_index", -1)
+        names = [name for name, _ in parameters_of(self._set)]
+        wanted, index = str(message.param_id), getattr(message, "param_index", -1)
         if kind == "PARAM_REQUEST_READ" and 0 <= index < len(names):
             self._send_parameter(index, answer=True)
         elif wanted in names and kind == "PARAM_REQUEST_READ":
             self._send_parameter(names.index(wanted), answer=True)
         elif wanted in names or message.target_component == COMPONENT:
-            self._refuse(message, wanted, _READ_ONLY if wanted in names else _UNKNOWN)
+            who = message.get_srcSystem(), message.get_srcComponent()
+            error = _READ_ONLY if wanted in names else _UNKNOWN
+            self._send(dialect.MAVLink_param_error_message(*who, wanted.encode()[:16], index, error), answer=True)
             if wanted in names:
                 self._send_parameter(names.index(wanted), answer=True)  # for stations that do not know PARAM_ERROR
-
-    def _refuse(self, message: Any, name: str, error: int) -> None:
-        index = getattr(message, "param_index", -1)
-        who = message.get_srcSystem(), message.get_srcComponent()
-        self._send(dialect.MAVLink_param_error_message(*who, name.encode()[:16], index, error), answer=True)
 
     # --- out
 

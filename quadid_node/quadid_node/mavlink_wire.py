@@ -251,21 +251,17 @@ def frames(buffer: bytearray, whole: bool) -> Iterator[bytes]:
         if start:
             del buffer[:start]
             continue
-        length = _length(buffer)
-        if length is None or length > len(buffer):
+        length = 0  # of a frame; its head tells
+        if len(buffer) > 2:
+            signature = _SIGNATURE if buffer[0] == 0xFD and buffer[2] & _SIGNED else 0
+            length = _HEAD[buffer[0]] + buffer[1] + signature
+        if not 0 < length <= len(buffer):
             if whole:
                 del buffer[:1]
                 continue
             return
         yield bytes(buffer[:length])
         del buffer[:length]
-
-
-def _length(buffer: bytearray) -> int | None:
-    if len(buffer) < 3:
-        return None
-    extra = _SIGNATURE if buffer[0] == 0xFD and buffer[2] & _SIGNED else 0
-    return _HEAD[buffer[0]] + buffer[1] + extra
 
 
 def message_id(frame: bytes) -> int:
@@ -449,7 +445,7 @@ class Wire:
                     if not admits(frame):
                         self.dropped += len(frame)
                         continue
-                    self.signed |= _is_signed(frame)
+                    self.signed |= frame[0] == 0xFD and bool(frame[2] & _SIGNED)
                     try:
                         message = self.mav.decode(bytearray(frame))
                     except dialect.MAVError:
@@ -528,7 +524,3 @@ class Wire:
             return bytes(self._conn.recv(4096) or b"")
         except (OSError, TypeError):
             return b""
-
-
-def _is_signed(frame: bytes) -> bool:
-    return frame[0] == 0xFD and bool(frame[2] & _SIGNED)

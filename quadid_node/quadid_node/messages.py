@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
@@ -213,15 +213,6 @@ def health_message(report: HealthReport, vehicle: str) -> Message:
     }  # fmt: skip
 
 
-RESULTS: Mapping[str, Callable[[Any, str, str], Message]] = {
-    "parameters": lambda output, vehicle, boot_id: parameter_set(output.item, vehicle, boot_id),
-    "candidate": lambda output, vehicle, boot_id: parameter_set(output.item, vehicle, boot_id),
-    "diagnosis": lambda output, vehicle, _: diagnosis(output, vehicle),
-    "vehicle_health": lambda output, vehicle, _: health_message(output, vehicle),
-}
-"""Message of an output, by its topic; of the vehicle's name and the `boot_id` of `parameter_set`."""
-
-
 def fit_status(status: SessionStatus, vehicle: str, seconds: float = math.nan) -> Message:
     """quadid_msgs/FitStatus; `seconds` is how long the last fit took."""
     return {
@@ -385,3 +376,23 @@ def _with_nan(value: Any) -> Any:
     if isinstance(value, list):
         return [_with_nan(inner) for inner in value]
     return math.nan if value is None else value
+
+
+class Result(NamedTuple):
+    """How an output is told: as a message, of the vehicle's name and the `boot_id` of `parameter_set`, and as JSON."""
+
+    message: Callable[[Any, str, str], Message]
+    json: Callable[[Any], dict[str, Any]]
+
+
+_SET = Result(
+    lambda output, vehicle, boot_id: parameter_set(output.item, vehicle, boot_id),
+    lambda output: set_to_dict(output.item),
+)  # fmt: skip
+RESULTS: Mapping[str, Result] = {
+    "parameters": _SET,
+    "candidate": _SET,
+    "diagnosis": Result(lambda output, vehicle, _: diagnosis(output, vehicle), diagnosis_to_dict),
+    "vehicle_health": Result(lambda output, vehicle, _: health_message(output, vehicle), health_to_dict),
+}
+"""What is told of an output, by its topic."""

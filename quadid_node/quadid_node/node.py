@@ -374,7 +374,8 @@ class IdentifyNode(PollingNode, LifecycleNode):
             if output.topic == "event":
                 self._log(output.level, output.text)
             elif self._service is not None and not self._outputs.silent and output.topic in messages.RESULTS:
-                self._send(output.topic, messages.RESULTS[output.topic](output, self._id, self._service.boot_id))
+                tell = messages.RESULTS[output.topic].message
+                self._send(output.topic, tell(output, self._id, self._service.boot_id))
                 if self._zenoh is not None:
                     self._zenoh.publish(output)
         if self._service is not None and self._service.approval != self.get_parameter("approval").value:

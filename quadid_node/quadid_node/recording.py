@@ -22,12 +22,12 @@ from quadid_replay.ros_messages import type_name
 from quadid_replay.schemas import has_definition, whole_text
 
 from quadid.condition.trim import flight_from_dict, flight_to_dict
-from quadid.data.window import Block, Recording, Sample
+from quadid.data.window import Recording, Sample
 from quadid.errors import LogError
 from quadid.online import OnlineSet, SessionSettings
 from quadid.vehicle import Vehicle
 from quadid_node.history import UNREADABLE, Restored
-from quadid_node.inputs import Chooser, Decoder, Input, best_ranks, seconds, source
+from quadid_node.inputs import Chooser, Decoder, Input, best_ranks, source
 from quadid_node.messages import set_from_dict, set_to_dict
 
 RECORD = "quadid.session"
@@ -154,13 +154,12 @@ def stream(recording: Recording) -> Iterator[Sample]:
     if not names:
         return
     times = [recording.channels[n].t for n in names]
+    stamps = [[(round(t * 1e9) + base) * 1e-9 for t in channel.tolist()] for channel in times]
     which = np.concatenate([np.full(len(t), i) for i, t in enumerate(times)])
     rows = np.concatenate([np.arange(len(t)) for t in times])
     order = np.argsort(np.concatenate(times), kind="stable")
     for i, row in zip(which[order].tolist(), rows[order].tolist(), strict=True):
-        channel = recording.channels[names[i]]
-        ns = round(float(channel.t[row]) * 1e9) + base
-        yield Sample(seconds(ns), names[i], tuple(channel.values[row].tolist()))
+        yield Sample(stamps[i][row], names[i], tuple(recording.channels[names[i]].values[row].tolist()))
 
 
 def arrivals(path: Path, preset: str, rotors: int) -> Iterator[Sample]:
@@ -190,4 +189,4 @@ def arrivals(path: Path, preset: str, rotors: int) -> Iterator[Sample]:
         decoders[number] = Decoder(entry, chooser, rotors, decode)
     for number, _, data in file.messages(decoders.keys()):
         for item in decoders[number].take([data]):
-            yield from item.samples() if isinstance(item, Block) else [item]
+            yield from item.samples()

@@ -71,13 +71,6 @@ def pack(item: object) -> bytes:
     return parcel
 
 
-def content(payload: Any) -> bytes:
-    """Bytes of a Zenoh payload, None for none; raises ParcelError for more than a parcel may have."""
-    if payload is not None and len(payload) > LARGEST:
-        raise ParcelError(f"a parcel of {len(payload)} bytes", f"at most {LARGEST}")
-    return bytes(payload.to_bytes()) if payload is not None else b""
-
-
 def unpack(data: bytes) -> Any:
     """The request or answer in bytes.
 

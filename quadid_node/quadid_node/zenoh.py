@@ -6,14 +6,14 @@ import json
 import queue
 import re
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import zenoh
 
 from quadid.errors import QuadidError
-from quadid_node.messages import Health, Output, diagnosis_to_dict, health_to_dict, set_to_dict, status_to_dict
+from quadid_node.messages import RESULTS, Health, Output, status_to_dict
 from quadid_node.service import Service
 
 # --- Opens Zenoh sessions: peers of this network, a locator, or a configuration file with TLS and access control
@@ -108,27 +108,20 @@ class LateSession:
 
 def config_of(where: str) -> Any:
     """The Zenoh configuration that `where` stands for, see `open_session`; raises ZenohError."""
-    config = _config_of(where)
-    config.insert_json5("transport/link/rx/max_message_size", str(LARGEST_MESSAGE))
-    return config
-
-
-def _config_of(where: str) -> Any:
-    if where == "local":
-        return zenoh.Config()
-    if re.match(r"^(tcp|udp|tls|quic|ws|unixsock-stream)/", where):
-        config = zenoh.Config()
-        config.insert_json5("mode", '"client"')
-        config.insert_json5("connect/endpoints", json.dumps([where]))
-        config.insert_json5("connect/timeout_ms", "2000")
-        return config
-    if not Path(where).is_file():
+    locator = re.match(r"^(tcp|udp|tls|quic|ws|unixsock-stream)/", where)
+    if where != "local" and not locator and not Path(where).is_file():
         raise ZenohError(f"no Zenoh configuration {where}", "local, a locator, or a configuration file")
     try:
-        return zenoh.Config.from_file(where)
+        config = zenoh.Config() if where == "local" or locator else zenoh.Config.from_file(where)
     except zenoh.ZError as error:
         why = str(error).splitlines()[0][:120]
         raise ZenohError(f"{where} is no Zenoh configuration ({why})", "JSON5 as in examples/zenoh") from error
+    if locator:
+        config.insert_json5("mode", '"client"')
+        config.insert_json5("connect/endpoints", json.dumps([where]))
+        config.insert_json5("connect/timeout_ms", "2000")
+    config.insert_json5("transport/link/rx/max_message_size", str(LARGEST_MESSAGE))
+    return config
 
 
 def key_of(vehicle: str, kind: str) -> str:
@@ -149,11 +142,6 @@ def key_of(vehicle: str, kind: str) -> str:
 # TLS and access control come from a Zenoh configuration file (docs/online.md, examples/zenoh).
 
 
-RESULTS: Mapping[str, Callable[[Any], dict[str, Any]]] = {
-    "parameters": lambda output: set_to_dict(output.item), "candidate": lambda output: set_to_dict(output.item),
-    "diagnosis": diagnosis_to_dict, "vehicle_health": health_to_dict,
-}  # fmt: skip
-"""What is told of an output, by its topic."""
 KINDS = (*RESULTS, "health")
 COMMANDS = ("approve", "rollback", "fit_now")
 MOST_COMMANDS = 16
@@ -205,7 +193,7 @@ class ZenohLink:
     def publish(self, output: Output) -> None:
         """Tells a result."""
         if output.topic in RESULTS:
-            self._put(output.topic, RESULTS[output.topic](output))
+            self._put(output.topic, RESULTS[output.topic].json(output))
 
     def report(self, health: Health) -> None:
         """Tells how things are."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from collections import deque
 from collections.abc import Iterator
 
@@ -37,12 +38,12 @@ def decoder(entry: Input, chooser: Chooser, mounted: bool = True) -> Decoder:
     return Decoder(entry, chooser, 4, decode, mounted)
 
 
-def flat(items: Iterator[Sample | Block]) -> list[Sample]:
-    return [s for item in items for s in (item.samples() if isinstance(item, Block) else [item])]
+def flat(items: Iterator[Block]) -> list[Sample]:
+    return [s for item in items for s in item.samples()]
 
 
-def by_intake(messages: list[Message], batch: int) -> tuple[list[Sample], list[Message], int]:
-    """Samples, what was recorded, and how many blocks there were, when taken in every `batch` messages."""
+def by_intake(messages: list[Message], batch: int) -> tuple[list[Sample], list[Message]]:
+    """Samples, and what was recorded, when taken in every `batch` messages."""
     chooser, now = Chooser(best_ranks(INPUTS)), [0.0]
     intake = Intake(lambda: now[0])
     arrived: dict[str, deque[bytes]] = {e.topic: deque() for e in INPUTS}
@@ -51,16 +52,14 @@ def by_intake(messages: list[Message], batch: int) -> tuple[list[Sample], list[M
         intake.open(e, e.topic, decoder(e, chooser), lambda q=waiting: q.popleft() if q else None)  # type: ignore[misc]
     out: list[Sample] = []
     recorded: list[Message] = []
-    blocks = 0
     for k in range(0, len(messages), batch):
         for topic, data in messages[k : k + batch]:
             arrived[topic].append(data)
         now[0] = min(k + batch, len(messages)) * SECONDS / len(messages)
         read = intake.read(intake.take(), lambda topic, kind, data: recorded.append((topic, data)))
         items = [item for topic in read for item in topic]
-        blocks += sum(isinstance(item, Block) for item in items)
         out += flat(iter(items))
-    return out, recorded, blocks
+    return out, recorded
 
 
 def one_by_one(messages: list[Message]) -> list[Sample]:
@@ -71,21 +70,20 @@ def one_by_one(messages: list[Message]) -> list[Sample]:
 
 @pytest.mark.parametrize("batch", [1, 7, 60])
 def test_a_batch_gives_the_samples_of_its_messages_in_the_order_recorded(messages: list[Message], batch: int) -> None:
-    samples, recorded, blocks = by_intake(messages, batch)
+    samples, recorded = by_intake(messages, batch)
     assert sorted(recorded) == sorted(messages)
     assert samples == one_by_one(recorded)
-    assert blocks > 0
     assert {s.channel for s in samples} >= {"gyro", "accel", "attitude", "rotor_speed", "velocity"}
 
 
 def test_the_gyro_comes_last(messages: list[Message]) -> None:
-    _, recorded, _ = by_intake(messages, 60)
+    _, recorded = by_intake(messages, 60)
     topics = [topic for topic, _ in recorded[:60]]
     assert topics.index("imu") == len(topics) - topics.count("imu")
 
 
 def test_no_topic_runs_far_ahead_when_much_has_piled_up(messages: list[Message]) -> None:
-    _, recorded, _ = by_intake(messages, len(messages))
+    _, recorded = by_intake(messages, len(messages))
     at = {topic: [k for k, (name, _) in enumerate(messages) if name == topic] for topic, _ in messages}
     arrived = [at[topic].pop(0) for topic, _ in recorded]
     per_second = len(messages) / SECONDS
@@ -135,6 +133,64 @@ def test_a_damaged_message_spoils_only_itself(messages: list[Message]) -> None:
     single = decoder(entry, Chooser(best_ranks(INPUTS)))
     assert flat(whole.take(imu)) == [s for data in imu for s in flat(single.take([data]))]
     assert whole.failed == single.failed == 1
+
+
+def imu_decoder() -> Decoder:
+    """Decoder of the IMU beside a topic that tells the attitude."""
+    chooser = Chooser(best_ranks(INPUTS))
+    assert list(chooser.take(Sample(0.0, "attitude", (1.0, 0.0, 0.0, 0.0)).block, 0))
+    return decoder(next(e for e in INPUTS if e.topic == "imu"), chooser)
+
+
+def sent(messages: list[Message], burst: int) -> tuple[Intake, Decoder]:
+    """The IMU alone, looked for ten times a second of its own clock; sent `burst` messages together."""
+    now, entry, waiting = [0.0], next(e for e in INPUTS if e.topic == "imu"), deque[bytes]()
+    intake, reader = Intake(lambda: now[0]), imu_decoder()
+    intake.open(entry, "imu", reader, lambda: waiting.popleft() if waiting else None)
+    held, step = list[bytes](), 0
+    for k, data in enumerate(data for topic, data in messages if topic == "imu"):
+        held.append(data)
+        if len(held) == burst:
+            waiting.extend(held)
+            held.clear()
+        while (k + 1) / 200.0 >= 0.1 * (step + 1):
+            now[0], step = 0.1 * (step + 1), step + 1
+            for items in intake.read(intake.take()):
+                flat(iter(items))
+    return intake, reader
+
+
+@pytest.mark.parametrize(("burst", "told"), [(1, ""), (100, "comes in bursts: 100 messages at once after")])
+def test_messages_that_are_sent_in_bursts_are_named(messages: list[Message], burst: int, told: str) -> None:
+    intake, _ = sent(messages, burst)
+    assert intake.troubles().get("imu", "").startswith(told)
+    assert bool(intake.troubles()) == bool(told)
+
+
+@pytest.mark.parametrize(("burst", "told"), [(1, ""), (10, "stamped in bursts")])
+def test_stamps_of_the_moment_of_sending_are_named_where_messages_are_sent_together(
+    messages: list[Message], burst: int, told: str
+) -> None:
+    stamped = list[Message]()
+    for k, data in enumerate(data for topic, data in messages if topic == "imu"):
+        ns = round((k // burst * burst / 200.0 + 1e-5 * (k % burst)) * 1e9)
+        stamped.append(("imu", data[:4] + struct.pack("<II", 1_700_000_000 + ns // 10**9, ns % 10**9) + data[12:]))
+    assert sent(stamped, 1)[1].trouble.startswith(told)
+    assert bool(sent(stamped, 1)[1].trouble) == bool(told)
+
+
+def test_a_signal_that_messages_say_not_to_have_is_named_where_nothing_else_tells_it(messages: list[Message]) -> None:
+    name = "sensor_msgs/msg/Imu"
+    decode = generate_dynamic(name, schema_text(name))[name]
+    encode = serialize_dynamic(name, schema_text(name))[name]
+    without = list[bytes]()
+    for data in (data for topic, data in messages if topic == "imu"):
+        message = decode(data)
+        message.angular_velocity_covariance[0] = -1.0
+        without.append(encode(message))
+    reader = imu_decoder()
+    assert {s.channel for s in flat(reader.take(without))} == {"accel"}
+    assert "angular_velocity_covariance[0] is -1" in reader.trouble
 
 
 def test_messages_without_a_stamp_are_named_as_such(messages: list[Message]) -> None:

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 from quadid_node.inputs import DECIDE, SILENT, Chooser, source, stamp
@@ -15,7 +17,7 @@ from quadid_node.settings import PARAMETERS, check_change, read_settings, vehicl
 from quadid_replay import open_log, write_mcap
 from quadid_replay.ros_messages import TYPES
 
-from quadid.data.window import Sample
+from quadid.data.window import Block
 from quadid.errors import QuadidError
 from quadid.parameters import Status
 from quadid_node import messages
@@ -98,22 +100,26 @@ def test_an_unknown_preset_names_the_nearest() -> None:
         source("mavross")
 
 
-def at(t: float, channel: str = "attitude") -> Sample:
-    return Sample(t, channel, (1.0, 0.0, 0.0, 0.0))
+def at(*t: float) -> Block:
+    return Block(np.array(t), (("attitude", np.arange(4.0 * len(t)).reshape(-1, 4)),))
+
+
+def times(blocks: Iterable[Block]) -> list[float]:
+    return [t for block in blocks for t in block.t.tolist()]
 
 
 def test_the_better_source_is_used_from_its_first_sample() -> None:
     chooser = Chooser({"attitude": 0})
     assert list(chooser.take(at(0.0), 1)) == []
-    assert [s.t for s in chooser.take(at(0.1), 0)] == [0.1]
+    assert times(chooser.take(at(0.1), 0)) == [0.1]
     assert list(chooser.take(at(0.2), 1)) == []
-    assert [s.t for s in chooser.take(at(0.3), 0)] == [0.3]
+    assert times(chooser.take(at(0.3), 0)) == [0.3]
 
 
 def test_a_lone_worse_source_is_used_without_loss() -> None:
     chooser, got = Chooser({"attitude": 0}), []
     for k in range(30):
-        got += [s.t for s in chooser.take(at(0.1 * k), 1)]
+        got += times(chooser.take(at(0.1 * k), 1))
     assert got == [0.1 * k for k in range(30)]
     assert DECIDE < 2.9
 
@@ -121,9 +127,22 @@ def test_a_lone_worse_source_is_used_without_loss() -> None:
 def test_a_source_that_falls_silent_gives_way() -> None:
     chooser = Chooser({"attitude": 0})
     list(chooser.take(at(0.0), 0))
-    got = [s.t for k in range(80) for s in chooser.take(at(0.1 * k), 1)]
+    got = times(block for k in range(80) for block in chooser.take(at(0.1 * k), 1))
     assert got
     assert min(got) > SILENT
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_how_samples_are_cut_into_blocks_changes_nothing(seed: int) -> None:
+    """Two or three sources that come, fall silent and come back, in any order of arrival."""
+    rng = np.random.default_rng(seed)
+    runs = [(int(rank), np.sort(start + rng.uniform(0.0, 3.0, 12))) for start in np.arange(0.0, 40.0, 2.5)
+            for rank in rng.permutation(3) if rng.random() < 0.5]  # fmt: skip
+    best = {"attitude": int(rng.integers(2))}
+    whole, single = Chooser(best), Chooser(best)
+    for rank, t in runs:
+        one_by_one = [s for k in t for block in single.take(at(k), rank) for s in times([block])]
+        assert times(whole.take(at(*t), rank)) == one_by_one
 
 
 def test_stamps_come_back_to_the_nanosecond(tmp_path: Path) -> None:

@@ -28,7 +28,8 @@ def free_port() -> int:
         return int(probe.getsockname()[1])
 
 
-def until(done: Callable[[], object], seconds: float = 10.0) -> bool:
+def until(done: Callable[[], object], seconds: float = 120.0) -> bool:
+    """Waits until something is true; a busy machine may take its time."""
     deadline = time.monotonic() + seconds
     while not done() and time.monotonic() < deadline:
         time.sleep(0.02)

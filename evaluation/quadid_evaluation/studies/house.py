@@ -148,7 +148,7 @@ def _fly_through(log: Path, folder: Path) -> None:
                     service.push(item)
             for output in [o for _ in range(5) for o in service.step()]:
                 if output.topic == "parameters":
-                    messages.RESULTS[output.topic](output, vehicle.name, service.boot_id)
+                    messages.RESULTS[output.topic].message(output, vehicle.name, service.boot_id)
                     return
     finally:
         service.close()
