@@ -9,20 +9,23 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from quadid_replay import write_mcap
 
 from quadid.online.fit_job import warm_up
 from quadid.vehicle import Vehicle
 from tests.conftest import THIS_MACHINE, absent
 from tests.node.peers import Ear
+from tests.online.driving import flight
 
 HERE = Path(__file__).resolve().parent
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Marks those that need ROS."""
+    """Marks those that need ROS; each of their waits has a limit of its own."""
     for item in items:
         if HERE in item.path.parents and item.path.stem.startswith("test_ros"):
             item.add_marker(pytest.mark.ros)
+            item.add_marker(pytest.mark.timeout(900))
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -45,6 +48,14 @@ def ros(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
         patch.setenv("AMENT_PREFIX_PATH", sys.prefix)
         patch.delenv("RMW_IMPLEMENTATION", raising=False)
         yield
+
+
+@pytest.fixture(scope="session")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Four minutes of flight: as long as a busy machine takes for what is waited for, and no test waits for its end."""
+    path = tmp_path_factory.mktemp("log") / "flight.mcap"
+    write_mcap(path, flight(240.0, 6).recording)
+    return path
 
 
 @pytest.fixture

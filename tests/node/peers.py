@@ -19,6 +19,10 @@ QUICK = {"window": 5.0, "gate.windows": 2, "gate.width": 0.08, "gate.yaw_width":
 """A first set after 10 s of flight."""
 
 
+LIMIT = 240.0
+"""Longest wait for an event [s]: what a machine needs that others keep busy."""
+
+
 class Process:
     """A child whose output is kept line by line."""
 
@@ -42,7 +46,7 @@ class Process:
         """Everything said so far."""
         return "\n".join(self.lines)
 
-    def wait_for(self, word: str, seconds: float = 60.0) -> str:
+    def wait_for(self, word: str, seconds: float = LIMIT) -> str:
         """Waits for a line with `word` in it, and returns it."""
         deadline = time.monotonic() + seconds
         while time.monotonic() < deadline:
@@ -54,7 +58,7 @@ class Process:
             time.sleep(0.02)
         raise AssertionError(f"'{word}' was not said within {seconds:g} s; said: {self.text}")
 
-    def end(self, number: int = signal.SIGINT, times: int = 1, seconds: float = 60.0) -> tuple[int, float]:
+    def end(self, number: int = signal.SIGINT, times: int = 1, seconds: float = LIMIT) -> tuple[int, float]:
         """Sends a signal (several times), waits; returns the exit code and how long it took [s].
 
         Without the time in which its first thread could have gone on, and other programs had the processors.
@@ -140,14 +144,14 @@ class Ear:
         self.node.create_subscription(kind, topic, callback, qos, raw=raw)
         return self.heard.setdefault(topic, [])
 
-    def until(self, done: Callable[[], Any], seconds: float = 60.0) -> bool:
+    def until(self, done: Callable[[], Any], seconds: float = LIMIT) -> bool:
         """Spins until something is true; returns whether it became so."""
         deadline = time.monotonic() + seconds
         while not done() and time.monotonic() < deadline:
             self._executor.spin_once(timeout_sec=0.05)
         return bool(done())
 
-    def call(self, service: str, kind: Any, request: Any = None, seconds: float = 20.0) -> Any:
+    def call(self, service: str, kind: Any, request: Any = None, seconds: float = LIMIT) -> Any:
         """Calls a service and returns its answer."""
         client = self.node.create_client(kind, service)
         assert self.until(client.service_is_ready, seconds), f"no service {service}"

@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -35,23 +36,34 @@ from tests.online.test_gate import TRUE, online_set
 PELICAN = Vehicle.shipped("pelican")
 
 
-OTHER = """
+OTHERS = """
 import sys
 from pathlib import Path
-from quadid_node.history import Store
-from quadid_node.history import StoreError
-try:
-    Store(Path(sys.argv[1]), "pelican")
-except StoreError as error:
-    sys.exit(str(error))
+from quadid_node.history import Store, StoreError
+for line in sys.stdin:
+    try:
+        Store(Path(line.strip()), "pelican").close()
+        print()
+    except StoreError as error:
+        print(error)
+    sys.stdout.flush()
 """
+"""A process that opens one history after the other as a second service, and says what it is told."""
+
+
+@cache
+def others() -> subprocess.Popen[str]:
+    return subprocess.Popen([sys.executable, "-c", OTHERS], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
 
 
 def another_process(path: Path) -> str:
     """What a second service says that opens the history; empty where it is let in."""
-    return subprocess.run(
-        [sys.executable, "-c", OTHER, str(path)], capture_output=True, text=True, check=False
-    ).stderr.strip()
+    told, heard = others().stdin, others().stdout
+    assert told is not None
+    assert heard is not None
+    told.write(f"{path}\n")
+    told.flush()
+    return heard.readline().strip()
 
 
 def until(done: Callable[[], object], seconds: float = 60.0) -> bool:
@@ -108,10 +120,10 @@ def test_a_set_survives_the_round_trip_bit_for_bit() -> None:
 
 def test_everything_is_there_after_a_restart(tmp_path: Path) -> None:
     path = tmp_path / "deep" / "history.sqlite"
-    filled(path).close()
+    filled(path).close(60.0)
     store = Store(path, "pelican")
     restored = store.restore()
-    store.close()
+    store.close(60.0)
     assert restored.item is not None
     assert restored.item.parameters["b"].value == 2.3e-5 + 1e-7
     assert restored.next_sequence > 3, "above the known ones, and above those of a history that may be lost"
@@ -141,14 +153,14 @@ def test_every_set_stands_with_the_run_that_numbered_it(tmp_path: Path) -> None:
         name.write_bytes(b"")
     third.numbered(replace(online_set(TRUE), sequence=10, approved_by="auto"))
     assert third.flush(20.0)
-    third.close()
+    third.close(60.0)
     told = [(s["sequence"], s["boot_id"]) for s in read_history(path, "pelican")["sets"]]
     assert told == [(1, first.boot_id), (10, third.boot_id)]
 
 
 def test_a_set_known_to_be_out_of_date_is_still_so_after_two_restarts(tmp_path: Path) -> None:
     path = tmp_path / "h.sqlite"
-    filled(path).close()
+    filled(path).close(60.0)
     for run in range(3):
         store = Store(path, "pelican")
         found = store.restore()
@@ -159,12 +171,12 @@ def test_a_set_known_to_be_out_of_date_is_still_so_after_two_restarts(tmp_path: 
         for action in sets.withdraw("mass +15 %", "mass_change"):
             assert isinstance(action, Publish)
             store.numbered(action.item)
-        store.close()
+        store.close(60.0)
     store = Store(path, "pelican")
     store.numbered(replace(online_set(TRUE), sequence=found.next_sequence + 10, approved_by="auto"))
     store.flush(5.0)
     item = store.restore().item
-    store.close()
+    store.close(60.0)
     assert item is not None
     assert not item.outdated
 
@@ -173,7 +185,7 @@ def test_the_baseline_is_the_last_set_a_person_approved(tmp_path: Path) -> None:
     store = filled(tmp_path / "h.sqlite")
     store.numbered(replace(online_set(TRUE), sequence=3, approved_by="ann"))
     store.numbered(replace(online_set(TRUE), sequence=4, approved_by="auto"))
-    store.close()
+    store.close(60.0)
     again = Store(tmp_path / "h.sqlite", "pelican")
     baseline = again.restore().baseline
     again.close()
@@ -184,7 +196,7 @@ def test_the_baseline_is_the_last_set_a_person_approved(tmp_path: Path) -> None:
 def test_old_candidates_are_forgotten_sets_never(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(storing, "PRUNE_EVERY", 5)
     store = filled(tmp_path / "h.sqlite", sets=40)
-    store.close()
+    store.close(60.0)
     again = Store(tmp_path / "h.sqlite", "pelican", {"candidates": 10, "events": 10})
     for k in range(30):
         again.event(Event(float(k), "info", "test", "x"))
@@ -225,7 +237,7 @@ def test_a_second_service_is_refused_whatever_is_done_to_the_file(tmp_path: Path
     assert "another service" in another_process(path)
     assert say(store, "third")
     assert "third" in lines(path)
-    store.close()
+    store.close(60.0)
     assert not another_process(path)
     happened(44, f"a second service on a history whose file is {how}: refused")
 
@@ -255,7 +267,7 @@ def test_two_names_of_one_file_are_refused_at_the_start(tmp_path: Path, happened
     os.link(path, hard)
     assert "has 2 names" in another_process(hard)
     assert say(store, "second")
-    store.close()
+    store.close(60.0)
     assert lines(path) == ["first", "second"]
     for name in (path, hard):
         with pytest.raises(StoreError, match="remove the other names"):
@@ -272,7 +284,7 @@ def test_a_first_start_and_another_vehicles_sets_are_nothing_unread(tmp_path: Pa
     other.numbered(replace(online_set(TRUE), sequence=1, approved_by="auto"))
     other.close()
     assert "another service" in another_process(path), "the end of the other one's lock must not end this one's"
-    store.close()
+    store.close(60.0)
 
 
 @pytest.mark.parametrize("change", ["", "ALTER TABLE sets ADD COLUMN signature TEXT", "CREATE TABLE more (x)"])
@@ -298,7 +310,7 @@ def test_a_history_of_a_newer_version_is_refused_and_not_touched(
 def test_a_history_of_an_earlier_version_is_read_as_it_is(tmp_path: Path) -> None:
     """Sets once had no mass, reference, run, or reason to be out of date; some have no covariance."""
     path = tmp_path / "h.sqlite"
-    filled(path).close()
+    filled(path).close(60.0)
     later = ("mass", "outdated", "outdated_code", "reference", "boot_id", "covariance")
     with closing(sqlite3.connect(path)) as db, db:
         for (data,) in db.execute("SELECT data FROM sets").fetchall():
@@ -307,7 +319,7 @@ def test_a_history_of_an_earlier_version_is_read_as_it_is(tmp_path: Path) -> Non
         db.execute(f"PRAGMA user_version = {VERSION - 1}")
     store = Store(path, "pelican")
     restored = store.restore(vehicle=PELICAN)
-    store.close()
+    store.close(60.0)
     assert not store.notes
     assert restored.item is not None
     assert restored.item.parameters.covariance[0, 0] == restored.item.parameters["b"].sigma ** 2
@@ -415,7 +427,7 @@ def test_a_read_only_home_is_said_and_the_service_goes_on(tmp_path: Path, happen
         service = Service(PELICAN, SessionSettings(), InlineWorker(), store)
         assert any(isinstance(o, Event) and "Read-only" in o.text for o in service.step())
         store.numbered(in_force(1))
-        store.close()
+        store.close(60.0)
     finally:
         subprocess.run(["umount", "-l", str(home)], check=False)
     happened(12, "read-only file system: the service starts and says that this run's history is lost")
@@ -449,7 +461,7 @@ def test_a_lock_held_by_another_program_delays_and_loses_nothing(tmp_path: Path,
 @pytest.mark.parametrize("damage", ["garbage", "zeros", "truncated", "empty page"])
 def test_a_damaged_history_is_set_aside_not_deleted(tmp_path: Path, damage: str) -> None:
     path = tmp_path / "h.sqlite"
-    filled(path, sets=40).close()
+    filled(path, sets=40).close(60.0)
     data = path.read_bytes()
     broken = {
         "garbage": os.urandom(len(data)),
@@ -465,7 +477,7 @@ def test_a_damaged_history_is_set_aside_not_deleted(tmp_path: Path, damage: str)
         (aside,) = [p for p in tmp_path.iterdir() if ".damaged-" in p.name and not p.name.endswith(("-wal", "-shm"))]
         assert aside.read_bytes() == broken
     store.numbered(replace(online_set(TRUE), sequence=1, approved_by="auto"))
-    store.close()
+    store.close(60.0)
     assert [s["sequence"] for s in read_history(path, "pelican")["sets"]] == [1]
 
 
@@ -527,7 +539,7 @@ def test_what_people_decided_outlives_a_history_damaged_in_service(tmp_path: Pat
     withdrawn = replace(confirmed, sequence=stale.sequence + 2, outdated="thrust stepped", outdated_code="thrust_drop")
     store.numbered(confirmed)
     store.numbered(withdrawn)
-    assert store.flush(10.0)
+    assert store.flush(60.0)
     with closing(sqlite3.connect(path)) as db:
         db.execute("PRAGMA wal_checkpoint(TRUNCATE)")
     path.write_bytes(b"no history" * 1000)
@@ -538,7 +550,7 @@ def test_what_people_decided_outlives_a_history_damaged_in_service(tmp_path: Pat
 
     store = Store(path, "pelican")
     restored = store.restore()
-    store.close()
+    store.close(60.0)
     assert restored.approval == "manual"
     assert restored.baseline is not None
     assert (restored.baseline.sequence, restored.baseline.approved_by) == (1000, "ann")
@@ -561,7 +573,7 @@ def test_a_history_that_could_not_be_made_at_first_is_told_to_be_written_again(
     service = Service(PELICAN, SessionSettings(), InlineWorker(), store)
     assert any(isinstance(o, Event) and "full" in o.text for o in service.step())
     store.numbered(in_force(7))
-    assert store.flush(10.0)
+    assert store.flush(60.0)
     assert any(isinstance(o, Event) and "written again" in o.text for o in service.step())
     service.close()
 
@@ -573,8 +585,8 @@ def kept(path: Path) -> None:
     """A history with one set."""
     store = Store(path, "v")
     store.numbered(online_set(TRUE))
-    assert store.flush(10.0)
-    store.close()
+    assert store.flush(60.0)
+    store.close(60.0)
 
 
 def with_all(**fields: object) -> str:
@@ -628,7 +640,7 @@ def test_a_set_that_no_fit_of_this_vehicle_made_is_left_out_and_said(
     assert restored.item is None
     assert restored.baseline is None
     assert "is no set and is not taken up again" in store.notes[0]
-    store.close()
+    store.close(60.0)
     happened(25 if what in HOSTILE_TO_A_VEHICLE else 12, f"a stored set with {what}: '{store.notes[0][50:140]}'")
 
 
@@ -675,7 +687,7 @@ def test_a_file_that_computes_is_set_aside(tmp_path: Path, what: str, happened: 
     store = Store(path, "v")
     assert "set aside" in store.notes[0]
     store.numbered(online_set(TRUE))
-    assert store.flush(10.0)
+    assert store.flush(60.0)
     assert [entry["sequence"] for entry in read_history(path, "v")["sets"]] == [online_set(TRUE).sequence]
-    store.close()
+    store.close(60.0)
     happened(12, f"a history with {what}: '{store.notes[0][:90]}'")

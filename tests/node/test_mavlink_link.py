@@ -290,7 +290,7 @@ def test_what_is_sent_has_a_budget(port: int, happened: Happened) -> None:
     link.publish(accepted())
     for sender in (vehicle, *stations):
         sender.heard(0.05)
-    asked, seconds = 0, 4
+    asked, seconds = 0, 2
     kinds = (
         dialect.MAVLink_param_set_message(1, 191, b"QI_SEQ", 1.0, 9),
         dialect.MAVLink_param_request_read_message(1, 191, b"QI_SEQ", -1),

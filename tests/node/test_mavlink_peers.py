@@ -57,8 +57,8 @@ def test_mavsdk_finds_component_191_reads_its_parameters_and_cannot_write_them(
     link, vehicle, port = crowd
     with Process(sys.executable, str(Path(__file__).with_name("mavsdk_station.py")), str(port)) as station:
         station.wait_for("listening")
-        keep_talking(link, vehicle, lambda: station.child.poll() is None, 3.0, 60.0)
-        assert station.child.wait(5) == 0, station.text
+        keep_talking(link, vehicle, lambda: station.child.poll() is None, 3.0, 240.0)
+        assert station.child.wait(120) == 0, station.text
         said = station.text
     assert "component 191 of system 1" in said
     assert "text quadid: set 3 accepted" in said
@@ -78,7 +78,8 @@ def test_mavproxy_sees_the_parameters(crowd: tuple[MavlinkLink, Sender, int], tm
         "--daemon", "--non-interactive", "--default-modules=", f"--logfile={log}", f"--state-basedir={tmp_path}",
     ]  # fmt: skip
     with Process(*command) as proxy:
-        keep_talking(link, vehicle, lambda: proxy.child.poll() is None, 3.0, 12.0)
+        keep_talking(link, vehicle, lambda: b"QI_J_XX" not in (log.read_bytes() if log.exists() else b""), 3.0, 120.0)
+        keep_talking(link, vehicle, lambda: True, 0.0, 1.0)
         proxy.end(signal.SIGTERM)
     assert log.exists(), proxy.text
     reader = mavutil.mavlink_connection(str(log))
@@ -103,13 +104,12 @@ def test_the_whole_service_over_udp(port: int, tmp_path: Path) -> None:
         "--gate", "windows=2,width=0.08,yaw_width=0.6", "--history", str(history), "--json", str(out),
     ]  # fmt: skip
     with Process(*serve) as service:
-        service.wait_for("ready", 120.0)
-        fly = [quadid, "simulate", f"udpout:127.0.0.1:{port}", "--seconds", "16", "--seed", "6"]
+        service.wait_for("ready")
+        fly = [quadid, "simulate", f"udpout:127.0.0.1:{port}", "--seconds", "240", "--seed", "6"]
         begin = time.monotonic()
-        with Process(*fly) as vehicle:
-            assert vehicle.child.wait(60) == 0, vehicle.text
-        assert time.monotonic() - begin > 15.0, "sixteen seconds of flight take as long"
-        service.wait_for("in force", 20.0)
+        with Process(*fly):
+            service.wait_for("in force")
+        assert time.monotonic() - begin > 5.0, "five seconds of flight, the window, take as long"
         code, took = service.end(signal.SIGINT, times=2)
     assert code == 0, service.text
     assert took < 2.0

@@ -6,7 +6,7 @@ import math
 import os
 import sqlite3
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -65,22 +65,24 @@ def accept(service: Service, **changes: float) -> OnlineSet:
     return session.active_set.in_force
 
 
-def said(service: Service, seconds: float = 3.0) -> Iterator[Output]:
-    deadline = time.monotonic() + seconds
-    while time.monotonic() < deadline:
-        yield from service.step()
+def said(service: Service, *wanted: Callable[[Output], bool]) -> list[Output]:
+    """What a service hands out until each `wanted` output has come; without any, in one step."""
+    out, deadline = service.step(), time.monotonic() + 120.0
+    while not all(any(map(one, out)) for one in wanted):
+        assert time.monotonic() < deadline, out
         time.sleep(0.01)
+        out += service.step()
+    return out
 
 
-def published(service: Service, number: int, seconds: float = 10.0) -> bool:
-    return any(isinstance(o, Publish) and o.item.sequence == number for o in said_until(service, number, seconds))
+def numbered(number: int) -> Callable[[Output], bool]:
+    """A published set of this number."""
+    return lambda output: isinstance(output, Publish) and output.item.sequence == number
 
 
-def said_until(service: Service, number: int, seconds: float) -> Iterator[Output]:
-    for output in said(service, seconds):
-        yield output
-        if isinstance(output, Publish) and output.item.sequence == number:
-            return
+def event(word: str) -> Callable[[Output], bool]:
+    """An event that says so."""
+    return lambda output: isinstance(output, Event) and word in output.text
 
 
 def test_nothing_is_published_that_a_full_disk_did_not_take(
@@ -91,7 +93,7 @@ def test_nothing_is_published_that_a_full_disk_did_not_take(
     store = Store(tmp_path / "h.sqlite", "pelican")
     service = service_with(store)
     first = accept(service)
-    assert published(service, first.sequence)
+    said(service, numbered(first.sequence))
 
     def full(path: Path, read_only: bool = False) -> sqlite3.Connection:
         db = connect(path, read_only)
@@ -101,14 +103,12 @@ def test_nothing_is_published_that_a_full_disk_did_not_take(
     monkeypatch.setattr(writing, "connect", full)
     with store._changed:  # one transaction for all: a single row may still fit into a page that the file has
         held = [accept(service) for _ in range(2 * MOST_WAITING)]
-    outputs = list(said(service, 1.5))
-    assert not [o for o in outputs if isinstance(o, Publish)]
-    assert any(isinstance(o, Event) and o.kind == "history" and "full" in o.text for o in outputs)
+    assert not [o for o in said(service, event("full")) if isinstance(o, Publish)]
     assert service.published is not None
     assert service.published.sequence == first.sequence, "who asks is told what is on the wire"
     monkeypatch.setattr(writing, "connect", connect)
-    assert published(service, held[-1].sequence), "with room again the newest one comes"
-    store.close()
+    said(service, numbered(held[-1].sequence))  # with room again the newest one comes
+    store.close(60.0)
     assert numbers_of(tmp_path / "h.sqlite") == [first.sequence, *(h.sequence for h in held)]
     happened(23, "disk full: 128 sets accepted, none published, said as ERROR; with room again the newest came")
 
@@ -119,7 +119,7 @@ def test_numbers_do_not_begin_anew_after_a_lost_history_or_without_one(tmp_path:
         store = Store(path, "pelican")
         service = service_with(store)
         given.append(accept(service).sequence)
-        store.close()
+        store.close(60.0)
         if loss == "deleted":
             for found in tmp_path.glob("h.sqlite*"):
                 found.unlink()
@@ -137,15 +137,15 @@ def test_a_restored_set_has_a_row_and_a_new_number(tmp_path: Path) -> None:
     store = Store(path, "pelican")
     before = accept(first := service_with(store))
     first.step()
-    store.close()
+    store.close(60.0)
     store = Store(path, "pelican")
     service = service_with(store)
     stale = service.session.active_set.in_force
     assert stale is not None
     assert stale.state is SetState.STALE
     assert stale.sequence > before.sequence, "a consumer that has the set learns that it is stale"
-    assert published(service, stale.sequence)
-    store.close()
+    said(service, numbered(stale.sequence))
+    store.close(60.0)
     assert numbers_of(path) == [before.sequence, stale.sequence]
 
 
@@ -166,7 +166,7 @@ def test_a_decision_of_a_person_outlives_the_service(tmp_path: Path, happened: H
     os_kill_like_end(service)
     again = next_run()
     assert again.session.active_set.approval == "manual", "a rollback asks for approval from then on, a restart or not"
-    assert any(isinstance(o, Event) and o.kind == "approval" for o in said(again, 0.2))
+    assert any(isinstance(o, Event) and o.kind == "approval" for o in said(again))
     force = again.session.active_set.in_force
     assert force is not None
     assert force.parameters["b"].value == TRUE["b"]
@@ -222,9 +222,8 @@ def test_a_row_that_never_reaches_the_disk_holds_up_no_later_set(tmp_path: Path,
     odd = replace(online_set(TRUE), reason="odd \udcff bytes")
     service.session._outbox.act(*service.session.active_set.accept(odd, "auto", 1.0, 1.0))
     after = accept(service)
-    outputs = list(said(service, 1.5))
+    outputs = said(service, numbered(after.sequence), event("no history can hold"))
     assert [o.item.sequence for o in outputs if isinstance(o, Publish)] == [after.sequence]
-    assert any(isinstance(o, Event) and "no history can hold" in o.text for o in outputs)
     service.close()
     happened(23, "a set whose reason no history can hold: not published, said; the next one is")
 
@@ -238,10 +237,10 @@ def test_a_history_that_is_no_file_is_said(tmp_path: Path, monkeypatch: pytest.M
     Path("file").write_text("no folder")
     store = Store(Path(name), "pelican")
     store.numbered(replace(online_set(TRUE), sequence=7))
-    assert store.flush(1.0) == (7 in store.written) == (name == ":memory:")
+    assert store.flush(60.0 if name == ":memory:" else 1.0) == (7 in store.written) == (name == ":memory:")
     assert bool(store.problem) != (7 in store.written)
     assert store.restore().item is None or 7 in store.written
-    store.close()
+    store.close(60.0)
 
 
 def test_a_path_that_names_no_file_is_one_line() -> None:
@@ -267,7 +266,7 @@ def test_while_the_disk_takes_nothing_candidates_are_forgotten_before_sets_and_d
     for _ in range(many):
         store.candidate(replace(online_set(TRUE, SetState.REJECTED), sequence=0))
     monkeypatch.setattr(writing, "connect", connect)
-    assert published(service, first.sequence), "it was forgotten, and everything after it waited for good"
+    said(service, numbered(first.sequence))  # it was forgotten, and everything after it waited for good
     service.close()
     again = Store(tmp_path / "h.sqlite", "pelican")
     assert again.restore().approval == "manual"
@@ -287,7 +286,7 @@ def test_a_waiting_set_is_on_the_disk_before_its_number_is_told(tmp_path: Path) 
     service = service_with(Store(tmp_path / "h.sqlite", "pelican"))
     held = service.session.active_set.hold(online_set(TRUE), 1.0)
     service.session._outbox.act(Publish("candidate", held))
-    assert published(service, held.sequence)
+    said(service, numbered(held.sequence))
     assert numbers_of(tmp_path / "h.sqlite") == [held.sequence]
     service.close()
 
@@ -297,7 +296,7 @@ def test_a_restored_set_is_checked_as_a_fresh_estimate(tmp_path: Path, value: fl
     path = tmp_path / "h.sqlite"
     store = Store(path, "pelican")
     store.numbered(replace(online_set(TRUE), sequence=7, approved_by="auto"))
-    store.close()
+    store.close(60.0)
     with sqlite3.connect(path) as db:
         (data,) = db.execute("SELECT data FROM sets").fetchone()
         text = "null" if not math.isfinite(value) else repr(value)
@@ -305,10 +304,8 @@ def test_a_restored_set_is_checked_as_a_fresh_estimate(tmp_path: Path, value: fl
     store = Store(path, "pelican")
     service = service_with(store)
     assert service.session.active_set.in_force is None
-    outputs = list(said(service, 0.2))
-    assert not [o for o in outputs if isinstance(o, Publish)]
-    assert any(isinstance(o, Event) and "is not taken up again" in o.text for o in outputs)
-    store.close()
+    assert not [o for o in said(service, event("is not taken up again")) if isinstance(o, Publish)]
+    store.close(60.0)
     happened(25, f"b = {value} written into the stored set: not taken up, not published, said")
 
 
@@ -317,8 +314,8 @@ def test_the_writer_outlives_what_no_history_can_hold(tmp_path: Path, happened: 
     store.event(Event(1.0, "info", "test", "odd \udcff bytes"))
     store.numbered(replace(online_set(TRUE), sequence=2**63 + 5, approved_by="auto"))
     store.event(Event(2.0, "info", "test", "afterwards"))
-    assert store.flush(10.0)
-    store.close()
+    assert store.flush(60.0)
+    store.close(60.0)
     found = read_history(tmp_path / "h.sqlite", "pelican", events=10)
     assert [e["text"] for e in found["events"]] == ["afterwards"]
     assert sum("no history can hold" in note for note in store.notes) == 2
@@ -332,12 +329,12 @@ def test_a_history_whose_numbers_are_used_up_is_set_aside(tmp_path: Path, number
     path = tmp_path / "h.sqlite"
     store = Store(path, "pelican")
     store.numbered(replace(online_set(TRUE), sequence=number, approved_by="auto"))
-    store.close()
+    store.close(60.0)
     store = Store(path, "pelican")
     assert "set aside" in store.notes[0]
     assert store.restore().next_sequence < LARGEST_NUMBER
     store.numbered(replace(online_set(TRUE), sequence=5, approved_by="auto"))
-    store.close()
+    store.close(60.0)
     assert numbers_of(path) == [5]
 
 
@@ -366,10 +363,10 @@ def test_outputs_that_need_no_row_wait_for_nothing(tmp_path: Path) -> None:
     refused = Publish("candidate", replace(online_set(TRUE, SetState.REJECTED), sequence=0))
     warning = Event(1.0, "warning", "change", "thrust stepped")
     assert publication.take([refused, warning]) == [refused, warning]
-    numbered = Publish("parameters", online_set(TRUE))
+    waits = Publish("parameters", online_set(TRUE))
     told = Event(1.0, "info", "accepted", "set 1 in force")
-    assert publication.take([numbered, told, warning]) == [warning]
-    assert Publication(None).take([numbered, told]) == [numbered, told]
+    assert publication.take([waits, told, warning]) == [warning]
+    assert Publication(None).take([waits, told]) == [waits, told]
 
 
 def test_a_service_without_history_begins_where_it_is_told() -> None:

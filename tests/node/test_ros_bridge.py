@@ -162,19 +162,19 @@ def test_dry_run_then_applied_then_rolled_back(controller: Controller, bridge: P
 
     health = ear.listen("/diagnostics", DiagnosticArray)
     controller.send(GOOD)
-    assert ear.until(lambda: "dry run: set 9 would set" in bridge.text, 30.0), bridge.text
+    assert ear.until(lambda: "dry run: set 9 would set" in bridge.text), bridge.text
     assert controller.values() == BEFORE, "only said"
-    assert ear.until(lambda: health, 20.0)
+    assert ear.until(lambda: health)
     assert [branches(s.name) for s in health[-1].status] == [["quadid/Bridge"]]
     dry(ear, False)
     after = {"gains.roll_rate.p": pytest.approx(20.0 * TRUE["J_xx"]), "thrust": pytest.approx(TRUE["b"])}
-    assert ear.until(lambda: "set 9 applied" in bridge.text, 20.0), bridge.text
+    assert ear.until(lambda: "set 9 applied" in bridge.text), bridge.text
     assert controller.values() == after
     answer = ear.call("quadid_bridge/rollback", Trigger)
     assert answer.success, answer.message
     assert controller.values() == BEFORE
     controller.send(replace(GOOD, sequence=10))
-    assert ear.until(lambda: "dry run: set 10" in bridge.text, 20.0), bridge.text
+    assert ear.until(lambda: "dry run: set 10" in bridge.text), bridge.text
     assert controller.values() == BEFORE, "a rollback makes dry_run true"
     assert not ear.call("quadid_bridge/rollback", Trigger).success
 
@@ -183,17 +183,17 @@ def test_a_controller_that_refuses_keeps_all_its_values(controller: Controller, 
     controller.most = 1e-3  # the gain is above, the thrust coefficient below
     dry(ear, False)
     controller.send(GOOD)
-    assert ear.until(lambda: "too much for this controller" in bridge.text, 30.0), bridge.text
+    assert ear.until(lambda: "too much for this controller" in bridge.text), bridge.text
     assert controller.values() == BEFORE
 
 
 def test_a_withdrawn_set_puts_the_first_values_back(controller: Controller, bridge: Process, ear: Ear) -> None:
     dry(ear, False)
     controller.send(GOOD)
-    assert ear.until(lambda: "set 9 applied" in bridge.text, 30.0), bridge.text
+    assert ear.until(lambda: "set 9 applied" in bridge.text), bridge.text
     assert controller.values() != BEFORE
     controller.send(replace(GOOD, sequence=10, outdated="thrust fell", outdated_code="thrust_drop"))
-    assert ear.until(lambda: controller.values() == BEFORE, 20.0), bridge.text
+    assert ear.until(lambda: controller.values() == BEFORE), bridge.text
 
 
 ALONE = f"""
@@ -220,20 +220,20 @@ def test_a_controller_that_dies_before_its_answer_holds_nothing_up(
     with Process(sys.executable, "-c", ALONE) as first:
         first.wait_for("ready")
         controller.send(GOOD)
-        assert ear.until(lambda: "dry run: set 9" in bridge.text, 30.0), bridge.text
+        assert ear.until(lambda: "dry run: set 9" in bridge.text), bridge.text
         first.child.send_signal(signal.SIGSTOP)
         dry(ear, False)
-        assert ear.until(lambda: "/alone does not answer" in bridge.text, 30.0), bridge.text
+        assert ear.until(lambda: "/alone does not answer" in bridge.text), bridge.text
     with Process(sys.executable, "-c", ALONE) as second:
-        assert ear.until(lambda: "set 9 applied" in bridge.text, 60.0), bridge.text
-        second.wait_for(f"asked {20.0 * TRUE['J_xx']}", 10.0)
+        assert ear.until(lambda: "set 9 applied" in bridge.text), bridge.text
+        second.wait_for(f"asked {20.0 * TRUE['J_xx']}")
         second.child.send_signal(signal.SIGSTOP)
-        answer = ear.call("quadid_bridge/rollback", Trigger, seconds=30.0)
+        answer = ear.call("quadid_bridge/rollback", Trigger)
         assert not answer.success
         assert answer.message == "/alone does not answer"
         second.child.send_signal(signal.SIGCONT)
         assert ear.call("quadid_bridge/rollback", Trigger).success
-        second.wait_for(f"asked {BEFORE['gains.roll_rate.p']}", 10.0)
+        second.wait_for(f"asked {BEFORE['gains.roll_rate.p']}")
 
 
 def test_a_lost_answer_leaves_the_way_back(controller: Controller, bridge: Process, ear: Ear) -> None:
@@ -247,20 +247,20 @@ def test_a_lost_answer_leaves_the_way_back(controller: Controller, bridge: Proce
     def hang(changed: list[Any]) -> Any:
         asked.append(changed)
         if len(asked) == 1:
-            bridge.wait_for("/ear does not answer", 30.0)
+            bridge.wait_for("/ear does not answer")
         return SetParametersResult(successful=True)
 
     ear.node.add_on_set_parameters_callback(hang)
     controller.send(GOOD)
-    assert ear.until(lambda: "set 9 applied" in bridge.text, 40.0), bridge.text
+    assert ear.until(lambda: "set 9 applied" in bridge.text), bridge.text
     assert ear.call("quadid_bridge/rollback", Trigger).success
     assert controller.values() == BEFORE
 
 
 def test_options_that_are_wrong_end_it_with_the_fix() -> None:
     with Process(sys.executable, "-m", "quadid_node.bridge") as started:
-        assert started.child.wait(60) == 2
-        started.wait_for("controller is not given", 5.0)
+        assert started.child.wait(120) == 2
+        started.wait_for("controller is not given")
 
 
 def test_the_configurations_of_the_package_belong_together() -> None:

@@ -11,12 +11,9 @@ from typing import Any
 import pytest
 
 from tests.node.peers import Ear, node
-from tests.node.test_ros_lifecycle import ACTIVATE, ACTIVE, CLEANUP, CONFIGURE, DEACTIVATE, SHUTDOWN, Client
-from tests.node.test_ros_node import latched
-from tests.node.test_ros_second import history_with
+from tests.node.test_ros_lifecycle import ACTIVATE, CLEANUP, CONFIGURE, DEACTIVATE, SHUTDOWN, UNCONFIGURED, Client
 
 pytestmark = pytest.mark.usefixtures("ros")
-LABELS = ("unconfigured", "inactive", "active", "finalized")
 
 
 def parameters(ear: Ear, *names: str) -> tuple[Any, ...]:
@@ -47,31 +44,18 @@ def test_status_and_diagnostics_speak_in_every_state_of_the_life_cycle(ear: Ear)
             active = bool(reasons) and reasons[-1].startswith("waiting for data")
             return active if state == "active" else all(idle)
 
-        return ear.until(both, 30.0)
+        return ear.until(both)
 
     with node("none", autostart=False) as managed:
         client = Client(ear)
         assert said("unconfigured"), managed.text
         for number, state in (
             (CONFIGURE, "inactive"), (ACTIVATE, "active"), (DEACTIVATE, "inactive"), (CLEANUP, "unconfigured"),
-            (CONFIGURE, "inactive"), (ACTIVATE, "active"), (SHUTDOWN[ACTIVE], "finalized"),
+            (SHUTDOWN[UNCONFIGURED], "finalized"),
         ):  # fmt: skip
             assert client.change(number), managed.text
             assert said(state), f"{state}: {status} {health}"
             assert abs(status[-1].published.sec - time.time()) < 60.0, "by the node's clock"
-        assert managed.end()[0] == 0
-
-
-def test_why_it_could_not_be_configured_stays_in_the_diagnostics(ear: Ear) -> None:
-    from diagnostic_msgs.msg import DiagnosticArray
-
-    health = ear.listen("/diagnostics", DiagnosticArray)
-    with node("none", autostart=False, vehicle="nowhere.yaml") as managed:
-        assert not Client(ear).change(CONFIGURE)
-        health.clear()
-        assert ear.until(
-            lambda: any("nowhere.yaml" in s.message and s.level == b"\x02" for h in health for s in h.status)
-        )
         assert managed.end()[0] == 0
 
 
@@ -102,23 +86,23 @@ def test_nothing_in_force_is_said_and_a_hanging_or_dead_service_is_told_from_a_q
     sets: list[Any] = []
     count = alive(ear, sets)
     with node("none") as identify:
-        identify.wait_for("ready", 120.0)
-        assert ear.until(lambda: sets, 30.0), identify.text
+        identify.wait_for("ready")
+        assert ear.until(lambda: sets), identify.text
         (none,) = sets
         assert (none.state, none.sequence, list(none.values)) == (ParameterSet.STATE_NONE, 0, [])
         assert none.schema_version == ParameterSet.SCHEMA_VERSION == 3
         assert (none.vehicle_id, len(none.boot_id)) == ("pelican", 32)
         assert abs(none.published.sec - time.time()) < 60.0
         assert "no set" in none.reason
-        assert ear.until(lambda: count() == 1, 10.0)
+        assert ear.until(lambda: count() == 1)
         ear.until(lambda: False, 12.0)
         assert count() == 1, "quiet, without any data, and alive"
         identify.child.send_signal(signal.SIGSTOP)
-        assert ear.until(lambda: count() == 0, 60.0), "it hangs"
+        assert ear.until(lambda: count() == 0), "it hangs"
         identify.child.send_signal(signal.SIGCONT)
-        assert ear.until(lambda: count() == 1, 60.0), "it goes on"
+        assert ear.until(lambda: count() == 1), "it goes on"
         identify.child.kill()
-        assert ear.until(lambda: count() == 0, 60.0), "it is dead"
+        assert ear.until(lambda: count() == 0), "it is dead"
     assert len(sets) == 1
 
 
@@ -142,18 +126,6 @@ def test_parameters_read_back_what_is_in_force(tmp_path: Path, ear: Ear) -> None
         assert parameters(ear, "vehicle_id", "approval") == ("", "auto"), "what the next configure starts from"
         assert managed.end()[0] == 0
     with node(history, approval="auto", **{"gate.step": "1"}) as restarted:
-        restarted.wait_for("ready", 120.0)
+        restarted.wait_for("ready")
         assert parameters(ear, "approval", "gate.step") == ("manual", 1.0), "as decided in the earlier run"
         assert restarted.end()[0] == 0
-
-
-def test_a_set_of_an_earlier_run_is_said_instead_of_nothing(tmp_path: Path, ear: Ear) -> None:
-    from quadid_msgs.msg import FitStatus, ParameterSet
-
-    sets = ear.listen("quadid/parameters", ParameterSet, latched())
-    status = ear.listen("quadid/status", FitStatus)
-    with node(history_with(tmp_path / "h.sqlite", 2.3e-5, 10)) as identify:
-        assert ear.until(lambda: sets, 120.0), identify.text
-        assert [s.state for s in sets] == [ParameterSet.STATE_STALE]
-        assert ear.until(lambda: status and status[-1].in_force == sets[-1].sequence, 10.0)
-        assert identify.end()[0] == 0

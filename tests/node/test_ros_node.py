@@ -25,14 +25,6 @@ PELICAN = Vehicle.shipped("pelican")
 SPEED = 2.0
 
 
-@pytest.fixture(scope="module")
-def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Half a minute of flight: the gate is sure of it on a busy machine too, and with a fit lost on the way."""
-    path = tmp_path_factory.mktemp("ros") / "flight.mcap"
-    write_mcap(path, flight(30.0, 6).recording)
-    return path
-
-
 def latched() -> Any:
     from quadid_node.publish import LATCHED_QOS
 
@@ -44,22 +36,19 @@ def test_a_late_subscriber_gets_the_latched_set_and_the_replay_gives_the_same_bi
 ) -> None:
     """Vehicle, node, recorder; a controller that comes late; the recording replayed; a restart."""
     from diagnostic_msgs.msg import DiagnosticArray
-    from quadid_msgs.msg import ParameterSet
+    from quadid_msgs.msg import FitStatus, ParameterSet
     from quadid_msgs.srv import GetHistory
 
     history, recorded = tmp_path / "h.sqlite", tmp_path / "recorded.mcap"
     with node(history, record=recorded) as identify:
         candidates = ear.listen("quadid/candidate", ParameterSet, 100)
         health = ear.listen("/diagnostics", DiagnosticArray)
-        identify.wait_for("ready", 120.0)
-        with player(log, SPEED) as vehicle:
-            assert ear.until(lambda: any(c.state == ParameterSet.STATE_ACCEPTED for c in candidates), 60.0), (
-                identify.text
-            )
-            assert ear.until(lambda: vehicle.child.poll() is not None, 30.0)
-        ear.until(lambda: False, 1.5)
+        identify.wait_for("ready")
+        with player(log, SPEED):
+            assert ear.until(lambda: any(c.state == ParameterSet.STATE_ACCEPTED for c in candidates)), identify.text
+            assert ear.until(lambda: len(candidates) > 5), identify.text
         with Process(sys.executable, str(ROOT / "examples" / "controller_subscriber.py"), "--show-tracking") as late:
-            line = late.wait_for("attitude tracking error", 60.0)
+            line = late.wait_for("attitude tracking error")
             assert "applied" in late.text
             before, after = (float(word) for word in line.split() if word.startswith("0."))
             assert after < before, line
@@ -87,9 +76,11 @@ def test_a_late_subscriber_gets_the_latched_set_and_the_replay_gives_the_same_bi
     assert len(replayed) - len(live) <= 1, "the run was stopped while its last fit ran, if at all"
 
     with node(history) as restarted:
-        stale = ear.sets()
-        assert ear.until(lambda: stale, 90.0), restarted.text
-        assert stale[-1].state == ParameterSet.STATE_STALE
+        stale = ear.listen("quadid/parameters", ParameterSet, latched())
+        status = ear.listen("quadid/status", FitStatus)
+        assert ear.until(lambda: stale), restarted.text
+        assert [s.state for s in stale] == [ParameterSet.STATE_STALE], "said instead of that nothing is in force"
+        assert ear.until(lambda: status and status[-1].in_force == stale[-1].sequence)
         assert list(stale[-1].values) == list(accepted.values)
         assert "not yet confirmed" in stale[-1].reason
         assert stale[-1].sequence > accepted.sequence
@@ -117,7 +108,7 @@ def test_approve_and_rollback_by_service_and_parameters_are_guarded(log: Path, t
     with node(tmp_path / "h.sqlite", approval="manual") as identify:
         sets = ear.sets()
         candidates = ear.listen("quadid/candidate", ParameterSet, 100)
-        answer = ear.call("quadid/approve", Approve, seconds=90.0)
+        answer = ear.call("quadid/approve", Approve)
         assert not answer.success
         assert not change("gate.width", double_value=5.0).successful, "outside its range"
         refused = change("window", double_value=8.0)
@@ -126,16 +117,14 @@ def test_approve_and_rollback_by_service_and_parameters_are_guarded(log: Path, t
         assert not change("approval", string_value="never").successful
         assert change("approval", string_value="manual").successful
         with player(log, SPEED):
-            assert ear.until(lambda: any(c.state == ParameterSet.STATE_PENDING for c in candidates), 60.0), (
-                identify.text
-            )
+            assert ear.until(lambda: any(c.state == ParameterSet.STATE_PENDING for c in candidates)), identify.text
             assert not sets, "nothing is published before a person approves"
             waiting = next(c for c in candidates if c.state == ParameterSet.STATE_PENDING)
             wrong = ear.call("quadid/approve", Approve, Approve.Request(sequence=waiting.sequence - 1))
             assert not wrong.success
             done = ear.call("quadid/approve", Approve, Approve.Request(sequence=waiting.sequence))
             assert done.success, done.message
-            assert ear.until(lambda: sets, 5.0)
+            assert ear.until(lambda: sets)
             assert sets[0].sequence == done.in_force
             assert list(sets[0].values) == list(waiting.values), "that set and no other"
             assert sets[0].approved_by == "ros service"
@@ -150,21 +139,27 @@ def test_approve_and_rollback_by_service_and_parameters_are_guarded(log: Path, t
     assert [s["approved_by"] for s in stored if s["state"] == "accepted"] == ["ros service"]
 
 
-def test_a_rollback_by_service_brings_the_set_before_back(tmp_path: Path, ear: Ear) -> None:
+def test_a_killed_fit_process_is_replaced_and_a_rollback_by_service_brings_the_set_before_back(
+    log: Path, tmp_path: Path, ear: Ear, happened: Happened
+) -> None:
+    from diagnostic_msgs.msg import DiagnosticArray
     from quadid_msgs.msg import ParameterSet
     from rcl_interfaces.srv import GetParameters
     from std_srvs.srv import Trigger
 
-    path = tmp_path / "long.mcap"
-    write_mcap(path, flight(60.0, 6).recording)
     with node(tmp_path / "h.sqlite") as identify:
         sets = ear.sets()
-        identify.wait_for("ready", 120.0)
-        with player(path, SPEED):
-            assert ear.until(lambda: len(sets) >= 2, 60.0), identify.text
+        health = ear.listen("/diagnostics", DiagnosticArray)
+        identify.wait_for("ready")
+        with player(log, 1.0):
+            assert ear.until(lambda: sets), identify.text
+            os.kill(worker_of(identify.child.pid), signal.SIGKILL)
+            assert ear.until(lambda: len(sets) >= 2), identify.text
+            assert "ended by signal 9" in identify.text
+            assert ear.until(lambda: restarts(health) == 1)
             before = sets[-2]
             assert ear.call("quadid/rollback", Trigger).success
-            assert ear.until(lambda: sets[-1].state == ParameterSet.STATE_ROLLED_BACK, 10.0)
+            assert ear.until(lambda: sets[-1].state == ParameterSet.STATE_ROLLED_BACK)
             reads = ear.call("quadid/get_parameters", GetParameters, GetParameters.Request(names=["approval"]))
             assert reads.values[0].string_value == "manual", "as the rollback made it"
         assert list(sets[-1].values) == list(before.values)
@@ -173,6 +168,7 @@ def test_a_rollback_by_service_brings_the_set_before_back(tmp_path: Path, ear: E
         assert identify.end()[0] == 0
     stored = read_history(tmp_path / "h.sqlite", "pelican")["sets"]
     assert "rolled_back" in [s["state"] for s in stored]
+    happened(11, "fit process of the node killed in flight: replaced, said in /diagnostics, the next set came")
 
 
 def test_two_vehicles_in_two_namespaces_do_not_mix(tmp_path: Path) -> None:
@@ -181,14 +177,14 @@ def test_two_vehicles_in_two_namespaces_do_not_mix(tmp_path: Path) -> None:
     logs = {}
     for name, effects in (("quad1", ()), ("quad2", heavy)):
         logs[name] = tmp_path / f"{name}.mcap"
-        write_mcap(logs[name], flight(30.0, 6, "excited", effects).recording)
+        write_mcap(logs[name], flight(240.0, 6, "excited", effects).recording)
     history = tmp_path / "h.sqlite"
     with Ear() as ear, node(history, "quad1") as first, node(history, "quad2") as second:
         sets = {n: ear.sets(f"/{n}/quadid/parameters") for n in logs}
         for started in (first, second):
-            started.wait_for("ready", 120.0)
+            started.wait_for("ready")
         with player(logs["quad1"], 1.0, "quad1"), player(logs["quad2"], 1.0, "quad2"):
-            assert ear.until(lambda: all(sets.values()), 60.0), first.text + second.text
+            assert ear.until(lambda: all(sets.values())), first.text + second.text
         found = {n: dict(zip(s[0].names, s[0].values, strict=True))["b"] for n, s in sets.items()}
         assert {n: s[0].vehicle_id for n, s in sets.items()} == {"quad1": "quad1", "quad2": "quad2"}
         assert found["quad1"] == pytest.approx(2.33e-5, rel=0.01)
@@ -220,8 +216,8 @@ print("threads left:", *threads())
 def test_no_thread_of_the_middleware_outlives_the_node() -> None:
     """Such a thread races with the interpreter's end, which then is a SIGSEGV now and then."""
     with Process(sys.executable, "-c", ENDING) as ended:
-        left = ended.wait_for("threads left", 60.0)
-        assert ended.child.wait(20) == 0
+        left = ended.wait_for("threads left")
+        assert ended.child.wait(120) == 0
     assert "dds.udp" not in left
     assert "dds.ev" not in left
 
@@ -262,39 +258,14 @@ def test_no_event_of_a_topic_is_left_to_the_executor() -> None:
         rclpy.try_shutdown()
 
 
-@pytest.mark.parametrize(
-    ("number", "times"), [(signal.SIGINT, 1), (signal.SIGTERM, 1), (signal.SIGINT, 2)], ids=["int", "term", "int int"]
-)
+@pytest.mark.parametrize(("number", "times"), [(signal.SIGTERM, 1), (signal.SIGINT, 2)], ids=["term", "int int"])
 def test_signals_end_it_cleanly_within_two_seconds(tmp_path: Path, number: int, times: int) -> None:
     with node(tmp_path / "h.sqlite") as identify:
-        identify.wait_for("ready", 120.0)
+        identify.wait_for("ready")
         code, took = identify.end(number, times)
     assert code == 0, identify.text
     assert "Traceback" not in identify.text
     assert took < 2.0
-
-
-def test_a_killed_fit_process_is_replaced_and_the_set_comes(
-    log: Path, tmp_path: Path, ear: Ear, happened: Happened
-) -> None:
-    from diagnostic_msgs.msg import DiagnosticArray
-    from quadid_msgs.msg import ParameterSet
-
-    with node(tmp_path / "h.sqlite") as identify:
-        sets = ear.sets()
-        candidates = ear.listen("quadid/candidate", ParameterSet, 100)
-        health = ear.listen("/diagnostics", DiagnosticArray)
-        identify.wait_for("ready", 120.0)
-        with player(log, 1.0) as vehicle:
-            assert ear.until(lambda: candidates, 60.0)
-            os.kill(worker_of(identify.child.pid), signal.SIGKILL)
-            assert ear.until(lambda: sets, 60.0), identify.text
-            ear.until(lambda: vehicle.child.poll() is not None, 30.0)
-        assert "ended by signal 9" in identify.text
-        assert ear.until(lambda: restarts(health) == 1, 10.0)
-        assert ear.until(lambda: level(health, "inputs") == b"\x02", 15.0), "silent inputs become an error"
-        assert "silent" in next(s.message for s in health[-1].status if s.name.endswith("inputs"))
-    happened(11, "fit process of the node killed in flight: replaced, said in /diagnostics, the set came")
 
 
 def worker_of(pid: int) -> int:
@@ -318,36 +289,6 @@ def level(health: list[Any], part: str) -> bytes:
     return found
 
 
-def test_a_second_publisher_that_speaks_pauses_it_and_a_killed_one_does_not(
-    log: Path, tmp_path: Path, ear: Ear
-) -> None:
-    from diagnostic_msgs.msg import DiagnosticArray
-    from sensor_msgs.msg import Imu
-
-    def rate() -> float:
-        entry = next(s for s in health[-1].status if s.name.endswith("inputs"))
-        return float(next(v.value for v in entry.values if v.key == "gyro [Hz]"))
-
-    with node(tmp_path / "h.sqlite") as identify:
-        health = ear.listen("/diagnostics", DiagnosticArray)
-        identify.wait_for("ready", 120.0)
-        with player(log, 1.0):
-            assert ear.until(lambda: health and level(health, "inputs") == b"\x00", 20.0)
-            rogue = ear.node.create_publisher(Imu, "imu", 10)
-            timer = ear.node.create_timer(0.1, lambda: rogue.publish(Imu()))
-            assert ear.until(lambda: "paused" in message(health, "inputs"), 20.0), message(health, "inputs")
-            assert level(health, "inputs") == b"\x02"
-            assert ear.until(lambda: rate() == 0.0, 10.0), "nothing is taken in"
-            ear.node.destroy_timer(timer)
-            ear.node.destroy_publisher(rogue)
-            assert ear.until(lambda: level(health, "inputs") == b"\x00", 20.0), identify.text
-        # The player was killed: it stays listed until its lease ends.
-        with player(log, 1.0):
-            assert ear.until(lambda: "only one publishes" in message(health, "inputs") and rate() > 20.0, 15.0), (
-                message(health, "inputs")
-            )
-
-
 @pytest.mark.parametrize(
     ("parameters", "word"),
     [
@@ -358,24 +299,24 @@ def test_a_second_publisher_that_speaks_pauses_it_and_a_killed_one_does_not(
 )
 def test_what_cannot_be_configured_is_told_with_the_fix(tmp_path: Path, parameters: dict[str, str], word: str) -> None:
     with node(tmp_path / "h.sqlite", **parameters) as identify:
-        assert identify.child.wait(60) == 2
-        identify.wait_for(word, 5.0)
+        assert identify.child.wait(120) == 2
+        identify.wait_for(word)
         assert "Traceback" not in identify.text
 
 
 def test_a_second_node_on_one_history_is_refused_and_may_observe(tmp_path: Path, happened: Happened) -> None:
     with node(tmp_path / "h.sqlite") as first:
-        first.wait_for("ready", 120.0)
+        first.wait_for("ready")
         with node(tmp_path / "h.sqlite") as second:
-            assert second.child.wait(60) == 2
+            assert second.child.wait(120) == 2
             assert "another service writes" in second.text
         with node(tmp_path / "h.sqlite", observer=True) as observer:
-            observer.wait_for("ready", 120.0)
+            observer.wait_for("ready")
             assert observer.end()[0] == 0
     happened(21, "second node on one history: refused with exit code 2 and the fix; as observer it runs")
 
 
 def test_a_log_that_cannot_be_played_is_told(tmp_path: Path) -> None:
     with player(tmp_path / "none.mcap") as vehicle:
-        assert vehicle.child.wait(60) == 2
+        assert vehicle.child.wait(120) == 2
         assert "no file" in vehicle.text

@@ -17,7 +17,7 @@ _PORT = "/fastrtps_port"
 def _mapped(folder: Path) -> str:
     """What a node that is ready has in its memory."""
     with node(folder / "h.sqlite") as identify:
-        identify.wait_for("ready", 120.0)
+        identify.wait_for("ready")
         mapped = Path(f"/proc/{identify.child.pid}/maps").read_text(encoding="utf-8")
         assert identify.end()[0] == 0
     return mapped

@@ -20,14 +20,14 @@ def test_watch_sees_the_state_of_a_ros_node(tmp_path: Path) -> None:
     fleet = Fleet(net.client("watch"))
     try:
         with node(tmp_path / "h.sqlite", zenoh=net.client("quad1"), vehicle_id="quad1") as it:
-            it.wait_for("ready", 120.0)
-            assert until(lambda: "health" in fleet.latest.get("quad1", {}), 30.0), it.text
+            it.wait_for("ready")
+            assert until(lambda: "health" in fleet.latest.get("quad1", {})), it.text
             assert fleet.alive["quad1"]
-            done, text = fleet.command("quad1", "rollback")
+            done, text = fleet.command("quad1", "rollback", seconds=60.0)
             assert not done
             assert "no earlier set" in text
             assert it.end()[0] == 0
-        assert until(lambda: not fleet.alive["quad1"], 30.0)
+        assert until(lambda: not fleet.alive["quad1"])
     finally:
         fleet.close()
         net.close()

@@ -1,4 +1,4 @@
-"""Scheduler are done in steps that end in time, whole, and one begins when it is due."""
+"""Rounds are done in steps that end in time, whole, and one begins when it is due."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from quadid_node.service import STEPS, WORK_SECONDS, Scheduler
 
 
 class Work:
-    """Scheduler of so many pieces, each of which takes so long [s]."""
+    """Rounds of so many pieces, each of which takes so long [s]."""
 
     def __init__(self, pieces: int, lasting: float) -> None:
         self.now, self.begun, self.done = 0.0, 0, 0
@@ -23,56 +23,31 @@ class Work:
             self.done += 1
             yield
 
-    def step(self) -> float:
-        """Takes a step; returns how long it lasted [s]."""
-        begin = self.now
-        self.rounds.step()
-        return self.now - begin
+
+@pytest.mark.parametrize(
+    ("pieces", "lasting", "steps", "done"),
+    [
+        (3, 0.1, 2 * STEPS, (2, 6)),  # at once where there is time; the next round waits until it is due
+        (2, 10.0, 1, (1, 1)),  # one piece a step, however long it takes
+        (40, 0.4, 14 * 3, (3, 120)),  # no piece begins after the time of a step, and none is left out
+    ],
+)
+def test_pieces_are_done_in_steps(pieces: int, lasting: float, steps: int, done: tuple[int, int]) -> None:
+    work = Work(pieces, lasting * WORK_SECONDS)
+    for _ in range(steps):
+        begin, before, rests = work.now, work.done, work.rounds.resting
+        work.rounds.step()
+        assert work.now - begin <= max(1.4, lasting) * WORK_SECONDS
+        assert rests == (work.done == before), "steps without work are known before"
+    assert (work.begun, work.done) == done
 
 
-def test_a_round_is_done_at_once_when_there_is_time_and_the_next_waits_until_it_is_due() -> None:
-    work = Work(3, WORK_SECONDS / 10.0)
-    for _ in range(2 * STEPS):
-        work.step()
-    assert (work.begun, work.done) == (2, 6)
-
-
-@pytest.mark.parametrize("pieces", [4, 40])
-def test_no_piece_begins_after_the_time_and_none_is_left_out(pieces: int) -> None:
-    work = Work(pieces, 0.4 * WORK_SECONDS)
-    while work.done < 3 * pieces:
-        assert work.step() <= 1.4 * WORK_SECONDS
-    assert work.begun == 3
-
-
-def test_one_piece_is_done_however_long_it_takes() -> None:
-    work = Work(2, 10.0 * WORK_SECONDS)
-    work.step()
-    assert work.done == 1
-
-
-def test_steps_without_work_are_known_before() -> None:
-    work, resting = Work(1, WORK_SECONDS / 10.0), []
-    for _ in range(3 * STEPS):
-        resting.append(work.rounds.resting)
-        before = work.done
-        work.step()
-        assert resting[-1] == (work.done == before)
-    assert sum(resting) == 3 * (STEPS - 1)
-
-
-def test_a_round_that_takes_twice_its_time_is_overdue() -> None:
-    work, overdue = Work(3 * STEPS, 2.0 * WORK_SECONDS), []
-    for _ in range(3 * STEPS):
-        work.step()
-        overdue.append(work.rounds.overdue)
-    assert overdue == [False] * 2 * STEPS + [True] * STEPS
-
-
-def test_a_dropped_round_is_not_gone_on_with() -> None:
-    work = Work(3, 2.0 * WORK_SECONDS)
-    work.step()
+def test_a_round_that_takes_twice_its_time_is_overdue_and_a_dropped_one_is_not_gone_on_with() -> None:
+    work = Work(3 * STEPS, 2.0 * WORK_SECONDS)
+    for step in range(3 * STEPS):
+        work.rounds.step()
+        assert work.rounds.overdue == (step >= 2 * STEPS)
+    assert work.begun == 1
     work.rounds.drop()
-    for _ in range(STEPS):
-        work.step()
-    assert (work.begun, work.done) == (2, 2)
+    work.rounds.step()
+    assert work.begun == 2

@@ -106,4 +106,4 @@ def test_a_spoilt_row_of_the_history_is_told_and_left_out(history: Path, tmp_pat
     store = Store(copy, PELICAN_X.name)
     assert len(store.restore().healthy) == ENOUGH
     assert any("healthy flight" in note for note in store.notes)
-    store.close()
+    store.close(60.0)

@@ -10,12 +10,11 @@ import time
 from collections.abc import Iterator
 
 import pytest
-import quadid_node.worker as working
-from quadid_node.worker import STILL, WORK, InlineWorker, ProcessWorker, Trouble, WarmUp, processor_seconds
+from quadid_node.worker import FIT_LIMIT, STILL, WORK, InlineWorker, ProcessWorker, Trouble, WarmUp, processor_seconds
 
 from quadid.online import FitReply, FitRequest, Session, SessionSettings
 from quadid.vehicle import Vehicle
-from quadid_node import worker as warm_up
+from quadid_node import worker as working
 from tests.faults.evidence import Happened
 from tests.online.driving import flight, samples
 
@@ -39,13 +38,13 @@ def requests() -> list[FitRequest]:
     return out
 
 
-def answers(worker: InlineWorker | ProcessWorker, request: FitRequest, seconds: float = 90.0) -> list[FitReply]:
+def answers(worker: InlineWorker | ProcessWorker, request: FitRequest, seconds: float = 240.0) -> list[FitReply]:
     """Submits a request and waits for its answer."""
     worker.submit(request)
     return wait(worker, seconds)[0]
 
 
-def wait(worker: InlineWorker | ProcessWorker, seconds: float = 90.0) -> tuple[list[FitReply], list[Trouble]]:
+def wait(worker: InlineWorker | ProcessWorker, seconds: float = 240.0) -> tuple[list[FitReply], list[Trouble]]:
     """Polls until there is an answer; returns it and what was told meanwhile."""
     told: list[Trouble] = []
     deadline = time.monotonic() + seconds
@@ -70,7 +69,7 @@ def worker() -> Iterator[ProcessWorker]:
 
 def warm(worker: ProcessWorker) -> ProcessWorker:
     """The worker, once its kernels are warm."""
-    deadline = time.monotonic() + 120.0
+    deadline = time.monotonic() + 240.0
     while not worker.ready and time.monotonic() < deadline:
         assert worker.poll() == []
         time.sleep(0.01)
@@ -114,16 +113,17 @@ def test_a_killed_child_is_replaced_and_the_fit_done(
 
 
 def test_a_stopped_child_is_replaced(requests: list[FitRequest], happened: Happened) -> None:
-    worker = warm(ProcessWorker(PELICAN, limit=4.0))
+    ahead = [0.0]
+    worker = warm(ProcessWorker(PELICAN, clock=lambda: ahead[0] + time.monotonic()))
     old = worker.pid
     os.kill(old, signal.SIGSTOP)
-    begin = time.monotonic()
     worker.submit(requests[0])
-    assert time.monotonic() - begin < 0.1, "a child that does not read must not hold up its parent"
+    assert (worker.poll(), worker.pid) == ([], old), "a child that does not read must not hold up its parent"
+    ahead[0] = FIT_LIMIT
     (reply,), told = wait(worker)
     assert reply.estimate is not None
     assert worker.pid not in (0, old)
-    assert any("hung for 4 s" in t.text for t in told)
+    assert any("hung for 30 s" in t.text for t in told)
     worker.close()
     happened(11, "fit process stopped (SIGSTOP): the parent was not held up; replaced, the window fitted, said")
 
@@ -134,7 +134,7 @@ def test_after_three_deaths_the_session_is_told(
     worker.submit(requests[0])
     told: list[Trouble] = []
     killed: set[int] = set()
-    deadline = time.monotonic() + 120.0
+    deadline = time.monotonic() + 240.0
     while time.monotonic() < deadline:
         if worker.state == "busy" and worker.pid:
             os.kill(worker.pid, signal.SIGKILL)
@@ -180,7 +180,7 @@ def test_a_window_that_waits_behind_children_hung_in_their_warm_up_is_given_up(
 
 def test_a_child_that_eats_its_memory_ends_and_is_told(requests: list[FitRequest], happened: Happened) -> None:
     worker = ProcessWorker(PELICAN, memory_mb=40)
-    deadline = time.monotonic() + 60.0
+    deadline = time.monotonic() + 240.0
     told: list[Trouble] = []
     while not told and time.monotonic() < deadline:
         told = [o for o in worker.poll() if isinstance(o, Trouble)]
@@ -191,16 +191,13 @@ def test_a_child_that_eats_its_memory_ends_and_is_told(requests: list[FitRequest
 
 
 def test_a_child_ends_with_its_parent() -> None:
-    import subprocess
-    import sys
-
     code = (
         "from quadid_node.worker import ProcessWorker; from quadid.vehicle import Vehicle; import os\n"
         "w = ProcessWorker(Vehicle.shipped('pelican')); print(w.pid, flush=True); os._exit(1)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     child = int(done.stdout)
-    deadline = time.monotonic() + 60.0
+    deadline = time.monotonic() + 240.0
     while time.monotonic() < deadline and os.path.exists(f"/proc/{child}") and _state(child) != "Z":
         time.sleep(0.05)
     assert not os.path.exists(f"/proc/{child}") or _state(child) == "Z"
@@ -234,7 +231,7 @@ def test_a_child_takes_no_module_of_the_folder_we_stand_in(monkeypatch: pytest.M
 def work(monkeypatch: pytest.MonkeyPatch) -> dict[str, float | None]:
     """Time on the clock, and processor time that the watched child has used so far."""
     told: dict[str, float | None] = {"now": 0.0, "used": 0.0}
-    monkeypatch.setattr(warm_up, "processor_seconds", lambda pid: told["used"])
+    monkeypatch.setattr(working, "processor_seconds", lambda pid: told["used"])
     return told
 
 
