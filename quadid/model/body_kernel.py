@@ -8,19 +8,19 @@ from typing import Any
 import numba as nb
 
 from quadid.model import layout as ix
-from quadid.model.kernel import Needs
+from quadid.model.kernel import TWELFTH, Needs, put_force, rotation_rate
 from quadid.model.simd import LANES, exact, inlined, jit, lane_kernel, variant
 from quadid.types import FloatArray, IntArray
 from quadid.vehicle import GRAVITY
 
 # isort: off
 from quadid.model.work_array import (
-    ALL_MOMENTS, A_G, A_M, A_S1, A_S2, A_X1, A_XX, A_XY, A_XZ, A_Y1, A_YY, A_YZ, A_Z1, A_ZZ, C_B, C_CGX, C_CGY, C_CLIMB,
-    C_CPAR, C_CPAR_Z, C_D, C_DRAG_ARM, C_FLOW_ARM, C_GROUND, C_GX, C_GXX, C_GXY, C_GY, C_GYY, C_HUB, C_HX, C_HY, C_INVM,
-    C_IXX, C_IXY, C_IXZ, C_IYY, C_IYZ, C_IZZ, C_JR, C_JSPIN, C_JXX, C_JXY, C_JXZ, C_JYY, C_JYZ, C_JZZ, C_KX, C_KY, C_KZ,
-    C_LIFT, C_LOWEST, C_LP, C_MQ, C_NR, C_RX, C_RY, C_RZ, C_TURNING, C_WE, C_WN, F0_X, F0_Y, F0_Z, F1_X, F1_Y, F1_Z,
-    F2_X, F2_Y, F2_Z, HALF, L_FX, L_FY, L_FZ, L_MX, L_MY, L_MZ, L_NOW, L_PAST, S_BENDX, S_BENDY, S_BENDZ, S_FX, S_FY,
-    S_FZ, S_P, S_Q, S_QW, S_QX, S_QY, S_QZ, S_R, X_D, X_E, X_N, X_P, X_Q, X_QW, X_QX, X_QY, X_QZ, X_R, X_VD, X_VE, X_VN,
+    A_DO, A_G, A_M, A_O1, A_S1, A_S2, A_X1, A_X2, A_XX, A_XY, A_XZ, A_Y1, A_Y2, A_YY, A_YZ, A_Z1, A_Z2, A_ZZ, C_B,
+    C_CGX, C_CGY, C_CLIMB, C_CPAR, C_CPAR_Z, C_D, C_DRAG_ARM, C_FLOW_ARM, C_GROUND, C_GX, C_GXX, C_GXY, C_GY, C_GYY,
+    C_HUB, C_HX, C_HY, C_INVM, C_IXX, C_IXY, C_IXZ, C_IYY, C_IYZ, C_IZZ, C_JR, C_JSPIN, C_JXX, C_JXY, C_JXZ, C_JYY,
+    C_JYZ, C_JZZ, C_KX, C_KY, C_KZ, C_LIFT, C_LOWEST, C_LP, C_MQ, C_NR, C_RX, C_RY, C_RZ, C_TURNING, C_WE, C_WN, HALF,
+    L_FX, L_FY, L_FZ, L_MX, L_MY, L_MZ, L_NOW, L_PAST, S_BENDX, S_BENDY, S_BENDZ, S_P, S_Q, S_QW, S_QX, S_QY, S_QZ, S_R,
+    X_D, X_E, X_N, X_P, X_Q, X_QW, X_QX, X_QY, X_QZ, X_R, X_VD, X_VE, X_VN,
 )  # fmt: skip
 # isort: on
 
@@ -91,41 +91,11 @@ def residual_forces(terms: IntArray, coefficients: FloatArray, signals: FloatArr
         s[L_FX + i] = s[L_NOW + i] + back * (s[L_NOW + i] - s[L_PAST + i])
 
 
-# --- The hot kernel: one step of the rigid body for many parameter vectors ("lanes") at once
+# --- One step of the rigid body with effects, for many parameter vectors at once
 #
-# Lanes are the innermost, fixed-length axis, so that the compiler turns each lane loop into SIMD instructions: no
-# trigonometry in the loops, no allocation, no branch that depends on a lane.  Where each row lies: `model.work_array`.
-#
-# The equations, those of `quadid.model.equations`, are written once and compiled for groups of effects; what a group
-# leaves out costs nothing.  Forces and moments are taken linear in time over the step with the rotors' half-step means
-# (`quadid.model.rotor_kernel`); attitude, rate and velocity are integrated with the classical Runge-Kutta rule.
-# Right-hand side and step are kept whole: one reads like the free-body diagram, the other like the Runge-Kutta tableau,
-# and all of it stays in registers.
-
-
-TWELFTH = 1.0 / 12.0
-
-
-@nb.njit(**inlined)
-def _rotation_rate(qw, qx, qy, qz, p, q, r):  # type: ignore[no-untyped-def]
-    """Eq. 1 as a quaternion: d/dt q = q (0, p, q, r) / 2."""
-    return (
-        0.5 * (-qx * p - qy * q - qz * r),
-        0.5 * (qw * p + qy * r - qz * q),
-        0.5 * (qw * q + qz * p - qx * r),
-        0.5 * (qw * r + qx * q - qy * p),
-    )
-
-
-@nb.njit(**inlined)
-def _put_force(ax, ay, az, bx, by, bz, lane, s):  # type: ignore[no-untyped-def]
-    """Stores the mean specific force of both half steps, and over one sample centred on the start of the step."""
-    s[S_FX + lane] = 0.5 * (s[F0_X + lane] + ax)
-    s[S_FY + lane] = 0.5 * (s[F0_Y + lane] + ay)
-    s[S_FZ + lane] = 0.5 * (s[F0_Z + lane] + az)
-    s[F1_X + lane], s[F1_Y + lane], s[F1_Z + lane] = ax, ay, az
-    s[F2_X + lane], s[F2_Y + lane], s[F2_Z + lane] = bx, by, bz
-    s[F0_X + lane], s[F0_Y + lane], s[F0_Z + lane] = bx, by, bz
+# The equations are written once and compiled for groups of effects; what a group leaves out costs nothing.  Forces are
+# those of `quadid.model.equations`, the integrator that of `quadid.model.kernel`.  Right-hand side and step are kept
+# whole: one reads like the free-body diagram, the other like the Runge-Kutta tableau, and all of it stays in registers.
 
 
 @nb.njit(**inlined)
@@ -239,7 +209,7 @@ def _body(  # type: ignore[no-untyped-def]
 
 
 @nb.njit(**inlined)
-def _step(air, hub, solid, rare, moments, first, row, half, each, dt, s):  # type: ignore[no-untyped-def]
+def _step(air, hub, solid, rare, dt, s):  # type: ignore[no-untyped-def]
     """One step with a group of effects, known where this is inlined: the others leave nothing behind.
 
     Args:
@@ -248,23 +218,17 @@ def _step(air, hub, solid, rare, moments, first, row, half, each, dt, s):  # typ
         solid: products of inertia, centre of gravity, lever arm, damping, spin-up, moment of drag, thrust and mass that
             change in flight.
         rare: parasitic drag and ground effect, for their roots and divisions; needs `air`.
-        moments: sums over rotors, rows A_S2 to A_DO of each lane, or numbers that all lanes share.
-        first: place of the first.
-        row: from one moment to the next.
-        half: from its mean over the first half step to that over the second.
-        each: from lane to lane; 0 where they share it.
         dt: step [s].
-        s: rows; state advanced in place; what reaches the sensors at the start of the step and mean specific force
-            [m/s^2] over both half steps written.
+        s: rows; as in `quadid.model.kernel.step_core`.
     """
     h = 0.5 * dt
     for lane in range(LANES):
-        at = first + each * lane
-        s2a, x2a, y2a, z2a = moments[at], moments[at + row], moments[at + 2 * row], moments[at + 3 * row]
-        o1a, doa = moments[at + 4 * row], moments[at + 6 * row]
-        at += half
-        s2b, x2b, y2b, z2b = moments[at], moments[at + row], moments[at + 2 * row], moments[at + 3 * row]
-        o1b, dob = moments[at + 4 * row], moments[at + 6 * row]
+        s2a, s2b = s[A_S2 + lane], s[A_S2 + HALF + lane]
+        x2a, x2b = s[A_X2 + lane], s[A_X2 + HALF + lane]
+        y2a, y2b = s[A_Y2 + lane], s[A_Y2 + HALF + lane]
+        z2a, z2b = s[A_Z2 + lane], s[A_Z2 + HALF + lane]
+        o1a, o1b = s[A_O1 + lane], s[A_O1 + HALF + lane]
+        doa, dob = s[A_DO + lane], s[A_DO + HALF + lane]
         ga, gb = s[A_G + lane], s[A_G + HALF + lane]
         ma, mb = s[A_M + lane], s[A_M + HALF + lane]
         qw, qx, qy, qz = s[X_QW + lane], s[X_QX + lane], s[X_QY + lane], s[X_QZ + lane]
@@ -284,7 +248,7 @@ def _step(air, hub, solid, rare, moments, first, row, half, each, dt, s):  # typ
             1.5 * o1a - 0.5 * o1b, 1.5 * doa - 0.5 * dob, 1.5 * ga - 0.5 * gb, 1.5 * ma - 0.5 * mb, lift,
             1.5, -0.5, lane, s,
         )  # fmt: skip
-        k1w, k1x, k1y, k1z = _rotation_rate(qw, qx, qy, qz, p, q, r)
+        k1w, k1x, k1y, k1z = rotation_rate(qw, qx, qy, qz, p, q, r)
         # stage 2
         s2, x2, y2, z2 = 0.5 * (s2a + s2b), 0.5 * (x2a + x2b), 0.5 * (y2a + y2b), 0.5 * (z2a + z2b)
         o1, do = 0.5 * (o1a + o1b), 0.5 * (doa + dob)
@@ -295,7 +259,7 @@ def _step(air, hub, solid, rare, moments, first, row, half, each, dt, s):  # typ
             air, hub, solid, rare, a, b, c, d, p2, q2, r2, vn + h * n1, ve + h * e1, vd + h * d1,
             s2, x2, y2, z2, o1, do, g, im, lift, 0.5, 0.5, lane, s,
         )  # fmt: skip
-        k2w, k2x, k2y, k2z = _rotation_rate(a, b, c, d, p2, q2, r2)
+        k2w, k2x, k2y, k2z = rotation_rate(a, b, c, d, p2, q2, r2)
         # stage 3
         p3, q3, r3 = p + h * a2x, q + h * a2y, r + h * a2z
         a, b, c, d = qw + h * k2w, qx + h * k2x, qy + h * k2y, qz + h * k2z
@@ -303,7 +267,7 @@ def _step(air, hub, solid, rare, moments, first, row, half, each, dt, s):  # typ
             air, hub, solid, rare, a, b, c, d, p3, q3, r3, vn + h * n2, ve + h * e2, vd + h * d2,
             s2, x2, y2, z2, o1, do, g, im, lift, 0.5, 0.5, lane, s,
         )  # fmt: skip
-        k3w, k3x, k3y, k3z = _rotation_rate(a, b, c, d, p3, q3, r3)
+        k3w, k3x, k3y, k3z = rotation_rate(a, b, c, d, p3, q3, r3)
         # stage 4
         p4, q4, r4 = p + dt * a3x, q + dt * a3y, r + dt * a3z
         a, b, c, d = qw + dt * k3w, qx + dt * k3x, qy + dt * k3y, qz + dt * k3z
@@ -313,7 +277,7 @@ def _step(air, hub, solid, rare, moments, first, row, half, each, dt, s):  # typ
             1.5 * o1b - 0.5 * o1a, 1.5 * dob - 0.5 * doa, 1.5 * gb - 0.5 * ga, 1.5 * mb - 0.5 * ma, lift,
             -0.5, 1.5, lane, s,
         )  # fmt: skip
-        k4w, k4x, k4y, k4z = _rotation_rate(a, b, c, d, p4, q4, r4)
+        k4w, k4x, k4y, k4z = rotation_rate(a, b, c, d, p4, q4, r4)
         sixth = dt / 6.0
         qw += sixth * (k1w + 2.0 * (k2w + k3w) + k4w)
         qx += sixth * (k1x + 2.0 * (k2x + k3x) + k4x)
@@ -336,7 +300,7 @@ def _step(air, hub, solid, rare, moments, first, row, half, each, dt, s):  # typ
             s[X_D + lane] += dt * vd + dt * sixth * (d1 + d2 + d3)
         # Means over the halves from a parabola through the stages.
         fx, fy, fz = 4.0 * (f2x + f3x), 4.0 * (f2y + f3y), 4.0 * (f2z + f3z)
-        _put_force(
+        put_force(
             TWELFTH * (5.0 * f1x + fx - f4x), TWELFTH * (5.0 * f1y + fy - f4y), TWELFTH * (5.0 * f1z + fz - f4z),
             TWELFTH * (fx - f1x + 5.0 * f4x), TWELFTH * (fy - f1y + 5.0 * f4y), TWELFTH * (fz - f1z + 5.0 * f4z),
             lane, s,
@@ -351,15 +315,13 @@ def _step_of(air: bool, hub: bool, solid: bool, rare: bool) -> Any:
     def step(dt: float, s: FloatArray) -> None:
         lane_kernel()
         # bool() keeps numba from writing the step anew for each constant.
-        _step(bool(air), bool(hub), bool(solid), bool(rare), s, A_S2, LANES, HALF, 1, dt, s)
+        _step(bool(air), bool(hub), bool(solid), bool(rare), dt, s)
 
     return step
 
 
-step_nominal = _step_of(False, False, False, False)
-"""One step of attitude and rate with a diagonal inertia: Eqs. 1 and 9."""
 step_solid = _step_of(False, False, True, False)
-"""One step of attitude and rate with what acts on the body without regard to velocity."""
+"""One step of attitude and rate with what acts on the body without regard to velocity; arguments as `step_core`."""
 step_air = _step_of(True, False, False, False)
 """One step of attitude, rate, velocity and position."""
 step_air_solid = _step_of(True, False, True, False)
@@ -375,16 +337,14 @@ step_full = _step_of(True, True, True, True)
 
 
 @nb.njit(**jit)
-def step_shared(dt: float, table: FloatArray, k: int, s: FloatArray) -> None:
-    """`step_nominal` where all lanes share the rotor moments of row k of `rotor_kernel.rotor_table`, flat."""
-    lane_kernel()
-    none = False
-    _step(none, none, none, none, table, 2 * ALL_MOMENTS * k, 1, ALL_MOMENTS, 0, dt, s)
+def step_in_air(need: Needs, dt: float, s: FloatArray) -> None:
+    """One step of attitude, rate, velocity and position with the groups of effects that any lane needs.
 
-
-@nb.njit(**jit)
-def step_body(need: Needs, dt: float, s: FloatArray) -> None:
-    """One step with the groups of effects that any lane needs; arguments as `_step`."""
+    Args:
+        need: which parts of the model any lane needs.
+        dt: step [s].
+        s: rows; as in `quadid.model.kernel.step_core`.
+    """
     if need.rare and need.solid:
         step_full(dt, s)
     elif need.rare:
@@ -393,11 +353,7 @@ def step_body(need: Needs, dt: float, s: FloatArray) -> None:
         step_hub_solid(dt, s)
     elif need.hub:
         step_hub(dt, s)
-    elif need.air and need.solid:
-        step_air_solid(dt, s)
-    elif need.air:
-        step_air(dt, s)
     elif need.solid:
-        step_solid(dt, s)
+        step_air_solid(dt, s)
     else:
-        step_nominal(dt, s)
+        step_air(dt, s)

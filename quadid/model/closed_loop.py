@@ -15,20 +15,13 @@ from quadid.attitude_controller import mixer_matrix, pack_gains, rotation_of, st
 from quadid.data.window import Window
 from quadid.errors import ParameterError, WindowError
 from quadid.model import layout as ix
-from quadid.model.body_kernel import (
-    N_SIGNALS,
-    residual_forces,
-    residual_signals,
-    step_full,
-    step_nominal,
-)
-from quadid.model.kernel import Flight, Needs, copy, flight_factors, load_payload, needs_of
+from quadid.model.body_kernel import N_SIGNALS, residual_coefficients, residual_forces, residual_signals, step_full
+from quadid.model.kernel import Flight, Needs, body_constants, copy, flight_factors, load_payload, needs_of, step_core
 from quadid.model.layout import residual_terms
 from quadid.model.rollout import Rollout, Segments
 from quadid.model.rollout import _threads as worker_threads
-from quadid.model.rollout_kernel import begin
-from quadid.model.rotor_kernel import turn_rotor
-from quadid.model.sensor_kernel import distort_imu, step_tilt_error, tilt_attitude
+from quadid.model.rotor_kernel import input_constants, rotor_constants, turn_rotor
+from quadid.model.sensor_kernel import distort_imu, sensor_constants, step_tilt_error, tilt_attitude
 from quadid.model.simd import LANES, SOURCES, aligned, cache_aligned, cached, jit
 from quadid.rotation import down
 from quadid.types import FloatArray, IntArray, check_shapes
@@ -36,8 +29,8 @@ from quadid.vehicle import GRAVITY, Vehicle
 
 # isort: off
 from quadid.model.work_array import (
-    C_GB, C_GS, C_R, C_SHIFT, E_QW, F1_X, F2_X, N_ROWS, N_STATE, ROTOR, R_NEXT, R_NOW, R_PAST, R_SPEED, S_FX, S_P, S_QW,
-    X_P, X_QW,
+    A_G, C_GB, C_GS, C_R, C_SHIFT, E_QW, F1_X, F2_X, HALF, N_ROWS, N_STATE, ROTOR, R_NEXT, R_NOW, R_PAST, R_SPEED, S_FX,
+    S_P, S_QW, X_P, X_QW,
 )  # fmt: skip
 # isort: on
 
@@ -119,13 +112,21 @@ def _on_disk(sources: int) -> Any:
         _ = sources
         rotors, dt = len(geometry), flight.dt / substeps
         s = cache_aligned(N_ROWS * LANES)
+        s[:] = 0.0
+        s[A_G : A_G + 2 * LANES] = 1.0
+        s[A_G + HALF : A_G + HALF + 2 * LANES] = 1.0
         rot = cache_aligned(rotors * ROTOR).reshape(rotors, ROTOR)
         rot[:] = 0.0
-        coefficients = cache_aligned(len(terms) * LANES).reshape(len(terms), LANES)
-        begin(theta, flight, dt, coefficients, rot, s)
+        body_constants(theta, flight, rotors, s)
+        sensor_constants(theta, dt, s)
+        rotor_constants(theta, dt, rot, s)
+        input_constants(theta, s)
         for i in range(N_STATE):
             s[X_QW + i * LANES : X_QW + (i + 1) * LANES] = x0[i]
+        s[E_QW : E_QW + LANES] = 1.0
+        coefficients = cache_aligned(len(terms) * LANES).reshape(len(terms), LANES)
         signals = cache_aligned(N_SIGNALS * LANES).reshape(N_SIGNALS, LANES)
+        residual_coefficients(theta, rotors, coefficients)
         sent, command = np.zeros((HISTORY, rotors, LANES)), np.zeros(rotors)
         integral, attitude, rate = np.zeros((LANES, 3)), np.zeros((3, 3)), np.zeros(3)
         wanted, torque = np.zeros((3, 3)), np.zeros(3)
@@ -159,10 +160,10 @@ def _on_disk(sources: int) -> Any:
                     residual_forces(terms, coefficients, signals, step == 0, s)
                 if need.payload:
                     load_payload(flight.t0 + dt * step, dt, theta, s)
-                if need.air or need.solid:
+                if need.full:
                     step_full(dt, s)
                 else:
-                    step_nominal(dt, s)
+                    step_core(dt, s)
                 if need.ahrs:
                     step_tilt_error(s)
                     tilt_attitude(s)

@@ -1,4 +1,4 @@
-"""What many parameter vectors ("lanes") need of the model, and their constants of the body."""
+"""Hot kernel: one step for many parameter vectors ("lanes") at once, without the parts that none of them needs."""
 
 from __future__ import annotations
 
@@ -16,10 +16,12 @@ from quadid.vehicle import GRAVITY
 
 # isort: off
 from quadid.model.work_array import (
-    A_G, A_M, C_B, C_CGX, C_CGY, C_CLIMB, C_CPAR, C_CPAR_Z, C_D, C_DRAG_ARM, C_DROP, C_DROP_TIME, C_FLOW_ARM, C_GROUND,
-    C_GX, C_GXX, C_GXY, C_GY, C_GYY, C_HOVER, C_HUB, C_HX, C_HY, C_INVM, C_IXX, C_IXY, C_IXZ, C_IYY, C_IYZ, C_IZZ, C_JR,
-    C_JSPIN, C_JXX, C_JXY, C_JXZ, C_JYY, C_JYZ, C_JZZ, C_KX, C_KY, C_KZ, C_LIFT, C_LOAD, C_LOAD_TIME, C_LOWEST, C_LP,
-    C_MQ, C_NR, C_RX, C_RY, C_RZ, C_SAG, C_TURNING, C_WE, C_WN, HALF,
+    ALL_MOMENTS, A_G, A_M, A_O1, A_S2, A_X2, A_Y2, A_Z2, C_B, C_CGX, C_CGY, C_CLIMB, C_CPAR, C_CPAR_Z, C_D, C_DRAG_ARM,
+    C_DROP, C_DROP_TIME, C_FLOW_ARM, C_GROUND, C_GX, C_GXX, C_GXY, C_GY, C_GYY, C_HOVER, C_HUB, C_HX, C_HY, C_INVM,
+    C_IXX, C_IXY, C_IXZ, C_IYY, C_IYZ, C_IZZ, C_JR, C_JSPIN, C_JXX, C_JXY, C_JXZ, C_JYY, C_JYZ, C_JZZ, C_KX, C_KY, C_KZ,
+    C_LIFT, C_LOAD, C_LOAD_TIME, C_LOWEST, C_LP, C_MQ, C_NR, C_RX, C_RY, C_RZ, C_SAG, C_TURNING, C_WE, C_WN,
+    F0_X, F0_Y, F0_Z, F1_X, F1_Y, F1_Z, F2_X, F2_Y, F2_Z, HALF, S_BENDX, S_BENDY, S_BENDZ, S_FX, S_FY, S_FZ,
+    S_P, S_Q, S_QW, S_QX, S_QY, S_QZ, S_R, X_P, X_Q, X_QW, X_QX, X_QY, X_QZ, X_R,
 )  # fmt: skip
 # isort: on
 
@@ -30,7 +32,8 @@ class Needs(NamedTuple):
     """Which parts of the model any lane of a block uses.
 
     Attributes:
-        air, hub, solid, rare: these groups of `quadid.model.body_kernel`.
+        full: more than the nominal step: one of the groups of `quadid.model.body_kernel`.
+        air, hub, solid, rare: these groups.
         shared: all that acts on rotors is the same in all lanes, and their moments are tabled.
         delayed: commands, or readings of speed, come late.
         uneven: speeding up and slowing down lag differently.
@@ -42,6 +45,7 @@ class Needs(NamedTuple):
         learned: terms beyond the catalogue act.
     """
 
+    full: bool
     air: bool
     hub: bool
     solid: bool
@@ -116,7 +120,7 @@ def _on_disk(sources: int) -> Any:
                 varied |= theta[lane, i] != theta[0, i]
             varied |= theta[lane, ix.OFFSET] != 0.0 and theta[lane, ix.B] != theta[0, ix.B]
         return Needs(
-            air, hub, solid, rare, not varied, _any_of(theta, _DELAY), _any_of(theta, _SLOWER),
+            air or solid, air, hub, solid, rare, not varied, _any_of(theta, _DELAY), _any_of(theta, _SLOWER),
             _any_of(theta, _EXPONENT), growth, factors, payload, _any_of(theta, _IMU_LAG),
             _any_of(theta, _ATT_DELAY), _any_of(theta, _IMU), _any_of(theta, _AHRS), learned,
         )  # fmt: skip
@@ -127,7 +131,15 @@ def _on_disk(sources: int) -> Any:
 needs_of = _on_disk(SOURCES)
 
 
-# --- Constants of the body, and what changes them in flight
+# --- The hot kernel: one step of the rigid body for many parameter vectors ("lanes") at once
+#
+# Lanes are the innermost, fixed-length axis, so that the compiler turns each lane loop into SIMD instructions: no
+# trigonometry in the loops, no allocation, no branch that depends on a lane.  Where each row lies: `model.work_array`.
+#
+# Integration: forces and moments are taken linear in time over the step with the rotors' half-step means
+# (`quadid.model.rotor_kernel`), and attitude, rate and velocity are integrated with the classical Runge-Kutta rule.
+# Here is the nominal step; effects on the body are in `quadid.model.body_kernel`.  Both are the same equations, listed
+# in `quadid.model.equations`.
 
 
 SLOWEST_HOVER = 0.1
@@ -136,6 +148,7 @@ of its own."""
 (LIFT,), (BESIDE_Z,) = places("translational_lift"), places("parasitic_drag.beside_z")
 (UNCOUPLED,) = places("no_gyroscopic_coupling")
 LOAD_XX, LOAD_YY, LOAD_ZZ, LOAD_X, LOAD_Y = places(*(f"mass_change.{k}" for k in ("J_xx", "J_yy", "J_zz", "x", "y")))
+TWELFTH = 1.0 / 12.0
 
 
 class Flight(NamedTuple):
@@ -255,3 +268,104 @@ def load_payload(t: float, dt: float, theta: FloatArray, s: FloatArray) -> None:
         )  # fmt: skip
         x, y = th[ix.CGX] + part * th[LOAD_X], th[ix.CGY] + part * th[LOAD_Y]
         s[C_CGX + lane], s[C_CGY + lane], s[C_RX + lane], s[C_RY + lane] = x, y, th[ix.LAX] - x, th[ix.LAY] - y
+
+
+@nb.njit(**inlined)
+def rotation_rate(qw, qx, qy, qz, p, q, r):  # type: ignore[no-untyped-def]
+    """Eq. 1 as a quaternion: d/dt q = q (0, p, q, r) / 2."""
+    return (
+        0.5 * (-qx * p - qy * q - qz * r),
+        0.5 * (qw * p + qy * r - qz * q),
+        0.5 * (qw * q + qz * p - qx * r),
+        0.5 * (qw * r + qx * q - qy * p),
+    )
+
+
+@nb.njit(**inlined)
+def put_force(ax, ay, az, bx, by, bz, lane, s):  # type: ignore[no-untyped-def]
+    """Stores the mean specific force of both half steps, and over one sample centred on the start of the step."""
+    s[S_FX + lane] = 0.5 * (s[F0_X + lane] + ax)
+    s[S_FY + lane] = 0.5 * (s[F0_Y + lane] + ay)
+    s[S_FZ + lane] = 0.5 * (s[F0_Z + lane] + az)
+    s[F1_X + lane], s[F1_Y + lane], s[F1_Z + lane] = ax, ay, az
+    s[F2_X + lane], s[F2_Y + lane], s[F2_Z + lane] = bx, by, bz
+    s[F0_X + lane], s[F0_Y + lane], s[F0_Z + lane] = bx, by, bz
+
+
+@nb.njit(**inlined)
+def _core(s2a, s2b, x2a, x2b, y2a, y2b, z2a, z2b, o1a, o1b, dt, lane, s):  # type: ignore[no-untyped-def]
+    """`step_core` of one lane for these rotor moments, means over the first and the second half step."""
+    b, d = s[C_B + lane], s[C_D + lane]
+    ixx, iyy, izz = s[C_IXX + lane], s[C_IYY + lane], s[C_IZZ + lane]
+    jxx, jyy, jzz, jr = s[C_JXX + lane], s[C_JYY + lane], s[C_JZZ + lane], s[C_JR + lane]
+    tx1, tx2 = -b * y2a, -b * y2b
+    ty1, ty2 = b * x2a, b * x2b
+    tz1, tz2 = d * z2a, d * z2b
+    o1, o2 = jr * o1a, jr * o1b
+    lift = -b * s[C_INVM + lane]
+    put_force(0.0, 0.0, lift * s2a, 0.0, 0.0, lift * s2b, lane, s)
+    qw, qx, qy, qz = s[X_QW + lane], s[X_QX + lane], s[X_QY + lane], s[X_QZ + lane]
+    p, q, r = s[X_P + lane], s[X_Q + lane], s[X_R + lane]
+    s[S_QW + lane], s[S_QX + lane], s[S_QY + lane], s[S_QZ + lane] = qw, qx, qy, qz
+    s[S_P + lane], s[S_Q + lane], s[S_R + lane] = p, q, r
+    cx, cy, cz = (jyy - jzz) * ixx, (jzz - jxx) * iyy, (jxx - jyy) * izz
+    # stage 1
+    tx, ty, tz, o = 1.5 * tx1 - 0.5 * tx2, 1.5 * ty1 - 0.5 * ty2, 1.5 * tz1 - 0.5 * tz2, 1.5 * o1 - 0.5 * o2
+    a1x, a1y, a1z = cx * q * r + (tx + o * q) * ixx, cy * p * r + (ty - o * p) * iyy, cz * p * q + tz * izz
+    k1w, k1x, k1y, k1z = rotation_rate(qw, qx, qy, qz, p, q, r)
+    # stage 2
+    h = 0.5 * dt
+    tx, ty, tz, o = 0.5 * (tx1 + tx2), 0.5 * (ty1 + ty2), 0.5 * (tz1 + tz2), 0.5 * (o1 + o2)
+    p2, q2, r2 = p + h * a1x, q + h * a1y, r + h * a1z
+    a2x, a2y, a2z = cx * q2 * r2 + (tx + o * q2) * ixx, cy * p2 * r2 + (ty - o * p2) * iyy, cz * p2 * q2 + tz * izz
+    k2w, k2x, k2y, k2z = rotation_rate(qw + h * k1w, qx + h * k1x, qy + h * k1y, qz + h * k1z, p2, q2, r2)
+    # stage 3
+    p3, q3, r3 = p + h * a2x, q + h * a2y, r + h * a2z
+    a3x, a3y, a3z = cx * q3 * r3 + (tx + o * q3) * ixx, cy * p3 * r3 + (ty - o * p3) * iyy, cz * p3 * q3 + tz * izz
+    k3w, k3x, k3y, k3z = rotation_rate(qw + h * k2w, qx + h * k2x, qy + h * k2y, qz + h * k2z, p3, q3, r3)
+    # stage 4
+    tx, ty, tz, o = 1.5 * tx2 - 0.5 * tx1, 1.5 * ty2 - 0.5 * ty1, 1.5 * tz2 - 0.5 * tz1, 1.5 * o2 - 0.5 * o1
+    p4, q4, r4 = p + dt * a3x, q + dt * a3y, r + dt * a3z
+    a4x, a4y, a4z = cx * q4 * r4 + (tx + o * q4) * ixx, cy * p4 * r4 + (ty - o * p4) * iyy, cz * p4 * q4 + tz * izz
+    k4w, k4x, k4y, k4z = rotation_rate(qw + dt * k3w, qx + dt * k3x, qy + dt * k3y, qz + dt * k3z, p4, q4, r4)
+    sixth = dt / 6.0
+    qw += sixth * (k1w + 2.0 * (k2w + k3w) + k4w)
+    qx += sixth * (k1x + 2.0 * (k2x + k3x) + k4x)
+    qy += sixth * (k1y + 2.0 * (k2y + k3y) + k4y)
+    qz += sixth * (k1z + 2.0 * (k2z + k3z) + k4z)
+    scale = 1.5 - 0.5 * (qw * qw + qx * qx + qy * qy + qz * qz)  # one Newton step to unit length
+    s[X_QW + lane], s[X_QX + lane], s[X_QY + lane], s[X_QZ + lane] = qw * scale, qx * scale, qy * scale, qz * scale
+    s[X_P + lane] = p + sixth * (a1x + 2.0 * (a2x + a3x) + a4x)
+    s[X_Q + lane] = q + sixth * (a1y + 2.0 * (a2y + a3y) + a4y)
+    s[X_R + lane] = r + sixth * (a1z + 2.0 * (a2z + a3z) + a4z)
+    s[S_BENDX + lane], s[S_BENDY + lane] = h * (a4x - a1x), h * (a4y - a1y)
+    s[S_BENDZ + lane] = h * (a4z - a1z)
+
+
+@nb.njit(**jit)
+def step_core(dt: float, s: FloatArray) -> None:
+    """One step of attitude and rate without velocity: Eqs. 1 and 9 with a diagonal inertia.
+
+    Args:
+        dt: step [s].
+        s: rows; state advanced in place; what reaches the sensors at the start of the step and mean specific force
+            [m/s^2] over both half steps written.
+    """
+    lane_kernel()
+    for lane in range(LANES):
+        _core(
+            s[A_S2 + lane], s[A_S2 + HALF + lane], s[A_X2 + lane], s[A_X2 + HALF + lane], s[A_Y2 + lane],
+            s[A_Y2 + HALF + lane], s[A_Z2 + lane], s[A_Z2 + HALF + lane], s[A_O1 + lane], s[A_O1 + HALF + lane],
+            dt, lane, s,
+        )  # fmt: skip
+
+
+@nb.njit(**jit)
+def step_core_shared(dt: float, table: FloatArray, k: int, s: FloatArray) -> None:
+    """`step_core` where all lanes share the rotor moments of row k of `table`, see `rotor_kernel.rotor_table`."""
+    lane_kernel()
+    s2a, x2a, y2a, z2a, o1a = table[k, 0], table[k, 1], table[k, 2], table[k, 3], table[k, 4]
+    s2b, x2b, y2b = table[k, ALL_MOMENTS], table[k, ALL_MOMENTS + 1], table[k, ALL_MOMENTS + 2]
+    z2b, o1b = table[k, ALL_MOMENTS + 3], table[k, ALL_MOMENTS + 4]
+    for lane in range(LANES):
+        _core(s2a, s2b, x2a, x2b, y2a, y2b, z2a, z2b, o1a, o1b, dt, lane, s)

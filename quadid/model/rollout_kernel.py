@@ -12,8 +12,8 @@ from quadid.model.body_kernel import (
     residual_coefficients,
     residual_forces,
     residual_signals,
-    step_body,
-    step_shared,
+    step_in_air,
+    step_solid,
 )
 from quadid.model.kernel import (
     Flight,
@@ -22,10 +22,13 @@ from quadid.model.kernel import (
     copy,
     flight_factors,
     load_payload,
+    step_core,
+    step_core_shared,
 )
 from quadid.model.rotor_kernel import (
     PLAIN_MOMENTS,
     Drive,
+    input_constants,
     rotor_constants,
     rotors_start,
     rotors_step,
@@ -175,32 +178,6 @@ def settle(total: FloatArray, inside: FloatArray, cost: FloatArray) -> None:
 
 
 @nb.njit(**jit)
-def begin(
-    theta: FloatArray, flight: Flight, dt: float, coefficients: FloatArray, rot: FloatArray, s: FloatArray
-) -> None:
-    """Writes all that stays the same while lanes fly: constants, and factors of thrust and mass where nothing changes.
-
-    Args:
-        theta: parameter vectors (LANES, size).
-        flight: numbers of the window.
-        dt: step [s].
-        coefficients: of the terms beyond the catalogue, (terms, LANES), written.
-        rot: rows of the rotors (rotors, ROTOR); gains written.
-        s: rows; all written, the state at zero.
-    """
-    for i in range(len(s)):
-        s[i] = 0.0
-    for i in range(2 * LANES):
-        s[A_G + i], s[A_G + HALF + i] = 1.0, 1.0
-    for lane in range(LANES):
-        s[E_QW + lane] = 1.0
-    body_constants(theta, flight, len(rot), s)
-    sensor_constants(theta, dt, s)
-    rotor_constants(theta, dt, rot, s)
-    residual_coefficients(theta, len(rot), coefficients)
-
-
-@nb.njit(**jit)
 def _start(seg: int, x0: FloatArray, dx: FloatArray, s: FloatArray) -> None:
     """Sets lane states from the initial state x0[seg] (13,) and each lane's tangent offset dx (12, LANES)."""
     lane_kernel()
@@ -267,6 +244,9 @@ def _on_disk(sources: int) -> Any:
         _ = sources
         rotors, dt = len(drive.geometry), flight.dt
         s = cache_aligned(N_ROWS * LANES)
+        s[:] = 0.0
+        s[A_G : A_G + 2 * LANES] = 1.0  # the factors of thrust and mass stay 1 unless asked for
+        s[A_G + HALF : A_G + HALF + 2 * LANES] = 1.0
         rot = cache_aligned(rotors * ROTOR).reshape(rotors, ROTOR)
         ahead = cache_aligned(rotors * ROTOR).reshape(rotors, ROTOR)
         steps = n_pre + n_seg
@@ -275,10 +255,13 @@ def _on_disk(sources: int) -> Any:
         inside = cache_aligned(basis.shape[2] * LANES).reshape(basis.shape[2], LANES)
         total[:] = 0.0
         inside[:] = 0.0
+        body_constants(theta, flight, rotors, s)
+        input_constants(theta, s)
+        sensor_constants(theta, dt, s)
+        rotor_constants(theta, dt, rot, s)
         coefficients = cache_aligned(len(terms) * LANES).reshape(len(terms), LANES)
         signals = cache_aligned(N_SIGNALS * LANES).reshape(N_SIGNALS, LANES)
-        begin(theta, flight, dt, coefficients, rot, s)
-        nominal, flat = not (need.air or need.solid), table.reshape(-1)
+        residual_coefficients(theta, rotors, coefficients)
         turned = max(starts[0] - n_pre - memory, 0)  # rotor steps already taken
         rotors_start(drive, turned, need, rot, s)
         for seg in range(len(starts)):
@@ -297,7 +280,7 @@ def _on_disk(sources: int) -> Any:
             for i in range(steps):
                 k = first + i
                 if need.shared:
-                    if not nominal:
+                    if need.full:
                         spread_moments(table, k, ALL_MOMENTS if need.hub else PLAIN_MOMENTS, s)
                 else:
                     if k == following:
@@ -317,10 +300,14 @@ def _on_disk(sources: int) -> Any:
                     residual_signals(s, signals)
                     residual_forces(terms, coefficients, signals, i == 0, s)
                 # This step gives the second half of the accelerometer's mean at t_k; the step before, the first.
-                if need.shared and nominal:
-                    step_shared(dt, flat, k, s)
+                if need.air:
+                    step_in_air(need, dt, s)
+                elif need.solid:
+                    step_solid(dt, s)
+                elif need.shared:
+                    step_core_shared(dt, table, k, s)
                 else:
-                    step_body(need, dt, s)
+                    step_core(dt, s)
                 if i == 0:
                     _settle_force(s)
                 if need.imu_lag:

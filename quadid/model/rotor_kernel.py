@@ -34,7 +34,6 @@ from quadid.model.work_array import (
 
 
 THIRD = 1.0 / 3.0
-(GROWTH,) = places("drag_torque_curve")
 A, B, C, D = 0, PIECE, 2 * PIECE, 3 * PIECE
 """Pieces of a step: its halves, each before and after the input switches."""
 
@@ -54,7 +53,6 @@ def rotor_constants(theta: FloatArray, dt: float, rot: FloatArray, s: FloatArray
         for r in range(len(rot)):
             loss = th[ix.LOSS + r]
             rot[r, R_GAIN + lane], rot[r, R_DRAG + lane] = 1.0 - loss, 1.0 - loss - th[ix.LOSS + len(rot) + r]
-        s[C_VOLT + lane], s[C_GROWTH + lane] = th[ix.EXPONENT], th[GROWTH]
         s[C_W0 + lane], s[C_CURVE + lane] = th[ix.DEAD_SPEED], th[ix.DEAD_SPEED] ** 2 + th[ix.OFFSET] / th[ix.B]
         delay = (max(th[ix.DELAY], 0.0) - max(th[ix.TELEMETRY], 0.0)) / dt
         f = delay - math.floor(delay)
@@ -213,6 +211,7 @@ def next_input(r: int, held: bool, sloped: bool, inv: float, rot: FloatArray, s:
 
 PLAIN_MOMENTS = 7
 """Moments that every model needs; the others belong to the air at each hub."""
+(GROWTH,) = places("drag_torque_curve")
 
 
 class Drive(NamedTuple):
@@ -249,6 +248,13 @@ def rotors_start(drive: Drive, k: int, need: Needs, rot: FloatArray, s: FloatArr
             rot[r, R_SPEED + lane] = factor * drive.u[k, r]
             for row in (R_PAST_SLOPE, R_NOW_SLOPE, R_NEXT_SLOPE):
                 rot[r, row + lane] = 0.0
+
+
+@nb.njit(**exact)
+def input_constants(theta: FloatArray, s: FloatArray) -> None:
+    """Derives what scales input and drag torque of all lanes from parameter vectors (LANES, size)."""
+    for lane in range(LANES):
+        s[C_VOLT + lane], s[C_GROWTH + lane] = theta[lane, ix.EXPONENT], theta[lane, GROWTH]
 
 
 @nb.njit(**jit)
@@ -395,6 +401,7 @@ def _on_disk(sources: int) -> Any:
         rotors = len(drive.geometry)
         rot = cache_aligned(rotors * ROTOR).reshape(rotors, ROTOR)
         rotor_constants(theta, drive.dt, rot, s)
+        input_constants(theta, s)
         s[A_S2 : A_S2 + 2 * HALF] = 0.0
         for k in range(len(drive.u)):
             if k == 0:

@@ -195,8 +195,23 @@ def remember_attitude(i: int, s: FloatArray, past: FloatArray) -> None:
 
 
 @nb.njit(**jit)
-def _look_up(i: int, dt: float, past: FloatArray, s: FloatArray) -> None:
-    """Copies the step before step i less each lane's delay, and how far back from there the lane looks."""
+def _look_up(back: int, i: int, dt: float, past: FloatArray, s: FloatArray) -> None:
+    """Copies step `back` of the past for all lanes, and how far back from there each of them looks at step i."""
+    lane_kernel()
+    before = max(back - 1, 0)
+    for row in range(7):
+        for lane in range(LANES):
+            s[D_QW + row * LANES + lane] = past[back, row, lane]
+    for row in range(3):
+        for lane in range(LANES):
+            s[D_P0 + row * LANES + lane] = past[before, 4 + row, lane]
+    for lane in range(LANES):
+        s[D_H + lane] = (s[C_ATT_DELAY + lane] - (i - back)) * dt
+
+
+@nb.njit(**jit)
+def _look_up_each(i: int, dt: float, past: FloatArray, s: FloatArray) -> None:
+    """As `_look_up` where lanes look back by different numbers of whole steps."""
     for lane in range(LANES):
         back = max(i - int(s[C_ATT_DELAY + lane]), 0)
         before = max(back - 1, 0)
@@ -213,7 +228,14 @@ def delay_attitude(i: int, dt: float, past: FloatArray, s: FloatArray) -> None:
 
     Between stored steps, and before the first, attitude follows from rate and its backward difference.
     """
-    _look_up(i, dt, past, s)
+    whole = int(s[C_ATT_DELAY])
+    alike = True
+    for lane in range(LANES):
+        alike &= int(s[C_ATT_DELAY + lane]) == whole
+    if alike:
+        _look_up(max(i - whole, 0), i, dt, past, s)
+    else:
+        _look_up_each(i, dt, past, s)
     _turn_back(dt, s)
 
 

@@ -11,15 +11,15 @@ import numpy as np
 
 from quadid.errors import ParameterError, WindowError
 from quadid.model import layout as ix
-from quadid.model.body_kernel import N_SIGNALS, residual_forces, residual_signals, step_body
-from quadid.model.kernel import Flight, Needs, flight_factors, load_payload, needs_of
+from quadid.model.body_kernel import N_SIGNALS, residual_coefficients, residual_forces, residual_signals, step_in_air
+from quadid.model.kernel import Flight, Needs, body_constants, flight_factors, load_payload, needs_of
 from quadid.model.layout import Layout, residual_terms
 from quadid.model.rollout import hub_geometry
-from quadid.model.rollout_kernel import begin
-from quadid.model.rotor_kernel import turn_rotor
+from quadid.model.rotor_kernel import input_constants, rotor_constants, turn_rotor
 from quadid.model.sensor_kernel import (
     delay_attitude,
     distort_imu,
+    sensor_constants,
     step_filter,
     step_tilt_error,
     tilt_attitude,
@@ -30,9 +30,9 @@ from quadid.vehicle import RandomForces, Vehicle
 
 # isort: off
 from quadid.model.work_array import (
-    C_SHIFT, E_QW, F1_X, F2_X, G_BEND, G_DF, G_F, G_F0, G_FM, G_W, G_W0, N_QW, N_ROWS, N_STATE, ROTOR, R_NEXT, R_NOW,
-    R_PAST, R_SPEED, S_BENDX, S_FX, S_P, S_QW, T_A1, X_D, X_E, X_N, X_P, X_Q, X_QW, X_QX, X_QY, X_QZ, X_R, X_VD, X_VE,
-    X_VN,
+    A_G, C_SHIFT, E_QW, F1_X, F2_X, G_BEND, G_DF, G_F, G_F0, G_FM, G_W, G_W0, HALF, N_QW, N_ROWS, N_STATE, ROTOR,
+    R_NEXT, R_NOW, R_PAST, R_SPEED, S_BENDX, S_FX, S_P, S_QW, T_A1, X_D, X_E, X_N, X_P, X_Q, X_QW, X_QX, X_QY, X_QZ,
+    X_R, X_VD, X_VE, X_VN,
 )  # fmt: skip
 # isort: on
 
@@ -172,8 +172,15 @@ def _on_disk(sources: int) -> Any:
         """
         _ = sources
         for block in range(len(theta)):
-            s = np.empty(N_ROWS * LANES)
-            begin(theta[block], flight, flight.dt, coefficients[block], rot[block], s)
+            s = np.zeros(N_ROWS * LANES)
+            for half in range(2):
+                for i in range(2 * LANES):
+                    s[A_G + half * HALF + i] = 1.0
+            body_constants(theta[block], flight, rot.shape[1], s)
+            input_constants(theta[block], s)
+            sensor_constants(theta[block], flight.dt, s)
+            rotor_constants(theta[block], flight.dt, rot[block], s)
+            residual_coefficients(theta[block], rot.shape[1], coefficients[block])
             constants[block] = s[:STATE]
 
     @nb.njit(**cached)
@@ -208,7 +215,7 @@ def _on_disk(sources: int) -> Any:
         count, rotors = commands.shape[1], commands.shape[2]
         need = Needs(
             needs[0], needs[1], needs[2], needs[3], needs[4], needs[5], needs[6], needs[7], needs[8], needs[9],
-            needs[10], needs[11], needs[12], needs[13], needs[14], needs[15],
+            needs[10], needs[11], needs[12], needs[13], needs[14], needs[15], needs[16],
         )  # fmt: skip
         plain = not (need.delayed or need.uneven)
         sensing = need.imu_lag or need.ahrs or need.learned
@@ -260,7 +267,7 @@ def _on_disk(sources: int) -> Any:
                 if need.learned:
                     residual_signals(s, signals)
                     residual_forces(terms, coefficients[block], signals, step + k == 0, s)
-                step_body(need, dt, s)
+                step_in_air(need, dt, s)
                 if len(walk) > 0:
                     for lane in range(min(LANES, count - first)):
                         for i in range(TURNS):

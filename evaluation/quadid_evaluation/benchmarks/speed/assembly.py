@@ -11,7 +11,8 @@ from typing import Any
 
 import numba as nb
 
-from quadid.model.body_kernel import step_air, step_full, step_nominal, step_solid
+from quadid.model.body_kernel import step_air, step_full, step_solid
+from quadid.model.kernel import step_core
 from quadid.model.simd import whole
 
 WIDEST = ("zmm", "ymm", "xmm")
@@ -20,7 +21,7 @@ _ARITHMETIC = re.compile(r"v(fn?m(add|sub)|add|sub|mul|min|max|rcp|rsqrt)")
 
 def instructions() -> dict[str, Any]:
     """Compiles the steps afresh and counts; by step."""
-    steps = {"nominal": step_nominal, "body alone": step_solid, "rotor drag": step_air, "full": step_full}
+    steps = {"nominal": step_core, "body alone": step_solid, "rotor drag": step_air, "full": step_full}
     return {"steps": {name: _counted(step) for name, step in steps.items()}}
 
 
