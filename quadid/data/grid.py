@@ -13,6 +13,7 @@ import numpy as np
 from quadid.data.intersample import follow_feedback
 from quadid.data.rotor_signal import RotorSignal, rotor_signal
 from quadid.data.window import (
+    COINCIDENT,
     Recording,
     Sampling,
     Window,
@@ -35,8 +36,6 @@ HALF_WIDTH = 4.0
 """Half-width of the low-pass kernel in steps of the new grid."""
 CUTOFF = 0.4
 """Frequency where the low-pass halves the amplitude, as a fraction of the new grid's rate (0.5 is its Nyquist)."""
-COINCIDENT = 5e-3
-"""Samples this close to the grid, in steps, lie on it: they are passed on bit for bit."""
 _CHUNK = 4096
 
 

@@ -38,6 +38,8 @@ CHANNELS: dict[str, tuple[int | None, str]] = {
 ``accel`` is specific force (-g on z at rest); ``accel_z`` its z alone, ``accel_world`` the same in world axes, from
 logs that hold no more.
 """
+COINCIDENT = 5e-3
+"""Samples this close to a uniform grid, in steps, lie on it."""
 _MEASURED = ("gyro", "attitude", "accel", "velocity", "position", "battery", "attitude_reference")
 """Channels of a window that may be missing."""
 

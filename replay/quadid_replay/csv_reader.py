@@ -11,8 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from quadid.data.grid import COINCIDENT
-from quadid.data.window import Channel, Recording, sample_period
+from quadid.data.window import COINCIDENT, Channel, Recording, sample_period
 from quadid.errors import LogError, nearest
 from quadid.sanitise import plain
 from quadid.types import FloatArray

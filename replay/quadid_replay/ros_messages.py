@@ -457,7 +457,7 @@ def decode_messages(messages: Iterable[Message], sources: Mapping[int, Source]) 
             for some, read in _read(sources[number].reader, rows, [batch[row][2] for row in rows]):
                 stamped[some], decoded[some] = read.ns, True
                 for order, (name, values, known) in enumerate(sources[number].kind.signals(read.blocks, read.extra)):
-                    here = np.broadcast_to(known, len(some))
+                    here = slice(None) if np.all(known) else np.broadcast_to(known, len(some))
                     parts.append(_Part((number, name), order, some[here], values[here]))
         headed = np.isin(numbers, [number for number, source in sources.items() if source.kind.stamp is None])
         times = np.full(len(batch), np.nan)
