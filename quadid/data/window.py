@@ -8,14 +8,16 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from typing import Any, Literal, NamedTuple, TypeGuard
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeGuard
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from quadid.errors import LogError, WindowError
 from quadid.types import BoolArray, FloatArray, IndexArray
-from quadid.vehicle import Vehicle
+
+if TYPE_CHECKING:
+    from quadid.vehicle import Vehicle
 
 Sampling = Literal["held", "instant"]
 

@@ -51,11 +51,11 @@ def test_a_child_reads_what_is_read_here(tmp_path: Path, kind: str) -> None:
     same(read_here(tmp_path / "log", "auto"), open_log(tmp_path / "log"))
 
 
-def test_reading_processes_import_neither_numba_nor_scipy() -> None:
+def test_reading_processes_import_neither_numba_nor_scipy_nor_pydantic() -> None:
     """One constant of `quadid.data.grid` in a reader took the first log of a program a second."""
     script = (
         "import sys, quadid_replay.opening\nfrom quadid_replay.formats import FORMATS, reader_of\n"
-        "for kind in FORMATS:\n    reader_of(kind.name)\nprint({'numba', 'scipy'} & {*sys.modules})"
+        "for kind in FORMATS:\n    reader_of(kind.name)\nprint({'numba', 'scipy', 'pydantic'} & {*sys.modules})"
     )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "set()"
