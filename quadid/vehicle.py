@@ -386,7 +386,7 @@ class Proof(Strict):
     Attributes:
         verdict: on the result that the file was written by: good (green), fair (amber), poor (red).
         unseen: flights that were predicted and not fitted.
-        error: largest of their errors over one second, in noise variances (1 is the noise floor).
+        error: largest of their errors: `identify` in what the model expects, `diagnose` in noise variances; 1 is none.
         fitted: flights that the values rest on; their standard deviations are no knowledge beside the same flights.
     """
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from quadid.app.identify import OPTIMIZERS, check_seed, out_of_reach, proven, search
 from quadid.app.logs import Log, file_name, settled
-from quadid.app.missing import Beside, MissingForces, missing_forces
+from quadid.app.missing import Beside, MissingForces, compared
 from quadid.app.options import Logs, OfVehicle, Seed, Validate
 from quadid.app.outcome import LIBRARY, NUMBER_COLUMNS, Advance, Fitted, number_rows, provenance, quality, silent
 from quadid.effects import EFFECTS
@@ -168,7 +168,8 @@ def diagnose(
     nominal = NominalFit(fit.vehicle, fit.theta, fit.noise)
     found, selection = diagnose_windows(windows, described, unseen, seed, advance, nominal=nominal)
     found, model = _within_reach(found, unreachable), selection.model
-    forces = missing_forces(train, held, fit.vehicle, {"nominal": fit.theta, "extended": model.theta}, advance)
+    models = {"nominal": fit.theta, "extended": model.theta}
+    forces, squares = compared(train, held, fit.vehicle, models, advance)
     removed = None if forces is None else _removed(forces, found, selection, fit.vehicle)
     if found.verdict is Explanation.PARTLY_EXPLAINED and removed is not None and removed < LEAST_REMOVED:
         told = (
@@ -189,8 +190,8 @@ def diagnose(
         scored(log, role, fit, model.theta) for role, part in (("train", train), ("validate", held)) for log in part
     ]
     result["sets"] = [
-        {"log": s.log, "role": s.role, "mse": {"nominal": s.initial.mse, "extended": s.fitted.mse, "noise_floor": 1.0}}
-        for s in sets
+        {"log": s.log, "role": s.role, "mse": {**square, "noise_floor": 1.0}}
+        for s, square in zip(sets, squares, strict=True)
     ]
     result["missing"] = None if forces is None else forces.result()
     result["removed"] = removed

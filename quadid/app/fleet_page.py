@@ -281,7 +281,7 @@ def every_log(logs: Sequence[Json]) -> JsonDict:
         ]  # fmt: skip
         tables.append(rows_of(head, rows, f"{unit}: {len(rows)} log{'s' * (len(rows) != 1)}", "compact"))
     intro = (
-        "Error over one second of simulation, before and after, in noise variances: 1 is the noise floor. The worst "
+        "Squared errors over what the model expects, before and after: 1 is right about its own errors. The worst "
         "come first. Dates are those of the clock in the log or of its file."
     )
     return section("logs", "Every log", intro + _left_out(logs), tables=tables)
@@ -336,7 +336,7 @@ class Fleet(Reported):
             details.append(f"{copies} {told} not counted.")
         if rough:
             what = "answer misses much of its flight" if rough == 1 else "answers miss much of their flights"
-            details.append(f"{rough} {what} (error above {ROUGH:g} noise variances): not to be used.")
+            details.append(f"{rough} {what} (errors above {ROUGH:g} times what the model expects): not to be used.")
         details += [
             f"{d['unit']}: {d['parameter']} {'rose' if d['change'] > 0 else 'fell'} by {percent(abs(d['change']))} "
             f"in {d['days']:.3g} days."

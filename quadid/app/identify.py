@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from numbers import Integral
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -14,7 +14,7 @@ import typer
 from quadid_evaluation.optimisers.minimise import minimise
 
 from quadid.app.logs import Log, file_name, remembered, settled
-from quadid.app.missing import Beside, MissingForces, missing_forces
+from quadid.app.missing import Beside, MissingForces, compared
 from quadid.app.options import Logs, OfVehicle, Seed, Validate
 from quadid.app.outcome import (
     LIBRARY,
@@ -33,7 +33,7 @@ from quadid.model.layout import Layout, with_reference_voltage
 from quadid.parameters import NOMINAL_NAMES, ParameterSet
 from quadid.report.page import render
 from quadid.report.tables import Cell, Column, TextTable, number, parameter_table
-from quadid.report.verdict import Verdict, identify_verdict
+from quadid.report.verdict import ROUGH, Verdict, identify_verdict, worst
 from quadid.sanitise import LONGEST_LINE, plain
 from quadid.types import FloatArray
 from quadid.vehicle import Proof, Vehicle
@@ -164,7 +164,8 @@ class Identified(Fitted):
                     *("-" if v is None or not math.isfinite(v) else f"{max(v, -999.0):.0f} %" for v in fits),
                 )
             )
-        followed = TextTable("Error over 1 s of simulation, in noise variances (1 = noise floor)", columns, tuple(rows))
+        title = "Squared errors over what the model expects (1 = right about its own errors)"
+        followed = TextTable(title, columns, tuple(rows))
         return [parameter_table(self.result["parameters"], truth), followed]
 
     def records(self) -> list[dict[str, Any]]:
@@ -263,7 +264,7 @@ def identify(
         ParameterError: an unknown search, parameter or effect, or nothing left to fit.
     """
     from quadid.identification.controller_gains import find_autopilot
-    from quadid.identification.result import answered, fitted_vehicle, identify_result
+    from quadid.identification.result import answered, fitted_vehicle, identify_result, parameter_entry
 
     check_optimizer(optimizer)
     check_seed(seed)
@@ -275,17 +276,25 @@ def identify(
     begin = time.perf_counter()
     fit = search(optimizer, windows, described, seed, advance, out_of_reach(train), names)
     seconds = time.perf_counter() - begin
+    models = {"nominal": fit.theta, "initial": Layout(fit.vehicle).initial(fit.vehicle)}
+    forces, squares = compared(train, held, fit.vehicle, models, advance)
     advance("scores", 0.0)
-    autopilot = find_autopilot(windows, described)
-    sets = [scored(log, role, fit, autopilot) for role, part in (("train", train), ("validate", held)) for log in part]
+    autopilot, logs = find_autopilot(windows, described), [*train, *held]
+    roles = ["train"] * len(train) + ["validate"] * len(held)
+    sets = [
+        scored(log, role, fit, autopilot, (square["initial"], square["nominal"]))
+        for log, role, square in zip(logs, roles, squares, strict=True)
+    ]
     result = identify_result(fit, optimizer, seed, seconds, sets, None, given.warnings)
-    for entry, log in zip(result["sets"], (*train, *held), strict=True):
+    for entry, log in zip(result["sets"], logs, strict=True):
         entry["seconds"] = log.grid.seconds_used
-    forces = missing_forces(train, held, fit.vehicle, {"nominal": fit.theta}, advance)
+    if not worst(result["sets"]) <= ROUGH:
+        fit = replace(fit, parameters=fit.parameters.unreliable(fit.parameters.names))
+        result["parameters"] = [parameter_entry(p) for p in fit.parameters]
     result["missing"] = None if forces is None else forces.result()
     advance("random forces", 0.0)
     beside = None if forces is None else forces.beside(fitted_vehicle(fit), terms=False)
-    done = Identified(result, fit, sets, [*train, *held], forces, beside)
+    done = Identified(result, fit, sets, logs, forces, beside)
     result["verdict"] = done.verdict.level
     if not answered(fit.parameters):
         raise UnansweredError(done)
@@ -353,7 +362,7 @@ def out_of_reach(logs: Sequence[Log]) -> dict[str, str]:
     return {name: each[0][name] for name in each[0] if all(name in one for one in each)} if each else {}
 
 
-def scored(log: Log, role: str, fit: Fit, autopilot: Autopilot | None) -> ScoredSet:
+def scored(log: Log, role: str, fit: Fit, autopilot: Autopilot | None, mse: tuple[float, float]) -> ScoredSet:
     """Scores the initial guess and the fit on one log; as the paper does, too, where the stabiliser is known."""
     from quadid.identification.paper_objective import paper_score
     from quadid.identification.result import ScoredSet
@@ -363,7 +372,7 @@ def scored(log: Log, role: str, fit: Fit, autopilot: Autopilot | None) -> Scored
     before, after = (mse_score(log.windows, fit.vehicle, theta, fit.noise) for theta in (initial, fit.theta))
     flown = [paper_score(log.windows, fit.vehicle, theta, autopilot) for theta in (initial, fit.theta)]
     paper = None if flown[0] is None or flown[1] is None else (flown[0].mse, flown[1].mse)
-    return ScoredSet(log.recording.name, role, before, after, paper)
+    return ScoredSet(log.recording.name, role, before, after, paper, mse)
 
 
 def origin_remark(logs: Sequence[Log]) -> str:

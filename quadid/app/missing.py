@@ -12,6 +12,7 @@ import numpy as np
 from quadid.app.logs import Log, free_name
 from quadid.data.window import Channel, Recording, Window, beginning
 from quadid.model.layout import Layout
+from quadid.report.verdict import percent
 from quadid.types import FloatArray, JsonDict
 from quadid.vehicle import RandomForces, ResidualTerm, Vehicle
 
@@ -87,8 +88,8 @@ class MissingForces:
             parts = [part for i in self.deciding for part in self.parts[model][i]]
             force, moment = (size(parts, is_force)[0] for is_force in (True, False))
             total, weight = float(np.linalg.norm(force)), parts[0].weight
-            shares = ", ".join(f"{100.0 * share:.2g}" for share in moment / control_size(parts))
-            each.append((f"{total:.2g} N ({100.0 * total / weight:.2g} % of the weight)", f"{shares} %"))
+            shares = ", ".join(percent(share).removesuffix(" %") for share in moment / control_size(parts))
+            each.append((f"{total:.2g} N ({percent(total / weight)} of the weight)", f"{shares} %"))
         (force_then, moment_then), (force_now, moment_now) = each[0], each[-1]
         unseen = "unseen flights" if "validate" in self.roles else "these flights"
         start = (
@@ -245,31 +246,43 @@ def _by_axis(values: FloatArray) -> dict[str, float]:
     return {axis: float(v) for axis, v in zip(AXES, values, strict=True)}
 
 
-def missing_forces(
+def compared(
     train: Sequence[Log], held: Sequence[Log], vehicle: Vehicle, models: Mapping[str, FloatArray],
     advance: Callable[[str, float], None],
-) -> MissingForces | None:  # fmt: skip
-    """Missing force and moment of parameter vectors, all at the noise of the first on the training logs.
+) -> tuple[MissingForces | None, list[dict[str, float]]]:  # fmt: skip
+    """Missing force and moment of parameter vectors, and how right each is about its own errors on every log.
 
-    None where a log lacks the gyro or the accelerometer, without which no force and moment is seen, and where a model
-    has no finite answer.
+    All are judged at the noise of the first on the training logs.  No force and moment is seen where a log lacks the
+    gyro or the accelerometer, or a model has no finite answer.
 
     Args:
         train: logs that were fitted.
         held: logs that were not.
         vehicle: geometry and mass.
-        models: parameter vectors by name, the nominal one first.
+        models: parameter vectors by name, the nominal one first; one called ``initial`` is scored only.
         advance: called with a stage and a share done.
+
+    Returns:
+        Missing force and moment; by log, training logs first, the mean square of whitened innovations of every model.
     """
     from quadid.estimate.missing import Vehicles
 
-    logs = [*train, *held]
+    logs, first = [*train, *held], next(iter(models.values()))
     flown = [beginning(log.windows, min(SECONDS, ROWS * log.windows[0].dt))[0] for log in logs]
+    advance("what is missing", 0.0)
+    flights = Vehicles([w for windows in flown[: len(train)] for w in windows], vehicle, first)
+    squares = [{name: flights.mean_square(windows, theta) for name, theta in models.items()} for windows in flown]
+    shown = {name: theta for name, theta in models.items() if name != "initial"}
+    return _missing_forces(train, held, flights, flown, shown, advance), squares
+
+
+def _missing_forces(
+    train: Sequence[Log], held: Sequence[Log], flights: Vehicles, flown: Sequence[Sequence[Window]],
+    models: Mapping[str, FloatArray], advance: Callable[[str, float], None],
+) -> MissingForces | None:  # fmt: skip
     if not all(windows and all(_seen(w) for w in windows) for windows in flown):
         return None
     stage, steps = "what is missing", 1 + len(models) * len(flown)
-    advance(stage, 0.0)
-    flights = Vehicles([w for windows in flown[: len(train)] for w in windows], vehicle, next(iter(models.values())))
     parts: dict[str, list[list[Missing]]] = {name: [] for name in models}
     for done, (name, windows) in enumerate(((n, w) for n in models for w in flown), 1):
         advance(stage, done / steps)
@@ -279,7 +292,7 @@ def missing_forces(
     roles = ["train"] * len(train) + ["validate"] * len(held)
     first, *_, last = models.values() if len(models) > 1 else [next(iter(models.values()))] * 2
     extends = not np.array_equal(first[6:], last[6:])
-    return MissingForces(tuple(models), logs, roles, parts, flights, flown, extends)
+    return MissingForces(tuple(models), [*train, *held], roles, parts, flights, flown, extends)
 
 
 def _seen(window: Window) -> bool:

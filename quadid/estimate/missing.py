@@ -16,12 +16,12 @@ import numpy as np
 from quadid.chi_square import Z95
 from quadid.data.window import Window
 from quadid.estimate import kalman as k
-from quadid.estimate.fit import ALL_NOISE, MOST, NEAR_SECONDS, NO_NOISE, Estimate, scoring
+from quadid.estimate.fit import ALL_NOISE, MOST, NEAR_SECONDS, NO_NOISE, Estimate, scoring, tails, whitened
 from quadid.estimate.problem import Problem
 from quadid.estimate.track import from_window
 from quadid.model.layout import Layout
 from quadid.rotation import conjugate, rotated
-from quadid.types import FloatArray
+from quadid.types import BoolArray, FloatArray
 from quadid.vehicle import GRAVITY, RandomForces, RandomInput, Vehicle
 
 RESIZING = 10
@@ -108,11 +108,18 @@ def _smoothed(problem: Problem, z: FloatArray, psi: FloatArray) -> list[Missing]
                 track.mass * GRAVITY,
                 psi[k.SIGMA + np.array([0, 0, 1, 2, 2, 3])],
                 psi[k.TIME + np.array([0, 0, 1, 2, 2, 3])],
-                np.where(g.S > 0.0, g.nu, np.nan),
+                np.where(_measured(track, g), g.nu, np.nan),
                 np.sqrt(g.S),
             )  # fmt: skip
         )
     return out
+
+
+def _measured(track: k.Track, g: k.Gains) -> BoolArray:
+    """Which innovations are of measurements, shape (n, M): a velocity that nobody measured has a prior in the filter."""
+    out = g.S > 0.0
+    out[:, k.VELOCITY :] &= track.seen[:, 3:]
+    return np.asarray(out)
 
 
 class Vehicles:
@@ -120,13 +127,18 @@ class Vehicles:
 
     Attributes:
         psi: noise numbers, those of the first model on the flights that it was fitted to.
+        tail: tails of its innovations there, see `fit.tails`.
     """
 
     def __init__(self, windows: Sequence[Window], vehicle: Vehicle, theta: FloatArray) -> None:
         """Estimates the noise numbers beside a parameter vector of `quadid.model`, from its liveliest minute."""
         self.vehicle = vehicle
         problem, z = settled(windows, vehicle, theta, None)
-        _, self.psi, *_ = scoring(problem.liveliest(NEAR_SECONDS), z, problem.first_noise(), MOST, ALL_NOISE)
+        part = problem.liveliest(NEAR_SECONDS)
+        _, self.psi, _, gains, _ = scoring(part, z, problem.first_noise(), MOST, ALL_NOISE)
+        self.tail = tails([whitened(g) for g in gains])
+        if self.tail.any():
+            _, self.psi, *_ = scoring(replace(part, tail=self.tail), z, self.psi, MOST, ALL_NOISE)
 
     def missing(self, windows: Sequence[Window], theta: FloatArray, vehicle: Vehicle | None = None) -> list[Missing]:
         """Missing force and moment of a parameter vector on these flights, which need not be those of the noise.
@@ -136,15 +148,27 @@ class Vehicles:
             theta: full parameter vector.
             vehicle: whose vector that is, where it is not that of the noise.
         """
-        problem, z = settled(windows, vehicle or self.vehicle, theta, self.psi)
+        problem, z = settled(windows, vehicle or self.vehicle, theta, self.psi, self.tail)
         part = problem.liveliest(NEAR_SECONDS)
         _, psi, *_ = scoring(part, z, self.psi, RESIZING, _SIZES)
         return _smoothed(problem, z, psi)
 
+    def mean_square(self, windows: Sequence[Window], theta: FloatArray) -> float:
+        """Mean over channels and rows of squared innovations of a parameter vector, whitened at `psi` and `tail`.
+
+        One where the model, random forces included, is right about its own errors; infinite where it diverges.
+        """
+        problem, z = settled(windows, self.vehicle, theta, self.psi, self.tail)
+        value, gains = problem.passes(z, self.psi)
+        each = zip(problem.tracks, gains, strict=True)
+        squares = np.concatenate([whitened(g)[_measured(track, g)] for track, g in each]) ** 2
+        return float(np.mean(squares)) if np.isfinite(value) and len(squares) else np.inf
+
 
 def settled(
-    windows: Sequence[Window], vehicle: Vehicle, theta: FloatArray, psi: FloatArray | None
-) -> tuple[Problem, FloatArray]:
+    windows: Sequence[Window], vehicle: Vehicle, theta: FloatArray, psi: FloatArray | None,
+    tail: FloatArray | None = None,
+) -> tuple[Problem, FloatArray]:  # fmt: skip
     """The problem of a model with fixed physics, and trim and biases of each flight, fitted.
 
     Args:
@@ -152,9 +176,11 @@ def settled(
         vehicle: geometry and mass.
         theta: full parameter vector; effects are simulated along the filtered states.
         psi: noise numbers; None: the first guess.
+        tail: of the innovations; None: Gaussian ones.
     """
     air = bool(np.any(theta[6:] != Layout(vehicle).neutral()[6:]))
     problem = Problem.fixed([from_window(w, vehicle, air=air) for w in windows], vehicle, theta, windows)
+    problem = problem if tail is None else replace(problem, tail=tail)
     z, noise = problem.start(), problem.first_noise() if psi is None else psi
     problem = problem.along(z, noise)
     z, *_ = scoring(problem, z, noise, TRIMMING, NO_NOISE)

@@ -165,11 +165,14 @@ class Problem:
         cls, tracks: Sequence[Track], vehicle: Vehicle, theta: FloatArray, names: tuple[str, ...],
         windows: Sequence[Window],
     ) -> Problem:  # fmt: skip
-        base = np.zeros(k.N_PHYSICS)
+        base, layout = np.zeros(k.N_PHYSICS), Layout(vehicle)
         base[:6] = theta[:6]
-        wider = bool(windows) and (
-            not set(names) <= set(PLACES) or bool(np.any(theta[6:] != Layout(vehicle).neutral()[6:]))
-        )
+        # What the filter has in its own equations it also differentiates: drag tells it the velocity through the
+        # accelerometer, which what is only added along its states cannot.
+        for name, place in PLACES.items():
+            if place >= k.DRAG:
+                base[place] = theta[layout.entry(name).index]
+        wider = bool(windows) and (not set(names) <= set(PLACES) or bool(np.any(theta[6:] != layout.neutral()[6:])))
         models = tuple(WholeModel(w, vehicle) for w in windows) if wider else ()
         return cls(tuple(tracks), vehicle, names, base, theta, models, np.zeros(4), control_moment(tracks, base))
 
@@ -383,10 +386,15 @@ class Problem:
         return (total if np.isfinite(total) else np.inf), [g for _, g in found]
 
     def along(self, z: FloatArray, psi: FloatArray) -> Problem:
-        """The problem in which effects stay as simulated along the states at z."""
+        """The problem in which effects stay as simulated along the states at z.
+
+        First along states that follow the measurements: where random forces are small, those of a model without its
+        effects run away.
+        """
         if not self.models:
             return self
-        tracks = [t._replace(beyond=g.beyond) for t, g in zip(self.tracks, self.passes(z, psi)[1], strict=True)]
+        _, near = replace(self, models=()).passes(z, self.first_noise())
+        tracks = [t._replace(beyond=g.beyond) for t, g in zip(self.tracks, self.passes(z, psi, near)[1], strict=True)]
         return replace(self, tracks=tuple(tracks), models=())
 
     def _pass(

@@ -35,6 +35,7 @@ class ScoredSet:
         initial: score of the initial guess.
         fitted: score of the fit.
         paper: mean squared error of the paper's closed-loop simulation before and after; None without a stabiliser.
+        mse: mean square of whitened innovations before and after.
     """
 
     log: str
@@ -42,6 +43,7 @@ class ScoredSet:
     initial: SetScore
     fitted: SetScore
     paper: tuple[float, float] | None = None
+    mse: tuple[float, float] = (math.nan, math.nan)
 
 
 def identify_result(
@@ -95,7 +97,7 @@ def _set_entry(s: ScoredSet) -> JsonDict:
     return {
         "log": s.log,
         "role": s.role,
-        "mse": {"initial": s.initial.mse, "fitted": s.fitted.mse, "noise_floor": 1.0},
+        "mse": {"initial": s.mse[0], "fitted": s.mse[1], "noise_floor": 1.0},
         "mse_paper": paper,
         "fit_percent": {c.name: c.fit_percent for c in seen},
         "rmse": {c.name: {"value": c.rmse, "unit": c.unit} for c in seen},

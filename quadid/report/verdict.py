@@ -61,9 +61,11 @@ def effects_words(effects: Mapping[str, Mapping[str, float]]) -> str:
 Level = Literal["good", "fair", "poor"]
 
 NOISE_LEVEL = 1.3
-"""Below this ratio to the noise floor nothing that a flight could show is missing."""
+"""Up to this mean square, in units of what a model expects, it is right about its own errors."""
 ROUGH = 5.0
-"""Above this ratio the simulation misses more than it explains."""
+"""Above it a model is wrong about its own errors: its values and its intervals are not to be used."""
+SMALL_FORCE, SMALL_MOMENT = 0.01, 0.05
+"""Missing force as a share of the weight, and moment as a share of the rotors', that do not count."""
 NEAR_FLOOR = 2.0
 """Up to this multiple of the floor a prediction error may be sensor noise: the floor is that of white noise alone."""
 LEAST_SECONDS = 10.0
@@ -107,7 +109,8 @@ class Verdict:
 def identify_verdict(result: Json) -> Verdict:
     """Judges the result of ``quadid identify``.
 
-    Green needs all parameters identified, errors at the noise floor, and `LEAST_SECONDS` of flight that was not fitted.
+    Green needs all parameters identified, nothing missing that counts, and `LEAST_SECONDS` of flight that was not
+    fitted; red is a model that is wrong about its own errors.
 
     Args:
         result: a dictionary of the form ``quadid.identify/1``.
@@ -117,11 +120,11 @@ def identify_verdict(result: Json) -> Verdict:
     known = [p for p in parameters if p["status"] == "identified" and p["name"] not in stuck]
     before = [p["name"] for p in parameters if decided_before(p)]
     open_ones = [p for p in parameters if p["status"] != "identified" and p["name"] not in before]
-    unseen = [s for s in sets if s["role"] == "validate"]
-    judged = unseen or sets
-    ratio = max((_number(s["mse"]["fitted"]) for s in judged), default=math.inf)
-    level, match = _match(ratio, "the validation flight" if unseen else "the fitted flight")
-    lacking = _lacking(sets)
+    judged = judging(sets)
+    ratio = worst(sets)
+    where = "the validation flight" if judged[0]["role"] == "validate" else "the fitted flight"
+    level, match = _match(ratio, _missing_shares(result), where)
+    lacking, adequate = _lacking(sets), level == "good"
     if not known and not before:
         level = "poor"
     elif (before or open_ones or stuck or lacking) and level == "good":
@@ -135,12 +138,22 @@ def identify_verdict(result: Json) -> Verdict:
     if not ratio <= ROUGH:
         headline = f"Not to be used yet: {match}."
         found = (
-            "The fit bends the parameters to make up for missing physics; they can be wrong even where the interval is "
-            "narrow."
+            "It differs from the flights that were fitted in what the model lacks; values can be wrong even where the "
+            "interval is narrow."
         )
-        details = (found, *([missing] if missing else []), *_details(known, judged)[1:]) if known else details
-    steps = _next_steps(result, open_ones, stuck, ratio)
+        details = (found, *([missing] if missing else []), *_details((), judged))
+    steps = _next_steps(result, open_ones, stuck, ratio, adequate)
     return Verdict(level, headline, details, (_TOGETHER, *steps) if before and ratio <= ROUGH else steps)
+
+
+def judging(sets: Sequence[Json]) -> list[Json]:
+    """The logs that judge a result: those that were not fitted, else all."""
+    return [s for s in sets if s["role"] == "validate"] or list(sets)
+
+
+def worst(sets: Sequence[Json]) -> float:
+    """Largest mean square of whitened innovations of the judging logs."""
+    return max(_number(s["mse"]["fitted"]) for s in judging(sets))
 
 
 def _lacking(sets: Sequence[Json]) -> tuple[str, ...]:
@@ -182,18 +195,28 @@ def score_verdict(result: Json) -> Verdict:
     return Verdict("fair", headline, (detail,), (_DIAGNOSE,))
 
 
-def _match(ratio: float, where: str) -> tuple[Level, str]:
-    if ratio <= NOISE_LEVEL:
-        return "good", f"the simulation matches {where} down to the sensor noise"
-    if ratio <= ROUGH:
-        return (
-            "fair",
-            f"the simulation follows {where} to {math.sqrt(ratio):.2g} times the sensor noise",
-        )
-    if math.isfinite(ratio):
-        off = f"{math.sqrt(ratio):.2g} times the sensor noise ({ratio:.3g} in variance)"
-        return "poor", f"on {where} the simulation is off by {off}"
-    return "poor", f"the simulation diverges on {where}"
+def _missing_shares(result: Json) -> tuple[float, float] | None:
+    """Largest missing force over the weight and moment over the rotors', of the logs that judge; None: not seen."""
+    if not result.get("missing"):
+        return None
+    judged = judging(result["missing"]["sets"])
+    forces = [math.hypot(*s["force"]["nominal"].values()) / s["force"]["of"] for s in judged]
+    moments = [s["moment"]["nominal"][axis] / size for s in judged for axis, size in s["moment"]["of"].items() if size]
+    return max(forces), max(moments, default=0.0)
+
+
+def _match(ratio: float, shares: tuple[float, float] | None, where: str) -> tuple[Level, str]:
+    """Level and words for the mean square of whitened innovations and what is missing."""
+    if not math.isfinite(ratio):
+        return "poor", f"the simulation diverges on {where}"
+    if ratio > ROUGH:
+        return "poor", f"on {where} errors are {math.sqrt(ratio):.2g} times what this model expects of itself"
+    if shares is None:
+        return "fair", f"without gyro and accelerometer nobody sees what the simulation misses on {where}"
+    if ratio <= NOISE_LEVEL and shares[0] <= SMALL_FORCE and shares[1] <= SMALL_MOMENT:
+        return "good", f"nothing that counts is missing in the simulation of {where}"
+    missing = f"{percent(shares[0])} of the weight and up to {percent(shares[1])} of the rotors' moment"
+    return "fair", f"on {where} the simulation misses {missing}"
 
 
 def _count(known: int, total: int) -> str:
@@ -222,7 +245,9 @@ def at_bounds(result: Json) -> list[str]:
     return [n for n in names if any(w.startswith(f"{n} = ") and "rests on its bound" in w for w in result["warnings"])]
 
 
-def _next_steps(result: Json, open_ones: Sequence[Json], stuck: Sequence[str], ratio: float) -> tuple[str, ...]:
+def _next_steps(
+    result: Json, open_ones: Sequence[Json], stuck: Sequence[str], ratio: float, adequate: bool
+) -> tuple[str, ...]:
     out = []
     rough = not ratio <= ROUGH
     if rough:
@@ -241,7 +266,7 @@ def _next_steps(result: Json, open_ones: Sequence[Json], stuck: Sequence[str], r
             out.append(f"Fly {MOTION.get(p['name'], 'with more motion')}: {p['name']} is not observable in these data.")
     if hidden:
         out.append("`quadid excite` proposes a manoeuvre and predicts its gain.")
-    if ratio > NOISE_LEVEL:
+    if not adequate:
         out.append(_DIAGNOSE)
     if not out:
         out.append(

@@ -107,6 +107,22 @@ def test_the_model_with_the_cause_misses_less_on_another_flight() -> None:
     assert np.all(size(before, force=True)[0][:2] > 0.01 * before[0].weight)
 
 
+@pytest.mark.parametrize("measured", [(), ("velocity",)], ids=["without velocity", "with velocity"])
+def test_the_right_model_misses_nothing_and_is_right_about_its_errors(measured: tuple[str, ...]) -> None:
+    """Drag tells the velocity that nobody measures; what was only added along the filter's states ran away there."""
+    hidden = {"rotor_drag": {"k_x": 0.3, "k_y": 0.3}, "weak_rotor": {"rotor": 2, "loss": 0.04}}
+    windows = [fly(PELICAN, None, 40.0, seed, effects=hidden, extras=measured).window for seed in (1, 2)]
+    layout = Layout(PELICAN)
+    theta = layout.initial(PELICAN)
+    theta[:6] = list(TruthParameters.of(PELICAN).as_dict().values())
+    layout.write_effects(theta, hidden)
+    flights = Vehicles(windows[:1], PELICAN, theta)
+    (found,) = flights.missing(windows[1:], theta)
+    assert np.all(size([found], force=True)[0] < 0.003 * found.weight)
+    assert np.all(size([found], force=False)[0] < 0.01 * found.control.std(axis=0))
+    assert [flights.mean_square([w], theta) for w in windows] == pytest.approx([1.0, 1.0], abs=0.07)
+
+
 def test_rows_without_a_measurement_are_rows_of_the_whole_model_too() -> None:
     """A gyro at half the grid's rate leaves every other row empty; the effects' table ended in a traceback there."""
     window = fly(PELICAN, draw_truth(PELICAN, 3), 10.0, 3, effects={"rotor_drag": {"k_x": 0.4, "k_y": 0.4}}).window

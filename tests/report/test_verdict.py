@@ -11,7 +11,11 @@ from quadid.report.fit_pages import HELD_OUT, diagnose_verdict
 from quadid.report.verdict import MOTION, digits, identify_verdict, percent, reason, score_verdict
 
 
-def _result(fitted: float | None = 1.0, status: str = "identified", role: str = "validate") -> dict[str, Any]:
+def _result(
+    fitted: float | None = 1.0, status: str = "identified", role: str = "validate", force: float = 0.05,
+    moment: float = 0.001,
+) -> dict[str, Any]:  # fmt: skip
+    """A result of ``quadid identify`` of a vehicle of 10 N whose rotors make 0.1 N m."""
     parameters = [
         {"name": n, "unit": "", "value": 1.1, "ci95": [1.09, 1.11], "initial": 1.0, "status": status} for n in MOTION
     ]
@@ -22,8 +26,13 @@ def _result(fitted: float | None = 1.0, status: str = "identified", role: str = 
         "mse": {"initial": 9.0, "fitted": fitted},
         "fit_percent": {"p": 95.0, "q": None},
     }
-    train = {**entry, "role": "train"}
-    return {"parameters": parameters, "sets": [train, entry] if role == "validate" else [train], "warnings": []}
+    sets = [{**entry, "role": part} for part in dict.fromkeys(("train", role))]
+    missed = {
+        "force": {"nominal": {"x": force, "y": 0.0, "z": 0.0}, "of": 10.0},
+        "moment": {"nominal": {"x": 0.0, "y": 0.0, "z": moment}, "of": {"x": 0.1, "y": 0.1, "z": 0.1}},
+    }
+    missing = {**missed, "statement": "What is missing.", "sets": [{"role": s["role"], **missed} for s in sets]}
+    return {"parameters": parameters, "sets": sets, "missing": missing, "warnings": []}
 
 
 def test_good_fair_and_poor() -> None:
@@ -37,6 +46,21 @@ def test_good_fair_and_poor() -> None:
         poor = identify_verdict(_result(fitted=bad))
         assert poor.level == "poor"
         assert poor.headline.startswith("Not to be used yet")
+
+
+@pytest.mark.parametrize("missed", [{"force": 0.4}, {"moment": 0.03}])
+def test_what_is_missing_keeps_a_result_from_green_and_is_said_in_shares(missed: dict[str, float]) -> None:
+    verdict = identify_verdict(_result(**missed))
+    share = {"force": "4 % of the weight", "moment": "30 % of the rotors' moment"}[next(iter(missed))]
+    assert verdict.level == "fair"
+    assert share in verdict.headline
+    assert "quadid diagnose" in " ".join(verdict.next_steps)
+
+
+def test_without_gyro_or_accelerometer_nobody_knows_what_is_missing() -> None:
+    verdict = identify_verdict({**_result(), "missing": None})
+    assert verdict.level == "fair"
+    assert "nobody sees" in verdict.headline
 
 
 def test_what_the_data_do_not_show_is_said_with_the_motion_it_needs() -> None:
