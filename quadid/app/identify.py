@@ -279,14 +279,14 @@ def identify(
     models = {"nominal": fit.theta, "initial": Layout(fit.vehicle).initial(fit.vehicle)}
     forces, squares = compared(train, held, fit.vehicle, models, advance)
     advance("scores", 0.0)
-    autopilot, logs = find_autopilot(windows, described), [*train, *held]
+    autopilot, flown = find_autopilot(windows, described), [*train, *held]
     roles = ["train"] * len(train) + ["validate"] * len(held)
     sets = [
         scored(log, role, fit, autopilot, (square["initial"], square["nominal"]))
-        for log, role, square in zip(logs, roles, squares, strict=True)
+        for log, role, square in zip(flown, roles, squares, strict=True)
     ]
     result = identify_result(fit, optimizer, seed, seconds, sets, None, given.warnings)
-    for entry, log in zip(result["sets"], logs, strict=True):
+    for entry, log in zip(result["sets"], flown, strict=True):
         entry["seconds"] = log.grid.seconds_used
     if not worst(result["sets"]) <= ROUGH:
         fit = replace(fit, parameters=fit.parameters.unreliable(fit.parameters.names))
@@ -294,7 +294,7 @@ def identify(
     result["missing"] = None if forces is None else forces.result()
     advance("random forces", 0.0)
     beside = None if forces is None else forces.beside(fitted_vehicle(fit), terms=False)
-    done = Identified(result, fit, sets, logs, forces, beside)
+    done = Identified(result, fit, sets, flown, forces, beside)
     result["verdict"] = done.verdict.level
     if not answered(fit.parameters):
         raise UnansweredError(done)

@@ -48,10 +48,13 @@ def test_good_fair_and_poor() -> None:
         assert poor.headline.startswith("Not to be used yet")
 
 
-@pytest.mark.parametrize("missed", [{"force": 0.4}, {"moment": 0.03}])
-def test_what_is_missing_keeps_a_result_from_green_and_is_said_in_shares(missed: dict[str, float]) -> None:
-    verdict = identify_verdict(_result(**missed))
-    share = {"force": "4 % of the weight", "moment": "30 % of the rotors' moment"}[next(iter(missed))]
+@pytest.mark.parametrize(
+    ("force", "moment", "share"), [(0.4, 0.0, "4 % of the weight"), (0.0, 0.03, "30 % of the rotors' moment")]
+)
+def test_what_is_missing_keeps_a_result_from_green_and_is_said_in_shares(
+    force: float, moment: float, share: str
+) -> None:
+    verdict = identify_verdict(_result(force=force, moment=moment))
     assert verdict.level == "fair"
     assert share in verdict.headline
     assert "quadid diagnose" in " ".join(verdict.next_steps)
