@@ -517,7 +517,10 @@ def better_description(lagged: Lagged | str, vehicle: Vehicle) -> Other | None:
     if gain - own < least or float(np.mean(axes[:2])) < _SETTLED:
         axes = _described(lagged, vehicle)
         right, reversed_ = (_yaw_explained(lagged, vehicle, turns) for turns in (1.0, -1.0))
-        if min(axes[0], axes[1]) < _SETTLED or axes[2] > _SETTLED or reversed_ < max(_SETTLED, right + _SPIN_GAIN):
+        # A fast loop answers the gyro's noise within a row, and that looks like the spin-up of reversed rotors: where
+        # drag alone says the right sign, even weakly, nothing is reversed.
+        settled = axes[2] > 0.5 * _SETTLED
+        if min(axes[0], axes[1]) < _SETTLED or settled or reversed_ < max(_SETTLED, right + _SPIN_GAIN):
             return None
         described, order, sign, axes = vehicle, rotors, -1.0, np.array([axes[0], axes[1], reversed_])
     told, fix = [], []

@@ -15,6 +15,7 @@ from quadid_replay.frames import flip_attitude, flip_body, flip_world
 from quadid.checks import Check, CheckResult, Inspection, inspect, proposed_cuts
 from quadid.checks.motion import Spans, fit_axes, gyro_check
 from quadid.data.window import Channel, Recording
+from quadid.flight import fly
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 from tests.faults.evidence import Happened
@@ -271,6 +272,13 @@ def test_a_frame_turned_about_z_is_named_with_the_angle(clean: Recording, degree
     assert found.verdict is CheckResult.ERROR
     assert np.degrees(found.numbers["turned_rad"]) == pytest.approx(-degrees, abs=5.0)
     happened(10, f"rotor positions turned by {degrees:+.0f} deg (X for +): '{found.message}'")
+
+
+@pytest.mark.parametrize(("name", "rate"), [("pelican", 100.0), ("pelican", 500.0), ("hexacopter", 200.0)])
+def test_a_loop_that_answers_the_noise_of_its_gyro_reverses_no_spins(name: str, rate: float) -> None:
+    """Logged at the loop's own rate, the answer looks like the spin-up of rotors that turn the other way."""
+    flown = fly(Vehicle.shipped(name), None, 20.0, 5, log_rate=rate).recording
+    assert check(inspect(flown, Vehicle.shipped(name)), "motor_order").verdict is CheckResult.OK
 
 
 def test_reversed_spins_show_in_yaw(clean: Recording) -> None:
