@@ -24,8 +24,12 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     return one, other
 
 
-def test_a_red_fit_writes_guesses(logs: tuple[Path, Path], tmp_path: Path) -> None:
-    train, unseen = (quadid.load(path, vehicle="pelican") for path in logs)
+def test_a_red_fit_writes_guesses(tmp_path: Path) -> None:
+    """The unseen flight drops a payload, which the model of the other one does not expect."""
+    train, unseen = (
+        quadid.load(quadid.simulate(seconds=30, seed=s, effects=e).save(tmp_path / f"{s}.csv"), vehicle="pelican")
+        for s, e in ((3, ()), (4, ("mass_change:time=15,fraction=-0.2",)))
+    )
     fit = quadid.identify(train, validate=unseen)
     assert fit.verdict.level == fit.result["verdict"] == "poor"
     file = fit.vehicle.save(tmp_path / "red.yaml")

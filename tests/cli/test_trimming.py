@@ -43,7 +43,7 @@ def standing(flights: Flights, tmp_path_factory: pytest.TempPathFactory) -> Path
 def test_inspect_proposes_what_is_in_the_air(inside: Cli, standing: Path) -> None:
     run = inside("inspect", standing, "--vehicle", "pelican", "--json", "-")
     assert run.data["use"] == ["standing.csv@12:30"]
-    assert "use standing.csv@12:30" in inside("inspect", standing, "--vehicle", "pelican").out
+    assert "use standing.csv@12:30" in inside("inspect", standing, "--vehicle", "pelican").err
     assert inside("inspect", f"{standing}@12:30", "--json", "-").data["use"] == []
 
 
