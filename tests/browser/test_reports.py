@@ -46,8 +46,10 @@ class Opened:
     def unfold(self) -> None:
         """Opens every part and scrolls through the page until every figure is drawn."""
         self.page.evaluate("document.querySelectorAll('details').forEach((d) => { d.open = true; })")
-        for box in self.page.query_selector_all(".plot"):
-            box.scroll_into_view_if_needed()
+        for i in range(self.page.locator(".plot").count()):
+            box = f"document.querySelectorAll('.plot')[{i}]"
+            self.page.evaluate(f"{box}.scrollIntoView()")
+            self.until(f"{box}.dataset.drawn")
         self.until(
             "[...document.querySelectorAll('.plot')].every((b) => b.dataset.drawn && b.querySelector('.main-svg'))"
         )
@@ -59,7 +61,7 @@ class Opened:
             if self.page.evaluate(condition):
                 return
             self.page.wait_for_timeout(100)
-        pytest.fail(f"never true: {condition}")
+        pytest.fail(f"never true: {condition}; {self.page.evaluate('document.visibilityState')}; {self.complaints}")
 
 
 @contextmanager
@@ -70,6 +72,7 @@ def opened(browser: Browser, file: Path, width: int = 1440, scheme: Scheme = "li
     page.set_default_timeout(120_000)
     one = Opened(page)
     page.goto(file.as_uri())
+    page.bring_to_front()  # a page behind another draws no frames, and its figures wait for one
     yield one
     context.close()
 
