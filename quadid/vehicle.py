@@ -399,7 +399,7 @@ class Proof(Strict):
     def lacking(self) -> str:
         """Why the values are not proven; empty when they are."""
         if self.verdict == "poor":
-            error = f": error {self.error:.3g} on an unseen flight, where 1 is what is expected" if self.error else ""
+            error = f": error {self.error:.3g} times what is expected on an unseen flight" if self.error else ""
             return f"its fit was judged poor{error}"
         return "" if self.unseen else "no flight was predicted that was not fitted"
 
