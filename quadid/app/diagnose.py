@@ -169,7 +169,7 @@ def diagnose(
     found, selection = diagnose_windows(windows, described, unseen, seed, advance, nominal=nominal)
     found, model = _within_reach(found, unreachable), selection.model
     models = {"nominal": fit.theta, "extended": model.theta}
-    forces, squares = compared(train, held, fit.vehicle, models, advance)
+    forces, squares = compared(train, held, fit.vehicle, models, {}, advance)
     removed = None if forces is None else _removed(forces, found, selection, fit.vehicle)
     if found.verdict is Explanation.PARTLY_EXPLAINED and removed is not None and removed < LEAST_REMOVED:
         told = (

@@ -75,12 +75,12 @@ class Proposed(Reported):
 
     @property
     def warnings(self) -> list[str]:
-        """What is wrong with the logs."""
+        """Faults of the logs."""
         return [text for log in self.logs for text in log.warnings]
 
     @property
     def verdict(self) -> Verdict:
-        """What the flight gains beside a gentle one, and whether it is worth flying."""
+        """Gain of the flight beside a gentle one, and whether it is worth flying."""
         gain, worst, seconds = self.result["gain"], self.result["worst"], self.result["seconds"]
         gained = f"makes the interval of {worst}, the least certain parameter, {gain:.3g} times narrower"
         if gain < LEAST_GAIN:

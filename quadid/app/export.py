@@ -92,7 +92,7 @@ def export(
 
 @dataclass(frozen=True, repr=False)
 class Forms(Outcome):
-    """What each form carries; `result` has the form ``quadid.formats/1``."""
+    """Contents of each form; `result` has the form ``quadid.formats/1``."""
 
     result: dict[str, Any]
 
@@ -108,12 +108,12 @@ class Forms(Outcome):
 
     @property
     def sentences(self) -> list[Cell]:
-        """What no table shows."""
+        """Remarks that no table shows."""
         told = "Every form carries mass and geometry; `yaml` carries all. What a form leaves out, its file names."
         return [Cell(told)]
 
 
 def forms() -> Forms:
-    """What each form carries."""
+    """Contents of each form."""
     carried = {name: {"program": form.program, "effects": list(form.effects)} for name, form in FORMS.items()}
     return Forms({"schema": "quadid.formats/1", "formats": carried})

@@ -96,7 +96,7 @@ def _figure(name: str, channel: Channel, identifier: str) -> JsonDict:
 
 
 def _checks(log: str, found: Inspection, place: int) -> JsonDict:
-    """What the checks found, and what the log allows."""
+    """Findings of the checks, and what the log allows."""
     rows = [[c.name.replace("_", " "), _WORDS[c.verdict.value], c.message, c.fix or "–"] for c in found.checks]
     outlook = [[o.parameter, "yes" if o.possible else "no", o.reason] for o in found.parameters]
     checks = rows_of(("Check", "Result", "Found", "What to do"), rows)

@@ -16,17 +16,7 @@ from quadid_evaluation.optimisers.minimise import minimise
 from quadid.app.logs import Log, file_name, remembered, settled
 from quadid.app.missing import Beside, MissingForces, compared
 from quadid.app.options import Logs, OfVehicle, Seed, Validate
-from quadid.app.outcome import (
-    LIBRARY,
-    Advance,
-    Fitted,
-    UnansweredError,
-    known,
-    provenance,
-    quality,
-    silent,
-    told,
-)  # fmt: skip
+from quadid.app.outcome import LIBRARY, Advance, Fitted, UnansweredError, known, provenance, quality, silent, told
 from quadid.data.window import Window
 from quadid.errors import ParameterError, nearest
 from quadid.model.layout import Layout, with_reference_voltage
@@ -276,8 +266,8 @@ def identify(
     begin = time.perf_counter()
     fit = search(optimizer, windows, described, seed, advance, out_of_reach(train), names)
     seconds = time.perf_counter() - begin
-    models = {"nominal": fit.theta, "initial": Layout(fit.vehicle).initial(fit.vehicle)}
-    forces, squares = compared(train, held, fit.vehicle, models, advance)
+    guess = Layout(fit.vehicle).initial(fit.vehicle)
+    forces, squares = compared(train, held, fit.vehicle, {"nominal": fit.theta}, {"initial": guess}, advance)
     advance("scores", 0.0)
     autopilot, flown = find_autopilot(windows, described), [*train, *held]
     roles = ["train"] * len(train) + ["validate"] * len(held)

@@ -248,7 +248,7 @@ def _by_axis(values: FloatArray) -> dict[str, float]:
 
 def compared(
     train: Sequence[Log], held: Sequence[Log], vehicle: Vehicle, models: Mapping[str, FloatArray],
-    advance: Callable[[str, float], None],
+    guesses: Mapping[str, FloatArray], advance: Callable[[str, float], None],
 ) -> tuple[MissingForces | None, list[dict[str, float]]]:  # fmt: skip
     """Missing force and moment of parameter vectors, and how right each is about its own errors on every log.
 
@@ -259,40 +259,36 @@ def compared(
         train: logs that were fitted.
         held: logs that were not.
         vehicle: geometry and mass.
-        models: parameter vectors by name, the nominal one first; one called ``initial`` is scored only.
+        models: parameter vectors by name, the nominal one first.
+        guesses: vectors by name of which only errors are asked.
         advance: called with a stage and a share done.
 
     Returns:
-        Missing force and moment; by log, training logs first, the mean square of whitened innovations of every model.
+        Missing force and moment; by log, training logs first, the mean square of whitened innovations of every vector.
     """
     from quadid.estimate.missing import Vehicles
 
-    logs, first = [*train, *held], next(iter(models.values()))
+    logs, roles = [*train, *held], ["train"] * len(train) + ["validate"] * len(held)
     flown = [beginning(log.windows, min(SECONDS, ROWS * log.windows[0].dt))[0] for log in logs]
-    advance("what is missing", 0.0)
-    flights = Vehicles([w for windows in flown[: len(train)] for w in windows], vehicle, first)
-    squares = [{name: flights.mean_square(windows, theta) for name, theta in models.items()} for windows in flown]
-    shown = {name: theta for name, theta in models.items() if name != "initial"}
-    return _missing_forces(train, held, flights, flown, shown, advance), squares
-
-
-def _missing_forces(
-    train: Sequence[Log], held: Sequence[Log], flights: Vehicles, flown: Sequence[Sequence[Window]],
-    models: Mapping[str, FloatArray], advance: Callable[[str, float], None],
-) -> MissingForces | None:  # fmt: skip
-    if not all(windows and all(_seen(w) for w in windows) for windows in flown):
-        return None
+    visible = all(windows and all(_seen(w) for w in windows) for windows in flown)
     stage, steps = "what is missing", 1 + len(models) * len(flown)
-    parts: dict[str, list[list[Missing]]] = {name: [] for name in models}
-    for done, (name, windows) in enumerate(((n, w) for n in models for w in flown), 1):
-        advance(stage, done / steps)
-        parts[name].append(flights.missing(windows, models[name]))
-    if not all(_finite(found) for found in parts.values()):
-        return None
-    roles = ["train"] * len(train) + ["validate"] * len(held)
+    advance(stage, 0.0)
+    # The noise of the first model decides; then every model on every log, trim and biases of the log fitted.
     first, *_, last = models.values() if len(models) > 1 else [next(iter(models.values()))] * 2
+    flights = Vehicles([w for windows in flown[: len(train)] for w in windows], vehicle, first)
+    squares = [{name: flights.mean_square(windows, theta) for name, theta in guesses.items()} for windows in flown]
+    parts: dict[str, list[list[Missing]]] = {name: [] for name in models}
+    for done, (name, i) in enumerate(((n, i) for n in models for i in range(len(flown))), 1):
+        advance(stage, done / steps)
+        if visible:
+            found, squares[i][name] = flights.both(flown[i], models[name])
+            parts[name].append(found)
+        else:
+            squares[i][name] = flights.mean_square(flown[i], models[name])
+    if not visible or not all(_finite(found) for found in parts.values()):
+        return None, squares
     extends = not np.array_equal(first[6:], last[6:])
-    return MissingForces(tuple(models), [*train, *held], roles, parts, flights, flown, extends)
+    return MissingForces(tuple(models), logs, roles, parts, flights, flown, extends), squares
 
 
 def _seen(window: Window) -> bool:

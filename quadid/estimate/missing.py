@@ -148,17 +148,25 @@ class Vehicles:
             theta: full parameter vector.
             vehicle: whose vector that is, where it is not that of the noise.
         """
-        problem, z = settled(windows, vehicle or self.vehicle, theta, self.psi, self.tail)
-        part = problem.liveliest(NEAR_SECONDS)
-        _, psi, *_ = scoring(part, z, self.psi, RESIZING, _SIZES)
-        return _smoothed(problem, z, psi)
+        return self._missing(*settled(windows, vehicle or self.vehicle, theta, self.psi, self.tail))
 
     def mean_square(self, windows: Sequence[Window], theta: FloatArray) -> float:
         """Mean over channels and rows of squared innovations of a parameter vector, whitened at `psi` and `tail`.
 
         One where the model, random forces included, is right about its own errors; infinite where it diverges.
         """
+        return self._mean_square(*settled(windows, self.vehicle, theta, self.psi, self.tail))
+
+    def both(self, windows: Sequence[Window], theta: FloatArray) -> tuple[list[Missing], float]:
+        """Results of `missing` and `mean_square`, trim and biases fitted once."""
         problem, z = settled(windows, self.vehicle, theta, self.psi, self.tail)
+        return self._missing(problem, z), self._mean_square(problem, z)
+
+    def _missing(self, problem: Problem, z: FloatArray) -> list[Missing]:
+        _, psi, *_ = scoring(problem.liveliest(NEAR_SECONDS), z, self.psi, RESIZING, _SIZES)
+        return _smoothed(problem, z, psi)
+
+    def _mean_square(self, problem: Problem, z: FloatArray) -> float:
         value, gains = problem.passes(z, self.psi)
         each = zip(problem.tracks, gains, strict=True)
         squares = np.concatenate([whitened(g)[_measured(track, g)] for track, g in each]) ** 2

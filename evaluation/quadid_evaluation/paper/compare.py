@@ -50,7 +50,7 @@ class Methods(Outcome):
 
     @property
     def warnings(self) -> list[str]:
-        """What is wrong with the logs."""
+        """Faults of the logs."""
         return list(self.notes)
 
     def tables(self) -> list[TextTable]:
@@ -75,7 +75,7 @@ class Methods(Outcome):
 
     @property
     def sentences(self) -> list[Cell]:
-        """What counts as failed."""
+        """Definition of a run that failed."""
         most = f"at most {self.result['budget']} simulations a run"
         return [Cell(f"failed: runs that ended above 1.01 times the lowest cost of all; {most}")]
 

@@ -62,7 +62,7 @@ class Explained:
         return sum(int(np.count_nonzero(g.S)) for g in self.gains)
 
     def places(self, cause: Candidate) -> list[int]:
-        """Where the entries of a cause are in z."""
+        """Places in z of the entries of a cause."""
         return [i for i, (name, _, _) in enumerate(self.problem.entries) if name in cause.names]
 
     def theta(self) -> FloatArray:
@@ -75,7 +75,7 @@ class Explained:
         return self.objective + float(np.linalg.slogdet(self.information)[1]) + prior
 
     def better(self, other: Explained) -> bool:
-        """Whether this one is more likely, and of models of which one contains the other also of use."""
+        """True if this one is more likely, and of models of which one contains the other also of use."""
         mine, others = {c.label for c in self.causes}, {c.label for c in other.causes}
         if mine < others:
             return not other.better(self)
@@ -127,7 +127,7 @@ def _carried(source: Explained, problem: Problem) -> FloatArray:
 
 
 def _starts(problem: Problem, causes: Sequence[Candidate]) -> FloatArray:
-    """Where searches over causes begin that cannot be linearised at neutral, scaled; 0: elsewhere."""
+    """Starts of the searches over causes that cannot be linearised at neutral, scaled; 0: elsewhere."""
     start = {n: v for c in causes for n, v in zip(c.names, c.start or [0.0] * len(c.names), strict=True)}
     return np.array([start.get(name, 0.0) for name, _, _ in problem.entries]) / problem.size
 
@@ -150,7 +150,7 @@ def _fitted(
 
 
 def scores(model: Explained, whole: Problem, listed: Sequence[Candidate]) -> list[tuple[float, Candidate]]:
-    """What each cause should take off -2 ln L, all regressors at once, beside the parameters that are free."""
+    """Expected drop of -2 ln L by each cause, all regressors at once, beside the parameters that are free."""
     present = {c.label for c in model.causes}
     open_to = [c for c in listed if c.label not in present and c.requires in (None, *model.names, *present)]
     problem = _with(whole, [*model.causes, *open_to])
