@@ -516,13 +516,12 @@ def better_description(lagged: Lagged | str, vehicle: Vehicle) -> Other | None:
     least = _SPIN_GAIN if described is vehicle and order == rotors else _GAIN
     if gain - own < least or float(np.mean(axes[:2])) < _SETTLED:
         axes = _described(lagged, vehicle)
-        right, reversed_ = (_yaw_explained(lagged, vehicle, turns) for turns in (1.0, -1.0))
-        # A fast loop answers the gyro's noise within a row, and that looks like the spin-up of reversed rotors: where
-        # drag alone says the right sign, even weakly, nothing is reversed.
-        settled = axes[2] > 0.5 * _SETTLED
-        if min(axes[0], axes[1]) < _SETTLED or settled or reversed_ < max(_SETTLED, right + _SPIN_GAIN):
+        spins, axes[2] = _spins(lagged, vehicle)
+        if min(axes[0], axes[1]) < _SETTLED or not spins:
             return None
-        described, order, sign, axes = vehicle, rotors, -1.0, np.array([axes[0], axes[1], reversed_])
+        described, order = vehicle, rotors
+    else:
+        spins = [rotors] if sign < 0.0 else []
     told, fix = [], []
     if described is turned:
         degrees = math.degrees(angle)
@@ -532,13 +531,15 @@ def better_description(lagged: Lagged | str, vehicle: Vehicle) -> Other | None:
         columns = ", ".join(str(i + 1) for i in order)
         told.append(f"much better with the log's columns in the order {columns}")
         fix.append(f"reorder the rotors of the vehicle file to take columns {columns}")
-    if sign < 0.0:
+    if spins == [rotors]:
         told.append("yaw is reversed")
         fix.append("negate the spins in the vehicle file")
+    elif spins:
+        one = " or ".join(str(k + 1) for (k,) in spins)
+        told.append(f"rotor {one} turns the other way")
+        fix.append(f"negate the spin of rotor {one} in the vehicle file")
     new = reordered(described, order) if order != rotors else described
-    if sign < 0.0:
-        spun = tuple(r.model_copy(update={"spin": -r.spin}) for r in new.rotors)
-        new = new.model_copy(update={"rotors": spun})
+    new = _spun(new, spins[0]) if spins else new
     return Other(new, " and ".join(told), " and ".join(fix), axes, angle if described is turned else 0.0)
 
 
@@ -627,8 +628,34 @@ def _correlations(
     return np.asarray(at_lag[_gain(at_lag).argmax(axis=0), np.arange(len(orders))])
 
 
-def _yaw_explained(lagged: Lagged, vehicle: Vehicle, sign: float) -> float:
-    """Correlation of yaw acceleration with drag and spin-up torque of the rotors, of spins times `sign`.
+def _spun(vehicle: Vehicle, turned: Sequence[int]) -> Vehicle:
+    """The vehicle with the spins of some rotors, counted from 0, the other way."""
+    rotors = [r.model_copy(update={"spin": -r.spin if k in turned else r.spin}) for k, r in enumerate(vehicle.rotors)]
+    return vehicle.model_copy(update={"rotors": tuple(rotors)})
+
+
+def _spins(lagged: Lagged, vehicle: Vehicle) -> tuple[list[tuple[int, ...]], float]:
+    """Alternatives of rotors (from 0) that turn the other way by drag and spin-up: all, or one of these; or none.
+
+    Also returns the correlation in yaw that the change gives.  A fast loop answers the noise of its gyro within a row,
+    and that looks like the spin-up of rotors that are all reversed: where drag alone says the right sign, even weakly,
+    not all are.
+    """
+    rotors = tuple(range(len(vehicle.rotors)))
+    own = _yaw_explained(lagged, vehicle)
+    single = np.array([_yaw_explained(lagged, _spun(vehicle, (k,))) for k in rotors])
+    gain = _gain(single[:, None]) - _gain(np.array([own]))
+    if single.max() > _SETTLED and gain.max() > _CHANGE:
+        # Partners on one arm have one command, so that either explains the motion.
+        return [(int(k),) for k in np.flatnonzero(gain > gain.max() - _CHANGE)], float(single.max())
+    all_ = _yaw_explained(lagged, _spun(vehicle, rotors))
+    if _described(lagged, vehicle)[2] < 0.5 * _SETTLED and all_ > max(_SETTLED, own + _SPIN_GAIN):
+        return [rotors], all_
+    return [], own
+
+
+def _yaw_explained(lagged: Lagged, vehicle: Vehicle) -> float:
+    """Correlation of yaw acceleration with drag and spin-up torque of the rotors.
 
     Each has a factor that cannot be negative: fast motion shows spin-up, slow motion drag.  The lag is that of roll and
     pitch: spin-up at another one looks like drag.
@@ -636,7 +663,7 @@ def _yaw_explained(lagged: Lagged, vehicle: Vehicle, sign: float) -> float:
     arms, inertia = vehicle.torque_arms[:, :2], vehicle.initial[2:4]
     tilt = [np.sum((squares @ arms) * motion[:, :2] * inertia) for squares, motion, _ in lagged]
     squares, motion, spun = lagged[int(np.argmax(tilt))]
-    causes = sign * np.column_stack([squares @ vehicle.torque_arms[:, 2], spun @ vehicle.spins])
+    causes = np.column_stack([squares @ vehicle.torque_arms[:, 2], spun @ vehicle.spins])
     scale = np.linalg.norm(causes, axis=0) + 1e-300
     torque = causes / scale @ nnls(causes / scale, motion[:, 2])[0]
     norm = np.linalg.norm(torque) * np.linalg.norm(motion[:, 2])

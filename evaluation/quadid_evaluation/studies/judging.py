@@ -329,7 +329,7 @@ MISTAKES: tuple[Mistake, ...] = (
     Mistake("motors one place on", of_rotors(lambda w: np.roll(w, 1, axis=1)), ORDER),
     Mistake("motors backwards", of_rotors(lambda w: w[:, ::-1]), ORDER),
     Mistake("spins reversed", spun(), "negate the spins"),
-    Mistake("spin of rotor 1 reversed", spun(0), "spin of rotor 1|negate"),
+    Mistake("spin of rotor 1 reversed", spun(0), r"spin of rotor 1\b"),
     Mistake("frame turned by 45 deg", placed(
         lambda x, y: ((x - y) * 0.70710678, (x + y) * 0.70710678)), "turn the rotor positions"),
     Mistake("positions mirrored", placed(lambda x, y: (x, -y)), f"{ORDER}|mirror"),
