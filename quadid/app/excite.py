@@ -13,7 +13,7 @@ import numpy as np
 import typer
 
 from quadid.app.identify import check_seed, search
-from quadid.app.logs import Given, Log, as_vehicle, file_name, load_vehicle, read, write_text
+from quadid.app.logs import Given, Log, as_vehicle, file_name, load_vehicle, read, write_texts
 from quadid.app.options import VEHICLE, Described, Seed, Typed
 from quadid.app.outcome import LIBRARY, Advance, Reported, provenance, silent
 from quadid.data.window import Window
@@ -180,7 +180,7 @@ class Proposed(Reported):
         for form in forms:
             texts |= written_as(self.plan, form, self.hover_throttle)
         name = file_name(self.plan.vehicle)
-        return [write_text(Path(folder) / f"{name}{end}", text) for end, text in texts.items()]
+        return write_texts(folder, {f"{name}{end}": text for end, text in texts.items()})
 
 
 def parse_height(text: str) -> tuple[float, float]:

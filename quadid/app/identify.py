@@ -15,7 +15,7 @@ from quadid_evaluation.optimisers.minimise import minimise
 
 from quadid.app.logs import Log, file_name, remembered, settled
 from quadid.app.missing import Beside, MissingForces, compared
-from quadid.app.options import Logs, OfVehicle, Seed, Validate
+from quadid.app.options import Bounds, Fix, Free, KnownEffects, Logs, OfVehicle, Priors, Seed, Validate
 from quadid.app.outcome import LIBRARY, Advance, Fitted, UnansweredError, known, provenance, quality, silent, told
 from quadid.data.window import Window
 from quadid.errors import ParameterError, nearest
@@ -183,9 +183,12 @@ class Identified(Fitted):
             as it is.
         """
         values, floors = self.parameters.sample(n, seed)
-        thetas = np.repeat(Layout(self.vehicle).initial(self.vehicle)[None], n, axis=0)
-        thetas[:, : len(self.parameters)] = values
-        return thetas, floors | dict.fromkeys(self.vehicle.effects, "as in the vehicle file, without a spread")
+        layout = Layout(self.vehicle)
+        thetas = np.repeat(layout.initial(self.vehicle)[None], n, axis=0)
+        thetas[:, [layout.entry(name).index for name in self.parameters.names]] = values
+        fitted = {name.split(".")[0] for name in self.parameters.names}
+        held = [*(n for n in NOMINAL_NAMES if n not in fitted), *(e for e in self.vehicle.effects if e not in fitted)]
+        return thetas, floors | dict.fromkeys(held, "as in the vehicle file, without a spread")
 
     def plot(self, log: int = -1, group: str = "rates") -> Any:
         """Measured and simulated outputs of one log as a plotly figure.
@@ -228,9 +231,8 @@ def identify(
     optimizer: Annotated[
         str, typer.Option("--optimizer", metavar="NAME", help=f"How to search: {', '.join(OPTIMIZERS)}.")
     ] = OPTIMIZERS[0],
-    seed: Seed = 1, free: Sequence[str] = (), fix: Sequence[str] = (),
-    bounds: Mapping[str, tuple[float, float]] | None = None, priors: Mapping[str, tuple[float, float]] | None = None,
-    effects: Mapping[str, Mapping[str, float]] | None = None, advance: Advance = silent,
+    seed: Seed = 1, free: Free = (), fix: Fix = (), bounds: Bounds = None, priors: Priors = None,
+    effects: KnownEffects = None, advance: Advance = silent,
 ) -> Identified:  # fmt: skip
     """Fits the parameters to logs, and scores the fit on them and on others.
 

@@ -8,13 +8,14 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import quadid_replay
 from numpy.typing import NDArray
 from quadid_replay import open_log
 
+from quadid.app.over_time import OverTime
 from quadid.data.grid import linear
 from quadid.data.window import Recording, Window
 from quadid.errors import LogError, QuadidError, VehicleError
@@ -25,21 +26,10 @@ from quadid.vehicle import MOST_FLIGHTS, FittedFlight, Vehicle
 
 if TYPE_CHECKING:
     import pandas as pd
+    import xarray as xr
 
     from quadid.checks.motion import Spans
     from quadid.data.grid import GridReport
-
-
-# --- pandas, where it is installed
-
-
-def import_pandas() -> Any:
-    """The module pandas; raises QuadidError where it is not installed."""
-    try:
-        import pandas
-    except ImportError as error:
-        raise QuadidError("pandas is not installed", fix="pip install pandas, or use .records()") from error
-    return pandas
 
 
 # --- Files written whole or not at all; files of users read without waiting for one that is none
@@ -68,6 +58,14 @@ def write_text(path: str | Path, text: str) -> Path:
     return target
 
 
+def make_folder(folder: Path) -> None:
+    """Makes a folder where there is none; raises OutputError where it cannot be made."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"{folder} cannot be made ({error.strerror})", fix="choose another folder") from error
+
+
 def write_texts(place: str | Path, texts: Mapping[str, str]) -> list[Path]:
     """Writes texts by file name into a folder, or the only one under the name that `place` is; returns absolute paths.
 
@@ -78,6 +76,7 @@ def write_texts(place: str | Path, texts: Mapping[str, str]) -> list[Path]:
     """
     where = Path(place)
     if where.is_dir() or not where.suffix:
+        make_folder(where)
         return [write_text(where / name, text) for name, text in texts.items()]
     if len(texts) != 1:
         raise OutputError(f"{where} is one file, this holds {len(texts)} files", "a folder", f"{where.parent}")
@@ -254,23 +253,35 @@ class Log:
             return self
         return _read(self.path, self.recording, described, self.grid.rate, self.cut)
 
-    def to_frame(self) -> pd.DataFrame:
-        """What is used, on the grid, as a pandas data frame: a row a time [s], columns as in a CSV (SI, FRD, NED)."""
+    def over_time(self) -> OverTime:
+        """The channels that are used, on the grid, with the columns of a CSV (SI, FRD, NED)."""
         from quadid_replay.writers import column_names, recording_of, union_rows
 
         recording = recording_of(self.windows)
         layout = column_names(recording)
-        t, columns = union_rows([recording.channels[name] for name in layout])
-        pandas = import_pandas()
-        return pandas.DataFrame(
-            np.column_stack([c for c in columns if c is not None]), index=pandas.Index(t, name="t"),
-            columns=[column for names in layout.values() for column in names],
-        )  # fmt: skip
+        t, rows = union_rows([recording.channels[name] for name in layout])
+        values = {name: row for name, row in zip(layout, rows, strict=True) if row is not None}
+        return OverTime(t, values, {n: _places(n, v.shape[1]) for n, v in values.items()}, layout)
+
+    def to_frame(self) -> pd.DataFrame:
+        """`over_time` as a pandas data frame: a row a time [s], columns as in a CSV."""
+        return self.over_time().to_frame()
+
+    def to_xarray(self) -> xr.Dataset:
+        """`over_time` as an xarray data set, with gyro (t, axis), attitude (t, quaternion), rotor_speed (t, rotor)."""
+        return self.over_time().to_xarray()
 
     def __repr__(self) -> str:
         used, whole = self.grid.seconds_used, self.grid.seconds_log
         head = f"{self.name}: {self.recording.format}, {used:.1f} of {whole:.1f} s used at {self.grid.rate:.4g} Hz"
         return "\n".join((f"{head}, vehicle {self.vehicle.name}", *(f"warning: {text}" for text in self.warnings)))
+
+
+def _places(channel: str, width: int) -> tuple[str, Sequence[str | int]]:
+    """Dimension of a channel's columns, and the label of each."""
+    if channel in ("rotor_speed", "motor_command"):
+        return "rotor", range(1, width + 1)
+    return {3: ("axis", "xyz"), 4: ("quaternion", "wxyz")}.get(width, (channel + "_column", range(1, width + 1)))
 
 
 def load_vehicle(name: str) -> Vehicle:

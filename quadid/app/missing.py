@@ -10,8 +10,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from quadid.app.logs import Log, free_name
+from quadid.app.over_time import OverTime
 from quadid.data.window import Channel, Recording, Window, beginning
+from quadid.errors import ParameterError
 from quadid.model.layout import Layout
+from quadid.model.rollout import CHANNEL_NAMES
 from quadid.report.verdict import percent
 from quadid.types import FloatArray, JsonDict
 from quadid.vehicle import RandomForces, ResidualTerm, Vehicle
@@ -162,18 +165,27 @@ class MissingForces:
     def _unseen(self, theta: FloatArray) -> list[Missing]:
         return [part for i in self.deciding for part in self.flights.missing(self.flown[i], theta)]
 
+    def over_time(self, i: int, model: str | None = None) -> OverTime:
+        """Missing force [N] and moment [N m] of log `i`, innovations, and the sigma of each; of the last model else.
+
+        Raises:
+            ParameterError: an unknown model.
+        """
+        if model not in (None, *self.models):
+            raise ParameterError(f"unknown model '{model}'", ", ".join(self.models))
+        chosen = model or self.models[-1]
+        sizes = {"force": ("axis", AXES), "moment": ("axis", AXES), "innovation": ("output", CHANNEL_NAMES[:12])}
+        labels = {part: of for name, of in sizes.items() for part in (name, f"{name}_sigma")}
+        values = {part: self._joined(i, chosen, part) for part in labels}
+        return OverTime(self._joined(i, chosen, "t"), values, labels)
+
     def save(self, folder: str | Path = ".") -> list[Path]:
         """Writes ``LOG.missing.csv`` for every log: force [N], moment [N m], innovations of every model, with sigma."""
-        from quadid.model.rollout import CHANNEL_NAMES
-
         out: list[Path] = []
         for i, log in enumerate(self.logs):
-            columns, table = ["t"], [self._joined(i, self.models[0], "t")[:, None]]
-            for model in self.models:
-                for name, axes in (("force", AXES), ("moment", AXES), ("innovation", CHANNEL_NAMES[:12])):
-                    for part in (name, f"{name}_sigma"):
-                        columns += [f"{model}/{part}_{axis}" for axis in axes]
-                        table.append(self._joined(i, model, part))
+            found = {model: self.over_time(i, model) for model in self.models}
+            columns = ["t", *(f"{model}/{column}" for model, one in found.items() for column in one.columns)]
+            table = [self._joined(i, self.models[0], "t")[:, None], *(one.table for one in found.values())]
             path = free_name(folder, log.name, "missing.csv", out)
             np.savetxt(path, np.concatenate(table, axis=1), "%.8g", ",", header=",".join(columns), comments="")
             out.append(path)

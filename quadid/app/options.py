@@ -16,6 +16,7 @@ import typer
 from typer.models import ParameterInfo
 
 from quadid.app.logs import GRID, Given, load_vehicle, parse_columns
+from quadid.errors import ParameterError
 from quadid.vehicle import Vehicle
 
 
@@ -104,6 +105,71 @@ READING: dict[str, tuple[Any, Any]] = {
     "unchecked": (Unchecked, False), "columns": (Columns, None),
 }  # fmt: skip
 """What a command whose logs are opened for it may be asked, with defaults; arguments of `quadid.load`."""
+
+# --- What is fitted, beside or instead of what the vehicle file says
+
+
+def key_numbers(text: str, rest: str) -> dict[str, float]:
+    """Numbers of ``KEY=VALUE,KEY=VALUE``, which is the `rest` of a `text`; raises ParameterError for another form."""
+    values: dict[str, float] = {}
+    for part in filter(None, rest.split(",")):
+        key, _, number = part.partition("=")
+        try:
+            values[key.strip()] = float(number)
+        except ValueError as error:
+            raise ParameterError(f"cannot read '{part}' in '{text}'", "NAME:KEY=NUMBER,KEY=NUMBER") from error
+    return values
+
+
+def _effects(texts: Sequence[str]) -> dict[str, dict[str, float]]:
+    """Effects of ``NAME:KEY=VALUE,KEY=VALUE``."""
+    return {name: key_numbers(text, rest) for text in texts for name, _, rest in [text.partition(":")]}
+
+
+def _pairs(form: str) -> Callable[[Sequence[str]], dict[str, tuple[float, float]]]:
+    """A reader of two numbers by name, typed in this form."""
+
+    def read(texts: Sequence[str]) -> dict[str, tuple[float, float]]:
+        out = {}
+        for text in texts:
+            name, _, numbers = text.partition("=")
+            try:
+                first, second = (float(number) for number in numbers.split(":"))
+            except ValueError as error:
+                raise ParameterError(f"cannot read '{text}'", form) from error
+            out[name.strip()] = (first, second)
+        return out
+
+    return read
+
+
+def _several(name: str, form: str, about: str, read: Callable[[Any], Any]) -> Typed:
+    return Typed(list[str] | None, typer.Option(name, metavar=form, help=f"{about} Repeatable."), read=read)
+
+
+Free = Annotated[
+    Sequence[str],
+    _several("--free", "NAME", "Fit this number of a known effect, too, as motor_lag.tau.", lambda typed: typed),
+]
+Fix = Annotated[
+    Sequence[str],
+    _several("--fix", "NAME", "Keep this one of the six as the vehicle file has it.", lambda typed: typed),
+]
+Bounds = Annotated[
+    Mapping[str, tuple[float, float]] | None,
+    _several("--bounds", "NAME=LOW:HIGH", "Bounds of one of the six, instead of the file's.", _pairs("NAME=LOW:HIGH")),
+]
+Priors = Annotated[
+    Mapping[str, tuple[float, float]] | None,
+    _several(
+        "--prior", "NAME=VALUE:SIGMA", "What is known of one of the six before, instead of the file's.",
+        _pairs("NAME=VALUE:SIGMA"),
+    ),
+]  # fmt: skip
+KnownEffects = Annotated[
+    Mapping[str, Mapping[str, float]] | None,
+    _several("--effect", "NAME:KEY=VALUE,...", "Known effect, beside or instead of the file's.", _effects),
+]
 
 # --- The work, and where its results go
 

@@ -19,11 +19,14 @@ from markupsafe import Markup
 from quadid_replay import write_compared
 from quadid_replay.frames import from_euler
 
-from quadid.app.logs import LONGEST, Log, free_name, import_pandas, write_text
+from quadid.app.logs import LONGEST, Log, free_name, write_text
 from quadid.app.missing import Beside, MissingForces
+from quadid.app.over_time import OverTime, imported
+from quadid.chi_square import Z95
 from quadid.data.window import Channel, Recording, beginning, sample_period
-from quadid.errors import NotIdentifiableError
+from quadid.errors import LogError, NotIdentifiableError
 from quadid.jsonable import jsonable
+from quadid.model.rollout import CHANNEL_NAMES
 from quadid.report.page import measures, number, part, quiet, render
 from quadid.report.tables import Cell, TextTable
 from quadid.report.verdict import Verdict
@@ -150,7 +153,7 @@ class UnansweredError(NotIdentifiableError):
         )
 
 
-NUMBER_COLUMNS = ("effect", "confident", "parameter", "unit", "value", "low", "high")
+NUMBER_COLUMNS = ("name", "effect", "confident", "parameter", "unit", "value", "sigma", "low", "high")
 """Columns of a table with one row a number of a finding."""
 
 
@@ -159,7 +162,9 @@ def number_rows(found: Sequence[Json]) -> Iterator[tuple[Json, tuple[Any, ...]]]
     for one in found:
         for p in one["parameters"]:
             low, high = p["ci95"] or (None, None)
-            yield one, (one["effect"], one["confident"], p["name"], p["unit"], p["value"], low, high)
+            sigma = None if low is None or high is None else (high - low) / (2.0 * Z95)
+            name = f"{one['effect']}.{p['name']}"
+            yield one, (name, one["effect"], one["confident"], p["name"], p["unit"], p["value"], sigma, low, high)
 
 
 def json_text(result: Any) -> str:
@@ -182,7 +187,7 @@ def data_frame(records: list[dict[str, Any]], columns: Sequence[str] = ()) -> pd
     Raises:
         QuadidError: pandas is not installed.
     """
-    pandas = import_pandas()
+    pandas = imported("pandas")
     frame = pandas.DataFrame(records) if records else pandas.DataFrame(columns=list(columns))
     if "name" in frame:
         frame.index = pandas.Index(frame["name"].to_numpy())
@@ -194,6 +199,8 @@ def data_frame(records: list[dict[str, Any]], columns: Sequence[str] = ()) -> pd
 
 _CHANNELS = {"gyro": 0, "attitude": 3, "accel": 6, "velocity": 9, "position": 12}
 """First of the three columns of each channel in a `quadid.identification.score.Series`."""
+YAW = 5
+"""Its column of the yaw, which is unwrapped."""
 
 
 def _recording(name: str, t: FloatArray, values: FloatArray) -> Recording:
@@ -275,6 +282,34 @@ class Fitted(Reported):
     def train(self) -> list[Log]:
         """The logs that were fitted."""
         return [log for log, s in zip(self.logs, self.sets, strict=True) if s.role == "train"]
+
+    def residuals(self, log: int = -1) -> OverTime:
+        """Measured and simulated outputs of one log in runs of a second, their difference, and the sensors' sigma.
+
+        Args:
+            log: which of the logs, in the order given, training logs first; -1 is the last.
+        """
+        series = self.sets[log].fitted.series
+        left, sigma = series.measured - series.simulated, np.broadcast_to(series.sigma, series.measured.shape)
+        if left.shape[1] > YAW:
+            left[:, YAW] = np.angle(np.exp(1j * left[:, YAW]))
+        values = {"measured": series.measured, "simulated": series.simulated, "residual": left, "sigma": sigma}
+        return OverTime(series.t, values, dict.fromkeys(values, ("output", CHANNEL_NAMES[: left.shape[1]])))
+
+    def missing(self, log: int = -1, model: str | None = None) -> OverTime:
+        """Missing force [N] and moment [N m] of one log in body axes, and innovations of the filter, with sigma.
+
+        Args:
+            log: which of the logs, in the order given, training logs first; -1 is the last.
+            model: ``nominal``, or of a diagnosis ``extended``; the last of them by default.
+
+        Raises:
+            LogError: a log without gyro or accelerometer, or a model without a finite answer.
+            ParameterError: another model.
+        """
+        if self.forces is None:
+            raise LogError("no missing force is known", "logs with gyro and accelerometer, a model that follows them")
+        return self.forces.over_time(log, model)
 
     def save_series(self, folder: str | Path = ".") -> list[Path]:
         """Writes what was measured, simulated and is missing over time, as CSV and MCAP; returns absolute paths.

@@ -16,8 +16,9 @@ from quadid.app.options import Horizons, Logs, OfVehicle, OwnRate
 from quadid.app.outcome import LIBRARY, Reported, provenance
 from quadid.data.window import Window, beginning
 from quadid.errors import NotIdentifiableError, ParameterError
+from quadid.identification.predict import SHARE
 from quadid.model.layout import Layout
-from quadid.report.page import figure, section, stacked, trace
+from quadid.report.page import band, figure, section, stacked, trace
 from quadid.report.tables import Cell, Column, TextTable, number
 from quadid.report.verdict import Verdict, score_verdict
 from quadid.types import FloatArray, Json
@@ -57,22 +58,46 @@ class Scored(Reported):
         return [Cell(self.result["bands"])]
 
     def records(self) -> list[dict[str, Any]]:
-        """One row a log and horizon, the pooled ones with the log None."""
-        entries = [*self.result["files"], {"log": None, **self.result}]
-        return [{"log": e["log"], "after": int(h), **errors} for e in entries for h, errors in e["horizons"].items()]
+        """One row a quantity and horizon; those of single logs, which follow, have the name of the log in theirs."""
+        from quadid.estimate.forecast import BANDS
+
+        result, out = self.result, []
+        for entry in [{"log": None, **result}, *(result["files"] if len(result["files"]) > 1 else ())]:
+            for h, errors in entry["horizons"].items():
+                for quantity, error in errors.items():
+                    low, high = entry["spread"][h][quantity]
+                    row = {
+                        "name": ".".join(filter(None, (entry["log"], quantity, h))), "log": entry["log"],
+                        "quantity": quantity, "after": int(h), "unit": result["units"][quantity], "error": error,
+                        "low": low, "high": high,
+                    }  # fmt: skip
+                    if entry["log"] is None:
+                        row |= {key: result[key][h][quantity] for key in ("noise_floor", "no_change")}
+                        inside = (result["coverage"][h] or {}).get(quantity) or dict.fromkeys(BANDS)
+                        row |= {f"inside_{band}": share for band, share in inside.items()}
+                    out.append(row)
+        return out
 
     def page(self, command: str = LIBRARY) -> str:
         """One page: errors over the horizon beside sensor noise and beside predicting no change, and the bands."""
         result, (errors, inside) = self.result, self.tables()
         steps = [int(h) for h in result["horizons"]]
         units = result["units"]
-        known = [n for n in units if any(errors[n] is not None for errors in result["horizons"].values())]
+        known = [n for n in units if not all(math.isnan(errors[n]) for errors in result["horizons"].values())]
         places, layout = stacked([(f"{n} [{units[n]}]", {"type": "log"}) for n in known], "samples ahead")
         lines = (
             ("before", "no change predicted", result["no_change"]), ("floor", "noise floor", result["noise_floor"]),
             ("after", "error", result["horizons"]),
         )  # fmt: skip
-        data = [
+        drawn_bands = [
+            part
+            for i, (name, where) in enumerate(zip(known, places, strict=True))
+            for part in band(
+                "after", "of the runs", np.array(steps, dtype=np.float64),
+                *np.array([result["spread"][str(h)][name] for h in steps], dtype=np.float64).T, **where,
+            )
+        ]  # fmt: skip
+        data = drawn_bands + [
             trace(
                 role, label, np.array(steps, dtype=np.float64),
                 np.array([math.nan if (v := of[str(h)][name]) is None else v for h in steps], dtype=np.float64),
@@ -80,7 +105,10 @@ class Scored(Reported):
             )
             for i, (name, where) in enumerate(zip(known, places, strict=True)) for role, label, of in lines
         ]  # fmt: skip
-        caption = "from the measured state on; at the noise floor an error cannot be told from the sensors'"
+        caption = (
+            f"mean error from the measured state on, and the band in which {100 * SHARE:.0f} % of the runs lie; at "
+            "the noise floor an error cannot be told from the sensors'"
+        )
         drawn = figure("horizons", "Error over the horizon", data, layout, 130 * len(known) + 70, caption=caption)
         sections = [
             section("errors", "Prediction errors", errors.title, [drawn], [errors.part()]),

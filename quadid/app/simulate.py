@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from quadid.app.identify import check_seed
 from quadid.app.logs import as_vehicle, write_recording
+from quadid.app.options import key_numbers
 from quadid.app.outcome import Outcome
 from quadid.effects import EFFECTS
 from quadid.errors import ParameterError, QuadidError, nearest
@@ -227,7 +228,7 @@ def parse_effects(
     outside: dict[str, dict[str, float]] = {}
     for text in texts:
         name, _, rest = text.partition(":")
-        values = _numbers(text, rest)
+        values = key_numbers(text, rest)
         if name in OUTSIDE:
             outside[name] = {**draw_outside(name, seed, 1.0, vehicle), **values}
         elif name not in EFFECTS:
@@ -238,17 +239,6 @@ def parse_effects(
             effects |= {k: v for k, v in draw_effect(name, seed, 1.0, vehicle, seconds).items() if k not in effects}
     check_effects(effects, len(vehicle.rotors))
     return effects, outside
-
-
-def _numbers(text: str, rest: str) -> dict[str, float]:
-    values: dict[str, float] = {}
-    for part in filter(None, rest.split(",")):
-        key, _, number = part.partition("=")
-        try:
-            values[key.strip()] = float(number)
-        except ValueError as error:
-            raise ParameterError(f"cannot read '{part}' in '{text}'", "NAME:KEY=NUMBER,KEY=NUMBER") from error
-    return values
 
 
 def read_manoeuvre(path: Path) -> list[Segment]:

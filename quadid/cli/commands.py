@@ -90,6 +90,7 @@ COMMANDS = {
         (
             "quadid identify flight.mcap --validate other.mcap --vehicle pelican --report report.html",
             "quadid identify a.bin b.bin@30:90 --vehicle mine.yaml --json result.json",
+            "quadid identify a.bin --vehicle mine.yaml --effect motor_lag:tau=0.03 --free motor_lag.tau --fix J_r",
         ),
         "quadid.app.identify:identify",
         "Fit b, d, J_xx, J_yy, J_zz and J_r to flight logs; say how well each is known and how well they predict.",

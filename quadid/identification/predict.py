@@ -241,6 +241,8 @@ HORIZONS = (1, 10, 50)
 SUM_TO = 50
 """The summed score adds the mean errors of the first fifty samples."""
 LONGEST = 2000
+SHARE = 0.9
+"""Of the runs whose errors lie within the stated spread, as many above as below it."""
 
 
 @dataclass(frozen=True)
@@ -252,15 +254,22 @@ class HorizonScore:
         mean: mean error by sample after the start, shape (longest, 4), columns as `QUANTITIES`; row h - 1 is h samples
             on; NaN for what the log lacks.
         horizons: those asked for.
+        spread: errors between which `SHARE` of the runs lie, shape (horizons, 2, 4); NaN for what the log lacks.
     """
 
     samples: int
     mean: FloatArray
     horizons: tuple[int, ...]
+    spread: FloatArray
 
     def at(self, horizon: int) -> dict[str, float]:
         """Mean error after `horizon` samples by quantity; NaN for what the log lacks."""
         return dict(zip(QUANTITIES, self.mean[horizon - 1].tolist(), strict=True))
+
+    def between(self, horizon: int) -> dict[str, list[float]]:
+        """Errors after `horizon` samples, one of those asked for, between which `SHARE` of the runs lie."""
+        ends = self.spread[self.horizons.index(horizon)].T
+        return dict(zip(QUANTITIES, ends.tolist(), strict=True))
 
     @property
     def sum(self) -> dict[str, float]:
@@ -288,14 +297,14 @@ def horizon_scores(
     """
     wanted = _checked(horizons)
     longest = max(*wanted, SUM_TO)
-    tallies = [_tally(windows, vehicle, theta, longest) for windows in files]
-    pooled, starts = np.sum([sums for sums, _ in tallies], axis=0), sum(count for _, count in tallies)
-    if starts == 0:
+    tallies = [_tally(windows, vehicle, theta, longest, np.array(wanted) - 1) for windows in files]
+    pooled, runs = np.sum([sums for sums, _ in tallies], axis=0), np.concatenate([runs for _, runs in tallies])
+    if len(runs) == 0:
         raise NotIdentifiableError(
             f"no run of {longest} samples fits: measured rate, and no gap for {longest} samples after it",
             f"stretches longer than {longest} samples with gyro", "log without gaps, or ask for a lower --rate",
         )  # fmt: skip
-    return _score(pooled, starts, wanted), [_score(*tally, wanted) for tally in tallies]
+    return _score(pooled, runs, wanted), [_score(*tally, wanted) for tally in tallies]
 
 
 def _checked(horizons: Sequence[int]) -> tuple[int, ...]:
@@ -325,23 +334,31 @@ def start_errors(windows: Sequence[Window], vehicle: Vehicle, horizons: Sequence
     return [lengths(OpenLoop(w, vehicle, max(wanted)).misses(theta, np.array(wanted))[0]) for w in windows]
 
 
-def _score(sums: FloatArray, starts: int, horizons: tuple[int, ...]) -> HorizonScore:
+def _score(sums: FloatArray, runs: FloatArray, horizons: tuple[int, ...]) -> HorizonScore:
     total, count = sums
     mean = np.divide(total, count, out=np.full_like(total, np.nan), where=count > 0)
+    # Runs in order of their errors, those that do not count last; the two whose ranks are the ends of the spread.
+    ordered, known = np.sort(runs, axis=0), np.count_nonzero(~np.isnan(runs), axis=0)
+    ranks = np.array([0.5 - 0.5 * SHARE, 0.5 + 0.5 * SHARE])[:, None, None] * np.maximum(known - 1, 0)
+    spread = np.full((2, len(horizons), 4), np.nan)
+    if len(runs):
+        spread = np.take_along_axis(ordered, np.rint(ranks).astype(int), axis=0)
     mean.setflags(write=False)
-    return HorizonScore(starts, mean, horizons)
+    return HorizonScore(len(runs), mean, horizons, np.moveaxis(spread, 0, 1))
 
 
-def _tally(windows: Sequence[Window], vehicle: Vehicle, theta: FloatArray, longest: int) -> tuple[FloatArray, int]:
-    """Summed errors of all runs and their counts, shape (2, longest, 4), and the number of runs."""
-    sums, starts, at = np.zeros((2, longest, 4)), 0, 1 + np.arange(longest)
+def _tally(
+    windows: Sequence[Window], vehicle: Vehicle, theta: FloatArray, longest: int, kept: IndexArray
+) -> tuple[FloatArray, FloatArray]:
+    """Summed errors of all runs and their counts, shape (2, longest, 4); those after `kept`, (runs, kept, 4)."""
+    sums, runs, at = np.zeros((2, longest, 4)), [np.zeros((0, len(kept), 4))], 1 + np.arange(longest)
     for window in windows:
-        for rows, misses in OpenLoop(window, vehicle, longest).parts(theta[None], at):
+        for _, misses in OpenLoop(window, vehicle, longest).parts(theta[None], at):
             errors = lengths(misses[0])
             known = ~np.isnan(errors)
             sums += np.where(known, errors, 0.0).sum(axis=0), known.sum(axis=0)
-            starts += len(rows)
-    return sums, starts
+            runs.append(errors[:, kept])
+    return sums, np.concatenate(runs)
 
 
 # --- The least error that a prediction from a measured state can have: what sensor noise alone makes of a perfect

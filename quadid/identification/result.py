@@ -198,5 +198,6 @@ def _horizon_entry(score: HorizonScore, gaps: int) -> JsonDict:
         "samples": score.samples,
         "gaps": gaps,
         "horizons": {str(h): score.at(h) for h in score.horizons},
+        "spread": {str(h): score.between(h) for h in score.horizons},
         "sum": {"to": SUM_TO, **score.sum},
     }

@@ -51,17 +51,19 @@ class ChannelScore:
 
 @dataclass(frozen=True)
 class Series:
-    """Measured and simulated outputs over time, for pictures.
+    """Measured and simulated outputs over time.
 
     Attributes:
         t: times [s], shape (n,).
         measured, simulated: shape (n, channels), attitude as roll, pitch, yaw [rad] (yaw unwrapped); NaN where not
             measured.
+        sigma: standard deviation of the sensor noise that scores count with, shape (channels,).
     """
 
     t: FloatArray
     measured: FloatArray
     simulated: FloatArray
+    sigma: FloatArray
 
 
 @dataclass(frozen=True)
@@ -277,7 +279,8 @@ def _series(shooting: Shooting, lin: Linearised) -> Series:
         absent = ~rollout.valid[rows][:, : shooting.channels]
         y[absent] = y_sim[absent] = np.nan
         parts.append((rollout.window.t[rows], y, y_sim))
-    return Series(*(np.concatenate(part) for part in zip(*parts, strict=True)))
+    t, y, y_sim = (np.concatenate(part) for part in zip(*parts, strict=True))
+    return Series(t, y, y_sim, np.hypot(shooting.noise.white, shooting.noise.slow))
 
 
 def _angles(q: FloatArray, error: FloatArray) -> tuple[FloatArray, FloatArray]:

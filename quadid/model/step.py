@@ -8,6 +8,7 @@ from typing import Any
 
 import numba as nb
 import numpy as np
+from numpy.typing import ArrayLike
 
 from quadid.errors import ParameterError, WindowError
 from quadid.model import layout as ix
@@ -389,6 +390,14 @@ class State:
         return self._read(X_N, 3)
 
     @property
+    def motion(self) -> FloatArray:
+        """Attitude, rate, velocity, position, rotor speeds: the states of `quadid.symbolic`, shape (vehicles, 13 + N).
+
+        A file without `motor_lag` has no rotor states there: its first 13 columns.
+        """
+        return np.hstack([self._read(X_QW, N_STATE), self.rotor_speed])
+
+    @property
     def rotor_speed(self) -> FloatArray:
         """True rotor speeds [rad/s], shape (vehicles, rotors)."""
         rot = self._memory[:, _ROTORS_AT : _ROTORS_AT + self._rotors * ROTOR].reshape(-1, self._rotors, ROTOR)
@@ -459,9 +468,9 @@ class Simulator:
         self._dt, self._constants, self._walk, self._delayed = 0.0, np.empty((0, STATE)), _NO_WALK, 2
 
     def start(
-        self, *, attitude: FloatArray = LEVEL, rate: FloatArray = STILL, velocity: FloatArray = STILL,
-        position: FloatArray = STILL, rotor_speed: FloatArray | float | None = None, time: float = 0.0,
-        inputs: FloatArray | float = 0.0, dt: float = 0.005,
+        self, *, attitude: ArrayLike = LEVEL, rate: ArrayLike = STILL, velocity: ArrayLike = STILL,
+        position: ArrayLike = STILL, rotor_speed: ArrayLike | None = None, time: float = 0.0,
+        inputs: ArrayLike = 0.0, dt: float = 0.005,
     ) -> State:  # fmt: skip
         """Returns a state to start from; each argument for one vehicle, or with a row a vehicle.
 
@@ -503,7 +512,7 @@ class Simulator:
         )  # fmt: skip
         return State(time, 0, n, np.concatenate([m.reshape(blocks, -1) for m in memory], axis=1), rotors, dt)
 
-    def step(self, state: State, command: FloatArray, dt: float, voltage: float | None = None) -> State:
+    def step(self, state: State, command: ArrayLike, dt: float, voltage: float | None = None) -> State:
         """Returns the state after one step; `state` stays as it is.
 
         Args:
@@ -519,12 +528,12 @@ class Simulator:
         self.advance(new, command, dt, voltage)
         return new
 
-    def advance(self, state: State, command: FloatArray, dt: float, voltage: float | None = None) -> None:
+    def advance(self, state: State, command: ArrayLike, dt: float, voltage: float | None = None) -> None:
         """Makes one step in place; arguments as for `step`."""
         given = np.asarray(command, dtype=np.float64)
         self._march(state, given[None, None] if given.ndim == 1 else given[None], dt, voltage)
 
-    def run(self, state: State, commands: FloatArray, dt: float) -> FloatArray:
+    def run(self, state: State, commands: ArrayLike, dt: float) -> FloatArray:
         """Makes a step a row of commands, in place.
 
         Args:

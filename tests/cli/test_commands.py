@@ -23,7 +23,7 @@ OPTIONS = {
     "init": "NAME --from --mass --arm --preset --json --out",
     "vehicles": "--json",
     "inspect": "LOG --vehicle --start --stop --preset --columns --json --out",
-    "identify": f"{FIT} --optimizer",
+    "identify": f"{FIT} --optimizer --free --fix --bounds --prior --effect",
     "score": f"LOG --vehicle --horizons --closed-loop {READING} --report --json --out",
     "compare": f"LOG --vehicle --validate --method --seeds --budget --objective --seed {READING} --json --out",
     "diagnose": FIT,

@@ -23,7 +23,9 @@ from quadid.app.init import init
 from quadid.app.logs import settled
 from quadid.condition import assess, flight_trim
 from quadid.errors import QuadidError, VehicleError
+from quadid.identification.predict import start_errors
 from quadid.jsonable import jsonable
+from quadid.model.layout import Layout
 from quadid.vehicle import Vehicle
 from tests.cli.conftest import Cli, Flights
 
@@ -276,3 +278,80 @@ def test_a_printed_fit_says_what_its_values_rest_on(logs: dict[str, str]) -> Non
     fit = quadid.identify(logs["good"], vehicle="pelican")
     assert "mass" in fit.opening[0].text
     assert str(fit).startswith(fit.opening[0].text)
+
+
+def test_vehicles_are_drawn_by_the_names_that_were_fitted(tmp_path: Path) -> None:
+    late = quadid.simulate(seconds=20.0, effects=["motor_lag:tau=0.04"]).save(tmp_path / "late.csv")
+    fit = quadid.identify(
+        late, vehicle="pelican", free=["motor_lag.tau"], fix=["J_r"],
+        effects={"motor_lag": {"tau": 0.02}, "rotor_drag": {"k_x": 0.1, "k_y": 0.1}},
+    )  # fmt: skip
+    thetas, floors = fit.sample(2000)
+    layout = Layout(fit.vehicle)
+    drawn = {name: thetas[:, layout.entry(name).index] for name in (*fit.parameters.names, "J_r", "rotor_drag.k_x")}
+    tau = fit.parameters["motor_lag.tau"]
+    assert np.median(drawn["motor_lag.tau"]) == pytest.approx(tau.value, rel=0.01)
+    assert drawn["motor_lag.tau"].std() == pytest.approx(tau.sigma, rel=0.1)
+    assert np.ptp(drawn["J_r"]) == np.ptp(drawn["rotor_drag.k_x"]) == 0.0
+    assert drawn["J_r"][0] == 3e-5
+    assert {"J_r", "rotor_drag"} <= set(floors)
+    assert "motor_lag" not in floors
+
+
+def test_the_command_frees_fixes_and_states_as_the_library_does(inside: Cli, tmp_path: Path) -> None:
+    late = quadid.simulate(seconds=20.0, effects=["motor_lag:tau=0.04"]).save(tmp_path / "late.csv")
+    run = inside(
+        "identify", late, "--vehicle", "pelican", "--effect", "motor_lag:tau=0.02", "--free", "motor_lag.tau",
+        "--fix", "J_r", "--bounds", "J_xx=5e-3:3e-2", "--prior", "d=5e-7:1e-8", "--out", tmp_path, "--json", "-",
+    )  # fmt: skip
+    made = quadid.identify(
+        late, vehicle="pelican", free=["motor_lag.tau"], effects={"motor_lag": {"tau": 0.02}}, fix=["J_r"],
+        bounds={"J_xx": (5e-3, 3e-2)}, priors={"d": (5e-7, 1e-8)},
+    )  # fmt: skip
+    assert same(run.data) == same(made.result)
+    for typed in (["--bounds", "J_xx=5e-3"], ["--prior", "d"], ["--effect", "motor_lag:tau=fast"]):
+        refused = inside("identify", late, "--vehicle", "pelican", *typed)
+        assert refused.code == 2
+        assert f"cannot read '{typed[1].rpartition(':')[2]}'" in refused.err
+
+
+def test_what_a_fit_leaves_is_a_table_and_arrays(logs: dict[str, str], tmp_path: Path) -> None:
+    xarray = pytest.importorskip("xarray")
+    fit = quadid.identify(load(logs["good"]), validate=load(logs["other"]))
+    left = fit.residuals()
+    frame, arrays = left.to_frame(), left.to_xarray()
+    assert isinstance(arrays, xarray.Dataset)
+    np.testing.assert_array_equal(frame["residual_q"], arrays.residual.sel(output="q"))
+    np.testing.assert_allclose(frame["residual_p"], frame["measured_p"] - frame["simulated_p"])
+    assert np.abs(frame["residual_psi"]).max() <= np.pi
+    assert frame["residual_p"].std() == pytest.approx(frame["sigma_p"].iloc[0], rel=0.2)
+    fit.save_series(tmp_path)
+    missing = fit.missing(log=0).to_frame()
+    file = np.genfromtxt(tmp_path / "train.mcap.missing.csv", delimiter=",", names=True, deletechars="")
+    np.testing.assert_allclose(file["nominal/force_z"], missing["force_z"], rtol=1e-6, atol=1e-9)
+    assert (missing["moment_sigma_x"] > 0.0).all()
+    with pytest.raises(QuadidError, match="unknown model 'extended'"):
+        fit.missing(model="extended")
+    channels = load(logs["good"]).to_xarray()
+    assert dict(channels.sizes) == {"t": len(channels.t), "axis": 3, "quaternion": 4, "rotor": 4}
+    np.testing.assert_array_equal(channels.gyro.sel(axis="y"), load(logs["good"]).to_frame()["q"])
+
+
+def test_a_score_holds_the_spread_of_its_runs(logs: dict[str, str]) -> None:
+    made = quadid.score(load(logs["other"]), horizons=(1, 10))
+    frame = made.to_frame()
+    assert list(frame.index[:4]) == ["position.1", "velocity.1", "rotation.1", "rate.1"]
+    rate = frame.loc["rate.10"]
+    windows = made.logs[0].windows
+    runs = np.concatenate([errors[:, 1, 3] for errors in start_errors(windows, made.logs[0].vehicle, [1, 10, 50])])
+    low, high = np.quantile(runs, [0.05, 0.95], method="nearest")
+    assert (rate["low"], rate["high"]) == (low, high)
+    assert rate["low"] < rate["error"] < rate["high"]
+
+
+def test_without_an_extra_package_the_call_says_how_to_get_it(
+    logs: dict[str, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "xarray", None)
+    with pytest.raises(QuadidError, match=r"xarray is not installed; fix: pip install 'quadid\[notebook\]'"):
+        load(logs["good"]).to_xarray()

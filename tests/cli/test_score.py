@@ -19,7 +19,7 @@ QUANTITIES = ["position", "velocity", "rotation", "rate"]
 
 def test_json_has_exactly_the_keys_of_the_contract(inside: Cli, flights: Flights) -> None:
     result = inside("score", flights.train, flights.unseen, "--vehicle", "pelican", "--json", "-").data
-    keys = ["schema", "vehicle", "samples", "gaps", "horizons", "sum", "files"]
+    keys = ["schema", "vehicle", "samples", "gaps", "horizons", "spread", "sum", "files"]
     assert list(result) == [*keys, "noise_floor", "no_change", "units", "coverage", "bands", "verdict"]
     assert result["schema"] == "quadid.score/1"
     assert list(result["horizons"]) == ["1", "10", "50"]

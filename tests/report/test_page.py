@@ -30,7 +30,10 @@ def scored(name: str, rows: int = 3000, channels: int = 9, seed: int = 0) -> Sco
 
     def one(error: float) -> SetScore:
         series = Series(
-            np.asarray(t, dtype=np.float64), measured, measured + error * rng.standard_normal(measured.shape)
+            np.asarray(t, dtype=np.float64),
+            measured,
+            measured + error * rng.standard_normal(measured.shape),
+            np.full(channels, 0.05),
         )
         entries = tuple(
             ChannelScore(n, u, (error / 0.05) ** 2, error, 90.0, rows)
