@@ -93,7 +93,7 @@ bands: venv ## coverage of predicted bands on recorded flights that were not fit
 cases: venv ## the independent simulated cases, diagnosed
 	$(STUDY) quadid_evaluation.studies.cases
 
-foreign: venv ## vehicles and logs of others: truth, answers, predictions beside regression and networks (half an hour)
+foreign: venv ## vehicles and logs of others: truth, answers, predictions beside regression (half an hour)
 	$(STUDY) quadid_evaluation.studies.foreign --out docs/results
 
 DATA ?= $(or $(QUADID_DATA),../shared/data)
@@ -128,8 +128,8 @@ health-hours: venv ## online rotor health: alarms in 100 h of healthy hover, sec
 health: venv ## damaged and loaded Crazyflies, recorded; hidden damage, simulated; what their spread allows
 	$(STUDY) quadid_evaluation.studies.health --out docs/results
 
-paper-scale: venv ## three 500 s sets: error, time and memory of the fit
-	$(STUDY) quadid_evaluation.studies.paper_scale --out docs/results
+paper-scale: dev ## three 500 s sets: error, time and memory of the fit
+	$(STUDY) quadid_evaluation.benchmarks.speed --parts identification memory
 
 excite: venv ## intervals that a proposed manoeuvre promises and obtains
 	$(STUDY) quadid_evaluation.studies.excite --out docs/results
@@ -143,8 +143,8 @@ subspace: venv ## CVA and MOESP: poles of known systems, prediction of flights
 control: venv ## tracking with guessed, identified, extended and true parameters
 	$(STUDY) quadid_evaluation.studies.control --out docs/results
 
-kernel-speed: venv ## nanoseconds per particle and step
-	$(STUDY) quadid_evaluation.benchmarks.kernel --out docs/results
+kernel-speed: dev ## nanoseconds per particle and step of the kernel, and of a step of `quadid.Simulator`
+	$(STUDY) quadid_evaluation.benchmarks.speed --parts kernel step
 
 bench: dev ## every speed beside its peers, in one run: docs/results/speed.md (half an hour on an idle machine)
 	$(STUDY) quadid_evaluation.benchmarks.speed --out docs/results

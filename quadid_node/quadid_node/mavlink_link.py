@@ -320,7 +320,7 @@ COMPONENT = 191
 MOTORS = 80.0
 """Sticks come in steps, mostly of 20 or 40 ms, and the rate loop answers each.  Snapshots of motors in step with them
 err alike: slow torque by 6 % where at this rate [Hz] it is 0.4 % (`python -m
-quadid_evaluation.studies.autopilot.readings`)."""
+quadid_evaluation.studies.readings`)."""
 REQUESTED = {
     "HIGHRES_IMU": 100.0, "RAW_IMU": 100.0, "ATTITUDE_QUATERNION": 50.0, "SERVO_OUTPUT_RAW": MOTORS,
     "ACTUATOR_OUTPUT_STATUS": MOTORS, "ESC_STATUS": MOTORS, "ATTITUDE_TARGET": 50.0,

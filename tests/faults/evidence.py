@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import pytest
-from quadid_evaluation.studies.judged import judged
+from quadid_evaluation.harness import judged
 
 from tests.faults.fault_list import FAULTS
 

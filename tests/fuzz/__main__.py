@@ -14,7 +14,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from quadid_evaluation.studies.judged import judged
+from quadid_evaluation.harness import judged
 
 from tests.fuzz.campaign import Outcome, input_of, run
 from tests.fuzz.formats import FORMATS

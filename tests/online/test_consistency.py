@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from quadid_evaluation.studies.poisoning.flying import Poison
+from quadid_evaluation.studies.poisoning import Poison
 from quadid_replay import open_log
 from scipy.signal import butter, sosfiltfilt
 

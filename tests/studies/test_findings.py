@@ -5,8 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from quadid_evaluation.studies.findings.__main__ import judged
-from quadid_evaluation.studies.findings.rows import FINDINGS, Finding
+from quadid_evaluation.studies.findings import FINDINGS, Finding, judged
 
 
 @pytest.mark.parametrize("finding", FINDINGS, ids=lambda f: f"{f.folder}: {f.what}")

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
-from quadid_evaluation.studies.foreign.numbers import of_set, table
-from quadid_evaluation.studies.foreign.sets import SETS
+from quadid_evaluation.studies.flight_sets import SETS
+from quadid_evaluation.studies.foreign import of_set, outside_table
 
 IRIS = SETS["iris"]
 
@@ -30,11 +30,11 @@ def test_b_beside_a_thrust_curve_has_a_truth_of_its_own() -> None:
 def test_the_share_counts_identified_numbers_and_names_those_outside() -> None:
     answers = {"identify": answered(6.1e-6, "identified"), "diagnose": answered(9.0e-6, "identified")}
     unused = of_set("iris", IRIS, {"diagnose": answered(9.0e-6, "unreliable")})
-    text = table([*of_set("iris", IRIS, answers), *unused])
+    text = outside_table([*of_set("iris", IRIS, answers), *unused])
     assert "Of 2 identified values with known truth, 1 have it inside" in text
     assert text.count("**+") == 1
 
 
 def test_refused_data_have_no_numbers() -> None:
     assert list(of_set("iris", IRIS, {"identify": None, "diagnose": None})) == []
-    assert table([]) == ""
+    assert outside_table([]) == ""

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections import Counter
 from pathlib import Path
 
-from quadid_evaluation.benchmarks.online.accuracy import flown
+from quadid_evaluation.benchmarks.online import flown
+from quadid_evaluation.harness import judged
 from quadid_evaluation.studies import coverage
-from quadid_evaluation.studies.judged import judged
-from quadid_evaluation.studies.soak.accelerated import BATCH, batches
+from quadid_evaluation.studies.soak import BATCH, batches
 
 
 def test_what_people_judged_outlives_the_next_run(tmp_path: Path) -> None:

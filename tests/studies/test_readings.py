@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from quadid_evaluation.studies.autopilot.readings import LOOP, errors
+from quadid_evaluation.studies.readings import LOOP, errors
 from quadid_node.mavlink_link import MOTORS as RATE
 from quadid_node.mavlink_link import REQUESTED
 

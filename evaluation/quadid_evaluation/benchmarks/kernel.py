@@ -1,6 +1,4 @@
-"""Speed of the simulation kernel in nanoseconds per particle-step, against NumPy and against the processor's peak.
-
-    python -m quadid_evaluation.benchmarks.kernel --out docs/results
+"""Speed of the simulation: the kernel in nanoseconds per particle-step, against NumPy and the processor's peak; a step.
 
 One particle-step is one parameter vector simulated over one sample at 50 Hz: rotors, Runge-Kutta step, sensors,
 residual.  Times are the best of many short runs, in rounds over all cases, since other programs only ever add to them.
@@ -9,22 +7,22 @@ The NumPy step does the nominal model's step alone, vectorised over particles, a
 
 from __future__ import annotations
 
-import argparse
-import json
-import os
+import functools
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
+from typing import Any
 
 import numba as nb
 import numpy as np
 
 from quadid.data.window import Window
+from quadid.effects import EFFECTS
 from quadid.model import layout as ix
 from quadid.model.layout import Layout
 from quadid.model.rollout import Rollout, Segments
 from quadid.model.simd import LANES, aligned, lane_kernel, whole
+from quadid.model.step import RandomInputs, Simulator
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 
@@ -36,25 +34,11 @@ NOMINAL_OPERATIONS = 190 + 35
 
 @dataclass
 class Case:
-    """Something to be timed: `run` does `steps` particle-steps (or operations); `shortest` is its best time [s]."""
+    """Something to be timed: `run` does `steps` particle-steps (or operations)."""
 
     name: str
     steps: int
     run: Callable[[], object]
-    shortest: float = np.inf
-
-    def time(self, seconds: float) -> None:
-        """Runs for a while and keeps the best time of one run."""
-        end = time.perf_counter() + seconds
-        while time.perf_counter() < end:
-            start = time.perf_counter()
-            self.run()
-            self.shortest = min(self.shortest, time.perf_counter() - start)
-
-    @property
-    def ns(self) -> float:
-        """Nanoseconds per step."""
-        return 1e9 * self.shortest / self.steps
 
 
 def recorded(vehicle: Vehicle, channels: int) -> Window:
@@ -228,39 +212,131 @@ def all_model_cases(vehicle: Vehicle, m: int) -> list[tuple[Case, Case]]:
     ]
 
 
-def main() -> None:
-    """Prints the table; writes it as JSON too when asked."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, help="folder for kernel.json")
-    parser.add_argument("--particles", type=int, default=8 * LANES)
-    parser.add_argument("--rounds", type=int, default=8)
-    arguments = parser.parse_args()
+# --- The tables
+
+
+SLICE, TURNS = 0.01, 10
+"""Time a case runs in one turn [s], and turns in a round.
+
+The best run of a turn counts; told are the best and quartiles over turns.  On one core that is processor time, so that
+other programs only take cache and memory from a run; on both it is time by the clock, which they add to.
+"""
+
+
+def kernel_table(rounds: int) -> dict[str, Any]:
+    """Measures every line, NumPy and the peak, in turn."""
     vehicle = Vehicle.shipped("pelican")
-    model = all_model_cases(vehicle, arguments.particles)
-    plain = [numpy_case(vehicle, particles(vehicle, m)) for m in (64, 256, 4096)]
+    model = all_model_cases(vehicle, 8 * LANES)
+    plain = [numpy_case(vehicle, particles(vehicle, m)) for m in (256, 4096)]
     peak = peak_case()
-    for _ in range(arguments.rounds):
-        for case in (*(c for pair in model for c in pair), *plain, peak):
-            case.time(0.15)
-    print(f"{'ns per particle-step':45s}{'one core':>12s}{'all cores':>12s}")
-    for one, every in model:
-        print(f"{one.name:45s}{one.ns:12.1f}{every.ns:12.1f}")
-    for case in plain:
-        print(f"{case.name:45s}{case.ns:12.1f}")
-    nominal = model[0][0].ns
-    share, gain = NOMINAL_OPERATIONS * peak.ns / nominal, min(case.ns for case in plain) / nominal
-    print(f"\npeak of this processor, one core: {1.0 / peak.ns:.1f} fused multiply-adds of float64 per ns")
-    print(f"the nominal rollout keeps {share:.0%} of it busy; NumPy at its best takes {gain:.0f} times as long")
-    if arguments.out:
-        arguments.out.mkdir(parents=True, exist_ok=True)
-        timings = [{"name": one.name, "one_core": one.ns, "all_cores": every.ns} for one, every in model]
-        result = {
-            "schema": "quadid.benchmark.kernel/1", "rate": RATE, "lanes": LANES, "cores": os.cpu_count(),
-            "particles": arguments.particles, "fma_per_ns": 1.0 / peak.ns, "share_of_peak": share,
-            "timings": timings, "numpy": {case.name: case.ns for case in plain}, "gain_over_numpy": gain,
-        }  # fmt: skip
-        (arguments.out / "kernel.json").write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+    every = [*(c for pair in model for c in pair), *plain, peak]
+    both = {id(c) for _, c in model}
+    seen: dict[int, list[float]] = {id(c): [] for c in every}
+    for turn in range(TURNS * rounds + 1):
+        for case in every:
+            best = _best(case, time.perf_counter if id(case) in both else time.thread_time)
+            if turn:
+                seen[id(case)].append(1e9 * best / case.steps)
+    nominal, full, plainest, top = (
+        _told(seen, c)["least"]
+        for c in (model[0][0], model[3][0], min(plain, key=lambda c: _told(seen, c)["least"]), peak)
+    )
+    return {
+        "lanes": LANES,
+        "timings": [
+            {"name": one.name, "one_core": _told(seen, one), "all_cores": _told(seen, both)} for one, both in model
+        ],
+        "numpy": {c.name: _told(seen, c) for c in plain},
+        "fma_per_ns": 1.0 / top,
+        "operations": NOMINAL_OPERATIONS,
+        "share_of_peak": NOMINAL_OPERATIONS * top / nominal,
+        "gain_over_numpy": plainest / nominal,
+        "extended_over_nominal": full / nominal,
+        "every_over_nominal": _told(seen, model[5][0])["least"] / nominal,
+    }  # fmt: skip
 
 
-if __name__ == "__main__":
-    main()
+def effect_table(rounds: int) -> dict[str, Any]:
+    """The swarm's cost with each effect of the catalogue alone, of another size in every particle, over the nominal."""
+    vehicle = Vehicle.shipped("pelican")
+    nominal, entries = particles(vehicle, LANES), Layout(vehicle).entries.values()
+    vectors = {"nominal": nominal}
+    for effect in EFFECTS:
+        own = [e for e in entries if e.name.startswith(f"{effect}.") and not e.name.endswith(".time")]
+        vectors[effect] = free(nominal, *((e.index, e.typical) for e in own))
+    cases = {name: model_cases(name, vehicle, thetas, 9, True)[0] for name, thetas in vectors.items()}
+    least = dict.fromkeys(cases, np.inf)
+    for _ in range(TURNS * rounds):
+        for name, case in cases.items():
+            least[name] = min(least[name], 1e9 * _best(case, time.thread_time) / case.steps)
+    ratios = {name: ns / least["nominal"] for name, ns in least.items() if name != "nominal"}
+    return {
+        "ns": least, "ratios": ratios, "median": float(np.median(list(ratios.values()))),
+        "largest": max(ratios, key=lambda name: ratios[name]),
+    }  # fmt: skip
+
+
+def _best(case: Case, clock: Callable[[], float]) -> float:
+    end, best = time.perf_counter() + SLICE, np.inf
+    while time.perf_counter() < end:
+        begin = clock()
+        case.run()
+        best = min(best, clock() - begin)
+    return best
+
+
+def _told(seen: dict[int, list[float]], case: Case) -> dict[str, float]:
+    low, middle, high = np.percentile(seen[id(case)], [25, 50, 75])
+    return {"median": middle, "low": low, "high": high, "least": min(seen[id(case)])}
+
+
+# --- One step of `quadid.Simulator`
+
+
+DT, BATCH = 0.002, 4096
+
+
+def fastest(run: Callable[[], object], calls: int) -> float:
+    """Shortest time of one call [s]."""
+    shortest = np.inf
+    for _ in range(9):
+        begin = time.perf_counter()
+        for _ in range(calls):
+            run()
+        shortest = min(shortest, (time.perf_counter() - begin) / calls)
+    return float(shortest)
+
+
+def rotorpy_step() -> float | None:
+    """Time of one step of RotorPy's Hummingbird [s]; None where it is not installed."""
+    try:
+        from rotorpy.vehicles.hummingbird_params import quad_params
+        from rotorpy.vehicles.multirotor import Multirotor
+    except ImportError:
+        return None
+    craft = Multirotor(quad_params)
+    state, control = craft.initial_state, {"cmd_motor_speeds": np.full(4, 350.0)}
+    return fastest(lambda: craft.step(state, control, DT), 50)
+
+
+def step_table() -> dict[str, Any]:
+    """Seconds of a step of one vehicle and of batches on one core, beside RotorPy's."""
+    pelican = Vehicle.shipped("pelican")
+    hover, one = np.full(4, pelican.hover_speed()), Simulator(pelican)
+    state, rows = one.start(dt=DT), np.tile(hover, (1000, 1))
+    times: dict[str, float | None] = {
+        "one vehicle, in place": fastest(lambda: one.advance(state, hover, DT), 5000),
+        "one vehicle, a new state": fastest(lambda: one.step(state, hover, DT), 5000),
+        "one vehicle, 1000 steps a run": fastest(lambda: one.run(state, rows, DT), 20) / 1000,
+    }
+    nominal, commands = particles(pelican, BATCH), np.tile(hover, (BATCH, 1))
+    random = RandomInputs((0.1, 0.1, 0.1), 1.0, (1.0, 1.0, 1.0), 0.5)
+    for name, thetas, extra in (
+        ("nominal", nominal, None),
+        ("every effect, random inputs", every_effect(pelican, nominal), random),
+    ):
+        batch = Simulator(pelican, thetas, random=extra, span=60.0)
+        flying = batch.start(dt=DT)
+        each = fastest(functools.partial(batch.advance, flying, commands, DT), 5) / BATCH
+        times[f"{BATCH} vehicles, {name}, each"] = each
+    return {"times": times | {"RotorPy, one vehicle": rotorpy_step()}}

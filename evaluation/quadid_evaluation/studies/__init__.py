@@ -1,1 +1,5 @@
-"""Longer studies, each with a `make` target and a recorded result in docs/results."""
+"""Studies: figures of docs/results; one module an experiment, `quadid_evaluation.harness` command line and page."""
+
+import os
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy: workers share the processors

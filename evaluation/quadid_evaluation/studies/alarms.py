@@ -9,15 +9,10 @@ a session asks for three seconds after the change.
 
 from __future__ import annotations
 
-import argparse
 import itertools
-import os
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from pathlib import Path
-
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 from scipy.stats import chi2
@@ -32,7 +27,7 @@ from quadid.online.grid_buffer import Rows, WindowCut
 from quadid.online.records import OnlineFinding
 from quadid.parameters import NOMINAL_NAMES
 from quadid.vehicle import Vehicle
-from quadid_evaluation.studies.page import put_section
+from quadid_evaluation.harness import study, table
 
 SECONDS, AT = 300.0, 40.3
 """Length of a healthy flight [s]; moment of a change [s]."""
@@ -121,7 +116,7 @@ def upper(count: int, hours: float) -> float:
 
 def healthy(hours: float, seed: int) -> str:
     """Alarms on healthy flights, as Markdown."""
-    lines, total, flights = [], Counter[str](), 0
+    rows, total, flights = [], Counter[str](), 0
     each = max(round(hours * 3600.0 / SECONDS / len(VEHICLES) / len(PROFILES) / len(AIR)), 1)
     for (air, strength), profile in itertools.product(AIR.items(), PROFILES):
         alarms, said = Counter[str](), Counter[str]()
@@ -133,22 +128,22 @@ def healthy(hours: float, seed: int) -> str:
         total += alarms + Counter({"windows refused": said.total()})
         flights += each * len(VEHICLES)
         texts = "; ".join(f"{what} ({n})" for what, n in (alarms + said).items())
-        lines.append(f"| {air} | {profile} | {each * len(VEHICLES) * SECONDS / 3600.0:.2f} | {alarms.total()} | "
-                     f"{said.total()} | {texts} |")  # fmt: skip
-        print(lines[-1], flush=True)
+        flew_here = f"{each * len(VEHICLES) * SECONDS / 3600.0:.2f}"
+        rows.append((air, profile, flew_here, alarms.total(), said.total(), texts))
+        print(*rows[-1], flush=True)
     flew, refused = flights * SECONDS / 3600.0, total.pop("windows refused", 0)
-    head = (
+    heads = ("air", "flight", "hours", "changes", "windows refused", "what")
+    return "\n".join([
         f"## Healthy flights\n`make alarms`, seed {seed}. {', '.join(VEHICLES)}; individuals "
         f"known to {KNOWN:.0%}, with motor lag, rotor drag and inflow. **{total.total()} false changes in {flew:.1f} "
-        f"h, at most {upper(total.total(), flew):.2f} an hour (95 %); {refused} windows refused.**\n\n"
-        "| air | flight | hours | changes | windows refused | what |\n|---|---|---|---|---|---|"
-    )
-    return "\n".join([head, *lines])
+        f"h, at most {upper(total.total(), flew):.2f} an hour (95 %); {refused} windows refused.**\n",
+        *table(heads, rows),
+    ])  # fmt: skip
 
 
 def detections(each: int, seed: int) -> str:
     """Delays until changes are named, as Markdown."""
-    pelican, lines = Vehicle.shipped("pelican"), []
+    pelican, rows = Vehicle.shipped("pelican"), []
     cases = [*((what, "mass_change") for what in CHANGES), (f"-{LOSS:.0%} of a rotor", "weak_rotor")]
     for (what, effect), profile, air in itertools.product(cases, ("hover", "excited"), ("calm", "light", "gusty")):
         soon, right, sizes = [], 0, []
@@ -168,14 +163,14 @@ def detections(each: int, seed: int) -> str:
         times = f"{np.median(soon):.1f}" if soon else ""
         size = f"{np.nanmedian(sizes):+.0%}" if len(sizes) and np.isfinite(sizes).any() else ""
         within = sum(s <= 5.0 for s in soon)
-        lines.append(f"| {what} | {profile} | {air} | {within} of {each} | {times} | {right} | {size} |")
-        print(lines[-1], flush=True)
-    head = (
+        rows.append((what, profile, air, f"{within} of {each}", times, right, size))
+        print(*rows[-1], flush=True)
+    heads = ("change", "flight", "air", "within 5 s", "delay [s]", "right", "size")
+    return "\n".join([
         f"## Changes\n`make alarms`, seed {seed}. Seen and named within 5 s; median delay; "
-        "named rightly (in hover the cause is among the alternatives; a rotor by its number); median size.\n\n"
-        "| change | flight | air | within 5 s | delay [s] | right | size |\n|---|---|---|---|---|---|---|"
-    )
-    return "\n".join([head, *lines])
+        "named rightly (in hover the cause is among the alternatives; a rotor by its number); median size.\n",
+        *table(heads, rows),
+    ])  # fmt: skip
 
 
 def _changed(vehicle: Vehicle, seed: int, profile: str, air: float, what: str, rotor: int) -> Flight:
@@ -192,25 +187,7 @@ def _changed(vehicle: Vehicle, seed: int, profile: str, air: float, what: str, r
     return replace(flight, window=replace(flight.window, rotor_speed=speed))
 
 
-def main() -> None:
-    """Measures, prints and writes the page."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, help="folder of the result page; default: print only")
-    parser.add_argument("--hours", type=float, default=6.0, help="of healthy flight")
-    parser.add_argument("--each", type=int, default=4, help="flights of every change")
-    parser.add_argument("--seed", type=int, default=500)
-    parser.add_argument("--parts", nargs="+", choices=("healthy", "changes"), default=("healthy", "changes"))
-    given = parser.parse_args()
-    makers = {
-        "healthy": lambda: healthy(given.hours, given.seed),
-        "changes": lambda: detections(given.each, given.seed),
-    }
-    for part in given.parts:
-        text = makers[part]()
-        print(text)
-        if given.out is not None:
-            put_section(given.out / "alarms.md", "False alarms, and changes that are seen", part, text)
-
-
 if __name__ == "__main__":
-    main()
+    study(__doc__, "alarms.md", "False alarms, and changes that are seen", {
+        "healthy": lambda g: healthy(g.hours, g.seed), "changes": lambda g: detections(g.each, g.seed),
+    }, hours=6.0, each=4, seed=500)  # fmt: skip

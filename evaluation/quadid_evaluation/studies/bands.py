@@ -9,14 +9,10 @@ flights; sets without another flight are left out.
 
 from __future__ import annotations
 
-import argparse
-import os
 import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
-
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 
@@ -27,8 +23,8 @@ from quadid.errors import QuadidError
 from quadid.estimate.forecast import BANDS, PHASES, Forecast
 from quadid.model.layout import Layout
 from quadid.types import FloatArray
-from quadid_evaluation.studies.foreign.sets import SETS, FlightSet
-from quadid_evaluation.studies.page import put_section
+from quadid_evaluation.harness import options, put, table
+from quadid_evaluation.studies.flight_sets import SETS, FlightSet
 
 AHEAD = 0.1
 """Horizon [s]."""
@@ -36,36 +32,30 @@ RATE = 100.0
 """Grid [Hz]."""
 WANTED = {"50": (0.40, 0.60), "95": (0.90, 0.99)}
 """Shares that a band must hold, by per cent."""
-COLUMNS = "| data | of | 50 % band | 80 % band | 95 % band | outcomes | missing removed |"
+COLUMNS = ("data", "of", "50 % band", "80 % band", "95 % band", "outcomes", "missing removed")
 
 
 def main() -> None:
     """Diagnoses and scores the sets that were asked for, or all, and prints a row a quantity."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", type=Path, default=Path(os.environ.get("QUADID_DATA", "../shared/data")))
-    parser.add_argument("--out", type=Path, help="folder of the page; without it, rows are printed only")
-    parser.add_argument("names", nargs="*", help=", ".join(n for n, one in SETS.items() if one.unseen))
-    given = parser.parse_args()
-    if unknown := [n for n in given.names if n not in SETS]:
+    given = options(__doc__, words=", ".join(n for n, one in SETS.items() if one.unseen))
+    if unknown := [n for n in given.words if n not in SETS]:
         sys.exit(f"no set called {unknown[0]}; there are {', '.join(SETS)}")
-    lines = [COLUMNS, "|---" * 7 + "|"]
-    for name in given.names or [n for n, one in SETS.items() if one.unseen]:
+    found: list[Sequence[str]] = []
+    for name in given.words or [n for n, one in SETS.items() if one.unseen]:
         begin = time.perf_counter()
-        found = rows(name, SETS[name], given.data)
-        print("\n".join([*lines[:2], *found, f"{time.perf_counter() - begin:.0f} s"]), flush=True)
-        lines += found
-    if given.out is not None:
-        told = (
-            f"`make bands`: files of `diagnose`, scored {AHEAD:g} s ahead on flights that were not fitted, from the "
-            "filtered state and the logged rotor speeds. Random forces are those of the file; sensor noise, trim and "
-            "biases come from the first third of each flight, outcomes from the rest. Brackets: 95 % interval, "
-            f"predictions as if one in {PHASES} were independent; bold: outside what is wanted (50 % bands 40 to 60, "
-            "95 % bands 90 to 99). Last column: what the findings take off the squared missing force and moment there."
-        )
-        put_section(given.out / "bands.md", "Bands of predictions", "bands", "\n".join([told, "", *lines]))
+        found += (new := rows(name, SETS[name], given.data))
+        print(*new, f"{time.perf_counter() - begin:.0f} s", sep="\n", flush=True)
+    told = (
+        f"`make bands`: files of `diagnose`, scored {AHEAD:g} s ahead on flights that were not fitted, from the "
+        "filtered state and the logged rotor speeds. Random forces are those of the file; sensor noise, trim and "
+        "biases come from the first third of each flight, outcomes from the rest. Brackets: 95 % interval, "
+        f"predictions as if one in {PHASES} were independent; bold: outside what is wanted (50 % bands 40 to 60, "
+        "95 % bands 90 to 99). Last column: what the findings take off the squared missing force and moment there."
+    )
+    put(given, "bands.md", "Bands of predictions", "bands", [told, "", *table(COLUMNS, found)])
 
 
-def rows(name: str, one: FlightSet, data: Path) -> list[str]:
+def rows(name: str, one: FlightSet, data: Path) -> list[Sequence[str]]:
     """Rows of one set, a quantity each."""
     vehicle = load_vehicle(str(data / one.vehicle))
     try:
@@ -81,11 +71,11 @@ def rows(name: str, one: FlightSet, data: Path) -> list[str]:
             for quantity, counts in forecast.covered([samples])[samples].items():
                 total[quantity] = total.get(quantity, 0.0) + counts
     except QuadidError as error:
-        return [f"| {name} | refused: {error.found} | | | | | |"]
+        return [(name, f"refused: {error.found}", *[""] * 5)]
     removed = found.result["removed"]
     told = "–" if removed is None else f"{100.0 * removed:.0f} %"
     return [
-        f"| {name} | {quantity} | {' | '.join(_cell(c, i) for i in range(len(BANDS)))} | {c[-1]:.0f} | {told} |"
+        (name, quantity, *(_cell(c, i) for i in range(len(BANDS))), f"{c[-1]:.0f}", told)
         for quantity, c in total.items() if c[-1]
     ]  # fmt: skip
 

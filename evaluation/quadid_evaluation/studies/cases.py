@@ -6,11 +6,8 @@ QUADID_DATA=../shared/data python -m quadid_evaluation.studies.cases
 from __future__ import annotations
 
 import json
-import os
 from pathlib import Path
 from typing import Any
-
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from quadid_replay import open_log
 
@@ -18,6 +15,7 @@ from quadid.data.grid import to_windows
 from quadid.data.window import Window
 from quadid.diagnosis import Diagnosis, diagnose
 from quadid.vehicle import Vehicle
+from quadid_evaluation.harness import options
 
 
 def windows(path: Path, vehicle: Vehicle) -> list[Window]:
@@ -59,18 +57,12 @@ def row(folder: Path, answer: dict[str, Any]) -> tuple[bool, str]:
     return good, f"| {case} | {hidden or '–'} | {verdict}{named or '–'} | {figures} |"
 
 
-def main() -> None:
-    """Prints the table."""
-    data = Path(os.environ.get("QUADID_DATA", "../shared/data"))
+if __name__ == "__main__":
+    given, results = options(__doc__), list[bool]()
     print("| case | hidden | found | error on the unseen flight |\n|---|---|---|---|")
-    results = []
     for folder in FOLDERS:
-        for answer in json.loads((data / folder / "answers.json").read_text(encoding="utf-8")):
-            good, text = row(data / folder / answer["case"], answer)
+        for answer in json.loads((given.data / folder / "answers.json").read_text(encoding="utf-8")):
+            good, text = row(given.data / folder / answer["case"], answer)
             results.append(good)
             print(text, flush=True)
     print(f"\n{sum(results)} of {len(results)} right")
-
-
-if __name__ == "__main__":
-    main()

@@ -8,12 +8,7 @@ parameters, those with lag and drag identified too, or the truth; everything els
 
 from __future__ import annotations
 
-import argparse
-import os
 from collections.abc import Callable
-from pathlib import Path
-
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 
@@ -24,7 +19,7 @@ from quadid.identification.fit import Fit, FitOptions, fit
 from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
-from quadid_evaluation.studies.page import put_section
+from quadid_evaluation.harness import study, table
 from quadid_evaluation.studies.tracking import (
     ATTITUDE_WEIGHTS,
     CONTROL,
@@ -151,22 +146,21 @@ def tables(results: FloatArray) -> list[str]:
     """Tables of errors, and of their differences with 95 % intervals; results of shape (seeds, paths, sets, 3)."""
     lost = ~np.isfinite(results[..., 0])
     text = [f"Median error in cm; control was lost in {lost.sum()} of {lost.size} flights.", ""]
-    text += ["| path | " + " | ".join(SETS) + " |", "|---" * (len(SETS) + 1) + "|"]
-    for i, path in enumerate(PATHS):
-        text.append(
-            f"| {path} | " + " | ".join(f"{100 * e:.2f}" for e in np.nanmedian(results[:, i, :, 0], axis=0)) + " |"
-        )
+    medians = 100 * np.nanmedian(results[..., 0], axis=0)
+    text += table(
+        ("path", *SETS), [(path, *(f"{e:.2f}" for e in row)) for path, row in zip(PATHS, medians, strict=True)]
+    )
     text += ["", "Mean change of the error, with its 95 % interval over vehicles (lost flights left out):", ""]
-    text += ["| path | " + " | ".join(f"{b} against {a}" for a, b in PAIRS) + " |", "|---" * (len(PAIRS) + 1) + "|"]
+    rows = []
     for i, path in enumerate(PATHS):
-        cells = []
+        cells = [path]
         for a, b in PAIRS:
             change = results[:, i, SETS.index(b), 0] / results[:, i, SETS.index(a), 0] - 1.0
             change = change[np.isfinite(change)]
             half = 1.96 * np.std(change, ddof=1) / np.sqrt(len(change))
             cells.append(f"{100 * np.mean(change):+.1f} % ± {100 * half:.1f}")
-        text.append(f"| {path} | " + " | ".join(cells) + " |")
-    return text
+        rows.append(cells)
+    return text + table(("path", *(f"{b} against {a}" for a, b in PAIRS)), rows)
 
 
 REMARK = """\
@@ -182,27 +176,12 @@ PAIRS = (
 )  # fmt: skip
 
 
-def main() -> None:
-    """Command line of the study."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seeds", type=int, default=30)
-    parser.add_argument("--out", default="")
-    options = parser.parse_args()
-    results = np.array([run(40_000 + seed) for seed in range(options.seeds)])
+def page(seeds: int) -> str:
+    """The page of so many vehicles."""
+    results = np.array([run(40_000 + seed) for seed in range(seeds)])
     about = (__doc__ or "").split("\n\n")[2].replace("  ", " ")
-    text = [
-        f"`python -m quadid_evaluation.studies.control --out docs/results`, {options.seeds} vehicles",
-        "",
-        about,
-        "",
-        *tables(results),
-        "",
-        REMARK,
-    ]
-    print("\n".join(text))
-    if options.out:
-        put_section(Path(options.out) / "control.md", "Tracking", "measured", "\n".join(text))
+    return "\n".join([f"`make control`, {seeds} vehicles", "", about, "", *tables(results), "", REMARK])
 
 
 if __name__ == "__main__":
-    main()
+    study(__doc__, "control.md", "Tracking", {"measured": lambda g: page(g.seeds)}, seeds=30)

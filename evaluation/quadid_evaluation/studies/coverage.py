@@ -6,7 +6,6 @@ make coverage)
 
 from __future__ import annotations
 
-import argparse
 import ast
 import json
 import sys
@@ -19,7 +18,7 @@ from typing import Any
 
 import coverage
 
-from quadid_evaluation.studies.judged import judged
+from quadid_evaluation.harness import judged, options, table
 
 GOAL = 90.0
 """Share of statements and branches of quadid/ that the tests have to run [%]."""
@@ -30,11 +29,8 @@ Counts = Counter[str]
 
 def main() -> None:
     """Writes the page of what was counted."""
-    parser = argparse.ArgumentParser(prog="python -m quadid_evaluation.studies.coverage", description=__doc__)
-    parser.add_argument("--out", type=Path, default=Path("docs/results"), help="folder of coverage.md")
-    given = parser.parse_args()
     files = counted()
-    where = given.out / "coverage.md"
+    where = options(__doc__).out / "coverage.md"
     where.write_text(page(files, compiled(Path("quadid"))) + judged(where), encoding="utf-8")
     share = percent(sum((Counter(f) for f in files.values()), Counter()))
     print(f"{share:.1f} % of statements and branches of quadid/; goal {GOAL:.0f} %: {where}")
@@ -82,6 +78,10 @@ def page(files: Mapping[str, Counts], machine_code: int) -> str:
     for name, c in files.items():
         parts = name.split("/")
         rooms["/".join(parts[:2]) if len(parts) > 2 else "quadid/*.py"].update(c)
+    rows = [
+        (f"`{name}`", f"{c['run']}/{c['statements']}", f"{c['taken']}/{c['branches']}", f"**{percent(c):.1f} %**")
+        for name, c in sorted(rooms.items())
+    ]
     every = sum(files.values(), Counter())
     least = sorted(files, key=lambda n: percent(files[n]))[:5]
     lines = [
@@ -91,15 +91,10 @@ def page(files: Mapping[str, Counts], machine_code: int) -> str:
         f"**{percent(every):.1f} % of statements and branches** (goal {GOAL:.0f} %): {every['run']:,} of "
         f"{every['statements']:,} statements, {every['taken']:,} of {every['branches']:,} branches, without "
         f"{machine_code:,} statements in compiled functions.", "",
-        "| package | statements | branches | both |", "|---|---|---|---|",
-        *(_row(name, c) for name, c in sorted(rooms.items())), "",
+        *table(("package", "statements", "branches", "both"), rows), "",
         "Least covered: " + ", ".join(f"`{n}` {percent(files[n]):.0f} %" for n in least) + ".",
     ]  # fmt: skip
     return "\n".join(lines) + "\n"
-
-
-def _row(name: str, c: Counts) -> str:
-    return f"| `{name}` | {c['run']}/{c['statements']} | {c['taken']}/{c['branches']} | **{percent(c):.1f} %** |"
 
 
 if __name__ == "__main__":

@@ -10,20 +10,13 @@ more: that minute by itself is forecast with what the first two told, and identi
 
 from __future__ import annotations
 
-import argparse
 import math
-import os
-from pathlib import Path
-
-from quadid.experiment import peaks
-
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 
 from quadid.app.excite import knowledge
 from quadid.data.window import Window
-from quadid.experiment import Limits, Proposal, TrialFlights, design_manoeuvre
+from quadid.experiment import Limits, Proposal, TrialFlights, design_manoeuvre, peaks
 from quadid.flight import Flight, draw_truth, fly
 from quadid.identification.excitation import halfwidths
 from quadid.identification.fit import FitOptions, fit
@@ -31,7 +24,7 @@ from quadid.identification.result import fitted_vehicle
 from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
-from quadid_evaluation.studies.page import put_section
+from quadid_evaluation.harness import study, table
 from quadid_evaluation.studies.truth import poor_guess
 
 LIMITS = Limits(math.radians(25.0), math.radians(150.0))
@@ -82,12 +75,6 @@ def held(flown: Flight, proposal: Proposal) -> bool:
     return peak.tilt < 1.1 * LIMITS.tilt and peak.rate < 1.1 * LIMITS.rate
 
 
-HEAD = (
-    "| parameter | one gentle minute | two | gentle, then lively | manoeuvre, forecast | obtained "
-    "| times narrower than two gentle |"
-)
-
-
 def sentences(widths: FloatArray, inside: float, kept: int) -> list[str]:
     """What the figures say; half-widths (seeds, 8, 6) as of `run`."""
     out = []
@@ -118,33 +105,33 @@ REMARK = """\
   and J_r are not known at all. With the values that the manoeuvre taught the same calculation agrees."""
 
 
-def main() -> None:
-    """Command line of the study."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seeds", type=int, default=10)
-    parser.add_argument("--seconds", type=float, default=60.0)
-    parser.add_argument("--out", default="")
-    options = parser.parse_args()
-    results = [run(30_000 + seed, options.seconds) for seed in range(options.seeds)]
+def page(seeds: int, seconds: float) -> str:
+    """The page of so many vehicles."""
+    results = [run(30_000 + seed, seconds) for seed in range(seeds)]
     widths = 100.0 * np.array([r[0] for r in results])
     inside = np.mean(np.abs([r[1] for r in results]) < 1.96)
     middle = np.median(widths, axis=0)
-    text = [
-        "`python -m quadid_evaluation.studies.excite --out docs/results`",
-        "",
-        (__doc__ or "").split("\n\n")[2].replace("  ", " "),
-        "",
+    heads = (
+        "parameter", "one gentle minute", "two", "gentle, then lively", "manoeuvre, forecast", "obtained",
+        "times narrower than two gentle",
+    )  # fmt: skip
+    rows = [
+        (name, *(f"{middle[k, j]:.3g}" for k in (0, 1, 2, 3, 5)), f"{np.median(widths[:, 1, j] / widths[:, 5, j]):.1f}")
+        for j, name in enumerate(NOMINAL_NAMES)
     ]
-    text += [f"Relative 95 % half-width in per cent, median of {options.seeds} vehicles:", "", HEAD, "|---" * 7 + "|"]
-    for j, name in enumerate(NOMINAL_NAMES):
-        gain = np.median(widths[:, 1, j] / widths[:, 5, j])
-        cells = " | ".join(f"{middle[k, j]:.3g}" for k in (0, 1, 2, 3, 5))
-        text.append(f"| {name} | {cells} | {gain:.1f} |")
-    text += ["", *sentences(widths, float(inside), sum(r[2] for r in results)), REMARK]
-    print("\n".join(text))
-    if options.out:
-        put_section(Path(options.out) / "excite.md", "What to fly next", "measured", "\n".join(text))
+    return "\n".join([
+        "`make excite`", "", (__doc__ or "").split("\n\n")[2].replace("  ", " "), "",
+        f"Relative 95 % half-width in per cent, median of {seeds} vehicles:", "", *table(heads, rows), "",
+        *sentences(widths, float(inside), sum(r[2] for r in results)), REMARK,
+    ])  # fmt: skip
 
 
 if __name__ == "__main__":
-    main()
+    study(
+        __doc__,
+        "excite.md",
+        "What to fly next",
+        {"measured": lambda g: page(g.seeds, g.seconds)},
+        seeds=10,
+        seconds=60.0,
+    )

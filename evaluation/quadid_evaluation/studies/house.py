@@ -7,7 +7,6 @@ python -m quadid_evaluation.studies.house --no-walks    count only
 
 from __future__ import annotations
 
-import argparse
 import ast
 import json
 import sys
@@ -20,6 +19,8 @@ from functools import cache
 from pathlib import Path
 from types import FrameType
 from typing import Any
+
+from quadid_evaluation.harness import options
 
 ROOT = Path(__file__).resolve().parents[3]
 RECORDED = ROOT / "docs" / "results" / "house.json"
@@ -211,14 +212,11 @@ def _numeric(value: ast.expr) -> bool:
 
 def main() -> int:
     """Command line; 1 where a figure rose."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--record", metavar="WHY", help="record the figures; WHY says what made any of them rise")
-    parser.add_argument("--no-walks", action="store_true", help="leave out the files that data cross")
-    options = parser.parse_args()
+    given = options(__doc__, record="", no_walks=False)
     recorded = json.loads(RECORDED.read_text(encoding="utf-8")) if RECORDED.exists() else {}
     now = count()
     print(*rooms(), sep="\n")
-    if not options.no_walks:
+    if not given.no_walks:
         followed = walks()
         now["files crossed"] = {name: len(files) for name, files in followed.items()}
         for name, files in followed.items():
@@ -226,10 +224,8 @@ def main() -> int:
     print()
     for kind, figures in now.items():
         print(f"{kind}: " + ", ".join(f"{name} {value}" for name, value in figures.items()))
-    if options.record:
-        RECORDED.write_text(
-            json.dumps({**recorded, **now, "reason": options.record}, indent=1) + "\n", encoding="utf-8"
-        )
+    if given.record:
+        RECORDED.write_text(json.dumps({**recorded, **now, "reason": given.record}, indent=1) + "\n", encoding="utf-8")
         return 0
     problems = risen(now, recorded)
     for problem in problems:

@@ -6,8 +6,6 @@ cell is `right` where the first line names the mistake, `silent` where nothing i
 
 from __future__ import annotations
 
-import argparse
-import os
 import re
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -27,7 +25,7 @@ from quadid.errors import LogError
 from quadid.rotation import conjugate, continuous_sign, euler, exponential, product
 from quadid.types import FloatArray
 from quadid.vehicle import Rotor, Vehicle
-from quadid_evaluation.studies.page import put_section
+from quadid_evaluation.harness import options, put, table
 
 Log = tuple[Recording, Vehicle]
 TITLE = "Mistakes by vehicle"
@@ -391,39 +389,31 @@ def cells(name: str, data: Path, parts: Sequence[str] = (), every: bool = False)
 
 def main() -> int:
     """Prints or writes the table; the number of wrong cells is the exit code."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--data", type=Path, default=Path(os.environ.get("QUADID_DATA", "../shared/data")))
-    parser.add_argument("--out", type=Path, help="folder of the page; printed without")
-    parser.add_argument("--vehicles", nargs="*", default=[*SIMULATED, *RECORDED])
-    parser.add_argument("--orders", action="store_true", help="all orders of four motors, too")
-    parser.add_argument("names", nargs="*", help="parts of mistakes; all without")
-    given = parser.parse_args()
-    table: dict[str, dict[str, tuple[str, str]]] = {}
-    for vehicle in given.vehicles:
-        for mistake, verdict, line in cells(vehicle, given.data, given.names, given.orders):
-            table.setdefault(mistake, {})[vehicle] = verdict, line
-    text = _text(table, given.vehicles)
-    print(text)
-    if given.out is not None:
-        put_section(given.out / "judging.md", TITLE, "table", text)
-    return min(sum(v == "WRONG" for row in table.values() for v, _ in row.values()), 99)
+    given = options(
+        __doc__, words="parts of mistakes; all without", vehicles=",".join((*SIMULATED, *RECORDED)), orders=False
+    )
+    vehicles, found = given.vehicles.split(","), dict[str, dict[str, tuple[str, str]]]()
+    for vehicle in vehicles:
+        for mistake, verdict, line in cells(vehicle, given.data, given.words, given.orders):
+            found.setdefault(mistake, {})[vehicle] = verdict, line
+    put(given, "judging.md", TITLE, "table", _text(found, vehicles))
+    return min(sum(v == "WRONG" for row in found.values() for v, _ in row.values()), 99)
 
 
-def _text(table: dict[str, dict[str, tuple[str, str]]], vehicles: Sequence[str]) -> str:
-    lines = [f"| mistake | {' | '.join(vehicles)} |", "|---" * (len(vehicles) + 1) + "|"]
-    for mistake, row in table.items():
-        lines.append(f"| {mistake} | {' | '.join(row.get(v, ('–', ''))[0] for v in vehicles)} |")
+def _text(found: dict[str, dict[str, tuple[str, str]]], vehicles: Sequence[str]) -> str:
+    rows = [(mistake, *(row.get(v, ("–", ""))[0] for v in vehicles)) for mistake, row in found.items()]
     wrong = [
         f"* {mistake}, {vehicle}: {line.replace('|', '/')[:200]}"
-        for mistake, row in table.items() for vehicle, (verdict, line) in row.items() if verdict == "WRONG"
+        for mistake, row in found.items() for vehicle, (verdict, line) in row.items() if verdict == "WRONG"
     ]  # fmt: skip
     count = {
-        v: sum(cell[0] == v for row in table.values() for cell in row.values()) for v in ("right", "silent", "WRONG")
+        v: sum(cell[0] == v for row in found.values() for cell in row.values()) for v in ("right", "silent", "WRONG")
     }
     return "\n".join(
         ["`make judging`: one mistake at a time on logs that are right; the first line that a user reads. *right*: it "
          "names the mistake; *silent*: nothing is said; –: the log has no such channel or rotor. "
-         f"{count['right']} right, {count['silent']} silent, {count['WRONG']} wrong.", "", *lines, "", *wrong]
+         f"{count['right']} right, {count['silent']} silent, {count['WRONG']} wrong.", "",
+         *table(("mistake", *vehicles), rows), "", *wrong]
     )  # fmt: skip
 
 

@@ -7,7 +7,6 @@ are built with the fields that the node reads (cmake, a compiler).
 
 from __future__ import annotations
 
-import argparse
 import math
 import os
 import shutil
@@ -35,7 +34,7 @@ from quadid.flight import fly
 from quadid.flight.setup import TABLE_2
 from quadid.parameters import NOMINAL_NAMES
 from quadid.vehicle import Vehicle
-from quadid_evaluation.studies.page import put_section
+from quadid_evaluation.harness import options, put, table
 
 ROOT = Path(__file__).resolve().parents[3]
 SOURCES = ("canonical", "px4", "mavros")
@@ -265,39 +264,34 @@ def flight(seconds: float) -> Recording:
 
 def main() -> None:
     """Runs every preset and writes the page."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--minutes", type=float, default=10.0, help="of flight, for each preset")
-    parser.add_argument("--load", type=float, default=10.0, help="busy loops are added until the machine has it")
-    parser.add_argument("--out", type=Path, default=Path("docs/results"))
-    parser.add_argument("--publish", choices=SOURCES[1:], help=argparse.SUPPRESS)
-    parser.add_argument("--seconds", type=float, help=argparse.SUPPRESS)
-    options = parser.parse_args()
-    if options.publish:
-        publish(options.publish, flight(options.seconds))
+    given = options(__doc__, minutes=10.0, load=10.0, publish="", seconds=0.0)
+    if given.publish:
+        publish(given.publish, flight(given.seconds))
         return
-    seconds = 60.0 * options.minutes
-    lines = [
-        f"{options.minutes:g} min of flight a preset, {RATE:g} Hz a channel, {os.cpu_count()} processors.", "",
-        "| preset | load | largest backlog | fits | sets | first set | largest error of b, d, J_xx, J_yy, J_zz, J_r |",
-        "|---|---|---|---|---|---|---|",
-    ]  # fmt: skip
+    seconds = 60.0 * given.minutes
+    rows = []
     os.environ["ROS_DOMAIN_ID"] = str(1 + os.getpid() % 100)
     with tempfile.TemporaryDirectory() as scratch, ExitStack() as ends:
         log = Path(scratch, "flight.mcap")
         write_mcap(log, flight(seconds))
         environment = built(ROOT / "build" / "ros_load")
-        for _ in range(math.ceil(max(options.load - os.getloadavg()[0], 0.0))):
+        for _ in range(math.ceil(max(given.load - os.getloadavg()[0], 0.0))):
             ends.callback(subprocess.Popen([sys.executable, "-c", "while True: pass"]).kill)
         for source in SOURCES:
             seen = run(source, log, seconds, environment)
             errors = ", ".join(f"{100 * e:.2g}" for e in seen.errors)
-            lines.append(
-                f"| {source} | {seen.load:.1f} | {seen.backlog:.2f} s | {seen.fits} | {seen.sets} |"
-                f" {seen.first:.0f} s | {errors} % |"
-            )
-            print(lines[-1], flush=True)
-    title, name = "The ROS node on a loaded machine", f"load {options.load:g}, {options.minutes:g} minutes"
-    put_section(options.out / "ros-load.md", title, name, "\n".join(lines))
+            rows.append((
+                source, f"{seen.load:.1f}", f"{seen.backlog:.2f} s", seen.fits, seen.sets, f"{seen.first:.0f} s",
+                f"{errors} %",
+            ))  # fmt: skip
+            print(*rows[-1], sep=" | ", flush=True)
+    heads = (
+        "preset", "load", "largest backlog", "fits", "sets", "first set",
+        "largest error of b, d, J_xx, J_yy, J_zz, J_r",
+    )  # fmt: skip
+    told = f"{given.minutes:g} min of flight a preset, {RATE:g} Hz a channel, {os.cpu_count()} processors."
+    title, name = "The ROS node on a loaded machine", f"load {given.load:g}, {given.minutes:g} minutes"
+    put(given, "ros-load.md", title, name, [told, "", *table(heads, rows)])
 
 
 if __name__ == "__main__":

@@ -1,7 +1,10 @@
 """A running ArduCopter, flown through pymavlink, with `quadid serve` beside it: sets against the truth, and alarms.
 
     python -m quadid_evaluation.studies.sitl --binary build/sitl/bin/arducopter --defaults copter.parm \\
-        --frame frame.json --vehicle my.yaml [--truth b=1.94e-5 --truth J_xx=0.011 …] [--seconds 120]
+        --frame frame.json --vehicle my.yaml [--seconds 120] [b=1.94e-5 J_xx=0.011 …]
+
+The binary is ArduCopter built for SITL (waf configure --board sitl; waf copter), the defaults are such as
+Tools/autotest/default_params/copter.parm, the frame file is the .sitl.json of `quadid export --format ardupilot`.
 
 The plan: take off in Guided, hover, then move roll, pitch and yaw sticks in Loiter for `--seconds`, with multisines out
 of step.  The table has first and last set against the truth, and every alarm; nothing changes in flight, so that every
@@ -11,7 +14,6 @@ the file is copied into the folder that the binary runs in.
 
 from __future__ import annotations
 
-import argparse
 import shutil
 import subprocess
 import sys
@@ -27,10 +29,8 @@ from pymavlink import mavutil
 
 from quadid.flight.pilot import AXES, PILOT_STEP, Segment, scripted
 from quadid.types import FloatArray
-from quadid_evaluation.studies.autopilot.__main__ import TITLE, row, section
-from quadid_evaluation.studies.autopilot.flights import Flown, Outcome
-from quadid_evaluation.studies.autopilot.live import listen, stored
-from quadid_evaluation.studies.page import put_section
+from quadid_evaluation.harness import Given, options, put
+from quadid_evaluation.studies.autopilot import TITLE, Flown, Outcome, listen, row, section, stored
 
 PILOT, SERVICE = 5760, 5762
 """TCP ports of ArduPilot's first two serial ports."""
@@ -109,11 +109,11 @@ def _until(done: Callable[[], bool]) -> None:
         time.sleep(0.5)
 
 
-def flown(given: argparse.Namespace) -> Outcome:
+def flown(given: Given) -> Outcome:
     """Starts the autopilot and the service, flies, ends both; what the service had stored."""
     with tempfile.TemporaryDirectory() as folder:
         model = given.model
-        if given.frame is not None:
+        if given.frame != Path():
             shutil.copy(given.frame, Path(folder) / "frame.json")
             model = f"{given.model}:frame.json"
         history = Path(folder) / "history.sqlite"
@@ -145,34 +145,21 @@ def flown(given: argparse.Namespace) -> Outcome:
 
 def main() -> None:
     """Flies what was asked for and prints the table, or says why not."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument(
-        "--binary", type=Path, help="arducopter, built for SITL (waf configure --board sitl; waf copter)"
-    )
-    parser.add_argument("--defaults", type=Path, help="parameters, such as Tools/autotest/default_params/copter.parm")
-    parser.add_argument("--model", default="+", help="frame name of ArduPilot's simulator")
-    parser.add_argument(
-        "--frame", type=Path, help="frame file, as `quadid export --format ardupilot` writes it (.sitl.json)"
-    )
-    parser.add_argument("--vehicle", type=Path, help="vehicle file")
-    parser.add_argument("--truth", action="append", default=[], metavar="NAME=VALUE", help="a parameter that is known")
-    parser.add_argument("--seconds", type=float, default=120.0, help="of moved sticks")
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--out", type=Path, help="folder of the result page; default: print only")
-    given = parser.parse_args()
-    if given.binary is None:
+    given = options(
+        __doc__, words="NAME=VALUE of parameters that are known", binary=Path(), defaults=Path(), model="+",
+        frame=Path(), vehicle=Path(), seconds=120.0, seed=1,
+    )  # fmt: skip
+    if given.binary == Path():
         print("skipped: no ArduCopter binary is named (--binary)")
         return
     for name in ("defaults", "vehicle"):
-        if getattr(given, name) is None:
-            parser.error(f"--{name} is needed beside --binary")
-    truth = {name: float(value) for name, value in (text.split("=", 1) for text in given.truth)}
+        if getattr(given, name) == Path():
+            sys.exit(f"--{name} is needed beside --binary")
+    truth = {name: float(value) for name, value in (text.split("=", 1) for text in given.words)}
     one = Flown(given.binary.name, str(given.vehicle), truth)
     done = flown(given)
-    text = "\n".join([section("ArduCopter", "flown by this study", [row(one, done)], 1e9), *done.alarms])
-    print(text)
-    if given.out is not None:
-        put_section(given.out / "autopilot.md", TITLE, "ArduCopter SITL", text)
+    text = [section("ArduCopter", "flown by this study", [row(one, done)], 1e9), *done.alarms]
+    put(given, "autopilot.md", TITLE, "ArduCopter SITL", text)
 
 
 if __name__ == "__main__":

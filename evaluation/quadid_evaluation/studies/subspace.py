@@ -9,12 +9,7 @@ example, sampled at 10 Hz; an unstable plant under the controller that keeps it.
 
 from __future__ import annotations
 
-import argparse
-import os
-from pathlib import Path
 from typing import NamedTuple
-
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 from scipy.linalg import expm
@@ -23,6 +18,7 @@ from quadid.flight import fly
 from quadid.identification.noise import NoiseModel
 from quadid.types import ComplexArray, FloatArray
 from quadid.vehicle import Vehicle
+from quadid_evaluation.harness import options, table
 from quadid_evaluation.paper.black_box import BlackBox, score_black_box
 from quadid_evaluation.paper.quadrotor_io import FEEDTHROUGH, quadrotor_io
 from quadid_evaluation.paper.subspace import METHODS, Loop, fit_subspace
@@ -93,7 +89,7 @@ def unstable(dither: float) -> System:
 
 def poles(seeds: int) -> list[str]:
     """Markdown rows: pole errors of every system, method and form."""
-    rows = ["| system | method | closed | open |", "|---|---|---|---|"]
+    rows = []
     cases = (
         (resonance(), 0.1, ROWS), (two_masses(), 0.1, ROWS),
         (unstable(3.0), 1.0, 2 * ROWS), (unstable(0.3), 1.0, 2 * ROWS),
@@ -101,15 +97,15 @@ def poles(seeds: int) -> list[str]:
     for system, noise, count in cases:
         data = [system.run(np.random.default_rng([seed, 3]), count, noise) for seed in range(seeds)]
         for method in METHODS:
-            cells = []
+            cells = [f"{system.name}, {noise:.0%} noise", method]
             for loop in LOOPS:
                 direct = not system.feedback
                 models = [fit_subspace(method, u, y, len(system.A), PAST, FUTURE, loop, direct) for u, y in data]
                 errors = np.array([system.pole_error(m.poles) for m in models])
                 inside = int(np.count_nonzero(errors < ALLOWED))
                 cells.append(f"{100 * np.median(errors):.3f}, {100 * errors.max():.3f}, {inside}/{seeds}")
-            rows.append(f"| {system.name}, {noise:.0%} noise | {method} | " + " | ".join(cells) + " |")
-    return rows
+            rows.append(cells)
+    return table(("system", "method", *LOOPS), rows)
 
 
 def flights(seconds: float, orders: tuple[int, ...]) -> list[str]:
@@ -118,42 +114,33 @@ def flights(seconds: float, orders: tuple[int, ...]) -> list[str]:
     windows = [fly(pelican, seconds=seconds, seed=seed).window for seed in (1, 2, 3)]
     noise = NoiseModel.guess(9)
     inputs, outputs = quadrotor_io(windows[0])
-    rows = ["| method, order | sets 1 (train), 2, 3: " + " | ".join(LOOPS) + " |", "|---|" + "---|" * len(LOOPS)]
+    rows = []
     for order in orders:
         for method in METHODS:
-            cells = []
+            cells = [f"{method}, {order}"]
             for loop in LOOPS:
                 model = fit_subspace(method, inputs, outputs, order, loop=loop, feedthrough=FEEDTHROUGH)
                 box = BlackBox(model, 1)
                 cells.append(", ".join(f"{score_black_box(box, [w], pelican, noise):.2f}" for w in windows))
-            rows.append(f"| {method}, {order} | {' | '.join(cells)} |")
-    return rows
+            rows.append(cells)
+    return table(("method, order", f"sets 1 (train), 2, 3: {LOOPS[0]}", *LOOPS[1:]), rows)
 
 
-def main() -> None:
-    """Command line of the study."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seeds", type=int, default=20)
-    parser.add_argument("--seconds", type=float, default=500.0)
-    parser.add_argument("--out", type=Path, default=None)
-    options = parser.parse_args()
+if __name__ == "__main__":
+    given = options(__doc__, seeds=20, seconds=500.0)
     text = "\n".join([
         "# CVA and MOESP: poles of known systems, prediction of flights", "",
-        f"`python -m quadid_evaluation.studies.subspace --seeds {options.seeds} --seconds {options.seconds:g} "
+        f"`python -m quadid_evaluation.studies.subspace --seeds {given.seeds} --seconds {given.seconds:g} "
         f"--out docs/results`", "",
         "## Poles", "",
         f"{ROWS} rows a record ({2 * ROWS} under feedback); noise: innovations relative to the output without them. "
         "The order is given. Median and largest pole error [%], records within 1 %. quadid uses the form `closed`.", "",
-        *poles(options.seeds), "",
+        *poles(given.seeds), "",
         "## Flights", "",
-        f"Three simulated Pelican flights of {options.seconds:g} s under the stabiliser, fitted on the first; mean "
+        f"Three simulated Pelican flights of {given.seconds:g} s under the stabiliser, fitted on the first; mean "
         "squared error over 1 s relative to a perfect physical model.", "",
-        *flights(options.seconds, (12, 22)), "",
+        *flights(given.seconds, (12, 22)), "",
     ])  # fmt: skip
     print(text)
-    if options.out is not None:
-        (options.out / "subspace.md").write_text(text, encoding="utf-8")
-
-
-if __name__ == "__main__":
-    main()
+    if given.out is not None:
+        (given.out / "subspace.md").write_text(text, encoding="utf-8")

@@ -9,13 +9,7 @@ run alone replaces its own section of the page and leaves the others.
 
 from __future__ import annotations
 
-import argparse
-import multiprocessing
-import os
 from dataclasses import dataclass
-from pathlib import Path
-
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 
@@ -32,7 +26,7 @@ from quadid.identification.score import settle_states
 from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray
 from quadid.vehicle import ParameterPrior, Vehicle
-from quadid_evaluation.studies.page import put_section
+from quadid_evaluation.harness import pooled, study, table
 
 SEGMENT = 1.0
 NOISE_SCALES = (0.3, 1.0, 3.0)
@@ -91,38 +85,32 @@ def run(job: tuple[int, str, float, float]) -> Outcome:
     )
 
 
-def study(jobs: list[tuple[int, str, float, float]], processes: int) -> list[Outcome]:
-    """Runs all jobs in worker processes."""
-    with multiprocessing.get_context("spawn").Pool(processes) as pool:
-        return list(pool.imap(run, jobs, chunksize=4))
-
-
-def table(outcomes: list[Outcome]) -> str:
-    """Markdown table of efficiency and coverage."""
+def efficiency(outcomes: list[Outcome]) -> list[str]:
+    """Lines of a table of efficiency and coverage."""
     error, sigma = np.array([o.error for o in outcomes]), np.array([o.sigma for o in outcomes])
     limit = np.array([o.bound for o in outcomes])
     n = len(outcomes)
     inside = np.mean(np.abs(error) <= Z95 * sigma, axis=0)
-    rows = [
-        "| parameter | RMS error % | bound of one set of segments % | ratio | bias % ± s.e. | coverage % ± s.e. |",
-        "|---|---|---|---|---|---|",
-    ]
+    heads = (
+        "parameter", "RMS error %", "bound of one set of segments %", "ratio", "bias % ± s.e.", "coverage % ± s.e.",
+    )  # fmt: skip
+    rows = []
     for j, name in enumerate(NOMINAL_NAMES):
         rms, crb = np.sqrt(np.mean(error[:, j] ** 2)), np.sqrt(np.mean(limit[:, j] ** 2))
         normal = np.sqrt(np.mean((error[:, j] / limit[:, j]) ** 2))
         mean, spread = np.mean(error[:, j]), np.std(error[:, j]) / np.sqrt(n)
         cover = inside[j]
-        rows.append(
-            f"| {name} | {100 * rms:.4f} | {100 * crb:.4f} | {normal:.3f} | {100 * mean:.4f} ± {100 * spread:.4f} | "
-            f"{100 * cover:.1f} ± {100 * np.sqrt(max(cover * (1 - cover), 1e-9) / n):.1f} |"
-        )
-    return "\n".join(rows)
+        rows.append((
+            name, f"{100 * rms:.4f}", f"{100 * crb:.4f}", f"{normal:.3f}", f"{100 * mean:.4f} ± {100 * spread:.4f}",
+            f"{100 * cover:.1f} ± {100 * np.sqrt(max(cover * (1 - cover), 1e-9) / n):.1f}",
+        ))  # fmt: skip
+    return table(heads, rows)
 
 
 def excited(seeds: int, processes: int) -> str:
     """Section on efficiency and coverage."""
-    part = study([(s, "excited", 60.0, 1.0) for s in range(seeds)], processes)
-    return f"## {seeds} excited flights of 60 s\n\n{table(part)}"
+    part = pooled(run, [(s, "excited", 60.0, 1.0) for s in range(seeds)], processes)
+    return "\n".join([f"## {seeds} excited flights of 60 s", "", *efficiency(part)])
 
 
 def noise_levels(seeds: int, processes: int) -> str:
@@ -130,7 +118,7 @@ def noise_levels(seeds: int, processes: int) -> str:
 
     In a closed loop the inputs answer the noise, which biases a plain regression more the noisier the sensors are.
     """
-    parts = {x: study([(10_000 + s, "excited", 60.0, x) for s in range(seeds)], processes) for x in NOISE_SCALES}
+    parts = {x: pooled(run, [(10_000 + s, "excited", 60.0, x) for s in range(seeds)], processes) for x in NOISE_SCALES}
     text = [
         f"## Bias with noise: {seeds} flights of 60 s at three noise levels", "",
         f"Mean error in stated standard deviations (standard error {1.0 / np.sqrt(seeds):.2f}) of "
@@ -147,7 +135,7 @@ def noise_levels(seeds: int, processes: int) -> str:
 def status(seeds: int, processes: int) -> str:
     """Section on what is claimed where flights do not move enough."""
     profiles = ("hover", "one_axis", "roll_pitch")
-    parts = [study([(20_000 + s, profile, 60.0, 1.0) for s in range(seeds)], processes) for profile in profiles]
+    parts = [pooled(run, [(20_000 + s, profile, 60.0, 1.0) for s in range(seeds)], processes) for profile in profiles]
     text = [
         f"## Status in {seeds} flights of 60 s, and the bound [%]", "",
         "| parameter | " + " | ".join(profiles) + " |", "|---" * (len(profiles) + 1) + "|",
@@ -184,41 +172,19 @@ def memories(seeds: int, processes: int) -> str:
         "| time [s] | estimate: median (range) | gyro scale: coverage [%] | RMS error [sigma] |",
         "|---|---|---|---|",
     ]  # fmt: skip
-    with multiprocessing.get_context("spawn").Pool(processes) as pool:
-        for memory in MEMORIES:
-            part = pool.map(remembering, [(30_000 + s, memory) for s in range(seeds)])
-            z, found = np.array([error for error, _ in part]), np.array([time for _, time in part])
-            inside = 100.0 * np.mean(np.abs(z) <= Z95)
-            text.append(
-                f"| {memory:g} | {np.median(found):.2f} ({found.min():.2f} … {found.max():.2f}) | {inside:.1f} of "
-                f"{z.size} | {np.sqrt(np.mean(z**2)):.2f} |"
-            )
+    for memory in MEMORIES:
+        part = pooled(remembering, [(30_000 + s, memory) for s in range(seeds)], processes)
+        z, found = np.array([error for error, _ in part]), np.array([time for _, time in part])
+        inside = 100.0 * np.mean(np.abs(z) <= Z95)
+        text.append(
+            f"| {memory:g} | {np.median(found):.2f} ({found.min():.2f} … {found.max():.2f}) | {inside:.1f} of "
+            f"{z.size} | {np.sqrt(np.mean(z**2)):.2f} |"
+        )
     return "\n".join(text)
 
 
-PARTS = {"excited": excited, "noise": noise_levels, "status": status, "memory": memories}
-
-
-def main() -> None:
-    """Command line of the study."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--parts", default=",".join(PARTS))
-    parser.add_argument("--seeds", type=int, default=1000, help="flights of the part 'excited'")
-    parser.add_argument("--noise-seeds", type=int, default=200, help="flights a noise level")
-    parser.add_argument("--few", type=int, default=20, help="flights a profile of the part 'status'")
-    parser.add_argument("--memory-seeds", type=int, default=20, help="flights a memory of the attitude noise")
-    parser.add_argument("--processes", type=int, default=2)
-    parser.add_argument("--out", default="")
-    options = parser.parse_args()
-    counts = {
-        "excited": options.seeds, "noise": options.noise_seeds, "status": options.few, "memory": options.memory_seeds,
-    }  # fmt: skip
-    for name in options.parts.split(","):
-        text = PARTS[name](counts[name], options.processes)
-        print(text, flush=True)
-        if options.out:
-            put_section(Path(options.out) / "truth.md", "Truth: efficiency, coverage, bias, status", name, text)
-
-
 if __name__ == "__main__":
-    main()
+    study(__doc__, "truth.md", "Truth: efficiency, coverage, bias, status", {
+        "excited": lambda g: excited(g.seeds, g.processes), "noise": lambda g: noise_levels(g.noise_seeds, g.processes),
+        "status": lambda g: status(g.few, g.processes), "memory": lambda g: memories(g.memory_seeds, g.processes),
+    }, seeds=1000, noise_seeds=200, few=20, memory_seeds=20, processes=2)  # fmt: skip

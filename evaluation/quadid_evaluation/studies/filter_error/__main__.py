@@ -10,14 +10,9 @@ that is run alone replaces its own section of the page and leaves the others.
 
 from __future__ import annotations
 
-import argparse
-import multiprocessing
-import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 from quadid_replay.opening import open_log
@@ -31,6 +26,7 @@ from quadid.flight import draw_truth, fly
 from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray
 from quadid.vehicle import ParameterPrior, Vehicle
+from quadid_evaluation.harness import Given, options, pooled, put
 from quadid_evaluation.studies.filter_error.causes import search
 from quadid_evaluation.studies.filter_error.jobs import (
     BRIEF,
@@ -43,7 +39,6 @@ from quadid_evaluation.studies.filter_error.jobs import (
     lagging,
     of_window,
 )
-from quadid_evaluation.studies.page import put_section
 from quadid_evaluation.studies.truth import poor_guess
 
 EFFECTS = (
@@ -90,8 +85,7 @@ def table(rows: Sequence[tuple[str, FloatArray]]) -> list[str]:
 
 def simulated(gusty: bool, flights: int, processes: int) -> str:
     """Flights of drawn vehicles, guesses off by up to a third: ours and today's fit."""
-    with multiprocessing.get_context("spawn").Pool(processes) as pool:
-        found = list(pool.imap(exact, [(100 + seed, gusty) for seed in range(flights)]))
+    found = pooled(exact, [(100 + seed, gusty) for seed in range(flights)], processes)
     ours, today = np.array([f[0] for f in found]), np.array([f[1] for f in found])
     sizes = np.median([f[2] for f in found], axis=0)
     truth = "0.6, 0.3 m/s^2, 1.0, 0.3 rad/s^2" if gusty else "none"
@@ -140,8 +134,7 @@ def feedback(flights: int, processes: int) -> str:
         "|---|---|---|---|---|---|---|",
     ]  # fmt: skip
     for every, share, speed in ((10, 0.0, 0.0), (10, 0.2, 0.0), (10, 0.2, 0.005), (5, 0.2, 0.005), (50, 0.2, 0.005)):
-        with multiprocessing.get_context("spawn").Pool(processes) as pool:
-            found = np.array(list(pool.imap(fast_loop, [(s, every, share, speed) for s in range(flights)])))
+        found = np.array(pooled(fast_loop, [(s, every, share, speed) for s in range(flights)], processes))
         cells = []
         for which in (0, 1):
             error, sigma = found[:, which, 0, 2], found[:, which, 1, 2]
@@ -188,8 +181,7 @@ def late(flights: int, processes: int) -> str:
         "|---|---|---|---|---|",
     ]  # fmt: skip
     for lag in (0.0, 0.03, 0.04):
-        with multiprocessing.get_context("spawn").Pool(processes) as pool:
-            found = np.array(list(pool.imap(lagging, [(300 + s, lag) for s in range(flights)])))
+        found = np.array(pooled(lagging, [(300 + s, lag) for s in range(flights)], processes))
         for which, free in enumerate(("the six", "and the family")):
             error, sigma = found[:, which, 0, 2:4], found[:, which, 1, 2:4]
             lines.append(
@@ -208,8 +200,7 @@ def named(flights: int, processes: int) -> str:
     ]  # fmt: skip
     kinds = [("single", n) for n in range(flights)] + [("null", n) for n in range(max(flights // 6, 2))]
     jobs = [(group, n, gusty) for group, n in kinds for gusty in (False, True)]
-    with multiprocessing.get_context("spawn").Pool(processes) as pool:
-        found = list(pool.imap(caused, jobs))
+    found = pooled(caused, jobs, processes)
     for still, rough in zip(found[::2], found[1::2], strict=True):
         cells = [f"{'' if good else '**'}{name}{'' if good else '**'}"
                  for one in (still, rough) for good, name in ((one[1], one[3]), (one[2], one[4]))]  # fmt: skip
@@ -270,34 +261,21 @@ def speed() -> str:
     )
 
 
-def main() -> None:
-    """Runs the parts and writes the page."""
-    parser = argparse.ArgumentParser(prog="python -m quadid_evaluation.studies.filter_error", description=__doc__)
-    parser.add_argument("--out", type=Path, default=Path("docs/results"))
-    parser.add_argument("--flights", type=int, default=60)
-    parser.add_argument("--processes", type=int, default=2)
-    parser.add_argument("--data", type=Path, default=Path(os.environ.get("QUADID_DATA", "../shared/data")))
-    given_parts: Mapping[str, tuple[str, Callable[[argparse.Namespace], str]]] = {
-        "exact": ("Simulated flights, exact model", lambda g: simulated(False, g.flights, g.processes)),
-        "gusty": ("The same in gusts", lambda g: simulated(True, g.flights, g.processes)),
-        "guesses": ("Guesses far off", lambda g: guesses(max(g.flights // 3, 3))),
-        "loop": ("A loop faster than its log", lambda g: feedback(max(g.flights // 5, 4), g.processes)),
-        "late": ("A hidden motor lag", lambda g: late(max(g.flights // 10, 4), g.processes)),
-        "causes": ("Causes by innovations", lambda g: causes(max(g.flights // 2, 4), g.processes, g.data)),
-        "recorded": ("Recorded vehicles", lambda g: recorded(g.data)),
-        "speed": ("Speed", lambda g: speed()),
-    }
-    parser.add_argument("--parts", nargs="+", choices=list(given_parts), default=list(given_parts))
-    given = parser.parse_args()
-    for name in given.parts:
-        title, run = given_parts[name]
-        text = (
-            f"## {title}\n\n`python -m quadid_evaluation.studies.filter_error --parts {name} --flights "
-            f"{given.flights}`\n\n{run(given)}"
-        )
-        put_section(given.out / "filter-error.md", "Filter error beside today's fit", name, text)
-        print(text, flush=True)
-
+PARTS: Mapping[str, tuple[str, Callable[[Given], str]]] = {
+    "exact": ("Simulated flights, exact model", lambda g: simulated(False, g.flights, g.processes)),
+    "gusty": ("The same in gusts", lambda g: simulated(True, g.flights, g.processes)),
+    "guesses": ("Guesses far off", lambda g: guesses(max(g.flights // 3, 3))),
+    "loop": ("A loop faster than its log", lambda g: feedback(max(g.flights // 5, 4), g.processes)),
+    "late": ("A hidden motor lag", lambda g: late(max(g.flights // 10, 4), g.processes)),
+    "causes": ("Causes by innovations", lambda g: causes(max(g.flights // 2, 4), g.processes, g.data)),
+    "recorded": ("Recorded vehicles", lambda g: recorded(g.data)),
+    "speed": ("Speed", lambda g: speed()),
+}
 
 if __name__ == "__main__":
-    main()
+    given = options(__doc__, PARTS, flights=60, processes=2)
+    for part in given.parts:
+        title, run = PARTS[part]
+        command = f"`python -m quadid_evaluation.studies.filter_error --parts {part} --flights {given.flights}`"
+        lines = [f"## {title}", "", command, "", run(given)]
+        put(given, "filter-error.md", "Filter error beside today's fit", part, lines)

@@ -20,7 +20,7 @@ from quadid.identification.fit import FitOptions, fit
 from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
-from quadid_evaluation.studies.campaign.hidden_cases import cases, flown
+from quadid_evaluation.studies.campaign import cases, flown
 from quadid_evaluation.studies.filter_error import causes, loop
 from quadid_evaluation.studies.truth import poor_guess
 

@@ -5,10 +5,8 @@ python -m quadid_evaluation.studies.health.hours --hours 100 --out docs/results
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 
@@ -16,8 +14,8 @@ from quadid.condition.watch import HealthReport, HealthWatch
 from quadid.online import Session, SessionSettings
 from quadid.online.records import Action
 from quadid.vehicle import Vehicle
+from quadid_evaluation.harness import study
 from quadid_evaluation.studies.health.flights import Wrong, hover_blocks, hover_seconds
-from quadid_evaluation.studies.page import put_section
 
 FLIGHT, HISTORY, ONSET = 1200, 12, 60
 """Seconds of a flight; healthy flights before; second at which a loss begins."""
@@ -146,21 +144,7 @@ def soon(each: int) -> str:
     return "\n".join([*lines, _row("session", 0.1, each, lambda j: session.named(j, 0.1))])
 
 
-def main() -> None:
-    """Measures, prints and writes parts of the health page."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--out", type=Path, default=Path("docs/results"))
-    parser.add_argument("--hours", type=float, default=100.0, help="of the watch, second by second")
-    parser.add_argument("--session", type=float, default=10.0, help="hours of a whole session at 50 Hz")
-    parser.add_argument("--each", type=int, default=25, help="losses of each size")
-    parser.add_argument("--parts", nargs="+", choices=("online", "losses"), default=("online", "losses"))
-    chosen = parser.parse_args()
-    makers = {"online": lambda: quiet(chosen.hours, chosen.session), "losses": lambda: soon(chosen.each)}
-    for part in chosen.parts:
-        text = makers[part]()
-        put_section(chosen.out / "health.md", "Health: what changed in this vehicle", part, text)
-        print(text)
-
-
 if __name__ == "__main__":
-    main()
+    study(__doc__, "health.md", "Health: what changed in this vehicle", {
+        "online": lambda g: quiet(g.hours, g.session), "losses": lambda g: soon(g.each),
+    }, hours=100.0, session=10.0, each=25)  # fmt: skip

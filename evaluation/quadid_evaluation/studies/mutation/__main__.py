@@ -8,7 +8,6 @@ Judgements stand in `judged.yaml` beside this file, by function and changed line
 
 from __future__ import annotations
 
-import argparse
 import json
 import re
 import time
@@ -22,7 +21,8 @@ import yaml
 from mutmut.mutation.diff_apply import get_diff_for_mutant
 from mutmut.stats import status_by_exit_code
 
-from quadid_evaluation.studies.judged import judged as by_hand
+from quadid_evaluation.harness import judged as by_hand
+from quadid_evaluation.harness import options
 
 MUTATED = ("gate", "active_set", "session")
 """Modules of quadid/online that are spoilt (`[tool.mutmut]` in pyproject.toml)."""
@@ -40,16 +40,13 @@ class Survivor(NamedTuple):
 
 def main() -> None:
     """Writes the page."""
-    parser = argparse.ArgumentParser(prog="python -m quadid_evaluation.studies.mutation", description=__doc__)
-    parser.add_argument("--out", type=Path, default=Path("docs/results"), help="folder of mutation.md")
-    given = parser.parse_args()
     judged = yaml.safe_load(Path(__file__).with_name("judged.yaml").read_text(encoding="utf-8")) or {}
     counts, left = {}, {}
     for module in MUTATED:
         verdicts = outcome(module)
         counts[module] = Counter(verdicts.values())
         left[module] = [survivor(module, name, judged) for name, verdict in verdicts.items() if verdict in UNNOTICED]
-    where = given.out / "mutation.md"
+    where = options(__doc__).out / "mutation.md"
     where.write_text(page(counts, left) + by_hand(where), encoding="utf-8")
     open_ = sum(not s.judgement for found in left.values() for s in found)
     print(f"{sum(len(found) for found in left.values())} unnoticed, {open_} of them not judged yet")

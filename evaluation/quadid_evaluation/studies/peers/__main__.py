@@ -1,56 +1,31 @@
-"""`make peers`: other programs beside ours on the same data, part by part, into docs/results/peers.md."""
+"""`make peers`: other programs beside ours on the same data, part by part, into peers.md.
+
+`--seeds` flights a row are ours, `--peer-seeds` those of the others, which take ten times as long.  `--anew PROGRAM`
+repeats its simulated flights.
+"""
 
 from __future__ import annotations
 
-import argparse
 import json
-import os
-from collections.abc import Mapping
 from importlib.metadata import version
 from itertools import product
 from pathlib import Path
 
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-
-from quadid_evaluation.studies.page import put_section
+from quadid_evaluation.harness import Given, machine, options, put
 from quadid_evaluation.studies.peers import online, recipe, recorded, simulated
 
-PARTS = ("simulated", "recorded", "recipe", "online")
-PACKAGES = ("mujoco", "filterpy")
 
-
-def machine() -> str:
+def peers() -> str:
     """Peers' versions and machine, for the foot of a section."""
-    packages = ", ".join(f"{name} {version(name)}" for name in PACKAGES)
-    return f"_{packages}; {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}_"
+    return f"_{', '.join(f'{name} {version(name)}' for name in ('mujoco', 'filterpy'))}; {machine()}_"
 
 
-def main() -> None:
-    """Runs the parts asked for; simulated flights go on where their records stop."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--out", type=Path, default=Path("docs/results"))
-    parser.add_argument("--data", type=Path, default=Path(os.environ.get("QUADID_DATA", "../shared/data")))
-    parser.add_argument("--seeds", type=int, default=200, help="simulated flights a row, ours")
-    parser.add_argument("--peer-seeds", type=int, default=48, help="... the others, which take ten times as long")
-    parser.add_argument("--anew", default="", metavar="PROGRAM", help="do its simulated flights again")
-    parser.add_argument("parts", nargs="*", help=", ".join(PARTS))
-    given = parser.parse_args()
-    for part in given.parts or PARTS:
-        if part == "simulated":
-            most = dict.fromkeys(simulated.PROGRAMS, given.peer_seeds) | {simulated.OURS: given.seeds}
-            _simulated(given.out, most, given.anew)
-        elif part == "recorded":
-            _put(given.out, "recorded", recorded.section(given.data))
-        elif part == "recipe":
-            _put(given.out, "recipe", recipe.section(given.data))
-        else:
-            _put(given.out, "online", online.section())
-
-
-def _simulated(out: Path, most: Mapping[str, int], anew: str) -> None:
-    path = out / "peers.json"
+def flown(given: Given) -> list[str]:
+    """Simulated flights; they go on where their records stop."""
+    most = dict.fromkeys(simulated.PROGRAMS, given.peer_seeds) | {simulated.OURS: given.seeds}
+    path = (given.out or Path("docs/results")) / "peers.json"
     records = json.loads(path.read_text(encoding="utf-8")) if path.exists() else []
-    records = [r for r in records if r["program"] != anew]
+    records = [r for r in records if r["program"] != given.anew]
     done = {(r["case"], r["seed"], r["program"]) for r in records}
     todo = [
         key for seed in range(1, max(most.values()) + 1) for key in product(simulated.CASES, (seed,), most)
@@ -61,14 +36,15 @@ def _simulated(out: Path, most: Mapping[str, int], anew: str) -> None:
     for key in todo:
         records.append(simulated.record(*key))
         path.write_text("[\n" + ",\n".join(map(json.dumps, records)) + "\n]\n", encoding="utf-8")
-    _put(out, "simulated", simulated.section(records))
+    return simulated.section(records)
 
 
-def _put(out: Path, name: str, lines: list[str]) -> None:
-    text = "\n".join([*lines, "", machine()])
-    print(text, flush=True)
-    put_section(out / "peers.md", "Beside the peers", f"peers {name}", text)
-
+PARTS = {
+    "simulated": flown, "recorded": lambda g: recorded.section(g.data), "recipe": lambda g: recipe.section(g.data),
+    "online": lambda g: online.section(),
+}  # fmt: skip
 
 if __name__ == "__main__":
-    main()
+    given = options(__doc__, words=", ".join(PARTS), seeds=200, peer_seeds=48, anew="")
+    for part in given.words or PARTS:
+        put(given, "peers.md", "Beside the peers", f"peers {part}", [*PARTS[part](given), "", peers()])

@@ -19,8 +19,7 @@ from quadid.data.window import Window
 from quadid.online import OnlineDiagnosis, Publish, Session
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
-from quadid_evaluation.benchmarks.online.accuracy import CHANGE, CHANGE_AT, PELICAN, flown
-from quadid_evaluation.benchmarks.online.driving import drive, samples
+from quadid_evaluation.benchmarks.online import CHANGE, CHANGE_AT, PELICAN, drive, flown, samples
 from quadid_evaluation.studies.peers.simulated import guessed
 
 NAMES = ("b", "d", "J_xx", "J_yy", "J_zz")

@@ -20,7 +20,7 @@ from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray
 from quadid.vehicle import ParameterPrior, Vehicle
 from quadid_evaluation.studies import rotorpy_flight
-from quadid_evaluation.studies.foreign.sets import SETS
+from quadid_evaluation.studies.flight_sets import SETS
 from quadid_evaluation.studies.peers import mujoco_sysid
 
 SECONDS = 60.0

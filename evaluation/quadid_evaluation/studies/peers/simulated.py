@@ -18,7 +18,7 @@ from quadid.model.layout import Layout
 from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray
 from quadid.vehicle import ParameterPrior, Vehicle
-from quadid_evaluation.studies.calibration import proportion
+from quadid_evaluation.harness import share, table
 from quadid_evaluation.studies.peers import mujoco_sysid, output_error
 from quadid_evaluation.studies.peers.mujoco_sysid import Answer
 
@@ -94,14 +94,14 @@ def rounded(values: FloatArray) -> list[float]:
     return [float(f"{v:.5g}") for v in values]
 
 
-def table(records: Sequence[Record]) -> list[str]:
+def errors_table(records: Sequence[Record]) -> list[str]:
     """Markdown: one row a case and program; white noise, which differs little, is in the records only."""
-    rows = [
-        "| flights | program | seeds | median error b, d, J_xx, J_yy, J_zz, J_r [%] | 95 % intervals contain the truth "
-        "(exact binomial interval, parameters as if independent) | of b, d, J_xx, J_yy, J_zz, J_r [%] | "
-        "rate error after 0.5 s | processor [s] |",
-        "|---|---|---|---|---|---|---|---|",
-    ]
+    heads = (
+        "flights", "program", "seeds", "median error b, d, J_xx, J_yy, J_zz, J_r [%]",
+        "95 % intervals contain the truth (exact binomial interval, parameters as if independent)",
+        "of b, d, J_xx, J_yy, J_zz, J_r [%]", "rate error after 0.5 s", "processor [s]",
+    )  # fmt: skip
+    rows = []
     told = ""
     for case, program in product(list(CASES)[1:], PROGRAMS):
         mine = [r for r in records if (r["case"], r["program"]) == (case, program)]
@@ -112,12 +112,12 @@ def table(records: Sequence[Record]) -> list[str]:
         hold = np.abs(error) <= half
         each = ", ".join(f"{100.0 * v:.0f}" for v in hold.mean(axis=0))
         ahead, seconds = (float(np.median([r[k] for r in mine])) for k in ("ahead", "seconds"))
-        rows.append(
-            f"|{'' if case == told else f' {case}'} | {program} | {len(mine)} | {median} | "
-            f"{proportion(int(hold.sum()), hold.size)} | {each} | {ahead:.3f} | {seconds:.2f} |"
-        )
+        rows.append((
+            "" if case == told else case, program, len(mine), median, share(int(hold.sum()), hold.size), each,
+            f"{ahead:.3f}", f"{seconds:.2f}",
+        ))  # fmt: skip
         told = case
-    return rows
+    return table(heads, rows)
 
 
 def said(records: Sequence[Record]) -> str:
@@ -148,5 +148,5 @@ def section(records: Sequence[Record]) -> list[str]:
         "the measured state) and output error (`nlgreyest`'s method on scipy) receive the true sensor noise; quadid "
         "estimates it.",
         "",
-        *table(records), "", said(records),
+        *errors_table(records), "", said(records),
     ]  # fmt: skip

@@ -1,0 +1,397 @@
+"""The online service: accuracy, changes, silence in hover, repeatability, refits, load.
+
+    python -m quadid_evaluation.benchmarks.online --out docs/results
+    python -m quadid_evaluation.benchmarks.online --parts load --out docs/results
+
+A part that is measured alone leaves the others as they are; `load` needs the ROS extra.  Every number stands in
+`online.json`.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from quadid_node.service import ROUND_SECONDS, STEP_SECONDS, WORK_SECONDS, Service
+from quadid_node.worker import InlineWorker, ProcessWorker
+
+from quadid.data.window import Recording, Sample
+from quadid.flight import Flight, fly
+from quadid.identification.fit import FIT_SECONDS, FitOptions, fit
+from quadid.online import FitRequest, Job, JobReply, OnlineDiagnosis, Publish, Session, SessionSettings
+from quadid.online.records import Action
+from quadid.online.stream import SETTLE
+from quadid.parameters import NOMINAL_NAMES
+from quadid.vehicle import Vehicle
+from quadid_evaluation.benchmarks import ros_flight
+from quadid_evaluation.harness import Given, machine, options, table
+
+Work = Callable[[Job], JobReply]
+
+
+def samples(recording: Recording, shift: float = 0.0) -> Iterator[Sample]:
+    """All samples of a recording in time order, `shift` [s] later."""
+    every = [
+        (t, name, row)
+        for name, channel in recording.channels.items()
+        for t, row in zip(channel.t.tolist(), channel.values.tolist(), strict=True)
+    ]
+    every.sort(key=lambda entry: entry[0])
+    for t, name, row in every:
+        yield Sample(shift + t, name, tuple(row))
+
+
+def drive(session: Session, stream: Iterable[Sample], work: Work = Job.run) -> Iterator[Action]:
+    """Pushes samples one by one, does every job at once, and yields what the session says."""
+    for sample in stream:
+        session.push(sample)
+        yield from session.poll()
+        while session.running is not None:
+            session.deliver(work(session.running))
+            yield from session.poll()
+
+
+PELICAN = Vehicle.shipped("pelican")
+SECONDS = 60.0
+CHANGE = 0.15
+CHANGE_AT = 33.3
+FOUND_WITHIN, SIZE_WITHIN = 5.0, 0.10
+
+
+def flown(seconds: float, seed: int, profile: str = "excited", **effects: dict[str, float]) -> Flight:
+    """A Pelican flight."""
+    return fly(PELICAN, seconds=seconds, seed=seed, profile=profile, effects=effects)
+
+
+def against_batch(seeds: range) -> dict[str, Any]:
+    """The last estimate of 60 s against `quadid.identify` on the same 60 s, and both against the truth.
+
+    How far the batch moves when its flight begins a quarter of a segment later tells what it leaves open itself.
+    """
+    rows = []
+    for seed in seeds:
+        flight = flown(SECONDS + 1.0, seed)
+        actions = list(drive(Session(PELICAN), samples(flight.recording)))
+        sets = [a.item for a in actions if isinstance(a, Publish) and a.topic == "parameters"]
+        every = [a.item for a in actions if isinstance(a, Publish) and a.topic == "candidate"]
+        batch, later = (
+            fit([flight.window.slice(first, round(SECONDS * 50))], PELICAN, FitOptions()).parameters
+            for first in (0, round(0.24 * FIT_SECONDS * 50))
+        )
+        truth = flight.truth.parameters.as_dict()
+        last = every[-1].parameters
+        rows.append({
+            "seed": seed,
+            "first_set_at": sets[0].stop if sets else None,
+            "sets": len(sets),
+            "to_batch": {n: last[n].value / batch[n].value - 1.0 for n in NOMINAL_NAMES},
+            "to_truth": {n: last[n].value / truth[n] - 1.0 for n in NOMINAL_NAMES},
+            "batch_cut_later": {n: later[n].value / batch[n].value - 1.0 for n in NOMINAL_NAMES},
+            "batch_to_truth": {n: batch[n].value / truth[n] - 1.0 for n in NOMINAL_NAMES},
+            "sigma": {n: last[n].sigma / last[n].value for n in NOMINAL_NAMES},
+        })  # fmt: skip
+    return {"seconds": SECONDS, "flights": rows}
+
+
+def mass_changes(seeds: range) -> dict[str, Any]:
+    """Mass up or down by 15 % in flight: when it is known, and what it is said to be."""
+    rows = []
+    for seed in seeds:
+        fraction = CHANGE if seed % 2 == 0 else -CHANGE
+        flight = flown(CHANGE_AT + 8.0, seed, mass_change={"time": CHANGE_AT, "fraction": fraction})
+        actions = list(drive(Session(PELICAN), samples(flight.recording)))
+        found = [a for a in actions if isinstance(a, OnlineDiagnosis)]
+        finding = found[0].findings[0] if found and found[0].findings else None
+        rows.append({
+            "seed": seed,
+            "fraction": fraction,
+            "said": [f.effect for d in found for f in d.findings],
+            "after": found[0].t - CHANGE_AT if found else None,
+            "size": finding.values.get("fraction") if finding is not None else None,
+            "confident": finding.confident if finding is not None else None,
+        })  # fmt: skip
+    good = [r for r in rows if _hit(r)]
+    return {"at": CHANGE_AT, "flights": rows, "hits": len(good)}
+
+
+def _hit(row: dict[str, Any]) -> bool:
+    """Named mass_change within 5 s with its size within 10 %."""
+    if row["said"][:1] != ["mass_change"] or row["size"] is None:
+        return False
+    return bool(row["after"] <= FOUND_WITHIN and abs(row["size"] / row["fraction"] - 1.0) <= SIZE_WITHIN)
+
+
+def hover(seconds: float, seeds: range) -> dict[str, Any]:
+    """Ten minutes of hover: what is published, and how far any number in the session moved."""
+    rows = []
+    for seed in seeds:
+        flight = flown(seconds, seed, "hover")
+        session = Session(PELICAN)
+        actions = list(drive(session, samples(flight.recording)))
+        sets = [a for a in actions if isinstance(a, Publish)]
+        rows.append({
+            "seed": seed,
+            "seconds": seconds,
+            "published": sum(a.topic == "parameters" for a in sets),
+            "candidates": sum(a.topic == "candidate" for a in sets),
+            "diagnoses": sum(isinstance(a, OnlineDiagnosis) for a in actions),
+            "phase": session.status().phase.value,
+        })  # fmt: skip
+    return {"flights": rows}
+
+
+def hover_after_flight(seconds: float, seed: int) -> dict[str, Any]:
+    """Excited flight first, hover after it: the set in force must stay as it is, to the bit."""
+    first, quiet = flown(SECONDS, seed), flown(seconds, seed, "hover")
+    session = Session(PELICAN)
+    list(drive(session, samples(first.recording)))
+    before = session.active_set.in_force
+    later = list(drive(session, samples(quiet.recording, SECONDS + 3.0)))
+    after = session.active_set.in_force
+    same = (
+        before is not None and after is not None and np.array_equal(before.parameters.values, after.parameters.values)
+    )
+    published = sum(isinstance(a, Publish) and a.topic == "parameters" for a in later)
+    return {"seconds": seconds, "same_bits": bool(same), "published": published}
+
+
+DELAYS = {"attitude": 0.1, "rotor_speed": 0.3}
+"""How much later these channels come than the others [s]."""
+PACE = 10.0
+"""Times real time."""
+
+
+def outcome(item: Any) -> tuple[Any, ...]:
+    """Everything of a set that must be the same, to the bit."""
+    p = item.parameters
+    return item.state, item.reason, p.values.tobytes(), p.covariance.tobytes(), item.input_hash
+
+
+def run_live(service: Service, arriving: list[Sample]) -> list[tuple[Any, ...]]:
+    """Plays samples in the order of arrival at a pace, polling as a service does, until the last fit is back."""
+    out: list[tuple[Any, ...]] = []
+
+    def step() -> None:
+        out.extend(outcome(o.item) for o in service.step() if isinstance(o, Publish))
+
+    while not service.ready:
+        step()
+        time.sleep(0.02)
+    begin, first = time.monotonic(), arriving[0].t
+    for k, sample in enumerate(arriving):
+        service.push(sample)
+        if k % 20 == 0:
+            step()
+            time.sleep(max(begin + (sample.t - first) / PACE - time.monotonic(), 0.0))
+    while service.session.running is not None or service.session.status().backlog > 1.0:
+        step()
+        time.sleep(0.002)
+    return out
+
+
+def repeatability(seconds: float, seed: int) -> dict[str, Any]:
+    """Estimates of a live run and of its replay: how many, and whether all are the same to the bit."""
+    flight = flown(seconds, seed)
+    rng = np.random.default_rng(seed)
+    every = list(samples(flight.recording))
+    arrival = [s.t + DELAYS.get(s.channel, 0.0) + rng.exponential(0.02) for s in every]
+    arriving = [every[i] for i in np.argsort(arrival, kind="stable")]
+    settings = SessionSettings()
+    live_service = Service(PELICAN, settings, ProcessWorker(PELICAN))
+    try:
+        live = run_live(live_service, arriving)
+    finally:
+        live_service.close()
+    replayed = run_live(Service(PELICAN, settings, InlineWorker()), arriving)
+    return {"seconds": seconds, "estimates": len(live), "same_bits": live == replayed and len(live) > 0}
+
+
+def refits(seconds: float) -> dict[str, Any]:
+    """Time of warm refits of a 10 s window: of the processor, and by the clock."""
+
+    spent: list[tuple[bool, float, float]] = []
+
+    def timed(job: Job) -> JobReply:
+        wall, cpu = time.perf_counter(), time.process_time()
+        reply = job.run()
+        if isinstance(job, FitRequest):
+            spent.append((job.search, time.process_time() - cpu, time.perf_counter() - wall))
+        return reply
+
+    list(drive(Session(PELICAN), samples(flown(seconds, 4).recording), timed))
+    warm = np.array([(cpu, wall) for search, cpu, wall in spent if not search]) * 1e3
+    cold = [1e3 * cpu for search, cpu, _ in spent if search]
+    return {
+        "refits": len(warm), "cpu_ms": _spread(warm[:, 0]), "wall_ms": _spread(warm[:, 1]), "first_ms": cold[:1],
+        "load_average": os.getloadavg()[0],
+    }  # fmt: skip
+
+
+def _spread(values: np.ndarray[Any, np.dtype[np.float64]]) -> dict[str, float]:
+    return {"p50": float(np.median(values)), "p99": float(np.quantile(values, 0.99)), "max": float(values.max())}
+
+
+# --- The page
+
+
+Result = Mapping[str, Any]
+
+
+def page(results: Mapping[str, Any]) -> str:
+    """Markdown of all parts that were measured."""
+    out = [
+        "# The online service", "",
+        "`python -m quadid_evaluation.benchmarks.online --out docs/results`; every value is in `online.json`. Window "
+        "10 s, a refit every second, grid 50 Hz, Pelican.", "",
+    ]  # fmt: skip
+    for name, (title, _, write) in PARTS.items():
+        out += [f"## {title}", ""]
+        if (found := results.get(name)) is None:
+            out += ["Not measured.", ""]
+            continue
+        out += [*write(found["result"]), "", f"_{found['measured']}, load {found['machine'].rpartition(' ')[2]}_", ""]
+    return "\n".join(out)
+
+
+def _estimate(r: Result) -> list[str]:
+    flights = r["flights"]
+    first = [f["first_set_at"] for f in flights if f["first_set_at"] is not None]
+    rows = []
+    for n in NOMINAL_NAMES:
+        batch = _column(flights, "to_batch", n)
+        rows.append((
+            n, f"{_rms(batch):.3f}, {np.abs(batch).max():.3f}", f"{np.sum(np.abs(batch) <= 1.0)} of {len(batch)}",
+            f"{_rms(_column(flights, 'to_truth', n)):.3f}, {_rms(_column(flights, 'batch_to_truth', n)):.3f}",
+            f"{np.median(_column(flights, 'sigma', n)):.3f}",
+        ))  # fmt: skip
+    heads = (
+        "parameter", "online to batch: RMS, worst [%]", "within 1 %", "RMS error [%]: online, batch", "sigma [%]",
+    )  # fmt: skip
+    return [
+        f"{len(flights)} excited flights of {r['seconds']:.0f} s. First set published after {_median(first):.0f} s "
+        f"(median; {len(first)} of {len(flights)} flights published). Goal: within 1 % of the offline batch.", "",
+        *table(heads, rows),
+    ]  # fmt: skip
+
+
+def _column(flights: list[Result], what: str, name: str) -> np.ndarray[Any, np.dtype[np.float64]]:
+    return 100.0 * np.array([f[what][name] for f in flights])
+
+
+def _change(r: Result) -> list[str]:
+    flights = r["flights"]
+    after = [f["after"] for f in flights if f["after"] is not None]
+    sized = [f for f in flights if f["size"] is not None]
+    error = np.array([abs(f["size"] / f["fraction"] - 1.0) for f in sized]) * 100.0
+    named = sum(f["said"][:1] == ["mass_change"] for f in flights)
+    return [
+        f"Mass +15 % or −15 % at {r['at']} s of {len(flights)} excited flights. Named `mass_change` within 5 s with "
+        f"its size within 10 %: **{r['hits']} of {len(flights)}**. Named at all: {named}. Reported after "
+        f"{_median(after):.2f} s (median), {max(after, default=float('nan')):.2f} s (latest); size off by "
+        f"{np.median(error):.2f} % (median), {error.max():.2f} % (worst).",
+    ]  # fmt: skip
+
+
+def _hover(r: Result) -> list[str]:
+    total = {key: sum(f[key] for f in r["flights"]) for key in ("published", "candidates", "diagnoses")}
+    phases = ", ".join(dict.fromkeys(f["phase"] for f in r["flights"]))
+    lines = [
+        f"{len(r['flights'])} hovers of {r['flights'][0]['seconds']:.0f} s: {total['published']} sets published, "
+        f"{total['candidates']} estimates, {total['diagnoses']} diagnoses; at the end: {phases}."
+    ]
+    after = r["after_flight"]
+    same = "the same to the bit" if after["same_bits"] else "**changed**"
+    lines += [f"60 s excited, then {after['seconds']:.0f} s of hover: {after['published']} sets published in the "
+              f"hover, the set in force is {same}."]  # fmt: skip
+    return lines
+
+
+def _repeat(r: Result) -> list[str]:
+    same = "all the same to the bit" if r["same_bits"] else "**they differ**"
+    return [
+        f"{r['seconds']:.0f} s, samples out of order and up to 0.3 s late; fits in a process, then inline: "
+        f"{r['estimates']} estimates, {same}. Over DDS: `tests/node/test_ros_node.py`.",
+    ]  # fmt: skip
+
+
+def _refit(r: Result) -> list[str]:
+    cpu, wall = r["cpu_ms"], r["wall_ms"]
+    return [
+        f"{r['refits']} warm refits of a 10 s window: processor time p50 {cpu['p50']:.0f} ms, p99 {cpu['p99']:.0f} ms; "
+        f"wall time worst {wall['max']:.0f} ms. First fit with global search: {r['first_ms'][0]:.0f} ms. Goal: 250 ms.",
+    ]  # fmt: skip
+
+
+def _load(r: Result) -> list[str]:
+    return [
+        "IMU 1 kHz, attitude and rotor speeds 250 Hz, references and odometry 50 Hz, from another process. Every "
+        f"{1e3 * ROUND_SECONDS:g} ms waiting messages are processed in steps {1e3 * STEP_SECONDS:g} ms apart, which "
+        f"block services and timers; no piece of work begins after {1e3 * WORK_SECONDS:.1f} ms. The grid waits "
+        f"{1e3 * SETTLE:.0f} ms for the slowest channel. Goals: under 15 % of a core, steps below 5 ms (p99).", "",
+        *table(
+            ("run", "% of a core: node, fits", "IMU received %", "wait of a message p50, p99 [ms]",
+             "a step p50, p99 [ms]", "memory MiB"),
+            [
+                (name, f"{100 * x['cpu_node']:.1f}, {100 * x['cpu_worker']:.1f}", f"{100 * x['imu_received']:.2f}",
+                 _pair(x["fitting"]), _pair(x["step"]), f"{x['memory_begin']:.0f} → {x['memory_end']:.0f}")
+                for name, x in r.items()
+            ],
+        ),
+    ]  # fmt: skip
+
+
+def _pair(x: Result) -> str:
+    return f"{x['p50']:.2f}, {x['p99']:.2f}" if x["count"] else "–"
+
+
+def _rms(x: np.ndarray[Any, np.dtype[np.float64]]) -> float:
+    return float(np.sqrt(np.mean(x**2)))
+
+
+def _median(x: list[float]) -> float:
+    return float(np.median(x)) if x else float("nan")
+
+
+PARTS: dict[str, tuple[str, Callable[[Given], Any], Callable[[Result], list[str]]]] = {
+    "estimate": ("Sixty seconds of excited flight against the offline batch",
+                 lambda g: against_batch(range(g.flights)), _estimate),
+    "change": ("Mass changed by 15 % in flight", lambda g: mass_changes(range(g.flights)), _change),
+    "hover": ("Ten minutes of hover",
+              lambda g: {**hover(600.0, range(3)), "after_flight": hover_after_flight(600.0, 3)}, _hover),
+    "repeat": ("Live and replayed", lambda g: repeatability(60.0, 1), _repeat),
+    "refit": ("Refit of a 10 s window", lambda g: refits(120.0), _refit),
+    "load": ("Load", lambda g: {
+        "excited": ros_flight.under_load(g.load_seconds, "excited"),
+        "hover": ros_flight.under_load(g.load_seconds, "hover"),
+        "recording": ros_flight.under_load(g.load_seconds, "excited", record=True),
+    }, _load),
+}  # fmt: skip
+"""Title, measurement and lines of each part; memory over many hours is what the soak shows."""
+
+
+def keep(file: Path, name: str, result: object) -> dict[str, Any]:
+    """All results of a JSON file with this one in it, which is read anew: parts may be measured side by side."""
+    results = json.loads(file.read_text(encoding="utf-8")) if file.exists() else {}
+    results[name] = {"result": result, "measured": time.strftime("%Y-%m-%d"), "machine": machine()}
+    file.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
+    return dict(results)
+
+
+def main() -> None:
+    """Measures what was asked for."""
+    given = options(__doc__, PARTS, flights=40, load_seconds=60.0)
+    out = given.out or Path("docs/results")
+    for name in given.parts:
+        begin = time.monotonic()
+        results = keep(out / "online.json", name, PARTS[name][1](given))
+        (out / "online.md").write_text(page(results), encoding="utf-8")
+        print(f"{name}: {time.monotonic() - begin:.1f} s", flush=True)
+
+
+if __name__ == "__main__":
+    main()

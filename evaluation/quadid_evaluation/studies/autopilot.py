@@ -1,0 +1,325 @@
+"""`make autopilot`: recorded flights of autopilots through the online session, replayed and live.
+
+    python -m quadid_evaluation.studies.autopilot [--out docs/results] [--live] [WORD ...]
+
+Words choose the flights whose name holds one of them; `--live` plays telemetry logs into `quadid serve` in real time.
+"""
+
+from __future__ import annotations
+
+import json
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from itertools import chain, takewhile
+from pathlib import Path
+from typing import Any
+
+from quadid_node.messages import Output, set_to_dict
+from quadid_node.recording import stream
+from quadid_node.service import Service
+from quadid_node.settings import session_settings
+from quadid_node.worker import InlineWorker
+from quadid_replay import open_log
+from quadid_replay.tlog import read_frames
+
+from quadid.app.logs import load_vehicle
+from quadid.data.window import Sample
+from quadid.online import Event, Phase, Publish
+from quadid_evaluation.harness import options, put, table
+from quadid_evaluation.studies.readings import telemetry
+
+# --- The flights, what is known of them, and what a session that flew one of them is asked for
+
+
+SITL = "ardupilot_sitl"
+X = {"b": 4.24e-5, "J_xx": 0.02297, "J_yy": 0.02297, "J_zz": 0.04594}
+"""Truth of ArduPilot's default frame; b is the secant of its thrust curve at hover."""
+X_PWM = {**X, "b": 3.69e-5}
+"""The same where the vehicle file takes 1000 to 2000 us for 0 to 754 rad/s: the pulse that hovers stands for 446."""
+SQUARE = {"b": 1.983e-5, "J_xx": 0.018, "J_yy": 0.024, "J_zz": 0.036}
+
+
+@dataclass(frozen=True)
+class Flown:
+    """One flight.
+
+    Attributes:
+        log, vehicle: below the data folder; a vehicle that begins with ``studies`` is one of the repository.
+        truth: of the parameters that are known.
+        interval: the log as a live link would bring it, with rotor readings so far apart [s]; 0: as it is.
+        pulses: such a link brings motor outputs, not rotor speeds.
+    """
+
+    log: str
+    vehicle: str
+    truth: Mapping[str, float] = field(default_factory=dict)
+    interval: float = 0.0
+    pulses: bool = False
+
+    @property
+    def name(self) -> str:
+        """Log and vehicle file."""
+        told = "motor outputs" if self.pulses else "rotors"
+        thinned = f", {told} every {self.interval * 1e3:g} ms" if self.interval else ""
+        return f"{self.log} with {self.vehicle.rsplit('/', 1)[-1]}{thinned}"
+
+
+ARDUCOPTER = (
+    Flown(f"{SITL}/quad_sq.bin", f"{SITL}/quad_sq.yaml", SQUARE),
+    Flown(f"{SITL}/x.bin", f"{SITL}/sitl_x.yaml", X),
+    Flown(f"{SITL}/quad_sq.tlog", f"{SITL}/quad_sq.yaml", SQUARE),
+    Flown(f"{SITL}/x.tlog", f"{SITL}/sitl_x.yaml", X),
+    Flown(f"{SITL}/quad_sq_pwm.tlog", f"{SITL}/quad_sq_pwm.yaml", SQUARE),
+    Flown(f"{SITL}/quad_sq.tlog", f"{SITL}/quad_sq_pwm.yaml", SQUARE),
+    Flown(f"{SITL}/x.tlog", f"{SITL}/sitl_x_pwm.yaml", X_PWM),
+    Flown(f"{SITL}/x_zero_rpm.tlog", f"{SITL}/sitl_x_pwm.yaml", X_PWM),
+    *(Flown(f"{SITL}/x.bin", f"{SITL}/sitl_x.yaml", X, interval) for interval in (0.02, 0.0125)),
+    *(Flown(f"{SITL}/quad_sq.bin", f"{SITL}/quad_sq.yaml", SQUARE, interval) for interval in (0.02, 0.0125)),
+    Flown(f"{SITL}/x.bin", f"{SITL}/sitl_x_pwm.yaml", X_PWM, 0.0125, True),
+    Flown(f"{SITL}/quad_sq.bin", f"{SITL}/quad_sq_pwm.yaml", SQUARE, 0.0125, True),
+)
+"""A real autopilot in a simulator of others: the truth is known, and nothing changes in flight."""
+OTHERS = (
+    Flown("ardupilot/log171.bin", "evaluation/quadid_evaluation/studies/vehicles/log171.yaml"),
+    Flown("px4/ascend_cubeorange_test.ulg", "evaluation/quadid_evaluation/studies/vehicles/ascend.yaml"),
+    *(Flown(f"crazyflie_rpm/figure8_{n}.csv", "crazyflie_rpm/vehicle.yaml") for n in (17, 22, 27, 35)),
+    *(Flown(f"nanodrone/{k}_run1.csv", "nanodrone/vehicle.yaml") for k in ("chirp", "random", "square")),
+)
+"""Real flights without change: every alarm is false."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a session made of a flight.
+
+    Attributes:
+        published, candidates: sets as JSON, in order.
+        events: kind and text, with time.
+        status: the last one, phase and reason.
+        seconds: wall time.
+    """
+
+    published: list[dict[str, Any]]
+    candidates: list[dict[str, Any]]
+    events: list[dict[str, Any]]
+    status: str
+    seconds: float
+
+    @property
+    def alarms(self) -> list[str]:
+        """What was said to have changed."""
+        return [f"{e['t'] - self.begin:.0f} s: {e['text']}" for e in self.events if e["kind"] == "change"]
+
+    @property
+    def models(self) -> list[str]:
+        """What the model took in."""
+        return [f"{e['t'] - self.begin:.0f} s: {e['text']}" for e in self.events if e["kind"] == "model"]
+
+    @property
+    def begin(self) -> float:
+        """Beginning of the excited flight: the first data learned from; before any, that of the stream [s]."""
+        times = [s["start"] for s in (*self.candidates, *self.published) if s.get("start")]
+        return min(times, default=min((e["t"] for e in self.events if e["t"] is not None), default=0.0))
+
+    @property
+    def first(self) -> float | None:
+        """Excited flight before the first set [s]; None: nothing was published."""
+        return self.published[0]["stop"] - self.begin if self.published else None
+
+
+def errors_of(item: Mapping[str, Any], truth: Mapping[str, float]) -> list[str]:
+    """Error of each identified parameter whose truth is known; bold where it is wrong.
+
+    Wrong is: more than 3 % and outside its interval, or more than 10 %.
+    """
+    out = []
+    for p in item["parameters"]:
+        if p["name"] in truth and p["status"] == "identified":
+            off = p["value"] / truth[p["name"]] - 1.0
+            outside = not p["ci95"][0] <= truth[p["name"]] <= p["ci95"][1]
+            wrong = abs(off) > 0.10 or (outside and abs(off) > 0.03)
+            text = f"{p['name']} {off:+.1%}"
+            out.append(f"**{text}**" if wrong else text)
+    return out
+
+
+# --- A telemetry log played into `quadid serve`: its bytes over UDP, each at its receive time
+
+
+WARM = 120.0
+"""Longest wait for the fit process to be warm [s]."""
+LINGER = 5.0
+"""The service goes on this long after the last byte [s]."""
+
+
+def serve(log: Path, vehicle: Path, seconds: float) -> Outcome:
+    """Plays a telemetry log in real time into a `quadid serve` of its own, and reads its history.
+
+    Args:
+        log: telemetry log.
+        vehicle: vehicle file.
+        seconds: of the log to play at most.
+    """
+    begin = time.monotonic()
+    with tempfile.TemporaryDirectory() as folder, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as wire:
+        wire.bind(("127.0.0.1", 0))
+        port, history = _free_port(), Path(folder) / "history.sqlite"
+        command = [str(Path(sys.executable).with_name("quadid"))]
+        served = subprocess.Popen(
+            [*command, "serve", "--vehicle", str(vehicle), "--mavlink", f"udpin:127.0.0.1:{port}",
+             "--history", str(history)],
+            stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+        )  # fmt: skip
+        said, ready = list[str](), threading.Event()
+        listener = threading.Thread(target=listen, args=(served, said, ready), daemon=True)
+        listener.start()
+        try:
+            ready.wait(WARM)
+            _send(log, wire, port, seconds)
+            time.sleep(LINGER)
+        finally:
+            served.terminate()
+            served.wait(30)
+        listener.join(5)
+        return stored(vehicle, history, said, time.monotonic() - begin)
+
+
+def stored(vehicle: Path, history: Path, said: list[str], seconds: float) -> Outcome:
+    """Record that an ended service left in its history; `said`: its lines; `seconds`: how long it ran."""
+    told = subprocess.run(
+        [str(Path(sys.executable).with_name("quadid")), "history", "--vehicle", str(vehicle), "--history", str(history),
+         "--candidates", "10000", "--events", "10000", "--json", "-"],
+        capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    found = json.loads(told.stdout)
+    last = [line for line in said if " | Hz: " in line][-1:]
+    status = last[0].split(" | Hz: ")[0] if last else ""
+    return Outcome(found["sets"], found["candidates"], found["events"], status, seconds)
+
+
+def _free_port() -> int:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def listen(served: subprocess.Popen[str], said: list[str], ready: threading.Event) -> None:
+    """Keeps the lines of a service, and notes when it is ready."""
+    assert served.stdout is not None
+    for line in served.stdout:
+        said.append(line.rstrip())
+        if line.startswith("ready"):
+            ready.set()
+
+
+def _send(log: Path, wire: socket.socket, port: int, seconds: float) -> None:
+    """Sends every frame when it came, counted from the first; what is asked of the vehicle finds no ear."""
+    frames, begin = read_frames(log), time.monotonic()
+    for k, due in enumerate(frames.received - frames.received[:1]):
+        if due > seconds:
+            return
+        time.sleep(max(begin + due - time.monotonic(), 0.0))
+        wire.sendto(frames.frame(k), ("127.0.0.1", port))
+
+
+# --- The study
+
+
+TITLE = "Flights of real autopilots, online"
+COMMAND = "make autopilot"
+BATCH = 200
+"""Samples between two looks at the session."""
+
+
+def main() -> None:
+    """Flies what was asked for, prints each flight, writes the page."""
+    given = options(__doc__, words="parts of names of flights; all without", live=False, seconds=1e9)
+    way = "live" if given.live else "replay"
+    for kind, flights in (("ArduCopter", ARDUCOPTER), ("Others", OTHERS)):
+        rows = list[list[str]]()
+        for one in flights:
+            if given.words and not any(w in one.name for w in given.words):
+                continue
+            if given.live and not one.log.endswith(".tlog"):
+                continue
+            done = flown(one, given.data, given.live, given.seconds)
+            rows.append(row(one, done))
+            print(*rows[-1], sep=" | ", flush=True)
+            for text in (*done.models, *done.alarms):
+                print(f"    {text}", flush=True)
+        if rows:
+            put(given, "autopilot.md", TITLE, f"{kind} {way}", section(kind, way, rows, given.seconds))
+
+
+def flown(one: Flown, data: Path, live: bool, seconds: float) -> Outcome:
+    """One flight through the session."""
+    file = Path(one.vehicle) if one.vehicle.startswith("studies") else data / one.vehicle
+    if live:
+        return serve(data / one.log, file, seconds)
+    begin = time.monotonic()
+    vehicle = load_vehicle(str(file))
+    recording = open_log(str(data / one.log), "auto", vehicle.columns)
+    if one.interval:
+        recording = telemetry(recording, one.interval, one.pulses)
+    service = Service(vehicle, session_settings("auto", seed=0), InlineWorker())
+    outputs: list[Output] = []
+    for count, sample in enumerate(until(stream(recording), seconds)):
+        service.push(sample)
+        if count % BATCH == 0:
+            outputs += _worked(service)
+    outputs += _worked(service)
+    sets: dict[str, list[dict[str, Any]]] = {"parameters": [], "candidate": []}
+    for output in outputs:
+        if isinstance(output, Publish):
+            sets[output.topic].append(set_to_dict(output.item, covariance=False))
+    events = [{"t": o.t, "kind": o.kind, "text": o.text} for o in outputs if isinstance(o, Event)]
+    status = service.session.status()
+    said = f"{status.phase.value}: {status.reason}"
+    return Outcome(sets["parameters"], sets["candidate"], events, said, time.monotonic() - begin)
+
+
+def _worked(service: Service) -> list[Output]:
+    """Steps until the session needs more samples."""
+    out = service.step()
+    while service.session.running is not None:
+        out += service.step()
+    return out
+
+
+def until(samples: Iterator[Sample], seconds: float) -> Iterator[Sample]:
+    """The first `seconds` of a stream."""
+    first = next(samples)
+    return chain([first], takewhile(lambda s: s.t - first.t <= seconds, samples))
+
+
+def row(one: Flown, done: Outcome) -> list[str]:
+    """The cells of one flight."""
+    first = "none" if done.first is None else f"{done.first:.0f}"
+    wrong = sum("**" in " ".join(errors_of(s, one.truth)) for s in done.published) if one.truth else None
+    counts = [len(done.published), *([] if wrong is None else [wrong]), len(done.alarms)]
+    cells = [one.name, ", ".join(map(str, counts)), first]
+    if one.truth:
+        sets = (done.published[0], done.published[-1]) if done.published else ()
+        cells += ["; ".join(errors_of(s, one.truth)) for s in sets] or ["", ""]
+    ending = "" if done.status.startswith(Phase.ACCEPTED.value) else done.status
+    return [*cells, ending]
+
+
+def section(kind: str, way: str, rows: list[list[str]], seconds: float) -> str:
+    """Markdown of one kind of flights."""
+    truth = ["first set", "last set"] if kind == "ArduCopter" else []
+    counts = "sets, wrong ones, alarms" if truth else "sets, alarms"
+    heads = ["flight", counts, "excited flight to first set [s]", *truth, "at the end, unless a set is in force"]
+    how = f"`{COMMAND}`, {way}" + (" in real time through `quadid serve`" if way == "live" else "")
+    how += f"; the first {seconds:g} s of each log" if seconds < 1e9 else ""
+    return "\n".join([f"## {kind}, {way}", "", f"{how}; seed 0.", "", *table(heads, rows)])
+
+
+if __name__ == "__main__":
+    main()

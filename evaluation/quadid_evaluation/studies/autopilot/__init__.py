@@ -1,1 +1,0 @@
-"""Recorded flights of autopilots through the online session: estimates, alarms and waits."""

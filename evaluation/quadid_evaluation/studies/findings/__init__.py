@@ -1,1 +1,0 @@
-"""Inputs on which the product failed once: each with what is right, and what comes out now."""

@@ -1,1 +1,0 @@
-"""Vehicles and logs that nobody here flew or simulated: truth, what is answered, and how far plain learning gets."""

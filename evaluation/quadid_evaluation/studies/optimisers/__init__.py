@@ -1,1 +1,0 @@
-"""When is a particle swarm worth it?"""

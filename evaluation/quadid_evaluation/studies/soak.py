@@ -1,0 +1,255 @@
+"""Soak: a day of flight at accelerated time and an hour in real time; writes `soak.json` and `soak.md`.
+
+python -m quadid_evaluation.studies.soak --out docs/results
+python -m quadid_evaluation.studies.soak --parts live --seconds 3600 --out docs/results
+"""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Callable, Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from quadid_node.history import KEPT, Store
+from quadid_node.service import Service
+from quadid_node.worker import InlineWorker, Trouble
+
+from quadid.data.window import Block, Recording
+from quadid.online import Publish, SessionSettings
+from quadid.online.records import JobReply
+from quadid_evaluation.benchmarks import ros_flight
+from quadid_evaluation.benchmarks.online import PELICAN, flown, keep
+from quadid_evaluation.harness import judged, options
+
+FLIGHT, GROUND = 120.0, 5.0
+"""A flight of so long [s] over and over, with a pause of so long between two."""
+BATCH = 0.4
+"""Time between two looks at the session [s]: 20 messages at 50 Hz, as far as the node lets a topic run ahead."""
+
+
+class TimedWorker(InlineWorker):
+    """Fits inline, and keeps apart what the fits cost.
+
+    Attributes:
+        spent: processor time of all fits and diagnoses [s]; fits: how many.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.spent, self.fits = 0.0, 0
+
+    def poll(self) -> list[JobReply | Trouble]:
+        """Does what waits, and times it."""
+        begin = time.thread_time()
+        done = super().poll()
+        if done:
+            self.spent += time.thread_time() - begin
+            self.fits += len(done)
+        return done
+
+    def sibling(self) -> InlineWorker:
+        """Diagnoses count with the fits."""
+        return self
+
+
+def day(
+    hours: float, refit: float, diagnose: float, tell: Callable[[str], None], limit: float, kept: int
+) -> dict[str, Any]:  # fmt: skip
+    """Takes in `hours` of flight.
+
+    Args:
+        hours: flight time, pauses included.
+        refit: between two fits [s].
+        diagnose: between two diagnoses [s].
+        tell: takes a line now and then.
+        limit: stops after so much wall time [s] and says how far it came.
+        kept: candidates and events that the history keeps; fewer than in service, so that the limit is reached.
+
+    Returns:
+        One entry an hour of flight: memory, files, time a sample and a fit, samples sent, taken and dropped.
+    """
+    flight = batches(flown(FLIGHT, 3).recording)
+    begin, points = time.monotonic(), []
+    with tempfile.TemporaryDirectory() as folder:
+        worker = TimedWorker()
+        store = Store(Path(folder) / "history.sqlite", "pelican", {"candidates": kept, "events": kept})
+        service = Service(PELICAN, SessionSettings(refit=refit, diagnose=diagnose), worker, store)
+        tally = _Tally(service, worker, flight)
+        last = round(hours * 3600.0 / (FLIGHT + GROUND))
+        every = max(round(min(hours / 12.0, 1.0) * 3600.0 / (FLIGHT + GROUND)), 1)
+        for loop in range(last):
+            tally.fly(loop * (FLIGHT + GROUND))
+            over = time.monotonic() - begin > limit
+            if (loop + 1) % every and loop + 1 != last and not over:
+                continue
+            points.append(
+                {**tally.point(), "hours": (loop + 1) * (FLIGHT + GROUND) / 3600.0, "files_mib": _size(folder)}
+            )
+            tell(f"{points[-1]['hours']:.1f} h of flight, {points[-1]['memory_mib']:.0f} MiB")
+            if over:
+                break
+        service.close()
+    return {
+        "asked_hours": hours,
+        "refit": refit,
+        "diagnose": diagnose,
+        "kept": kept,
+        "wall_seconds": time.monotonic() - begin,
+        "points": points,
+    }
+
+
+def batches(recording: Recording) -> list[tuple[Block, ...]]:
+    """The recording as the node takes messages in: `BATCH` seconds of one channel, then of the next one."""
+    channels = recording.channels
+    begin, end = min(c.t[0] for c in channels.values()), max(c.t[-1] for c in channels.values())
+    edges = np.arange(begin, end + BATCH, BATCH)
+    places = {name: np.searchsorted(c.t, [*edges, np.inf]) for name, c in channels.items()}
+    made = (
+        tuple(
+            Block(c.t[p[k] : p[k + 1]], ((name, c.values[p[k] : p[k + 1]]),))
+            for (name, c), p in zip(channels.items(), places.values(), strict=True) if p[k + 1] > p[k]
+        )
+        for k in range(len(edges))
+    )  # fmt: skip
+    return [batch for batch in made if batch]
+
+
+class _Tally:
+    """Flies, and counts since the last point."""
+
+    def __init__(self, service: Service, worker: TimedWorker, flight: list[tuple[Block, ...]]) -> None:
+        self._service, self._worker, self._flight = service, worker, flight
+        self._size = sum(len(block.t) * len(block.columns) for batch in flight for block in batch)
+        self._sent = self._published = 0
+        self._sent_before = self._fits_before = 0
+        self._own = self._fits_spent = 0.0
+
+    def fly(self, shift: float) -> None:
+        """One flight, `shift` [s] later than the recording."""
+        service, spent = self._service, self._worker.spent
+        begin = time.thread_time()
+        for batch in self._flight:
+            for block in batch:
+                service.push(Block(block.t + shift, block.columns))
+            self._note(service.step())
+            while service.session.running is not None:
+                self._note(service.step())
+        self._sent += self._size
+        self._own += time.thread_time() - begin - (self._worker.spent - spent)
+
+    def _note(self, outputs: list[Any]) -> None:
+        self._published += sum(isinstance(o, Publish) and o.topic == "parameters" for o in outputs)
+
+    def point(self) -> dict[str, Any]:
+        """What was counted since the last point, and memory now."""
+        buffer, worker = self._service.session.resampler, self._worker
+        taken, dropped = sum(buffer.counts.values()), sum(buffer.faults.values())
+        out = {
+            "memory_mib": ros_flight.resident(), "sent": self._sent, "taken": taken, "dropped": dropped,
+            "us_a_sample": 1e6 * self._own / max(self._sent - self._sent_before, 1),
+            "ms_a_fit": 1e3 * (worker.spent - self._fits_spent) / max(worker.fits - self._fits_before, 1),
+            "fits": worker.fits, "published": self._published,
+        }  # fmt: skip
+        self._sent_before, self._fits_before = self._sent, worker.fits
+        self._own, self._fits_spent = 0.0, worker.spent
+        return out
+
+
+def slope(points: list[dict[str, Any]], name: str) -> float:
+    """Least-squares slope of a column over the last three quarters [1/h]; NaN for fewer than three points."""
+    late = [p for p in points if p["hours"] > 0.25 * points[-1]["hours"]]
+    if len(late) < 3:
+        return float("nan")
+    return float(np.polyfit([p["hours"] for p in late], [p[name] for p in late], 1)[0])
+
+
+def _size(folder: str) -> float:
+    return sum(f.stat().st_size for f in Path(folder).rglob("*") if f.is_file()) / 2**20
+
+
+Result = Mapping[str, Any]
+
+
+def page(results: Result) -> str:
+    """Markdown of the parts that were measured."""
+    out = [
+        "# Soak", "",
+        "`make soak`: session, fits, diagnoses and history in one process at accelerated time; the node over DDS with "
+        "its fit process in real time. Points over time are in `soak.json`.", "",
+    ]  # fmt: skip
+    for name, title, write in (
+        ("accelerated", "At accelerated time", _accelerated), ("live", "In real time", _live),
+    ):  # fmt: skip
+        found = results.get(name)
+        out += [f"## {title}", "", *(write(found["result"]) if found else ["Not measured."]), ""]
+        if found:
+            out += [
+                f"_{found['measured']}, load {found['machine'].partition('load ')[2].removeprefix('average ')}_",
+                "",
+            ]
+    return "\n".join(out)
+
+
+def _accelerated(r: Result) -> list[str]:
+    points = r["points"]
+    last = points[-1]
+    short = (
+        ""
+        if last["hours"] > 0.99 * r["asked_hours"]
+        else f", **stopped before the {r['asked_hours']:.0f} h asked for,**"
+    )
+    lines = [
+        f"**{last['hours']:.1f} h of flight**{short} in {r['wall_seconds'] / 60:.0f} min: {FLIGHT:.0f} s flown, "
+        f"{GROUND:.0f} s of silence, and again; {last['fits']} fits, a diagnosis every {r['diagnose']:.0f} s, "
+        f"{last['published']} sets published. The history keeps the newest {r['kept']} candidates and events here (in "
+        f"service {KEPT['candidates']} and {KEPT['events']}).", "",
+        f"Samples sent {last['sent']:,}, taken {last['taken']:,}, dropped {last['dropped']:,}: "
+        f"**{last['sent'] - last['taken'] - last['dropped']} lost**. Memory {last['memory_mib']:.0f} MiB at the end. "
+        f"Slopes over the last three quarters: memory {slope(points, 'memory_mib'):+.3f} MiB/h, files "
+        f"{slope(points, 'files_mib'):+.3f} MiB/h, processor time {slope(points, 'us_a_sample'):+.3f} us a sample per "
+        "hour.",
+    ]  # fmt: skip
+    return lines
+
+
+def _live(r: Result) -> list[str]:
+    points, minutes = r["points"], r["minutes"]
+    taken, sent = minutes[-1]["messages"], r["sent"]
+    lost = {t: n - taken.get(t, 0) for t, n in sent.items()}
+    p99 = np.array([m["p99"] for m in minutes if m["p99"] is not None])
+    third = max(len(p99) // 3, 1)
+    lines = [
+        f"**{points[-1]['hours'] * 60:.0f} min**; all inputs at 100 Hz, a fit every second, a diagnosis every minute: "
+        f"{minutes[-1]['fits']} fits, set {minutes[-1]['in_force']} in force at the end, exit code {r['exit_code']}, "
+        f"{len(r['problems'])} warnings or errors.", "",
+        f"Messages sent {sum(sent.values()):,}, taken {sum(taken.values()):,}; "
+        f"**lost: {', '.join(f'{t} {n}' for t, n in lost.items() if n) or 'none'}**; samples dropped by the session: "
+        f"{minutes[-1]['dropped'] or 'none'}. Slopes over the last three quarters: memory "
+        f"{slope(points, 'memory_mib'):+.2f} MiB/h, fit process {slope(points, 'worker_mib'):+.2f} MiB/h, files "
+        f"{slope(points, 'files_mib'):+.2f} MiB/h; handles {points[0]['handles']:.0f} → {points[-1]['handles']:.0f}. "
+        f"IMU latency p99: first third {np.median(p99[:third]):.0f} ms, last third {np.median(p99[-third:]):.0f} ms "
+        f"(load average {points[0]['load']:.0f} → {points[-1]['load']:.0f}).",
+    ]  # fmt: skip
+    if r["problems"]:
+        lines += ["", "Warnings: " + "; ".join(f"`{p[:160]}`" for p in r["problems"][:8])]
+    return lines
+
+
+PARTS: Mapping[str, Callable[[Any], dict[str, Any]]] = {
+    "accelerated": lambda g: day(g.hours, g.refit, g.diagnose, partial(print, flush=True), g.limit, g.kept),
+    "live": lambda g: ros_flight.flown(g.seconds, 100.0, "excited", False, 60.0, partial(print, flush=True)),
+}
+
+if __name__ == "__main__":
+    given = options(
+        __doc__, PARTS, hours=24.0, refit=10.0, diagnose=1800.0, kept=2000, limit=1e9, seconds=3600.0
+    )  # fmt: skip
+    where = (given.out or Path("docs/results")) / "soak.md"
+    for part in given.parts:
+        found = keep(where.with_suffix(".json"), part, PARTS[part](given))
+        where.write_text(page(found) + judged(where), encoding="utf-8")
