@@ -11,8 +11,10 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import hypothesis
 import pytest
 
+from tests.commands import inside as inside  # fixtures for every folder
+from tests.commands import quadid as quadid
 from tests.faults.evidence import Collector
-from tests.faults.evidence import happened as happened  # a fixture for every folder
+from tests.faults.evidence import happened as happened
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 LONG = ("diagnose", "online", "examples", "node", "cli", "identify", "health", "studies")

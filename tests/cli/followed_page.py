@@ -8,7 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from tests.cli.conftest import Cli
+from tests.commands import Cli
 
 
 def commands(page: Path, chapter: str = "") -> list[list[str]]:

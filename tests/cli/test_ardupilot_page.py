@@ -12,8 +12,8 @@ from typing import Any
 
 import pytest
 
-from tests.cli.conftest import Cli
 from tests.cli.followed_page import follow
+from tests.commands import Cli
 
 SQUARE = {"mass": 1.8, "b": 1.983e-5, "J_xx": 0.018, "J_yy": 0.024}
 X = {"mass": 3.0, "b": 4.24e-5, "J_xx": 0.02297, "J_yy": 0.02297}

@@ -13,7 +13,8 @@ import yaml
 from quadid_replay import write_tlog
 
 from quadid.vehicle import Vehicle
-from tests.cli.conftest import Cli, Flights, one_line, table, write_table
+from tests.cli.conftest import Flights, table, write_table
+from tests.commands import Cli, one_line
 from tests.faults.evidence import Happened
 
 

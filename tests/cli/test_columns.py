@@ -8,7 +8,8 @@ import pytest
 from quadid_replay import write_csv
 
 from quadid.app.excite import grouped
-from tests.cli.conftest import Cli, Flights
+from tests.cli.conftest import Flights
+from tests.commands import Cli
 
 COMMANDS = {
     "score": (), "replay": ("--diagnose", "0"), "excite": ("--seconds", "6.5"), "fleet": ("--workers", "1"),

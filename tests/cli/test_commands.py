@@ -12,7 +12,8 @@ from quadid_replay import write_csv
 
 from quadid.cli.commands import COMMANDS, load
 from quadid.vehicle import Command, Vehicle
-from tests.cli.conftest import Cli, Flights
+from tests.cli.conftest import Flights
+from tests.commands import Cli
 
 READING = "--rate --start --stop --preset --unchecked --columns"
 FIT = f"LOG --vehicle --validate --seed {READING} --report --series --json --out"

@@ -8,7 +8,8 @@ from typing import Any
 import pytest
 from quadid_evaluation.paper.comparison import METHODS
 
-from tests.cli.conftest import Cli, Flights, one_line, table, write_table
+from tests.cli.conftest import Flights, table, write_table
+from tests.commands import Cli, one_line
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ from quadid_replay import write_csv
 
 from quadid.flight import fly
 from quadid.vehicle import Vehicle
-from tests.cli.conftest import Cli
+from tests.commands import Cli
 
 
 def test_demo_finds_what_was_flown(quadid: Cli, tmp_path: Path) -> None:

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from quadid.cli.commands import COMMANDS, load
-from tests.cli.conftest import Cli
 from tests.cli.followed_page import commands
+from tests.commands import Cli
 
 
 @pytest.mark.slow

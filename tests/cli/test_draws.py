@@ -12,7 +12,7 @@ from quadid.app.outcome import json_text
 from quadid.app.simulate import simulate_draws
 from quadid.errors import ParameterError, VehicleError
 from quadid.vehicle import ParameterPrior, RandomForces, RandomInput, Vehicle
-from tests.cli.conftest import Cli, one_line
+from tests.commands import Cli, one_line
 
 RANDOM = RandomForces(
     horizontal=RandomInput(sigma=0.8, time=0.5), vertical=RandomInput(sigma=0.3, time=0.3),

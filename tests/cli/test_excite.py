@@ -17,7 +17,8 @@ from quadid.errors import ParameterError
 from quadid.flight import Segment, fly
 from quadid.parameters import NOMINAL_NAMES
 from quadid.vehicle import GRAVITY, Vehicle
-from tests.cli.conftest import Cli, Flights, one_line
+from tests.cli.conftest import Flights
+from tests.commands import Cli, one_line
 
 
 def test_a_manoeuvre_from_a_log_keeps_limits_and_promises(inside: Cli, flights: Flights, tmp_path: Path) -> None:

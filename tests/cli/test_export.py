@@ -16,7 +16,7 @@ from quadid.app.init import init as begin
 from quadid.errors import VehicleError
 from quadid.report.programs import FORMATS, export
 from quadid.vehicle import GRAVITY, Command, ParameterPrior, Proof, RandomForces, RandomInput, ResidualTerm, Vehicle
-from tests.cli.conftest import Cli, one_line
+from tests.commands import Cli, one_line
 
 SPEED = 900.0
 

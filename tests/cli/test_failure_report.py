@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.cli.conftest import Cli, Flights, one_line, table, write_table
+from tests.cli.conftest import Flights, table, write_table
+from tests.commands import Cli, one_line
 
 
 @pytest.mark.parametrize("command", ["identify", "diagnose"])

@@ -23,7 +23,7 @@ from quadid.cli.fleet import ClusterError, cluster, find_jobs, open_store, resul
 from quadid.errors import LogError, VehicleError
 from quadid.flight import fly
 from quadid.vehicle import Vehicle
-from tests.cli.conftest import Cli, one_line
+from tests.commands import Cli, one_line
 
 DAY_NS = 86_400 * 10**9
 

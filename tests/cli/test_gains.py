@@ -21,7 +21,7 @@ from quadid.report.autopilots import AUTOPILOTS
 from quadid.report.programs import export
 from quadid.types import FloatArray
 from quadid.vehicle import Command, ParameterPrior, Vehicle
-from tests.cli.conftest import Cli
+from tests.commands import Cli
 
 FULL = 800.0
 TRUTH = TruthParameters.of(Vehicle.shipped("pelican"))

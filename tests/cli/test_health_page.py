@@ -10,8 +10,8 @@ import pytest
 from quadid_evaluation.studies.health.flights import Wrong, hover
 
 from quadid.vehicle import GRAVITY, Vehicle
-from tests.cli.conftest import Cli
 from tests.cli.followed_page import commands
+from tests.commands import Cli
 from tests.replay import blackbox_writer as writer
 
 FLIGHTS = {"today": "controller_055", "a": "controller_067", "b": "controller_068", "c": "motor_144"}

@@ -13,7 +13,8 @@ import pytest
 
 from quadid.parameters import NOMINAL_NAMES, NOMINAL_UNITS
 from quadid.vehicle import Vehicle
-from tests.cli.conftest import Cli, Flights, Run, table, write_table
+from tests.cli.conftest import Flights, table, write_table
+from tests.commands import Cli, Run
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,8 @@ import pytest
 import quadid
 from quadid.app.init import init
 from quadid.vehicle import Vehicle
-from tests.cli.conftest import Cli, Flights, one_line
+from tests.cli.conftest import Flights
+from tests.commands import Cli, one_line
 
 
 def test_a_template_is_a_vehicle_and_says_what_to_fill_in(inside: Cli, tmp_path: Path) -> None:

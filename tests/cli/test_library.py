@@ -27,7 +27,8 @@ from quadid.identification.predict import start_errors
 from quadid.jsonable import jsonable
 from quadid.model.layout import Layout
 from quadid.vehicle import Vehicle
-from tests.cli.conftest import Cli, Flights
+from tests.cli.conftest import Flights
+from tests.commands import Cli
 
 WRITTEN = ("vehicle_file", "report", "files", "file", "log", "manoeuvre_file")
 """Paths of files, which only a command writes."""

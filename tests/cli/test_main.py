@@ -11,7 +11,7 @@ import pytest
 from quadid.cli.commands import COMMANDS
 from quadid.cli.main import BLAS_THREADS
 from quadid.version import __version__
-from tests.cli.conftest import Cli, one_line
+from tests.commands import Cli, one_line
 
 
 def test_help_lists_every_installed_command(quadid: Cli) -> None:

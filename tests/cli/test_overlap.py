@@ -14,7 +14,8 @@ import quadid
 from quadid.app.logs import Log, check_unseen
 from quadid.data.window import Recording
 from quadid.errors import LogError
-from tests.cli.conftest import Cli, Flights, one_line
+from tests.cli.conftest import Flights
+from tests.commands import Cli, one_line
 
 
 def load(path: Path | str) -> Log:

@@ -12,8 +12,8 @@ import pytest
 
 from quadid.flight import TruthParameters, fly
 from quadid.vehicle import Vehicle
-from tests.cli.conftest import Cli
 from tests.cli.followed_page import follow
+from tests.commands import Cli
 from tests.replay.px4_flight import px4_ulog
 
 PELICAN = Vehicle.shipped("pelican")

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from quadid.vehicle import Vehicle
-from tests.cli.conftest import Cli
 from tests.cli.followed_page import commands
+from tests.commands import Cli
 
 
 def test_commands_of_the_readme_work(

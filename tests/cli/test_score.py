@@ -12,7 +12,8 @@ import yaml
 import quadid
 from quadid.estimate import forecast
 from quadid.vehicle import Stabiliser, Vehicle
-from tests.cli.conftest import Cli, Flights, one_line, table, write_table
+from tests.cli.conftest import Flights, table, write_table
+from tests.commands import Cli, one_line
 
 QUANTITIES = ["position", "velocity", "rotation", "rate"]
 

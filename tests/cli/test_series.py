@@ -10,7 +10,8 @@ import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
-from tests.cli.conftest import Cli, Flights, one_line, table
+from tests.cli.conftest import Flights, table
+from tests.commands import Cli, one_line
 
 RATES = "pqr"
 

@@ -10,7 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.cli.conftest import QUADID, Cli, Flights
+from tests.cli.conftest import Flights
+from tests.commands import QUADID, Cli
 
 COLOUR = re.compile(r"\x1b\[[0-9;]*3[0-7]m")
 

@@ -13,7 +13,8 @@ from quadid.checks.motion import Spans, flying_spans
 from quadid.data.window import Recording
 from quadid.errors import LogError
 from quadid.vehicle import Vehicle
-from tests.cli.conftest import Cli, Flights, table, write_table
+from tests.cli.conftest import Flights, table, write_table
+from tests.commands import Cli
 
 
 @pytest.fixture(scope="module")

@@ -22,7 +22,7 @@ from rosbags.highlevel import AnyReader
 
 from quadid.flight import fly
 from quadid.vehicle import Vehicle
-from tests.cli.conftest import Cli
+from tests.commands import Cli
 
 ROOT = Path(__file__).resolve().parents[2]
 

@@ -8,7 +8,8 @@ import subprocess
 import sys
 from pathlib import Path
 
-from tests.cli.conftest import Cli, Flights
+from tests.cli.conftest import Flights
+from tests.commands import Cli
 
 ASK = "from quadid.app.kernels import FIT, missing; print(*missing(FIT))"
 SIGNATURES = """

@@ -12,7 +12,7 @@ import pytest
 from quadid_node.history import Store
 from quadid_node.messages import set_to_dict
 
-from tests.cli.conftest import Cli, inside
+from tests.commands import Cli, inside
 from tests.faults.evidence import Happened
 from tests.online.test_gate import TRUE, online_set
 

@@ -19,7 +19,7 @@ from quadid.data.window import Recording
 from quadid.errors import LogError, VehicleError
 from quadid.sanitise import LONGEST_LINE
 from quadid.vehicle import Vehicle
-from tests.cli.conftest import Cli, inside
+from tests.commands import Cli, inside
 from tests.faults.evidence import Happened
 from tests.fuzz.seeds import mcap_of
 from tests.online.test_gate import TRUE, online_set

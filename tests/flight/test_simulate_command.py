@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import socket
-import sys
 import threading
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -14,43 +11,21 @@ import pytest
 from quadid_replay import open_log
 
 from quadid.app.simulate import SimulateError, parse_effects, read_manoeuvre
-from quadid.cli.main import app_main
 from quadid.cli.simulate import check_target, stream
 from quadid.errors import ParameterError, VehicleError
 from quadid.flight import fly
 from quadid.vehicle import Vehicle
+from tests.commands import Cli, one_line
 
 PELICAN = Vehicle.shipped("pelican")
 
 
-Outcome = tuple[int, str, str]
-"""Exit code, stdout, stderr."""
-
-
-@pytest.fixture
-def quadid(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> Callable[..., Outcome]:
-    """Runs the command line in an empty folder."""
-
-    def run(*arguments: str) -> Outcome:
-        monkeypatch.chdir(tmp_path)
-        monkeypatch.setattr(sys, "argv", ["quadid", *arguments])
-        code = app_main()
-        told = capsys.readouterr()
-        return code, told.out, told.err
-
-    return run
-
-
 @pytest.mark.parametrize("suffix", ["csv", "mcap", "tlog"])
-def test_files(suffix: str, tmp_path: Path, quadid: Callable[..., Outcome]) -> None:
-    code, out, err = quadid(
-        "simulate", f"a.{suffix}", "--seconds", "5", "--seed", "7", "--effect", "rotor_drag:k_x=0.3,k_y=0.2",
+def test_files(suffix: str, tmp_path: Path, inside: Cli) -> None:
+    result = inside(
+        "simulate", tmp_path / f"a.{suffix}", "--seconds", "5", "--seed", "7", "--effect", "rotor_drag:k_x=0.3,k_y=0.2",
         "--json", "-",
-    )  # fmt: skip
-    assert code == 0, err
-    result = json.loads(out)
+    ).data  # fmt: skip
     assert result["schema"] == "quadid.simulate/1"
     assert result["effects"] == {"rotor_drag": {"k_x": 0.3, "k_y": 0.2}}
     assert result["log"] == str(tmp_path / f"a.{suffix}")
@@ -75,12 +50,10 @@ def test_files(suffix: str, tmp_path: Path, quadid: Callable[..., Outcome]) -> N
     ],
 )
 def test_refusals_are_one_line(
-    arguments: list[str], reason: str, tmp_path: Path, quadid: Callable[..., Outcome]
+    arguments: list[str], reason: str, tmp_path: Path, inside: Cli, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    code, _, err = quadid("simulate", *arguments)
-    assert code == 2
-    assert reason in err
-    assert len(err.strip().splitlines()) == 1
+    monkeypatch.chdir(tmp_path)
+    assert reason in one_line(inside("simulate", *arguments), 2)
     assert list(tmp_path.iterdir()) == []
 
 

@@ -35,7 +35,7 @@ from quadid.online.change_job import ChangeReply
 from quadid.online.records import OnlineFinding
 from quadid.vehicle import Vehicle
 from quadid_node import ground
-from tests.cli.conftest import QUADID
+from tests.commands import QUADID
 from tests.faults.evidence import Happened
 from tests.node.zenoh_net import Net, accepted, free_port, service, until
 from tests.online.driving import flight, samples

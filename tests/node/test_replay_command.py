@@ -3,51 +3,20 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
 
 import pytest
 from quadid_node.history import Store
 from quadid_replay import write_mcap
 from quadid_replay.mcap_file import McapFile
 
-from quadid.cli.main import app_main as main
 from quadid.online.records import OnlineSet, SetState
 from quadid.vehicle import Vehicle
+from tests.commands import Cli
 from tests.faults.evidence import Happened
 from tests.online.driving import flight
 from tests.online.test_gate import TRUE, online_set
-
-
-def quadid(*arguments: str) -> subprocess.CompletedProcess[str]:
-    program = Path(sys.executable).with_name("quadid")
-    return subprocess.run([str(program), *arguments], capture_output=True, text=True, check=False)
-
-
-class Ran(NamedTuple):
-    """What a command left when run in this process."""
-
-    code: int
-    out: str
-    err: str
-
-
-@pytest.fixture
-def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., Ran]:
-    """Runs a command in this process, which saves its start."""
-
-    def call(*arguments: str) -> Ran:
-        monkeypatch.setattr(sys, "argv", ["quadid", *arguments])
-        capsys.readouterr()
-        code = main()
-        told = capsys.readouterr()
-        return Ran(code, told.out, told.err)
-
-    return call
 
 
 @pytest.fixture(scope="module")
@@ -58,11 +27,9 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_a_log_gives_sets_findings_and_an_mcap(log: Path, tmp_path: Path, run: Callable[..., Ran]) -> None:
+def test_a_log_gives_sets_findings_and_an_mcap(log: Path, tmp_path: Path, quadid: Cli, inside: Cli) -> None:
     out = tmp_path / "published.mcap"
-    done = quadid("replay", str(log), "--vehicle", "pelican", "--out", str(out), "--json", "-")
-    assert done.returncode == 0, done.stderr
-    result: dict[str, Any] = json.loads(done.stdout)
+    result = quadid("replay", log, "--vehicle", "pelican", "--out", out, "--json", "-").data
     assert result["schema"] == "quadid.replay/1"
     assert [(s["state"], bool(s["outdated"])) for s in result["published"]] == [("accepted", False), ("accepted", True)]
     (diagnosis,) = result["diagnoses"]
@@ -79,23 +46,23 @@ def test_a_log_gives_sets_findings_and_an_mcap(log: Path, tmp_path: Path, run: C
     rest = {number for number, topic in file.topics.items() if topic.name != "quadid/health"}
     stamps = [ns for _, ns, _ in file.messages(rest)]
     assert min(stamps) >= 1_700_000_010 * 10**9
-    again = run("replay", str(log), "--vehicle", "pelican", "--json", "-")
+    again = inside("replay", str(log), "--vehicle", "pelican", "--json", "-")
     assert json.loads(again.out)["published"] == result["published"], "the same bits every time"
 
 
-def test_a_span_of_a_log_is_played(log: Path, run: Callable[..., Ran]) -> None:
-    done = run("replay", f"{log}@2:6", "--vehicle", "pelican", "--diagnose", "0", "--json", "-")
+def test_a_span_of_a_log_is_played(log: Path, inside: Cli) -> None:
+    done = inside("replay", f"{log}@2:6", "--vehicle", "pelican", "--diagnose", "0", "--json", "-")
     assert done.code == 3, "too short to publish anything, as the whole log does"
     assert json.loads(done.out)["published"] == []
-    whole = run("replay", f"{log}@2:6", "--vehicle", "pelican", "--as-recorded")
+    whole = inside("replay", f"{log}@2:6", "--vehicle", "pelican", "--as-recorded")
     assert whole.code == 2
     assert "a part; allowed: whole recordings" in whole.err
 
 
-def test_nothing_published_is_exit_code_3_with_the_reason(tmp_path: Path, run: Callable[..., Ran]) -> None:
+def test_nothing_published_is_exit_code_3_with_the_reason(tmp_path: Path, inside: Cli) -> None:
     path = tmp_path / "hover.mcap"
     write_mcap(path, flight(20.0, 7, "hover").recording)
-    done = run("replay", str(path), "--vehicle", "pelican")
+    done = inside("replay", str(path), "--vehicle", "pelican")
     assert done.code == 3
     assert "move too little" in done.out
 
@@ -110,58 +77,52 @@ def test_nothing_published_is_exit_code_3_with_the_reason(tmp_path: Path, run: C
         (("--rate", "1e9"), "rate"),
     ],
 )
-def test_wrong_usage_is_one_line_and_exit_code_2(
-    log: Path, arguments: tuple[str, ...], word: str, run: Callable[..., Ran]
-) -> None:
-    done = run("replay", str(log), "--vehicle", "pelican", *arguments)
+def test_wrong_usage_is_one_line_and_exit_code_2(log: Path, arguments: tuple[str, ...], word: str, inside: Cli) -> None:
+    done = inside("replay", str(log), "--vehicle", "pelican", *arguments)
     assert done.code == 2
     assert word in done.err
     assert len(done.err.strip().splitlines()) == 1
 
 
-def test_history_shows_what_was_stored(
-    tmp_path: Path, run: Callable[..., Ran], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_history_shows_what_was_stored(tmp_path: Path, inside: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "h.sqlite"
     store = Store(path, "pelican")
     store.numbered(replace(online_set(TRUE), sequence=1, approved_by="ann", reason="three windows agree"))
     store.close()
     monkeypatch.setenv("QUADID_HISTORY", str(path))
-    done = run("history", "--vehicle", "pelican", "--json", "-")
+    done = inside("history", "--vehicle", "pelican", "--json", "-")
     assert done.code == 0, done.err
     (entry,) = json.loads(done.out)["sets"]
     assert (entry["approved_by"], entry["reason"]) == ("ann", "three windows agree")
-    shown = run("history", "--vehicle", "pelican", "--history", str(path))
+    shown = inside("history", "--vehicle", "pelican", "--history", str(path))
     assert "ann" in shown.out
-    missing = run("history", "--vehicle", "pelican", "--history", str(tmp_path / "none"))
+    missing = inside("history", "--vehicle", "pelican", "--history", str(tmp_path / "none"))
     assert missing.code == 2
     assert "no history" in missing.err
 
 
-def test_a_vehicle_of_a_fleet_is_found_by_its_name_and_its_set_exported(
-    tmp_path: Path, run: Callable[..., Ran]
-) -> None:
+def test_a_vehicle_of_a_fleet_is_found_by_its_name_and_its_set_exported(tmp_path: Path, inside: Cli) -> None:
     path = tmp_path / "h.sqlite"
     store = Store(path, "quad1")
     store.numbered(replace(online_set(TRUE), sequence=1, approved_by="ann"))
     store.close()
-    told = run("history", "--vehicle", "quad1", "--history", str(path), "--json", "-")
+    told = inside("history", "--vehicle", "quad1", "--history", str(path), "--json", "-")
     assert [s["sequence"] for s in json.loads(told.out)["sets"]] == [1]
-    unknown = run("history", "--vehicle", "quad7", "--history", str(path))
+    unknown = inside("history", "--vehicle", "quad7", "--history", str(path))
     assert unknown.code == 2
     assert "quad1" in unknown.err
     where = ("--vehicle", "pelican", "--history", str(path), "--out", str(tmp_path))
-    done = run("export", *where, "--id", "quad1", "--json", "-")
+    done = inside("export", *where, "--id", "quad1", "--json", "-")
     assert done.code == 0, done.err
     (file,) = json.loads(done.out)["files"]
     exported = Vehicle.from_yaml(Path(file).read_text(encoding="utf-8"))
     assert exported.parameters["b"].initial == pytest.approx(TRUE["b"], rel=1e-6)
     assert exported.parameters["b"].sigma is not None
     assert "set 1 of quad1" in Path(file).read_text(encoding="utf-8")
-    other = run("export", *where)
+    other = inside("export", *where)
     assert other.code == 2
     assert "one of: quad1" in other.err
-    assert "--history" in run("export", "--vehicle", "pelican", "--id", "quad1").err
+    assert "--history" in inside("export", "--vehicle", "pelican", "--id", "quad1").err
 
 
 def history_of(path: Path, *items: OnlineSet) -> Path:
@@ -187,25 +148,25 @@ DOUBTFUL = {
 
 @pytest.mark.parametrize("case", list(DOUBTFUL))
 def test_a_set_that_is_not_in_force_is_exported_only_when_insisted(
-    case: str, tmp_path: Path, run: Callable[..., Ran], happened: Happened
+    case: str, tmp_path: Path, inside: Cli, happened: Happened
 ) -> None:
     items, why = DOUBTFUL[case]
     path = history_of(tmp_path / "h.sqlite", *items)
     out = tmp_path / "out"
     where = ("--vehicle", "pelican", "--history", str(path), "--out", str(out))
-    refused = run("export", *where)
+    refused = inside("export", *where)
     assert refused.code == 2
     assert why in refused.err
     assert "--anyway" in refused.err
     assert not list(out.glob("*"))
-    done = run("export", *where, "--anyway", "--json", "-")
+    done = inside("export", *where, "--anyway", "--json", "-")
     assert done.code == 0, done.err
     told = json.loads(done.out)
     assert why in told["warnings"][-1]
     first = Path(told["files"][0]).read_text(encoding="utf-8").splitlines()[0]
     assert first.startswith("# NOT PROVEN: ")
     assert why in first
-    shown = run("history", "--vehicle", "pelican", "--history", str(path), "--json", "-")
+    shown = inside("history", "--vehicle", "pelican", "--history", str(path), "--json", "-")
     assert why in json.loads(shown.out)["in_force"]["doubt"]
     # The service takes up none of these as it is: one rule for all who read a history.
     store = Store(path, "pelican")
@@ -215,10 +176,10 @@ def test_a_set_that_is_not_in_force_is_exported_only_when_insisted(
     happened(36, f"export of a set {case}: '{refused.err.strip()[:100]}'")
 
 
-def test_a_set_in_force_is_exported_without_a_word(tmp_path: Path, run: Callable[..., Ran]) -> None:
+def test_a_set_in_force_is_exported_without_a_word(tmp_path: Path, inside: Cli) -> None:
     path = history_of(tmp_path / "h.sqlite", replace(GOOD, outdated="thrust stepped"), GOOD)
-    done = run("export", "--vehicle", "pelican", "--history", str(path), "--out", str(tmp_path), "--json", "-")
+    done = inside("export", "--vehicle", "pelican", "--history", str(path), "--out", str(tmp_path), "--json", "-")
     assert done.code == 0, done.err
     assert not [text for text in json.loads(done.out)["warnings"] if "set 2" in text]
-    shown = run("history", "--vehicle", "pelican", "--history", str(path), "--json", "-")
+    shown = inside("history", "--vehicle", "pelican", "--history", str(path), "--json", "-")
     assert json.loads(shown.out)["in_force"] == {"sequence": 2, "doubt": ""}

@@ -11,9 +11,9 @@ from quadid_replay import write_csv
 
 from quadid.app.inspect import channel_table, parameter_outlook_table
 from quadid.checks import inspect
-from quadid.cli.main import app_main
 from quadid.data.window import Recording
 from quadid.parameters import NOMINAL_NAMES
+from tests.commands import Cli, one_line
 from tests.replay.synthetic import Flight
 
 
@@ -24,40 +24,32 @@ def log(tmp_path: Path) -> Path:
     return path
 
 
-def run(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
-    monkeypatch.setattr("sys.argv", ["quadid", "inspect", *arguments])
-    return app_main()
-
-
-def test_tables_for_people(log: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(monkeypatch, str(log)) == 0
-    out = capsys.readouterr().out
+def test_tables_for_people(log: Path, inside: Cli) -> None:
+    out = inside("inspect", log).out
     for text in ("gyro", "rate (Hz)", "gravity", "J_xx", "usable for identification"):
         assert text in out
     assert "[bold]" not in out
 
 
-def test_json_alone_on_stdout(log: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(monkeypatch, str(log), "--vehicle", "pelican", "--json", "-") == 0
-    result = json.loads(capsys.readouterr().out)
+def test_json_alone_on_stdout(log: Path, inside: Cli) -> None:
+    result = inside("inspect", log, "--vehicle", "pelican", "--json", "-").data
     assert result["schema"] == "quadid.inspect/1"
     assert result["log"] == str(log)
     assert {row["name"] for row in result["excitation"]} == {"b", "d", "J_xx", "J_yy", "J_zz", "J_r"}
     assert all(row["relative_sigma"] > 0 for row in result["excitation"])
 
 
-def test_files_are_named_by_absolute_path(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_files_are_named_by_absolute_path(log: Path, inside: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(log.parent)
-    assert run(monkeypatch, "flight.csv", "--json", "result.json", "--out", "written") == 0
+    assert inside("inspect", "flight.csv", "--json", "result.json", "--out", "written").code == 0
     result = json.loads((log.parent / "result.json").read_text())
     (written,) = result["files"]
     assert Path(written).is_absolute()
     assert json.loads(Path(written).read_text())["schema"] == "quadid.inspect/1"
 
 
-def test_a_span_of_the_log(log: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(monkeypatch, f"{log}@2:5", "--json", "-") == 0
-    assert json.loads(capsys.readouterr().out)["seconds"] == pytest.approx(3.0, abs=0.05)
+def test_a_span_of_the_log(log: Path, inside: Cli) -> None:
+    assert inside("inspect", f"{log}@2:5", "--json", "-").data["seconds"] == pytest.approx(3.0, abs=0.05)
 
 
 @pytest.mark.parametrize(
@@ -70,33 +62,20 @@ def test_a_span_of_the_log(log: Path, monkeypatch: pytest.MonkeyPatch, capsys: p
         (["{log}@100:"], "nothing after 100.0 s; allowed: a span inside the log, 0.0 to "),
     ],
 )
-def test_bad_input_is_one_line_and_exit_2(
-    log: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], arguments: list[str], text: str
-) -> None:
-    code = run(monkeypatch, *(a.format(log=log) for a in arguments))
-    captured = capsys.readouterr()
-    assert code == 2
-    assert text in captured.err
-    assert captured.err.count("\n") == 1
-    assert captured.out == ""
+def test_bad_input_is_one_line_and_exit_2(log: Path, inside: Cli, arguments: list[str], text: str) -> None:
+    assert text in one_line(inside("inspect", *(a.format(log=log) for a in arguments)), 2)
 
 
-def test_control_characters_of_a_log_do_not_reach_the_terminal(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_control_characters_of_a_log_do_not_reach_the_terminal(tmp_path: Path, inside: Cli) -> None:
     recording = Flight().recording(seconds=5.0)
     path = tmp_path / "evil\x1b[31m[bold]name.csv"
     write_csv(path, Recording(recording.name, "csv", recording.channels))
-    assert run(monkeypatch, str(path)) == 0
-    assert "\x1b" not in capsys.readouterr().out
+    assert "\x1b" not in inside("inspect", path).out
 
 
-def test_a_single_sample_has_no_rate(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_single_sample_has_no_rate(tmp_path: Path, inside: Cli) -> None:
     (tmp_path / "one.csv").write_text("t,p,q,r\n0,0,0,0\n0.02,x,0,0\n", encoding="utf-8")
-    assert run(monkeypatch, str(tmp_path / "one.csv")) == 0
-    shown = capsys.readouterr()
+    shown = inside("inspect", tmp_path / "one.csv")
     out = " ".join(f"{shown.out} {shown.err}".split())
     assert "nan" not in out
     assert "one sample is too little" in out
@@ -114,23 +93,18 @@ def test_motion_is_not_told_where_the_rotors_come_too_slowly() -> None:
         assert [row[2] for row in table.rows].count("0.1 %") == shown
 
 
-def test_times_for_people_are_those_of_a_span(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_times_for_people_are_those_of_a_span(tmp_path: Path, inside: Cli) -> None:
     """The clock of this log began 1000 s before it: what is printed can be asked for as LOG@from:to."""
     flown = Flight().recording(seconds=10.0)
     booted = {name: replace(c, t=c.t + 1000.0) for name, c in flown.channels.items()}
     path = tmp_path / "late.csv"
     write_csv(path, replace(flown, channels=booted))
-    assert run(monkeypatch, str(path), "--vehicle", "pelican") == 0
-    out = capsys.readouterr().out
+    out = inside("inspect", path, "--vehicle", "pelican").out
     assert "flying from-to (s): 0.0-10.0" in out
     assert "1000.0" not in out
-    assert run(monkeypatch, f"{path}@2:5") == 0
-    assert "flying from-to (s): 2.0-5.0" in capsys.readouterr().out
-    monkeypatch.setattr("sys.argv", ["quadid", "identify", f"{path}@1002:1005", "--vehicle", "pelican"])
-    assert app_main() == 2
-    assert "nothing to use between 1002 and 1005 s; allowed: 0.0 to 10.0 s after its first" in capsys.readouterr().err
+    assert "flying from-to (s): 2.0-5.0" in inside("inspect", f"{path}@2:5").out
+    refused = inside("identify", f"{path}@1002:1005", "--vehicle", "pelican")
+    assert "nothing to use between 1002 and 1005 s; allowed: 0.0 to 10.0 s after its first" in one_line(refused, 2)
 
 
 def test_a_long_source_stays_where_it_says_what_the_motors_are() -> None:
