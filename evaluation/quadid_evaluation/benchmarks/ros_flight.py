@@ -26,10 +26,6 @@ from typing import Any
 
 import numpy as np
 
-from quadid.data.window import Channel, Recording
-from quadid.flight import fly
-from quadid.vehicle import Vehicle
-
 THIS_MACHINE = {
     "ROS_AUTOMATIC_DISCOVERY_RANGE": "SYSTEM_DEFAULT",
     "FASTRTPS_DEFAULT_PROFILES_FILE": str(Path(__file__).parents[3] / "quadid_node" / "config" / "loopback.xml"),
@@ -49,8 +45,12 @@ _LAST_DOUBLE = struct.Struct("<d")
 # --- The vehicle
 
 
-def recording(seconds: float, rate: float, profile: str) -> Recording:
-    """A Pelican flight; at `FAST`, IMU apart, with slower channels."""
+def recording(seconds: float, rate: float, profile: str) -> Any:
+    """A Pelican flight as a recording; at `FAST`, IMU apart, with slower channels."""
+    from quadid.data.window import Channel, Recording  # not for the node, whose memory is measured
+    from quadid.flight import fly
+    from quadid.vehicle import Vehicle
+
     extras = ["velocity"] if rate == FAST else []
     flight = fly(
         Vehicle.shipped("pelican"), seconds=seconds, seed=4, profile=profile, log_rate=rate, extras=extras

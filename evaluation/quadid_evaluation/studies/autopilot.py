@@ -50,7 +50,7 @@ class Flown:
     """One flight.
 
     Attributes:
-        log, vehicle: below the data folder; a vehicle that begins with ``studies`` is one of the repository.
+        log, vehicle: below the data folder, or a path of its own.
         truth: of the parameters that are known.
         interval: the log as a live link would bring it, with rotor readings so far apart [s]; 0: as it is.
         pulses: such a link brings motor outputs, not rotor speeds.
@@ -85,9 +85,10 @@ ARDUCOPTER = (
     Flown(f"{SITL}/quad_sq.bin", f"{SITL}/quad_sq_pwm.yaml", SQUARE, 0.0125, True),
 )
 """A real autopilot in a simulator of others: the truth is known, and nothing changes in flight."""
+_VEHICLES = Path(__file__).parent / "vehicles"
 OTHERS = (
-    Flown("ardupilot/log171.bin", "evaluation/quadid_evaluation/studies/vehicles/log171.yaml"),
-    Flown("px4/ascend_cubeorange_test.ulg", "evaluation/quadid_evaluation/studies/vehicles/ascend.yaml"),
+    Flown("ardupilot/log171.bin", f"{_VEHICLES}/log171.yaml"),
+    Flown("px4/ascend_cubeorange_test.ulg", f"{_VEHICLES}/ascend.yaml"),
     *(Flown(f"crazyflie_rpm/figure8_{n}.csv", "crazyflie_rpm/vehicle.yaml") for n in (17, 22, 27, 35)),
     *(Flown(f"nanodrone/{k}_run1.csv", "nanodrone/vehicle.yaml") for k in ("chirp", "random", "square")),
 )
@@ -259,7 +260,7 @@ def main() -> None:
 
 def flown(one: Flown, data: Path, live: bool, seconds: float) -> Outcome:
     """One flight through the session."""
-    file = Path(one.vehicle) if one.vehicle.startswith("studies") else data / one.vehicle
+    file = data / one.vehicle
     if live:
         return serve(data / one.log, file, seconds)
     begin = time.monotonic()
