@@ -112,17 +112,17 @@ class Effect:
 
     @property
     def timed(self) -> bool:
-        """Whether it begins at an unknown moment."""
+        """Checks whether it begins at an unknown moment."""
         return any(p.name == "time" for p in self.parameters)
 
     @property
     def turns(self) -> bool:
-        """Whether angular acceleration shows it, from which a moment of inertia is estimated."""
+        """Checks whether angular acceleration shows it, from which a moment of inertia is estimated."""
         return any("':" in s or s.endswith("_dot") for s in self.shows)
 
     @property
     def needs_fast_rotors(self) -> bool:
-        """Whether a rotor signal too slow for inertias hides it: a lag or delay is over before the next sample."""
+        """True if a rotor signal too slow for inertias hides it: a lag or delay is over before the next sample."""
         return self.family == "late"
 
     @property
@@ -143,7 +143,7 @@ class Effect:
 
     @property
     def start(self) -> tuple[float, ...]:
-        """Where a search over `entries` begins; none: at neutral."""
+        """Start of a search over `entries`; none: at neutral."""
         start = tuple(p.start for p in self.parameters if p.name != "time" and not p.optional)
         return start if any(start) else ()
 

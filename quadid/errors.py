@@ -7,6 +7,7 @@ Every error states what was found, what is allowed and what to do about it.  The
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Iterable
 
 from quadid.sanitise import one_line
@@ -57,11 +58,24 @@ class NotIdentifiableError(QuadidError):
     exit_code = 3
 
 
+FOREIGN_UNIT = re.compile(
+    r"rpm|dps|degrees|(?<![a-z])(deg|rev|ms|us|ns|g|mm|cm|km|kmh|kph|mph|ft|inch|pct|percent)(?![a-z])", re.IGNORECASE
+)
+"""Units in names of others that no name of ours has."""
+
+
 def nearest(name: str, valid: Iterable[str]) -> str:
-    """Returns ``did you mean 'x'?`` for the valid name closest to `name`, or the list of valid names."""
+    """Returns ``did you mean 'x'?`` for the valid name closest to `name`, or the list of valid names.
+
+    A name that carries a unit of its own, as ``max_rpm``, is told that ours are in SI units.
+    """
     options = list(valid)
     close = difflib.get_close_matches(name, options, n=1, cutoff=0.5)
-    return f"did you mean '{close[0]}'?" if close else _one_of(", ".join(options))
+    if not close:
+        return _one_of(", ".join(options))
+    unit = FOREIGN_UNIT.search(name)
+    in_si = f", in SI units, not {unit[0]}" if unit and not FOREIGN_UNIT.search(close[0]) else ""
+    return f"did you mean '{close[0]}'{in_si}?"
 
 
 def _one_of(options: str) -> str:

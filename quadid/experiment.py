@@ -39,7 +39,7 @@ MIXES = (
     ("roll", "pitch", "yaw"), ("roll", "pitch", "yaw", "throttle"),
 )  # fmt: skip
 AMPLITUDES = {"roll": (0.1, 0.35), "pitch": (0.1, 0.35), "yaw": (0.3, 1.5), "throttle": (0.07, 0.15)}
-"""Where the search for the largest amplitude within limits begins, and ends at the latest: rad rms, fraction of hover
+"""Start and latest end of the search for the largest amplitude within limits: rad rms, fraction of hover
 thrust."""
 SWEEP = (0.5, 3.5)
 """Frequencies of sweeps of one axis at a time [Hz], lowest and highest."""
@@ -50,7 +50,7 @@ FASTEST = 500.0
 
 @dataclass(frozen=True)
 class Limits:
-    """What a manoeuvre must not exceed: tilt [rad], body rate [rad/s]."""
+    """Limits of a manoeuvre: tilt [rad], body rate [rad/s]."""
 
     tilt: float
     rate: float

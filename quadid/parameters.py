@@ -14,7 +14,7 @@ from quadid.types import FloatArray
 
 
 class Status(StrEnum):
-    """What the data determine of one parameter."""
+    """Status of one parameter: what the data determine."""
 
     IDENTIFIED = "identified"
     RATIO_ONLY = "ratio_only"
@@ -29,7 +29,7 @@ AT_BOUND = 1e-3
 
 
 def at_bound(value: float, low: float, high: float) -> bool:
-    """Whether `value` rests on one of its bounds; a bound of zero has the scale of the other one."""
+    """Checks whether `value` rests on one of its bounds; a bound of zero has the scale of the other one."""
     scale = (abs(low) or abs(high), abs(high) or abs(low))
     return value <= low + AT_BOUND * scale[0] or value >= high - AT_BOUND * scale[1]
 
@@ -190,7 +190,7 @@ class ParameterSet:
 INERTIAS = ("J_xx", "J_yy", "J_zz")
 """Principal moments of inertia."""
 INERTIA_SLACK = 3.0
-"""How far a guess may break the triangle inequality.  The paper's own Table 2 breaks it by 24 % (J_zz = 0.0292 against
+"""Largest breach of the triangle inequality.  The paper's own Table 2 breaks it by 24 % (J_zz = 0.0292 against
 J_xx + J_yy = 0.0236) and a first guess may be off by half, so only a breach beyond any such guess is a wrong file."""
 
 

@@ -94,7 +94,7 @@ class Rotor(Strict):
 
 
 class Command(Strict):
-    """What the rotor columns of a log mean.
+    """Meaning of the rotor columns of a log.
 
     Attributes:
         kind: ``rotor_speed`` [rad/s], ``normalized`` [0..1], ``thrust`` [0..1, proportional to thrust, where the
@@ -200,7 +200,7 @@ class RandomInput(Strict):
 
 
 class RandomForces(Strict):
-    """What acts on the vehicle at random, beyond its model, in body axes.
+    """Random forces on the vehicle, beyond its model, in body axes.
 
     Attributes:
         horizontal, vertical: specific force along x and y, along z, sigma in m/s^2.
@@ -306,12 +306,12 @@ SIGNALS: dict[str, str] = {
     "v_x": "m/s", "v_y": "m/s", "v_z": "m/s", "p": "rad/s", "q": "rad/s", "r": "rad/s", "g_x": "", "g_y": "",
     "g_z": "", "T": "N", "W": "rad/s", "V": "m/s",
 }  # fmt: skip
-"""What may be multiplied, with units, all in body axes (FRD): velocity through the air, rates, direction of gravity,
+"""Factors of a term, with units, all in body axes (FRD): velocity through the air, rates, direction of gravity,
 thrust and speeds of all rotors together, airspeed.  In the order of `quadid.model.body_kernel`, after the one."""
 TARGETS: dict[str, str] = {
     "force_x": "N", "force_y": "N", "force_z": "N", "moment_x": "N m", "moment_y": "N m", "moment_z": "N m",
 }  # fmt: skip
-"""What a term acts on, with units: force and moment in body axes at the centre of gravity."""
+"""Targets of a term, with units: force and moment in body axes at the centre of gravity."""
 MOST_FACTORS = 3
 """Signals in one product, at most."""
 MOST_TERMS = 500
@@ -381,7 +381,7 @@ class FittedFlight(Strict):
 
 
 class Proof(Strict):
-    """What shows that the values of this file predict.
+    """Proof that the values of this file predict.
 
     Attributes:
         verdict: on the result that the file was written by: good (green), fair (amber), poor (red).
@@ -604,7 +604,7 @@ class Vehicle(Strict):
 
     @property
     def bounds(self) -> FloatArray:
-        """Where to look for the six: the file's bounds, else a factor of 4 each way, shape (6, 2)."""
+        """Search range of the six: the file's bounds, else a factor of 4 each way, shape (6, 2)."""
         return np.array([self.parameters[n].limits for n in NOMINAL_NAMES])
 
     def limits(self, name: str) -> tuple[float, float]:
@@ -681,7 +681,7 @@ class Vehicle(Strict):
 
 
 def _first_problem(error: ValidationError) -> tuple[str, str]:
-    """What is wrong first of all, and what to do about it."""
+    """First problem of a file, and what to do about it."""
     details = error.errors()
     detail = next((d for d in details if d["type"] == "extra_forbidden"), details[0])  # a slip explains what is missing
     place = ".".join(str(part) for part in detail["loc"])

@@ -44,7 +44,7 @@ class Compared(Reported):
 
     @property
     def verdict(self) -> Verdict:
-        """Which predicts better, and by how much."""
+        """Better file, and by how much."""
         result = self.result
         low, high = result["ci95"]
         span = f"Ratio of errors B / A {number(result['ratio'], 3)}, 95 % {number(low, 3)} to {number(high, 3)}"

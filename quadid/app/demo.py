@@ -24,7 +24,7 @@ HIDDEN_SECTION = "A second vehicle, with something hidden in it"
 
 @dataclass(frozen=True)
 class Shown:
-    """What the demonstration produced.
+    """Results of the demonstration.
 
     Attributes:
         identified: from the first flights.

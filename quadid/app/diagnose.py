@@ -35,7 +35,7 @@ LEAST_REMOVED = 0.3
 
 @dataclass(frozen=True, repr=False)
 class Diagnosed(Fitted):
-    """What a diagnosis found.
+    """Result of a diagnosis.
 
     Attributes:
         result: of the form ``quadid.diagnose/1``; ``vehicle_file`` is None until a file is written.
@@ -74,7 +74,7 @@ class Diagnosed(Fitted):
 
     @property
     def verdict(self) -> Verdict:
-        """Whether the model may be used, and what to do next."""
+        """Checks whether the model may be used, and what to do next."""
         from quadid.report.fit_pages import diagnose_verdict
 
         return diagnose_verdict(self.result)
@@ -122,7 +122,7 @@ class Diagnosed(Fitted):
         return render(page)
 
     def maps(self) -> dict[str, ResidualMap]:
-        """What every cause looks like in the residual of the diagnosed logs, by name of the effect."""
+        """Picture of every cause in the residual of the diagnosed logs, by name of the effect."""
         from quadid.report.residual_maps import residual_map
 
         windows = [w for log in self.train for w in log.windows]

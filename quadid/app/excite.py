@@ -1,4 +1,4 @@
-"""Which manoeuvre to fly next, and what it would gain."""
+"""Next manoeuvre to fly, and its gain."""
 
 from __future__ import annotations
 

@@ -99,7 +99,7 @@ def _opened(job: Job, cut: LogPart) -> tuple[Vehicle, Recording]:
 
 
 def _seen(recording: Recording, vehicle: Vehicle, doubts: Sequence[str]) -> Row:
-    """What a flight shows whether or not anything can be fitted to it; its trim where it flew steadily."""
+    """Facts of a flight, whether or not anything can be fitted to it; its trim where it flew steadily."""
     from quadid.condition.trim import flight_to_dict, flight_trim
 
     row: Row = {

@@ -199,7 +199,7 @@ def date(seconds: float) -> str:
 
 
 def summary_sections(summary: Json) -> list[JsonDict]:
-    """What `summarise` found, a section a kind; none for kinds without a row."""
+    """Findings of `summarise`, a section a kind; none for kinds without a row."""
     head, tables = ("Parameter", "Median", "Unit", "Spread", "Flights"), list[JsonDict]()
     for unit in summary["units"][:MOST_ROWS]:
         rows = [
@@ -312,7 +312,7 @@ class Fleet(Reported):
 
     @property
     def verdict(self) -> Verdict:
-        """How many logs gave an answer, which vehicles have changed by their last flight, and what needs attention."""
+        """Number of logs with an answer, which vehicles have changed by their last flight, and what needs attention."""
         summary, health = self.result, self.result["health"]
         counts = summary["counts"]
         total, done = sum(counts.values()), counts.get("done", 0)
@@ -379,7 +379,7 @@ class Fleet(Reported):
 
     @property
     def sentences(self) -> list[Cell]:
-        """What kept logs from an answer, and how much was done."""
+        """Reasons that kept logs from an answer, and how much was done."""
         told = [f"{r['logs']} {r['status']}: {r['reason']}" for r in self.result["reasons"][:10]]
         done = f"{self.result['worked']} of {self.result['logs']} logs worked on in {self.result['seconds']:.1f} s"
         return [Cell(text) for text in (*told, done)]
@@ -406,7 +406,7 @@ class Fleet(Reported):
 
 
 def _when(logs: Sequence[Json]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Where each log lies on an axis of time, and that axis.
+    """Place of each log on an axis of time, and that axis.
 
     Dates of files are mostly those of a copy: then flights are counted, in the order of their dates and names.
     """
@@ -462,7 +462,7 @@ def _health(rows: Sequence[Json], logs: Sequence[Json]) -> dict[str, Any] | None
 
 
 def _changes_of(own: Sequence[Json]) -> tuple[str, ...]:
-    """How many flights of a vehicle have changed, the first and last of them, and what had at the last; or nothing."""
+    """Changed flights of a vehicle: their number, first and last, and what had changed at the last; or nothing."""
     changed = [row for row in own if has_changed(row)]
     if not changed:
         return ()

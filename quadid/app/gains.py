@@ -170,7 +170,7 @@ def loop_table(result: Json) -> TextTable:
 
 
 def used_table(result: Json) -> TextTable:
-    """What the gains rest on."""
+    """Basis of the gains."""
     heads = (("number", False), ("value", True), ("95 % interval", True))
     columns = (*(Column(text, right) for text, right in heads), Column("from", rank=1))
     rows = []

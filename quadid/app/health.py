@@ -32,7 +32,7 @@ LEAST_THRUST = 0.25
 
 @dataclass(frozen=True, repr=False)
 class HealthOutcome(Reported):
-    """What changed.
+    """Changes.
 
     Attributes:
         result: of the form ``quadid.health/1``.
@@ -202,7 +202,7 @@ def _distinct(tested: Sequence[Recording], healthy: Sequence[Recording]) -> None
 
 
 def _overlap(one: Recording, other: Recording) -> bool:
-    """Whether two parts of a log share time."""
+    """Checks whether two parts of a log share time."""
     (a, b), (c, d) = one.span, other.span
     return a < d and c < b
 
@@ -252,7 +252,7 @@ def change_words(change: Json) -> str:
 
 
 def has_changed(result: Json) -> bool:
-    """Whether a result of the form ``quadid.health/1`` shows a change, be it one without a name."""
+    """Checks whether a result of the form ``quadid.health/1`` shows a change, be it one without a name."""
     return result["verdict"] != "unchanged" and not result["baseline_lacking"] and not result["unfamiliar"]
 
 
@@ -301,7 +301,7 @@ def health_verdict(result: Json) -> Verdict:
 
 
 def _first(result: Json) -> tuple[str, ...]:
-    """What to check before anything else, where the change is as large as between two vehicles."""
+    """First checks where the change is as large as between two vehicles."""
     (effort,) = (t["value"] - t["baseline"] for t in result["trim"] if t["name"] == "effort")
     return (_ONE_VEHICLE,) if abs(effort) > _LARGE else ()
 
@@ -321,7 +321,7 @@ def _step(change: Json) -> str:
 
 
 def change_table(changes: Sequence[Json]) -> TextTable:
-    """What changed, with intervals and the explanations that lost."""
+    """Changes with intervals, and the explanations that lost."""
     columns = (
         Column("change"), Column("value"), Column("95 % interval"), Column("p", right=True, rank=1),
         Column("probability", right=True, rank=2), Column("rejected alternative", rank=3),

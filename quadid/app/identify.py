@@ -94,7 +94,7 @@ def search(
 
 @dataclass(frozen=True, repr=False)
 class Identified(Fitted):
-    """What an identification found.
+    """Result of an identification.
 
     Attributes:
         result: of the form ``quadid.identify/1``; ``vehicle_file`` is None until a file is written.
@@ -128,12 +128,12 @@ class Identified(Fitted):
 
     @property
     def verdict(self) -> Verdict:
-        """Whether the result may be used, and what to do next."""
+        """Checks whether the result may be used, and what to do next."""
         return identify_verdict(self.result)
 
     @property
     def opening(self) -> list[Cell]:
-        """What the values rest on."""
+        """Basis of the values."""
         return [Cell(f"{self.fit.vehicle.name}: {known(self.fit.vehicle)}, from its file. All values depend on these.")]
 
     def tables(self, truth: Mapping[str, float] | None = None) -> list[TextTable]:
@@ -368,7 +368,7 @@ def scored(log: Log, role: str, fit: Fit, autopilot: Autopilot | None, mse: tupl
 
 
 def origin_remark(logs: Sequence[Log]) -> str:
-    """What a fitted vehicle file was made from."""
+    """Sources of a fitted vehicle file."""
     lines = [f"Fitted by quadid {__version__}; `initial` with a `sigma` was fitted, without it was not. From:"]
     lines += [f"  {log.recording.name}  sha256 {log.recording.sha256 or 'unknown'}" for log in logs]
     return "\n".join(plain(line, LONGEST_LINE) for line in lines)

@@ -64,7 +64,7 @@ class Initial(Outcome):
 
     @property
     def sentences(self) -> list[Cell]:
-        """What to do next."""
+        """Next step."""
         blanks = ", ".join(self.result["fill_in"])
         fill = [Cell(f"To fill in: {blanks} (then delete the words FILL IN)")] if blanks else []
         return [*fill, Cell(f"Next: quadid inspect LOG --vehicle {file_name(self.result['vehicle'])}.yaml")]

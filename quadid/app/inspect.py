@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, repr=False)
 class Inspected(Outcome):
-    """What a log holds; `result` has the form ``quadid.inspect/1``."""
+    """Contents of a log; `result` has the form ``quadid.inspect/1``."""
 
     result: dict[str, Any]
     found: Inspection
@@ -61,7 +61,7 @@ class Inspected(Outcome):
 
     @property
     def sentences(self) -> list[Cell]:
-        """What the checks found and what is missing, a sentence each."""
+        """Findings of the checks and missing channels, a sentence each."""
         out = []
         for check in self.found.checks:
             fix = f". Fix: {_clean(check.fix)}" if check.fix else ""
@@ -73,7 +73,7 @@ class Inspected(Outcome):
 
     @property
     def warnings(self) -> list[str]:
-        """What the reader had to say, and what to leave out of the log."""
+        """Remarks of the reader, and what to leave out of the log."""
         use = self.result["use"]
         return [*self.found.warnings, *([left_on_ground(use)] if use else [])]
 
@@ -220,7 +220,7 @@ def check_table(found: Inspection) -> TextTable:
 
 
 def parameter_outlook_table(found: Inspection) -> TextTable:
-    """Which parameters the log can show, and how sharply; motion says nothing where a channel lacks or is too slow."""
+    """Parameters that the log can show, and how sharply; motion says nothing where a channel lacks or is too slow."""
     expected = {str(row["name"]): float(row["relative_sigma"]) for row in found.excitation}
     columns = [Column("parameter"), Column("possible")]
     if expected:

@@ -42,7 +42,7 @@ def missing(names: tuple[str, ...]) -> list[str]:
 
 
 def on_disk(kernel: Any) -> bool:
-    """Whether machine code of a kernel, for this processor and this source, is in numba's cache."""
+    """Checks whether machine code of a kernel, for this processor and this source, is in numba's cache."""
     from numba.core.registry import cpu_target
 
     cache = kernel._cache
@@ -184,7 +184,7 @@ PARTS = {
     "estimate": Part(_estimate, _estimate_kernels, 30),
     "flight": Part(_flight, _flight_kernels, 30),
 }
-"""What an identification or a diagnosis needs, in three parts, and the flown vehicle of `quadid simulate`."""
+"""Kernels of an identification or a diagnosis, in three parts, and the flown vehicle of `quadid simulate`."""
 FIT = ("simulation", "statistics", "estimate")
 
 

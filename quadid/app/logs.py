@@ -167,7 +167,7 @@ def parse_part(text: str, start: float | None = None, stop: float | None = None)
 
 
 def flown_parts(recording: Recording, flying: Spans, cut: LogPart) -> Spans:
-    """What to use of a log that also stands on the ground [s, after its first IMU sample]; none where it hardly does.
+    """Parts to use of a log that also stands on the ground [s, after its first IMU sample]; none where it hardly does.
 
     A part that was asked for is used as it is.
 
@@ -190,7 +190,7 @@ def names_of(cut: LogPart, parts: Spans) -> list[str]:
 
 
 def left_on_ground(names: Sequence[str]) -> str:
-    """What is used of a log that also stands on the ground, by the names of its parts, and how to use all of it."""
+    """Used parts of a log that also stands on the ground, by the names of its parts, and how to use all of it."""
     whole = names[0].rpartition("@")[0]
     return f"time on the ground is left out: fits use {' '.join(names)}; to use all of it: {whole}@0:"
 
@@ -238,7 +238,7 @@ class Log:
 
     @property
     def warnings(self) -> list[str]:
-        """What was wrong with the log and its gridding, each with the log's name."""
+        """Problems of the log and its gridding, each with the log's name."""
         return [f"{self.path.name}: {text}" for text in (*self.recording.warnings, *self.doubts, *self.grid.notes)]
 
     def at(self, rate: float | None) -> Log:
@@ -393,7 +393,7 @@ def on_grid(
 def gridded(
     recording: Recording, vehicle: Vehicle, rate: float | None, cut: LogPart, flown: Spans
 ) -> tuple[list[Window], GridReport]:
-    """What is flown of a log, or the part that was asked for, on a grid of so many rows a second [Hz]."""
+    """Flown parts of a log, or the part that was asked for, on a grid of so many rows a second [Hz]."""
     from quadid.data.grid import grid_recording
 
     zero = recording.first_imu_time
@@ -644,7 +644,7 @@ def read(logs: Given, vehicle: Vehicle) -> list[Log]:
 
 @dataclass(frozen=True)
 class Settled:
-    """What a piece of work is about.
+    """Subject of a piece of work.
 
     Attributes:
         vehicle: as described, without priors that come from the flights to fit.

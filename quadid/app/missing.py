@@ -111,7 +111,7 @@ class MissingForces:
         return missing_section(self._entry(self.deciding), self.logs[shown].recording.name, parts)
 
     def beside(self, vehicle: Vehicle, terms: bool) -> Beside:
-        """What acts beside the values of a vehicle file: terms beyond the catalogue, and what remains, at random.
+        """Forces beside the values of a vehicle file: terms beyond the catalogue, and what remains, at random.
 
         Terms are kept where they take a part of what is missing off flights that were not fitted.
 
@@ -223,7 +223,7 @@ class MissingForces:
 
 @dataclass(frozen=True)
 class Beside:
-    """What acts beside the values of a vehicle file.
+    """Forces that act beside the values of a vehicle file.
 
     Attributes:
         terms: beyond the catalogue.
@@ -238,7 +238,7 @@ class Beside:
 
     @property
     def sentence(self) -> str:
-        """What the terms are worth."""
+        """Worth of the terms."""
         return (
             f"Terms beyond the catalogue take {100.0 * (self.removed or 0.0):.2g} % off its squares: "
             f"{'; '.join(t.formula for t in self.terms)}."

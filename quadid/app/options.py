@@ -104,7 +104,7 @@ READING: dict[str, tuple[Any, Any]] = {
     "rate": (Rate, GRID), "start": (Start, None), "stop": (Stop, None), "preset": (Preset, "auto"),
     "unchecked": (Unchecked, False), "columns": (Columns, None),
 }  # fmt: skip
-"""What a command whose logs are opened for it may be asked, with defaults; arguments of `quadid.load`."""
+"""Options of a command whose logs are opened for it, with defaults; arguments of `quadid.load`."""
 
 # --- What is fitted, beside or instead of what the vehicle file says
 

@@ -71,22 +71,22 @@ class Outcome(ABC):
 
     @property
     def verdict(self) -> Verdict | None:
-        """What the result means and what to do next; None where the numbers speak alone."""
+        """Meaning of the result and the next step; None where the numbers speak alone."""
         return None
 
     @property
     def opening(self) -> list[Cell]:
-        """What stands above the tables, a line each."""
+        """Lines above the tables."""
         return []
 
     @property
     def sentences(self) -> list[Cell]:
-        """What stands below the tables, a sentence each."""
+        """Sentences below the tables."""
         return []
 
     @property
     def warnings(self) -> list[str]:
-        """What a user should know, from logs and from the work itself."""
+        """Remarks for the user, from logs and from the work itself."""
         return list(self.result.get("warnings", ()))
 
     def write(self, folder: Path, kept: str | None = None) -> list[tuple[str, Path]]:
@@ -344,7 +344,7 @@ def known(vehicle: Vehicle) -> str:
 
 
 def told(fit: Fit, logs: Sequence[Log]) -> dict[str, Any]:
-    """What the fitted logs can tell about each parameter, from `LONGEST` s of them at most."""
+    """Information of the fitted logs about each parameter, from `LONGEST` s of them at most."""
     from quadid.identification.excitation import excitation
     from quadid.report.fit_pages import excitation_part
 
@@ -353,7 +353,7 @@ def told(fit: Fit, logs: Sequence[Log]) -> dict[str, Any]:
 
 
 def quality(log: Log) -> JsonDict:
-    """What one log offered and what of it was used, as part of a page."""
+    """Contents of one log and their use, as part of a page."""
     grid = log.grid
     summary = [
         f"{grid.seconds_used:.1f} of {grid.seconds_log:.1f} s used, on a {grid.rate:.4g} Hz grid",

@@ -40,12 +40,12 @@ class Scored(Reported):
 
     @property
     def warnings(self) -> list[str]:
-        """What was wrong with the logs."""
+        """Problems of the logs."""
         return list(self.notes)
 
     @property
     def verdict(self) -> Verdict:
-        """How the errors stand beside sensor noise, and beside predicting no change."""
+        """Errors beside sensor noise, and beside predicting no change."""
         return score_verdict(self.result)
 
     def tables(self) -> list[TextTable]:
@@ -54,7 +54,7 @@ class Scored(Reported):
 
     @property
     def sentences(self) -> list[Cell]:
-        """What the bands rest on."""
+        """Basis of the bands."""
         return [Cell(self.result["bands"])]
 
     def records(self) -> list[dict[str, Any]]:

@@ -36,7 +36,7 @@ MOST_DRAWS = 1000
 
 
 class SimulateError(QuadidError):
-    """What was asked for cannot be flown or written."""
+    """A flight that cannot be flown or written as asked."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -53,7 +53,7 @@ class Simulated(Outcome):
 
     @property
     def opening(self) -> list[Cell]:
-        """What was flown, and where it was logged."""
+        """Flight, and where it was logged."""
         r, log = self.result, f" and logged to {self.result['log']}" if self.result["log"] else ""
         return [Cell(f"{r['vehicle']}: {r['rows']} rows at {r['rows'] / r['seconds']:.4g} Hz flown{log}")]
 
@@ -267,7 +267,7 @@ def read_manoeuvre(path: Path) -> list[Segment]:
 
 
 def summary(flight: Flight, seed: int, profile: str) -> dict[str, Any]:
-    """What was flown, as JSON: the truth, the effects, the stabiliser's gains and how much the vehicle moved."""
+    """Flight as JSON: the truth, the effects, the stabiliser's gains and how much the vehicle moved."""
     truth = flight.truth
     parameters = truth.parameters.as_dict()
     upright = float(down(truth.quaternion)[:, 2].min())

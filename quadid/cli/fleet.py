@@ -119,7 +119,7 @@ _WARM = (
     "distributed", "distributed.nanny", "quadid.app.fleet", "quadid.app.identify", "quadid.condition.trim",
     "quadid.condition.trim", "quadid_replay.rosbag",
 )  # fmt: skip
-"""What a process has imported from which all workers are forked, those that replace dead ones too."""
+"""Modules imported by the process from which all workers are forked, those that replace dead ones too."""
 
 STARTING = 180.0
 """Time that a worker may take to start [s]: when none lives for so long, there is no cluster."""
@@ -233,7 +233,7 @@ def _answered(ended: Iterator[tuple[Any, Job]]) -> Generator[Row, None, list[Job
 
 
 def _row(future: Any) -> Row | None:
-    """What an ended future holds; None where its worker died with the job, or with the result before it was fetched."""
+    """Result of an ended future; None where its worker died with the job, or with the result before it was fetched."""
     from distributed import KilledWorker
     from distributed.client import FutureCancelledError
 
@@ -299,7 +299,7 @@ def _lost(job: Job) -> Row:
 
 VEHICLE_FILE = "vehicle.yaml"
 SUFFIXES = (".mcap", ".tlog", ".bin", ".ulg")
-"""What is called like a log is tried, and its refusal reported, even if its content is not recognised."""
+"""Suffixes of logs: such a file is tried, and its refusal reported, even if its content is not recognised."""
 
 
 @dataclass(frozen=True)

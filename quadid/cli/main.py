@@ -56,7 +56,7 @@ def _quadid(
 
 
 BLAS_THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
-"""What decides how many threads numpy's linear algebra takes.  Ours is of small matrices, and the simulation uses every
+"""Variables of numpy's number of threads.  Our linear algebra is of small matrices, and the simulation uses every
 core itself: more threads than one only wait for each other, on a busy machine for most of the time."""
 
 

@@ -121,7 +121,7 @@ def _pace(speed: str) -> float:
 
 
 def _beginning(log: Path, vehicle: str) -> Beginning:
-    """What the session of a node's recording began with; raises ReplayError when there is none, or of another one."""
+    """Start of the session of a node's recording; raises ReplayError when there is none, or of another one."""
     from quadid_node.recording import read_beginning
 
     found = read_beginning(log)
@@ -225,7 +225,7 @@ def write_outputs(path: Path, outputs: Sequence[Output], vehicle: str) -> None:
 
 @dataclass(frozen=True, repr=False)
 class Replayed(Outcome):
-    """What a session published, refused and found; `result` has the form ``quadid.replay/1``."""
+    """Outputs of a session: published, refused and found; `result` has the form ``quadid.replay/1``."""
 
     result: dict[str, Any]
 
@@ -250,5 +250,5 @@ class Replayed(Outcome):
 
     @property
     def sentences(self) -> list[Cell]:
-        """Where it was written."""
+        """Place to which it was written."""
         return [Cell(f"Written: {self.result['out']}")] if "out" in self.result else []

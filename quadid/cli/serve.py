@@ -142,7 +142,7 @@ class _Console:
 
 
 def summary(service: Service, link: MavlinkLink, name: str) -> dict[str, Any]:
-    """How it ended, of the form ``quadid.serve/1``."""
+    """End of the service, of the form ``quadid.serve/1``."""
     from quadid_node.messages import set_to_dict, status_to_dict
 
     health, traffic = service.health(), link.traffic()

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 REFRESH = 0.5
 SETTLE = 1.0
-"""How long a snapshot waits for answers [s]."""
+"""Time that a snapshot waits for answers [s]."""
 _LONGEST = 160
 
 
@@ -67,7 +67,7 @@ def watch(
 
 
 def _command(fleet: Fleet, vehicle: str, name: str) -> dict[str, Any]:
-    """What the vehicle said to a command that it carried out, of the form ``quadid.command/1``."""
+    """Answer of the vehicle to a command that it carried out, of the form ``quadid.command/1``."""
     vehicle, _, number = vehicle.partition("=")
     sequence = int(number) if number.isdigit() else None
     if name == "approve" and sequence is None:
@@ -91,7 +91,7 @@ def _live(fleet: Fleet, seconds: float, console: Any) -> None:
 
 
 def snapshot(fleet: Fleet) -> dict[str, Any]:
-    """What is known of all vehicles now, of the form ``quadid.watch/1``."""
+    """State of all vehicles now, of the form ``quadid.watch/1``."""
     names = sorted({*fleet.latest, *fleet.alive})
     return {
         "schema": "quadid.watch/1",

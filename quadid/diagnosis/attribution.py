@@ -1,4 +1,4 @@
-"""What the findings gain on data that neither the fit nor the selection saw: each of them, and all together.
+"""Gain of the findings on data that neither the fit nor the selection saw: each of them, and all together.
 
 A cause is worth what is lost without it, all others refitted, in the segments that decided.  With validation logs the
 parameters stay as fitted there, and values that belong to a flight (`per_log`) are carried over; without such logs
@@ -40,7 +40,7 @@ from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 
 UNTIDY = 0.2
-"""How far, in typical sizes, the numbers of an effect may be from neutral on any vehicle."""
+"""Distance from neutral, in typical sizes, of an effect's numbers on any vehicle."""
 
 
 @dataclass(frozen=True)
@@ -88,12 +88,12 @@ class Validation:
 
 
 def untidy_sized(model: Model, cause: Candidate) -> bool:
-    """Whether no number of `cause` is further from neutral in `model` than it may be on any vehicle."""
+    """Checks whether no number of `cause` is further from neutral in `model` than it may be on any vehicle."""
     return bool(np.all(np.abs(model.numbers(cause).from_neutral(model.theta)) <= UNTIDY))
 
 
 def ordinary(model: Model, cause: Candidate) -> bool:
-    """Whether any vehicle may have `cause` as large as it is in `model`; no event, wind or ground is ordinary."""
+    """True if any vehicle may have `cause` as large as it is in `model`; no event, wind or ground is ordinary."""
     apart = cause.timed is not None or cause.refines or bool(EFFECTS[cause.effect].needs)
     return not apart and untidy_sized(model, cause)
 

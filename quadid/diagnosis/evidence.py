@@ -36,7 +36,7 @@ the time step of a simulation or of an autopilot's own filter can imitate: nulls
 
 
 def better(b: Model, a: Model) -> bool:
-    """Whether `b` is better than `a`: more likely, and of models of which one contains the other also of use."""
+    """Checks whether `b` is better than `a`: more likely, and of models of which one contains the other also of use."""
     more, less = {c.label for c in b.causes}, {c.label for c in a.causes}
     if more < less:
         return not better(a, b)
@@ -74,7 +74,7 @@ def calibration(model: Model, own: BoolArray) -> float:
 
 
 def relevant(small: Model, large: Model) -> bool:
-    """Whether what `large` has more gains enough on unseen blocks, and half of that where the best of them is missing.
+    """True if what `large` has more gains enough on unseen blocks, and half of that where the best of them is missing.
 
     It is missing in the fit as well: what a single stretch determines, such as a step near the end, gains elsewhere by
     keeping that stretch apart.
@@ -163,7 +163,7 @@ class Everything:
         return risen - own.fall + self._unspent()
 
     def scores(self, gone: Candidate | None = None) -> list[Score]:
-        """What each candidate that is not in the model would do, in the place of `gone` if given; best first."""
+        """Effect of each candidate that is not in the model, in the place of `gone` if given; best first."""
         lin, own, risen = self._left(gone)
         risen += self._unspent()
         present = set(self.model.free.names)
@@ -304,7 +304,7 @@ def slight_causes(model: Model) -> dict[str, str]:
 
 
 def impossible(model: Model, cause: Candidate) -> str:
-    """Which number of `cause` no vehicle has; empty when all are possible."""
+    """Number of `cause` that no vehicle has; empty when all are possible."""
     sigma = dict(zip(model.free.names, model.uncertainty.sigma, strict=True))
     for e in model.numbers(cause).entries:
         value = float(model.theta[e.index])

@@ -62,7 +62,7 @@ class Candidate:
         return EFFECTS[self.effect].family
 
     def carries(self, other: Candidate) -> bool:
-        """Whether `other` can only be in a model that has this one; a refinement carries nothing."""
+        """Checks whether `other` can only be in a model that has this one; a refinement carries nothing."""
         return not self.refines and other.requires in (self.effect, self.label)
 
     def __post_init__(self) -> None:
@@ -214,7 +214,7 @@ def sum_by_block(values: FloatArray, labels: IndexArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class Gain:
-    """What one model gains over another on data not fitted.
+    """Gain of one model over another on data not fitted.
 
     Attributes:
         total: summed reduction of the deviance; error: its standard error.
@@ -302,7 +302,7 @@ class Model(Polished):
 
     @property
     def finds_velocity(self) -> bool:
-        """Whether airspeed matters and is not measured, so that the segments' initial velocities are fitted."""
+        """Checks whether airspeed matters and is not measured, so that the segments' initial velocities are fitted."""
         return bool(np.any(self.lin.occam))
 
     @property
@@ -340,7 +340,7 @@ def refit(
 
 @dataclass(frozen=True)
 class Start:
-    """Where a refit with another cause begins.
+    """Start of a refit with another cause.
 
     Attributes:
         theta: full vector.
@@ -354,7 +354,7 @@ class Start:
 
 
 def sketch(shooting: Shooting, model: Model, candidate: Candidate) -> Start:
-    """Where one Gauss-Newton step from the start of `candidate` leads, and what it would gain."""
+    """End of one Gauss-Newton step from the start of `candidate`, and its gain."""
     free = shooting.free(free_names((*model.causes, candidate)))
     prior = default_prior(shooting, free)
     theta = model.theta.copy()

@@ -40,7 +40,7 @@ _AXES = "xyz"
 
 @dataclass(frozen=True)
 class Site:
-    """Where a probe acts.
+    """Site of a probe.
 
     Attributes:
         name: for people.
@@ -55,7 +55,7 @@ class Site:
 
 @dataclass(frozen=True)
 class Follows:
-    """What the residual follows at one site.
+    """Signals that the residual follows at one site.
 
     Attributes:
         site: where.
@@ -74,7 +74,7 @@ class Follows:
 
     @property
     def significant(self) -> bool:
-        """Whether the gain stands above its own error."""
+        """Checks whether the gain stands above its own error."""
         return self.gain.total > ERRORS * self.gain.error
 
 
@@ -113,7 +113,7 @@ def follows(shooting: Shooting, model: Model) -> tuple[Follows, ...]:
 
 @dataclass(frozen=True)
 class _Prepared:
-    """What all sites of one window share.
+    """Data that all sites of one window share.
 
     Attributes:
         part: its segments.
@@ -258,7 +258,7 @@ def _predicted_attitude(part: Columns, measured: FloatArray) -> FloatArray:
 ALARM = 5.0
 """Standard errors above the floor that count as structure; calibrated on flights without effects."""
 CHANGES = ("time", "thrust", "squared thrust", "cubed thrust", "a_x", "a_y", "a_z")
-"""How the name of a signal begins that an offset may follow: warming up, vibration, acceleration."""
+"""First words of the names of signals that an offset may follow: warming up, vibration, acceleration."""
 CHANGE_SHARE = 0.008
 """Share of an offset's own chi-square beyond which it is no offset: an untidy vehicle has a little of everything."""
 
@@ -284,7 +284,7 @@ class Structure:
 
 @dataclass(frozen=True)
 class Remainder:
-    """What is left, by channel of the residual and by what it follows.
+    """Rest by channel of the residual and by what it follows.
 
     Attributes:
         channels: power above the noise, one entry a channel.
@@ -360,7 +360,7 @@ def inconstant_causes(model: Model, left: Remainder) -> dict[str, str]:
 
 
 def _inconstant(model: Model, cause: Candidate, left: Remainder) -> str:
-    """What an offset that is not constant follows; empty where it follows nothing, or claims no constancy."""
+    """Signal that an offset that is not constant follows; empty where it follows nothing, or claims no constancy."""
     kind = EFFECTS[cause.effect].constant_on
     if not kind:
         return ""

@@ -124,7 +124,7 @@ class Diagnosis:
 
     @property
     def unexplained_follows(self) -> list[dict[str, Any]]:
-        """What the rest follows, strongest first: where it acts, the signal, and the errors by which it stands out."""
+        """Signals that the rest follows, strongest first: site, signal, and the errors by which it stands out."""
         return [
             {"acts_on": f.site.name, "signal": f.signal, "share": round(f.gain.total / self.remainder.rows, 5)}
             for f in self.remainder.followed

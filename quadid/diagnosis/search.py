@@ -27,13 +27,13 @@ CLEAN_MISFIT = 1.2
 
 
 def is_long(shooting: Shooting) -> bool:
-    """Whether segments are longer than usual: there the cost of a missing moment grows beyond all measure."""
+    """Checks whether segments are longer than usual: there the cost of a missing moment grows beyond all measure."""
     return shooting.seconds > 1.5 * USUAL_SECONDS
 
 
 @dataclass(frozen=True)
 class Stage:
-    """Where the continuation stands.
+    """State of the continuation.
 
     Attributes:
         schedule: the data cut into segments of falling length.
@@ -60,7 +60,7 @@ class Stage:
 
     @property
     def follows(self) -> bool:
-        """Whether segments are not too long for the model to decide on them."""
+        """Checks whether segments are not too long for the model to decide on them."""
         return self.model.lin.reduced_chi_square < (CLEAN_MISFIT if is_long(self.shooting) else LINEAR_MISFIT)
 
     def at(self, rung: int) -> Stage:
@@ -244,7 +244,7 @@ def _swaps(shooting: Shooting, everything: Everything, least: float) -> Iterator
 
 
 def _rivals(score: Score, cause: Candidate, regains: bool) -> bool:
-    """Whether a candidate may stand in the place of `cause`: a look-alike by name, or by what it should regain."""
+    """True if a candidate may stand in the place of `cause`: a look-alike by name, or by what it should regain."""
     candidate = score.candidate
     if candidate.split or candidate.effect == cause.effect:
         return False
@@ -284,7 +284,7 @@ def _removable(model: Model) -> list[Candidate]:
 
 
 def _start(shooting: Shooting, model: Model, score: Score) -> Start:
-    """Where a refit starts and what to expect; a sketch leads to causes that no slope at neutral shows."""
+    """Start of a refit and what to expect; a sketch leads to causes that no slope at neutral shows."""
     if score.candidate.start:
         return sketch(shooting, model, score.candidate)
     theta = model.theta.copy()

@@ -31,7 +31,7 @@ from quadid.types import FloatArray
 from quadid.vehicle import ParameterPrior, Vehicle
 
 SHOWN = tuple(n for n in NOMINAL_NAMES if n not in YAW)
-"""What fast motion shows."""
+"""Parameters that fast motion shows."""
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ class Held:
 
 
 def held_by_fast_motion(windows: Sequence[Window], short: Shooting, model: Model) -> Held | None:
-    """What the selected model has wrong because moments that no model has turn the vehicle; None where it has not.
+    """Errors of the selected model because moments that no model has turn the vehicle; None where it has not.
 
     Args:
         windows: the data.

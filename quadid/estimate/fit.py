@@ -23,7 +23,7 @@ NEAR, MOST = 4, 40
 ENOUGH = 0.1
 """Gain in -2 ln L that no step is worth taking for."""
 ALL_NOISE, NO_NOISE = np.ones(k.N_NOISE, dtype=np.bool_), np.zeros(k.N_NOISE, dtype=np.bool_)
-"""Which noise numbers a step may change."""
+"""Noise numbers that a step may change."""
 ROUNDS = 4
 """Most times that the noise of rotor speeds is taken out anew."""
 CHANCE = 4.0

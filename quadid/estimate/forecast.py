@@ -88,7 +88,7 @@ class Forecast:
         self.problem = replace(whole, control=problem.control, tail=problem.tail).along(z, psi)
 
     def covered(self, samples: Sequence[int]) -> Shares:
-        """How many outcomes lie inside the bands predicted from the filtered state and the logged rotor speeds.
+        """Numbers of outcomes inside the bands predicted from the filtered state and the logged rotor speeds.
 
         Args:
             samples: of the grid after the filtered state.
@@ -227,7 +227,7 @@ def _count(
 
 
 def _inside(error: FloatArray) -> FloatArray:
-    """How many errors, in standard deviations, lie inside each of `BANDS`, and how many there are, shape (4,)."""
+    """Numbers of errors, in standard deviations, inside each of `BANDS`, and how many there are, shape (4,)."""
     return np.array([*(np.count_nonzero(np.abs(error) <= b) for b in BANDS.values()), error.size], dtype=np.float64)
 
 

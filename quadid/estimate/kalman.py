@@ -54,7 +54,7 @@ B, D, JX, JY, JZ, JR, TRIM, GYRO_BIAS, ACCEL_BIAS, DRAG, DAMP, CG, DELAY, N_PHYS
 # yaw), e (tilt, heading) and of logged rotor speeds [rad/s]; correlation times of f, f, alpha, alpha, e [s].
 SIGMA, ROTOR, TIME, N_NOISE = M, M + 6, M + 7, M + 12
 _GROUP = np.array([0, 0, 1, 2, 2, 3, 4, 4, 5])
-"""Which standard deviation belongs to each Gauss-Markov state from FO on …"""
+"""Standard deviation of each Gauss-Markov state from FO on …"""
 _CLOCK = np.array([0, 0, 1, 2, 2, 3, 4, 4, 4])
 """… and which correlation time."""
 # Rotor moments over all rotors: squares, squares times x, y, spin, speeds times spin, speeds.

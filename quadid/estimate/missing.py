@@ -116,7 +116,7 @@ def _smoothed(problem: Problem, z: FloatArray, psi: FloatArray) -> list[Missing]
 
 
 def _measured(track: k.Track, g: k.Gains) -> BoolArray:
-    """Which innovations are of measurements, shape (n, M): a velocity that nobody measured has only a prior."""
+    """Mask of innovations that are of measurements, shape (n, M): a velocity that nobody measured has only a prior."""
     out = g.S > 0.0
     out[:, k.VELOCITY :] &= track.seen[:, 3:]
     return np.asarray(out)

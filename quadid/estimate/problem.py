@@ -81,7 +81,7 @@ def control_moment(tracks: Sequence[Track], p: FloatArray) -> FloatArray:
 
 
 def _of_flight(name: str) -> bool:
-    """Whether a value belongs to a flight."""
+    """Checks whether a value belongs to a flight."""
     effect = name.split(".")[0]
     return effect in PER_FLIGHT or (effect in EFFECTS and EFFECTS[effect].per_log)
 
@@ -290,7 +290,7 @@ class Problem:
         return replace(self, tracks=tuple(t._replace(waver=new) for t in self.tracks))
 
     def explained(self, z: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """What is taken off at z, shape (4,), and half its logarithm's derivative, shape (4, P)."""
+        """Penalty taken off at z, shape (4,), and half its logarithm's derivative, shape (4, P)."""
         wide = np.column_stack([ACTS[:, place] if place < 6 else np.zeros(4) for _, place, _ in self.entries])
         return self.borrowed * np.exp(2.0 * ACTS @ np.log(self.physics(z, 0)[:6])), wide
 
@@ -413,7 +413,7 @@ class Problem:
         return float(value), gains
 
     def _beyond(self, z: FloatArray, j: int, means: FloatArray) -> FloatArray:
-        """What the whole model adds at these means of flight j."""
+        """Contribution of the whole model at these means of flight j."""
         if not self.models:
             return self.tracks[j].beyond
         return self.models[j].beyond(self.tracks[j], self.physics(z, j), self.vector(z, j), means)

@@ -16,7 +16,7 @@ from quadid.flight.rotors import Drive, advance, load_input, spin_up_kick
 from quadid.types import FloatArray
 
 SUPPLY_FALL = 0.15
-"""How much of its mean the supply voltage loses over a flight in which it matters …"""
+"""Share of its mean that the supply voltage loses over a flight in which it matters …"""
 SUPPLY_DIP = 0.04
 """… and what the battery's resistance takes from it in hover: 10 milliohm and 45 A of a pack of 11 V."""
 NO_TIME = 1e300
@@ -63,7 +63,7 @@ class OnBoard(NamedTuple):
 
 
 class Events(NamedTuple):
-    """What happens at some time, or over time; fractions are losses.
+    """Events at some time, or over time; fractions are losses.
 
     Attributes:
         mass_time, mass_fraction: mass grows by the fraction.
@@ -236,7 +236,7 @@ def efficiencies(base: FloatArray, memory: FloatArray, drive: Drive, events: Eve
 
 
 class Progress(NamedTuple):
-    """What has happened on the way.
+    """Record of the way.
 
     Attributes:
         head: first command that has not reached the rotors.

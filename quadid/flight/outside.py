@@ -343,7 +343,7 @@ ARRANGE: dict[Arrange, Sizes] = {
     dead_time_jitter: {"jitter": Size(0.02, 0.045)},  # [s]
     lost_commands: {"probability": Size(0.15, 0.4)},
 }  # fmt: skip
-"""What changes a flight: the function, which names and describes the effect, and its numbers."""
+"""Changes of a flight: the function, which names and describes the effect, and its numbers."""
 DISTORT: dict[Distort, Sizes] = {
     vibration_rectification: {"shift": Size(0.3, 0.8)},  # [m/s^2]
     gyro_g_sensitivity: {"gain": Size(0.004, 0.012)},  # [rad s/m]
@@ -357,7 +357,7 @@ DISTORT: dict[Distort, Sizes] = {
     repeated_rows: {"probability": Size(0.1, 0.3)},
     gyro_spikes: {"probability": Size(0.01, 0.03), "size": _fixed(0.5, 2.0)},  # size [rad/s]
 }
-"""What changes a log, likewise."""
+"""Changes of a log, likewise."""
 OUTSIDE: dict[str, Sizes] = {act.__name__: sizes for act, sizes in (*ARRANGE.items(), *DISTORT.items())}
 """Numbers of every effect outside the catalogue, by its name."""
 

@@ -26,7 +26,7 @@ PILOT_STEP = 0.02
 
 
 class Pilot(NamedTuple):
-    """How firmly the pilot holds the vehicle in place.
+    """Gains with which the pilot holds the vehicle in place.
 
     Attributes:
         altitude: wanted height above the ground, which is at world z = 0 [m].

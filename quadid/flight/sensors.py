@@ -1,4 +1,4 @@
-"""What is measured and logged: noise, vibration, telemetry filters, sampling at the log rate.
+"""Measured and logged signals: noise, vibration, telemetry filters, sampling at the log rate.
 
 Gyro, attitude, velocity and position are instants at t; acceleration is the mean over one sample centred on t.
 """

@@ -32,7 +32,7 @@ NEGLIGIBLE = 1e-5
 
 
 class Whitening:
-    """What weights and whitens the channels of a segment.
+    """Weights and whitening of the channels of a segment.
 
     Attributes:
         precision: 1 / sigma of each channel, for rows that are not whitened, shape (C,).
@@ -56,7 +56,7 @@ class Whitening:
 
 
 class StatePrior(NamedTuple):
-    """What holds the initial states back.
+    """Prior of the initial states.
 
     Attributes:
         ridge: precision of the step of each eliminated direction, shape (own,).

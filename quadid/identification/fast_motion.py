@@ -39,7 +39,7 @@ LEAST_COHERENCE = 0.01
 
 
 def undecided(windows: Sequence[Window], vehicle: Vehicle, white: FloatArray) -> FloatArray:
-    """What J_xx and J_yy are undecided by, in log scale, shape (2,).
+    """Indecision of J_xx and J_yy, in log scale, shape (2,).
 
     It is minus the logarithm of the share of quick roll and pitch acceleration, less what the gyro's noise makes of it,
     that the rotors' torque accounts for.
@@ -88,7 +88,7 @@ def _without_gaps(values: FloatArray) -> FloatArray:
 THRUST_AXIS = 8
 """Residual channel of the specific force along z."""
 LATE_START = 0.005
-"""Where lags and delays begin in the fit [s]."""
+"""Start of lags and delays in the fit [s]."""
 MOST_SEGMENTS = 1000
 """Most segments of this fit and of a first one; the parameters need no more."""
 ROUNDS = 15
@@ -174,7 +174,7 @@ def fast_motion(
 
 
 def _late(window: Window) -> list[str]:
-    """What may be late between the rotor columns and the rates."""
+    """Delays between the rotor columns and the rates."""
     columns = "readings" if window.sampling == "instant" else "commands"
     effects = [e for e in EFFECTS.values() if e.family == "late" and e.turns and {columns}.issuperset(e.needs)]
     return [name for e in effects for name in e.entries]

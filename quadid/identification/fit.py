@@ -144,7 +144,7 @@ def possible_moments(parameters: tuple[Parameter, ...]) -> tuple[tuple[Parameter
 
 
 def on_bounds(parameters: Iterable[Parameter]) -> list[str]:
-    """Which parameters rest on a bound, and which nominal ones have an interval that reaches one, in words."""
+    """Parameters that rest on a bound, and which nominal ones have an interval that reaches one, in words."""
     out = []
     for p in parameters:
         low, high = p.bounds
@@ -204,7 +204,7 @@ WHITE_SHARE = 0.5
 """Fast motion alone decides where less than this share of what short segments leave of roll or pitch rate is white
 noise and the rest is made by random moments."""
 YAW = ("d", "J_zz", "J_r")
-"""What fast motion hardly shows: rotors turn a vehicle about z by drag, slowly, and there random moments rule."""
+"""Parameters that fast motion hardly shows: rotors turn a vehicle about z slowly, and there random moments rule."""
 _QUICK = (
     "something that the model lacks turns the vehicle: b, J_xx and J_yy were estimated from fast motion; "
     f"{', '.join(YAW[:-1])} and {YAW[-1]} cannot be; `quadid diagnose` looks for the cause"
@@ -213,7 +213,7 @@ _QUICK = (
 
 @dataclass(frozen=True)
 class FitOptions:
-    """How to fit.
+    """Options of a fit.
 
     Attributes:
         particles, iterations: swarm size and most iterations; 0 iterations start from the initial guess.
@@ -317,7 +317,7 @@ def fit(
 
 
 def has_unmodelled_moments(short: Shooting, plain: Polished) -> bool:
-    """Whether moments that the model lacks rule the rates: as random ones they explain most of what it leaves.
+    """Checks whether moments that the model lacks rule the rates: as random ones they explain most of what it leaves.
 
     Turbulence, aerodynamic moments, uncalibrated rotor speeds and offsets act slowly; a model without them otherwise
     takes them for a large inertia.

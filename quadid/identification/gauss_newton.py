@@ -91,7 +91,7 @@ HUBER = 4.0
 
 
 class Convergence(StrEnum):
-    """How a polish ended; the values read as sentences."""
+    """End of a polish; the values read as sentences."""
 
     CONVERGED = "the step fell below the statistical resolution"
     BUDGET = "the iteration limit was reached before the step was small"

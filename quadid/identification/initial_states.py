@@ -26,7 +26,7 @@ _VELOCITY = slice(7, 10)
 
 
 class Starts(NamedTuple):
-    """Where the simulations of all segments start.
+    """Starts of the simulations of all segments.
 
     Attributes:
         x0: states, one array (segments, 13) a window.
@@ -48,7 +48,7 @@ class InitialStates:
     starts: Mapping[int, Starts] = field(default_factory=dict)
 
     def __bool__(self) -> bool:
-        """Whether any are known."""
+        """Checks whether any are known."""
         return bool(self.starts)
 
     def at(self, n_pre: int, rollouts: Sequence[Rollout], segments: Sequence[Segments]) -> Starts:

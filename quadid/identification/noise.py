@@ -167,7 +167,7 @@ class NoiseModel:
         return _whitener(self, length, dt)
 
     def whitening(self, length: int, dt: float) -> Whitening:
-        """What weights and whitens the channels of a segment; see `whitener`."""
+        """Weights and whitening of the channels of a segment; see `whitener`."""
         return _whitening(self, length, dt)
 
     def whitened(self, rows: FloatArray, weights: FloatArray, dt: float) -> FloatArray:

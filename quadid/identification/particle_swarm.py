@@ -36,7 +36,7 @@ class Stop(StrEnum):
 
 @dataclass(frozen=True)
 class SwarmOptions:
-    """How a swarm moves and when it stops.
+    """Rules by which a swarm moves and stops.
 
     Attributes:
         variant: ``constriction`` (Clerc & Kennedy: chi = 0.7298 for c1 = c2 = 2.05) or ``inertia`` (Algorithm 1).

@@ -31,7 +31,7 @@ from quadid.vehicle import GRAVITY, Vehicle
 
 
 QUANTITIES: dict[str, str] = {"position": "m", "velocity": "m/s", "rotation": "rad", "rate": "rad/s"}
-"""What is predicted, with units."""
+"""Predicted quantities, with units."""
 _PLACES = (12, 9, 3, 0)
 """First of the three residual channels of each quantity."""
 _CHUNK = 256
@@ -57,7 +57,7 @@ class OpenLoop:
         self.rows = np.flatnonzero(self.known["gyro"][: max(len(window) - longest, 0)])
 
     def counted(self, rows: IndexArray, at: IndexArray) -> BoolArray:
-        """Which quantities of runs from `rows` count `at` samples after the start, shape (rows, at, 4).
+        """Mask of the quantities of runs from `rows` that count `at` samples after the start, shape (rows, at, 4).
 
         A quantity counts where it was measured at the target and the start was known well enough: a velocity needs
         attitude and velocity at the start, a position its own start too.
@@ -99,7 +99,7 @@ class OpenLoop:
             yield rows, np.where(self.counted(rows, at)[..., None], ran, np.nan)
 
     def misses(self, theta: FloatArray, at: IndexArray) -> FloatArray:
-        """What all runs miss by, shape (vectors, starts, at, 4, 3); see `parts`."""
+        """Errors of all runs, shape (vectors, starts, at, 4, 3); see `parts`."""
         none = np.full((len(theta), 0, len(at), 4, 3), np.nan)
         return np.concatenate([none, *(misses for _, misses in self.parts(theta, at))], axis=1)
 

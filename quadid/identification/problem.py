@@ -99,7 +99,7 @@ class Free:
             return np.where(self.is_log, np.log(values / start), (values - start) / self.scale)
 
     def from_neutral(self, theta: FloatArray) -> FloatArray:
-        """How far effects are from neutral at `theta`, in typical sizes, shape (parameters,)."""
+        """Distances of effects from neutral at `theta`, in typical sizes, shape (parameters,)."""
         return np.asarray((theta[self.index] - np.array([e.neutral for e in self.entries])) / self.scale)
 
     def move(self, theta: FloatArray, z: FloatArray) -> FloatArray:
@@ -215,7 +215,7 @@ class Columns:
 
     @property
     def projected(self) -> FloatArray:
-        """What `parameters` do that the initial state cannot undo, shape (segments, length, channels, P)."""
+        """Sensitivity to `parameters` that the initial state cannot undo, shape (segments, length, channels, P)."""
         flat = self.parameters - self.basis @ (self.basis.transpose(0, 2, 1) @ self.parameters)
         return flat.reshape(*self.weights.shape, -1)
 
@@ -312,7 +312,7 @@ class Shooting:
         return Free(tuple(self.layout.entry(n) for n in names))
 
     def finds_velocity(self, names: Sequence[str]) -> bool:
-        """Whether initial velocities are found with the parameters `names`: airspeed matters and is not measured."""
+        """True if initial velocities are found with the parameters `names`: airspeed matters and is not measured."""
         return not self.has_velocity and bool(np.isin(self.free(names).index, _AIR).any())
 
     def with_noise(self, noise: NoiseModel) -> Shooting:
@@ -374,7 +374,7 @@ class Shooting:
         return (self.lead if warm else 1), tangents
 
     def starts(self, n_pre: int, states: InitialStates | None = None) -> Starts:
-        """Where simulations start, `n_pre` rows before the segments: of `states`, else as measured."""
+        """Starts of simulations, `n_pre` rows before the segments: of `states`, else as measured."""
         return (states or MEASURED).at(n_pre, self.rollouts, self.segments)
 
     def linearise(self, theta: FloatArray, free: Free, states: InitialStates | None = None) -> Linearised:

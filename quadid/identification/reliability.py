@@ -104,7 +104,7 @@ WIDE = 0.7
 
 @dataclass(frozen=True)
 class Reliability:
-    """What estimates of the parameters differ by, beyond chance.
+    """Differences of estimates of the parameters, beyond chance.
 
     Attributes:
         spread: standard deviation between estimates, scaled parameters, shape (P,).
@@ -126,7 +126,7 @@ class Reliability:
         return unc.widened(self.widening, self._counted(unc))
 
     def _counted(self, unc: Uncertainty) -> FloatArray:
-        """What has to stay below `SPREAD_LIMIT`, shape (P,)."""
+        """Spread that has to stay below `SPREAD_LIMIT`, shape (P,)."""
         return np.full(len(self.spread), np.inf) if self.missed else np.hypot(self.spread, self.misfit * unc.sigma)
 
     def reasons(self, free: Free, unc: Uncertainty) -> tuple[str, ...]:

@@ -1,4 +1,4 @@
-"""How well a parameter vector explains a set: simulation over 1 s segments with estimated initial states.
+"""Score of a parameter vector on a set: simulation over 1 s segments with estimated initial states.
 
 The mean squared residual of each channel is divided by what pure sensor noise would leave there after the initial
 states were fitted, so a perfect model scores 1.0 whatever the segment length, noise colour or channel.
@@ -112,7 +112,7 @@ def mse_score(
 
 @dataclass(frozen=True)
 class Tally:
-    """What `mse_score` compares, summed over segments; tallies of different data add up.
+    """Sums that `mse_score` compares, over segments; tallies of different data add up.
 
     Attributes:
         squares: of the residuals of each channel, shape (channels,).

@@ -96,7 +96,7 @@ class Projected:
         return np.asarray(np.sum(parts, axis=0), dtype=np.float64)
 
     def residuals(self, thetas: FloatArray) -> FloatArray:
-        """What `costs` sums the squares of, shapes (m, size) -> (m, samples)."""
+        """Residuals whose squares `costs` sums, shapes (m, size) -> (m, samples)."""
         parts = []
         for rollout, segments, x0, weights, basis in self._jobs:
             out, _ = rollout.roll(segments, thetas, x0, None, self._n_pre)

@@ -367,7 +367,7 @@ def with_scale_uncertainty(
 
 
 def _directions(free: Free, theta: FloatArray) -> FloatArray:
-    """How each scaled parameter goes with the logarithm of mass and of arm, shape (P, 2)."""
+    """Exponents with which each scaled parameter goes with the logarithm of mass and of arm, shape (P, 2)."""
     out = np.zeros((len(free.entries), 2))
     for j, e in enumerate(free.entries):
         if e.name in NOMINAL_NAMES:

@@ -200,7 +200,7 @@ fly_closed_loop = _on_disk(SOURCES)
 
 
 class Flown(NamedTuple):
-    """What the simulated vehicle's sensors read, rows of the window.
+    """Readings of the simulated vehicle's sensors, rows of the window.
 
     Attributes:
         rates: body rates [rad/s], shape (m, n, 3).

@@ -29,7 +29,7 @@ from quadid.model.work_array import (
 
 
 class Needs(NamedTuple):
-    """Which parts of the model any lane of a block uses.
+    """Parts of the model that any lane of a block uses.
 
     Attributes:
         full: more than the nominal step: one of the groups of `quadid.model.body_kernel`.
@@ -77,7 +77,7 @@ DELAY_ENTRIES = places("command_delay", "rotor_telemetry_delay")
 ROTOR_ENTRIES = places(
     "motor_lag", "command_delay", "rotor_telemetry_delay", "thrust_curve", "supply_voltage", "drag_torque_curve"
 )
-"""What makes rotors of one lane differ from those of another; losses beside them."""
+"""Differences between the rotors of one lane and those of another; losses beside them."""
 # As arrays, which all are of one type: `_any_of` would be compiled anew for each length of a tuple.
 _HUB, _RARE, _PAYLOAD, _FACTORS = (np.array(e) for e in (HUB_ENTRIES, RARE_ENTRIES, PAYLOAD_ENTRIES, FACTOR_ENTRIES))
 _SOLID, _IMU, _DELAY = (np.array(e) for e in (SOLID_ENTRIES, IMU_ENTRIES, DELAY_ENTRIES))
@@ -88,7 +88,7 @@ _IMU_LAG, _ATT_DELAY = np.array([ix.IMU_PERIOD]), np.array([ix.ATT_DELAY])
 
 @nb.njit(**jit)
 def _any_of(theta: FloatArray, entries: IntArray) -> bool:
-    """Whether any of these entries is not neutral in any lane."""
+    """Checks whether any of these entries is not neutral in any lane."""
     found = False
     for lane in range(len(theta)):
         for i in entries:

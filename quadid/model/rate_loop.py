@@ -51,7 +51,7 @@ class RateGains(NamedTuple):
 
 @dataclass(frozen=True)
 class AxisPlant:
-    """What lies between the output of a rate controller and the rate it reads, for one axis.
+    """Chain between the output of a rate controller and the rate it reads, for one axis.
 
     Attributes:
         gain: A, shape (variants,); the first variant is the nominal one, here as below.
@@ -161,7 +161,7 @@ class Loops:
 
     @property
     def stable(self) -> bool:
-        """Whether every variant of both loops is stable."""
+        """Checks whether every variant of both loops is stable."""
         return bool(min(*self.margins().phase, *self.margins().gain) > 0.0) and (
             self.attitude == 0.0 or bool(min(*self.margins(True).phase, *self.margins(True).gain) > 0.0)
         )

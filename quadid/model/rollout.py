@@ -55,7 +55,7 @@ def channels_of(window: Window) -> int:
 
 
 def measurements(window: Window, channels: int) -> tuple[FloatArray, BoolArray]:
-    """What a window measured, as the kernel reads it.
+    """Measurements of a window, as the kernel reads it.
 
     Args:
         window: the data, n rows.
@@ -85,7 +85,7 @@ def measurements(window: Window, channels: int) -> tuple[FloatArray, BoolArray]:
 
 @dataclass(frozen=True)
 class Segments:
-    """How a window is cut for multiple shooting.
+    """Cut of a window for multiple shooting.
 
     Attributes:
         length: scored rows a segment.

@@ -110,7 +110,7 @@ def compare_motion(
 
 @nb.njit(**inlined)
 def _collect_three(c, seg, at, basis, r, total, inside):  # type: ignore[no-untyped-def]
-    """What `collect` does for channels c, c + 1 and c + 2."""
+    """Work of `collect` for channels c, c + 1 and c + 2."""
     x, y, z = c * LANES, (c + 1) * LANES, (c + 2) * LANES
     for lane in range(LANES):
         r0, r1, r2 = r[0, 0, x + lane], r[0, 0, y + lane], r[0, 0, z + lane]

@@ -215,7 +215,7 @@ PLAIN_MOMENTS = 7
 
 
 class Drive(NamedTuple):
-    """What the rotors of a window get.
+    """Inputs of the rotors of a window.
 
     Attributes:
         u: shape (n, rotors), input [rad/s].

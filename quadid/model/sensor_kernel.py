@@ -1,4 +1,4 @@
-"""What the sensors make of the motion, for many parameter vectors at once: IMU filter, AHRS, errors of the IMU.
+"""Sensors that read the motion, for many parameter vectors at once: IMU filter, AHRS, errors of the IMU.
 
 The rows S_* hold what reaches the sensors at one sample; each stage works on them in place, and
 `rollout_kernel.compare` ends the chain.

@@ -35,7 +35,7 @@ LEFT_OUT = (
 
 
 class Functions(Protocol):
-    """What a library of numbers must offer beside arithmetic."""
+    """Functions that a library of numbers must offer beside arithmetic."""
 
     def sqrt(self, x: Scalar) -> Scalar:
         """Square root."""
@@ -241,7 +241,7 @@ AROUND = (
 
 
 class Frame:
-    """What of a vehicle does not change while it flies.
+    """Properties of a vehicle that do not change while it flies.
 
     Attributes:
         vehicle: the file.
@@ -337,7 +337,7 @@ class Frame:
         return tuple(name for name in self.vehicle.effects if name in LEFT_OUT)
 
     def _volts(self, th: Sequence[Scalar]) -> bool:
-        """Whether the supply voltage counts; a symbol does."""
+        """Checks whether the supply voltage counts; a symbol does."""
         return not (isinstance(th[ix.EXPONENT], float) and th[ix.EXPONENT] == 0.0)
 
 

@@ -1,4 +1,4 @@
-"""Where each row of the kernel's work array lies.
+"""Places of the rows in the kernel's work array.
 
 All quantities of one time step live in one flat array `s`: a row is LANES numbers, one for each parameter vector, and
 starts at a fixed offset.  With one base and constant distances the compiler sees that rows do not overlap.

@@ -1,4 +1,4 @@
-"""Which set is in force: numbering, approval, watching a new set against its predecessor, rollback."""
+"""Set in force: numbering, approval, watching a new set against its predecessor, rollback."""
 
 from __future__ import annotations
 

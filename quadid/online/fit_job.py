@@ -56,7 +56,7 @@ EFFECT_WIDTH = 3.0
 ROUNDS = 4
 """Fits after which the noise that the fit leaves has settled, where none is known."""
 ORDER: dict[Sampling, int] = {"held": 1, "instant": 2}
-"""What is missed between readings grows with this power of their distance (Richardson): steps miss twice as much at
+"""Power with which the error between readings grows of their distance (Richardson): steps miss twice as much at
 twice the distance, lines four times."""
 LASTING = 75.0
 """A pilot's style and the place of the readings between the sticks' steps stay for more than a minute [s]: for that

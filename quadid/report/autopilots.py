@@ -50,7 +50,7 @@ class Hover(NamedTuple):
 
 
 class Autopilot(NamedTuple):
-    """Where an autopilot keeps its rate and attitude loops.
+    """Rate and attitude loops of an autopilot.
 
     Attributes:
         program: its name.

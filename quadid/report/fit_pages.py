@@ -163,7 +163,7 @@ def spectrum(accel: Channel, spans: Spans) -> tuple[FloatArray, FloatArray] | No
 
 
 def _turning(recording: Recording, vehicle: Vehicle, spans: Spans, highest: float) -> tuple[float | None, str]:
-    """Where the mean rotor speed in flight shows in the spectrum [Hz], and that in words."""
+    """Frequencies at which the mean rotor speed in flight shows in the spectrum [Hz], and that in words."""
     rotors, _ = rotor_channel(recording, vehicle)
     if rotors is None or rotors.name != "rotor_speed":
         return None, "The rotor speed is not logged; peaks are most often rotors out of balance."
@@ -336,7 +336,7 @@ def set_parts(entries: Sequence[Json], sets: Sequence[ScoredSet]) -> list[JsonDi
 
 
 def quality_section(logs: Sequence[Json], noise: NoiseModel) -> JsonDict:
-    """What was used of every log, and the sensor noise."""
+    """Used parts of every log, and the sensor noise."""
     white = part("Sensor noise, estimated from the flight", tables=[noise_table(noise)])
     return section("quality", "Data quality", parts=[*logs, white])
 
@@ -380,7 +380,7 @@ def correlation_section(parameters: ParameterSet) -> dict[str, Any]:
 
 
 HELD_OUT = "held-out blocks"
-"""What a diagnosis without validation logs measures its gain on."""
+"""Data on which a diagnosis without validation logs measures its gain."""
 _LEVELS: dict[str, Level] = {
     "nothing_found": "good",
     "explained": "good",
@@ -425,7 +425,7 @@ def diagnose_verdict(result: Json) -> Verdict:
 
 
 def _change(errors: Json, found: bool) -> str:
-    """What findings make of the error."""
+    """Error without and with the findings."""
     before, after = errors["mse_nominal"], errors["mse_extended"]
     if not found:
         return f"is {_short(before)}"
@@ -519,7 +519,7 @@ _REMARKS = {
 
 
 def _finding_advice(finding: Json) -> str:
-    """What to do about a cause, and what sets it apart."""
+    """Advice about a cause, and what sets it apart."""
     known = EFFECTS.get(finding["effect"])
     parts = [] if known is None or finding.get("ordinary") else [known.advice]
     return " ".join([*parts, *(text for key, text in _REMARKS.items() if finding.get(key))]).strip()
@@ -580,7 +580,7 @@ def _less(before: float | None, after: float | None) -> float | None:
 
 
 def _noise_sentence(gain: Json, floor: float, name: str) -> str:
-    """How much of the error is sensor noise that no model removes, without and with the cause."""
+    """Share of the error that is sensor noise that no model removes, without and with the cause."""
     shares = [min(floor / v, 1.0) if v else None for v in (gain["mse_before"], gain["mse_after"])]
     if None in shares:
         return ""
@@ -633,7 +633,7 @@ def missing_section(
 
 
 def remaining(result: Json, sets: Sequence[ScoredSet]) -> list[JsonDict]:
-    """What is left: by channel, and what it follows."""
+    """Rest of the error: by channel, and what it follows."""
     channels = {c.name: c for s in sets[-1:] for c in s.fitted.channels}
     rows = [
         (name, percent(share), number(known.rmse if known else None, 3), unit(known.unit if known else ""))

@@ -1,4 +1,4 @@
-"""What a cause looks like in the residual: binned against the quantity it depends on, with the cause and without.
+"""Picture of a cause in the residual: binned against the quantity it depends on, with the cause and without.
 
 A cause leaves a shape: a lag an error in step with the angular acceleration, drag one in step with speed, a failing
 battery one in step with time.  Every effect lists the few pairs of channel and quantity where its equation puts it; the
@@ -37,13 +37,13 @@ _VELOCITY = slice(7, 10)
 
 
 def _pair(text: str) -> tuple[Mode, int, str]:
-    """How the residual is taken, its channel, and what it is drawn against, from the table's words."""
+    """Kind of residual, its channel, and what it is drawn against, from the table's words."""
     channel, against = text.split(": ")
     return ("slope" if channel.endswith("'") else "value"), CHANNEL_NAMES.index(channel.rstrip("'")), against
 
 
 PAIRS = {e.name: tuple(_pair(text) for text in e.shows) for e in EFFECTS.values()}
-"""Where each effect shows: how the residual is taken, its channel, and the quantity it is drawn against."""
+"""Place at which each effect shows: how the residual is taken, its channel, and the quantity it is drawn against."""
 _NAMES = {
     "time": ("time", "s"), "p": ("roll rate", "rad/s"), "q": ("pitch rate", "rad/s"), "r": ("yaw rate", "rad/s"),
     "p_dot": ("roll acceleration", "rad/s^2"), "q_dot": ("pitch acceleration", "rad/s^2"),

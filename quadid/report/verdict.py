@@ -42,7 +42,7 @@ def status_words(parameter: Mapping[str, Any]) -> str:
 
 
 def decided_before(parameter: Mapping[str, Any]) -> bool:
-    """Whether earlier knowledge, such as a `sigma` of the vehicle file, decides the value rather than this flight."""
+    """True if earlier knowledge, such as a `sigma` of the vehicle file, decides the value rather than this flight."""
     return parameter["status"] == "prior_dominated" and bool(parameter.get("measured_before"))
 
 
@@ -82,7 +82,7 @@ MOTION = {
     "J_zz": "quick yaw doublets, together with roll and pitch",
     "J_r": "roll and pitch doublets while yawing",
 }
-"""What the vehicle must do for each parameter to show."""
+"""Motion that the vehicle must make for each parameter to show."""
 
 
 @dataclass(frozen=True)
@@ -157,7 +157,7 @@ def worst(sets: Sequence[Json]) -> float:
 
 
 def _lacking(sets: Sequence[Json]) -> tuple[str, ...]:
-    """What keeps a result from being proven."""
+    """Reasons that keep a result from being proven."""
     unseen, seen = (
         [_number(s.get("seconds", LEAST_SECONDS)) for s in sets if s["role"] == role] for role in ("validate", "train")
     )

@@ -32,7 +32,7 @@ WAIT = 0.1
 
 @dataclass
 class Done:
-    """What a worker has done: requests answered, requests refused, seconds spent on them."""
+    """Work of a worker: requests answered, requests refused, seconds spent on them."""
 
     answered: int = 0
     refused: int = 0
@@ -154,7 +154,7 @@ class Ground:
 
     @property
     def there(self) -> bool:
-        """Whether a ground machine can be asked."""
+        """Checks whether a ground machine can be asked."""
         return self._session is not None and bool(self.alive) and self._clock() >= self._rests_until
 
     def ask(self, request: Job, answers: queue.Queue[tuple[int, Any]], seconds: float) -> None:
@@ -210,7 +210,7 @@ class RemoteWorker:
 
     @property
     def ready(self) -> bool:
-        """Whether the child on board is warm: only then nothing depends on the ground machine."""
+        """Checks whether the child on board is warm: only then nothing depends on the ground machine."""
         return self._local.ready
 
     @property
@@ -236,7 +236,7 @@ class RemoteWorker:
             self._fall_back(f"cannot be asked ({str(error).splitlines()[0]:.80})")
 
     def poll(self) -> list[JobReply | Trouble]:
-        """What has come from either; never waits."""
+        """Replies of either; never waits."""
         out: list[JobReply | Trouble] = list(self._local.poll())
         while not self._answers.empty():
             number, data = self._answers.get_nowait()

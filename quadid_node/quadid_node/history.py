@@ -170,7 +170,7 @@ def make_usable(path: Path) -> str:
 
 
 def is_damage(error: sqlite3.Error) -> bool:
-    """Whether an error says that the file is no sound database, not that it cannot be reached now."""
+    """Checks whether an error says that the file is no sound database, not that it cannot be reached now."""
     told = str(error)
     return "malformed" in told or "not a database" in told or "no such table" in told
 
@@ -473,7 +473,7 @@ def first_number(highest: int = 0) -> int:
 
 @dataclass(frozen=True)
 class Restored:
-    """What an earlier run left.
+    """State left by an earlier run.
 
     Attributes:
         item: the set last in force; None: none.
@@ -605,7 +605,7 @@ class Store:
     # --- what an earlier run left
 
     def restore(self, gate: GateSettings | None = None, vehicle: Vehicle | None = None) -> Restored:
-        """What the last run left; a set is taken up again when this `gate` and `vehicle` could have let it pass."""
+        """State left by the last run; a set is taken up again when this `gate` and `vehicle` could have let it pass."""
         gate = gate or GateSettings()
         if self._lock is None or not self.path.is_file() or not self.path.stat().st_size:
             return Restored(None, first_number())

@@ -102,7 +102,7 @@ class Chooser:
             yield from self.take(_part(block, stop, None), rank)
 
     def has(self, channel: str) -> bool:
-        """Whether some source tells the channel."""
+        """Checks whether some source tells the channel."""
         return channel in self._chosen or channel in self._held
 
 
@@ -161,7 +161,7 @@ class Pace:
 
     @property
     def trouble(self) -> str:
-        """How they bunch; empty where they do not."""
+        """Description of how they bunch; empty where they do not."""
         if len(self._bursts) == AGAIN and self._bursts[0][0] > self.looked - MEMORY:
             _, count, quiet = self._bursts[-1]
             return f"comes in bursts: {count} messages at once after {quiet:.1f} s without one: send each when measured"
@@ -360,7 +360,7 @@ class Decoder:
 
     @property
     def trouble(self) -> str:
-        """What is wrong with messages of this topic, or empty."""
+        """Problem of messages of this topic, or empty."""
         lately = self.pace.looked - MEMORY
         if self._unstamped_at >= lately:
             return f"{self.unstamped} messages have no time (header.stamp is zero) and are left out: stamp them"
@@ -539,7 +539,7 @@ class Intake:
                     yield list(decoder.take(piece))
 
     def troubles(self) -> dict[str, str]:
-        """What is wrong with the messages of topics, by topic name as resolved."""
+        """Problems of the messages of topics, by topic name as resolved."""
         return {topic: why for topic, decoder in self.decoders.items() if (why := decoder.trouble)}
 
     def clear(self) -> None:

@@ -1,4 +1,4 @@
-"""What the launch files make of their arguments: only what was given overrides the configuration file."""
+"""Arguments of the launch files: only what was given overrides the configuration file."""
 
 from __future__ import annotations
 

@@ -38,7 +38,7 @@ MOST_ROUNDS = 5
 """... and so often at most."""
 _ESC_MESSAGES = ("ESC_STATUS", "ESC_TELEMETRY")
 PATIENCE = 6.0
-"""What an ArduPilot has not told so long after its first outputs [s] is taken to go without saying."""
+"""Time after its first outputs [s] from which what an ArduPilot has not told goes without saying."""
 
 
 class MotorOrder:
@@ -147,7 +147,7 @@ RANKS = {
     for channel, names in table.items()
     for rank, name in enumerate(names)
 }
-"""Which message a channel is best taken from."""
+"""Best message for each channel."""
 
 
 _MOTORS = {"esc": "rotor_speed", "servo": "motor_command", "actuator": "motor_command"}
@@ -345,7 +345,7 @@ _WANTED = _OF_OTHERS | {_IDS[n] for n in (*READERS, "COMMAND_ACK", "PARAM_VALUE"
 
 @dataclass(frozen=True)
 class Traffic:
-    """What comes over the link: measured rates [Hz] by message, requests denied, frames refused, bytes dropped.
+    """Traffic of the link: measured rates [Hz] by message, requests denied, frames refused, bytes dropped.
 
     Attributes:
         behind: a stream signed with our key is refused because its stamps are this far behind [s]; 0 for none.
@@ -501,7 +501,7 @@ class MavlinkLink:
     # --- out
 
     def step(self) -> None:
-        """What is due: heartbeat, requests, measured rates, the numbers again for who came late."""
+        """Messages that are due: heartbeat, requests, measured rates, the numbers again for who came late."""
         now = self._clock()
         if now - self._beat >= 1.0:
             self._beat = now
@@ -539,7 +539,7 @@ class MavlinkLink:
             self._say(SEVERITY[output.level], f"quadid: {output.text}")
 
     def traffic(self) -> Traffic:
-        """What comes over the link."""
+        """Messages of the link."""
         wire = self._wire
         problems = [self._source.problem, self._decoder.order.problem, wire.memory_problem]
         for own, most, whose in ((True, FRAMES_A_SECOND, "the vehicle"), (False, OTHERS_A_SECOND, "others")):

@@ -98,7 +98,7 @@ SILENT = 3.0
 
 Time counts only while we listened (`Wire.listened`): who sent during a stall of ours was not silent."""
 JUDGED, ROWS = 40, 160
-"""Whether frame numbers come in two rows is judged after so many frames, of the last so many."""
+"""Checks whether frame numbers come in two rows is judged after so many frames, of the last so many."""
 CALM = 2.0
 """Frame numbers must follow for so long [s] before a stream that two had mixed is believed again."""
 REPEATS, REPEAT_SECONDS = 3, 10.0
@@ -136,7 +136,7 @@ class Source:
         return address == self._address
 
     def take(self, address: Address | None, now: float) -> bool:
-        """Whether a frame of the vehicle from an address may be believed now [s]; None where a link tells none."""
+        """True if a frame of the vehicle from an address may be believed now [s]; None where a link tells none."""
         if now - self._heard > SILENT:
             self._address = address
             self._numbers.clear()
@@ -169,7 +169,7 @@ class Source:
                 self._mixed_until = now + CALM
 
     def _repeats(self, sequence: int, now: float, content: int) -> bool:
-        """Whether numbers used a moment ago have come with something else in them again and again."""
+        """Checks whether numbers used a moment ago have come with something else in them again and again."""
         if now - self._counted > PAUSE:
             self._contents.clear()
         self._counted = now

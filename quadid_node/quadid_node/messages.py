@@ -1,4 +1,4 @@
-"""What the service hands out, for others: messages with the fields of quadid_msgs, and JSON.
+"""Outputs of the service for others: messages with the fields of quadid_msgs, and JSON.
 
 Messages are plain dictionaries, for ROS topics and for MCAP alike; times inside are stamps.  JSON is what the history
 keeps, Zenoh carries and the commands print.
@@ -33,7 +33,7 @@ from quadid.parameters import NOMINAL_NAMES
 from quadid_node.inputs import stamp
 
 Output = Publish | OnlineDiagnosis | HealthReport | HealthyFlight | Event
-"""What a service hands out; its `topic` says which it is, and is what the tables of the links are keyed by."""
+"""Output of a service; its `topic` says which it is, and is what the tables of the links are keyed by."""
 SILENT_WARNING, SILENT_ERROR = 1.0, 5.0
 """A channel that was there and is silent for this long [s] is worth a warning, an error."""
 BEHIND = 2.0
@@ -49,7 +49,7 @@ def lag(seconds: float) -> str:
 
 @dataclass(frozen=True)
 class Feed:
-    """How one channel arrives.
+    """Arrival of one channel.
 
     Attributes:
         rate: samples a second over the last two seconds [Hz].
@@ -363,7 +363,7 @@ def health_to_dict(report: HealthReport) -> dict[str, Any]:
 
 
 def status_to_dict(status: SessionStatus) -> dict[str, Any]:
-    """What a session is doing."""
+    """State of a session."""
     excitation = dict(zip(NOMINAL_NAMES, status.excitation.tolist(), strict=True))
     data: dict[str, Any] = jsonable({**vars(status), "phase": status.phase.name.lower(), "excitation": excitation})
     return data
@@ -379,7 +379,7 @@ def _with_nan(value: Any) -> Any:
 
 
 class Result(NamedTuple):
-    """How an output is told: as a message, of the vehicle's name and the `boot_id` of `parameter_set`, and as JSON."""
+    """Forms of an output: as a message, of the vehicle's name and the `boot_id` of `parameter_set`, and as JSON."""
 
     message: Callable[[Any, str, str], Message]
     json: Callable[[Any], dict[str, Any]]
@@ -395,4 +395,4 @@ RESULTS: Mapping[str, Result] = {
     "diagnosis": Result(lambda output, vehicle, _: diagnosis(output, vehicle), diagnosis_to_dict),
     "vehicle_health": Result(lambda output, vehicle, _: health_message(output, vehicle), health_to_dict),
 }
-"""What is told of an output, by its topic."""
+"""Forms of each output, by its topic."""

@@ -84,7 +84,7 @@ class PollingNode(Node):
 
     @property
     def subscriptions(self) -> Iterator[Subscription[Any]]:
-        """What the executor waits for."""
+        """Entities for which the executor waits."""
         return (s for s in super().subscriptions if s not in self._polled)
 
     def poll(self, kind: Any, topic: str, qos: Any) -> Callable[[], bytes | None]:
@@ -117,7 +117,7 @@ class PollingNode(Node):
         return time.monotonic() - self._broken_at.get(topic, -math.inf)
 
     def publisher_counts(self) -> dict[str, int]:
-        """How many publishers send to each polled topic now; one is counted before its first message can be taken."""
+        """Publishers that send to each polled topic now; one is counted before its first message can be taken."""
         return {s.topic_name: s.get_publisher_count() for s in self._polled}
 
     def destroy_polled(self) -> None:

@@ -169,7 +169,7 @@ class Publishers:
 
     @property
     def silent(self) -> bool:
-        """Whether results stay unsaid: an observer, or another service speaks for this vehicle."""
+        """Checks whether results stay unsaid: an observer, or another service speaks for this vehicle."""
         return self._ownership is None or self._ownership.publisher is None
 
     @property

@@ -39,7 +39,7 @@ CHUNK_BYTES = 1 << 16
 
 @dataclass(frozen=True)
 class Beginning:
-    """What a session began with: vehicle, settings, preset of its topics, and what an earlier run had left."""
+    """Start of a session: vehicle, settings, preset of its topics, and what an earlier run had left."""
 
     vehicle: Vehicle
     settings: SessionSettings
@@ -103,7 +103,7 @@ def installed_definition(package: str, kind: str) -> str:
 
 
 def read_beginning(path: Path) -> Beginning | None:
-    """What the session of a recording began with; None for a file that no `Recorder` wrote.
+    """Start of the session of a recording; None for a file that no `Recorder` wrote.
 
     Raises:
         LogError: its record is damaged.

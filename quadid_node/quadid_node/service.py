@@ -65,7 +65,7 @@ class Publication:
         return out
 
     def _released(self) -> list[Output]:
-        """What waits up to the first set that is not on the disk yet; one that never will be holds up no other."""
+        """Outputs up to the first set that is not on the disk yet; one that never will be holds up no other."""
         store, out = self._store, list[Output]()
         while store is not None and self._waiting:
             output = self._waiting[0]
@@ -81,7 +81,7 @@ class Publication:
 
 
 DECISION_SECONDS = 2.0
-"""How long a person's decision waits to be on the disk before it is answered [s]."""
+"""Time that a person's decision waits to be on the disk before it is answered [s]."""
 PATIENCE = 1.0
 """A session this far behind its data [s] waits no longer for a fit that takes as long, and begins no other."""
 RATE_MEMORY = 2.0
@@ -152,7 +152,7 @@ class Service:
 
     @property
     def ready(self) -> bool:
-        """Whether fits can begin at once."""
+        """Checks whether fits can begin at once."""
         return self._worker.ready
 
     def push(self, messages: Block | Sample) -> None:
@@ -356,12 +356,12 @@ class Scheduler:
 
     @property
     def overdue(self) -> bool:
-        """Whether the round lasts twice as long as it should, and work that can wait should be left to the next."""
+        """True if the round lasts twice as long as it should, and work that can wait should be left to the next."""
         return self._steps >= 2 * STEPS
 
     @property
     def resting(self) -> bool:
-        """Whether there is nothing to do until the next round."""
+        """Checks whether there is nothing to do until the next round."""
         return self._round is None and self._steps + 1 < STEPS
 
     def step(self, seconds: float = WORK_SECONDS) -> None:

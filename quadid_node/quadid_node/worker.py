@@ -85,17 +85,17 @@ class Trouble:
 
 
 class Worker(Protocol):
-    """What the service needs of a worker."""
+    """Interface of a worker for the service."""
 
     def submit(self, request: Job) -> None:
         """Begins a fit."""
 
     def poll(self) -> list[JobReply | Trouble]:
-        """What has happened since the last call."""
+        """Events since the last call."""
 
     @property
     def ready(self) -> bool:
-        """Whether kernels are warm and a fit can begin at once."""
+        """Checks whether kernels are warm and a fit can begin at once."""
 
     @property
     def state(self) -> str:
@@ -168,7 +168,7 @@ class ProcessWorker:
 
     @property
     def ready(self) -> bool:
-        """Whether kernels are warm and a fit can begin at once."""
+        """Checks whether kernels are warm and a fit can begin at once."""
         return self.state in ("idle", "busy")
 
     @property

@@ -276,7 +276,7 @@ LONGEST_INTEGER = 20
 
 
 class Fleet:
-    """What is known of all vehicles, from a Zenoh session.
+    """State of all vehicles, from a Zenoh session.
 
     Attributes:
         latest: by vehicle and kind, the last value.

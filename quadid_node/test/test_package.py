@@ -1,4 +1,4 @@
-"""What `colcon test` asks of this package without a running middleware: its manifest, its launch files, its lint."""
+"""Checks of `colcon test` without a running middleware: the package's manifest, its launch files, its lint."""
 
 from __future__ import annotations
 

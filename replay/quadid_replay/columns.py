@@ -25,7 +25,7 @@ STEP_BACK = 1.0
 STEP_AHEAD = 30.0
 """A stamp this far [s] after the newest one is suspect until others confirm it."""
 CONFIRMATIONS = 3
-"""How many further stamps must agree before a new time base is believed; a single wild stamp moves nothing."""
+"""Number of further stamps that must agree before a new time base is believed; a single wild stamp moves nothing."""
 PAUSE = 1.0
 """Recording time [s] put between the last sample before a reboot and the first one after it."""
 

@@ -41,7 +41,7 @@ _ROWS = 65536
 
 @dataclass
 class DataflashIndex:
-    """Where the records of a log are.
+    """Places of the records of a log.
 
     Attributes:
         data: the file's bytes, mapped.

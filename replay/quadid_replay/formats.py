@@ -15,7 +15,7 @@ from quadid.sanitise import plain
 from quadid_replay.rosbag import bag_files, is_bag_folder
 
 HEAD_BYTES = 65536
-"""How much of the file is looked at."""
+"""Bytes of the file that are looked at."""
 ALLOWED = (
     "ROS 2 MCAP and rosbag2 (.db3 or folder), MAVLink .tlog, ArduPilot DataFlash .bin, PX4 .ulg, "
     "Crazyflie µSD log, Betaflight blackbox, CSV with a header row and a column t"

@@ -118,7 +118,7 @@ is one in thirty, and of two every second one, or each where the second one coun
 
 
 def two_rows(number: IntArray) -> bool:
-    """Whether frame numbers of one id jump to and fro between two rows: jumps land where an earlier one had left off.
+    """True if frame numbers of one id jump to and fro between two rows: jumps land where an earlier one had left off.
 
     Numbers of one sender jump over what was lost, and seldom return to where they were before.
 
@@ -267,7 +267,7 @@ PREFERENCE: dict[str, tuple[str, ...]] = {
     "position": ("LOCAL_POSITION_NED",),
     "battery": ("BATTERY_STATUS", "SYS_STATUS"),
 }
-"""Which message a channel is taken from; a later one only when it comes twice as fast."""
+"""Messages from which a channel is taken; a later one only when it comes twice as fast."""
 
 
 def boot_seconds(m: Any) -> Any:
@@ -379,7 +379,7 @@ class BootClock(Generic[T]):
 
 
 class Stamps(NamedTuple):
-    """What n messages of one vehicle tell of their times, in file order; NaN where nothing.
+    """Times of n messages of one vehicle, in file order; NaN where nothing.
 
     Attributes:
         received: when they came [s, UNIX], shape (n,).

@@ -131,7 +131,7 @@ _NAMED = 4
 
 
 class Outputs(NamedTuple):
-    """Which outputs are motors.
+    """Outputs that are motors.
 
     Attributes:
         columns: of the rotors one by one, 0 is the first output; empty where that is not known.

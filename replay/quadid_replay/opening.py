@@ -118,7 +118,7 @@ def open_log(path: str | Path, preset: str = AUTO, columns: Mapping[str, str] | 
 
 
 class Limits(NamedTuple):
-    """What reading one log may take: memory [MiB], processor time [s]."""
+    """Limits of reading one log: memory [MiB], processor time [s]."""
 
     memory: int
     seconds: float
@@ -230,7 +230,7 @@ class _Refused(msgspec.Struct, tag=True):
 
 
 class _Fault(msgspec.Struct, tag=True):
-    """How the reader failed."""
+    """Failure of the reader."""
 
     what: str
 

@@ -31,7 +31,7 @@ _STAMP_AT, _AFTER_STAMP = 4, 12
 
 
 class Read(NamedTuple):
-    """What n messages hold: stamps [ns], zero for none, shape (n,); runs of numbers, shapes (n, size); and what else
+    """Contents of n messages: stamps [ns], zero for none, shape (n,); runs of numbers, shapes (n, size); and what else
     was noted of all of them."""
 
     ns: IntArray
@@ -136,12 +136,12 @@ _LAST_NUMBER = re.compile(r"(\d{1,9})\D*$", re.ASCII)
 UNDECODABLE = (
     McapError, struct.error, ValueError, LookupError, TypeError, AttributeError, RecursionError, OverflowError,
 )  # fmt: skip
-"""What the library and the types' functions raise on damaged data."""
+"""Errors that the library and the types' functions raise on damaged data."""
 
 
 @dataclass(frozen=True)
 class MessageType:
-    """How to read one type.
+    """Reader of one type.
 
     Attributes:
         blocks: runs of doubles of a decoded message, in the order in which they stand.

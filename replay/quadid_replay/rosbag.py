@@ -178,7 +178,7 @@ class Folder:
         yield from merge(*(of(*member) for member in self._members), key=lambda message: message[1])
 
     def damage(self) -> list[str]:
-        """What could not be read, of all files."""
+        """Unread parts of all files."""
         return [note for bag, _ in self._members for note in bag.damage()]
 
 

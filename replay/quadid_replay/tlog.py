@@ -121,7 +121,7 @@ def read_frames(path: Path) -> Frames:
 
 
 def _marks(data: Bytes) -> IntArray:
-    """Where the high bytes of a receive time between the years 2000 and 2100 stand, and a mark behind it."""
+    """Places at which the high bytes of a receive time between the years 2000 and 2100 stand, and a mark behind it."""
     found = [np.empty(0, dtype=np.int64)]
     for begin in range(0, len(data) - _STAMP, _BLOCK):
         end = min(begin + _BLOCK, len(data) - _STAMP)
@@ -259,7 +259,7 @@ def _checksums(data: Bytes, begin: IntArray, end: IntArray, seeds: IntArray) -> 
 
 @cache
 def _tables() -> tuple[NDArray[np.uint16], NDArray[np.uint16]]:
-    """What a byte, and what two, make of a checksum: shapes (256,) and (65536,)."""
+    """Tables of one and of two bytes of a checksum: shapes (256,) and (65536,)."""
     bits = np.arange(256)
     for _ in range(8):
         bits = np.where(bits & 1, bits >> 1 ^ 0x8408, bits >> 1)
@@ -296,7 +296,7 @@ Told: TypeAlias = Mapping[str, tuple[IntArray, Messages]]
 
 @dataclass(frozen=True)
 class VehicleLog:
-    """What one MAVLink component told.
+    """Messages of one MAVLink component.
 
     Attributes:
         clock: of the log.
@@ -475,7 +475,7 @@ def read_tlog(path: Path) -> Recording:
 
 
 def _vehicles(frames: Frames, which: IntArray) -> dict[tuple[int, int], VehicleLog]:
-    """What each system and component tells in the frames `which`, in the order in which they are first heard; of many
+    """Messages of each system and component in the frames `which`, in the order in which they are first heard; of many
     senders those with the most frames.
     """
     sender = frames.system[which].astype(np.int64) << 8 | frames.component[which]

@@ -41,14 +41,14 @@ _DEFINITIONS = frozenset(b"FP")
 _SYNC = bytes((0x2F, 0x73, 0x13, 0x20, 0x25, 0x0C, 0xBB, 0x12))
 _HEADER = 16
 _NEAR = 65536
-"""How far behind a damaged place records are looked for byte by byte; further on only sync marks are."""
+"""Distance behind a damaged place in which records are looked for byte by byte; further on only sync marks are."""
 _CHAIN = 3
 """So many plausible records in a row are believed to be records."""
 
 
 @dataclass
 class UlogRecords:
-    """What a walk found.
+    """Result of a walk.
 
     Attributes:
         clean: header and whole records of definitions, parameters, and data of the wanted topics.
@@ -68,7 +68,7 @@ class UlogRecords:
     lengths: dict[int, int] = field(default_factory=dict)
     boundaries: list[int] = field(default_factory=list)
     sync: int = 0
-    """Where the next sync mark begins, as far as it was looked for; the end of the file when there is none."""
+    """Begin of the next sync mark, as far as it was looked for; the end of the file when there is none."""
 
 
 def collect_records(path: Path, topics: frozenset[str]) -> UlogRecords:
@@ -410,7 +410,7 @@ def _actuator_motors(log: _Log) -> list[RawChannel]:
 
 
 def _motor_command(log: _Log, key: tuple[str, int], thrust: FloatArray, how: str = "normalized") -> RawChannel:
-    """What goes to the ESCs of relative thrust (n, rotors), as PX4 itself makes it with THR_MDL_FAC."""
+    """Output to the ESCs of relative thrust (n, rotors), as PX4 itself makes it with THR_MDL_FAC."""
     factor = log.parameters.get("THR_MDL_FAC", 0.0)
     if factor > 0.0:
         rest = 1.0 - factor
@@ -438,7 +438,7 @@ def _allocated(log: _Log) -> list[RawChannel]:
 
 
 def _motors_agree(log: _Log, moment: IntArray, thrust: FloatArray) -> bool:
-    """Whether logged motors are those allocated (n, rotors) of setpoints at `moment` (n,), where both are there."""
+    """True if logged motors are those allocated (n, rotors) of setpoints at `moment` (n,), where both are there."""
     motors, columns = ("actuator_motors", 0), tuple(f"control[{i}]" for i in range(thrust.shape[1]))
     if not _has(log, motors, *columns, "timestamp_sample"):
         return False

@@ -36,7 +36,7 @@ _FIRST_LOOK = 16
 
 @dataclass
 class UsdRecords:
-    """What a walk found.
+    """Result of a walk.
 
     Attributes:
         tables: records by event type's name: structured arrays with ``t`` [µs] and the variables by their full name.

@@ -162,7 +162,7 @@ def _effects(recording: Recording) -> list[str]:
 
 
 def _remarks(recording: Recording) -> list[str]:
-    """What the autopilot assumes of thrust and battery, for the reader."""
+    """Assumptions of the autopilot on thrust and battery, for the reader."""
     names = ("MOT_THST_EXPO", "MOT_SPIN_MIN", "MOT_THST_HOVER", "MOT_BAT_VOLT_MAX", "MOT_BAT_VOLT_MIN", "THR_MDL_FAC")
     held = [f"{name} {recording.autopilot[name]:g}" for name in names if name in recording.autopilot]
     return [f"# The autopilot assumes: {', '.join(held)}"] if held else []

@@ -32,7 +32,7 @@ from quadid_replay.schemas import has_definition, schema_text
 
 
 Source: TypeAlias = Recording | Window | Sequence[Window]
-"""What can be written: a recording, or windows of one log."""
+"""Sources that can be written: a recording, or windows of one log."""
 
 
 def recording_of(source: Source) -> Recording:
@@ -609,7 +609,7 @@ _CHANNELS: dict[str, Callable[[Channel], Callable[[int], list[Any]]]] = {
     "attitude": _attitude, "rotor_speed": _escs, "motor_command": _outputs, "attitude_reference": _reference,
     "battery": _voltage,
 }  # fmt: skip
-"""What makes the messages of a channel's rows."""
+"""Makers of the messages of a channel's rows."""
 
 
 # --- Writes recordings of one flight side by side, such as measured and simulated, for viewers that draw curves

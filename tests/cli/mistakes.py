@@ -271,6 +271,11 @@ MISTAKES = (
     Mistake("tabs in a vehicle file", of(lambda p: p.bytes("vehicle.yaml", b"name: x\n\tmass: 1\n")), "line 2"),
     Mistake("a vehicle file of another size", of(lambda p: "crazyflie"), "vehicle file of this log"),
     Mistake("a key misspelt", of(lambda p: p.vehicle(mass=None, mas=1.3)), "did you mean 'mass'"),
+    Mistake(
+        "a key in another unit",
+        of(lambda p: p.vehicle(command={"kind": "normalized", "max_rpm": 7640})),
+        "did you mean 'max_speed', in SI units, not rpm",
+    ),
     Mistake("a vehicle name misspelt", of(lambda p: "pelicn"), "pelican"),
     Mistake("a vehicle file that is not there", of(lambda p: p.folder / "none.yaml"), "no vehicle file"),
     Mistake("another airframe", of(lambda p: "hexacopter"), "rotor columns"),
