@@ -44,6 +44,8 @@ NOMINAL_UNITS: dict[str, str] = {
 }
 """The paper's identified vector Theta: thrust and drag coefficient, body inertias, rotor inertia; with SI units."""
 NOMINAL_NAMES: tuple[str, ...] = tuple(NOMINAL_UNITS)
+TANGENT = "b_tangent"
+"""Beside the six where a thrust curve was fitted along: thrust changes with speed at hover as by b w^2 with this b."""
 MAY_VANISH = "J_r"
 """Light rotors hardly turn the vehicle, and simulators leave their inertia out: this may be as good as nothing."""
 VANISHED = 1e-3

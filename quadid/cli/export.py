@@ -66,6 +66,9 @@ def _in_force(vehicle: Vehicle, history: Path, name: str) -> tuple[Vehicle, str,
     from quadid_node.history import StoreError, read_history, read_in_force
 
     from quadid.identification.result import with_values
+    from quadid.model.layout import ThrustModel
+    from quadid.parameters import TANGENT
+    from quadid.vehicle import GRAVITY
 
     found = read_in_force(history, name, vehicle)
     if found.item is None:
@@ -73,4 +76,15 @@ def _in_force(vehicle: Vehicle, history: Path, name: str) -> tuple[Vehicle, str,
         unread = f": {found.why_none}" if found.why_none else ""
         raise StoreError(f"no set of '{name}' was ever in force in {history}{unread}", f"one of: {names}", "give --id")
     fitted = with_values(vehicle, found.item.parameters).model_copy(update={"proof": None})
+    if TANGENT in found.item.parameters.names:
+        # The file says by a dead speed how steep thrust is at hover.
+        b, steep = (found.item.parameters[n].value for n in ("b", TANGENT))
+        law = ThrustModel.stated(fitted).with_tangent(steep / b, fitted.mass * GRAVITY)
+        prior = fitted.parameters["b"].model_copy(update={"initial": law.curve[0], "bounds": None, "sigma": None})
+        curve = {**fitted.effects.get("thrust_curve", {}), "dead_speed": law.curve[1]}
+        fitted = fitted.model_copy(
+            update={
+                "parameters": {**fitted.parameters, "b": prior}, "effects": {**fitted.effects, "thrust_curve": curve},
+            }
+        )  # fmt: skip
     return fitted, f"{history.name}, set {found.item.sequence} of {name}", found.doubt

@@ -247,6 +247,23 @@ class ThrustModel:
         other._b = b
         return other
 
+    def with_tangent(self, share: float, weight: float) -> ThrustModel:
+        """The same where the rotors carry `weight` [N], and `share` times the slope there."""
+        hover, other = self.hover_speed(weight), copy(self)
+        other._b = self._b * share**2
+        other._dead_speed = hover - (hover - self._dead_speed) / share
+        return other
+
+    @property
+    def curve(self) -> tuple[float, float]:
+        """B [N s^2/rad^2] and dead speed [rad/s]."""
+        return self._b, self._dead_speed
+
+    @property
+    def at_rest(self) -> float:
+        """Thrust [N] that the law has where nothing turns: no rotor has any, so it is a support, or a sensor's."""
+        return float(self._share.sum()) * (self._b * min(self._dead_speed, 0.0) ** 2 + self._offset)
+
     def at_speed(self, speed: float) -> FloatArray:
         """Thrust of each rotor [N], shape (rotors,), where all turn at `speed` [rad/s]."""
         return np.asarray(self.single(np.full((1, len(self._share)), speed))[0])

@@ -82,7 +82,7 @@ class WindowEstimate:
         information: Fisher information there, without prior, shape (P, P).
         score: half the gradient of the cost there, shape (P,).
         cost: cost at z; rows: independent residuals, so that cost / rows is 1 at the noise floor.
-        left_out: what the parameters leave out of each rotor's thrust, and its standard deviations, shape (2, R).
+        left_out: what the parameters leave out of thrust, and its standard deviations, shape (2, R + 1) (`left_out`).
     """
 
     start: float
@@ -242,7 +242,7 @@ def _is_estimate(estimate: WindowEstimate, vehicle: Vehicle, start: float, stop:
     shapes = (estimate.z.shape, estimate.score.shape, estimate.information.shape)
     if shapes != ((SIX,), (SIX,), (SIX, SIX)) or (estimate.start, estimate.stop) != (start, stop):
         return False
-    if estimate.left_out.shape != (2, len(vehicle.rotors)) or np.any(estimate.left_out[1] <= 0.0):
+    if estimate.left_out.shape != (2, len(vehicle.rotors) + 1) or np.any(estimate.left_out[1] <= 0.0):
         return False
     if not estimate.finite:
         return True
@@ -539,10 +539,13 @@ def widened(estimate: WindowEstimate, covariance: FloatArray) -> WindowEstimate:
 
 
 def left_out(fitted: Flexible) -> FloatArray:
-    """Thrust at hover beyond b w^2: a row of values and one of their standard deviations, shape (2, R).
+    """Thrust beyond b w^2: a row of values and one of their standard deviations, shape (2, R + 1).
 
-    The value of a rotor is the logarithm of its thrust's change with speed, as fitted, over that by the published b.  A
-    thrust curve, a support force and an accelerometer of another scale give all rotors the same, a weak rotor itself.
+    The value of a rotor is the logarithm of its thrust's change with speed at hover, as fitted, over that by the
+    published b.  A thrust curve, a support force and an accelerometer of another scale give all rotors the same, a weak
+    rotor itself.  The last value tells them apart: the thrust that the fitted law has where no rotor turns, over the
+    weight.  A rotor's own curve has none there; what a support carries, or the bias that hides a wrong scale, is there.
+    Where no such constant is fitted along, nothing is known of it.
     """
     problem, free, prior, best = fitted
     weight, stated = problem.vehicle.mass * GRAVITY, ThrustModel.stated(problem.vehicle)
@@ -550,13 +553,17 @@ def left_out(fitted: Flexible) -> FloatArray:
     def value(at: FloatArray) -> FloatArray:
         full = ThrustModel(problem.layout, at)
         six = stated.with_b(full.like(stated, weight))
-        return np.log(np.maximum(full.slope(weight), 1e-12) / six.slope(weight))
+        own = np.log(np.maximum(full.slope(weight), 1e-12) / six.slope(weight))
+        return np.append(own, (full.at_rest - six.at_rest) / weight)
 
     here, steps = _differences(value, free, best.theta)
     covariance = posterior_covariance(best.lin.information, prior)
     excess = np.maximum(variance_ratio(best.lin, covariance)[0], 1.0)
     spread = np.sqrt(excess)[:, None] * steps
-    return np.stack([here, np.sqrt(np.einsum("pr,pq,qr->r", spread, covariance, spread))])
+    sigma = np.sqrt(np.einsum("pr,pq,qr->r", spread, covariance, spread))
+    if all(e.name != "thrust_curve.offset" for e in free.entries):
+        here[-1], sigma[-1] = 0.0, 1.0
+    return np.stack([here, sigma])
 
 
 def _differences(value: Callable[[FloatArray], Any], free: Free, theta: FloatArray) -> tuple[Any, FloatArray]:

@@ -11,11 +11,11 @@ import hashlib
 import math
 from collections import Counter, deque
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from quadid.chi_square import exceeded
+from quadid.chi_square import Z95, exceeded
 from quadid.data.window import Window
 from quadid.identification.noise import NoiseModel
 from quadid.identification.problem import Free
@@ -27,7 +27,7 @@ from quadid.online.fit_job import FitReply, FitRequest, WindowEstimate, prior_of
 from quadid.online.gate import Case
 from quadid.online.grid_buffer import WindowCut
 from quadid.online.records import OnlineSet
-from quadid.parameters import NOMINAL_NAMES, ParameterSet, Status
+from quadid.parameters import NOMINAL_NAMES, TANGENT, ParameterSet, Status
 from quadid.types import FloatArray
 from quadid.vehicle import GRAVITY, Vehicle
 
@@ -156,7 +156,7 @@ class Fusion:
         return float(difference @ np.linalg.solve(own.covariance + covariance, difference))
 
     def left_out(self) -> FloatArray | None:
-        """Weighted mean of `WindowEstimate.left_out` of disjoint windows, shape (2, R), widened where they scatter."""
+        """Mean `WindowEstimate.left_out` of disjoint windows, widened where they scatter, shape (2, R + 1)."""
         told = np.array([w.left_out for w in self.disjoint()])
         if not len(told):
             return None
@@ -277,10 +277,15 @@ class Estimator:
 
     @property
     def published(self) -> ThrustModel:
-        """Thrust by the b that is published and the vehicle file's own effects: what who uses the six has."""
+        """Thrust by what is published and the vehicle file's own effects: what who uses a set has."""
         fused = self.fusion.estimate()
         stated = ThrustModel.stated(self.vehicle)
-        return stated if fused is None else stated.with_b(math.exp(fused.z[B]))
+        if fused is None:
+            return stated
+        model, told = stated.with_b(math.exp(fused.z[B])), self.fusion.left_out() if self.flexible else None
+        if told is None:
+            return model
+        return model.with_tangent(math.exp(told[0, :-1].mean()), self.vehicle.mass * GRAVITY)
 
     @property
     def input_hash(self) -> str:
@@ -390,7 +395,9 @@ class Estimator:
         if self._yaw_missed:
             theta, covariance = self._without_yaw(theta, covariance)
         unc = Uncertainty(covariance, np.ones(len(fused.z)), self._prior_sigma)
-        return parameter_set(self._free, theta, self._initial, unc)
+        six = parameter_set(self._free, theta, self._initial, unc)
+        left_out = self.fusion.left_out() if self.flexible else None
+        return six if left_out is None else with_tangent(six, *left_out[:, :-1].mean(axis=1).tolist())
 
     def _without_yaw(self, theta: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
         """The estimate with what couples into yaw alone as uncertain as before the flight, where the model misses it.
@@ -482,6 +489,19 @@ class Estimator:
         published = self.published
         total = float(np.mean(np.concatenate([published.total(w.rotor_speed) for w in windows])))
         return total / (self.vehicle.mass * max(felt, 1e-3))
+
+
+def with_tangent(six: ParameterSet, share: float, sigma: float) -> ParameterSet:
+    """The six and, beside b, the slope of thrust over speed: `share` (log) of that by b, known to `sigma`."""
+    b = six["b"]
+    value, both = b.value * math.exp(share), math.hypot(b.sigma / b.value, sigma)
+    low, high = (value * math.exp(z * both) for z in (-Z95, Z95))
+    new = replace(b, name=TANGENT, value=value, sigma=value * both, ci95=(low, high), measured_before=False)
+    spread = np.zeros((len(six.parameters) + 1,) * 2)
+    spread[:-1, :-1] = six.covariance
+    spread[-1, :-1] = spread[:-1, -1] = six.covariance[six.names.index("b")] * value / b.value
+    spread[-1, -1] = new.sigma**2
+    return ParameterSet((*six.parameters, new), spread)
 
 
 def _bytes(window: Window) -> bytes:

@@ -14,9 +14,20 @@ from quadid.chi_square import Z95
 from quadid.identification.uncertainty import PRIOR_SHARE
 from quadid.online.checks import Factor
 from quadid.online.records import WAITS, OnlineSet, SetState
-from quadid.parameters import MAY_VANISH, NOMINAL_NAMES, UNKNOWN, ParameterSet, Status, at_bound, impossible_inertia
+from quadid.parameters import (
+    MAY_VANISH,
+    NOMINAL_NAMES,
+    TANGENT,
+    UNKNOWN,
+    ParameterSet,
+    Status,
+    at_bound,
+    impossible_inertia,
+)
 from quadid.types import FloatArray
 
+LIMITED = (*NOMINAL_NAMES, TANGENT)
+"""What may not jump from one set to the next; effects may."""
 MUST_BE_KNOWN = ("b", "J_xx", "J_yy")
 """Without these no set is published; yaw parameters may stay at the vehicle file's values, and say so."""
 
@@ -78,7 +89,7 @@ class Case:
         walked: change of torque over inertia (log) from the oldest to the newest agreeing window and its standard
             deviation, by the inertia's name.
         between_rows: relative standard deviation by what the rotors do between readings, newest window, by name.
-        left_out: of each rotor's thrust by b w^2 and standard deviations, shape (2, R) (`fit_job.left_out`).
+        left_out: of thrust by b w^2 and standard deviations, shape (2, R + 1) (`fit_job.left_out`).
         loaded: why the vehicle may have another mass than the vehicle file says, or empty.
     """
 
@@ -97,7 +108,7 @@ class Case:
     stated: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     walked: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     between_rows: Mapping[str, float] = field(default_factory=dict)
-    left_out: FloatArray = field(default_factory=lambda: np.zeros((2, 1)))
+    left_out: FloatArray = field(default_factory=lambda: np.zeros((2, 2)))
     loaded: str = ""
 
 
@@ -171,7 +182,7 @@ def _width(case: Case, settings: GateSettings) -> str | None:
                 unseen = f"; what the rotors do between readings moves it by {missed:.0%}"
                 way = "log motors faster (80 Hz, not 50), or fly more smoothly"
                 return f"{text}{unseen}: {way}" if missed > settings.width else text
-        elif p.status is Status.IDENTIFIED and half > settings.yaw_width:
+        elif p.name in NOMINAL_NAMES and p.status is Status.IDENTIFIED and half > settings.yaw_width:
             return f"{p.name} is known to {half:.0%} only, wanted {settings.yaw_width:.0%}: yaw more"
     return None
 
@@ -222,8 +233,9 @@ def _unproven(case: Case, settings: GateSettings) -> str | None:
     for f in case.doubts:
         if _too_far(np.array([f.off]), np.array([f.sigma]), settings)[1]:
             return f"{f}, wanted +- {0.5 * settings.width / Z95:.3f}: whether the sensors agree is not known yet"
-    if _too_far(case.left_out[0], case.left_out[1], settings)[1]:
-        half = Z95 * float(case.left_out[1].max())
+    value, sigma = case.left_out[:, :-1]
+    if _too_far(value, sigma, settings)[1]:
+        half = Z95 * float(sigma.max())
         return f"how thrust follows rotor speed is known to {half:.1%} only, wanted {0.5 * settings.width:.1%}: climb"
     return None
 
@@ -231,7 +243,7 @@ def _unproven(case: Case, settings: GateSettings) -> str | None:
 def _doubtful(case: Case, settings: GateSettings) -> str | None:
     for f in case.doubts:
         if _too_far(*_together(f, case), settings)[0]:
-            also = f" and thrust {math.expm1(case.left_out[0].mean()):+.1%} off b w^2"
+            also = f" and thrust {math.expm1(_hidden(case)[0]):+.1%} off what the set says"
             return f"{f}{also}: b, J_xx and J_yy may be off by it, allowed {settings.width:.0%}"
     return None
 
@@ -241,16 +253,27 @@ def _together(factor: Factor, case: Case) -> tuple[FloatArray, FloatArray]:
 
     Each may be within its own limit: an accelerometer 3 % high under a gyro 2.5 % high, and a support of 4 %.
     """
-    value, sigma = case.left_out.mean(axis=1)
+    value, sigma = _hidden(case)
     return np.array([abs(factor.off) + abs(value)]), np.array([math.hypot(factor.sigma, sigma)])
 
 
+def _hidden(case: Case) -> tuple[float, float]:
+    """What is wrong with all rotors' thrust alike by the set, and its standard deviation.
+
+    The change of thrust with speed off b w^2, or, where the set states that change, what is carried while no rotor
+    turns: a curve of the rotors' own is no error of such a set.
+    """
+    slope, at_rest = case.left_out[:, :-1].mean(axis=1).tolist(), case.left_out[:, -1].tolist()
+    stated = TANGENT in case.parameters.names
+    return min([slope, at_rest] if stated else [slope], key=lambda v: abs(v[0]) + Z95 * v[1])
+
+
 def _left_out(case: Case, settings: GateSettings) -> str | None:
-    """Thrust that the six leave out: the fit contains it, a user of the six does not."""
-    value, sigma = case.left_out
-    if not _too_far(value, sigma, settings)[0]:
+    """Thrust that the set leaves out: the fit contains it, a user of the set does not."""
+    value, sigma = case.left_out[:, :-1]
+    own, (hidden, spread) = value - value.mean(), _hidden(case)
+    if not _too_far(own + hidden, np.maximum(sigma, spread), settings)[0]:
         return None
-    own = value - value.mean()
     worst = int(np.argmax(np.abs(own)))
     if abs(own[worst]) > abs(value.mean()):
         off = f"rotor {worst + 1} gives {math.expm1(value[worst]):+.0%} against b"
@@ -272,7 +295,7 @@ def _step(case: Case, settings: GateSettings, times: float = 1.0) -> str | None:
                 continue
             old = reference.parameters[p.name]
             known = not UNKNOWN & {p.status, old.status}
-            change = p.value / old.value - 1.0 if p.name in NOMINAL_NAMES and old.value > 0.0 else 0.0
+            change = p.value / old.value - 1.0 if p.name in LIMITED and old.value > 0.0 else 0.0
             # What was only guessed before may be learned: its own interval says how far it may move.
             room = limit + (2.0 * old.sigma / old.value if known and old.value > 0.0 else math.inf)
             if abs(math.log1p(change)) > math.log1p(room):

@@ -20,6 +20,7 @@ PARAMETER_NAMES: dict[str, str] = {
     "J_yy": "Pitch inertia",
     "J_zz": "Yaw inertia",
     "J_r": "Rotor inertia",
+    "b_tangent": "Slope of thrust",
 }
 STATUS_WORDS: dict[str, str] = {
     "identified": "identified",

@@ -33,9 +33,9 @@ from quadid.condition.trim import FlightTrim, flight_from_dict, flight_to_dict
 from quadid.condition.watch import MOST_FLIGHTS
 from quadid.errors import QuadidError
 from quadid.online.fit_job import ROOM, with_room
-from quadid.online.gate import GateSettings, implausible
+from quadid.online.gate import LIMITED, GateSettings, implausible
 from quadid.online.records import Event, OnlineDiagnosis, OnlineSet, SetState
-from quadid.parameters import NOMINAL_NAMES, ParameterSet
+from quadid.parameters import NOMINAL_NAMES, TANGENT, ParameterSet
 from quadid.sanitise import plain
 from quadid.vehicle import Vehicle
 from quadid_node.messages import Output, diagnosis_to_dict, set_from_dict, set_to_dict
@@ -431,7 +431,7 @@ def why_none(found: OnlineSet, number: int, gate: GateSettings, vehicle: Vehicle
     """
     if found.sequence != number:
         return f"it says that it is set {str(found.sequence)[:40]} in the row of set {str(number)[:40]}"
-    if found.parameters.names != NOMINAL_NAMES:
+    if found.parameters.names not in (NOMINAL_NAMES, LIMITED):
         missing = [n for n in NOMINAL_NAMES if n not in found.parameters.names]
         return (
             f"it lacks {', '.join(missing)}" if missing else f"it has other parameters than {', '.join(NOMINAL_NAMES)}"
@@ -443,7 +443,7 @@ def why_none(found: OnlineSet, number: int, gate: GateSettings, vehicle: Vehicle
     if not math.isnan(found.mass) and not vehicle.mass / ROOM <= found.mass <= vehicle.mass * ROOM:
         return f"it rests on a mass of {found.mass:g} kg, the vehicle has {vehicle.mass:g} kg"
     widest = with_room(vehicle).parameters
-    bounded = tuple(replace(p, bounds=widest[p.name].limits) for p in found.parameters)
+    bounded = tuple(replace(p, bounds=widest["b" if p.name == TANGENT else p.name].limits) for p in found.parameters)
     vague = next((p for p in bounded if p.sigma > ROOM * p.bounds[1]), None)
     if vague is not None:
         return f"{vague.name} has a standard deviation of {vague.sigma:g} {vague.unit}"

@@ -246,14 +246,17 @@ class MavlinkDecoder:
 # --- A parameter set as read-only MAVLink parameters
 
 
-PARAMETERS = {"b": "QI_B", "d": "QI_D", "J_xx": "QI_J_XX", "J_yy": "QI_J_YY", "J_zz": "QI_J_ZZ", "J_r": "QI_J_R"}
+PARAMETERS = {
+    "b": "QI_B", "d": "QI_D", "J_xx": "QI_J_XX", "J_yy": "QI_J_YY", "J_zz": "QI_J_ZZ", "J_r": "QI_J_R",
+    "b_tangent": "QI_B_TAN",
+}  # fmt: skip
 
 REFERENCES = {"none": 0.0, "vehicle_file": 1.0, "history": 2.0}
 """Reference of a set, as a number."""
 
 
 def parameters_of(item: OnlineSet | None) -> list[tuple[str, float]]:
-    """Names and values: number, state, reference of the set; the nominal parameters and their deviations."""
+    """Names and values: number, state, reference of the set; the parameters and their deviations."""
     if item is None:
         return [("QI_SEQ", 0.0)]
     high, low = divmod(item.sequence, 1 << 24)  # a float holds 24 bits

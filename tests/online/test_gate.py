@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -13,9 +14,11 @@ from hypothesis import strategies as st
 
 from quadid.chi_square import Z95
 from quadid.online.checks import Factor
+from quadid.online.fusion import with_tangent
 from quadid.online.gate import CHECKS, JUDGED, Case, GateSettings, decide
 from quadid.online.records import OnlineSet, SetState
 from quadid.parameters import NOMINAL_NAMES, NOMINAL_UNITS, Parameter, ParameterSet, Status, impossible_inertia
+from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 from tests.faults.evidence import Happened
 
@@ -179,24 +182,48 @@ def test_what_sensors_may_be_off_by_together_is_bounded() -> None:
     [((0.12, 0.12, 0.12, 0.12), "support"), ((-0.09, 0.03, 0.03, 0.03), "rotor 1"), ((0.05, -0.05) * 2, "rotor")],
 )
 def test_what_the_six_leave_out_of_the_thrust_waits_for_a_person(values: tuple[float, ...], word: str) -> None:
-    decision = decide(good(left_out=np.array([values, [0.005] * 4])), GateSettings())
+    decision = decide(good(left_out=off_by(values)), GateSettings())
     assert (decision.state, decision.check) == (SetState.PENDING, "thrust")
     assert word in decision.reason
-    small = np.array([[0.01] * 4, [0.01] * 4])
-    assert decide(good(left_out=small), GateSettings()).state is ACCEPTED
-    vague = decide(good(left_out=np.array([[0.01] * 4, [0.03] * 4])), GateSettings())
+    assert decide(good(left_out=off_by([0.01] * 4, 0.01)), GateSettings()).state is ACCEPTED
+    vague = decide(good(left_out=off_by([0.01] * 4, 0.03)), GateSettings())
     assert (vague.state, vague.check) == (SetState.REJECTED, "sensors")
 
 
+@pytest.mark.parametrize(
+    ("values", "at_rest", "state"),
+    [
+        ((-0.28,) * 4, (0.004, 0.005), SetState.ACCEPTED),  # the rotors' own curve, which the set states
+        ((-0.28,) * 4, (0.12, 0.005), SetState.PENDING),  # something carries an eighth of the weight
+        ((-0.28,) * 4, (0.0, 1.0), SetState.PENDING),  # which of both is not known
+        ((-0.40, -0.24, -0.24, -0.24), (0.004, 0.005), SetState.PENDING),  # a rotor of its own
+        ((0.01,) * 4, (0.0, 1.0), SetState.ACCEPTED),
+    ],
+)
+def test_a_curve_of_all_rotors_is_published_where_nothing_is_carried_at_rest(
+    values: tuple[float, ...], at_rest: tuple[float, float], state: SetState
+) -> None:
+    left_out = off_by(values, at_rest=at_rest)
+    curved = with_tangent(parameter_set(TRUE), float(np.mean(values)), 0.005)
+    assert curved["b_tangent"].value == pytest.approx(TRUE["b"] * math.exp(np.mean(values)))
+    assert decide(good(parameters=curved, left_out=left_out), GateSettings()).state is state
+    if abs(np.mean(values)) > 0.1:
+        assert decide(good(left_out=left_out), GateSettings()).check == "thrust", "a set that states no curve"
+
+
+def off_by(values: Sequence[float], sigma: float = 0.005, at_rest: tuple[float, float] = (0.0, 1.0)) -> FloatArray:
+    return np.array([[*values, at_rest[0]], [*([sigma] * len(values)), at_rest[1]]])
+
+
 def test_what_sensors_and_thrust_are_off_by_is_added_up() -> None:
-    sensors, thrust = (Factor("accelerometer times turn", 1.03, 0.005),), np.array([[-0.03] * 4, [0.004] * 4])
+    sensors, thrust = (Factor("accelerometer times turn", 1.03, 0.005),), off_by([-0.03] * 4, 0.004)
     assert decide(good(doubts=sensors), GateSettings()).state is ACCEPTED
     assert decide(good(left_out=thrust), GateSettings()).state is ACCEPTED
     for sign in (1.0, -1.0):  # one may hide the other: no sign makes them cancel
         both = good(doubts=sensors, left_out=thrust * [[sign], [1.0]])
         decision = decide(both, GateSettings())
         assert (decision.state, decision.check) == (SetState.PENDING, "sensors")
-        assert "b w^2" in decision.reason
+        assert "thrust" in decision.reason
 
 
 def test_a_set_that_rests_on_another_mass_waits_for_a_person() -> None:

@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 
 from quadid.data.window import Recording
-from quadid.online import Session, SessionSettings
+from quadid.model.layout import Layout
+from quadid.online import FitRequest, Session, SessionSettings
+from quadid.online.fit_job import with_room
 from quadid.online.records import OnlineSet, SetState
 from quadid.types import FloatArray
 from quadid.vehicle import GRAVITY, ParameterPrior, Vehicle
@@ -95,6 +97,27 @@ def test_a_thrust_curve_that_the_vehicle_file_lacks_waits_and_one_that_it_has_is
     accepted = published(drive(told, samples(made.recording)))
     assert accepted, told.status().reason
     assert all(abs(off(s, n)) < 0.05 for s in accepted for n in ("b", "J_xx", "J_yy"))
+
+
+def test_what_a_support_carries_shows_at_rest_and_a_curve_of_the_rotors_own_does_not() -> None:
+    """At hover the two look alike; ArduCopter's default frame was held back as if something carried it."""
+    dead = -90.0
+    bent = (("thrust_curve", "dead_speed", dead), ("thrust_curve", "offset", -TRUE["b"] * dead**2))
+    each = PELICAN.mass * GRAVITY / 4.0
+    hover = dead + np.sqrt(each / TRUE["b"] + dead**2)
+    slope = np.log(TRUE["b"] * (hover - dead) * hover / each)
+    plain = flight(24.0, 3)
+    held_up = replace(plain.window, rotor_speed=supported(0.15)(plain.window.rotor_speed))
+    for window, sloped, carried in ((flight(24.0, 3, effects=bent).window, slope, 0.0), (held_up, None, 0.15)):
+        model = with_room(PELICAN)
+        theta = Layout(model).initial(model)
+        asked = FitRequest(1, model, (window,), 0.0, 24.0, theta, None, True, 0, flexible=True)
+        reply = asked.answer()
+        assert reply.estimate is not None, reply.problem
+        (*rotors, at_rest), (*_, sigma) = reply.estimate.left_out
+        assert at_rest == pytest.approx(carried, abs=3.0 * sigma)
+        assert sigma < 0.03
+        assert sloped is None or np.mean(rotors) == pytest.approx(sloped, abs=0.03)
 
 
 def test_three_sensors_each_within_its_limit_do_not_move_a_set_by_seven_per_cent(happened: Happened) -> None:
