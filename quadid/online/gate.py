@@ -263,9 +263,10 @@ def _hidden(case: Case) -> tuple[float, float]:
     The change of thrust with speed off b w^2, or, where the set states that change, what is carried while no rotor
     turns: a curve of the rotors' own is no error of such a set.
     """
-    slope, at_rest = case.left_out[:, :-1].mean(axis=1).tolist(), case.left_out[:, -1].tolist()
-    stated = TANGENT in case.parameters.names
-    return min([slope, at_rest] if stated else [slope], key=lambda v: abs(v[0]) + Z95 * v[1])
+    slope, at_rest = case.left_out[:, :-1].mean(axis=1), case.left_out[:, -1]
+    stated = TANGENT in case.parameters.names and abs(at_rest[0]) + Z95 * at_rest[1] < abs(slope[0]) + Z95 * slope[1]
+    value, sigma = (at_rest if stated else slope).tolist()
+    return float(value), float(sigma)
 
 
 def _left_out(case: Case, settings: GateSettings) -> str | None:
