@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 import subprocess
 import sys
@@ -48,27 +47,6 @@ def logs(flights: Flights) -> dict[str, str]:
 def load(path: str, vehicle: str = "pelican") -> Any:
     """A log of the library."""
     return quadid.load(path, vehicle=vehicle)
-
-
-def test_a_command_gives_what_its_function_gives(inside: Cli, logs: dict[str, str], tmp_path: Path) -> None:
-    run = inside("score", logs["good"], "--vehicle", "pelican", "--horizons", "1,5", "--json", tmp_path / "r.json")
-    made = quadid.score(load(logs["good"]), horizons=(1, 5))
-    assert same(json.loads((tmp_path / "r.json").read_text(encoding="utf-8"))) == same(made.result)
-    assert [line.removeprefix("warning: ") for line in run.err.splitlines()] == made.warnings
-    assert all(line in run.out.splitlines() for line in made.tables()[0].text(160).splitlines())
-
-
-def test_simulate_and_export_agree(inside: Cli, tmp_path: Path) -> None:
-    effect = "rotor_drag:k_x=0.3,k_y=0.3"
-    run = inside("simulate", tmp_path / "a.csv", "--seconds", "10", "--effect", effect, "--json", "-")
-    made = quadid.simulate(seconds=10.0, effects=[effect])
-    assert same(run.data) == same(made.result)
-    assert (tmp_path / "a.csv").read_bytes() == made.save(tmp_path / "b.csv").read_bytes()
-    run = inside("export", "--vehicle", "pelican", "--format", "rotorpy", "--out", tmp_path, "--json", "-")
-    exported = quadid.export("pelican", "rotorpy")
-    assert same(run.data) == same(exported.result)
-    for file in run.data["files"]:
-        assert Path(file).read_text(encoding="utf-8") == exported.texts[Path(file).name]
 
 
 PATHS: dict[str, Callable[..., Any]] = {
@@ -210,14 +188,6 @@ def test_a_fitted_file_knows_the_voltage_that_it_was_fitted_at(tmp_path: Path) -
     volts = np.concatenate([np.ravel(w.battery) for w in log.windows if w.battery is not None])
     fit = quadid.identify(log)
     assert fit.vehicle.reference_voltage == pytest.approx(np.nanmean(volts), rel=1e-3)
-
-
-def test_an_inspection_prints_what_its_command_prints(logs: dict[str, str]) -> None:
-    found = quadid.inspect(logs["good"], vehicle="pelican")
-    for text in (found.text(), found._repr_html_()):
-        assert "flying from-to (s)" in text
-        assert "rotor speed: the rotors agree with each other" in text
-        assert "usable for identification" in text
 
 
 def test_parts_of_a_log_warn_of_it_once(logs: dict[str, str], tmp_path: Path) -> None:

@@ -77,58 +77,6 @@ def test_wrong_effects_are_named() -> None:
         check_effects({"motor_lag": {"tau": 3.0}}, 4)
 
 
-def test_rotor_drag_brakes() -> None:
-    got = acceleration({"rotor_drag": {"k_x": 0.3, "k_y": 0.2}}, velocity=np.array([2.0, 3.0, 0.0]))
-    np.testing.assert_allclose(got, [-0.6, -0.6, 0, 0, 0, 0], atol=1e-12)
-
-
-def test_wind_from_behind_pushes_when_there_is_drag() -> None:
-    effects = {"rotor_drag": {"k_x": 0.3, "k_y": 0.2}, "wind": {"north": 2.0, "east": -1.0}}
-    np.testing.assert_allclose(acceleration(effects)[:3], [0.6, -0.2, 0.0], atol=1e-12)
-    assert np.all(acceleration({"wind": {"north": 5.0}}) == 0.0)
-
-
-def test_parasitic_drag_grows_with_speed_squared() -> None:
-    got = acceleration({"parasitic_drag": {"c": 0.02}}, velocity=np.array([3.0, 0.0, 4.0]))
-    np.testing.assert_allclose(got[:3], [-0.3, 0.0, -0.4], atol=1e-12)
-
-
-def test_rotor_drag_above_the_cg_tips_the_vehicle_back() -> None:
-    """Flying forward, the drag pulls the top backwards: nose up; flying right it rolls left."""
-    drag = {"rotor_drag": {"k_x": 0.3, "k_y": 0.3}}
-    velocity = np.array([2.0, 1.0, 0.0])
-    both = acceleration({**drag, "rotor_drag_moment": {"h_x": 0.02, "h_y": 0.03}}, velocity)
-    tip = both - acceleration(drag, velocity)
-    m, p = 1.30, setup_of().truth
-    np.testing.assert_allclose(tip[3:], [-0.03 * m * 0.3 * 1.0 / p.J_xx, 0.02 * m * 0.3 * 2.0 / p.J_yy, 0], atol=1e-10)
-
-
-def test_rate_damping_brakes_rotation() -> None:
-    got = acceleration({"rate_damping": {"l_p": 0.5, "m_q": 2.0}}, rates=np.array([1.0, 0.5, 0.7]))
-    np.testing.assert_allclose(got[3:], [-0.5, -1.0, 0.0], atol=1e-10)
-
-
-def test_climbing_costs_thrust() -> None:
-    got = acceleration({"axial_inflow": {"k_z": 0.3}}, velocity=np.array([0.0, 0.0, -2.0]))
-    np.testing.assert_allclose(got[:3], [0.0, 0.0, 0.6], atol=1e-12)
-
-
-@pytest.mark.parametrize(("down", "lost"), [(-2.0, 0.2), (0.0, 0.0), (2.0, 0.0)])
-def test_the_square_of_the_climb_costs_thrust_and_a_descent_gives_none(down: float, lost: float) -> None:
-    got = acceleration({"axial_inflow": {"k_z": 0.0, "k_climb": 0.05}}, velocity=np.array([0.0, 0.0, down]))
-    np.testing.assert_allclose(got, [0.0, 0.0, lost, 0.0, 0.0, 0.0], atol=1e-12)
-
-
-def test_k_climb_is_what_a_slipstream_of_given_speed_loses() -> None:
-    """T = rho A (v_e^2 - v^2) / 2 a rotor, with v_e such that it hovers: k_climb = rho A N / (2 m) = g / v_e^2."""
-    area, density, climb, mass = 0.05, 1.2, 3.0, setup_of().truth.mass
-    leaving = np.sqrt(2.0 * mass * GRAVITY / (4.0 * density * area))
-    left = 4.0 * density * area / 2.0 * (leaving**2 - climb**2)
-    effects = {"axial_inflow": {"k_z": 0.0, "k_climb": GRAVITY / leaving**2}}
-    got = acceleration(effects, velocity=np.array([0.0, 0.0, -climb]))
-    assert got[2] == pytest.approx(GRAVITY - left / mass, rel=1e-9)
-
-
 def test_weak_rotor_one_of_the_pelican_is_the_rear_one() -> None:
     """The tail drops (nose up), and the vehicle turns to the right, since rotor 1 pushed it to the left."""
     p = setup_of().truth
@@ -136,12 +84,6 @@ def test_weak_rotor_one_of_the_pelican_is_the_rear_one() -> None:
     lost = 0.1 * p.b * HOVER**2
     np.testing.assert_allclose(got[2], lost / p.mass, rtol=1e-12)
     np.testing.assert_allclose(got[3:], [0.0, 0.21 * lost / p.J_yy, 0.1 * p.d * HOVER**2 / p.J_zz], atol=1e-9)
-
-
-def test_several_weak_rotors_add_up() -> None:
-    first, third = (acceleration({"weak_rotor": {"rotor": n, "loss": 0.1}}) for n in (1.0, 3.0))
-    both, none = acceleration({"weak_rotor": {"loss_1": 0.1, "loss_3": 0.1}}), acceleration({})
-    np.testing.assert_allclose(both - none, first + third - 2.0 * none, atol=1e-9)
 
 
 def test_cg_ahead_of_the_centre_drops_the_nose() -> None:
@@ -157,12 +99,6 @@ def test_product_of_inertia_has_the_negative_in_the_tensor() -> None:
     assert tensor[1, 2] == -5e-4
     with pytest.raises(ParameterError, match="indefinite"):
         setup_of(effects={"product_of_inertia": {"J_xy": 9e-3, "J_xz": 9e-3, "J_yz": 9e-3}})
-
-
-def test_dead_speed_bends_the_thrust_curve() -> None:
-    got = acceleration({"thrust_curve": {"dead_speed": 30.0}})
-    np.testing.assert_allclose(got[2], GRAVITY * (1.0 - ((HOVER - 30.0) / HOVER) ** 2), rtol=1e-9)
-    assert got[5] == pytest.approx(0.0, abs=1e-12)
 
 
 def accel_z(flight: Flight) -> tuple[FloatArray, FloatArray]:

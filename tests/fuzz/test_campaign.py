@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import signal
-import time
-from pathlib import Path
 from random import Random
 
 import pytest
 
-from quadid.data.window import Recording
 from tests.faults.evidence import Happened
 from tests.fuzz import campaign
 from tests.fuzz.formats import FORMATS
@@ -43,25 +39,3 @@ def test_seeds_are_whole_logs_whose_records_are_known(kind: str) -> None:
         assert any(form.define(Random(n), record) != record for n in range(20) for record in records)
     assert campaign.input_of(kind, 7) == campaign.input_of(kind, 7)
     assert len({campaign.input_of(kind, n) for n in range(50)}) > 40
-
-
-def _greedy(path: Path, preset: str) -> Recording:
-    bytearray(campaign.LIMIT + (64 << 20))
-    raise AssertionError("the limit did not hold")
-
-
-def _slow(path: Path, preset: str) -> Recording:
-    while time.process_time() < 1e9:
-        pass
-    raise AssertionError("the guard did not strike")
-
-
-@pytest.mark.parametrize("reader", [_greedy, _slow])
-def test_guards_strike(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, reader: object) -> None:
-    monkeypatch.setattr(campaign, "read_here", reader)
-    monkeypatch.setattr(campaign, "SECONDS", 0.2)
-    old = signal.signal(signal.SIGPROF, campaign._expired)
-    with campaign.memory_limit():
-        assert campaign.judge(tmp_path / "log") == ("stopped", "", "")
-    signal.signal(signal.SIGPROF, old)
-    assert signal.getitimer(signal.ITIMER_PROF)[0] == 0.0

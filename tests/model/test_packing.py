@@ -28,15 +28,6 @@ def one_each() -> FloatArray:
     return out
 
 
-def test_every_vector_has_a_lane_of_its_own_and_the_first_has_the_first() -> None:
-    thetas = one_each()
-    lane = packing(thetas, 4, 9)
-    assert lane[0] == 0
-    assert len(set(lane.tolist())) == len(thetas)
-    assert lane.max() < -(-len(thetas) // LANES) * LANES
-    np.testing.assert_array_equal(packed(thetas, lane)[lane], thetas)
-
-
 def test_vectors_that_need_little_are_not_beside_those_that_need_much() -> None:
     thetas = one_each()
     spread = packed(thetas, packing(thetas, 4, 9))
@@ -44,10 +35,6 @@ def test_vectors_that_need_little_are_not_beside_those_that_need_much() -> None:
     assert sum(b.shared for b in blocks) >= len(blocks) - 1
     assert sum(b.air for b in blocks) <= 2
     assert sum(b.imu_lag or b.att_delay or b.ahrs for b in blocks) <= 2
-
-
-def test_few_vectors_stay_where_they_are() -> None:
-    np.testing.assert_array_equal(packing(one_each()[:LANES], 4, 9), np.arange(LANES))
 
 
 @pytest.mark.parametrize("channels", [9, 15])

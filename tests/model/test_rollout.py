@@ -15,7 +15,7 @@ from quadid.data.window import Window
 from quadid.errors import VehicleError, WindowError
 from quadid.model import layout as ix
 from quadid.model.layout import Layout
-from quadid.model.rollout import CHANNEL_NAMES, CHANNEL_UNITS, Rollout, Segments, shared_rollout
+from quadid.model.rollout import Rollout, Segments
 from quadid.model.rollout_kernel import roll_segments
 from quadid.model.simd import LANES
 from quadid.vehicle import Vehicle
@@ -56,16 +56,6 @@ def test_tangent_offsets_move_the_initial_state() -> None:
     slope = (out[0, 0, 0, :, 1:13] - out[0, 0, 0, :, :1]) / h
     order = [3, 4, 5, 0, 1, 2, 9, 10, 11, 12, 13, 14]
     assert np.abs(slope[order] - np.eye(12)).max() < 0.25, "one step later each offset has hardly changed"
-
-
-def test_lanes_beyond_the_last_vector_repeat_it() -> None:
-    window = noisy_window()
-    rollout = Rollout(window, VEHICLE)
-    segments = Segments.cut(len(window), 20)
-    out, ends = rollout.roll(segments, np.tile(NOMINAL, (LANES + 2, 1)), rollout.initial_states(segments))
-    assert out.shape == (2, len(segments.starts), 20, 15, LANES)
-    assert ends.shape == (2, len(segments.starts), 13, LANES)
-    assert np.array_equal(out[1, ..., 1], out[1, ..., LANES - 1])
 
 
 def test_results_can_be_written_into_earlier_ones() -> None:
@@ -135,10 +125,6 @@ def test_impossible_calls_are_refused() -> None:
         rollout.roll(segments, Layout(VEHICLE).neutral()[None], x0)
 
 
-def test_every_channel_has_a_name_and_a_unit() -> None:
-    assert len(CHANNEL_NAMES) == len(CHANNEL_UNITS) == 15
-
-
 def test_layout_reads_and_writes_vehicle_files() -> None:
     layout = Layout(VEHICLE)
     effects = {
@@ -192,14 +178,6 @@ def test_a_second_start_compiles_nothing() -> None:
     )
     test_results_can_be_written_into_earlier_ones()
     subprocess.run([sys.executable, "-c", script], check=True, timeout=120)
-
-
-def test_a_rollout_is_shared_while_somebody_uses_it() -> None:
-    window = noisy_window()
-    one = shared_rollout(window, VEHICLE)
-    assert shared_rollout(window, VEHICLE) is one
-    assert shared_rollout(window, VEHICLE.model_copy()) is not one
-    assert shared_rollout(noisy_window(), VEHICLE) is not one
 
 
 def test_running_speeds_pickled_windows_and_read_only_states_need_no_kernel_of_their_own() -> None:

@@ -11,7 +11,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from quadid_evaluation.optimisers.lshade import LShade, LShadeOptions, Stop
 
-from quadid.errors import ParameterError
 from quadid.types import FloatArray
 
 Cost = Callable[[FloatArray], FloatArray]
@@ -97,56 +96,10 @@ def test_population_shrinks_linearly_and_the_budget_is_kept_to_the_evaluation() 
     np.testing.assert_allclose(sizes[1:], 54 - 50 * np.array(spent[1:]) / 1003, atol=0.5)
 
 
-def test_same_seed_same_run() -> None:
-    a, b, c = (run(rastrigin, 3, 5.0, 900, seed) for seed in (5, 5, 6))
-    np.testing.assert_array_equal(a.best, b.best)
-    assert not np.array_equal(a.best, c.best)
-
-
 def test_stops_when_the_population_has_collapsed() -> None:
     solver = run(sphere, 2, 1.0, 100_000, 0)
     assert solver.stop is Stop.CONVERGED
     assert solver.evaluations < 20_000
-
-
-@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
-def test_costs_that_are_not_finite_are_worst(bad: float) -> None:
-    solver = run(lambda x: np.where(x[:, 0] > 0.0, bad, sphere(x + 1.0)), 3, 5.0, 6_000, 0)
-    np.testing.assert_allclose(solver.best, -1.0, atol=1e-3)
-
-
-def test_says_so_when_no_cost_is_finite() -> None:
-    assert run(lambda x: np.full(len(x), math.nan), 2, 1.0, 300, 0).stop is Stop.NO_FINITE_COST
-
-
-def test_initial_points_join_the_first_population() -> None:
-    point = np.array([0.25, -0.5])
-    solver = LShade([-1.0, -1.0], [1.0, 1.0], 500, 0, LShadeOptions(initial_points=point))
-    np.testing.assert_array_equal(solver.ask()[0], point)
-    np.testing.assert_array_equal(solver.ask(), solver.ask())
-
-
-@pytest.mark.parametrize(
-    ("budget", "options", "message"),
-    [
-        (10, {}, "budget of 10"),
-        (100, {"population": 3}, "population of 3"),
-        (100, {"initial_points": [[9.0, 0.0]]}, "outside the box"),
-        (100, {"initial_points": [[0.0]]}, "initial points of shape"),
-    ],
-)
-def test_what_cannot_evolve_is_refused(budget: int, options: dict[str, object], message: str) -> None:
-    with pytest.raises(ParameterError, match=message):
-        LShade([-1.0, -1.0], [1.0, 1.0], budget, 0, LShadeOptions(**options))  # type: ignore[arg-type]
-
-
-def test_costs_of_the_wrong_number_or_unasked_are_refused() -> None:
-    solver = LShade([-1.0, -1.0], [1.0, 1.0], 500, 0)
-    with pytest.raises(ParameterError, match="one tell of shape"):
-        solver.tell([1.0])
-    solver.tell(sphere(solver.ask()))
-    with pytest.raises(ParameterError, match="one tell of shape"):
-        solver.tell(np.zeros(36))
 
 
 @settings(max_examples=40)

@@ -8,7 +8,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from quadid_replay.columns import Columns, LogClock, RawChannel, clean_channel, fastest_first
 from quadid_replay.frames import (
-    cross,
     flip_attitude,
     flip_body,
     flip_world,
@@ -133,11 +132,6 @@ def test_samples_that_cannot_be_used_are_dropped_and_counted() -> None:
     absurd = clean_channel(RawChannel("position", np.array([0.0, 1.0]), np.array([[0.0, 1, 2], [1e200, 0, 0]]), "x"))
     assert absurd is not None
     assert (len(absurd.t), dict(absurd.faults)) == (1, {"absurd": 1})
-
-
-def test_cross_products_are_those_of_numpy_to_the_bit() -> None:
-    a, b = np.random.default_rng(1).normal(size=(2, 200, 3)) * np.array([[[1e-9, 1.0, 1e9]], [[1e6, 1e-3, 1.0]]])
-    assert cross(a, b).tobytes() == np.cross(a, b).tobytes()
 
 
 def test_columns_keep_doubles_and_refuse_other_widths() -> None:

@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from quadid_replay import open_log
-from quadid_replay.frames import flip_attitude, flip_body, flip_world
 
 from quadid.checks import Check, CheckResult, Inspection, inspect, proposed_cuts
 from quadid.checks.motion import Spans, fit_axes, gyro_check
@@ -89,58 +88,6 @@ def test_axes_that_hardly_turn_are_not_called_swapped(axis: int) -> None:
     assert found.verdict is CheckResult.OK, found.message
 
 
-def test_flu_for_frd_in_one_channel_and_in_all(clean: Recording, happened: Happened) -> None:
-    gravity = check(inspect(changed(clean, "accel", flip_body)), "gravity")
-    assert gravity.verdict is CheckResult.ERROR
-    assert "FLU" in gravity.message
-    gyro = check(inspect(changed(clean, "gyro", flip_body)), "gyro_attitude")
-    assert gyro.verdict is CheckResult.ERROR
-    assert "x = x, y = -y, z = -z" in gyro.message
-    ros = clean
-    for name, flip in (
-        ("gyro", flip_body),
-        ("accel", flip_body),
-        ("attitude", flip_attitude),
-        ("velocity", flip_world),
-    ):
-        ros = changed(ros, name, flip)
-    verdicts = {c.name: c.verdict for c in inspect(ros).checks}
-    assert verdicts["gravity"] is CheckResult.ERROR
-    happened(10, "FLU for FRD in one channel or in all: refused, with the axis map 'x = x, y = -y, z = -z'")
-
-
-def test_degrees_for_radians(clean: Recording, happened: Happened) -> None:
-    gyro = check(inspect(changed(clean, "gyro", np.degrees)), "gyro_attitude")
-    assert gyro.verdict is CheckResult.ERROR
-    assert "deg/s" in gyro.message
-    assert gyro.fix == "convert to radians"
-    happened(10, "gyro in deg/s: refused, 'convert to radians'")
-
-
-@pytest.mark.parametrize(
-    ("change", "name"),
-    [(lambda q: q * [1, -1, -1, -1], "world to body"), (lambda q: q[:, [1, 2, 3, 0]], "scalar last")],
-)
-def test_quaternions_read_the_wrong_way(
-    clean: Recording, change: Callable[[FloatArray], FloatArray], name: str
-) -> None:
-    found = check(inspect(changed(clean, "attitude", change)), "gyro_attitude")
-    assert found.verdict is CheckResult.ERROR
-    assert name in found.message
-
-
-def test_swapped_gyro_axes_are_named(clean: Recording) -> None:
-    found = check(inspect(changed(clean, "gyro", lambda v: v[:, [1, 0, 2]])), "gyro_attitude")
-    assert found.verdict is CheckResult.ERROR
-    assert "x = y, y = x, z = z" in found.message
-
-
-def test_velocity_in_enu_beside_an_attitude_in_ned(clean: Recording) -> None:
-    found = check(inspect(changed(clean, "velocity", flip_world)), "velocity_attitude")
-    assert found.verdict is CheckResult.ERROR
-    assert "x = y, y = x" in found.message
-
-
 def with_position(recording: Recording, factor: tuple[float, float, float], shuffle: bool = False) -> Recording:
     """The flight with its own path as position, and a velocity that is `factor` times the change of it."""
     speed = recording.channels["velocity"]
@@ -182,17 +129,6 @@ def test_recorded_crazyflies_have_a_velocity_that_is_too_large_horizontally(data
         assert 1.05 < found.numbers["scale horizontally"] < 1.11
     right = check(inspect(open_log(data_dir / "nanobench" / "B2_circle_fast_rep1.csv")), "position_velocity")
     assert right.verdict is CheckResult.OK
-
-
-@pytest.mark.parametrize("order", [(1, 0, 2, 3), (3, 2, 1, 0), (2, 3, 0, 1), (1, 2, 3, 0)])
-def test_the_order_of_swapped_motors_is_named(clean: Recording, order: tuple[int, ...], happened: Happened) -> None:
-    swapped = changed(clean, "rotor_speed", lambda v: v[:, order])
-    found = check(inspect(swapped, PELICAN), "motor_order")
-    assert found.verdict is CheckResult.ERROR
-    back = ", ".join(str(int(i) + 1) for i in np.argsort(order))
-    assert back in found.message
-    assert back in found.fix
-    happened(10, f"motors logged in the order {order}: refused, with the order {back} that fits")
 
 
 def known(vehicle: Vehicle, mass: float = 1.0, arm: float = 1.0, turn: float = 0.0) -> Vehicle:
@@ -279,22 +215,6 @@ def test_a_loop_that_answers_the_noise_of_its_gyro_reverses_no_spins(name: str, 
     """Logged at the loop's own rate, the answer looks like the spin-up of rotors that turn the other way."""
     flown = fly(Vehicle.shipped(name), None, 20.0, 5, log_rate=rate).recording
     assert check(inspect(flown, Vehicle.shipped(name)), "motor_order").verdict is CheckResult.OK
-
-
-def test_reversed_spins_show_in_yaw(clean: Recording) -> None:
-    data = PELICAN.model_dump()
-    for rotor in data["rotors"]:
-        rotor["spin"] = -rotor["spin"]
-    found = check(inspect(clean, Vehicle.model_validate(data)), "motor_order")
-    assert found.verdict is CheckResult.ERROR
-
-
-@pytest.mark.parametrize(("factor", "unit"), [(60 / (2 * np.pi), "rpm"), (1 / (2 * np.pi), "rev/s")])
-def test_rotor_speeds_in_other_units(clean: Recording, factor: float, unit: str, happened: Happened) -> None:
-    found = check(inspect(changed(clean, "rotor_speed", lambda v: v * factor), PELICAN), "hover")
-    assert found.verdict is CheckResult.ERROR
-    assert unit in found.message
-    happened(10, f"rotor speeds in {unit}: refused, fix: {found.fix}")
 
 
 def test_the_wrong_vehicle_is_an_error_of_hover(clean: Recording) -> None:

@@ -113,13 +113,6 @@ def test_punches_and_falls_are_part_of_the_flight() -> None:
     assert next(c for c in found.checks if c.name == "gravity").verdict is CheckResult.OK
 
 
-def test_vertical_signs(flight: Recording) -> None:
-    up = flight.channels["velocity"].values * [1.0, 1.0, -1.0]
-    assert "points up" in verdict(with_channel(flight, "velocity", up), "velocity_attitude").message
-    high = flight.channels["position"].values * [1.0, 1.0, -1.0]
-    assert "points up" in verdict(with_channel(flight, "position", high), "position_velocity").message
-
-
 def test_after_an_error_nothing_later_is_asked(flight: Recording) -> None:
     degrees = with_channel(flight, "gyro", np.degrees(flight.channels["gyro"].values))
     assert not {"hover", "motor_order", "rotor_timing", "geometry"} & {*names(degrees)}
@@ -127,14 +120,6 @@ def test_after_an_error_nothing_later_is_asked(flight: Recording) -> None:
     made = names(swapped)
     assert "rotor_speed" not in made
     assert verdict(swapped, "motor_order").fix.endswith("columns 2, 1, 3, 4")
-
-
-def test_a_late_rotor_signal_is_no_other_order(flight: Recording) -> None:
-    speeds = flight.channels["rotor_speed"]
-    late = Channel("rotor_speed", speeds.t + 0.06, speeds.values, speeds.source)
-    made = replace(flight, channels={**flight.channels, "rotor_speed": late})
-    assert "reorder" not in " ".join(c.fix for c in inspect(made, Vehicle.shipped("pelican")).checks)
-    assert verdict(made, "rotor_timing").verdict is CheckResult.ERROR
 
 
 def test_held_readings_count_at_the_rate_at_which_they_change(flight: Recording) -> None:

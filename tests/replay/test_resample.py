@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from scipy import ndimage
 from scipy.interpolate import CubicHermiteSpline
 
-from quadid.data.grid import hold_mean, interpolate, lowpass, lowpass_span, matching_rows, moving_mean, split_stretches
-from quadid.data.window import fresh_rows, measured_period, measured_rows, sample_period
+from quadid.data.grid import interpolate, lowpass, lowpass_span, moving_mean, split_stretches
+from quadid.data.window import fresh_rows, measured_period, measured_rows
 from quadid.types import FloatArray
 
 STEP = 0.02
@@ -63,18 +63,6 @@ def test_half_amplitude_at_the_cutoff() -> None:
     assert abs(response(0.4 / STEP, np.arange(0.0, 8.0, 0.001))) == pytest.approx(0.5, abs=0.01)
 
 
-def test_response_does_not_depend_on_the_rate_of_the_source() -> None:
-    gains = [response(11.0, np.arange(0.0, 8.0, 1.0 / rate)) for rate in (160.0, 333.0, 1000.0)]
-    assert np.ptp(np.abs(gains)) < 2e-3
-
-
-def test_jitter_and_a_lost_sample_do_little() -> None:
-    rng = np.random.default_rng(3)
-    t = np.arange(0.0, 8.0, 0.002)
-    jittered = np.delete(np.sort(t + rng.normal(0.0, 6e-5, len(t))), [700, 2000, 2001])
-    assert response(5.0, jittered) == pytest.approx(response(5.0, t), abs=2e-3)
-
-
 def test_held_samples_count_at_the_middle_of_their_step() -> None:
     """A staircase of rate 1/T is half a sample late; its low-pass sees that and the staircase's own droop."""
     period, hertz = 0.004, 5.0
@@ -91,44 +79,11 @@ def test_constants_pass_exactly(value: float, held: bool, rate: float) -> None:
     np.testing.assert_allclose(out, value, rtol=1e-12, atol=1e-12)
 
 
-def test_hold_mean_is_the_exact_average() -> None:
-    t = np.array([0.0, 1.0, 1.5, 3.0])
-    values = np.array([[2.0], [4.0], [0.0], [1.0]])
-    out = hold_mean(t, values, np.array([0.0, 0.5, 1.25, 2.5, 3.0]), 1.0)[:, 0]
-    np.testing.assert_allclose(out, [2.0, 0.5 * 2 + 0.5 * 4, 0.25 * 4, 0.5, 1.0])
-
-
-def test_smooth_interpolation_keeps_more_amplitude_than_lines() -> None:
-    t = np.arange(0.0, 2.0, STEP)
-    at = t[10:-10] + 0.5 * STEP
-    smooth, lines = (np.abs(interpolate(t, tone(t, 10.0), at, s)[:, 0]).max() for s in (True, False))
-    assert lines < 0.82 < 0.9 < smooth <= 1.0
-
-
-def test_nothing_is_read_outside_a_stretch() -> None:
-    out = interpolate(np.array([0.0, 1.0]), np.array([[0.0], [1.0]]), np.array([-0.1, 0.5, 1.1]), False)
-    assert np.isnan(out[[0, 2]]).all()
-    assert out[1, 0] == 0.5
-
-
 def test_stretches_end_at_gaps_and_breaks() -> None:
     t = np.array([0.0, 1.0, 2.0, 5.0, 6.0, 7.0])
     assert split_stretches(t, 1.5, [6.5]) == [slice(0, 3), slice(3, 5), slice(5, 6)]
     assert split_stretches(t, 1.5, [5.0]) == [slice(0, 3), slice(3, 6)]
     assert split_stretches(np.empty(0), 1.0) == []
-
-
-def test_matching_rows_needs_every_time() -> None:
-    t = np.array([0.0, 0.1, 0.2, 0.3])
-    found = matching_rows(t, np.array([0.1, 0.3]), 0.1)
-    assert found is not None
-    assert list(found) == [1, 3]
-    assert matching_rows(t, np.array([0.1, 0.25]), 0.1) is None
-
-
-def test_period_ignores_gaps() -> None:
-    assert sample_period(np.array([0.0, 0.1, 0.2, 5.0, 5.1])) == pytest.approx(0.1)
-    assert np.isnan(sample_period(np.array([1.0])))
 
 
 def test_fresh_rows_of_a_staircase_and_of_a_resting_signal() -> None:

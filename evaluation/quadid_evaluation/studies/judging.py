@@ -285,17 +285,17 @@ MISTAKES: tuple[Mistake, ...] = (
     Mistake("acceleration reversed", scaled("accel", -1.0), "sign is reversed|points up"),
     Mistake("gravity taken out", gravity_out, "gravity is missing"),
     Mistake("body FLU", flu, "FLU"),
-    Mistake("gyro FLU alone", scaled("gyro", (1.0, -1.0, -1.0)), "gyro axes differ"),
+    Mistake("gyro FLU alone", scaled("gyro", (1.0, -1.0, -1.0)), "gyro axes differ.*x = x, y = -y, z = -z"),
     Mistake("accelerometer FLU alone", scaled("accel", (1.0, -1.0, -1.0)), "points up"),
-    Mistake("pitch rate reversed", scaled("gyro", (1.0, -1.0, 1.0)), "gyro axes differ"),
-    Mistake("gyro x and y exchanged", columns("gyro", (1, 0, 2)), "gyro axes differ"),
+    Mistake("pitch rate reversed", scaled("gyro", (1.0, -1.0, 1.0)), "gyro axes differ.*x = x, y = -y, z = z"),
+    Mistake("gyro x and y exchanged", columns("gyro", (1, 0, 2)), "gyro axes differ.*x = y, y = x, z = z"),
     Mistake("world ENU", enu, "ENU"),
     Mistake("world ENU, body FLU", ros, "ENU|FLU"),
     Mistake("quaternion scalar last", attitude(lambda q: q[:, [1, 2, 3, 0]]), "scalar last"),
     Mistake("attitude inverse", attitude(conjugate), "world to body"),
     Mistake("vz up", scaled("velocity", (1.0, 1.0, -1.0)), "points up"),
     Mistake("z up", scaled("position", (1.0, 1.0, -1.0)), "points up"),
-    Mistake("vx, vy exchanged", columns("velocity", (1, 0, 2)), "world axes"),
+    Mistake("vx, vy exchanged", columns("velocity", (1, 0, 2)), "world axes.*x = y, y = x"),
     Mistake("Euler rates as gyro", euler_rates, "rates of roll, pitch and yaw"),
     Mistake("differentiated Euler angles as gyro", differentiated, "rates of roll, pitch and yaw|differentiated"),
     Mistake("differentiated quaternion as gyro", turned_rates, "differentiated"),
@@ -341,7 +341,8 @@ def orders(rotors: int) -> Iterator[Mistake]:
     for order in permutations(range(rotors)):
         if order != tuple(range(rotors)):
             name = "".join(str(k + 1) for k in order)
-            yield Mistake(f"order {name}", of_rotors(lambda w, o=order: w[:, list(o)]), ORDER)  # type: ignore[misc]
+            back = ", ".join(str(order.index(k) + 1) for k in range(rotors))
+            yield Mistake(f"order {name}", of_rotors(lambda w, o=order: w[:, list(o)]), back)  # type: ignore[misc]
 
 
 # --- The table
