@@ -33,7 +33,7 @@ from quadid.vehicle import GRAVITY, Vehicle
 
 Spans = tuple[tuple[float, float], ...]
 
-_OFF = 16.0
+HOPELESS = 16.0
 """A thrust coefficient that is wrong by more tells nothing of the weight."""
 _NOTHING = 0.1
 """A rotor below this share of the median speed of all is ignored."""
@@ -158,7 +158,7 @@ def _thrust(channel: Channel, vehicle: Vehicle | None, felt: FloatArray | None) 
         modelled, hover = ThrustModel.stated(vehicle).total(values), vehicle.mass * GRAVITY
         highest = float(np.max(modelled))  # of losses that no rotor has it may be negative
         typical = float(np.median(modelled[modelled >= 0.25 * highest])) if highest > 0.0 else 0.0
-        if 1.0 / _OFF < typical / hover < _OFF:
+        if 1.0 / HOPELESS < typical / hover < HOPELESS:
             return modelled, hover
     strong = thrust > 0.5 * np.quantile(thrust, 0.95)
     if felt is not None and (strong := strong & (felt > 0.5)).any():
@@ -342,6 +342,8 @@ _MOTION = 0.03
 """Rotation rate [rad/s] an axis must have, as standard deviation, to be checked."""
 _STEP = 0.1
 """Attitudes are compared over steps of at least this [s]: noise and repeated readings matter little then."""
+_UNIT = 1.5
+"""Two channels of one motion whose sizes are farther apart are of no use together."""
 _JUMP = 8.0
 """An attitude step of so many times the usual one, beside half as much of the gyro's, is no motion."""
 _FARTHEST, _LAG, _TOO_LATE = 0.3, 0.02, 0.08
@@ -439,8 +441,8 @@ def gravity_check(recording: Recording, spans: Spans) -> Check:
     flown = z > 0.5 * length and bool(spans) and _turns(recording.channels.get("gyro"), spans)
     if z > -0.5 * length and not flown and _attitude_explains(accel, recording.channels.get("attitude"), inside):
         return check(CheckResult.UNKNOWN, f"{message}; its attitude says that the vehicle lies or turns so")
-    if not spans and abs(z) < 0.8 * length:
-        return check(CheckResult.UNKNOWN, f"{message}; the vehicle does not fly in this log")
+    if not spans and z > -0.8 * length:
+        return check(CheckResult.UNKNOWN, f"{message}; the vehicle does not fly in this log: it may lie so")
     if z > 0.5 * length:
         turned = f"{message}: z points up (FLU, as ROS has it) or the sign is reversed"
         return check(CheckResult.ERROR, turned, _downwards(recording, accel, inside))
@@ -724,17 +726,26 @@ def _judge_rates(reading: str, fit: AxisMap) -> Check:
     message = f"attitude rate / gyro = {fit.scale:.3f} (R^2 {fit.r2:.2f})"
     if 0.85 < fit.scale < 1.15:
         return check(CheckResult.OK, message)
+    if not 1.0 / _UNIT < fit.scale < _UNIT:
+        remedy = f"multiply gyro by {fit.scale:.3g}, or correct the attitude"
+        return check(CheckResult.ERROR, f"{message}: the scale of one is wrong", remedy)
     return check(CheckResult.WARNING, message, "check scales and filters")
 
 
 def velocity_check(recording: Recording) -> Check:
-    """Change of world velocity against rotated specific force and gravity: world frame of attitude and velocity."""
+    """Change of world velocity against rotated specific force and gravity: world frame of attitude and velocity.
+
+    Where no velocity is logged, it is that of the position.
+    """
     channels = recording.channels
-    accel, attitude, velocity = (channels.get(n) for n in ("accel", "attitude", "velocity"))
+    accel, attitude = channels.get("accel"), channels.get("attitude")
+    velocity = channels.get("velocity") or _flown(channels.get("position"))
     if accel is None or attitude is None or velocity is None or min(map(len, (accel.t, attitude.t, velocity.t))) < 20:
-        return Check("velocity_attitude", CheckResult.UNKNOWN, "needs accelerometer, attitude and velocity")
+        return Check("velocity_attitude", CheckResult.UNKNOWN, "needs accelerometer, attitude and velocity or position")
+    if not 0.5 < np.median(np.linalg.norm(accel.values, axis=1)) / GRAVITY < 2.0:
+        return Check("velocity_attitude", CheckResult.UNKNOWN, "needs specific force in m/s^2")
     gained, derived = _velocity_gains(accel, attitude, velocity)
-    level = _level_velocity(gained, derived)
+    level = _level_velocity(gained, derived, velocity.name)
     if level.verdict is CheckResult.ERROR or len(gained) < 20:
         return level
     # Vertical changes that are clearly the reverse of what the force makes.
@@ -742,23 +753,36 @@ def velocity_check(recording: Recording) -> Check:
     if not (min(np.std(up), np.std(down)) > 0.2 and np.corrcoef(up, down)[0, 1] < -0.7):
         return level
     return Check(
-        "velocity_attitude", CheckResult.ERROR, "vertical velocity rises where the force pushes down: it points up",
+        "velocity_attitude", CheckResult.ERROR,
+        f"vertical {velocity.name} rises where the force pushes down: it points up",
         "negate vz, and z if it points up too: the world is NED", {"vertical": -1.0},
     )  # fmt: skip
 
 
-def _level_velocity(gained: FloatArray, derived: FloatArray) -> Check:
-    """Horizontal axes of `velocity_check`."""
+def _flown(position: Channel | None) -> Channel | None:
+    """Change of the position [m/s] over steps of at least 0.5 s, at their middles, as a channel of its name."""
+    if position is None or len(position.t) < FEWEST_SAMPLES:
+        return None
+    stride = max(1, round(0.5 / sample_period(position.t)))
+    t, place = position.t[::stride], position.values[::stride]
+    return Channel("position", 0.5 * (t[1:] + t[:-1]), np.diff(place, axis=0) / np.diff(t)[:, None], position.source)
+
+
+def _level_velocity(gained: FloatArray, derived: FloatArray, name: str) -> Check:
+    """Horizontal axes of `velocity_check`, of the channel `name`."""
     if len(gained) < 20 or np.max(np.std(gained[:, :2], axis=0)) < 0.2:
         return Check("velocity_attitude", CheckResult.UNKNOWN, "too little horizontal acceleration to compare")
     fit = fit_axes(derived[:, :2], gained[:, :2])
     check = partial(Check, "velocity_attitude", numbers={"scale": fit.scale, "r2": fit.r2})
     if fit.r2 < _CLEAR:
-        return check(CheckResult.UNKNOWN, f"velocity does not follow tilt and thrust clearly (R^2 {fit.r2:.2f})")
+        return check(CheckResult.UNKNOWN, f"{name} does not follow tilt and thrust clearly (R^2 {fit.r2:.2f})")
     if not fit.straight:
-        message = f"world axes of velocity differ from the attitude's: {fit} (R^2 {fit.r2:.2f})"
+        message = f"world axes of {name} differ from the attitude's: {fit} (R^2 {fit.r2:.2f})"
         return check(CheckResult.ERROR, message, "use NED for both; ROS' ENU swaps x and y")
-    return check(CheckResult.OK, f"velocity follows tilt and thrust (scale {fit.scale:.3g}, R^2 {fit.r2:.2f})")
+    message = f"{name} follows tilt and thrust (scale {fit.scale:.3g}, R^2 {fit.r2:.2f})"
+    if not 1.0 / _UNIT < fit.scale < _UNIT:
+        return check(CheckResult.ERROR, f"{message}: its scale is wrong", f"divide {name} by {fit.scale:.3g}")
+    return check(CheckResult.OK, message)
 
 
 def _rates(gyro: Channel, t: FloatArray, q: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -839,6 +863,7 @@ def position_check(recording: Recording) -> Check | None:
     numbers: dict[str, float] = {}
     scales: list[str] = []
     off: list[str] = []
+    unit = False
     for where, axes in (("horizontally", (0, 1)), ("vertically", (2,))):
         p, v = (x[:, axes] - x[:, axes].mean(axis=0) for x in (moved, flown))
         correlation = float(np.sum(p * v) / np.sqrt(max(np.sum(p * p) * np.sum(v * v), 1e-300)))
@@ -856,12 +881,16 @@ def position_check(recording: Recording) -> Check | None:
         numbers |= {f"scale {where}": scale, f"correlation {where}": correlation}
         scales.append(f"{scale:.3f} ± {error:.3f} {where} (correlation {correlation:.4f})")
         # Beyond chance, and enough to matter to whoever predicts positions.
+        unit |= not 1.0 / _UNIT < scale < _UNIT
         if abs(scale - 1.0) > max(SCALE, 4.0 * error):
             off.append(f"{abs(scale - 1.0):.1%} {'larger' if scale > 1.0 else 'smaller'} {where}")
     if not scales:
         message = "velocity does not follow the change of position clearly, or the vehicle hardly moves"
         return Check("position_velocity", CheckResult.UNKNOWN, message)
     measured = f"velocity against change of position: {', '.join(scales)}"
+    if unit:
+        fix = "write position in m and velocity in m/s"
+        return Check("position_velocity", CheckResult.ERROR, f"{measured}: they are in different units", fix, numbers)
     if not off:
         return Check("position_velocity", CheckResult.OK, measured, numbers=numbers)
     return Check(

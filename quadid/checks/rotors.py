@@ -9,10 +9,9 @@ from itertools import combinations, permutations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import nnls
 
 from quadid.checks.findings import Check, CheckResult
-from quadid.checks.motion import Spans, within
+from quadid.checks.motion import HOPELESS, Spans, within
 from quadid.data.grid import linear, moving_mean, to_windows, true_runs
 from quadid.data.rotor_signal import INERTIA_RATE, RotorSignal, rotor_channel, rotor_signal
 from quadid.data.window import Channel, Recording, Window, measured_period, sample_period
@@ -175,8 +174,9 @@ def readings_check(recording: Recording, vehicle: Vehicle, spans: Spans) -> Chec
     if step:
         message = f"rotor speeds come in steps of {step:.3g} rad/s: too coarse for the motion ({signal.source})"
         return Check(_NAME, CheckResult.WARNING, message, "log them finer, or motor commands", {"step_rad_s": step})
-    problem = _dead(values, most) or _same(values) or _stuck(signal, recording, inside)
-    return problem and Check(_NAME, CheckResult.ERROR, f"{problem[0]} ({signal.source})", _FIX, problem[1])
+    problem = _dead(values, most) or _same(values, vehicle, most) or _stuck(signal, recording, inside)
+    fix = _FIX if most < 0.5 else "check which outputs drive the motors, and that all of them were logged"
+    return problem and Check(_NAME, CheckResult.ERROR, f"{problem[0]} ({signal.source})", fix, problem[1])
 
 
 def _coarse(speeds: FloatArray) -> float:
@@ -188,11 +188,16 @@ def _coarse(speeds: FloatArray) -> float:
     return step if step > 0.5 * float(np.median(np.std(speeds, axis=0))) else 0.0
 
 
-def _same(speeds: FloatArray) -> Problem | None:
-    """Columns that are one: their differences, which turn the vehicle, are lost."""
-    if speeds.shape[1] < 3 or np.ptp(speeds) == 0.0 or np.any(speeds != speeds[:, :1]):
-        return None
-    return "all rotor columns are the same: one was written for all", {"columns": float(speeds.shape[1])}
+def _same(speeds: FloatArray, vehicle: Vehicle, most: float) -> Problem | None:
+    """Columns that are one: their difference, which turns the vehicle, is lost; one command may go to one axle."""
+    places = vehicle.rotor_positions[:, :2]
+    for i, j in combinations(range(speeds.shape[1]), 2):
+        axle = most == 0.5 and np.linalg.norm(places[i] - places[j]) < 0.1 * vehicle.arm
+        if np.ptp(speeds[:, i]) > 0.0 and np.array_equal(speeds[:, i], speeds[:, j]) and not axle:
+            which = f"rotor columns {i + 1} and {j + 1}"
+            which = "all rotor columns" if np.all(speeds == speeds[:, :1]) else which
+            return f"{which} are the same: one was written for the other", {"rotor": i + 1.0, "other": j + 1.0}
+    return None
 
 
 def _commanded(recording: Recording, vehicle: Vehicle) -> bool:
@@ -346,11 +351,13 @@ _UNITS = (
 """Units that speeds may be in instead of rad/s, and the factor that mends each."""
 _SLOW_MOTION = 0.4
 """Motion slower than about 1/0.4 s is left out: there aerodynamics and the controller rule [s]."""
+_TURNING = 2.0, 0.2
+"""Motion about z between these times [s] shows the spins: faster, it is mostly what a loop answers to its own noise."""
 _LAGS = 5
 """Motors answer late: torque up to this many rows earlier is tried."""
 _SETTLED = 0.25
 """Correlation in roll and pitch that settles an order."""
-_GAIN, _SPIN_GAIN, _CHANGE = 0.3, 0.15, 0.1
+_GAIN, _CHANGE = 0.3, 0.1
 """Likelihood that another order or frame, or other spins, must gain for each sample; what each change costs."""
 _MOST_ROTORS = 6
 """Beyond this turns, mirror images and exchanges of the order are tried, not all permutations."""
@@ -389,7 +396,8 @@ def hover_check(recording: Recording, vehicle: Vehicle, spans: Spans) -> Check:
         return check(CheckResult.ERROR, f"{message}: speeds seem to be squared", "take their square roots")
     few = "did it fly? Else " if needed > high else ""
     fix = few + "check mass, the unit of the rotor speeds, max_speed of the command, or the bounds of b"
-    return check(CheckResult.WARNING, f"{message}, outside its bounds {low:.3g} to {high:.3g}", fix)
+    verdict = CheckResult.WARNING if low / HOPELESS < needed < high * HOPELESS else CheckResult.ERROR
+    return check(verdict, f"{message}, outside its bounds {low:.3g} to {high:.3g}", fix)
 
 
 def _supply(recording: Recording, vehicle: Vehicle, t: FloatArray) -> FloatArray:
@@ -402,8 +410,15 @@ def _supply(recording: Recording, vehicle: Vehicle, t: FloatArray) -> FloatArray
     return np.asarray((volts / (vehicle.reference_voltage or float(volts.mean()))) ** exponent)[:, None]
 
 
-Lagged = list[tuple[FloatArray, FloatArray, FloatArray]]
-"""Thrust over b (n, rotors), angular acceleration (n, 3) and rotors' own (n, rotors), for each lag of the motors."""
+Rows = tuple[FloatArray, FloatArray, FloatArray]
+"""Thrust over b (n, rotors), angular acceleration (n, 3) and rotors' own (n, rotors)."""
+
+
+class Lagged(NamedTuple):
+    """Fast motion for each lag of the motors, and slower turning about z, without the noise that a loop answers."""
+
+    fast: list[Rows]
+    slow: Rows
 
 
 def motor_order_check(lagged: Lagged | str, vehicle: Vehicle, other: Other | None) -> Check:
@@ -452,17 +467,19 @@ def lagged_of(windows: Sequence[Window], vehicle: Vehicle, rate: float) -> Lagge
         return f"rotor signal at {rate:.3g} Hz is too slow to check the motor order"
     thrust, b = ThrustModel.stated(vehicle), vehicle.parameters["b"].initial
     acted = [thrust.single(w.rotor_speed) / b for w in windows]
-    lagged = [_fast_motion(windows, acted, lag) for lag in range(_LAGS)]
-    return lagged if len(lagged[0][0]) >= 100 else "too little flight to check the motor order"
+    fast = [_in_band(windows, acted, lag, _SLOW_MOTION, 0.0) for lag in range(_LAGS)]
+    slow = _in_band(windows, acted, 0, *_TURNING)
+    return Lagged(fast, slow) if len(fast[0][0]) >= 100 else "too little flight to check the motor order"
 
 
-def _fast_motion(
-    windows: Sequence[Window], thrust: list[FloatArray], lag: int
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Returns thrust over b and rotor acceleration `lag` rows earlier, and angular acceleration, no slow parts."""
-    parts: list[tuple[FloatArray, FloatArray, FloatArray]] = []
+def _in_band(windows: Sequence[Window], thrust: list[FloatArray], lag: int, slowest: float, fastest: float) -> Rows:
+    """Returns thrust over b and rotor acceleration `lag` rows earlier, and angular acceleration.
+
+    What is slower than one time [s] is left out, what is faster than the other smoothed away.
+    """
+    parts: list[Rows] = []
     for w, acted in zip(windows, thrust, strict=True):
-        width = max(3, round(_SLOW_MOTION / w.dt))
+        width, smooth = max(3, round(slowest / w.dt)), max(1, round(fastest / w.dt) | 1)
         if w.gyro is None or len(w) < 2 * width + lag or np.isnan(w.gyro).any():
             continue
         # The change over two steps against what acted in between: the row itself and its neighbours' halves.
@@ -473,7 +490,8 @@ def _fast_motion(
         )
         gained, spun = ((rows[2:] - rows[:-2]) / (2.0 * w.dt) for rows in (w.gyro, w.rotor_speed))
         rows = acted[: len(acted) - lag], gained[lag:], spun[: len(spun) - lag]
-        acted, gained, spun = (r - moving_mean(r, width, mirrored=True) for r in rows)
+        smoothed = [moving_mean(r, smooth) for r in rows]
+        acted, gained, spun = (r - moving_mean(r, width, mirrored=True) for r in smoothed)
         parts.append((acted, gained, spun))
     if not parts:
         return np.empty((0, 0)), np.empty((0, 3)), np.empty((0, 0))
@@ -499,29 +517,23 @@ def better_description(lagged: Lagged | str, vehicle: Vehicle) -> Other | None:
     """
     if isinstance(lagged, str) or _still(lagged):
         return None
-    grams = [_Gram.of(rows) for rows in lagged]
+    grams = [_Gram.of(rows) for rows in lagged.fast]
     rotors = tuple(range(len(vehicle.rotors)))
     turned, angle = _turned(grams, vehicle)
-    named: list[tuple[float, Vehicle, tuple[int, ...], float, FloatArray]] = []
+    named: list[tuple[float, Vehicle, tuple[int, ...], FloatArray]] = []
     own_frame = [rotors] if abs(angle) > math.radians(20.0) else []  # a smaller turn is none
     for described, orders in ((vehicle, _orders(len(rotors))), (turned, own_frame)):
         for sign in (1.0, -1.0):
             for order, axes in _best(grams, described, orders, sign):
                 cost = _CHANGE * (_moved(order) + (sign < 0.0) + 1.5 * (described is turned))
-                named.append((float(_gain(axes)) - cost, described, order, sign, axes))
-    own = next(
-        gain for gain, described, order, sign, _ in named if described is vehicle and order == rotors and sign > 0.0
-    )
-    gain, described, order, sign, axes = max(named, key=lambda one: one[0])
-    least = _SPIN_GAIN if described is vehicle and order == rotors else _GAIN
-    if gain - own < least or float(np.mean(axes[:2])) < _SETTLED:
-        axes = _described(lagged, vehicle)
-        spins, axes[2] = _spins(lagged, vehicle)
-        if min(axes[0], axes[1]) < _SETTLED or not spins:
-            return None
-        described, order = vehicle, rotors
-    else:
-        spins = [rotors] if sign < 0.0 else []
+                named.append((float(_gain(axes)) - cost, described, order, axes))
+    own = max((one for one in named if one[1] is vehicle and one[2] == rotors), key=lambda one: one[0])
+    best = max(named, key=lambda one: one[0])
+    _, described, order, axes = best if best[0] - own[0] >= _GAIN and np.mean(best[3][:2]) >= _SETTLED else own
+    spins, yaw = _spins(lagged, reordered(described, order))
+    if described is vehicle and order == rotors and (min(axes[0], axes[1]) < _SETTLED or not spins):
+        return None
+    axes = np.append(axes[:2], yaw)
     told, fix = [], []
     if described is turned:
         degrees = math.degrees(angle)
@@ -535,10 +547,10 @@ def better_description(lagged: Lagged | str, vehicle: Vehicle) -> Other | None:
         told.append("yaw is reversed")
         fix.append("negate the spins in the vehicle file")
     elif spins:
-        one = " or ".join(str(k + 1) for (k,) in spins)
-        told.append(f"rotor {one} turns the other way")
-        fix.append(f"negate the spin of rotor {one} in the vehicle file")
-    new = reordered(described, order) if order != rotors else described
+        which = " or ".join(" and ".join(str(k + 1) for k in one) for one in spins)
+        told.append(f"rotor {which} {'turns' if len(spins[0]) == 1 else 'turn'} the other way")
+        fix.append(f"negate the spin of rotor {which} in the vehicle file")
+    new = reordered(described, order)
     new = _spun(new, spins[0]) if spins else new
     return Other(new, " and ".join(told), " and ".join(fix), axes, angle if described is turned else 0.0)
 
@@ -549,7 +561,7 @@ def reordered(vehicle: Vehicle, order: tuple[int, ...]) -> Vehicle:
 
 
 def _still(lagged: Lagged) -> bool:
-    return float(np.max(np.std(lagged[0][1], axis=0))) < 0.05
+    return float(np.max(np.std(lagged.fast[0][1], axis=0))) < 0.05
 
 
 class _Gram(NamedTuple):
@@ -560,7 +572,7 @@ class _Gram(NamedTuple):
     power: FloatArray
 
     @classmethod
-    def of(cls, rows: tuple[FloatArray, FloatArray, FloatArray]) -> _Gram:
+    def of(cls, rows: Rows) -> _Gram:
         """Products of one lag's rows."""
         thrust, motion, _ = rows
         return cls(thrust.T @ thrust, thrust.T @ motion, np.sum(motion**2, axis=0))
@@ -568,7 +580,7 @@ class _Gram(NamedTuple):
 
 def _described(lagged: Lagged, vehicle: Vehicle) -> FloatArray:
     """Correlation of the vehicle as it is described, in roll, pitch and yaw, at its best lag, shape (3,)."""
-    grams = [_Gram.of(rows) for rows in lagged]
+    grams = [_Gram.of(rows) for rows in lagged.fast]
     return _best(grams, vehicle, [tuple(range(len(vehicle.rotors)))], 1.0)[0][1]
 
 
@@ -635,39 +647,42 @@ def _spun(vehicle: Vehicle, turned: Sequence[int]) -> Vehicle:
 
 
 def _spins(lagged: Lagged, vehicle: Vehicle) -> tuple[list[tuple[int, ...]], float]:
-    """Alternatives of rotors (from 0) that turn the other way by drag and spin-up: all, or one of these; or none.
+    """Alternatives of rotors (from 0) that turn the other way: one, two or all; or none.
 
-    Also returns the correlation in yaw that the change gives.  A fast loop answers the noise of its gyro within a row,
-    and that looks like the spin-up of rotors that are all reversed: where drag alone says the right sign, even weakly,
-    not all are.
+    Also returns the correlation of yaw acceleration and drag that the change gives.
     """
-    rotors = tuple(range(len(vehicle.rotors)))
-    own = _yaw_explained(lagged, vehicle)
-    single = np.array([_yaw_explained(lagged, _spun(vehicle, (k,))) for k in rotors])
-    gain = _gain(single[:, None]) - _gain(np.array([own]))
-    if single.max() > _SETTLED and gain.max() > _CHANGE:
-        # Partners on one arm have one command, so that either explains the motion.
-        return [(int(k),) for k in np.flatnonzero(gain > gain.max() - _CHANGE)], float(single.max())
-    all_ = _yaw_explained(lagged, _spun(vehicle, rotors))
-    if _described(lagged, vehicle)[2] < 0.5 * _SETTLED and all_ > max(_SETTLED, own + _SPIN_GAIN):
-        return [rotors], all_
-    return [], own
+    count = len(vehicle.rotors)
+    # Two of more than four are made up for by roll and pitch.
+    sizes = (0, 1, 2, count) if count == 4 else (0, 1, count)
+    turned = [which for size in sizes for which in combinations(range(count), size)]
+    if len(lagged.slow[0]) < 100:
+        return [], 0.0
+    found = np.array([_drag_explains(lagged.slow, _spun(vehicle, which)) for which in turned])
+    wrong = np.array([len(which) for which in turned])
+    # Without turning on purpose, what yaw follows is a matter of chance.
+    gain = np.where(found > 2.0 * _SETTLED, _gain(found[:, None]) - _CHANGE * wrong.clip(max=2), -np.inf)
+    best = int(np.argmax(gain[1:])) + 1
+    if gain[best] <= _gain(found[:1]):
+        return [], float(found[0])
+    # Which of them is told by roll and pitch, but for partners on one arm: they have one command.
+    near = np.flatnonzero((wrong == wrong[best]) & (gain > gain[best] - _CHANGE))
+    whole = _gain(np.array([[_drag_explains(lagged.slow, _spun(vehicle, turned[k]), alone=False)] for k in near]))
+    return [turned[k] for k in near[whole > whole.max() - _CHANGE]], float(found[best])
 
 
-def _yaw_explained(lagged: Lagged, vehicle: Vehicle) -> float:
-    """Correlation of yaw acceleration with drag and spin-up torque of the rotors.
+def _drag_explains(slow: Rows, vehicle: Vehicle, alone: bool = True) -> float:
+    """Correlation of yaw acceleration with the drag of the rotors; 0 where all turn the same way.
 
-    Each has a factor that cannot be negative: fast motion shows spin-up, slow motion drag.  The lag is that of roll and
-    pitch: spin-up at another one looks like drag.
+    What follows their spin-up has no part in it: a loop against disturbances makes that look reversed.  Nor, `alone`,
+    has what follows roll and pitch: a tilted gyro makes it.
     """
-    arms, inertia = vehicle.torque_arms[:, :2], vehicle.initial[2:4]
-    tilt = [np.sum((squares @ arms) * motion[:, :2] * inertia) for squares, motion, _ in lagged]
-    squares, motion, spun = lagged[int(np.argmax(tilt))]
-    causes = np.column_stack([squares @ vehicle.torque_arms[:, 2], spun @ vehicle.spins])
-    scale = np.linalg.norm(causes, axis=0) + 1e-300
-    torque = causes / scale @ nnls(causes / scale, motion[:, 2])[0]
-    norm = np.linalg.norm(torque) * np.linalg.norm(motion[:, 2])
-    return float(torque @ motion[:, 2] / max(norm, 1e-300))
+    squares, motion, spun = slow
+    if len(set(vehicle.spins)) < 2:
+        return 0.0
+    both = np.column_stack([motion[:, 2], squares @ vehicle.torque_arms[:, 2]])
+    others = np.linalg.qr(np.column_stack([*motion[:, : 2 * alone].T, spun @ vehicle.spins]))[0]
+    yaw, drag = (both - others @ (others.T @ both)).T
+    return float(yaw @ drag / np.sqrt(yaw @ yaw * (drag @ drag) + 1e-300))
 
 
 def _turned(grams: Sequence[_Gram], vehicle: Vehicle) -> tuple[Vehicle, float]:
@@ -769,7 +784,7 @@ def geometry_check(lagged: Lagged | str, vehicle: Vehicle) -> Check:
     if isinstance(lagged, str):
         return Check(name, CheckResult.UNKNOWN, lagged)
     arms, inertia = vehicle.torque_arms[:, :2], vehicle.initial[2:4]
-    fits = [_map(squares @ arms, motion[:, :2] * inertia) for squares, motion, _ in lagged]
+    fits = [_map(squares @ arms, motion[:, :2] * inertia) for squares, motion, _ in lagged.fast]
     share, a = max(fits, key=lambda fit: float(np.min(fit[0])))
     if float(np.min(share)) < 0.1:
         axis = ("roll", "pitch")[int(np.argmin(share))]

@@ -11,6 +11,8 @@ from quadid.errors import LogError, NotIdentifiableError
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 
+_COUNTS = (100.0, 255.0, 1000.0, 2047.0, 65535.0)
+"""Full commands that programs count to."""
 SLOWEST_RATE = 6.0
 """Below this rate [Hz] a rotor signal does not show what happened between its samples; it is refused."""
 INERTIA_RATE = 30.0
@@ -133,8 +135,14 @@ def _check_columns(recording: Recording, signal: RotorSignal, vehicle: Vehicle) 
 
 
 def _check_speeds(recording: Recording, speed: Channel) -> None:
-    """Rotors that carry a vehicle turn at tens of rad/s at least; commands from 0 to 1 do not."""
+    """Rotors that carry a vehicle turn at tens of rad/s at least; commands from 0 to 1 do not, nor signed speeds."""
     top = float(np.quantile(speed.values, 0.99))
+    backwards = [str(k + 1) for k, middle in enumerate(np.median(speed.values, axis=0)) if middle < 0.0]
+    if backwards:
+        raise LogError(
+            f"{recording.name}: rotor speeds below zero ({speed.source}, rotor {', '.join(backwards)})",
+            "speeds without a sign", "write their sizes; which way a rotor turns is its `spin` in the vehicle file",
+        )  # fmt: skip
     if 0.0 < top <= 1.5:
         raise LogError(
             f"{recording.name}: rotor speeds up to {top:.3g} ({speed.source}) are commands from 0 to 1, no rad/s",
@@ -167,12 +175,16 @@ def _looks_like_pwm(command: Channel) -> bool:
 
 def _check_unit(recording: Recording, command: Channel, vehicle: Vehicle) -> None:
     kind = vehicle.command.kind
-    pwm = _looks_like_pwm(command)
-    if pwm == (kind == "pwm"):
+    low, high = (float(end) for end in np.nanquantile(command.values, [0.01, 0.99]))
+    whole = "motor_command" not in recording.channels or -0.1 <= low <= high <= 1.5  # a mixer's may exceed it
+    if _looks_like_pwm(command) if kind == "pwm" else whole:
         return
-    low, high = float(np.nanmin(command.values)), float(np.nanmax(command.values))
-    raise LogError(
-        f"{recording.name}: motor commands from {low:.4g} to {high:.4g} ({command.source}) are not '{kind}'",
-        "0..1 for normalized, about 1000..2000 us for pwm",
-        f"set command kind '{'pwm' if pwm else 'normalized'}' in '{vehicle.name}'",
-    )
+    found = f"{recording.name}: motor commands from {low:.4g} to {high:.4g} ({command.source}) are"
+    allowed = "0..1 for normalized, about 1000..2000 us for pwm"
+    pulses = low > 500.0 and high < 2500.0
+    if pulses or whole:
+        fix = f"set command kind '{'pwm' if pulses else 'normalized'}' in '{vehicle.name}'"
+        raise LogError(f"{found} not '{kind}'", allowed, fix)
+    full = next((f"{count:g}" for count in _COUNTS if high <= count), "its value")
+    fix = f"write shares of the full command: divide by {full}" if low > -0.1 * high else "write 0 for standing still"
+    raise LogError(f"{found} neither shares of the full command nor pulses", allowed, fix)

@@ -113,6 +113,78 @@ def test_punches_and_falls_are_part_of_the_flight() -> None:
     assert next(c for c in found.checks if c.name == "gravity").verdict is CheckResult.OK
 
 
+def test_without_a_velocity_the_position_is_compared_with_the_force(flight: Recording) -> None:
+    high = with_channel(flight, "position", flight.channels["position"].values * [1.0, 1.0, -1.0])
+    for recording, said in ((high, "vertical position rises"), (flight, "position follows tilt and thrust")):
+        channels = {name: channel for name, channel in recording.channels.items() if name != "velocity"}
+        assert said in verdict(replace(recording, channels=channels), "velocity_attitude").message
+
+
+@pytest.mark.parametrize(
+    ("channel", "factor", "check", "said"),
+    [
+        ("gyro", 1e3, "gyro_attitude", "scale of one is wrong"),
+        ("gyro", 10.0, "gyro_attitude", "multiply gyro by 0."),
+        ("position", 1e3, "position_velocity", "different units"), ("velocity", 3.6, "velocity_attitude", "by 3."),
+        ("rotor_speed", 60.0, "hover", "check mass, the unit"), ("rotor_speed", 0.01, "hover", "check mass, the unit"),
+    ],
+)  # fmt: skip
+def test_a_unit_that_nobody_named_is_an_error_all_the_same(
+    flight: Recording, channel: str, factor: float, check: str, said: str
+) -> None:
+    found = verdict(with_channel(flight, channel, flight.channels[channel].values * factor), check)
+    assert found.verdict is CheckResult.ERROR
+    assert said in f"{found.message}; {found.fix}"
+
+
+def turned(vehicle: Vehicle, *spins: int) -> Vehicle:
+    """The vehicle with the spins of some rotors, counted from 0, the other way."""
+    rotors = [r.model_copy(update={"spin": -r.spin if k in spins else r.spin}) for k, r in enumerate(vehicle.rotors)]
+    return vehicle.model_copy(update={"rotors": tuple(rotors)})
+
+
+@pytest.mark.parametrize(("rate", "seconds"), [(50.0, 25.0), (250.0, 15.0)])
+@pytest.mark.parametrize("name", ["pelican", "pelican_x", "hexacopter"])
+def test_spins_are_judged_by_drag_at_every_rate(name: str, rate: float, seconds: float) -> None:
+    vehicle = Vehicle.shipped(name)
+    recording = quadid.simulate(vehicle, seconds=seconds, seed=9, rate=rate).flight.recording
+    count = len(vehicle.rotors)
+    wrong: dict[tuple[int, ...], str] = {(k,): f"spin of rotor {k + 1} in" for k in range(count)}
+    wrong |= {(0, 1): "spin of rotor 1 and 2", (1, 2): "2 and 3"} if count == 4 else {}
+    wrong[tuple(range(count))] = "negate the spins in"
+    answers = {which: verdict(recording, "motor_order", turned(vehicle, *which)).fix for which in wrong}
+    assert {which: fix for which, fix in answers.items() if wrong[which] not in fix} == {}
+    assert verdict(recording, "motor_order", vehicle).verdict is CheckResult.OK
+
+
+@pytest.mark.parametrize("rate", [250.0, 500.0])
+@pytest.mark.parametrize("effects", [(), ("imu_misalignment:x=0.05,y=-0.06,z=0.05",)])
+@pytest.mark.parametrize("name", ["pelican", "hexacopter"])
+def test_a_loop_that_holds_its_heading_does_not_look_reversed(name: str, effects: tuple[str, ...], rate: float) -> None:
+    """Rotors that answer disturbances and noise speed up against the turn, as reversed ones would with it."""
+    simulated = quadid.simulate(name, seconds=15.0, seed=11, rate=rate, profile="roll_pitch", effects=effects)
+    assert verdict(simulated.flight.recording, "motor_order", Vehicle.shipped(name)).verdict is CheckResult.OK
+
+
+def test_positions_that_are_exchanged_without_their_spins_are_both_named(flight: Recording) -> None:
+    vehicle = Vehicle.shipped("pelican")
+    first, second, *others = vehicle.rotors
+    moved = [a.model_copy(update={"position": b.position}) for a, b in ((first, second), (second, first))]
+    found = verdict(flight, "motor_order", vehicle.model_copy(update={"rotors": (*moved, *others)}))
+    assert found.fix.startswith("reorder the rotors of the vehicle file to take columns 2, 1, 3, 4")
+    assert "negate the spin of rotor 1 and 2" in found.fix
+
+
+def test_what_lies_on_its_back_and_never_flies_is_no_wrong_frame() -> None:
+    t = 0.02 * np.arange(500)
+    noise = np.random.default_rng(1).normal(0.0, 0.02, (500, 6))
+    made = {
+        "gyro": Channel("gyro", t, 0.1 * noise[:, :3]), "accel": Channel("accel", t, noise[:, 3:] + [0.0, 0.0, 9.81]),
+    }  # fmt: skip
+    found = inspect(Recording("made", "csv", made))
+    assert [c.verdict for c in found.checks if c.name == "gravity"] == [CheckResult.UNKNOWN]
+
+
 def test_after_an_error_nothing_later_is_asked(flight: Recording) -> None:
     degrees = with_channel(flight, "gyro", np.degrees(flight.channels["gyro"].values))
     assert not {"hover", "motor_order", "rotor_timing", "geometry"} & {*names(degrees)}
