@@ -373,7 +373,7 @@ def read_blackbox(path: Path) -> Recording:
         notes.append(f"{best[1].skipped} of {len(data)} bytes are damaged and were skipped")
     if not best[1].ended:
         notes.append("no end-of-log mark: power was cut or the file is not whole; everything before is used")
-    clock = LogClock()
+    clock = LogClock(apart=0.0)
     values = best[0].values
     kept = {name: _value(values, name, math.nan) for name in _KEPT if name in values}
     return assemble(path.name, "blackbox", _channels(*best, clock), clock, notes, kept)

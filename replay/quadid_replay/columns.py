@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from array import array
+from bisect import bisect_left
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import NamedTuple
 
@@ -22,10 +23,16 @@ from quadid_replay.frames import unit_quaternions
 
 STEP_BACK = 1.0
 """A stamp this far [s] before the newest one means a reboot or a clock step."""
+SOON = 1.0
+"""A stamp this far [s] after the newest one ends a gap once others confirm it; else nothing follows from it."""
 STEP_AHEAD = 30.0
-"""A stamp this far [s] after the newest one is suspect until others confirm it."""
+"""A stamp this far [s] after the newest one is refused until others confirm it."""
 CONFIRMATIONS = 3
-"""Number of further stamps that must agree before a new time base is believed; a single wild stamp moves nothing."""
+"""Number of further stamps that must agree before a new time is believed; a single wild stamp moves nothing."""
+APART = 0.01
+"""Messages closer than this [s] are of one instant, which may be wild as a whole, and confirm nothing of each other."""
+_TOGETHER = 4096
+"""Stamps that are looked at together."""
 PAUSE = 1.0
 """Recording time [s] put between the last sample before a reboot and the first one after it."""
 
@@ -40,7 +47,9 @@ class LogClock:
         wild: number of stamps refused because nothing confirmed them.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, apart: float = APART) -> None:
+        """Starts; stamps so close [s] may be those of one instant."""
+        self._apart = apart
         self.breaks: list[float] = []
         self.reboots = 0
         self.jumps = 0
@@ -48,6 +57,8 @@ class LogClock:
         self._offset = 0.0
         self._newest: float | None = None
         self._suspects: list[float] = []
+        self._waiting = 0
+        self._ahead: list[float] = []
 
     def times(self, raw: FloatArray) -> FloatArray:
         """Maps stamps [s] in file order, shape (n,); NaN for one that is refused or still waits for confirmation."""
@@ -58,18 +69,19 @@ class LogClock:
             steps = np.diff(raw[: 2 + CONFIRMATIONS])
             begin = int(not -STEP_BACK < steps[0] < STEP_AHEAD and bool(np.all(np.abs(steps[1:]) < STEP_BACK)))
             self.wild += begin
-        if not self._suspects and begin < len(raw):
-            # All stamps up to the first that does not follow the newest one before it.
-            first = raw[begin] if self._newest is None else self._newest
-            newest = np.maximum.accumulate(np.concatenate([[first], raw[begin:]]))
-            follows = (newest[:-1] - STEP_BACK < raw[begin:]) & (raw[begin:] < newest[:-1] + STEP_AHEAD)
-            plain = len(follows) if follows.all() else int(np.argmin(follows))
-            if plain:
-                out[begin : begin + plain] = raw[begin : begin + plain] + self._offset
-                begin, self._newest = begin + plain, float(newest[plain])
-        for k in range(begin, len(raw)):  # the others one by one: each may begin or confirm a new time base
-            out[k] = self._time(float(raw[k]))
+        for k in range(begin, len(raw), _TOGETHER):
+            out[k : k + _TOGETHER] = self._mapped(raw[k : k + _TOGETHER])
         return out
+
+    def _mapped(self, raw: FloatArray) -> FloatArray:
+        first = raw[0] if self._newest is None else self._newest
+        newest = np.maximum.accumulate(np.concatenate([[first], raw]))
+        follows = (newest[:-1] - STEP_BACK < raw) & (raw < newest[:-1] + SOON)
+        if follows.all() and not self._suspects and not self._ahead:
+            self._newest = float(newest[-1])
+            return np.asarray(raw + self._offset)
+        # One by one: each may begin or confirm a new time.
+        return np.array([self._time(stamp) for stamp in raw.tolist()])
 
     def _time(self, raw: float) -> float:
         if not math.isfinite(raw):
@@ -78,20 +90,30 @@ class LogClock:
         if self._newest is None:
             self._newest = raw
             return raw
-        if self._newest - STEP_BACK < raw < self._newest + STEP_AHEAD:
-            self.wild += len(self._suspects)
-            self._suspects.clear()
+        reached = self._ahead[-1] if self._ahead else self._newest
+        if not self._newest - STEP_BACK < raw < reached + STEP_AHEAD:
+            return self._suspect(raw)
+        self._refuse()
+        if raw < max(self._newest + SOON, reached - STEP_BACK):  # what was ahead is not confirmed
+            self._ahead.clear()
+        if raw < self._newest + SOON:
             self._newest = max(self._newest, raw)
             return raw + self._offset
-        return self._suspect(raw)
+        if not self._ahead or raw > self._ahead[-1] + self._apart:
+            self._ahead.append(raw)
+        if len(self._ahead) > CONFIRMATIONS:
+            self._newest = self._ahead[-1]
+            self._ahead.clear()
+        return raw + self._offset
 
     def _suspect(self, raw: float) -> float:
         """Collects stamps of a possible new time base and moves to it when enough agree."""
         if self._suspects and abs(raw - self._suspects[-1]) > STEP_BACK:
-            self.wild += len(self._suspects)
-            self._suspects.clear()
-        self._suspects.append(raw)
+            self._refuse()
+        if not self._suspects or raw > self._suspects[-1] + self._apart:
+            self._suspects.append(raw)
         if len(self._suspects) <= CONFIRMATIONS:
+            self._waiting += 1
             return math.nan
         assert self._newest is not None
         base = min(self._suspects)
@@ -104,8 +126,16 @@ class LogClock:
             self.jumps += 1
             self.breaks.append(base + self._offset)
         self._newest = max(self._suspects)
+        self._waiting = 0
         self._suspects.clear()
+        self._ahead.clear()
         return raw + self._offset
+
+    def _refuse(self) -> None:
+        """The stamps that waited were wild."""
+        self.wild += self._waiting
+        self._waiting = 0
+        self._suspects.clear()
 
     def warnings(self) -> list[str]:
         """Says in sentences what was wrong with the log's time."""
@@ -128,7 +158,7 @@ _ABSURD = 1e9
 """No channel holds a number of this size in SI units; damage does."""
 _REASONS = {
     "duplicate": "with a repeated stamp",
-    "backwards": "running backwards in time",
+    "backwards": "out of order in time",
     "not_finite": "not finite",
     "absurd": "beyond any physical value",
     "bad_stamp": "with a wild stamp",
@@ -240,11 +270,29 @@ def _running_median(values: FloatArray) -> FloatArray:
     return np.asarray(np.median(around, axis=1))
 
 
+def rising(t: FloatArray) -> BoolArray:
+    """The most samples whose times (n,) rise; of equal times the first."""
+    if np.all(np.diff(t) > 0.0):
+        return np.ones(len(t), dtype=np.bool_)
+    # The longest rising series of times, from its end: of each length the one that begins latest, and what follows it.
+    begins: list[float] = []
+    places: list[int] = []
+    after = [-1] * len(t)
+    for k in reversed(range(len(t))):
+        length = bisect_left(begins, -t[k])
+        begins[length : length + 1], places[length : length + 1] = [-float(t[k])], [k]
+        after[k] = places[length - 1] if length else -1
+    kept, k = np.zeros(len(t), dtype=np.bool_), places[-1]
+    while k >= 0:
+        kept[k], k = True, after[k]
+    return kept
+
+
 def clean_channel(raw: RawChannel) -> Channel | None:
     """Makes a channel of raw samples: drops and counts what cannot be used.
 
     Dropped: refused stamps, values that are not finite or absurd, single impossible rotor speeds, repeated stamps,
-    samples running backwards, quaternions that are none.
+    samples out of order, quaternions that are none.
     Returns None when nothing remains.
     """
     stamped = np.isfinite(raw.t)
@@ -267,11 +315,11 @@ def clean_channel(raw: RawChannel) -> Channel | None:
     t, values = t[finite], values[finite]
     if len(t) == 0:
         return None
-    newest = np.maximum.accumulate(t)
-    forward = np.concatenate([[True], t[1:] > newest[:-1]])
-    faults["duplicate"] = int(np.count_nonzero(t[1:] == newest[:-1]))
-    faults["backwards"] = int(np.count_nonzero(~forward)) - faults["duplicate"]
-    t, values = t[forward], values[forward]
+    kept = rising(t)
+    before = np.maximum.accumulate(np.where(kept, np.arange(len(t)), 0))
+    faults["duplicate"] = int(np.count_nonzero(t[~kept] == t[before[~kept]]))
+    faults["backwards"] = int(np.count_nonzero(~kept)) - faults["duplicate"]
+    t, values = t[kept], values[kept]
     if raw.name == "attitude":
         values = continuous_sign(values)
     return Channel(raw.name, t, values, raw.source, {k: n for k, n in faults.items() if n})

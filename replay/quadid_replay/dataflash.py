@@ -15,7 +15,16 @@ from pymavlink.DFReader import FORMAT_TO_STRUCT, DFFormat, null_term
 
 from quadid.data.window import Recording
 from quadid.types import FloatArray, IntArray
-from quadid_replay.columns import LogClock, RawChannel, Source, assemble, channels_of, mode_changes, spikes
+from quadid_replay.columns import (
+    LogClock,
+    RawChannel,
+    Source,
+    assemble,
+    channels_of,
+    mode_changes,
+    rising,
+    spikes,
+)  # fmt: skip
 from quadid_replay.frames import from_euler
 
 # isort: off
@@ -351,6 +360,8 @@ def _reference(
     t, angles = desired[0], np.radians(desired[1])
     angles[:, 2] = np.remainder(angles[:, 2] + np.pi, 2.0 * np.pi) - np.pi
     written, level = (part[np.isfinite(throttle[0])] for part in throttle)
+    kept = rising(written)
+    written, level = written[kept], level[kept]
     latest = np.searchsorted(written, t, side="right") - 1
     known = latest >= 0
     unit = 1.0 if source.columns[3] == "ThO" else 1e-3
@@ -421,12 +432,11 @@ def _esc(
         return []
     series, dropped = [], 0
     for motor in found.columns:
-        rows = (instance == motor) & np.isfinite(t) & np.isfinite(rpm)
-        rising = np.concatenate([[True], np.diff(t[rows]) > 0.0])[: int(rows.sum())]
-        speeds = rpm[rows][rising] * RPM
-        far = spikes(speeds)  # before others are interpolated to
+        rows = np.flatnonzero((instance == motor) & np.isfinite(t) & np.isfinite(rpm))
+        rows = rows[rising(t[rows])]
+        far = spikes(rpm[rows])  # before others are interpolated to
         dropped += int(np.count_nonzero(far))
-        series.append((t[rows][rising][~far], speeds[~far]))
+        series.append((t[rows[~far]], rpm[rows[~far]] * RPM))
     at, values = merge_instances(series)
     label = f"ESC RPM of {len(found.columns)} motors"
     return [RawChannel("rotor_speed", at, np.abs(values), label, spikes=dropped)]

@@ -122,6 +122,7 @@ def test_columns_nobody_knows_are_reported(tmp_path: Path) -> None:
         ("t,w1,w3\n0,1,2\n", r"numbered \[1, 3\]"),
         ("t,p,p,r\n0,1,2,3\n", "p appears twice"),
         ("t,foo\n0,1\n", "none of the columns"),
+        ("t,p,q,r,volt\x1b[31m\n0,1,2,3,4\n", "header is no plain text"),
         ("t,p,q,r\n", "no usable row"),
         ("t,p,q,r\nx,y,z,w\n", "column t holds 'x', no number"),
         ("t,p,q,r\nnan,1,2,3\n", "no usable flight data"),
@@ -147,7 +148,9 @@ def test_angles_beyond_a_turn_are_refused_as_degrees(tmp_path: Path, columns: st
             open_log(path)
 
 
-@pytest.mark.parametrize(("step", "unit"), [(20, "milliseconds"), (2, "milliseconds"), (20_000, "microseconds")])
+@pytest.mark.parametrize(
+    ("step", "unit"), [(20, "milliseconds"), (2, "milliseconds"), (20_000, "microseconds"), (20_000_000, "nanoseconds")]
+)
 def test_time_in_another_unit_is_named_with_its_column(tmp_path: Path, step: int, unit: str) -> None:
     path = tmp_path / "a.csv"
     path.write_text("t,p,q,r\n" + "".join(f"{step * k},0,0,0\n" for k in range(50)))

@@ -105,6 +105,46 @@ def test_a_jump_ahead_is_a_break_and_a_single_wild_stamp_is_dropped() -> None:
     assert any("confirm" in w for w in clock.warnings())
 
 
+@pytest.mark.parametrize(
+    ("places", "late"),
+    [([500], 20.0), ([500], 0.5), ([500], -20.0), ([0], 20.0), ([500, 501, 502], 20.0),
+     ([500, 502, 504, 506], 20.0), ([*range(50, 2000, 100)], 20.0), ([*range(50, 2000, 100)], -29.0)],
+)  # fmt: skip
+def test_single_wild_stamps_cost_themselves_and_no_other(places: list[int], late: float) -> None:
+    t = 0.02 * np.arange(2000)
+    wild = t.copy()
+    wild[places] += late
+    clock = LogClock()
+    channel = clean_channel(RawChannel("gyro", clock.times(wild), np.zeros((2000, 3)), "x"))
+    assert channel is not None
+    assert sum(channel.faults.values()) == len(places)
+    assert clock.breaks == []
+    assert set(channel.t) == set(np.delete(t, places))
+
+
+@pytest.mark.parametrize("late", [20.0, -20.0, 1e4])
+def test_messages_of_one_instant_do_not_confirm_each_other(late: float) -> None:
+    t = np.repeat(0.02 * np.arange(500), 9) + np.tile(0.0002 * np.arange(9), 500)
+    wild = t.copy()
+    wild[9 * 250 : 9 * 251] += late
+    clock = LogClock()
+    mapped = clock.times(wild)
+    assert (clock.breaks, clock.reboots, clock.jumps) == ([], 0, 0)
+    others = np.delete(np.arange(len(t)), slice(9 * 250, 9 * 251))
+    np.testing.assert_array_equal(mapped[others], t[others])
+
+
+@pytest.mark.parametrize("gap", [1.5, 12.0, 29.0])
+def test_a_gap_is_no_break_and_costs_nothing(gap: float) -> None:
+    t = 0.02 * np.arange(2000)
+    t[1000:] += gap
+    clock = LogClock()
+    np.testing.assert_array_equal(clock.times(t), t)
+    assert (clock.breaks, clock.wild) == ([], 0)
+    slow = np.arange(0.0, 900.0, gap)
+    np.testing.assert_array_equal(LogClock().times(slow), slow)
+
+
 @given(
     st.lists(st.floats(allow_nan=True, allow_infinity=True) | st.floats(0.0, 3.0), max_size=60),
     st.lists(st.integers(0, 60), max_size=5),

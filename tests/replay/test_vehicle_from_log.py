@@ -66,6 +66,16 @@ def test_a_log_without_an_airframe_is_refused(data_dir: Path) -> None:
     assert frame_of({"FRAME_CLASS": float("nan")}, 0.2) is None
 
 
+@pytest.mark.parametrize("firmware", ["ArduPlane", "ArduHeli", "ArduRover"])
+def test_no_vehicle_is_made_of_a_log_of_another_kind(data_dir: Path, tmp_path: Path, firmware: str) -> None:
+    log = (data_dir / "findings" / "logs" / "dataflash_esc_index_44" / "aux44.bin").read_bytes()
+    told = b"ArduCopter V4.4.4"
+    (tmp_path / "log.bin").write_bytes(log.replace(told, f"{firmware} V4.4.4".encode().ljust(len(told))))
+    recording = open_log(tmp_path / "log.bin")
+    with pytest.raises(LogError, match=f"{firmware}, no multirotor"):
+        vehicle_text(recording, "mine")
+
+
 def test_arducopter_writes_its_attitude_as_ang(data_dir: Path) -> None:
     attitude = open_log(data_dir / "ardupilot_sitl" / "x.bin").channels["attitude"]
     assert attitude.source == "ANG (degrees)"
