@@ -13,6 +13,7 @@ from itertools import islice
 from typing import Any, NamedTuple
 
 import numpy as np
+from quadid_replay.motors import no_multirotor
 from quadid_replay.presets import PRESETS
 from quadid_replay.ros_messages import SIGNALS, TYPES, MessageReader
 
@@ -48,6 +49,7 @@ DECIDE = 1.0
 SILENT = 3.0
 """A chosen source that is silent for this long [s] gives way to the next."""
 MOST_HELD = 5000
+_ROTORS = ("motor_command", "rotor_speed")
 
 
 class Chooser:
@@ -55,11 +57,14 @@ class Chooser:
 
     Samples of a source that is not the best possible are held back until it is certain that no better one comes, so
     that a channel never mixes two sources.  How samples are cut into blocks changes nothing.
+
+    Attributes:
+        other: why the vehicle's outputs are no rotors; empty where they are.  Of them nothing is used.
     """
 
     def __init__(self, best: dict[str, int]) -> None:
         """Knows the best (lowest) rank that each channel could have."""
-        self._best = best
+        self._best, self.other = best, ""
         self._chosen: dict[str, int] = {}
         self._last: dict[str, float] = {}
         self._held: dict[str, dict[int, list[Block]]] = {}
@@ -72,6 +77,8 @@ class Chooser:
             rank: of its source for this channel; 0 is the best.
         """
         channel, t = block.columns[0][0], block.t
+        if self.other and channel in _ROTORS:
+            return
         chosen = self._chosen.get(channel)
         if chosen is not None and rank > chosen:  # of use once the chosen one has fallen silent
             late = np.flatnonzero(t > self._last[channel] + SILENT)
@@ -229,6 +236,7 @@ _TYPES = {
         "fmu/out/vehicle_attitude_setpoint": "px4_msgs/VehicleAttitudeSetpoint",
         "fmu/out/vehicle_local_position": "px4_msgs/VehicleLocalPosition",
         "fmu/out/battery_status": "px4_msgs/BatteryStatus",
+        "fmu/out/vehicle_status": "px4_msgs/VehicleStatus",
     },
     "ardupilot": {
         "ap/imu/experimental/data": "sensor_msgs/Imu",
@@ -244,7 +252,13 @@ _TYPES = {
 _PREFIX = {"mavros": "mavros/"}
 _VERSIONED = {
     f"fmu/out/{name}"
-    for name in ("vehicle_attitude", "vehicle_attitude_setpoint", "vehicle_local_position", "battery_status")
+    for name in (
+        "vehicle_attitude",
+        "vehicle_attitude_setpoint",
+        "vehicle_local_position",
+        "battery_status",
+        "vehicle_status",
+    )
 }
 """Topics to which newer PX4 appends the version of their messages: `_v1` is listened to as well."""
 _HINTS = {
@@ -361,6 +375,8 @@ class Decoder:
     @property
     def trouble(self) -> str:
         """Problem of messages of this topic, or empty."""
+        if self._chooser.other and "vehicle_kind" in self._ranks:
+            return self._chooser.other
         lately = self.pace.looked - MEMORY
         if self._unstamped_at >= lately:
             return f"{self.unstamped} messages have no time (header.stamp is zero) and are left out: stamp them"
@@ -388,9 +404,11 @@ class Decoder:
         self._deny(name for name, _ in read[1])
         for name, values in read[1]:
             channel, convert = SIGNALS[name]
-            if channel not in self._ranks:
+            if channel == "vehicle_kind":
+                self._chooser.other = no_multirotor({}, int(values[-1, 0]))
+            if channel not in self._ranks or channel == "vehicle_kind":
                 continue
-            width = self._rotors if channel in ("motor_command", "rotor_speed") else None
+            width = self._rotors if channel in _ROTORS else None
             block = Block(t, ((channel, convert(values)[:, :width]),))
             for used in self._chooser.take(block, self._ranks[channel] + _BEHIND.get(name, 0)):
                 if used is block:

@@ -214,3 +214,26 @@ def test_messages_that_cannot_be_read_are_named_as_long_as_they_come(messages: l
         assert reader.trouble == f"{reader.failed} messages could not be read"
     reader.pace.look(3.0 * MEMORY, 2.9 * MEMORY, 1)
     assert (reader.failed, reader.trouble) == (3, "")
+
+
+@pytest.mark.parametrize(("kind", "used"), [(2, True), (0, True), (1, False), (22, False)])
+def test_outputs_of_a_plane_are_no_rotors_on_live_topics_either(kind: int, used: bool) -> None:
+    inputs = source("px4").inputs
+    chooser = Chooser(best_ranks(inputs))
+    layouts = {
+        "px4_msgs/VehicleStatus": ("uint64 timestamp\nuint8 system_type\n", {"timestamp": 10**6, "system_type": kind}),
+        "px4_msgs/ActuatorMotors": (
+            "uint64 timestamp\nfloat32[12] control\n",
+            {"timestamp": 10**6, "control": [0.5] * 12},
+        ),
+    }
+    taken: list[Sample] = []
+    for name, (layout, message) in layouts.items():
+        entry = next(e for e in inputs if e.type == name)
+        full = name.replace("/", "/msg/")
+        reader = Decoder(entry, chooser, 4, generate_dynamic(full, layout)[full])
+        taken += flat(reader.take([serialize_dynamic(full, layout)[full](message)] * 3))
+        if "Status" in name:
+            assert ("no multirotor" in reader.trouble) is not used
+    # Commands are held back while a better source may come; what was refused is not.
+    assert (bool(taken) or chooser.has("motor_command")) is used
