@@ -112,7 +112,7 @@ def test_a_jump_ahead_is_a_break_and_a_single_wild_stamp_is_dropped() -> None:
 )  # fmt: skip
 def test_single_wild_stamps_cost_themselves_and_no_other(places: list[int], late: float) -> None:
     t = 0.02 * np.arange(2000)
-    wild = t.copy()
+    wild: FloatArray = np.array(t, dtype=np.float64)
     wild[places] += late
     clock = LogClock()
     channel = clean_channel(RawChannel("gyro", clock.times(wild), np.zeros((2000, 3)), "x"))
@@ -125,7 +125,7 @@ def test_single_wild_stamps_cost_themselves_and_no_other(places: list[int], late
 @pytest.mark.parametrize("late", [20.0, -20.0, 1e4])
 def test_messages_of_one_instant_do_not_confirm_each_other(late: float) -> None:
     t = np.repeat(0.02 * np.arange(500), 9) + np.tile(0.0002 * np.arange(9), 500)
-    wild = t.copy()
+    wild: FloatArray = np.array(t, dtype=np.float64)
     wild[9 * 250 : 9 * 251] += late
     clock = LogClock()
     mapped = clock.times(wild)
@@ -136,12 +136,12 @@ def test_messages_of_one_instant_do_not_confirm_each_other(late: float) -> None:
 
 @pytest.mark.parametrize("gap", [1.5, 12.0, 29.0])
 def test_a_gap_is_no_break_and_costs_nothing(gap: float) -> None:
-    t = 0.02 * np.arange(2000)
+    t: FloatArray = np.asarray(0.02 * np.arange(2000), dtype=np.float64)
     t[1000:] += gap
     clock = LogClock()
     np.testing.assert_array_equal(clock.times(t), t)
     assert (clock.breaks, clock.wild) == ([], 0)
-    slow = np.arange(0.0, 900.0, gap)
+    slow: FloatArray = np.arange(0.0, 900.0, gap, dtype=np.float64)
     np.testing.assert_array_equal(LogClock().times(slow), slow)
 
 

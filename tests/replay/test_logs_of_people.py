@@ -176,7 +176,7 @@ def test_positions_that_are_exchanged_without_their_spins_are_both_named(flight:
 
 
 def test_what_lies_on_its_back_and_never_flies_is_no_wrong_frame() -> None:
-    t = 0.02 * np.arange(500)
+    t = np.arange(0.0, 10.0, 0.02, dtype=np.float64)
     noise = np.random.default_rng(1).normal(0.0, 0.02, (500, 6))
     made = {
         "gyro": Channel("gyro", t, 0.1 * noise[:, :3]), "accel": Channel("accel", t, noise[:, 3:] + [0.0, 0.0, 9.81]),
