@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from quadid_evaluation.studies.control import CRAFT, PATHS, unmixer
-from quadid_evaluation.studies.tracking import (
+from quadid_evaluation.studies.control import (
     ATTITUDE_WEIGHTS,
     CONTROL,
+    CRAFT,
     EDGE,
+    PATHS,
     POSITION_WEIGHTS,
     Known,
     desired_frame,
     gains,
     reference,
     track,
+    unmixer,
 )
 
 from quadid.flight import draw_truth

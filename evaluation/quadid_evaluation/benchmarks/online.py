@@ -1,16 +1,15 @@
-"""The online service: accuracy, changes, silence in hover, repeatability, refits, load.
+"""The online service: accuracy, changes, silence in hover, repeatability, load.
 
     python -m quadid_evaluation.benchmarks.online --out docs/results
     python -m quadid_evaluation.benchmarks.online --parts load --out docs/results
 
-A part that is measured alone leaves the others as they are; `load` needs the ROS extra.  Every number stands in
-`online.json`.
+A part that is measured alone leaves the others as they are; `load` needs the ROS extra; `speed` times a refit.  Every
+number stands in `online.json`.
 """
 
 from __future__ import annotations
 
 import json
-import os
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
@@ -23,7 +22,7 @@ from quadid_node.worker import InlineWorker, ProcessWorker
 from quadid.data.window import Recording, Sample
 from quadid.flight import Flight, fly
 from quadid.identification.fit import FIT_SECONDS, FitOptions, fit
-from quadid.online import FitRequest, Job, JobReply, OnlineDiagnosis, Publish, Session, SessionSettings
+from quadid.online import Job, JobReply, OnlineDiagnosis, Publish, Session, SessionSettings
 from quadid.online.records import Action
 from quadid.online.stream import SETTLE
 from quadid.parameters import NOMINAL_NAMES
@@ -211,31 +210,6 @@ def repeatability(seconds: float, seed: int) -> dict[str, Any]:
     return {"seconds": seconds, "estimates": len(live), "same_bits": live == replayed and len(live) > 0}
 
 
-def refits(seconds: float) -> dict[str, Any]:
-    """Time of warm refits of a 10 s window: of the processor, and by the clock."""
-
-    spent: list[tuple[bool, float, float]] = []
-
-    def timed(job: Job) -> JobReply:
-        wall, cpu = time.perf_counter(), time.process_time()
-        reply = job.run()
-        if isinstance(job, FitRequest):
-            spent.append((job.search, time.process_time() - cpu, time.perf_counter() - wall))
-        return reply
-
-    list(drive(Session(PELICAN), samples(flown(seconds, 4).recording), timed))
-    warm = np.array([(cpu, wall) for search, cpu, wall in spent if not search]) * 1e3
-    cold = [1e3 * cpu for search, cpu, _ in spent if search]
-    return {
-        "refits": len(warm), "cpu_ms": _spread(warm[:, 0]), "wall_ms": _spread(warm[:, 1]), "first_ms": cold[:1],
-        "load_average": os.getloadavg()[0],
-    }  # fmt: skip
-
-
-def _spread(values: np.ndarray[Any, np.dtype[np.float64]]) -> dict[str, float]:
-    return {"p50": float(np.median(values)), "p99": float(np.quantile(values, 0.99)), "max": float(values.max())}
-
-
 # --- The page
 
 
@@ -319,14 +293,6 @@ def _repeat(r: Result) -> list[str]:
     ]  # fmt: skip
 
 
-def _refit(r: Result) -> list[str]:
-    cpu, wall = r["cpu_ms"], r["wall_ms"]
-    return [
-        f"{r['refits']} warm refits of a 10 s window: processor time p50 {cpu['p50']:.0f} ms, p99 {cpu['p99']:.0f} ms; "
-        f"wall time worst {wall['max']:.0f} ms. First fit with global search: {r['first_ms'][0]:.0f} ms. Goal: 250 ms.",
-    ]  # fmt: skip
-
-
 def _load(r: Result) -> list[str]:
     return [
         "IMU 1 kHz, attitude and rotor speeds 250 Hz, references and odometry 50 Hz, from another process. Every "
@@ -364,7 +330,6 @@ PARTS: dict[str, tuple[str, Callable[[Given], Any], Callable[[Result], list[str]
     "hover": ("Ten minutes of hover",
               lambda g: {**hover(600.0, range(3)), "after_flight": hover_after_flight(600.0, 3)}, _hover),
     "repeat": ("Live and replayed", lambda g: repeatability(60.0, 1), _repeat),
-    "refit": ("Refit of a 10 s window", lambda g: refits(120.0), _refit),
     "load": ("Load", lambda g: {
         "excited": ros_flight.under_load(g.load_seconds, "excited"),
         "hover": ros_flight.under_load(g.load_seconds, "hover"),
