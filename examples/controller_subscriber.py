@@ -33,6 +33,8 @@ UNITS = {
 }  # fmt: skip
 NEEDED = ("b", "J_xx", "J_yy")
 """Without these the set is of no use; the others may stay as they are."""
+SLOPE = "b_tangent"
+"""Where thrust has a curve: torques come from differences of speed, so from its slope; b alone carries the weight."""
 IN_FORCE = (ParameterSet.STATE_ACCEPTED, ParameterSet.STATE_ROLLED_BACK)
 LARGEST_STEP = 1.0
 """This controller bears parameters that change by a factor of two, as its first guess may be off; yours may not."""
@@ -52,8 +54,9 @@ class Model:
 
     def apply(self, message: Any) -> None:
         """Takes the values that the data determine; the others stay."""
+        self.values.pop(SLOPE, None)
         for name, value, status in zip(message.names, message.values, message.status, strict=True):
-            if name in UNITS and status == ParameterSet.STATUS_IDENTIFIED:
+            if (name in UNITS or name == SLOPE) and status == ParameterSet.STATUS_IDENTIFIED:
                 self.values[name] = value
         self.sequence = message.sequence
 
@@ -107,7 +110,7 @@ def gains(values: dict[str, float], start: dict[str, float]) -> dict[str, float]
     ):  # fmt: skip
         out[f"{axis}_rate_p"] = bandwidth * values[inertia]
         out[f"{axis}_rate_i"] = integral * values[inertia]
-    out["thrust_coefficient"], out["drag_coefficient"] = values["b"], values["d"]
+    out["thrust_coefficient"], out["drag_coefficient"] = values.get(SLOPE, values["b"]), values["d"]
     return out
 
 
