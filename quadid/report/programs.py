@@ -512,6 +512,12 @@ FORMS: dict[str, Form] = {
         {".params.toml": "drone_models.toml"},
         drone_models,
     ),
+    "fmu": Form(
+        "FMU 3.0",
+        tuple(name for name in ALL if not name.startswith(("random", "battery_sag"))),
+        {"_fmu.py": "fmu.py"},
+        lambda facts: {"vehicle_file": facts.vehicle.to_yaml()},
+    ),
     "isaac-lab": Form("Isaac Lab", (*_BODY, *_LAGS, "random"), {"_isaaclab.py": "isaac_lab.py"}, isaac_lab),
 }
 FORMATS = tuple(FORMS)
