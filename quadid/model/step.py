@@ -25,7 +25,7 @@ from quadid.model.sensor_kernel import (
     step_tilt_error,
     tilt_attitude,
 )
-from quadid.model.simd import LANES, SOURCES, cache_aligned, cached, jit
+from quadid.model.simd import LANES, SOURCES, cached, jit
 from quadid.types import BoolArray, FloatArray, IntArray
 from quadid.vehicle import RandomForces, Vehicle
 
@@ -188,7 +188,7 @@ def _on_disk(sources: int) -> Any:
     def step_blocks(
         commands: FloatArray, geometry: FloatArray, theta: FloatArray, terms: IntArray, coefficients: FloatArray,
         needs: BoolArray, constants: FloatArray, walk: FloatArray, time: float, span: float, dt: float, seed: int,
-        step: int, delayed: int, state: FloatArray, out: FloatArray,
+        step: int, delayed: int, s: FloatArray, state: FloatArray, out: FloatArray,
     ) -> None:  # fmt: skip
         """Makes one step a row of commands with every vehicle of a batch.
 
@@ -199,7 +199,7 @@ def _on_disk(sources: int) -> Any:
             terms: beyond the catalogue, (terms, 4).
             coefficients: of those, (blocks, terms, LANES).
             needs: which parts of the model any vehicle needs, in the order of `Needs`.
-            constants: rows of each block, or of one for all of them, (blocks or 1, STATE).
+            constants: rows of each block, (blocks, STATE); one row for all blocks stands in `s` already.
             walk: of the random inputs, exp(-dt / T) and the standard deviation of what a step adds, (2, TURNS); no rows
                 where there are none.
             time: at the start of the first step [s].
@@ -208,6 +208,7 @@ def _on_disk(sources: int) -> Any:
             seed: of the random inputs.
             step: number of steps made before.
             delayed: commands that are remembered.
+            s: work array (N_ROWS * LANES), overwritten.
             state: motion and filters, rotors, last commands, past attitudes, random inputs (blocks, width), advanced;
                 see `quadid.model.step.State`.
             out: after each step (steps, vehicles, N_STATE + 10), written: motion, sensors; no rows: not wanted.
@@ -222,8 +223,6 @@ def _on_disk(sources: int) -> Any:
         sensing = need.imu_lag or need.ahrs or need.learned
         moving = N_ROWS * LANES - STATE if sensing else SENSED + 10 * LANES - STATE
         own, signals = np.empty(TURNS), np.empty((N_SIGNALS, LANES))
-        s = cache_aligned(N_ROWS * LANES)
-        s[STATE:] = 0.0
         newest = delayed - 1
         at_rotors = N_ROWS * LANES - STATE
         at_sent = at_rotors + rotors * ROTOR
@@ -235,7 +234,7 @@ def _on_disk(sources: int) -> Any:
             sent = now[at_sent:at_inputs].reshape(delayed, rotors, LANES)
             inputs = now[at_inputs:at_past].reshape(TURNS, LANES)
             past = now[at_past:].reshape(-1, 7, LANES)
-            if block < len(constants):
+            if len(constants) > 1:
                 for i in range(STATE):
                     s[i] = constants[block, i]
             for i in range(moving):
@@ -307,6 +306,7 @@ write_constants, step_blocks = _on_disk(SOURCES)
 LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
 STILL = np.zeros(3)
 _NO_OUT, _NO_WALK = np.empty((0, 0, 0)), np.empty((0, TURNS))
+_NO_CONSTANTS = np.empty((0, STATE))
 _ROTORS_AT = N_ROWS * LANES - STATE
 """First number of the rotors in the memory of a block."""
 
@@ -360,10 +360,13 @@ class State:
     _memory: FloatArray
     _rotors: int
     _dt: float
+    _work: FloatArray
+    _constants: FloatArray
 
     def copy(self) -> State:
         """Returns a state that changes no more with this one."""
-        return State(self.time, self.steps, self.vehicles, self._memory.copy(), self._rotors, self._dt)
+        kept, none = self._memory.copy(), _NO_CONSTANTS
+        return State(self.time, self.steps, self.vehicles, kept, self._rotors, self._dt, none, none)
 
     def _read(self, row: int, count: int) -> FloatArray:
         rows = self._memory[:, row - STATE : row - STATE + count * LANES].reshape(-1, count, LANES)
@@ -465,7 +468,7 @@ class Simulator:
         self._terms = residual_terms(vehicle)
         self._coefficients = np.empty((blocks, len(self._terms), LANES))
         self._seed, self._span = seed, min(span, 1e9)
-        self._dt, self._constants, self._walk, self._delayed = 0.0, np.empty((0, STATE)), _NO_WALK, 2
+        self._dt, self._constants, self._walk, self._delayed = 0.0, _NO_CONSTANTS, _NO_WALK, 2
 
     def start(
         self, *, attitude: ArrayLike = LEVEL, rate: ArrayLike = STILL, velocity: ArrayLike = STILL,
@@ -510,7 +513,8 @@ class Simulator:
             moving[:, STATE:], rot, np.repeat(speeds[:, None], self._delayed, axis=1),
             _in_lanes(given[5], blocks), np.repeat(rows[:, None, :7], late, axis=1),
         )  # fmt: skip
-        return State(time, 0, n, np.concatenate([m.reshape(blocks, -1) for m in memory], axis=1), rotors, dt)
+        kept, none = np.concatenate([m.reshape(blocks, -1) for m in memory], axis=1), _NO_CONSTANTS
+        return State(time, 0, n, kept, rotors, dt, none, none)
 
     def step(self, state: State, command: ArrayLike, dt: float, voltage: float | None = None) -> State:
         """Returns the state after one step; `state` stays as it is.
@@ -571,9 +575,12 @@ class Simulator:
         if voltage is not None:
             exponent = self._theta[..., ix.EXPONENT].reshape(-1)[: state.vehicles]
             commands = commands * voltage ** exponent[None, :, None]
+        if state._constants is not self._constants:  # a new state or a copy, or another step or simulator than before
+            state._work, state._constants = self._prepared.copy(), self._constants
         step_blocks(
             commands, self._geometry, self._theta, self._terms, self._coefficients, self._needs, self._constants,
-            self._walk, state.time, self._span, dt, self._seed, state.steps, self._delayed, state._memory, out,
+            self._walk, state.time, self._span, dt, self._seed, state.steps, self._delayed, state._work,
+            state._memory, out,
         )  # fmt: skip
         state.time += len(commands) * dt
         state.steps += len(commands)
@@ -587,6 +594,7 @@ class Simulator:
         constants, rot = np.empty((blocks, STATE)), np.zeros((blocks, len(self._geometry), ROTOR))
         write_constants(self._theta, flight, self._coefficients, constants, rot)
         self._constants = constants[:1] if self._alike else constants
+        self._prepared = np.concatenate([constants[0], np.zeros(N_ROWS * LANES - STATE)])
         self._delayed = math.floor(max(float(self._theta[..., ix.DELAY].max()), 0.0) / dt) + 2
         if self.random is not None:
             size, time = self.random.each_axis

@@ -159,3 +159,25 @@ def test_files_that_need_more_say_so() -> None:
     with pytest.raises(WindowError, match="one step size"):
         delayed.step(delayed.start(dt=0.01), np.full(4, 400.0), 0.005)
     assert quadid.Simulator is Simulator
+
+
+def test_a_state_flies_on_with_another_simulator_and_its_copy_likewise() -> None:
+    """What a step works with beside the state belongs to one simulator, one step size and one state."""
+    light, heavy = Vehicle.shipped("pelican"), Vehicle.shipped("pelican").model_copy(update={"mass": 2.0})
+    command = light.hover_speed() * np.array([1.02, 0.99, 1.01, 0.98])
+    first, second = Simulator(light), Simulator(heavy)
+    state = first.start(dt=0.005)
+    for simulator, dt in ((first, 0.005), (second, 0.005), (first, 0.01), (first, 0.005)):
+        copied = state.copy()
+        simulator.advance(state, command, dt)
+        simulator.advance(copied, command, dt)
+        np.testing.assert_array_equal(state.motion, copied.motion)
+    alone = second.start(dt=0.005)
+    fresh = Simulator(heavy)
+    for _ in range(3):
+        second.advance(alone, command, 0.005)
+    again = fresh.start(dt=0.005)
+    for _ in range(3):
+        again = fresh.step(again, command, 0.005)
+    np.testing.assert_array_equal(alone.motion, again.motion)
+    assert alone.motion.shape == (1, 17)
