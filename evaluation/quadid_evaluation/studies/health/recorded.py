@@ -257,7 +257,8 @@ def command(flights: Sequence[Flown], folder: Path) -> str:
             without = [figure([j for j in mine if (j.flown.condition, *sorted(j.flown.rotors)) != s]) for s in sets]
             known = [value for value in without if np.isfinite(value)]
             spread = f" ({min(known):.2f} to {max(known):.2f} without one of {len(sets)} sets)" if known else ""
-            cells.append(f"{figure(mine):.2f} of {sum(map(of, mine))}{spread}")
+            asked = sum(map(of, mine))
+            cells.append(f"{figure(mine):.2f} of {asked}{spread}" if asked else "–")
         rows.append(cells)
     return "\n".join([
         "## The command, three baseline flights",
