@@ -152,7 +152,7 @@ def implausible(parameters: ParameterSet, settings: GateSettings) -> str | None:
     for p in parameters:
         if not math.isfinite(p.value) or not 0.0 <= p.sigma < math.inf:
             return f"{p.name} = {p.value:g} {p.unit} with standard deviation {p.sigma:g} is not a number"
-        if p.name in NOMINAL_NAMES and not p.value > 0.0:
+        if p.name in LIMITED and not p.value > 0.0:
             return f"{p.name} = {p.value:g} {p.unit} is not positive"
         low, high = p.bounds
         guessed = p.status is Status.PRIOR_DOMINATED or p.prior_share > PRIOR_SHARE**2

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,8 +12,10 @@ from quadid_node.history import Store
 from quadid_replay import write_mcap
 from quadid_replay.mcap_file import McapFile
 
+from quadid.model.layout import ThrustModel
+from quadid.online.fusion import with_tangent
 from quadid.online.records import OnlineSet, SetState
-from quadid.vehicle import Vehicle
+from quadid.vehicle import GRAVITY, Vehicle
 from tests.commands import Cli
 from tests.faults.evidence import Happened
 from tests.online.driving import flight
@@ -183,3 +186,20 @@ def test_a_set_in_force_is_exported_without_a_word(tmp_path: Path, inside: Cli) 
     assert not [text for text in json.loads(done.out)["warnings"] if "set 2" in text]
     shown = inside("history", "--vehicle", "pelican", "--history", str(path), "--json", "-")
     assert json.loads(shown.out)["in_force"] == {"sequence": 2, "doubt": ""}
+
+
+def test_a_set_that_states_a_slope_of_thrust_is_taken_up_and_exported_as_a_curve(tmp_path: Path, inside: Cli) -> None:
+    curved = replace(GOOD, parameters=with_tangent(GOOD.parameters, math.log(0.75), 0.01))
+    path = history_of(tmp_path / "h.sqlite", curved)
+    store = Store(path, "pelican")
+    pelican = Vehicle.shipped("pelican")
+    item = store.restore(vehicle=pelican).item
+    store.close()
+    assert item is not None
+    assert item.parameters["b_tangent"].value == pytest.approx(0.75 * TRUE["b"])
+    done = inside("export", "--vehicle", "pelican", "--history", str(path), "--out", str(tmp_path), "--json", "-")
+    assert done.code == 0, done.err
+    written = ThrustModel.stated(Vehicle.from_yaml(Path(json.loads(done.out)["files"][0]).read_text(encoding="utf-8")))
+    plain, weight = ThrustModel.stated(pelican).with_b(TRUE["b"]), pelican.mass * GRAVITY
+    assert written.hover_speed(weight) == pytest.approx(plain.hover_speed(weight))
+    assert written.slope(weight) == pytest.approx(0.75 * plain.slope(weight))

@@ -68,6 +68,13 @@ def test_the_secant_of_a_thrust_curve_carries_the_weight() -> None:
     assert thrust.slope(weight) == pytest.approx(rise)
 
 
+def test_a_stated_slope_bends_the_law_where_it_carries_the_weight() -> None:
+    weight, plain = PELICAN.mass * GRAVITY, ThrustModel.stated(PELICAN)
+    bent = plain.with_tangent(0.75, weight)
+    assert bent.hover_speed(weight) == pytest.approx(plain.hover_speed(weight))
+    assert bent.slope(weight) == pytest.approx(0.75 * plain.slope(weight))
+
+
 def test_the_b_of_a_vehicle_is_the_mean_of_its_rotors_whichever_is_weak() -> None:
     theta = Layout(PELICAN).initial(PELICAN)
     for rotor in range(4):
