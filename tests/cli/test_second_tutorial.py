@@ -45,7 +45,7 @@ def test_from_a_raw_log_to_an_exported_file(
     for name, stated, truth in rows:
         assert values[name] == pytest.approx(float(stated), rel=0.01), name
         assert values[name] == pytest.approx(float(truth), rel=0.04), name
-    before, after = re.findall(r"off by ([\d.]+) m/s.*?it is by ([\d.]+)", page)[0]
+    before, after = re.findall(r"off by (\d\.\d+) m/s.*?it is by (\d\.\d+)", page)[0]
     assert scores == [pytest.approx(float(before), rel=0.02), pytest.approx(float(after), rel=0.1)]
     for written in ("mine.sitl.json", "mine.param", "diagnosis.html", "series/flight.bin.missing.csv"):
         assert Path(written).is_file(), written
