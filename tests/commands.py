@@ -46,7 +46,7 @@ def quadid() -> Cli:
             text=True,
             cwd=cwd,
             env={**os.environ, "COLUMNS": "160", **environment},
-            timeout=280,
+            timeout=1800,  # only a hang: a busy machine may take minutes
             check=False,
         )
         return Run(done.returncode, done.stdout, done.stderr)

@@ -35,7 +35,7 @@ def on_a_terminal(arguments: list[str], cwd: Path, **environment: str) -> str:
             break
         parts.append(part)
     os.close(leader)
-    assert process.wait(timeout=250) == 0
+    assert process.wait(timeout=900) == 0
     return b"".join(parts).decode()
 
 

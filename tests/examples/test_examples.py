@@ -29,7 +29,7 @@ def run(
     """An example in a process of its own."""
     done = subprocess.run(
         [sys.executable, str(repository / "examples" / name), *map(str, arguments)], cwd=cwd,
-        capture_output=True, text=True, timeout=280, check=False,
+        capture_output=True, text=True, timeout=900, check=False,
         env={**os.environ, "PYTHONPATH": os.pathsep.join([str(repository), os.environ.get("PYTHONPATH", "")])},
     )  # fmt: skip
     assert done.returncode == code, done.stderr
@@ -78,7 +78,7 @@ def test_the_example_refuses_what_the_command_refuses(
     command = subprocess.run(
         [sys.executable, "-c", "import sys; from quadid.cli.main import app_main; sys.exit(app_main())",
          "identify", str(tmp_path / "flight.csv"), "--vehicle", "pelican", "--out", str(tmp_path)],
-        capture_output=True, text=True, timeout=280, check=False,
+        capture_output=True, text=True, timeout=900, check=False,
     )  # fmt: skip
     assert command.returncode == 2
     line = command.stderr.strip().removeprefix("quadid: ")

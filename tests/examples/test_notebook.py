@@ -23,7 +23,7 @@ def ran(repository: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> An
         book = nbformat.read(repository / "examples" / f"{name}.ipynb", as_version=4)
         assert all(not cell.get("outputs") for cell in book.cells), "outputs are not kept in the repository"
         book.cells.append(nbformat.v4.new_code_cell(last))
-        nbclient.NotebookClient(book, timeout=200, resources={"metadata": {"path": str(tmp_path)}}).execute()
+        nbclient.NotebookClient(book, timeout=900, resources={"metadata": {"path": str(tmp_path)}}).execute()
         return book
 
     return run

@@ -39,7 +39,7 @@ def test_only_what_a_passed_test_said_gets_into_the_page(tmp_path: Path, reposit
     (tmp_path / "page.json").write_text(json.dumps(known))
     command = [sys.executable, "-m", "pytest", "-q", "-n", "1", "-c", str(tmp_path / "none.ini"), str(tmp_path)]
     (tmp_path / "none.ini").write_text("[pytest]\n" + f"pythonpath = {repository}\n")
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=100)
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=900)
     assert "1 failed, 1 passed, 1 skipped" in done.stdout, done.stdout
     text = (tmp_path / "page.md").read_text()
     account = json.loads((tmp_path / "page.json").read_text())

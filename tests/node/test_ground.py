@@ -165,7 +165,7 @@ def test_a_ground_machine_ends_in_peace_and_refuses_what_is_no_request(router: s
             (reply,) = session.get("quadid/quad1/work/fit", payload=payload, timeout=60.0)
             assert reply.ok is None
     machine.send_signal(signal.SIGTERM)
-    out, _ = machine.communicate(timeout=120)
+    out, _ = machine.communicate(timeout=900)
     assert machine.returncode == 0
     assert "4 refused" in out
 

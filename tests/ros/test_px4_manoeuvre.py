@@ -146,9 +146,9 @@ def fly(script: tuple[Path, dict[str, str]], low_at: float, hover: float = 0.4) 
         done = subprocess.run(
             [sys.executable, str(path), "--ros-args", "-p", f"hover_thrust:={hover}"],
             env=environment, capture_output=True,
-            text=True, timeout=120, check=False,
+            text=True, timeout=900, check=False,
         )  # fmt: skip
-        out, _ = autopilot.communicate("", timeout=30)
+        out, _ = autopilot.communicate("", timeout=900)
     finally:
         autopilot.kill()
     return done.returncode, done.stdout + done.stderr, json.loads(out)
