@@ -96,7 +96,7 @@ class Compared(Reported):
     def records(self) -> list[dict[str, Any]]:
         """One row a horizon and quantity."""
         return [
-            {"after": int(h), "quantity": name, **{k: v for k, v in e.items() if k != "ci95"},
+            {"name": f"{name}.{h}", "after": int(h), "quantity": name, **{k: v for k, v in e.items() if k != "ci95"},
              "low": e["ci95"][0], "high": e["ci95"][1]}
             for h, errors in self.result["horizons"].items() for name, e in errors.items()
         ]  # fmt: skip

@@ -64,7 +64,9 @@ def test_effects_stand_side_by_side(flights: Flights) -> None:
     made = quadid.compare_vehicles(near(1.2), lagged, str(flights.unseen))
     assert made.result["effects"] == [{"effect": "motor_lag", "name": "tau", "a": None, "b": 0.001}]
     assert "predicts better than" in made.text()
-    assert len(made.to_frame()) == 12
+    frame = made.to_frame()
+    assert len(frame) == 12
+    assert frame.loc["rate.10", "low"] <= frame.loc["rate.10", "ratio"] <= frame.loc["rate.10", "high"]
     assert "Effects side by side" in made.page()
 
 
