@@ -14,7 +14,7 @@ from quadid.app.logs import Log, fitted_before, settled
 from quadid.app.missing import ROWS, SECONDS
 from quadid.app.options import Horizons, Logs, OfVehicle, OwnRate
 from quadid.app.outcome import LIBRARY, Reported, provenance
-from quadid.data.window import Window, beginning
+from quadid.data.window import Window, beginning, sample_period
 from quadid.errors import NotIdentifiableError, ParameterError
 from quadid.identification.predict import SHARE
 from quadid.model.layout import Layout
@@ -162,7 +162,20 @@ def score(
         for log in opened
         if fitted_before(described, log)
     ]
-    return Scored(result, (*seen, *(text for log in opened for text in log.warnings)), tuple(opened))
+    notes = (*seen, *unmet(opened, result), *(text for log in opened for text in log.warnings))
+    return Scored(result, notes, tuple(opened))
+
+
+def unmet(logs: Sequence[Log], result: Json) -> list[str]:
+    """Says where logs measure a quantity so seldom that no run of these horizons begins and ends at a reading."""
+    out = []
+    for name in ("position", "velocity"):
+        slow = [log.recording.channels[name] for log in logs if any(getattr(w, name) is not None for w in log.windows)]
+        if slow and all(math.isnan(errors[name]) for errors in result["horizons"].values()):
+            rate = 1.0 / max(sample_period(channel.t) for channel in slow)
+            told = f"{name} is measured at {rate:.3g} Hz: no run of these horizons begins and ends at a reading"
+            out.append(f"{told}; --rate {rate:.3g} compares it")
+    return out
 
 
 def ahead(horizons: str | Sequence[int | str], windows: Sequence[Window]) -> list[int]:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
+from quadid_replay import write_csv
 
 import quadid
 from quadid.estimate import forecast
@@ -149,3 +151,15 @@ def test_shipped_vehicle_equals_its_file(inside: Cli, flights: Flights, tmp_path
     file.write_text(Vehicle.shipped("pelican").to_yaml(), encoding="utf-8")
     one = inside("score", flights.train, "--vehicle", "pelican", "--json", "-").data
     assert inside("score", flights.train, "--vehicle", file, "--json", "-").data == one
+
+
+def test_a_quantity_measured_too_seldom_for_the_horizons_is_said(flights: Flights, tmp_path: Path) -> None:
+    flown = flights.unseen_flight.recording
+    known = flown.channels["velocity"]
+    slow = replace(known, t=known.t[::16], values=known.values[::16])
+    write_csv(tmp_path / "slow.csv", replace(flown, channels={**flown.channels, "velocity": slow}))
+    made = quadid.score(tmp_path / "slow.csv", vehicle="pelican")
+    assert [w for w in made.warnings if "velocity is measured at 3.1" in w and "--rate 3.1" in w]
+    assert not [w for w in made.warnings if "position is measured" in w]
+    met = quadid.score(tmp_path / "slow.csv", vehicle="pelican", horizons=(16,))
+    assert not [w for w in met.warnings if "is measured at" in w]
