@@ -29,7 +29,9 @@ from quadid.vehicle import GRAVITY, Vehicle
 _STEP = 0.01
 """Lags are compared at multiples of this [s]; the peak is found between them."""
 _FARTHEST = 25
-_BLOCK = 15.0
+_BLOCK = 7.5
+_QUIET = 0.1
+"""A block with less than this share of the motion of the liveliest is a hover: what disturbs it has lags of its own."""
 _CLEAR = 0.3
 """Correlation above which the peak of a block counts."""
 _LATE, _TOO_LATE = 0.015, 0.025
@@ -37,11 +39,11 @@ _LATE, _TOO_LATE = 0.015, 0.025
 
 
 class _Peak(NamedTuple):
-    """Axis, lag [s] of its angular acceleration behind the torque in one block, and their correlation there."""
+    """Lag [s] of angular acceleration behind the torque in one block, correlation there, and size of the motion."""
 
-    axis: int
     lag: float
     correlation: float
+    motion: float
 
 
 def rotor_timing_check(recording: Recording, vehicle: Vehicle, spans: Spans) -> Check:
@@ -56,19 +58,23 @@ def rotor_timing_check(recording: Recording, vehicle: Vehicle, spans: Spans) -> 
         return Check(name, CheckResult.UNKNOWN, "rotor signal or gyro too slow to place them in time")
     # Rows that no block takes are not read for each: the check of a long log takes time by its length.
     width = max(3, round(2.5 * slowest / _STEP) | 1)
-    peaks = [peak for times in _blocks(spans) for peak in _peaks(signal, gyro, vehicle, times, width)]
-    if not peaks:
+    blocks = [_peaks(signal, gyro, vehicle, times, width) for times in _blocks(spans)]
+    if not blocks:
         return Check(name, CheckResult.UNKNOWN, "too little flight to place the rotor signal in time")
-    correlation = float(np.median([p.correlation for p in peaks]))
-    clear = np.array([p.lag for p in peaks if p.correlation > _CLEAR])
-    # Lags of each axis about their own median: axes may differ, for other motion excites them.
-    by_axis = [np.array([p.lag for p in peaks if p.axis == axis and p.correlation > _CLEAR]) for axis in range(2)]
-    about = [lags - np.median(lags) for lags in by_axis if len(lags)]
+    lags, scores, sizes = (np.array([[peak[k] for peak in axes] for axes in blocks]) for k in range(3))
+    lively = sizes >= _QUIET * sizes.max(axis=0)
+    correlation = float(np.median(scores[lively]))
+    placed = lively & (scores > _CLEAR)
+    clear = lags[placed]
     numbers = {"correlation": correlation}
-    if len(clear) < max(2, len(peaks) // 2):
+    if len(clear) < max(2, int(lively.sum()) // 2):
         message = f"torque and angular acceleration correlate by {correlation:.2f} only, at any lag"
         return Check(name, CheckResult.UNKNOWN, message, "fly with more roll and pitch motion", numbers)
-    low, high = np.quantile(np.concatenate(about), [0.1, 0.9])
+    # Lags of each axis about their own median, for other motion excites it; a clock moves both alike.
+    own = [np.median(lags[placed[:, axis], axis]) if placed[:, axis].any() else 0.0 for axis in range(2)]
+    both = placed.any(axis=1)
+    about = np.average(lags - own, axis=1, weights=placed + 1e-12)[both]
+    low, high = np.quantile(about, [0.1, 0.9])
     lag = float(np.median(clear))
     numbers |= {"lag_s": lag, "wander_s": float(high - low)}
     message = (
@@ -107,7 +113,7 @@ def _peaks(signal: RotorSignal, gyro: Channel, vehicle: Vehicle, at: FloatArray,
     squares = linear(signal.t[speeds], signal.values[speeds] ** 2, at)
     motion = _quick(np.gradient(rates, _STEP, axis=0), width)
     torque = _quick(squares @ vehicle.torque_arms[:, :2], width)
-    return [_peak(axis, torque[:, axis], motion[:, axis]) for axis in range(2)]
+    return [_peak(torque[:, axis], motion[:, axis]) for axis in range(2)]
 
 
 def _around(t: FloatArray, at: FloatArray) -> slice:
@@ -121,7 +127,7 @@ def _quick(values: FloatArray, width: int) -> FloatArray:
     return np.asarray(smooth - moving_mean(smooth, round(_SLOW_MOTION / _STEP) | 1, mirrored=True))
 
 
-def _peak(axis: int, torque: FloatArray, motion: FloatArray) -> _Peak:
+def _peak(torque: FloatArray, motion: FloatArray) -> _Peak:
     n, far = len(torque), _FARTHEST
     later = motion[far : n - far]
     rows = [torque[far - k : n - far - k] for k in range(-far, far + 1)]
@@ -131,7 +137,7 @@ def _peak(axis: int, torque: FloatArray, motion: FloatArray) -> _Peak:
     if 0 < best < 2 * far:
         before, here, after = scores[best - 1 : best + 2]
         shift = 0.5 * float((before - after) / (before - 2.0 * here + after))
-    return _Peak(axis, (best - far + shift) * _STEP, float(scores[best]))
+    return _Peak((best - far + shift) * _STEP, float(scores[best]), float(np.std(later)))
 
 
 # --- Rotor signals against each other, the thrust felt and the motion: dead, stuck, halved, and out of time

@@ -194,6 +194,25 @@ def test_after_an_error_nothing_later_is_asked(flight: Recording) -> None:
     assert verdict(swapped, "motor_order").fix.endswith("columns 2, 1, 3, 4")
 
 
+@pytest.mark.parametrize(("rate", "drift"), [(50.0, 0.002), (200.0, 0.002), (100.0, -0.002)])
+def test_a_clock_of_the_rotors_that_drifts_is_seen_in_half_a_minute(rate: float, drift: float) -> None:
+    recording = quadid.simulate(seconds=30.0, seed=5, rate=rate).flight.recording
+    speeds = recording.channels["rotor_speed"]
+    late = Channel("rotor_speed", speeds.t * (1.0 + drift), speeds.values, speeds.source)
+    found = verdict(replace(recording, channels={**recording.channels, "rotor_speed": late}), "rotor_timing")
+    assert found.verdict is CheckResult.ERROR
+    assert "not in time with the gyro" in found.message
+
+
+def test_a_hover_between_manoeuvres_does_not_place_the_rotors(data_dir: Path) -> None:
+    """A motor that weakens in hover, and a payload, disturb it: rotors follow what turns the vehicle, not before it."""
+    folder = data_dir / "findings" / "ardupilot"
+    vehicle = Vehicle.from_yaml((folder / "mine_pwm.yaml").read_text(encoding="utf-8"))
+    found = verdict(open_log(folder / "payload_hover_378s_no_alarm.tlog"), "rotor_timing", vehicle)
+    assert found.verdict is CheckResult.OK
+    assert found.numbers["lag_s"] == pytest.approx(0.013, abs=0.002)
+
+
 def test_held_readings_count_at_the_rate_at_which_they_change(flight: Recording) -> None:
     speeds = flight.channels["rotor_speed"].values
     held = with_channel(flight, "rotor_speed", speeds[np.arange(len(speeds)) // 5 * 5])
