@@ -755,7 +755,8 @@ def velocity_check(recording: Recording) -> Check:
     return Check(
         "velocity_attitude", CheckResult.ERROR,
         f"vertical {velocity.name} rises where the force pushes down: it points up",
-        "negate vz, and z if it points up too: the world is NED", {"vertical": -1.0},
+        f"negate {'vz, and z if it points up too' if velocity.name == 'velocity' else 'z'}: the world is NED",
+        {"vertical": -1.0},
     )  # fmt: skip
 
 

@@ -365,6 +365,8 @@ _SETTLED = 0.25
 """Correlation in roll and pitch that settles an order."""
 _GAIN, _CHANGE = 0.3, 0.1
 """Likelihood that another order or frame, or other spins, must gain for each sample; what each change costs."""
+_TURNED = 8
+"""Orders that are tried with a turned frame, too."""
 _MOST_ROTORS = 6
 """Beyond this turns, mirror images and exchanges of the order are tried, not all permutations."""
 
@@ -525,23 +527,26 @@ def better_description(lagged: Lagged | str, vehicle: Vehicle) -> Other | None:
         return None
     grams = [_Gram.of(rows) for rows in lagged.fast]
     rotors = tuple(range(len(vehicle.rotors)))
-    turned, angle = _turned(grams, vehicle)
-    named: list[tuple[float, Vehicle, tuple[int, ...], FloatArray]] = []
-    own_frame = [rotors] if abs(angle) > math.radians(20.0) else []  # a smaller turn is none
-    for described, orders in ((vehicle, _orders(len(rotors))), (turned, own_frame)):
-        for sign in (1.0, -1.0):
-            for order, axes in _best(grams, described, orders, sign):
-                cost = _CHANGE * (_moved(order) + (sign < 0.0) + 1.5 * (described is turned))
-                named.append((float(_gain(axes)) - cost, described, order, axes))
-    own = max((one for one in named if one[1] is vehicle and one[2] == rotors), key=lambda one: one[0])
-    best = max(named, key=lambda one: one[0])
-    _, described, order, axes = best if best[0] - own[0] >= _GAIN and np.mean(best[3][:2]) >= _SETTLED else own
+    named = [
+        (float(_gain(axes)) - _CHANGE * (_moved(order) + (sign < 0.0)), 0.0, order, axes)
+        for sign in (1.0, -1.0) for order, axes in _best(grams, vehicle, _orders(len(rotors)), sign)
+    ]  # fmt: skip
+    own = max((one for one in named if one[2] == rotors), key=lambda one: one[0])
+    # The most likely orders, and the own one, with the frame turned as roll and pitch then answer.
+    for order in {rotors, *(one[2] for one in sorted(named, key=lambda one: -one[0])[:_TURNED])}:
+        if abs(angle := _turn(grams, reordered(vehicle, order))) > math.radians(20.0):  # a smaller turn is none
+            for sign in (1.0, -1.0):
+                ((_, axes),) = _best(grams, _rotated(vehicle, angle), [order], sign)
+                named.append((float(_gain(axes)) - _CHANGE * (_moved(order) + (sign < 0.0) + 1.5), angle, order, axes))
+    best = max((one for one in named if np.mean(one[3][:2]) >= _SETTLED), key=lambda one: one[0], default=own)
+    _, angle, order, axes = best if best[0] - own[0] >= _GAIN else own
+    described = _rotated(vehicle, angle) if angle else vehicle
     spins, yaw = _spins(lagged, reordered(described, order))
-    if described is vehicle and order == rotors and (min(axes[0], axes[1]) < _SETTLED or not spins):
+    if not angle and order == rotors and (min(axes[0], axes[1]) < _SETTLED or not spins):
         return None
     axes = np.append(axes[:2], yaw)
     told, fix = [], []
-    if described is turned:
+    if angle:
         degrees = math.degrees(angle)
         told.append(f"the vehicle answers as if its rotors stood {degrees:+.0f} deg further about z")
         fix.append(f"turn the rotor positions of the vehicle file by {degrees:+.0f} deg (x towards y)")
@@ -558,7 +563,7 @@ def better_description(lagged: Lagged | str, vehicle: Vehicle) -> Other | None:
         fix.append(f"negate the spin of rotor {which} in the vehicle file")
     new = reordered(described, order)
     new = _spun(new, spins[0]) if spins else new
-    return Other(new, " and ".join(told), " and ".join(fix), axes, angle if described is turned else 0.0)
+    return Other(new, " and ".join(told), " and ".join(fix), axes, angle)
 
 
 def reordered(vehicle: Vehicle, order: tuple[int, ...]) -> Vehicle:
@@ -691,8 +696,8 @@ def _drag_explains(slow: Rows, vehicle: Vehicle, alone: bool = True) -> float:
     return float(yaw @ drag / np.sqrt(yaw @ yaw * (drag @ drag) + 1e-300))
 
 
-def _turned(grams: Sequence[_Gram], vehicle: Vehicle) -> tuple[Vehicle, float]:
-    """The vehicle with its frame turned about z as roll and pitch answer, and by how much [rad].
+def _turn(grams: Sequence[_Gram], vehicle: Vehicle) -> float:
+    """Angle [rad] by which the vehicle answers in roll and pitch as if its frame were turned about z.
 
     With A the least-squares map from torque over b to inertia times acceleration, A = k R(alpha).
     """
@@ -704,12 +709,17 @@ def _turned(grams: Sequence[_Gram], vehicle: Vehicle) -> tuple[Vehicle, float]:
         explained = float(np.sum(a * cross / (gram.power[:2] * inertia**2 + 1e-300)))
         if explained > best:
             best, angle = explained, math.atan2(a[0, 1] - a[1, 0], a[0, 0] + a[1, 1])
+    return angle
+
+
+def _rotated(vehicle: Vehicle, angle: float) -> Vehicle:
+    """The vehicle with its rotor positions turned about z by an angle [rad]."""
     cos, sin = math.cos(angle), math.sin(angle)
     rotors = tuple(
         r.model_copy(update={"position": (cos * x - sin * y, sin * x + cos * y, z)})
         for r in vehicle.rotors for x, y, z in (r.position,)
     )  # fmt: skip
-    return vehicle.model_copy(update={"rotors": rotors}), angle
+    return vehicle.model_copy(update={"rotors": rotors})
 
 
 def _orders(rotors: int) -> list[tuple[int, ...]]:

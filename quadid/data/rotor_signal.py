@@ -176,7 +176,7 @@ def _looks_like_pwm(command: Channel) -> bool:
 def _check_unit(recording: Recording, command: Channel, vehicle: Vehicle) -> None:
     kind = vehicle.command.kind
     low, high = (float(end) for end in np.nanquantile(command.values, [0.01, 0.99]))
-    whole = "motor_command" not in recording.channels or -0.1 <= low <= high <= 1.5  # a mixer's may exceed it
+    whole = "motor_command" not in recording.channels or -0.02 <= low <= high <= 1.5  # a mixer's may exceed it
     if _looks_like_pwm(command) if kind == "pwm" else whole:
         return
     found = f"{recording.name}: motor commands from {low:.4g} to {high:.4g} ({command.source}) are"

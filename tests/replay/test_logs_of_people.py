@@ -175,6 +175,38 @@ def test_positions_that_are_exchanged_without_their_spins_are_both_named(flight:
     assert "negate the spin of rotor 1 and 2" in found.fix
 
 
+@pytest.mark.parametrize(("flew", "file", "degrees"), [("pelican_x", "pelican", -45), ("pelican", "pelican_x", 45)])
+def test_another_frame_numbered_otherwise_is_answered_with_turn_and_order(flew: str, file: str, degrees: int) -> None:
+    recording = quadid.simulate(flew, seconds=25.0, seed=13).flight.recording
+    found = verdict(recording, "motor_order", Vehicle.shipped(file))
+    assert found.verdict is CheckResult.ERROR
+    assert np.degrees(found.numbers["turned_rad"]) == pytest.approx(degrees, abs=3.0)
+    assert "turn the rotor positions" in found.fix
+    assert "reorder the rotors of the vehicle file to take columns 2, 1, 4, 3" in found.fix
+
+
+@pytest.mark.parametrize(
+    ("full", "zero", "said"),
+    [(100.0, 0.0, "divide by 100"), (255.0, 0.0, "divide by 255"), (1000.0, 0.0, "divide by 1000"),
+     (65535.0, 0.0, "divide by 65535"), (2.0, -1.0, "write 0 for standing still")],
+)  # fmt: skip
+def test_commands_that_count_to_another_number_are_no_pulses_nor_speeds(full: float, zero: float, said: str) -> None:
+    vehicle = Vehicle.shipped("crazyflie")
+    recording = quadid.simulate(vehicle, seconds=10.0, seed=14).flight.recording
+    counted = with_channel(recording, "motor_command", zero + full * recording.channels["motor_command"].values)
+    found = verdict(counted, "hover", vehicle)
+    assert found.verdict is CheckResult.ERROR
+    assert said in found.fix
+
+
+def test_a_column_written_twice_and_speeds_with_a_sign_are_named(flight: Recording) -> None:
+    speeds = flight.channels["rotor_speed"].values
+    twice = verdict(with_channel(flight, "rotor_speed", speeds[:, [0, 0, 2, 3]]), "rotor_speed")
+    assert "rotor columns 1 and 2 are the same" in twice.message
+    signed = verdict(with_channel(flight, "rotor_speed", speeds * [1.0, -1.0, 1.0, -1.0]), "hover")
+    assert "rotor 2, 4" in signed.message
+
+
 def test_what_lies_on_its_back_and_never_flies_is_no_wrong_frame() -> None:
     t = np.arange(0.0, 10.0, 0.02, dtype=np.float64)
     noise = np.random.default_rng(1).normal(0.0, 0.02, (500, 6))
