@@ -371,6 +371,11 @@ class AxisMap(NamedTuple):
         """Each axis follows itself with its own sign."""
         return self.axes == tuple(range(len(self.axes))) and all(s > 0 for s in self.signs)
 
+    @property
+    def absurd(self) -> bool:
+        """The scale is wrong by more than `_UNIT`, whichever of the signals the noise is in."""
+        return self.scale > _UNIT or self.scale < self.r2 / _UNIT
+
     def __str__(self) -> str:
         return ", ".join(
             f"{_AXES[i]} = {'-' if s < 0 else ''}{_AXES[a]}"
@@ -726,7 +731,7 @@ def _judge_rates(reading: str, fit: AxisMap) -> Check:
     message = f"attitude rate / gyro = {fit.scale:.3f} (R^2 {fit.r2:.2f})"
     if 0.85 < fit.scale < 1.15:
         return check(CheckResult.OK, message)
-    if not 1.0 / _UNIT < fit.scale < _UNIT:
+    if fit.absurd:
         remedy = f"multiply gyro by {fit.scale:.3g}, or correct the attitude"
         return check(CheckResult.ERROR, f"{message}: the scale of one is wrong", remedy)
     return check(CheckResult.WARNING, message, "check scales and filters")
@@ -781,7 +786,7 @@ def _level_velocity(gained: FloatArray, derived: FloatArray, name: str) -> Check
         message = f"world axes of {name} differ from the attitude's: {fit} (R^2 {fit.r2:.2f})"
         return check(CheckResult.ERROR, message, "use NED for both; ROS' ENU swaps x and y")
     message = f"{name} follows tilt and thrust (scale {fit.scale:.3g}, R^2 {fit.r2:.2f})"
-    if not 1.0 / _UNIT < fit.scale < _UNIT:
+    if fit.absurd:
         return check(CheckResult.ERROR, f"{message}: its scale is wrong", f"divide {name} by {fit.scale:.3g}")
     return check(CheckResult.OK, message)
 

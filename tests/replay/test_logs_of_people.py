@@ -137,6 +137,19 @@ def test_a_unit_that_nobody_named_is_an_error_all_the_same(
     assert said in f"{found.message}; {found.fix}"
 
 
+@pytest.mark.parametrize(
+    ("channel", "noise", "check"), [("gyro", 0.4, "gyro_attitude"), ("accel", 1.5, "velocity_attitude")]
+)
+def test_noise_makes_a_slope_small_and_no_scale_wrong(
+    flight: Recording, channel: str, noise: float, check: str
+) -> None:
+    values = flight.channels[channel].values
+    slow = np.repeat(np.random.default_rng(2).normal(0.0, noise, (len(values) // 25 + 1, 3)), 25, axis=0)
+    found = verdict(with_channel(flight, channel, values + slow[: len(values)]), check)
+    assert found.numbers["scale"] < 0.66
+    assert "scale is wrong" not in found.message
+
+
 def turned(vehicle: Vehicle, *spins: int) -> Vehicle:
     """The vehicle with the spins of some rotors, counted from 0, the other way."""
     rotors = [r.model_copy(update={"spin": -r.spin if k in spins else r.spin}) for k, r in enumerate(vehicle.rotors)]
