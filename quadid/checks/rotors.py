@@ -539,7 +539,8 @@ def better_description(lagged: Lagged | str, vehicle: Vehicle) -> Other | None:
                 ((_, axes),) = _best(grams, _rotated(vehicle, angle), [order], sign)
                 named.append((float(_gain(axes)) - _CHANGE * (_moved(order) + (sign < 0.0) + 1.5), angle, order, axes))
     best = max((one for one in named if np.mean(one[3][:2]) >= _SETTLED), key=lambda one: one[0], default=own)
-    _, angle, order, axes = best if best[0] - own[0] >= _GAIN else own
+    least = _GAIN - 1.5 * _CHANGE * (best[1] != 0.0)  # what a turn costs only puts it behind an order
+    _, angle, order, axes = best if best[0] - own[0] >= least else own
     described = _rotated(vehicle, angle) if angle else vehicle
     spins, yaw = _spins(lagged, reordered(described, order))
     if not angle and order == rotors and (min(axes[0], axes[1]) < _SETTLED or not spins):
