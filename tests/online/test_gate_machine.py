@@ -37,6 +37,7 @@ from quadid.parameters import NOMINAL_NAMES, impossible_inertia
 from quadid.vehicle import Vehicle
 from tests.faults.evidence import Happened
 from tests.online.driving import flight, samples
+from tests.online.made_up import nothing_left_out
 from tests.online.test_gate import TRUE
 
 PELICAN = Vehicle.shipped("pelican")
@@ -82,7 +83,7 @@ def estimate(request: FitRequest, factors: dict[str, float], sigma: float) -> Fi
         z = np.log(values)
     window = WindowEstimate(
         request.start, request.stop, z, np.eye(6) / sigma**2, np.zeros(6), 2000.0, 2000.0,
-        np.stack([np.zeros(4), np.full(4, 0.005)]),
+        nothing_left_out(),
     )  # fmt: skip
     theta = request.theta.copy()
     theta[:6] = values
