@@ -235,7 +235,17 @@ VEHICLES: tuple[Finding, ...] = (
         for name in ("1_nano_lag_beside_delay", "3_hexb_intervals", "5_x8_feedback_and_health", "6_bob_gyro_scale")
     ),
 )  # fmt: skip
-FINDINGS = (*LOGS, *VEHICLES)
+ARDUPILOT: tuple[Finding, ...] = tuple(
+    Finding(
+        "ardupilot", what, inspect(log, "mine_pwm.yaml"),
+        lambda a: usable(a) and verdicts(a)["motor_order"] == "ok" and verdicts(a)["rotor_timing"] == "ok",
+    )
+    for what, log in (
+        ("first sticks after a hover", "first_sticks_57s_false_pitch_step.tlog"),
+        ("weak motors and a payload in hover", "payload_hover_378s_no_alarm.tlog"),
+    )
+)  # fmt: skip
+FINDINGS = (*LOGS, *VEHICLES, *ARDUPILOT)
 
 
 def judged(finding: Finding, data: Path) -> tuple[bool, str, str]:
