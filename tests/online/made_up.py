@@ -37,9 +37,9 @@ def light_flight(seconds: float, seed: int = 1, drop_at: float = math.inf, drop:
     rng = np.random.default_rng(seed)
     turn = np.array([5.0, 6.1, 2.3])  # rad/s
     rate = 0.9 * np.sin(np.outer(t, turn))
-    inertia = np.array([TRUE["J_xx"], TRUE["J_yy"]])
-    wanted = 0.9 * turn[:2] * np.cos(np.outer(t + 0.01, turn[:2])) * inertia / TRUE["b"]
-    arms = np.column_stack([-PELICAN.rotor_positions[:, 1], PELICAN.rotor_positions[:, 0]])
+    inertia = np.array([TRUE["J_xx"], TRUE["J_yy"], TRUE["J_zz"]])
+    wanted = 0.9 * turn * np.cos(np.outer(t + 0.01, turn)) * inertia / np.array([TRUE["b"], TRUE["b"], TRUE["d"]])
+    arms = PELICAN.torque_arms
     square = PELICAN.hover_speed(TRUE["b"]) ** 2 * (1.0 + 0.08 * np.sin(3.1 * t))[:, None]
     square = square + wanted @ np.linalg.pinv(arms)
     lift = TRUE["b"] * square.sum(axis=1) / PELICAN.mass
