@@ -249,6 +249,11 @@ def test_a_clock_of_the_rotors_that_drifts_is_seen_in_half_a_minute(rate: float,
     assert "not in time with the gyro" in found.message
 
 
+def test_a_centre_of_gravity_that_is_off_is_no_clock() -> None:
+    flown = quadid.simulate("pelican_x", seconds=25.0, seed=6, effects=("cg_offset:x=0.02,y=-0.02",)).flight.recording
+    assert verdict(flown, "rotor_timing", Vehicle.shipped("pelican_x")).verdict is CheckResult.OK
+
+
 def test_a_hover_between_manoeuvres_does_not_place_the_rotors(data_dir: Path) -> None:
     """A motor that weakens in hover, and a payload, disturb it: rotors follow what turns the vehicle, not before it."""
     folder = data_dir / "findings" / "ardupilot"
