@@ -33,7 +33,8 @@ class Process:
             command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, cwd=ROOT,
             env={**os.environ, "PYTHONUNBUFFERED": "1", **environment}, start_new_session=True,
         )  # fmt: skip
-        threading.Thread(target=self._read, daemon=True).start()
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
 
     def _read(self) -> None:
         assert self.child.stdout is not None
@@ -43,7 +44,9 @@ class Process:
 
     @property
     def text(self) -> str:
-        """Everything said so far."""
+        """Everything said so far; of a child that has ended, all of it."""
+        if self.child.poll() is not None:
+            self._reader.join(10.0)
         return "\n".join(self.lines)
 
     def wait_for(self, word: str, seconds: float = LIMIT) -> str:

@@ -81,7 +81,7 @@ def test_every_transition_in_every_state_is_answered_and_the_node_lives(last: in
         state = VALID[state, number]
         assert client.state == state
     refuse_all_others(client, FINALIZED, managed)
-    assert "cannot" in managed.text, "what was refused is said, with what may be asked for"
+    managed.wait_for("cannot")  # what was refused is said, with what may be asked for
 
 
 def test_an_error_in_a_transition_is_said_and_the_node_can_be_configured_again(managed: Process, ear: Ear) -> None:
@@ -99,7 +99,7 @@ def test_an_error_in_a_transition_is_said_and_the_node_can_be_configured_again(m
     vehicle("nowhere.yaml")
     assert not client.change(CONFIGURE)
     assert client.state == UNCONFIGURED
-    assert "nowhere.yaml" in managed.text
+    managed.wait_for("nowhere.yaml")
     health.clear()
     assert ear.until(lambda: any("nowhere.yaml" in s.message and s.level == ERROR for h in health for s in h.status))
     vehicle("pelican")
@@ -204,5 +204,5 @@ def test_configure_gives_up_after_a_bounded_time_and_says_what_to_do(ear: Ear) -
         client = Client(ear)
         assert not client.change(CONFIGURE)
         assert client.state == UNCONFIGURED
-        assert "quadid warmup" in started.text
+        started.wait_for("quadid warmup")
         assert started.end()[0] == 0

@@ -49,7 +49,7 @@ def test_a_late_subscriber_gets_the_latched_set_and_the_replay_gives_the_same_bi
             assert ear.until(lambda: len(candidates) > 5), identify.text
         with Process(sys.executable, str(ROOT / "examples" / "controller_subscriber.py"), "--show-tracking") as late:
             line = late.wait_for("attitude tracking error")
-            assert "applied" in late.text
+            late.wait_for("applied")
             before, after = (float(word) for word in line.split() if word.startswith("0."))
             assert after < before, line
         shown = [branch for s in health[-1].status for branch in branches(s.name)]
@@ -155,7 +155,7 @@ def test_a_killed_fit_process_is_replaced_and_a_rollback_by_service_brings_the_s
             assert ear.until(lambda: sets), identify.text
             os.kill(worker_of(identify.child.pid), signal.SIGKILL)
             assert ear.until(lambda: len(sets) >= 2), identify.text
-            assert "ended by signal 9" in identify.text
+            identify.wait_for("ended by signal 9")
             assert ear.until(lambda: restarts(health) == 1)
             before = sets[-2]
             assert ear.call("quadid/rollback", Trigger).success
