@@ -93,12 +93,25 @@ def connect(path: Path, read_only: bool = False) -> sqlite3.Connection:
                 "use the version of quadid that wrote it, or another history",
             )  # fmt: skip
         if not read_only:
-            db.execute("PRAGMA journal_mode = WAL")
+            _into_wal(db)
             db.execute("PRAGMA synchronous = FULL")
     except BaseException:
         db.close()
         raise
     return db
+
+
+def _into_wal(db: sqlite3.Connection) -> None:
+    """Enters WAL mode; of two that do so at once on a new file SQLite refuses one without waiting."""
+    deadline = time.monotonic() + BUSY_SECONDS
+    while True:
+        try:
+            db.execute("PRAGMA journal_mode = WAL")
+            return
+        except sqlite3.OperationalError as error:
+            if "locked" not in str(error) or time.monotonic() > deadline:
+                raise
+            time.sleep(0.02)
 
 
 def make_tables(path: Path) -> None:

@@ -11,6 +11,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import replace
 from functools import cache
@@ -18,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from quadid_node.history import VERSION, Store, StoreError, read_history
+from quadid_node.history import VERSION, Store, StoreError, make_usable, read_history
 from quadid_node.messages import Output, set_from_dict, set_to_dict
 from quadid_node.service import Service
 from quadid_node.worker import InlineWorker
@@ -691,3 +692,10 @@ def test_a_file_that_computes_is_set_aside(tmp_path: Path, what: str, happened: 
     assert [entry["sequence"] for entry in read_history(path, "v")["sets"]] == [online_set(TRUE).sequence]
     store.close(60.0)
     happened(12, f"a history with {what}: '{store.notes[0][:90]}'")
+
+
+def test_services_that_begin_one_history_at_once_all_can(tmp_path: Path) -> None:
+    """Of two that entered WAL mode together SQLite refused one at once: "another program holds the history"."""
+    for turn in range(40):
+        with ThreadPoolExecutor(3) as pool:
+            assert list(pool.map(make_usable, [tmp_path / f"{turn}.sqlite"] * 3)) == [""] * 3
