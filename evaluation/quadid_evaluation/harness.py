@@ -1,4 +1,4 @@
-"""What studies share: command line, pages of sections, worker processes, tables, shares with their intervals."""
+"""Common parts of studies: command line, pages of sections, worker processes, tables, shares with their intervals."""
 
 from __future__ import annotations
 

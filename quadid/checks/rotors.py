@@ -174,14 +174,15 @@ def readings_check(recording: Recording, vehicle: Vehicle, spans: Spans) -> Chec
     if np.count_nonzero(inside) < 20:
         return None
     # A command may rest for half of the flight, a speed for a twentieth.
-    most = 0.5 if _commanded(recording, vehicle) else 0.05
+    commands = _commanded(recording, vehicle)
+    most = 0.5 if commands else 0.05
     values = signal.values[inside]
     step = _coarse(values)
     if step:
         message = f"rotor speeds come in steps of {step:.3g} rad/s: too coarse for the motion ({signal.source})"
         return Check(_NAME, CheckResult.WARNING, message, "log them finer, or motor commands", {"step_rad_s": step})
-    problem = _dead(values, most) or _same(values, vehicle, most) or _stuck(signal, recording, inside)
-    fix = _FIX if most < 0.5 else "check which outputs drive the motors, and that all of them were logged"
+    problem = _dead(values, most) or _same(values, vehicle, commands) or _stuck(signal, recording, inside)
+    fix = "check which outputs drive the motors, and that all of them were logged" if commands else _FIX
     return problem and Check(_NAME, CheckResult.ERROR, f"{problem[0]} ({signal.source})", fix, problem[1])
 
 
@@ -194,11 +195,11 @@ def _coarse(speeds: FloatArray) -> float:
     return step if step > 0.5 * float(np.median(np.std(speeds, axis=0))) else 0.0
 
 
-def _same(speeds: FloatArray, vehicle: Vehicle, most: float) -> Problem | None:
+def _same(speeds: FloatArray, vehicle: Vehicle, commands: bool) -> Problem | None:
     """Columns that are one: their difference, which turns the vehicle, is lost; one command may go to one axle."""
     places = vehicle.rotor_positions[:, :2]
     for i, j in combinations(range(speeds.shape[1]), 2):
-        axle = most == 0.5 and np.linalg.norm(places[i] - places[j]) < 0.1 * vehicle.arm
+        axle = commands and np.linalg.norm(places[i] - places[j]) < 0.1 * vehicle.arm
         if np.ptp(speeds[:, i]) > 0.0 and np.array_equal(speeds[:, i], speeds[:, j]) and not axle:
             which = f"rotor columns {i + 1} and {j + 1}"
             which = "all rotor columns" if np.all(speeds == speeds[:, :1]) else which

@@ -278,14 +278,21 @@ class Estimator:
     @property
     def published(self) -> ThrustModel:
         """Thrust by what is published and the vehicle file's own effects: what who uses a set has."""
-        fused = self.fusion.estimate()
-        stated = ThrustModel.stated(self.vehicle)
+        fused, beyond = self.fusion.estimate(), self._slope_beyond_b
+        model = ThrustModel.stated(self.vehicle)
         if fused is None:
-            return stated
-        model, told = stated.with_b(math.exp(fused.z[B])), self.fusion.left_out() if self.flexible else None
-        if told is None:
             return model
-        return model.with_tangent(math.exp(told[0, :-1].mean()), self.vehicle.mass * GRAVITY)
+        model = model.with_b(math.exp(fused.z[B]))
+        return model if beyond is None else model.with_tangent(math.exp(beyond[0]), self.vehicle.mass * GRAVITY)
+
+    @property
+    def _slope_beyond_b(self) -> tuple[float, float] | None:
+        """Change of thrust with speed at hover over that by b (log), mean of the rotors, and its standard deviation.
+
+        None while no effects are fitted along.
+        """
+        left_out = self.fusion.left_out() if self.flexible else None
+        return None if left_out is None else (float(left_out[0, :-1].mean()), float(left_out[1, :-1].mean()))
 
     @property
     def input_hash(self) -> str:
@@ -396,8 +403,8 @@ class Estimator:
             theta, covariance = self._without_yaw(theta, covariance)
         unc = Uncertainty(covariance, np.ones(len(fused.z)), self._prior_sigma)
         six = parameter_set(self._free, theta, self._initial, unc)
-        left_out = self.fusion.left_out() if self.flexible else None
-        return six if left_out is None else with_tangent(six, *left_out[:, :-1].mean(axis=1).tolist())
+        beyond = self._slope_beyond_b
+        return six if beyond is None else with_tangent(six, *beyond)
 
     def _without_yaw(self, theta: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
         """The estimate with what couples into yaw alone as uncertain as before the flight, where the model misses it.

@@ -27,7 +27,7 @@ from quadid.parameters import (
 from quadid.types import FloatArray
 
 LIMITED = (*NOMINAL_NAMES, TANGENT)
-"""What may not jump from one set to the next; effects may."""
+"""Parameters that may not jump from one set to the next; effects may."""
 MUST_BE_KNOWN = ("b", "J_xx", "J_yy")
 """Without these no set is published; yaw parameters may stay at the vehicle file's values, and say so."""
 
@@ -258,7 +258,7 @@ def _together(factor: Factor, case: Case) -> tuple[FloatArray, FloatArray]:
 
 
 def _hidden(case: Case) -> tuple[float, float]:
-    """What is wrong with all rotors' thrust alike by the set, and its standard deviation.
+    """Error of all rotors' thrust alike by the set, and its standard deviation.
 
     The change of thrust with speed off b w^2, or, where the set states that change, what is carried while no rotor
     turns: a curve of the rotors' own is no error of such a set.

@@ -160,7 +160,7 @@ def hover_after_flight(seconds: float, seed: int) -> dict[str, Any]:
 
 
 DELAYS = {"attitude": 0.1, "rotor_speed": 0.3}
-"""How much later these channels come than the others [s]."""
+"""Delay of these channels behind the others [s]."""
 PACE = 10.0
 """Times real time."""
 

@@ -61,7 +61,7 @@ GOALS: tuple[Goal, ...] = (
 
 
 def _faster(r: Result, suffix: str, library: str) -> str:
-    """How often our reading, all processor time counted, goes into that of a library."""
+    """Ratio of a library's reading to ours, all processor time counted."""
     other = r["times"].get(f"{suffix}, {library}")
     ours = r["times"][f"{suffix}, quadid"]["processor"]
     return "–" if other is None else f"{other['processor'] / ours:.1f} times faster"
@@ -194,7 +194,7 @@ def draw_scaling(r: Mapping[str, Any], path: Path) -> None:
 
 
 def parts(rounds: int, longest: int, folder: Path) -> dict[str, Callable[[], dict[str, Any]]]:
-    """What can be measured, in the order of the page."""
+    """Parts that can be measured, in the order of the page."""
     few = max(rounds // 2, 1)
     return {
         "kernel": lambda: kernel_table(rounds),

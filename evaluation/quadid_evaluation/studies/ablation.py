@@ -1,4 +1,4 @@
-"""What each rule and number of the diagnosis is good for: without it, or with half and twice it, what changes.
+"""Worth of each rule and number of the diagnosis: what changes without it, or with half and twice it.
 
     QUADID_DATA=../shared/data python -m quadid_evaluation.studies.ablation --out docs/results
 
@@ -208,7 +208,7 @@ OUT: dict[str, Any] = {
     "CHANGE_SHARE": 0.0, "LINEAR_MISFIT": math.inf, "CLEAN_MISFIT": LINEAR_MISFIT, "NEAR": 1.0, "ALIKE": 1.0,
     "MOST_REFITS": 1000,
 }  # fmt: skip
-"""What stands for a number that is left out; numbers that have no such value are halved and doubled only."""
+"""Value that stands for a number that is left out; numbers that have no such value are halved and doubled only."""
 
 
 # --- The flights: hidden effects of the campaign, independent cases, recorded and foreign flights
@@ -224,7 +224,7 @@ FLIGHTS = (
     "single 1083", "single 8005", "look_alike 15", "outside 1029", "clutter 2005", "clutter 2019", "cases case_012",
     "cases_hub case_002", "cases_hub case_006", "iris", "arpl", "sitl square", "brushed rpm", "crazyflie",
 )  # fmt: skip
-"""What a run takes where nothing else is asked for: besides those, flights that rules were once made for."""
+"""Flights of a run where nothing else is asked for: besides those, flights that rules were once made for."""
 Windows = tuple[list[Window], list[Window], Vehicle]
 """Windows to diagnose, windows to measure the gain on, and the vehicle."""
 
@@ -433,7 +433,7 @@ WIDTH = 0.05
 
 @dataclass(frozen=True)
 class Answer:
-    """What a diagnosis gave.
+    """Answer of a diagnosis.
 
     Attributes:
         flight: its name; variant: what was changed in the method.
@@ -459,7 +459,7 @@ class Answer:
     follows: str = ""
 
     def difference(self, other: Answer) -> str:
-        """What an answer has that this one has not, in words; empty where nothing differs.
+        """Things that an answer has and this one has not, in words; empty where nothing differs.
 
         Names come before the first of them and the verdict, these before the error on unseen data, and that before
         intervals and the rest.
@@ -508,7 +508,7 @@ def ask(flight: Flight, given: Windows, variant: str, memory: Memory) -> Answer:
 
 
 def _right(flight: Flight, verdict: str, listed: Sequence[str], named: Sequence[str]) -> bool | None:
-    """Whether the answer is what the class of the flight asks for (as
+    """True if the answer is what the class of the flight asks for (as
     `quadid_evaluation.studies.campaign.right`)."""
     if flight.hidden is None:
         return None
@@ -550,11 +550,11 @@ def read(records: Path) -> list[Answer]:
 
 
 REMOVED = Path(__file__).with_name("ablation_removed.md")
-"""What went because of such runs, in words."""
+"""Rules that went because of such runs, in words."""
 IDLE = re.compile(r"\* [^:]+: ")
 """A row in which nothing changes."""
 NAMES = re.compile(r"\*\*[−+]|: [−+]\w|: first |confident →")
-"""What a row has in which a name or a verdict changes."""
+"""Mark of a row in which a name or a verdict changes."""
 
 
 def told(answer: Answer) -> None:
