@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from quadid_evaluation.paper.comparison import METHODS
+from quadid_evaluation.paper.compare import METHODS, check_names
 
 from tests.cli.conftest import Flights, table, write_table
 from tests.commands import Cli, one_line
@@ -57,7 +57,13 @@ def test_random_methods_run_once_a_seed_and_never_overdraw_their_budget(compared
         if m["name"] in ("pso", "pso_polish", "cma_es", "l_shade", "differential_evolution"):
             assert m["runs"] == 2
             assert {t["seed"] for t in m["trials"]} == {1, 2}
+            assert m["cost"] == min(t["cost"] for t in m["trials"])  # of two runs the better one stands for a method
         assert all(t["evaluations"] <= 600 for t in m.get("trials", []))
+
+
+def test_methods_keep_the_order_of_the_table() -> None:
+    assert check_names(["moesp", "initial", "pso", "pso"], "shooting") == ("initial", "pso", "moesp")
+    assert check_names(None, "shooting") == METHODS
 
 
 def test_an_unknown_method_is_refused_with_the_nearest_name(inside: Cli, flights: Flights) -> None:

@@ -7,9 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from quadid_evaluation.paper.page import PAPER_GAIN, PAPER_MSE
 from quadid_evaluation.paper.protocol import Plan, reproduce
-from quadid_evaluation.paper.result import summary
-from quadid_evaluation.paper.tables import PAPER_GAIN, PAPER_MSE
 
 from quadid.cli.reproduce import write
 from quadid.jsonable import jsonable
@@ -22,9 +21,9 @@ pytestmark = pytest.mark.timeout(900)
 def done(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], Path]:
     folder = tmp_path_factory.mktemp("reproduced")
     plan = Plan(seconds=40.0, particles=32, iterations=12, seeds=1)
-    found = reproduce(folder / "flights", plan, 1, lambda stage, share: None)
-    result = jsonable(summary(found, plan, 1, 1.0, "a test"))
-    return {**result, "files": write(found, result, folder)}, folder
+    found, scores = reproduce(folder / "flights", plan, 1, lambda stage, share: None, "a test")
+    result = jsonable(found)
+    return {**result, "files": write(result, scores, folder)}, folder
 
 
 def test_the_searches_stand_in_their_order(done: tuple[dict[str, Any], Path]) -> None:

@@ -1,4 +1,8 @@
-"""The swarm beside other optimisers and beside black-box models, on the same flights."""
+"""The swarm beside other optimisers and beside black-box models on the same flights: `quadid compare`.
+
+Optimisers all minimise one objective in one box from one start, and may spend one budget; each is run with several
+seeds.  Subspace models are fitted to the same windows.  Whatever found it, a model is scored as every other.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +10,7 @@ import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
@@ -14,29 +18,24 @@ from quadid.app.identify import check_seed
 from quadid.app.logs import settled
 from quadid.app.options import Logs, OfVehicle, Seed, Typed, Validate
 from quadid.app.outcome import Advance, Outcome, silent
-from quadid.data.window import Window
 from quadid.errors import NotIdentifiableError, ParameterError, QuadidError, nearest
 from quadid.parameters import NOMINAL_NAMES
 from quadid.report.tables import Cell, Column, TextTable, number
 from quadid.types import JsonDict
-from quadid.vehicle import Vehicle
-from quadid_evaluation.paper import comparison
-from quadid_evaluation.paper.comparison import (
-    METHODS,
-    Problem,
-    Scores,
-    Tried,
-    black_box_entry,
-    check_methods,
-    failed_entry,
-    optimiser_entry,
-)
+from quadid_evaluation.optimisers.minimise import NAMES, Result, minimise
 from quadid_evaluation.paper.subspace import METHODS as BLACK_BOXES
 
-if TYPE_CHECKING:
-    from quadid.identification.controller_gains import Autopilot
-    from quadid.identification.noise import NoiseModel
-
+METHODS = (
+    "initial", "quasi_newton", "least_squares", "pso", "pso_polish", "cma_es", "l_shade", "differential_evolution",
+    *BLACK_BOXES,
+)  # fmt: skip
+"""Methods by name, in the order of the table."""
+KNOWN = (*METHODS, *(name for name in NAMES if name not in METHODS))
+"""All names that may be asked for."""
+SEEDLESS = ("initial", "quasi_newton", "least_squares")
+"""Optimisers without randomness: run once, whatever the number of seeds."""
+SUCCESS = 1.01
+"""A run has failed when its cost is above this multiple of the lowest cost that any run of any method found."""
 OBJECTIVES = ("shooting", "closed_loop")
 """What optimisers may be asked to minimise."""
 
@@ -77,7 +76,7 @@ class Methods(Outcome):
     def sentences(self) -> list[Cell]:
         """Definition of a run that failed."""
         most = f"at most {self.result['budget']} simulations a run"
-        return [Cell(f"failed: runs that ended above 1.01 times the lowest cost of all; {most}")]
+        return [Cell(f"failed: runs that ended above {SUCCESS} times the lowest cost of all; {most}")]
 
     def records(self) -> list[dict[str, Any]]:
         """One row a method."""
@@ -85,12 +84,13 @@ class Methods(Outcome):
 
 
 def check_names(methods: Sequence[str] | None, objective: str) -> Sequence[str]:
-    """The methods to run; raises ParameterError for an unknown method or objective."""
-
-    names = check_methods(methods or METHODS)
+    """The methods to run, each once, in the order of the table; raises ParameterError for unknown names."""
+    for name in methods or ():
+        if name not in KNOWN:
+            raise ParameterError(f"unknown method '{name}'", ", ".join(KNOWN), nearest(name, KNOWN))
     if objective not in OBJECTIVES:
         raise ParameterError(f"unknown objective '{objective}'", ", ".join(OBJECTIVES), nearest(objective, OBJECTIVES))
-    return names
+    return tuple(name for name in KNOWN if name in (methods or METHODS))
 
 
 def compare(
@@ -136,91 +136,90 @@ def compare(
     """
     from quadid.identification.controller_gains import find_autopilot
     from quadid.identification.fit import FitOptions, fit
+    from quadid.identification.paper_objective import paper_score
+    from quadid.identification.score import mse_score
+    from quadid_evaluation.optimisers.box import BoxProblem, PaperBox
+    from quadid_evaluation.paper.black_box import fit_black_box, score_black_box
 
     names = check_names(methods, objective)
     if seeds < 1:
         raise ParameterError("no seed", "one or more", "for example seeds=3")
     check_seed(seed)
-    each = range(seed, seed + seeds)
     given = settled(logs, validate, vehicle)
-    described, train, held = given.vehicle, given.train, given.held
-    windows, unseen = [w for log in train for w in log.windows], [log.windows for log in held]
-    noise = fit(windows, described, FitOptions(seed=seed), progress=lambda _, share: advance("noise", share)).noise
-    judge = Judge(described, noise, windows, unseen, find_autopilot(windows, described))
-    problem = judge.problem(objective)
-    tried, boxes = {}, {}
+    craft, train, held = given.vehicle, given.train, given.held
+    windows = [w for log in train for w in log.windows]
+    sets = [windows, *(log.windows for log in held)]
+    noise = fit(windows, craft, FitOptions(seed=seed), progress=lambda _, share: advance("noise", share)).noise
+    autopilot = find_autopilot(windows, craft)
+    if objective == "shooting":
+        problem: BoxProblem | PaperBox = BoxProblem(windows, craft)
+    elif autopilot is not None:
+        problem = PaperBox(windows, craft, autopilot)
+    else:
+        raise NotIdentifiableError(
+            "the stabiliser is not known", "references in the log, or gains in the vehicle file",
+            "give `stabiliser: {gains: ...}`, or use --objective shooting",
+        )  # fmt: skip
+
+    # Fits, every optimiser with every seed.
+    p, boxes = problem, dict[str, JsonDict]()
+    runs: dict[str, list[tuple[int, Result]]] = {}
     for i, name in enumerate(names):
         advance(name, i / len(names))
         if name in BLACK_BOXES:
-            boxes[name] = judge.black_box(name)
+            begin = time.perf_counter()
+            try:
+                box = fit_black_box(name, windows, noise)
+                seconds = time.perf_counter() - begin
+                first, *others = (score_black_box(box, part, craft, noise) for part in sets)
+            except QuadidError as error:  # cannot be fitted to these data
+                boxes[name] = _entry(name, math.nan, [], None, 0, math.nan) | {
+                    "runs": 1, "failures": 1, "note": str(error)
+                }  # fmt: skip
+                continue
+            boxes[name] = _entry(name, first, others, None, box.tried + 1, seconds) | {
+                "order": box.model.order, "runs": 1, "failures": 0,
+                "note": "a black box: predicts, gives no physical parameters",
+            }  # fmt: skip
         else:
-            tried[name] = comparison.run_optimiser(name, problem, each, budget, time.perf_counter)
-    lowest = comparison.lowest_cost(list(tried.values()))
-    scored = {name: judge.optimiser(m, lowest, problem) for name, m in tried.items()}
+            runs[name] = [
+                (s, minimise(name, p.cost, p.start, p.lower, p.upper, budget, s, p.residual, time.perf_counter))
+                for s in range(seed, seed + (1 if name in SEEDLESS else seeds))
+            ]
+
+    # Scores: the run of median cost, the lower one of two, stands for an optimiser.
+    lowest = min((found.cost for tried in runs.values() for _, found in tried), default=math.inf)
+    for name, tried in runs.items():
+        chosen, found = sorted(tried, key=lambda run: run[1].cost)[(len(tried) - 1) // 2]
+        theta = problem.theta(found.x)
+        first, *others = (mse_score(part, craft, theta, noise).mse for part in sets)
+        paper = None
+        if autopilot is not None:
+            scores = [paper_score(part, craft, theta, autopilot) for part in sets]
+            paper = [math.nan if s is None else s.mse for s in scores]
+        boxes[name] = _entry(name, first, others, paper, found.evaluations, found.seconds) | {
+            "cost": found.cost, "parameters": dict(zip(NOMINAL_NAMES, theta[:6].tolist(), strict=True)),
+            "seed": chosen, "stop": found.stop.value, "runs": len(tried),
+            "failures": sum(not run.cost <= SUCCESS * lowest for _, run in tried),
+            "trials": [
+                {"seed": s, "cost": run.cost, "evaluations": run.evaluations, "seconds": run.seconds}
+                for s, run in tried
+            ],
+        }  # fmt: skip
     result = {
-        "schema": "quadid.compare/1", "vehicle": described.name, "objective": objective, "budget": budget,
-        "seeds": list(each), "noise_floor": 1.0, "train": [log.recording.name for log in train],
-        "validate": [log.recording.name for log in held],
-        "methods": [scored[name] if name in scored else boxes[name] for name in names],
+        "schema": "quadid.compare/1", "vehicle": craft.name, "objective": objective, "budget": budget,
+        "seeds": list(range(seed, seed + seeds)), "noise_floor": 1.0, "train": [log.recording.name for log in train],
+        "validate": [log.recording.name for log in held], "methods": [boxes[name] for name in names],
     }  # fmt: skip
     return Methods(result, tuple(text for log in (*train, *held) for text in log.warnings))
 
 
-@dataclass(frozen=True)
-class Judge:
-    """Scores what any method found on the same data.
-
-    Attributes:
-        vehicle: initial guess, bounds, known effects.
-        noise: sensor noise.
-        train: training windows.
-        unseen: windows of each validation log.
-        autopilot: the stabiliser, or None where it is not known.
-    """
-
-    vehicle: Vehicle
-    noise: NoiseModel
-    train: Sequence[Window]
-    unseen: Sequence[Sequence[Window]]
-    autopilot: Autopilot | None
-
-    def problem(self, objective: str) -> Problem:
-        """The problem that optimisers solve; raises NotIdentifiableError where the data do not hold what it needs."""
-        from quadid_evaluation.optimisers.box import BoxProblem, PaperBox
-
-        if objective == "shooting":
-            return BoxProblem(self.train, self.vehicle)
-        if self.autopilot is None:
-            raise NotIdentifiableError(
-                "the stabiliser is not known", "references in the log, or gains in the vehicle file",
-                "give `stabiliser: {gains: ...}`, or use --objective shooting",
-            )  # fmt: skip
-        return PaperBox(self.train, self.vehicle, self.autopilot)
-
-    def optimiser(self, method: Tried, lowest: float, problem: Problem) -> JsonDict:
-        """One optimiser's entry of the result."""
-        from quadid.identification.paper_objective import paper_score
-        from quadid.identification.score import mse_score
-
-        theta = problem.theta(method.typical.found.x)
-        sets = (self.train, *self.unseen)
-        train, *validate = (mse_score(part, self.vehicle, theta, self.noise).mse for part in sets)
-        flown = [paper_score(part, self.vehicle, theta, self.autopilot) for part in sets]
-        paper = [math.nan if s is None else s.mse for s in flown]
-        parameters = dict(zip(NOMINAL_NAMES, theta[: len(NOMINAL_NAMES)].tolist(), strict=True))
-        told = None if self.autopilot is None else Scores(paper[0], tuple(paper[1:]))
-        return optimiser_entry(method, lowest, Scores(train, tuple(validate)), told, parameters)
-
-    def black_box(self, name: str) -> JsonDict:
-        """Fits and scores one subspace method; one that cannot be fitted to these data has failed, and says why."""
-        from quadid_evaluation.paper.black_box import fit_black_box, score_black_box
-
-        begin = time.perf_counter()
-        try:
-            box = fit_black_box(name, self.train, self.noise)
-            seconds = time.perf_counter() - begin
-            sets = (self.train, *self.unseen)
-            train, *validate = (score_black_box(box, part, self.vehicle, self.noise) for part in sets)
-        except QuadidError as error:
-            return failed_entry(name, str(error))
-        return black_box_entry(name, Scores(train, tuple(validate)), box.model.order, box.tried + 1, seconds)
+def _entry(
+    name: str, train: float, validate: list[float], paper: list[float] | None, evaluations: int, seconds: float
+) -> JsonDict:
+    """What every method has in ``quadid.compare/1``; `paper` is its score on each set."""
+    return {
+        "name": name, "mse": {"train": train, "validate": validate},
+        "mse_paper": None if paper is None else {"train": paper[0], "validate": paper[1:]},
+        "evaluations": evaluations, "seconds": seconds, "parameters": {},
+    }  # fmt: skip

@@ -2,22 +2,33 @@
 
 from __future__ import annotations
 
+import datetime
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from quadid.app.outcome import Advance
-    from quadid.data.window import Window
-    from quadid.diagnosis import Diagnosis
-    from quadid.identification.fit import Fit
-    from quadid.identification.noise import NoiseModel
-    from quadid.identification.paper_objective import PaperScore
-    from quadid.types import FloatArray
-    from quadid.vehicle import Vehicle
-    from quadid_evaluation.optimisers.box import PaperBox
+import numpy as np
+
+from quadid.app.logs import GRID, load, load_vehicle, write_recording, write_text
+from quadid.app.outcome import Advance
+from quadid.chi_square import Z95
+from quadid.diagnosis import diagnose
+from quadid.flight import fly
+from quadid.identification.controller_gains import find_autopilot
+from quadid.identification.fit import FitOptions, fit
+from quadid.identification.paper_objective import PaperScore
+from quadid.identification.particle_swarm import Stop, Swarm, SwarmOptions
+from quadid.identification.score import mse_score
+from quadid.model.layout import Layout
+from quadid.parameters import NOMINAL_NAMES
+from quadid.types import FloatArray, JsonDict
+from quadid.vehicle import Stabiliser, Vehicle
+from quadid.version import __version__
+from quadid_evaluation.optimisers.box import PaperBox
+from quadid_evaluation.optimisers.minimise import minimise
+from quadid_evaluation.paper.black_box import fit_black_box, score_black_box
+from quadid_evaluation.paper.subspace import METHODS
 
 VEHICLE = "pelican"
 EFFECTS = {
@@ -50,26 +61,9 @@ class Plan:
     seeds: int = 3
 
 
+SPENT = ("quasi_newton", "pso", "pso_polish")
+"""Searches on the paper's objective, whose effort is told."""
 QUICK = Plan(60.0, 32, 25, 2)
-
-
-@dataclass(frozen=True)
-class Protocol:
-    """The flights and what is known about the vehicle.
-
-    Attributes:
-        vehicle: nominal, with the gains of its stabiliser.
-        sets: windows of the three sets, the first for training.
-        truth: the six true parameters by name.
-        perfect: full parameter vector of the flown vehicle.
-        logs: where the flights were written.
-    """
-
-    vehicle: Vehicle
-    sets: list[list[Window]]
-    truth: Mapping[str, float]
-    perfect: FloatArray
-    logs: list[str]
 
 
 @dataclass
@@ -88,34 +82,9 @@ class Column:
     others: list[FloatArray] = field(default_factory=list)
 
 
-@dataclass(frozen=True)
-class Reproduced:
-    """Everything the tables and figures need.
-
-    Attributes:
-        protocol: flights.
-        columns: models by name.
-        fit: quadid's own identification of the nominal model.
-        diagnosis: of set 1, validated on the others.
-        sigma: standard deviations of the extended model's six parameters.
-        noise: sensor noise that the scores are measured by.
-        paper: by column, the paper's score on each set.
-        mse: by column, the score over 1 s stretches on each set; subspace models too.
-        orders: of the subspace models.
-    """
-
-    protocol: Protocol
-    columns: dict[str, Column]
-    fit: Fit
-    diagnosis: Diagnosis
-    sigma: Mapping[str, float]
-    noise: NoiseModel
-    paper: dict[str, list[PaperScore]]
-    mse: dict[str, list[float]]
-    orders: dict[str, int]
-
-
-def reproduce(folder: Path, plan: Plan, seed: int, advance: Advance) -> Reproduced:
+def reproduce(
+    folder: Path, plan: Plan, seed: int, advance: Advance, command: str
+) -> tuple[JsonDict, dict[str, list[PaperScore]]]:
     """Flies, fits and scores all.
 
     Args:
@@ -123,64 +92,33 @@ def reproduce(folder: Path, plan: Plan, seed: int, advance: Advance) -> Reproduc
         plan: how much.
         seed: of flights and searches.
         advance: told how far it is.
+        command: that renews the result.
+
+    Returns:
+        All numbers as JSON, of the form ``quadid.reproduce/1``; by column, the paper's score on each set.
     """
-    from quadid.identification.controller_gains import find_autopilot
-    from quadid.identification.score import mse_score
-    from quadid_evaluation.optimisers.box import PaperBox
-
-    flown = fly(folder, plan, seed, advance)
-    train, vehicle = flown.sets[0], flown.vehicle
-    autopilot = find_autopilot(train, vehicle)
-    assert autopilot is not None  # its gains are in the vehicle file
-    problems = [PaperBox(windows, vehicle, autopilot) for windows in flown.sets]
-    columns = _searches(problems[0], plan, seed, advance)
-    fit, diagnosis, extended, noise = _own(flown, seed, advance)
-    columns |= {"identified": Column(fit.theta, fit.evaluations), "extended": Column(extended)}
-    nominal = columns["initial"].theta.copy()
-    nominal[: len(flown.truth)] = list(flown.truth.values())
-    columns |= {"true_nominal": Column(nominal), "perfect": Column(flown.perfect)}
-    advance("score", 0.0)
-    paper = {name: [p.score(c.theta) for p in problems] for name, c in columns.items()}
-    mse = {n: [mse_score(w, vehicle, c.theta, noise).mse for w in flown.sets] for n, c in columns.items()}
-    boxes, orders = _black_boxes(flown, noise, advance)
-    sigma = extended_sigma(diagnosis)
-    return Reproduced(flown, columns, fit, diagnosis, sigma, noise, paper, mse | boxes, orders)
-
-
-def fly(folder: Path, plan: Plan, seed: int, advance: Advance) -> Protocol:
-    """Flies the three sets, writes them as logs, and reads them back as any other log."""
-    from quadid.app.logs import GRID, load, load_vehicle, write_recording, write_text
-    from quadid.flight import fly as fly_once
-    from quadid.model.layout import Layout
-    from quadid.parameters import NOMINAL_NAMES
-    from quadid.vehicle import Stabiliser
-
+    begin = time.perf_counter()
+    # The three sets, written as logs and read back as any other log; the first trains.
     base, sets, logs = load_vehicle(VEHICLE), [], []
     folder.mkdir(parents=True, exist_ok=True)
     place = folder.resolve()
     for i in range(3):
         advance(f"fly set {i + 1}", i / 3)
-        flight = fly_once(base, seconds=plan.seconds, seed=10 * seed + i, effects=EFFECTS, command_rate=STABILISER_RATE)
+        flight = fly(base, seconds=plan.seconds, seed=10 * seed + i, effects=EFFECTS, command_rate=STABILISER_RATE)
         path = place / f"set{i + 1}.mcap"
         write_recording(path, flight.recording)
-        flown = base.model_copy(update={"stabiliser": Stabiliser(gains=dict(flight.gains), rate=STABILISER_RATE)})
-        sets.append(load(path, flown, rate=GRID).windows)
+        sets.append(load(path, _with(base, flight.gains, STABILISER_RATE), rate=GRID).windows)
         logs.append(str(path))
-    vehicle = base.model_copy(update={"stabiliser": Stabiliser(gains=dict(flight.gains), rate=SIMULATED_RATE)})
+    vehicle = _with(base, flight.gains, SIMULATED_RATE)
     write_text(place / "pelican.yaml", vehicle.to_yaml())
     values = flight.truth.parameters.as_dict()
     truth = {name: values[name] for name in NOMINAL_NAMES}
-    layout = Layout(vehicle)
-    perfect = layout.neutral()
-    perfect[: len(truth)] = list(truth.values())
-    layout.write_effects(perfect, EFFECTS)
-    return Protocol(vehicle, sets, truth, perfect, logs)
+    train, unseen = sets[0], [w for windows in sets[1:] for w in windows]
 
-
-def _searches(problem: PaperBox, plan: Plan, seed: int, advance: Advance) -> dict[str, Column]:
-    """The paper's columns, all on its objective: initial guess, quasi-Newton, its swarm; and the swarm polished."""
-    from quadid_evaluation.optimisers.minimise import minimise
-
+    # The paper's columns, all on its objective: initial guess, quasi-Newton, its swarm; and the swarm polished.
+    autopilot = find_autopilot(train, vehicle)
+    assert autopilot is not None  # its gains are in the vehicle file
+    problem, *others = (PaperBox(windows, vehicle, autopilot) for windows in sets)
     columns = {"initial": Column(problem.theta(problem.start))}
     for i, name in enumerate(("quasi_newton", "pso_polish")):
         advance(f"{name} on the paper's objective", i / 2)
@@ -192,23 +130,76 @@ def _searches(problem: PaperBox, plan: Plan, seed: int, advance: Advance) -> dic
     runs = []
     for i in range(plan.seeds):
         advance("swarm on the paper's objective", i / plan.seeds)
-        runs.append(algorithm_1(problem, plan, seed + i))
-    ranked = sorted(runs, key=lambda run: run[0])
-    median = ranked[(len(ranked) - 1) // 2][1]
-    median.others = [column.theta for _, column in runs]
-    columns["pso"] = median
-    return columns
+        runs.append(_algorithm_1(problem, plan, seed + i))
+    columns["pso"] = sorted(runs, key=lambda run: run[0])[(len(runs) - 1) // 2][1]
+    columns["pso"].others = [column.theta for _, column in runs]
+
+    # Quadid's own: the nominal model identified, and extended by what the diagnosis finds; and the truth.
+    nominal = fit(train, vehicle, FitOptions(seed=seed), progress=advance)
+    diagnosis, search = diagnose(train, vehicle, unseen, seed, advance)
+    noise = search.shooting.noise  # one noise for all columns: that which the better model leaves
+    columns |= {"identified": Column(nominal.theta, nominal.evaluations), "extended": Column(search.model.theta)}
+    exact = columns["initial"].theta.copy()
+    exact[: len(truth)] = list(truth.values())
+    layout = Layout(vehicle)
+    perfect = layout.neutral()
+    perfect[: len(truth)] = list(truth.values())
+    layout.write_effects(perfect, EFFECTS)
+    columns |= {"true_nominal": Column(exact), "perfect": Column(perfect)}
+
+    # Scores, of subspace models too.
+    advance("score", 0.0)
+    paper = {name: [p.score(c.theta) for p in (problem, *others)] for name, c in columns.items()}
+    mse = {n: [mse_score(w, vehicle, c.theta, noise).mse for w in sets] for n, c in columns.items()}
+    orders = {}
+    for i, method in enumerate(METHODS):
+        advance(method, i / len(METHODS))
+        box = fit_black_box(method, train, noise)
+        mse[method] = [score_black_box(box, windows, vehicle, noise) for windows in sets]
+        orders[method] = box.model.order
+
+    spread = Vehicle.from_yaml(diagnosis.vehicle_yaml).parameters
+    parameters = {}
+    for i, name in enumerate(NOMINAL_NAMES):
+        p, extended, sigma = nominal.parameters[name], columns["extended"].theta[i], spread[name].sigma
+        half = Z95 * (np.nan if sigma is None else sigma)
+        parameters[name] = {
+            "truth": truth[name],
+            **{c: float(columns[c].theta[i]) for c in ("initial", *SPENT, "identified", "extended")},
+            "pso_seeds": [float(theta[i]) for theta in columns["pso"].others],
+            "ci95": list(p.ci95),
+            "status": p.status.value.replace("_", " ") + (f" to {p.relative_to}" if p.relative_to else ""),
+            "extended_ci95": [float(extended - half), float(extended + half)],
+        }
+    result = {
+        "schema": "quadid.reproduce/1", "date": datetime.date.today().isoformat(), "version": __version__,
+        "command": command, "seed": seed, "seconds": time.perf_counter() - begin,
+        "flight": {
+            "seconds": plan.seconds, "stabiliser_rate": STABILISER_RATE, "effects": EFFECTS, "truth": truth,
+            "logs": logs,
+        },
+        "swarm": {"particles": plan.particles, "iterations": plan.iterations, "seeds": plan.seeds},
+        "mse_paper": {name: [s.mse for s in scores] for name, scores in paper.items()},
+        "fit_percent": {name: [s.fit_percent for s in scores] for name, scores in paper.items()},
+        "mse": mse, "noise_floor": 1.0, "orders": orders, "parameters": parameters,
+        "correlations": nominal.parameters.correlation, "verdict": diagnosis.verdict.value.replace("_", " "),
+        "findings": [finding.to_dict() for finding in diagnosis.findings],
+        "effort": {n: {"evaluations": columns[n].evaluations, "seconds": columns[n].seconds} for n in SPENT},
+    }  # fmt: skip
+    return result, paper
 
 
-def algorithm_1(problem: PaperBox, plan: Plan, seed: int) -> tuple[float, Column]:
+def _with(base: Vehicle, gains: Mapping[str, float], rate: float) -> Vehicle:
+    """The vehicle with its stabiliser."""
+    return base.model_copy(update={"stabiliser": Stabiliser(gains=dict(gains), rate=rate)})
+
+
+def _algorithm_1(problem: PaperBox, plan: Plan, seed: int) -> tuple[float, Column]:
     """One run of the paper's Algorithm 1, the guess among its particles; returns the cost and the column.
 
     As printed (global best, inertia weight, positions clamped to the box), but that the particles of an iteration are
     evaluated together and not one after the other.
     """
-
-    from quadid.identification.particle_swarm import Stop, Swarm, SwarmOptions
-
     begin = time.perf_counter()
     options = replace(
         SwarmOptions.algorithm_1(plan.iterations), update="batch", initial_points=problem.start[None], tolerance=1e-4
@@ -216,40 +207,4 @@ def algorithm_1(problem: PaperBox, plan: Plan, seed: int) -> tuple[float, Column
     swarm = Swarm(problem.lower, problem.upper, plan.particles, seed, options)
     while swarm.stop is Stop.RUNNING:
         swarm.tell(problem.cost(swarm.ask()))
-    seconds = time.perf_counter() - begin
-    return swarm.best_cost, Column(problem.theta(swarm.best), swarm.evaluations, seconds)
-
-
-def _own(flown: Protocol, seed: int, advance: Advance) -> tuple[Fit, Diagnosis, FloatArray, NoiseModel]:
-    """Quadid's own columns: the nominal model identified, and extended by what the diagnosis finds."""
-
-    from quadid.diagnosis import diagnose
-    from quadid.identification.fit import FitOptions, fit
-
-    train, unseen = flown.sets[0], [w for windows in flown.sets[1:] for w in windows]
-    found = fit(train, flown.vehicle, FitOptions(seed=seed), progress=lambda stage, share: advance(stage, share))
-    diagnosis, search = diagnose(train, flown.vehicle, unseen, seed, advance)
-    # One noise for all columns: that which the better model leaves.
-    noise = search.shooting.noise
-    return replace(found, noise=noise), diagnosis, search.model.theta, noise
-
-
-def _black_boxes(flown: Protocol, noise: NoiseModel, advance: Advance) -> tuple[dict[str, list[float]], dict[str, int]]:
-    from quadid_evaluation.paper.black_box import fit_black_box, score_black_box
-    from quadid_evaluation.paper.subspace import METHODS
-
-    scores, orders = {}, {}
-    for i, method in enumerate(METHODS):
-        advance(method, i / len(METHODS))
-        box = fit_black_box(method, flown.sets[0], noise)
-        scores[method] = [score_black_box(box, windows, flown.vehicle, noise) for windows in flown.sets]
-        orders[method] = box.model.order
-    return scores, orders
-
-
-def extended_sigma(diagnosis: Diagnosis) -> dict[str, float]:
-    """Standard deviations of the extended model's six parameters, from its vehicle file; NaN where there is none."""
-    from quadid.vehicle import Vehicle
-
-    told = Vehicle.from_yaml(diagnosis.vehicle_yaml).parameters
-    return {name: prior.sigma if prior.sigma is not None else float("nan") for name, prior in told.items()}
+    return swarm.best_cost, Column(problem.theta(swarm.best), swarm.evaluations, time.perf_counter() - begin)

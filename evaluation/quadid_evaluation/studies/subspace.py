@@ -19,8 +19,7 @@ from quadid.identification.noise import NoiseModel
 from quadid.types import ComplexArray, FloatArray
 from quadid.vehicle import Vehicle
 from quadid_evaluation.harness import options, table
-from quadid_evaluation.paper.black_box import BlackBox, score_black_box
-from quadid_evaluation.paper.quadrotor_io import FEEDTHROUGH, quadrotor_io
+from quadid_evaluation.paper.black_box import FEEDTHROUGH, BlackBox, quadrotor_io, score_black_box
 from quadid_evaluation.paper.subspace import METHODS, Loop, fit_subspace
 
 LOOPS: tuple[Loop, Loop] = ("closed", "open")

@@ -1,17 +1,36 @@
-"""What the black box sees of a flight, and that it can be identified from a flight under its stabiliser."""
+"""Black boxes: what they see of a flight, that one is found under its stabiliser, and the score beside the model."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
-from quadid_evaluation.paper.quadrotor_io import FEEDTHROUGH, OUTPUT_NAMES, OUTPUT_UNITS, quadrotor_io
-from quadid_evaluation.paper.state_space import predict
-from quadid_evaluation.paper.subspace import METHODS, fit_subspace
+from quadid_evaluation.paper.black_box import FEEDTHROUGH, fit_black_box, quadrotor_io, score_black_box
+from quadid_evaluation.paper.subspace import METHODS, fit_subspace, predict
 
 from quadid.data.window import Window
-from quadid.errors import WindowError
+from quadid.errors import NotIdentifiableError, WindowError
 from quadid.flight import fly
+from quadid.identification.noise import NoiseModel
+from quadid.identification.score import mse_score
+from quadid.model.layout import Layout
+from quadid.parameters import NOMINAL_NAMES
 from quadid.vehicle import Vehicle
+
+PELICAN = Vehicle.shipped("pelican")
+
+
+def test_black_boxes_stand_on_the_same_scale_as_the_physical_model() -> None:
+    """On a flight that the physical model describes fully it is at the floor, and a linear model cannot be below."""
+    flights = [fly(PELICAN, seconds=60.0, seed=seed) for seed in (41, 42)]
+    noise, theta = NoiseModel.guess(9), Layout(PELICAN).initial(PELICAN)
+    values = flights[0].truth.parameters.as_dict()
+    theta[: len(NOMINAL_NAMES)] = [values[n] for n in NOMINAL_NAMES]
+    perfect = mse_score([flights[1].window], PELICAN, theta, noise).mse
+    box = fit_black_box("cva", [flights[0].window], noise, (12, 20))
+    unseen = score_black_box(box, [flights[1].window], PELICAN, noise)
+    assert perfect < unseen < 5.0 * perfect
+    with pytest.raises(NotIdentifiableError, match="1.4 s without gaps"):
+        score_black_box(box, [flights[1].window.slice(0, 30)], PELICAN, noise)
 
 
 def turning(rows: int = 5) -> Window:
@@ -29,7 +48,7 @@ def turning(rows: int = 5) -> Window:
 def test_inputs_are_squares_and_outputs_are_named_rates_angles_forces() -> None:
     inputs, outputs = quadrotor_io(turning())
     np.testing.assert_array_equal(inputs, 160_000.0)
-    assert outputs.shape == (5, len(OUTPUT_NAMES)) == (5, len(OUTPUT_UNITS)) == (5, len(FEEDTHROUGH))
+    assert outputs.shape == (5, 9) == (5, len(FEEDTHROUGH))
     np.testing.assert_allclose(outputs[:, 3], 0.2)
     np.testing.assert_allclose(outputs[:, 4], -0.1)
     np.testing.assert_allclose(outputs[:, 5], np.linspace(3.0, 3.4, 5))  # unwrapped over pi
@@ -53,8 +72,7 @@ def test_a_window_without_a_channel_is_refused_by_name() -> None:
 
 
 def test_a_flight_under_its_stabiliser_gives_a_model_that_predicts_another_flight_for_a_second() -> None:
-    pelican = Vehicle.shipped("pelican")
-    train, validate = (quadrotor_io(fly(pelican, seconds=60.0, seed=seed).window) for seed in (1, 2))
+    train, validate = (quadrotor_io(fly(PELICAN, seconds=60.0, seed=seed).window) for seed in (1, 2))
     sigma = np.repeat([0.02, 0.005, 0.2], 3)
     for method in METHODS:
         model = fit_subspace(method, *train, 12, 15, 10, feedthrough=FEEDTHROUGH)
