@@ -25,7 +25,7 @@ from quadid.condition.watch import HealthReport
 from quadid.data.window import Sample
 from quadid.online.records import OnlineSet
 from quadid_node.inputs import Chooser
-from quadid_node.mavlink_wire import LinkError, Source, Wire, dialect, message_id, sender
+from quadid_node.mavlink_wire import LinkError, Source, Wire, dialect, is_autopilot, message_id, sender
 from quadid_node.messages import Health, Output
 from quadid_node.service import Service
 
@@ -438,12 +438,15 @@ class MavlinkLink:
             self._empty = last
 
     def _admits(self, frame: bytes) -> bool:
-        """True if a frame is worth its decoding: the vehicle's have a budget of their own, others' floods leave it."""
+        """True if a frame is worth its decoding: what may be the vehicle's has a budget of its own."""
         _, *who = sender(frame)
-        is_named = (*who,) == (self.vehicle_system, self._target)
-        own = is_named and self._source.is_from(self._wire.source)
-        if self.vehicle_system and not is_named and message_id(frame) not in _OF_OTHERS:
-            return False
+        if self.vehicle_system:
+            is_named = (*who,) == (self.vehicle_system, self._target)
+            own = is_named and self._source.may_be(self._wire.source, self._wire.listened)
+            if not is_named and message_id(frame) not in _OF_OTHERS:
+                return False
+        else:
+            own = who[0] == (self._only or who[0]) and is_autopilot(frame)
         self._left[own] -= 1
         if self._left[own] < 0:
             self._flooded[own] = self._clock()

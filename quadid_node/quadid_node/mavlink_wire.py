@@ -131,9 +131,9 @@ class Source:
         self._newest, self._counted = 0, -1e9
         self._repeated: deque[float] = deque(maxlen=REPEATS)
 
-    def is_from(self, address: Address | None) -> bool:
-        """True if this is the address of the vehicle."""
-        return address == self._address
+    def may_be(self, address: Address | None, now: float) -> bool:
+        """True if `take` would believe a frame from an address now [s], were it not for the frames' numbers."""
+        return address == self._address or now - self._heard > SILENT
 
     def take(self, address: Address | None, now: float) -> bool:
         """True if a frame of the vehicle from an address may be believed now [s]; None where a link tells none."""
@@ -200,7 +200,7 @@ class Peers:
         known = self._hellos.get(address)
         if known is not None:
             self._hellos[address] = [known[0], now, known[2] + 1.0]
-        elif len(self._hellos) < 4 * MOST_PEERS:
+        elif vehicle or len(self._hellos) < 4 * MOST_PEERS:
             self._hellos[address] = [now, now, 1.0]
 
     def answered(self, now: float) -> set[Address]:
@@ -232,7 +232,7 @@ SENT_A_SECOND, SENT_AT_ONCE = 100.0, 300.0
 _LONGEST = 12 + 255 + _SIGNATURE
 _DATAGRAM = 65535
 _RECEIVED = 1 << 22
-"""Bytes that wait in the vehicle's socket while we are busy, as far as the system allows."""
+"""Bytes that wait in a socket while we are busy, as far as the system allows."""
 
 
 class LinkError(QuadidError):
@@ -273,6 +273,12 @@ def sender(frame: bytes) -> tuple[int, int, int]:
     """Frame number, system and component of a frame."""
     place = 2 if frame[0] == 0xFE else 4
     return frame[place], frame[place + 1], frame[place + 2]
+
+
+def is_autopilot(frame: bytes) -> bool:
+    """True if a frame is a heartbeat of an autopilot, without a look at its checksum."""
+    place = 11 if frame[0] == 0xFE else 15
+    return message_id(frame) == 0 and frame[place : place + 1] not in (b"", bytes([dialect.MAV_AUTOPILOT_INVALID]))
 
 
 class SafeMavlink(_Coder):
@@ -391,6 +397,8 @@ class Wire:
             ) from error
         self._datagrams = isinstance(self._conn, mavutil.mavudp)
         self._serves = self._datagrams and bool(self._conn.udp_server)
+        if self._serves:
+            self._conn.port.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVED)
         self.mav = SafeMavlink(None, srcSystem=system, srcComponent=component)
         self._memory: SigningMemory | None = None
         if key is not None:

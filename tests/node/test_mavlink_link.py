@@ -274,6 +274,48 @@ def test_a_flood_of_other_systems_costs_the_vehicle_no_frame(port: int, known: b
     )
 
 
+@pytest.mark.parametrize("only", [0, 1])
+@pytest.mark.parametrize("version", [1, 2])
+def test_a_flood_before_the_vehicle_comes_or_comes_back_keeps_nobody_out(
+    port: int, only: int, version: int, happened: Happened
+) -> None:
+    """By the link's own clock; the flood comes first in every look, and stands in the list of peers, too."""
+    now = [1000.0]
+    link = MavlinkLink(f"udpin:127.0.0.1:{port}", 4, only, clock=lambda: now[0])
+    others = [Sender(port, system=77 + k) for k in range(40)]
+    heartbeat = [dialect.MAVLink_heartbeat_message(2, 12, 0, 0, 4, 3)]
+
+    def imu(t: float) -> list[Any]:
+        return [dialect.MAVLink_highres_imu_message(int(t * 1e6), 0.0, 0.0, -9.8, 0.1, *[0.0] * 9, 0x3F)]
+
+    def looks(vehicle: Sender, count: int) -> int:
+        """Samples of the vehicle's gyro, in looks of 20 ms with 10,000 heartbeats of others a second before it."""
+        found = 0
+        for k in range(count):
+            now[0] += 0.02
+            for j in range(200):
+                others[j % 40].heartbeat(autopilot=3 if only else 8)
+            for message in heartbeat[k % 50 :] + imu(now[0]):
+                vehicle.socket.send(bytes(message.pack(vehicle.mav, force_mavlink1=version == 1)))
+                vehicle.mav.seq = (vehicle.mav.seq + 1) % 256
+            found += sum(s.channel == "gyro" for s in link.receive())
+            link.step()
+        return found
+
+    vehicle = Sender(port)
+    assert looks(vehicle, 60) == 60
+    assert link.vehicle_system == 1
+    assert any(m.get_type() == "COMMAND_LONG" for m in vehicle.heard(0.05)), "it is asked for its messages"
+    for _ in range(40):
+        now[0] += 0.1
+        assert not list(link.receive())
+    again = Sender(port)
+    assert looks(again, 60) == 60
+    link.close()
+    happened(43, "a flood of 10,000 frames a second before the vehicle is heard, and as it comes back from another "
+                 "address: its first frame is taken, and it is asked")  # fmt: skip
+
+
 def test_what_is_sent_has_a_budget(port: int, happened: Happened) -> None:
     now = [1000.0]
     link = MavlinkLink(f"udpin:127.0.0.1:{port}", 4, clock=lambda: now[0])
