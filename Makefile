@@ -97,7 +97,7 @@ foreign: venv ## vehicles and logs of others: truth, answers, predictions beside
 	$(STUDY) quadid_evaluation.studies.foreign --out docs/results
 
 DATA ?= $(or $(QUADID_DATA),../shared/data)
-findings: venv ## every input on which the product failed once: answers now, right or wrong (a minute; DATA=DIR)
+findings: venv ## every input on which the product failed once: answers now, right or wrong (ten minutes; DATA=DIR)
 	$(STUDY) quadid_evaluation.studies.findings --data $(DATA)
 
 .PHONY: judging

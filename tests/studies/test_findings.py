@@ -25,3 +25,10 @@ def test_each_finding_is_answered_rightly(
     monkeypatch.setattr(findings, "answer_of", answer_of)
     right, line, numbers = findings.judged(finding, data_dir)
     assert right, (line, numbers)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("attack", findings.ATTACKS, ids=lambda f: f"{f.folder}: {f.what}")
+def test_each_attack_is_answered_rightly(attack: findings.Finding, data_dir: Path) -> None:
+    right, line, numbers = findings.judged(attack, data_dir)
+    assert right, (line, numbers)
