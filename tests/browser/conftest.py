@@ -90,7 +90,7 @@ def fleet_page(tmp_path_factory: pytest.TempPathFactory) -> Path:
     import numpy as np
 
     from quadid.app.fleet import health_trend
-    from tests.cli.test_fleet_health import PELICAN_X, fleet
+    from tests.cli.test_health import PELICAN_X, fleet
     from tests.report.test_fleet_page import rows, summed
 
     rng = np.random.default_rng(1)

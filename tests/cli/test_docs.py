@@ -1,17 +1,28 @@
-"""The documentation: its commands run, its equations become MathML, and it names nothing that is not there."""
+"""Documents: commands run as they stand, equations become MathML, and nothing is named that is not there."""
 
 from __future__ import annotations
 
 import importlib.util
+import json
 import re
 import shlex
+import shutil
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
+from quadid_evaluation.studies.health.flights import Wrong, hover
 
 from quadid.cli.commands import COMMANDS, load
-from tests.cli.followed_page import commands
+from quadid.flight import TruthParameters, fly
+from quadid.vehicle import GRAVITY, Vehicle
+from tests.cli.followed_page import commands, follow
 from tests.commands import Cli
+from tests.replay import blackbox_writer as writer
+from tests.replay.px4_flight import px4_ulog
+
+# --- The documentation: its commands run, its equations become MathML, and it names nothing that is not there
 
 
 @pytest.mark.slow
@@ -90,3 +101,209 @@ def test_equations_become_mathml_and_code_is_left_alone(repository: Path) -> Non
     assert "\n<math" not in module.on_page_markdown("in the text\n$x^2$ begins a line")
     assert "`$HOME and $PATH`" in page
     assert "$$ z $$" in page
+
+
+# --- The page for users of ArduPilot, "From logs": every command as it stands there, on flights of its own simulator
+
+
+SQUARE = {"mass": 1.8, "b": 1.983e-5, "J_xx": 0.018, "J_yy": 0.024}
+X = {"mass": 3.0, "b": 4.24e-5, "J_xx": 0.02297, "J_yy": 0.02297}
+"""Truth; b of the default frame is the secant of its thrust curve at hover."""
+MAX_SPEED = 754.0
+
+
+def errors(parameters: list[dict[str, Any]], truth: dict[str, float]) -> dict[str, float]:
+    return {p["name"]: abs(p["value"] / truth[p["name"]] - 1.0) for p in parameters if p["name"] in truth}
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+@pytest.mark.parametrize(("flight", "truth", "arm"), [("quad_sq", SQUARE, 0.25), ("x", X, 0.35)])
+def test_first_flight_with_ardupilot(
+    flight: str, truth: dict[str, float], arm: float, inside: Cli, tmp_path: Path, repository: Path, data_dir: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    monkeypatch.chdir(tmp_path)
+    shutil.copy(data_dir / "ardupilot_sitl" / f"{flight}.bin", "flight.bin")
+
+    def filled_in(text: str) -> str:
+        assert text.count("FILL IN") == 2
+        text = re.sub(r"(?m)^mass: \S+", f"mass: {truth['mass']}", text)
+        text = text.replace("0.1768", f"{arm / 2**0.5:.4f}")
+        return text.replace("sampling: instant}", f"sampling: instant, max_speed: {MAX_SPEED}}}")
+
+    told = follow(repository / "docs" / "using-with-ardupilot.md", inside, filled_in)
+    published = told["replay"]["published"]
+    assert published
+    for item in published:
+        off = errors(item["parameters"], truth)
+        assert off.keys() == {"b", "J_xx", "J_yy"}
+        assert max(off.values()) < 0.03, off
+    known = [p for p in told["diagnose"]["parameters"] if p["status"] == "identified" and p["name"] != "b"]
+    off = errors(known, truth)
+    assert off.keys() == {"J_xx", "J_yy"}
+    assert max(off.values()) < 0.03, off
+    assert all(Path(file).is_file() for file in told["export"]["files"])
+
+
+# --- The page for users of PX4, "From logs": every command as it stands there, on logs with motors at full rate
+
+
+PELICAN = Vehicle.shipped("pelican")
+FULL_SPEED = 900.0
+"""Rotor speed at full command [rad/s]."""
+DRAG = {"rotor_drag": {"k_x": 0.3, "k_y": 0.3}}
+
+
+def weighed(text: str) -> str:
+    """The vehicle file with the mass filled in, all that it asks for."""
+    assert text.count("FILL IN") == 1
+    return re.sub(r"(?m)^mass: \S+", f"mass: {PELICAN.mass}", text)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+def test_first_flight_with_px4(inside: Cli, tmp_path: Path, repository: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A made-up log: the shared flights of a real PX4 have motors at 10 Hz only, from which no inertia comes."""
+    monkeypatch.chdir(tmp_path)
+    for seed, name in ((5, "flight.ulg"), (6, "second.ulg")):
+        flight = fly(PELICAN, seconds=90.0, seed=seed, log_rate=100.0, effects=DRAG)
+        (tmp_path / name).write_bytes(px4_ulog(flight, PELICAN, FULL_SPEED))
+    told = follow(repository / "docs" / "using-with-px4.md", inside, weighed)
+    published = told["replay"]["published"]
+    assert published
+    truth = TruthParameters.of(PELICAN)
+    for item in published:
+        values = {p["name"]: p["value"] for p in item["parameters"]}
+        for name in ("b", "J_xx", "J_yy"):
+            assert values[name] == pytest.approx(getattr(truth, name), rel=0.03)
+    assert {f["effect"] for f in told["diagnose"]["findings"]} == {"rotor_drag"}
+    assert all(Path(file).is_file() for file in told["export"]["files"])
+
+
+# --- docs/health.md "Is my drone still healthy?": its command as it stands there, on recorded and on Betaflight logs
+
+
+FLIGHTS = {"today": "controller_055", "a": "controller_067", "b": "controller_068", "c": "motor_144"}
+"""Names on the page, and recorded flights: M3 cut, and healthy ones of the same airframe in both kinds of log."""
+PELICAN_X = Vehicle.shipped("pelican_x")
+BETAFLIGHT = PELICAN_X.model_copy(update={"rotors": tuple(PELICAN_X.rotors[j] for j in (1, 0, 2, 3))})
+"""Its motors: 1 rear right, 2 front right, 3 rear left, 4 front left."""
+ERPM = 7 * 60.0 / (2.0 * np.pi) / 100.0
+"""Of 14 poles, in hundreds, per rad/s."""
+
+
+def blackbox(vehicle: Vehicle, wrong: Wrong | None, seed: int) -> bytes:
+    """A hover as Betaflight logs it: turns of the motors and acceleration, body FLU."""
+    flown = hover(vehicle, wrong, seed).channels
+    t, accel = flown["accel"].t, flown["accel"].values * (1.0, -1.0, -1.0) * 2048.0 / GRAVITY
+    turns = np.rint(flown["rotor_speed"].values * ERPM).astype(int).tolist()
+    rows = []
+    for k, (force, speeds) in enumerate(zip(np.rint(accel).astype(int).tolist(), turns, strict=True)):
+        row = dict.fromkeys(writer.NAMES, 0) | {
+            "loopIteration": k,
+            "time": round(1e6 * t[k]),
+            "vbatLatest": 1590,
+            "rcCommand[3]": 1500,
+        }
+        row |= {f"motor[{j}]": 48 + speed for j, speed in enumerate(speeds)}
+        row |= {f"eRPM[{j}]": speed for j, speed in enumerate(speeds)}
+        row |= {f"accSmooth[{j}]": one for j, one in enumerate(force)}
+        rows.append([row[name] for name in writer.NAMES])
+    return writer.header() + b"".join(writer.frames(rows)) + writer.END
+
+
+def test_the_page_s_command_names_the_cut_propeller(
+    inside: Cli, data_dir: Path, repository: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name, flight in FLIGHTS.items():
+        shutil.copy(data_dir / "crazypad" / f"{flight}.usd", f"{name}.usd")
+    (command,) = commands(repository / "docs" / "health.md")
+    run = inside(*command)
+    assert run.code == 0, run.err
+    assert "The vehicle has changed: rotor 3: " in run.out
+    assert 'class="disc damaged"' in Path("health.html").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("weak", [1, 2, None])
+def test_the_same_command_on_betaflight_logs(
+    inside: Cli, repository: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, weak: int | None
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for seed, name in enumerate(FLIGHTS):
+        wrong = Wrong({weak: 0.2}, {weak: 0.2}) if weak and name == "today" else None
+        Path(f"{name}.bbl").write_bytes(blackbox(BETAFLIGHT, wrong, seed))
+    Path("mine.yaml").write_text(BETAFLIGHT.to_yaml(), encoding="utf-8")
+    (command,) = commands(repository / "docs" / "health.md")
+    filled_in = {"crazyflie": "mine.yaml"} | {f"{name}.usd": f"{name}.bbl" for name in FLIGHTS}
+    run = inside(*[filled_in.get(word, word) for word in command])
+    assert run.code == 0, run.err
+    wanted = f"The vehicle has changed: rotor {weak}: " if weak else "The vehicle flies as it did in the baseline"
+    assert wanted in run.out
+
+
+# --- The second tutorial: every command as it stands there, on a flight of ArduCopter in its own simulator
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+def test_from_a_raw_log_to_an_exported_file(
+    inside: Cli, tmp_path: Path, repository: Path, data_dir: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    shutil.copy(data_dir / "ardupilot_sitl" / "quad_sq.bin", "flight.bin")
+    page = (repository / "docs" / "tutorial-flight.md").read_text(encoding="utf-8")
+    found: dict[str, Any] = {}
+    said, scores = [], []
+    for name, *arguments in commands(repository / "docs" / "tutorial-flight.md"):
+        file = found.get("vehicle_file", "")
+        run = inside(name, *(a.replace("mine+….yaml", file) for a in arguments), "--json", f"{name}.json")
+        assert run.code == 0, (name, arguments, run.err)
+        said.append(" ".join(run.out.split()))
+        result = json.loads(Path(f"{name}.json").read_text(encoding="utf-8"))
+        found = result if name == "diagnose" else found
+        scores += [result["horizons"]["25"]["velocity"]] if name == "score" else []
+    # 1. What the page quotes was printed.
+    quoted = re.findall(r"^> (.+)$", page, re.MULTILINE)
+    assert len(quoted) == 5
+    for sentence in quoted:
+        assert any(sentence in out for out in said), sentence
+    # 2. Its table holds what was found, near what the simulator's sources say.
+    values = {p["name"]: p["value"] for p in found["parameters"]}
+    values |= {f"{f['effect']}.{p['name']}": p["value"] for f in found["findings"] for p in f["parameters"]}
+    rows = re.findall(r"^\| `([\w.]+)`[^|]* \| ([\d.e-]+) \| ([\d.e-]+) \|$", page, re.MULTILINE)
+    assert len(rows) == 7
+    for name, stated, truth in rows:
+        assert values[name] == pytest.approx(float(stated), rel=0.01), name
+        assert values[name] == pytest.approx(float(truth), rel=0.04), name
+    before, after = re.findall(r"off by (\d\.\d+) m/s.*?it is by (\d\.\d+)", page)[0]
+    assert scores == [pytest.approx(float(before), rel=0.02), pytest.approx(float(after), rel=0.1)]
+    for written in ("mine.sitl.json", "mine.param", "diagnosis.html", "series/flight.bin.missing.csv"):
+        assert Path(written).is_file(), written
+
+
+# --- The commands that README shows, run as written
+
+
+def test_commands_of_the_readme_work(
+    inside: Cli, repository: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    found = commands(repository / "README.md", "Use")
+    assert len(found) == 7
+    for arguments in found:
+        run = inside(*arguments)
+        assert run.code == 0, (arguments, run.err)
+    for file in ("report.html", "pelican.fitted.yaml", "pelican.params"):
+        assert (tmp_path / file).is_file()
+
+
+def test_vehicles_named_in_the_readme_are_shipped(repository: Path) -> None:
+    text = (repository / "README.md").read_text(encoding="utf-8")
+    named = re.search(r"shipped name \(([^)]*)\)", text)
+    assert named is not None
+    names = re.findall(r"`(\w+)`", named[1])
+    assert sorted(names) == sorted(p.stem for p in (repository / "quadid" / "vehicles").glob("*.yaml"))
+    for name in names:
+        Vehicle.shipped(name)

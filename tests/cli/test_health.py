@@ -1,18 +1,27 @@
-"""`quadid health` and `quadid.health`: contract JSON, exit codes, report, and recorded flights."""
+"""`quadid health`, `quadid.health` and the health of a fleet: JSON, exit codes, report, recorded flights."""
 
 from __future__ import annotations
 
 import json
 import shutil
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
-from quadid_evaluation.studies.health.flights import hover
+from quadid_evaluation.studies.health.flights import Wrong, hover
 from quadid_replay import write_csv
 
 import quadid
+from quadid.app.fleet import BASELINE, FEWEST, Job, health_trend, identify_one
+from quadid.condition import flight_trim
+from quadid.condition.trim import flight_to_dict
 from quadid.errors import LogError
 from quadid.vehicle import Vehicle
+from tests.report.test_fleet_page import summed
+
+# --- `quadid health` and `quadid.health`: contract JSON, exit codes, report, and recorded flights
+
 
 HEALTHY = ("controller_067", "controller_068", "motor_144", "motor_145", "motor_146")
 """Healthy flights of airframe E9, both kinds of log."""
@@ -80,3 +89,71 @@ def test_a_span_outside_the_log_is_named(data_dir: Path) -> None:
     late, healthy = paths(data_dir, "motor_145", "motor_144")
     with pytest.raises(LogError, match="nothing between 5000.0 and 6000.0 s"):
         quadid.health(f"{late}@5000:6000", healthy, vehicle="crazyflie")
+
+
+# --- The health of a fleet over its flights: the flight after which a propeller was cut stands out, and is named
+
+
+PELICAN_X = Vehicle.shipped("pelican_x")
+
+
+def fleet() -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """Rows of the logs and of the trims of two vehicles; a propeller of vehicle a is cut after the seventh flight."""
+    logs, trims = [], []
+    for unit, cut_after in (("a", 6), ("b", 99)):
+        for k in range(9):
+            wrong = Wrong({3: 0.25}, {3: 0.25}) if k > cut_after else None
+            name = f"{unit}/{k}.mcap"
+            flown = flight_trim(hover(PELICAN_X, wrong, seed=17 * k + ord(unit)), PELICAN_X)
+            started = 1.7e9 + 86400.0 * k
+            logs.append({"name": name, "unit": unit, "started": started, "status": "refused", "reason": "gentle",
+                         "dated_by": "log", "mse_initial": None, "mse_fitted": None, "verdict": None})  # fmt: skip
+            trims.append({"log": name, "trim": json.dumps(flight_to_dict(flown))})
+    return logs, trims
+
+
+def test_each_flight_is_compared_with_the_first_ones_of_its_vehicle() -> None:
+    logs, trims = fleet()
+    text = PELICAN_X.to_yaml()
+    order = np.random.default_rng(1).permutation(len(logs))
+    rows = health_trend([logs[i] for i in order], trims, {"a": text, "b": text})
+    assert [row["log"] for row in rows] == [log["name"] for log in logs], "by vehicle, in the order of time"
+    assert sum(row["baseline"] for row in rows) == 2 * BASELINE
+    changed = [row for row in rows if not row["baseline"] and row["verdict"] == "changed"]
+    assert [row["log"] for row in changed] == ["a/7.mcap", "a/8.mcap"]
+    assert {row["changes"][0]["parameters"][0]["value"] for row in changed} == {3}
+    verdict = summed(logs, [], rows).verdict
+    assert verdict.details[0].startswith("a has changed: rotor 3: 2")
+    assert not any(text.startswith("b ") for text in verdict.details)
+    page = summed(logs, [], rows).page()
+    assert "Health over flights" in page
+    assert "a/7.mcap" in page
+
+
+def test_a_flight_that_few_baseline_flights_cannot_judge_is_no_change() -> None:
+    logs, _ = fleet()
+    row = {"unit": "a", "log": "a/8.mcap", "baseline": False, "verdict": "unknown", "changes": [], "unfamiliar": ""}
+    for lacking, changed in ((2, False), (0, True)):
+        verdict = summed(logs, [], [{**row, "baseline_lacking": lacking}]).verdict
+        assert verdict.headline.endswith("vehicles have changed.") == changed
+
+
+def test_a_vehicle_with_few_flights_has_no_trend() -> None:
+    logs, trims = [], []
+    for k in range(FEWEST):
+        logs.append({"name": str(k), "unit": "a", "started": float(k)})
+        flown = flight_trim(hover(PELICAN_X, seed=k), PELICAN_X)
+        trims.append({"log": str(k), "trim": json.dumps(flight_to_dict(flown))})
+    assert health_trend(logs, trims, {"a": PELICAN_X.to_yaml()}) == []
+
+
+def test_a_log_without_a_gyro_has_its_place_in_the_trend(tmp_path: Path) -> None:
+    file, text = tmp_path / "a.csv", PELICAN_X.to_yaml()
+    write_csv(file, hover(PELICAN_X, Wrong({3: 0.25}, {3: 0.25}), seed=5))
+    row = identify_one(Job(str(file), "a/last.mcap", "a", text, file.stat().st_size, 0, "", 50.0, 1, False))
+    assert (row["status"], row["reason"][:22]) == ("refused", "a.csv: no gyro in the ")
+    logs, trims = fleet()
+    trims.append({"log": row["name"], **row["trims"][0]})
+    rows = health_trend([*logs, {**row, "started": 1.8e9}], trims, {"a": text})
+    assert (rows[-1]["log"], rows[-1]["verdict"]) == ("a/last.mcap", "changed")
+    assert "a/last.mcap" in summed([*logs, row], [], rows).page()

@@ -1,20 +1,35 @@
-"""`quadid identify` from logs to JSON, vehicle file and report."""
+"""`quadid identify` from logs to JSON, vehicle file and report: logs and columns it takes, and what later fits use."""
 
 from __future__ import annotations
 
 import json
 import math
 import re
+import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from quadid_replay import write_csv, write_mcap
 
-from quadid.parameters import NOMINAL_NAMES, NOMINAL_UNITS
+import quadid
+import quadid.checks
+from quadid.app.diagnose import Diagnosed
+from quadid.app.excite import grouped
+from quadid.app.identify import Identified
+from quadid.app.init import init
+from quadid.app.logs import Log, check_unseen
+from quadid.checks.motion import Spans, flying_spans
+from quadid.data.window import Recording
+from quadid.errors import LogError, QuadidError
+from quadid.parameters import NOMINAL_NAMES, NOMINAL_UNITS, Status
 from quadid.vehicle import Vehicle
 from tests.cli.conftest import Flights, table, write_table
-from tests.commands import Cli, Run
+from tests.commands import Cli, Run, one_line
+
+# --- `quadid identify` from logs to JSON, vehicle file and report
 
 
 @pytest.fixture(scope="module")
@@ -196,3 +211,453 @@ def test_what_rests_on_a_bound_is_not_identified(inside: Cli, flights: Flights, 
     by_name = {p["name"]: p for p in run.data["parameters"]}
     assert by_name["J_xx"]["status"] == "unreliable"
     assert any(w.startswith("J_xx = ") and "rests on its bound" in w for w in run.data["warnings"])
+
+
+# --- `--columns` names the columns of a CSV wherever a log is read
+
+
+COMMANDS = {
+    "score": (), "replay": ("--diagnose", "0"), "excite": ("--seconds", "6.5"), "fleet": ("--workers", "1"),
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def renamed(flights: Flights, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a flight whose rates are called otherwise."""
+    folder = tmp_path_factory.mktemp("logs")
+    write_csv(folder / "a.csv", flights.train_flight.recording)
+    head, rows = (folder / "a.csv").read_text(encoding="utf-8").split("\n", 1)
+    names = [{"p": "gyro_x", "q": "gyro_y", "r": "gyro_z"}.get(name, name) for name in head.split(",")]
+    (folder / "a.csv").write_text(",".join(names) + "\n" + rows, encoding="utf-8")
+    return folder
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_columns_are_named_wherever_a_log_is_read(command: str, renamed: Path, inside: Cli, tmp_path: Path) -> None:
+    log = renamed if command == "fleet" else renamed / "a.csv"
+    out = ("--out", tmp_path) if command in ("excite", "fleet") else ()
+    call = (command, log, "--vehicle", "pelican", *COMMANDS[command], *out, "--json", "-")
+    named = inside(*call, "--columns", "gyro_x=p,gyro_y=q,gyro_z=r")
+    assert named.code in ((0, 3) if command == "replay" else (0,)), named.err  # a short flight publishes nothing yet
+    if command == "fleet":
+        assert named.data["counts"] == {"done": 1}
+    elif command == "replay":
+        assert named.data["status"] != inside(*call).data["status"]
+    else:
+        assert inside(*call).code == 2
+
+
+def test_equal_movements_are_one_row() -> None:
+    moves = [{"name": n, "amplitudes": {"roll": 0.1}} for n in ("a", "a", "b", "a")]
+    assert [(name, times) for name, times, _ in grouped(moves)] == [("a", "2"), ("b", "1"), ("a", "1")]
+
+
+# --- A flight that was fitted cannot validate: under another name, in another format, in part, from a second recorder
+
+
+def load(path: Path | str) -> Log:
+    return quadid.load(path, vehicle="pelican")
+
+
+def moved(recording: Recording, by: float, noise: float = 0.0) -> Recording:
+    """The recording at another time [s], as another gyro with noise of its own [rad/s] has it."""
+    channels = {n: replace(c, t=c.t + by) for n, c in recording.channels.items()}
+    rates = channels["gyro"].values
+    extra = noise * np.random.default_rng(1).standard_normal(rates.shape)
+    channels["gyro"] = replace(channels["gyro"], values=rates + extra)
+    return replace(recording, channels=channels)
+
+
+@pytest.mark.parametrize("spans", [("", ""), ("@0:20", "@15:30"), ("", "@5:15"), ("@10:20", "")])
+def test_the_same_log_and_overlapping_parts_of_it(
+    spans: tuple[str, str], inside: Cli, flights: Flights, tmp_path: Path
+) -> None:
+    copy = tmp_path / "renamed.mcap"
+    shutil.copy(flights.train, copy)
+    train, held = f"{flights.train}{spans[0]}", f"{copy}{spans[1]}"
+    for command in ("identify", "diagnose", "compare"):
+        line = one_line(inside(command, train, "--validate", held, "--vehicle", "pelican", "--out", tmp_path), 2)
+        assert "renamed.mcap cannot validate" in line
+        assert "train.mcap, which is fitted" in line
+
+
+def test_a_copy_in_another_format(flights: Flights, tmp_path: Path) -> None:
+    write_csv(tmp_path / "copy.csv", flights.train_flight.recording)
+    with pytest.raises(LogError, match="cannot validate"):
+        check_unseen([load(flights.train)], [load(tmp_path / "copy.csv")])
+
+
+def test_another_flight_and_another_part_are_fine(flights: Flights) -> None:
+    check_unseen([load(flights.train)], [load(flights.unseen)])
+    check_unseen([load(f"{flights.train}@0:15")], [load(f"{flights.train}@15:30")])
+
+
+def test_a_second_recorder_of_the_same_flight(flights: Flights, tmp_path: Path) -> None:
+    for name, by, noise in (("one", 0.0, 0.0), ("two", 5.003, 0.02), ("later", 60.0, 0.02)):
+        recording = moved(flights.train_flight.recording, by, noise)
+        # The second recorder's clock starts five seconds earlier.
+        epoch = 1_700_000_000 - (5 if name == "two" else 0)
+        write_mcap(tmp_path / f"{name}.mcap", recording, epoch_ns=epoch * 10**9)
+    with pytest.raises(LogError, match="cannot validate"):
+        check_unseen([load(tmp_path / "one.mcap")], [load(tmp_path / "two.mcap")])
+    check_unseen([load(tmp_path / "one.mcap")], [load(tmp_path / "later.mcap")])
+
+
+# --- A red fit teaches the next one nothing: its values are guesses, and no export takes them unasked
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """Two flights of a vehicle with a weak rotor and rotor drag."""
+    folder = tmp_path_factory.mktemp("flown")
+    effects = ["weak_rotor:rotor=2,loss=0.1", "motor_lag:tau=0.08"]
+    one, other = (
+        quadid.simulate(seconds=30, seed=seed, effects=effects).save(folder / f"{seed}.csv") for seed in (3, 4)
+    )
+    return one, other
+
+
+def test_a_red_fit_writes_guesses(tmp_path: Path) -> None:
+    """The unseen flight drops a payload, which the model of the other one does not expect."""
+    train, unseen = (
+        quadid.load(quadid.simulate(seconds=30, seed=s, effects=e).save(tmp_path / f"{s}.csv"), vehicle="pelican")
+        for s, e in ((3, ()), (4, ("mass_change:time=15,fraction=-0.2",)))
+    )
+    fit = quadid.identify(train, validate=unseen)
+    assert fit.verdict.level == fit.result["verdict"] == "poor"
+    file = fit.vehicle.save(tmp_path / "red.yaml")
+    again = Vehicle.from_yaml(file.read_text(encoding="utf-8"))
+    assert all(p.sigma is None for p in again.parameters.values())
+    # What is not identified is as the former file has it.
+    former, doubtful = (
+        Vehicle.shipped("pelican").parameters,
+        {p.name for p in fit.parameters if p.status != "identified"},
+    )
+    assert doubtful
+    assert {n: again.parameters[n] for n in doubtful} == {n: former[n] for n in doubtful}
+    assert again.random is not None
+    assert again.proof is not None
+    assert again.proof.unseen == (unseen.name,)
+    with pytest.raises(QuadidError, match="--anyway"):
+        quadid.export(file, "px4")
+
+
+def test_only_an_unseen_flight_makes_it_green(tmp_path: Path) -> None:
+    paths = [quadid.simulate(seconds=25, seed=seed).save(tmp_path / f"{seed}.csv") for seed in (5, 6)]
+    one, other = (quadid.load(path, vehicle="pelican") for path in paths)
+    alone, proven = quadid.identify(one), quadid.identify(one, validate=other)
+    short = quadid.identify(one, validate=quadid.load(f"{paths[1]}@0:5", vehicle="pelican"))
+    assert [fit.verdict.level for fit in (alone, short, proven)] == ["fair", "fair", "good"]
+    assert "--validate" in alone.verdict.next_steps[0]
+    assert alone.vehicle.proof is not None
+    assert alone.vehicle.proof.lacking
+    assert proven.vehicle.proof is not None
+    assert not proven.vehicle.proof.lacking
+    found = quadid.diagnose(one)
+    assert found.verdict.level == "fair"
+    assert any("no unseen flight" in line for line in found.verdict.details)
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, Path]:
+    """Two flights of a Pelican as it is, and the file fitted to the first."""
+    folder = tmp_path_factory.mktemp("again")
+    one, other = (quadid.simulate(seconds=25, seed=seed).save(folder / f"{seed}.csv") for seed in (5, 6))
+    return one, other, quadid.identify(quadid.load(one, vehicle="pelican")).vehicle.save(folder / "fitted.yaml")
+
+
+@pytest.mark.parametrize("part", ["", "@5:20"])
+def test_a_flight_is_not_counted_twice(flown: tuple[Path, Path, Path], part: str, tmp_path: Path) -> None:
+    one, _, fitted = flown
+    copy = shutil.copy(one, tmp_path / "copy.csv")
+    again = quadid.identify(quadid.load(f"{copy}{part}", vehicle=fitted))
+    assert any("copy.csv (5.csv) already" in warning for warning in again.warnings)
+    # What the flight says alone, from the same start: nothing is sharper for having been fitted before.
+    bare = Vehicle.from_yaml(fitted.read_text(encoding="utf-8")).model_copy(update={"proof": None})
+    guesses = {n: p.model_copy(update={"sigma": None}) for n, p in bare.parameters.items()}
+    alone = quadid.identify(quadid.load(f"{copy}{part}", vehicle=bare.model_copy(update={"parameters": guesses})))
+    assert again.parameters.values.tolist() == alone.parameters.values.tolist()
+    assert [p["ci95"] for p in again.result["parameters"]] == [p["ci95"] for p in alone.result["parameters"]]
+    assert all(p.status is Status.IDENTIFIED for p in again.parameters if p.name in ("b", "J_xx", "J_yy"))
+
+
+def test_a_prior_that_decides_is_named(flown: tuple[Path, Path, Path]) -> None:
+    _, other, fitted = flown
+    second = quadid.identify(quadid.load(f"{other}@0:12", vehicle=fitted))
+    entry = {p["name"]: p for p in second.result["parameters"]}["b"]
+    assert entry["status"] == "prior_dominated"
+    assert entry["measured_before"]
+    table = second.tables()[0].text(100)
+    assert f"{100 * entry['prior_share']:.0f} % from the file" in table
+    assert "does not show" not in second.text()
+    # The next file rests on both flights and says so.
+    assert second.vehicle.proof is not None
+    assert [flight.log for flight in second.vehicle.proof.fitted] == ["6.csv", "5.csv"]
+    # What this flight did not identify stays as the former file has it, and only that file knows how sure it was.
+    former, written = Vehicle.from_yaml(fitted.read_text(encoding="utf-8")).parameters["b"], second.vehicle.parameters
+    assert written["b"] == former.model_copy(update={"sigma": None})
+
+
+def test_a_file_is_not_proven_on_its_own_flight(flown: tuple[Path, Path, Path]) -> None:
+    one, other, fitted = flown
+    with pytest.raises(LogError, match="to which this vehicle file was fitted"):
+        quadid.identify(quadid.load(other, vehicle=fitted), validate=quadid.load(one, vehicle=fitted))
+    scored = quadid.score(quadid.load(one, vehicle=fitted))
+    assert any("no proof" in warning for warning in scored.warnings)
+    assert not quadid.score(quadid.load(other, vehicle=fitted)).warnings
+
+
+# --- A log that also stands on the ground: what is in the air is used, and named as LOG@from:to
+
+
+@pytest.fixture(scope="module")
+def standing(flights: Flights, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A flight that begins with ten seconds on its legs, rotors idling."""
+    names, rows = table(flights.unseen)
+    early = rows[:, 0] < rows[0, 0] + 10.0
+    still = {
+        "p": 0.0,
+        "q": 0.0,
+        "r": 0.0,
+        "ax": 0.0,
+        "ay": 0.0,
+        "az": -9.81,
+        "qw": 1.0,
+        "qx": 0.0,
+        "qy": 0.0,
+        "qz": 0.0,
+    }
+    for name, value in {**still, **{n: 80.0 for n in names if n.startswith("w")}}.items():
+        rows[early, names.index(name)] = value
+    noise = np.random.default_rng(1).normal(0.0, 0.01, (len(rows), 6))
+    rows[:, [names.index(n) for n in ("p", "q", "r", "ax", "ay", "az")]] += noise
+    return write_table(tmp_path_factory.mktemp("standing") / "standing.csv", names, rows)
+
+
+def test_inspect_proposes_what_is_in_the_air(inside: Cli, standing: Path) -> None:
+    run = inside("inspect", standing, "--vehicle", "pelican", "--json", "-")
+    assert run.data["use"] == ["standing.csv@12:30"]
+    assert "use standing.csv@12:30" in inside("inspect", standing, "--vehicle", "pelican").err
+    assert inside("inspect", f"{standing}@12:30", "--json", "-").data["use"] == []
+
+
+def test_excitation_is_that_of_the_flight(inside: Cli, standing: Path) -> None:
+    whole, cut, all_of_it = (
+        inside("inspect", f"{standing}{part}", "--vehicle", "pelican", "--json", "-").data["excitation"]
+        for part in ("", "@12:30", "@0:")
+    )
+    assert whole == cut
+    assert whole != all_of_it
+
+
+def test_when_it_flies_is_worked_out_once(standing: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[str] = []
+
+    def counted(recording: Recording, vehicle: Vehicle | None) -> Spans:
+        asked.append(recording.name)
+        return flying_spans(recording, vehicle)
+
+    monkeypatch.setattr(quadid.checks, "flying_spans", counted)
+    quadid.load(standing, vehicle="pelican")
+    assert len(asked) == 1
+
+
+def test_only_what_is_in_the_air_is_used_and_said_once(standing: Path) -> None:
+    log = quadid.load(standing, vehicle="pelican")
+    assert [w for w in log.warnings if "ground" in w] == [
+        "standing.csv: time on the ground is left out: fits use standing.csv@12:30; to use all of it: standing.csv@0:"
+    ]
+    (flown,) = log.windows
+    (cut,) = quadid.load(f"{standing}@12:30", vehicle="pelican").windows
+    np.testing.assert_array_equal(flown.gyro, cut.gyro)
+    (slower,) = log.at(25.0).windows
+    assert slower.t[0] >= log.recording.channels["gyro"].t[0] + 12.0 - 1e-6
+
+
+@pytest.mark.parametrize("part", ["@0:", "@12:30"])
+def test_a_part_that_was_asked_for_is_used_as_it_is(standing: Path, part: str) -> None:
+    log = quadid.load(f"{standing}{part}", vehicle="pelican")
+    assert not [w for w in log.warnings if "ground" in w]
+    first = log.recording.channels["gyro"].t[0]
+    assert log.windows[0].t[0] - first == pytest.approx(float(part[1:].split(":")[0]), abs=0.02)
+
+
+def test_a_refused_log_proposes_it_as_well(standing: Path, tmp_path: Path) -> None:
+    names, rows = table(standing)
+    rows[:, names.index("az")] *= -1.0
+    wrong = write_table(tmp_path / "wrong.csv", names, rows)
+    with pytest.raises(LogError) as refused:
+        quadid.load(wrong, vehicle="pelican")
+    assert "use wrong.csv@12:30" in str(refused.value.fix)
+
+
+def test_a_recorded_flight(inside: Cli, data_dir: Path) -> None:
+    """Armed at 72 s, crashed at about 220 s: see the data's README."""
+    (use,) = inside("inspect", data_dir / "ardupilot" / "log171.bin", "--json", "-").data["use"]
+    start, stop = (float(v) for v in use.rpartition("@")[2].split(":"))
+    assert 72.0 < start < 78.0
+    assert 210.0 < stop < 230.0
+
+
+# --- When there is no answer, the report still says why and shows the data
+
+
+@pytest.mark.parametrize("command", ["identify", "diagnose"])
+def test_wrong_units_are_refused_and_shown(inside: Cli, flights: Flights, tmp_path: Path, command: str) -> None:
+    names, rows = table(flights.unseen)
+    for c in (names.index(n) for n in ("p", "q", "r")):
+        rows[:, c] = np.rad2deg(rows[:, c])
+    log = write_table(tmp_path / "degrees.csv", names, rows)
+    report = tmp_path / "why.html"
+    run = inside(command, log, "--vehicle", "pelican", "--out", tmp_path, "--report", report)
+    line = one_line(run, 2)
+    assert f"the data as they are: {report}" in run.err
+    page = report.read_text(encoding="utf-8")
+    assert "No answer: degrees.csv:" in page
+    assert "Nothing was identified" in page
+    for shown in ("rotor speed", "gyro", "sha256", "What degrees.csv allows"):
+        assert shown in page
+    assert line.split(": ")[1] in page
+
+
+def test_logs_that_cannot_be_read_are_named(inside: Cli, flights: Flights, tmp_path: Path) -> None:
+    (tmp_path / "empty.bin").write_bytes(b"")
+    report = tmp_path / "why.html"
+    run = inside("identify", flights.train, tmp_path / "empty.bin", "--vehicle", "pelican", "--report", report,
+                 "--out", tmp_path)  # fmt: skip
+    one_line(run, 2)
+    page = report.read_text(encoding="utf-8")
+    assert "empty.bin" in page
+    assert "train.mcap" in page
+
+
+def test_a_good_report_says_what_to_fly_next(inside: Cli, flights: Flights, tmp_path: Path) -> None:
+    report = tmp_path / "good.html"
+    run = inside("identify", flights.train, "--vehicle", "pelican", "--report", report, "--out", tmp_path)
+    assert run.code == 0, run.err
+    page = report.read_text(encoding="utf-8")
+    assert "What to fly next" in page
+    assert "Cramér–Rao" in page
+    assert len(page) < 6_000_000
+
+
+# --- One flight, one error: what `identify` states for it is what `diagnose` starts from
+
+
+@pytest.fixture(scope="module")
+def two_flights(tmp_path_factory: pytest.TempPathFactory) -> tuple[Log, Log]:
+    """Two flights with rotor drag and a weak rotor, as in the tutorial."""
+    folder = tmp_path_factory.mktemp("two_flights")
+    hidden = ("rotor_drag:k_x=0.3,k_y=0.3", "weak_rotor:rotor=2,loss=0.04")
+    paths = [quadid.simulate(seconds=40, seed=s, effects=hidden).save(folder / f"{s}.mcap") for s in (3, 4)]
+    return quadid.load(paths[0], vehicle="pelican"), quadid.load(paths[1], vehicle="pelican")
+
+
+def test_on_an_unseen_flight(two_flights: tuple[Log, Log]) -> None:
+    train, unseen = two_flights
+    fit, found = quadid.identify(train, validate=unseen), quadid.diagnose(train, validate=unseen)
+    assert_alike(fit, found)
+    stated = found.result["validation"]
+    assert stated["mse_nominal"] > 10.0
+    assert stated["mse_extended"] == pytest.approx(1.0, abs=0.1)
+    assert stated["deciding"]["seconds"] == found.result["findings"][0]["gain"]["seconds"] != 1.0
+    assert f"falls from {stated['mse_nominal']:.3g} to" in found.verdict.details[1]
+    assert f"In simulations of {stated['deciding']['seconds']:g} s" in found.verdict.details[2]
+
+
+def test_no_value_is_identified_where_the_model_is_wrong_about_its_errors_on_another_flight(tmp_path: Path) -> None:
+    """Fitted to a flight without a payload that the other one drops: the first model expects no such errors."""
+    paths = [
+        quadid.simulate(seconds=40, seed=s, effects=e).save(tmp_path / f"{s}.mcap")
+        for s, e in ((5, ()), (6, ("mass_change:time=20,fraction=-0.2",)))
+    ]
+    alone, beside = quadid.identify(paths[0], vehicle="pelican"), quadid.identify(*paths, vehicle="pelican")
+    assert {p["status"] for p in alone.result["parameters"]} == {"identified"}
+    assert beside.verdict.level == "poor"
+    assert beside.verdict.headline.startswith("Not to be used yet")
+    assert {p["status"] for p in beside.result["parameters"]} == {"unreliable"}
+    assert all(p.sigma is None for p in beside.vehicle.parameters.values())
+
+
+def test_blocks_left_out_are_called_that_and_lie_near_the_fitted_flight(two_flights: tuple[Log, Log]) -> None:
+    train, _ = two_flights
+    fit, found = quadid.identify(train), quadid.diagnose(train)
+    assert_alike(fit, found)
+    assert found.result["validation"]["on"] == "held-out blocks"
+    assert "held-out blocks of the same flight" in found.verdict.details[1]
+
+
+def test_on_motion_capture(data_dir: Path) -> None:
+    """Noise of two millimetres, and a model that misses slow moments: it is right about its errors, and the same."""
+    folder = data_dir / "crazyflie_rpm"
+    log = quadid.load(f"{folder / 'figure8_27.csv'}@0:25", vehicle=folder / "vehicle.yaml")
+    fit, found = quadid.identify(log), quadid.diagnose(log)
+    assert_alike(fit, found)
+    assert any("fast motion" in warning for warning in fit.warnings)
+    # What the model lacks is no noise: a Crazyflie's gyro is quieter than 0.15 rad/s.
+    assert np.all(np.sqrt(fit.fit.noise.variance[:3]) < 0.15)
+
+
+def assert_alike(fit: Identified, found: Diagnosed) -> None:
+    """Every log has one error without the findings, and misses one force and moment, in both results."""
+    assert fit.result["missing"]["force"]["nominal"] == found.result["missing"]["force"]["nominal"]
+    assert fit.result["missing"]["moment"]["nominal"] == found.result["missing"]["moment"]["nominal"]
+    assert all(0.85 < s["mse"]["fitted"] < 1.3 for s in fit.result["sets"])
+    assert [s["mse"]["fitted"] for s in fit.result["sets"]] == [s["mse"]["nominal"] for s in found.result["sets"]]
+    assert [s["log"] for s in fit.result["sets"]] == [s["log"] for s in found.result["sets"]]
+
+
+# --- `quadid init`, `quadid vehicles`, and logs whose columns have other names
+
+
+def test_a_template_is_a_vehicle_and_says_what_to_fill_in(inside: Cli, tmp_path: Path) -> None:
+    run = inside("init", "my quad", "--mass", "0.9", "--out", tmp_path, "--json", "-")
+    assert run.code == 0, run.err
+    vehicle = Vehicle.from_yaml(Path(run.data["file"]).read_text(encoding="utf-8"))
+    assert (vehicle.name, vehicle.mass) == ("my quad", 0.9)
+    assert run.data["fill_in"] == ["rotors"]
+    refused = one_line(inside("identify", "any.csv", "--vehicle", run.data["file"]), 2)
+    assert "rotors is a guess of `quadid init`" in refused
+    assert "is there already" in one_line(inside("init", "my quad", "--out", tmp_path), 2)
+
+
+def test_a_log_of_an_autopilot_fills_it(inside: Cli, data_dir: Path, tmp_path: Path) -> None:
+    log = data_dir / "px4" / "ascend_cubeorange_test.ulg"
+    run = inside("init", "copter", "--from", log, "--out", tmp_path, "--json", "-")
+    assert run.code == 0, run.err
+    text = Path(run.data["file"]).read_text(encoding="utf-8")
+    assert text == init("copter", log).content
+    assert len(Vehicle.from_yaml(text).rotors) >= 4
+    assert "mass" in run.data["fill_in"]
+
+
+def test_a_log_without_an_airframe_is_refused(inside: Cli, flights: Flights, tmp_path: Path) -> None:
+    assert "airframe" in one_line(inside("init", "x", "--from", flights.train, "--out", tmp_path), 2)
+
+
+def test_shipped_vehicles(inside: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
+    rows = inside("vehicles", "--json", "-").data["vehicles"]
+    assert {"pelican", "hexacopter", "crazyflie_brushless"} <= {row["name"] for row in rows}
+    for width in (60, 80):
+        monkeypatch.setenv("COLUMNS", str(width))
+        assert max(map(len, inside("vehicles").out.splitlines())) <= width
+
+
+def test_columns_of_other_names(inside: Cli, flights: Flights, tmp_path: Path) -> None:
+    header, _, rows = flights.unseen.read_text(encoding="utf-8").partition("\n")
+    renamed = {"t": "time_s", "p": "gyro_x", "q": "gyro_y", "r": "gyro_z"}
+    log = tmp_path / "named.csv"
+    log.write_text(",".join(renamed.get(n, n) for n in header.split(",")) + "\n" + rows, encoding="utf-8")
+    options = ["--columns", "time_s=t,gyro_x=p", "--columns", "gyro_y=q,gyro_z=r"]
+    expected = inside("score", flights.unseen, "--vehicle", "pelican", "--json", "-").data
+    assert (
+        inside("score", log, "--vehicle", "pelican", *options, "--json", "-").data["horizons"] == expected["horizons"]
+    )
+    file = Vehicle.shipped("pelican").model_copy(update={"columns": renamed}).save(tmp_path / "mine.yaml")
+    assert quadid.score(quadid.load(log, vehicle=file)).result["horizons"] == expected["horizons"]
+    for wrong, why in (
+        ("gyro_x", "NAME_IN_FILE=NAME"),
+        ("gyrox=p,time_s=t", "gyro_x"),
+        ("time_s=t,gyro_x=pp", "unknown"),
+    ):
+        assert why in one_line(inside("score", log, "--vehicle", "pelican", "--columns", wrong), 2)

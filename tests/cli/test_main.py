@@ -1,17 +1,47 @@
-"""The command line as a whole: help, versions, usage errors, quick start."""
+"""The command line: help, usage errors, terminals, pipes, bad input answered in one line."""
 
 from __future__ import annotations
 
 import os
+import pty
+import re
 import subprocess
 import sys
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
 
+import numpy as np
 import pytest
+import yaml
+from quadid_evaluation.paper.compare import Methods
+from quadid_node.history import read_history
+from quadid_node.mavlink_wire import SigningMemory, read_key
+from quadid_node.wire_format import repeat
+from quadid_node.zenoh import config_of
+from quadid_replay import open_log, write_tlog
+from quadid_replay.writers import open_for_writing
 
+from quadid.app.excite import Proposed
+from quadid.app.fleet_page import Fleet
+from quadid.app.logs import load_vehicle, write_text
+from quadid.app.simulate import read_manoeuvre
 from quadid.cli.commands import COMMANDS
+from quadid.cli.history import Stored
 from quadid.cli.main import BLAS_THREADS
+from quadid.cli.replay import Replayed
+from quadid.cli.terminal import conclude
+from quadid.errors import QuadidError
+from quadid.parameters import NOMINAL_UNITS
+from quadid.report.tables import Column, TextTable
+from quadid.vehicle import Vehicle
 from quadid.version import __version__
-from tests.commands import Cli, one_line
+from tests.cli.conftest import Flights, table, write_table
+from tests.commands import QUADID, Cli, one_line
+from tests.faults.evidence import Happened
+
+# --- The command line as a whole: help, versions, usage errors, quick start
 
 
 def test_help_lists_every_installed_command(quadid: Cli) -> None:
@@ -67,3 +97,411 @@ def test_usage_errors_are_one_line(inside: Cli) -> None:
     assert "--vehicle" in one_line(inside("identify", "x.csv"), 2)
     assert "--rat" in one_line(inside("score", "x.csv", "--vehicle", "pelican", "--rat", "5"), 2)
     assert "--seed" in one_line(inside("identify", "x.csv", "--vehicle", "pelican", "--seed", "x"), 2)
+
+
+# --- On a terminal: colours, progress, completion; in a pipe: plain text and nothing else
+
+
+COLOUR = re.compile(r"\x1b\[[0-9;]*3[0-7]m")
+
+
+def on_a_terminal(arguments: list[str], cwd: Path, **environment: str) -> str:
+    """Everything that a command writes to a terminal of 120 columns."""
+    leader, follower = pty.openpty()
+    plain = {k: v for k, v in os.environ.items() if k not in ("NO_COLOR", "FORCE_COLOR", "CI", "COLUMNS")}
+    process = subprocess.Popen(
+        [*QUADID, *arguments], stdin=follower, stdout=follower, stderr=follower, cwd=cwd,
+        env={**plain, "TERM": "xterm-256color", "COLUMNS": "120", **environment},
+    )  # fmt: skip
+    os.close(follower)
+    parts = []
+    while True:
+        try:
+            part = os.read(leader, 65536)
+        except OSError:  # the last writer has closed the terminal
+            break
+        if not part:
+            break
+        parts.append(part)
+    os.close(leader)
+    assert process.wait(timeout=900) == 0
+    return b"".join(parts).decode()
+
+
+def test_a_terminal_gets_progress_and_no_color_is_respected(flights: Flights, tmp_path: Path) -> None:
+    arguments = ["identify", str(flights.train), "--vehicle", "pelican", "--out", str(tmp_path)]
+    shown = on_a_terminal(arguments, tmp_path)
+    assert " % " in shown
+    assert "what is missing" in shown
+    assert COLOUR.search(shown)
+    assert not COLOUR.search(on_a_terminal(["inspect", str(flights.train)], tmp_path, NO_COLOR="1"))
+    assert COLOUR.search(on_a_terminal(["inspect", str(flights.train)], tmp_path))
+
+
+def test_a_pipe_gets_plain_text_and_no_progress(quadid: Cli, flights: Flights, tmp_path: Path) -> None:
+    run = quadid("identify", flights.train, "--vehicle", "pelican", "--out", tmp_path)
+    assert "\x1b" not in run.out + run.err
+    assert "%" not in run.err
+    assert "J_xx" in run.out
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        ("quadid i", "inspect"),
+        ("quadid identify --vehicle pel", "pelican_x"),
+        ("quadid diagnose --val", "--validate"),
+    ],
+)
+def test_the_shell_completes_commands_options_and_vehicles(quadid: Cli, words: str, expected: str) -> None:
+    count = str(len(words.split()) - 1)
+    run = quadid(_QUADID_COMPLETE="complete_bash", COMP_WORDS=words, COMP_CWORD=count)
+    assert expected in run.out.split()
+
+
+# --- A pipe, a device or a folder where a file is asked for: refused, and not waited for
+
+
+READERS: dict[str, Callable[[Path], object]] = {
+    "vehicle file": lambda path: load_vehicle(str(path)),
+    "manoeuvre": read_manoeuvre,
+    "signing key": read_key,
+    "log": open_log,
+    "history that is shown": lambda path: read_history(path, "pelican"),
+    "configuration of Zenoh": lambda path: config_of(str(path)),
+    "kept input of a failed fit": repeat,
+}
+WRITERS: dict[str, Callable[[Path], object]] = {
+    "result": lambda path: write_text(path, "{}"),
+    "log": open_for_writing,
+    "vehicle file": Vehicle.shipped("pelican").save,
+}
+
+
+@pytest.mark.parametrize("what", READERS)
+def test_what_is_no_file_is_refused(what: str, tmp_path: Path, happened: Happened) -> None:
+    os.mkfifo(tmp_path / "pipe.yaml")
+    for path in (tmp_path / "pipe.yaml", Path("/dev/zero"), tmp_path):
+        with pytest.raises((QuadidError, OSError), match="regular file|[Ii]s a directory|no history|no Zenoh"):
+            READERS[what](path)
+    happened(35, f"a pipe, /dev/zero and a folder as {what}: refused at once")
+
+
+@pytest.mark.parametrize("what", WRITERS)
+def test_a_pipe_that_nobody_reads_is_not_waited_for_and_stays(what: str, tmp_path: Path, happened: Happened) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises((QuadidError, OSError), match="No such device"):
+        WRITERS[what](tmp_path / "pipe")
+    assert (tmp_path / "pipe").is_fifo()
+    happened(35, f"a {what} to a pipe that nobody reads: refused at once, the pipe is there")
+
+
+def test_a_pipe_that_is_read_gets_the_result_and_no_device_becomes_a_file(tmp_path: Path) -> None:
+    """As root a result for /dev/null took the place of the device."""
+    os.mkfifo(tmp_path / "pipe")
+    reader = os.open(tmp_path / "pipe", os.O_RDONLY | os.O_NONBLOCK)
+    write_text(tmp_path / "pipe", "{}")
+    assert os.read(reader, 99) == b"{}"
+    os.close(reader)
+    (tmp_path / "null").symlink_to("/dev/null")
+    write_text(tmp_path / "null", "{}")
+    assert (tmp_path / "null").is_char_device()
+    assert [p.name for p in tmp_path.iterdir() if p.name.startswith(".")] == []
+
+
+def test_a_pipe_where_time_stamps_of_signatures_were_kept_is_said(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "kept.json")
+    signing = SimpleNamespace(stream_timestamps={}, timestamp=0)
+    assert "no regular file" in SigningMemory(tmp_path / "kept.json", signing).problem
+
+
+# --- What commands print fits a narrow terminal: lines fold, and every value stands there whole
+
+
+PARAMETERS = [
+    {"name": name, "unit": unit, "value": 1.23456e-5 * (i + 1), "ci95": [1.23356e-5 * (i + 1), 1.23556e-5 * (i + 1)],
+     "initial": 2e-5, "status": "identified"}
+    for i, (name, unit) in enumerate(NOMINAL_UNITS.items())
+]  # fmt: skip
+SET = {
+    "sequence": 3, "wall": 1.7e9, "state": "rolled_back", "approved_by": "operator", "start": 1.0, "stop": 59.0,
+    "mse": 1.234, "parameters": PARAMETERS, "reason": "it predicts new windows worse than its predecessor",
+}  # fmt: skip
+METHOD = {
+    "name": "differential_evolution", "mse": {"train": 1.2345, "validate": [2.3456, 3.4567]},
+    "mse_paper": {"train": 4.5678}, "evaluations": 4000, "seconds": 12.3, "failures": 1, "runs": 3, "note": "stopped",
+}  # fmt: skip
+EXCITED = {
+    "seconds": 58.5, "worst": "J_r", "gain": 7.3, "manoeuvre_file": "m.yaml", "files": [],
+    "parameters": [
+        {"name": name, "now": 0.00569, "gentle_flight": 0.00567, "manoeuvre": 0.00409, "one_axis_at_a_time": 0.00543}
+        for name in NOMINAL_UNITS
+    ],
+    "movements": [{"name": "roll + pitch + yaw + throttle, 0.8 to 2 Hz", "amplitudes": {"roll": 0.2, "yaw": 0.15}}],
+    "peak": {"tilt_deg": 23.0, "rate_deg_s": 120.0}, "room": {"sideways_m": 5.0, "up_m": 0.1, "down_m": 0.1},
+    "envelope": {"lowest_m": 10, "highest_m": 40, "radius_m": 10, "abort_tilt_deg": 32, "battery_percent": 40},
+}  # fmt: skip
+COMPARED = {"validate": ["other.mcap", "third.mcap"], "methods": [METHOD], "budget": 4000}
+REPLAYED = {
+    "vehicle": "pelican", "events": [], "refused": {"held_out_gain": 27}, "published": [SET], "status": {},
+}  # fmt: skip
+STORED = {"vehicle": "pelican", "sets": [SET], "vehicles": [], "candidates": [], "events": [], "in_force": None}
+FLEET = {
+    "units": [{"unit": "airframe-07", "logs": 2, "done": 2, "parameters": [
+        {"parameter": n, "unit": u, "median": 1.23456e-5, "spread": 0.0123} for n, u in NOMINAL_UNITS.items()
+    ]}],
+    "counts": {"done": 2}, "rough": 0, "drifts": [], "outliers": [], "reasons": [], "health": [], "worked": 2,
+    "logs": 2, "copies": [], "seconds": 1.0, "files": [], "report": "fleet.html",
+}  # fmt: skip
+SHOWN: dict[str, tuple[Callable[..., Any], tuple[str, ...]]] = {
+    "excite": (lambda: conclude(Proposed(EXCITED, *[cast(Any, None)] * 4), None),
+               ("0.569 %", "0.567 %", "0.409 %", "0.543 %")),
+    "compare": (lambda: conclude(Methods(COMPARED), None),
+                ("differential_evolution", "1.234", "2.346", "3.457", "4000", "12.3", "1/3")),
+    "fleet": (lambda: conclude(Fleet(FLEET, [], []), None),
+              ("airframe-07", "J_xx", "1.235e-05", "N s^2/rad^2", "1.2 %")),
+    "replay": (lambda: conclude(Replayed(REPLAYED), None), ("1.2346e-05", "7.4074e-05", "identified", "held out gain")),
+    "history": (lambda: conclude(Stored(STORED), None),
+                ("operator", "rolled_back", "1.23", "1.235e-05", "7.407e-05", "predecessor")),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("width", [60, 80])
+@pytest.mark.parametrize("command", SHOWN)
+def test_every_value_stands_whole(
+    command: str, width: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("COLUMNS", str(width))
+    show, values = SHOWN[command]
+    show()
+    text = capsys.readouterr().out
+    assert "…" not in text
+    assert not [line for line in text.splitlines() if len(line) > width]
+    assert not [value for value in values if value not in text]
+
+
+def test_columns_beyond_the_width_stand_below_with_the_first_beside_them() -> None:
+    columns = (Column("set"), *(Column(f"column {i}", right=True) for i in range(5)))
+    table = TextTable("t", columns, (("a", "1", "2", "3", "4", "5"),))
+    assert table.text(60).splitlines()[1].split("  ")[-1] == "column 4"
+    narrow = table.text(25).splitlines()
+    assert [line.split()[0] for line in narrow[1:] if line] == ["set", "a"] * 3
+    assert max(map(len, narrow)) <= 25
+
+
+# --- Whatever is wrong with the input: one line that says what and how to mend it, exit code 2 or 3, no traceback
+
+
+def _pelican(**changes: object) -> str:
+    data = yaml.safe_load(Vehicle.shipped("pelican").to_yaml())
+    return str(yaml.safe_dump({**data, **changes}))
+
+
+@pytest.mark.parametrize(
+    ("content", "expected"),
+    [
+        (b"\x00\x01\x02\x03" * 100, "unknown format"),
+        (b"#ROSBAG V2.0\n" + b"\x00" * 100, "ROS 1 bag"),
+        (b"t,speed\n0,1\n", "none of the columns"),
+        (b"t,p,q,r,w1,w2,w3,w4\n", "no usable row"),
+        (b"t,p,q,r,w1,w2,w3,w4\nx,x,x,x,x,x,x,x\n", "column t holds 'x', no number"),
+    ],
+)
+def test_files_that_are_no_logs(inside: Cli, tmp_path: Path, content: bytes, expected: str) -> None:
+    log = tmp_path / "log.csv"
+    log.write_bytes(content)
+    assert expected in one_line(inside("identify", log, "--vehicle", "pelican", "--out", tmp_path), 2)
+
+
+def test_a_directory_as_log(quadid: Cli, tmp_path: Path) -> None:
+    assert "quadid fleet" in one_line(quadid("score", tmp_path, "--vehicle", "pelican"), 2)
+
+
+def test_a_truncated_log_is_used_as_far_as_it_goes(inside: Cli, flights: Flights, tmp_path: Path) -> None:
+    whole = flights.unseen.read_bytes()
+    cut = tmp_path / "cut.csv"
+    cut.write_bytes(whole[: len(whole) // 2])
+    run = inside("score", cut, "--vehicle", "pelican", "--json", "-")
+    assert run.code == 0
+    assert 650 < run.data["samples"] < 750
+    assert "cut.csv" in run.err
+
+
+def test_what_is_allowed_is_said_once(inside: Cli, flights: Flights) -> None:
+    line = one_line(inside("compare", flights.train, "--vehicle", "pelican", "--method", "magic"), 2)
+    assert line.count("l_shade") == 1
+    assert "fix" not in line
+
+
+@pytest.mark.parametrize("kept", [60, 2000, 100_000])
+def test_a_truncated_log_with_nothing_left(inside: Cli, flights: Flights, tmp_path: Path, kept: int) -> None:
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(flights.train.read_bytes()[:kept])
+    one_line(inside("score", cut, "--vehicle", "pelican"), 2)
+
+
+def test_a_corrupted_log(inside: Cli, flights: Flights, tmp_path: Path) -> None:
+    data = bytearray(flights.train.read_bytes())
+    middle = len(data) // 2
+    data[middle : middle + 64] = bytes(64)
+    broken = tmp_path / "broken.mcap"
+    broken.write_bytes(data)
+    run = inside("score", broken, "--vehicle", "pelican")
+    assert "Traceback" not in run.err
+    assert run.code in (0, 2, 3)
+    assert "broken.mcap" in run.err
+
+
+@pytest.fixture(scope="module")
+def whole_logs(flights: Flights, data_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    """One log of each format, by suffix."""
+    folder = tmp_path_factory.mktemp("formats")
+    write_tlog(folder / "log.tlog", flights.unseen_flight.recording)
+    return {
+        "mcap": flights.train.read_bytes(),
+        "csv": flights.unseen.read_bytes(),
+        "tlog": (folder / "log.tlog").read_bytes(),
+        "bin": (data_dir / "ardupilot" / "log171.bin").read_bytes()[:400_000],
+        "ulg": (data_dir / "px4" / "ascend_cubeorange_test.ulg").read_bytes()[:600_000],
+    }
+
+
+@pytest.mark.parametrize("suffix", ["mcap", "csv", "tlog", "bin", "ulg"])
+def test_a_log_of_each_format_cut_in_its_first_bytes(
+    inside: Cli, whole_logs: dict[str, bytes], tmp_path: Path, suffix: str
+) -> None:
+    for kept in (0, 1, 10, 30):
+        log = tmp_path / f"cut.{suffix}"
+        log.write_bytes(whole_logs[suffix][:kept])
+        line = one_line(inside("inspect", log), 2)
+        assert f"cut.{suffix}" in line
+
+
+@pytest.mark.parametrize("suffix", ["mcap", "csv", "tlog", "bin", "ulg"])
+def test_a_log_of_each_format_cut_in_the_middle(
+    inside: Cli, whole_logs: dict[str, bytes], tmp_path: Path, suffix: str
+) -> None:
+    """What is before the cut is read, and the warning says so; without a whole chunk there is one clear line."""
+    data = whole_logs[suffix]
+    log = tmp_path / f"cut.{suffix}"
+    log.write_bytes(data[: len(data) * 2 // 3 + 1])
+    run = inside("inspect", log)
+    assert "Traceback" not in run.err
+    if run.code == 0:
+        assert f"cut.{suffix}" in run.out
+    else:
+        assert f"cut.{suffix}" in one_line(run, 2)
+
+
+@pytest.mark.parametrize("suffix", ["mcap", "csv", "tlog", "bin", "ulg"])
+def test_a_corrupted_log_of_each_format(inside: Cli, whole_logs: dict[str, bytes], tmp_path: Path, suffix: str) -> None:
+    """Zeros in the middle cost what they cover; noise behind a true beginning is refused with one line."""
+    data = bytearray(whole_logs[suffix])
+    log = tmp_path / f"broken.{suffix}"
+    middle = len(data) // 2
+    data[middle : middle + 512] = bytes(512)
+    log.write_bytes(data)
+    run = inside("inspect", log)
+    assert "Traceback" not in run.err
+    assert run.code == 0 or f"broken.{suffix}" in one_line(run, 2)
+    noise = np.random.default_rng(1).bytes(20_000)
+    log.write_bytes(bytes(data[:20]) + noise)
+    assert f"broken.{suffix}" in one_line(inside("inspect", log), 2)
+
+
+@pytest.mark.parametrize(("columns", "order"), [((2, 3, 0, 1), "3, 4, 1, 2"), ((3, 0, 1, 2), "2, 3, 4, 1")])
+def test_swapped_motors(inside: Cli, flights: Flights, tmp_path: Path, columns: tuple[int, ...], order: str) -> None:
+    """Two motors exchanged, opposite ones exchanged, all moved by one; the line names the columns to take."""
+    names, rows = table(flights.unseen)
+    place = [names.index(f"w{i}") for i in range(1, 5)]
+    rows[:, place] = rows[:, [place[c] for c in columns]]
+    log = write_table(tmp_path / "swapped.csv", names, rows)
+    for command in ("identify", "diagnose"):
+        line = one_line(inside(command, log, "--vehicle", "pelican", "--out", tmp_path), 2)
+        assert f"in the order {order}" in line
+        assert "order the rotors of the vehicle file" in line
+
+
+def test_nan_in_a_log_is_left_out(inside: Cli, flights: Flights, tmp_path: Path) -> None:
+    names, rows = table(flights.unseen)
+    rows[100:110, names.index("p")] = np.nan
+    log = write_table(tmp_path / "holes.csv", names, rows)
+    run = inside("score", log, "--vehicle", "pelican", "--json", "-")
+    assert run.code == 0
+    assert run.data["gaps"] >= 1
+    assert "not finite" in run.err
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        (_pelican(mass=-1.0), "mass"),
+        (_pelican(parameters={"b": 2e-5, "d": 4e-7, "J_xx": -8e-3, "J_yy": 8e-3, "J_zz": 1e-2, "J_r": 3e-5}), "J_xx"),
+        (_pelican(effects={"motor_lga": {"tau": 0.1}}), "did you mean 'motor_lag'?"),
+        (_pelican(effects=[1]), "effects must map names"),
+        (_pelican(rotors=[]), "rotors"),
+        ("[1, 2", "not YAML"),
+        ("just text", "mapping"),
+        ("", "mapping"),
+    ],
+)
+def test_impossible_vehicle_files(inside: Cli, flights: Flights, tmp_path: Path, text: str, expected: str) -> None:
+    file = tmp_path / "vehicle.yaml"
+    file.write_text(text, encoding="utf-8")
+    assert expected in one_line(inside("identify", flights.train, "--vehicle", file, "--out", tmp_path), 2)
+
+
+def test_places_that_cannot_be_written(inside: Cli, flights: Flights, tmp_path: Path) -> None:
+    file = tmp_path / "file"
+    file.write_text("", encoding="utf-8")
+    common = ("identify", flights.train, "--vehicle", "pelican")
+    assert "file" in one_line(inside(*common, "--out", file), 2)
+    assert "directory" in one_line(inside(*common, "--report", tmp_path), 2)
+
+
+def test_the_vehicle_file_read_is_never_overwritten(inside: Cli, flights: Flights, tmp_path: Path) -> None:
+    file = tmp_path / "pelican.fitted.yaml"
+    text = Vehicle.shipped("pelican").to_yaml()
+    file.write_text(text, encoding="utf-8")
+    for command in ("identify", "diagnose"):
+        run = inside(command, flights.train, "--vehicle", file, "--out", tmp_path, "--json", "-")
+        assert run.code == 0, run.err
+        assert run.data["vehicle_file"] == str(tmp_path / "pelican.fitted.new.yaml")
+        assert file.read_text(encoding="utf-8") == text
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (("--rate", "0"), "grid rate"),
+        (("--rate", "nan"), "grid rate"),
+    ],
+)
+def test_impossible_options(
+    inside: Cli, flights: Flights, tmp_path: Path, arguments: tuple[str, ...], expected: str
+) -> None:
+    run = inside("identify", flights.train, "--vehicle", "pelican", "--out", tmp_path, *arguments)
+    assert expected in one_line(run, 2)
+
+
+def test_impossible_horizons(inside: Cli, flights: Flights) -> None:
+    for horizons in ("0", "1,x", "", "99999"):
+        one_line(inside("score", flights.train, "--vehicle", "pelican", "--horizons", horizons), 2)
+    line = one_line(inside("score", flights.train, "--vehicle", "pelican", "--horizons", "1900"), 3)
+    assert "no run of 1900 samples fits" in line
+
+
+def test_control_characters_in_names_do_not_reach_the_terminal(inside: Cli, tmp_path: Path, happened: Happened) -> None:
+    run = inside("score", str(tmp_path / "evil\x1b[31m\nname.csv"), "--vehicle", "pelican")
+    assert "\x1b" not in run.err
+    one_line(run, 2)
+    happened(20, "ANSI and line ends in a file name: none on the terminal, one line")
+
+
+def test_the_vehicle_file_of_a_vehicle_thirty_times_as_heavy(inside: Cli, tmp_path: Path, data_dir: Path) -> None:
+    """Its rotors stand in another order as well, but that is not what to mend."""
+    log = data_dir / "crazyflie_rpm" / "figure8_17.csv"
+    run = inside("identify", log, "--vehicle", "pelican", "--out", tmp_path)
+    line = one_line(run, 2)
+    assert "so b would be 1.26e-06" in line
+    assert "fix: use the vehicle file of this log; else" in line

@@ -1,19 +1,24 @@
-"""The examples run as they stand; the one for ROS 2 is run by tests/node/test_ros_node.py."""
+"""The examples run as they stand, Foxglove's with a viewer of its own; ROS's are run by tests/node/test_ros_node.py."""
 
 from __future__ import annotations
 
+import asyncio
 import importlib.util
+import json
 import os
 import re
 import subprocess
 import sys
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from mcap.records import Schema
+from mcap_ros2.decoder import DecoderFactory
 from quadid_replay import write_csv, write_mcap
 
 from quadid.errors import WindowError
@@ -21,6 +26,8 @@ from quadid.flight import TruthParameters, fly
 from quadid.model.layout import Layout
 from quadid.model.step import simulate
 from quadid.vehicle import GRAVITY, ParameterPrior, Vehicle
+
+# --- The examples run as they stand; the one for ROS 2 is run by tests/node/test_ros_node.py
 
 
 def run(
@@ -141,3 +148,58 @@ def test_a_policy_learns_over_the_vehicles_of_a_fit(repository: Path) -> None:
     assert first == again
     _, curve = example.learn(env, 18)
     assert np.mean(curve[-3:]) > 1.5 * curve[0]
+
+
+# --- The Foxglove example, seen by a viewer of its own: every topic announced as in the file, every message delivered
+
+
+pytest.importorskip("foxglove", reason="pip install .[foxglove]")
+SECONDS = 5.0
+
+
+async def watch(port: int) -> tuple[dict[str, Any], dict[str, list[bytes]]]:
+    """Subscribes to everything a server announces; returns its channels and the messages of each, by topic."""
+    from tornado.websocket import websocket_connect
+
+    viewer = await websocket_connect(f"ws://127.0.0.1:{port}", subprotocols=["foxglove.sdk.v1"])
+    channels: dict[str, Any] = {}
+    got: dict[str, list[bytes]] = {}
+    topic: dict[int, str] = {}
+    while (message := await viewer.read_message()) is not None:
+        if isinstance(message, bytes):
+            # 1: message data; 4 bytes subscription (or channel), 8 bytes time, then the message
+            if message[0] == 1:
+                got.setdefault(topic[int.from_bytes(message[1:5], "little")], []).append(message[13:])
+            continue
+        told = json.loads(message)
+        if told["op"] == "advertise":
+            for channel in told["channels"]:
+                channels[channel["topic"]] = channel
+                topic[channel["id"]] = channel["topic"]
+            wanted = [{"id": c["id"], "channelId": c["id"]} for c in told["channels"]]
+            await viewer.write_message(json.dumps({"op": "subscribe", "subscriptions": wanted}))
+    return channels, got
+
+
+def test_a_viewer_gets_every_topic_and_message(repository: Path, tmp_path: Path) -> None:
+    log = tmp_path / "flight.mcap"
+    write_mcap(log, fly(Vehicle.shipped("pelican"), seconds=SECONDS, seed=1).recording)
+    command = [sys.executable, "-u", str(repository / "examples" / "foxglove_live.py"), str(log)]
+    done = subprocess.Popen(
+        [*command, "--port", "0", "--speed", "5"],
+        stdout=subprocess.PIPE, text=True, env={**os.environ, "PYTHONPATH": str(repository)},
+    )  # fmt: skip
+    assert done.stdout is not None
+    port = re.search(r":(\d+)$", done.stdout.readline().strip())
+    assert port is not None
+    with ThreadPoolExecutor(1) as apart:  # another test's browser may keep a loop of events in this thread
+        channels, got = apart.submit(asyncio.run, asyncio.wait_for(watch(int(port[1])), 120.0)).result()
+    assert done.wait(60) == 0
+    assert channels["imu"]["schemaName"] == "sensor_msgs/msg/Imu"
+    assert channels["imu"]["encoding"] == "cdr"
+    assert len(got["imu"]) == round(SECONDS * 50)
+    told = channels["imu"]
+    schema = Schema(told["id"], told["schema"].encode(), told["schemaEncoding"], told["schemaName"])
+    decoder = DecoderFactory().decoder_for("cdr", schema)
+    assert decoder is not None
+    assert decoder(got["imu"][-1]).linear_acceleration.z == pytest.approx(9.8, abs=8.0)

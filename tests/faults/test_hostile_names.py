@@ -1,8 +1,10 @@
-"""Names of a megabyte with HTML, ANSI, NUL and SQL in them: harmless in reader, terminal, report and history."""
+"""Names and histories of strangers: harmless in reader, terminal, report and history."""
 
 from __future__ import annotations
 
+import contextlib
 import json
+import sqlite3
 import struct
 import xml.etree.ElementTree as ET
 from collections.abc import Callable
@@ -12,6 +14,7 @@ from typing import Any
 
 import pytest
 from quadid_node.history import Store, read_history
+from quadid_node.messages import set_to_dict
 from quadid_replay import open_log
 from quadid_replay.schemas import schema_text
 
@@ -28,6 +31,9 @@ from tests.replay.test_mcap import imu
 from tests.replay.test_ulog import Ulog
 from tests.replay.test_ulog import flight as ulog_flight
 from tests.report.test_page import EVIL, page, scored
+
+# --- Names of a megabyte with HTML, ANSI, NUL and SQL in them: harmless in reader, terminal, report and history
+
 
 __all__ = ["inside"]
 MEGABYTE = 1 << 20
@@ -176,3 +182,48 @@ def test_a_name_full_of_markup_is_a_name(tmp_path: Path, inside: Cli, happened: 
     done = inside("export", "--vehicle", file, "--format", "rotorpy", "--out", tmp_path, "--json", "-")
     compile(Path(done.data["files"][0]).read_text(encoding="utf-8"), "x", "exec")
     happened(33, f"vehicle named {name[:30]}…: the same name in SDF by an XML parser, and a module that compiles")
+
+
+# --- A history that a stranger filled: shown without a character that a terminal acts on, or refused in one line
+
+
+EVIL_TEXT = "\x1b[31mred\u202eevil\u2028x\x85y\x9bz\x00 [bold red]m[/] <script>"
+FIELDS = ("reason", "approved_by", "outdated", "check", "input_hash")
+ROWS: dict[str, tuple[str, object]] = {
+    "texts": ("data", json.dumps({**set_to_dict(online_set(TRUE)), **dict.fromkeys(FIELDS, EVIL_TEXT)})),
+    "a time of 1e300": ("wall", 1e300), "a time of words": ("wall", "abc"), "a time of bytes": ("wall", b"\xff"),
+    "an endless time": ("wall", float("inf")), "a list": ("data", "[]"), "a number": ("data", "3"),
+    "bytes": ("data", b"\xff\xfe"),
+    "words for a stamp": ("data", json.dumps({**set_to_dict(online_set(TRUE)), "stop": "x"})),
+    "no state": ("data", json.dumps({**set_to_dict(online_set(TRUE)), "state": None})),
+    "parameters that are none": ("data", json.dumps({**set_to_dict(online_set(TRUE)), "parameters": [1]})),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("what", ROWS)
+def test_a_history_of_a_stranger_is_shown_as_text_or_refused_in_one_line(
+    what: str, tmp_path: Path, inside: Cli, happened: Happened
+) -> None:
+    path, (column, value) = tmp_path / "h.sqlite", ROWS[what]
+    store = Store(path, "pelican")
+    store.numbered(replace(online_set(TRUE), sequence=7, approved_by="auto"))
+    assert store.flush(10.0)
+    store.close()
+    with contextlib.closing(sqlite3.connect(path)) as db, db:
+        db.execute(f"UPDATE sets SET {column} = ?", (value,))
+        db.execute(
+            "INSERT INTO events (vehicle, level, kind, text, t, wall) VALUES ('pelican', ?, ?, ?, 1.0, 1e9)",
+            (EVIL_TEXT, EVIL_TEXT, EVIL_TEXT),
+        )
+    run = inside("history", "--vehicle", "pelican", "--history", path, "--events", "9", "--json", "-")
+    shown = inside("history", "--vehicle", "pelican", "--history", path, "--events", "9")
+    for told in (run, shown):
+        assert told.code == (0 if what == "texts" else 2), told.err
+        assert all(c.isprintable() or c == "\n" for c in told.out + told.err)
+        assert "Traceback" not in told.err
+    if what == "texts":
+        assert run.data["events"][0]["text"] == EVIL_TEXT, "JSON holds it, escaped"
+        assert shown.out.count("evil") >= 4
+    else:
+        assert shown.err.count("\n") == 1
+    happened(44, f"stored sets with {what}: `quadid history` ends with {shown.code}, no control character")

@@ -1,10 +1,17 @@
-"""Whole flights: determinism, clocks, individuals, and 500 s within bounds whatever is hidden in the vehicle."""
+"""Whole flights: determinism, clocks, individuals, bounds; the vehicle stepped from outside; machine code on disk."""
 
 from __future__ import annotations
 
+import hashlib
+from pathlib import Path
+from typing import Any, cast
+
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
+import quadid.attitude_controller
+import quadid.flight
 from quadid.data.window import CHANNELS
 from quadid.effects import EFFECTS
 from quadid.errors import ParameterError
@@ -12,17 +19,24 @@ from quadid.flight import (
     OUTSIDE,
     Flight,
     FlightError,
+    SteppedFlight,
     TruthParameters,
     default_gains,
     draw_effect,
     draw_outside,
     draw_truth,
     fly,
+    jit,
 )
+from quadid.flight.airframe import derivative
+from quadid.flight.march import march
 from quadid.flight.outside import ARRANGE, DISTORT
 from quadid.flight.setup import SIZES
 from quadid.parameters import NOMINAL_NAMES
-from quadid.vehicle import Vehicle
+from quadid.vehicle import GRAVITY, Vehicle
+
+# --- Whole flights: determinism, clocks, individuals, and 500 s within bounds whatever is hidden in the vehicle
+
 
 VEHICLES = ["pelican", "pelican_x", "hexacopter", "hummingbird", "crazyflie_brushless"]
 PELICAN = Vehicle.shipped("pelican")
@@ -145,3 +159,56 @@ def test_outside_effects_are_many_and_none_is_one_of_the_catalogue() -> None:
         draw_outside("gust", 1)
     with pytest.raises(ParameterError, match="push"):
         fly(PELICAN, seconds=2.0, outside={"gusts": {"push": 1.0}})
+
+
+# --- The flown vehicle stepped from outside flies as `fly` does, from the same commands
+
+
+@pytest.mark.parametrize(
+    "effects",
+    [{}, {"motor_lag": {"tau": 0.04}, "command_delay": {"delay": 0.0135}, "rotor_drag": {"k_x": 0.3, "k_y": 0.2}}],
+    ids=["nominal", "late"],
+)
+def test_the_commands_of_a_flight_give_that_flight(effects: dict[str, dict[str, float]]) -> None:
+    flown = fly(PELICAN, seconds=3.0, seed=4, effects=effects, noise_scale=0.0)
+    truth, again = flown.truth, SteppedFlight(PELICAN, effects=effects)
+    first = 50  # what acts there is the command of the row before
+    again._y[0:3], again._y[3:6], again._y[15:18] = (v[first] for v in (truth.position, truth.velocity, truth.rates))
+    again._y[6:15] = Rotation.from_quat(truth.quaternion[first], scalar_first=True).as_matrix().ravel()
+    again.rotor_speed[:] = truth.rotor_speed[first]
+    rows = flown.window.rotor_speed
+    again._rotors.level[:] = rows[first - 1]
+    for k in range(first, 100):
+        again.step(rows[k], 0.02)
+    np.testing.assert_allclose(again.velocity, truth.velocity[100], atol=1e-9)
+    np.testing.assert_allclose(again.rate, truth.rates[100], atol=1e-9)
+    np.testing.assert_allclose(again.rotor_speed, truth.rotor_speed[100], atol=1e-9)
+
+
+def test_a_hover_stays_and_a_wrong_command_is_refused() -> None:
+    flight = SteppedFlight(PELICAN, TruthParameters())
+    hover = flight.rotor_speed.copy()
+    for _ in range(50):
+        flight.step(hover, 0.01)
+    np.testing.assert_allclose(flight.velocity, 0.0, atol=1e-9)
+    assert flight.time == pytest.approx(0.5)
+    assert flight.position[2] == pytest.approx(-30.0)
+    np.testing.assert_allclose(flight.quaternion, [1.0, 0.0, 0.0, 0.0], atol=1e-12)
+    with pytest.raises(ParameterError, match="4 finite rotor speeds"):
+        flight.step(np.ones(3), 0.01)
+
+
+# --- Machine code on disk is dropped when any source of the room changes, not only the kernel's own file
+
+
+def test_stamp_of_every_kernel_covers_all_sources() -> None:
+    digest = hashlib.sha256(repr(GRAVITY).encode())
+    digest.update(Path(quadid.attitude_controller.__file__).read_bytes())
+    for file in sorted(Path(quadid.flight.__file__).parent.glob("*.py")):
+        digest.update(file.read_bytes())
+    assert jit.fingerprint() == digest.hexdigest()
+    for kernel in (march, derivative):
+        # numba's own names: a numba that renames them must fail here and not fly stale physics
+        index = cast(Any, kernel)._cache._cache_file
+        assert str(index._source_stamp).endswith(jit.fingerprint())
+        assert index._load_index() == {} or index._source_stamp

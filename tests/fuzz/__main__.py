@@ -87,7 +87,7 @@ def page(account: Mapping[str, Sequence[Run]]) -> str:
         "`make fuzz`: small logs are mutated with knowledge of their format and read within 0.5 s of processor time "
         "and 1 GiB. Anything but a recording of finite values and rising times, one line of a documented error, or an "
         "end by limits, as the process that reads logs has them, is a finding; findings become tests "
-        f"(`tests/fuzz/test_findings.py`). Runs and notes: `fuzz.json`. Goal: {GOAL:,} inputs per format.",
+        f"(`tests/fuzz/test_campaign.py`). Runs and notes: `fuzz.json`. Goal: {GOAL:,} inputs per format.",
         "",
         "| format | inputs | read | refused | stopped | findings | inputs/s |",
         "|---|---|---|---|---|---|---|",

@@ -176,3 +176,19 @@ class Ear:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+
+def latched() -> Any:
+    from quadid_node.publish import LATCHED_QOS
+
+    return LATCHED_QOS
+
+
+def message(health: list[Any], part: str) -> str:
+    found: str = next(s.message for s in health[-1].status if s.name.endswith(part))
+    return found
+
+
+def level(health: list[Any], part: str) -> bytes:
+    found: bytes = next(s.level for s in health[-1].status if s.name.endswith(part))
+    return found

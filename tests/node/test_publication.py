@@ -1,9 +1,10 @@
-"""On the disk before on the wire: what was published has its row, and its number is never given again."""
+"""Publication: on the disk before on the wire, one service a topic, neighbours named."""
 
 from __future__ import annotations
 
 import math
 import os
+import random
 import sqlite3
 import time
 from collections.abc import Callable, Iterator
@@ -13,6 +14,7 @@ from pathlib import Path
 import pytest
 from quadid_node.history import LARGEST_NUMBER, Restored, Row, Store, StoreError, connect, read_history
 from quadid_node.messages import Output
+from quadid_node.publish import BESIDE, FOUND_WITHIN, OBSERVES, STRANGER, YOUNG, GraphMonitor, Offer, TopicOwnership
 from quadid_node.service import MOST_WAITING, Publication, Service
 from quadid_node.worker import InlineWorker
 
@@ -22,6 +24,9 @@ from quadid.vehicle import Vehicle
 from tests.faults.evidence import Happened
 from tests.node.killed_services import Services
 from tests.online.test_gate import TRUE, online_set
+
+# --- On the disk before on the wire: what was published has its row, and its number is never given again
+
 
 ROOT = Path(__file__).resolve().parents[2]
 PELICAN = Vehicle.shipped("pelican")
@@ -372,3 +377,212 @@ def test_outputs_that_need_no_row_wait_for_nothing(tmp_path: Path) -> None:
 def test_a_service_without_history_begins_where_it_is_told() -> None:
     service = Service(PELICAN, SETTINGS, InlineWorker(), None, restored=Restored(None, 41))
     assert accept(service).sequence == 41
+
+
+# --- The right to publish: simulated services that look once a second, see each other late, come and go
+
+
+SETTLED = FOUND_WITHIN + 2.0
+"""By then [s] a service that sees no other one speaks."""
+
+
+class Topic:
+    """Who publishes, as services see it; `apart`: they do not see each other."""
+
+    def __init__(self) -> None:
+        self.now, self.apart = 0.0, False
+        self.publishers: dict[int, str] = {}
+        self._next = 0
+
+    def service(self) -> TopicOwnership:
+        """A service that looks at this topic; its own publisher it always sees."""
+        mine: set[int] = set()
+
+        def count() -> int:
+            return len(mine) if self.apart else len(self.publishers)
+
+        def kin() -> int:
+            return len(mine) if self.apart else sum(name == "quadid" for name in self.publishers.values())
+
+        def create() -> int:
+            number = self.stranger("quadid")
+            mine.add(number)
+            return number
+
+        def destroy(number: int) -> None:
+            mine.discard(number)
+            del self.publishers[number]
+
+        return TopicOwnership(count, kin, create, destroy, lambda: self.now)
+
+    def stranger(self, name: str = "someone") -> int:
+        self._next += 1
+        self.publishers[self._next] = name
+        return self._next
+
+    def run(self, seconds: float, *services: TopicOwnership) -> None:
+        for _ in range(round(seconds)):
+            self.now += 1.0
+            for service in services:
+                service.step()
+
+
+def speaking(*services: TopicOwnership) -> int:
+    return sum(s.publisher is not None for s in services)
+
+
+def test_the_second_observes_and_takes_over_when_the_first_is_gone() -> None:
+    topic = Topic()
+    first, second = topic.service(), topic.service()
+    topic.run(SETTLED, first)
+    topic.run(30.0, first, second)
+    assert (first.publisher is not None, second.publisher) == (True, None)
+    assert (first.problem, second.problem) == ("", OBSERVES)
+    first.let_go()
+    topic.run(6.0, second)
+    assert second.publisher is not None
+    assert second.problem == ""
+
+
+def test_one_that_is_found_by_its_next_announcement_is_not_talked_over() -> None:
+    topic = Topic()
+    first = topic.service()
+    topic.run(SETTLED, first)
+    second = topic.service()
+    topic.apart = True
+    topic.run(3.0, second)  # Fast DDS announces a participant every 3 s
+    assert second.publisher is None
+    topic.apart = False
+    topic.run(30.0, first, second)
+    assert (first.publisher is not None, second.publisher) == (True, None)
+
+
+def test_one_that_is_not_active_yet_tells_and_claims_nothing() -> None:
+    topic = Topic()
+    first, second = topic.service(), topic.service()
+    topic.run(SETTLED, first)
+    assert not second.step(wanted=False)
+    assert second.problem == OBSERVES
+    first.let_go()
+    topic.now += 60.0
+    assert not second.step(wanted=False)
+    assert (second.publisher, second.problem) == (None, "")
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_two_that_claimed_at_once_or_apart_end_with_one(seed: int) -> None:
+    random.seed(seed)
+    topic = Topic()
+    services = topic.service(), topic.service(), topic.service()
+    topic.apart = True
+    topic.run(SETTLED if seed % 2 else SETTLED + 2.0 * YOUNG, *services)
+    assert speaking(*services) == 3, "they do not see each other"
+    topic.apart = False
+    topic.run(60.0, *services)
+    assert speaking(*services) == 1
+    assert sorted(s.problem for s in services) == ["", OBSERVES, OBSERVES]
+
+
+def test_to_a_stranger_a_settled_service_does_not_give_way_and_says_so() -> None:
+    topic = Topic()
+    service = topic.service()
+    topic.run(SETTLED + YOUNG, service)
+    forger = topic.stranger()
+    topic.run(30.0, service)
+    assert service.publisher is not None
+    assert service.problem == STRANGER
+    del topic.publishers[forger]
+    topic.run(1.0, service)
+    assert service.problem == ""
+
+
+def test_one_that_gives_way_says_so_first() -> None:
+    topic = Topic()
+    service = topic.service()
+    topic.run(SETTLED + YOUNG, service)
+    topic.stranger("quadid")
+    topic.run(1.0, service)
+    assert (service.publisher is not None, service.problem) == (True, BESIDE)
+    topic.run(5.0, service)
+    assert (service.publisher, service.problem) == (None, OBSERVES)
+
+
+# --- What others do on the topics is told, and taken back when it is over
+
+
+IMU, JOINTS = "sensor_msgs/msg/Imu", "sensor_msgs/msg/JointState"
+GOOD = Offer(IMU, True)
+
+
+class HeardTopic:
+    """One input, whose publishers are as set."""
+
+    def __init__(self) -> None:
+        self.offers: list[Offer] = [GOOD]
+        self.lines: list[str] = []
+        self.unbroken = 0.0
+        self.graph = GraphMonitor(
+            {"/imu": IMU}, lambda topic: self.offers, lambda topic: self.unbroken, self.lines.append
+        )
+
+    def look(self, *offers: Offer, deaf: bool = False) -> dict[str, str]:
+        self.offers = [*offers]
+        self.graph.look({"/candidate": deaf})
+        return self.graph.notes
+
+
+@pytest.fixture
+def topic() -> HeardTopic:
+    return HeardTopic()
+
+
+@pytest.mark.parametrize(
+    ("offers", "told"),
+    [
+        ([GOOD, GOOD], "2 publishers on one topic: paused until only one publishes"),
+        ([Offer(IMU, False)], "its publisher's QoS does not match"),
+        ([GOOD, Offer(JOINTS, True)], f"a publisher of another type ({JOINTS} for {IMU}), which is not listened to"),
+    ],
+)
+def test_what_is_wrong_is_told_once_and_taken_back(topic: HeardTopic, offers: list[Offer], told: str) -> None:
+    assert topic.look(*offers) == {"/imu": told}
+    topic.look(*offers)
+    assert topic.lines == [f"/imu: {told}"]
+    assert topic.look(GOOD) == {}
+    assert topic.look(*offers) == {"/imu": told}
+    assert topic.look() == {}, "nobody there any more"
+
+
+def test_two_publishers_pause_at_once_and_one_goes_on(topic: HeardTopic) -> None:
+    topic.graph.count("/imu", 1)
+    assert not topic.graph.paused
+    topic.graph.count("/imu", 2)
+    assert topic.graph.paused
+    topic.look(GOOD, GOOD)
+    assert topic.graph.paused
+    topic.look(GOOD)
+    assert not topic.graph.paused
+
+
+def test_a_publisher_that_is_listed_but_not_heard_does_not_pause(topic: HeardTopic) -> None:
+    """One that was killed is listed until its lease ends."""
+    topic.graph.count("/imu", 2)
+    assert topic.graph.paused
+    topic.unbroken = 1.1
+    assert topic.look(GOOD, GOOD) == {"/imu": "2 publishers on one topic, only one publishes"}
+    assert not topic.graph.paused
+    topic.unbroken = 0.02
+    topic.graph.count("/imu", 2)
+    assert topic.graph.paused
+
+
+def test_two_types_on_a_topic_do_not_pause(topic: HeardTopic) -> None:
+    topic.look(GOOD, Offer(JOINTS, True))
+    assert not topic.graph.paused
+
+
+def test_a_subscriber_that_hears_nothing_is_named_while_it_is_there(topic: HeardTopic) -> None:
+    assert topic.look(GOOD, deaf=True) == {
+        "/candidate, its subscriber": "asks for a QoS that is not offered here, and receives nothing"
+    }
+    assert topic.look(GOOD) == {}

@@ -18,8 +18,7 @@ from quadid.online import SetState
 from quadid.parameters import Status
 from quadid_node import messages
 from tests.node.aggregator import branches
-from tests.node.peers import ROOT, Ear, Process
-from tests.node.test_ros_node import latched
+from tests.node.peers import ROOT, Ear, Process, latched
 from tests.online.test_gate import TRUE, online_set, parameter_set, scaled
 
 pytestmark = pytest.mark.usefixtures("ros")

@@ -1,28 +1,44 @@
-"""What must hold without ROS: imports, the choice of sources, the table of parameters, messages as dictionaries."""
+"""Parts of the node that need no ROS: imports, sources, parameters, launch arguments, mistakes of publishers named."""
 
 from __future__ import annotations
 
+import importlib
+import importlib.util
+import math
+import re
 import subprocess
 import sys
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import yaml
 from quadid_node.inputs import DECIDE, SILENT, Chooser, source, stamp
+from quadid_node.launching import ARGUMENTS, NODE_ARGUMENTS, fleet, parameters, truth
+from quadid_node.messages import WARN, diagnostics
 from quadid_node.recording import base_seconds, stream
+from quadid_node.service import Service
 from quadid_node.settings import PARAMETERS, check_change, read_settings, vehicle_id
+from quadid_node.worker import InlineWorker
 from quadid_replay import open_log, write_mcap
 from quadid_replay.ros_messages import TYPES
 
 from quadid.data.window import Block
 from quadid.errors import QuadidError
+from quadid.online import SessionSettings
 from quadid.parameters import Status
+from quadid.vehicle import GRAVITY
 from quadid_node import messages
-from tests.online.driving import flight
+from tests.node.aggregator import branches
+from tests.node.launch_stand_in import GroupAction, Node, launched
+from tests.online.driving import EPOCH, flight, samples
+from tests.online.made_up import PELICAN
 from tests.online.test_gate import TRUE, online_set
+
+# --- What must hold without ROS: imports, the choice of sources, the table of parameters, messages as dictionaries
 
 
 def test_everything_but_the_nodes_imports_without_ros() -> None:
@@ -165,3 +181,158 @@ def test_a_set_carries_its_mass_whether_it_is_out_of_date_and_what_is_unreliable
     assert told["window_end"] == {"sec": 1_700_000_030, "nanosec": 250_000_000}
     assert set(messages.STATUSES) >= {s.value for s in Status}
     assert messages.STATUSES["unreliable"] == 4
+
+
+# --- What launch arguments become: only those given override the configuration; a fleet has its own of each
+
+
+ROOT = Path(__file__).resolve().parents[2]
+LAUNCH = ROOT / "quadid_node" / "launch"
+
+
+def test_what_is_not_given_leaves_the_configuration_alone() -> None:
+    """`approval: manual` in the file once became auto, by the default of a launch argument."""
+    nothing = dict.fromkeys(ARGUMENTS, "")
+    assert parameters(nothing) == {}
+    assert parameters({**nothing, "approval": "manual", "observer": "true"}) == {"approval": "manual", "observer": True}
+    text = (LAUNCH / "identify.launch.py").read_text(encoding="utf-8")
+    assert re.findall(r'DeclareLaunchArgument\(k, default_value=("?\w*"?)', text) == ['""', "v"]
+
+
+def test_every_argument_is_a_parameter_of_the_node() -> None:
+    known = {p.name: p.default for p in PARAMETERS} | {"use_sim_time": False}
+    assert set(ARGUMENTS) <= set(known)
+    for name, value in parameters(dict.fromkeys(ARGUMENTS, "false")).items():
+        assert type(value) is type(known[name]), name
+    assert {"record", "history", "observer", "autostart"} <= set(ARGUMENTS)
+    assert {"log_level", "respawn"} <= set(NODE_ARGUMENTS)
+
+
+def test_the_configuration_file_of_the_package_and_a_launch_argument_are_merged_as_ros_does() -> None:
+    given = yaml.safe_load((ROOT / "quadid_node" / "config" / "quadid.yaml").read_text())["/**"]["ros__parameters"]
+    file = {**given, "approval": "manual"}
+    assert {**file, **parameters({"vehicle": "x.yaml"})} == {**file, "vehicle": "x.yaml"}
+
+
+def test_a_fleet_has_a_vehicle_and_a_configuration_each() -> None:
+    given = {"vehicle": "a.yaml, b.yaml", "config": "a_node.yaml,b_node.yaml", "source": "mavros"}
+    assert fleet("quad1,quad2", given) == [
+        {"namespace": "quad1", "vehicle": "a.yaml", "config": "a_node.yaml", "source": "mavros"},
+        {"namespace": "quad2", "vehicle": "b.yaml", "config": "b_node.yaml", "source": "mavros"},
+    ]
+    with pytest.raises(ValueError, match="one for each of the 3 vehicles or one for all"):
+        fleet("a,b,c", {"vehicle": "x,y"})
+    with pytest.raises(ValueError, match="give one for each of the 2 vehicles,"):
+        fleet("a,b", {"record": "run.mcap"})
+    with pytest.raises(ValueError, match="give each vehicle its own"):
+        fleet("a,a", {})
+
+
+def test_a_truth_value_that_is_none_is_refused() -> None:
+    assert truth("respawn", "True")
+    with pytest.raises(ValueError, match="respawn:=yes: true or false"):
+        truth("respawn", "yes")
+
+
+def test_the_launch_file_of_one_node_overrides_what_is_given_and_nothing_else(monkeypatch: pytest.MonkeyPatch) -> None:
+    file = LAUNCH / "identify.launch.py"
+    (plain,) = launched(file, {}, monkeypatch)
+    assert isinstance(plain, Node)
+    _, overrides = plain.named["parameters"]
+    assert overrides == {}, "approval: manual of the configuration file stays"
+    assert (plain.named["package"], plain.named["executable"]) == ("quadid_node", "identify")
+    assert (plain.named["ros_arguments"], plain.named["respawn"]) == ([], False)
+    given = {"vehicle": "x.yaml", "approval": "manual", "observer": "true", "log_level": "debug", "respawn": "true"}
+    (told,) = launched(file, given, monkeypatch)
+    assert told.named["parameters"][1] == {"vehicle": "x.yaml", "approval": "manual", "observer": True}
+    assert (told.named["ros_arguments"], told.named["respawn"]) == (["--log-level", "debug"], True)
+
+
+def test_the_launch_file_of_a_fleet_gives_each_vehicle_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    given = {"namespaces": "quad1,quad2", "vehicle": "a.yaml,b.yaml", "approval": "manual"}
+    groups = launched(LAUNCH / "fleet.launch.py", given, monkeypatch)
+    told = []
+    for group in groups:
+        assert isinstance(group, GroupAction)
+        assert group.named["forwarding"] is False
+        (one,) = group.arguments[0]
+        told.append(dict(one.named["launch_arguments"]))
+    assert told == [
+        {"namespace": "quad1", "vehicle": "a.yaml", "approval": "manual"},
+        {"namespace": "quad2", "vehicle": "b.yaml", "approval": "manual"},
+    ]
+    with pytest.raises(AssertionError, match="required: namespaces"):
+        launched(LAUNCH / "fleet.launch.py", {}, monkeypatch)
+
+
+@pytest.mark.ros
+@pytest.mark.parametrize("name", ["identify", "fleet"])
+def test_the_launch_file_starts_nodes(name: str) -> None:
+    """Where ROS' own launch is installed (the wheels of the package index have none)."""
+    if importlib.util.find_spec("launch_ros") is None:
+        pytest.skip("launch_ros is on no package index: run where ROS is installed")
+    launch, actions = importlib.import_module("launch"), importlib.import_module("launch.actions")
+    spec = importlib.util.spec_from_file_location(name, LAUNCH / f"{name}.launch.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    context, made = launch.LaunchContext(), list[Any]()
+    context.launch_configurations.update({"namespaces": "quad1,quad2", "vehicle": "pelican"})
+    for entity in module.generate_launch_description().entities:
+        done = entity.visit(context)
+        made += done if isinstance(entity, actions.OpaqueFunction) and done else []
+    assert len(made) == (1 if name == "identify" else 2)
+
+
+# --- What ROS users publish wrongly is named in /diagnostics, at WARN, and nothing is learned from it
+
+
+Values = tuple[float, ...]
+
+
+def flipped(v: Values) -> Values:
+    return v[0], -v[1], -v[2]
+
+
+def turned(q: Values) -> Values:
+    """The body's axes turned by half a turn about x."""
+    return q[0], q[1], -q[2], -q[3]
+
+
+def world(q: Values) -> Values:
+    """The world's axes exchanged: north for east, up for down."""
+    w, x, y, z = q
+    return tuple(c / math.sqrt(2.0) for c in (-x - y, w + z, w - z, y - x))
+
+
+MISTAKES: dict[str, tuple[dict[str, Callable[[Values], Values]], str]] = {
+    "PX4's body axes in every channel": (
+        {"gyro": flipped, "accel": flipped, "attitude": turned},
+        "PX4 has FRD and NED",
+    ),
+    "PX4's body axes in the gyro": ({"gyro": flipped}, "gyro axes differ"),
+    "PX4's world": ({"attitude": world}, "its world has z up"),
+    "no gravity": ({"accel": lambda v: (v[0], v[1], v[2] + GRAVITY)}, "gravity is missing"),
+    "acceleration in g": ({"accel": lambda v: tuple(c / GRAVITY for c in v)}, "in g"),
+    "degrees": ({"gyro": lambda v: tuple(map(math.degrees, v))}, "deg/s"),
+    "rpm": ({"rotor_speed": lambda v: tuple(c * 30.0 / math.pi for c in v)}, "rpm"),
+    "two rotors exchanged": ({"rotor_speed": lambda v: (v[1], v[0], *v[2:])}, "in the order 2, 1, 3, 4"),
+    "rotors numbered around": ({"rotor_speed": lambda v: (v[1], v[2], v[3], v[0])}, "in the order 4, 1, 2, 3"),
+}
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_a_mistake_is_named_at_warn_and_nothing_is_learned(mistake: str) -> None:
+    changes, word = MISTAKES[mistake]
+    service = Service(PELICAN, SessionSettings(diagnose=0.0), InlineWorker())
+    for sample in samples(flight(16.0, 3).recording, EPOCH):
+        change = changes.get(sample.channel)
+        service.push(sample if change is None else replace(sample, values=change(sample.values)))
+    service.step()
+    told = diagnostics(service.health(), "/quad1/quadid", "pelican", {}, {}, {})
+    assert all(len(branches(entry["name"])) == 1 for entry in told["status"])
+    session = next(entry for entry in told["status"] if entry["name"].endswith("session"))
+    assert word in session["message"]
+    assert session["level"] == WARN
+    assert service.session.status().fits == 0

@@ -1,4 +1,4 @@
-"""The ROS node over DDS, every part a process of its own: simulated vehicle, node, subscribers, services, signals."""
+"""The ROS node over DDS, every part a process of its own: vehicle, node, subscribers, services, signals, Zenoh."""
 
 from __future__ import annotations
 
@@ -7,28 +7,32 @@ import os
 import signal
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from quadid_node.history import read_history
+from quadid_node.messages import WARN
+from quadid_node.process import without_shared_memory
+from quadid_node.zenoh import Fleet
 from quadid_replay import write_mcap
 
 from quadid.vehicle import Vehicle
 from tests.faults.evidence import Happened
 from tests.node.aggregator import branches
-from tests.node.peers import ROOT, Ear, Process, node, player
+from tests.node.peers import ROOT, Ear, Process, latched, node, player
+from tests.node.test_ros_free import MISTAKES
+from tests.node.zenoh_net import Net, until
 from tests.online.driving import flight
+
+# --- The ROS node over DDS, every part a process of its own: simulated vehicle, node, subscribers, services, signals
+
 
 pytestmark = pytest.mark.usefixtures("ros")
 PELICAN = Vehicle.shipped("pelican")
 SPEED = 2.0
-
-
-def latched() -> Any:
-    from quadid_node.publish import LATCHED_QOS
-
-    return LATCHED_QOS
 
 
 def test_a_late_subscriber_gets_the_latched_set_and_the_replay_gives_the_same_bits(
@@ -279,16 +283,6 @@ def restarts(health: list[Any]) -> int:
     return int(next(v.value for v in entry.values if v.key == "restarts"))
 
 
-def message(health: list[Any], part: str) -> str:
-    found: str = next(s.message for s in health[-1].status if s.name.endswith(part))
-    return found
-
-
-def level(health: list[Any], part: str) -> bytes:
-    found: bytes = next(s.level for s in health[-1].status if s.name.endswith(part))
-    return found
-
-
 @pytest.mark.parametrize(
     ("parameters", "word"),
     [
@@ -320,3 +314,89 @@ def test_a_log_that_cannot_be_played_is_told(tmp_path: Path) -> None:
     with player(tmp_path / "none.mcap") as vehicle:
         assert vehicle.child.wait(120) == 2
         assert "no file" in vehicle.text
+
+
+# --- Which way Fast DDS carries the node's messages
+
+
+_PORT = "/fastrtps_port"
+
+
+def _mapped(folder: Path) -> str:
+    """What a node that is ready has in its memory."""
+    with node(folder / "h.sqlite") as identify:
+        identify.wait_for("ready")
+        mapped = Path(f"/proc/{identify.child.pid}/maps").read_text(encoding="utf-8")
+        assert identify.end()[0] == 0
+    return mapped
+
+
+@pytest.mark.parametrize(("chosen", "shared"), [("", False), ("DEFAULT", True)])
+def test_shared_memory_is_used_only_where_the_user_asks_for_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, chosen: str, shared: bool
+) -> None:
+    monkeypatch.delenv("FASTRTPS_DEFAULT_PROFILES_FILE")
+    monkeypatch.setenv("FASTDDS_BUILTIN_TRANSPORTS", chosen)
+    assert (_PORT in _mapped(tmp_path)) == shared
+
+
+def test_the_shipped_profile_keeps_to_this_machine_without_shared_memory(tmp_path: Path) -> None:
+    assert _PORT not in _mapped(tmp_path)
+
+
+def test_a_profile_of_the_user_is_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("FASTDDS_BUILTIN_TRANSPORTS", raising=False)
+    monkeypatch.setenv("FASTRTPS_DEFAULT_PROFILES_FILE", "profile.xml")
+    without_shared_memory()
+    assert "FASTDDS_BUILTIN_TRANSPORTS" not in os.environ
+
+
+# --- The ROS node on Zenoh too: what `quadid watch` shows of it, and the commands it carries
+
+
+def test_watch_sees_the_state_of_a_ros_node(tmp_path: Path) -> None:
+    folder = tmp_path / "net"
+    folder.mkdir()
+    net = Net(folder)
+    fleet = Fleet(net.client("watch"))
+    try:
+        with node(tmp_path / "h.sqlite", zenoh=net.client("quad1"), vehicle_id="quad1") as it:
+            it.wait_for("ready")
+            assert until(lambda: "health" in fleet.latest.get("quad1", {})), it.text
+            assert fleet.alive["quad1"]
+            done, text = fleet.command("quad1", "rollback", seconds=60.0)
+            assert not done
+            assert "no earlier set" in text
+            assert it.end()[0] == 0
+        assert until(lambda: not fleet.alive["quad1"])
+    finally:
+        fleet.close()
+        net.close()
+
+
+# --- What ROS users publish wrongly is named in /diagnostics of a real node; `test_mistakes_are_said` has the others
+
+
+def test_a_mistake_on_the_topics_is_named_at_warn(tmp_path: Path, ear: Ear) -> None:
+    from diagnostic_msgs.msg import DiagnosticArray
+
+    changes, word = MISTAKES["two rotors exchanged"]
+    recording = flight(240.0, 3).recording
+    channels = dict(recording.channels)
+    for name, change in changes.items():
+        values = np.array([change(tuple(row)) for row in channels[name].values.tolist()])
+        channels[name] = replace(channels[name], values=values)
+    write_mcap(tmp_path / "spoilt.mcap", replace(recording, channels=channels))
+    health = ear.listen("/diagnostics", DiagnosticArray)
+
+    def said() -> list[Any]:
+        return [s for h in health for s in h.status if s.name == "quadid: session" and word in s.message]
+
+    with node(tmp_path / "h.sqlite") as identify:
+        identify.wait_for("ready")
+        with player(tmp_path / "spoilt.mcap", 3.0):
+            assert ear.until(said), identify.text
+    assert {s.level for s in said()} == {WARN}
+    inputs = [s.message for h in health for s in h.status if s.name == "quadid: inputs"]
+    assert "data arrive" in inputs
+    assert not [text for text in inputs if "bursts" in text or "_covariance" in text], "of evenly sent messages"

@@ -1,4 +1,4 @@
-"""The checkout as source of a colcon workspace: three packages, laid out as `ros2 run` and `ros2 launch` want them."""
+"""The checkout in a ROS environment: colcon workspace, quadid_msgs, and the recipe of docs/using-with-ros.md."""
 
 from __future__ import annotations
 
@@ -8,11 +8,15 @@ import re
 import shutil
 import subprocess
 import sys
+import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from tests.conftest import absent
+
+# --- The checkout as source of a colcon workspace: three packages, laid out as `ros2 run` and `ros2 launch` want them
 
 
 def colcon(scratch: Path, *arguments: str, **environment: str) -> str:
@@ -143,3 +147,125 @@ def test_who_wants_the_messages_needs_no_linters(target: str, wanted: bool, tmp_
     assert (".[dev]" in done.stdout) is wanted
     if wanted:
         assert done.stdout.index(".[dev]") < done.stdout.index(".[ros]")
+
+
+# --- quadid_msgs in this environment: complete, documented, and a latched set crosses to another process over DDS
+
+
+NAMES = ("AttitudeCommand", "Diagnosis", "Finding", "FitStatus", "MotorCommand", "ParameterSet")
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_message_has_type_support(name: str) -> None:
+    import quadid_msgs.msg
+    from rclpy.serialization import deserialize_message, serialize_message
+
+    kind: Any = getattr(quadid_msgs.msg, name)
+    message = kind()
+    assert deserialize_message(serialize_message(message), kind) == message
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_installed_definition_is_the_one_in_the_checkout(name: str, repository: Path) -> None:
+    installed = Path(sys.prefix, "share", "quadid_msgs", "msg", f"{name}.msg").read_text(encoding="utf-8")
+    assert installed == (repository / "msgs" / "msg" / f"{name}.msg").read_text(encoding="utf-8"), "run 'make messages'"
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_number_names_its_unit_or_meaning(name: str, repository: Path) -> None:
+    text = (repository / "msgs" / "msg" / f"{name}.msg").read_text(encoding="utf-8")
+    fields = [line for line in text.splitlines() if re.match(r"[A-Za-z]", line) and "=" not in line.split("#")[0]]
+    assert fields
+    for line in fields:
+        assert "#" in line, f"{name}: no comment on '{line}'"
+        if line.startswith("float64"):
+            assert re.search(r"# \[\S+\]|# row-major", line), f"{name}: no unit in '{line}'"
+
+
+def test_a_late_joiner_in_another_process_receives_the_latched_set() -> None:
+    """The contract's parameter topic: reliable, transient local, depth 1."""
+    import rclpy
+    from quadid_msgs.msg import ParameterSet
+    from rclpy.executors import SingleThreadedExecutor
+
+    from tests.ros.latched_publisher import LATCHED, example
+
+    with subprocess.Popen(
+        [sys.executable, str(Path(__file__).with_name("latched_publisher.py"))],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    ) as publisher:
+        assert publisher.stdin is not None
+        assert publisher.stdout is not None
+        assert publisher.stdout.readline() == "published\n"
+
+        context = rclpy.Context()
+        context.init()
+        node = rclpy.create_node("late_joiner", context=context)
+        received: list[Any] = []
+        node.create_subscription(ParameterSet, "quadid/parameters", received.append, LATCHED)
+        executor = SingleThreadedExecutor(context=context)
+        executor.add_node(node)
+        deadline = time.monotonic() + 30.0
+        while not received and time.monotonic() < deadline:
+            executor.spin_once(timeout_sec=0.1)
+        executor.spin_once(timeout_sec=0.5)  # a second message would be one too many
+        executor.shutdown()
+        node.destroy_node()
+        context.shutdown()
+
+        publisher.stdin.close()
+        assert publisher.wait(timeout=20.0) == 0
+    assert received == [example(2)]
+
+
+# --- The environment that docs/using-with-ros.md makes beside the Python packages of Debian, line by line
+
+
+DEBIANS = Path("/usr/bin/python3")
+COLCON = "colcon-core colcon-ros colcon-python-setup-py colcon-recursive-crawl colcon-package-selection 'setuptools<80'"
+SHOW = "import sys, numpy, pydantic; print(pydantic.VERSION, numpy.__version__, sys.prefix)"
+
+
+def page_lines(repository: Path) -> list[str]:
+    """The lines of the page that make the environment, install into it and build."""
+    text = (repository / "docs" / "using-with-ros.md").read_text(encoding="utf-8")
+    (block,) = re.findall(r"^```\n(.*?python3 -m venv.*?)^```", text.split("## Run")[0], re.S | re.M)
+    return [line for line in block.splitlines() if line.startswith(("python3 -m venv", "venv/bin/"))]
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+def test_the_environment_beside_debians_packages(tmp_path: Path, repository: Path) -> None:
+    """Debian's pydantic 1.10, which cannot be uninstalled, stays; the environment has the version that quadid needs."""
+    python = DEBIANS if DEBIANS.exists() else Path(sys.executable)
+    scrubbed = {k: v for k, v in os.environ.items() if not k.startswith(("_ROS", "LD_", "VIRTUAL", "PYTHON"))}
+    environment = {**scrubbed, "PATH": f"{python.parent}{os.pathsep}{os.environ['PATH']}"}
+
+    def run(line: str, **options: bool) -> str:
+        done = subprocess.run(
+            line, shell=True, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
+        )
+        if "ensurepip" in done.stderr or "No matching distribution" in done.stderr:
+            pytest.skip(f"no venv module or no package index here: {done.stderr[-200:]}")
+        assert options.get("may_fail") or done.returncode == 0, f"{line}\n{done.stdout}{done.stderr}"
+        return done.stdout.strip()
+
+    (tmp_path / "src").mkdir()
+    (tmp_path / "src" / "quadid").symlink_to(repository)
+    before = run(f"{python} -c '{SHOW}'", may_fail=True)
+    make, install, build = page_lines(repository)
+    for line in (make, install):
+        assert "--break-system-packages" not in line
+        run(line)
+    run(f"venv/bin/pip install {COLCON}")  # in ROS, colcon is apt's
+    assert build.startswith("venv/bin/python -m colcon build && source install/setup.bash")
+    run("venv/bin/python -m colcon build --packages-select quadid")  # the other two need ROS
+    version, _, prefix = run(f"venv/bin/python -c '{SHOW}'").split()
+    assert int(version.split(".")[0]) >= 2
+    assert Path(prefix) == tmp_path / "venv"
+    assert "pelican" in run(". install/local_setup.sh && quadid vehicles")
+    assert run(". install/local_setup.sh && command -v quadid") == str(tmp_path / "install/quadid/bin/quadid")
+    assert "not found" in run("venv/bin/pip show quadid 2>&1 || true"), "installed once"
+    assert run(f"{python} -c '{SHOW}'", may_fail=True) == before, "Debian's own packages are as they were"

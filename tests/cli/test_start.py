@@ -1,15 +1,63 @@
-"""The folder a command is run in may have been packed by a stranger: nothing in it is run."""
+"""Start of a command: kernels compiled once, folders of strangers, import paths of the release before."""
 
 from __future__ import annotations
 
+import importlib
+import inspect
+import json
 import os
+import pickle
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from quadid_replay.formats import FORMATS, LogFormat
 
+import quadid
+from quadid import old_paths
+from tests.cli.conftest import Flights
+from tests.commands import Cli
 from tests.faults.evidence import Happened
+
+# --- Kernels are compiled before the first fit, in processes side by side; what they compile is what a fit calls
+
+
+ASK = "from quadid.app.kernels import FIT, missing; print(*missing(FIT))"
+SIGNATURES = """
+import json, sys, quadid
+from quadid.app.kernels import FIT, PARTS
+for name in FIT:
+    PARTS[name].run()
+quadid.identify(quadid.load(sys.argv[1], vehicle="pelican"))
+print(json.dumps({k.__name__: len(k.signatures) for name in FIT for k in PARTS[name].kernels()}))
+"""
+
+
+def python(text: str, *arguments: str, **environment: str) -> str:
+    """What a Python of its own prints."""
+    run = subprocess.run(
+        [sys.executable, "-c", text, *arguments], env={**os.environ, **environment}, capture_output=True, text=True,
+        check=True,
+    )  # fmt: skip
+    return run.stdout
+
+
+def test_what_is_missing_is_known_without_compiling(tmp_path: Path) -> None:
+    assert python(ASK, NUMBA_CACHE_DIR=str(tmp_path)).split() == ["simulation", "statistics", "estimate"]
+
+
+def test_a_fit_calls_what_was_compiled_and_nothing_else(flights: Flights, inside: Cli) -> None:
+    counts = json.loads(python(SIGNATURES, str(flights.train)).splitlines()[-1])
+    names = ("needs_of", "roll_segments", "rotor_table", "reduce", "fly_closed_loop")
+    filters = ("moments", "kalman", "replay", "backward", "single_steps", "specific_force")
+    assert counts == dict.fromkeys((*names, *filters), 1)
+    assert inside("warmup").out.startswith("Kernels: compiled")
+    assert inside("warmup").out == "Kernels: compiled already.\n"
+
+
+# --- The folder a command is run in may have been packed by a stranger: nothing in it is run
+
 
 QUADID = Path(sys.executable).with_name("quadid")
 
@@ -107,3 +155,46 @@ def test_also_those_of_a_folder_that_it_changes_to(tmp_path: Path) -> None:
     lines = f"import os, quadid\nos.chdir({str(tmp_path)!r})\nimport quadid.model.kernel"
     done = subprocess.run([sys.executable, "-c", lines], cwd="/", capture_output=True, text=True, check=False)
     assert "ImportError: .numba_config.yaml in this folder" in done.stderr
+
+
+# --- Import paths of the release before: each works and warns; public names stay functions
+
+
+@pytest.mark.parametrize("old", sorted(old for old in old_paths.new_paths() if not old.startswith("quadid_node")))
+def test_an_old_path_is_the_new_module_and_warns(old: str) -> None:
+    sys.modules.pop(old, None)
+    with pytest.warns(DeprecationWarning, match=f"{old} is "):
+        found = importlib.import_module(old)
+    assert found is importlib.import_module(old_paths.new_path(old))
+
+
+@pytest.mark.parametrize("one", FORMATS, ids=lambda one: one.name)
+def test_no_reader_of_logs_is_found_by_an_old_path(one: LogFormat) -> None:
+    assert not old_paths.new_path("quadid_replay." + one.reader.split(":")[0])
+
+
+@pytest.mark.parametrize("name", ["identify", "diagnose", "health"])
+def test_names_of_rooms_are_functions_also_after_an_old_import(name: str) -> None:
+    code = (
+        f"import warnings, quadid; warnings.simplefilter('ignore'); import quadid.{name}; "
+        f"from quadid_workflow.{name} import {name} as function; assert quadid.{name} is function"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+    function = getattr(quadid, name)
+    assert inspect.isfunction(function)
+    assert pickle.loads(pickle.dumps(function)) is function
+
+
+@pytest.mark.parametrize("statement", [
+    "from quadid_report.page import render", "import quadid_cli.main", "import quadid_paper.subspace",
+    "from quadid.identify.fit import fit", "from quadid.diagnose import Diagnosis",
+    "from quadid.health.trim_estimation import FlightTrim",
+])  # fmt: skip
+def test_old_statements_work_alone(statement: str) -> None:
+    done = subprocess.run([sys.executable, "-W", "always", "-c", statement], check=True, capture_output=True, text=True)
+    assert "DeprecationWarning" in done.stderr
+
+
+def test_what_never_was_is_not_found() -> None:
+    with pytest.raises(ModuleNotFoundError):
+        importlib.import_module("quadid.identify.never_there")
