@@ -6,6 +6,8 @@ import argparse
 import multiprocessing
 import os
 import re
+import socket
+import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
@@ -14,6 +16,8 @@ from typing import Any, TypeVar
 from scipy.stats import binomtest
 
 DATA = Path(os.environ.get("QUADID_DATA", "../shared/data"))
+QUADID = str(Path(sys.executable).with_name("quadid"))
+"""The command of this environment."""
 JUDGED = "## Judged by hand"
 Given = argparse.Namespace
 Job = TypeVar("Job")
@@ -111,6 +115,13 @@ def share(k: int, n: int) -> str:
         return "–"
     low, high = binomtest(k, n).proportion_ci(method="exact")
     return f"{k} of {n} ({100 * k / n:.1f} %, {100 * low:.0f}–{100 * high:.0f})"
+
+
+def free_port() -> int:
+    """A UDP port of this machine that nobody uses now."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
 
 
 def machine() -> str:

@@ -346,8 +346,10 @@ def first_line(mistake: Mistake, place: Place) -> tuple[int, str]:
 
 
 def shown(line: str, names: str) -> str:
-    """What the line finds and the fix, without program, log and what is allowed; long ones around `names`."""
-    short = re.sub(r"^quadid: (log\.\w+: )?|; allowed: [^;]{26,}(?=; fix)|, or insist with --unchecked", "", line)
+    """What the line finds, without program, log, what is allowed and the fix, where that names the mistake already."""
+    short = re.sub(r"^quadid: (log\.\w+: )?|, or insist with --unchecked", "", line)
+    found = re.split("; allowed: |; fix: ", short)[0]
+    short = found if re.search(names, found) else re.sub("; allowed: [^;]{26,}(?=; fix)", "", short)
     return "; fix: ".join(_around(part, names) for part in short.split("; fix: ")).replace("|", "/").replace("`", "")
 
 
@@ -365,9 +367,9 @@ def page() -> str:
     """The table of docs/mistakes.md."""
     head = [
         "# Mistakes and their first line", "",
-        "Written by `python -m tests.cli.mistakes`; a test makes each mistake. Lines begin with `quadid:` and the log; "
-        "… marks shortened ones. `--unchecked` overrules checks of units, frames and motors. *: does not name the "
-        "cause yet.", "",
+        "Written by `python -m tests.cli.mistakes`; a test makes each mistake. Lines begin with `quadid:` and the log "
+        "and end with the fix, both left out here. `--unchecked` overrules checks of units, frames and motors. *: does "
+        "not name the cause yet.", "",
         "| mistake | first line |", "|---|---|",
     ]  # fmt: skip
     with tempfile.TemporaryDirectory() as folder:

@@ -25,6 +25,7 @@ from quadid_evaluation.studies.foreign import of_set, outside_table
 from quadid_evaluation.studies.peers import online, simulated
 from quadid_evaluation.studies.readings import LOOP, errors
 from quadid_evaluation.studies.soak import BATCH, batches, slope
+from quadid_evaluation.studies.truth import poor_guess
 from quadid_node.mavlink_link import MOTORS as RATE
 from quadid_node.mavlink_link import REQUESTED
 
@@ -147,7 +148,7 @@ def test_the_truth_of_a_flight_without_noise_is_found(program: str) -> None:
     truth = simulated.body(1)
     numbers = truth.as_dict()
     window = fly(PELICAN, truth, 8.0, 1, noise=SensorNoise().scaled(1e-6)).window
-    found, _ = simulated.PROGRAMS[program](window, simulated.guessed(numbers, 1))
+    found, _ = simulated.PROGRAMS[program](window, poor_guess(PELICAN, numbers, 1))
     error = found.values - np.log([numbers[n] for n in NOMINAL_NAMES])
     assert np.all(np.abs(error[:5]) < 0.01), "b, d and the inertias"
     assert abs(error[5]) < 0.05, "J_r"
@@ -156,7 +157,7 @@ def test_the_truth_of_a_flight_without_noise_is_found(program: str) -> None:
 def test_kalman_filters_come_to_the_truth_and_follow_a_change_of_mass() -> None:
     truth = {n: p.initial for n, p in PELICAN.parameters.items()}
     flight = fly(PELICAN, seconds=20.0, seed=1, effects={"mass_change": {"time": 12.0, "fraction": 0.15}})
-    vehicle = simulated.guessed(truth, 1)
+    vehicle = poor_guess(PELICAN, truth, 1)
     start = np.concatenate([np.zeros(3), np.log([vehicle.parameters[n].initial for n in online.NAMES])])
     true = np.log([flight.truth.parameters.as_dict()[n] for n in online.NAMES])
     for run in online.FILTERS.values():

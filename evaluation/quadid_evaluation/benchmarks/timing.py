@@ -19,6 +19,8 @@ from typing import Any
 
 import numpy as np
 
+from quadid_evaluation.harness import QUADID
+
 LIBRARIES = ("numpy", "numba", "scipy")
 
 
@@ -79,9 +81,12 @@ def child(code: str, *arguments: str, environment: Mapping[str, str] | None = No
 def command(*arguments: str, environment: Mapping[str, str] | None = None) -> None:
     """Runs `quadid` in a process of its own, quietly."""
     with tempfile.TemporaryFile() as nothing:
-        launch = [str(Path(sys.executable).with_name("quadid")), *arguments]
         subprocess.run(
-            launch, stdout=nothing, stderr=nothing, check=True, env={**_surroundings(), **(environment or {})}
+            [QUADID, *arguments],
+            stdout=nothing,
+            stderr=nothing,
+            check=True,
+            env={**_surroundings(), **(environment or {})},
         )
 
 

@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
+from quadid_replay.frames import from_euler
 
 from quadid.data.window import Window
 from quadid.errors import NotIdentifiableError, WindowError
@@ -139,6 +140,10 @@ def score_black_box(box: BlackBox, windows: Sequence[Window], vehicle: Vehicle, 
     Raises:
         NotIdentifiableError: no stretch is long enough for one segment.
     """
+
+    def turns(outputs: FloatArray) -> FloatArray:
+        return from_euler(outputs[..., 3:6].reshape(-1, 3)).reshape(*outputs.shape[:-1], 4)
+
     shooting = scored_problem(windows, vehicle, noise)
     expected = expected_squares(shooting, Layout(vehicle).initial(vehicle)).sum(axis=0)[:CHANNELS]
     squares, samples = np.zeros(CHANNELS), np.zeros(CHANNELS)
@@ -148,7 +153,7 @@ def score_black_box(box: BlackBox, windows: Sequence[Window], vehicle: Vehicle, 
         predicted = predict(box.model, inputs, outputs, segments.length, segments.starts, sigma).outputs
         measured = outputs[segments.rows]
         error = predicted - measured
-        turned = product(conjugate(_quaternion(measured[..., 3:6])), _quaternion(predicted[..., 3:6]))
+        turned = product(conjugate(turns(measured)), turns(predicted))
         error[..., 3:6] = 2.0 * np.where(turned[..., :1] >= 0.0, turned[..., 1:], -turned[..., 1:])
         seen = rollout.valid[segments.rows][..., :CHANNELS]
         squares += np.sum(np.where(seen, error, 0.0) ** 2, axis=(0, 1))
@@ -158,12 +163,3 @@ def score_black_box(box: BlackBox, windows: Sequence[Window], vehicle: Vehicle, 
         return np.inf
     ratio = np.where(told, squares / np.where(told, expected, 1.0), 0.0)
     return float(np.sum(samples * told * ratio) / np.sum(samples * told))
-
-
-def _quaternion(angles: FloatArray) -> FloatArray:
-    """Unit quaternions wxyz, body to world, of roll, pitch, yaw [rad] (z-y-x)."""
-    (cx, cy, cz), (sx, sy, sz) = np.moveaxis(np.cos(0.5 * angles), -1, 0), np.moveaxis(np.sin(0.5 * angles), -1, 0)
-    return np.stack(
-        [cx * cy * cz + sx * sy * sz, sx * cy * cz - cx * sy * sz, cx * sy * cz + sx * cy * sz,
-         cx * cy * sz - sx * sy * cz], axis=-1,
-    )  # fmt: skip

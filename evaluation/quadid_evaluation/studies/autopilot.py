@@ -10,7 +10,6 @@ from __future__ import annotations
 import json
 import socket
 import subprocess
-import sys
 import tempfile
 import threading
 import time
@@ -31,7 +30,7 @@ from quadid_replay.tlog import read_frames
 from quadid.app.logs import load_vehicle
 from quadid.data.window import Sample
 from quadid.online import Event, Phase, Publish
-from quadid_evaluation.harness import options, put, table
+from quadid_evaluation.harness import QUADID, free_port, options, put, table
 from quadid_evaluation.studies.readings import telemetry
 
 # --- The flights, what is known of them, and what a session that flew one of them is asked for
@@ -170,10 +169,9 @@ def serve(log: Path, vehicle: Path, seconds: float) -> Outcome:
     begin = time.monotonic()
     with tempfile.TemporaryDirectory() as folder, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as wire:
         wire.bind(("127.0.0.1", 0))
-        port, history = _free_port(), Path(folder) / "history.sqlite"
-        command = [str(Path(sys.executable).with_name("quadid"))]
+        port, history = free_port(), Path(folder) / "history.sqlite"
         served = subprocess.Popen(
-            [*command, "serve", "--vehicle", str(vehicle), "--mavlink", f"udpin:127.0.0.1:{port}",
+            [QUADID, "serve", "--vehicle", str(vehicle), "--mavlink", f"udpin:127.0.0.1:{port}",
              "--history", str(history)],
             stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
         )  # fmt: skip
@@ -194,7 +192,7 @@ def serve(log: Path, vehicle: Path, seconds: float) -> Outcome:
 def stored(vehicle: Path, history: Path, said: list[str], seconds: float) -> Outcome:
     """Record that an ended service left in its history; `said`: its lines; `seconds`: how long it ran."""
     told = subprocess.run(
-        [str(Path(sys.executable).with_name("quadid")), "history", "--vehicle", str(vehicle), "--history", str(history),
+        [QUADID, "history", "--vehicle", str(vehicle), "--history", str(history),
          "--candidates", "10000", "--events", "10000", "--json", "-"],
         capture_output=True, text=True, check=True,
     )  # fmt: skip
@@ -202,12 +200,6 @@ def stored(vehicle: Path, history: Path, said: list[str], seconds: float) -> Out
     last = [line for line in said if " | Hz: " in line][-1:]
     status = last[0].split(" | Hz: ")[0] if last else ""
     return Outcome(found["sets"], found["candidates"], found["events"], status, seconds)
-
-
-def _free_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 def listen(served: subprocess.Popen[str], said: list[str], ready: threading.Event) -> None:

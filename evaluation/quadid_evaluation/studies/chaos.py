@@ -33,7 +33,7 @@ from quadid.data.window import Channel, Recording
 from quadid.flight import Flight, fly
 from quadid.parameters import NOMINAL_NAMES
 from quadid.vehicle import Vehicle
-from quadid_evaluation.harness import judged, options
+from quadid_evaluation.harness import QUADID, free_port, judged, options, table
 
 # --- The service under fire, its history as it is seen from outside, its fit process
 
@@ -66,7 +66,7 @@ class Running:
     def another(self, history: Path) -> subprocess.Popen[str]:
         """A further service on the same vehicle."""
         command = [
-            str(Path(sys.executable).with_name("quadid")), "serve", "--vehicle", "pelican", "--window", "5",
+            QUADID, "serve", "--vehicle", "pelican", "--window", "5",
             "--diagnose", "0", "--gate", GATE, "--history", str(history), "--key", str(self._key),
             "--mavlink", f"udpin:127.0.0.1:{self._port}",
         ]  # fmt: skip
@@ -109,28 +109,23 @@ class Running:
         except OSError:
             return 0
 
-    def newest_estimate(self) -> float:
-        """When the newest estimate was journalled (UNIX time); remembers the numbered sets on the way."""
+    def asked(self, query: str) -> list[tuple[Any, ...]]:
+        """Rows of the history; none where it cannot be read now."""
         try:
             address = f"{self.history.as_uri()}?mode=ro"
             with contextlib.closing(sqlite3.connect(address, uri=True, timeout=0.2)) as db:
-                for sequence, b in db.execute(
-                    "SELECT sequence, json_extract(data, '$.parameters[0].value') FROM sets"
-                ).fetchall():
-                    self.rows.add((int(sequence), float(b)))
-                (wall,) = db.execute("SELECT max(wall) FROM candidates").fetchone()
+                return db.execute(query).fetchall()
         except sqlite3.Error:
-            return 0.0
-        return float(wall or 0.0)
+            return []
+
+    def newest_estimate(self) -> float:
+        """When the newest estimate was journalled (UNIX time); remembers the numbered sets on the way."""
+        self.rows |= set(self.asked("SELECT sequence, json_extract(data, '$.parameters[0].value') FROM sets"))
+        return float(sum(wall or 0.0 for (wall,) in self.asked("SELECT max(wall) FROM candidates")))
 
     def newest_number(self) -> int:
         """Largest number of a set in the history; 0 for none."""
-        try:
-            address = f"{self.history.as_uri()}?mode=ro"
-            with contextlib.closing(sqlite3.connect(address, uri=True, timeout=0.2)) as db:
-                return int(db.execute("SELECT max(sequence) FROM sets").fetchone()[0] or 0)
-        except sqlite3.Error:
-            return 0
+        return sum(number or 0 for (number,) in self.asked("SELECT max(sequence) FROM sets"))
 
     def _read(self, child: subprocess.Popen[str]) -> None:
         assert child.stdout is not None
@@ -143,13 +138,6 @@ class Running:
 def low_bits(number: int) -> int:
     """What QI_SEQ says of a set's number: a float on the wire holds 24 bits, QI_SEQ_HI the others."""
     return number % (1 << 24)
-
-
-def stop_quietly(process: subprocess.Popen[Any]) -> None:
-    """Ends a process of ours."""
-    if process.poll() is None:
-        process.kill()
-    process.wait(30)
 
 
 # --- The vehicle
@@ -287,14 +275,6 @@ REFUSED_LIMIT = 300.0
 """A second service has to say within this time [s] that it is refused; starting took a minute on a crowded machine."""
 
 
-def worker_killed(scene: Scene) -> str:
-    return _signal_worker(scene, signal.SIGKILL)
-
-
-def worker_stopped(scene: Scene) -> str:
-    return _signal_worker(scene, signal.SIGSTOP)
-
-
 def worker_out_of_memory(scene: Scene) -> str:
     pid = scene.service.worker()
     if not pid:
@@ -407,14 +387,6 @@ def sensor_stuck(scene: Scene) -> str:
     return _spoilt(scene, spoil, "gyro frozen for 5 s")
 
 
-def wrong_units(scene: Scene) -> str:
-    return _spoilt(scene, lambda m: _scaled(m, 180.0 / math.pi), "gyro in deg/s for 5 s")
-
-
-def wrong_sign(scene: Scene) -> str:
-    return _spoilt(scene, lambda m: _scaled(m, -1.0), "gyro with the sign flipped for 5 s")
-
-
 def half_lost(scene: Scene) -> str:
     return _spoilt(scene, lambda m: m if scene.rng.random() < 0.5 else None, "half of all messages lost for 5 s")
 
@@ -473,7 +445,8 @@ def second_service(scene: Scene) -> str:
     try:
         out, _ = other.communicate(timeout=REFUSED_LIMIT)
     except subprocess.TimeoutExpired:
-        stop_quietly(other)
+        other.kill()
+        other.wait(30)
         scene.service.crashes.append(f"a second service on one history was not refused within {REFUSED_LIMIT:.0f} s")
         return "**not refused**"
     if "another service" not in out:
@@ -489,13 +462,16 @@ def history_removed(scene: Scene) -> str:
 
 
 FAULTS: dict[str, tuple[int, Fault]] = {
-    "fit process killed": (11, worker_killed), "fit process stopped": (11, worker_stopped),
+    "fit process killed": (11, lambda scene: _signal_worker(scene, signal.SIGKILL)),
+    "fit process stopped": (11, lambda scene: _signal_worker(scene, signal.SIGSTOP)),
     "fit process out of memory": (11, worker_out_of_memory), "SIGTERM or SIGINT": (13, terminated),
     "power cut": (13, power_cut), "kill between commit and publication": (23, killed_at_commit),
     "history locked": (12, history_locked), "history damaged": (12, history_damaged),
     "history deleted": (12, history_removed), "disk full": (12, disk_full), "link silent": (9, link_silent),
     "vehicle reboots": (7, vehicle_reboots), "sensor not a number": (6, sensor_not_a_number),
-    "sensor stuck": (6, sensor_stuck), "wrong units": (10, wrong_units), "wrong sign": (17, wrong_sign),
+    "sensor stuck": (6, sensor_stuck),
+    "wrong units": (10, lambda s: _spoilt(s, lambda m: _scaled(m, 180.0 / math.pi), "gyro in deg/s for 5 s")),
+    "wrong sign": (17, lambda s: _spoilt(s, lambda m: _scaled(m, -1.0), "gyro with the sign flipped for 5 s")),
     "half of the messages lost": (8, half_lost), "forged frames": (14, forged), "replayed frames": (14, replayed),
     "flood": (14, flood), "second service": (21, second_service),
 }  # fmt: skip
@@ -526,15 +502,26 @@ def main() -> None:
     truth = {n: getattr(flight.truth.parameters, n) for n in NOMINAL_NAMES}
     entries: list[Entry] = []
     with tempfile.TemporaryDirectory() as name, small_disk(Path(name) / "disk") as small:
-        key, port = Path(name) / "key", _free_port()
+        key, port = Path(name) / "key", free_port()
         key.write_bytes(KEY)
         service, vehicle = Running(Path(name), port, key), SignedVehicle(port, KEY, flight)
         vehicle.start()
         scene = Scene(service, vehicle, port, random.Random(given.seed), small)
         try:
-            minutes = _attack(scene, given.words or list(FAULTS), entries, 60.0 * given.minutes)
-        finally:
-            _land(scene)
+            first = _recovered(service, time.time(), START_LIMIT)
+            if first is None:
+                sys.exit(f"the service made no estimate within {START_LIMIT:.0f} s: {service.lines[-3:]}")
+            _say(f"first estimate after {first:.0f} s; now the faults")
+            begin = time.time()
+            _throw(scene, given.words or list(FAULTS), entries, begin + 60.0 * given.minutes)
+            minutes = (time.time() - begin) / 60.0
+        finally:  # ends service and vehicle; the last numbered sets are in the history
+            service.check()
+            if service.child is not None:
+                service.newest_estimate()
+                service.end(signal.SIGTERM)
+            vehicle.stop()
+            service.newest_estimate()
     wrong, sets = judge(vehicle.told, truth, service.rows)
     command = f"python -m quadid_evaluation.studies.chaos --minutes {given.minutes:g} --seed {given.seed}"
     if given.out is not None:
@@ -542,27 +529,6 @@ def main() -> None:
         where.write_text(page(command, minutes, entries, service.crashes, wrong, sets) + judged(where))
     _say(f"{len(entries)} faults, {len(service.crashes)} crashes, {len(wrong)} wrong publications")
     sys.exit(bool(service.crashes or wrong))
-
-
-def _attack(scene: Scene, names: Sequence[str], entries: list[Entry], seconds: float) -> float:
-    """Waits for a first estimate, then throws faults for `seconds`; returns how long it did so [min]."""
-    first = _recovered(scene.service, time.time(), START_LIMIT)
-    if first is None:
-        sys.exit(f"the service made no estimate within {START_LIMIT:.0f} s: {scene.service.lines[-3:]}")
-    _say(f"first estimate after {first:.0f} s; now the faults")
-    begin = time.time()
-    _throw(scene, names, entries, begin + seconds)
-    return (time.time() - begin) / 60.0
-
-
-def _land(scene: Scene) -> None:
-    """Ends service and vehicle; takes the last numbered sets from the history."""
-    scene.service.check()
-    if scene.service.child is not None:
-        scene.service.newest_estimate()
-        scene.service.end(signal.SIGTERM)
-    scene.vehicle.stop()
-    scene.service.newest_estimate()
 
 
 def _throw(scene: Scene, names: Sequence[str], entries: list[Entry], until: float) -> None:
@@ -635,12 +601,6 @@ def small_disk(where: Path) -> Iterator[bool]:
             subprocess.run(["umount", "-l", str(where)], check=False)
 
 
-def _free_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
-
-
 def _say(text: str) -> None:
     print(f"{time.strftime('%H:%M:%S')} {text}", flush=True)
 
@@ -658,18 +618,16 @@ def page(
         "* Wrong publications (b, J_xx or J_yy more than 5 % off, not in the history, or under another set's number): "
         f"**{len(wrong)}** of {sets} sets", "",
         "Recovery: from the end of the fault to the next estimate; a window takes 5 s.", "",
-        "| fault (times) | recovery [s]: median, longest |",
-        "|---|---|",
     ]  # fmt: skip
+    rows = []
     for name in FAULTS:
         found = [e for e in entries if e["name"] == name]
         times = [e["recovered"] for e in found if e["recovered"] is not None]
-        if not found:
-            lines.append(f"| {name} (0) | – |")
-        elif times:
-            lines.append(f"| {name} ({len(found)}) | {np.median(times):.1f}, {max(times):.1f} |")
-        else:
-            lines.append(f"| {name} ({len(found)}) | **none**: {found[-1]['did']} |")
+        told = (
+            f"{np.median(times):.1f}, {max(times):.1f}" if times else f"**none**: {found[-1]['did']}" if found else "–"
+        )
+        rows.append((f"{name} ({len(found)})", told))
+    lines += table(("fault (times)", "recovery [s]: median, longest"), rows)
     for title, items in (("Crashes", crashes), ("Wrong", wrong)):
         if items:
             lines += ["", f"{title}:", *(f"* {item}" for item in items)]

@@ -19,11 +19,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from quadid_evaluation.harness import options
+from quadid_evaluation.harness import QUADID, options
 
 Answer = tuple[int, str, Mapping[str, Any]]
 """Exit code, what was said (stdout and stderr), and the JSON."""
-QUADID = Path(sys.executable).with_name("quadid")
 
 
 def answer_of(arguments: Sequence[str | Path]) -> Answer:
@@ -34,7 +33,7 @@ def answer_of(arguments: Sequence[str | Path]) -> Answer:
         wants = [] if arguments[0] in ("init", "bash") else ["--json", result]
         run = subprocess.run(
             [*map(str, [*program, *arguments, *wants])], capture_output=True, text=True, check=False,
-            env={**os.environ, "Q": str(QUADID), "P": sys.executable, "PYTHONWARNINGS": "ignore"},
+            env={**os.environ, "Q": QUADID, "P": sys.executable, "PYTHONWARNINGS": "ignore"},
         )  # fmt: skip
         data = json.loads(result.read_text(encoding="utf-8")) if result.exists() else {}
     return run.returncode, f"{run.stderr}{run.stdout}", data

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 import quadid
 from quadid.app.logs import load_vehicle
@@ -324,17 +325,16 @@ def _runs(w: Window, seconds: float) -> tuple[FloatArray, FloatArray] | None:
     start = np.arange(0, len(w) - steps, every)
     start = start[known[start] & known[start + steps]]
     end = start + steps
-    turn = _matrix(w.attitude)
-    into = turn[start].transpose(0, 2, 1)
+    before, after = (Rotation.from_quat(w.attitude[rows], scalar_first=True) for rows in (start, end))
     edges = np.linspace(0, steps, BINS + 1).astype(int)
     sums = np.cumsum(np.vstack([np.zeros(w.rotor_speed.shape[1]), w.rotor_speed]), axis=0)
     inputs = [(sums[start + b] - sums[start + a]) / (b - a) for a, b in zip(edges[:-1], edges[1:], strict=True)]
-    state = [np.einsum("nij,nj->ni", into, w.velocity[start]), w.gyro[start], turn[start, 2]]
+    state = [before.apply(w.velocity[start], inverse=True), w.gyro[start], before.apply([0.0, 0.0, 1.0], inverse=True)]
     place = np.zeros_like(w.velocity) if w.position is None else np.nan_to_num(w.position)
     changes = [
-        np.einsum("nij,nj->ni", into, place[end] - place[start]),
-        np.einsum("nij,nj->ni", into, w.velocity[end] - w.velocity[start]),
-        _rotation_vector(np.einsum("nij,njk->nik", into, turn[end])),
+        before.apply(place[end] - place[start], inverse=True),
+        before.apply(w.velocity[end] - w.velocity[start], inverse=True),
+        (before.inv() * after).as_rotvec(),
         w.gyro[end] - w.gyro[start],
     ]
     return np.concatenate([*state, *inputs], axis=1), np.stack(changes, axis=1)
@@ -400,38 +400,10 @@ def shares(predict: Predictor, unseen: Runs) -> FloatArray:
 def _errors(truth: FloatArray, guess: FloatArray) -> FloatArray:
     """Errors (runs, 4): Euclidean, of turns the angle between them."""
     miss = truth - guess
-    between = np.einsum("nji,njk->nik", _turn(guess[:, 2]), _turn(truth[:, 2]))
-    angle = np.arccos(np.clip((np.trace(between, axis1=1, axis2=2) - 1.0) / 2.0, -1.0, 1.0))
+    angle = (Rotation.from_rotvec(guess[:, 2]).inv() * Rotation.from_rotvec(truth[:, 2])).magnitude()
     miss[:, 2] = 0.0
     miss[:, 2, 0] = 2.0 * np.sin(0.5 * angle)  # `lengths` takes an axis times twice the sine of half the angle
     return lengths(miss)
-
-
-def _matrix(q: FloatArray) -> FloatArray:
-    """Rotation matrices of quaternions wxyz, shape (n, 3, 3)."""
-    w, x, y, z = q.T
-    rows = [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y), 2 * (x * y + w * z),
-            1 - 2 * (x * x + z * z), 2 * (y * z - w * x), 2 * (x * z - w * y), 2 * (y * z + w * x),
-            1 - 2 * (x * x + y * y)]  # fmt: skip
-    return np.stack(rows, axis=1).reshape(-1, 3, 3)
-
-
-def _rotation_vector(turn: FloatArray) -> FloatArray:
-    angle = np.arccos(np.clip((np.trace(turn, axis1=1, axis2=2) - 1.0) / 2.0, -1.0, 1.0))
-    axis = np.stack([turn[:, 2, 1] - turn[:, 1, 2], turn[:, 0, 2] - turn[:, 2, 0], turn[:, 1, 0] - turn[:, 0, 1]], 1)
-    length = np.linalg.norm(axis, axis=1)
-    return np.asarray(axis * (angle / np.maximum(length, 1e-12))[:, None])
-
-
-def _turn(vector: FloatArray) -> FloatArray:
-    """Rotation matrices of rotation vectors (Rodrigues), shape (n, 3, 3)."""
-    angle = np.linalg.norm(vector, axis=1)
-    k = vector / np.maximum(angle, 1e-12)[:, None]
-    cross = np.zeros((len(k), 3, 3))
-    cross[:, 0, 1], cross[:, 0, 2], cross[:, 1, 2] = -k[:, 2], k[:, 1], -k[:, 0]
-    cross -= cross.transpose(0, 2, 1)
-    sine, cosine = np.sin(angle)[:, None, None], np.cos(angle)[:, None, None]
-    return np.asarray(np.eye(3) + sine * cross + (1.0 - cosine) * cross @ cross)
 
 
 # --- The measurement

@@ -16,13 +16,14 @@ from typing import NamedTuple
 
 import numpy as np
 from quadid_replay import open_log
+from quadid_replay.frames import from_euler
 
 import quadid
 from quadid.app.logs import LogPart, check_conventions, load_vehicle
 from quadid.checks import CheckResult, inspect
 from quadid.data.window import Channel, Recording
 from quadid.errors import LogError
-from quadid.rotation import conjugate, continuous_sign, euler, exponential, product
+from quadid.rotation import conjugate, continuous_sign, euler, product
 from quadid.types import FloatArray
 from quadid.vehicle import Rotor, Vehicle
 from quadid_evaluation.harness import options, put, table
@@ -129,12 +130,6 @@ def held(names: str, rate: float) -> Callable[[Recording, Vehicle], Log]:
 def attitude(change: Callable[[FloatArray], FloatArray]) -> Callable[[Recording, Vehicle], Log]:
     """A recording whose attitude is changed, where it has one."""
     return lambda r, v: (changed(r, attitude=change(values(r, "attitude"))) if "attitude" in r.channels else r, v)
-
-
-def of_euler(angles: FloatArray) -> FloatArray:
-    """Quaternions of roll, pitch and yaw [rad], all (n, ·)."""
-    roll, pitch, yaw = (exponential(np.eye(3)[k] * angles[:, k : k + 1]) for k in range(3))
-    return product(product(yaw, pitch), roll)
 
 
 def enu(r: Recording, v: Vehicle) -> Log:
@@ -304,9 +299,9 @@ MISTAKES: tuple[Mistake, ...] = (
     Mistake("attitude 100 ms late", late("attitude", 0.1), "attitude comes"),
     Mistake("attitude 200 ms late", late("attitude", 0.2), "attitude comes"),
     Mistake("attitude in steps of 1 deg", attitude(
-        lambda q: of_euler(np.radians(np.round(np.degrees(euler(q)))))), "in steps"),
+        lambda q: from_euler(np.radians(np.round(np.degrees(euler(q)))))), "in steps"),
     Mistake("attitude in steps of 5 deg", attitude(
-        lambda q: of_euler(np.radians(5.0 * np.round(np.degrees(euler(q)) / 5.0)))), "in steps"),
+        lambda q: from_euler(np.radians(5.0 * np.round(np.degrees(euler(q)) / 5.0)))), "in steps"),
     Mistake("attitude held at 10 Hz", held("attitude", 10.0), "^$|attitude.*Hz"),
     Mistake("gyro clipped", clipped, "limit of its range"),
     Mistake("rotors in rpm", scaled("rotor_speed", 30.0 / np.pi), "in rpm"),

@@ -18,12 +18,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from quadid_replay.frames import from_euler
 from scipy.signal import butter, sosfiltfilt
 
 from quadid.data.window import Block, Recording
 from quadid.flight import Flight, fly
 from quadid.online import Job, Publish, Session, SessionSettings
 from quadid.online.records import OnlineSet
+from quadid.rotation import euler
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 from quadid_evaluation.harness import judged, options, table
@@ -130,15 +132,7 @@ def late(channel: str, seconds: float) -> Spoil:
 
 def turned(q: FloatArray, factor: FloatArray) -> FloatArray:
     """Attitudes whose roll and pitch are multiplied, heading as it was; shapes (n, 4) and (n,)."""
-    w, x, y, z = q.T
-    roll = np.arctan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y)) * factor
-    pitch = np.arcsin(np.clip(2.0 * (w * y - z * x), -1.0, 1.0)) * factor
-    yaw = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
-    (cr, sr), (cp, sp), (cy, sy) = ((np.cos(0.5 * a), np.sin(0.5 * a)) for a in (roll, pitch, yaw))
-    return np.column_stack([
-        cr * cp * cy + sr * sp * sy, sr * cp * cy - cr * sp * sy,
-        cr * sp * cy + sr * cp * sy, cr * cp * sy - sr * sp * cy,
-    ])  # fmt: skip
+    return from_euler(euler(q) * np.column_stack([factor, factor, np.ones(len(q))]))
 
 
 def fly_online(session: Session, recording: Recording, start: float, stop: float) -> list[OnlineSet]:

@@ -29,7 +29,7 @@ from pymavlink import mavutil
 
 from quadid.flight.pilot import AXES, PILOT_STEP, Segment, scripted
 from quadid.types import FloatArray
-from quadid_evaluation.harness import Given, options, put
+from quadid_evaluation.harness import QUADID, Given, options, put
 from quadid_evaluation.studies.autopilot import TITLE, Flown, Outcome, listen, row, section, stored
 
 PILOT, SERVICE = 5760, 5762
@@ -122,11 +122,11 @@ def flown(given: Given) -> Outcome:
              "--speedup", "1"],
             cwd=folder, stdout=subprocess.DEVNULL, stderr=subprocess.STDOUT,
         )  # fmt: skip
-        quadid, said, ready = str(Path(sys.executable).with_name("quadid")), list[str](), threading.Event()
+        said, ready = list[str](), threading.Event()
         try:
             link = mavutil.mavlink_connection(f"tcp:127.0.0.1:{PILOT}", retries=60)
             served = subprocess.Popen(
-                [quadid, "serve", "--vehicle", str(given.vehicle), "--mavlink", f"tcp:127.0.0.1:{SERVICE}",
+                [QUADID, "serve", "--vehicle", str(given.vehicle), "--mavlink", f"tcp:127.0.0.1:{SERVICE}",
                  "--history", str(history)],
                 stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
             )  # fmt: skip

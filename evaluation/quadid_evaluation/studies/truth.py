@@ -9,6 +9,7 @@ run alone replaces its own section of the page and leaves the others.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -45,7 +46,7 @@ class Outcome:
     status: tuple[str, ...]
 
 
-def poor_guess(vehicle: Vehicle, truth: dict[str, float], seed: int, spread: float = 0.3) -> Vehicle:
+def poor_guess(vehicle: Vehicle, truth: Mapping[str, float], seed: int, spread: float = 0.3) -> Vehicle:
     """The vehicle with each initial value off by a log-uniform factor up to exp(`spread`)."""
     rng = np.random.default_rng([seed, 5])
     priors = {n: ParameterPrior(initial=truth[n] * float(np.exp(rng.uniform(-spread, spread)))) for n in NOMINAL_NAMES}

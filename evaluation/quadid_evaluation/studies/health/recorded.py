@@ -7,7 +7,6 @@ import json
 import os
 import shutil
 import subprocess
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import product
@@ -24,7 +23,7 @@ from quadid.condition import FlightTrim, Health, assess, flight_trim
 from quadid.data.window import Recording
 from quadid.errors import QuadidError
 from quadid.vehicle import Vehicle
-from quadid_evaluation.harness import share, table
+from quadid_evaluation.harness import QUADID, share, table
 
 CRAZYFLIE = Vehicle.shipped("crazyflie")
 LARGE = 3.0
@@ -288,7 +287,7 @@ def fleet(flights: Sequence[Flown], data: Path) -> str:
             for k, flown in enumerate(sorted(mine, key=lambda f: (f.total, f.file))):
                 copy = shutil.copy(data / flown.file, logs / name)
                 os.utime(copy, (_FIRST + _DAY * k, _FIRST + _DAY * k))
-        command = [str(Path(sys.executable).with_name("quadid")), "fleet", str(logs), "--vehicle", "crazyflie"]
+        command = [QUADID, "fleet", str(logs), "--vehicle", "crazyflie"]
         subprocess.run(
             [*command, "--out", str(out), "--json", str(out / "fleet.json")], check=True, stdout=subprocess.DEVNULL
         )

@@ -20,7 +20,7 @@ from quadid.online import OnlineDiagnosis, Publish, Session
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 from quadid_evaluation.benchmarks.online import CHANGE, CHANGE_AT, PELICAN, drive, flown, samples
-from quadid_evaluation.studies.peers.simulated import guessed
+from quadid_evaluation.studies.truth import poor_guess
 
 NAMES = ("b", "d", "J_xx", "J_yy", "J_zz")
 SEEDS = range(1, 6)
@@ -120,7 +120,7 @@ def _filtered(who: str, seed: int) -> tuple[FloatArray, float, float]:
     """Errors after a minute (5,), seconds until a change of mass is seen, processor time per second of flight."""
     flight = flown(SECONDS + 1.0, seed)
     truth = flight.truth.parameters.as_dict()
-    vehicle = guessed(truth, seed)
+    vehicle = poor_guess(PELICAN, truth, seed)
     start = np.concatenate([np.zeros(3), np.log([vehicle.parameters[n].initial for n in NAMES])])
     begin = time.process_time()
     *_, last = FILTERS[who](flight.window, vehicle, start)
@@ -138,7 +138,7 @@ def _session(seed: int) -> tuple[FloatArray, float, float]:
     flight = flown(SECONDS + 1.0, seed)
     truth: Mapping[str, float] = flight.truth.parameters.as_dict()
     begin = time.process_time()
-    actions = list(drive(Session(guessed(truth, seed)), samples(flight.recording)))
+    actions = list(drive(Session(poor_guess(PELICAN, truth, seed)), samples(flight.recording)))
     cost = (time.process_time() - begin) / SECONDS
     last = [a.item for a in actions if isinstance(a, Publish) and a.topic == "candidate"][-1].parameters
     changed = flown(CHANGE_AT + 12.0, seed, mass_change={"time": CHANGE_AT, "fraction": CHANGE})

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import product
 from typing import Any
@@ -17,10 +17,11 @@ from quadid.identification.predict import mean_errors, no_change
 from quadid.model.layout import Layout
 from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray
-from quadid.vehicle import ParameterPrior, Vehicle
+from quadid.vehicle import Vehicle
 from quadid_evaluation.harness import share, table
 from quadid_evaluation.studies.peers import mujoco_sysid, output_error
 from quadid_evaluation.studies.peers.mujoco_sysid import Answer
+from quadid_evaluation.studies.truth import poor_guess
 
 SECONDS = 60.0
 AHEAD = 25
@@ -38,13 +39,6 @@ def body(seed: int) -> TruthParameters:
     """A drawn Pelican whose J_zz is that of a body, which MuJoCo insists on."""
     truth = draw_truth(Vehicle.shipped("pelican"), seed)
     return replace(truth, J_zz=min(truth.J_zz, 0.9 * (truth.J_xx + truth.J_yy)))
-
-
-def guessed(truth: Mapping[str, float], seed: int) -> Vehicle:
-    """The vehicle with every initial value off by up to 35 %."""
-    rng = np.random.default_rng([seed, 5])
-    priors = {n: ParameterPrior(initial=truth[n] * float(np.exp(rng.uniform(-0.3, 0.3)))) for n in NOMINAL_NAMES}
-    return Vehicle.shipped("pelican").model_copy(update={"parameters": priors})
 
 
 def warm_up() -> None:
@@ -78,7 +72,7 @@ def record(case: str, seed: int, program: str) -> Record:
     window, unseen = (
         fly(vehicle, truth, SECONDS, s, noise=noise, effects=effects).window for s in (seed, 10**6 + seed)
     )
-    answer, statuses = PROGRAMS[program](window, guessed(numbers, seed))
+    answer, statuses = PROGRAMS[program](window, poor_guess(vehicle, numbers, seed))
     theta = Layout(vehicle).initial(vehicle)
     theta[: len(NOMINAL_NAMES)] = np.exp(answer.values)
     ahead = mean_errors([unseen], vehicle, theta, AHEAD)["rate"] / no_change([unseen], vehicle, AHEAD)["rate"]
