@@ -407,8 +407,9 @@ def in_force(db: sqlite3.Connection, name: str, gate: GateSettings, vehicle: Veh
         return last
     told = stored(db, name, f"({_FORCE} OR state = 'stale') ORDER BY rowid DESC", gate, vehicle).item or last.item
     item = replace(last.item, outdated=told.outdated, outdated_code=told.outdated_code)
-    if vehicle is not None and not item.outdated and abs(item.mass / vehicle.mass - 1.0) > _SAME_MASS:
-        why = f"it rests on a mass of {item.mass:g} kg, the vehicle file has {vehicle.mass:g} kg"
+    if vehicle is not None and not item.outdated and not abs(item.mass / vehicle.mass - 1.0) <= _SAME_MASS:
+        rests = "a mass that it does not state" if math.isnan(item.mass) else f"a mass of {item.mass:g} kg"
+        why = f"it rests on {rests}, the vehicle file has {vehicle.mass:g} kg"
         item = replace(item, outdated=why, outdated_code="mass_change")
     return last._replace(item=item, confirmed=told.state is not SetState.STALE)
 

@@ -144,6 +144,12 @@ DOUBTFUL = {
         (GOOD, replace(GOOD, state=SetState.STALE, outdated="thrust stepped")), "out of date: thrust stepped"),
     "not confirmed since a restart": ((GOOD, replace(GOOD, state=SetState.STALE)), "stale: no flight has confirmed it"),
     "of another mass": ((replace(GOOD, mass=1.35),), "a mass of 1.35 kg, the vehicle file has 1.3 kg"),
+    "of a mass not stated": ((replace(GOOD, mass=math.nan),), "a mass that it does not state"),
+    "rolled back to and withdrawn": (
+        (GOOD, *(replace(GOOD, state=SetState.ROLLED_BACK, outdated=why) for why in ("", "stepped"))),
+        "out of date: stepped"),
+    "withdrawn, and another waits": (
+        (GOOD, replace(GOOD, outdated="stepped"), replace(GOOD, state=SetState.PENDING)), "out of date: stepped"),
     "of a mass that is none": ((replace(GOOD, mass=130.0),), "a mass of 130 kg, the vehicle has 1.3 kg"),
     "no plausible one": ((GOOD, MAD), "no set that a fit makes"),
 }  # fmt: skip
