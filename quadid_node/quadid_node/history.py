@@ -263,17 +263,19 @@ def _set(wall: float, data: str) -> dict[str, Any]:
 #
 # The lock lies on the database itself (a byte of the file beyond any content, one a vehicle), so that links, bind
 # mounts and cleaners change nothing.  It belongs to an open file description: other locks of this process, as
-# SQLite's, and their end leave it alone.
+# SQLite's, and their end leave it alone.  SQLite keeps the log of what is not in the file yet beside its name: services
+# of several vehicles share a file, but only by one name in one folder, for which another byte stands.
 
-_FIRST = 1 << 60
-"""First byte of the locks: SQLite's lie at 2^30."""
-_LOCK = getattr(fcntl, "F_OFD_SETLK", fcntl.F_SETLK)
+_FIRST, _NAMES = 1 << 60, (1 << 60) + (1 << 32)
+"""First bytes of the locks of vehicles and names: SQLite's lie at 2^30."""
+_LOCK, _TEST = (getattr(fcntl, f"F_OFD_{do}", getattr(fcntl, f"F_{do}")) for do in ("SETLK", "GETLK"))
+_FREE = struct.pack("h", fcntl.F_UNLCK)
 _File = tuple[int, int]
 """Device and inode."""
 _guard = threading.Lock()
-_locked: dict[_File, tuple[int, set[str]]] = {}
-"""Files with a lock of this process: descriptor and vehicles; each is opened once, since closing a second descriptor
-would take SQLite's own locks of it away."""
+_locked: dict[_File, tuple[int, set[str], int]] = {}
+"""Files with a lock of this process: descriptor, vehicles and name; each is opened once, since closing a second
+descriptor would take SQLite's own locks of it away."""
 
 
 class HistoryLock:
@@ -312,7 +314,7 @@ class HistoryLock:
         with _guard:
             file, self._file = self._file, None
             if file is not None:
-                descriptor, vehicles = _locked[file]
+                descriptor, vehicles, _ = _locked[file]
                 vehicles.remove(self._vehicle)
                 fcntl.fcntl(descriptor, _LOCK, self._byte(fcntl.F_UNLCK))
                 _close_unused(file)
@@ -320,9 +322,10 @@ class HistoryLock:
     def _take(self) -> None:
         opened = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_NONBLOCK, 0o644)
         found = os.fstat(opened)
-        file = (found.st_dev, found.st_ino)
+        file, folder = (found.st_dev, found.st_ino), self._path.parent.stat()
+        name = zlib.crc32(f"{folder.st_dev} {folder.st_ino} {self._path.name}".encode())
         with _guard:
-            descriptor, vehicles = _locked.setdefault(file, (opened, set()))
+            descriptor, vehicles, known = _locked.setdefault(file, (opened, set(), name))
             if descriptor != opened:
                 os.close(opened)
             try:
@@ -336,6 +339,14 @@ class HistoryLock:
                     )  # fmt: skip
                 if self._vehicle in vehicles:
                     raise BlockingIOError
+                fcntl.fcntl(descriptor, _LOCK, _flock(fcntl.F_RDLCK, _NAMES + known))
+                beside = (_NAMES, known), (_NAMES + known + 1, (1 << 32) - known - 1)
+                if name != known or any(_is_locked(descriptor, *part) for part in beside):
+                    raise StoreError(
+                        f"another service has the history {self._path} open by another name (as by a bind mount of the "
+                        "file): by each it would be another database",
+                        "one name in one folder", "mount the folder, not the file",
+                    )  # fmt: skip
                 fcntl.fcntl(descriptor, _LOCK, self._byte(fcntl.F_WRLCK))
                 vehicles.add(self._vehicle)
                 self._file = file
@@ -348,12 +359,22 @@ class HistoryLock:
                 _close_unused(file)
 
     def _byte(self, kind: int) -> bytes:
-        """A `struct flock` of the byte that stands for the vehicle."""
-        return struct.pack("hhqqi", kind, os.SEEK_SET, _FIRST + zlib.crc32(self._vehicle.encode()), 1, 0)
+        """Lock of the byte that stands for the vehicle."""
+        return _flock(kind, _FIRST + zlib.crc32(self._vehicle.encode()))
+
+
+def _flock(kind: int, first: int, count: int = 1) -> bytes:
+    """A `struct flock` of some bytes."""
+    return struct.pack("hhqqi", kind, os.SEEK_SET, first, count, 0)
+
+
+def _is_locked(descriptor: int, first: int, count: int) -> bool:
+    """True if somebody else has a lock on one of some bytes."""
+    return bool(count) and fcntl.fcntl(descriptor, _TEST, _flock(fcntl.F_WRLCK, first, count))[:2] != _FREE
 
 
 def _close_unused(file: _File) -> None:
-    descriptor, vehicles = _locked[file]
+    descriptor, vehicles, _ = _locked[file]
     if not vehicles:
         del _locked[file]
         os.close(descriptor)

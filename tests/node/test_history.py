@@ -37,13 +37,14 @@ from tests.online.test_gate import TRUE, online_set
 PELICAN = Vehicle.shipped("pelican")
 
 
-OTHERS = """
+OTHERS = r"""
 import sys
 from pathlib import Path
 from quadid_node.history import Store, StoreError
 for line in sys.stdin:
     try:
-        Store(Path(line.strip()), "pelican").close()
+        path, vehicle = line[:-1].split("\t")
+        Store(Path(path), vehicle).close()
         print()
     except StoreError as error:
         print(error)
@@ -57,12 +58,12 @@ def others() -> subprocess.Popen[str]:
     return subprocess.Popen([sys.executable, "-c", OTHERS], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
 
 
-def another_process(path: Path) -> str:
+def another_process(path: Path, vehicle: str = "pelican") -> str:
     """What a second service says that opens the history; empty where it is let in."""
     told, heard = others().stdin, others().stdout
     assert told is not None
     assert heard is not None
-    told.write(f"{path}\n")
+    told.write(f"{path}\t{vehicle}\n")
     told.flush()
     return heard.readline().strip()
 
@@ -259,6 +260,29 @@ def test_a_file_that_another_service_put_there_is_not_written(tmp_path: Path) ->
     assert ours.flush(30.0)
     assert lines(path) == ["theirs", "second"]
     ours.close()
+
+
+def test_services_of_several_vehicles_share_a_file_by_one_name_only(tmp_path: Path, happened: Happened) -> None:
+    """As by a bind mount of the file, which a rename stands for: by two names SQLite has two logs of one file, and rows
+    that were on the disk are gone.
+    """
+    path, aside = tmp_path / "h.sqlite", tmp_path / "aside.sqlite"
+    (tmp_path / "link").symlink_to(tmp_path)
+    store = Store(path, "pelican")
+    assert say(store, "first")
+    assert not another_process(path, "hexacopter")
+    assert not another_process(tmp_path / "link" / "h.sqlite", "hexacopter"), "the same folder"
+    path.rename(aside)
+    told = another_process(aside, "hexacopter")
+    assert "open by another name" in told
+    with pytest.raises(StoreError, match="open by another name"):
+        Store(aside, "hexacopter")
+    aside.rename(path)
+    assert not another_process(path, "hexacopter")
+    store.close(60.0)
+    path.rename(aside)
+    assert not another_process(aside, "hexacopter")
+    happened(44, f"a second vehicle's service by another name of the same file: '{told[-160:]}'")
 
 
 def test_two_names_of_one_file_are_refused_at_the_start(tmp_path: Path, happened: Happened) -> None:
