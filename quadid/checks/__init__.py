@@ -27,6 +27,7 @@ from quadid.checks.rotors import (
     Lagged,
     better_description,
     geometry_check,
+    gyro_filter_check,
     hover_check,
     lagged_motion,
     mass_check,
@@ -112,7 +113,8 @@ class Log:
             again = rotor_timing_check(recording, other.vehicle, spans)
             own, its = (check.numbers.get("correlation", 0.0) for check in (time, again))
             fits = again.verdict is CheckResult.OK and its >= own - 1e-9
-            if fits and rotor_speed_check(recording, other.vehicle, spans).verdict is not CheckResult.ERROR:
+            out_of_balance = (CheckResult.ERROR, CheckResult.WARNING)
+            if fits and rotor_speed_check(recording, other.vehicle, spans).verdict not in out_of_balance:
                 return {"motor_order": motor_order_check(lagged, vehicle, other)}
         wrong = [check for check in (time, balance) if check.verdict is CheckResult.ERROR]
         if wrong:
@@ -164,7 +166,12 @@ STAGES: tuple[tuple[Question, ...], ...] = (
             lambda log: mass_check(log.recording, log.known, log.spans, log.hover.numbers.get("b_from_hover")),
             fatal=False,
         ),
-        Question("geometry", lambda log: geometry_check(log.lagged, log.known), fatal=False),
+        Question(
+            "geometry",
+            lambda log: geometry_check(log.lagged, log.known, log.hover.numbers.get("b_from_hover")),
+            fatal=False,
+        ),
+        Question("gyro_source", lambda log: gyro_filter_check(log.recording, log.known, log.spans), fatal=False),
     ),
 )
 FATAL = {"saturated", *(question.name for stage in STAGES for question in stage if question.fatal)}

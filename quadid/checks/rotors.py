@@ -82,6 +82,9 @@ def rotor_timing_check(recording: Recording, vehicle: Vehicle, spans: Spans) -> 
         f"which wanders by {1e3 * (high - low):.0f} ms"
     )
     fix = "stamp the rotor signal by the clock that stamps the IMU, or log both on board"
+    if high - low > 0.02 and correlation < 0.5:
+        weak = f"{message}: too weak to tell a clock from other motion"
+        return Check(name, CheckResult.UNKNOWN, weak, numbers=numbers)
     if high - low > 0.02:  # [s]; a centre of gravity a tenth of the arm off makes 16 ms
         return Check(name, CheckResult.ERROR, f"{message}: the rotor signal is not in time with the gyro", fix, numbers)
     if -_TOO_LATE < lag < -_LATE:
@@ -108,12 +111,16 @@ def _blocks(spans: Spans) -> list[FloatArray]:
 
 def _peaks(signal: RotorSignal, gyro: Channel, vehicle: Vehicle, at: FloatArray, width: int) -> list[_Peak]:
     """Peaks of one block at times `at`, with both signals smoothed over `width` of its rows."""
+    torque, motion = (_quick(rows, width) for rows in _answered(signal, gyro, vehicle, at))
+    return [_peak(torque[:, axis], motion[:, axis]) for axis in range(2)]
+
+
+def _answered(signal: RotorSignal, gyro: Channel, vehicle: Vehicle, at: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Roll and pitch torque over b and angular acceleration at the times of a block, both (n, 2)."""
     turning, speeds = _around(gyro.t, at), _around(signal.t, at)
     rates = linear(gyro.t[turning], gyro.values[turning, :2], at)
     squares = linear(signal.t[speeds], signal.values[speeds] ** 2, at)
-    motion = _quick(np.gradient(rates, _STEP, axis=0), width)
-    torque = _quick(squares @ vehicle.torque_arms[:, :2], width)
-    return [_peak(torque[:, axis], motion[:, axis]) for axis in range(2)]
+    return squares @ vehicle.torque_arms[:, :2], np.gradient(rates, _STEP, axis=0)
 
 
 def _around(t: FloatArray, at: FloatArray) -> slice:
@@ -138,6 +145,58 @@ def _peak(torque: FloatArray, motion: FloatArray) -> _Peak:
         before, here, after = scores[best - 1 : best + 2]
         shift = 0.5 * float((before - after) / (before - 2.0 * here + after))
     return _Peak((best - far + shift) * _STEP, float(scores[best]), float(np.std(later)))
+
+
+_OCTAVES = 1.0, 1.5, 2.25, 3.4, 5.0, 7.5, 11.0
+"""Edges of bands [Hz] in which the motion that torque makes is compared: its size over that of the torque."""
+_FLAT = 0.45
+"""Share of a slower band's answer that is left where the gyro was filtered; bodies answer torque alike at each."""
+
+
+def gyro_filter_check(recording: Recording, vehicle: Vehicle, spans: Spans) -> Check | None:
+    """A warning where the gyro hardly answers quick torque that it answers when slow: it was low-passed; else None.
+
+    What makes motion small makes it late, motors and sensors alike; only smoothing of a log does not.  With measured
+    speeds no motor is between torque and motion, and what is late is the gyro's filter.
+    """
+    gyro = recording.channels.get("gyro")
+    if gyro is None or not spans:
+        return None
+    signal = rotor_signal(recording, vehicle)
+    rows = round(2.0 / _STEP)
+    spectra = []
+    for at in _blocks(spans):
+        parts = np.hstack(_answered(signal, gyro, vehicle, at))
+        parts = np.lib.stride_tricks.sliding_window_view(parts, rows, axis=0)[:: rows // 2]
+        spectra.append(np.fft.rfft((parts - parts.mean(axis=-1, keepdims=True)) * np.hanning(rows)))
+    if sum(map(len, spectra)) < 5:
+        return None
+    torque, motion = np.split(np.concatenate(spectra), 2, axis=1)
+    cross, acted, turned = (
+        np.sum(x, axis=0) for x in (motion * torque.conj(), np.abs(torque) ** 2, np.abs(motion) ** 2)
+    )
+    place = np.digitize(np.fft.rfftfreq(rows, _STEP), _OCTAVES)
+    slowest = max(measured_period(signal.t, signal.values), sample_period(gyro.t))
+    bands = [k for k in range(1, len(_OCTAVES)) if _OCTAVES[k] < 0.4 / slowest]
+    sums = [
+        [np.sum(x[:, place == k], axis=1) for x in (cross, acted, turned, np.abs(cross) ** 2 / acted)] for k in bands
+    ]
+    found = []
+    for (low, (along, *slow)), (high, (then, *fast)) in combinations(zip(bands, sums, strict=True), 2):
+        clear, clear_then = slow[2] / slow[1], fast[2] / fast[1]
+        if min(clear.min(), clear_then.min()) > _CLEAR + 0.2:  # the least answer that is likely, and the most
+            left = np.sqrt(fast[1] / fast[0] / clear_then / (slow[1] / slow[0] * clear))
+            found.append((float(left.max()), low, high, float(np.abs(np.angle(then * along.conj())).max())))
+    left, low, high, lag = min(found, default=(1.0, 0, 0, 0.0))
+    smoothed = lag < 0.75 * math.acos(min(left, 1.0))
+    measured = vehicle.command.sampling == "instant" and "imu_lag" not in vehicle.effects
+    if left > _FLAT or not (smoothed or measured):
+        return None
+    slower, quicker = (math.sqrt(_OCTAVES[k - 1] * _OCTAVES[k]) for k in (low, high))
+    message = f"gyro answers torque at {quicker:.2g} Hz by {left:.0%} of what it does at {slower:.2g} Hz: it was "
+    message += "smoothed without a delay" if smoothed else "low-passed"
+    fix = "log the raw gyro, else inertias come out too large" + ("" if smoothed else "; `imu_lag` models a filter")
+    return Check("gyro_source", CheckResult.WARNING, message, fix, {"left": left, "lag_rad": lag})
 
 
 # --- Rotor signals against each other, the thrust felt and the motion: dead, stuck, halved, and out of time
@@ -450,9 +509,13 @@ def motor_order_check(lagged: Lagged | str, vehicle: Vehicle, other: Other | Non
     if other is not None:
         r, p, y = other.correlation
         return check(CheckResult.ERROR, f"{text}; {other.told} ({r:.2f}, {p:.2f}, {y:.2f})", other.fix)
-    if min(own[0], own[1]) > _SETTLED:
-        return check(CheckResult.OK, text)
-    return check(CheckResult.UNKNOWN, f"{text}: too weak to judge")
+    if min(own[0], own[1]) <= _SETTLED:
+        return check(CheckResult.UNKNOWN, f"{text}: too weak to judge")
+    if pairs := _tilted_pairs(lagged, vehicle):
+        pair = _listed(pairs)
+        unclear = f"{text}; yaw follows roll and pitch as if rotor {pair} turned the other way, or the gyro were tilted"
+        return check(CheckResult.WARNING, unclear, f"check the spins of rotor {pair}, and how the IMU is mounted")
+    return check(CheckResult.OK, text)
 
 
 def lagged_motion(recording: Recording, vehicle: Vehicle, spans: Spans) -> Lagged | str:
@@ -539,7 +602,9 @@ def better_description(lagged: Lagged | str, vehicle: Vehicle) -> Other | None:
             for sign in (1.0, -1.0):
                 ((_, axes),) = _best(grams, _rotated(vehicle, angle), [order], sign)
                 named.append((float(_gain(axes)) - _CHANGE * (_moved(order) + (sign < 0.0) + 1.5), angle, order, axes))
-    best = max((one for one in named if np.mean(one[3][:2]) >= _SETTLED), key=lambda one: one[0], default=own)
+    # What is right explains neither roll nor pitch worse: one axis may be bought with the other.
+    fair = [one for one in named if np.mean(one[3][:2]) >= _SETTLED and np.all(one[3][:2] > own[3][:2] - 0.1)]
+    best = max(fair, key=lambda one: one[0], default=own)
     least = _GAIN - 1.5 * _CHANGE * (best[1] != 0.0)  # what a turn costs only puts it behind an order
     _, angle, order, axes = best if best[0] - own[0] >= least else own
     described = _rotated(vehicle, angle) if angle else vehicle
@@ -560,8 +625,8 @@ def better_description(lagged: Lagged | str, vehicle: Vehicle) -> Other | None:
         told.append("yaw is reversed")
         fix.append("negate the spins in the vehicle file")
     elif spins:
-        which = " or ".join(" and ".join(str(k + 1) for k in one) for one in spins)
-        told.append(f"rotor {which} {'turns' if len(spins[0]) == 1 else 'turn'} the other way")
+        which = _listed(spins)
+        told.append(f"rotor {which} {'turns' if max(map(len, spins)) == 1 else 'turn'} the other way")
         fix.append(f"negate the spin of rotor {which} in the vehicle file")
     new = reordered(described, order)
     new = _spun(new, spins[0]) if spins else new
@@ -665,9 +730,7 @@ def _spins(lagged: Lagged, vehicle: Vehicle) -> tuple[list[tuple[int, ...]], flo
     Also returns the correlation of yaw acceleration and drag that the change gives.
     """
     count = len(vehicle.rotors)
-    # Two of more than four are made up for by roll and pitch.
-    sizes = (0, 1, 2, count) if count == 4 else (0, 1, count)
-    turned = [which for size in sizes for which in combinations(range(count), size)]
+    turned = [which for size in (0, 1, 2, count) for which in combinations(range(count), size)]
     if len(lagged.slow[0]) < 100:
         return [], 0.0
     found = np.array([_drag_explains(lagged.slow, _spun(vehicle, which)) for which in turned])
@@ -678,9 +741,28 @@ def _spins(lagged: Lagged, vehicle: Vehicle) -> tuple[list[tuple[int, ...]], flo
     if gain[best] <= _gain(found[:1]):
         return [], float(found[0])
     # Which of them is told by roll and pitch, but for partners on one arm: they have one command.
-    near = np.flatnonzero((wrong == wrong[best]) & (gain > gain[best] - _CHANGE))
+    near = 1 + np.flatnonzero(gain[1:] > gain[best] - _CHANGE)
     whole = _gain(np.array([[_drag_explains(lagged.slow, _spun(vehicle, turned[k]), alone=False)] for k in near]))
     return [turned[k] for k in near[whole > whole.max() - _CHANGE]], float(found[best])
+
+
+def _tilted_pairs(lagged: Lagged, vehicle: Vehicle) -> list[tuple[int, ...]]:
+    """Pairs of more than four rotors (from 0) whose spins, the other way, explain all that a tilted gyro does; or none.
+
+    Torques of such a pair add up to roll and pitch, which `_spins` takes out.
+    """
+    pairs = list(combinations(range(len(vehicle.rotors)), 2))
+    if len(vehicle.rotors) <= 4 or len(lagged.slow[0]) < 100:
+        return []
+    found = [_drag_explains(lagged.slow, _spun(vehicle, pair), alone=False) for pair in pairs]
+    own = [_drag_explains(lagged.slow, vehicle, alone) for alone in (False, True)]
+    least = max(_gain(np.array(own)[:, None]) + [_GAIN, -_CHANGE])
+    return [pair for pair, more in zip(pairs, _gain(np.array(found)[:, None]), strict=True) if more > least]
+
+
+def _listed(rotors: Sequence[tuple[int, ...]]) -> str:
+    """Alternatives of rotors, for people: "1 and 2 or 4"."""
+    return " or ".join(" and ".join(str(k + 1) for k in one) for one in rotors)
 
 
 def _drag_explains(slow: Rows, vehicle: Vehicle, alone: bool = True) -> float:
@@ -743,6 +825,10 @@ _KNOWN = 0.1
 """Relative standard deviation up to which a parameter counts as known."""
 
 
+_SIZES = 0.1, 0.5
+"""J_xx over mass and squared arm: 0.11 (a heavy octocopter) to 0.32 of known ones, 0.5 with all mass at the rotors."""
+
+
 def mass_check(recording: Recording, vehicle: Vehicle, spans: Spans, b_from_hover: float | None) -> Check | None:
     """Weighs the vehicle by its known thrust coefficient; None where that is not known or nothing flew.
 
@@ -792,11 +878,12 @@ def _load(recording: Recording, spans: Spans) -> float:
     return load if 0.8 < load < 1.5 else 1.0
 
 
-def geometry_check(lagged: Lagged | str, vehicle: Vehicle) -> Check:
+def geometry_check(lagged: Lagged | str, vehicle: Vehicle, b_from_hover: float | None = None) -> Check:
     """Roll and pitch acceleration (of `lagged_motion`) against the torque that the stated rotor positions give.
 
     With A the least-squares map from torque over b to inertia times acceleration, A = k R(alpha): the frame is turned
-    by alpha about z, and k is b times the factor by which arms (or inertias) are wrong.
+    by alpha about z, and k is b times the factor by which arms (or inertias) are wrong.  With the b that carries the
+    weight, inertia over mass and squared arm follows: where no vehicle has it, the arm is asked for.
     """
     name = "geometry"
     if isinstance(lagged, str):
@@ -813,7 +900,7 @@ def geometry_check(lagged: Lagged | str, vehicle: Vehicle) -> Check:
     angle = math.atan2(a[0, 1] - a[1, 0], a[0, 0] + a[1, 1])
     scale = 0.5 * math.hypot(a[0, 1] - a[1, 0], a[0, 0] + a[1, 1])
     numbers = {"turned_rad": angle, "explained": float(np.min(share))}
-    return _judge_scale(vehicle, scale, numbers)
+    return _judge_scale(vehicle, scale, b_from_hover or 0.0, numbers)
 
 
 def _map(torque: FloatArray, answer: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -823,10 +910,22 @@ def _map(torque: FloatArray, answer: FloatArray) -> tuple[FloatArray, FloatArray
     return np.asarray(1.0 - np.sum((answer - torque @ a) ** 2, axis=0) / total), a
 
 
-def _judge_scale(vehicle: Vehicle, scale: float, numbers: dict[str, float]) -> Check:
+def _judge_scale(vehicle: Vehicle, scale: float, hover: float, numbers: dict[str, float]) -> Check:
     thrust, inertias = _known_thrust(vehicle), [_known(vehicle, n) for n in ("J_xx", "J_yy")]
     turned = f"rotor positions agree with the motion within {abs(math.degrees(numbers['turned_rad'])):.0f} deg"
     if thrust is None or not all(inertias):
+        (least, most), told = _SIZES, vehicle.command
+        size = float(np.mean(vehicle.initial[2:4])) * hover / max(scale, 1e-300) / (vehicle.mass * vehicle.arm**2)
+        # A lag of motors, and noise of the torque, make it too large.
+        large = told.sampling == "instant" and size * numbers["explained"] > most
+        if told.kind == "rotor_speed" and (large or 0.0 < size < least):
+            return Check(
+                "geometry", CheckResult.WARNING,
+                f"weight, arm and motion make the inertia about x and y {size:.2g} times mass times arm squared, which "
+                f"is {least:g} to {most:g} on other vehicles: are the rotors {vehicle.arm:.3g} m from the centre?",
+                f"measure the arm: {size / most * vehicle.arm:.2g} to {size / least * vehicle.arm:.2g} m would fit",
+                {**numbers, "size": size},
+            )  # fmt: skip
         return Check(
             "geometry", CheckResult.OK, f"{turned}; the arm itself shows only relative to the inertia", numbers=numbers
         )

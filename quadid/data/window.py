@@ -149,6 +149,7 @@ class Recording:
         autopilot: the autopilot's own parameters as the log holds them, by their names there (`INS_GYRO_FILTER`).
         epoch: UNIX time of its time 0 [s]; None where its clock has no date.
         modes: when the autopilot entered a flight mode [s], and its name; empty where the log lacks them.
+        other: what says that it is no multirotor, whose outputs are left out; empty where nothing does.
     """
 
     name: str
@@ -161,6 +162,7 @@ class Recording:
     autopilot: Mapping[str, float] = field(default_factory=dict)
     epoch: float | None = None
     modes: tuple[tuple[float, str], ...] = ()
+    other: str = ""
 
     @property
     def span(self) -> tuple[float, float]:
@@ -412,7 +414,10 @@ def measured_rows(t: FloatArray, values: FloatArray) -> BoolArray:
 def measured_period(t: FloatArray, values: FloatArray) -> float:
     """Period [s] at which `values` were measured, see `fresh_rows`, `measured_rows` and `sample_period`."""
     fresh = fresh_rows(values)
-    return sample_period(t[fresh][measured_rows(t[fresh], values[fresh])])
+    rows = fresh[measured_rows(t[fresh], values[fresh])]
+    repeated = len(fresh) < len(values)  # then a signal that rests, on the ground, tells of no rate
+    moving = ~copied(values[rows]) if repeated else slice(None)
+    return period_of(np.diff(t[rows])[moving])
 
 
 # --- Faults of the data themselves, seen without any model: a sensor at the end of its range, rows that are copies

@@ -332,15 +332,18 @@ def assemble(
     clock: LogClock,
     notes: Sequence[str],
     autopilot: Mapping[str, float] | None = None,
+    other: str = "",
 ) -> Recording:
     """Cleans the channels and makes the recording; of several sources of one channel the first usable one is kept.
+
+    Of what is no multirotor, as `other` says (of `motors.no_multirotor`), no output is.
 
     Raises:
         LogError: no channel holds a usable sample.
     """
     channels: dict[str, Channel] = {}
     for entry in raw:
-        if entry.name in channels or len(entry.t) == 0:
+        if entry.name in channels or len(entry.t) == 0 or (other and entry.name in ("rotor_speed", "motor_command")):
             continue
         channel = clean_channel(entry)
         if channel is not None:
@@ -351,8 +354,8 @@ def assemble(
             f"{name}: no usable flight data in it{why}", "gyro, attitude, accelerometer or rotor signals",
             "see docs/logs.md for the messages that are read",
         )  # fmt: skip
-    warnings = (*notes, *clock.warnings(), *fault_warnings(channels))
-    return Recording(name, kind, channels, tuple(clock.breaks), warnings, autopilot=dict(autopilot or {}))
+    warnings = (*notes, *filter(None, [other]), *clock.warnings(), *fault_warnings(channels))
+    return Recording(name, kind, channels, tuple(clock.breaks), warnings, autopilot=dict(autopilot or {}), other=other)
 
 
 def fastest_first(raw: Sequence[RawChannel], advantage: float = 1.3) -> list[RawChannel]:

@@ -268,13 +268,12 @@ def read_dataflash(path: Path) -> Recording:
 
     raw = channels_of(sources, rows)
     firmware = _firmware(index)
-    if other := no_multirotor(parameters, firmware=firmware[1] if firmware else ""):
-        notes.append(other)
-    else:
+    other = no_multirotor(parameters, firmware=firmware[1] if firmware else "")
+    if not other:
         raw += [*_outputs(index, times, parameters, notes), *_esc(index, times, parameters, notes)]
     changed = changed_within(names, values)
     notes += [changed] if changed else []
-    recording = assemble(_name(path), "dataflash", raw, clock, notes, parameters)
+    recording = assemble(_name(path), "dataflash", raw, clock, notes, parameters, other)
     return replace(recording, modes=_modes(index, times))
 
 

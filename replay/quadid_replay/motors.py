@@ -123,8 +123,6 @@ _OTHER_FRAMES = {6: "helicopter", 8: "single copter", 9: "coax copter", 11: "hel
 _OTHER_AIRFRAMES = {1: "plane", 2: "VTOL", 3: "tiltrotor", 4: "tailsitter", 5: "rover", 6: "rover", 10: "helicopter",
                     11: "helicopter", 12: "helicopter", 13: "rover", 14: "spacecraft"}  # fmt: skip
 """CA_AIRFRAME of PX4 that is no multirotor."""
-NO_MULTIROTOR = "no multirotor: its outputs are not used"
-"""End of the note of a log that is another vehicle's."""
 _SHOTS = {"OneShot125": (125.0, 250.0), "OneShot42": (42.0, 84.0), "Multishot": (5.0, 25.0)}
 """Short pulses [us] that stand for those of 1000 and 2000, by protocol."""
 DSHOT, UAVCAN = 1999.0, 8191.0
@@ -327,7 +325,7 @@ def no_multirotor(parameters: Mapping[str, float], mav_type: int = 0, firmware: 
         else "Q_ENABLE 1" if parameters.get("Q_ENABLE") == 1.0
         else ""
     )  # fmt: skip
-    return which and f"the vehicle calls itself {which}, {NO_MULTIROTOR}"
+    return which and f"the vehicle calls itself {which}, no multirotor: its outputs are not used"
 
 
 def in_pulses(outputs: FloatArray) -> tuple[FloatArray, str]:

@@ -220,6 +220,7 @@ class _Recording(msgspec.Struct, tag=True):
     autopilot: dict[str, float]
     epoch: float | None
     modes: tuple[tuple[float, str], ...]
+    other: str
     channels: list[_Channel]
 
 
@@ -253,7 +254,7 @@ def pack(told: Recording | _Refused | _Fault | _Limit) -> bytes:
     ]  # fmt: skip
     return msgspec.msgpack.encode(_Recording(
         _text(told.name), told.format, told.breaks, tuple(map(_text, told.warnings)), told.sha256, told.grid,
-        dict(told.autopilot), told.epoch, told.modes, channels,
+        dict(told.autopilot), told.epoch, told.modes, _text(told.other), channels,
     ))  # fmt: skip
 
 
@@ -291,7 +292,7 @@ def unpack(answer: memoryview) -> Recording | str:
     return Recording(
         _text(told.name), _text(told.format), channels, told.breaks, tuple(map(_text, told.warnings)),
         _text(told.sha256), told.grid, {_text(name): value for name, value in told.autopilot.items()}, told.epoch,
-        tuple((t, _text(mode)) for t, mode in told.modes),
+        tuple((t, _text(mode)) for t, mode in told.modes), _text(told.other),
     )  # fmt: skip
 
 

@@ -218,11 +218,8 @@ def read_mcap(path: Path, preset: str = AUTO) -> Recording:
     raw = _channels(columns, sources, preset)
     kinds = [entry for entry in raw if entry.name == "vehicle_kind"]
     other = no_multirotor({}, int(kinds[0].values[-1, 0])) if kinds else ""
-    if other:
-        notes.append(other)
-    unused = ("vehicle_kind", "rotor_speed", "motor_command") if other else ("vehicle_kind",)
-    raw = [entry for entry in raw if entry.name not in unused]
-    recording = assemble(path.name, "mcap", raw, stamps.clock, notes)
+    raw = [entry for entry in raw if entry.name != "vehicle_kind"]
+    recording = assemble(path.name, "mcap", raw, stamps.clock, notes, other=other)
     return replace(recording, epoch=float(stamps.base_ns // 10**9) if stamps.base_ns else None)
 
 

@@ -470,8 +470,10 @@ def read_tlog(path: Path) -> Recording:
         more = f" and {len(others) - _NAMED} more" if len(others) > _NAMED else ""
         named = ", ".join(f"{s}/{c}" for s, c in others[:_NAMED])
         notes.append(f"vehicle {who[0]} used; also in the log: {named}{more}")
-    raw = _channels(vehicles[who], notes)
-    return assemble(path.name, "tlog", raw, vehicles[who].clock, notes, vehicles[who].parameters)
+    used = vehicles[who]
+    other = no_multirotor(used.parameters, used.kind)
+    raw = _channels(used) + ([] if other else _motors(used, notes))
+    return assemble(path.name, "tlog", raw, used.clock, notes, used.parameters, other)
 
 
 def _vehicles(frames: Frames, which: IntArray) -> dict[tuple[int, int], VehicleLog]:
@@ -504,7 +506,7 @@ def _notes(frames: Frames, bad: int) -> list[str]:
     return notes
 
 
-def _channels(vehicle: VehicleLog, notes: list[str]) -> list[RawChannel]:
+def _channels(vehicle: VehicleLog) -> list[RawChannel]:
     raw: list[RawChannel] = []
     for channel, messages in PREFERENCE.items():
         found = []
@@ -513,14 +515,11 @@ def _channels(vehicle: VehicleLog, notes: list[str]) -> list[RawChannel]:
                 if signal == channel and source.split(" ")[0] == message:
                     found.append(RawChannel(channel, t, values, source))
         raw += fastest_first(found, 2.0)
-    return raw + _motors(vehicle, notes)
+    return raw
 
 
 def _motors(vehicle: VehicleLog, notes: list[str]) -> list[RawChannel]:
     """Rotor speeds and outputs, each of the motors in their order."""
-    if other := no_multirotor(vehicle.parameters, vehicle.kind):
-        notes.append(other)
-        return []
     rotors = vehicle.rotors or px4_rotor_count(vehicle.parameters) or MULTIROTORS.get(vehicle.kind, 0)
     notes += [vehicle.changed] if vehicle.changed else []
     raw: list[RawChannel] = []

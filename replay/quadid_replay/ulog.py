@@ -314,12 +314,11 @@ def read_ulog(path: Path) -> Recording:
     log = _load(path, records)
     notes = _notes(records, path.stat().st_size)
     raw = channels_of(SOURCES, lambda source: _rows(log, source), 2.0)
-    if other := no_multirotor(log.parameters):
-        notes.append(other)
-    else:
+    other = no_multirotor(log.parameters)
+    if not other:
         raw += fastest_first([*_actuator_motors(log), *_actuator_outputs(log), *_allocated(log)], 2.0)
         raw += _esc(log, notes)
-    recording = assemble(path.name, "ulog", raw, LogClock(), notes, log.parameters)
+    recording = assemble(path.name, "ulog", raw, LogClock(), notes, log.parameters, other)
     return replace(recording, modes=_modes(log))
 
 

@@ -17,7 +17,7 @@ from quadid.data.rotor_signal import rotor_channel
 from quadid.data.window import Channel, Recording
 from quadid.errors import LogError
 from quadid.vehicle import GRAVITY, Vehicle
-from quadid_replay.motors import NO_MULTIROTOR, Frame, frame_of
+from quadid_replay.motors import Frame, frame_of
 
 _MASS, _ARM, _MAX_SPEED = 1.5, 0.25, 900.0
 _BLADE = 0.5
@@ -49,9 +49,8 @@ def vehicle_text(recording: Recording, name: str, mass: float | None = None, arm
     Raises:
         LogError: neither airframe nor rotor signal in the log, or it is no multirotor's.
     """
-    other = next((note for note in recording.warnings if note.endswith(NO_MULTIROTOR)), "")
-    if other:
-        raise LogError(f"{recording.name}: {other}", "a log of a multirotor", "choose another log")
+    if recording.other:
+        raise LogError(f"{recording.name}: {recording.other}", "a log of a multirotor", "choose another log")
     frame = frame_of(recording.autopilot, arm or _ARM)
     channel, notes = rotor_channel(recording, None)
     if frame is None:

@@ -174,9 +174,13 @@ def test_spins_are_judged_by_drag_at_every_rate(name: str, rate: float, seconds:
 @pytest.mark.parametrize("effects", [(), ("imu_misalignment:x=0.05,y=-0.06,z=0.05",)])
 @pytest.mark.parametrize("name", ["pelican", "hexacopter"])
 def test_a_loop_that_holds_its_heading_does_not_look_reversed(name: str, effects: tuple[str, ...], rate: float) -> None:
-    """Rotors that answer disturbances and noise speed up against the turn, as reversed ones would with it."""
+    """Rotors that answer disturbances and noise speed up against the turn, as reversed ones would with it.
+
+    On six rotors a gyro tilted by 4 degrees may look like a pair of them: then both are asked for.
+    """
     simulated = quadid.simulate(name, seconds=15.0, seed=11, rate=rate, profile="roll_pitch", effects=effects)
-    assert verdict(simulated.flight.recording, "motor_order", Vehicle.shipped(name)).verdict is CheckResult.OK
+    found = verdict(simulated.flight.recording, "motor_order", Vehicle.shipped(name))
+    assert found.verdict is CheckResult.OK or (effects and "or the gyro were tilted" in found.message)
 
 
 def test_positions_that_are_exchanged_without_their_spins_are_both_named(flight: Recording) -> None:

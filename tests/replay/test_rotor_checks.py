@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -9,10 +10,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from quadid_replay import open_log
+from scipy.signal import butter, filtfilt, lfilter
 
-from quadid.checks import Check, CheckResult, inspect
+from quadid import simulate
+from quadid.app.logs import load_vehicle
+from quadid.checks import Check, CheckResult, flying_spans, inspect
+from quadid.checks.rotors import gyro_filter_check
 from quadid.data.rotor_signal import rotor_signal
-from quadid.data.window import Channel, Recording
+from quadid.data.window import Channel, Recording, measured_period, sample_period
 from quadid.errors import LogError
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
@@ -144,3 +149,77 @@ def test_speeds_that_are_all_zero_do_not_advise_another_vehicle_file(flight: tup
     with pytest.raises(LogError, match="all zero: the motors are off, or the ESCs do not report") as caught:
         rotor_signal(replace(recording, channels=channels), vehicle)
     assert str(caught.value.fix).startswith("fly; if the ESCs never report, write command: {kind: pwm")
+
+
+@pytest.mark.parametrize("log", ["crazyflie_rpm/figure8_17.csv", "brushed/jana00.csv"])
+def test_a_gyro_that_was_smoothed_is_told_from_one_that_was_not(data_dir: Path, log: str) -> None:
+    recording = open_log(data_dir / log)
+    vehicle = load_vehicle(str(data_dir / log.split("/")[0] / "vehicle.yaml"))
+    gyro = recording.channels["gyro"]
+
+    def told(values: FloatArray) -> list[str]:
+        channels = {**recording.channels, "gyro": replace(gyro, values=np.asarray(values))}
+        checks = inspect(replace(recording, channels=channels), vehicle).checks
+        return [check.message for check in checks if check.name == "gyro_source"]
+
+    filtered = butter(2, 4.0, fs=1.0 / sample_period(gyro.t))
+    assert told(gyro.values) == []
+    assert "smoothed without a delay" in told(filtfilt(*filtered, gyro.values, axis=0))[0]
+
+
+def test_a_gyro_behind_a_slow_filter_is_named_where_speeds_are_measured(data_dir: Path) -> None:
+    recording = open_log(data_dir / "crazyflie_rpm" / "figure8_17.csv")
+    vehicle = load_vehicle(str(data_dir / "crazyflie_rpm" / "vehicle.yaml"))
+    gyro = recording.channels["gyro"]
+    late = np.asarray(lfilter(*butter(2, 2.5, fs=1.0 / sample_period(gyro.t)), gyro.values, axis=0))
+    slow = replace(recording, channels={**recording.channels, "gyro": replace(gyro, values=late)})
+    check = gyro_filter_check(slow, vehicle, flying_spans(slow, vehicle))
+    assert check is not None
+    assert "low-passed" in check.message
+    assert "imu_lag" in check.fix
+    modelled = vehicle.model_copy(update={"effects": {"imu_lag": {"cutoff": 2.5}}})
+    assert gyro_filter_check(slow, modelled, flying_spans(slow, modelled)) is None
+
+
+def test_an_arm_that_no_inertia_fits_is_asked_for(data_dir: Path) -> None:
+    folder = data_dir / "cases_hub" / "case_008"
+    right = load_vehicle(str(folder / "vehicle.yaml"))
+    recording = open_log(folder / "train.csv")
+    places = np.array([r.position for r in right.rotors])
+    for factor, asked in ((1.0, False), (2.0, True)):
+        rotors = tuple(
+            r.model_copy(update={"position": tuple(factor * p)}) for r, p in zip(right.rotors, places, strict=True)
+        )
+        checks = inspect(recording, right.model_copy(update={"rotors": rotors})).checks
+        geometry = next(check for check in checks if check.name == "geometry")
+        assert (geometry.verdict is CheckResult.WARNING) is asked
+        if asked:
+            low, high = (float(x) for x in re.findall(r"([0-9.]+) to ([0-9.]+) m would fit", geometry.fix)[0])
+            assert low < right.arm < high < 2.0 * right.arm
+
+
+@pytest.mark.parametrize("effects", [{}, {"imu_misalignment": {}}])
+def test_a_tilted_gyro_is_no_pair_of_reversed_spins(effects: dict[str, dict[str, float]]) -> None:
+    vehicle = Vehicle.shipped("hexacopter")
+    recording = simulate(vehicle, seconds=30.0, seed=3, effects=effects).flight.recording
+    (own,) = (check for check in inspect(recording, vehicle).checks if check.name == "motor_order")
+    assert own.verdict is CheckResult.OK
+
+
+def test_a_pair_of_reversed_spins_on_six_rotors_is_asked_for() -> None:
+    vehicle = Vehicle.shipped("hexacopter")
+    recording = simulate(vehicle, seconds=30.0, seed=3).flight.recording
+    rotors = tuple(r.model_copy(update={"spin": -r.spin}) if k in (0, 3) else r for k, r in enumerate(vehicle.rotors))
+    (check,) = (
+        check for check in inspect(recording, vehicle.model_copy(update={"rotors": rotors})).checks
+        if check.name == "motor_order"
+    )  # fmt: skip
+    assert check.verdict is CheckResult.WARNING
+    assert "rotor 1 and 4, and how the IMU is mounted" in check.fix
+
+
+def test_ground_before_a_flight_does_not_hide_that_a_signal_was_held() -> None:
+    t = np.arange(0.0, 60.0, 0.01)
+    speeds = np.random.default_rng(1).normal(500.0, 20.0, (len(t) // 10, 4)).repeat(10, axis=0)
+    speeds[t < 35.0] = 0.0
+    assert measured_period(t, speeds) == pytest.approx(0.1, rel=0.01)

@@ -11,7 +11,7 @@ SILENT = {"arms 1.35 times", "mass 1.3 times"}
 """What a vehicle file of guesses does not reveal."""
 
 
-@pytest.mark.parametrize("vehicle", ["pelican", "pelican_x", "hexacopter", "x8"])
+@pytest.mark.parametrize("vehicle", ["pelican", "pelican_x", "hexacopter", "x8", "crazyflie"])
 def test_each_mistake_is_named_first(vehicle: str) -> None:
     answers = {
         mistake: (verdict, line) for mistake, verdict, line in cells(vehicle, Path(), every=vehicle == "pelican_x")

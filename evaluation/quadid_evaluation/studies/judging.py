@@ -17,11 +17,12 @@ from typing import NamedTuple
 import numpy as np
 from quadid_replay import open_log
 from quadid_replay.frames import from_euler
+from scipy.signal import butter, filtfilt
 
 import quadid
 from quadid.app.logs import LogPart, check_conventions, load_vehicle
 from quadid.checks import CheckResult, inspect
-from quadid.data.window import Channel, Recording
+from quadid.data.window import Channel, Recording, sample_period
 from quadid.errors import LogError
 from quadid.rotation import conjugate, continuous_sign, euler, product
 from quadid.types import FloatArray
@@ -190,6 +191,13 @@ def clipped(r: Recording, v: Vehicle) -> Log:
     return changed(r, gyro=np.clip(g, -most, most)), v
 
 
+def smoothed(r: Recording, v: Vehicle) -> Log:
+    """The gyro is smoothed over a quarter of a second, without a delay."""
+    c = r.channels["gyro"]
+    filtered = filtfilt(*butter(2, 4.0, fs=1.0 / sample_period(c.t)), c.values, axis=0)
+    return changed(r, gyro=np.asarray(filtered)), v
+
+
 def gravity_out(r: Recording, v: Vehicle) -> Log:
     """Linear acceleration in place of specific force, as an estimator makes it."""
     c, q = r.channels["accel"], r.channels["attitude"]
@@ -242,6 +250,11 @@ def one_rotor(rotor: int, change: Callable[[FloatArray], FloatArray | float]) ->
         return w
 
     return of_rotors(changed_one)
+
+
+def half_speed(r: Recording, v: Vehicle) -> Log:
+    """Rotor 2 turns half as fast, by a log of speeds or of thrust."""
+    return one_rotor(1, lambda w: (0.25 if v.command.kind == "thrust" else 0.5) * w)(r, v)
 
 
 def spun(*rotors: int) -> Callable[[Recording, Vehicle], Log]:
@@ -304,13 +317,14 @@ MISTAKES: tuple[Mistake, ...] = (
         lambda q: from_euler(np.radians(5.0 * np.round(np.degrees(euler(q)) / 5.0)))), "in steps"),
     Mistake("attitude held at 10 Hz", held("attitude", 10.0), "^$|attitude.*Hz"),
     Mistake("gyro clipped", clipped, "limit of its range"),
+    Mistake("gyro smoothed at 4 Hz", smoothed, "smoothed without a delay"),
     Mistake("rotors in rpm", scaled("rotor_speed", 30.0 / np.pi), "in rpm"),
     Mistake("rotors in rev/s", scaled("rotor_speed", 0.5 / np.pi), "in rev/s"),
     Mistake("rotors electrical", scaled("rotor_speed", 7.0), "electrical"),
     Mistake("rotors squared", squared, "squared"),
     Mistake("rotor 2 dead", one_rotor(1, lambda w: 0.0), "rotor 2 reads nothing"),
     Mistake("rotor 2 stuck", one_rotor(1, lambda w: float(np.median(w))), "rotor 2 holds"),
-    Mistake("rotor 2 at half speed", one_rotor(1, lambda w: 0.5 * w), "rotor 2 reads"),
+    Mistake("rotor 2 at half speed", half_speed, "rotor 2 reads"),
     Mistake("one column for all", of_rotors(lambda w: np.repeat(w[:, :1], w.shape[1], axis=1)), "are the same"),
     Mistake("rotors 30 ms late", rotor_late(0.03), LATE_ROTORS),
     Mistake("rotors 60 ms late", rotor_late(0.06), LATE_ROTORS),
@@ -323,6 +337,8 @@ MISTAKES: tuple[Mistake, ...] = (
     Mistake("motors backwards", of_rotors(lambda w: w[:, ::-1]), ORDER),
     Mistake("spins reversed", spun(), "negate the spins"),
     Mistake("spin of rotor 1 reversed", spun(0), r"spin of rotor 1\b"),
+    Mistake("spins of rotors 1, 2 reversed", spun(0, 1), r"\b1 and 2\b"),
+    Mistake("spins of rotors 1, 3 reversed", spun(0, 2), r"\b1 and 3\b"),
     Mistake("frame turned by 45 deg", placed(
         lambda x, y: ((x - y) * 0.70710678, (x + y) * 0.70710678)), "turn the rotor positions"),
     Mistake("positions mirrored", placed(lambda x, y: (x, -y)), f"{ORDER}|mirror"),
