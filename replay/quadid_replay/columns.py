@@ -65,9 +65,11 @@ class LogClock:
         out = np.full(len(raw), np.nan)
         begin = 0
         if self._newest is None and len(raw) > 1 + CONFIRMATIONS:
-            # The first stamp is far from the second, which others follow: it is wild, and no time base.
-            steps = np.diff(raw[: 2 + CONFIRMATIONS])
-            begin = int(not -STEP_BACK < steps[0] < STEP_AHEAD and bool(np.all(np.abs(steps[1:]) < STEP_BACK)))
+            # The first instant is far from the second, which others follow: it is wild, and no time base.
+            second = int(np.argmax(np.abs(raw - raw[0]) > self._apart))
+            ahead, *steps = np.diff(raw[max(second - 1, 0) : second + 1 + CONFIRMATIONS])
+            if not -STEP_BACK < ahead < STEP_AHEAD and bool(np.all(np.abs(steps) < STEP_BACK)):
+                begin = second
             self.wild += begin
         for k in range(begin, len(raw), _TOGETHER):
             out[k : k + _TOGETHER] = self._mapped(raw[k : k + _TOGETHER])
@@ -288,6 +290,18 @@ def rising(t: FloatArray) -> BoolArray:
     return kept
 
 
+def _confirmed(t: FloatArray) -> tuple[int, int]:
+    """Begin and end of rising times (n,) without few that stand alone before and after: no neighbour confirms them."""
+    steps = np.diff(t)
+    far = max(STEP_BACK, 50.0 * float(np.median(steps))) if len(steps) else math.inf
+    edges = [0, *(np.flatnonzero(steps > far) + 1).tolist(), len(t)]
+    while len(edges) > 2 and edges[1] - edges[0] <= CONFIRMATIONS:
+        edges.pop(0)
+    while len(edges) > 2 and edges[-1] - edges[-2] <= CONFIRMATIONS:
+        edges.pop()
+    return edges[0], edges[-1]
+
+
 def clean_channel(raw: RawChannel) -> Channel | None:
     """Makes a channel of raw samples: drops and counts what cannot be used.
 
@@ -320,6 +334,9 @@ def clean_channel(raw: RawChannel) -> Channel | None:
     faults["duplicate"] = int(np.count_nonzero(t[~kept] == t[before[~kept]]))
     faults["backwards"] = int(np.count_nonzero(~kept)) - faults["duplicate"]
     t, values = t[kept], values[kept]
+    begin, end = _confirmed(t)
+    faults["bad_stamp"] += len(t) - (end - begin)
+    t, values = t[begin:end], values[begin:end]
     if raw.name == "attitude":
         values = continuous_sign(values)
     return Channel(raw.name, t, values, raw.source, {k: n for k, n in faults.items() if n})

@@ -407,8 +407,10 @@ class Stamps:
         for group in (True, False):
             its = np.flatnonzero((headed == group) & (stamps != 0))
             if len(its) and group not in self._offsets:
-                # Boot or simulation time beside a log on UNIX time: the first message tells the distance.
-                ahead = float(since[its[0]] - times[its[0]])
+                # Boot or simulation time beside a log on UNIX time: the first message that is no exception tells the
+                # distance.
+                apart = since[its] - times[its]
+                ahead = float(apart[np.abs(apart - np.sort(apart)[len(apart) // 2]) < _OTHER_CLOCK][0])
                 self._offsets[group] = ahead if abs(ahead) > _OTHER_CLOCK else 0.0
             times[its] += self._offsets.get(group, 0.0)
         return self.clock.times(np.where(stamps == 0, since, times))

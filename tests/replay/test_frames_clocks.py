@@ -99,6 +99,10 @@ def test_a_jump_ahead_is_a_break_and_a_single_wild_stamp_is_dropped() -> None:
     assert clock.jumps == 1
     assert out[np.isfinite(out)][100] == pytest.approx(500.3)
     clock = LogClock()
+    instant = np.concatenate([np.full(5, 14.0), np.arange(0.0, 10.0, 0.1).repeat(5)])
+    assert list(np.flatnonzero(np.isnan(clock.times(instant)))) == [0, 1, 2, 3, 4]
+    assert (clock.breaks, clock.wild) == ([], 5)
+    clock = LogClock()
     wild = np.insert(np.arange(0.0, 10.0, 0.1), [40, 60], [1e9, -1e6])
     assert list(np.flatnonzero(np.isnan(clock.times(wild)))) == [40, 61]
     assert (clock.breaks, clock.wild) == ([], 2)
@@ -192,3 +196,20 @@ def test_a_source_must_be_clearly_faster_to_be_preferred() -> None:
 
     assert [e.source for e in fastest_first([raw(100, "a"), raw(110, "b")])] == ["a", "b"]
     assert fastest_first([raw(100, "a"), raw(400, "b")])[0].source == "b"
+
+
+@pytest.mark.parametrize("rate", [4.0, 50.0, 500.0])
+@pytest.mark.parametrize("late", [2.0, 20.0, 29.0])
+@pytest.mark.parametrize("count", [1, 3])
+def test_few_samples_alone_at_an_end_cost_themselves_and_no_time(rate: float, late: float, count: int) -> None:
+    """No stamp after the last denies it, and a log that is sorted by its stamps has every wild one at an end."""
+    t = np.arange(0.0, 60.0, 1.0 / rate)
+    for wild in (t[-1] + late + t[:count], t[0] - late - t[:count]):
+        stamps = np.sort(np.concatenate([t, wild]))
+        channel = clean_channel(RawChannel("gyro", stamps, np.zeros((len(stamps), 3)), "x"))
+        assert channel is not None
+        if late < 50.0 / rate:  # so slow a signal has gaps of this length
+            assert len(channel.t) == len(stamps)
+        else:
+            np.testing.assert_array_equal(channel.t, t)
+            assert channel.faults == {"bad_stamp": count}
