@@ -176,23 +176,23 @@ class Consistency:
     def doubts(self) -> tuple[Factor, ...]:
         """Products that b, J_xx and J_yy are off by: of the accelerometer alone, and of it and the gyro about an axis.
 
-        Each channel may be within its own limit and all together not.  Yaw may turn too little for ever; a stream
-        without an attitude allows no comparison at all.
+        Each channel may be within its own limit and all together not; so may what leaks into an axis, by its share of
+        that axis' turns.  Yaw may turn too little for ever; a stream without an attitude allows no comparison at all.
         """
         if not self._compared:
             return ()
-        found = {f.what: f for f in self.factors()}
-        force = found.get(GRAVITY_FACTOR)
-        turns = [
-            found.get(what, Factor(what, 1.0, math.inf)) for what in (f"{axis} {TURN_FACTOR}" for axis in AXES[:2])
-        ]
-        if force is None:
-            return tuple(turns)
-        both = [
-            Factor(f"{force.what} times {t.what}", force.value * t.value, math.hypot(force.sigma, t.sigma))
-            for t in turns
-        ]  # fmt: skip
-        return (force, *both)
+        force = next((f for f in self.factors() if f.what == GRAVITY_FACTOR), None)
+        found = [force] if force is not None else []
+        for axis, told in enumerate(self._turns[:2]):
+            turns, leaked = Factor(f"{AXES[axis]} {TURN_FACTOR}", 1.0, math.inf), 0.0
+            if told.seconds > FEWEST * TURN:
+                (turns, *leaks), size = _gyro_factors(axis, told), np.sqrt(np.diag(told.sum))
+                leaked = float(np.abs([f.value for f in leaks]) @ np.delete(size[:3], axis) / size[axis])
+            what, value, sigma = turns.what, turns.value, turns.sigma
+            if force is not None:
+                what, value, sigma = f"{force.what} times {what}", force.value * value, math.hypot(force.sigma, sigma)
+            found.append(Factor(what, value + math.copysign(leaked, value - 1.0), sigma))
+        return tuple(found)
 
 
 def _gyro_factors(axis: int, told: _Fading) -> list[Factor]:

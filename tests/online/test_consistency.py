@@ -87,6 +87,18 @@ def test_a_gyro_axis_that_leaks_into_another_is_named(axis: int, into: int) -> N
     assert wrong.value == pytest.approx(-0.15, abs=0.02 + 2.0 * wrong.sigma)
 
 
+def test_a_small_leak_adds_to_what_the_sensors_may_be_off_by() -> None:
+    """q + 0.03 p under a support and a hidden scale of 4 % each, all within their limits: inertias were 6 % off."""
+    made = flight(40.0, 5).recording
+    gyro = made.channels["gyro"]
+    mixed = gyro.values + 0.03 * gyro.values[:, [0]] * [0.0, 1.0, 0.0]
+    spoilt = consistency_of(replace(made, channels={**made.channels, "gyro": replace(gyro, values=mixed)}))
+    assert not spoilt.fault
+    plain, leaky = consistency_of(made).doubts(), spoilt.doubts()
+    far = [abs(now.off) - abs(before.off) for before, now in zip(plain, leaky, strict=True)]
+    assert far == pytest.approx([0.0, 0.0, 0.03 * np.ptp(gyro.values[:, 0]) / np.ptp(gyro.values[:, 1])], abs=0.01)
+
+
 def test_a_gyro_that_was_smoothed_without_delay_is_seen_where_inertias_are() -> None:
     """3 Hz, forwards and backwards: turns of a second had the right size, and the inertias were 9 % off."""
     made = flight(40.0, 5).recording

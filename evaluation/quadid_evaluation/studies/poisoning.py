@@ -203,6 +203,12 @@ PARTS: dict[str, Spoil] = {
 }  # fmt: skip
 """Faults that are small enough to pass alone: in pairs and triples."""
 TOGETHER = [c for n in (2, 3) for c in combinations(PARTS, n) if len({p.split()[0] for p in c}) == n]
+HIDING = [
+    ("support +8% of weight", "accelerometer scale 1.06 under a bias"),
+    ("support +15% of weight", "accelerometer scale 1.12 under a bias"),
+    ("support -8% of weight", "accelerometer scale 0.9 under a bias"),
+]
+"""Faults that hide each other where thrust is compared: by no sensor of this flight can they be told."""
 SEED = 3
 SETTINGS = SessionSettings(refit=2.0)
 Cell = dict[str, Any]
@@ -217,7 +223,7 @@ def cells() -> list[Cell]:
                 out.append({"when": "in flight", "channel": name, "factor": factor, "ramp": ramp})
                 if ramp == 0.0 or name == "all rotor speeds":
                     out.append({"when": "from take-off", "channel": name, "factor": factor, "ramp": ramp})
-    names = [*SINGLE, *(" + ".join(c) for c in TOGETHER)]
+    names = [*SINGLE, *(" + ".join(c) for c in TOGETHER + HIDING)]
     return out + [{"when": "first flight", "channel": name, "factor": 1.0, "ramp": 0.0} for name in names]
 
 
