@@ -397,12 +397,14 @@ class StoredSet(NamedTuple):
         why_none: why it cannot be taken up; empty where it can, or where there is none.
         confirmed: whether a flight of the last run confirmed it; after a restart a set is stale until one does.
         boot_id: of the run that numbered it; empty where the history does not say.
+        rotors: `rotors_of` the vehicle that it was estimated for; None where the history does not say.
     """
 
     item: OnlineSet | None
     why_none: str = ""
     confirmed: bool = True
     boot_id: str = ""
+    rotors: Any = None
 
     @property
     def doubt(self) -> str:
@@ -414,8 +416,13 @@ class StoredSet(NamedTuple):
         return "" if self.confirmed else "stale: no flight has confirmed it since the service started again"
 
 
+def rotors_of(vehicle: Vehicle) -> list[list[float]]:
+    """Place and spin of each rotor, as they stand beside a set: b and the inertias rest on them."""
+    return [[*rotor.position, rotor.spin] for rotor in vehicle.rotors]
+
+
 def in_force(db: sqlite3.Connection, name: str, gate: GateSettings, vehicle: Vehicle | None) -> StoredSet:
-    """The set last in force, with why it is out of date: withdrawn since, or of another mass than the vehicle file's.
+    """The set last in force, with why it is out of date: withdrawn, or of other rotors or mass than the vehicle file's.
 
     Args:
         db: the history.
@@ -428,6 +435,8 @@ def in_force(db: sqlite3.Connection, name: str, gate: GateSettings, vehicle: Veh
         return last
     told = stored(db, name, f"({_FORCE} OR state = 'stale') ORDER BY rowid DESC", gate, vehicle).item or last.item
     item = replace(last.item, outdated=told.outdated, outdated_code=told.outdated_code)
+    if vehicle is not None and not item.outdated and last.rotors not in (None, rotors_of(vehicle)):
+        item = replace(item, outdated="it rests on rotors in other places than those of the vehicle file")
     if vehicle is not None and not item.outdated and not abs(item.mass / vehicle.mass - 1.0) <= _SAME_MASS:
         rests = "a mass that it does not state" if math.isnan(item.mass) else f"a mass of {item.mass:g} kg"
         why = f"it rests on {rests}, the vehicle file has {vehicle.mass:g} kg"
@@ -450,7 +459,8 @@ def stored(db: sqlite3.Connection, name: str, which: str, gate: GateSettings, ve
     try:
         data = json.loads(row[0])
         found = set_from_dict(data)
-        return StoredSet(found, why_none(found, row[1], gate, vehicle), boot_id=str(data.get("boot_id", "")))
+        why, boot = why_none(found, row[1], gate, vehicle), str(data.get("boot_id", ""))
+        return StoredSet(found, why, boot_id=boot, rotors=data.get("rotors"))
     except UNREADABLE as error:
         return StoredSet(found, f"{type(error).__name__}: {str(error)[:120]}")
 
@@ -602,6 +612,7 @@ class Store:
             raise StoreError(f"{str(path)!r} names no file ({error})", "a path", "give another --history") from error
         self.vehicle, self.boot_id, self._kept = vehicle, uuid.uuid4().hex, kept
         self._boots: dict[int, str] = {}
+        self._rotors: list[list[float]] | None = None
         self.notes: list[str] = []
         self.problem = ""
         self._unread = False
@@ -640,8 +651,12 @@ class Store:
     # --- what an earlier run left
 
     def restore(self, gate: GateSettings | None = None, vehicle: Vehicle | None = None) -> Restored:
-        """State left by the last run; a set is taken up again when this `gate` and `vehicle` could have let it pass."""
+        """State left by the last run; a set is taken up again when this `gate` and `vehicle` could have let it pass.
+
+        From now on each set is noted with the vehicle's rotors.
+        """
         gate = gate or GateSettings()
+        self._rotors = rotors_of(vehicle) if vehicle is not None else None
         if self._lock is None or not self.path.is_file() or not self.path.stat().st_size:
             return Restored(None, first_number())
         try:
@@ -771,7 +786,7 @@ class Store:
     def _stands(self, item: OnlineSet) -> Row:
         """The row of a set, kept where a new file would have to begin with it; what `_restored` looks for."""
         state = item.state.value
-        data = {**set_to_dict(item), "boot_id": self._boots.get(item.sequence, self.boot_id)}
+        data = {**set_to_dict(item), "boot_id": self._boots.get(item.sequence, self.boot_id), "rotors": self._rotors}
         row = self._row(
             "sets", item.sequence, sequence=item.sequence, state=state, reason=item.reason,
             approved_by=item.approved_by, stop=item.stop, data=json.dumps(data),

@@ -185,6 +185,31 @@ def test_a_set_that_is_not_in_force_is_exported_only_when_insisted(
     happened(36, f"export of a set {case}: '{refused.err.strip()[:100]}'")
 
 
+def test_a_set_of_a_vehicle_with_other_rotors_is_exported_only_when_insisted(
+    tmp_path: Path, inside: Cli, happened: Happened
+) -> None:
+    """Of the same name and mass; the service that finds such a set publishes it as out of date."""
+    pelican, cross, path = Vehicle.shipped("pelican"), Vehicle.shipped("pelican_x"), tmp_path / "h.sqlite"
+    assert cross.mass == pelican.mass
+    wider = [r.model_copy(update={"position": tuple(1.1 * x for x in r.position)}) for r in pelican.rotors]
+    store = Store(path, "pelican")
+    store.restore(vehicle=pelican)
+    store.numbered(replace(GOOD, sequence=1, approved_by="auto"))
+    store.close()
+    for rotors, code in ((pelican.rotors, 0), (tuple(wider), 2), (cross.rotors, 2)):
+        other = tmp_path / "other.yaml"
+        pelican.model_copy(update={"rotors": rotors}).save(other)
+        run = inside("export", "--vehicle", other, "--history", path, "--out", tmp_path / "out")
+        assert run.code == code, run.err
+        assert ("rotors in other places" in run.err) == bool(code)
+    store = Store(path, "pelican")
+    item = store.restore(vehicle=Vehicle.named(other)).item
+    store.close()
+    assert item is not None
+    assert "rotors in other places" in item.outdated
+    happened(36, f"export of a set for rotors in other places: '{run.err.strip()[:100]}'")
+
+
 def test_a_set_in_force_is_exported_without_a_word(tmp_path: Path, inside: Cli) -> None:
     path = history_of(tmp_path / "h.sqlite", replace(GOOD, outdated="thrust stepped"), GOOD)
     done = inside("export", "--vehicle", "pelican", "--history", str(path), "--out", str(tmp_path), "--json", "-")

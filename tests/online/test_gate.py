@@ -39,7 +39,7 @@ def parameter_set(values: dict[str, float], sigma: float = 0.005, **status: Stat
 
 
 def online_set(values: dict[str, float], state: SetState = SetState.ACCEPTED, sigma: float = 0.005) -> OnlineSet:
-    return OnlineSet(1, state, "", parameter_set(values, sigma), 0.0, 30.0, 1500)
+    return OnlineSet(1, state, "", parameter_set(values, sigma), 0.0, 30.0, 1500, mass=PELICAN.mass)
 
 
 def good(**changes: Any) -> Case:
