@@ -525,6 +525,15 @@ class Vehicle(Strict):
             raise ValueError(str(error)) from error
         if why := impossible_inertia([self.parameters[n].initial for n in INERTIAS]):
             raise ValueError(f"impossible inertia: {why}")
+        square = self.mass * self.arm**2  # with all mass at the rotors, half of it is J_xx
+        for name in INERTIAS[:2]:
+            least, most = self.parameters[name].limits
+            if least > 2.0 * square or most < 0.02 * square:
+                raise ValueError(
+                    f"impossible inertia: {name} is {least:.3g} to {most:.3g}, but {self.mass:g} kg with rotors "
+                    f"{self.arm:.3g} m from the centre have {0.1 * square:.2g} to {0.5 * square:.2g} kg m^2; "
+                    "is it in g m^2 or kg cm^2?"
+                )
         if self.stand_thrust is not None and not low < self.stand_thrust[0] < high:
             raise ValueError(
                 f"thrust_stand yields b = {self.stand_thrust[0]:.3g}, outside its bounds [{low:.3g}, {high:.3g}]; "

@@ -219,8 +219,9 @@ def _spans(t: FloatArray, on: BoolArray) -> Spans:
 
 _GRID = 0.02
 """Step of the grid [s] for which gaps are reported, that of the fit."""
+IMU = "gyro", "accel"
 _STUCK = 0.5
-"""An IMU channel that does not change for this long [s] in flight is stuck."""
+"""An IMU channel that does not change for this long [s] in flight is stuck; others after ten times as long."""
 
 
 def channel_facts(recording: Recording, flying: Spans = ()) -> tuple[ChannelFacts, ...]:
@@ -297,12 +298,12 @@ def timing_checks(recording: Recording, facts: tuple[ChannelFacts, ...]) -> list
         message = f"{f.name}: steps vary by {f.jitter:.0%} of their median: stamps are unsteady or samples are lost"
         checks.append(Check("timing", CheckResult.WARNING, message, "stamp at the sensor", {"jitter": f.jitter}))
     for f in facts:
-        if f.name in ("gyro", "accel") and f.stuck > _STUCK:
+        if f.name in IMU and f.stuck > _STUCK or f.stuck > 10.0 * _STUCK and f.name in ("velocity", "position"):
             message = f"{f.name}: does not change for {f.stuck:.2g} s of flight ({f.source})"
             checks.append(
                 Check("stuck", CheckResult.WARNING, message, "check this sensor or topic", {"stuck_s": f.stuck})
             )
-        if f.name in ("gyro", "accel") and f.saturated:
+        if f.name in IMU and f.saturated:
             share = f.saturated / f.count
             # Inertias come out 2 % too large where 6 % of the rates are clipped, 8 % at 16 %.
             verdict = CheckResult.ERROR if f.name == "gyro" and share > 0.05 else CheckResult.WARNING
@@ -499,7 +500,17 @@ def attitude_check(recording: Recording) -> Check:
     accel, attitude = recording.channels.get("accel"), recording.channels.get("attitude")
     if rates.verdict is CheckResult.ERROR or accel is None or attitude is None or len(attitude.t) < 2:
         return rates
-    down = float(np.median(_in_world(accel, attitude)[:, 2]))
+    vertical = _in_world(accel, attitude)[:, 2]
+    down, up, seconds = float(np.median(vertical)), -float(np.mean(vertical)), float(np.ptp(accel.t))
+    # What is felt upwards makes up for gravity on the average, but for 5 m/s of vertical speed.
+    most = 0.7 + 5.0 / max(seconds, 1e-3)
+    if down < 0.5 * GRAVITY and most < abs(up - GRAVITY) < 0.5 * GRAVITY:
+        return Check(
+            "gravity", CheckResult.ERROR if abs(up - GRAVITY) > 2.0 * most else CheckResult.WARNING,
+            f"specific force is {up:.3g} m/s^2 upwards on the average of {seconds:.3g} s, which must be "
+            f"{GRAVITY:.2f}: scale or zero of the accelerometer is wrong, and b with it",
+            f"calibrate it; if it is the scale, multiply acceleration by {GRAVITY / up:.3g}", {"up": up},
+        )  # fmt: skip
     if down < 0.5 * GRAVITY:
         return rates
     return Check(
@@ -535,7 +546,44 @@ def gyro_check(recording: Recording) -> Check:
     if best is None:
         return Check("gyro_attitude", CheckResult.UNKNOWN, "too little rotation to compare gyro and attitude")
     late = _apart(gyro, attitude, best[1].r2) if best[0] == "as given" else None
-    return late or _angle_rates(gyro, attitude) or _bias_step(gyro, attitude) or _judge_rates(*best)
+    return (
+        late or _angle_rates(gyro, attitude) or _one_axis(gyro, attitude) or _bias_step(gyro, attitude)
+        or _judge_rates(*best)
+    )  # fmt: skip
+
+
+def _one_axis(gyro: Channel, attitude: Channel) -> Check | None:
+    """An error where one axis is still or has a scale of its own, a warning where one is far off zero."""
+    rows = _without_jumps(*_moving_rates(gyro, attitude.t, attitude.values))
+    if len(rows[0]) < FEWEST_SAMPLES:
+        return None
+    (size, turned), offset = (np.std(x, axis=0) for x in rows), np.mean(rows[0] - rows[1], axis=0)
+    follows = np.mean((rows[0] - rows[0].mean(axis=0)) * (rows[1] - rows[1].mean(axis=0)), axis=0) > (
+        0.9 * size * turned + 1e-12
+    )
+    scale = turned / np.maximum(size, 1e-300)
+    agrees = follows & (scale < _UNIT) & (scale > 1.0 / _UNIT) & (size > _MOTION)
+    if not agrees.any():
+        return None
+    check = partial(Check, "gyro_attitude")
+    for axis, name in enumerate(_AXES):
+        still = [which for which, x in (("gyro", size), ("attitude", turned)) if x[axis] < 1e-6]
+        numbers = {"scale": float(scale[axis]), "offset": float(offset[axis])}
+        if len(still) == 1 and max(size[axis], turned[axis]) > 3.0 * _MOTION:
+            message = f"{still[0]} does not turn about {name}, where the other does"
+            return check(CheckResult.ERROR, message, "log all of its axes", numbers)
+        if follows[axis] and not agrees[axis] and size[axis] > _MOTION:
+            message = f"attitude rate / gyro = {scale[axis]:.3g} about {name}, not about every axis"
+            return check(
+                CheckResult.ERROR, message, f"multiply the gyro's {name} by it, or correct the attitude", numbers
+            )
+    worst = int(np.argmax(np.abs(offset)))
+    if abs(offset[worst]) < 0.1 or not agrees[worst]:  # [rad/s]; of recorded flights up to 0.04
+        return None
+    message = f"gyro reads {offset[worst]:+.2g} rad/s about {_AXES[worst]} more than the attitude turns"
+    return check(
+        CheckResult.WARNING, message, "calibrate it at rest, or subtract this", {"offset": float(offset[worst])}
+    )
 
 
 def _bias_step(gyro: Channel, attitude: Channel) -> Check | None:

@@ -412,7 +412,7 @@ def _against_thrust(
 
 _UNITS = (
     ("in rpm", 2.0 * np.pi / 60.0), ("in rev/s", 2.0 * np.pi), ("of the electrical field (14 poles)", 1.0 / 7.0),
-    ("ten times too low", 10.0),
+    ("ten times too low, or b to be per rpm^2", 10.0),
 )  # fmt: skip
 """Units that speeds may be in instead of rad/s, and the factor that mends each."""
 _SLOW_MOTION = 0.4
@@ -457,7 +457,10 @@ def hover_check(recording: Recording, vehicle: Vehicle, spans: Spans) -> Check:
         units, factors = (" or ".join(parts) for parts in zip(*((u, f"{f:.6g}") for u, f in fitting), strict=True))
         slip = f"{message}, outside {low:.3g} to {high:.3g}: speeds seem to be {units}"
         return check(
-            CheckResult.ERROR, slip, f"multiply rotor speeds by {factors}, or use the vehicle file of this log"
+            CheckResult.ERROR,
+            slip,
+            f"multiply rotor speeds by {factors}{', or b by 91.2' * ('rpm^2' in slip)}, or use "
+            "the vehicle file of this log",
         )
     root = ThrustModel.stated(vehicle).total(np.sqrt(np.abs(speeds)))
     if low <= guess.initial * vehicle.mass * GRAVITY / max(float(np.mean(root)), 1e-300) <= high:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from quadid_replay import open_log, write_csv
 from quadid_replay.columns import RawChannel, clean_channel
 from quadid_replay.motors import active_outputs, frame_of, in_pulses, motor_columns, no_multirotor
@@ -17,7 +19,7 @@ from quadid.app.logs import LogPart, check_conventions
 from quadid.checks import Check, CheckResult, inspect
 from quadid.checks.motion import attitude_steps_check
 from quadid.data.window import Channel, Recording
-from quadid.errors import LogError
+from quadid.errors import LogError, QuadidError
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 
@@ -118,6 +120,40 @@ def test_without_a_velocity_the_position_is_compared_with_the_force(flight: Reco
     for recording, said in ((high, "vertical position rises"), (flight, "position follows tilt and thrust")):
         channels = {name: channel for name, channel in recording.channels.items() if name != "velocity"}
         assert said in verdict(replace(recording, channels=channels), "velocity_attitude").message
+
+
+@pytest.mark.parametrize(
+    ("channel", "scale", "zero", "error", "said"),
+    [
+        ("gyro", [1.0, 0.5, 1.0], [0.0, 0.0, 0.0], True, r"attitude rate / gyro = (1\.9\d|2|2\.0\d) about y"),
+        ("gyro", [1.0, 1.0, 57.3], [0.0, 0.0, 0.0], True, r"attitude rate / gyro = 0\.017\d about z"),
+        ("gyro", [1.0, 0.0, 1.0], [0.0, 0.0, 0.0], True, "gyro does not turn about y"),
+        ("gyro", [1.0, 1.0, 1.0], [0.5, 0.0, 0.0], False, r"gyro reads \+0\.5 rad/s about x"),
+        ("accel", [1.3, 1.3, 1.3], [0.0, 0.0, 0.0], True, r"force is 12\.[78] m/s\^2 upwards"),
+        ("accel", [0.8, 0.8, 0.8], [0.0, 0.0, 0.0], True, r"force is 7\.[89]\d? m"),
+        ("accel", [1.0, 1.0, 1.0], [0.0, 0.0, 1.0], False, r"force is 8\.[89]\d? m"),
+        ("velocity", [0.0, 0.0, 0.0], [0.0, 0.0, 0.0], False, "velocity: does not change for"),
+    ],
+)  # fmt: skip
+def test_one_axis_and_zero_of_a_sensor(
+    flight: Recording, channel: str, scale: list[float], zero: list[float], error: bool, said: str
+) -> None:
+    recording = with_channel(flight, channel, flight.channels[channel].values * scale + zero)
+    wanted = CheckResult.ERROR if error else CheckResult.WARNING
+    told = [check.message for check in inspect(recording, Vehicle.shipped("pelican")).checks if check.verdict is wanted]
+    assert any(re.search(said, line) for line in told), told
+
+
+def test_inertia_in_grams_and_thrust_per_rpm_are_named(flight: Recording) -> None:
+    text = Vehicle.shipped("pelican").to_yaml()
+    made = yaml.safe_load(text)
+    for name in ("J_xx", "J_yy", "J_zz"):
+        made["parameters"][name] = 1e3 * Vehicle.shipped("pelican").parameters[name].initial
+    with pytest.raises(QuadidError, match="is it in g m"):
+        Vehicle.from_yaml(yaml.safe_dump(made), "mine")
+    made = yaml.safe_load(text) | {"parameters": yaml.safe_load(text)["parameters"] | {"b": 2.0e-5 / 91.2}}
+    check = verdict(flight, "hover", Vehicle.from_yaml(yaml.safe_dump(made), "mine"))
+    assert "b by 91.2" in check.fix
 
 
 @pytest.mark.parametrize(
