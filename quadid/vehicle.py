@@ -397,7 +397,7 @@ class Proof(Strict):
 
     @property
     def lacking(self) -> str:
-        """Why the values are not proven; empty when they are."""
+        """Reason why the values are not proven; empty when they are."""
         if self.verdict == "poor":
             error = f": error {self.error:.3g} times what is expected on an unseen flight" if self.error else ""
             return f"its fit was judged poor{error}"

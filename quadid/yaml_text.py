@@ -26,7 +26,7 @@ _NULL = {"", "~", "null", "Null", "NULL"}
 
 
 class _RefusedError(Exception):
-    """Why a text is not read, and how to write it instead."""
+    """Reason why a text is not read, and how to write it instead."""
 
     def __init__(self, why: str, instead: str) -> None:
         super().__init__(why)

@@ -18,7 +18,7 @@ QUADID = [sys.executable, "-c", "import sys; from quadid.cli.main import app_mai
 
 
 class Run(NamedTuple):
-    """What a command did."""
+    """Outcome of a command."""
 
     code: int
     out: str

@@ -1,4 +1,4 @@
-"""What all tests share: where the recorded flights are, and what must not be skipped in CI."""
+"""Shared by all tests: the folder of the recorded flights, and the rule that nothing is skipped in CI."""
 
 from __future__ import annotations
 

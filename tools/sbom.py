@@ -1,4 +1,4 @@
-"""What quadid installs with it: NOTICE with every licence, and an SBOM (CycloneDX 1.5, JSON). Usage: sbom.py OUT_FOLDER
+"""Packages beside quadid: NOTICE with every licence, and an SBOM (CycloneDX 1.5, JSON). Usage: sbom.py OUT_FOLDER
 
 Both are read from the metadata of the installed packages that `pip install .` brings, and from nothing else.
 """

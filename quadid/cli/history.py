@@ -69,7 +69,7 @@ class Stored(Outcome):
     result: dict[str, Any]
 
     def tables(self) -> list[TextTable]:
-        """When, by whom and from which data; then the values."""
+        """Time, author and data of the set; then the values."""
         sets = self.result["sets"]
         return [_story(sets, f"Parameter sets of {self.result['vehicle']}"), _values(sets)] if sets else []
 
@@ -92,7 +92,7 @@ class Stored(Outcome):
 
 
 def _story(sets: Sequence[dict[str, Any]], title: str) -> TextTable:
-    """When, by whom and from which data."""
+    """Time, author and data of a set."""
     columns = (
         Column("set", right=True), Column("when"), Column("state"), Column("by"), Column("data [s]", right=True),
         Column("error", right=True),

@@ -457,7 +457,7 @@ def assess(flights: Sequence[FlightTrim], baseline: Sequence[FlightTrim], vehicl
 
 
 def _unfamiliar(flights: Sequence[FlightTrim], baseline: Sequence[FlightTrim]) -> str:
-    """Why the flights are of a kind that no baseline flight is; empty where they are not, or rates are not known."""
+    """Reason why no baseline flight is of the kind of these flights; empty where one is, or rates are not known."""
     now, known = (max(flight.turning for flight in part) for part in (flights, baseline))
     if not now > max(3.0 * known, 0.3):  # also of NaN
         return ""

@@ -91,7 +91,7 @@ def rotor_channel(recording: Recording, vehicle: Vehicle | None) -> tuple[Channe
 
 
 def _passed_over(speed: Channel, command: Channel | None, vehicle: Vehicle | None) -> str:
-    """Why measured speeds are not used; empty where they are."""
+    """Reason why measured speeds are not used; empty where they are."""
     if not np.any(speed.values):
         return "are all zero: the motors are off, or the ESCs do not report"
     if command is None or vehicle is None or vehicle.command.kind == "rotor_speed":

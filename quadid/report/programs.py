@@ -203,7 +203,7 @@ class Facts:
 
     @property
     def unproven(self) -> str:
-        """Why nothing shows that the values predict; empty where something does."""
+        """Reason why nothing shows that the values predict; empty where something does."""
         proof = self.vehicle.proof
         if self.doubt:
             return self.doubt
@@ -284,7 +284,7 @@ def px4(facts: Facts) -> dict[str, Any]:
 
 
 def _not_sih(facts: Facts) -> str:
-    """Why PX4's simulation in hardware cannot be this vehicle; empty where its X and motor order hold."""
+    """Reason why PX4's simulation in hardware cannot be this vehicle; empty where its X and motor order hold."""
     shape = "four alike rotors in an X: front right and back left counterclockwise, then front left and back right"
     if len(facts.rotors) != _SIH.shape[1]:
         return f"no SIH_*: PX4 simulates {shape}, this vehicle has {len(facts.rotors)} rotors"

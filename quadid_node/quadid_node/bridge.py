@@ -87,7 +87,7 @@ def entry(text: str) -> Entry:
 
 
 def objection(message: Any, vehicle: str, mass: float, newest: int) -> str:
-    """Why a set is not for this controller, or not in force; empty when it may be applied."""
+    """Reason why a set is not for this controller, or not in force; empty when it may be applied."""
     if message.schema_version != SCHEMA_VERSION:
         return f"schema {message.schema_version}, this bridge knows {SCHEMA_VERSION}"
     if not len(message.names) == len(message.values) == len(message.status):

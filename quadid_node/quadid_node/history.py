@@ -466,7 +466,7 @@ def stored(db: sqlite3.Connection, name: str, which: str, gate: GateSettings, ve
 
 
 def why_none(found: OnlineSet, number: int, gate: GateSettings, vehicle: Vehicle | None) -> str:
-    """Why a stored set is none that a fresh estimate could be; empty where it may be one.
+    """Reason why a stored set is none that a fresh estimate could be; empty where it may be one.
 
     Args:
         found: the set.

@@ -174,7 +174,7 @@ class Publishers:
 
     @property
     def problem(self) -> str:
-        """Who else publishes parameter sets, or empty."""
+        """Other publishers of parameter sets, or empty."""
         return self._ownership.problem if self._ownership is not None else ""
 
     def step(self, wanted: bool = True) -> bool:

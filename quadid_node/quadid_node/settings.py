@@ -114,7 +114,7 @@ def vehicle_id(given: str, namespace: str, vehicle: Vehicle) -> str:
 
 
 def check_change(name: str, value: Any) -> str:
-    """Why a parameter may not be changed to this now; empty when it may."""
+    """Reason why a parameter may not be changed to this now; empty when it may."""
     known = {p.name: p for p in PARAMETERS}
     if name not in known:
         return ""  # not ours: use_sim_time, QoS overrides

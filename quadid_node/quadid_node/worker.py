@@ -39,7 +39,7 @@ class WarmUp:
         self._used, self._moved = 0.0, clock()
 
     def given_up(self) -> str:
-        """Why the child is given up; empty while it may go on."""
+        """Reason why the child is given up; empty while it may go on."""
         now, used = self._clock(), processor_seconds(self._pid)
         if used is not None and used >= self._used + STEP:
             self._used, self._moved = used, now

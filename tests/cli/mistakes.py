@@ -174,7 +174,7 @@ class Place:
 
 @dataclass(frozen=True)
 class Mistake:
-    """What was done wrong, the call, and words of which its first line must hold one.
+    """A mistake: its name, the call, and words of which its first line must hold one.
 
     With `vague` the line does not name the cause yet: the page says so, and the test only wants one line.
     """
@@ -346,7 +346,7 @@ def first_line(mistake: Mistake, place: Place) -> tuple[int, str]:
 
 
 def shown(line: str, names: str) -> str:
-    """What the line finds, without program, log, what is allowed and the fix, where that names the mistake already."""
+    """The finding of the line, without program, log and what is allowed; without the fix where it names the mistake."""
     short = re.sub(r"^quadid: (log\.\w+: )?|, or insist with --unchecked", "", line)
     found = re.split("; allowed: |; fix: ", short)[0]
     short = found if re.search(names, found) else re.sub("; allowed: [^;]{26,}(?=; fix)", "", short)

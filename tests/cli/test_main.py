@@ -381,7 +381,7 @@ def test_a_log_of_each_format_cut_in_its_first_bytes(
 def test_a_log_of_each_format_cut_in_the_middle(
     inside: Cli, whole_logs: dict[str, bytes], tmp_path: Path, suffix: str
 ) -> None:
-    """What is before the cut is read, and the warning says so; without a whole chunk there is one clear line."""
+    """Everything before the cut is read, and the warning says so; without a whole chunk there is one clear line."""
     data = whole_logs[suffix]
     log = tmp_path / f"cut.{suffix}"
     log.write_bytes(data[: len(data) * 2 // 3 + 1])

@@ -35,7 +35,7 @@ print(json.dumps({k.__name__: len(k.signatures) for name in FIT for k in PARTS[n
 
 
 def python(text: str, *arguments: str, **environment: str) -> str:
-    """What a Python of its own prints."""
+    """Output of a Python of its own."""
     run = subprocess.run(
         [sys.executable, "-c", text, *arguments], env={**os.environ, **environment}, capture_output=True, text=True,
         check=True,

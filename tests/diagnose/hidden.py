@@ -35,7 +35,7 @@ def data(case_key: tuple[str, int, float]) -> tuple[Case, Window, Window, Vehicl
 
 
 def answer(case: Case) -> tuple[Diagnosis, Search]:
-    """What the diagnosis says about the case; it gets the flights and the vehicle file alone."""
+    """Answer of the diagnosis to the case; it gets the flights and the vehicle file alone."""
     _, train, validate, vehicle = data((case.group, case.number, case.seconds))
     return diagnose([train], vehicle, [validate], seed=case.seed)
 

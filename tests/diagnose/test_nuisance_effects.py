@@ -1,4 +1,4 @@
-"""What any vehicle may have is told from what is larger, an event or a matter of wind and ground."""
+"""Effects that any vehicle may have are told from what is larger, an event or a matter of wind and ground."""
 
 from __future__ import annotations
 

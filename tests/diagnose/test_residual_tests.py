@@ -1,4 +1,4 @@
-"""What remains: noise has the spectrum of noise, a tone stands out at its frequency, verdicts follow from shares."""
+"""Remainder: noise has the spectrum of noise, a tone stands out at its frequency, verdicts follow from shares."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def test_structure_is_counted_once_though_two_looks_see_it() -> None:
 
 @dataclass(frozen=True)
 class Stub:
-    """What `judge` reads of a model."""
+    """The parts of a model that `judge` reads."""
 
     causes: tuple[str, ...]
     held_out: FloatArray

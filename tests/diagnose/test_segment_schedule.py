@@ -1,4 +1,4 @@
-"""Which segments decide: the longest that the model follows, and long ones only where airspeed must be found."""
+"""Segments that decide: the longest that the model follows, and long ones only where airspeed must be found."""
 
 from __future__ import annotations
 

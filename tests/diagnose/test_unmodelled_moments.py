@@ -25,7 +25,7 @@ SHOWN = ("b", "J_xx", "J_yy")
 
 
 def diagnosed(seed: int = SEED, **effects: dict[str, float]) -> Diagnosis:
-    """What the diagnosis says of a flight through turbulence, from a poor guess.
+    """Diagnosis of a flight through turbulence, from a poor guess.
 
     The simulator shares no equation with the model.
     """
@@ -70,7 +70,7 @@ def test_nor_does_it_beside_a_cause_that_is_found(seed: int) -> None:
 
 
 def held(window: Window, shooting: Shooting, model: Model) -> object:
-    """What is held of a model."""
+    """Values of a model that are held."""
     short = Shooting.cut([window], shooting.vehicle, SWARM_SECONDS, shooting.noise, shooting.layout)
     return held_by_fast_motion([window], short, model)
 

@@ -1,4 +1,4 @@
-"""What tests measured against the rows of `tests.faults.fault_list`: collected, and written as one page.
+"""Measurements of tests against the rows of `tests.faults.fault_list`: collected, and written as one page.
 
 A test asks for the fixture `happened` and says what it saw, in one sentence with figures, next to the assertion that
 holds it.  `pytest --faults-page FILE tests` (`make faults`) runs the tests that do so, and writes the table.  Only what
@@ -102,7 +102,7 @@ def _alone(test: str) -> str:
 
 
 def _stands(test: str) -> bool:
-    """Whether a test, as pytest names it, is still in its file."""
+    """Checks whether a test, as pytest names it, is still in its file."""
     file, _, name = test.partition("::")
     function = name.split("[")[0].rsplit("::", 1)[-1]
     return Path(file).exists() and f"def {function}(" in Path(file).read_text(encoding="utf-8")

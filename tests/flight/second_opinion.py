@@ -55,7 +55,7 @@ class SecondOpinion:
         return np.array([[J_xx, -j_xy, -j_xz], [-j_xy, J_yy, -j_yz], [-j_xz, -j_yz, J_zz]])
 
     def loaded(self, t: float) -> bool:
-        """Whether mass has been taken up by time t."""
+        """Checks whether mass has been taken up by time t."""
         return bool(t >= self.get("mass_change", "time", np.inf))
 
     def cg(self, t: float) -> FloatArray:

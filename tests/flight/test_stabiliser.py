@@ -129,7 +129,7 @@ PELICAN = Vehicle.shipped("pelican")
 
 
 def movement(flight: Flight) -> dict[str, FloatArray]:
-    """How much a flight moves: rms of rates, tilt angles, relative thrust."""
+    """Movement of a flight: rms of rates, tilt angles, relative thrust."""
     q = flight.truth.quaternion
     angles = Rotation.from_quat(q[:, [1, 2, 3, 0]]).as_euler("ZYX")[:, :0:-1]
     squares = (flight.window.rotor_speed**2).sum(axis=1)

@@ -23,7 +23,7 @@ FILLER = (b"\xfe", b"\x00", b"\xff", b"\xa3\x95\x80", b"\x2f\x73\x13\x20\x25\x0c
 
 
 class Format(NamedTuple):
-    """What a fuzzer needs of a format.
+    """Functions that a fuzzer needs of a format.
 
     Attributes:
         split: the records of a log; joined they are the log.
@@ -113,7 +113,7 @@ def _change(rng: Random, form: Format, records: list[bytes], at: int, seeds: Seq
 
 @lru_cache(maxsize=4096)
 def _tells(form: Format, record: bytes) -> bool:
-    """Whether a record says something of other records; seeds share most of theirs."""
+    """Checks whether a record says something of other records; seeds share most of theirs."""
     return form.define(Random(1), record) != record
 
 

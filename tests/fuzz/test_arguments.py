@@ -1,4 +1,4 @@
-"""Whatever is typed after `quadid`: an exit code of the contract, one line of reason, no traceback."""
+"""Any arguments after `quadid`: an exit code of the contract, one line of reason, no traceback."""
 
 from __future__ import annotations
 

@@ -263,5 +263,5 @@ def test_senders_without_end_take_no_more_than_their_bytes(tmp_path: Path, happe
 
 
 def function(output: int, value: int) -> Any:
-    """What an ArduPilot says that an output drives."""
+    """ArduPilot's parameter for an output's function."""
     return MAV.MAVLink_param_value_message(f"SERVO{output}_FUNCTION".encode(), float(value), 9, 900, output)

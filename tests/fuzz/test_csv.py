@@ -1,4 +1,4 @@
-"""Whatever stands in a CSV, it is a recording that keeps its promises or one error that says what is wrong."""
+"""Any CSV is a recording that keeps its promises or one error that says what is wrong."""
 
 from __future__ import annotations
 

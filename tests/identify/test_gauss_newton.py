@@ -49,7 +49,7 @@ def optimum() -> Polished:
 
 
 def distance(optimum: Polished, theta: FloatArray) -> FloatArray:
-    """How far `theta` lies from the optimum, in standard deviations of each parameter."""
+    """Distance of `theta` from the optimum, in standard deviations of each parameter."""
     sigma = np.sqrt(np.diag(np.linalg.inv(optimum.lin.gram.sum(axis=0))))
     return np.asarray(np.log(theta[:6] / optimum.theta[:6]) / sigma)
 

@@ -1,4 +1,4 @@
-"""What held commands do within their samples: seen where a controller is faster than the log, and nowhere else."""
+"""Effect of held commands within their samples: seen where a controller is faster than the log, and nowhere else."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is known beforehand: mass, arm, thrust stand, CAD inertia; each with its uncertainty, seen in the posterior."""
+"""Prior knowledge: mass, arm, thrust stand, CAD inertia; each with its uncertainty, seen in the posterior."""
 
 from __future__ import annotations
 

@@ -25,7 +25,7 @@ DRAWS = 60
 
 
 def both(window: Window, start: FloatArray | None = None) -> tuple[BothCuts | None, FloatArray, FloatArray]:
-    """What both cuts tell of a window with the noise `WHITE`, and value and information of one, nominal parameters."""
+    """Information of both cuts of a window with the noise `WHITE`, and value and information of one, nominal."""
     noise = NoiseModel(WHITE, np.zeros(9))
     shooting = Shooting.cut([window], PELICAN, 1.0, noise)
     free = shooting.free(NOMINAL_NAMES)

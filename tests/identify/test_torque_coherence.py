@@ -1,4 +1,4 @@
-"""What torque and motion that do not cohere leave open of inertias."""
+"""Inertias left open where torque and motion do not cohere."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def window(unknown: float, lost: float = 0.0, seconds: float = 60.0) -> Window:
 
 
 def share_open(one: Window, white: float = 0.0) -> FloatArray:
-    """What J_xx and J_yy are undecided by."""
+    """Share by which J_xx and J_yy are undecided."""
     return undecided([one], PELICAN, np.full(2, white))
 
 

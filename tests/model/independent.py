@@ -86,7 +86,7 @@ class Flown:
         return np.column_stack([quaternion(y[:, EULER]), y[:, RATE], y[:, VELOCITY], y[:, POSITION]])
 
     def window(self, **channels: FloatArray | None) -> Window:
-        """What perfect sensors log at the rows but the first and the last, which have no whole sample around them."""
+        """Log of perfect sensors at the rows but the first and the last, which have no whole sample around them."""
         t = self.given.t
         y = self.at(t)
         accel = np.full((len(t), 3), np.nan)
@@ -170,7 +170,7 @@ class Independent:
         return np.asarray((climbs**2 + 2.0 * climbs * -cross(nu, arm - middle)[2]) * DOWN)
 
     def loaded(self, t: float) -> bool:
-        """Whether the payload has been taken up at time t."""
+        """Checks whether the payload has been taken up at time t."""
         return bool(t > self.values.get("mass_change.time", np.inf))
 
     def rhs(

@@ -1,4 +1,4 @@
-"""Which vectors share a block of lanes: a matter of time alone, never of the result."""
+"""Vectors that share a block of lanes: a matter of time alone, never of the result."""
 
 from __future__ import annotations
 

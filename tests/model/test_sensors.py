@@ -1,4 +1,4 @@
-"""What the sensors make of the motion: filters, delays, errors, each against SciPy or the contract's wording."""
+"""Sensors: filters, delays, errors, each against SciPy or the contract's wording."""
 
 from __future__ import annotations
 

@@ -162,7 +162,7 @@ def test_files_that_need_more_say_so() -> None:
 
 
 def test_a_state_flies_on_with_another_simulator_and_its_copy_likewise() -> None:
-    """What a step works with beside the state belongs to one simulator, one step size and one state."""
+    """Work data of a step beside the state belong to one simulator, one step size and one state."""
     light, heavy = Vehicle.shipped("pelican"), Vehicle.shipped("pelican").model_copy(update={"mass": 2.0})
     command = light.hover_speed() * np.array([1.02, 0.99, 1.01, 0.98])
     first, second = Simulator(light), Simulator(heavy)

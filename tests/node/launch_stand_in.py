@@ -1,4 +1,4 @@
-"""What the launch files use of ROS' `launch` and `launch_ros`, which are on no package index: enough to carry them out.
+"""Stand-in for ROS' `launch` and `launch_ros`, which are on no package index: enough to carry out the launch files.
 
 Arguments that are declared take their defaults where they are not given, functions are called with the context, and
 what would be started or included is kept with its arguments.
@@ -83,7 +83,7 @@ KEPT = {
 
 
 def launched(file: Path, given: dict[str, str], monkeypatch: pytest.MonkeyPatch) -> list[Kept]:
-    """What a launch file starts or includes with these arguments."""
+    """Nodes and files that a launch file starts or includes with these arguments."""
     for name in (*MODULES, *KEPT):
         module = ModuleType(name)
         for kind in MODULES.get(name, ()):

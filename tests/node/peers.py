@@ -79,7 +79,7 @@ class Process:
         return code, time.monotonic() - begin - (held - before)
 
     def _held(self, last: float) -> float:
-        """How long its first thread has waited for a processor [s], as Linux counts; the last value if it is gone."""
+        """Time that its first thread has waited for a processor [s], as Linux counts; the last value if it is gone."""
         try:
             return 1e-9 * int(Path(f"/proc/{self.child.pid}/schedstat").read_text().split()[1])
         except OSError:

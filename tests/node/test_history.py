@@ -59,7 +59,7 @@ def others() -> subprocess.Popen[str]:
 
 
 def another_process(path: Path, vehicle: str = "pelican") -> str:
-    """What a second service says that opens the history; empty where it is let in."""
+    """Words of a second service that opens the history; empty where it is let in."""
     told, heard = others().stdin, others().stdout
     assert told is not None
     assert heard is not None
@@ -86,7 +86,7 @@ def say(store: Store, text: str) -> bool:
 
 
 def lines(path: Path) -> list[str]:
-    """What the history holds of them."""
+    """Texts of the events in the history."""
     return [e["text"] for e in read_history(path, "pelican", events=1000)["events"]]
 
 

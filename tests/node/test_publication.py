@@ -71,7 +71,7 @@ def accept(service: Service, **changes: float) -> OnlineSet:
 
 
 def said(service: Service, *wanted: Callable[[Output], bool]) -> list[Output]:
-    """What a service hands out until each `wanted` output has come; without any, in one step."""
+    """Outputs of a service until each `wanted` output has come; without any, in one step."""
     out, deadline = service.step(), time.monotonic() + 120.0
     while not all(any(map(one, out)) for one in wanted):
         assert time.monotonic() < deadline, out
@@ -387,7 +387,7 @@ SETTLED = FOUND_WITHIN + 2.0
 
 
 class Topic:
-    """Who publishes, as services see it; `apart`: they do not see each other."""
+    """Publishers of a topic, as services see them; `apart`: they do not see each other."""
 
     def __init__(self) -> None:
         self.now, self.apart = 0.0, False

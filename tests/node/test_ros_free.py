@@ -268,7 +268,7 @@ def test_the_launch_file_of_a_fleet_gives_each_vehicle_its_own(monkeypatch: pyte
 @pytest.mark.ros
 @pytest.mark.parametrize("name", ["identify", "fleet"])
 def test_the_launch_file_starts_nodes(name: str) -> None:
-    """Where ROS' own launch is installed (the wheels of the package index have none)."""
+    """With ROS' own launch, where it is installed (the wheels of the package index have none)."""
     if importlib.util.find_spec("launch_ros") is None:
         pytest.skip("launch_ros is on no package index: run where ROS is installed")
     launch, actions = importlib.import_module("launch"), importlib.import_module("launch.actions")

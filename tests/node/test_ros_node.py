@@ -323,7 +323,7 @@ _PORT = "/fastrtps_port"
 
 
 def _mapped(folder: Path) -> str:
-    """What a node that is ready has in its memory."""
+    """Files mapped into the memory of a node that is ready."""
     with node(folder / "h.sqlite") as identify:
         identify.wait_for("ready")
         mapped = Path(f"/proc/{identify.child.pid}/maps").read_text(encoding="utf-8")

@@ -91,7 +91,7 @@ def between(stream: Iterable[Sample], start: float, stop: float = math.inf, shif
 
 
 def nothing_left_out(sigma: float = 0.005) -> FloatArray:
-    """What a fit says that knows the thrust of four rotors to be b w^2, each to `sigma`, and nothing at rest."""
+    """Answer of a fit that knows the thrust of four rotors to be b w^2, each to `sigma`, and nothing at rest."""
     return np.stack([np.zeros(5), np.append(np.full(4, sigma), 1.0)])
 
 

@@ -36,7 +36,7 @@ def factors_of(recording: Recording, vehicle: Vehicle = PELICAN) -> tuple[Factor
 
 
 def consistency_of(recording: Recording, vehicle: Vehicle = PELICAN) -> Consistency:
-    """What a session knows of the sensors at the end of a flight."""
+    """Knowledge of a session about the sensors at the end of a flight."""
     resampler, store, found = Resampler(vehicle, 50.0), GridBuffer(50.0, 20.0), Consistency()
     tick = 1.0
     for sample in samples(recording):

@@ -125,7 +125,7 @@ def test_a_step_of_thrust_that_no_fit_explains_is_a_force_and_nothing_is_ruled_o
 
 
 def test_a_rotor_that_recovers_is_said_to() -> None:
-    """What was known before the change holds the loss; what is told is how it changed."""
+    """The knowledge before the change holds the loss; reported is how it changed."""
     request = explained("excited", (), ChangePoint(40.0, "roll moment", -0.1, 30.0))
     weak = request.theta.copy()
     weak[LOSS + 2] = 0.1

@@ -49,7 +49,7 @@ def resampled(log: Path, vehicle: Vehicle) -> Iterator[Rows]:
 def steps(
     log: Path, file: Path, scale: float = 1.0, at: float = np.inf, velocity: bool = True
 ) -> list[tuple[float, str, float]]:
-    """What is seen: when [s], channel, size; from `at` [s] on rotors give only `scale` as much for their speed."""
+    """Changes seen: when [s], channel, size; from `at` [s] on rotors give only `scale` as much for their speed."""
     vehicle = Vehicle.from_yaml(file.read_text())
     store, estimator = GridBuffer(RATE, 60.0), Estimator(vehicle, 60.0, 0)
     supervisor, seen, first, tick = ChangeWatch(vehicle, store), list[tuple[float, str, float]](), 0.0, 0.0

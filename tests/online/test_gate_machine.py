@@ -1,4 +1,4 @@
-"""Whatever arrives, samples, fits, commands, restarts: what is published was approved, bounded and journalled.
+"""Any order of samples, fits, commands, restarts: every published set was approved, bounded and journalled.
 
 Session, gate, ledger, service and SQLite are real.  The fit process is the adversary: it answers with any estimate.
 """

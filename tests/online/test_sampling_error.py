@@ -1,4 +1,4 @@
-"""What the rotors do between two readings widens the intervals of a window."""
+"""Motion of the rotors between two readings widens the intervals of a window."""
 
 from __future__ import annotations
 

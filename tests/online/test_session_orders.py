@@ -129,7 +129,7 @@ def test_a_rollback_returns_to_the_set_before_and_learns_anew_from_there() -> No
 
 
 def session_start(session: Session) -> float:
-    """What turns session time into stamps [s]."""
+    """Offset from session time to stamps [s]."""
     return session.resampler.time.stamp(0.0)
 
 

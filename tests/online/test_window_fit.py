@@ -1,4 +1,4 @@
-"""How the fit cuts its windows: into segments that fill them, at borders that differ from window to window."""
+"""Cuts of the fit's windows: into segments that fill them, at borders that differ from window to window."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What `pip install .` brings: seven packages with their data, one version, and imports that cost nothing."""
+"""Contents of `pip install .`: seven packages with their data, one version, and imports that cost nothing."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What every real log holds, in numbers.  Write them anew with ``python -m tests.replay.golden``."""
+"""Contents of every real log, in numbers.  Write them anew with ``python -m tests.replay.golden``."""
 
 from __future__ import annotations
 

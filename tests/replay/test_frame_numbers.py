@@ -13,7 +13,7 @@ FRAMES = 160
 
 
 def windows(number: IntArray) -> list[bool]:
-    """What is found in each stretch of as many frames as a live link looks at."""
+    """Findings in each stretch of as many frames as a live link looks at."""
     return [two_rows(number[k : k + FRAMES]) for k in range(0, len(number) - FRAMES, FRAMES)]
 
 

@@ -26,7 +26,7 @@ def without_rows(recording: Recording, gone: IndexArray) -> Recording:
 
 
 def shift_between(a: FloatArray, b: FloatArray, dt: float) -> float:
-    """How late `b` is against `a` [s], from the phase of their cross spectrum below 5 Hz."""
+    """Delay of `b` against `a` [s], from the phase of their cross spectrum below 5 Hz."""
     window = np.hanning(len(a))
     fa, fb = (np.fft.rfft((x - x.mean()) * window) for x in (a, b))
     f = np.fft.rfftfreq(len(a), dt)

@@ -1,4 +1,4 @@
-"""What an inspection must notice: wrong units, wrong frames, swapped motors, absent and slow channels, clock faults."""
+"""Faults that an inspection notices: wrong units, wrong frames, swapped motors, absent and slow channels, clocks."""
 
 from __future__ import annotations
 

@@ -79,7 +79,7 @@ def test_a_folder_may_take_what_its_files_may(tmp_path: Path, monkeypatch: pytes
 
 @pytest.mark.parametrize("path", ["", os.pathsep])
 def test_no_code_of_the_folder_we_stand_in_is_run(tmp_path: Path, path: str, happened: Happened) -> None:
-    """Whoever packs a folder of logs may put a json.py into it; an empty name in PYTHONPATH means that folder."""
+    """A packed folder of logs may hold a json.py; an empty name in PYTHONPATH means that folder."""
     write_mcap(tmp_path / "a.mcap", full_recording(1.0, 50.0))
     (tmp_path / "json.py").write_text("open('ran', 'w').close()\nraise SystemExit\n")
     script = (
@@ -231,7 +231,7 @@ def extended(tmp_path_factory: pytest.TempPathFactory, repository: Path) -> Path
 
 
 def told(folder: Path, *paths: Path, seconds: str = "", memory: str = "") -> list[str]:
-    """What `open_log` of that folder's package tells of these files, in another process."""
+    """Answers of `open_log` of that folder's package to these files, in another process."""
     script = (
         "import json, sys\nfrom quadid.errors import LogError\nfrom quadid_replay import open_log\n"
         "for path in sys.argv[1:]:\n    try:\n        log = open_log(path)\n"

@@ -1,4 +1,4 @@
-"""What is written is read back: every channel, frames and all, to the precision that the format has."""
+"""Written logs are read back: every channel, frames and all, to the precision that the format has."""
 
 from __future__ import annotations
 

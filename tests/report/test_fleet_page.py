@@ -1,4 +1,4 @@
-"""What many flights say together: drift and outliers are found where they are, and not where they are not."""
+"""Statistics over many flights: drift and outliers are found where they are, and not where they are not."""
 
 from __future__ import annotations
 

@@ -87,7 +87,7 @@ GRAVITY = 9.81
 
 @dataclass
 class Autopilot:
-    """What a script sees of a vehicle that hovers at 20 m, nose to the south-west, and what it asks of it."""
+    """View of a script on a vehicle that hovers at 20 m, nose to the south-west, and what it asks of it."""
 
     now: float = 100.0
     mode: int = LOITER

@@ -460,7 +460,7 @@ def slope(found: ResidualMap) -> float:
 
 
 def flat(found: ResidualMap) -> bool:
-    """Whether nearly all bins with the cause hold zero in their interval, widened a little."""
+    """Checks whether nearly all bins with the cause hold zero in their interval, widened a little."""
     return bool(np.mean(np.abs(found.after) < 1.7 * found.after_error) > 0.85)
 
 

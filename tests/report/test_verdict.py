@@ -1,4 +1,4 @@
-"""What a result means in plain words."""
+"""Meaning of a result in plain words."""
 
 from __future__ import annotations
 

@@ -37,7 +37,7 @@ def colcon(scratch: Path, *arguments: str, **environment: str) -> str:
 
 
 def assert_layout(prefix: Path, package: Path) -> None:
-    """What `ros2 run quadid_node identify` and `ros2 launch quadid_node identify.launch.py` look up under a prefix."""
+    """Files that `ros2 run quadid_node identify` and `ros2 launch quadid_node identify.launch.py` find there."""
     assert (prefix / "share/ament_index/resource_index/packages/quadid_node").is_file()
     assert (prefix / "share/quadid_node/package.xml").is_file()
     for executable in ("identify", "replay", "bridge"):

@@ -276,7 +276,7 @@ def test_sticks_move_three_axes_out_of_step_and_leave_the_throttle() -> None:
 
 @dataclass
 class Autopilot:
-    """What `fly` needs of a link: it climbs once it was told to, and refuses to arm at first."""
+    """Stand-in for the link that `fly` needs: it climbs once it was told to, and refuses to arm at first."""
 
     flightmode: str = "STABILIZE"
     height: float = 0.0

@@ -25,7 +25,7 @@ SMALLEST_POPULATION = 4
 
 
 class Stop(StrEnum):
-    """Why the evolution stopped, or that it did not."""
+    """State of the evolution: running, or the reason for its end."""
 
     RUNNING = "the population is still evolving"
     CONVERGED = "the population has shrunk below the tolerance"

@@ -25,7 +25,7 @@ from quadid_evaluation.optimisers.lshade import Stop as LShadeStop
 
 
 class Stop(StrEnum):
-    """How an optimiser ended."""
+    """End of an optimiser."""
 
     CONVERGED = "the optimiser met its own tolerance"
     STALLED = "the optimiser gave up before it met its tolerance"
@@ -36,7 +36,7 @@ class Stop(StrEnum):
 
 @dataclass(frozen=True)
 class Result:
-    """What an optimiser found.
+    """Result of an optimiser.
 
     Attributes:
         x: best point, shape (n,).

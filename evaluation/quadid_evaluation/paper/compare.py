@@ -217,7 +217,7 @@ def compare(
 def _entry(
     name: str, train: float, validate: list[float], paper: list[float] | None, evaluations: int, seconds: float
 ) -> JsonDict:
-    """What every method has in ``quadid.compare/1``; `paper` is its score on each set."""
+    """Entries of every method in ``quadid.compare/1``; `paper` is its score on each set."""
     return {
         "name": name, "mse": {"train": train, "validate": validate},
         "mse_paper": None if paper is None else {"train": paper[0], "validate": paper[1:]},

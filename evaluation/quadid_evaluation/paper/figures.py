@@ -50,7 +50,7 @@ class PaperFigure:
 
     @property
     def title(self) -> str:
-        """What the figure shows."""
+        """Contents of the figure."""
         role = "training set" if self.sets == (1,) else "validation sets"
         return f"Figure {self.number}: {GROUPS[self.group][0]} in closed loop, {role}"
 

@@ -1,4 +1,4 @@
-"""What `quadid reproduce` computes: the paper's flights, every column of its tables, and what it lacks."""
+"""Computation of `quadid reproduce`: the paper's flights, every column of its tables, and what it lacks."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ BUDGET = 400
 
 @dataclass(frozen=True)
 class Plan:
-    """How much is done.
+    """Amount of work.
 
     Attributes:
         seconds: of each flight.

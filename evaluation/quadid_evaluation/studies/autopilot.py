@@ -96,7 +96,7 @@ OTHERS = (
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a session made of a flight.
+    """Outcome of a flight in a session.
 
     Attributes:
         published, candidates: sets as JSON, in order.
@@ -113,12 +113,12 @@ class Outcome:
 
     @property
     def alarms(self) -> list[str]:
-        """What was said to have changed."""
+        """Changes that were reported."""
         return [f"{e['t'] - self.begin:.0f} s: {e['text']}" for e in self.events if e["kind"] == "change"]
 
     @property
     def models(self) -> list[str]:
-        """What the model took in."""
+        """Effects that the model took in."""
         return [f"{e['t'] - self.begin:.0f} s: {e['text']}" for e in self.events if e["kind"] == "model"]
 
     @property

@@ -149,7 +149,7 @@ def guessed_vehicle(case: Case, truth: dict[str, float]) -> Vehicle:
 
 
 def needs(case: Case) -> set[str]:
-    """What must be logged for the case's effects to be seen; who logs position logs velocity."""
+    """Channels needed to see the case's effects; a log with position has velocity too."""
     found = {need for name in case.hidden for need in EFFECTS[name].needs}
     return found | ({"velocity"} if "position" in found else set())
 
@@ -274,7 +274,7 @@ def _near_truth(shooting: Shooting, model: Model, effect: str, values: dict[str,
 
 
 def right(g: Graded) -> bool:
-    """Whether the answer is right in full: all that was hidden, nothing else; `unknown` for the unknown."""
+    """Checks whether the answer is right in full: all that was hidden, nothing else; `unknown` for the unknown."""
     group = g.case.group
     if group == "null":
         return g.verdict == "nothing_found"
@@ -319,7 +319,7 @@ def parameter_errors(graded: Sequence[Graded]) -> dict[str, list[float]]:
 
 
 def coverage(graded: Sequence[Graded]) -> dict[str, tuple[int, int]]:
-    """How often the 95 % interval of a found effect's own parameters holds the truth, by effect."""
+    """Number of times that the 95 % interval of a found effect's own parameters holds the truth, by effect."""
     inside: dict[str, list[bool]] = {}
     for g in graded:
         for effect in g.case.expected:

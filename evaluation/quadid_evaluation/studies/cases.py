@@ -28,7 +28,7 @@ FOLDERS = ("cases", "cases_hub")
 
 
 def right(found: Diagnosis, answer: dict[str, Any]) -> bool:
-    """Whether verdict and names agree with the answer sheet; amid clutter the large effect must come first."""
+    """Checks whether verdict and names agree with the answer sheet; amid clutter the large effect must come first."""
     hidden, named = answer["effects"], [f.effect for f in found.findings if f.confident]
     if hidden == ["unknown"]:
         return found.verdict.value == "unknown"

@@ -119,7 +119,7 @@ class Running:
             return []
 
     def newest_estimate(self) -> float:
-        """When the newest estimate was journalled (UNIX time); remembers the numbered sets on the way."""
+        """Time of the newest estimate in the history (UNIX time); remembers the numbered sets on the way."""
         self.rows |= set(self.asked("SELECT sequence, json_extract(data, '$.parameters[0].value') FROM sets"))
         return float(sum(wall or 0.0 for (wall,) in self.asked("SELECT max(wall) FROM candidates")))
 
@@ -136,7 +136,7 @@ class Running:
 
 
 def low_bits(number: int) -> int:
-    """What QI_SEQ says of a set's number: a float on the wire holds 24 bits, QI_SEQ_HI the others."""
+    """Value of QI_SEQ for a set's number: a float on the wire holds 24 bits, QI_SEQ_HI the others."""
     return number % (1 << 24)
 
 
@@ -259,7 +259,7 @@ def _later(recording: Recording, shift: float) -> Recording:
 
 @dataclass
 class Scene:
-    """What a fault can get hold of."""
+    """Things that a fault can get hold of."""
 
     service: Running
     vehicle: SignedVehicle

@@ -1,4 +1,4 @@
-"""Does a better model fly better?  One controller, four sets of parameters, three paths, many vehicles.
+"""Tracking with better and worse models.  One controller, four sets of parameters, three paths, many vehicles.
 
     python -m quadid_evaluation.studies.control --out docs/results
 
@@ -52,7 +52,7 @@ NOISE = np.array([0.005] * 3 + [0.02] * 3 + [0.003] * 3 + [0.02] * 3)
 
 
 class Known(NamedTuple):
-    """What the controller believes: SI; lag [s] and drag [1/s] are 0 where it knows of none."""
+    """Parameters that the controller uses: SI; lag [s] and drag [1/s] are 0 where it knows of none."""
 
     mass: float
     b: float
@@ -227,7 +227,7 @@ PATHS: dict[str, Callable[[FloatArray], tuple[FloatArray, FloatArray]]] = {
 
 
 def beliefs(truth: TruthParameters, effects: dict[str, dict[str, float]], seed: int) -> list[Known]:
-    """What the controller is given, in the order of `SETS`."""
+    """Parameters given to the controller, in the order of `SETS`."""
     window = fly(CRAFT, truth, FLIGHT, seed, effects=effects).window
     guess = poor_guess(CRAFT, truth.as_dict(), seed, SPREAD)
     options = FitOptions(iterations=0, seed=seed)
@@ -246,7 +246,7 @@ def _value(found: Fit, i: int) -> float:
 
 
 def known_from(values: FloatArray, lag: float, drag: tuple[float, float]) -> Known:
-    """What the controller is given: the six parameters, lag [s] and drag [1/s]."""
+    """Parameters given to the controller: the six parameters, lag [s] and drag [1/s]."""
     b, d, j_xx, j_yy, j_zz, j_r = (float(v) for v in values)
     return Known(CRAFT.mass, b, d, np.array([j_xx, j_yy, j_zz]), j_r, lag, np.array(drag))
 

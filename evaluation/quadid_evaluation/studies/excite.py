@@ -1,4 +1,4 @@
-"""Does the proposed manoeuvre keep its promise?  Predicted intervals against those obtained, and against the pilot's.
+"""Promises of proposed manoeuvres.  Predicted intervals against those obtained, and against the pilot's.
 
     python -m quadid_evaluation.studies.excite --out docs/results
 
@@ -69,14 +69,14 @@ def run(seed: int, seconds: float) -> tuple[FloatArray, FloatArray, bool]:
 
 
 def held(flown: Flight, proposal: Proposal) -> bool:
-    """Whether the true vehicle stayed within a tenth of the limits that its simulation kept."""
+    """Checks whether the true vehicle stayed within a tenth of the limits that its simulation kept."""
 
     peak = peaks(flown)
     return peak.tilt < 1.1 * LIMITS.tilt and peak.rate < 1.1 * LIMITS.rate
 
 
 def sentences(widths: FloatArray, inside: float, kept: int) -> list[str]:
-    """What the figures say; half-widths (seeds, 8, 6) as of `run`."""
+    """Sentences on the figures; half-widths (seeds, 8, 6) as of `run`."""
     out = []
     for k, got, name in (
         (3, 5, "the forecast, made with the values believed before"),

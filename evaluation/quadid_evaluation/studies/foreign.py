@@ -58,12 +58,12 @@ class Number:
 
     @property
     def inside(self) -> bool:
-        """Whether the interval holds the truth, or part of what is known of it."""
+        """Checks whether the interval holds the truth, or part of what is known of it."""
         return self.interval[0] <= self.truth[1] and self.truth[0] <= self.interval[1]
 
     @property
     def identified(self) -> bool:
-        """Whether the number deserves its name, as the command says."""
+        """Checks whether the command calls the value identified."""
         return self.status == Status.IDENTIFIED.value
 
 
@@ -159,7 +159,7 @@ _LEARNT = ("ridge", "random features")
 
 @dataclass(frozen=True)
 class Row:
-    """What one set gave.
+    """Results of one set.
 
     Attributes:
         identified, diagnosed: JSON results; None with the reason in `failed`.
@@ -341,7 +341,7 @@ def _runs(w: Window, seconds: float) -> tuple[FloatArray, FloatArray] | None:
 
 
 def velocity_against_position(windows: Sequence[Window], seconds: float = 0.5) -> tuple[float, float]:
-    """How much larger the logged velocity is than the change of position, and what that alone costs.
+    """Scale of the logged velocity against the change of position, and the error that it alone makes.
 
     Returns:
         Scale of the velocity against the change of position, least squares; mean distance between the change of

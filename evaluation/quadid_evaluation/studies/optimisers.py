@@ -1,4 +1,4 @@
-"""When is a particle swarm worth it?  Every optimiser on smooth and non-smooth problems, narrow and wide bounds.
+"""Worth of a particle swarm.  Every optimiser on smooth and non-smooth problems, narrow and wide bounds.
 
     python -m quadid_evaluation.studies.optimisers --seeds 30 --out docs/results
 
@@ -222,7 +222,7 @@ def best(outcomes: list[dict[str, Outcome]]) -> list[str]:
 
 
 def answer(results: dict[tuple[str, str], list[dict[str, Outcome]]]) -> list[str]:
-    """What the tables say about the swarm."""
+    """Conclusions from the tables about the swarm."""
     worth, alone = [], []
     for (kind, bounds), outcomes in results.items():
         first = best(outcomes)[0]

@@ -1,4 +1,4 @@
-"""How far apart rotor readings may be, and in step with what: snapshots of one rate loop, taken at other intervals.
+"""Allowed interval of rotor readings: snapshots of one rate loop, taken at other intervals.
 
     python -m quadid_evaluation.studies.readings
 

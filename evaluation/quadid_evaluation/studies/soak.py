@@ -146,7 +146,7 @@ class _Tally:
         self._published += sum(isinstance(o, Publish) and o.topic == "parameters" for o in outputs)
 
     def point(self) -> dict[str, Any]:
-        """What was counted since the last point, and memory now."""
+        """Counts since the last point, and memory now."""
         buffer, worker = self._service.session.resampler, self._worker
         taken, dropped = sum(buffer.counts.values()), sum(buffer.faults.values())
         out = {

@@ -1,4 +1,4 @@
-"""Do CVA and MOESP find the poles of known systems, with and without feedback, and how well do they predict flights?
+"""Poles of known systems found by CVA and MOESP, with and without feedback, and their prediction of flights.
 
     python -m quadid_evaluation.studies.subspace --seeds 20 --out docs/results
 

@@ -1,4 +1,4 @@
-"""Does the fit tell the truth?  Errors against the Cramer-Rao bound, coverage, bias with noise, its memory, status.
+"""Truth of the fit.  Errors against the Cramer-Rao bound, coverage, bias with noise, its memory, status.
 
     python -m quadid_evaluation.studies.truth --out docs/results
     python -m quadid_evaluation.studies.truth --parts noise --out docs/results

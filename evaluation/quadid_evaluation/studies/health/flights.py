@@ -20,7 +20,7 @@ G = 9.80665
 
 
 class Wrong(NamedTuple):
-    """What is wrong: loss of thrust and of drag torque by rotor (from 1), added mass [kg] and where [m], a shift of the
+    """Damage: loss of thrust and of drag torque by rotor (from 1), added mass [kg] and where [m], a shift of the
     CG without mass [m], effort."""
 
     loss: Mapping[int, float] = {}

@@ -132,7 +132,7 @@ def quiet(hours: float, session: float) -> str:
 
 
 def soon(each: int) -> str:
-    """How soon losses of a rotor are named, as Markdown; `each`: of every size."""
+    """Delays until losses of a rotor are named, as Markdown; `each`: of every size."""
     rng = np.random.default_rng(12)
     lines = [
         f"### A loss in flight\n`make health-hours`, seed 12. A rotor loses thrust and drag torque after {ONSET} s.\n",

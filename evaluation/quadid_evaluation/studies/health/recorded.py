@@ -67,7 +67,7 @@ class Judged:
 
     @property
     def changed(self) -> bool:
-        """Whether the flight shows a change, be it one without a name."""
+        """Checks whether the flight shows a change, be it one without a name."""
         return has_changed(self.health.to_dict())
 
     @property
@@ -117,7 +117,7 @@ def judge(flights: Sequence[Flown]) -> list[Judged]:
 
 
 def is_large(one: Flown) -> bool:
-    """Whether a flight's damage must be found: cuts from `LARGE` on, glued weights."""
+    """Checks whether a flight's damage must be found: cuts from `LARGE` on, glued weights."""
     return one.condition == "cut" and one.total >= LARGE or (one.condition == "weight" and "glued" in one.weight)
 
 
@@ -126,17 +126,17 @@ def _small(one: Judged) -> bool:
 
 
 def is_single(one: Judged, low: float, high: float) -> bool:
-    """Whether one propeller was cut, by `low` [mm] or more and less than `high`."""
+    """Checks whether one propeller was cut, by `low` [mm] or more and less than `high`."""
     return one.flown.condition == "cut" and len(one.flown.rotors) == 1 and low <= one.flown.total < high
 
 
 def named_first(one: Judged) -> bool:
-    """Whether the one cut propeller comes first in the answer."""
+    """Checks whether the one cut propeller comes first in the answer."""
     return one.named[:1] == list(one.flown.rotors)
 
 
 def kind_right(one: Judged) -> bool:
-    """Whether a propeller is told from a weight."""
+    """Checks whether a propeller is told from a weight."""
     rotor = bool(one.health.changes) and one.health.changes[0].effect == "weak_rotor"
     return rotor == (one.flown.condition == "cut")
 
@@ -151,7 +151,7 @@ def order(judged: Sequence[Judged], airframe: str, kind: str) -> list[Judged]:
 
 @dataclass(frozen=True)
 class Question:
-    """What is asked of some of the flights, what is wanted, and when an answer is right."""
+    """A question about some of the flights, the wanted rate, and the check of an answer."""
 
     text: str
     wanted: str

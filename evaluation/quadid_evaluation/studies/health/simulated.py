@@ -27,7 +27,7 @@ LOSSES = (0.02, 0.03, 0.05, 0.1, 0.2, 0.3)
 
 @dataclass(frozen=True)
 class Case:
-    """What is hidden: losses of thrust and of drag torque by rotor (from 1), a shift of the CG [m], a mass (fraction)
+    """A hidden damage: losses of thrust and of drag torque by rotor (from 1), a shift of the CG [m], a mass (fraction)
     and where it sits [m]."""
 
     group: str
@@ -98,7 +98,7 @@ SIMULATORS: Mapping[str, Simulator] = {"closed loop": flown, "balance": balanced
 
 
 def right(case: Case, effects: list[tuple[str, int]]) -> bool:
-    """Whether the answer names what is hidden, and no other rotor or cause."""
+    """Checks whether the answer names what is hidden, and no other rotor or cause."""
     if case.losses:
         return {rotor for effect, rotor in effects if effect == "weak_rotor"} == set(case.losses)
     names = {effect for effect, _ in effects}
@@ -108,7 +108,7 @@ def right(case: Case, effects: list[tuple[str, int]]) -> bool:
 
 
 class Outcome(NamedTuple):
-    """Whether a case is called changed, rightly answered, wrongly with confidence; errors of its losses of thrust
+    """Flags of a case: called changed, rightly answered, wrongly with confidence; errors of its losses of thrust
     and drag torque, NaN where none is named."""
 
     changed: bool
@@ -119,7 +119,7 @@ class Outcome(NamedTuple):
 
 
 def judged(case: Case, k: int, simulate: Simulator) -> Outcome:
-    """What is answered to case `k`."""
+    """Answer to case `k`."""
     vehicle = Vehicle.shipped(("pelican", "pelican_x")[k % 2])
     profile = ("hover", "gentle", "excited")[k % 3]
 

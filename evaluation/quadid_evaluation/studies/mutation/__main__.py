@@ -1,4 +1,4 @@
-"""What `mutmut run` found, as `mutation.md`: every mutant that no test noticed, with a person's judgement of it.
+"""Findings of `mutmut run`, as `mutation.md`: every mutant that no test noticed, with a person's judgement of it.
 
 python -m quadid_evaluation.studies.mutation --out docs/results        (after `mutmut run`, from the root of the
 checkout: make mutation)
@@ -62,7 +62,7 @@ def outcome(module: str) -> dict[str, str]:
 
 
 def survivor(module: str, name: str, judged: Mapping[str, Mapping[str, str]]) -> Survivor:
-    """What was changed, and what a person wrote about it."""
+    """The change of a mutant, and a person's judgement of it."""
     difference = get_diff_for_mutant(name, path=f"quadid/online/{module}.py").splitlines()[2:]
     before, after = (" ".join(line[1:].strip() for line in difference if line.startswith(sign)) for sign in ("-", "+"))
     function = name.rpartition(".")[2].rpartition("__mutmut_")[0].removeprefix("x").replace("ǁ", ".").strip("_.")

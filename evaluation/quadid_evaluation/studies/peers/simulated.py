@@ -115,7 +115,7 @@ def errors_table(records: Sequence[Record]) -> list[str]:
 
 
 def said(records: Sequence[Record]) -> str:
-    """What each says of a missing effect, and how wide our intervals then are."""
+    """Words of each program about a missing effect, and the width of our intervals then."""
     mine = [r for r in records if CASES[r["case"]][1] and r["program"] == OURS]
     statuses = [s for r in mine for s in r["status"]]
     counts = ", ".join(f"{statuses.count(s)} {s}" for s in dict.fromkeys(statuses))
