@@ -53,11 +53,7 @@ def study(doc: str | None, page: str, title: str, parts: Mapping[str, Callable[[
     """Runs the parts that are asked for; prints each, and replaces it on the page in `--out`.
 
     Args:
-        doc: as for `options`.
-        page: file name of the page.
-        title: heading of a new page.
         parts: by name, of the options a part's Markdown.
-        more: as for `options`.
     """
     given = options(doc, parts, **more)
     for name in given.parts:
@@ -76,10 +72,7 @@ def put_section(path: Path, title: str, name: str, text: str) -> None:
     """Writes one part of a page, or replaces it where the page has it, with its date.
 
     Args:
-        path: the page, made when absent.
-        title: heading of a new page.
         name: of the part; kept in a comment that a reader of the page does not see.
-        text: Markdown of the part.
     """
     mark = name.replace(" ", "-")
     begin, end = f"<!--{mark}-->", f"<!--/{mark}-->"

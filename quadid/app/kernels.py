@@ -12,6 +12,7 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pkgutil import resolve_name
 from threading import Thread
 from typing import TYPE_CHECKING, Any
 
@@ -27,13 +28,17 @@ class Part:
 
     Attributes:
         run: calls each of them once, as a fit or a flight does.
-        kernels: the functions on disk.
+        names: the functions on disk, each as the module of quadid and its name.
         functions: how many functions are compiled for them, about; for a share done.
     """
 
     run: Callable[[], None]
-    kernels: Callable[[], list[Any]]
+    names: tuple[str, ...]
     functions: int
+
+    def kernels(self) -> list[Any]:
+        """The functions on disk."""
+        return [resolve_name(f"quadid.{name}") for name in self.names]
 
 
 def missing(names: tuple[str, ...]) -> list[str]:
@@ -149,40 +154,24 @@ def _flight() -> None:
     fly(_hover()[0], seconds=0.5)
 
 
-def _simulation_kernels() -> list[Any]:
-    from quadid.model.kernel import needs_of
-    from quadid.model.rollout_kernel import roll_segments
-    from quadid.model.rotor_kernel import rotor_table
-
-    return [needs_of, roll_segments, rotor_table]
-
-
-def _statistics_kernels() -> list[Any]:
-    from quadid.identification.elimination import _reduce_on_disk
-    from quadid.model.closed_loop import fly_closed_loop
-
-    return [_reduce_on_disk, fly_closed_loop]
-
-
-def _estimate_kernels() -> list[Any]:
-    from quadid.estimate import kalman
-
-    return [
-        kalman.moments, kalman.kalman, kalman.replay, kalman.backward, kalman.single_steps, kalman.specific_force
-    ]  # fmt: skip
-
-
-def _flight_kernels() -> list[Any]:
-    from quadid.flight.march import march
-
-    return [march]
-
-
 PARTS = {
-    "simulation": Part(_simulation, _simulation_kernels, 100),
-    "statistics": Part(_statistics, _statistics_kernels, 100),
-    "estimate": Part(_estimate, _estimate_kernels, 30),
-    "flight": Part(_flight, _flight_kernels, 30),
+    "simulation": Part(
+        _simulation,
+        ("model.kernel:needs_of", "model.rollout_kernel:roll_segments", "model.rotor_kernel:rotor_table"),
+        100,
+    ),
+    "statistics": Part(
+        _statistics, ("identification.elimination:_reduce_on_disk", "model.closed_loop:fly_closed_loop"), 100
+    ),
+    "estimate": Part(
+        _estimate,
+        tuple(
+            f"estimate.kalman:{name}"
+            for name in ("moments", "kalman", "replay", "backward", "single_steps", "specific_force")
+        ),
+        30,
+    ),
+    "flight": Part(_flight, ("flight.march:march",), 30),
 }
 """Kernels of an identification or a diagnosis, in three parts, and the flown vehicle of `quadid simulate`."""
 FIT = ("simulation", "statistics", "estimate")

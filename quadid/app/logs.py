@@ -58,12 +58,12 @@ def write_text(path: str | Path, text: str) -> Path:
     return target
 
 
-def make_folder(folder: Path) -> None:
+def make_folder(folder: Path, fix: str = "choose another folder") -> None:
     """Makes a folder where there is none; raises OutputError where it cannot be made."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise OutputError(f"{folder} cannot be made ({error.strerror})", fix="choose another folder") from error
+        raise OutputError(f"{folder} cannot be made ({error.strerror})", "a folder", fix) from error
 
 
 def write_texts(place: str | Path, texts: Mapping[str, str]) -> list[Path]:

@@ -221,28 +221,21 @@ def results(client: Any, jobs: Sequence[Job], work: Callable[[Job], Row] = ident
 
 
 def _answered(ended: Iterator[tuple[Any, Job]]) -> Generator[Row, None, list[Job]]:
-    """Yields the rows of ended futures; returns the jobs whose worker died."""
+    """Yields the rows of ended futures; returns the jobs whose worker died, or the result before it was fetched."""
+    from distributed import KilledWorker
+    from distributed.client import FutureCancelledError
+
     died = []
     for future, job in ended:
-        row = _row(future)
+        try:
+            row = dict(future.result()) if future.status == "finished" else None
+        except (KilledWorker, FutureCancelledError):
+            row = None
         if row is None:
             died.append(job)
         else:
             yield row
     return died
-
-
-def _row(future: Any) -> Row | None:
-    """Result of an ended future; None where its worker died with the job, or with the result before it was fetched."""
-    from distributed import KilledWorker
-    from distributed.client import FutureCancelledError
-
-    if future.status != "finished":
-        return None
-    try:
-        return dict(future.result())
-    except (KilledWorker, FutureCancelledError):
-        return None
 
 
 def _stream(
@@ -321,11 +314,8 @@ def find_jobs(
     are one flight, and one job.
 
     Args:
-        root: folder of the fleet.
         default: text of the vehicle file for folders without one.
         rate: of the grid [Hz].
-        seed: of all searches.
-        diagnose: whether to diagnose, too.
         leave_out: folder that is not looked into, for the results.
 
     Raises:

@@ -138,11 +138,8 @@ def play(
     """Plays a recording into a service.
 
     Args:
-        recording: the log.
-        samples: its samples, in the order to play them.
         service: with an inline worker.
         pace: factor of real time; 0 for as fast as possible.
-        advance: told how far it is.
 
     Returns:
         Everything the service put out, in order.

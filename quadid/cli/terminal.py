@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from quadid.app.kernels import prepare
-from quadid.app.logs import OutputError, write_text
+from quadid.app.logs import OutputError, make_folder, write_text
 from quadid.app.outcome import Advance, Outcome, json_text, silent
 from quadid.errors import QuadidError
 from quadid.report.tables import SPACE, Cell, TextTable
@@ -30,10 +30,6 @@ _PIPE_WIDTH = 120
 
 def console(quiet: bool = False, stderr: bool = False) -> Console:
     """Returns the console to print on.
-
-    Args:
-        quiet: print nothing (stdout carries JSON).
-        stderr: print on stderr instead of stdout.
 
     Nothing is markup, and nothing that is printed holds characters that a terminal acts on, whoever named it.  Colours
     follow the terminal and ``NO_COLOR``; a pipe gets plain text that is not broken at 80 columns.
@@ -96,10 +92,7 @@ def out_folder(folder: Path) -> Path:
     Raises:
         OutputError: it cannot be made or written to.
     """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"{folder} cannot be made ({error.strerror})", "a folder", "choose another --out") from error
+    make_folder(folder, "choose another --out")
     if not os.access(folder, os.W_OK | os.X_OK):
         raise OutputError(f"{folder} is not writable", "a folder you may write to", "choose another --out")
     return folder.resolve()
@@ -184,8 +177,6 @@ def conclude(
     Args:
         done: the result; its warnings go to stderr.
         json: where its JSON goes, as `write_json`.
-        report: where its HTML report goes.
-        folder: where its files go.
         series: folder for measured, simulated and missing over time.
         kept: vehicle file that was read, which is not overwritten.
     """

@@ -115,10 +115,15 @@ def table(found: Mapping[str, Any]) -> Table:
         color = "green" if kinds["alive"] else "red"
         state = f"{_plain(status.get('phase', 'unknown'))}: {_plain(status.get('reason', ''))}"
         old = f"\nout of date: {_plain(force['outdated'])}" if force.get("outdated") else ""
+        diagnosis = kinds.get("diagnosis", {})
+        lines = []
+        for finding in _listing(diagnosis.get("findings"))[:5]:
+            sure = "" if finding.get("confident") else " (?)"
+            lines.append(f"{_plain(finding.get('effect'))}{sure}: {_plain(finding.get('evidence'))}")
         out.add_row(
             Text(_plain(name), style=color), Text(state if kinds["alive"] else "gone"),
             Text(_plain(f"{force.get('sequence', '-')} {force.get('state', '')}") + old), Text(_parameters(force)),
-            Text(_findings(kinds.get("diagnosis", {}))), Text(_feeds(health)),
+            Text("\n".join(lines)), Text(_feeds(health)),
         )  # fmt: skip
     return out
 
@@ -129,14 +134,6 @@ def _parameters(force: Mapping[str, Any]) -> str:
         value, sigma = p.get("value"), p.get("sigma")
         if isinstance(value, int | float) and isinstance(sigma, int | float) and value:
             lines.append(f"{_plain(p.get('name'))} {value:.4g} +-{196.0 * sigma / abs(value):.1f} %")
-    return "\n".join(lines)
-
-
-def _findings(diagnosis: Mapping[str, Any]) -> str:
-    lines = []
-    for finding in _listing(diagnosis.get("findings"))[:5]:
-        sure = "" if finding.get("confident") else " (?)"
-        lines.append(f"{_plain(finding.get('effect'))}{sure}: {_plain(finding.get('evidence'))}")
     return "\n".join(lines)
 
 

@@ -277,19 +277,17 @@ def _explain(change: FloatArray, healthy: Healthy, flights: int, alike: Sequence
     """Explanations with as many parameters each, of one change."""
     deviation, freedom = healthy.predictive(flights), float(healthy.freedom.mean())
     fitted = _fit(change[None], deviation, freedom, alike)
-    chances = _along(change / deviation, np.stack([one.effect for one in alike]) / deviation[:, None], freedom)
-    value, covariance = fitted.value[:, 0], fitted.scale[:, 0, None, None] * fitted.covariance
-    each = zip(alike, fitted.log_evidence[:, 0].tolist(), value, covariance, chances.tolist(), strict=True)
-    return [Explained(*one) for one in each]
-
-
-def _along(z: FloatArray, scaled: FloatArray, freedom: float) -> FloatArray:
-    """F test of the part of the change that explanations' free parameters account for, shape (explanations,)."""
+    # F test of the part of the change that explanations' free parameters account for, shape (explanations,).
+    z = change / deviation
+    scaled = np.stack([one.effect for one in alike]) / deviation[:, None]
     basis, sizes, _ = np.linalg.svd(scaled, full_matrices=False)
     kept = sizes > 1e-9 * sizes[:, :1]
     part = (np.einsum("hkj,k->hj", basis, z) ** 2 * kept).sum(axis=1)
     count = kept.sum(axis=1)
-    return np.asarray(fdtrc(count, freedom, part / count))
+    chances = np.asarray(fdtrc(count, freedom, part / count))
+    value, covariance = fitted.value[:, 0], fitted.scale[:, 0, None, None] * fitted.covariance
+    each = zip(alike, fitted.log_evidence[:, 0].tolist(), value, covariance, chances.tolist(), strict=True)
+    return [Explained(*one) for one in each]
 
 
 def compare(change: FloatArray, healthy: Healthy, flights: int, offered: Sequence[Hypothesis]) -> list[Explained]:

@@ -121,7 +121,11 @@ class HealthWatch:
         if self._healthy is None:
             if len(self._trims) > 1:
                 return None
-            return self._without_baseline(t)
+            n = len(self._vehicle.rotors)
+            text = f"no baseline: {len(self.history)} of {ENOUGH} healthy flights are known; this flight becomes one"
+            return HealthReport(
+                t, "unknown", False, math.nan, (), (math.nan,) * n, ((math.nan, math.nan),) * n, _NO_MASS, text
+            )
         return self._judged(t, self._healthy)
 
     def airborne(self, load: FloatArray) -> bool:
@@ -156,13 +160,6 @@ class HealthWatch:
             self._healthy = healthy_spread(self.history)
             squares = np.mean([flight.wander**2 for flight in self.history], axis=0)
             self._wander = np.maximum(np.sqrt(squares), [0.002, 0.002, 0.002, 0.005])
-
-    def _without_baseline(self, t: float) -> HealthReport:
-        n = len(self._vehicle.rotors)
-        text = f"no baseline: {len(self.history)} of {ENOUGH} healthy flights are known; this flight becomes one"
-        return HealthReport(
-            t, "unknown", False, math.nan, (), (math.nan,) * n, ((math.nan, math.nan),) * n, _NO_MASS, text
-        )
 
     def _judged(self, t: float, healthy: Healthy) -> HealthReport | None:
         if self._alarm is not None or len(self._trims) < RECENT:

@@ -63,7 +63,12 @@ def rotor_signal(recording: Recording, vehicle: Vehicle) -> RotorSignal:
         _check_unit(recording, channel, vehicle)
         values = vehicle.command.to_rotor_speed(channel.values)
         signal = RotorSignal(channel.t, values, vehicle.command.sampling, source, notes)
-    _check_columns(recording, signal, vehicle)
+    found, wanted = signal.values.shape[1], len(vehicle.rotors)
+    if found != wanted:
+        raise LogError(
+            f"{recording.name}: {found} rotor columns ({signal.source})", f"{wanted}, the rotors of '{vehicle.name}'",
+            "choose the vehicle file that belongs to this log",
+        )  # fmt: skip
     rate = 1.0 / measured_period(signal.t, signal.values)
     if rate < SLOWEST_RATE:
         raise NotIdentifiableError(
@@ -83,7 +88,19 @@ def rotor_channel(recording: Recording, vehicle: Vehicle | None) -> tuple[Channe
     """
     speed, command, mixed = (_usable(recording, name) for name in ("rotor_speed", "motor_command", "mixer_input"))
     if command is None and mixed is not None and vehicle is not None:
-        command = _after_mixer(recording, mixed, vehicle)
+        # Motor commands of logged mixer inputs, as the vehicle file's mixer makes them.
+        if vehicle.mixer is None:
+            raise LogError(
+                f"{recording.name}: holds mixer inputs ({mixed.source}), but '{vehicle.name}' has no mixer",
+                "a vehicle file with `mixer:`", "add it, for example mixer: crazyflie",
+            )  # fmt: skip
+        matrix = vehicle.mixing
+        if mixed.values.shape[1] != matrix.shape[1]:
+            raise LogError(
+                f"{recording.name}: {mixed.values.shape[1]} mixer inputs ({mixed.source})",
+                f"{matrix.shape[1]}, the columns of the mixer of '{vehicle.name}'", "correct `mixer:`",
+            )  # fmt: skip
+        command = Channel("motor_command", mixed.t, mixed.values @ matrix.T, f"{mixed.source}, mixed")
     why = "" if speed is None else _passed_over(speed, command, vehicle)
     if speed is not None and why:
         return command, (f"measured speeds ({speed.source}) {why}",)
@@ -104,34 +121,9 @@ def _passed_over(speed: Channel, command: Channel | None, vehicle: Vehicle | Non
     return ""
 
 
-def _after_mixer(recording: Recording, mixed: Channel, vehicle: Vehicle) -> Channel:
-    """Motor commands of logged mixer inputs, as the vehicle file's mixer makes them."""
-    if vehicle.mixer is None:
-        raise LogError(
-            f"{recording.name}: holds mixer inputs ({mixed.source}), but '{vehicle.name}' has no mixer",
-            "a vehicle file with `mixer:`", "add it, for example mixer: crazyflie",
-        )  # fmt: skip
-    matrix = vehicle.mixing
-    if mixed.values.shape[1] != matrix.shape[1]:
-        raise LogError(
-            f"{recording.name}: {mixed.values.shape[1]} mixer inputs ({mixed.source})",
-            f"{matrix.shape[1]}, the columns of the mixer of '{vehicle.name}'", "correct `mixer:`",
-        )  # fmt: skip
-    return Channel("motor_command", mixed.t, mixed.values @ matrix.T, f"{mixed.source}, mixed")
-
-
 def _usable(recording: Recording, name: str) -> Channel | None:
     channel = recording.channels.get(name)
     return channel if channel is not None and len(channel.t) and channel.t[-1] > channel.t[0] else None
-
-
-def _check_columns(recording: Recording, signal: RotorSignal, vehicle: Vehicle) -> None:
-    found, wanted = signal.values.shape[1], len(vehicle.rotors)
-    if found != wanted:
-        raise LogError(
-            f"{recording.name}: {found} rotor columns ({signal.source})", f"{wanted}, the rotors of '{vehicle.name}'",
-            "choose the vehicle file that belongs to this log",
-        )  # fmt: skip
 
 
 def _check_speeds(recording: Recording, speed: Channel) -> None:

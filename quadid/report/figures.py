@@ -198,17 +198,13 @@ def thinned(values: FloatArray, points: int) -> IndexArray:
     n = len(values)
     if n <= points:
         return np.arange(n)
-    loud = values[:, _loudest(values)]
+    loud = values[:, int(np.argmax(np.nan_to_num(values[:, :3]).std(axis=0)))]
     edges = np.linspace(0, n, points // 2 + 1).astype(np.intp)
     filled = np.nan_to_num(loud)
     keep = [
         i + np.array([filled[i:j].argmin(), filled[i:j].argmax()]) for i, j in zip(edges[:-1], edges[1:], strict=True)
     ]
     return np.unique(np.concatenate(keep))
-
-
-def _loudest(values: FloatArray) -> int:
-    return int(np.argmax(np.nan_to_num(values[:, :3]).std(axis=0)))
 
 
 def liveliest(t: FloatArray, values: FloatArray, points: int = DETAIL_POINTS) -> IndexArray:

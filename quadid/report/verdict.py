@@ -295,7 +295,8 @@ def reason(parameter: Json, stuck: Sequence[str] = ()) -> str:
     change = _number(parameter["value"]) / _number(parameter["initial"]) - 1.0 if parameter["initial"] else math.nan
     if not math.isfinite(change):
         return f"Known to {percent(relative_halfwidth(parameter))}."
-    if _within(parameter):
+    low, high = (_number(v) for v in parameter["ci95"])
+    if low <= _number(parameter["initial"]) <= high:
         return f"Known to {percent(relative_halfwidth(parameter))}; the old value lies inside the interval."
     moved = "raised" if change > 0 else "lowered"
     return f"Known to {percent(relative_halfwidth(parameter))}; {moved} by {percent(abs(change))}."
@@ -317,11 +318,6 @@ def percent(share: float) -> str:
     if value > 200.0:
         return "over 200 %"
     return f"{value:.0f} %" if value >= 9.95 else f"{value:.2g} %"
-
-
-def _within(parameter: Json) -> bool:
-    low, high = (_number(v) for v in parameter["ci95"])
-    return low <= _number(parameter["initial"]) <= high
 
 
 def _number(value: Any) -> float:

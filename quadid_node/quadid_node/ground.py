@@ -40,16 +40,7 @@ class Done:
 
 
 def work(where: str, stop: Callable[[], bool], told: Callable[[str], None]) -> Done:
-    """Answers requests until `stop` says so; waits for a router that is not there yet.
-
-    Args:
-        where: see `zenoh.open_session`.
-        stop: asked often.
-        told: takes a sentence for people.
-
-    Raises:
-        ZenohError: a configuration that is none.
-    """
+    """Answers requests until `stop` says so; waits for a router that is not there yet."""
     config_of(where)
     said = set[str]()
 
@@ -138,11 +129,7 @@ MOST_ANSWERS, MOST_GROUNDS = 8, 256
 
 
 class Ground:
-    """The way to ground machines: a Zenoh session that is opened in the background.
-
-    Attributes:
-        alive: names of the ground machines that live.
-    """
+    """The way to ground machines: a Zenoh session that is opened in the background."""
 
     def __init__(self, where: str, vehicle: str, clock: Callable[[], float] = time.monotonic) -> None:
         """Begins to connect; raises ZenohError for a configuration that is none."""
@@ -244,7 +231,10 @@ class RemoteWorker:
                 self._take(data, out)
         if self._asked is not None and (not self._ground.alive or self._clock() > self._until):
             self._fall_back("does not answer" if self._ground.alive else "vanished")
-        self._tell_changes()
+        there = self._ground.there
+        if there and not self._was_there:
+            self._told.append(Trouble("info", "a ground machine is there: fits go to it"))
+        self._was_there = there
         told, self._told = self._told, []
         return [*out, *told]
 
@@ -281,12 +271,6 @@ class RemoteWorker:
         if request is not None:
             self._local.submit(request)
 
-    def _tell_changes(self) -> None:
-        there = self._ground.there
-        if there and not self._was_there:
-            self._told.append(Trouble("info", "a ground machine is there: fits go to it"))
-        self._was_there = there
-
 
 # --- Who fits for a service: the child process on board, or a ground machine where one is asked for
 
@@ -295,8 +279,6 @@ def fit_worker(vehicle: Vehicle, name: str, where: str = "", memory_mb: int = ME
     """The child process on board; with a place on Zenoh, one that lets ground machines there fit as well.
 
     Args:
-        vehicle: whose model is warmed up.
-        name: of the vehicle on Zenoh.
         where: see `zenoh.open_session`; empty: no ground machine is asked.
         memory_mb: most memory of the child [MiB]; 0 for no limit.
 

@@ -215,8 +215,6 @@ def read_history(
     """Reads a history without touching it: sets, newest candidates and events, and the names of all vehicles.
 
     Args:
-        path: database file.
-        vehicle: name of the vehicle.
         candidates: newest candidates to return; events: newest events; sets: newest sets, -1: all.
 
     Raises:
@@ -425,9 +423,6 @@ def in_force(db: sqlite3.Connection, name: str, gate: GateSettings, vehicle: Veh
     """The set last in force, with why it is out of date: withdrawn, or of other rotors or mass than the vehicle file's.
 
     Args:
-        db: the history.
-        name: of the vehicle in it.
-        gate: of this run.
         vehicle: of this run; None: its mass is not compared.
     """
     last = stored(db, name, f"{_FORCE} ORDER BY rowid DESC", gate, vehicle)
@@ -469,9 +464,6 @@ def why_none(found: OnlineSet, number: int, gate: GateSettings, vehicle: Vehicle
     """Reason why a stored set is none that a fresh estimate could be; empty where it may be one.
 
     Args:
-        found: the set.
-        number: of the row that holds it.
-        gate: of this run.
         vehicle: of this run, whose bounds hold for it; None: those of the set itself.
     """
     if found.sequence != number:
@@ -522,12 +514,10 @@ class Restored:
 
     Attributes:
         item: the set last in force; None: none.
-        next_sequence: the first number of this run.
         baseline: what creeping counts from.
         healthy: trims of healthy flights, the oldest first.
         approval: auto or manual where a person decided so while the earlier run was configured as this one, manual
             where that cannot be read; else empty.
-        decided: why.
     """
 
     item: OnlineSet | None
@@ -558,7 +548,6 @@ class Row(NamedTuple):
     """A row that is to be written.
 
     Attributes:
-        table: where it belongs; values: by column.
         number: of the set which may be published once the row is on the disk; 0 for none.
         passes: the row may be lost where there are too many; others hold what is in force and what people decided.
     """
@@ -587,7 +576,6 @@ class Store:
     Attributes:
         notes: what people should know of what is past: a damaged history set aside, a row refused.
         problem: why nothing is written at the moment, or empty.
-        boot_id: of this run; stands with every set that it numbers.
         written: numbers of the sets that are on the disk; lost: of those that never will be.
     """
 
@@ -595,8 +583,6 @@ class Store:
         """Opens the history, or makes it.
 
         Args:
-            path: database file.
-            vehicle: name of the vehicle.
             kept: rows that stay, by table; older ones are forgotten.
 
         Raises:

@@ -7,7 +7,7 @@ import math
 import re
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from typing import Any, NamedTuple
@@ -73,7 +73,6 @@ class Chooser:
         """Yields what may be used now.
 
         Args:
-            block: samples of one channel.
             rank: of its source for this channel; 0 is the best.
         """
         channel, t = block.columns[0][0], block.t
@@ -147,13 +146,7 @@ class Pace:
         self._stamps: deque[float] = deque(maxlen=STAMPS)
 
     def look(self, now: float, since: float, count: int) -> None:
-        """Somebody looked for messages.
-
-        Args:
-            now: time of the look [s].
-            since: of the look before [s].
-            count: messages that were there.
-        """
+        """Somebody looked for messages."""
         self.looked = now
         if not count:
             self._quiet += now - since
@@ -190,8 +183,6 @@ class Input:
     """One topic to subscribe to.
 
     Attributes:
-        topic: relative name.
-        type: ``package/Type``.
         channels: the core's channels it may feed, each with its rank: the lowest that arrives is used.
     """
 
@@ -339,7 +330,6 @@ class Decoder:
 
     Attributes:
         failed: messages that could not be decoded; unstamped: those whose stamp is zero; of all that came.
-        pace: how evenly they come.
     """
 
     def __init__(
@@ -348,10 +338,7 @@ class Decoder:
         """Prepares for one input.
 
         Args:
-            entry: topic, type, channels with ranks.
-            chooser: shared by all topics.
             rotors: number of rotors; surplus motor outputs are left out.
-            decode: serialized bytes to a message of the type; see `deserializer`.
             mounted: the vehicle file says how the IMU stands in the body.
         """
         kind = TYPES[entry.type]
@@ -401,7 +388,9 @@ class Decoder:
             return
         t, together = seconds(read[0]), list[tuple[str, FloatArray]]()
         self.pace.stamped(t)
-        self._deny(name for name, _ in read[1])
+        # Notes which signals the newest messages say to have none of.
+        told = (name for name, _ in read[1])
+        self._denied = sorted(self._deniable.keys() - set(told)) if self._deniable else []
         for name, values in read[1]:
             channel, convert = SIGNALS[name]
             if channel == "vehicle_kind":
@@ -434,10 +423,6 @@ class Decoder:
                 self.unstamped, self._unstamped_at = self.unstamped + 1, self.pace.looked
             return None
         return read.ns, [(name, values) for name, values, known in told if np.all(known)]
-
-    def _deny(self, told: Iterable[str]) -> None:
-        """Notes which signals the newest messages say to have none of."""
-        self._denied = sorted(self._deniable.keys() - set(told)) if self._deniable else []
 
 
 _BODY_FRAME = re.compile(r"^$|(^|/)(base_|body|fcu)[^/]*$")
@@ -506,11 +491,7 @@ class Waiting(NamedTuple):
 
 
 class Intake:
-    """The messages of all topics of one vehicle.
-
-    Attributes:
-        decoders: by topic name as resolved.
-    """
+    """The messages of all topics of one vehicle."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         """Takes a clock that never steps [s]."""
@@ -522,9 +503,6 @@ class Intake:
         """Adds a topic.
 
         Args:
-            entry: topic, type, channels with ranks.
-            topic: its name as resolved.
-            decoder: of its messages.
             take: gives the next serialized message that waits; None when there is none.
         """
         self.decoders[topic] = decoder
@@ -544,7 +522,6 @@ class Intake:
         """Reads what was taken, one topic after the other.
 
         Args:
-            waiting: what `take` gave.
             record: writes a message down (topic, type, bytes), in the order in which they are read.
         """
         for k in range(waiting.slices):

@@ -45,7 +45,6 @@ class MotorOrder:
     """The outputs that are motors.
 
     Attributes:
-        ardupilot: whether the autopilot is one.
         kind: MAV_TYPE of its heartbeats; 0 for unknown.
         problem: what speaks against its outputs; empty for nothing.
     """
@@ -88,13 +87,7 @@ class MotorOrder:
             )
 
     def take(self, values: tuple[float, ...], message: str, now: float) -> tuple[float, ...]:
-        """The values of the rotors, one by one; empty where it is not known which they are, or no more.
-
-        Args:
-            values: of all outputs of a message.
-            message: its name.
-            now: when it came [s].
-        """
+        """The values of the rotors, one by one; empty where it is not known which they are, or no more."""
         if self._moved:
             return ()
         if message in _ESC_MESSAGES:
@@ -166,12 +159,7 @@ class _Round:
 
 
 class MavlinkDecoder:
-    """Messages of one vehicle to samples.
-
-    Attributes:
-        counts: messages by name.
-        order: of its motors among its outputs.
-    """
+    """Messages of one vehicle to samples."""
 
     def __init__(self, rotors: int, wall: Callable[[], float] = time.time) -> None:
         """Expects a vehicle with `rotors` rotors; `wall` tells the UNIX time [s] at which its clock is put."""
@@ -186,7 +174,6 @@ class MavlinkDecoder:
         """Yields the samples that may be used now.
 
         Args:
-            message: decoded message of the vehicle.
             received: when it was read [s, any clock that runs on].
             earliest: it came after this [s, same clock]; default: when it was read.
         """
@@ -207,14 +194,11 @@ class MavlinkDecoder:
         for waited, t in placed:
             if t is not None:
                 for reading in waited:
-                    yield from self._channel(self._absolute(t), reading, received)
-
-    def _absolute(self, boot: float) -> float:
-        """UNIX time of a time of the vehicle's clock, set by ours when it is first heard and when it reboots."""
-        if boot < self._newest - REBOOT:
-            self._epoch, self._newest = self._wall() - boot, boot
-        self._newest = max(self._newest, boot)
-        return boot + self._epoch
+                    # UNIX time: the vehicle's clock is set by ours when it is first heard and when it reboots.
+                    if t < self._newest - REBOOT:
+                        self._epoch, self._newest = self._wall() - t, t
+                    self._newest = max(self._newest, t)
+                    yield from self._channel(t + self._epoch, reading, received)
 
     def _channel(self, t: float, reading: Reading, received: float) -> Iterator[Sample]:
         source = reading.source.split(" ")[0]
@@ -377,11 +361,7 @@ class MavlinkLink:
         """Opens the link.
 
         Args:
-            url: any URL of pymavlink.
-            rotors: of the vehicle.
             system: system id of the vehicle; 0 takes the first autopilot heard.
-            key: signing key.
-            clock: seconds, monotonic.
             memory: file that keeps the time stamps of signatures over a restart.
 
         Raises:
@@ -427,7 +407,12 @@ class MavlinkLink:
                     continue
                 self._wire.follow(self._wire.source)
             if kind == "HEARTBEAT":
-                self._on_heartbeat(message)
+                # Notes who is heard again and again and will be answered; asks the vehicle for the parameters we lack.
+                self._wire.peers.hello(self._wire.source, self._wire.listened, self._is_vehicle(message))
+                if self._is_vehicle(message):
+                    for name in self._decoder.order.lacking():
+                        wanted = self.vehicle_system, self._target, name.encode(), -1
+                        self._send(dialect.MAVLink_param_request_read_message(*wanted))
             elif kind in ("PARAM_REQUEST_LIST", "PARAM_REQUEST_READ", "PARAM_SET"):
                 self._on_parameter(kind, message)
             elif kind == "COMMAND_ACK" and self._is_vehicle(message):
@@ -464,14 +449,6 @@ class MavlinkLink:
             and message.get_srcSystem() == self.vehicle_system
             and message.get_srcComponent() == self._target
         )
-
-    def _on_heartbeat(self, message: Any) -> None:
-        """Notes who is heard again and again and will be answered; asks the vehicle for the parameters we lack."""
-        self._wire.peers.hello(self._wire.source, self._wire.listened, self._is_vehicle(message))
-        if self._is_vehicle(message):
-            for name in self._decoder.order.lacking():
-                wanted = self.vehicle_system, self._target, name.encode(), -1
-                self._send(dialect.MAVLink_param_request_read_message(*wanted))
 
     def _on_ack(self, message: Any) -> None:
         """Notes a refused request for a message."""
@@ -515,7 +492,10 @@ class MavlinkLink:
                 dialect.MAV_TYPE_ONBOARD_CONTROLLER, dialect.MAV_AUTOPILOT_INVALID, 0, 0, dialect.MAV_STATE_ACTIVE, 3
             ))  # fmt: skip
         if now - self._measured >= 2.0:
-            self._measure(now)
+            counts = self._decoder.counts
+            span = now - self._measured
+            self._rates = {n: (c - self._before.get(n, 0)) / span for n, c in counts.items()}
+            self._before, self._measured = dict(counts), now
         if self._list_due and now - self._listed >= LIST_EVERY:
             self._list_due, self._listed = False, now
             for index in range(len(parameters_of(self._set))):
@@ -573,12 +553,6 @@ class MavlinkLink:
                 self.vehicle_system, self._target, dialect.MAV_CMD_SET_MESSAGE_INTERVAL, 0,
                 float(_IDS[name]), 1e6 / wanted[name], 0.0, 0.0, 0.0, 0.0, 0.0,
             ))  # fmt: skip
-
-    def _measure(self, now: float) -> None:
-        counts = self._decoder.counts
-        span = now - self._measured
-        self._rates = {n: (c - self._before.get(n, 0)) / span for n, c in counts.items()}
-        self._before, self._measured = dict(counts), now
 
     def _send(self, message: Any, answer: bool = False) -> None:
         self._wire.send(message, self._clock(), answer)
@@ -640,15 +614,7 @@ def run(
     service: Service, link: MavlinkLink, outlets: list[Outlet], stop: Callable[[], bool],
     clock: Callable[[], float] = time.monotonic,
 ) -> None:  # fmt: skip
-    """Serves until `stop` says so.
-
-    Args:
-        service: of the vehicle.
-        link: where samples come from and results go.
-        outlets: where results go as well.
-        stop: asked often.
-        clock: seconds, monotonic.
-    """
+    """Serves until `stop` says so."""
     reported = clock()
     while not stop():
         busy = False

@@ -376,8 +376,6 @@ class Wire:
 
         Args:
             url: any URL of pymavlink, as ``udpin:0.0.0.0:14540`` or ``/dev/ttyACM0,921600``.
-            system: our system id.
-            component: our component id.
             key: signing key; with one, every frame that is not signed with it is refused.
             memory: file that keeps the newest time stamps of signatures over a restart.
 
@@ -491,8 +489,6 @@ class Wire:
         """Sends a message, as far as the budget allows; a link that is down loses it.
 
         Args:
-            message: to be sent.
-            now: clock of `receive` [s].
             answer: to what the frame yielded last asked for: only its sender gets it, if it is a peer, else all do.
         """
         self._tokens = min(self._tokens + (now - self._filled) * SENT_A_SECOND, SENT_AT_ONCE)

@@ -247,13 +247,8 @@ def diagnostics(
 
     Args:
         health: of the service; None before the node is configured.
-        name: full node name.
-        hardware: vehicle.
-        now: stamp of the report.
         notes: errors of the transport by topic or link (a QoS that does not match, a second publisher).
-        hints: what is wrong with the messages of a topic.
         idle: why the node is not active, and what to do; empty while it is.
-        problem: why it could not be configured, or empty.
     """
     if health is None:
         said = f"{idle}; {problem}" if problem else idle

@@ -63,10 +63,7 @@ class TopicOwnership:
         """Claims nothing yet.
 
         Args:
-            count: publishers on the topic, ours included.
             kin: those of them that are services like this one, ours included.
-            create: makes our publisher; destroy: takes it away.
-            clock: seconds, monotonic.
         """
         self._count, self._kin, self._create, self._destroy, self._clock = count, kin, create, destroy, clock
         self._not_before, self._since = clock() + FOUND_WITHIN, 0.0
@@ -247,7 +244,6 @@ class GraphMonitor:
     """Monitors the graph: reports what is wrong on the topics.
 
     Attributes:
-        notes: by topic.
         paused: two publishers of an input are heard: taking samples would mix two vehicles.
     """
 
@@ -258,10 +254,7 @@ class GraphMonitor:
         """Watches the topics `inputs`.
 
         Args:
-            inputs: type of messages by full name.
-            offered: a topic's publishers.
             unbroken: for how long [s] a topic's messages have been one publisher's.
-            tell: takes a line for people.
         """
         self._inputs, self._offered, self._unbroken, self._tell = dict(inputs), offered, unbroken, tell
         self.notes: dict[str, str] = {}

@@ -165,11 +165,6 @@ def stream(recording: Recording) -> Iterator[Sample]:
 def arrivals(path: Path, preset: str, rotors: int) -> Iterator[Sample]:
     """Yields the samples of a node's recording as the node's session got them: the same numbers in the same order.
 
-    Args:
-        path: the recording.
-        preset: whose topic names and types it holds.
-        rotors: of the vehicle.
-
     Raises:
         LogError: a message definition that cannot be used.
     """

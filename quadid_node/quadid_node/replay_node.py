@@ -92,12 +92,9 @@ def play(recording: Recording, speed: float, stamps: str, wait: float, args: lis
     """Plays a recording until its end or until `stop` says so.
 
     Args:
-        recording: of any log.
         speed: times its pace; 0: as fast as possible.
         stamps: ``now`` or ``log``, as `epoch_of`.
         wait: given to subscribers to find the topics [s].
-        args: of ROS.
-        stop: asked for by a signal.
     """
     without_shared_memory()
     rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)

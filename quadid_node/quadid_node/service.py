@@ -92,9 +92,7 @@ class Service:
     """The service of one vehicle.
 
     Attributes:
-        vehicle: as given.
         restored: what an earlier run had left.
-        session: the session.
         boot_id: of this run; with a set's number it never repeats, whatever becomes of history and clock.
     """
 
@@ -105,10 +103,6 @@ class Service:
         """Starts where the last run of this vehicle ended.
 
         Args:
-            vehicle: geometry, mass, first guess.
-            settings: of the session.
-            worker: does the fits.
-            store: history; None for none.
             clock: seconds, monotonic; only rates and silences are measured with it.
             restored: what an earlier run had left; default: what the history says.
             live: data come at their own pace, so that work is shed when behind; a replay waits for every fit.

@@ -20,7 +20,6 @@ def session_settings(approval: str = "auto", **given: Any) -> SessionSettings:
     """Session settings from loose arguments.
 
     Args:
-        approval: auto or manual.
         given: fields of `SessionSettings`, or of `GateSettings` with ``gate_`` before.
 
     Raises:
@@ -50,9 +49,7 @@ class NodeParameter:
     """One parameter of the node.
 
     Attributes:
-        name: ROS name.
         default: its type is the parameter's type.
-        description: one sentence with the unit.
         span: lowest and highest value, for numbers.
         live: whether it may be changed while the node is configured.
     """

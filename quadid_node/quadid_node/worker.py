@@ -149,9 +149,7 @@ class ProcessWorker:
         """Starts the child; `ready` tells when its kernels are warm.
 
         Args:
-            vehicle: whose model is warmed up.
             memory_mb: most memory of the child [MiB]; 0 for no limit.
-            clock: seconds, monotonic.
             name: what it is called when something is told of it.
             limit: a request that takes longer [s] counts as hung.
         """

@@ -24,7 +24,18 @@ def main() -> None:
     os.dup2(2, 1)  # whatever prints must not end up between replies
     requests = os.fdopen(os.dup(0), "rb")
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    _behave(int(sys.argv[1]))
+    # Lowers priority, leaves the first core to others, bounds memory.
+    megabytes = int(sys.argv[1])
+    os.nice(NICE)
+    if hasattr(os, "sched_getaffinity"):
+        cores = sorted(os.sched_getaffinity(0))
+        if len(cores) > 1:
+            os.sched_setaffinity(0, cores[1:])
+    _end_with_parent()
+    if megabytes > 0:
+        limit = megabytes << 20
+        resource.setrlimit(resource.RLIMIT_DATA, (limit, limit))
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     from quadid.online.fit_job import warm_up
 
     def answer(item: object) -> None:
@@ -40,20 +51,6 @@ def main() -> None:
         return
     except MemoryError:
         sys.exit("the fit process needs more memory than it may have")  # one line; the parent says what follows
-
-
-def _behave(megabytes: int) -> None:
-    """Lowers priority, leaves the first core to others, bounds memory."""
-    os.nice(NICE)
-    if hasattr(os, "sched_getaffinity"):
-        cores = sorted(os.sched_getaffinity(0))
-        if len(cores) > 1:
-            os.sched_setaffinity(0, cores[1:])
-    _end_with_parent()
-    if megabytes > 0:
-        limit = megabytes << 20
-        resource.setrlimit(resource.RLIMIT_DATA, (limit, limit))
-    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
 
 
 def _end_with_parent() -> None:

@@ -163,9 +163,6 @@ class ZenohLink:
         """Begins to connect.
 
         Args:
-            where: see `open_session`.
-            vehicle: name of the vehicle.
-            service: takes commands.
             retry: pause between two attempts [s].
 
         Raises:
@@ -280,7 +277,6 @@ class Fleet:
 
     Attributes:
         latest: by vehicle and kind, the last value.
-        alive: vehicles whose service lives.
         refused: payloads that were not ours.
     """
 
@@ -311,10 +307,7 @@ class Fleet:
         """Sends a command to one vehicle; returns whether it was done, and what the vehicle said.
 
         Args:
-            vehicle: its name.
             name: approve, rollback or fit_now.
-            sequence: of the set to approve.
-            seconds: how long to wait for the answer.
         """
         asked = f"?sequence={sequence}" if sequence is not None else ""
         for reply in self._session.get(key_of(vehicle, f"command/{name}") + asked, timeout=seconds):

@@ -25,8 +25,6 @@ def follow(page: Path, quadid: Cli, fill_in: Callable[[str], str]) -> dict[str, 
     """Does what "From logs" says in the current folder, which holds its logs; what each command said, by its name.
 
     Args:
-        page: of the documents.
-        quadid: the program.
         fill_in: what a person makes of the text of the vehicle file that `init` wrote.
     """
     told: dict[str, dict[str, Any]] = {}

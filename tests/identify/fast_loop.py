@@ -22,8 +22,6 @@ def fly_fast(
 
     Args:
         vehicle: with its nominal parameters as truth.
-        seconds: length.
-        seed: of references and noise.
         kp: feedback of the angle [1/s^2].
         kd: feedback of the rate [1/s].
         act_every: steps between two actions of the controller; `EVERY`: commands are held like the log.

@@ -170,7 +170,9 @@ def numpy_case(vehicle: Vehicle, thetas: FloatArray) -> Case:
 # --- the processor's peak
 
 
-def _peak_source() -> str:
+def peak_case() -> Case:
+    """Fused multiply-adds of float64 on one core: independent chains that stay in registers."""
+    scope: dict[str, object] = {"lane_kernel": lane_kernel}
     lines = [
         "def peak(rounds, a, x):",
         "    lane_kernel()",
@@ -180,13 +182,7 @@ def _peak_source() -> str:
     lines += [f"            c{j} = x[{8 * j} + lane]" for j in range(PEAK_CHAINS)]
     lines += [f"            c{j} = c{j} * a + 0.5" for _ in range(PEAK_DEPTH) for j in range(PEAK_CHAINS)]
     lines += [f"            x[{8 * j} + lane] = c{j}" for j in range(PEAK_CHAINS)]
-    return "\n".join(lines)
-
-
-def peak_case() -> Case:
-    """Fused multiply-adds of float64 on one core: independent chains that stay in registers."""
-    scope: dict[str, object] = {"lane_kernel": lane_kernel}
-    exec(_peak_source(), scope)  # written out, because there are no loops over registers
+    exec("\n".join(lines), scope)  # written out, because there are no loops over registers
     peak = nb.njit(**whole)(scope["peak"])
     x = aligned((8 * PEAK_CHAINS,))
     x[:] = 0.0

@@ -191,12 +191,8 @@ def flown(
     """Runs the node beside a vehicle.
 
     Args:
-        seconds: how long the vehicle is there.
         rate: of its channels [Hz].
-        profile: what its pilot does.
-        record: whether the node records what it takes in.
         between: time between two points [s]; the first comes after `SETTLE`.
-        tell: takes a line a point.
 
     Returns:
         What was `sent` by topic, the `points` seen from outside, the notes of the node (`minutes`), `problems` that it

@@ -34,7 +34,6 @@ class Box:
 
     Attributes:
         lower: bounds of the logarithms, shape (6,).
-        upper: likewise.
         start: the vehicle file's guess, shape (6,).
     """
 
@@ -104,11 +103,7 @@ def fit_at(
     """Wraps a parameter vector as a fit: intervals and status at `theta`, which need not be an optimum.
 
     Args:
-        windows: training data.
-        vehicle: as given.
         theta: full parameter vector, shape (size,).
-        noise: sensor noise.
-        evaluations: parameter vectors that the search simulated.
         how: sentence on how it ended.
     """
     shooting = Shooting.cut(windows, vehicle, FIT_SECONDS, noise)

@@ -38,7 +38,6 @@ class Ledger:
     Attributes:
         evaluations: parameter vectors simulated so far.
         best: best u by cost, shape (n,); None before the first finite cost.
-        best_cost: its cost.
     """
 
     def __init__(self, cost: Batch, residual: Batch | None, lower: FloatArray, upper: FloatArray, budget: int) -> None:

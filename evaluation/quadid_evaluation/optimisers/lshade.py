@@ -73,11 +73,7 @@ class LShade:
         """Draws the first population.
 
         Args:
-            lower: shape (n,).
-            upper: shape (n,).
             budget: evaluations in all; the population shrinks linearly from N_init to 4 over them.
-            seed: of its own generator.
-            options: default `LShadeOptions()`.
 
         Raises:
             ParameterError: an invalid box, initial point, or a budget below one population.
@@ -108,7 +104,24 @@ class LShade:
     def ask(self) -> FloatArray:
         """Returns positions to be evaluated, shape (k, n); the same ones until they are told."""
         if not self._asked:
-            self._breed()
+            size, n = self._x.shape
+            entry = self._rng.integers(len(self._m_f), size=size)
+            # Eq. (1): CR_i = 0 if M_CR is terminal, else N(M_CR, 0.1) cut to [0, 1].
+            mean = self._m_cr[entry]
+            normal = np.clip(mean + 0.1 * self._rng.standard_normal(size), 0.0, 1.0)
+            self._cr = np.where(np.isnan(mean), 0.0, normal)
+            # Eq. (2): F_i = Cauchy(M_F, 0.1), drawn again while not positive, cut at 1.
+            location = self._m_f[entry]
+            f = np.zeros(len(location))
+            while np.any(pending := f <= 0.0):
+                f[pending] = location[pending] + 0.1 * self._rng.standard_cauchy(int(pending.sum()))
+            self._f = np.minimum(f, 1.0)
+            mutant = self._mutate(self._f)
+            # Eq. (5): binomial crossover; component j_rand always comes from the mutant.
+            keep = self._rng.random((size, n)) > self._cr[:, None]
+            keep[np.arange(size), self._rng.integers(n, size=size)] = False
+            # No trial beyond the budget: the last generation may be incomplete.
+            self._trials = np.where(keep, self._x, mutant)[: self.budget - self.evaluations]
             self._asked = True
         return self._trials.copy()
 
@@ -127,8 +140,25 @@ class LShade:
         if not len(self._x):
             self._x, self._cost = self._trials.copy(), array
         else:
-            self._select(array)
-            self._shrink()
+            # Eq. (6): a trial replaces a parent it equals or beats; only a strict success enters archive and history.
+            k = len(array)
+            parent = self._cost[:k].copy()
+            success, accept = array < parent, array <= parent
+            self._archive = np.concatenate([self._archive, self._x[:k][success]])
+            with np.errstate(over="ignore"):
+                gain = parent[success] - array[success]
+            self._learn(gain, self._cr[:k][success], self._f[:k][success])
+            self._x[:k][accept] = self._trials[accept]
+            self._cost[:k][accept] = array[accept]
+            # Eq. (10): N = round((N_min - N_init) / budget * evaluations + N_init); the worst leave.
+            span = SMALLEST_POPULATION - self._first_size
+            size = max(round(span * self.evaluations / self.budget + self._first_size), SMALLEST_POPULATION)
+            if size < len(self._x):
+                stay = np.sort(np.argsort(self._cost, kind="stable")[:size])
+                self._x, self._cost = self._x[stay], self._cost[stay]
+            room = round(self.options.archive * len(self._x))
+            if len(self._archive) > room:
+                self._archive = self._archive[self._rng.choice(len(self._archive), room, replace=False)]
         leader = int(np.argmin(self._cost))
         if self._cost[leader] < self.best_cost:
             self.best, self.best_cost = read_only(self._x[leader]), float(self._cost[leader])
@@ -138,28 +168,6 @@ class LShade:
     def population(self) -> int:
         """Present number of individuals."""
         return len(self._x) or self._first_size
-
-    def _breed(self) -> None:
-        size, n = self._x.shape
-        entry = self._rng.integers(len(self._m_f), size=size)
-        # Eq. (1): CR_i = 0 if M_CR is terminal, else N(M_CR, 0.1) cut to [0, 1].
-        mean = self._m_cr[entry]
-        normal = np.clip(mean + 0.1 * self._rng.standard_normal(size), 0.0, 1.0)
-        self._cr = np.where(np.isnan(mean), 0.0, normal)
-        self._f = self._cauchy(self._m_f[entry])
-        mutant = self._mutate(self._f)
-        # Eq. (5): binomial crossover; component j_rand always comes from the mutant.
-        keep = self._rng.random((size, n)) > self._cr[:, None]
-        keep[np.arange(size), self._rng.integers(n, size=size)] = False
-        # No trial beyond the budget: the last generation may be incomplete.
-        self._trials = np.where(keep, self._x, mutant)[: self.budget - self.evaluations]
-
-    def _cauchy(self, location: FloatArray) -> FloatArray:
-        # Eq. (2): F_i = Cauchy(M_F, 0.1), drawn again while not positive, cut at 1.
-        f = np.zeros(len(location))
-        while np.any(pending := f <= 0.0):
-            f[pending] = location[pending] + 0.1 * self._rng.standard_cauchy(int(pending.sum()))
-        return np.minimum(f, 1.0)
 
     def _mutate(self, f: FloatArray) -> FloatArray:
         # Eq. (3), current-to-pbest/1: v_i = x_i + F_i (x_pbest - x_i) + F_i (x_r1 - x_r2), r2 also from the archive.
@@ -182,18 +190,6 @@ class LShade:
             r2 += r2 >= taken
         return r1, r2
 
-    def _select(self, cost: FloatArray) -> None:
-        # Eq. (6): the trial replaces a parent it equals or beats; only a strict success enters archive and history.
-        k = len(cost)
-        parent = self._cost[:k].copy()
-        success, accept = cost < parent, cost <= parent
-        self._archive = np.concatenate([self._archive, self._x[:k][success]])
-        with np.errstate(over="ignore"):
-            gain = parent[success] - cost[success]
-        self._learn(gain, self._cr[:k][success], self._f[:k][success])
-        self._x[:k][accept] = self._trials[accept]
-        self._cost[:k][accept] = cost[accept]
-
     def _learn(self, gain: FloatArray, cr: FloatArray, f: FloatArray) -> None:
         # Algorithm 1 and Eqs. (7)-(9): weighted Lehmer means of the successful CR and F replace the oldest entry.
         if not len(gain):
@@ -206,17 +202,6 @@ class LShade:
         self._m_cr[self._entry] = np.nan if terminal else (weight @ cr**2) / (weight @ cr)
         self._m_f[self._entry] = (weight @ f**2) / (weight @ f)
         self._entry = (self._entry + 1) % len(self._m_f)
-
-    def _shrink(self) -> None:
-        # Eq. (10): N = round((N_min - N_init) / budget * evaluations + N_init); the worst leave.
-        span = SMALLEST_POPULATION - self._first_size
-        size = max(round(span * self.evaluations / self.budget + self._first_size), SMALLEST_POPULATION)
-        if size < len(self._x):
-            stay = np.sort(np.argsort(self._cost, kind="stable")[:size])
-            self._x, self._cost = self._x[stay], self._cost[stay]
-        room = round(self.options.archive * len(self._x))
-        if len(self._archive) > room:
-            self._archive = self._archive[self._rng.choice(len(self._archive), room, replace=False)]
 
     def _judge(self) -> None:
         finite = math.isfinite(self.best_cost)

@@ -40,10 +40,8 @@ class Result:
 
     Attributes:
         x: best point, shape (n,).
-        cost: its cost; infinite when none was finite.
         evaluations: parameter vectors simulated, finite differences and the polish included; never above the budget.
         seconds: time on the caller's clock; NaN without a clock.
-        stop: how it ended.
     """
 
     x: FloatArray
@@ -70,10 +68,7 @@ def minimise(
         name: one of `NAMES`.
         cost_batch: (k, n) -> (k,); what is not finite counts as worst.
         x0: start, shape (n,), in the box.
-        lower: shape (n,).
-        upper: shape (n,).
         budget: largest number of parameter vectors that may be simulated.
-        seed: of all randomness.
         residual: (k, n) -> (k, m), for ``least_squares`` and ``pso_polish``; half its sum of squares is minimised, so
             the cost should rise and fall with that.
         clock: returns seconds, for `Result.seconds`.

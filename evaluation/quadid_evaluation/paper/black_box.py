@@ -71,14 +71,8 @@ def order_errors(
 
     Args:
         method: this and all that is not explained here: as `fit_subspace`.
-        inputs: (rows, m) a record.
-        outputs: (rows, p) a record.
-        orders: candidates.
         length: rows a segment.
         sigma: standard deviations that weigh the outputs, shape (p,).
-        past: block rows.
-        future: block rows.
-        feedthrough: for all outputs or each.
 
     Raises:
         NotIdentifiableError: no record is long enough to hold a segment out.
@@ -115,10 +109,8 @@ def fit_black_box(
     """Fits a subspace model to windows, its order chosen on their last parts.
 
     Args:
-        method: ``cva`` or ``moesp``.
         windows: training data on one grid, with gyro, attitude and accel.
         noise: sensor noise; weighs the outputs when orders are compared.
-        orders: candidates.
 
     Raises:
         WindowError: a channel is absent.

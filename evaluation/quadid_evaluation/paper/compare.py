@@ -123,12 +123,10 @@ def compare(
         logs: a log or several to fit, as paths or from `load`.
         validate: flights that are scored only.
         vehicle: initial guess, bounds, known effects; default that of the first loaded log.
-        methods: names; all by default.
         seeds: runs of each random method.
         budget: simulations of the data a run may spend.
         objective: one of `OBJECTIVES`.
         seed: of the first run; the others have the following ones.
-        advance: told how far it is.
 
     Raises:
         ParameterError: an unknown method or objective.

@@ -39,7 +39,6 @@ class PaperFigure:
     """One figure: a group of outputs on one or two sets.
 
     Attributes:
-        number: of the figure in the paper.
         group: key of `GROUPS`.
         sets: numbers of the sets, from 1.
     """
@@ -84,7 +83,6 @@ def draw(figure: PaperFigure, scores: Mapping[str, Sequence[PaperScore]]) -> Fig
     """Draws a figure for print; the caller saves it.
 
     Args:
-        figure: which one.
         scores: by model (``quasi_newton``, ``pso``), of every set.
     """
     from matplotlib.figure import Figure

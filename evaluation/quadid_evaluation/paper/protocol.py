@@ -48,12 +48,7 @@ BUDGET = 400
 
 @dataclass(frozen=True)
 class Plan:
-    """Amount of work.
-
-    Attributes:
-        seconds: of each flight.
-        particles, iterations, seeds: of the paper's swarm.
-    """
+    """Amount of work."""
 
     seconds: float = 500.0
     particles: int = 32
@@ -71,7 +66,6 @@ class Column:
     """One column of the tables: a model and how it was found.
 
     Attributes:
-        theta: full parameter vector.
         evaluations, seconds: spent on finding it.
         others: parameter vectors of other seeds.
     """
@@ -88,10 +82,6 @@ def reproduce(
     """Flies, fits and scores all.
 
     Args:
-        folder: for the logs.
-        plan: how much.
-        seed: of flights and searches.
-        advance: told how far it is.
         command: that renews the result.
 
     Returns:

@@ -108,7 +108,6 @@ def fit_subspace(
         method: ``cva`` or ``moesp``.
         inputs: shape (rows, m), or one such array a record.
         outputs: shape (rows, p), or one such array a record; rows with NaN are left out with all that reach over them.
-        order: number of states.
         past: block rows of the past; the predictor must have forgotten its state after so many rows.
         future: block rows of the future, at most `past`.
         loop: ``closed`` where the inputs were computed from the outputs, as in flight; ``open`` where they were not.
@@ -319,7 +318,6 @@ def predict(
     takes n degrees of freedom from the length * p measurements of a segment.
 
     Args:
-        model: n states.
         inputs: shape (rows, m), finite.
         outputs: shape (rows, p); NaN where nothing was measured.
         length: rows a segment.

@@ -234,8 +234,6 @@ class Flight:
     """One diagnosis to make.
 
     Attributes:
-        name: of the case or the vehicle.
-        case: of the campaign.
         train, held: logs below the data folder, each with `@from:to` where cut; vehicle: its file there.
         hidden: what a case hides; None where nobody knows.
         clutter: what may be named beside it, after it.
@@ -307,7 +305,6 @@ def load(flight: Flight, cache: Path | None = None) -> Windows:
     """Windows to diagnose, windows to measure the gain on, and the vehicle as guessed.
 
     Args:
-        flight: which.
         cache: folder that keeps flights once flown or read; they do not depend on the diagnosis.
     """
     kept = None if cache is None else cache / f"{flight.name.replace(' ', '-').replace('/', '-')}.pickle"

@@ -100,7 +100,6 @@ class Outcome:
 
     Attributes:
         published, candidates: sets as JSON, in order.
-        events: kind and text, with time.
         status: the last one, phase and reason.
         seconds: wall time.
     """

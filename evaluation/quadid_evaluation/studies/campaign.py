@@ -26,13 +26,12 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from quadid.data.window import Window
-from quadid.diagnosis import Diagnosis, Search, diagnose
+from quadid.diagnosis import Search, diagnose
 from quadid.diagnosis.attribution import block_deviance
-from quadid.diagnosis.hypotheses import Candidate, Model, Start, candidates, extend, fit_model
+from quadid.diagnosis.hypotheses import Model, Start, candidates, extend, fit_model
 from quadid.effects import EFFECTS
 from quadid.errors import QuadidError
 from quadid.flight import OUTSIDE, FlightError, draw_effect, draw_outside, draw_truth, fly
-from quadid.identification.problem import Shooting
 from quadid.parameters import NOMINAL_NAMES
 from quadid.vehicle import Command, ParameterPrior, Vehicle
 from quadid_evaluation.harness import options, share, table
@@ -187,14 +186,11 @@ class Graded:
     """The answer to one case beside the truth.
 
     Attributes:
-        case: what was hidden.
         verdict: of the diagnosis, or ``failed``.
         named: effects called confident; listed: all findings; first: the first of them.
         values: found parameters by effect and name; intervals: their 95 % intervals.
         mse_nominal, mse_extended: on the second flight; mse_oracle: of the true structure fitted to the first.
         rest: structure left, as a share of the noise.
-        seconds: time of the diagnosis.
-        note: why it failed.
     """
 
     case: Case
@@ -225,10 +221,6 @@ def run(case: Case) -> Graded:
         return _failed(case, f"refused: {error}")
     seconds = time.perf_counter() - began
     oracle = _oracle(case, search, validate) if case.group in WITH_ORACLE else None
-    return _graded(case, found, search, oracle, seconds)
-
-
-def _graded(case: Case, found: Diagnosis, search: Search, oracle: float | None, seconds: float) -> Graded:
     return Graded(
         case,
         found.verdict.value,
@@ -254,23 +246,15 @@ def _oracle(case: Case, search: Search, validate: Window) -> float:
     listed = candidates(shooting.layout, shooting.has_velocity, shooting.channels >= 15)
     model: Model = search.nominal
     for effect, values in sorted(case.hidden.items(), key=lambda item: item[0] != "rotor_drag"):
-        start = Start(_near_truth(shooting, model, effect, values), model.states)
-        model = extend(shooting, model, _cause(listed, effect, values), start, 12)
+        # From the true effect, and nominal parameters of the vehicle file.
+        theta = np.asarray(model.theta).copy()
+        shooting.layout.write_effects(theta, {effect: values})
+        start = Start(theta, model.states)
+        label = f"weak_rotor {round(values['rotor'])}" if effect == "weak_rotor" else effect
+        model = extend(shooting, model, next(c for c in listed if c.label == label), start, 12)
     model = fit_model(shooting, model.theta, model.causes, model.states, 12)
     deviance, rows = block_deviance(shooting.on([validate]), model)
     return float(deviance.sum()) / rows
-
-
-def _cause(listed: list[Candidate], effect: str, values: dict[str, float]) -> Candidate:
-    label = f"weak_rotor {round(values['rotor'])}" if effect == "weak_rotor" else effect
-    return next(c for c in listed if c.label == label)
-
-
-def _near_truth(shooting: Shooting, model: Model, effect: str, values: dict[str, float]) -> np.ndarray:
-    """Start of the oracle: the true effect, nominal parameters of the vehicle file."""
-    theta = np.asarray(model.theta).copy()
-    shooting.layout.write_effects(theta, {effect: values})
-    return theta
 
 
 def right(g: Graded) -> bool:

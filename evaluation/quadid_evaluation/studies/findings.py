@@ -47,8 +47,6 @@ class Finding:
         folder: of the findings, below the data.
         what: done wrong, or meant, in a few words.
         call: arguments of the command, of the folder and of one to write into.
-        right: whether the answer is right.
-        numbers: what the table shows of it.
     """
 
     folder: str

@@ -17,7 +17,6 @@ class FlightSet:
         truth: parameters known from elsewhere, each with the interval [low, high] in which the truth lies, in the units
             of the vehicle file: its mass, and rotor speeds as its command gives them.
         beside_curve: truth of those that mean something else beside a thrust curve.
-        source: where the truth comes from.
     """
 
     vehicle: str

@@ -164,11 +164,9 @@ class Row:
     Attributes:
         identified, diagnosed: JSON results; None with the reason in `failed`.
         prediction: half-second errors as shares of no change by what predicts them, each of the four quantities.
-        seconds: wall time.
         terms: formulas of the residual terms.
         soon: error of the rate after 0.1 s by the same predictors, as a share of no change.
         velocity: scale of the logged velocity against the change of position, and the position error it makes.
-        date: of the measurement.
     """
 
     identified: dict[str, Any] | None

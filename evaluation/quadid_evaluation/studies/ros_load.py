@@ -188,10 +188,8 @@ class Seen(NamedTuple):
 
     Attributes:
         first: from the first message to the first set [s]; NaN for none.
-        sets: published.
         errors: largest relative error of each nominal parameter over all sets, shape (6,); NaN for none.
         backlog: largest of the status [s].
-        fits: done.
         load: mean of the machine's load over the last minute, while it flew.
     """
 

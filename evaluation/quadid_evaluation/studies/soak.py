@@ -62,10 +62,8 @@ def day(
     """Takes in `hours` of flight.
 
     Args:
-        hours: flight time, pauses included.
         refit: between two fits [s].
         diagnose: between two diagnoses [s].
-        tell: takes a line now and then.
         limit: stops after so much wall time [s] and says how far it came.
         kept: candidates and events that the history keeps; fewer than in service, so that the limit is reached.
 

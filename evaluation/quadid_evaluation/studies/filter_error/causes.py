@@ -33,12 +33,8 @@ class Explained:
     """One model at its maximum.
 
     Attributes:
-        causes: its causes.
-        problem: with their entries free.
         z: scaled parameters; psi: noise numbers.
         objective: -2 ln of likelihood and priors.
-        gains: of the last pass.
-        information: of the scaled parameters.
         tests: causes that were looked at.
     """
 

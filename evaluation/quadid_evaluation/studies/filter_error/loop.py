@@ -95,8 +95,6 @@ def fly(
     """One flight with the guess of the vehicle file as truth.
 
     Args:
-        vehicle: the truth.
-        seconds: length.
         seed: of references, moments and noise.
         every: steps of 2 ms a row of the log.
         share: random moments, as a share of the control moment.

@@ -49,8 +49,6 @@ def squared_speeds(
     """Squares of the rotor speeds that balance weight and moments, shape (rotors,).
 
     Args:
-        vehicle: whose b and d are taken for true.
-        wrong: what is wrong.
         imbalance: relative thrust and drag torque of each healthy rotor beyond the mean, shape (rotors,).
         load: mass beyond the vehicle's, relative.
         shift: of the healthy CG [m].
@@ -76,10 +74,6 @@ def hover_seconds(
     """Mean squared rotor speeds and specific force of each second of a hover.
 
     Args:
-        vehicle: whose b and d are taken for true.
-        seconds: how many.
-        rng: of everything.
-        variation: healthy variation.
         wrong: what is wrong from `onset` [s] on.
     """
     how, n = Variation() if variation is None else variation, len(vehicle.rotors)
@@ -117,11 +111,8 @@ def hover(
     """A log of a hover at 50 Hz: rotors and accelerometer, on the ground for 2 s before and after.
 
     Args:
-        vehicle: what hovers.
-        wrong: what is wrong with it.
         seed: of noise and of what differs from flight to flight.
         spread: standard deviation of each rotor's thrust from flight to flight, relative.
-        seconds: in the air.
     """
     rng = np.random.default_rng(seed)
     own = np.random.default_rng(99).normal(0.0, 0.03, len(vehicle.rotors))  # this vehicle's rotors differ for good

@@ -112,12 +112,7 @@ def _row(what: str, loss: float, each: int, flown: Callable[[int], Found]) -> st
 
 
 def quiet(hours: float, session: float) -> str:
-    """Alarms in healthy hover, as Markdown.
-
-    Args:
-        hours: of the watch, second by second.
-        session: of a whole session at 50 Hz.
-    """
+    """Alarms in healthy hover, as Markdown."""
     rng = np.random.default_rng(11)
     watch, flown = practised(rng), Flown(rng)
     count, whole = (round(h * 3600.0 / FLIGHT) for h in (hours, session))

@@ -79,8 +79,6 @@ def identify(
     """Estimates the nominal parameters (their logarithms) of flights with gyro, attitude and accelerometer.
 
     Args:
-        windows: the flights, on one grid.
-        vehicle: geometry, mass and initial guess.
         noise: standard deviations of gyro [rad/s], accelerometer [m/s^2] and a quaternion's parts.
         factor: bounds, as factors of the guess.
         chunk: length of the simulated pieces [s].
@@ -96,7 +94,18 @@ def identify(
     parameters = sysid.ParameterDict()
     parameters.add(sysid.Parameter("numbers", start, low, high, modifier=_apply(vehicle)))
     _apply(vehicle)(spec, parameters["numbers"])
-    sequences = _sequences(windows, vehicle, spec, chunk)
+    # The flights in chunks, each from the state that was measured.
+    model = spec.compile()
+    states, controls, sensors = [], [], []
+    for window in windows:
+        steps = round(chunk / window.dt)
+        for first in range(0, len(window) - steps, steps):
+            state, held, measured = _chunk(window.slice(first, first + steps + 1), vehicle, model)
+            states.append(state)
+            controls.append(held)
+            sensors.append(measured)
+    names = [f"chunk{k}" for k in range(len(states))]
+    sequences = sysid.ModelSequences("quadrotor", spec, names, states, controls, sensors)
     residual = sysid.build_residual_fn(
         models_sequences=[sequences], modify_residual=_difference(noise), n_threads=2, resample_true=False
     )
@@ -124,21 +133,6 @@ def _slope_of_log_j_zz(x: FloatArray) -> FloatArray:
     slope[[_J_XX, _J_YY]] = weight / weight.sum()
     slope[_J_ZZ] = 1.0 / x[_J_ZZ]
     return slope
-
-
-def _sequences(windows: Sequence[Window], vehicle: Vehicle, spec: Any, seconds: float) -> Any:
-    """The flights in chunks, each from the state that was measured."""
-    model = spec.compile()
-    states, controls, sensors = [], [], []
-    for window in windows:
-        steps = round(seconds / window.dt)
-        for first in range(0, len(window) - steps, steps):
-            state, held, measured = _chunk(window.slice(first, first + steps + 1), vehicle, model)
-            states.append(state)
-            controls.append(held)
-            sensors.append(measured)
-    names = [f"chunk{k}" for k in range(len(states))]
-    return sysid.ModelSequences("quadrotor", spec, names, states, controls, sensors)
 
 
 def _chunk(chunk: Window, vehicle: Vehicle, model: Any) -> tuple[Any, Any, Any]:

@@ -80,8 +80,6 @@ def identify(window: Window, vehicle: Vehicle, noise: tuple[float, float, float]
     """Estimates the nominal parameters (their logarithms) of one flight.
 
     Args:
-        window: the flight, with gyro and accelerometer.
-        vehicle: geometry, mass and initial guess.
         noise: standard deviations of gyro [rad/s] and accelerometer [m/s^2]; the third is not used.
     """
     begin = time.process_time()
