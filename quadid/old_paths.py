@@ -86,6 +86,12 @@ MOVED = {
     "quadid.identification.predict": "quadid.identify.open_loop quadid.identify.prediction "
     "quadid.identify.prediction_floor",
     "quadid_evaluation.optimisers.box": "quadid.identify.shooting_objective",
+    "quadid_evaluation.paper.subspace": "quadid_evaluation.paper.hankel quadid_evaluation.paper.order "
+    "quadid_evaluation.paper.state_space",
+    "quadid_evaluation.paper.black_box": "quadid_evaluation.paper.quadrotor_io",
+    "quadid_evaluation.paper.compare": "quadid_evaluation.paper.comparison",
+    "quadid_evaluation.paper.protocol": "quadid_evaluation.paper.result",
+    "quadid_evaluation.paper.page": "quadid_evaluation.paper.tables",
     "quadid.diagnosis.hypotheses": "quadid.diagnose.candidates quadid.diagnose.cross_validation quadid.diagnose.model",
     "quadid.diagnosis.evidence": "quadid.diagnose.log_evidence quadid.diagnose.score_test quadid.diagnose.plausibility",
     "quadid.diagnosis.search": "quadid.diagnose.segment_schedule quadid.diagnose.selection",
@@ -171,7 +177,8 @@ def new_path(name: str) -> str:
     if name in _NEW:
         return _NEW[name]
     room = next((room for room in ROOMS if name == room or name.startswith(f"{room}.")), "")
-    return ROOMS[room] + name.removeprefix(room) if room else ""
+    new = ROOMS[room] + name.removeprefix(room) if room else ""
+    return _NEW.get(new, new)
 
 
 class _OldPaths(MetaPathFinder, Loader):

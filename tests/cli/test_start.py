@@ -187,6 +187,7 @@ def test_names_of_rooms_are_functions_also_after_an_old_import(name: str) -> Non
 
 @pytest.mark.parametrize("statement", [
     "from quadid_report.page import render", "import quadid_cli.main", "import quadid_paper.subspace",
+    "import quadid_paper.hankel", "import quadid.baselines.order",
     "from quadid.identify.fit import fit", "from quadid.diagnose import Diagnosis",
     "from quadid.health.trim_estimation import FlightTrim",
 ])  # fmt: skip
