@@ -27,11 +27,11 @@ ORDERS = tuple(range(4, 25, 2))
 """Numbers of states that are tried."""
 HELD_OUT = 0.3
 """Last part of each record that judges the orders fitted to the rest."""
-CHANNELS = 9
 FEEDTHROUGH = (False,) * 6 + (True,) * 3
 """Rotor speeds act at once on the specific force, through an integration on rates and angles.  The stabiliser computes
 row k of the rotor speeds from rates and angles of the same instant: allowing a direct effect there would mistake the
 stabiliser for the vehicle."""
+CHANNELS = len(FEEDTHROUGH)
 
 
 def quadrotor_io(window: Window) -> tuple[FloatArray, FloatArray]:
