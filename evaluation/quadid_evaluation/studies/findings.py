@@ -291,7 +291,7 @@ def spoilt(folder: str, what: str, change: str, simulate: str = "") -> Finding:
     return gate(folder, what, f"{before}bash ../gate_cli.sh '{what}' '{change}'")
 
 
-_SDF = "import glob,xml.etree.ElementTree as E; print(E.parse(*glob.glob('o/**/*.sdf')).getroot()[0].attrib)"
+_SDF = "import glob,xml.etree.ElementTree as E; print(E.parse(*glob.glob('o/*.sdf')).getroot()[0].attrib)"
 _PAYLOAD = "bash ../gate-payload/run.sh"
 ATTACKS: tuple[Finding, ...] = (
     *(
