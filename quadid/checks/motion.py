@@ -558,9 +558,9 @@ def _one_axis(gyro: Channel, attitude: Channel) -> Check | None:
     if len(rows[0]) < FEWEST_SAMPLES:
         return None
     (size, turned), offset = (np.std(x, axis=0) for x in rows), np.mean(rows[0] - rows[1], axis=0)
-    follows = np.mean((rows[0] - rows[0].mean(axis=0)) * (rows[1] - rows[1].mean(axis=0)), axis=0) > (
-        0.9 * size * turned + 1e-12
-    )
+    together = np.mean((rows[0] - rows[0].mean(axis=0)) * (rows[1] - rows[1].mean(axis=0)), axis=0)
+    correlation = together / (size * turned + 1e-12)
+    follows = correlation > 0.9
     scale = turned / np.maximum(size, 1e-300)
     agrees = follows & (scale < _UNIT) & (scale > 1.0 / _UNIT) & (size > _MOTION)
     if not agrees.any():
@@ -572,6 +572,9 @@ def _one_axis(gyro: Channel, attitude: Channel) -> Check | None:
         if len(still) == 1 and max(size[axis], turned[axis]) > 3.0 * _MOTION:
             message = f"{still[0]} does not turn about {name}, where the other does"
             return check(CheckResult.ERROR, message, "log all of its axes", numbers)
+        if abs(correlation[axis]) < 0.3 and size[axis] > 0.2 and np.count_nonzero(agrees) == 2:
+            message = f"gyro does not follow the attitude about {name} (correlation {correlation[axis]:.2f})"
+            return check(CheckResult.ERROR, message, f"check {name} of both, or a heading that was held", numbers)
         if follows[axis] and not agrees[axis] and size[axis] > _MOTION:
             message = f"attitude rate / gyro = {scale[axis]:.3g} about {name}, not about every axis"
             return check(

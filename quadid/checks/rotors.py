@@ -58,7 +58,13 @@ def rotor_timing_check(recording: Recording, vehicle: Vehicle, spans: Spans) -> 
         return Check(name, CheckResult.UNKNOWN, "rotor signal or gyro too slow to place them in time")
     # Rows that no block takes are not read for each: the check of a long log takes time by its length.
     width = max(3, round(2.5 * slowest / _STEP) | 1)
-    blocks = [_peaks(signal, gyro, vehicle, times, width) for times in _blocks(spans)]
+    blocks, about = list[list[_Peak]](), 0.0
+    for times in _blocks(spans):
+        near = _peaks(signal._replace(t=signal.t + about), gyro, vehicle, times, width)
+        blocks.append([peak._replace(lag=peak.lag + about) for peak in near])
+        clearest = max(near, key=lambda peak: peak.correlation)
+        if clearest.correlation > 0.5 and abs(clearest.lag) > 0.1:  # a clock that drifts leaves what is searched
+            about += clearest.lag
     if not blocks:
         return Check(name, CheckResult.UNKNOWN, "too little flight to place the rotor signal in time")
     lags, scores, sizes = (np.array([[peak[k] for peak in axes] for axes in blocks]) for k in range(3))

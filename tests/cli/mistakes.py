@@ -103,6 +103,12 @@ class Place:
         rotors = yaml.safe_load(Vehicle.shipped("pelican").to_yaml())["rotors"]
         return self.vehicle(rotors=[{**r, "position": [factor * x for x in r["position"]]} for r in rotors])
 
+    def inertia(self, factor: float) -> Path:
+        """A Pelican file with other inertias."""
+        known = yaml.safe_load(Vehicle.shipped("pelican").to_yaml())["parameters"]
+        told = {n: factor * Vehicle.shipped("pelican").parameters[n].initial for n in ("J_xx", "J_yy", "J_zz")}
+        return self.vehicle(parameters=known | told)
+
     def spins(self) -> Path:
         """A Pelican file whose rotors all turn the other way."""
         rotors = yaml.safe_load(Vehicle.shipped("pelican").to_yaml())["rotors"]
@@ -246,6 +252,7 @@ MISTAKES = (
         "cannot validate",
     ),
     Mistake("mass in grams", of(lambda p: p.vehicle(mass=1300.0)), "gram|mass"),
+    Mistake("inertia in g m^2", of(lambda p: p.inertia(1e3)), "is it in g m"),
     Mistake("mass half as much again", of(lambda p: p.vehicle(mass=1.95)), "mass 1.95 kg", 0),
     Mistake("arms in millimetres", of(lambda p: p.arms(1000.0)), "arm|mm|position"),
     Mistake("arms ten times too short", of(lambda p: p.arms(0.1)), "rotors 0.021 m"),
@@ -257,6 +264,9 @@ MISTAKES = (
     Mistake("gyro 160 ms late", fit(lambda p: p.late("p q r", 8)), "gyro comes 160 ms after the attitude"),
     Mistake("attitude 160 ms late", fit(lambda p: p.late("qw qx qy qz", 8)), "attitude comes 160 ms after the gyro"),
     Mistake("rates of Euler angles as gyro", fit(lambda p: p.euler_rates()), "rates of roll, pitch and yaw"),
+    Mistake("one axis of the gyro in degrees", fit(lambda p: p.scaled("r", 57.3)), "about z"),
+    Mistake("one axis of the gyro not logged", fit(lambda p: p.scaled("q", 0.0)), "does not turn about y"),
+    Mistake("an accelerometer that reads 30 % too much", fit(lambda p: p.scaled("ax ay az", 1.3)), "scale or zero"),
     Mistake("a gyro that is clipped", fit(lambda p: p.clipped()), "limit of its range"),
     Mistake("one rotor column four times", fit(lambda p: p.moved("w2 w3 w4", "w1 w1 w1")), "the same"),
     Mistake("squared rotor speeds", fit(lambda p: p.of_rotors(np.square)), "squared"),

@@ -11,6 +11,7 @@ import pytest
 import yaml
 from quadid_replay import open_log, write_csv
 from quadid_replay.columns import RawChannel, clean_channel
+from quadid_replay.frames import from_euler
 from quadid_replay.motors import active_outputs, frame_of, in_pulses, motor_columns, no_multirotor
 from quadid_replay.vehicle_from_log import vehicle_text
 
@@ -20,6 +21,7 @@ from quadid.checks import Check, CheckResult, inspect
 from quadid.checks.motion import attitude_steps_check
 from quadid.data.window import Channel, Recording
 from quadid.errors import LogError, QuadidError
+from quadid.rotation import euler
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 
@@ -142,6 +144,13 @@ def test_one_axis_and_zero_of_a_sensor(
     wanted = CheckResult.ERROR if error else CheckResult.WARNING
     told = [check.message for check in inspect(recording, Vehicle.shipped("pelican")).checks if check.verdict is wanted]
     assert any(re.search(said, line) for line in told), told
+
+
+def test_a_heading_that_was_held_is_named(flight: Recording) -> None:
+    angles = euler(flight.channels["attitude"].values) * [1.0, 1.0, 0.0]
+    check = verdict(with_channel(flight, "attitude", from_euler(angles)), "gyro_attitude")
+    assert check.verdict is CheckResult.ERROR
+    assert "does not follow the attitude about z" in check.message
 
 
 def test_inertia_in_grams_and_thrust_per_rpm_are_named(flight: Recording) -> None:

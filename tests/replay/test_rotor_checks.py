@@ -112,6 +112,13 @@ def test_a_signal_that_drifts_out_of_time_is_refused(flight: tuple[Recording, Ve
     assert 0.02 < check.numbers["wander_s"] < 0.05
 
 
+def test_a_clock_that_runs_away_is_refused_too(flight: tuple[Recording, Vehicle]) -> None:
+    """After half a minute it is beyond the lags that a block is searched for."""
+    check = judged(flight, lambda c: replace(c, t=c.t * 1.01), "rotor_timing")
+    assert "not in time" in check.message
+    assert check.numbers["wander_s"] > 0.5
+
+
 def test_correlation_and_lag_are_reported(flight: tuple[Recording, Vehicle]) -> None:
     recording, vehicle = flight
     check = next(c for c in inspect(recording, vehicle).checks if c.name == "rotor_timing")
