@@ -40,7 +40,7 @@ class ChannelFacts:
         longest_gap: [s], 0 when there is none.
         bridged: lost samples too few for a gap.
         repeated: fraction of rows equal to the row before.
-        stuck: longest time in flight without any change [s]; 0 where it is unknown when it flies.
+        stuck: longest time in flight without any change, or of the flight if an axis has none [s]; 0 without flight.
         saturated: samples at a limit that the channel hits several times.
         dropped: samples the reader dropped, by reason.
     """

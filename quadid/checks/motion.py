@@ -240,7 +240,11 @@ def _facts(channel: Channel, flying: Spans) -> ChannelFacts:
     long = steps > (longest_step(channel.t, _GRID) if len(steps) else np.inf)
     usual = steps[~long]
     same = copied(channel.values)
-    first, end = true_runs(same & within(channel.t[:-1], flying) & within(channel.t[1:], flying))
+    inside = within(channel.t, flying)
+    first, end = true_runs(same & inside[:-1] & inside[1:])
+    stuck = float(np.max(channel.t[end] - channel.t[first], initial=0.0))
+    if inside.sum() > 1 and np.min(np.ptp(channel.values[inside], axis=0)) == 0.0:
+        stuck = float(np.ptp(channel.t[inside]))  # one axis of it
     return ChannelFacts(
         name=channel.name,
         unit=CHANNELS[channel.name][1],
@@ -254,7 +258,7 @@ def _facts(channel: Channel, flying: Spans) -> ChannelFacts:
         bridged=holes(channel.t, _GRID) if len(steps) else 0,
         longest_gap=float(steps[long].max()) if long.any() else 0.0,
         repeated=float(np.mean(same)) if len(same) else 0.0,
-        stuck=float(np.max(channel.t[end] - channel.t[first], initial=0.0)),
+        stuck=stuck,
         saturated=sum(end.samples for end in at_limit(channel.values))
         if channel.name in ("gyro", "accel", "motor_command")
         else 0,
@@ -299,7 +303,7 @@ def timing_checks(recording: Recording, facts: tuple[ChannelFacts, ...]) -> list
         checks.append(Check("timing", CheckResult.WARNING, message, "stamp at the sensor", {"jitter": f.jitter}))
     for f in facts:
         if f.name in IMU and f.stuck > _STUCK or f.stuck > 10.0 * _STUCK and f.name in ("velocity", "position"):
-            message = f"{f.name}: does not change for {f.stuck:.2g} s of flight ({f.source})"
+            message = f"{f.name}: does not change for {f.stuck:.2g} s of flight, or one axis does not ({f.source})"
             checks.append(
                 Check("stuck", CheckResult.WARNING, message, "check this sensor or topic", {"stuck_s": f.stuck})
             )
@@ -501,6 +505,9 @@ def attitude_check(recording: Recording) -> Check:
     if rates.verdict is CheckResult.ERROR or accel is None or attitude is None or len(attitude.t) < 2:
         return rates
     vertical = _in_world(accel, attitude)[:, 2]
+    vertical = vertical[np.abs(vertical) < 20.0 * GRAVITY]  # single wild readings are no scale
+    if not len(vertical):
+        return rates
     down, up, seconds = float(np.median(vertical)), -float(np.mean(vertical)), float(np.ptp(accel.t))
     # What is felt upwards makes up for gravity on the average, but for 5 m/s of vertical speed.
     most = 0.7 + 5.0 / max(seconds, 1e-3)
