@@ -39,9 +39,7 @@ class Diagnosed(Fitted):
 
     Attributes:
         result: of the form ``quadid.diagnose/1``; ``vehicle_file`` is None until a file is written.
-        found: the diagnosis itself.
         sets: logs scored without and with the findings.
-        noise: estimated sensor noise.
         nominal: vehicle that was given.
         search: how the causes were selected.
     """

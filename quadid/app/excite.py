@@ -51,12 +51,9 @@ class Proposed(Reported):
 
     Attributes:
         result: of the form ``quadid.excite/1``; ``manoeuvre_file`` is None until it is written.
-        proposal: the manoeuvre itself.
-        manoeuvre: text of its file.
         plan: what scripts and instructions are made from.
         hover_throttle: share of full throttle at hover.
         forms: what flies it is written in these as well (`quadid.report.manoeuvres.FORMS`).
-        logs: flights so far.
     """
 
     result: dict[str, Any]

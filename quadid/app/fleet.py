@@ -34,7 +34,6 @@ class Job:
         path: absolute, with a span if wanted; every worker must see it there.
         name: relative to the folder of the fleet.
         unit: which vehicle of the fleet it belongs to.
-        vehicle: text of its vehicle file.
         size, modified: of the file [bytes], [ns]; with `key` they tell whether a stored result is still good.
         key: hash of everything else that decides the result.
         rate: of the grid [Hz]; seed: of the search; diagnose: name what the simulation gets wrong too.

@@ -36,8 +36,6 @@ class HealthOutcome(Reported):
 
     Attributes:
         result: of the form ``quadid.health/1``.
-        found: the comparison itself.
-        vehicle: whose flights they are.
         recordings: the logs as read, those in question first.
     """
 

@@ -98,7 +98,6 @@ class Identified(Fitted):
 
     Attributes:
         result: of the form ``quadid.identify/1``; ``vehicle_file`` is None until a file is written.
-        fit: the fit itself.
     """
 
     title = "Identification"

@@ -211,7 +211,6 @@ class Log:
     """A log that was read, checked and brought onto the grid.
 
     Attributes:
-        path: absolute path.
         recording: as read, each channel at its own rate.
         vehicle: whose log it is; says what the rotor columns mean.
         windows: on one grid, without gaps.
@@ -648,9 +647,6 @@ class Settled:
 
     Attributes:
         vehicle: as described, without priors that come from the flights to fit.
-        train: logs to fit.
-        held: logs to score only.
-        notes: what a user should know about this choice.
     """
 
     vehicle: Vehicle

@@ -37,7 +37,6 @@ class MissingForces:
         roles: ``train`` or ``validate`` of each.
         parts: by model, the stretches of every log.
         flights: the noise at which models are compared.
-        flown: windows of every log.
         extends: the last model has effects that the first one lacks.
     """
 
@@ -226,7 +225,6 @@ class Beside:
     """Forces that act beside the values of a vehicle file.
 
     Attributes:
-        terms: beyond the catalogue.
         removed: share of the squared missing force and moment that they take off unseen flights, off the training
             flights where there are no others; None without terms.
         random: what remains, at random; None where no finite answer is found.

@@ -24,10 +24,7 @@ class Typed(NamedTuple):
     """A parameter that is typed in another form than a caller of the library gives it.
 
     Attributes:
-        kind: its type on the command line.
-        option: names, metavar and help.
         default: on the command line; None for that of the function, `...` where it must be typed.
-        read: makes the argument from what was typed.
         opened: names of logs, opened with the log options of the command before the function is called.
     """
 

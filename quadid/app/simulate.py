@@ -135,8 +135,6 @@ class Draw:
     """One of several vehicles that a vehicle file may stand for.
 
     Attributes:
-        seed: of its flight.
-        vehicle: with its values.
         flown: its flight; None where it did not last.
         failed: why it did not last; empty where it did.
     """

@@ -32,8 +32,6 @@ class Command:
     """One command.
 
     Attributes:
-        short: its line in `quadid --help`.
-        examples: calls that its help ends with.
         function: ``module:name`` of a function of the library, or of the command line itself.
         long: what the help of a function of the library begins with; others have it in their docstring.
         reading: options of how its logs are read.

@@ -56,7 +56,6 @@ class Hypothesis(NamedTuple):
         prior: covariance of the parameters, shape (parameters, parameters).
         centre: their prior mean, shape (parameters,).
         positive: which parameters cannot be negative.
-        log_odds: prior.
     """
 
     kind: str
@@ -130,10 +129,8 @@ class Explained(NamedTuple):
     """One explanation after the fact.
 
     Attributes:
-        hypothesis: what may have changed.
         log_evidence: of the change of trim, with the prior odds.
         value: posterior mean of the parameters, shape (parameters,).
-        covariance: posterior covariance.
         p_value: chance that healthy flights differ so much along this explanation.
     """
 
@@ -340,13 +337,11 @@ class Change:
     """One thing that changed.
 
     Attributes:
-        effect: name of the contract.
         parameters: (name, unit, value, 95 % interval or None).
         p_value: chance that healthy flights differ so much along this explanation.
         share: probability of the explanations that hold it, among all.
         confident: whether it is certain enough to act on.
         rivals: other explanations, the most probable first.
-        evidence: one sentence.
     """
 
     effect: str
@@ -388,8 +383,6 @@ class Health:
         trim: of the flights in question, shape (4,), see `trims.AXES`.
         distance: of each trim from healthy, in standard deviations, shape (4,).
         healthy: the baseline's trim and spread.
-        flights: trims of the flights in question.
-        baseline: trims of the baseline flights.
         unfamiliar: why the flights are of a kind that no baseline flight is; the verdict is unknown then.  Else empty.
     """
 

@@ -45,7 +45,6 @@ class FlightTrim(NamedTuple):
     """The trim of one flight.
 
     Attributes:
-        name: of the log.
         mean: trim at zero velocity, shape (4,), see `AXES`.
         parts: the same of parts of the flight (between landings, else thirds), shape (parts, 4).
         shares: each rotor's share of sum(w), shape (rotors,).
@@ -232,7 +231,6 @@ class Healthy(NamedTuple):
         mean: shape (4,), see `trims.AXES`.
         deviation: standard deviation between healthy flights, shape (4,).
         freedom: degrees of freedom of each, shape (4,).
-        flights: number of baseline flights.
         shares: each rotor's share of the load, shape (rotors,).
     """
 

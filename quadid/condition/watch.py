@@ -46,7 +46,6 @@ class HealthReport:
         rotor_interval: 95 % intervals, shape (rotors, 2).
         mass: mass that the rotors carry by the thrust of the baseline, and its 95 % interval [kg], shape (3,); NaN
             without a baseline, where commands do not indicate thrust, and where a rotor or all of them lost thrust.
-        text: one sentence.
     """
 
     topic: ClassVar[Literal["vehicle_health"]] = "vehicle_health"

@@ -363,7 +363,6 @@ class GridReport:
 
     Attributes:
         rate: grid rate [Hz].
-        windows: number of windows kept.
         seconds_used: time inside windows [s].
         seconds_log: first to last sample of the log [s].
         gaps: number of places where the log was cut (gaps and breaks).
@@ -373,7 +372,6 @@ class GridReport:
         rotor_rate: their own rate in the log [Hz].
         filtered: whether the channels were low-passed for the grid.
         bridged: number of holes in rotor signal, gyro and accelerometer too short for a gap, read between neighbours.
-        notes: sentences for people.
     """
 
     rate: float

@@ -48,7 +48,6 @@ class Feedback(NamedTuple):
     Attributes:
         proportional: kp [1/s^2], angular acceleration for an angle.
         derivative: kd [1/s], angular acceleration for a rate.
-        sigma: standard errors of both.
     """
 
     proportional: float

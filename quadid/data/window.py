@@ -139,12 +139,10 @@ class Recording:
     """Contents of a log, in core units and frames, each channel at its own rate.
 
     Attributes:
-        name: name for people (file name).
         format: how it was recognised: csv, mcap, tlog, dataflash, ulog, usdlog.
         channels: by name; absent channels are absent keys.
         breaks: times [s] across which nothing may be joined (reboots, clock steps).
         warnings: what was wrong with the log and what was done about it.
-        sha256: hash of the bytes read.
         grid: for a log that already is a uniform grid (CSV), its step [s]; else None.
         autopilot: the autopilot's own parameters as the log holds them, by their names there (`INS_GYRO_FILTER`).
         epoch: UNIX time of its time 0 [s]; None where its clock has no date.
@@ -221,7 +219,6 @@ class Window:
         sampling: ``held``: row k of `rotor_speed` acts from t_k to t_k+1; ``instant``: a reading, linear in between.
         rotor_slope: shape (n, rotors) [rad/s^2]: a held row is the mean of a speed that runs on at this slope within
             its sample (`quadid.data.intersample`); None: it stays the same.
-        name: where it came from.
         log_span: first and last time [s] of the whole log, for effects that run over a flight.
     """
 
@@ -438,9 +435,7 @@ class AtLimit(NamedTuple):
     """One end of one axis at its limit.
 
     Attributes:
-        axis: column.
         level: the value that is not left, in the unit of the values.
-        samples: how many are there.
         share: of the column's finite samples.
     """
 
@@ -478,7 +473,6 @@ class DataFault:
     Attributes:
         kind: ``saturated`` or ``repeated``.
         channel: name of the channel, with its axis where there is one.
-        share: of the samples.
         text: one sentence with what to do.
     """
 

@@ -40,7 +40,6 @@ class Truth:
         position: of the CG, world NED [m], shape (n, 3).
         rotor_speed: real rotor speeds [rad/s], shape (n, rotors).
         parameters: what an identification should find.
-        effects: catalogue effects that were flown, complete.
         outside: effects outside the catalogue that were flown.
     """
 
@@ -65,7 +64,6 @@ class Flight:
         truth: true states; nothing that identifies may look at it.
         references: roll, pitch, yaw [rad], throttle 0..1 at the log instants, shape (n, 4).
         gains: of the stabiliser, by name.
-        vehicle: what was flown.
     """
 
     window: Window
@@ -81,15 +79,8 @@ class Flown:
     """A finished flight, not yet logged.
 
     Attributes:
-        plan: clock.
-        setup: constants.
-        outside: effects outside the catalogue.
-        track: output of `march`.
-        sensor: noise.
-        streams: random generators by name.
         gyro_noise: white noise of the gyro at the control instants [rad/s], shape (controls, 3).
         tilt_noise: error of the attitude there, body rotation vector [rad], shape (controls, 3).
-        seed: of the flight.
     """
 
     plan: Plan

@@ -27,8 +27,6 @@ class Scene:
     """A flight about to start.
 
     Attributes:
-        setup: constants of the kernel.
-        plan: clock.
         arrival: when each command reaches the rotors [s].
         pushes: disturbance a step: specific force, world [m/s^2], angular acceleration and specific force, body
             [rad/s^2], [m/s^2]; shape (steps, 9), or (1, 9) while there is none.

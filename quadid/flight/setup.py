@@ -260,7 +260,6 @@ class Setup:
 
     Attributes:
         vehicle, truth: what flies.
-        effects: complete effects.
         body, air, odd, drive, events, on_board: constants of the kernel.
         efficiency: factors on thrust and drag torque of each rotor, shape (rotors, 2).
         delay: delay from command to rotor [s].

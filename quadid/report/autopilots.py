@@ -38,7 +38,6 @@ class Hover(NamedTuple):
     """Rotors about hover, by command 0..1 of full speed.
 
     Attributes:
-        command: in hover.
         thrust, drag: change of each rotor's thrust [N] and drag torque [N m] with its command, shape (rotors,).
         most: thrust of each rotor at full command [N], shape (rotors,).
     """
@@ -53,7 +52,6 @@ class Autopilot(NamedTuple):
     """Rate and attitude loops of an autopilot.
 
     Attributes:
-        program: its name.
         names: parameters of P, I, D of the rates and of the attitude gain, an axis each; empty for none.
         units: what one of each stands for: output per rad/s, rad, rad/s^2; and 1/s.
         digits: after the decimal point that it stores; None for any.

@@ -20,8 +20,6 @@ class Plan:
     """A manoeuvre to be written down.
 
     Attributes:
-        vehicle: its name.
-        seconds: length.
         segments: multisines: axis, start [s], duration [s], amplitude (rms) [rad, or share of hover thrust], frequency
             and frequency_end [Hz].
         sweeps: one axis at a time instead: axis, amplitude [rad, rad/s for yaw, share of hover thrust], frequency,

@@ -52,8 +52,6 @@ class Facts:
     """A vehicle as other programs describe it.
 
     Attributes:
-        vehicle: the vehicle file.
-        source: its name, for headers.
         doubt: what speaks against its values beside their proof, for headers.
     """
 
@@ -449,7 +447,6 @@ class Form(NamedTuple):
     """The form of another program.
 
     Attributes:
-        program: whose.
         carried: effects that it can hold, and optional numbers of these; all others are named in the file as left out.
         templates: name of the template of every file, by the ending of the file's name.
         particulars: what the templates need beside `Facts`; of this vehicle the form cannot hold the effects ``lost``

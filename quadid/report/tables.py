@@ -34,7 +34,6 @@ class Column:
 
     Attributes:
         heading: its heading, with the unit where all values share one.
-        right: numbers stand at the right.
         rank: 0 always stays; of the others the highest goes first where the width does not hold all.
     """
 

@@ -92,8 +92,6 @@ class Verdict:
 
     Attributes:
         level: good, fair or poor.
-        headline: one sentence.
-        details: further sentences.
         next_steps: what to do, most useful first.
     """
 
