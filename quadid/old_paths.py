@@ -77,7 +77,7 @@ MOVED = {
     "quadid.identification.noise": "quadid.identify.process_noise quadid.identify.noise_model",
     "quadid.identification.noise_fit": "quadid.identify.noise_spectrum quadid.identify.noise_estimation "
     "quadid.identify.noise_memory",
-    "quadid.identification.fast_motion": "quadid.identify.torque_coherence",
+    "quadid.identification.filter_error": "quadid.identify.torque_coherence",
     "quadid.identification.uncertainty": "quadid.identify.covariance quadid.identify.composite_likelihood "
     "quadid.identify.scale_uncertainty",
     "quadid.identification.reliability": "quadid.identify.richardson",

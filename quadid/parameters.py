@@ -110,15 +110,6 @@ class ParameterSet:
             raise ParameterError(f"covariance of shape {self.covariance.shape}", f"shape ({n}, {n})")
         self.covariance.setflags(write=False)
 
-    def first(self, n: int) -> ParameterSet:
-        """The first `n` parameters; what is known only relative to another one than these is not to be used."""
-        names = self.names[:n]
-        kept = [
-            p if p.relative_to in (None, *names) else replace(p, status=Status.UNRELIABLE, relative_to=None)
-            for p in self.parameters[:n]
-        ]
-        return ParameterSet(tuple(kept), np.array(self.covariance[:n, :n]))
-
     def unreliable(self, names: Sequence[str]) -> ParameterSet:
         """The same, with the identified ones of `names` marked unreliable."""
         return ParameterSet(unreliable(self.parameters, names), np.array(self.covariance))

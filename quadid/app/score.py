@@ -59,7 +59,7 @@ class Scored(Reported):
 
     def records(self) -> list[dict[str, Any]]:
         """One row a quantity and horizon; those of single logs, which follow, have the name of the log in theirs."""
-        from quadid.estimate.forecast import BANDS
+        from quadid.identification.forecast import BANDS
 
         result, out = self.result, []
         for entry in [{"log": None, **result}, *(result["files"] if len(result["files"]) > 1 else ())]:
@@ -221,8 +221,8 @@ def coverage(
         wanted: samples ahead.
         closed_loop: simulate with the autopilot in the loop instead of taking the logged rotor speeds.
     """
-    from quadid.estimate.forecast import BANDS, Forecast
     from quadid.identification.controller_gains import find_autopilot
+    from quadid.identification.forecast import BANDS, Forecast
 
     total: dict[int, dict[str, FloatArray]] = {}
     reasons = []

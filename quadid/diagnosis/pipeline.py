@@ -14,7 +14,7 @@ from quadid.diagnosis.hypotheses import BLOCKS, Model, candidates, free_names, r
 from quadid.diagnosis.residual_tests import Remainder, inconstant_causes, remainder
 from quadid.diagnosis.result import Diagnosis, Explanation, describe
 from quadid.diagnosis.search import LINEAR_MISFIT, Search, from_everything, pruned, select
-from quadid.diagnosis.unmodelled_moments import Held, held_by_fast_motion, refitted
+from quadid.diagnosis.unmodelled_moments import Held, held_by_filter, refitted
 from quadid.effects import EFFECTS
 from quadid.identification.fit import FitOptions, check_windows, on_bounds, possible_moments, tied
 from quadid.identification.gauss_newton import polish
@@ -67,9 +67,9 @@ def diagnose(
     faults = data_faults([*windows, *validation])
     windows, validation = without_copies(windows), without_copies(validation)
     vehicle = with_reference_voltage(vehicle, windows)
-    # Which causes, and where moments that no model has rule: what fast motion shows is held, the causes refitted.
+    # Which causes, and where moments that no model has rule: what the filter shows is held, the causes refitted.
     schedule, search = _selected(windows, vehicle, FitOptions(seed=seed) if swarm else None, report)
-    held = held_by_fast_motion(windows, schedule[-1], search.model)
+    held = held_by_filter(windows, schedule[-1], search.model)
     if held is not None:
         schedule, search = refitted(held, schedule, search)
     # What remains, and what each cause gains on unseen data.
@@ -117,8 +117,8 @@ def _nominal_parameters(
     """The nominal six beside the findings, as an identification gives them, and why some are not to be used.
 
     Estimates must agree as those of an identification, and with models without each cause `doubted` (by label).  Where
-    the cause of the error is unknown, none is to be used, nor an inertia beside a doubtful moment, nor what is `held`
-    beside causes that do not explain all.  What is `held` and shows without any cause is not concerned.
+    the cause of the error is unknown, none is to be used, nor an inertia beside a doubtful moment, but what is `held`,
+    whose intervals hold such doubt.
     """
     brief = polish(short, model.theta, model.free, model.prior, iterations=8)
     trust = reliability(decisive, model, model.free, model.prior, brief)
@@ -132,19 +132,17 @@ def _nominal_parameters(
             reasons = (*reasons, f"{', '.join(moved)}: more than {SPREAD_LIMIT:.0%} different without {label}")
     everything = parameter_set(model.free, model.theta, initial, uncertain)
     nominal = tuple(p for p in everything if p.name in NOMINAL_NAMES)
+    spoilt = {NOMINAL_NAMES: "the cause of the error is unknown"} if verdict is Explanation.UNKNOWN else {}
+    if turning := [c.label for c in model.causes if c.label in steps and EFFECTS[c.effect].turns]:
+        spoilt |= {INERTIAS: f"something else passes for {' and '.join(turning)}"}
     if held is not None:
+        held = held if not spoilt and verdict is Explanation.EXPLAINED else held.beside_doubt()
         nominal, reasons = held.among(nominal), (held.sentence, *reasons)
     reasons = (*on_bounds(nominal), *reasons)
     for cause in model.causes:
         nominal = tied(nominal, EFFECTS[cause.effect].ties)
-    spoilt = {NOMINAL_NAMES: "the cause of the error is unknown"} if verdict is Explanation.UNKNOWN else {}
-    if turning := [c.label for c in model.causes if c.label in steps and EFFECTS[c.effect].turns]:
-        spoilt |= {INERTIAS: f"something else passes for {' and '.join(turning)}"}
-    if held and verdict is not Explanation.EXPLAINED:
-        spoilt |= {tuple(held.parameters): "fast motion shows them beside causes that leave too much unexplained"}
-    safe = held.regardless() if held and spoilt else set()
     for names, why in spoilt.items():
-        open_to_it = set(names) - safe
+        open_to_it = set(names) - set(held.parameters if held else ())
         if lost := [p.name for p in nominal if p.status not in UNKNOWN and p.name in open_to_it]:
             nominal = unreliable(nominal, lost)
             reasons = (*reasons, f"{', '.join(lost)}: not to be used while {why}")

@@ -1,10 +1,10 @@
-"""Physics beside moments that no model has: where they rule, b, J_xx and J_yy are those that fast motion shows.
+"""Physics beside moments that no model has: where they rule, the nominal values are those of the filter.
 
-The selection follows slow motion too, and there such moments, which the controller answers, pass for inertia.  Quick
-motion by itself (`quadid.identification.fast_motion`) is free of that.  The selected model is fitted to it too, its
+The selection follows simulated runs, and there such moments, which the controller answers, pass for inertia.  The fit
+beside random forces (`quadid.identification.filter_error`) is free of that.  The selected model is fitted so too, its
 causes as they were found but for what is late: without them an offset of the centre of gravity would count as a random
-moment, free they would take up random moments.  Unless fast motion confirms b, J_xx and J_yy, all three are held at its
-estimates and the causes refitted.
+moment, free they would take up random moments.  Unless that fit confirms the selection's values, they are held at its
+own and the causes refitted.
 """
 
 from __future__ import annotations
@@ -18,25 +18,23 @@ from quadid.data.window import Window
 from quadid.diagnosis.evidence import impossible_causes
 from quadid.diagnosis.hypotheses import Model, fit_model, free_names, without
 from quadid.diagnosis.search import Search, Stage, pruned
-from quadid.effects import EFFECTS
-from quadid.identification.fast_motion import MOST_SEGMENTS, fast_motion
-from quadid.identification.fit import YAW, fast_fit, has_unmodelled_moments
+from quadid.identification.filter_error import LATE, Filtered, filtered, has_unmodelled_moments
+from quadid.identification.fit import MOST_SEGMENTS, YAW, beside_random_forces
 from quadid.identification.gauss_newton import polish
 from quadid.identification.noise_fit import residual_noise
-from quadid.identification.problem import Shooting
-from quadid.identification.uncertainty import SPREAD_LIMIT
+from quadid.identification.problem import Free, Shooting
 from quadid.model.layout import Layout
-from quadid.parameters import INERTIAS, NOMINAL_NAMES, UNKNOWN, Parameter, ParameterSet
+from quadid.parameters import INERTIAS, NOMINAL_NAMES, UNKNOWN, Parameter, ParameterSet, unreliable
 from quadid.types import FloatArray
 from quadid.vehicle import ParameterPrior, Vehicle
 
 SHOWN = tuple(n for n in NOMINAL_NAMES if n not in YAW)
-"""Parameters that fast motion shows."""
+"""What is held."""
 
 
 @dataclass(frozen=True)
 class Held:
-    """Parameters held at what fast motion shows.
+    """Parameters held at what the fit beside random forces shows.
 
     Attributes:
         parameters: by name, as an identification gives them.
@@ -56,29 +54,34 @@ class Held:
         return replace(shooting, vehicle=self.vehicle, layout=Layout(self.vehicle))
 
     def among(self, parameters: Sequence[Parameter]) -> tuple[Parameter, ...]:
-        """Parameters with those held in their place, and no trust in what fast motion does not show."""
+        """Parameters with those held in their place, and no trust in the rest."""
         listed = ParameterSet(tuple(parameters), np.zeros((len(parameters), len(parameters)))).unreliable(YAW)
         return tuple(self.parameters.get(p.name, p) for p in listed)
 
-    def regardless(self) -> set[str]:
-        """Names of those that fast motion shows without any cause too."""
-        alone = fast_motion(self.windows, self.short, self.theta, NOMINAL_NAMES)
+    def beside_doubt(self) -> Held:
+        """The same where causes leave much or are doubtful: as uncertain as without any, and by the step to that."""
+        free = self.short.free(NOMINAL_NAMES)
+        alone = filtered(self.windows, self.short.vehicle, self.theta, free)
         if alone is None:
-            return set()
-        fitted = dict(zip(alone.free.names, alone.found.theta[alone.free.index], strict=True))
-        return {n for n, p in self.parameters.items() if abs(np.log(fitted[n] / p.value)) <= SPREAD_LIMIT}
+            lost = unreliable(self.parameters.values(), SHOWN)
+            return replace(self, parameters={p.name: p for p in lost})
+        here = alone.theta.copy()
+        for name, p in self.parameters.items():
+            here[self.short.layout.entry(name).index] = p.value
+        doubt = alone.uncertainty.differing([free.step(here, alone.theta)])
+        return replace(self, parameters=_shown(self.short, alone._replace(theta=here, uncertainty=doubt), free))
 
     @property
     def sentence(self) -> str:
         """Why they are."""
         return (
-            f"something that the model lacks turns the vehicle: {', '.join(self.parameters)} were estimated from fast "
-            f"motion, which does not reveal {', '.join(YAW)}"
+            f"something that the model lacks moves the vehicle: {', '.join(self.parameters)} were estimated beside "
+            f"random forces and moments, which leave {', '.join(YAW)} open"
         )
 
 
-def held_by_fast_motion(windows: Sequence[Window], short: Shooting, model: Model) -> Held | None:
-    """Errors of the selected model because moments that no model has turn the vehicle; None where it has not.
+def held_by_filter(windows: Sequence[Window], short: Shooting, model: Model) -> Held | None:
+    """Parameters that the selected model has wrong because moments that no model has turn the vehicle, or None.
 
     Args:
         windows: the data.
@@ -89,11 +92,11 @@ def held_by_fast_motion(windows: Sequence[Window], short: Shooting, model: Model
     brief = polish(short, model.theta, model.free, model.prior, iterations=8)
     if not has_unmodelled_moments(short.with_noise(residual_noise(short, brief)), brief):
         return None
-    names = free_names(tuple(c for c in model.causes if c.family == "late" and EFFECTS[c.effect].turns))
-    quick = fast_motion(windows, short, model.theta, names)
-    if quick is None:
+    free = short.free([*NOMINAL_NAMES, *(n for n in free_names(model.causes) if n in LATE)])
+    found = filtered(windows, short.vehicle, model.theta, free)
+    if found is None:
         return None
-    shown = {p.name: p for p in fast_fit(quick, names).parameters if p.name in SHOWN}
+    shown = _shown(short, found, free)
     values = dict(zip(model.free.names, model.theta[model.free.index].tolist(), strict=True))
     if all(p.status not in UNKNOWN and p.ci95[0] <= values[n] <= p.ci95[1] for n, p in shown.items()):
         return None
@@ -101,6 +104,11 @@ def held_by_fast_motion(windows: Sequence[Window], short: Shooting, model: Model
     neutral[short.free(NOMINAL_NAMES).index] = model.theta[short.free(NOMINAL_NAMES).index]
     # Together: torque is b times a square over an inertia, and one may be known only relative to another.
     return Held(shown, _holding(short.vehicle, shown), windows, short, neutral)
+
+
+def _shown(short: Shooting, found: Filtered, free: Free) -> dict[str, Parameter]:
+    """Parameters by name that a fit beside random forces shows."""
+    return {p.name: p for p in beside_random_forces(short, found, free).parameters if p.name in SHOWN}
 
 
 def _holding(vehicle: Vehicle, held: Mapping[str, Parameter]) -> Vehicle:

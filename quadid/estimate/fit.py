@@ -1,4 +1,4 @@
-"""Filter-error estimation: swarm on innovations, Fisher scoring with frozen gains, noise numbers by the full filter."""
+"""Filter-error estimation: Fisher scoring with frozen gains, noise numbers by the full filter."""
 
 from __future__ import annotations
 
@@ -6,18 +6,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.optimize import lsq_linear
 
 from quadid.estimate import kalman as k
 from quadid.estimate.kalman import Gains
 from quadid.estimate.problem import Problem
-from quadid.identification.particle_swarm import Stop, Swarm, SwarmOptions
-from quadid.parameters import NOMINAL_NAMES
 from quadid.types import BoolArray, FloatArray
 
 BOLD = 1.5
 """Longest step of a logarithm: less than a factor of five."""
-SWARM_SECONDS, NEAR_SECONDS = 20.0, 60.0
-"""Of all flights together, what the swarm searches and what the first steps look at [s]."""
+FIRST_SECONDS, NEAR_SECONDS = 20.0, 60.0
+"""Of all flights together, what the very first and the first steps look at [s]."""
 NEAR, MOST = 4, 40
 """Steps with random forces held large, and most steps after that."""
 ENOUGH = 0.1
@@ -66,26 +65,23 @@ class Estimate:
         raise KeyError(name)
 
 
-def estimate(problem: Problem, seed: int = 0, particles: int = 64, iterations: int = 30) -> Estimate:
+def estimate(problem: Problem, start: FloatArray | None = None) -> Estimate:
     """Parameters, noise and random forces of the flights of a problem.
 
     Args:
         problem: the flights and what is free.
-        seed: of the swarm.
-        particles: its size.
-        iterations: of it; without any the search starts from the guess.
+        start: scaled parameters where to begin; default the guess.
     """
-    part = problem.liveliest(SWARM_SECONDS)
-    z, psi = part.start(), part.first_noise()
-    # 1. Search with random forces held large, so that no flight diverges from a bad guess.
-    if iterations > 0:
-        z = swarm_search(part, z, psi, particles, iterations, seed)
-    z = scoring(part, z, psi, NEAR, NO_NOISE)[0]
-    problem, z = problem.based_on(z)
+    whole = problem
+    part = problem.liveliest(FIRST_SECONDS)
+    z, psi = part.start() if start is None else start, part.first_noise()
+    # 1. Steps with random forces held large, so that no flight diverges from a bad guess.
+    z = scoring(part.along(z, psi), z, psi, NEAR, NO_NOISE)[0]
+    whole, z = whole.based_on(z)
     # 2. Let them shrink: noise and physics together, until the likelihood stays; near it, over all flights.
-    part = problem.liveliest(NEAR_SECONDS)
-    if part is not problem:
-        z, psi, *_ = scoring(part, z, psi, MOST, ALL_NOISE)
+    part = whole.liveliest(NEAR_SECONDS)
+    z, psi = settle_noise(part.along(z, psi), z, psi)
+    problem = whole.along(z, psi)
     z, psi, value, gains, information = scoring(problem, z, psi, MOST, ALL_NOISE)
     # 3. Where innovations have outliers, their density has tails.
     tail = tails([whitened(g) for g in gains])
@@ -95,8 +91,8 @@ def estimate(problem: Problem, seed: int = 0, particles: int = 64, iterations: i
     # 4. Noise of logged rotor speeds makes inertias too large by as much as it explains.
     for _ in range(ROUNDS):
         problem = problem.unbiased(z, psi, gains)
-        taken, wide = problem.explained(z)
-        if (taken @ wide) @ np.linalg.solve(information, taken @ wide) < ENOUGH:
+        taken = problem.borrowed @ problem.acting
+        if taken @ np.linalg.solve(information, taken) < ENOUGH:
             break
         before = z
         z, psi, value, gains, information = scoring(problem, z, psi, MOST, ALL_NOISE)
@@ -107,10 +103,28 @@ def estimate(problem: Problem, seed: int = 0, particles: int = 64, iterations: i
     inverse = np.linalg.inv(information)
     z = z + 0.5 * inverse @ within.sum(axis=0)
     # 6. Intervals: score over slope, and how well the noise of rotor speeds and that answer are known.
-    by_square = taken @ wide * _of_square(problem, z, psi, gains)
-    score = information + (wide.T * taken) @ wide + 0.25 * within.T @ within + np.outer(by_square, by_square)
+    by_square = taken * _of_square(problem, z, psi, gains)
+    noise = (problem.acting.T * problem.borrowed) @ problem.acting
+    score = information + noise + 0.25 * within.T @ within + np.outer(by_square, by_square)
     covariance = inverse @ score @ inverse
     return Estimate(problem, z, psi, np.asarray(covariance), value, tuple(whitened(g) for g in gains))
+
+
+def settle_noise(problem: Problem, z: FloatArray, psi: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Scaled parameters and noise numbers where the likelihood is largest, with exact rotor speeds and noisy ones.
+
+    Noise of rotor speeds may stand for that of a gyro, which is then none: the likelihood has a peak at either.
+    """
+    exact = psi.copy()
+    exact[k.ROTOR] = problem.noise_bounds[k.ROTOR, 0]
+    others = np.arange(k.N_NOISE) != k.ROTOR
+    # Noise of about the right size before physics moves, or a long lag takes it for what it makes of the rotors.
+    exact = scoring(problem, z, exact, MOST, others, physics=False)[1]
+    first = scoring(problem, z, exact, MOST, others)
+    noisy = first[1].copy()
+    noisy[k.ROTOR] = psi[k.ROTOR]
+    z, psi, *_ = min((first, scoring(problem, first[0], noisy, MOST, ALL_NOISE)), key=lambda found: found[2])
+    return z, psi
 
 
 def _of_square(problem: Problem, z: FloatArray, psi: FloatArray, gains: Sequence[Gains]) -> float:
@@ -144,30 +158,8 @@ def tails(whitened: Sequence[FloatArray]) -> FloatArray:
     return out
 
 
-def swarm_search(
-    problem: Problem, z: FloatArray, psi: FloatArray, particles: int, iterations: int, seed: int
-) -> FloatArray:
-    """Particle swarm over the nominal six; gains are renewed at the best particle, innovations under them compared."""
-    low, high = np.log(problem.vehicle.bounds).T
-    six = [i for i, (name, _, _) in enumerate(problem.entries) if name in NOMINAL_NAMES]
-    rounds = 2
-    for turn in range(rounds):
-        _, gains = problem.passes(z, psi)
-        guess = np.clip(z[six], low, high)[None]
-        options = SwarmOptions(iterations=iterations // rounds, initial_points=guess)
-        swarm = Swarm(low, high, particles, seed + turn, options)
-        while swarm.stop is Stop.RUNNING:
-            points = swarm.ask()
-            many = np.repeat(z[None], len(points), axis=0)
-            many[:, six] = points
-            swarm.tell(problem.replayed(many, psi, gains))
-        z = z.copy()
-        z[six] = swarm.best
-    return z
-
-
 def scoring(
-    problem: Problem, z: FloatArray, psi: FloatArray, turns: int, noise: BoolArray
+    problem: Problem, z: FloatArray, psi: FloatArray, turns: int, noise: BoolArray, physics: bool = True
 ) -> tuple[FloatArray, FloatArray, float, list[Gains], FloatArray]:
     """Fisher scoring of physics and noise, whose information has no common part.
 
@@ -181,10 +173,13 @@ def scoring(
     low, high = np.log(problem.noise_bounds.T)
     least, most = problem.limits
     value, gains = problem.passes(z, psi)
-    curvature, at, damping = np.eye(len(psi)), np.full(len(psi), np.inf), 0.0
+    information, gradient = np.eye(len(z)), np.zeros(len(z))
+    curvature, slope, at, damping = np.eye(len(psi)), np.zeros(len(psi)), np.full(len(psi), np.inf), 0.0
     for _ in range(turns):
-        information, gradient = problem.normal_equations(z, psi, gains)
-        log, slope, free = np.log(psi), np.zeros(len(psi)), np.zeros(len(psi), dtype=np.bool_)
+        if physics:
+            information, gradient = problem.normal_equations(z, psi, gains)
+        log = np.log(psi)
+        reach = np.where(noise, BOLD, 0.0)
         if noise.any():
             slope = problem.score(z, psi, gains) * psi
             if np.max(np.abs(log - at)) > STALE:
@@ -192,15 +187,11 @@ def scoring(
                     2.0 * problem.noise_information(z, psi, gains) + np.diag(problem.noise_curvature(psi)),
                     log,
                 )
-            # What rests on a bound and would go beyond stays there.
-            free = noise & ~(((log <= low) & (slope > 0.0)) | ((log >= high) & (slope < 0.0)))
-        moves = ~(((z <= least) & (gradient > 0.0)) | ((z >= most) & (gradient < 0.0)))
         for _ in range(PATIENCE):
-            step, bold = np.zeros(len(z)), np.zeros(len(psi))
-            step[moves] = _damped(information[np.ix_(moves, moves)], gradient[moves], damping)
-            bold[free] = _damped(curvature[np.ix_(free, free)], slope[free], damping)
+            step = newton_step(information, gradient, damping, np.maximum(least - z, -BOLD), np.minimum(most - z, BOLD))
+            bold = newton_step(curvature, slope, damping, np.maximum(low - log, -reach), np.minimum(high - log, reach))
             expected = -float(gradient @ step) - 0.5 * float(slope @ bold)
-            moved, changed = np.clip(z + step, least, most), np.exp(np.clip(log + bold, low, high))
+            moved, changed = z + step, np.exp(log + bold)
             better, renewed = problem.passes(moved, changed, gains)
             if better < value or expected < ENOUGH:
                 break
@@ -214,7 +205,15 @@ def scoring(
     return z, psi, value, gains, information
 
 
-def _damped(curvature: FloatArray, slope: FloatArray, damping: float) -> FloatArray:
-    """Levenberg-Marquardt step, no longer than `BOLD` in any direction."""
-    step = -np.linalg.solve(curvature + damping * np.diag(np.diag(curvature)), slope)
-    return np.asarray(step * min(1.0, BOLD / float(np.max(np.abs(step), initial=BOLD))))
+def newton_step(
+    curvature: FloatArray, slope: FloatArray, damping: float, least: FloatArray, most: FloatArray
+) -> FloatArray:
+    """Levenberg-Marquardt step: the minimum within a box around zero of a parabola with these derivatives."""
+    step, free = np.zeros(len(slope)), most > least
+    if free.any():
+        scale = 1.0 / np.sqrt(np.diag(curvature)[free])
+        root = np.linalg.cholesky(curvature[np.ix_(free, free)] * np.outer(scale, scale) + damping * np.eye(len(scale)))
+        wanted = -np.linalg.solve(root, slope[free] * scale)
+        found = lsq_linear(root.T, wanted, (least[free] / scale, most[free] / scale), method="bvls")
+        step[free] = found.x * scale
+    return step

@@ -46,9 +46,9 @@ N_MEAN = N + 1
 # Scalar measurements: gyro, attitude (rotation vector), accelerometer, velocity.
 GYRO, ATTITUDE, ACCEL, VELOCITY, M = 0, 3, 6, 9, 12
 # Physics: the six, trim [rad/s^2], gyro bias, accelerometer bias, rotor drag [1/s], damping [1/s], centre of gravity
-# [m], how late rotor speeds act [s].
-B, D, JX, JY, JZ, JR, TRIM, GYRO_BIAS, ACCEL_BIAS, DRAG, DAMP, CG, DELAY, N_PHYSICS = (
-    0, 1, 2, 3, 4, 5, 6, 9, 12, 15, 17, 20, 22, 23,
+# [m], how late rotor speeds act [s] and their first-order lag [s].
+B, D, JX, JY, JZ, JR, TRIM, GYRO_BIAS, ACCEL_BIAS, DRAG, DAMP, CG, DELAY, LAG, N_PHYSICS = (
+    0, 1, 2, 3, 4, 5, 6, 9, 12, 15, 17, 20, 22, 23, 24,
 )  # fmt: skip
 # Noise: white of every scalar measurement; standard deviations of f (horizontal, vertical), alpha (roll and pitch,
 # yaw), e (tilt, heading) and of logged rotor speeds [rad/s]; correlation times of f, f, alpha, alpha, e [s].
@@ -124,8 +124,38 @@ class Gains(NamedTuple):
 
 
 @nb.njit(**_FAST)
-def _integrals(piece_t: FloatArray, piece: FloatArray, t: float, at: int, out: FloatArray) -> int:
-    """Writes the integral of every moment up to time t; returns its piece, looked for from piece `at` on."""
+def _lagged(piece_t: FloatArray, piece: FloatArray, lag: float) -> FloatArray:
+    """Moments at the begin of every piece behind a first-order lag [s], shape (pieces, MOMENTS).
+
+    On a piece the lag follows a parabola, and forgets what it was before.
+    """
+    out = np.empty((len(piece_t), MOMENTS))
+    for m in range(MOMENTS):
+        out[0, m] = piece[0, m, 1]
+    for k in range(len(piece_t) - 1):
+        s = piece_t[k + 1] - piece_t[k]
+        for m in range(MOMENTS):
+            out[k + 1, m] = _behind(piece[k, m], lag, s, out[k, m])
+    return out
+
+
+@nb.njit(**_FAST)
+def _behind(polynomial: FloatArray, lag: float, s: float, begin: float) -> float:
+    """Moment behind a lag, s after the begin of a piece: y' = (M - y) / lag with M a parabola."""
+    c = 3.0 * polynomial[3]
+    b = 2.0 * (polynomial[2] - lag * c)
+    a = polynomial[1] - lag * b
+    return float(a + s * (b + s * c) + (begin - a) * math.exp(-s / lag))
+
+
+@nb.njit(**_FAST)
+def _integrals(
+    piece_t: FloatArray, piece: FloatArray, lag: float, begin: FloatArray, t: float, at: int, out: FloatArray
+) -> int:
+    """Writes the integral of every moment up to time t; returns its piece, looked for from piece `at` on.
+
+    Behind a lag the integral is that without, less lag times the moment, but for a constant.
+    """
     while at > 0 and piece_t[at] > t:
         at -= 1
     while at + 1 < len(piece_t) and piece_t[at + 1] <= t:
@@ -133,32 +163,36 @@ def _integrals(piece_t: FloatArray, piece: FloatArray, t: float, at: int, out: F
     s = t - piece_t[at]
     for m in range(MOMENTS):
         out[m] = piece[at, m, 0] + s * (piece[at, m, 1] + s * (piece[at, m, 2] + s * piece[at, m, 3]))
+        if lag > 0.0:
+            out[m] -= lag * (_behind(piece[at, m], lag, s, begin[at, m]) if s > 0.0 else begin[at, m])
     return at
 
 
 @nb.njit(**_FAST)
-def moments(track: Track, delay: float) -> FloatArray:
+def moments(track: Track, delay: float, lag: float) -> FloatArray:
     """Mean rotor moments, shape (n, 3 MOMENTS): both halves of the step from each time; while the accelerometer reads.
 
     Args:
         track: the flight.
         delay: by which rotor speeds act later than the log has them [s].
+        lag: with which they follow [s].
     """
+    begin = _lagged(track.piece_t, track.piece, lag) if lag > 0.0 else np.empty((0, MOMENTS))
     n = len(track.t)
     out = np.zeros((n, 3 * MOMENTS))
     a, b, c = np.empty(MOMENTS), np.empty(MOMENTS), np.empty(MOMENTS)
     d, e = np.empty(MOMENTS), np.empty(MOMENTS)
-    at = _integrals(track.piece_t, track.piece, track.t[0] - delay, 0, a)
+    at = _integrals(track.piece_t, track.piece, lag, begin, track.t[0] - delay, 0, a)
     for k in range(n):
         t = track.t[k] - delay
-        _integrals(track.piece_t, track.piece, t - track.half, at, d)
-        _integrals(track.piece_t, track.piece, t + track.half, at, e)
+        _integrals(track.piece_t, track.piece, lag, begin, t - track.half, at, d)
+        _integrals(track.piece_t, track.piece, lag, begin, t + track.half, at, e)
         for m in range(MOMENTS):
             out[k, 2 * MOMENTS + m] = (e[m] - d[m]) / (2.0 * track.half)
         if k + 1 < n:
             h = 0.5 * (track.t[k + 1] - track.t[k])
-            at = _integrals(track.piece_t, track.piece, t + h, at, b)
-            at = _integrals(track.piece_t, track.piece, t + 2.0 * h, at, c)
+            at = _integrals(track.piece_t, track.piece, lag, begin, t + h, at, b)
+            at = _integrals(track.piece_t, track.piece, lag, begin, t + 2.0 * h, at, c)
             for m in range(MOMENTS):
                 out[k, m], out[k, MOMENTS + m] = (b[m] - a[m]) / h, (c[m] - b[m]) / h
                 a[m] = c[m]
@@ -573,7 +607,7 @@ def kalman(track: Track, p: FloatArray, psi: FloatArray, tail: FloatArray, store
     g = Gains(
         np.zeros((rows, M, N)), np.zeros((rows, M)), np.zeros((rows, M)), np.zeros((rows, M)),
         np.zeros((rows, 3, 6)), np.zeros((rows, N_MEAN)), np.zeros((rows, N, 9)),
-        moments(track, p[DELAY]), track.beyond,
+        moments(track, p[DELAY], p[LAG]), track.beyond,
     )  # fmt: skip
     c, keep = _constants(p, track), np.empty(9)
     x, after = _start(track, p), np.empty(N_MEAN)
@@ -701,7 +735,7 @@ def single_steps(track: Track, p: FloatArray, means: FloatArray) -> FloatArray:
         means: shape (n, N_MEAN).
     """
     air = track.still > 0.0 or track.seen[:, 3].any()
-    c, keep, table, after = _constants(p, track), np.ones(9), moments(track, p[DELAY]), means.copy()
+    c, keep, table, after = _constants(p, track), np.ones(9), moments(track, p[DELAY], p[LAG]), means.copy()
     for k in range(len(means)):
         after[k, FO + 1 :] = 0.0
         if k + 1 < len(means):
@@ -713,7 +747,7 @@ def single_steps(track: Track, p: FloatArray, means: FloatArray) -> FloatArray:
 def specific_force(track: Track, p: FloatArray, means: FloatArray) -> FloatArray:
     """Accelerometer readings at these means without random forces, shape (n, 3)."""
     air = track.still > 0.0 or track.seen[:, 3].any()
-    c, table, out = _constants(p, track), moments(track, p[DELAY]), np.zeros((len(means), 3))
+    c, table, out = _constants(p, track), moments(track, p[DELAY], p[LAG]), np.zeros((len(means), 3))
     for k in range(len(means)):
         out[k, 2] = -c[0] * table[k, 2 * MOMENTS]
         if air:

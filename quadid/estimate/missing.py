@@ -16,7 +16,17 @@ import numpy as np
 from quadid.chi_square import Z95
 from quadid.data.window import Window
 from quadid.estimate import kalman as k
-from quadid.estimate.fit import ALL_NOISE, MOST, NEAR_SECONDS, NO_NOISE, Estimate, scoring, tails, whitened
+from quadid.estimate.fit import (
+    ALL_NOISE,
+    MOST,
+    NEAR_SECONDS,
+    NO_NOISE,
+    Estimate,
+    scoring,
+    settle_noise,
+    tails,
+    whitened,
+)
 from quadid.estimate.problem import Problem
 from quadid.estimate.track import from_window
 from quadid.model.layout import Layout
@@ -135,8 +145,8 @@ class Vehicles:
         self.vehicle = vehicle
         problem, z = settled(windows, vehicle, theta, None)
         part = problem.liveliest(NEAR_SECONDS)
-        _, self.psi, _, gains, _ = scoring(part, z, problem.first_noise(), MOST, ALL_NOISE)
-        self.tail = tails([whitened(g) for g in gains])
+        z, self.psi = settle_noise(part, z, problem.first_noise())
+        self.tail = tails([whitened(g) for g in part.passes(z, self.psi)[1]])
         if self.tail.any():
             _, self.psi, *_ = scoring(replace(part, tail=self.tail), z, self.psi, MOST, ALL_NOISE)
 

@@ -32,6 +32,7 @@ PLACES: dict[str, int] = {
     **{f"rate_damping.{a}": k.DAMP + i for i, a in enumerate(("l_p", "m_q", "n_r"))},
     **{f"cg_offset.{a}": k.CG + i for i, a in enumerate("xy")},
     "command_delay.delay": k.DELAY,
+    "motor_lag.tau": k.LAG,
 }
 """Entries of the physics vector by name: those that the filter has in its own equations."""
 PER_FLIGHT = ("trim_moment", "gyro_bias", "accel_bias")
@@ -40,7 +41,14 @@ UPRIGHT = "accel_bias.z"
 """Told from thrust only where velocity is measured; without, it stays zero."""
 TRIMMED = tuple(name for name in PLACES if name.split(".")[0] in PER_FLIGHT and name != UPRIGHT)
 """Parameters free in every model beside its own: a constant moment and the sensors' biases."""
-_SIZE = {"gyro_bias": 0.05, "accel_bias": 0.5, "rotor_drag": 0.5, "rate_damping": 2.0, "command_delay": 0.01}
+_SIZE = {
+    "gyro_bias": 0.05,
+    "accel_bias": 0.5,
+    "rotor_drag": 0.5,
+    "rate_damping": 2.0,
+    "command_delay": 0.01,
+    "motor_lag": 0.02,
+}
 """Standard deviation of the prior, in the parameter's unit; about what is met on real vehicles."""
 OFF_CENTRE = 0.05
 """The same of the centre of gravity, as a share of the arm; that of a trim moment is the control moment."""
@@ -75,7 +83,7 @@ LEAST = 1e-2
 
 def control_moment(tracks: Sequence[Track], p: FloatArray) -> FloatArray:
     """Standard deviation of the angular acceleration that the rotors ask for at physics p, shape (3,) [rad/s^2]."""
-    moment = np.concatenate([k.moments(track, 0.0)[:-1, :4] for track in tracks])
+    moment = np.concatenate([k.moments(track, 0.0, 0.0)[:-1, :4] for track in tracks])
     arms = np.column_stack([-p[k.B] * moment[:, 2], p[k.B] * moment[:, 1], p[k.D] * moment[:, 3]])
     return np.asarray(np.std(arms / p[k.JX : k.JX + 3], axis=0) + 1e-3)
 
@@ -136,21 +144,25 @@ class Problem:
 
     @classmethod
     def of(
-        cls, tracks: Sequence[Track], vehicle: Vehicle, names: Sequence[str] = (), windows: Sequence[Window] = ()
-    ) -> Problem:
+        cls, tracks: Sequence[Track], vehicle: Vehicle, names: Sequence[str] = (), windows: Sequence[Window] = (),
+        theta: FloatArray | None = None, nominal: Sequence[str] = NOMINAL_NAMES,
+    ) -> Problem:  # fmt: skip
         """The six, trim moment, biases and `names` free, from the vehicle file's guess.
 
         Args:
             tracks: the flights.
             vehicle: geometry, mass, guesses and bounds.
-            names: entries to free.
-            windows: of the same flights, row by row; without them `names` are of `PLACES`, the file's effects left out.
+            names: entries to free beside them.
+            windows: of the same flights, row by row; without them `names` are of `PLACES`, effects left out.
+            theta: full vector of what is not free; default that of the vehicle file.
+            nominal: which of the six are free.
         """
         layout = Layout(vehicle)
-        theta = layout.initial(vehicle) if windows else layout.neutral()
-        theta[:6] = vehicle.initial
+        if theta is None:
+            theta = layout.initial(vehicle) if windows else layout.neutral()
+            theta[:6] = vehicle.initial
         upright = (UPRIGHT,) if any(t.seen[:, 3].any() for t in tracks) else ()
-        return cls._beside(tracks, vehicle, theta, (*NOMINAL_NAMES, *TRIMMED, *upright, *names), windows)
+        return cls._beside(tracks, vehicle, theta, (*nominal, *TRIMMED, *upright, *names), windows)
 
     @classmethod
     def fixed(
@@ -221,10 +233,12 @@ class Problem:
 
     @cached_property
     def limits(self) -> FloatArray:
-        """Bounds of the scaled parameters, shape (2, P); what the filter has of its own is free."""
+        """Bounds of the scaled parameters, shape (2, P); effects that the filter has of its own are free but a lag."""
         out = np.tile([[-np.inf], [np.inf]], len(self.entries))
         for i, (name, place, _) in enumerate(self.entries):
-            if place >= k.N_PHYSICS:
+            if place < k.TRIM:
+                out[:, i] = np.log(self.vehicle.limits(name))
+            elif place >= k.LAG:
                 entry = self.layout.entry(name)
                 out[:, i] = (np.array([entry.lower, entry.upper]) - entry.neutral) / self.size[i]
         return out
@@ -264,35 +278,44 @@ class Problem:
         """Scaled parameters of the guess."""
         return self.prior[0].copy()
 
+    def at(self, theta: FloatArray) -> FloatArray:
+        """Scaled parameters of a full vector, with no trim moment and no biases."""
+        z = self.start()
+        for i, (name, place, _) in enumerate(self.entries):
+            if place < k.TRIM:
+                z[i] = np.log(theta[place])
+            elif name in self.layout.entries and name.split(".")[0] not in PER_FLIGHT:
+                entry = self.layout.entry(name)
+                z[i] = (theta[entry.index] - entry.neutral) / self.size[i]
+        return np.clip(z, *self.limits)
+
     def penalty(self, z: FloatArray) -> float:
-        """-2 ln of the prior of the physics, less what noise of the rotor speeds explains (`unbiased`)."""
+        """-2 ln of the prior of the physics, tilted by what noise of the rotor speeds explains (`unbiased`)."""
         mean, sigma = self.prior
-        return float(np.sum(((z - mean) / sigma) ** 2) - np.sum(self.explained(z)[0]))
+        return float(np.sum(((z - mean) / sigma) ** 2) - 2.0 * self.borrowed @ self.acting @ z)
 
     def unbiased(self, z: FloatArray, psi: FloatArray, gains: Sequence[Gains]) -> Problem:
-        """The problem whose objective has its minimum at the truth although logged rotor speeds are noisy.
+        """The problem whose objective has its minimum at the truth (if that is z) though logged rotor speeds are noisy.
 
         The same noise is in an innovation and in its derivative by the physics.  It makes the slope of the sum of
-        squares, by every parameter, that of sum G' N G Q (`kalman.backward`) with N frozen; that sum is taken off, so
+        squares, by every parameter, that of sum G' N G Q (`kalman.backward`) with N frozen; that slope is taken off, so
         that inertias are not too large (corrected score: Nakamura 1990, doi:10.1093/biomet/77.1.127).
         """
-        p = self.physics(z, 0)
         found = [
             k.backward(t, self.physics(z, j), psi, g, False)[3]
             for j, (t, g) in enumerate(zip(self.tracks, gains, strict=True))
         ]
-        amounts = np.sum(found, axis=0) / np.exp(2.0 * ACTS @ np.log(p[:6]))
-        return replace(self._wavering(p), borrowed=amounts)
+        return replace(self._wavering(self.physics(z, 0)), borrowed=np.sum(found, axis=0))
 
     def _wavering(self, p: FloatArray) -> Problem:
         """The problem whose rotor noise acts as at physics p; it does not change with the point that is tried."""
         new = wavering(self.vehicle, p[:6])
         return replace(self, tracks=tuple(t._replace(waver=new) for t in self.tracks))
 
-    def explained(self, z: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Penalty taken off at z, shape (4,), and half its logarithm's derivative, shape (4, P)."""
-        wide = np.column_stack([ACTS[:, place] if place < 6 else np.zeros(4) for _, place, _ in self.entries])
-        return self.borrowed * np.exp(2.0 * ACTS @ np.log(self.physics(z, 0)[:6])), wide
+    @cached_property
+    def acting(self) -> FloatArray:
+        """Derivative of the logarithm of what rotors make, thrust and angular accelerations, by z, shape (4, P)."""
+        return np.column_stack([ACTS[:, place] if place < 6 else np.zeros(4) for _, place, _ in self.entries])
 
     def within_a_step(self, z: FloatArray, gains: Sequence[Gains]) -> FloatArray:
         """Slope of half the objective if rotors answer random moments as soon as they act, by control axis, (3, P).
@@ -301,7 +324,7 @@ class Problem:
         Half as much is answered within the step by a loop faster than the log (a random walk's mean against its end),
         nothing by one as slow: the log does not tell which.
         """
-        out, wide = np.zeros((3, len(z))), self.explained(z)[1]
+        out = np.zeros((3, len(z)))
         for j, (track, g) in enumerate(zip(self.tracks, gains, strict=True)):
             p, h = self.physics(z, j), np.diff(track.t)
             half = 0.5 * (g.table[:, 1:4] + g.table[:, k.MOMENTS + 1 : k.MOMENTS + 4])
@@ -316,7 +339,7 @@ class Problem:
                 beside = np.column_stack([g.nu[rows, i], *past, np.ones(len(rows))])[seen]
                 if len(beside) > 4 * beside.shape[1]:
                     answer = float(np.linalg.lstsq(beside, a[rows[seen], i], rcond=None)[0][0])
-                    out[i] -= 0.5 * min(answer, 0.0) * float(np.sum(h[rows[seen]])) * wide[i + 1]
+                    out[i] -= 0.5 * min(answer, 0.0) * float(np.sum(h[rows[seen]])) * self.acting[i + 1]
         return out
 
     @cached_property
@@ -386,12 +409,12 @@ class Problem:
         return (total if np.isfinite(total) else np.inf), [g for _, g in found]
 
     def along(self, z: FloatArray, psi: FloatArray) -> Problem:
-        """The problem in which effects stay as simulated along the states at z.
+        """The problem in which effects stay as simulated along the states at z, unless one of them is free.
 
         First along states that follow the measurements: where random forces are small, those of a model without its
         effects run away.
         """
-        if not self.models:
+        if not self.models or not set(self.names) <= set(PLACES):
             return self
         _, near = replace(self, models=()).passes(z, self.first_noise())
         tracks = [t._replace(beyond=g.beyond) for t, g in zip(self.tracks, self.passes(z, psi, near)[1], strict=True)]
@@ -466,7 +489,8 @@ class Problem:
         return np.array(_each(one, len(points)))
 
     def _table(self, track: Track, g: Gains, p: FloatArray) -> FloatArray:
-        return k.moments(track, p[k.DELAY]) if "command_delay.delay" in self.names else g.table
+        late = not {"command_delay.delay", "motor_lag.tau"}.isdisjoint(self.names)
+        return k.moments(track, p[k.DELAY], p[k.LAG]) if late else g.table
 
     def normal_equations(
         self, z: FloatArray, psi: FloatArray, gains: Sequence[Gains], nudge: float | FloatArray = 1e-5
@@ -479,9 +503,8 @@ class Problem:
         mean, sigma = self.prior
         # Expected information of a Student-t density against that of a Gaussian as wide.
         expected = np.repeat(np.sqrt((1.0 + self.tail) / (1.0 + 3.0 * self.tail)), 3)
-        taken, wide = self.explained(z)
-        information = np.diag(1.0 / sigma**2) - (wide.T * taken) @ wide
-        gradient = (z - mean) / sigma**2 - taken @ wide
+        information = np.diag(1.0 / sigma**2) - (self.acting.T * self.borrowed) @ self.acting
+        gradient = (z - mean) / sigma**2 - self.borrowed @ self.acting
         for j, g in enumerate(gains):
             mine = [i for i, (_, _, where) in enumerate(self.entries) if where in (-1, j)]
             plain, *moved = self._several(j, [z, *(z + steps[i] for i in mine)], psi, g)

@@ -11,7 +11,7 @@ import numpy as np
 from quadid.chi_square import Z95
 from quadid.data.window import Window
 from quadid.errors import NotIdentifiableError, WindowError
-from quadid.identification.fast_motion import MOST_SEGMENTS, FastMotion, fast_motion, with_moments
+from quadid.identification.filter_error import Filtered, filtered, has_unmodelled_moments
 from quadid.identification.gauss_newton import Convergence, Polished, polish
 from quadid.identification.noise import NoiseModel
 from quadid.identification.noise_fit import FAR_ITERATIONS, flexible_fit, reweighted_fit, with_memory
@@ -67,20 +67,6 @@ class Fit:
     outcome: Convergence
     evaluations: int
     warnings: tuple[str, ...] = ()
-
-    def of(self, names: Sequence[str]) -> Fit:
-        """The same for some of its parameters, which come first; others were fitted along and are neutral again."""
-        if len(names) == len(self.parameters):
-            return self
-        theta, layout = self.theta.copy(), Layout(self.vehicle)
-        for p in self.parameters.parameters[len(names) :]:
-            theta[layout.entry(p.name).index] = p.initial
-        return replace(
-            self,
-            theta=theta,
-            parameters=self.parameters.first(len(names)),
-            uncertainty=self.uncertainty.first(len(names)),
-        )
 
 
 def final_answer(fit: Fit, out_of_reach: Mapping[str, str]) -> Fit:
@@ -200,14 +186,13 @@ def spread(windows: Sequence[Window]) -> tuple[list[Window], tuple[str, ...]]:
 
 
 FIT_SECONDS = 1.0
-WHITE_SHARE = 0.5
-"""Fast motion alone decides where less than this share of what short segments leave of roll or pitch rate is white
-noise and the rest is made by random moments."""
 YAW = ("d", "J_zz", "J_r")
-"""Parameters that fast motion hardly shows: rotors turn a vehicle about z slowly, and there random moments rule."""
-_QUICK = (
-    "something that the model lacks turns the vehicle: b, J_xx and J_yy were estimated from fast motion; "
-    f"{', '.join(YAW[:-1])} and {YAW[-1]} cannot be; `quadid diagnose` looks for the cause"
+"""Not to be used beside random moments: rotors turn a vehicle about z by drag, slowly, and there such moments rule."""
+MOST_SEGMENTS = 1000
+"""Most segments of the first polish; a start needs no more."""
+_RANDOM = (
+    "something that the model lacks moves the vehicle: its parameters were estimated beside random forces and moments, "
+    "with drag, damping, centre of gravity and what is late fitted along; `quadid diagnose` looks for the cause"
 )
 
 
@@ -282,15 +267,12 @@ def fit(
     # Where channels cannot show how the vehicle turns, longer segments and other models cannot be compared either.
     comparable = not set(INERTIAS) & set(out_of_reach or ())
     report("polish", 0.2)
-    # 3. Where moments that the model lacks rule the rates, fast motion alone decides.
-    quick = fast_motion(windows, short, first.theta, free.names) if has_unmodelled_moments(short, first) else None
-    if quick is not None:
-        # Longer segments would only let the missing moments in again, and what these leave is no measure of the noise.
+    # 3. Where moments that the model lacks rule the rates, random ones are in the likelihood.
+    beside = filtered(windows, short.vehicle, first.theta, free) if has_unmodelled_moments(short, first) else None
+    if beside is not None:
         report("noise", 0.0)
-        starts = [quick.found.theta, first.theta]
-        noise = flexible_fit(windows, short, starts, free, typical, FAR_ITERATIONS).noise
-        report("intervals", 0.0)
-        found = fast_fit(quick, free.names, comparable)
+        noise = flexible_fit(windows, short, [beside.theta, first.theta], free, typical, FAR_ITERATIONS).noise
+        found = beside_random_forces(short, beside, free)
     else:
         # 4. Else noise from a flexible fit, polish on longer segments, memory of the attitude noise, polish again.
         noise = flexible_fit(windows, short, [first.theta], free).noise
@@ -316,51 +298,20 @@ def fit(
     return final_answer(found, out_of_reach or {})
 
 
-def has_unmodelled_moments(short: Shooting, plain: Polished) -> bool:
-    """Checks whether moments that the model lacks rule the rates: as random ones they explain most of what it leaves.
-
-    Turbulence, aerodynamic moments, uncalibrated rotor speeds and offsets act slowly; a model without them otherwise
-    takes them for a large inertia.
-
-    Args:
-        short: short segments, with the noise that the model leaves there.
-        plain: the model fitted to them.
-    """
-    white = with_moments(short, plain.lin).variance[:2]
-    return bool(np.isfinite(plain.cost) and np.any(white < WHITE_SHARE * short.noise.variance[:2]))
-
-
-def fast_fit(quick: FastMotion, names: Sequence[str], comparable: bool = True) -> Fit:
-    """Estimates of `names` from fast motion, with intervals and statuses.
-
-    Args:
-        quick: the fit.
-        names: of the vehicle's own parameters.
-        comparable: whether short segments and other models test the numbers.
-    """
-    remarks = [_QUICK]
-    if late := [n for n, step in zip(quick.free.names, quick.prompt, strict=True) if abs(step) > SPREAD_LIMIT]:
-        remarks.append(f"{', '.join(late)}: more than {SPREAD_LIMIT:.0%} different where nothing is late")
-    remarks += [
-        f"{name}: the rotors' torque accounts for {np.exp(-by):.0%} of quick angular acceleration only"
-        for name, by in zip(quick.free.names, quick.undecided, strict=True)
-        if by > SPREAD_LIMIT
-    ]
-    judge = quick.short if comparable else None
-    others = [quick.prompt, quick.undecided]
-    found = _finish(quick.shooting, quick.found, quick.free, quick.prior, quick.simulated, judge, others).of(names)
-    found = replace(found, parameters=found.parameters.unreliable(YAW))
-    return replace(found, warnings=(*remarks, *found.warnings, *_warnings(found)))
+def beside_random_forces(short: Shooting, found: Filtered, free: Free) -> Fit:
+    """The answer of the fit beside random forces: its parameters, intervals and statuses."""
+    theta, unc = with_scale_uncertainty(short.vehicle, free, default_prior(short, free), found.theta, found.uncertainty)
+    parameters = parameter_set(free, theta, short.layout.initial(short.vehicle), unc).unreliable(YAW)
+    otherwise = (f"{', '.join(found.late)}: more than {SPREAD_LIMIT:.0%} different where nothing is late",)
+    remarks = (_RANDOM, *(otherwise if found.late else ()), *on_bounds(parameters))
+    return Fit(short.vehicle, theta, parameters, short.noise, unc, Convergence.CONVERGED, 0, remarks)
 
 
 def _finish(
     shooting: Shooting, polished: Polished, free: Free, prior: Prior, evaluations: int,
-    short: Polished | None, others: Sequence[FloatArray] = (),
+    short: Polished | None,
 ) -> Fit:  # fmt: skip
-    """Intervals and statuses.
-
-    The fit to `short` segments tests the numbers, and so do `others`, scaled steps to other estimates.
-    """
+    """Intervals and statuses; the fit to `short` segments tests the numbers."""
     theta, ended = polished.theta, np.isfinite(polished.cost)
     both = with_second_cut(shooting, polished, free, prior) if ended else None
     unc = uncertainty(polished.lin, prior, None if both is None else both.information)
@@ -370,7 +321,7 @@ def _finish(
     doubts: tuple[str, ...] = ()
     if short is not None and ended:
         trust = reliability(shooting, polished, free, prior, short)
-        unc, doubts = trust.widened(unc).differing(others), trust.reasons(free, unc)
+        unc, doubts = trust.widened(unc), trust.reasons(free, unc)
     initial = shooting.layout.initial(shooting.vehicle)
     parameters = parameter_set(free, theta, initial, unc)
     return Fit(shooting.vehicle, theta, parameters, shooting.noise, unc, polished.outcome, evaluations, doubts)

@@ -1,4 +1,4 @@
-"""Sensor noise: white plus slowly coloured, per channel; random moments; whitening; estimation from residuals.
+"""Sensor noise: white plus slowly coloured, per channel; whitening; estimation from residuals; random moments.
 
 Each channel's noise is modelled as ``white^2 I + slow^2 R`` within a segment, R the correlation of a first-order
 Gauss-Markov process.  The two variances are found by equating two quadratic forms of the residual with their
@@ -6,11 +6,7 @@ expectation given that the segment's initial state was fitted (minimum-norm quad
 J. Multivariate Analysis 1 (1971) 257).
 
 Rates carry random moments beside their noise: what no model of the vehicle makes, such as turbulence and the wake of
-rotors.  They turn the vehicle, the controller answers, and a fit that takes the rotors for all there is finds inertias
-too large (an error of closed loop: U. Forssell and L. Ljung, Automatica 35 (1999) 1215).  With the covariance of what
-they do to the rate the fit is consistent: slow motion, which they rule, hardly counts, and fast motion does.  Their
-angular acceleration is taken for a random walk, and for unknown where a segment begins: the controller answers it
-already.
+rotors.  How much of a rate is theirs shows whether `quadid.identification.filter_error` is asked.
 """
 
 from __future__ import annotations
@@ -28,10 +24,8 @@ from quadid.vehicle import Noise
 # --- Random moments
 
 
-ANY = 100.0
-"""Angular acceleration [rad/s^2] beyond all at the beginning of a segment."""
-AXES = (0, 1, 2)
-"""Residual channels that it acts on: the rates."""
+RATES = (0, 1, 2)
+"""Residual channels that they act on."""
 _USUAL = 0.98
 """Share of the segments, those with the least power, that count: the rest holds outliers."""
 LEAST_WHITE = 1e-4
@@ -49,13 +43,6 @@ def rate_covariance(length: int, dt: float) -> FloatArray:
     integral = dt * np.tril(np.ones((length, length)), -1)
     walk = integral @ np.tril(np.ones((length, length))) * np.sqrt(dt)
     return np.asarray(walk @ walk.T)
-
-
-@lru_cache(maxsize=32)
-def begun_covariance(length: int, dt: float) -> FloatArray:
-    """Of rates that an acceleration makes which is unknown at the first row, shape (length, length)."""
-    time = dt * np.arange(length)
-    return np.asarray(ANY**2 * np.outer(time, time))
 
 
 def likeliest(residuals: FloatArray, dt: float) -> tuple[float, float]:
@@ -127,15 +114,12 @@ class NoiseModel:
         slow_time: correlation time of the slow part [s].
         shape: relative spectrum of the white part on `SHAPE_POINTS` frequencies from 0 to Nyquist, mean 1, shape
             (channels, SHAPE_POINTS); None when all is white.
-        moments: random walk of an angular acceleration about x, y, z [rad/s^2/sqrt(s)] that rates carry beside their
-            noise (`quadid.identification.noise`); None for none.
     """
 
     white: FloatArray
     slow: FloatArray
     slow_time: float = SLOW_TIME
     shape: FloatArray | None = None
-    moments: tuple[float, float, float] | None = None
 
     @classmethod
     def guess(cls, channels: int, known: Noise | None = None) -> NoiseModel:
@@ -156,7 +140,7 @@ class NoiseModel:
 
     @property
     def variance(self) -> FloatArray:
-        """Total variance of the noise of each channel, random moments left out, shape (channels,)."""
+        """Total variance of the noise of each channel, shape (channels,)."""
         return np.asarray(self.white**2 + self.slow**2)
 
     def whitener(self, length: int, dt: float) -> FloatArray:
@@ -188,32 +172,28 @@ class NoiseModel:
 
         Segments with masked samples stay unwhitened.
         """
-        out = rows * (weights / self.deviation(rows.shape[1], dt)[channel])[..., None]
+        out = rows * (weights / self.deviation[channel])[..., None]
         if self.coloured[channel]:
             full = np.all(weights > 0.0, axis=1)
             out[full] = np.matmul(self.whitener(rows.shape[1], dt)[channel], rows[full] * weights[full, :, None])
         return np.asarray(out)
 
-    def deviation(self, length: int, dt: float) -> FloatArray:
-        """Standard deviation of each channel in a segment, random moments included, shape (channels,)."""
-        variance = self.variance
-        if self.moments is not None:
-            variance[list(AXES)] += np.mean(np.diag(begun_covariance(length, dt)))
-        return np.asarray(np.sqrt(variance))
+    @property
+    def deviation(self) -> FloatArray:
+        """Standard deviation of each channel, shape (channels,)."""
+        return np.asarray(np.sqrt(self.variance))
 
     @property
     def coloured(self) -> BoolArray:
         """True for channels that are not white, shape (channels,)."""
         mask = self.slow > 0.0
-        if self.moments is not None:
-            mask[list(AXES)] = True
         return mask if self.shape is None else mask | (np.ptp(self.shape, axis=1) > 0.0)
 
 
 @lru_cache(maxsize=16)
 def _whitening(noise: NoiseModel, length: int, dt: float) -> Whitening:
     """`NoiseModel.whitening`."""
-    return Whitening(noise.deviation(length, dt), noise.coloured, _whitener(noise, length, dt))
+    return Whitening(noise.deviation, noise.coloured, _whitener(noise, length, dt))
 
 
 @lru_cache(maxsize=16)
@@ -228,8 +208,6 @@ def _whitener(noise: NoiseModel, length: int, dt: float) -> FloatArray:
         if noise.shape is not None and not slow > 0.0:
             covariance = white**2 * _stationary(noise.shape[c], length)
         covariance += slow**2 * correlation(length, dt / noise.slow_time)
-        if noise.moments is not None and c in AXES:
-            covariance += noise.moments[c] ** 2 * rate_covariance(length, dt) + begun_covariance(length, dt)
         out[c] = np.tril(np.linalg.inv(np.linalg.cholesky(covariance)))
     out.setflags(write=False)
     return out

@@ -162,8 +162,7 @@ def reliability(problem: Shooting, found: Polished, free: Free, prior: Prior, sh
     own = uncertainty(found.lin, prior)
     between, mean = _between_blocks(found, prior, own)
     left = found.lin.reduced_chi_square
-    # Beside random moments the model misses something, however well these account for it.
-    misfit = problem.noise.moments is not None or left > MISFIT
+    misfit = left > MISFIT
     # The same data in short segments, on a coarser grid, and in models with causes that the residual asks for.
     steps, names = [_beyond_chance(found, free, own, short, prior)], ["when shorter pieces of the flight are fitted"]
     if (rows := on_coarse_grid(problem, found, free, prior)) is not None:

@@ -68,11 +68,6 @@ class Uncertainty:
         """Standard deviation of each scaled parameter without what estimates differ by, shape (P,)."""
         return self.sigma if self.grown is None else self.sigma / self.grown
 
-    def first(self, n: int) -> Uncertainty:
-        """Of the first `n` parameters."""
-        grown, spread = (None if a is None else a[:n] for a in (self.grown, self.spread))
-        return Uncertainty(self.covariance[:n, :n], self.inflation[:n], self.prior_sigma[:n], grown, spread)
-
     def differing(self, steps: Sequence[FloatArray]) -> Uncertainty:
         """Intervals that hold other estimates too, which lie `steps` away, each of shape (P,); they count as spread."""
         if not steps:
@@ -230,11 +225,11 @@ def with_second_cut(shooting: Shooting, found: Polished, free: Free, prior: Prio
         prior: of those; counts once.
 
     Returns:
-        None where there are too few segments, where random moments rule, or one of the cuts has no good fit.
+        None where there are too few segments, or one of the cuts has no good fit.
     """
     second = shooting.between()
     enough = max(FEWEST_SEGMENTS, LEAST_OF_FIRST * shooting.count)
-    if second.count < enough or shooting.noise.moments is not None or not np.isfinite(found.cost):
+    if second.count < enough or not np.isfinite(found.cost):
         return None
     other = polish(second, found.theta, free, prior, iterations=8, robust=True)
     if not other.cost * found.lin.total_rows < WORSE * found.cost * other.lin.total_rows:

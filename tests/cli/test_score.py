@@ -12,7 +12,7 @@ import yaml
 from quadid_replay import write_csv
 
 import quadid
-from quadid.estimate import forecast
+from quadid.identification import forecast
 from quadid.vehicle import Stabiliser, Vehicle
 from tests.cli.conftest import Flights, table, write_table
 from tests.commands import Cli, one_line

@@ -8,9 +8,9 @@ import pytest
 from quadid.data.window import Window
 from quadid.diagnosis import Diagnosis, diagnose
 from quadid.diagnosis.hypotheses import Model, fit_model
-from quadid.diagnosis.unmodelled_moments import held_by_fast_motion
+from quadid.diagnosis.unmodelled_moments import held_by_filter
 from quadid.flight import draw_truth, fly
-from quadid.identification import fit as fitting
+from quadid.identification import filter_error
 from quadid.identification.problem import Shooting
 from quadid.identification.search import SWARM_SECONDS
 from quadid.parameters import UNKNOWN, Status
@@ -35,7 +35,7 @@ def diagnosed(seed: int = SEED, **effects: dict[str, float]) -> Diagnosis:
 
 
 def errors(found: Diagnosis, seed: int = SEED) -> dict[str, float]:
-    """Relative errors of what fast motion shows."""
+    """Relative errors of what is held."""
     truth = draw_truth(PELICAN, seed).as_dict()
     return {p.name: p.value / truth[p.name] - 1.0 for p in found.parameters if p.name in SHOWN}
 
@@ -48,22 +48,22 @@ def test_turbulence_does_not_pass_for_inertia() -> None:
         assert parameters[name].ci95[0] < truth[name] < parameters[name].ci95[1]
         assert parameters[name].status not in UNKNOWN
     assert all(parameters[name].status in UNKNOWN for name in ("d", "J_zz", "J_r"))
-    assert any("fast motion" in w for w in found.warnings)
+    assert any("random forces" in w for w in found.warnings)
     written = Vehicle.from_yaml(found.vehicle_yaml).parameters
     known = [n for n in SHOWN if parameters[n].status is Status.IDENTIFIED]
     assert known
     assert all(written[n].initial == pytest.approx(parameters[n].value, rel=1e-6) for n in known)
 
 
-def test_without_fast_motion_it_does(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(fitting, "WHITE_SHARE", 0.0)
+def test_without_random_forces_it_does(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(filter_error, "WHITE_SHARE", 0.0)
     found = errors(diagnosed())
     assert max(found.values()) > 0.2, found
 
 
 @pytest.mark.parametrize("seed", [pytest.param(2, marks=pytest.mark.slow), 3])
 def test_nor_does_it_beside_a_cause_that_is_found(seed: int) -> None:
-    """Fast motion without the cause would count it as a random moment."""
+    """Without the cause it would count as a random moment."""
     found = diagnosed(seed, cg_offset={"x": 0.01, "y": -0.01})
     assert "cg_offset" in {f.effect for f in found.findings}
     assert max(map(abs, errors(found, seed).values())) < 0.05, errors(found, seed)
@@ -72,7 +72,7 @@ def test_nor_does_it_beside_a_cause_that_is_found(seed: int) -> None:
 def held(window: Window, shooting: Shooting, model: Model) -> object:
     """Values of a model that are held."""
     short = Shooting.cut([window], shooting.vehicle, SWARM_SECONDS, shooting.noise, shooting.layout)
-    return held_by_fast_motion([window], short, model)
+    return held_by_filter([window], short, model)
 
 
 def test_a_model_that_leaves_noise_keeps_its_numbers() -> None:

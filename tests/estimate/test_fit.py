@@ -39,7 +39,7 @@ def estimated(seed: int, factor: float = 1.4, guess: int = 0, gusty: bool = Fals
     flight = fly(PELICAN, truth, SECONDS, seed, outside=GUSTS if gusty else {})
     vehicle = guessed(truth.as_dict(), factor, guess)
     problem = Problem.of([from_window(flight.window, vehicle)], vehicle)
-    return estimate(problem, seed=guess, particles=24, iterations=16), truth.as_dict()
+    return estimate(problem), truth.as_dict()
 
 
 def test_truth_lies_inside_the_intervals_and_no_random_force_is_found() -> None:
@@ -78,7 +78,7 @@ def test_gusts_are_found_in_newtons() -> None:
 def test_noisy_rotor_speeds_leave_the_inertias_alone(speed: float) -> None:
     """Random moments and 0.5 % noise on logged speeds made J 20 % too large, outside its interval."""
     window = fast_loop(PELICAN, 60.0, 1, speed=speed)
-    found = estimate(Problem.of([from_window(window, PELICAN)], PELICAN), iterations=0)
+    found = estimate(Problem.of([from_window(window, PELICAN)], PELICAN))
     for name, true in zip(NOMINAL_NAMES[2:4], PELICAN.initial[2:4], strict=True):
         value, sigma = found.value(name)
         assert abs(np.log(value / true)) < max(3.0 * sigma, 0.01), name
@@ -175,7 +175,7 @@ def test_a_motor_lag_among_the_late_causes_leaves_the_inertias_alone() -> None:
     vehicle = guessed(truth.as_dict(), 1.2, 5)
     window = fly(PELICAN, truth, SECONDS, 5, effects={"motor_lag": {"tau": 0.03}}).window
     track = from_window(window, vehicle)
-    six, family = (estimate(Problem.of([track], vehicle, n, [window]), iterations=0) for n in ((), LATE))
+    six, family = (estimate(Problem.of([track], vehicle, n, [window])) for n in ((), LATE))
     for name in NOMINAL_NAMES[2:4]:
         wrong, (value, sigma) = six.value(name)[0], family.value(name)
         assert np.log(wrong / truth.as_dict()[name]) > 0.05, name

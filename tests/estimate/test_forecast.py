@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from quadid.errors import NotIdentifiableError
-from quadid.estimate.forecast import BANDS, PHASES, Forecast, Shares
 from quadid.flight import Flight, fly
 from quadid.identification.controller_gains import Autopilot
+from quadid.identification.forecast import BANDS, PHASES, Forecast, Shares
 from quadid.model.layout import Layout
 from quadid.parameters import NOMINAL_NAMES
 from quadid.vehicle import ParameterPrior, RandomForces, RandomInput, Vehicle

@@ -55,4 +55,4 @@ def test_a_model_that_misses_slow_moments_does_not_call_its_inertias_identified(
         p = found.parameters[name]
         inside = p.ci95[0] <= truth[name] <= p.ci95[1]
         assert inside or p.status is not Status.IDENTIFIED
-    assert any("different" in w for w in found.warnings)
+    assert any("random forces" in w for w in found.warnings)

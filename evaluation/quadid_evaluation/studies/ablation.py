@@ -194,7 +194,7 @@ RULES: dict[str, dict[str, Any]] = {
     "ordinary sizes last": {"ordinary": _given(False)},
     "contradiction by unseen data": {"stated_errors": _uncontradicted},
     "what the rest follows": {"follows": _given(())},
-    "fast motion beside unmodelled moments": {"held_by_fast_motion": _given(None)},
+    "the filter beside unmodelled moments": {"held_by_filter": _given(None)},
     "moments that a rigid body can have": {"possible_moments": _as_fitted},
     "slight steps and winds": {"slight_causes": _given({})},
     "lags beside unreliable inertias": {"late_unknown": _given({})},
@@ -332,7 +332,7 @@ def _windows(names: Sequence[str], vehicle: Vehicle) -> list[Window]:
 
 FITS = (
     "polish", "settle_states", "flexible_fit", "residual_noise", "with_memory", "mode_power",
-    "fast_motion", "fast_fit", "mse_score", "reliability", "follows",
+    "filtered", "mse_score", "reliability", "follows",
 )  # fmt: skip
 """Functions that the diagnosis calls, of `quadid.identify`, which no variant changes, but for the last one …"""
 NUMBERS = ("quadid.diagnosis.residual_tests", "quadid.diagnosis.hypotheses")

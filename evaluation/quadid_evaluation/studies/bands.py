@@ -20,7 +20,7 @@ import quadid
 from quadid.app.logs import load_vehicle
 from quadid.chi_square import Z95
 from quadid.errors import QuadidError
-from quadid.estimate.forecast import BANDS, PHASES, Forecast
+from quadid.identification.forecast import BANDS, PHASES, Forecast
 from quadid.model.layout import Layout
 from quadid.types import FloatArray
 from quadid_evaluation.harness import options, put, table

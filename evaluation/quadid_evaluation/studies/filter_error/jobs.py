@@ -29,9 +29,9 @@ GUSTS = {"gusts": {"push": 0.6, "turn": 1.0, "time": 0.5}}
 """Forces of 0.6 m/s^2, moments of 1 rad/s^2: a quarter of the control moment of these flights."""
 
 
-def of_window(window: Window, vehicle: Vehicle, swarm: int = 0, seed: int = 0) -> Estimate:
+def of_window(window: Window, vehicle: Vehicle) -> Estimate:
     """The new estimate of one window."""
-    return estimate(Problem.of([from_window(window, vehicle)], vehicle), seed, iterations=swarm)
+    return estimate(Problem.of([from_window(window, vehicle)], vehicle))
 
 
 def errors(found: Estimate, truth: Sequence[float]) -> FloatArray:
@@ -81,7 +81,7 @@ def lagging(job: tuple[int, float]) -> FloatArray:
     window = fly(craft, truth, SECONDS, seed, effects={"motor_lag": {"tau": lag}} if lag else {}).window
     vehicle = poor_guess(craft, numbers, seed)
     track = from_window(window, vehicle)
-    found = [estimate(Problem.of([track], vehicle, names, [window]), seed, iterations=0) for names in ((), LATE)]
+    found = [estimate(Problem.of([track], vehicle, names, [window])) for names in ((), LATE)]
     return np.array([errors(one, list(numbers.values())) for one in found])
 
 
