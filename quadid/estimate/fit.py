@@ -72,12 +72,11 @@ def estimate(problem: Problem, start: FloatArray | None = None) -> Estimate:
         problem: the flights and what is free.
         start: scaled parameters where to begin; default the guess.
     """
-    whole = problem
     part = problem.liveliest(FIRST_SECONDS)
     z, psi = part.start() if start is None else start, part.first_noise()
     # 1. Steps with random forces held large, so that no flight diverges from a bad guess.
     z = scoring(part.along(z, psi), z, psi, NEAR, NO_NOISE)[0]
-    whole, z = whole.based_on(z)
+    whole, z = problem.based_on(z)
     # 2. Let them shrink: noise and physics together, until the likelihood stays; near it, over all flights.
     part = whole.liveliest(NEAR_SECONDS)
     z, psi = settle_noise(part.along(z, psi), z, psi)
@@ -175,7 +174,7 @@ def scoring(
     value, gains = problem.passes(z, psi)
     information, gradient = np.eye(len(z)), np.zeros(len(z))
     curvature, slope, at, damping = np.eye(len(psi)), np.zeros(len(psi)), np.full(len(psi), np.inf), 0.0
-    for _ in range(turns):
+    for _ in range(turns if np.isfinite(value) else 0):
         if physics:
             information, gradient = problem.normal_equations(z, psi, gains)
         log = np.log(psi)

@@ -84,7 +84,10 @@ def filtered(windows: Sequence[Window], vehicle: Vehicle, theta: FloatArray, fre
     beside = [n for n in free.names if n not in NOMINAL_NAMES]
     tracks = [from_window(w, vehicle, air=True) for w in windows]
     problem = Problem.of(tracks, vehicle, (*beside, *along), windows, theta, nominal).liveliest(MOST_SECONDS)
-    found = estimate(problem, problem.at(theta))
+    try:
+        found = estimate(problem, problem.at(theta))
+    except np.linalg.LinAlgError:  # the filter ran away
+        return None
     names = [name for name, *_ in problem.entries]
     places = [names.index(n) for n in free.names]
     values = np.array([found.value(n, 0)[0] for n in free.names])

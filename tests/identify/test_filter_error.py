@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from quadid_evaluation.studies.filter_error import loop
 
 import quadid
 from quadid.data.window import Window
@@ -68,6 +69,16 @@ def test_turbulence_does_not_pass_for_inertia(change: str) -> None:
     assert all(found.parameters[name].status not in SURE for name in ("d", "J_zz", "J_r"))
     assert any("random forces" in w for w in found.warnings)
     assert len(found.parameters) == 6, "what is late was fitted along, and is not told"
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_loop_faster_than_its_log_has_no_long_lag_and_no_small_inertia(seed: int) -> None:
+    """Moments of a fifth of the rotors', a stabiliser at 500 Hz, a log at 50 Hz with noisy rotor speeds."""
+    found = fit([loop.fly(PELICAN, 60.0, seed, every=10, share=0.2, speed=0.005)], PELICAN, FitOptions(iterations=0))
+    for name, truth in zip(("b", "J_xx", "J_yy"), PELICAN.initial[[0, 2, 3]], strict=True):
+        p = found.parameters[name]
+        assert p.ci95[0] < truth < p.ci95[1]
+        assert p.value == pytest.approx(truth, rel=0.1)
 
 
 def test_without_random_moments_it_does(monkeypatch: pytest.MonkeyPatch) -> None:
