@@ -29,6 +29,8 @@ CHANCE = 4.0
 """Standard errors of the kurtosis beyond which innovations have outliers."""
 PATIENCE = 8
 """Times a step is shortened before the search ends."""
+FLAT = 1e-12
+"""Curvature of scaled numbers below which a direction is as good as flat."""
 STALE = 0.2
 """Change of a noise number's logarithm after which the information is taken anew."""
 
@@ -211,8 +213,10 @@ def newton_step(
     step, free = np.zeros(len(slope)), most > least
     if free.any():
         scale = 1.0 / np.sqrt(np.diag(curvature)[free])
-        root = np.linalg.cholesky(curvature[np.ix_(free, free)] * np.outer(scale, scale) + damping * np.eye(len(scale)))
-        wanted = -np.linalg.solve(root, slope[free] * scale)
-        found = lsq_linear(root.T, wanted, (least[free] / scale, most[free] / scale), method="bvls")
+        size, turn = np.linalg.eigh(curvature[np.ix_(free, free)] * np.outer(scale, scale))
+        root = np.sqrt(np.maximum(size, FLAT) + damping)
+        wanted = -turn.T @ (slope[free] * scale) / root
+        box = least[free] / scale, most[free] / scale
+        found = lsq_linear(root[:, None] * turn.T, wanted, box, method="bvls")
         step[free] = found.x * scale
     return step

@@ -176,8 +176,9 @@ class Consistency:
     def doubts(self) -> tuple[Factor, ...]:
         """Products that b, J_xx and J_yy are off by: of the accelerometer alone, and of it and the gyro about an axis.
 
-        Each channel may be within its own limit and all together not; so may what leaks into an axis, by its share of
-        that axis' turns.  Yaw may turn too little for ever; a stream without an attitude allows no comparison at all.
+        Each channel may be within its own limit and all together not; so may what leaks into an axis, beyond its
+        standard error and by its share of that axis' turns.  Yaw may turn too little for ever; a stream without an
+        attitude allows no comparison at all.
         """
         if not self._compared:
             return ()
@@ -187,7 +188,8 @@ class Consistency:
             turns, leaked = Factor(f"{AXES[axis]} {TURN_FACTOR}", 1.0, math.inf), 0.0
             if told.seconds > FEWEST * TURN:
                 (turns, *leaks), size = _gyro_factors(axis, told), np.sqrt(np.diag(told.sum))
-                leaked = float(np.abs([f.value for f in leaks]) @ np.delete(size[:3], axis) / size[axis])
+                beyond = [max(abs(f.value) - f.sigma, 0.0) for f in leaks]
+                leaked = float(np.array(beyond) @ np.delete(size[:3], axis) / size[axis])
             what, value, sigma = turns.what, turns.value, turns.sigma
             if force is not None:
                 what, value, sigma = f"{force.what} times {what}", force.value * value, math.hypot(force.sigma, sigma)

@@ -593,7 +593,7 @@ def test_on_motion_capture(data_dir: Path) -> None:
     log = quadid.load(f"{folder / 'figure8_27.csv'}@0:25", vehicle=folder / "vehicle.yaml")
     fit, found = quadid.identify(log), quadid.diagnose(log)
     assert_alike(fit, found)
-    assert any("fast motion" in warning for warning in fit.warnings)
+    assert any("random forces" in warning for warning in fit.warnings)
     # What the model lacks is no noise: a Crazyflie's gyro is quieter than 0.15 rad/s.
     assert np.all(np.sqrt(fit.fit.noise.variance[:3]) < 0.15)
 

@@ -50,7 +50,7 @@ def test_runs_never_cross_a_gap(inside: Cli, flights: Flights, tmp_path: Path) -
 def test_without_torque_the_rate_error_is_that_of_no_change(inside: Cli, data_dir: Path, tmp_path: Path) -> None:
     """A vehicle too heavy to turn predicts the measured rate forever; real flight, own log rate, held speeds."""
     vehicle = yaml.safe_load((data_dir / "nanodrone" / "vehicle.yaml").read_text(encoding="utf-8"))
-    vehicle["parameters"] |= {n: {"initial": 1e3, "bounds": [1e2, 1e4]} for n in ("J_xx", "J_yy", "J_zz")}
+    vehicle["parameters"] |= {n: {"initial": 1e3, "bounds": [2e-5, 1e4]} for n in ("J_xx", "J_yy", "J_zz")}
     file = tmp_path / "stiff.yaml"
     file.write_text(yaml.safe_dump(vehicle), encoding="utf-8")
     log = data_dir / "nanodrone" / "square_run1.csv"
