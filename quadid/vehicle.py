@@ -409,6 +409,8 @@ class Proof(Strict):
 
 GRAVITY = 9.80665
 """Standard gravity [m/s^2]."""
+INERTIA_SHARE = 0.1, 0.5
+"""J_xx over mass and squared arm: 0.11 (a heavy octocopter) to 0.32 of known ones, 0.5 with all mass at the rotors."""
 STAND_ERROR = 0.02
 """Smallest relative error of a thrust stand: its scale, and air that the vehicle meets elsewhere."""
 MOST_ROTORS = 16
@@ -525,13 +527,13 @@ class Vehicle(Strict):
             raise ValueError(str(error)) from error
         if why := impossible_inertia([self.parameters[n].initial for n in INERTIAS]):
             raise ValueError(f"impossible inertia: {why}")
-        square = self.mass * self.arm**2  # with all mass at the rotors, half of it is J_xx
+        small, large = (share * self.mass * self.arm**2 for share in INERTIA_SHARE)
         for name in INERTIAS[:2]:
             least, most = self.parameters[name].limits
-            if least > 2.0 * square or most < 0.02 * square:
+            if least > 4.0 * large or most < 0.2 * small:
                 raise ValueError(
                     f"impossible inertia: {name} is {least:.3g} to {most:.3g}, but {self.mass:g} kg with rotors "
-                    f"{self.arm:.3g} m from the centre have {0.1 * square:.2g} to {0.5 * square:.2g} kg m^2; "
+                    f"{self.arm:.3g} m from the centre have {small:.2g} to {large:.2g} kg m^2; "
                     "is it in g m^2 or kg cm^2?"
                 )
         if self.stand_thrust is not None and not low < self.stand_thrust[0] < high:

@@ -18,7 +18,7 @@ from quadid.data.window import Channel, Recording, Window, measured_period, samp
 from quadid.errors import QuadidError
 from quadid.model.layout import ThrustModel, voltage_at
 from quadid.types import BoolArray, FloatArray
-from quadid.vehicle import GRAVITY, Vehicle
+from quadid.vehicle import GRAVITY, INERTIA_SHARE, Vehicle
 
 # --- Whether the rotor signal stands in one place in time before the motion that it causes
 #
@@ -834,10 +834,6 @@ _KNOWN = 0.1
 """Relative standard deviation up to which a parameter counts as known."""
 
 
-_SIZES = 0.1, 0.5
-"""J_xx over mass and squared arm: 0.11 (a heavy octocopter) to 0.32 of known ones, 0.5 with all mass at the rotors."""
-
-
 def mass_check(recording: Recording, vehicle: Vehicle, spans: Spans, b_from_hover: float | None) -> Check | None:
     """Weighs the vehicle by its known thrust coefficient; None where that is not known or nothing flew.
 
@@ -923,7 +919,7 @@ def _judge_scale(vehicle: Vehicle, scale: float, hover: float, numbers: dict[str
     thrust, inertias = _known_thrust(vehicle), [_known(vehicle, n) for n in ("J_xx", "J_yy")]
     turned = f"rotor positions agree with the motion within {abs(math.degrees(numbers['turned_rad'])):.0f} deg"
     if thrust is None or not all(inertias):
-        (least, most), told = _SIZES, vehicle.command
+        (least, most), told = INERTIA_SHARE, vehicle.command
         size = float(np.mean(vehicle.initial[2:4])) * hover / max(scale, 1e-300) / (vehicle.mass * vehicle.arm**2)
         # A lag of motors, and noise of the torque, make it too large.
         large = told.sampling == "instant" and size * numbers["explained"] > most

@@ -18,7 +18,8 @@ from quadid.data.window import Window
 from quadid.diagnosis.evidence import impossible_causes
 from quadid.diagnosis.hypotheses import Model, fit_model, free_names, without
 from quadid.diagnosis.search import Search, Stage, pruned
-from quadid.identification.filter_error import LATE, Filtered, filtered, has_unmodelled_moments
+from quadid.estimate.problem import LATE
+from quadid.identification.filter_error import Filtered, filtered, has_unmodelled_moments
 from quadid.identification.fit import MOST_SEGMENTS, YAW, beside_random_forces
 from quadid.identification.gauss_newton import polish
 from quadid.identification.noise_fit import residual_noise
@@ -29,7 +30,7 @@ from quadid.types import FloatArray
 from quadid.vehicle import ParameterPrior, Vehicle
 
 SHOWN = tuple(n for n in NOMINAL_NAMES if n not in YAW)
-"""What is held."""
+"""Parameters that are held."""
 
 
 @dataclass(frozen=True)

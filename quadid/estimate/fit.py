@@ -81,7 +81,7 @@ def estimate(problem: Problem, start: FloatArray | None = None) -> Estimate:
     whole, z = problem.based_on(z)
     # 2. Let them shrink: noise and physics together, until the likelihood stays; near it, over all flights.
     part = whole.liveliest(NEAR_SECONDS)
-    z, psi = settle_noise(part.along(z, psi), z, psi)
+    z, psi, _ = settle_noise(part.along(z, psi), z, psi)
     problem = whole.along(z, psi)
     z, psi, value, gains, information = scoring(problem, z, psi, MOST, ALL_NOISE)
     # 3. Where innovations have outliers, their density has tails.
@@ -92,7 +92,7 @@ def estimate(problem: Problem, start: FloatArray | None = None) -> Estimate:
     # 4. Noise of logged rotor speeds makes inertias too large by as much as it explains.
     for _ in range(ROUNDS):
         problem = problem.unbiased(z, psi, gains)
-        taken = problem.borrowed @ problem.acting
+        taken, noise = problem.taken
         if taken @ np.linalg.solve(information, taken) < ENOUGH:
             break
         before = z
@@ -105,14 +105,13 @@ def estimate(problem: Problem, start: FloatArray | None = None) -> Estimate:
     z = z + 0.5 * inverse @ within.sum(axis=0)
     # 6. Intervals: score over slope, and how well the noise of rotor speeds and that answer are known.
     by_square = taken * _of_square(problem, z, psi, gains)
-    noise = (problem.acting.T * problem.borrowed) @ problem.acting
     score = information + noise + 0.25 * within.T @ within + np.outer(by_square, by_square)
     covariance = inverse @ score @ inverse
     return Estimate(problem, z, psi, np.asarray(covariance), value, tuple(whitened(g) for g in gains))
 
 
-def settle_noise(problem: Problem, z: FloatArray, psi: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Scaled parameters and noise numbers where the likelihood is largest, with exact rotor speeds and noisy ones.
+def settle_noise(problem: Problem, z: FloatArray, psi: FloatArray) -> tuple[FloatArray, FloatArray, list[Gains]]:
+    """Scaled parameters, noise numbers and gains of the largest likelihood, with exact rotor speeds and noisy ones.
 
     Noise of rotor speeds may stand for that of a gyro, which is then none: the likelihood has a peak at either.
     """
@@ -124,8 +123,8 @@ def settle_noise(problem: Problem, z: FloatArray, psi: FloatArray) -> tuple[Floa
     first = scoring(problem, z, exact, MOST, others)
     noisy = first[1].copy()
     noisy[k.ROTOR] = psi[k.ROTOR]
-    z, psi, *_ = min((first, scoring(problem, first[0], noisy, MOST, ALL_NOISE)), key=lambda found: found[2])
-    return z, psi
+    z, psi, _, gains, _ = min((first, scoring(problem, first[0], noisy, MOST, ALL_NOISE)), key=lambda found: found[2])
+    return z, psi, gains
 
 
 def _of_square(problem: Problem, z: FloatArray, psi: FloatArray, gains: Sequence[Gains]) -> float:
@@ -166,7 +165,7 @@ def scoring(
 
     Physics by sensitivities of the innovations under the gains of this turn; the noise numbers' logarithms, those that
     `noise` (N_NOISE,) frees, by the exact score of the full filter.  Gains are renewed after every step; one that does
-    not help is damped (Levenberg-Marquardt).
+    not help is damped (Levenberg-Marquardt).  Without `physics` the noise alone moves.
 
     Returns:
         Scaled parameters, noise numbers, objective, gains there; information (P, P) before the last step.
@@ -176,11 +175,12 @@ def scoring(
     value, gains = problem.passes(z, psi)
     information, gradient = np.eye(len(z)), np.zeros(len(z))
     curvature, slope, at, damping = np.eye(len(psi)), np.zeros(len(psi)), np.full(len(psi), np.inf), 0.0
+    far = BOLD if physics else 0.0
+    reach = np.where(noise, BOLD, 0.0)
     for _ in range(turns if np.isfinite(value) else 0):
         if physics:
             information, gradient = problem.normal_equations(z, psi, gains)
         log = np.log(psi)
-        reach = np.where(noise, BOLD, 0.0)
         if noise.any():
             slope = problem.score(z, psi, gains) * psi
             if np.max(np.abs(log - at)) > STALE:
@@ -189,7 +189,7 @@ def scoring(
                     log,
                 )
         for _ in range(PATIENCE):
-            step = newton_step(information, gradient, damping, np.maximum(least - z, -BOLD), np.minimum(most - z, BOLD))
+            step = newton_step(information, gradient, damping, np.maximum(least - z, -far), np.minimum(most - z, far))
             bold = newton_step(curvature, slope, damping, np.maximum(low - log, -reach), np.minimum(high - log, reach))
             expected = -float(gradient @ step) - 0.5 * float(slope @ bold)
             moved, changed = z + step, np.exp(log + bold)

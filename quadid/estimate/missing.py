@@ -145,8 +145,8 @@ class Vehicles:
         self.vehicle = vehicle
         problem, z = settled(windows, vehicle, theta, None)
         part = problem.liveliest(NEAR_SECONDS)
-        z, self.psi = settle_noise(part, z, problem.first_noise())
-        self.tail = tails([whitened(g) for g in part.passes(z, self.psi)[1]])
+        z, self.psi, gains = settle_noise(part, z, problem.first_noise())
+        self.tail = tails([whitened(g) for g in gains])
         if self.tail.any():
             _, self.psi, *_ = scoring(replace(part, tail=self.tail), z, self.psi, MOST, ALL_NOISE)
 

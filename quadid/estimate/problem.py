@@ -35,6 +35,8 @@ PLACES: dict[str, int] = {
     "motor_lag.tau": k.LAG,
 }
 """Entries of the physics vector by name: those that the filter has in its own equations."""
+LATE = ("command_delay.delay", "motor_lag.tau")
+"""Those that move what rotors make in time."""
 PER_FLIGHT = ("trim_moment", "gyro_bias", "accel_bias")
 """Values that belong to a flight and not to the vehicle, beside effects that do."""
 UPRIGHT = "accel_bias.z"
@@ -42,13 +44,9 @@ UPRIGHT = "accel_bias.z"
 TRIMMED = tuple(name for name in PLACES if name.split(".")[0] in PER_FLIGHT and name != UPRIGHT)
 """Parameters free in every model beside its own: a constant moment and the sensors' biases."""
 _SIZE = {
-    "gyro_bias": 0.05,
-    "accel_bias": 0.5,
-    "rotor_drag": 0.5,
-    "rate_damping": 2.0,
-    "command_delay": 0.01,
+    "gyro_bias": 0.05, "accel_bias": 0.5, "rotor_drag": 0.5, "rate_damping": 2.0, "command_delay": 0.01,
     "motor_lag": 0.02,
-}
+}  # fmt: skip
 """Standard deviation of the prior, in the parameter's unit; about what is met on real vehicles."""
 OFF_CENTRE = 0.05
 """The same of the centre of gravity, as a share of the arm; that of a trim moment is the control moment."""
@@ -292,7 +290,7 @@ class Problem:
     def penalty(self, z: FloatArray) -> float:
         """-2 ln of the prior of the physics, tilted by what noise of the rotor speeds explains (`unbiased`)."""
         mean, sigma = self.prior
-        return float(np.sum(((z - mean) / sigma) ** 2) - 2.0 * self.borrowed @ self.acting @ z)
+        return float(np.sum(((z - mean) / sigma) ** 2) - 2.0 * self.taken[0] @ z)
 
     def unbiased(self, z: FloatArray, psi: FloatArray, gains: Sequence[Gains]) -> Problem:
         """The problem whose objective has its minimum at the truth (if that is z) though logged rotor speeds are noisy.
@@ -316,6 +314,11 @@ class Problem:
     def acting(self) -> FloatArray:
         """Derivative of the logarithm of what rotors make, thrust and angular accelerations, by z, shape (4, P)."""
         return np.column_stack([ACTS[:, place] if place < 6 else np.zeros(4) for _, place, _ in self.entries])
+
+    @cached_property
+    def taken(self) -> tuple[FloatArray, FloatArray]:
+        """Slope and curvature of half the objective that noise of rotor speeds adds, shapes (P,) and (P, P)."""
+        return self.borrowed @ self.acting, (self.acting.T * self.borrowed) @ self.acting
 
     def within_a_step(self, z: FloatArray, gains: Sequence[Gains]) -> FloatArray:
         """Slope of half the objective if rotors answer random moments as soon as they act, by control axis, (3, P).
@@ -489,8 +492,7 @@ class Problem:
         return np.array(_each(one, len(points)))
 
     def _table(self, track: Track, g: Gains, p: FloatArray) -> FloatArray:
-        late = not {"command_delay.delay", "motor_lag.tau"}.isdisjoint(self.names)
-        return k.moments(track, p[k.DELAY], p[k.LAG]) if late else g.table
+        return g.table if set(LATE).isdisjoint(self.names) else k.moments(track, p[k.DELAY], p[k.LAG])
 
     def normal_equations(
         self, z: FloatArray, psi: FloatArray, gains: Sequence[Gains], nudge: float | FloatArray = 1e-5
@@ -503,8 +505,7 @@ class Problem:
         mean, sigma = self.prior
         # Expected information of a Student-t density against that of a Gaussian as wide.
         expected = np.repeat(np.sqrt((1.0 + self.tail) / (1.0 + 3.0 * self.tail)), 3)
-        information = np.diag(1.0 / sigma**2) - (self.acting.T * self.borrowed) @ self.acting
-        gradient = (z - mean) / sigma**2 - self.borrowed @ self.acting
+        information, gradient = np.diag(1.0 / sigma**2) - self.taken[1], (z - mean) / sigma**2 - self.taken[0]
         for j, g in enumerate(gains):
             mine = [i for i, (_, _, where) in enumerate(self.entries) if where in (-1, j)]
             plain, *moved = self._several(j, [z, *(z + steps[i] for i in mine)], psi, g)

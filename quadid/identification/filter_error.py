@@ -15,7 +15,7 @@ import numpy as np
 
 from quadid.data.window import Window
 from quadid.estimate.fit import estimate
-from quadid.estimate.problem import Problem
+from quadid.estimate.problem import LATE, Problem
 from quadid.estimate.track import from_window
 from quadid.identification.gauss_newton import Polished
 from quadid.identification.noise import LEAST_WHITE, RATES, likeliest
@@ -28,7 +28,6 @@ from quadid.vehicle import Vehicle
 
 WHITE_SHARE = 0.5
 """Random moments rule where less than this share of what short segments leave of roll or pitch rate is white noise."""
-LATE = ("command_delay.delay", "motor_lag.tau")
 ALONG = (
     "rotor_drag.k_x", "rotor_drag.k_y", "rate_damping.l_p", "rate_damping.m_q", "rate_damping.n_r", "cg_offset.x",
     "cg_offset.y", *LATE,
@@ -77,8 +76,8 @@ def filtered(windows: Sequence[Window], vehicle: Vehicle, theta: FloatArray, fre
     Returns:
         None where the filter has no finite answer.
     """
-    neutral = Layout(vehicle).neutral()
-    known = {e.name.split(".")[0] for e in Layout(vehicle).entries.values() if theta[e.index] != neutral[e.index]}
+    layout = Layout(vehicle)
+    known = {e.name.split(".")[0] for e in layout.entries.values() if theta[e.index] != e.neutral}
     along = [n for n in ALONG if n.split(".")[0] not in known and n not in free.names]
     nominal = [n for n in free.names if n in NOMINAL_NAMES]
     beside = [n for n in free.names if n not in NOMINAL_NAMES]

@@ -94,7 +94,7 @@ def test_a_calm_flight_is_fitted_whole() -> None:
 
 
 def crazyflie(data_dir: Path, log: str, start: float | None = None, stop: float | None = None) -> quadid.ParameterSet:
-    """What a flight, or seconds of it, shows."""
+    """The fit of a flight, or of seconds of it."""
     folder = data_dir / "crazyflie_rpm"
     return quadid.identify(quadid.load(folder / log, folder / "vehicle.yaml", start=start, stop=stop)).parameters
 
