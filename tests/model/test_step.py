@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from typing import Any
 
 import numpy as np
@@ -159,6 +160,21 @@ def test_files_that_need_more_say_so() -> None:
     with pytest.raises(WindowError, match="one step size"):
         delayed.step(delayed.start(dt=0.01), np.full(4, 400.0), 0.005)
     assert quadid.Simulator is Simulator
+
+
+def test_a_state_of_other_vehicles_is_refused_and_commands_need_not_lie_in_a_row() -> None:
+    """The kernel would read beyond the parameters of the smaller batch."""
+    one = Simulator(PELICAN)
+    thetas = np.tile(Layout(PELICAN).initial(PELICAN), (40, 1))
+    many, hexacopter = Simulator(PELICAN, thetas), Simulator(Vehicle.shipped("hexacopter"))
+    for other in (many, hexacopter):
+        with pytest.raises(WindowError, match="a state of"):
+            one.step(other.start(dt=0.01), np.full(4, 400.0), 0.01)
+    rows = np.repeat(speeds(PELICAN, 4), 2, axis=1)
+    apart, dense = one.start(dt=0.01), one.start(dt=0.01)
+    np.testing.assert_array_equal(
+        pickle.loads(pickle.dumps(one)).run(apart, rows[:, ::2], 0.01), one.run(dense, rows[:, ::2].copy(), 0.01)
+    )
 
 
 def test_a_state_flies_on_with_another_simulator_and_its_copy_likewise() -> None:
