@@ -106,21 +106,21 @@ READING: dict[str, tuple[Any, Any]] = {
 # --- What is fitted, beside or instead of what the vehicle file says
 
 
-def key_numbers(text: str, rest: str) -> dict[str, float]:
-    """Numbers of ``KEY=VALUE,KEY=VALUE``, which is the `rest` of a `text`; raises ParameterError for another form."""
+def key_numbers(pairs: str, text: str, form: str = "NAME:KEY=NUMBER,KEY=NUMBER") -> dict[str, float]:
+    """Numbers of ``KEY=VALUE,KEY=VALUE``, part of a `text` of this form; raises ParameterError for another."""
     values: dict[str, float] = {}
-    for part in filter(None, rest.split(",")):
+    for part in filter(None, pairs.split(",")):
         key, _, number = part.partition("=")
         try:
             values[key.strip()] = float(number)
         except ValueError as error:
-            raise ParameterError(f"cannot read '{part}' in '{text}'", "NAME:KEY=NUMBER,KEY=NUMBER") from error
+            raise ParameterError(f"cannot read '{part}' in '{text}'", form) from error
     return values
 
 
 def _effects(texts: Sequence[str]) -> dict[str, dict[str, float]]:
     """Effects of ``NAME:KEY=VALUE,KEY=VALUE``."""
-    return {name: key_numbers(text, rest) for text in texts for name, _, rest in [text.partition(":")]}
+    return {name: key_numbers(rest, text) for text in texts for name, _, rest in [text.partition(":")]}
 
 
 def _pairs(form: str) -> Callable[[Sequence[str]], dict[str, tuple[float, float]]]:
@@ -172,6 +172,22 @@ KnownEffects = Annotated[
 
 
 Seed = Annotated[int, typer.Option("--seed", metavar="N", min=0, help="Seed of all random numbers.")]
+WindowSeconds = Annotated[float, typer.Option("--window", metavar="S", help="Flight that one fit looks at.")]
+Refit = Annotated[float, typer.Option("--refit", metavar="S", help="Time between fits.")]
+Diagnose = Annotated[
+    float, typer.Option("--diagnose", metavar="S", help="Time between two diagnoses of the last minute; 0: never.")
+]
+Approval = Annotated[str, typer.Option("--approval", metavar="HOW", help="auto or manual.")]
+Gate = Annotated[
+    str, typer.Option("--gate", metavar="K=V,...", help="Gate settings, as windows=3,width=0.05; see docs/online.md.")
+]
+
+
+def gate_settings(pairs: str) -> dict[str, float]:
+    """Arguments of `quadid_node.settings.session_settings` that `Gate` stands for; raises ParameterError."""
+    return {f"gate_{name}": value for name, value in key_numbers(pairs, pairs, "NAME=NUMBER,NAME=NUMBER").items()}
+
+
 Horizons = Annotated[
     str | Sequence[int | str],
     Typed(

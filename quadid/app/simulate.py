@@ -209,10 +209,8 @@ def parse_effects(
     """Reads effects as written on the command line, ``name`` or ``name:key=value,key=value``.
 
     Args:
-        texts: ``name`` or ``name:key=value,key=value``.
         vehicle: scales drawn sizes.
         seed: decides drawn sizes.
-        seconds: length of the flight.
 
     Returns:
         Effects of the catalogue, and effects outside it.
@@ -226,7 +224,7 @@ def parse_effects(
     outside: dict[str, dict[str, float]] = {}
     for text in texts:
         name, _, rest = text.partition(":")
-        values = key_numbers(text, rest)
+        values = key_numbers(rest, text)
         if name in OUTSIDE:
             outside[name] = {**draw_outside(name, seed, 1.0, vehicle), **values}
         elif name not in EFFECTS:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -11,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from quadid_replay import TopicWriter, open_log
 
-from quadid.app.options import Columns, JsonTarget, Preset, Rate, Seed, VehicleName
+from quadid.app import options
 from quadid.app.outcome import Outcome
 from quadid.errors import QuadidError
 from quadid.report.tables import Cell, TextTable, parameter_table
@@ -21,11 +20,8 @@ if TYPE_CHECKING:
     from quadid_node.recording import Beginning
     from quadid_node.service import Service
 
-    from quadid.app.outcome import Advance
-    from quadid.data.window import Recording, Sample
+    from quadid.data.window import Recording
 
-BATCH = 200
-"""Samples between two looks at the session."""
 NOTHING = 3
 """Exit code when the log was played but no set was published."""
 
@@ -38,22 +34,17 @@ def replay(
     log: Annotated[
         str, typer.Argument(metavar="LOG", help="Flight log: MCAP, .tlog, DataFlash, ULog, CSV. LOG@76:216: a span.")
     ],
-    vehicle: VehicleName,
+    vehicle: options.VehicleName,
     speed: Annotated[str, typer.Option("--speed", metavar="1|max", help="Multiple of real time, or max.")] = "max",
     out: Annotated[
         Path | None, typer.Option("--out", metavar="F.mcap", help="Write what would have been published.")
     ] = None,
-    rate: Rate = 50.0,
-    window: Annotated[float, typer.Option("--window", metavar="S", help="Flight that one fit looks at.")] = 10.0,
-    refit: Annotated[float, typer.Option("--refit", metavar="S", help="Time between fits.")] = 1.0,
-    diagnose: Annotated[
-        float, typer.Option("--diagnose", metavar="S", help="Time between two diagnoses of the last minute; 0: never.")
-    ] = 60.0,
-    approval: Annotated[str, typer.Option("--approval", metavar="HOW", help="auto or manual.")] = "auto",
-    gate: Annotated[
-        str,
-        typer.Option("--gate", metavar="K=V,...", help="Gate settings, as windows=3,width=0.05; see docs/online.md."),
-    ] = "",
+    rate: options.Rate = 50.0,
+    window: options.WindowSeconds = 10.0,
+    refit: options.Refit = 1.0,
+    diagnose: options.Diagnose = 60.0,
+    approval: options.Approval = "auto",
+    gate: options.Gate = "",
     as_recorded: Annotated[
         bool,
         typer.Option(
@@ -65,13 +56,13 @@ def replay(
     candidates: Annotated[
         bool, typer.Option("--candidates", help="Every estimate in the JSON, not only sets.")
     ] = False,
-    seed: Seed = 0,
-    preset: Preset = "auto",
-    columns: Columns = None,
-    json: JsonTarget = None,
+    seed: options.Seed = 0,
+    preset: options.Preset = "auto",
+    columns: options.Columns = None,
+    json: options.JsonTarget = None,
 ) -> None:
     """Drive the online session from a log: the sets, findings and reasons that a live service would have published."""
-    from quadid_node.recording import arrivals, stream
+    from quadid_node.recording import arrivals, play, stream
     from quadid_node.service import Service
     from quadid_node.settings import session_settings
     from quadid_node.worker import InlineWorker
@@ -83,8 +74,9 @@ def replay(
     terminal.check_file(out, "--out")
     pace = _pace(speed)
     described = load_vehicle(vehicle)
-    asked = {f"gate_{name}": value for name, value in parse_pairs(gate).items()}
-    settings = session_settings(approval, rate=rate, window=window, refit=refit, diagnose=diagnose, seed=seed, **asked)
+    settings = session_settings(
+        approval, rate=rate, window=window, refit=refit, diagnose=diagnose, seed=seed, **options.gate_settings(gate)
+    )
     cut = parse_part(log)
     if as_recorded and cut.path != Path(log):
         raise ReplayError(f"--as-recorded of {log}, a part", "whole recordings", f"--as-recorded {cut.path}")
@@ -93,12 +85,13 @@ def replay(
         beginning = _beginning(Path(log), described.name)
         described = beginning.vehicle
         service = Service(described, beginning.settings, InlineWorker(), restored=beginning.restored, live=False)
-        samples = arrivals(Path(log), beginning.source, len(described.rotors))
+        blocks = arrivals(Path(log), beginning.source, len(described.rotors))
     else:
         service = Service(described, settings, InlineWorker(), live=False)
-        samples = stream(recording)
+        blocks = stream(recording)
+    rows = sum(len(c.t) for c in recording.channels.values())
     with terminal.progress() as advance:
-        outputs = play(recording, samples, service, pace, advance)
+        outputs = play(service, blocks, pace, lambda count: advance("replay", min(count / max(rows, 1), 1.0)))
     result = summary(recording, service, outputs, candidates)
     if out is not None:
         write_outputs(out, outputs, described.name)
@@ -130,55 +123,6 @@ def _beginning(log: Path, vehicle: str) -> Beginning:
     if found.vehicle.name != vehicle:
         raise ReplayError(f"{log.name} was recorded of '{found.vehicle.name}', not '{vehicle}'", fix="change --vehicle")
     return found
-
-
-def play(
-    recording: Recording, samples: Iterable[Sample], service: Service, pace: float, advance: Advance
-) -> list[Output]:
-    """Plays a recording into a service.
-
-    Args:
-        service: with an inline worker.
-        pace: factor of real time; 0 for as fast as possible.
-
-    Returns:
-        Everything the service put out, in order.
-    """
-    total = sum(len(c.t) for c in recording.channels.values())
-    outputs: list[Output] = []
-    begin = first = None
-    for count, sample in enumerate(samples):
-        if pace > 0.0:
-            if begin is None or first is None:
-                begin, first = time.monotonic(), sample.t
-            time.sleep(max(begin + (sample.t - first) / pace - time.monotonic(), 0.0))
-        service.push(sample)
-        if count % BATCH == 0 or pace > 0.0:
-            outputs.extend(_work(service))
-            advance("replay", count / max(total, 1))
-    outputs.extend(_work(service))
-    advance("replay", 1.0)
-    return outputs
-
-
-def _work(service: Service) -> list[Output]:
-    """Steps until the session needs more samples."""
-    out = service.step()
-    while service.session.running is not None:
-        out.extend(service.step())
-    return out
-
-
-def parse_pairs(text: str) -> dict[str, float]:
-    """Reads ``name=number,name=number``; raises ReplayError."""
-    out = {}
-    for part in filter(None, text.split(",")):
-        name, _, number = part.partition("=")
-        try:
-            out[name.strip()] = float(number)
-        except ValueError as error:
-            raise ReplayError(f"cannot read '{part}'", "NAME=NUMBER,NAME=NUMBER", "for example windows=3") from error
-    return out
 
 
 def summary(

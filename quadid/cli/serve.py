@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from quadid.app.options import JsonTarget, Seed, VehicleName
-from quadid.cli.replay import parse_pairs
+from quadid.app import options
 
 if TYPE_CHECKING:
     from quadid_node.mavlink_link import MavlinkLink
@@ -23,7 +22,7 @@ SAY_EVERY = 10.0
 
 
 def serve(
-    vehicle: VehicleName,
+    vehicle: options.VehicleName,
     mavlink: Annotated[
         str,
         typer.Option("--mavlink", metavar="URL", help="Link: udpin:0.0.0.0:14540, tcp:HOST:PORT, /dev/ttyACM0,921600."),
@@ -45,22 +44,18 @@ def serve(
     name: Annotated[
         str, typer.Option("--id", metavar="NAME", help="Name of this vehicle; default the vehicle's.")
     ] = "",
-    approval: Annotated[str, typer.Option("--approval", metavar="HOW", help="auto or manual.")] = "auto",
-    window: Annotated[float, typer.Option("--window", metavar="S", help="Flight that one fit looks at.")] = 10.0,
-    refit: Annotated[float, typer.Option("--refit", metavar="S", help="Time between fits.")] = 1.0,
-    diagnose: Annotated[
-        float, typer.Option("--diagnose", metavar="S", help="Time between two diagnoses of the last minute; 0: never.")
-    ] = 60.0,
-    gate: Annotated[
-        str, typer.Option("--gate", metavar="K=V,...", help="Gate settings, as windows=3,width=0.05.")
-    ] = "",
+    approval: options.Approval = "auto",
+    window: options.WindowSeconds = 10.0,
+    refit: options.Refit = 1.0,
+    diagnose: options.Diagnose = 60.0,
+    gate: options.Gate = "",
     file: Annotated[
         Path | None,
         typer.Option("--history", metavar="FILE", help="History file; default QUADID_HISTORY, else the user's."),
     ] = None,
     seconds: Annotated[float, typer.Option("--seconds", metavar="S", help="End after this long; 0: never.")] = 0.0,
-    seed: Seed = 0,
-    json: JsonTarget = None,
+    seed: options.Seed = 0,
+    json: options.JsonTarget = None,
 ) -> None:
     """Identify a flying vehicle over MAVLink; publish parameters, findings and health as component 191."""
     from quadid_node.process import Stop
@@ -79,8 +74,9 @@ def serve(
 
     terminal.check_file(json, "--json")
     described = load_vehicle(vehicle)
-    asked = {f"gate_{n}": v for n, v in parse_pairs(gate).items()}
-    settings = session_settings(approval=approval, window=window, refit=refit, diagnose=diagnose, seed=seed, **asked)
+    settings = session_settings(
+        approval, window=window, refit=refit, diagnose=diagnose, seed=seed, **options.gate_settings(gate)
+    )
     known = name or described.name
     end = time.monotonic() + seconds if seconds > 0.0 else float("inf")
     with ExitStack() as opened:

@@ -1,11 +1,11 @@
-"""Measured data as the core sees it: samples, channels, recordings, and windows on a uniform grid.
+"""Measured data as the core sees it: blocks of messages, channels, recordings, and windows on a uniform grid.
 
 Inside the core all data are SI, world NED, body FRD, quaternions body to world, scalar first.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeGuard
@@ -47,36 +47,25 @@ _MEASURED = ("gyro", "attitude", "accel", "velocity", "position", "battery", "at
 
 
 @dataclass(frozen=True)
-class Sample:
-    """One message's worth of one channel: time [s], channel name, values in the channel's unit."""
-
-    t: float
-    channel: str
-    values: tuple[float, ...]
-
-    @property
-    def block(self) -> Block:
-        """The sample as a block."""
-        return Block(np.array([self.t]), ((self.channel, np.array([self.values])),))
-
-
-@dataclass(frozen=True)
 class Block:
-    """Messages of one kind, in order: times [s], shape (n,), and values by channel, each of shape (n, columns).
+    """Messages of one kind in order of arrival, n >= 1: what every source of data gives and a session takes.
 
-    It stands for its samples message by message, within a message in the order of `columns`.
+    Attributes:
+        t: times [s], shape (n,).
+        columns: channel and values in its unit, shape (n, columns), of each channel that the messages hold.
     """
 
     t: FloatArray
     columns: tuple[tuple[str, FloatArray], ...]
 
-    def samples(self, start: int = 0, stop: int | None = None) -> Iterator[Sample]:
-        """The samples of messages `start` to before `stop`."""
-        times = self.t[start:stop].tolist()
-        rows = [(name, values[start:stop].tolist()) for name, values in self.columns]
-        for k, t in enumerate(times):
-            for name, values in rows:
-                yield Sample(t, name, tuple(values[k]))
+    @classmethod
+    def one(cls, t: float, channel: str, values: Sequence[float]) -> Block:
+        """One message of one channel at `t` [s]."""
+        return cls(np.array([t]), ((channel, np.array([values])),))
+
+    def part(self, start: int, stop: int | None = None) -> Block:
+        """Messages `start` to before `stop`."""
+        return Block(self.t[start:stop], tuple((name, values[start:stop]) for name, values in self.columns))
 
 
 def _never_changes(values: ArrayLike) -> TypeGuard[FloatArray]:

@@ -1,6 +1,6 @@
-"""The online session of one vehicle: samples and commands in, actions out; the same input gives the same output.
+"""The online session of one vehicle: messages and commands in, actions out; the same input gives the same output.
 
-    push(sample)            buffer it
+    push(messages)          buffer them
     poll() -> actions       every tick of the data's own time, in order:
         compare the sensors with each other     -> while they disagree, nothing is learned
         look for sudden changes                 -> ChangeRequest, OnlineDiagnosis
@@ -25,7 +25,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from quadid.condition.trim import FlightTrim
 from quadid.condition.watch import HealthWatch
-from quadid.data.window import Block, Sample
+from quadid.data.window import Block
 from quadid.online.active_set import ActiveSet, Answer
 from quadid.online.background_diagnosis import DIAGNOSED_SECONDS, BackgroundDiagnosis
 from quadid.online.change_job import PULL, ChangePoint, ChangeReply, ChangeRequest, carried
@@ -144,9 +144,9 @@ class Session:
 
     # --- input
 
-    def push(self, messages: Block | Sample) -> None:
+    def push(self, messages: Block) -> None:
         """Takes messages: stamps [s], channels in core units and frames; their portions change nothing."""
-        self.resampler.push(messages if isinstance(messages, Block) else messages.block)
+        self.resampler.push(messages)
         for channel, text in self.resampler.notices:
             if channel == LEADER:
                 self._outbox.note(self.resampler.time.newest, Phase.BLOCKED, text)

@@ -83,7 +83,7 @@ class Chooser:
             late = np.flatnonzero(t > self._last[channel] + SILENT)
             if not late.size:
                 return
-            block, chosen = _part(block, late[0], None), None
+            block, chosen = block.part(late[0]), None
             t = block.t
         if chosen is not None or rank == self._best.get(channel, 0):
             self._held.pop(channel, None)
@@ -97,7 +97,7 @@ class Chooser:
         count = sum(len(one.t) for one in held) + np.arange(1, len(t) + 1)
         enough = np.flatnonzero((t - first >= DECIDE) | (count >= MOST_HELD))
         stop = int(enough[0]) + 1 if enough.size else len(t)
-        held.append(_part(block, 0, stop))
+        held.append(block.part(0, stop))
         if not enough.size:
             return
         best = min(by_rank)
@@ -105,15 +105,11 @@ class Chooser:
         self._chosen[channel], self._last[channel] = best, float(released[-1].t[-1])
         yield from released
         if stop < len(t):
-            yield from self.take(_part(block, stop, None), rank)
+            yield from self.take(block.part(stop), rank)
 
     def has(self, channel: str) -> bool:
         """Checks whether some source tells the channel."""
         return channel in self._chosen or channel in self._held
-
-
-def _part(block: Block, start: int, stop: int | None) -> Block:
-    return Block(block.t[start:stop], tuple((name, values[start:stop]) for name, values in block.columns))
 
 
 # --- Whether the messages of a topic come evenly: by when they are there, and by their stamps
@@ -326,7 +322,7 @@ def deserializer(name: str) -> Callable[[bytes], Any]:
 
 
 class Decoder:
-    """Turns the serialized messages of one topic into samples.
+    """Turns the serialized messages of one topic into blocks.
 
     Attributes:
         failed: messages that could not be decoded; unstamped: those whose stamp is zero; of all that came.

@@ -22,7 +22,7 @@ from quadid_replay.motors import (
 )
 
 from quadid.condition.watch import HealthReport
-from quadid.data.window import Sample
+from quadid.data.window import Block
 from quadid.online.records import OnlineSet
 from quadid_node.inputs import Chooser
 from quadid_node.mavlink_wire import LinkError, Source, Wire, dialect, is_autopilot, message_id, sender
@@ -125,7 +125,7 @@ class MotorOrder:
         return [ESC_GROUPS[k] for k in sorted({k // 4 for k in (*columns, *range(self._rotors))})]
 
 
-# --- A live vehicle's MAVLink messages to samples, at absolute times; the rules are those of telemetry logs
+# --- A live vehicle's MAVLink messages as blocks, at absolute times; the rules are those of telemetry logs
 
 
 REBOOT = 1.0
@@ -159,7 +159,7 @@ class _Round:
 
 
 class MavlinkDecoder:
-    """Messages of one vehicle to samples."""
+    """MAVLink messages of one vehicle as blocks."""
 
     def __init__(self, rotors: int, wall: Callable[[], float] = time.time) -> None:
         """Expects a vehicle with `rotors` rotors; `wall` tells the UNIX time [s] at which its clock is put."""
@@ -170,8 +170,8 @@ class MavlinkDecoder:
         self._wall, self._epoch, self._newest = wall, 0.0, math.inf
         self._rounds: dict[str, _Round] = {}
 
-    def samples(self, message: Any, received: float, earliest: float | None = None) -> Iterator[Sample]:
-        """Yields the samples that may be used now.
+    def blocks(self, message: Any, received: float, earliest: float | None = None) -> Iterator[Block]:
+        """Yields what may be used now.
 
         Args:
             received: when it was read [s, any clock that runs on].
@@ -200,7 +200,7 @@ class MavlinkDecoder:
                     self._newest = max(self._newest, t)
                     yield from self._channel(t + self._epoch, reading, received)
 
-    def _channel(self, t: float, reading: Reading, received: float) -> Iterator[Sample]:
+    def _channel(self, t: float, reading: Reading, received: float) -> Iterator[Block]:
         source = reading.source.split(" ")[0]
         channel, values = reading.signal, tuple(float(v) for v in reading.values)
         if channel in ("esc", "servo"):
@@ -212,8 +212,7 @@ class MavlinkDecoder:
             return
         if reading.signal in ("esc", "servo"):
             self._rounds[source].row = [math.nan] * ESCS  # it is told once
-        for block in self._chooser.take(Sample(t, channel, values).block, rank):
-            yield from block.samples()
+        yield from self._chooser.take(Block.one(t, channel, values), rank)
 
     def _joined(self, t: float, reading: Reading, source: str) -> tuple[float, tuple[float, ...]]:
         """The row so far of a round of messages (four ESCs or sixteen outputs each), at the time of the first."""
@@ -388,8 +387,8 @@ class MavlinkLink:
 
     # --- in
 
-    def receive(self) -> Iterator[Sample]:
-        """Yields the samples that have arrived; answers what was asked of us."""
+    def receive(self) -> Iterator[Block]:
+        """Yields the measurements that have arrived; answers what was asked of us."""
         now = last = self._clock()
         if int(now) != self._second:
             self._second, self._left = int(now), {True: FRAMES_A_SECOND, False: OTHERS_A_SECOND}
@@ -418,7 +417,7 @@ class MavlinkLink:
             elif kind == "COMMAND_ACK" and self._is_vehicle(message):
                 self._on_ack(message)
             elif self._is_vehicle(message):
-                yield from self._decoder.samples(message, last, self._empty)
+                yield from self._decoder.blocks(message, last, self._empty)
         if self._wire.drained:
             self._empty = last
 
@@ -618,9 +617,9 @@ def run(
     reported = clock()
     while not stop():
         busy = False
-        for sample in link.receive():
+        for block in link.receive():
             busy = True
-            service.push(sample)
+            service.push(block)
         for output in service.step(WORK_SECONDS):
             link.publish(output)
             for outlet in outlets:

@@ -8,9 +8,9 @@ of them what the session began with, so that a replay repeats the run bit for bi
 from __future__ import annotations
 
 import json
-import re
+import math
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,15 +20,17 @@ from quadid_replay import TopicWriter
 from quadid_replay.mcap_file import McapFile, read_metadata
 from quadid_replay.ros_messages import type_name
 from quadid_replay.schemas import has_definition, whole_text
+from quadid_replay.writers import in_time_order
 
 from quadid.condition.trim import flight_from_dict, flight_to_dict
-from quadid.data.window import Recording, Sample
+from quadid.data.window import Block, Recording
 from quadid.errors import LogError
 from quadid.online import OnlineSet, SessionSettings
 from quadid.vehicle import Vehicle
 from quadid_node.history import UNREADABLE, Restored
-from quadid_node.inputs import Chooser, Decoder, Input, best_ranks, source
-from quadid_node.messages import set_from_dict, set_to_dict
+from quadid_node.inputs import Chooser, Decoder, Input, best_ranks, seconds, source
+from quadid_node.messages import Output, set_from_dict, set_to_dict
+from quadid_node.service import Service
 
 RECORD = "quadid.session"
 WRITTEN = 32
@@ -131,39 +133,20 @@ def _set(data: object) -> OnlineSet | None:
 # itself in the order in which the messages came
 
 
-_BASE = re.compile(r"times count from UNIX time (\d+) s")
-
-
-def base_seconds(recording: Recording) -> int:
-    """UNIX time that the recording's times count from [s]; 0 when they are no UNIX times."""
-    for note in recording.warnings:
-        found = _BASE.search(note)
-        if found is not None:
-            return int(found[1])
-    return 0
-
-
-def stream(recording: Recording) -> Iterator[Sample]:
-    """Yields all samples in time order, at equal times by channel; absolute where the log's times are.
+def stream(recording: Recording) -> Iterator[Block]:
+    """Yields all rows in time order, at equal times by channel; absolute where the log's times are.
 
     Times are brought back to whole nanoseconds, as they came in headers, so that a replayed log gives the numbers of
     the live run bit for bit.
     """
-    base = base_seconds(recording) * 10**9
-    names = list(recording.channels)
-    if not names:
-        return
-    times = [recording.channels[n].t for n in names]
-    stamps = [[(round(t * 1e9) + base) * 1e-9 for t in channel.tolist()] for channel in times]
-    which = np.concatenate([np.full(len(t), i) for i, t in enumerate(times)])
-    rows = np.concatenate([np.arange(len(t)) for t in times])
-    order = np.argsort(np.concatenate(times), kind="stable")
-    for i, row in zip(which[order].tolist(), rows[order].tolist(), strict=True):
-        yield Sample(stamps[i][row], names[i], tuple(recording.channels[names[i]].values[row].tolist()))
+    base, channels = int(recording.epoch or 0.0) * 10**9, list(recording.channels.values())
+    whole = [Block(seconds(np.rint(c.t * 1e9).astype(np.int64) + base), ((c.name, c.values),)) for c in channels]
+    for which, row in in_time_order([c.t for c in channels]):
+        yield whole[which].part(row, row + 1)
 
 
-def arrivals(path: Path, preset: str, rotors: int) -> Iterator[Sample]:
-    """Yields the samples of a node's recording as the node's session got them: the same numbers in the same order.
+def arrivals(path: Path, preset: str, rotors: int) -> Iterator[Block]:
+    """Yields the messages of a node's recording as the node's session got them: the same numbers in the same order.
 
     Raises:
         LogError: a message definition that cannot be used.
@@ -183,5 +166,40 @@ def arrivals(path: Path, preset: str, rotors: int) -> Iterator[Sample]:
             ) from error
         decoders[number] = Decoder(entry, chooser, rotors, decode)
     for number, _, data in file.messages(decoders.keys()):
-        for item in decoders[number].take([data]):
-            yield from item.samples()
+        yield from decoders[number].take([data])
+
+
+BATCH = 200
+"""Rows between two looks at the session."""
+
+
+def play(
+    service: Service, blocks: Iterable[Block], pace: float = 0.0, told: Callable[[int], None] = lambda rows: None
+) -> list[Output]:
+    """Plays a stream into a service with an inline worker; returns everything that it put out, in order.
+
+    Args:
+        pace: factor of real time; 0 for as fast as possible.
+        told: takes how many rows have been played, now and then.
+    """
+    outputs: list[Output] = []
+    begin, first, count, due = time.monotonic(), math.nan, 0, 0
+
+    def work() -> None:
+        """Steps until the session needs more."""
+        outputs.extend(service.step())
+        while service.session.running is not None:
+            outputs.extend(service.step())
+        told(count)
+
+    for block in blocks:
+        if pace > 0.0:
+            first = float(block.t[0]) if count == 0 else first
+            time.sleep(max(begin + (float(block.t[-1]) - first) / pace - time.monotonic(), 0.0))
+        service.push(block)
+        count += len(block.t)
+        if count >= due or pace > 0.0:
+            due = count + BATCH
+            work()
+    work()
+    return outputs

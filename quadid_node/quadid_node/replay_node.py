@@ -27,7 +27,6 @@ from quadid.data.window import Recording
 from quadid.errors import QuadidError
 from quadid_node.inputs import message_class, source
 from quadid_node.process import Stop, end_middleware, without_shared_memory
-from quadid_node.recording import base_seconds
 
 QOS = QoSProfile(depth=100, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.BEST_EFFORT)
 _CHECK_EVERY = 0.1
@@ -83,7 +82,7 @@ class TopicPlayer(TopicWriter):
 def epoch_of(recording: Recording, stamps: str) -> int:
     """Nanoseconds to add to recording time: the log's own UNIX time, or such that the log begins now."""
     if stamps == "log":
-        return base_seconds(recording) * 10**9
+        return int(recording.epoch or 0.0) * 10**9
     first, _ = recording.span
     return (time.time_ns() // 10**6) * 10**6 - round(first * 1e9)
 

@@ -1,6 +1,6 @@
-"""One vehicle's service, whatever carries its samples: session, worker and history wired together.
+"""One vehicle's service, independent of transport: session, worker and history wired together.
 
-The ROS node, the MAVLink link and the replay push samples, call `step` often, and carry out what it returns.
+The ROS node, the MAVLink link and the replay push messages, call `step` often, and carry out what it returns.
 """
 
 from __future__ import annotations
@@ -11,15 +11,10 @@ import uuid
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 
-from quadid.data.window import Block, Sample
+from quadid.data.window import Block
 from quadid.online import Job, Session, SessionSettings
 from quadid.online.active_set import Answer
-from quadid.online.records import (
-    Action,
-    Event,
-    OnlineSet,
-    Publish,
-)
+from quadid.online.records import Action, Event, OnlineSet, Publish
 from quadid.vehicle import Vehicle
 from quadid_node.history import UNREADABLE, Restored, Store, StoreError, read_history
 from quadid_node.messages import BEHIND, Feed, Health, Message, Output, lag, parameter_set, set_from_dict
@@ -149,12 +144,10 @@ class Service:
         """Checks whether fits can begin at once."""
         return self._worker.ready
 
-    def push(self, messages: Block | Sample) -> None:
+    def push(self, messages: Block) -> None:
         """Takes messages; their portions change nothing."""
-        now, block = self._clock(), messages if isinstance(messages, Block) else messages.block
-        for name, _ in block.columns:
-            self._arrived[name] = now
-        self.session.push(block)
+        self._arrived |= dict.fromkeys((name for name, _ in messages.columns), self._clock())
+        self.session.push(messages)
 
     def step(self, seconds: float = math.inf) -> list[Output]:
         """Moves everything on by what there is to do; never waits.

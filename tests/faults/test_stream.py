@@ -14,7 +14,7 @@ from quadid_replay import open_log
 from quadid_replay.mcap_file import McapFile
 
 from quadid.checks import inspect
-from quadid.data.window import Sample, at_limit, data_faults
+from quadid.data.window import at_limit, data_faults
 from quadid.online import Session, SessionSettings
 from quadid.online.checks import judge
 from quadid.online.gate import GateSettings
@@ -23,6 +23,7 @@ from quadid.vehicle import Vehicle
 from tests.faults.evidence import Happened
 from tests.online.driving import drive, flight, published, samples
 from tests.online.test_quality import thrust_of
+from tests.samples import Sample
 
 # --- Row 8: duplicates, reordering, jitter and 30 % dropout change the estimate by no more than its interval says
 

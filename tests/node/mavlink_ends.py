@@ -12,6 +12,7 @@ from quadid_node.mavlink_wire import SIGNING_EPOCH, dialect
 
 from quadid.online.records import Publish
 from tests.online.test_gate import TRUE, online_set
+from tests.samples import flat
 
 KEY = bytes(range(32))
 
@@ -72,7 +73,7 @@ def samples(link: MavlinkLink, seconds: float = 0.3) -> list[Any]:
     out: list[Any] = []
     deadline = time.monotonic() + seconds
     while time.monotonic() < deadline:
-        out += list(link.receive())
+        out += flat(link.receive())
         link.step()
         time.sleep(0.005)
     return out

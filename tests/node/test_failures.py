@@ -34,7 +34,7 @@ def test_the_input_of_an_unexpected_error_is_kept_for_replay(tmp_path: Path, hap
     store = Store(tmp_path / "h.sqlite", "pelican")
     service, told = Service(PELICAN, QUICK, Failing(), store), []
     for sample in light_flight(20.0):
-        service.push(sample)
+        service.push(sample.block)
         told += [o.text for o in service.step() if o.topic == "event" and o.level == "error"]
     kept = sorted(folder_of(store.path).iterdir())
     assert kept

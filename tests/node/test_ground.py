@@ -47,7 +47,7 @@ PELICAN = Vehicle.shipped("pelican")
 def request_() -> FitRequest:
     session = Session(PELICAN, SessionSettings(window=5.0))
     for sample in samples(flight(8.0, 6).recording):
-        session.push(sample)
+        session.push(sample.block)
     session.poll()
     assert isinstance(session.running, FitRequest)
     return session.running

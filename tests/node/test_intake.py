@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import struct
 from collections import deque
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,13 +19,14 @@ from quadid_replay.mcap_file import McapFile, read_metadata
 from quadid_replay.schemas import schema_text
 
 from quadid.condition.trim import FlightTrim, flight_to_dict
-from quadid.data.window import Block, Sample
+from quadid.data.window import Block
 from quadid.errors import LogError
 from quadid.flight import fly
 from quadid.online import SessionSettings
 from quadid.vehicle import Vehicle
 from tests.online.driving import flight
 from tests.online.test_gate import TRUE, online_set
+from tests.samples import Sample, flat
 
 # --- Messages read a batch at a time: the samples, and the recording, are those of one message after the other
 
@@ -49,10 +49,6 @@ def decoder(entry: Input, chooser: Chooser, mounted: bool = True) -> Decoder:
     kind = entry.type.replace("/", "/msg/")
     decode = generate_dynamic(kind, schema_text(kind))[kind]
     return Decoder(entry, chooser, 4, decode, mounted)
-
-
-def flat(items: Iterator[Block]) -> list[Sample]:
-    return [s for item in items for s in item.samples()]
 
 
 def by_intake(messages: list[Message], batch: int) -> tuple[list[Sample], list[Message]]:
@@ -151,7 +147,7 @@ def test_a_damaged_message_spoils_only_itself(messages: list[Message]) -> None:
 def imu_decoder() -> Decoder:
     """Decoder of the IMU beside a topic that tells the attitude."""
     chooser = Chooser(best_ranks(INPUTS))
-    assert list(chooser.take(Sample(0.0, "attitude", (1.0, 0.0, 0.0, 0.0)).block, 0))
+    assert list(chooser.take(Block.one(0.0, "attitude", (1.0, 0.0, 0.0, 0.0)), 0))
     return decoder(next(e for e in INPUTS if e.topic == "imu"), chooser)
 
 
@@ -301,8 +297,8 @@ def test_messages_come_back_in_the_order_of_arrival(tmp_path: Path) -> None:
         recorder.take(topic, kind, data)
     recorder.close()
     assert messages_of(path) == shuffled
-    got = list(arrivals(path, "canonical", 4))
-    sorted_ones = list(stream(open_log(str(log))))
+    got = flat(arrivals(path, "canonical", 4))
+    sorted_ones = flat(stream(open_log(str(log))))
     assert sorted(got, key=lambda s: (s.channel, s.t)) == sorted(sorted_ones, key=lambda s: (s.channel, s.t))
     assert got != sorted(got, key=lambda s: s.t)
 

@@ -23,6 +23,7 @@ from tests.faults.evidence import Happened
 from tests.node.mavlink_ends import KEY, Sender, accepted, decoded, free_port, samples
 from tests.online.driving import flight
 from tests.online.test_gate import TRUE
+from tests.samples import flat
 
 CHANNELS = ("gyro", "accel", "attitude", "rotor_speed", "attitude_reference")
 
@@ -68,7 +69,7 @@ def test_a_flight_over_the_wire_gives_every_channel(link: MavlinkLink, port: int
     got = []
     for _, message in mavlink_messages(flight(4.0).recording):
         vehicle.send(message)
-        got += list(link.receive())
+        got += flat(link.receive())
     got += samples(link, 0.2)
     counts = {c: sum(s.channel == c for s in got) for c in CHANNELS}
     assert min(counts.values()) >= 199
@@ -149,7 +150,7 @@ def test_a_flood_is_bounded_and_the_peer_list_does_not_grow(port: int, happened:
             for _ in range(40):
                 vehicle.socket.send(payload)
                 sent += 20
-            decoded += len(list(link.receive())) // 2
+            decoded += len(flat(link.receive())) // 2
     spent = time.process_time() - begin
     assert sent > 3 * seconds * FRAMES_A_SECOND
     assert decoded <= 1.02 * seconds * FRAMES_A_SECOND
@@ -223,7 +224,7 @@ def test_a_stall_of_the_service_hands_the_vehicle_to_nobody(port: int, stall: fl
             other.imu(500.0 + 0.01 * k, rate=50.0)
             if k % 5 == 4:
                 vehicle.imu(1.0 + 0.01 * k)
-        return {s.values[0] for s in link.receive() if s.channel == "gyro"}
+        return {s.values[0] for s in flat(link.receive()) if s.channel == "gyro"}
 
     for _ in range(10):
         now[0] += 0.02
@@ -234,9 +235,9 @@ def test_a_stall_of_the_service_hands_the_vehicle_to_nobody(port: int, stall: fl
     assert "second source" in link.traffic().problems[0]
     for _ in range(40):  # the vehicle falls silent, and comes from elsewhere
         now[0] += 0.1
-        assert not list(link.receive())
+        assert not flat(link.receive())
     other.imu(500.0, rate=50.0)
-    got = [s.values[0] for s in link.receive() if s.channel == "gyro"]
+    got = [s.values[0] for s in flat(link.receive()) if s.channel == "gyro"]
     assert got == pytest.approx([50.0])
     link.close()
     happened(43, f"the service stalls for {stall:g} s while two send under the vehicle's ids: the vehicle stays")
@@ -263,9 +264,9 @@ def test_a_flood_of_other_systems_costs_the_vehicle_no_frame(port: int, known: b
         for _ in range(10):
             vehicle.imu(1.0 + 0.002 * sent)
             sent += 1
-        got += sum(s.channel == "gyro" for s in link.receive())
+        got += sum(s.channel == "gyro" for s in flat(link.receive()))
     for _ in range(10):
-        got += sum(s.channel == "gyro" for s in link.receive())
+        got += sum(s.channel == "gyro" for s in flat(link.receive()))
     assert got == sent
     assert any("flood" in problem for problem in link.traffic().problems)
     link.close()
@@ -298,7 +299,7 @@ def test_a_flood_before_the_vehicle_comes_or_comes_back_keeps_nobody_out(
             for message in heartbeat[k % 50 :] + imu(now[0]):
                 vehicle.socket.send(bytes(message.pack(vehicle.mav, force_mavlink1=version == 1)))
                 vehicle.mav.seq = (vehicle.mav.seq + 1) % 256
-            found += sum(s.channel == "gyro" for s in link.receive())
+            found += sum(s.channel == "gyro" for s in flat(link.receive()))
             link.step()
         return found
 
@@ -308,7 +309,7 @@ def test_a_flood_before_the_vehicle_comes_or_comes_back_keeps_nobody_out(
     assert any(m.get_type() == "COMMAND_LONG" for m in vehicle.heard(0.05)), "it is asked for its messages"
     for _ in range(40):
         now[0] += 0.1
-        assert not list(link.receive())
+        assert not flat(link.receive())
     again = Sender(port)
     assert looks(again, 60) == 60
     link.close()
@@ -326,9 +327,9 @@ def test_what_is_sent_has_a_budget(port: int, happened: Happened) -> None:
             station.heartbeat(autopilot=8)
         for _ in range(2):
             now[0] += 0.3
-            list(link.receive())
+            flat(link.receive())
             now[0] += 0.3
-            list(link.receive())
+            flat(link.receive())
     link.publish(accepted())
     for sender in (vehicle, *stations):
         sender.heard(0.05)
@@ -345,7 +346,7 @@ def test_what_is_sent_has_a_budget(port: int, happened: Happened) -> None:
             stations[0].send(message)
             stranger.send(message)
             asked += 2
-        list(link.receive())
+        flat(link.receive())
         link.step()
         answers += len([m for m in stations[0].heard(0.002) if m.get_type().startswith("PARAM")])
     others = [m for s in stations[1:] for m in s.heard(0.05) if m.get_type().startswith("PARAM")]
@@ -432,7 +433,7 @@ def test_parameters_nobody_needs_take_no_memory() -> None:
     decoder = MavlinkDecoder(4)
     for k in range(1000):
         name = f"X{k}".encode()
-        list(decoder.samples(decoded(dialect.MAVLink_param_value_message(name, 1.0, 9, 100, 0)), 0.0))
+        flat(decoder.blocks(decoded(dialect.MAVLink_param_value_message(name, 1.0, 9, 100, 0)), 0.0))
     assert decoder.order._parameters == {}
 
 
@@ -443,7 +444,7 @@ def test_speeds_of_rotors_that_are_not_there_are_left_out(rotors: int, happened:
         decoder = MavlinkDecoder(rotors)
         for first in (0, index, 0, 4):
             message = dialect.MAVLink_esc_status_message(first, 10**6, [6000] * 4, [1.0] * 4, [1.0] * 4)
-            assert all(len(s.values) == rotors for s in decoder.samples(decoded(message), 1.0))
+            assert all(len(s.values) == rotors for s in flat(decoder.blocks(decoded(message), 1.0)))
     happened(15, f"ESC_STATUS from rotor 0 to 255 of a vehicle with {rotors}: nothing but its own rotors")
 
 
@@ -537,14 +538,14 @@ def test_servo_outputs_follow_the_autopilots_motor_functions_and_unwrap() -> Non
     decoder.order.ardupilot = True
     for output, motor in ((1, 36), (2, 35), (3, 34), (4, 33)):
         name = f"SERVO{output}_FUNCTION".encode()
-        list(decoder.samples(decoded(dialect.MAVLink_param_value_message(name, float(motor), 9, 100, output)), 0.0))
+        flat(decoder.blocks(decoded(dialect.MAVLink_param_value_message(name, float(motor), 9, 100, output)), 0.0))
     boot = 4300.0  # beyond 71.6 minutes: the 32 bits of the servo message have wrapped
     imu = dialect.MAVLink_highres_imu_message(int(boot * 1e6), 0, 0, -9.8, 0, 0, 0, *[0.0] * 7, 0x3F)
-    out = list(decoder.samples(decoded(imu), 100.0))
+    out = flat(decoder.blocks(decoded(imu), 100.0))
     pulses = [1100, 1200, 1300, 1400] + [0] * 12
     servo = dialect.MAVLink_servo_output_raw_message(int(boot * 1e6 + 5000) % 2**32, 0, *pulses)
     for k in range(3):
-        out += list(decoder.samples(decoded(servo), 100.0 + k))
+        out += flat(decoder.blocks(decoded(servo), 100.0 + k))
         servo = dialect.MAVLink_servo_output_raw_message(int(boot * 1e6 + 1e6 * (k + 1)) % 2**32, 0, *pulses)
     motors = [s for s in out if s.channel == "motor_command"]
     assert motors[0].values == (1400.0, 1300.0, 1200.0, 1100.0)
@@ -589,13 +590,13 @@ def test_what_came_while_nobody_looked_is_of_the_moment_before() -> None:
     vehicle.heartbeat(autopilot=3)
     for k in range(4):
         vehicle.send(dialect.MAVLink_param_value_message(f"SERVO{k + 1}_FUNCTION".encode(), 33 + k, 4, 4, k))
-    list(link.receive())
+    flat(link.receive())
     for k in range(100):
         vehicle.imu(10.0 + ROUND * k)
-        got += list(link.receive())
+        got += flat(link.receive())
         vehicle.send(speeds(4000 + k))
         now[0] += ROUND  # busy with something else
-        got += list(link.receive())
+        got += flat(link.receive())
     link.close()
     gyro, rotors = ([s.t for s in got if s.channel == channel] for channel in ("gyro", "rotor_speed"))
     assert len(rotors) == 99
@@ -613,6 +614,6 @@ def test_a_flight_whose_bytes_are_read_late_keeps_its_rounds(every: float, data_
         decoder.order.tell(f"SERVO{k + 1}_FUNCTION", 33.0 + k)
     for k in np.flatnonzero((came > 50.0) & (came < 60.0) & (frames.system == 1)).tolist():
         message, read = coder.decode(bytearray(frames.frame(k))), every * np.ceil(came[k] / every)
-        times += [s.t for s in decoder.samples(message, read, read - every) if s.channel == "rotor_speed"]
+        times += [s.t for s in flat(decoder.blocks(message, read, read - every)) if s.channel == "rotor_speed"]
     assert len(times) > 490
     np.testing.assert_allclose(np.diff(times), ROUND, rtol=0.0, atol=2e-3)

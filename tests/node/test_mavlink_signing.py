@@ -25,6 +25,7 @@ from tests.faults.evidence import Happened
 from tests.node.mavlink_ends import KEY, Sender, accepted, decoded, free_port, samples
 from tests.node.peers import Process
 from tests.online.test_gate import TRUE
+from tests.samples import flat
 
 # --- MAVLink signing over UDP: with a key, nothing that is forged, replayed or unsigned changes anything
 
@@ -256,7 +257,7 @@ def keep_talking(link: MavlinkLink, vehicle: Sender, going: Callable[[], bool], 
                 vehicle.heartbeat()
             if told - begin > silent:
                 link.publish(accepted())
-        list(link.receive())
+        flat(link.receive())
         link.step()
         time.sleep(0.01)
 
@@ -392,7 +393,7 @@ def test_rotor_speeds_go_with_the_outputs_of_their_motors(first: int, esc: int) 
             made = getattr(dialect, f"MAVLink_esc_telemetry_{group}_to_{group + 3}_message")
             sent.append(made(none, none, none, none, [1000 * m if group == esc else 0 for m in motors], none))
         for message in sent:
-            got += list(decoder.samples(decoded(message), us * 1e-6))
+            got += flat(decoder.blocks(decoded(message), us * 1e-6))
     rows = {s.channel: s.values for s in got}
     np.testing.assert_allclose(np.array(rows["rotor_speed"]) / RPM, [1000, 2000, 3000, 4000])
     assert rows["motor_command"] == (1100.0, 1200.0, 1300.0, 1400.0)

@@ -10,11 +10,11 @@ from quadid_node.messages import BEHIND, Output, diagnostics, fit_status, set_to
 from quadid_node.service import PATIENCE, Service
 from quadid_node.worker import InlineWorker, Trouble
 
-from quadid.data.window import Sample
 from quadid.online import FitRequest
 from quadid.online.records import Event, Job, JobReply, Publish
 from tests.faults.evidence import Happened
 from tests.online.made_up import DROPPED, PELICAN, QUICK, light_flight, tells
+from tests.samples import Sample
 
 NOW = [0.0]
 
@@ -46,7 +46,7 @@ def served(stream: Sequence[Sample], worker: InlineWorker, late: float = math.in
     service, out = Service(PELICAN, QUICK, worker, clock=lambda: NOW[0]), list[Output]()
     for k, sample in enumerate(stream):
         NOW[0] = sample.t
-        service.push(sample)
+        service.push(sample.block)
         if k % (4 if sample.t < late else 120) == 3:
             out += service.step(math.inf if sample.t < late else 0.0)
     return service, out
@@ -88,7 +88,7 @@ def test_one_slow_fit_does_not_end_all_others() -> None:
     for k, sample in enumerate(light_flight(30.0)):
         NOW[0] = sample.t
         worker.seconds = 5.0 if worker.asked == 2 else 0.1
-        service.push(sample)
+        service.push(sample.block)
         if k % 4 == 3:
             sets += [o for o in service.step() if isinstance(o, Publish) and o.topic == "parameters"]
     status = service.session.status()
@@ -114,7 +114,7 @@ def test_a_change_is_seen_and_the_set_withdrawn_while_fits_take_for_ever(seconds
     for k, sample in enumerate(DROPPED):
         NOW[0] = sample.t
         quick.seconds = seconds if sample.t > 13.0 else 0.0
-        service.push(sample)
+        service.push(sample.block)
         if k % 4 == 3:
             new = service.step()
             out += new
@@ -136,7 +136,7 @@ def test_an_estimate_of_before_a_change_that_comes_late_is_not_taken() -> None:
     for k, sample in enumerate(DROPPED):
         NOW[0] = sample.t
         worker.seconds = 0.0 if sample.t < 13.9 else math.inf
-        service.push(sample)
+        service.push(sample.block)
         if k % 4 == 3:
             service.step()
             if late is None and service.session._late is not None:

@@ -17,10 +17,10 @@ from quadid_node.worker import InlineWorker
 
 from quadid.condition.trim import flight_from_dict, flight_to_dict
 from quadid.condition.watch import ENOUGH, HealthReport
-from quadid.data.window import Sample
 from quadid.online import Event, SessionSettings
 from quadid.online.records import HealthyFlight
 from quadid.vehicle import Vehicle
+from tests.samples import Sample, flat
 
 PELICAN_X = Vehicle.shipped("pelican_x")
 SETTINGS = SessionSettings(rate=25.0, window=60.0, refit=60.0, diagnose=0.0)
@@ -29,14 +29,13 @@ RATE = 25
 
 def flown(seed: int, begin: float, seconds: int = 40, wrong: Wrong | None = None, onset: int = 0) -> Iterator[Sample]:
     """A hover with 6 s on the ground before and after; from `begin` [s] on."""
-    for block in hover_blocks(PELICAN_X, begin, seconds, np.random.default_rng(seed), wrong, onset, RATE):
-        yield from block.samples()
+    yield from flat(hover_blocks(PELICAN_X, begin, seconds, np.random.default_rng(seed), wrong, onset, RATE))
 
 
 def served(service: Service, samples: Iterator[Sample]) -> list[Output]:
     out: list[Output] = []
     for k, sample in enumerate(samples):
-        service.push(sample)
+        service.push(sample.block)
         if k % 100 == 0:
             out += service.step()
     return out + service.step()

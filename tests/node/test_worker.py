@@ -31,7 +31,7 @@ def requests() -> list[FitRequest]:
     """Two fit requests of a real session."""
     session, out = Session(PELICAN, QUICK), []
     for sample in samples(flight(12.0, 6).recording):
-        session.push(sample)
+        session.push(sample.block)
     for _ in range(2):
         session.poll()
         request = session.running

@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from functools import lru_cache
 
-from quadid.data.window import Recording, Sample
+from quadid.data.window import Recording
 from quadid.flight import Flight, fly
 from quadid.online import Job, JobReply, Session
 from quadid.online.records import Action, Event, OnlineDiagnosis, OnlineSet, Publish
 from quadid.vehicle import Vehicle
+from tests.samples import Sample
 
 Background = Callable[[Job], JobReply | None]
 EPOCH = 1_700_000_000.0
@@ -64,7 +65,7 @@ def drive(session: Session, stream: Sequence[Sample], chunk: int = 40, diagnose:
     out: list[Action] = []
     for start in range(0, len(stream), chunk):
         for sample in stream[start : start + chunk]:
-            session.push(sample)
+            session.push(sample.block)
         out.extend(answer(session, diagnose))
     return out
 

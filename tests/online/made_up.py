@@ -8,14 +8,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import replace
 from functools import lru_cache
 from itertools import accumulate
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from quadid.data.window import Sample
 from quadid.online import FitReply, FitRequest, GateSettings, Session, SessionSettings
 from quadid.online.change_job import ChangeRequest
 from quadid.online.fit_job import WindowEstimate
@@ -24,6 +22,7 @@ from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray
 from quadid.vehicle import GRAVITY, Vehicle
 from tests.online.test_gate import TRUE
+from tests.samples import Sample
 
 PELICAN = Vehicle.shipped("pelican")
 Worker = Callable[[Job], JobReply | None]
@@ -87,7 +86,7 @@ def on_the_ground(seconds: float) -> list[Sample]:
 
 def between(stream: Iterable[Sample], start: float, stop: float = math.inf, shift: float = 0.0) -> list[Sample]:
     """Samples with start <= t < stop [s], their times then shifted [s]."""
-    return [replace(s, t=s.t + shift) for s in stream if start - 1e-9 <= s.t < stop - 1e-9]
+    return [s._replace(t=s.t + shift) for s in stream if start - 1e-9 <= s.t < stop - 1e-9]
 
 
 def nothing_left_out(sigma: float = 0.005) -> FloatArray:
@@ -118,7 +117,7 @@ def works(session: Session, stream: Sequence[Sample], worker: Worker) -> list[Ac
     out: list[Action] = []
     for start in range(0, max(len(stream), 1), 4):
         for sample in stream[start : start + 4]:
-            session.push(sample)
+            session.push(sample.block)
         out += answered(session, worker)
     return out
 

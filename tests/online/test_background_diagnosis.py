@@ -7,12 +7,12 @@ from dataclasses import replace
 
 import pytest
 
-from quadid.data.window import Sample
 from quadid.online import Job, JobReply, Session, SessionSettings
 from quadid.online.background_diagnosis import DiagnosisReply, DiagnosisRequest
 from quadid.online.records import Action, OnlineFinding
 from quadid.vehicle import Vehicle
 from tests.online.driving import EPOCH, diagnosed, drive, flight, samples, unanswered
+from tests.samples import Sample
 
 PELICAN = Vehicle.shipped("pelican")
 QUICK = SessionSettings(refit=5.0)

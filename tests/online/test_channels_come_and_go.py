@@ -109,7 +109,7 @@ def test_an_unexpected_error_of_a_fit_is_told_and_does_not_repeat_for_ever(happe
     assert all(UNEXPECTED in e.text and "IndexError" in e.text and e.level == "error" for e in told)
     assert "no more fits" in session.status().reason
     session.fit_now()
-    later = works(session, [replace(s, t=s.t + 60.0) for s in light_flight(30.0)], tells())
+    later = works(session, [s._replace(t=s.t + 60.0) for s in light_flight(30.0)], tells())
     assert published(later)
     happened(11, f"a fit that fails by an error of the program: told {len(told)} times, then only on request")
 
@@ -126,5 +126,5 @@ def test_an_unexpected_error_of_the_session_itself_does_not_end_it(monkeypatch: 
     assert len(told) == MOST_ERRORS
     monkeypatch.undo()
     session.fit_now()
-    later = works(session, [replace(s, t=s.t + 15.0) for s in light_flight(45.0)], tells())
+    later = works(session, [s._replace(t=s.t + 15.0) for s in light_flight(45.0)], tells())
     assert published(later)

@@ -162,7 +162,7 @@ def test_while_sensors_contradict_each_other_nothing_is_learned_or_published(
                 values = np.array([np.sqrt(1.0 - half @ half), *half])
             else:
                 values[slice(None) if column is None else column] *= factor
-        stream.append(replace(s, values=tuple(values.tolist())))
+        stream.append(s._replace(values=tuple(values.tolist())))
     session = Session(PELICAN, QUICK)
     early = works(session, between(stream, 0.0, begin + 12.0), tells())
     late = works(session, between(stream, begin + 12.0, 60.0), tells(b=1.03))
@@ -180,7 +180,7 @@ def test_while_sensors_contradict_each_other_nothing_is_learned_or_published(
 def test_a_fault_that_is_over_is_forgotten_however_wild_it_was(channel: str, factor: float, happened: Happened) -> None:
     """Five seconds in another unit: what came before and after is right, and alone decides in the end."""
     stream = [
-        replace(s, values=tuple(factor * v for v in s.values)) if s.channel == channel and 15.0 <= s.t < 20.0 else s
+        s._replace(values=tuple(factor * v for v in s.values)) if s.channel == channel and 15.0 <= s.t < 20.0 else s
         for s in light_flight(100.0)
     ]
     session = Session(PELICAN, QUICK)

@@ -39,8 +39,8 @@ def rows_of(log: Path, vehicle: Path) -> Iterator[Rows]:
 def resampled(log: Path, vehicle: Vehicle) -> Iterator[Rows]:
     """Rows as they come."""
     resampler = Resampler(vehicle, RATE)
-    for count, sample in enumerate(stream(open_log(str(log), "auto", vehicle.columns))):
-        resampler.push(sample.block)
+    for count, block in enumerate(stream(open_log(str(log), "auto", vehicle.columns))):
+        resampler.push(block)
         while count % 200 == 0 and resampler.busy:
             if (rows := resampler.work()) is not None:
                 yield rows

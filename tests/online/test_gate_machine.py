@@ -29,7 +29,6 @@ from quadid_node.messages import Output
 from quadid_node.service import Service
 from quadid_node.worker import Trouble
 
-from quadid.data.window import Sample
 from quadid.online import FitReply, FitRequest, GateSettings, Publish, SessionSettings, SetState
 from quadid.online.fit_job import WindowEstimate
 from quadid.online.records import Job, JobReply, OnlineSet
@@ -39,6 +38,7 @@ from tests.faults.evidence import Happened
 from tests.online.driving import flight, samples
 from tests.online.made_up import nothing_left_out
 from tests.online.test_gate import TRUE
+from tests.samples import Sample
 
 PELICAN = Vehicle.shipped("pelican")
 GATE = GateSettings(windows=2, width=0.15, yaw_width=0.6)
@@ -122,7 +122,7 @@ class Machine(RuleBasedStateMachine):
         while self.place < len(every) and every[self.place].t < end:
             sample = every[self.place]
             self.place += 1
-            self.service.push(spoil(replace(sample, t=sample.t - begin + self.t)))
+            self.service.push(spoil(sample._replace(t=sample.t - begin + self.t)).block)
         self.t += seconds
         if self.place >= len(every) - 2500:
             self.place = 0
@@ -143,13 +143,13 @@ class Machine(RuleBasedStateMachine):
         def spoil(sample: Sample) -> Sample:
             if sample.channel != channel:
                 return sample
-            return replace(sample, values=tuple(v * value for v in sample.values))
+            return sample._replace(values=tuple(v * value for v in sample.values))
 
         self.push(1.0, spoil)
 
     @rule(step=st.sampled_from([-5000.0, -2.0, 3.0, 40.0, 1e12, math.nan]))
     def clock_steps(self, step: float) -> None:
-        self.push(0.5, lambda s: replace(s, t=s.t + step))
+        self.push(0.5, lambda s: s._replace(t=s.t + step))
         if abs(step) < 100.0:
             self.t += max(step, 0.0)
 

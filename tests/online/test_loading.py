@@ -13,16 +13,16 @@ from tests.online.driving import flight
 CHILD = """
 import sys
 import numpy as np
+from quadid.data.window import Block
 from quadid.online import FitRequest, Session, SessionSettings
 from quadid.vehicle import Vehicle
-from quadid.data.window import Sample
 
 session = Session(Vehicle.shipped("pelican"), SessionSettings(window=5.0, diagnose=0.0))
 flown = np.load(sys.argv[1])
 before = set(sys.modules)
 for k in range(len(flown["t"])):
     for name in ("attitude", "rotor_speed", "accel", "gyro"):
-        session.push(Sample(float(flown["t"][k]), name, tuple(flown[name][k].tolist())))
+        session.push(Block.one(float(flown["t"][k]), name, flown[name][k]))
     session.poll()
 assert isinstance(session.running, FitRequest), session.status()
 print(*sorted(set(sys.modules) - before))

@@ -11,13 +11,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from quadid.data.grid import to_windows
-from quadid.data.window import Sample
+from quadid.data.window import Block
 from quadid.flight import fly
 from quadid.online.grid_buffer import GridBuffer, Rows
 from quadid.online.stream import BLOCK, SETTLE, Resampler
 from quadid.vehicle import Vehicle
 from tests.faults.evidence import Happened
 from tests.online.driving import EPOCH, flight, samples
+from tests.samples import Sample
 
 PELICAN = Vehicle.shipped("pelican")
 
@@ -162,9 +163,9 @@ def test_values_that_are_no_numbers_never_reach_a_row(bad: float, happened: Happ
 
 def test_wrong_width_unknown_channel_and_zero_quaternion_are_counted() -> None:
     buffer = Resampler(PELICAN)
-    buffer.push(Sample(0.0, "gyro", (1.0, 2.0)).block)
-    buffer.push(Sample(0.0, "altitude", (1.0,)).block)
-    buffer.push(Sample(0.0, "attitude", (0.0, 0.0, 0.0, 0.0)).block)
+    buffer.push(Block.one(0.0, "gyro", (1.0, 2.0)))
+    buffer.push(Block.one(0.0, "altitude", (1.0,)))
+    buffer.push(Block.one(0.0, "attitude", (0.0, 0.0, 0.0, 0.0)))
     assert sum(buffer.faults.values()) == 3
 
 

@@ -57,7 +57,7 @@ def test_how_samples_are_pushed_and_polled_changes_nothing() -> None:
     while place < len(shuffled):
         size = int(rng.integers(1, 400))
         for sample in shuffled[place : place + size]:
-            other.push(sample)
+            other.push(sample.block)
         place += size
         jumpy += other.poll(most=int(rng.integers(0, 3)))
         if other.running is not None and rng.random() < 0.5:  # some replies come late

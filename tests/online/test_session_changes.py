@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from quadid.data.window import Sample
 from quadid.online import FitReply, FitRequest, Phase, Session
 from quadid.online.background_diagnosis import DiagnosisReply, DiagnosisRequest
 from quadid.online.change_job import ChangeReply, ChangeRequest
@@ -28,6 +27,7 @@ from tests.online.made_up import (
     tells,
     works,
 )
+from tests.samples import Sample
 
 MASS = OnlineFinding(
     "mass_change", {"fraction": 0.17}, {"fraction": 0.01}, {"fraction": ""}, 9.0, 1.0, 1e-9, (), "seen"
@@ -198,7 +198,7 @@ def test_what_is_not_known_or_does_not_move_is_not_studied(worker: str) -> None:
 
 
 def test_while_the_data_are_bad_nothing_is_studied() -> None:
-    ground: list[Sample] = [replace(s, t=s.t + 50.0) for s in on_the_ground(20.0)]
+    ground: list[Sample] = [s._replace(t=s.t + 50.0) for s in on_the_ground(20.0)]
     session = Session(PELICAN, STUDYING)
     actions = works(session, between(LONG, 0.0, 50.0) + ground, tells())
     assert session.status().phase is Phase.NOT_FLYING

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import pytest
 
-from quadid.data.window import Sample
 from quadid.online import FitRequest, Phase, Session, SessionSettings, SetState
 from quadid.online.change_job import ChangeRequest
 from quadid.online.gate import Decision
@@ -26,6 +25,7 @@ from tests.online.made_up import (
     tells,
     works,
 )
+from tests.samples import Sample
 
 MANUAL = QUICK.model_copy(update={"gate": GATE.model_copy(update={"approval": "manual"})})
 FLIGHT = light_flight(30.0)
@@ -223,7 +223,7 @@ def test_a_set_that_predicts_worse_than_its_predecessor_is_taken_back_by_itself(
 
 
 def test_a_stuck_gyro_blocks_and_is_named_once() -> None:
-    stuck = [replace(s, values=(0.1, 0.2, 0.3)) if s.channel == "gyro" and s.t > 9.0 else s for s in FLIGHT]
+    stuck = [s._replace(values=(0.1, 0.2, 0.3)) if s.channel == "gyro" and s.t > 9.0 else s for s in FLIGHT]
     session = Session(PELICAN, QUICK)
     actions = works(session, stuck[: 4 * 50 * 16], tells())
     assert session.status().phase is Phase.BLOCKED
@@ -271,7 +271,7 @@ def test_a_known_vehicle_that_its_rotors_carry_by_a_third_only_does_not_fly() ->
 
     def lightly(start: float, stop: float) -> list[Sample]:
         stretch = between(FLIGHT, start, stop)
-        return [replace(s, values=tuple(v * factor.get(s.channel, 1.0) for v in s.values)) for s in stretch]
+        return [s._replace(values=tuple(v * factor.get(s.channel, 1.0) for v in s.values)) for s in stretch]
 
     session = Session(PELICAN, QUICK)
     works(session, between(FLIGHT, 0.0, 9.7) + lightly(9.7, 15.7), tells())

@@ -164,7 +164,7 @@ def test_pieces_are_counted() -> None:
     for most in (1, 3):
         session, polls = Session(PELICAN, QUICK), 0
         for sample in between(FLIGHT, 0.0, 4.0):  # ends before the first fit
-            session.push(sample)
+            session.push(sample.block)
         while session.busy and polls < 1000:
             session.poll(most)
             polls += 1
@@ -176,7 +176,7 @@ def test_pieces_are_counted() -> None:
 def test_where_no_piece_is_allowed_none_is_done() -> None:
     session = Session(PELICAN, QUICK)
     for sample in between(FLIGHT, 0.0, 0.9):  # one block of rows
-        session.push(sample)
+        session.push(sample.block)
     assert session.poll(0) == []
     assert session.busy
     before = session.status()

@@ -16,10 +16,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from quadid_node.recording import stream
 from quadid_node.service import ROUND_SECONDS, STEP_SECONDS, WORK_SECONDS, Service
 from quadid_node.worker import InlineWorker, ProcessWorker
 
-from quadid.data.window import Recording, Sample
+from quadid.data.window import Block
 from quadid.flight import Flight, fly
 from quadid.identification.fit import FIT_SECONDS, FitOptions, fit
 from quadid.online import Job, JobReply, OnlineDiagnosis, Publish, Session, SessionSettings
@@ -33,22 +34,10 @@ from quadid_evaluation.harness import Given, machine, options, table
 Work = Callable[[Job], JobReply]
 
 
-def samples(recording: Recording, shift: float = 0.0) -> Iterator[Sample]:
-    """All samples of a recording in time order, `shift` [s] later."""
-    every = [
-        (t, name, row)
-        for name, channel in recording.channels.items()
-        for t, row in zip(channel.t.tolist(), channel.values.tolist(), strict=True)
-    ]
-    every.sort(key=lambda entry: entry[0])
-    for t, name, row in every:
-        yield Sample(shift + t, name, tuple(row))
-
-
-def drive(session: Session, stream: Iterable[Sample], work: Work = Job.run) -> Iterator[Action]:
-    """Pushes samples one by one, does every job at once, and yields what the session says."""
-    for sample in stream:
-        session.push(sample)
+def drive(session: Session, blocks: Iterable[Block], work: Work = Job.run) -> Iterator[Action]:
+    """Pushes blocks one by one, does every job at once, and yields what the session says."""
+    for block in blocks:
+        session.push(block)
         yield from session.poll()
         while session.running is not None:
             session.deliver(work(session.running))
@@ -75,7 +64,7 @@ def against_batch(seeds: range) -> dict[str, Any]:
     rows = []
     for seed in seeds:
         flight = flown(SECONDS + 1.0, seed)
-        actions = list(drive(Session(PELICAN), samples(flight.recording)))
+        actions = list(drive(Session(PELICAN), stream(flight.recording)))
         sets = [a.item for a in actions if isinstance(a, Publish) and a.topic == "parameters"]
         every = [a.item for a in actions if isinstance(a, Publish) and a.topic == "candidate"]
         batch, later = (
@@ -103,7 +92,7 @@ def mass_changes(seeds: range) -> dict[str, Any]:
     for seed in seeds:
         fraction = CHANGE if seed % 2 == 0 else -CHANGE
         flight = flown(CHANGE_AT + 8.0, seed, mass_change={"time": CHANGE_AT, "fraction": fraction})
-        actions = list(drive(Session(PELICAN), samples(flight.recording)))
+        actions = list(drive(Session(PELICAN), stream(flight.recording)))
         found = [a for a in actions if isinstance(a, OnlineDiagnosis)]
         finding = found[0].findings[0] if found and found[0].findings else None
         rows.append({
@@ -131,7 +120,7 @@ def hover(seconds: float, seeds: range) -> dict[str, Any]:
     for seed in seeds:
         flight = flown(seconds, seed, "hover")
         session = Session(PELICAN)
-        actions = list(drive(session, samples(flight.recording)))
+        actions = list(drive(session, stream(flight.recording)))
         sets = [a for a in actions if isinstance(a, Publish)]
         rows.append({
             "seed": seed,
@@ -148,9 +137,9 @@ def hover_after_flight(seconds: float, seed: int) -> dict[str, Any]:
     """Excited flight first, hover after it: the set in force must stay as it is, to the bit."""
     first, quiet = flown(SECONDS, seed), flown(seconds, seed, "hover")
     session = Session(PELICAN)
-    list(drive(session, samples(first.recording)))
+    list(drive(session, stream(first.recording)))
     before = session.active_set.in_force
-    later = list(drive(session, samples(quiet.recording, SECONDS + 3.0)))
+    later = list(drive(session, (Block(b.t + SECONDS + 3.0, b.columns) for b in stream(quiet.recording))))
     after = session.active_set.in_force
     same = (
         before is not None and after is not None and np.array_equal(before.parameters.values, after.parameters.values)
@@ -171,8 +160,8 @@ def outcome(item: Any) -> tuple[Any, ...]:
     return item.state, item.reason, p.values.tobytes(), p.covariance.tobytes(), item.input_hash
 
 
-def run_live(service: Service, arriving: list[Sample]) -> list[tuple[Any, ...]]:
-    """Plays samples in the order of arrival at a pace, polling as a service does, until the last fit is back."""
+def run_live(service: Service, arriving: list[Block]) -> list[tuple[Any, ...]]:
+    """Plays blocks in the order of arrival at a pace, polling as a service does, until the last fit is back."""
     out: list[tuple[Any, ...]] = []
 
     def step() -> None:
@@ -181,12 +170,12 @@ def run_live(service: Service, arriving: list[Sample]) -> list[tuple[Any, ...]]:
     while not service.ready:
         step()
         time.sleep(0.02)
-    begin, first = time.monotonic(), arriving[0].t
-    for k, sample in enumerate(arriving):
-        service.push(sample)
+    begin, first = time.monotonic(), arriving[0].t[0]
+    for k, block in enumerate(arriving):
+        service.push(block)
         if k % 20 == 0:
             step()
-            time.sleep(max(begin + (sample.t - first) / PACE - time.monotonic(), 0.0))
+            time.sleep(max(begin + (block.t[0] - first) / PACE - time.monotonic(), 0.0))
     while service.session.running is not None or service.session.status().backlog > 1.0:
         step()
         time.sleep(0.002)
@@ -197,8 +186,8 @@ def repeatability(seconds: float, seed: int) -> dict[str, Any]:
     """Estimates of a live run and of its replay: how many, and whether all are the same to the bit."""
     flight = flown(seconds, seed)
     rng = np.random.default_rng(seed)
-    every = list(samples(flight.recording))
-    arrival = [s.t + DELAYS.get(s.channel, 0.0) + rng.exponential(0.02) for s in every]
+    every = [block.part(k, k + 1) for block in stream(flight.recording) for k in range(len(block.t))]
+    arrival = [b.t[0] + DELAYS.get(b.columns[0][0], 0.0) + rng.exponential(0.02) for b in every]
     arriving = [every[i] for i in np.argsort(arrival, kind="stable")]
     settings = SessionSettings()
     live_service = Service(PELICAN, settings, ProcessWorker(PELICAN))

@@ -19,8 +19,8 @@ from itertools import chain, takewhile
 from pathlib import Path
 from typing import Any
 
-from quadid_node.messages import Output, set_to_dict
-from quadid_node.recording import stream
+from quadid_node.messages import set_to_dict
+from quadid_node.recording import play, stream
 from quadid_node.service import Service
 from quadid_node.settings import session_settings
 from quadid_node.worker import InlineWorker
@@ -28,7 +28,7 @@ from quadid_replay import open_log
 from quadid_replay.tlog import read_frames
 
 from quadid.app.logs import load_vehicle
-from quadid.data.window import Sample
+from quadid.data.window import Block
 from quadid.online import Event, Phase, Publish
 from quadid_evaluation.harness import QUADID, free_port, options, put, table
 from quadid_evaluation.studies.readings import telemetry
@@ -225,8 +225,6 @@ def _send(log: Path, wire: socket.socket, port: int, seconds: float) -> None:
 
 TITLE = "Flights of real autopilots, online"
 COMMAND = "make autopilot"
-BATCH = 200
-"""Samples between two looks at the session."""
 
 
 def main() -> None:
@@ -260,12 +258,7 @@ def flown(one: Flown, data: Path, live: bool, seconds: float) -> Outcome:
     if one.interval:
         recording = telemetry(recording, one.interval, one.pulses)
     service = Service(vehicle, session_settings("auto", seed=0), InlineWorker())
-    outputs: list[Output] = []
-    for count, sample in enumerate(until(stream(recording), seconds)):
-        service.push(sample)
-        if count % BATCH == 0:
-            outputs += _worked(service)
-    outputs += _worked(service)
+    outputs = play(service, until(stream(recording), seconds))
     sets: dict[str, list[dict[str, Any]]] = {"parameters": [], "candidate": []}
     for output in outputs:
         if isinstance(output, Publish):
@@ -276,18 +269,10 @@ def flown(one: Flown, data: Path, live: bool, seconds: float) -> Outcome:
     return Outcome(sets["parameters"], sets["candidate"], events, said, time.monotonic() - begin)
 
 
-def _worked(service: Service) -> list[Output]:
-    """Steps until the session needs more samples."""
-    out = service.step()
-    while service.session.running is not None:
-        out += service.step()
-    return out
-
-
-def until(samples: Iterator[Sample], seconds: float) -> Iterator[Sample]:
+def until(blocks: Iterator[Block], seconds: float) -> Iterator[Block]:
     """The first `seconds` of a stream."""
-    first = next(samples)
-    return chain([first], takewhile(lambda s: s.t - first.t <= seconds, samples))
+    first = next(blocks)
+    return chain([first], takewhile(lambda b: b.t[0] - first.t[0] <= seconds, blocks))
 
 
 def row(one: Flown, done: Outcome) -> list[str]:

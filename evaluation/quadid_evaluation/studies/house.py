@@ -14,13 +14,18 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from functools import cache
 from pathlib import Path
 from types import FrameType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from quadid_evaluation.harness import options
+
+if TYPE_CHECKING:
+    from quadid.vehicle import Vehicle
+
+Follow = AbstractContextManager[set[str] | None]
 
 ROOT = Path(__file__).resolve().parents[3]
 RECORDED = ROOT / "docs" / "results" / "house.json"
@@ -98,21 +103,24 @@ def walks() -> dict[str, list[str]]:
     import quadid
     from quadid.flight import fly
 
+    vehicle = quadid.Vehicle.shipped("pelican")
     with tempfile.TemporaryDirectory() as folder:
         log = Path(folder) / "flight.mcap"
-        write_mcap(log, fly(quadid.Vehicle.shipped("pelican"), seconds=SECONDS, seed=5).recording, EPOCH * 10**9)
+        write_mcap(log, fly(vehicle, seconds=SECONDS, seed=5).recording, EPOCH * 10**9)
         out: dict[str, list[str]] = {}
         for follow in (nullcontext, _followed):  # the first time round kernels are compiled, which nobody is to watch
             with follow() as row:
-                quadid.identify(log, vehicle="pelican").to_json()
-            with follow() as message:
-                _fly_through(log, Path(folder))
-            out = {"imu message": sorted(message or ()), "log row": sorted(row or ())}
+                quadid.identify(log, vehicle=vehicle).to_json()
+            message = _fly_through(log, vehicle, Path(folder), follow)
+            out = {"imu message": sorted(message), "log row": sorted(row or ())}
         return out
 
 
-def _fly_through(log: Path, folder: Path) -> None:
-    """Gives the messages of a log to the service, as the node does, until a set is published."""
+def _fly_through(log: Path, vehicle: Vehicle, folder: Path, follow: Callable[[], Follow]) -> set[str]:
+    """Gives the messages of a log to the service, as the node does, until a set is published; returns files crossed.
+
+    What reads the log and opens service and history is not on a message's way.
+    """
     from mcap_ros2._dynamic import generate_dynamic
     from quadid_node.history import Store
     from quadid_node.inputs import Chooser, Decoder, Intake, best_ranks, source
@@ -120,15 +128,14 @@ def _fly_through(log: Path, folder: Path) -> None:
     from quadid_node.worker import InlineWorker
     from quadid_replay.mcap_file import McapFile
 
-    import quadid
     from quadid.online import SessionSettings
     from quadid_node import messages
 
-    vehicle = quadid.Vehicle.shipped("pelican")
     file, inputs = McapFile(log), {entry.topic: entry for entry in source("canonical").inputs}
+    topics = file.topics
     stamps, chooser = [0.0], Chooser(best_ranks(list(inputs.values())))
     intake, arrived = Intake(lambda: stamps[0]), dict[str, list[bytes]]()
-    for topic in file.topics.values():
+    for topic in topics.values():
         entry = inputs[topic.name]
         decode = generate_dynamic(topic.type, topic.definition)[topic.type]
         arrived[topic.name] = []
@@ -138,19 +145,21 @@ def _fly_through(log: Path, folder: Path) -> None:
     service = Service(
         vehicle, SessionSettings(), InlineWorker(), Store(folder / f"{time.monotonic_ns()}.db", vehicle.name)
     )
+    recorded = list(file.messages(topics.keys()))
     try:
-        for n, (number, nanoseconds, data) in enumerate(file.messages(file.topics.keys())):
-            arrived[file.topics[number].name].append(data)
-            if n % BATCH:
-                continue
-            stamps[0] = nanoseconds * 1e-9 - EPOCH
-            for items in intake.read(intake.take()):
-                for item in items:
-                    service.push(item)
-            for output in [o for _ in range(5) for o in service.step()]:
-                if output.topic == "parameters":
-                    messages.RESULTS[output.topic].message(output, vehicle.name, service.boot_id)
-                    return
+        with follow() as crossed:
+            for n, (number, nanoseconds, data) in enumerate(recorded):
+                arrived[topics[number].name].append(data)
+                if n % BATCH:
+                    continue
+                stamps[0] = nanoseconds * 1e-9 - EPOCH
+                for items in intake.read(intake.take()):
+                    for item in items:
+                        service.push(item)
+                for output in [o for _ in range(5) for o in service.step()]:
+                    if output.topic == "parameters":
+                        messages.RESULTS[output.topic].message(output, vehicle.name, service.boot_id)
+                        return crossed or set()
     finally:
         service.close()
     raise RuntimeError(f"no set was published from {SECONDS:g} s of flight: nothing was followed to its end")

@@ -14,12 +14,13 @@ from typing import Any
 
 import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter, MerweScaledSigmaPoints, UnscentedKalmanFilter
+from quadid_node.recording import stream
 
 from quadid.data.window import Window
 from quadid.online import OnlineDiagnosis, Publish, Session
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
-from quadid_evaluation.benchmarks.online import CHANGE, CHANGE_AT, PELICAN, drive, flown, samples
+from quadid_evaluation.benchmarks.online import CHANGE, CHANGE_AT, PELICAN, drive, flown
 from quadid_evaluation.studies.truth import poor_guess
 
 NAMES = ("b", "d", "J_xx", "J_yy", "J_zz")
@@ -138,11 +139,11 @@ def _session(seed: int) -> tuple[FloatArray, float, float]:
     flight = flown(SECONDS + 1.0, seed)
     truth: Mapping[str, float] = flight.truth.parameters.as_dict()
     begin = time.process_time()
-    actions = list(drive(Session(poor_guess(PELICAN, truth, seed)), samples(flight.recording)))
+    actions = list(drive(Session(poor_guess(PELICAN, truth, seed)), stream(flight.recording)))
     cost = (time.process_time() - begin) / SECONDS
     last = [a.item for a in actions if isinstance(a, Publish) and a.topic == "candidate"][-1].parameters
     changed = flown(CHANGE_AT + 12.0, seed, mass_change={"time": CHANGE_AT, "fraction": CHANGE})
-    found = [a for a in drive(Session(PELICAN), samples(changed.recording)) if isinstance(a, OnlineDiagnosis)]
+    found = [a for a in drive(Session(PELICAN), stream(changed.recording)) if isinstance(a, OnlineDiagnosis)]
     named = [a for a in found if a.findings and a.findings[0].effect == "mass_change"]
     after = named[0].t - CHANGE_AT if named else float("nan")
     return np.log([last[n].value / truth[n] for n in NAMES]), after, cost
