@@ -1,6 +1,6 @@
 """Forty mistakes and more: how each is made, and what the first line that a person sees must name.
 
-python -m tests.cli.mistakes > docs/mistakes.md
+python -m tests.cli.mistakes > docs/results/mistakes.md
 """
 
 from __future__ import annotations
@@ -374,7 +374,7 @@ def _around(text: str, names: str) -> str:
 
 
 def page() -> str:
-    """The table of docs/mistakes.md."""
+    """The table of docs/results/mistakes.md."""
     head = [
         "# Mistakes and their first line", "",
         "Written by `python -m tests.cli.mistakes`; a test makes each mistake. Lines begin with `quadid:` and the log "

@@ -1,4 +1,4 @@
-"""Every mistake is answered with one line that names it, and docs/mistakes.md shows these lines."""
+"""Every mistake is answered with one line that names it, and docs/results/mistakes.md shows these lines."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def test_the_first_line_names_the_mistake(mistake: Mistake, place: Place, monkey
 
 
 def test_the_page_lists_every_mistake(repository: Path) -> None:
-    text = (repository / "docs" / "mistakes.md").read_text(encoding="utf-8")
+    text = (repository / "docs" / "results" / "mistakes.md").read_text(encoding="utf-8")
     rows = dict(re.findall(r"^\| (.+?)(?: \*)? \| `(.+)` \|$", text, re.M))
     assert list(rows) == [m.what for m in MISTAKES]
     for mistake in MISTAKES:
