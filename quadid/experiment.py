@@ -153,7 +153,6 @@ class AsLogged:
             simulator: what is believed of the vehicle, with the noise that was found.
             recording: a log of the vehicle; each channel will come as often as there.
             rate: of its grid [Hz].
-            windows: of all logs so far.
             theta: parameters identified from them, shape (L,).
         """
         vehicle = simulator.vehicle
@@ -219,11 +218,7 @@ def design_manoeuvre(
     """Chooses a manoeuvre of about `seconds` and predicts what it would give.
 
     Args:
-        simulator: what is believed of the vehicle.
         known: information there already is, prior included, shape (P, P).
-        limits: largest tilt and rate.
-        seconds: length of the manoeuvre.
-        advance: called with the progress.
 
     Raises:
         NotIdentifiableError: no movement stays within the limits.
@@ -260,11 +255,6 @@ def design_manoeuvre(
 
 def one_axis_at_a_time(simulator: TrialFlights, limits: Limits, seconds: float) -> tuple[Segment, ...]:
     """Sweeps of roll, pitch, yaw and throttle one after the other, as large as the limits allow.
-
-    Args:
-        simulator: what is believed of the vehicle.
-        limits: largest tilt and rate.
-        seconds: of all together.
 
     Returns:
         None where there is too little time for two swings of the lowest frequency.

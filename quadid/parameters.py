@@ -138,8 +138,6 @@ class ParameterSet:
         drawn with no width.
 
         Args:
-            n: number of draws.
-            seed: decides them.
             floor: least relative standard deviation of a parameter that is not identified.
 
         Returns:

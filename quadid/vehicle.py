@@ -263,7 +263,6 @@ def impossible_size(mass: float, arm: float) -> str:
     """Says which unit a mass [kg] or an arm [m] seems to be in; empty for what can fly.
 
     Args:
-        mass: of the vehicle.
         arm: mean horizontal distance of the rotors from the centre.
     """
     if _fits(mass, arm):

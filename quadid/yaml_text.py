@@ -37,7 +37,6 @@ def read_mapping(text: str, origin: str, wanted: str = "a YAML mapping") -> dict
     """Returns the mapping that a YAML text holds; numbers are decimal, all else is text.
 
     Args:
-        text: the YAML.
         origin: name of the file, for errors.
         wanted: what the mapping should hold, for errors.
 

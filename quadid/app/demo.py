@@ -44,9 +44,6 @@ def run(seconds: float, seed: int, folder: Path, advance: Advance) -> Shown:
 
     Args:
         seconds: length of each of the three flights.
-        seed: of flights and searches.
-        folder: for logs and vehicle files.
-        advance: told how far it is.
     """
     from quadid.flight import TruthParameters
 

@@ -334,7 +334,6 @@ def made_into_plan(vehicle: str, proposal: Proposal, tilt: float, height: tuple[
 
 
 def _result(vehicle: str, proposal: Proposal, tilt: float, rate_limit: float) -> dict[str, Any]:
-
     rows = zip(NOMINAL_NAMES, proposal.now, proposal.pilot, proposal.after, proposal.swept, strict=True)
     worst = int(np.argmax(proposal.pilot))
     return {

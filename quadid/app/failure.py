@@ -29,12 +29,8 @@ def failure_html(
     """The page as HTML.
 
     Args:
-        error: why there is no answer.
         what: what was asked for, for the title.
         texts: logs as they were given.
-        vehicle: whose they are.
-        preset: topic names of ROS logs.
-        command: as it was typed.
     """
     rows, sections = provenance([], command), list[JsonDict]()
     missing = []

@@ -403,7 +403,6 @@ def airframe_picture(
     """SVG of the airframe, nose up.
 
     Args:
-        vehicle: geometry.
         load: each rotor's share of the commanded load in the flights in question.
         baseline: the same of healthy flights.
         changes: entries of ``quadid.health/1``.

@@ -382,8 +382,6 @@ def proven(
     Values of a red fit become guesses without `sigma`.
 
     Args:
-        vehicle: with what was found.
-        verdict: on the result.
         sets: its scored logs, as in ``quadid.identify/1``.
         train: the logs that were fitted.
         beside: what acts beside its values; None keeps what its file has.

@@ -172,9 +172,7 @@ def flown_parts(recording: Recording, flying: Spans, cut: LogPart) -> Spans:
     A part that was asked for is used as it is.
 
     Args:
-        recording: the whole log.
         flying: when it flies [s, in the time of the recording].
-        cut: the part that is asked for.
     """
     from quadid.checks import proposed_cuts
 
@@ -426,8 +424,6 @@ def check_conventions(recording: Recording, vehicle: Vehicle, cut: LogPart) -> C
     """Checks that a log means what its reader and the vehicle file believe, before anything is fitted to it.
 
     Args:
-        recording: the whole log.
-        vehicle: whose log it is.
         cut: the part that is asked for; an error about a whole log proposes what is in the air.
 
     Raises:

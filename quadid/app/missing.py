@@ -115,7 +115,6 @@ class MissingForces:
         Terms are kept where they take a part of what is missing off flights that were not fitted.
 
         Args:
-            vehicle: the file.
             terms: whether they are looked for.
         """
         from quadid.estimate.missing import random_forces, removed
@@ -266,12 +265,8 @@ def compared(
     gyro or the accelerometer, or a model has no finite answer.
 
     Args:
-        train: logs that were fitted.
-        held: logs that were not.
-        vehicle: geometry and mass.
         models: parameter vectors by name, the nominal one first.
         guesses: vectors by name of which only errors are asked.
-        advance: called with a stage and a share done.
 
     Returns:
         Missing force and moment; by log, training logs first, the mean square of whitened innovations of every vector.

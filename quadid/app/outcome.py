@@ -93,7 +93,6 @@ class Outcome(ABC):
         """Writes the files of the command and names them in `result`.
 
         Args:
-            folder: for the files.
             kept: vehicle file that was read, which is not overwritten.
 
         Returns:

@@ -215,8 +215,6 @@ def coverage(
     """Shares of outcomes inside the predicted bands by horizon and quantity, and what the bands rest on.
 
     Args:
-        logs: the logs.
-        vehicle: the vehicle.
         theta: its full parameter vector.
         wanted: samples ahead.
         closed_loop: simulate with the autopilot in the loop instead of taking the logged rotor speeds.

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from quadid.app.kernels import prepare
+from quadid.app.kernels import FIT, prepare
 from quadid.app.logs import OutputError, make_folder, write_text
 from quadid.app.outcome import Advance, Outcome, json_text, silent
 from quadid.errors import QuadidError
@@ -55,7 +55,7 @@ def warn(messages: tuple[str, ...] | list[str]) -> None:
 
 
 @contextmanager
-def progress(compiled: Sequence[str] = ("simulation", "statistics", "estimate")) -> Iterator[Advance]:
+def progress(compiled: Sequence[str] = FIT) -> Iterator[Advance]:
     """Shows a progress bar on stderr while the block runs, if stderr is a terminal; yields how to advance it.
 
     Args:
@@ -175,8 +175,6 @@ def conclude(
     """Writes what a command gives beside what it prints, names that in its JSON, and prints the result.
 
     Args:
-        done: the result; its warnings go to stderr.
-        json: where its JSON goes, as `write_json`.
         series: folder for measured, simulated and missing over time.
         kept: vehicle file that was read, which is not overwritten.
     """

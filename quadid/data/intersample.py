@@ -58,10 +58,6 @@ class Feedback(NamedTuple):
 def follow_feedback(windows: Sequence[Window], vehicle: Vehicle) -> tuple[list[Window], str]:
     """Gives the rotor speeds of a log the slope within each sample that feedback makes.
 
-    Args:
-        windows: of one log.
-        vehicle: where its rotors are; its stabiliser, where known.
-
     Returns:
         The windows with `rotor_slope`, and a sentence for people; the same windows and "" without evidence.
     """

@@ -142,7 +142,6 @@ def rotor_wrench(omega: FloatArray, efficiency: FloatArray, changed: int, body: 
         omega: rotor speeds, shape (n,) [rad/s].
         efficiency: factor on thrust (column 0) and drag torque (column 1) of each rotor, shape (n, 2).
         changed: 0 before, 1 after `mass_change`.
-        body: geometry.
         out: sum of speeds [rad/s], thrust along -z [N], roll, pitch, yaw torque about the CG [N m], Omega_r [rad/s].
     """
     total = thrust = roll = pitch = yaw = spin_sum = 0.0
@@ -178,8 +177,6 @@ def hub_forces(
         velocity: of the CG relative to the air, body axes [m/s].
         rates: of the body [rad/s].
         changed: 0 before, 1 after `mass_change`.
-        body: mass and geometry.
-        air: aerodynamics.
     """
     fx = fy = fz = roll = pitch = yaw = 0.0
     drag_reach, axial_reach = air.drag_reach, air.axial_reach
@@ -230,10 +227,6 @@ def derivative(
         changed: 0 before, 1 after `mass_change`; selects the inertia.
         push: outside disturbance: specific force in world axes [m/s^2], angular acceleration and specific force in
             body axes [rad/s^2], [m/s^2].
-        body: mass and geometry.
-        air: aerodynamics.
-        odd: effects outside the catalogue.
-        dy: derivative, written.
     """
     r00, r01, r02, r10, r11, r12, r20, r21, r22 = y[6], y[7], y[8], y[9], y[10], y[11], y[12], y[13], y[14]
     p, q, r = y[15], y[16], y[17]

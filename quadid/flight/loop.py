@@ -211,10 +211,8 @@ def supply(t: float, omega: FloatArray, hover: float, events: Events) -> float:
     """Supply voltage over its mean in hover at time t [s]: it falls in a straight line and dips with the rotors' power.
 
     Args:
-        t: time [s].
         omega: rotor speeds [rad/s].
         hover: hover speed [rad/s]; power goes with the cube of speed.
-        events: span of the flight.
     """
     part, load = (t - events.sag_start) / (events.sag_end - events.sag_start), 0.0
     for i in range(omega.shape[0]):
@@ -288,19 +286,11 @@ def fly_on(
     """Flies from time `left` to `end` [s], cut wherever something jumps: commands, ramps, mass, thrust.
 
     Args:
-        left: time at the start [s].
-        end: time at the end [s].
         issued: number of commands given so far.
-        progress: what has happened on the way.
         commands: (at least issued, n) [rad/s].
         arrival: when each reaches the rotors [s], non-decreasing.
         efficiency: factors on thrust and drag torque, shape (n, 2).
         push: disturbance, see `airframe.derivative`.
-        body: mass and geometry.
-        air: aerodynamics.
-        odd: effects outside the catalogue.
-        drive: from command to rotor speed.
-        events: what happens at some time.
         y: state, shape (33,); in place.
         rotors: in place.
     """

@@ -44,14 +44,6 @@ def march(
     """Flies the closed loop.
 
     Args:
-        plan: clock.
-        body: mass and geometry.
-        air: aerodynamics.
-        odd: effects outside the catalogue.
-        drive: from command to rotor speed.
-        events: what happens at some time.
-        on_board: sensor errors.
-        pilot: how firmly the vehicle is held in place.
         gains: of the stabiliser, see `pack_gains`.
         mixer: of the stabiliser, see `mixer_matrix`.
         sticks: shape (pilot instants, 4).

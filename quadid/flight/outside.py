@@ -369,7 +369,6 @@ def draw_outside(name: str, seed: int, scale: float = 1.0, vehicle: Vehicle | No
 
     Args:
         name: key of `OUTSIDE`.
-        seed: decides the draw.
         scale: multiplies those numbers that grow with the effect.
         vehicle: scales levers from a Pelican's; default a Pelican.
 

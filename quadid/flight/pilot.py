@@ -66,7 +66,6 @@ def fly_by_hand(
     """One look of the pilot: corrections plus stick movement give the references of the stabiliser.
 
     Args:
-        pilot: gains.
         position: world NED [m].
         velocity: world NED [m/s].
         attitude: rotation matrix, body to world.
@@ -134,8 +133,6 @@ def doublets(rng: np.random.Generator, n: int, every: float, width: tuple[float,
     """Doublets (up, then down) at random times, on average one in `every` seconds.
 
     Args:
-        rng: generator.
-        n: samples.
         every: mean distance [s].
         width: shortest and longest half doublet [s].
         size: amplitude, each scaled by 0.5..1 with random sign.

@@ -148,10 +148,6 @@ def advance(
         mass_factor: present mass / original mass.
         changed: 0 before, 1 after `mass_change`.
         push: outside disturbance, see `airframe.derivative`.
-        drive: from command to rotor speed.
-        body: mass and geometry.
-        air: aerodynamics.
-        odd: effects outside the catalogue.
         h: step [s].
         work: scratch, shape (at least 5, max(33, n)).
     """
@@ -198,7 +194,6 @@ def spin_up_kick(y: FloatArray, jump: float, changed: int, body: Body) -> None:
         y: state, in place.
         jump: change of Omega_r [rad/s].
         changed: selects the inertia.
-        body: constants.
     """
     impulse = body.spin_up * jump
     inverse = body.inverse[changed]

@@ -74,8 +74,6 @@ def draw_truth(vehicle: Vehicle, seed: int, spread: float = 0.15) -> TruthParame
     """Draws one individual of the vehicle's type.
 
     Args:
-        vehicle: type of the vehicle.
-        seed: decides the draw.
         spread: each of b, d, J_xx, J_yy, J_zz, J_r is uniform within (1 +- spread) of `TruthParameters.of`.
 
     Returns:
@@ -192,7 +190,6 @@ def draw_effect(
 
     Args:
         name: key of `quadid.effects.EFFECTS`.
-        seed: decides the draw.
         scale: multiplies the size (divides the cut-off of imu_lag); companions are not scaled.
         vehicle: scales lengths, inertias and speeds from a Pelican's; default a Pelican.
         seconds: length of the flight, for effects that happen at a time (30 to 70 % of it).
@@ -421,8 +418,6 @@ def prepare(
     """Builds the constants of a flight.
 
     Args:
-        vehicle: geometry.
-        truth: true parameters.
         effects: hidden effects, see `check_effects`.
         last: time of the last log row [s]; the battery sags until then.
         ramp: time the rotors take to reach a command [s]; 0 for held commands.

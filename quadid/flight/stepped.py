@@ -32,7 +32,6 @@ class SteppedFlight:
         """Begins level, at rest, in hover.
 
         Args:
-            vehicle: geometry.
             truth: true parameters; default `TruthParameters.of(vehicle)`.
             effects: hidden effects of the catalogue, name -> parameter -> value.
             height: above the ground [m].
@@ -81,7 +80,6 @@ class SteppedFlight:
 
         Args:
             command: rotor speeds [rad/s], shape (rotors,), held until the next.
-            dt: [s].
 
         Raises:
             ParameterError: a command of another shape or not finite, or a step that is not positive.

@@ -341,7 +341,6 @@ def step_in_air(need: Needs, dt: float, s: FloatArray) -> None:
     """One step of attitude, rate, velocity and position with the groups of effects that any lane needs.
 
     Args:
-        need: which parts of the model any lane needs.
         dt: step [s].
         s: rows; as in `quadid.model.kernel.step_core`.
     """

@@ -103,9 +103,7 @@ def _on_disk(sources: int) -> Any:
             lanes: how many of the block's lanes are wanted.
             geometry: (rotors, 4), see `rotor_kernel.Drive`.
             terms: beyond the catalogue, (terms, 4), see `body_kernel.residual_forces`.
-            flight: numbers of the window.
             theta: parameter vectors (LANES, size).
-            need: which parts of the model any lane needs.
             x0: state at the first row (13,).
             out: (n, OUTPUTS, LANES), written: rates, quaternion, mean specific force at each row.
         """

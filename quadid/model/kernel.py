@@ -201,8 +201,6 @@ def body_constants(theta: FloatArray, flight: Flight, rotors: int, s: FloatArray
 
     Args:
         theta: shape (LANES, size), see `quadid.model.layout`.
-        flight: numbers of the window.
-        rotors: number of rotors.
         s: rows, written.
     """
     for lane in range(LANES):

@@ -361,11 +361,6 @@ class Rollout:
         """Simulates as `roll` does, a few segments at a time, so that residuals are used while they are in cache.
 
         Args:
-            segments: the cut.
-            theta: parameter vectors, shape (m, size).
-            x0: initial states, as for `roll`.
-            dx: tangent offsets, as for `roll`.
-            n_pre: rows rolled before the first scored one.
             use: called with which segments, and their residuals (blocks, segments, length, channels, LANES), which
                 are overwritten afterwards; called from several threads.
         """

@@ -72,7 +72,6 @@ def compare(
         k: row of `measured` and `scale`.
         measured: (n, 16): gyro 3, quaternion 4, accel 3, velocity 3, position 3.
         scale: (n, channels), factor on each residual.
-        s: rows.
         out: (segments, rows, channels * LANES); the first nine channels are written.
     """
     lane_kernel()
@@ -220,9 +219,7 @@ def _on_disk(sources: int) -> Any:
         than that.
 
         Args:
-            drive: rotor input of the window.
             terms: beyond the catalogue, (terms, 4), see `body_kernel.residual_forces`.
-            flight: numbers of the window.
             table: moments that all lanes share, see `rotor_table`; not read unless `need.shared`.
             measured: (n, 16), see `compare`.
             scale: (n, channels), factor on residuals: 1 where measured, else 0; or weights.
@@ -232,7 +229,6 @@ def _on_disk(sources: int) -> Any:
             x0: initial state at start - n_pre, (segments, 13).
             theta: parameter vectors (LANES, size).
             dx: tangent offsets of the initial state (12, LANES).
-            need: which parts of the model any lane needs.
             channels: 9, 12 with velocity, 15 with position too.
             n_seg: scored rows a segment.
             sums: add up the cost of the residuals instead of writing them.

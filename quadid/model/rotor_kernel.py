@@ -172,7 +172,6 @@ def next_input(r: int, held: bool, sloped: bool, inv: float, rot: FloatArray, s:
     """Writes value at the start and slope of both pieces of rotor r's input, before and after it switches or bends.
 
     Args:
-        r: rotor.
         held: the input acts held, else linear between samples.
         sloped: a held input runs on within its samples.
         inv: 2 / dt [1/s].
@@ -301,7 +300,6 @@ def turn_rotor(
         sloped: a held input runs on within its samples.
         geometry: see `Drive`.
         dt: step [s].
-        need: which parts of the model any lane needs.
         rot: rows of the rotors, advanced in place.
         s: rows; moments written.
     """
@@ -358,9 +356,6 @@ def rotors_step(drive: Drive, k: int, need: Needs, rot: FloatArray, s: FloatArra
     """Advances all rotors over step k, from t_k to t_k+1, and sums their moments for both half steps.
 
     Args:
-        drive: input of the window.
-        k: step.
-        need: which parts of the model any lane needs.
         rot: rows of the rotors, (rotors, ROTOR), advanced in place.
         s: rows; moments of both half steps written.
     """
@@ -391,8 +386,6 @@ def _on_disk(sources: int) -> Any:
         """Moments of every step of a window for lanes that share all that acts on rotors.
 
         Args:
-            drive: input of the window.
-            need: which parts of the model the lanes need.
             theta: the same parameter vector in every lane, (LANES, size).
             table: (n, 2 * ALL_MOMENTS), written: moments of the first, then of the second half step.
         """

@@ -253,7 +253,6 @@ class Frame:
         """Takes the vehicle's geometry.
 
         Args:
-            vehicle: as read from a file.
             span: length of the flight [s], over which `battery_sag` takes its share.
 
         Raises:

@@ -83,7 +83,6 @@ class ActiveSet:
         """Puts a set in force.
 
         Args:
-            item: the set.
             by: who approved it.
             t: now, as a stamp [s].
             stop: end of the data it rests on [s, session time].

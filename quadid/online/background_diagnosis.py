@@ -97,7 +97,6 @@ class BackgroundDiagnosis:
         """The next question, if it is time for one.
 
         Args:
-            number: of the job.
             tick: now [s].
             since: data before this belong to another vehicle [s].
         """

@@ -239,8 +239,6 @@ def judge(cut: WindowCut, vehicle: Vehicle, thrust: ThrustModel, known: bool) ->
     """Judges the windows of one fit.
 
     Args:
-        cut: stretches on the grid.
-        vehicle: the vehicle.
         thrust: of the rotors, by the best estimate at hand.
         known: whether it was identified or is a guess.
     """
@@ -300,8 +298,6 @@ def mistake(cut: WindowCut, vehicle: Vehicle, known: bool) -> str:
     """Names the wrong unit or frame, or the wrong order of rotors, that would be fitted into the parameters.
 
     Args:
-        cut: stretches on the grid.
-        vehicle: the vehicle.
         known: whether it was identified: then its rotors are in order.
 
     Returns:

@@ -432,8 +432,6 @@ def flexible_fit(
     """Fits everything.
 
     Args:
-        windows: data.
-        vehicle: the vehicle.
         nominal: prior of the nominal six.
         theta: start, full vector.
         noise: None lets the fit find it, all structure that remains counted as noise.

@@ -438,9 +438,7 @@ class Estimator:
         """The case for the gate, without what speaks against the sensors.
 
         Args:
-            parameters: the estimate.
             request: of the newest fit.
-            reply: its answer.
             sets: what was published before.
             windows: whose agreement is asked for.
         """

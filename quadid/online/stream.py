@@ -162,7 +162,6 @@ class ChannelBuffer:
 
         Args:
             oldest: earlier samples [s] are too late.
-            before: see above.
             since: what came before the stream had passed this [s] belongs to an earlier stretch, and is not late.
         """
         chunks = self._take(before)
@@ -271,7 +270,6 @@ class CommandReconstruction:
         """Computes commands up to a time.
 
         Args:
-            buffers: samples by channel.
             until: time [s] up to which all samples are there.
             forget: commands before this time [s] are dropped.
         """

@@ -54,7 +54,6 @@ def channel_figures(
     """Measured and simulated outputs of one log, one figure a group of channels: the whole log and its liveliest part.
 
     Args:
-        scored: the log with both scores.
         prefix: makes the figures' identifiers unique.
         logs: number of logs that share the page.
         labels: what the two simulations are called.
@@ -284,7 +283,6 @@ def gain_figure(finding: Mapping[str, Any], floor: float, identifier: str) -> Js
     Args:
         finding: of the form ``quadid.diagnose/1``.
         floor: noise floor in the same measure.
-        identifier: of the figure.
     """
     title = finding["effect"].replace("_", " ")
     rows = [("without it", finding["gain"]["mse_before"], "before"), (title, finding["gain"]["mse_after"], "after")]
@@ -318,7 +316,6 @@ def channel_plot(scored: ScoredSet, group: str = "rates", labels: tuple[str, str
     """Measured and simulated outputs of one log as a ``plotly.graph_objects.Figure``.
 
     Args:
-        scored: the log with both scores.
         group: one of `figures.GROUPS`.
         labels: what the two simulations are called.
 

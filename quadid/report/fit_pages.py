@@ -80,8 +80,6 @@ def flight_section(recording: Recording, vehicle: Vehicle, place: int) -> dict[s
 
     Args:
         recording: as read, each channel at its own rate.
-        vehicle: whose log it is.
-        place: of the log among those of the page.
     """
     spans = flying_spans(recording, vehicle)
     drawn, said = _vibration(recording, vehicle, spans, f"log{place}-vibration") if spans else (None, "")
@@ -243,9 +241,7 @@ def identify_page(
     Args:
         result: of the form ``quadid.identify/1``.
         sets: the scored logs in the order of ``result["sets"]``.
-        noise: estimated sensor noise.
         quality: a part of the page for each log.
-        provenance: rows of name and value.
         truth: true parameters, where a simulation knows them.
         missing: of `missing_section`.
         more: sections below the parameters.
@@ -277,8 +273,8 @@ def _subtitle(result: Json) -> str:
 _APPLIED = "Nothing has been applied to any vehicle. The interval is where the value lies in 95 of 100 such flights."
 _PREDICTION = (
     "The simulation runs for one second at a time from an estimated start, then is compared with the measurement. "
-    "Error: mean squared residual over that of pure sensor noise, so 1 is the best that any model can reach. Fit: 100 "
-    "% follows every move, 0 % is no better than the mean; what is mostly noise cannot come near 100 %."
+    "Error: mean squared difference from prediction over what the model expects, so at 1 it is right about its own "
+    "errors. Fit: 100 % follows every move, 0 % is no better than the mean; mostly noise, it cannot come near 100 %."
 )
 _KEYS = (
     "Drag to zoom, double-click to come back, click a name to hide it. With the keyboard: + and − zoom, ← and → move, "
@@ -477,8 +473,6 @@ def diagnosis_part(
         result: of the form ``quadid.diagnose/1``.
         sets: logs scored without (`initial`) and with (`fitted`) the findings.
         prefix: makes identifiers of figures unique on the page.
-        title: heading, where a page holds several.
-        intro: sentence below it.
         maps: what each cause looks like in the residual, by name of the effect.
         missing: of `missing_section`, whose figures are shown.
         judged: with its verdict.

@@ -88,7 +88,6 @@ def written_as(plan: Plan, form: str, hover_throttle: float) -> dict[str, str]:
     """Texts of a form by the end of their file names.
 
     Args:
-        plan: the manoeuvre.
         form: of `FORMS`.
         hover_throttle: share of full throttle at hover.
 

@@ -89,11 +89,9 @@ def residual_map(
 
     Args:
         windows: flight; its first `MOST_SECONDS` are used.
-        vehicle: geometry and mass.
         theta: full parameter vector with the cause, shape (size,).
         effect: name of the cause.
         names: its entries of the vector, as ``motor_lag.tau``.
-        noise: sensor noise.
 
     Returns:
         The map, against time only where nothing else of the equation is known; None where the flight lacks the
@@ -172,7 +170,6 @@ def _in_the_air(window: Window, rows: IndexArray, start: FloatArray, n_pre: int)
     """Heading, and body velocity: measured, else from the velocity fitted at each start and the accelerometer.
 
     Args:
-        window: the data.
         rows: of the samples, (segments, length).
         start: fitted velocity `n_pre` rows before each segment [m/s], (segments, 3).
         n_pre: rows between the start and the segment.

@@ -117,7 +117,6 @@ def _put(text: str, width: int, right: bool) -> str:
 
 
 def _folded(text: str, width: int) -> Sequence[str]:
-
     return textwrap.wrap(text, max(width, 20)) or [""]
 
 

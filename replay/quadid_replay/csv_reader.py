@@ -40,7 +40,6 @@ def read_csv(path: Path, columns: Mapping[str, str] | None = None) -> Recording:
     """Reads a CSV log.
 
     Args:
-        path: the file.
         columns: names in this file for those of the contract, such as ``{"p": "gyro_x"}``.
 
     Raises:

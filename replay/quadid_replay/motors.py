@@ -154,10 +154,8 @@ def motor_outputs(
     output is used.
 
     Args:
-        parameters: of the autopilot, by name.
         rotors: how many the vehicle has; 0 for unknown.
         width: how many outputs the message holds.
-        message: its name.
         ardupilot: whether it is an ArduPilot, be none of these parameters known.
     """
     ardupilot |= any(name.startswith("SERVO") and MOTOR_FUNCTION.fullmatch(name) for name in parameters)
@@ -202,10 +200,8 @@ def esc_columns(
     which more ESCs report; if both do alike, the version decides.
 
     Args:
-        parameters: of the autopilot, by name.
         rotors: how many the vehicle has; 0 for unknown.
         reporting: whether each ESC, from the first, ever reports a speed.
-        message: its name.
         ardupilot: whether it is an ArduPilot, be none of these parameters known.
         version: of ArduPilot, major and minor; None for unknown.
     """
@@ -310,7 +306,6 @@ def no_multirotor(parameters: Mapping[str, float], mav_type: int = 0, firmware: 
     """Says why a vehicle's outputs are not all rotors: it is a plane, a VTOL, a helicopter …; empty for a multirotor.
 
     Args:
-        parameters: of the autopilot, by name.
         mav_type: MAV_TYPE of its heartbeats; 0 for unknown.
         firmware: of ArduPilot, such as Copter or Plane; empty for unknown.
     """

@@ -43,7 +43,6 @@ class MessageReader:
     """Reads the messages of one topic.
 
     Args:
-        kind: their type.
         decode: the library's decoder: bytes to message.
     """
 

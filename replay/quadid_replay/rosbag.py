@@ -198,7 +198,6 @@ def read_mcap(path: Path, preset: str = AUTO) -> Recording:
     """Reads a ROS 2 log, whole or damaged: an MCAP file, a rosbag2 database or a rosbag2 folder.
 
     Args:
-        path: the file or folder.
         preset: key of `quadid_replay.presets.PRESETS`, or ``auto``.
 
     Raises:

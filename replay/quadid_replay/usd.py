@@ -61,10 +61,6 @@ class _Declared:
 def collect_usd_records(data: bytes, name: str) -> UsdRecords:
     """Reads all whole records.
 
-    Args:
-        data: the whole file.
-        name: file name, for errors.
-
     Raises:
         LogError: declarations that are damaged: without them no record can be read.
     """

@@ -42,7 +42,6 @@ def vehicle_text(recording: Recording, name: str, mass: float | None = None, arm
 
     Args:
         recording: a log; of an autopilot, with its parameters, for the airframe.
-        name: of the vehicle.
         mass: as it flies [kg]; without it a guess, marked to be filled in.
         arm: distance of the rotors from the centre [m], where the autopilot does not store it.
 

@@ -275,7 +275,6 @@ def write_recordings(
     """Writes recordings to an open writer, in time order, each with its name before its topics; see `write_mcap`.
 
     Args:
-        writer: open.
         recordings: by name.
         epoch_ns: added to recording time [ns].
         wrenches: by topic, times [s] and force [N] and moment [N m] in FRD, shapes (n,) and (n, 6).
@@ -404,10 +403,6 @@ _ROWS = 4096
 def write_csv(file: str | Path | BinaryIO, source: Source) -> None:
     """Writes a recording or windows to CSV: one row a time, cells empty where a channel has no sample.
 
-    Args:
-        file: path or binary stream.
-        source: what to write.
-
     Raises:
         LogError: nothing to write, or a file that cannot be written.
     """
@@ -462,10 +457,6 @@ _Messages = tuple[FloatArray, Callable[[int], list[Any]]]
 
 def write_tlog(file: str | Path | BinaryIO, source: Source) -> None:
     """Writes a recording or windows to a telemetry log.
-
-    Args:
-        file: path or binary stream.
-        source: what to write.
 
     Raises:
         LogError: nothing to write, times that boot clocks cannot tell, or a file that cannot be written.

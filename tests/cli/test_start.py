@@ -62,24 +62,19 @@ def test_a_fit_calls_what_was_compiled_and_nothing_else(flights: Flights, inside
 QUADID = Path(sys.executable).with_name("quadid")
 
 
-def test_settings_of_numba_that_lie_in_the_folder_are_refused(tmp_path: Path, happened: Happened) -> None:
+@pytest.mark.parametrize("command", [
+    (str(QUADID), "vehicles"), (sys.executable, "-P", "-m", "quadid_node.identify", "flight.mcap"),
+    (sys.executable, "-P", "-m", "quadid_node.replay_node", "flight.mcap"),
+])  # fmt: skip
+def test_settings_of_numba_that_lie_in_the_folder_are_refused(
+    tmp_path: Path, command: tuple[str, ...], happened: Happened
+) -> None:
     (tmp_path / ".numba_config.yaml").write_text("cache_dir: /tmp/somebody\n")
-    done = subprocess.run([QUADID, "vehicles"], cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert done.returncode == 2
-    assert ".numba_config.yaml in this folder" in done.stderr
-    assert done.stderr.count("\n") == 1
-    happened(34, f"a .numba_config.yaml in the folder we stand in: '{done.stderr.strip()[:80]}'")
-
-
-@pytest.mark.parametrize("module", ["identify", "replay_node"])
-def test_so_does_the_ros_node(tmp_path: Path, module: str, happened: Happened) -> None:
-    (tmp_path / ".numba_config.yaml").write_text("cache_dir: /tmp/somebody\n")
-    command = [sys.executable, "-P", "-m", f"quadid_node.{module}", "flight.mcap"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False, timeout=900)
     assert done.returncode == 2
     assert ".numba_config.yaml in this folder" in done.stderr
     assert done.stderr.count("\n") == 1
-    happened(34, f"the same before the ROS node's {module}: '{done.stderr.strip()[:80]}'")
+    happened(34, f"a .numba_config.yaml in the folder we stand in, {command[-2]}: '{done.stderr.strip()[:80]}'")
 
 
 def test_modules_that_lie_in_the_folder_are_not_imported(tmp_path: Path, happened: Happened) -> None:
@@ -143,17 +138,14 @@ def test_processes_of_libraries_do_not_import_from_it_either(planted: Path, path
     assert not (planted / "ran").exists()
 
 
-@pytest.mark.parametrize("lines", ["import quadid", "import quadid.vehicle", "import os, quadid.app.logs"])
-def test_a_library_refuses_settings_of_numba_too(tmp_path: Path, lines: str) -> None:
+@pytest.mark.parametrize(("start", "lines"), [
+    ("{here}", "import quadid"), ("{here}", "import quadid.vehicle"), ("{here}", "import os, quadid.app.logs"),
+    ("/", "import os, quadid\nos.chdir('{here}')\nimport quadid.model.kernel"),
+])  # fmt: skip
+def test_a_library_refuses_them_too_also_in_a_folder_that_it_changes_to(tmp_path: Path, start: str, lines: str) -> None:
     (tmp_path / ".numba_config.yaml").write_text("cache_dir: /tmp/somebody\n")
-    done = subprocess.run([sys.executable, "-c", lines], cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert "ImportError: .numba_config.yaml in this folder" in done.stderr
-
-
-def test_also_those_of_a_folder_that_it_changes_to(tmp_path: Path) -> None:
-    (tmp_path / ".numba_config.yaml").write_text("cache_dir: /tmp/somebody\n")
-    lines = f"import os, quadid\nos.chdir({str(tmp_path)!r})\nimport quadid.model.kernel"
-    done = subprocess.run([sys.executable, "-c", lines], cwd="/", capture_output=True, text=True, check=False)
+    where, code = (text.format(here=tmp_path) for text in (start, lines))
+    done = subprocess.run([sys.executable, "-c", code], cwd=where, capture_output=True, text=True, check=False)
     assert "ImportError: .numba_config.yaml in this folder" in done.stderr
 
 

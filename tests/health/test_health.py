@@ -50,15 +50,13 @@ def test_a_weak_rotor_is_named_with_its_loss(name: str, rotor: int) -> None:
     assert found.changes[0].confident
 
 
-def test_a_weak_rotor_of_a_hexacopter_is_named() -> None:
-    vehicle = Vehicle.shipped("hexacopter")
-    found = compared(vehicle, Wrong({2: 0.25}, {2: 0.25}), seed=5)
-    assert next(iter(changes_of(found))) == "weak_rotor 2"
-
-
-def test_two_weak_rotors_are_both_named() -> None:
-    found = compared(PELICAN_X, Wrong({1: 0.25, 2: 0.15}, {1: 0.25, 2: 0.15}), seed=6)
-    assert list(changes_of(found)) == ["weak_rotor 1", "weak_rotor 2"]
+@pytest.mark.parametrize(
+    ("name", "losses", "seed"), [("hexacopter", {2: 0.25}, 5), ("pelican_x", {1: 0.25, 2: 0.15}, 6)]
+)
+def test_weak_rotors_are_named_first(name: str, losses: dict[int, float], seed: int) -> None:
+    found = compared(Vehicle.shipped(name), Wrong(losses, losses), seed=seed)
+    assert list(changes_of(found))[: len(losses)] == [f"weak_rotor {rotor}" for rotor in losses]
+    assert len(losses) == 1 or len(found.changes) == len(losses)
 
 
 def test_a_flight_far_from_its_only_baseline_in_every_trim_is_not_called_unchanged() -> None:
@@ -132,21 +130,20 @@ def test_a_light_weight_on_an_arm_is_mostly_no_rotor() -> None:
     assert called.count("weak_rotor") <= 10
 
 
-def test_more_speed_in_the_same_balance_is_a_mass_or_else_thrust() -> None:
-    found = compared(PELICAN, Wrong(effort=0.15), seed=9)
-    (change,) = found.changes
-    assert change.effect == "mass_change"
-    assert change.rivals[0].effects == ("thrust_drop",)
-    assert change.parameters[0][2] == pytest.approx(0.14, abs=0.03)
-
-
-def test_more_command_in_the_same_balance_is_thrust_or_else_a_mass() -> None:
-    commanded = PELICAN.model_copy(update={"command": Command(kind="normalized", max_speed=900.0)})
-    found = compared(commanded, Wrong(effort=0.15), seed=9)
-    (change,) = found.changes
-    assert change.effect == "thrust_drop"
-    assert change.rivals[0].effects == ("mass_change",)
-    assert change.parameters[0][2] == pytest.approx(1.0 - 1.0 / 1.15, abs=0.03)
+@pytest.mark.parametrize(
+    ("command", "effect", "rival", "size"),
+    [
+        (PELICAN.command, "mass_change", "thrust_drop", 0.14),
+        (Command(kind="normalized", max_speed=900.0), "thrust_drop", "mass_change", 1.0 - 1.0 / 1.15),
+    ],
+)
+def test_more_effort_in_the_same_balance_is_a_mass_by_speed_and_thrust_by_command(
+    command: Command, effect: str, rival: str, size: float
+) -> None:
+    (change,) = compared(PELICAN.model_copy(update={"command": command}), Wrong(effort=0.15), seed=9).changes
+    assert change.effect == effect
+    assert change.rivals[0].effects == (rival,)
+    assert change.parameters[0][2] == pytest.approx(size, abs=0.03)
 
 
 def test_healthy_flights_are_left_alone() -> None:

@@ -73,22 +73,22 @@ def test_an_older_stamp_between_is_disorder() -> None:
     assert clock.stamped("attitude", 1.02, 0.002)[0] == ("esc", 1.006)
 
 
-def test_a_link_that_draws_out_the_messages_of_one_moment_does_not_delay_the_last_of_them() -> None:
+@pytest.mark.parametrize(
+    ("stamps", "came", "placed"),
+    [
+        # A link that draws out the messages of one moment does not delay the last of them.
+        (((1.0002, 5.0), (1.0, 5.010)), 5.0101, 1.0003),
+        # A stamp of an earlier moment tells nothing of the link.
+        (((1.0, 5.0), (0.9, 5.008)), 5.009, 1.009),
+    ],
+)
+def test_older_stamps_beside_do_not_move_a_message(
+    stamps: tuple[tuple[float, float], ...], came: float, placed: float
+) -> None:
     clock: BootClock[str] = BootClock()
-    clock.stamped("servo", 1.0002, 5.0)
-    clock.stamped("position", 1.0, 5.010)
-    clock.unstamped("esc", 5.0101)
-    clock.stamped("attitude", 1.0, 5.015)
+    for stamp, received in stamps:
+        clock.stamped("other", stamp, received)
+    clock.unstamped("esc", came)
     item, time = clock.stamped("next", 1.02, 5.02)[0]
     assert item == "esc"
-    assert time == pytest.approx(1.0003)
-
-
-def test_a_stamp_of_an_earlier_moment_tells_nothing_of_the_link() -> None:
-    clock: BootClock[str] = BootClock()
-    clock.stamped("servo", 1.0, 5.0)
-    clock.stamped("position of a while ago", 0.9, 5.008)
-    clock.unstamped("esc", 5.009)
-    item, time = clock.stamped("next", 1.02, 5.02)[0]
-    assert item == "esc"
-    assert time == pytest.approx(1.009)
+    assert time == pytest.approx(placed)
