@@ -19,7 +19,7 @@ from quadid.app.outcome import LIBRARY, Advance, Reported, provenance, silent
 from quadid.data.window import Window
 from quadid.errors import ParameterError
 from quadid.parameters import NOMINAL_NAMES
-from quadid.report.manoeuvres import Plan, check_form, half_width, written_as
+from quadid.report.manoeuvres import ManoeuvrePlan, check_form, half_width, written_as
 from quadid.report.page import axis, figure, rows_of, section, trace
 from quadid.report.tables import Cell, Column, TextTable
 from quadid.report.verdict import Verdict
@@ -59,7 +59,7 @@ class Proposed(Reported):
     result: dict[str, Any]
     proposal: Proposal
     manoeuvre: str
-    plan: Plan
+    plan: ManoeuvrePlan
     hover_throttle: float
     forms: tuple[str, ...] = ()
     logs: tuple[Log, ...] = ()
@@ -315,7 +315,9 @@ def propose(
     return Proposed(result, proposal, manoeuvre_file(believed.name, proposal), plan, hover, tuple(forms), tuple(given))
 
 
-def made_into_plan(vehicle: str, proposal: Proposal, tilt: float, height: tuple[float, float], battery: float) -> Plan:
+def made_into_plan(
+    vehicle: str, proposal: Proposal, tilt: float, height: tuple[float, float], battery: float
+) -> ManoeuvrePlan:
     """The manoeuvre with its envelope; raises ParameterError where it needs more height than there is."""
     sideways, up, down = proposal.room.tolist()
     if up + down > height[1] - height[0]:
@@ -330,7 +332,7 @@ def made_into_plan(vehicle: str, proposal: Proposal, tilt: float, height: tuple[
     }  # fmt: skip
     promises = (dict(zip(NOMINAL_NAMES, half.tolist(), strict=True)) for half in (proposal.after, proposal.swept))
     segments, sweeps = ([asdict(s) for s in part] for part in (proposal.segments, proposal.sweeps))
-    return Plan(vehicle, proposal.seconds, segments, sweeps, envelope, *promises)
+    return ManoeuvrePlan(vehicle, proposal.seconds, segments, sweeps, envelope, *promises)
 
 
 def _result(vehicle: str, proposal: Proposal, tilt: float, rate_limit: float) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from quadid.app import options
 
 if TYPE_CHECKING:
     from quadid_node.mavlink_link import MavlinkLink
-    from quadid_node.messages import Health, Output
+    from quadid_node.messages import Output, ServiceHealth
     from quadid_node.service import Service
     from rich.console import Console
 
@@ -58,9 +58,9 @@ def serve(
     json: options.JsonTarget = None,
 ) -> None:
     """Identify a flying vehicle over MAVLink; publish parameters, findings and health as component 191."""
-    from quadid_node.process import Stop
+    from quadid_node.process import StopSignal
 
-    stop = Stop()
+    stop = StopSignal()
     from quadid_node.ground import fit_worker
     from quadid_node.history import Store, default_path
     from quadid_node.mavlink_link import MavlinkLink, Outlet, run
@@ -107,7 +107,7 @@ class _Console:
         if item.topic == "event":
             self._console.print(f"{item.level:7} {item.text}", soft_wrap=True)
 
-    def report(self, health: Health) -> None:
+    def report(self, health: ServiceHealth) -> None:
         """A line when fits can begin, and one now and then about how things are."""
         if not self._ready and health.worker in ("idle", "busy"):
             self._ready = True

@@ -14,7 +14,7 @@ from quadid.errors import QuadidError
 from quadid.sanitise import plain
 
 if TYPE_CHECKING:
-    from quadid_node.zenoh import Fleet
+    from quadid_node.zenoh import FleetView
     from rich.table import Table
 
 REFRESH = 0.5
@@ -41,12 +41,12 @@ def watch(
     json: JsonTarget = None,
 ) -> None:
     """Show parameters with intervals, gate state and reason, findings and data rates of all vehicles, live."""
-    from quadid_node.zenoh import Fleet
+    from quadid_node.zenoh import FleetView
 
     from quadid.cli import terminal
 
     terminal.check_file(json, "--json")
-    fleet = Fleet(zenoh)
+    fleet = FleetView(zenoh)
     try:
         for vehicle, name in ((approve, "approve"), (rollback, "rollback")):
             if vehicle:
@@ -66,7 +66,7 @@ def watch(
         fleet.close()
 
 
-def _command(fleet: Fleet, vehicle: str, name: str) -> dict[str, Any]:
+def _command(fleet: FleetView, vehicle: str, name: str) -> dict[str, Any]:
     """Answer of the vehicle to a command that it carried out, of the form ``quadid.command/1``."""
     vehicle, _, number = vehicle.partition("=")
     sequence = int(number) if number.isdigit() else None
@@ -80,7 +80,7 @@ def _command(fleet: Fleet, vehicle: str, name: str) -> dict[str, Any]:
     return {"schema": "quadid.command/1", "vehicle": vehicle, "command": name, "text": plain(text)}
 
 
-def _live(fleet: Fleet, seconds: float, console: Any) -> None:
+def _live(fleet: FleetView, seconds: float, console: Any) -> None:
     from rich.live import Live
 
     end = time.monotonic() + seconds if seconds > 0.0 else float("inf")
@@ -90,7 +90,7 @@ def _live(fleet: Fleet, seconds: float, console: Any) -> None:
             live.update(table(snapshot(fleet)), refresh=True)
 
 
-def snapshot(fleet: Fleet) -> dict[str, Any]:
+def snapshot(fleet: FleetView) -> dict[str, Any]:
     """State of all vehicles now, of the form ``quadid.watch/1``."""
     names = sorted({*fleet.latest, *fleet.alive})
     return {

@@ -20,9 +20,9 @@ def worker(
     json: JsonTarget = None,
 ) -> None:
     """Fit windows on this machine for vehicles' services; they fit on board whenever this one is gone."""
-    from quadid_node.process import Stop
+    from quadid_node.process import StopSignal
 
-    stop = Stop()
+    stop = StopSignal()
     from quadid_node.ground import work
 
     from quadid.cli import terminal

@@ -205,7 +205,7 @@ OPTIONAL = ("attitude", "velocity", "position", "battery", "attitude_reference")
 
 
 @dataclass(frozen=True)
-class Track:
+class ChannelTrack:
     """One channel on its way to the grid; times strictly increase, `period` [s] is that of its samples."""
 
     t: FloatArray
@@ -230,16 +230,18 @@ class Track:
         return self.stretches[int(begin) : int(end)]
 
 
-class Plan(NamedTuple):
+class GridPlan(NamedTuple):
     """Grid step [s], whether fast channels are low-passed for it, tracks by channel, meaning of the rotor rows."""
 
     step: float
     filtered: bool
-    tracks: dict[str, Track]
+    tracks: dict[str, ChannelTrack]
     sampling: Sampling
 
 
-def make_plan(recording: Recording, t: FloatArray, speeds: FloatArray, sampling: Sampling, rate: float | None) -> Plan:
+def make_plan(
+    recording: Recording, t: FloatArray, speeds: FloatArray, sampling: Sampling, rate: float | None
+) -> GridPlan:
     """Prepares all channels; `t`, `speeds` [rad/s], `sampling`: rotor signal; `rate` [Hz]: None for the log's own."""
     raw = {"rotor_speed": (t, speeds)}
     for name in (*REQUIRED[1:], *OPTIONAL):
@@ -261,8 +263,8 @@ def make_plan(recording: Recording, t: FloatArray, speeds: FloatArray, sampling:
                 period = sample_period(times)
                 longest = longest_step(times, step) if len(times) > 1 else period  # stuck: there is no period
         cuts = tuple(split_stretches(times, longest, recording.breaks))
-        tracks[name] = Track(times, values, period, cuts, name == "rotor_speed" and sampling == "held")
-    return Plan(step, filtered, tracks, "instant" if filtered else sampling)
+        tracks[name] = ChannelTrack(times, values, period, cuts, name == "rotor_speed" and sampling == "held")
+    return GridPlan(step, filtered, tracks, "instant" if filtered else sampling)
 
 
 def longest_step(t: FloatArray, grid_step: float) -> float:
@@ -284,12 +286,12 @@ def _distinct(t: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray
     return t[keep], values[keep]
 
 
-def _is_filtered(track: Track, plan: Plan) -> bool:
+def _is_filtered(track: ChannelTrack, plan: GridPlan) -> bool:
     """A channel slower than the grid is not low-passed, but a staircase always is: it is known between its samples."""
     return plan.filtered and (track.held or track.period <= 1.1 * plan.step)
 
 
-def reach(track: Track, cut: slice, plan: Plan) -> tuple[float, float]:
+def reach(track: ChannelTrack, cut: slice, plan: GridPlan) -> tuple[float, float]:
     """Returns the first and last time [s] at which one stretch of a track can be read on the grid."""
     t = track.t[cut]
     if _is_filtered(track, plan):
@@ -297,7 +299,7 @@ def reach(track: Track, cut: slice, plan: Plan) -> tuple[float, float]:
     return float(t[0]), float(t[-1])
 
 
-def on_grid(name: str, track: Track, at: FloatArray, plan: Plan) -> FloatArray:
+def on_grid(name: str, track: ChannelTrack, at: FloatArray, plan: GridPlan) -> FloatArray:
     """Reads one channel at the grid times; NaN where nothing was measured."""
     out = np.full((len(at), track.values.shape[1]), np.nan)
     tolerance = COINCIDENT * plan.step
@@ -309,7 +311,7 @@ def on_grid(name: str, track: Track, at: FloatArray, plan: Plan) -> FloatArray:
     return out
 
 
-def _stretch_on_grid(name: str, track: Track, cut: slice, at: FloatArray, plan: Plan) -> FloatArray:
+def _stretch_on_grid(name: str, track: ChannelTrack, cut: slice, at: FloatArray, plan: GridPlan) -> FloatArray:
     t, values, step = track.t[cut], track.values[cut], plan.step
     filtered = _is_filtered(track, plan)
     if not filtered:
@@ -450,7 +452,7 @@ def grid_recording(
 
 
 def _report(
-    plan: Plan, rotor: RotorSignal, windows: list[Window], gaps: int, dropped: list[float], log_span: Span
+    plan: GridPlan, rotor: RotorSignal, windows: list[Window], gaps: int, dropped: list[float], log_span: Span
 ) -> GridReport:
     period = measured_period(rotor.t, rotor.values)
     slow = [
@@ -473,7 +475,7 @@ def _report(
     )
 
 
-def _spans(plan: Plan) -> list[Span]:
+def _spans(plan: GridPlan) -> list[Span]:
     """Returns the times [s] during which every required channel is there, cut at gaps and breaks."""
     spans: list[Span] = [(-math.inf, math.inf)]
     for name in REQUIRED:
@@ -497,7 +499,7 @@ def _common(one: Sequence[Span], other: Sequence[Span]) -> list[Span]:
     return out
 
 
-def _inside(plan: Plan, span: Span) -> Span:
+def _inside(plan: GridPlan, span: Span) -> Span:
     """Shrinks a span to where the low-pass, if there is one, has samples on both sides in every required channel."""
     a, b = span
     for name in REQUIRED:
@@ -507,7 +509,7 @@ def _inside(plan: Plan, span: Span) -> Span:
     return a, b
 
 
-def _grid_times(plan: Plan, a: float, b: float) -> FloatArray:
+def _grid_times(plan: GridPlan, a: float, b: float) -> FloatArray:
     """Returns the grid in [a, b]; its first point is a sample of the gyro, else of the rotor signal."""
     tolerance = COINCIDENT * plan.step
     t = plan.tracks["gyro" if "gyro" in plan.tracks else "rotor_speed"].t
@@ -517,7 +519,7 @@ def _grid_times(plan: Plan, a: float, b: float) -> FloatArray:
     return np.asarray(t[first] + plan.step * np.arange(math.floor((b - t[first] + tolerance) / plan.step) + 1))
 
 
-def _window(plan: Plan, at: FloatArray, name: str, log_span: Span) -> Window:
+def _window(plan: GridPlan, at: FloatArray, name: str, log_span: Span) -> Window:
     columns = {}
     for channel, track in plan.tracks.items():
         values = on_grid(channel, track, at, plan)

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from quadid.data.grid import GAP, OPTIONAL, REQUIRED, Plan, Track, on_grid, split_stretches, true_runs
+from quadid.data.grid import GAP, OPTIONAL, REQUIRED, ChannelTrack, GridPlan, on_grid, split_stretches, true_runs
 from quadid.data.window import Sampling, Window
 from quadid.types import BoolArray, FloatArray
 
@@ -40,7 +40,7 @@ class Rows:
     new_clock: bool = False
 
 
-def columns_on_grid(plan: Plan, at: FloatArray) -> Generator[None, None, dict[str, FloatArray]]:
+def columns_on_grid(plan: GridPlan, at: FloatArray) -> Generator[None, None, dict[str, FloatArray]]:
     """Reads the channels of a plan, one a piece; returns values by channel, NaN where nothing was measured.
 
     Optional channels that say nothing in these rows are left out.
@@ -60,7 +60,7 @@ def columns_on_grid(plan: Plan, at: FloatArray) -> Generator[None, None, dict[st
     return columns
 
 
-def _mended(track: Track, step: float) -> Track:
+def _mended(track: ChannelTrack, step: float) -> ChannelTrack:
     """The track with stretches joined where only a few packets of a fast stream were lost.
 
     They are no gap while samples come within two grid steps: the low-pass reaches over twice as far.

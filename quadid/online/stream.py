@@ -406,7 +406,7 @@ class _Stretch(NamedTuple):
     new_clock: bool
 
 
-class Column(NamedTuple):
+class Measured(NamedTuple):
     """Values of one channel, shape (n, columns), and which rows are measurements, shape (n,)."""
 
     values: FloatArray
@@ -437,7 +437,7 @@ class Resampler:
         self._columns = {name: (count or rotors) for name, (count, _) in CHANNELS.items()}
         self._buffers = {name: ChannelBuffer(count) for name, count in self._columns.items()}
         self._reconstruction = CommandReconstruction(vehicle)
-        self._early: deque[tuple[FloatArray, dict[str, Column]]] = deque(maxlen=MOST_EARLY)
+        self._early: deque[tuple[FloatArray, dict[str, Measured]]] = deque(maxlen=MOST_EARLY)
         self._apart: dict[str, tuple[int, int]] = {}
         self._leads = 0
         self._told: set[str] = set()
@@ -461,7 +461,7 @@ class Resampler:
             if a < b:  # messages whose gyro is of no use follow like all others
                 (self._lead if lead[a] else self._follow)(block.t[a:b], _part(columns, slice(a, b)))
 
-    def _measured(self, name: str, values: FloatArray) -> Column | None:
+    def _measured(self, name: str, values: FloatArray) -> Measured | None:
         """Values of a channel, and which rows are measurements; None for what is no such channel."""
         columns = self._columns.get(name)
         if columns is None:
@@ -484,9 +484,9 @@ class Resampler:
             usable = usable & unit
             odd = usable & (np.abs(norm - 1.0) > 1e-3)
             values = np.where(odd[:, None], values / np.where(odd, norm, 1.0)[:, None], values)
-        return Column(values, usable)
+        return Measured(values, usable)
 
-    def _lead(self, stamps: FloatArray, columns: Mapping[str, Column]) -> None:
+    def _lead(self, stamps: FloatArray, columns: Mapping[str, Measured]) -> None:
         """Takes messages with gyro, which move the clock one after the other."""
         room = MOST_SAMPLES - self._buffers[LEADER].waiting
         if len(stamps) > room:
@@ -515,7 +515,7 @@ class Resampler:
                 self.counts.subtract(list(followers[1]))
         self._take(columns, t, reached)
 
-    def _follow(self, stamps: FloatArray, columns: Mapping[str, Column]) -> None:
+    def _follow(self, stamps: FloatArray, columns: Mapping[str, Measured]) -> None:
         """Takes messages of other channels: none moves the clock."""
         if self.time.newest > -math.inf:
             t = self.time.follow(stamps)
@@ -529,7 +529,7 @@ class Resampler:
         if len(self._early) == MOST_EARLY:
             self._notice(LEADER, f"no gyro yet, while {', '.join(sorted(columns))} arrive; fix: connect the IMU")
 
-    def _take(self, columns: Mapping[str, Column], t: FloatArray, reached: FloatArray) -> None:
+    def _take(self, columns: Mapping[str, Measured], t: FloatArray, reached: FloatArray) -> None:
         """Keeps what is usable of messages at times `t` [s], NaN: refused, before which the stream had come so far."""
         for name, (values, usable) in columns.items():
             self._fault(f"{name}: unconfirmed time" if name == LEADER else f"{name}: ahead", usable & np.isnan(t))
@@ -667,6 +667,6 @@ class Resampler:
         return self._reconstruction.signal(until)
 
 
-def _part(columns: Mapping[str, Column], which: slice) -> dict[str, Column]:
+def _part(columns: Mapping[str, Measured], which: slice) -> dict[str, Measured]:
     """Some messages of columns."""
-    return {name: Column(values[which], usable[which]) for name, (values, usable) in columns.items()}
+    return {name: Measured(values[which], usable[which]) for name, (values, usable) in columns.items()}

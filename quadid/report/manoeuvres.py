@@ -16,7 +16,7 @@ from quadid.types import Json
 
 
 @dataclass(frozen=True)
-class Plan:
+class ManoeuvrePlan:
     """A manoeuvre to be written down.
 
     Attributes:
@@ -84,7 +84,7 @@ def check_form(form: str) -> None:
         raise ParameterError(f"--format {form}", ", ".join(FORMS), nearest(form, FORMS))
 
 
-def written_as(plan: Plan, form: str, hover_throttle: float) -> dict[str, str]:
+def written_as(plan: ManoeuvrePlan, form: str, hover_throttle: float) -> dict[str, str]:
     """Texts of a form by the end of their file names.
 
     Args:
@@ -117,7 +117,7 @@ def written_as(plan: Plan, form: str, hover_throttle: float) -> dict[str, str]:
     }
 
 
-def _sweep(plan: Plan, i: int, sweep: Json, hover_throttle: float) -> dict[str, Any]:
+def _sweep(plan: ManoeuvrePlan, i: int, sweep: Json, hover_throttle: float) -> dict[str, Any]:
     axis, size = str(sweep["axis"]), float(sweep["amplitude"])
     what = f"sweeps of SystemID mode, {i} of {len(plan.sweeps)} ({axis})"
     magnitude = size * hover_throttle if axis == "throttle" else math.degrees(size)
@@ -125,7 +125,7 @@ def _sweep(plan: Plan, i: int, sweep: Json, hover_throttle: float) -> dict[str, 
     return {"sweep": sweep, "axis": SID_AXES[axis], "magnitude": magnitude, "header": header}
 
 
-def _blocks(plan: Plan) -> list[tuple[list[dict[str, Any]], int]]:
+def _blocks(plan: ManoeuvrePlan) -> list[tuple[list[dict[str, Any]], int]]:
     """Movements of the sticks at one time, alike ones counted."""
     shown = [
         [{**s, "start": 0.0, "peak": PEAK * s["amplitude"], "peak_deg": math.degrees(PEAK * s["amplitude"])} for s in b]

@@ -54,7 +54,7 @@ OPTIONS = {
 """Parameters: default and description."""
 
 
-class Entry(NamedTuple):
+class MapEntry(NamedTuple):
     """One parameter of the controller: `factor` times the value `source` of a set, within `low` to `high`."""
 
     target: str
@@ -64,7 +64,7 @@ class Entry(NamedTuple):
     high: float
 
 
-class Plan(NamedTuple):
+class ParameterPlan(NamedTuple):
     """Values to set by parameter, and what is left as it is, for people; or why nothing is set."""
 
     values: dict[str, float]
@@ -72,7 +72,7 @@ class Plan(NamedTuple):
     refused: str = ""
 
 
-def entry(text: str) -> Entry:
+def entry(text: str) -> MapEntry:
     """Reads an entry of `map`; raises QuadidError."""
     found = _ENTRY.fullmatch(text.strip())
     if found is None:
@@ -80,7 +80,7 @@ def entry(text: str) -> Entry:
             f"map: '{text}'", "'parameter = factor * name in low .. high', as in the option's description"
         )
     target, factor, source, low, high = found.groups()
-    made = Entry(target, float(factor or 1.0), source, float(low), float(high))
+    made = MapEntry(target, float(factor or 1.0), source, float(low), float(high))
     if not made.low < made.high:
         raise QuadidError(f"map: '{text}'", "a lower limit below the upper one")
     return made
@@ -105,27 +105,29 @@ def objection(message: Any, vehicle: str, mass: float, newest: int) -> str:
     return ""
 
 
-def plan(message: Any, entries: Sequence[Entry], now: Mapping[str, Any], step: float) -> Plan:
+def plan(message: Any, entries: Sequence[MapEntry], now: Mapping[str, Any], step: float) -> ParameterPlan:
     """Values to set, from a set and the controller's values now; all of them or none."""
     found = dict(zip(message.names, zip(message.values, message.status, strict=True), strict=True))
     values, left = dict[str, float](), []
     for target, factor, source, low, high in entries:
         if source not in found:
-            return Plan({}, refused=f"{target}: the set has no {source}")
+            return ParameterPlan({}, refused=f"{target}: the set has no {source}")
         estimate, status = found[source]
         value, before = factor * estimate, now.get(target)
         if status != message.STATUS_IDENTIFIED:
             left.append(f"{target} (the data do not determine {source})")
         elif not isinstance(before, float):
             kind = "not declared" if before is None else "no double"
-            return Plan({}, refused=f"{target} is {kind} in the controller")
+            return ParameterPlan({}, refused=f"{target} is {kind} in the controller")
         elif not (math.isfinite(value) and low <= value <= high):
-            return Plan({}, refused=f"{target} = {value:.4g}, allowed: {low:g} .. {high:g}")
+            return ParameterPlan({}, refused=f"{target} = {value:.4g}, allowed: {low:g} .. {high:g}")
         elif not abs(value - before) <= step * abs(before):
-            return Plan({}, refused=f"{target} would change from {before:.4g} to {value:.4g}: more than {step:.0%}")
+            return ParameterPlan(
+                {}, refused=f"{target} would change from {before:.4g} to {value:.4g}: more than {step:.0%}"
+            )
         else:
             values[target] = value
-    return Plan(values, ", ".join(left), "" if values else f"nothing to set: {', '.join(left)}")
+    return ParameterPlan(values, ", ".join(left), "" if values else f"nothing to set: {', '.join(left)}")
 
 
 class BridgeNode(Node):

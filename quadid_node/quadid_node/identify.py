@@ -6,7 +6,7 @@ import contextlib
 import importlib
 import sys
 
-from quadid_node.process import Stop, end_middleware, without_shared_memory
+from quadid_node.process import StopSignal, end_middleware, without_shared_memory
 
 SPIN_SECONDS = 0.2
 """Longest wait before signals are looked at [s]; the executor of these wheels needs a limit to deliver anything."""
@@ -19,12 +19,12 @@ def main(args: list[str] | None = None) -> int:
     except ImportError as error:
         print(f"identify: {error}", file=sys.stderr)  # noqa: T201 - a command's last word
         return 2
-    code = _run(args, Stop(nothing_open=True))
+    code = _run(args, StopSignal(nothing_open=True))
     end_middleware()
     return code
 
 
-def _run(args: list[str] | None, stop: Stop) -> int:
+def _run(args: list[str] | None, stop: StopSignal) -> int:
     import rclpy
     from rclpy.executors import ExternalShutdownException
     from rclpy.experimental.events_executor import EventsExecutor

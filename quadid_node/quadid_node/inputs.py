@@ -52,7 +52,7 @@ MOST_HELD = 5000
 _ROTORS = ("motor_command", "rotor_speed")
 
 
-class Chooser:
+class SourceSelector:
     """Picks one source for each channel.
 
     Samples of a source that is not the best possible are held back until it is certain that no better one comes, so
@@ -129,7 +129,7 @@ CLOSE, CROWDED = 0.2, 0.4
 """Stamps closer than this share of the mean step, and the share of them that even a random stream does not have."""
 
 
-class Pace:
+class ArrivalMonitor:
     """The pace of one topic.
 
     Attributes:
@@ -188,7 +188,7 @@ class Input:
 
 
 @dataclass(frozen=True)
-class Source:
+class InputPreset:
     """A preset: its inputs, and what its users should know when there is no motor signal."""
 
     inputs: tuple[Input, ...]
@@ -259,7 +259,7 @@ _HINTS = {
 }
 
 
-def source(name: str) -> Source:
+def source(name: str) -> InputPreset:
     """The preset of that name.
 
     Raises:
@@ -272,7 +272,7 @@ def source(name: str) -> Source:
         ranks = [(channel, names.index(topic)) for channel, names in PRESETS[name].items() if topic in names]
         for version in ("", "_v1") if topic in _VERSIONED else ("",):
             inputs.append(Input(_PREFIX.get(name, "") + topic + version, kind, tuple(ranks)))
-    return Source(tuple(inputs), _HINTS[name])
+    return InputPreset(tuple(inputs), _HINTS[name])
 
 
 # --- Between ROS messages and the core: the only file that knows message types
@@ -329,7 +329,7 @@ class Decoder:
     """
 
     def __init__(
-        self, entry: Input, chooser: Chooser, rotors: int, decode: Callable[[bytes], Any], mounted: bool = True
+        self, entry: Input, chooser: SourceSelector, rotors: int, decode: Callable[[bytes], Any], mounted: bool = True
     ) -> None:  # fmt: skip
         """Prepares for one input.
 
@@ -344,7 +344,7 @@ class Decoder:
         self._chooser, self._rotors = chooser, rotors
         self.failed = self.unstamped = 0
         self._failed_at = self._unstamped_at = -math.inf
-        self.pace = Pace()
+        self.pace = ArrivalMonitor()
         self._deniable, self._denied = _DENIABLE.get(entry.type, {}), list[str]()
 
         def noted(data: bytes) -> Any:

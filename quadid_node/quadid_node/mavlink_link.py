@@ -24,9 +24,9 @@ from quadid_replay.motors import (
 from quadid.condition.watch import HealthReport
 from quadid.data.window import Block
 from quadid.online.records import OnlineSet
-from quadid_node.inputs import Chooser
-from quadid_node.mavlink_wire import LinkError, Source, Wire, dialect, is_autopilot, message_id, sender
-from quadid_node.messages import Health, Output
+from quadid_node.inputs import SourceSelector
+from quadid_node.mavlink_wire import LinkError, VehicleSender, Wire, dialect, is_autopilot, message_id, sender
+from quadid_node.messages import Output, ServiceHealth
 from quadid_node.service import Service
 
 # --- Which output drives which rotor of a live vehicle: asked of the autopilot, taken over once, never changed in use
@@ -165,7 +165,7 @@ class MavlinkDecoder:
         """Expects a vehicle with `rotors` rotors; `wall` tells the UNIX time [s] at which its clock is put."""
         self.counts: Counter[str] = Counter()
         self.order = MotorOrder(rotors)
-        self._chooser = Chooser({channel: 0 for channel, _ in RANKS})
+        self._chooser = SourceSelector({channel: 0 for channel, _ in RANKS})
         self._boot_clock: BootClock[list[Reading]] = BootClock()
         self._wall, self._epoch, self._newest = wall, 0.0, math.inf
         self._rounds: dict[str, _Round] = {}
@@ -369,7 +369,7 @@ class MavlinkLink:
         if not 0 <= system <= 255:
             raise LinkError(f"system id {system}", "1 to 255, or 0 for the first one heard")
         self._wire, self._key = Wire(url, system or 1, COMPONENT, key, memory), key is not None
-        self._source = Source()
+        self._source = VehicleSender()
         self._decoder = MavlinkDecoder(rotors)
         self._clock = clock
         self.vehicle_system = 0
@@ -602,7 +602,7 @@ class Outlet(Protocol):
     def publish(self, output: Output) -> None:
         """Tells a result."""
 
-    def report(self, health: Health) -> None:
+    def report(self, health: ServiceHealth) -> None:
         """Tells once a second how things are."""
 
     def attend(self) -> None:

@@ -114,7 +114,7 @@ MOST_PEERS = 8
 """... and never more of them at a time."""
 
 
-class Source:
+class VehicleSender:
     """Holds that all frames of the vehicle come from one sender.
 
     Attributes:

@@ -61,7 +61,7 @@ class Feed:
 
 
 @dataclass(frozen=True)
-class Health:
+class ServiceHealth:
     """Snapshot for monitoring: session, channels, worker, history, how long the last fit took [s]."""
 
     status: SessionStatus
@@ -240,7 +240,7 @@ def idle_status(vehicle: str, reason: str) -> Message:
 
 
 def diagnostics(
-    health: Health | None, name: str, hardware: str, now: Message, notes: dict[str, str], hints: dict[str, str],
+    health: ServiceHealth | None, name: str, hardware: str, now: Message, notes: dict[str, str], hints: dict[str, str],
     idle: str = "", problem: str = "",
 ) -> Message:  # fmt: skip
     """diagnostic_msgs/DiagnosticArray: session, inputs, worker and history, each a status of its own (REP-107).

@@ -33,10 +33,10 @@ from quadid_node.ground import fit_worker
 from quadid_node.history import Store, default_path
 from quadid_node.inputs import (
     DEPTH,
-    Chooser,
     Decoder,
+    InputPreset,
     Intake,
-    Source,
+    SourceSelector,
     best_ranks,
     deserializer,
     message_class,
@@ -294,9 +294,9 @@ class IdentifyNode(PollingNode, LifecycleNode):
         )
         self._reads_back = False
 
-    def _subscribe(self, preset: Source, vehicle: Vehicle) -> None:
+    def _subscribe(self, preset: InputPreset, vehicle: Vehicle) -> None:
         mounted = "mounting" in vehicle.model_fields_set
-        chooser = Chooser(best_ranks(preset.inputs))
+        chooser = SourceSelector(best_ranks(preset.inputs))
         for entry in preset.inputs:
             decoder = Decoder(entry, chooser, len(vehicle.rotors), deserializer(entry.type), mounted)
             topic = self.resolve_topic_name(entry.topic)

@@ -14,7 +14,7 @@ _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _CHOSEN_BY_USER = ("FASTDDS_BUILTIN_TRANSPORTS", "FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PROFILES_FILE")
 
 
-class Stop:
+class StopSignal:
     """Notes SIGINT and SIGTERM from the first moment on; true once one has come."""
 
     def __init__(self, nothing_open: bool = False) -> None:

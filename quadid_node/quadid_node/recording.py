@@ -28,7 +28,7 @@ from quadid.errors import LogError
 from quadid.online import OnlineSet, SessionSettings
 from quadid.vehicle import Vehicle
 from quadid_node.history import UNREADABLE, Restored
-from quadid_node.inputs import Chooser, Decoder, Input, best_ranks, seconds, source
+from quadid_node.inputs import Decoder, Input, SourceSelector, best_ranks, seconds, source
 from quadid_node.messages import Output, set_from_dict, set_to_dict
 from quadid_node.service import Service
 
@@ -152,7 +152,7 @@ def arrivals(path: Path, preset: str, rotors: int) -> Iterator[Block]:
         LogError: a message definition that cannot be used.
     """
     file, inputs = McapFile(path), source(preset).inputs
-    chooser = Chooser(best_ranks(inputs))
+    chooser = SourceSelector(best_ranks(inputs))
     decoders = {}
     for number, topic in file.topics.items():
         entry = next((e for e in inputs if e.topic == topic.name and e.type == type_name(topic.type)), None)

@@ -26,7 +26,7 @@ from rclpy.utilities import remove_ros_args
 from quadid.data.window import Recording
 from quadid.errors import QuadidError
 from quadid_node.inputs import message_class, source
-from quadid_node.process import Stop, end_middleware, without_shared_memory
+from quadid_node.process import StopSignal, end_middleware, without_shared_memory
 
 QOS = QoSProfile(depth=100, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.BEST_EFFORT)
 _CHECK_EVERY = 0.1
@@ -87,7 +87,9 @@ def epoch_of(recording: Recording, stamps: str) -> int:
     return (time.time_ns() // 10**6) * 10**6 - round(first * 1e9)
 
 
-def play(recording: Recording, speed: float, stamps: str, wait: float, args: list[str] | None, stop: Stop) -> None:
+def play(
+    recording: Recording, speed: float, stamps: str, wait: float, args: list[str] | None, stop: StopSignal
+) -> None:
     """Plays a recording until its end or until `stop` says so.
 
     Args:
@@ -121,7 +123,7 @@ def main(args: list[str] | None = None) -> int:
     parser.add_argument("--wait", type=float, default=2.0, help="seconds for subscribers to find the topics")
     parser.add_argument("--preset", default="auto", help="topic names of a ROS log")
     given = parser.parse_args(remove_ros_args(args or sys.argv)[1:])
-    stop = Stop()
+    stop = StopSignal()
     try:
         recording = open_log(given.log, given.preset)
     except QuadidError as error:

@@ -17,7 +17,7 @@ from quadid.online.active_set import Answer
 from quadid.online.records import Action, Event, OnlineSet, Publish
 from quadid.vehicle import Vehicle
 from quadid_node.history import UNREADABLE, Restored, Store, StoreError, read_history
-from quadid_node.messages import BEHIND, Feed, Health, Message, Output, lag, parameter_set, set_from_dict
+from quadid_node.messages import BEHIND, Feed, Message, Output, ServiceHealth, lag, parameter_set, set_from_dict
 from quadid_node.wire_format import keep
 from quadid_node.worker import Trouble, Worker
 
@@ -286,13 +286,13 @@ class Service:
         except UNREADABLE as error:
             raise StoreError(f"the history {path} cannot be read ({error})") from error
 
-    def health(self) -> Health:
+    def health(self) -> ServiceHealth:
         """Snapshot for monitoring."""
         now = self._clock()
         feeds = {name: Feed(self._rate(name, now), max(self._looked - at, 0.0)) for name, at in self._arrived.items()}
         restarts = getattr(self._worker, "restarts", 0)
         history = self._store.problem if self._store is not None else "none kept"
-        return Health(self.session.status(), feeds, self._worker.state, restarts, history, self._fit_seconds)
+        return ServiceHealth(self.session.status(), feeds, self._worker.state, restarts, history, self._fit_seconds)
 
     def close(self) -> None:
         """Ends workers and history; what was journalled is on the disk afterwards."""

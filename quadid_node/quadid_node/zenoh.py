@@ -13,7 +13,7 @@ from typing import Any
 import zenoh
 
 from quadid.errors import QuadidError
-from quadid_node.messages import RESULTS, Health, Output, status_to_dict
+from quadid_node.messages import RESULTS, Output, ServiceHealth, status_to_dict
 from quadid_node.service import Service
 
 # --- Opens Zenoh sessions: peers of this network, a locator, or a configuration file with TLS and access control
@@ -192,7 +192,7 @@ class ZenohLink:
         if output.topic in RESULTS:
             self._put(output.topic, RESULTS[output.topic].json(output))
 
-    def report(self, health: Health) -> None:
+    def report(self, health: ServiceHealth) -> None:
         """Tells how things are."""
         feeds = {name: {"rate": feed.rate, "silence": feed.silence} for name, feed in health.feeds.items()}
         self._put("health", {
@@ -272,7 +272,7 @@ LONGEST_INTEGER = 20
 """Digits; longer ones are read as floating point, that no arithmetic overflows."""
 
 
-class Fleet:
+class FleetView:
     """State of all vehicles, from a Zenoh session.
 
     Attributes:

@@ -117,14 +117,14 @@ def open_log(path: str | Path, preset: str = AUTO, columns: Mapping[str, str] | 
 # --- Limits, and why there is no answer
 
 
-class Limits(NamedTuple):
+class ReadLimits(NamedTuple):
     """Limits of reading one log: memory [MiB], processor time [s]."""
 
     memory: int
     seconds: float
 
 
-def limits(size: int) -> Limits:
+def limits(size: int) -> ReadLimits:
     """Limits for a file of `size` bytes: 768 MiB and 16 times its size, at most half of this machine's memory and
     8 GiB; 10 s and 4 s a MiB of processor time.
 
@@ -133,7 +133,7 @@ def limits(size: int) -> Limits:
     """
     machine = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // _MIB
     memory = _given(MEMORY, min(machine / 2, LARGEST_MEMORY_MB, LEAST_MEMORY_MB + MEMORY_A_MIB * size / _MIB))
-    return Limits(int(memory), _given(SECONDS, LEAST_SECONDS + SECONDS_A_MIB * size / _MIB))
+    return ReadLimits(int(memory), _given(SECONDS, LEAST_SECONDS + SECONDS_A_MIB * size / _MIB))
 
 
 def _given(name: str, otherwise: float) -> float:
@@ -156,7 +156,7 @@ _BY_SIGNAL = {
 _BY_ERROR: dict[int, Literal["written", "open files"]] = {errno.EFBIG: "written", errno.EMFILE: "open files"}
 
 
-def _stopped(path: Path, ended: int, allowed: Limits) -> LogError:
+def _stopped(path: Path, ended: int, allowed: ReadLimits) -> LogError:
     """Why there is no answer, by how the child ended: minus the signal that ended it, as in `subprocess`."""
     if -ended in _BY_SIGNAL:
         return _limited(path, _BY_SIGNAL[signal.Signals(-ended)], allowed)
@@ -167,7 +167,7 @@ def _stopped(path: Path, ended: int, allowed: Limits) -> LogError:
     )  # fmt: skip
 
 
-def _limited(path: Path, name: str, allowed: Limits) -> LogError:
+def _limited(path: Path, name: str, allowed: ReadLimits) -> LogError:
     """That reading met a limit: seconds (of the processor), standing (by the clock), memory, written, open files."""
     slow = "logs that are read faster", f"cut it into parts, or allow more time with {SECONDS}"
     only_read = "logs that are only read", "cut it into parts, or copy it again"

@@ -415,7 +415,7 @@ class Stamps:
         return self.clock.times(np.where(stamps == 0, since, times))
 
 
-class Source(NamedTuple):
+class TopicSource(NamedTuple):
     """A topic that is read: its description, its type, and what reads its messages."""
 
     topic: Topic
@@ -440,7 +440,7 @@ class _Part(NamedTuple):
     values: FloatArray
 
 
-def decode_messages(messages: Iterable[Message], sources: Mapping[int, Source]) -> Decoded:
+def decode_messages(messages: Iterable[Message], sources: Mapping[int, TopicSource]) -> Decoded:
     """Streams through messages and keeps their numbers.
 
     Args:

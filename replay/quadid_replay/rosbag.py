@@ -21,7 +21,7 @@ from quadid_replay.columns import Columns, RawChannel, assemble, fastest_first
 from quadid_replay.mcap_file import McapFile, Message, Topic, usable_definition
 from quadid_replay.motors import active_outputs, no_multirotor
 from quadid_replay.presets import AUTO, preset_rank
-from quadid_replay.ros_messages import SIGNALS, TYPES, MessageReader, Source, decode_messages, type_name
+from quadid_replay.ros_messages import SIGNALS, TYPES, MessageReader, TopicSource, decode_messages, type_name
 
 # --- Folders that `ros2 bag record` makes: which files of them are read, in which order
 
@@ -222,7 +222,7 @@ def read_mcap(path: Path, preset: str = AUTO) -> Recording:
     return replace(recording, epoch=float(stamps.base_ns // 10**9) if stamps.base_ns else None)
 
 
-def _sources(bag: Bag, preset: str, notes: list[str]) -> dict[int, Source]:
+def _sources(bag: Bag, preset: str, notes: list[str]) -> dict[int, TopicSource]:
     """Picks the topics whose type is known and whose name the preset lists for one of its channels."""
     sources = {}
     for number, topic in bag.topics.items():
@@ -239,7 +239,7 @@ def _sources(bag: Bag, preset: str, notes: list[str]) -> dict[int, Source]:
         except Exception as error:  # noqa: BLE001 - the parser of untrusted definitions raises anything; it is reported
             notes.append(f"{topic.name}: its message definition is damaged ({type(error).__name__}): not used")
             continue
-        sources[number] = Source(topic, kind, MessageReader(kind, decode))
+        sources[number] = TopicSource(topic, kind, MessageReader(kind, decode))
     return sources
 
 
@@ -250,7 +250,9 @@ def _decoder(kind: str, definition: str) -> Callable[[bytes], Any]:
     return decode
 
 
-def _channels(columns: dict[tuple[int, str], Columns], sources: dict[int, Source], preset: str) -> list[RawChannel]:
+def _channels(
+    columns: dict[tuple[int, str], Columns], sources: dict[int, TopicSource], preset: str
+) -> list[RawChannel]:
     """Makes channels of the columns; of several topics for one channel the best comes first."""
     ranked: dict[str, list[tuple[int, RawChannel]]] = {}
     for (number, signal), kept in columns.items():

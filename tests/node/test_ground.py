@@ -27,7 +27,7 @@ from msgspec.msgpack import decode, encode
 from quadid_node.ground import Ground, RemoteWorker, work
 from quadid_node.wire_format import KINDS, LARGEST, LARGEST_RECORD, ParcelError, pack, unpack
 from quadid_node.worker import InlineWorker, ProcessWorker, Trouble
-from quadid_node.zenoh import Fleet, ZenohLink
+from quadid_node.zenoh import FleetView, ZenohLink
 
 from quadid.online import FitReply, FitRequest, Session, SessionSettings
 from quadid.online.background_diagnosis import DiagnosisReply
@@ -228,7 +228,7 @@ def test_through_mutual_tls_only_the_ground_machine_fits(net: Net, request_: Fit
 def test_the_ground_machine_sees_and_sends_windows_and_fits_only(net: Net) -> None:
     ground, heard = zenoh.open(zenoh.Config.from_file(net.client("ground"))), list[bytes]()
     spy = ground.declare_subscriber("quadid/**", lambda sample: heard.append(sample.payload.to_bytes()))
-    link, fleet = ZenohLink(net.client("quad1"), "quad1", service()), Fleet(net.client("watch"))
+    link, fleet = ZenohLink(net.client("quad1"), "quad1", service()), FleetView(net.client("watch"))
     try:
         assert until(lambda: fleet.alive.get("quad1", False))
         time.sleep(0.3)

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from mcap_ros2._dynamic import generate_dynamic, serialize_dynamic
 from quadid_node.history import Restored
-from quadid_node.inputs import MEMORY, SLICE, Chooser, Decoder, Input, Intake, best_ranks, source
+from quadid_node.inputs import MEMORY, SLICE, Decoder, Input, Intake, SourceSelector, best_ranks, source
 from quadid_node.recording import RECORD, Beginning, Recorder, arrivals, read_beginning, stream
 from quadid_replay import TopicWriter, open_log, write_mcap
 from quadid_replay.mcap_file import McapFile, read_metadata
@@ -45,7 +45,7 @@ def messages(tmp_path_factory: pytest.TempPathFactory) -> list[Message]:
     return [(file.topics[number].name, data) for number, _, data in file.messages(file.topics.keys())]
 
 
-def decoder(entry: Input, chooser: Chooser, mounted: bool = True) -> Decoder:
+def decoder(entry: Input, chooser: SourceSelector, mounted: bool = True) -> Decoder:
     kind = entry.type.replace("/", "/msg/")
     decode = generate_dynamic(kind, schema_text(kind))[kind]
     return Decoder(entry, chooser, 4, decode, mounted)
@@ -53,7 +53,7 @@ def decoder(entry: Input, chooser: Chooser, mounted: bool = True) -> Decoder:
 
 def by_intake(messages: list[Message], batch: int) -> tuple[list[Sample], list[Message]]:
     """Samples, and what was recorded, when taken in every `batch` messages."""
-    chooser, now = Chooser(best_ranks(INPUTS)), [0.0]
+    chooser, now = SourceSelector(best_ranks(INPUTS)), [0.0]
     intake = Intake(lambda: now[0])
     arrived: dict[str, deque[bytes]] = {e.topic: deque() for e in INPUTS}
     for e in INPUTS:
@@ -72,7 +72,7 @@ def by_intake(messages: list[Message], batch: int) -> tuple[list[Sample], list[M
 
 
 def one_by_one(messages: list[Message]) -> list[Sample]:
-    chooser = Chooser(best_ranks(INPUTS))
+    chooser = SourceSelector(best_ranks(INPUTS))
     known = {e.topic: decoder(e, chooser) for e in INPUTS}
     return [s for topic, data in messages for s in flat(known[topic].take([data]))]
 
@@ -122,7 +122,7 @@ def test_an_imu_in_a_frame_of_its_own_is_told_unless_its_mounting_is_given(
         framed.append(encode(message))
     attitude = next(e for e in INPUTS if e.topic == "attitude")
     for mounted in (False, True):
-        chooser = Chooser(best_ranks(INPUTS))
+        chooser = SourceSelector(best_ranks(INPUTS))
         assert flat(decoder(attitude, chooser).take([data for topic, data in messages if topic == "attitude"]))
         reader = decoder(entry, chooser, mounted)
         assert len(flat(reader.take(original))) == 40
@@ -138,15 +138,15 @@ def test_a_damaged_message_spoils_only_itself(messages: list[Message]) -> None:
     imu = [data for topic, data in messages if topic == "imu"][:40]
     imu[20] = imu[20][:30]
     entry = next(e for e in INPUTS if e.topic == "imu")
-    whole = decoder(entry, Chooser(best_ranks(INPUTS)))
-    single = decoder(entry, Chooser(best_ranks(INPUTS)))
+    whole = decoder(entry, SourceSelector(best_ranks(INPUTS)))
+    single = decoder(entry, SourceSelector(best_ranks(INPUTS)))
     assert flat(whole.take(imu)) == [s for data in imu for s in flat(single.take([data]))]
     assert whole.failed == single.failed == 1
 
 
 def imu_decoder() -> Decoder:
     """Decoder of the IMU beside a topic that tells the attitude."""
-    chooser = Chooser(best_ranks(INPUTS))
+    chooser = SourceSelector(best_ranks(INPUTS))
     assert list(chooser.take(Block.one(0.0, "attitude", (1.0, 0.0, 0.0, 0.0)), 0))
     return decoder(next(e for e in INPUTS if e.topic == "imu"), chooser)
 
@@ -205,7 +205,7 @@ def test_a_signal_that_messages_say_not_to_have_is_named_where_nothing_else_tell
 def test_messages_without_a_stamp_are_named_as_such(messages: list[Message]) -> None:
     imu = [data[:4] + bytes(8) + data[12:] for topic, data in messages if topic == "imu"][:5]
     entry = next(e for e in INPUTS if e.topic == "imu")
-    reader = decoder(entry, Chooser(best_ranks(INPUTS)))
+    reader = decoder(entry, SourceSelector(best_ranks(INPUTS)))
     assert flat(reader.take(imu)) == []
     assert "5 messages have no time" in reader.trouble
     reader.pace.look(0.9 * MEMORY, 0.0, 0)
@@ -216,7 +216,7 @@ def test_messages_without_a_stamp_are_named_as_such(messages: list[Message]) -> 
 
 def test_messages_that_cannot_be_read_are_named_as_long_as_they_come(messages: list[Message]) -> None:
     entry = next(e for e in INPUTS if e.topic == "imu")
-    reader = decoder(entry, Chooser(best_ranks(INPUTS)))
+    reader = decoder(entry, SourceSelector(best_ranks(INPUTS)))
     for now in (0.0, 0.9 * MEMORY, 1.8 * MEMORY):
         reader.pace.look(now, now - 0.1, 1)
         assert flat(reader.take([b"no message"])) == []
@@ -228,7 +228,7 @@ def test_messages_that_cannot_be_read_are_named_as_long_as_they_come(messages: l
 @pytest.mark.parametrize(("kind", "used"), [(2, True), (0, True), (1, False), (22, False)])
 def test_outputs_of_a_plane_are_no_rotors_on_live_topics_either(kind: int, used: bool) -> None:
     inputs = source("px4").inputs
-    chooser = Chooser(best_ranks(inputs))
+    chooser = SourceSelector(best_ranks(inputs))
     layouts = {
         "px4_msgs/VehicleStatus": ("uint64 timestamp\nuint8 system_type\n", {"timestamp": 10**6, "system_type": kind}),
         "px4_msgs/ActuatorMotors": (

@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from quadid_node.mavlink_link import FRAMES_A_SECOND, MavlinkDecoder, MavlinkLink, Requests
-from quadid_node.mavlink_wire import JUDGED, LinkError, SafeMavlink, Source, dialect, frames
+from quadid_node.mavlink_wire import JUDGED, LinkError, SafeMavlink, VehicleSender, dialect, frames
 from quadid_replay.tlog import read_frames
 from quadid_replay.writers import mavlink_messages
 
@@ -362,7 +362,7 @@ def test_what_is_sent_has_a_budget(port: int, happened: Happened) -> None:
 
 def test_two_senders_mixed_into_one_stream_are_told_by_their_frame_numbers(happened: Happened) -> None:
     """As a router that merges links does: one address, or a serial line, which has none."""
-    lossy, mixed, rng = Source(), Source(), random.Random(1)
+    lossy, mixed, rng = VehicleSender(), VehicleSender(), random.Random(1)
     for k in range(400):
         assert lossy.take(None, 0.02 * k)
         if rng.random() < 0.5:
@@ -385,7 +385,7 @@ def test_two_senders_mixed_into_one_stream_are_told_by_their_frame_numbers(happe
 @pytest.mark.parametrize("ahead", [0, 1, -5, 40, 129])
 def test_a_second_sender_that_follows_the_numbers_of_the_first_is_seen(ahead: int, happened: Happened) -> None:
     """From the vehicle's own address, one frame in ten: the steps of the numbers look like those of one sender."""
-    source, address, taken = Source(), ("10.0.0.1", 14550), 0
+    source, address, taken = VehicleSender(), ("10.0.0.1", 14550), 0
     source.take(address, 0.0)
     for k in range(2000):
         now = 0.005 * k
@@ -402,7 +402,7 @@ def test_a_second_sender_that_follows_the_numbers_of_the_first_is_seen(ahead: in
 def test_frames_that_come_twice_late_or_not_at_all_are_those_of_one_sender() -> None:
     rng, address = random.Random(1), ("10.0.0.1", 14550)
     for lost in (0.0, 0.3, 0.7):
-        source, late = Source(), -1
+        source, late = VehicleSender(), -1
         source.take(address, 0.0)
         for k in range(4000):
             if rng.random() < lost:

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from quadid_node.inputs import DECIDE, SILENT, Chooser, source, stamp
+from quadid_node.inputs import DECIDE, SILENT, SourceSelector, source, stamp
 from quadid_node.launching import ARGUMENTS, NODE_ARGUMENTS, fleet, parameters, truth
 from quadid_node.messages import WARN, diagnostics
 from quadid_node.recording import stream
@@ -125,7 +125,7 @@ def times(blocks: Iterable[Block]) -> list[float]:
 
 
 def test_the_better_source_is_used_from_its_first_sample() -> None:
-    chooser = Chooser({"attitude": 0})
+    chooser = SourceSelector({"attitude": 0})
     assert list(chooser.take(at(0.0), 1)) == []
     assert times(chooser.take(at(0.1), 0)) == [0.1]
     assert list(chooser.take(at(0.2), 1)) == []
@@ -133,7 +133,7 @@ def test_the_better_source_is_used_from_its_first_sample() -> None:
 
 
 def test_a_lone_worse_source_is_used_without_loss() -> None:
-    chooser, got = Chooser({"attitude": 0}), []
+    chooser, got = SourceSelector({"attitude": 0}), []
     for k in range(30):
         got += times(chooser.take(at(0.1 * k), 1))
     assert got == [0.1 * k for k in range(30)]
@@ -141,7 +141,7 @@ def test_a_lone_worse_source_is_used_without_loss() -> None:
 
 
 def test_a_source_that_falls_silent_gives_way() -> None:
-    chooser = Chooser({"attitude": 0})
+    chooser = SourceSelector({"attitude": 0})
     list(chooser.take(at(0.0), 0))
     got = times(block for k in range(80) for block in chooser.take(at(0.1 * k), 1))
     assert got
@@ -155,7 +155,7 @@ def test_how_samples_are_cut_into_blocks_changes_nothing(seed: int) -> None:
     runs = [(int(rank), np.sort(start + rng.uniform(0.0, 3.0, 12))) for start in np.arange(0.0, 40.0, 2.5)
             for rank in rng.permutation(3) if rng.random() < 0.5]  # fmt: skip
     best = {"attitude": int(rng.integers(2))}
-    whole, single = Chooser(best), Chooser(best)
+    whole, single = SourceSelector(best), SourceSelector(best)
     for rank, t in runs:
         one_by_one = [s for k in t for block in single.take(at(k), rank) for s in times([block])]
         assert times(whole.take(at(*t), rank)) == one_by_one

@@ -16,7 +16,7 @@ import pytest
 from quadid_node.history import read_history
 from quadid_node.messages import WARN
 from quadid_node.process import without_shared_memory
-from quadid_node.zenoh import Fleet
+from quadid_node.zenoh import FleetView
 from quadid_replay import write_mcap
 
 from quadid.vehicle import Vehicle
@@ -358,7 +358,7 @@ def test_watch_sees_the_state_of_a_ros_node(tmp_path: Path) -> None:
     folder = tmp_path / "net"
     folder.mkdir()
     net = Net(folder)
-    fleet = Fleet(net.client("watch"))
+    fleet = FleetView(net.client("watch"))
     try:
         with node(tmp_path / "h.sqlite", zenoh=net.client("quad1"), vehicle_id="quad1") as it:
             it.wait_for("ready")

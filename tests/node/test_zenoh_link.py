@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import pytest
 import zenoh
-from quadid_node.zenoh import KINDS, Fleet, ZenohError, ZenohLink, key_of
+from quadid_node.zenoh import KINDS, FleetView, ZenohError, ZenohLink, key_of
 
 from quadid.cli.watch import snapshot, table
 from quadid.online.records import OnlineDiagnosis, OnlineFinding
@@ -39,7 +39,7 @@ def test_three_vehicles_are_seen_and_who_comes_late_gets_the_latest(net: Net) ->
             link.publish(accepted(2, 2.0e-5 + 1e-6 * k))
             link.report(service().health())
         time.sleep(0.5)
-        fleet = Fleet(net.client("watch"))
+        fleet = FleetView(net.client("watch"))
         try:
             complete = until(lambda: len(fleet.latest) == 3 and all(len(v) == 2 for v in fleet.latest.values()))
             assert complete, fleet.latest.keys()
@@ -64,7 +64,7 @@ def test_commands_reach_the_service_and_are_answered(net: Net) -> None:
     owned = service()
     owned.session.active_set.approval = "manual"
     held = [owned.session.active_set.hold(online_set(TRUE), 30.0).sequence for _ in range(2)]
-    link, fleet = ZenohLink(net.client("quad1"), "quad1", owned), Fleet(net.client("watch"))
+    link, fleet = ZenohLink(net.client("quad1"), "quad1", owned), FleetView(net.client("watch"))
     try:
         time.sleep(0.5)
         with link_attended(link):
@@ -80,7 +80,7 @@ def test_commands_reach_the_service_and_are_answered(net: Net) -> None:
 
 
 def test_forged_values_and_spying_are_refused_by_the_router(net: Net, happened: Happened) -> None:
-    watcher = Fleet(net.client("watch"))
+    watcher = FleetView(net.client("watch"))
     mallory = zenoh.open(zenoh.Config.from_file(net.client("quad2")))
     victim = ZenohLink(net.client("quad1"), "quad1", service())
     try:
@@ -140,7 +140,7 @@ def test_who_has_no_certificate_of_ours_does_not_get_in(net: Net, how: str, happ
 
 
 def test_garbage_and_floods_are_counted_not_shown(net: Net, happened: Happened) -> None:
-    fleet = Fleet(net.client("watch"))
+    fleet = FleetView(net.client("watch"))
     rogue = zenoh.open(zenoh.Config.from_file(net.client("quad3")))
     try:
         time.sleep(0.3)
@@ -182,14 +182,14 @@ def test_a_router_that_comes_late_is_found_and_a_wrong_configuration_told(tmp_pa
     link.publish(accepted(1))
     assert until(lambda: "Unable to connect" in link.problem)
     with pytest.raises(ZenohError, match="Unable to connect"):
-        Fleet(where)
+        FleetView(where)
     config = zenoh.Config()
     config.insert_json5("mode", '"router"')
     config.insert_json5("listen/endpoints", json.dumps([where]))
     config.insert_json5("scouting/multicast/enabled", "false")
     with zenoh.open(config):
         assert until(lambda: not link.problem)
-        fleet = Fleet(where)
+        fleet = FleetView(where)
         assert until(lambda: "parameters" in fleet.latest.get("quad1", {}))
         fleet.close()
     link.close()
@@ -201,7 +201,7 @@ def test_a_router_that_comes_late_is_found_and_a_wrong_configuration_told(tmp_pa
 
 
 def test_findings_cross_too(net: Net) -> None:
-    link, fleet = ZenohLink(net.client("quad2"), "quad2", service()), Fleet(net.client("watch"))
+    link, fleet = ZenohLink(net.client("quad2"), "quad2", service()), FleetView(net.client("watch"))
     try:
         time.sleep(0.3)
         finding = OnlineFinding(
@@ -241,7 +241,7 @@ class _Bytes(bytes):
 def test_a_watcher_is_not_filled_up_nor_upset_by_strangers(monkeypatch: pytest.MonkeyPatch, happened: Happened) -> None:
     session = _Listening()
     monkeypatch.setattr(zenoh_fleet, "open_session", lambda where: session)
-    fleet = Fleet("local")
+    fleet = FleetView("local")
     huge = b'{"parameters": [{"name": "b", "value": ' + b"9" * 4000 + b', "sigma": 1}], "feeds": 1, "sequence": -1}'
     session.take(_Heard("quadid/odd/parameters", _Bytes(huge)))
     table(snapshot(fleet))
@@ -249,7 +249,7 @@ def test_a_watcher_is_not_filled_up_nor_upset_by_strangers(monkeypatch: pytest.M
     for k in range(300):
         session.take(_Heard(f"quadid/v{k}/{KINDS[k % 5]}", large))
     held = sum(len(str(value)) for kinds in fleet.latest.values() for value in kinds.values())
-    assert held <= Fleet.MOST_BYTES
+    assert held <= FleetView.MOST_BYTES
     assert fleet.refused > 200
     session.take(_Heard("quadid/v0/parameters", _Bytes(b'{"a": 1}')))
     assert fleet.latest["v0"]["parameters"] == {"a": 1}, "who is known goes on"

@@ -13,7 +13,7 @@ from quadid_replay import ros_messages as mcap_decode
 from quadid_replay import write_mcap
 from quadid_replay.formats import read_here
 from quadid_replay.mcap_file import Topic
-from quadid_replay.ros_messages import MessageReader, MessageType, Source, decode_messages
+from quadid_replay.ros_messages import MessageReader, MessageType, TopicSource, decode_messages
 from quadid_replay.schemas import schema_text
 
 from quadid.data.window import Recording
@@ -159,5 +159,5 @@ def test_types_without_a_layout_are_read_one_by_one() -> None:
         raise ValueError(data)
 
     kind = MessageType(lambda m: [[0.0]], lambda runs, extra: [("battery", runs[0], True)], stamp=lambda m: 1)
-    source = Source(Topic("t", "k", "", "cdr"), kind, MessageReader(kind, unread))
+    source = TopicSource(Topic("t", "k", "", "cdr"), kind, MessageReader(kind, unread))
     assert decode_messages([(1, 0, b"x")], {1: source}).failed == 1

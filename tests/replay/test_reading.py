@@ -19,7 +19,7 @@ import pytest
 import quadid_replay.opening
 from quadid_replay import open_log, write_csv, write_mcap, write_tlog
 from quadid_replay.formats import read_here
-from quadid_replay.opening import BadAnswerError, Limits, limits, pack, unpack
+from quadid_replay.opening import BadAnswerError, ReadLimits, limits, pack, unpack
 
 from quadid.data.window import Recording
 from quadid.errors import LogError
@@ -68,7 +68,7 @@ def test_a_folder_may_take_what_its_files_may(tmp_path: Path, monkeypatch: pytes
     files = ", ".join(f"bag_{part}.mcap" for part in range(2))
     (folder / "metadata.yaml").write_text(f"rosbag2_bagfile_information:\n  relative_file_paths: [{files}]\n")
 
-    def noted(size: int) -> Limits:
+    def noted(size: int) -> ReadLimits:
         allowed.append(size)
         return limits(size)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict
 
 from quadid.flight import Segment
-from quadid.report.manoeuvres import Plan
+from quadid.report.manoeuvres import ManoeuvrePlan
 
 SECONDS = 13.0
 SEGMENTS = [
@@ -14,7 +14,7 @@ SEGMENTS = [
     Segment("roll", "multisine", 6.5, 6.0, 0.1, 0.3, 1.0),
     Segment("yaw", "multisine", 6.5, 6.0, 0.35, 0.3, 1.0),
 ]  # fmt: skip
-PLAN = Plan(
+PLAN = ManoeuvrePlan(
     vehicle="pelican",
     seconds=SECONDS,
     segments=[asdict(s) for s in SEGMENTS],

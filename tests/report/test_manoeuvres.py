@@ -15,7 +15,7 @@ from quadid.app.excite import propose
 from quadid.errors import ParameterError
 from quadid.flight import Segment
 from quadid.flight.pilot import AXES, PILOT_STEP, scripted
-from quadid.report.manoeuvres import FORMS, Plan, written_as
+from quadid.report.manoeuvres import FORMS, ManoeuvrePlan, written_as
 from tests.report.manoeuvre_plan import PLAN, SECONDS, SEGMENTS
 
 # --- A manoeuvre as parameters and in words: what they ask for is what was simulated, and the envelope stands in each
@@ -100,7 +100,7 @@ class Autopilot:
     yaw: float = -2.2
     old: bool = False
     refuses: bool = False
-    plan: Plan = PLAN
+    plan: ManoeuvrePlan = PLAN
     pitch: float = 0.0
     east: float = 0.0
     velocity: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -300,7 +300,7 @@ def test_what_is_exported_stays_inside_its_own_envelope(name: str, tilt: float) 
         stays_inside(plan, spin_up)
 
 
-def stays_inside(plan: Plan, spin_up: float) -> None:
+def stays_inside(plan: ManoeuvrePlan, spin_up: float) -> None:
     autopilot = Autopilot(plan=plan, height=30.0, spin_up=spin_up).load()
     autopilot.run(0.5)
     autopilot.switch = 2

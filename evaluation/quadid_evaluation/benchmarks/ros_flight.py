@@ -66,7 +66,7 @@ def recording(seconds: float, rate: float, profile: str) -> Any:
 def feed(seconds: float, rate: float, profile: str) -> None:
     """Flies in real time, again and again, until the time is over; prints what was sent by topic."""
     import rclpy
-    from quadid_node.process import Stop
+    from quadid_node.process import StopSignal
     from quadid_node.replay_node import Stopped, TopicPlayer, epoch_of
     from quadid_replay.writers import write_recording
     from rclpy.signals import SignalHandlerOptions
@@ -84,7 +84,7 @@ def feed(seconds: float, rate: float, profile: str) -> None:
             self._publisher(topic, kind).publish(data)
             self.counts[topic] += 1
 
-    stop, made = Stop(), recording(min(FLIGHT, seconds), rate, profile)
+    stop, made = StopSignal(), recording(min(FLIGHT, seconds), rate, profile)
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     node = rclpy.create_node("feeder")
     feeder = Feeder(node, 1.0, stop)

@@ -123,7 +123,7 @@ def _fly_through(log: Path, vehicle: Vehicle, folder: Path, follow: Callable[[],
     """
     from mcap_ros2._dynamic import generate_dynamic
     from quadid_node.history import Store
-    from quadid_node.inputs import Chooser, Decoder, Intake, best_ranks, source
+    from quadid_node.inputs import Decoder, Intake, SourceSelector, best_ranks, source
     from quadid_node.service import Service
     from quadid_node.worker import InlineWorker
     from quadid_replay.mcap_file import McapFile
@@ -133,7 +133,7 @@ def _fly_through(log: Path, vehicle: Vehicle, folder: Path, follow: Callable[[],
 
     file, inputs = McapFile(log), {entry.topic: entry for entry in source("canonical").inputs}
     topics = file.topics
-    stamps, chooser = [0.0], Chooser(best_ranks(list(inputs.values())))
+    stamps, chooser = [0.0], SourceSelector(best_ranks(list(inputs.values())))
     intake, arrived = Intake(lambda: stamps[0]), dict[str, list[bytes]]()
     for topic in topics.values():
         entry = inputs[topic.name]
