@@ -103,9 +103,7 @@ class TrialFlights:
     def __init__(self, vehicle: Vehicle, noise: NoiseModel | None, seed: int) -> None:
         """Takes the vehicle file's values for the truth; `noise` as found in logs, or None for a typical one."""
         self.vehicle, self.noise, self.seed = vehicle, noise, seed
-        self.truth = TruthParameters(
-            **{n: vehicle.parameters[n].initial for n in NOMINAL_NAMES}, mass=vehicle.mass
-        )  # fmt: skip
+        self.truth = TruthParameters(**{n: vehicle.parameters[n].initial for n in NOMINAL_NAMES}, mass=vehicle.mass)
 
     def fly(self, segments: Sequence[Segment], seconds: float, profile: str = "scripted") -> Flight:
         """One flight; raises FlightError when it ends on the ground."""

@@ -116,7 +116,7 @@ class Diagnosed(Fitted):
         missing = None if self.forces is None else self.forces.section()
         page = diagnose_page(
             self.result, self.nominal.name, self.sets, self.noise, logs, rows, warnings, self.maps(), missing
-        )  # fmt: skip
+        )
         return render(page)
 
     def maps(self) -> dict[str, ResidualMap]:
@@ -259,7 +259,7 @@ def _finding_rows(finding: Json) -> list[tuple[str | Cell, ...]]:
         number(gain["mse_before"], 3),
         number(gain["mse_after"], 3),
         f"{rival['effect'].replace('_', ' ')} ({number(rival['mse_after'], 3)})" if rival else "",
-    ]  # fmt: skip
+    ]
     rows: list[tuple[str | Cell, ...]] = []
     for p in finding["parameters"]:
         name, before, after, other = first if not rows else ["", "", "", ""]

@@ -243,9 +243,7 @@ def propose(
             parse_height,
         ),
     ] = (10.0, 40.0),
-    battery: Annotated[
-        float, typer.Option("--battery", metavar="%", help="What must remain of the battery.")
-    ] = 40.0,
+    battery: Annotated[float, typer.Option("--battery", metavar="%", help="What must remain of the battery.")] = 40.0,
     forms: Annotated[
         Sequence[str],
         Typed(
@@ -257,8 +255,9 @@ def propose(
             ),
         ),
     ] = (),
-    seed: Seed = 1, advance: Advance = silent,
-) -> Proposed:  # fmt: skip
+    seed: Seed = 1,
+    advance: Advance = silent,
+) -> Proposed:
     """Proposes the manoeuvre that shrinks the intervals most, within tilt and rate limits.
 
     Args:

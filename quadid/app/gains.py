@@ -222,7 +222,7 @@ def gains(
         ),
     ] = None,
     anyway: Annotated[bool, typer.Option("--anyway", help="Take guesses and unproven values, too.")] = False,
-) -> Gains:  # fmt: skip
+) -> Gains:
     """Proposes rate and attitude gains from the identified vehicle; nothing is sent to a vehicle.
 
     The loops keep their margins for every combination of the ends of the 95 % intervals.
@@ -315,7 +315,7 @@ def _lateness(vehicle: Vehicle, motor_lag: float | None, delay: float | None) ->
             f"{vehicle.name}: neither motor_lag nor command_delay is in the file: not identified{why}",
             "one of them: they limit every loop",
             "`quadid diagnose` on a log with motor commands, or give --motor-lag and --delay",
-        )  # fmt: skip
+        )
     tau = max(lag.get("tau", 0.0), lag.get("tau_down", 0.0))
     out = []
     for name, given, held, stated in (

@@ -417,13 +417,10 @@ def airframe_picture(
         ).format(_SIZE),
         *(_line(centre, centre, x, y) for x, y in places),
         Markup('<path class="nose" d="M{0:.0f} {1:.0f} l-9 18 h18 z"/>').format(centre, centre - 30.0),
-        *(
-            _rotor(j, x, y, load[j] / baseline[j] - 1.0, weak.get(j), centre)
-            for j, (x, y) in enumerate(places)
-        ),
+        *(_rotor(j, x, y, load[j] / baseline[j] - 1.0, weak.get(j), centre) for j, (x, y) in enumerate(places)),
         *_shift(changes, centre, scale),
         Markup("</svg>"),
-    ]  # fmt: skip
+    ]
     return str(Markup("").join(parts))
 
 

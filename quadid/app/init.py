@@ -85,7 +85,7 @@ def init(
         float | None, typer.Option("--arm", metavar="M", min=0.001, help="Distance of the rotors from the centre.")
     ] = None,
     preset: Preset = "auto",
-) -> Initial:  # fmt: skip
+) -> Initial:
     """A vehicle file to fill in.
 
     Args:

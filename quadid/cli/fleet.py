@@ -117,7 +117,7 @@ _QUIET = {
 """Dask otherwise looks at every worker's stack each 10 ms, at itself each 20 ms and at memory each 100 ms."""
 _WARM = (
     "distributed", "distributed.nanny", "quadid.app.fleet", "quadid.app.identify", "quadid.condition.trim",
-    "quadid.condition.trim", "quadid_replay.rosbag",
+    "quadid_replay.rosbag",
 )  # fmt: skip
 """Modules imported by the process from which all workers are forked, those that replace dead ones too."""
 
@@ -238,9 +238,7 @@ def _answered(ended: Iterator[tuple[Any, Job]]) -> Generator[Row, None, list[Job
     return died
 
 
-def _stream(
-    client: Any, jobs: Sequence[Job], work: Callable[[Job], Row], ahead: int
-) -> Iterator[tuple[Any, Job]]:  # fmt: skip
+def _stream(client: Any, jobs: Sequence[Job], work: Callable[[Job], Row], ahead: int) -> Iterator[tuple[Any, Job]]:
     """Ended futures with their jobs, in the order in which they end; at most `ahead` are handed out."""
     waiting = iter(jobs)
     ended: SimpleQueue[Any] = SimpleQueue()

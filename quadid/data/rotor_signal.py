@@ -140,7 +140,7 @@ def _check_speeds(recording: Recording, speed: Channel) -> None:
             f"{recording.name}: rotor speeds up to {top:.3g} ({speed.source}) are commands from 0 to 1, no rad/s",
             "rad/s",
             "name the columns u1 … uN, with command: {kind: normalized, max_speed: <rad/s>} in the vehicle file",
-        )  # fmt: skip
+        )
 
 
 def _needs_command_kind(

@@ -20,7 +20,7 @@ from quadid.flight.loop import (
     quaternion_of,
     shake,
     turned,
-)  # fmt: skip
+)
 from quadid.flight.pilot import Pilot, fly_by_hand
 from quadid.flight.rotors import Drive
 from quadid.types import FloatArray

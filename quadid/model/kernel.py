@@ -101,9 +101,7 @@ def _on_disk(sources: int) -> Any:
     def needs_of(theta: FloatArray, rotors: int, channels: int) -> Needs:
         """Returns what a block of parameter vectors (LANES, size) needs of the model."""
         _ = sources
-        rare, factors, payload = (
-            _any_of(theta, _RARE), _any_of(theta, _FACTORS), _any_of(theta, _PAYLOAD)
-        )  # fmt: skip
+        rare, factors, payload = (_any_of(theta, _RARE), _any_of(theta, _FACTORS), _any_of(theta, _PAYLOAD))
         learned = False
         for lane in range(len(theta)):
             for i in range(ix.LOSS + 2 * rotors, theta.shape[1]):

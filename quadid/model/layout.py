@@ -335,5 +335,5 @@ def relative_voltage(window: Window, vehicle: Vehicle) -> FloatArray:
             f"{window.name or 'window'}: no supply voltage, which scales this vehicle's commands (supply_voltage)",
             "battery voltage in the log and reference_voltage in the vehicle file",
             "log the battery, or leave supply_voltage out",
-        )  # fmt: skip
+        )
     return np.zeros(len(window))

@@ -202,7 +202,7 @@ def _largest(allowed: Callable[[float], bool], low: float, high: float) -> float
 
 def design(
     plant: AxisPlant, phase_margin: float, most: float, cutoff: float, derivative: bool, on_error: bool
-) -> Loops:  # fmt: skip
+) -> Loops:
     """The fastest loops with margins that every variant keeps.
 
     Args:

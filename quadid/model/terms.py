@@ -296,9 +296,7 @@ class Frame:
         if self.lagging:
             omega = list(x[13:])
             pairs = zip(wanted, omega, strict=True)
-            turning = [
-                (goal - w) / (th[ix.TAU] + f.where(w > goal, th[ix.SLOWER], 0.0)) for goal, w in pairs
-            ]  # fmt: skip
+            turning = [(goal - w) / (th[ix.TAU] + f.where(w > goal, th[ix.SLOWER], 0.0)) for goal, w in pairs]
         rows = (
             (qw * qw + qx * qx - qy * qy - qz * qz, 2.0 * (qx * qy - qw * qz), 2.0 * (qx * qz + qw * qy)),
             (2.0 * (qx * qy + qw * qz), qw * qw - qx * qx + qy * qy - qz * qz, 2.0 * (qy * qz - qw * qx)),

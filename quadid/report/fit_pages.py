@@ -501,9 +501,7 @@ def diagnosis_part(
 
 def findings_section(diagnoses: Sequence[Json]) -> JsonDict:
     """Diagnoses as a section of a page."""
-    return section(
-        "findings", "What the simulation gets wrong", parts=diagnoses, menu="What is wrong", kind="plain"
-    )  # fmt: skip
+    return section("findings", "What the simulation gets wrong", parts=diagnoses, menu="What is wrong", kind="plain")
 
 
 _REMARKS = {
@@ -550,12 +548,10 @@ def finding_part(finding: Json, floor: float, identifier: str, seen: ResidualMap
             *([map_figure(seen, f"{identifier}-map", name)] if seen is not None else []),
             gain_figure(finding, floor, f"{identifier}-gain"),
         ],
-        lines=[
-            finding["evidence"], Markup("").join(map(_value, finding["parameters"])), _finding_advice(finding)
-        ],
+        lines=[finding["evidence"], Markup("").join(map(_value, finding["parameters"])), _finding_advice(finding)],
         after=[f"{''.join(gained)}. {_noise_sentence(gain, floor, name)}".rstrip(), quiet(rejected)],
         kind="finding",
-    )  # fmt: skip
+    )
 
 
 def _value(p: Json) -> Markup:
@@ -584,9 +580,7 @@ def _noise_sentence(gain: Json, floor: float, name: str) -> str:
     )
 
 
-def missing_section(
-    missing: Json, log: str, parts: Mapping[str, Sequence[Missing]]
-) -> dict[str, Any]:  # fmt: skip
+def missing_section(missing: Json, log: str, parts: Mapping[str, Sequence[Missing]]) -> dict[str, Any]:
     """The missing force and moment as part of a page: over time on one log, and by axis over the deciding logs.
 
     Args:

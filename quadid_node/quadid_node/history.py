@@ -211,7 +211,7 @@ def opened(path: Path) -> Iterator[sqlite3.Connection]:
 
 def read_history(
     path: Path, vehicle: str, candidates: int = 0, events: int = 0, sets: int = -1
-) -> dict[str, list[dict[str, Any]]]:  # fmt: skip
+) -> dict[str, list[dict[str, Any]]]:
     """Reads a history without touching it: sets, newest candidates and events, and the names of all vehicles.
 
     Args:
@@ -726,9 +726,9 @@ class Store:
 
     def event(self, item: Event, data: str | None = None) -> None:
         """Journals an event, with JSON that belongs to it."""
-        self._put(self._row(
-            "events", passes=True, level=item.level, kind=item.kind, text=item.text, t=item.t, data=data
-        ))  # fmt: skip
+        self._put(
+            self._row("events", passes=True, level=item.level, kind=item.kind, text=item.text, t=item.t, data=data)
+        )
 
     def diagnosis(self, item: OnlineDiagnosis) -> None:
         """Journals findings."""

@@ -330,7 +330,7 @@ class Decoder:
 
     def __init__(
         self, entry: Input, chooser: SourceSelector, rotors: int, decode: Callable[[bytes], Any], mounted: bool = True
-    ) -> None:  # fmt: skip
+    ) -> None:
         """Prepares for one input.
 
         Args:

@@ -383,7 +383,7 @@ class Result(NamedTuple):
 _SET = Result(
     lambda output, vehicle, boot_id: parameter_set(output.item, vehicle, boot_id),
     lambda output: set_to_dict(output.item),
-)  # fmt: skip
+)
 RESULTS: Mapping[str, Result] = {
     "parameters": _SET,
     "candidate": _SET,

@@ -43,7 +43,7 @@ from quadid_node.inputs import (
     service_class,
     source,
     to_message,
-)  # fmt: skip
+)
 from quadid_node.publish import NO_SUBSCRIPTION_EVENTS, Bond, GraphMonitor, Offer, Publishers, bond_of
 from quadid_node.recording import WRITTEN, Beginning, Recorder
 from quadid_node.service import ROUND_SECONDS, STEP_SECONDS, WORK_SECONDS, Scheduler, Service

@@ -123,10 +123,10 @@ class TopicOwnership:
 _ALWAYS = {"deadline": Infinite, "liveliness": LivelinessPolicy.AUTOMATIC, "liveliness_lease_duration": Infinite}
 USUAL_QOS = QoSProfile(
     depth=10, durability=DurabilityPolicy.VOLATILE, reliability=ReliabilityPolicy.RELIABLE, **_ALWAYS
-)  # fmt: skip
+)
 LATCHED_QOS = QoSProfile(
     depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL, reliability=ReliabilityPolicy.RELIABLE, **_ALWAYS
-)  # fmt: skip
+)
 LEASE = 5.0
 """A service that asserts its liveliness on the parameter topic for longer than this [s] no more is dead or hangs."""
 PARAMETERS_QOS = QoSProfile(

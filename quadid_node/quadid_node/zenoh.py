@@ -54,7 +54,7 @@ def open_session(where: str) -> Any:
 
 def wait_for_session(
     where: str, wait: Callable[[float], bool], told: Callable[[str], None], retry: float = RETRY
-) -> Any:  # fmt: skip
+) -> Any:
     """Opens a session as soon as somebody listens there; None once `wait`, given a pause [s], says to stop."""
     while True:
         try:

@@ -86,7 +86,7 @@ def _no_rows(path: Path, names: Sequence[str], delimiter: str) -> LogError:
             f"{path.name}: column {plain(name, 40)} holds '{plain(cell.strip(), 40)}', no number",
             "numbers in every row",
             "write times as seconds: 0.02, 0.04 …" if name == "t" else "leave that column out, or export numbers",
-        )  # fmt: skip
+        )
     return LogError(f"{path.name}: no usable row below the header", "numbers in every row", "check the export")
 
 

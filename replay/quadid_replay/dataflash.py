@@ -24,7 +24,7 @@ from quadid_replay.columns import (
     mode_changes,
     rising,
     spikes,
-)  # fmt: skip
+)
 from quadid_replay.frames import from_euler
 
 # isort: off
@@ -376,7 +376,7 @@ def _outputs(
         place |= {int(m[1]) - 1: (name, m[0]) for c in columns if (m := _OUTPUT.fullmatch(c)) and 0 < int(m[1]) <= ESCS}
     told = {
         name: _rows(index, times, name, tuple(c for n, c in place.values() if n == name)) for name, _ in place.values()
-    }  # fmt: skip
+    }
     first = next(iter(told.values()), None)
     if first is None:
         return []

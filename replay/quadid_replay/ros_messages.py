@@ -157,9 +157,7 @@ class MessageType:
 
 def _runs(*names: str, some: bool = False) -> Callable[[list[FloatArray], Any], Signals]:
     """Signals that are whole runs; where a type may hold `some` of them only, an empty one is not told."""
-    return lambda runs, extra: [
-        (n, run, run.shape[1] > 0 or not some) for n, run in zip(names, runs, strict=True)
-    ]  # fmt: skip
+    return lambda runs, extra: [(n, run, run.shape[1] > 0 or not some) for n, run in zip(names, runs, strict=True)]
 
 
 def _vector(v: Any) -> list[float]:

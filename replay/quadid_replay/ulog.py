@@ -349,15 +349,11 @@ def _load(path: Path, records: UlogRecords) -> _Log:
             "a PX4 ULog", "copy the file again from the vehicle",
         ) from error  # fmt: skip
     topics = {(unversioned(d.name), d.multi_id): d.data for d in reversed(ulog.data_list)}
-    parameters = {
-        str(k): float(v) for k, v in ulog.initial_parameters.items() if isinstance(v, int | float)
-    }  # fmt: skip
+    parameters = {str(k): float(v) for k, v in ulog.initial_parameters.items() if isinstance(v, int | float)}
     return _Log(topics, parameters)
 
 
-def _raw(
-    log: _Log, channel: str, key: tuple[str, int], values: FloatArray, note: str = ""
-) -> RawChannel:  # fmt: skip
+def _raw(log: _Log, channel: str, key: tuple[str, int], values: FloatArray, note: str = "") -> RawChannel:
     source = f"{key[0]}{f' {key[1]}' if key[1] else ''}{f' ({note})' if note else ''}"
     return RawChannel(channel, _times(log.topics[key], "timestamp"), values, source)
 

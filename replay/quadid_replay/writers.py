@@ -290,7 +290,7 @@ def write_recordings(
     blocks = [
         None if s.plain else BlockWriter(encode, s.build, s.rows.shape[1])
         for s, encode in zip(each, encoders, strict=True)
-    ]  # fmt: skip
+    ]
     for which, row in in_time_order([s.t for s in each]):
         s, block = each[which], blocks[which]
         ns, values = epoch_ns + round(float(s.t[row]) * 1e9), s.rows[row].tolist()
@@ -546,7 +546,7 @@ def _mavlink_series(channels: Mapping[str, Channel], first: float, last: float) 
 def _attitude(c: Channel) -> Callable[[int], list[Any]]:
     return lambda row: [
         dialect.MAVLink_attitude_quaternion_message(_ms(c.t[row]), *c.values[row].tolist(), 0.0, 0.0, 0.0)
-    ]  # fmt: skip
+    ]
 
 
 def _escs(c: Channel) -> Callable[[int], list[Any]]:

@@ -229,7 +229,7 @@ def test_hostile_names_in_a_log_stay_text(chromium: Browser, hostile_page: Path,
 @pytest.mark.parametrize(("width", "scheme"), [(390, "light"), (1280, "dark")])
 def test_the_other_reports_too(
     chromium: Browser, request: pytest.FixtureRequest, shots: Path, name: str, width: int, scheme: Scheme
-) -> None:  # fmt: skip
+) -> None:
     file: Path = request.getfixturevalue(name)
     with opened(chromium, file, width, scheme) as one:
         one.unfold()

@@ -26,9 +26,7 @@ from tests.replay.px4_flight import px4_ulog
 
 
 @pytest.mark.slow
-def test_the_tutorial_runs_as_written(
-    quadid: Cli, repository: Path, tmp_path: Path
-) -> None:  # fmt: skip
+def test_the_tutorial_runs_as_written(quadid: Cli, repository: Path, tmp_path: Path) -> None:
     found = commands(repository / "docs" / "tutorial.md")
     assert len(found) == 10
     said = []

@@ -128,9 +128,7 @@ RANDOM = RandomForces(
 
 def uncertain(share: float = 0.02, random: RandomForces | None = RANDOM) -> Vehicle:
     pelican = Vehicle.shipped("pelican")
-    priors = {
-        n: ParameterPrior(initial=p.initial, sigma=share * p.initial) for n, p in pelican.parameters.items()
-    }  # fmt: skip
+    priors = {n: ParameterPrior(initial=p.initial, sigma=share * p.initial) for n, p in pelican.parameters.items()}
     return pelican.model_copy(update={"parameters": priors, "random": random})
 
 

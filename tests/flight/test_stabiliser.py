@@ -158,9 +158,7 @@ def test_excited_moves_like_the_independent_flights(data_dir: Path) -> None:
         names = file.open().readline().strip().split(",")
         table = dict(zip(names, np.loadtxt(file, delimiter=",", skiprows=1, unpack=True), strict=True))
         squares = np.sum([table[f"w{i}"] ** 2 for i in range(1, 5)], axis=0)
-        others.append(
-            [table[c].std() for c in ("p", "q", "r", "phi", "theta")] + [squares.std() / squares.mean()]
-        )  # fmt: skip
+        others.append([table[c].std() for c in ("p", "q", "r", "phi", "theta")] + [squares.std() / squares.mean()])
     ours = []
     for seed in range(6):
         m = movement(fly(PELICAN, draw_truth(PELICAN, seed), 100.0, seed))

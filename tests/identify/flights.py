@@ -43,9 +43,8 @@ def guessed(truth: TruthParameters, seed: int = 0, spread: float = 0.3) -> Vehic
     rng = np.random.default_rng([seed, 5])
     off = np.exp(rng.uniform(-spread, spread, len(NOMINAL_NAMES)))
     priors = {
-        n: ParameterPrior(initial=float(v * f))
-        for n, v, f in zip(NOMINAL_NAMES, values_of(truth), off, strict=True)
-    }  # fmt: skip
+        n: ParameterPrior(initial=float(v * f)) for n, v, f in zip(NOMINAL_NAMES, values_of(truth), off, strict=True)
+    }
     return PELICAN.model_copy(update={"parameters": priors})
 
 

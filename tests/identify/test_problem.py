@@ -21,9 +21,7 @@ from quadid.types import FloatArray
 from tests.identify.dense import DenseProblem, perturbed
 from tests.identify.flights import PELICAN, at_truth, flown, without_rows
 
-NOISE = NoiseModel(
-    np.array([0.02] * 3 + [0.003] * 3 + [0.25] * 3), np.array([0.0] * 3 + [0.004] * 3 + [0.0] * 3)
-)  # fmt: skip
+NOISE = NoiseModel(np.array([0.02] * 3 + [0.003] * 3 + [0.25] * 3), np.array([0.0] * 3 + [0.004] * 3 + [0.0] * 3))
 RIDGE = np.array([1.0] * 3 + [20.0] * 3 + [30.0] * 3 + [100.0] * 3)
 LATE = (*NOMINAL_NAMES, "motor_lag.tau", "cg_offset.x", "gyro_bias.z", "battery_sag.fraction")
 DRAGGED = (*NOMINAL_NAMES, "rotor_drag.k_x", "rotor_drag.k_y", "parasitic_drag.c", "accel_bias.x")

@@ -404,7 +404,7 @@ def test_an_effect_may_change_as_far_as_it_likes(value: float) -> None:
 def test_what_was_known_badly_may_move_by_two_deviations_more(factor: float, state: SetState) -> None:
     case = good(
         parameters=parameter_set(scaled(**dict.fromkeys(NOMINAL_NAMES, factor))), in_force=online_set(TRUE, sigma=0.1)
-    )  # fmt: skip
+    )
     assert decide(case, GateSettings()).state is state
 
 

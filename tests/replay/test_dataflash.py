@@ -42,7 +42,7 @@ class Dataflash:
 
 def flight(
     seconds: float = 4.0, start: float = 10.0, motors: tuple[int, ...] = (3, 0, 1, 2), escs: int = 0
-) -> Dataflash:  # fmt: skip
+) -> Dataflash:
     log = Dataflash()
     log.describe(1, "PARM", "QNf", "TimeUS,Name,Value")
     log.describe(2, "IMU", "QBffffff", "TimeUS,I,GyrX,GyrY,GyrZ,AccX,AccY,AccZ")

@@ -138,7 +138,7 @@ def test_without_a_velocity_the_position_is_compared_with_the_force(flight: Reco
         ("velocity", [1.0, 1.0, 0.0], [0.0, 0.0, 0.0], False, "velocity: does not change for .* or one axis does not"),
         ("accel", [1.0, 1.0, 0.0], [0.0, 0.0, -9.81], False, "accel: does not change for .* or one axis does not"),
     ],
-)  # fmt: skip
+)
 def test_one_axis_and_zero_of_a_sensor(
     flight: Recording, channel: str, scale: list[float], zero: list[float], error: bool, said: str
 ) -> None:

@@ -249,7 +249,7 @@ def kernel_table(rounds: int) -> dict[str, Any]:
         "gain_over_numpy": plainest / nominal,
         "extended_over_nominal": full / nominal,
         "every_over_nominal": _told(seen, model[5][0])["least"] / nominal,
-    }  # fmt: skip
+    }
 
 
 def effect_table(rounds: int) -> dict[str, Any]:

@@ -257,7 +257,7 @@ def _change(r: Result) -> list[str]:
         f"its size within 10 %: **{r['hits']} of {len(flights)}**. Named at all: {named}. Reported after "
         f"{_median(after):.2f} s (median), {max(after, default=float('nan')):.2f} s (latest); size off by "
         f"{np.median(error):.2f} % (median), {error.max():.2f} % (worst).",
-    ]  # fmt: skip
+    ]
 
 
 def _hover(r: Result) -> list[str]:
@@ -279,7 +279,7 @@ def _repeat(r: Result) -> list[str]:
     return [
         f"{r['seconds']:.0f} s, samples out of order and up to 0.3 s late; fits in a process, then inline: "
         f"{r['estimates']} estimates, {same}. Over DDS: `tests/node/test_ros_node.py`.",
-    ]  # fmt: skip
+    ]
 
 
 def _load(r: Result) -> list[str]:

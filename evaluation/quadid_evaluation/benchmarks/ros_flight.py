@@ -52,9 +52,7 @@ def recording(seconds: float, rate: float, profile: str) -> Any:
     from quadid.vehicle import Vehicle
 
     extras = ["velocity"] if rate == FAST else []
-    flight = fly(
-        Vehicle.shipped("pelican"), seconds=seconds, seed=4, profile=profile, log_rate=rate, extras=extras
-    )  # fmt: skip
+    flight = fly(Vehicle.shipped("pelican"), seconds=seconds, seed=4, profile=profile, log_rate=rate, extras=extras)
     step = SLOWER if rate == FAST else {}
     channels = {
         name: Channel(name, c.t[:: step.get(name, 1)], c.values[:: step.get(name, 1)], name)

@@ -71,9 +71,7 @@ class Running:
             "--mavlink", f"udpin:127.0.0.1:{self._port}",
         ]  # fmt: skip
         environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
-        return subprocess.Popen(
-            command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=environment
-        )  # fmt: skip
+        return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=environment)
 
     def end(self, number: int) -> float:
         """Sends a signal and waits; returns how long it took [s]."""
@@ -607,7 +605,7 @@ def _say(text: str) -> None:
 
 def page(
     command: str, minutes: float, entries: list[dict[str, Any]], crashes: list[str], wrong: list[str], sets: int
-) -> str:  # fmt: skip
+) -> str:
     """Markdown: totals, then recovery by fault."""
     lines = [
         "# Chaos: random faults at the running service", "",

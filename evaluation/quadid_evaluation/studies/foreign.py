@@ -123,7 +123,7 @@ def outside_table(numbers: Sequence[Number], short: Sequence[str] = ("cases", "R
         + ", ".join(f"{group} {sum(n.inside for n in mine)} of {len(mine)}" for group, mine in _groups(named, short))
         + ". All values: `foreign.json`.",
         "",
-    ]  # fmt: skip
+    ]
     rows = []
     for n in named:
         if n.inside:

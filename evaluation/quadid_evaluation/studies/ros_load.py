@@ -61,7 +61,7 @@ MESSAGES = {
         "RCOut": "std_msgs/Header header\nuint16[] channels",
         "AttitudeTarget": "std_msgs/Header header\ngeometry_msgs/Quaternion orientation\nfloat32 thrust",
     },
-}  # fmt: skip
+}
 """Fields that the node reads, by package and type."""
 NEEDED = ("std_msgs", "geometry_msgs")
 PACKAGE = """<package format="3"><name>{name}</name><version>0.0.0</version><description>fields in use</description>

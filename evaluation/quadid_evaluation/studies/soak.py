@@ -58,7 +58,7 @@ class TimedWorker(InlineWorker):
 
 def day(
     hours: float, refit: float, diagnose: float, tell: Callable[[str], None], limit: float, kept: int
-) -> dict[str, Any]:  # fmt: skip
+) -> dict[str, Any]:
     """Takes in `hours` of flight.
 
     Args:
@@ -244,9 +244,7 @@ PARTS: Mapping[str, Callable[[Any], dict[str, Any]]] = {
 }
 
 if __name__ == "__main__":
-    given = options(
-        __doc__, PARTS, hours=24.0, refit=10.0, diagnose=1800.0, kept=2000, limit=1e9, seconds=3600.0
-    )  # fmt: skip
+    given = options(__doc__, PARTS, hours=24.0, refit=10.0, diagnose=1800.0, kept=2000, limit=1e9, seconds=3600.0)
     where = (given.out or Path("docs/results")) / "soak.md"
     for part in given.parts:
         found = keep(where.with_suffix(".json"), part, PARTS[part](given))

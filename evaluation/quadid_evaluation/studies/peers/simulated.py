@@ -119,10 +119,7 @@ def said(records: Sequence[Record]) -> str:
     mine = [r for r in records if CASES[r["case"]][1] and r["program"] == OURS]
     statuses = [s for r in mine for s in r["status"]]
     counts = ", ".join(f"{statuses.count(s)} {s}" for s in dict.fromkeys(statuses))
-    wrong = [
-        (abs(e) > h, s) for r in mine
-        for e, h, s in zip(r["error"], r["half"], r["status"], strict=True)
-    ]  # fmt: skip
+    wrong = [(abs(e) > h, s) for r in mine for e, h, s in zip(r["error"], r["half"], r["status"], strict=True)]
     missed = sum(bool(out) for out, status in wrong if status == "identified")
     widths = ", ".join(f"{100.0 * v:.3g}" for v in np.median([r["half"] for r in mine], axis=0))
     return (
