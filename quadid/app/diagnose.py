@@ -167,6 +167,7 @@ def diagnose(
     found, selection = diagnose_windows(windows, described, unseen, seed, advance, nominal=nominal)
     found, model = _within_reach(found, unreachable), selection.model
     models = {"nominal": fit.theta, "extended": model.theta}
+    # What force and moment the vehicle misses without and with the causes: too little taken off, and none is confident.
     forces, squares = compared(train, held, fit.vehicle, models, {}, advance)
     removed = None if forces is None else _removed(forces, found, selection, fit.vehicle)
     if found.verdict is Explanation.PARTLY_EXPLAINED and removed is not None and removed < LEAST_REMOVED:
@@ -193,6 +194,7 @@ def diagnose(
     ]
     result["missing"] = None if forces is None else forces.result()
     result["removed"] = removed
+    # What each cause alone takes off.
     advance("gain of each cause", 0.0)
     for entry in result["findings"]:
         names = [n for c in model.causes if c.effect == entry["effect"] for n in c.names]

@@ -193,7 +193,7 @@ def check_limits(
     seconds: float, tilt: float, rate_limit: float, height: tuple[float, float], battery: float,
     forms: Sequence[str],
 ) -> None:  # fmt: skip
-    """Raises ParameterError for a manoeuvre that nobody can fly, or a form that is not written."""
+    """Raises ParameterError for a manoeuvre that cannot be flown, or a form that is not written."""
     for form in forms:
         check_form(form)
     if not 2.0 <= height[0] < height[1] <= 500.0:
@@ -273,7 +273,7 @@ def propose(
         advance: told how far it is.
 
     Raises:
-        ParameterError: limits that nobody can fly.
+        ParameterError: limits that cannot be flown.
         NotIdentifiableError: no movement stays within the limits, or too little data.
     """
     from quadid.experiment import AsLogged, Limits, TrialFlights, design_manoeuvre, manoeuvre_file

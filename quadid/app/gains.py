@@ -249,6 +249,7 @@ def gains(
         raise ParameterError(f"a phase margin of {phase_margin:g} deg", "20 to 80 deg")
     if bandwidth is not None and not 0.0 < bandwidth < math.inf:
         raise ParameterError(f"a bandwidth of {bandwidth:g} Hz", "more than 0 Hz")
+    # What the gains rest on: the vehicle, the autopilot's filters and rates, and how late the rotors answer.
     described, autopilot = as_vehicle(vehicle), AUTOPILOTS[format]
     facts, known = Facts(described, ""), _told(current, autopilot)
     warnings = _check_identified(described, anyway)
@@ -259,6 +260,7 @@ def gains(
     most = SHARE * authority(facts, at) / inertia / STEP
     fixed = _on_board(autopilot, known, described)
     used = [*_measured(facts), *late, *fixed.values()]
+    # Axis by axis: the fastest loop that keeps its margins, slower where that is wanted, in the autopilot's parameters.
     loops, before, axes, chosen = {}, {}, [], []
     for k, axis in enumerate(AXES):
         plant = _plant(facts, k, late, fixed)

@@ -259,14 +259,17 @@ def identify(
 
     check_optimizer(optimizer)
     check_seed(seed)
+    # Logs on the grid, and the vehicle as stated: its guesses, bounds, priors and known effects.
     given = settled(logs, validate, vehicle)
     train, held = given.train, given.held
     windows = [w for log in train for w in log.windows]
     described = stated(with_reference_voltage(given.vehicle, windows), bounds or {}, priors or {}, effects or {})
     names = freed(described, free, fix)
+    # The fit.
     begin = time.perf_counter()
     fit = search(optimizer, windows, described, seed, advance, out_of_reach(train), names)
     seconds = time.perf_counter() - begin
+    # How well guess and fit predict each log, and what force and moment they miss.
     guess = Layout(fit.vehicle).initial(fit.vehicle)
     forces, squares = compared(train, held, fit.vehicle, {"nominal": fit.theta}, {"initial": guess}, advance)
     advance("scores", 0.0)
@@ -279,6 +282,7 @@ def identify(
     result = identify_result(fit, optimizer, seed, seconds, sets, None, given.warnings)
     for entry, log in zip(result["sets"], flown, strict=True):
         entry["seconds"] = log.grid.seconds_used
+    # A model that is wrong about its own errors proves no parameter.
     if not worst(result["sets"]) <= ROUGH:
         fit = replace(fit, parameters=fit.parameters.unreliable(fit.parameters.names))
         result["parameters"] = [parameter_entry(p) for p in fit.parameters]

@@ -220,7 +220,7 @@ def check_table(found: Inspection) -> TextTable:
 
 
 def parameter_outlook_table(found: Inspection) -> TextTable:
-    """Parameters that the log can show, and how sharply; motion says nothing where a channel lacks or is too slow."""
+    """Parameters that the log can show, and how sharply, unless a channel is missing or too slow."""
     expected = {str(row["name"]): float(row["relative_sigma"]) for row in found.excitation}
     columns = [Column("parameter"), Column("possible")]
     if expected:

@@ -90,7 +90,7 @@ def file_name(name: str) -> str:
 
 
 def free_name(folder: str | Path, name: str, ending: str, taken: Sequence[Path]) -> Path:
-    """An absolute path that no other log of this run has; two logs of one name are told apart by number."""
+    """An absolute path that no other log of this run has; two logs of one name are distinguished by number."""
     whole = Path(folder).absolute()
     path, number = whole / f"{file_name(name)}.{ending}", 2
     while path in taken:
@@ -436,7 +436,7 @@ def check_conventions(recording: Recording, vehicle: Vehicle, cut: LogPart) -> C
     # Rotors at a speed that cannot carry this vehicle: what else is wrong about them is that of another one.
     stranger = next((c.message for c in found.checks if c.name == "hover" and c.verdict is CheckResult.WARNING), "")
     for check in found.checks:
-        # A check without numbers could not be made; what comes next says why, and better.
+        # A check without numbers could not be made; what comes next gives the better reason.
         if check.verdict is CheckResult.ERROR and check.name in FATAL and check.numbers:
             fix = f"{check.fix}, or insist with --unchecked" if check.fix else "insist with --unchecked"
             of_rotors = stranger if check.name in ("motor_order", "rotor_timing") else ""

@@ -249,10 +249,12 @@ def make_plan(
         if channel is not None and len(channel.t) >= 2:
             raw[name] = (channel.t, channel.values)
     raw = {name: _distinct(*pair) for name, pair in raw.items()}
+    # The step of the grid, and whether any channel is so fast for it that all must be low-passed alike.
     periods = {name: sample_period(times) for name, (times, _) in raw.items()}
     own = periods.get("gyro", periods["rotor_speed"])
     step = round(own, 9) if rate is None else 1.0 / rate
     filtered = min(periods[n] for n in REQUIRED if n in raw) < _FAST * step
+    # Repeated readings are none where a low-pass would smear them; stretches end at gaps and breaks.
     tracks = {}
     for name, (times, values) in raw.items():
         period, longest = periods[name], longest_step(times, step)
@@ -430,6 +432,7 @@ def grid_recording(
     recording = in_body_axes(recording, vehicle)
     rotor = rotor_signal(recording, vehicle)
     plan = make_plan(recording, rotor.t, rotor.values, rotor.sampling, rate)
+    # Windows where every required channel is there, inside the parts that are asked for.
     spans = _spans(plan)
     shortest = SHORTEST if rate is not None else 0.0
     log_span = recording.span

@@ -306,7 +306,7 @@ class Size(NamedTuple):
     Attributes:
         low, high: range.
         scales: whether it grows with the effect (a frequency does not).
-        by: key of `draw.vehicle_scales`, for numbers that depend on the vehicle's size.
+        by: key of `quadid.flight.setup.vehicle_scales`, for numbers that depend on the vehicle's size.
     """
 
     low: float

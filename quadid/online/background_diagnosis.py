@@ -76,10 +76,10 @@ def _online(f: Finding, slow: bool) -> OnlineFinding:
 
 
 class BackgroundDiagnosis:
-    """Asks for diagnoses of one vehicle, and tells what is new in their answers.
+    """Asks for diagnoses of one vehicle, and reports what is new in their answers.
 
     Attributes:
-        wrong_scale: what the last answer says of a sensor's scale, too large for calibrated ones; empty: nothing.
+        wrong_scale: a sensor's scale by the last answer, if too large for calibrated ones; else empty.
     """
 
     def __init__(
@@ -150,7 +150,7 @@ def _is_wrong_scale(finding: OnlineFinding) -> bool:
 
 
 def _same(old: DiagnosisReply, new: DiagnosisReply) -> bool:
-    """No news: the same verdict and causes, and no number outside the interval told before."""
+    """No news: the same verdict and causes, and no number outside the interval reported before."""
     if old.verdict != new.verdict or [f.effect for f in old.findings] != [f.effect for f in new.findings]:
         return False
     return all(

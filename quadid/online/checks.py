@@ -43,11 +43,11 @@ TURN = 0.2
 LEAD = 2.0 * TURN
 """A change of turn needs so much of the past [s]."""
 MOVING = 0.1
-"""An axis that turns slower than this on average [rad/s] tells nothing: gyro noise would make the factor too small."""
+"""An axis that turns slower than this on average [rad/s] is not used: gyro noise would make the factor too small."""
 FEWEST = 15
 """Turns that tell a factor, at least,"""
 KNOWN = 0.05
-"""... and the standard deviation from which on it is told: noise makes a ratio of small turns too large."""
+"""... and the standard deviation from which on it is used: noise makes a ratio of small turns too large."""
 AXES = ("roll", "pitch", "yaw")
 TURN_FACTOR = "turn by the attitude over that by the gyro"
 GRAVITY_FACTOR = "accelerometer over gravity by the attitude"
@@ -59,7 +59,7 @@ class Factor:
 
     Attributes:
         what: the two, in words.
-        value: of the factor; sigma: its standard deviation, infinite where nothing tells it.
+        value: of the factor; sigma: its standard deviation, infinite where no data show it.
         ideal: what it is where they agree.
     """
 

@@ -244,7 +244,7 @@ MOST_ERRORS = 5
 
 
 def unexpected(error: BaseException) -> str:
-    """The problem that an error is which nobody foresaw: what, and where it arose."""
+    """An unforeseen error as a problem: what, and where it arose."""
     *_, last = traceback.extract_tb(error.__traceback__)
     return f"{UNEXPECTED}{type(error).__name__}: {str(error)[:200]} ({Path(last.filename).name}, line {last.lineno})"
 
@@ -313,7 +313,7 @@ class Job(ABC):
         return isinstance(reply, self.reply) and reply.number == self.number
 
 
-# --- What a session says: its phase and reason, and the actions that wait to be handed out
+# --- Outgoing actions of a session: its phase and reason, and what waits to be handed out
 
 
 Action = Job | Publish | OnlineDiagnosis | HealthReport | HealthyFlight | Event

@@ -540,7 +540,7 @@ class Session:
         self._relearn(learn_from, "the vehicle has changed")
 
     def _fail(self, t: float, problem: str) -> None:
-        """After an error that nobody foresaw, at `t` [s]: what was learned may be its cause and is forgotten."""
+        """After an unforeseen error at `t` [s]: what was learned may be its cause and is forgotten."""
         self._errors += 1
         left = MOST_ERRORS - self._errors
         what = "learning restarts" if left > 0 else f"{MOST_ERRORS} in a row: no more fits until fit_now or a restart"

@@ -41,7 +41,7 @@ CONFIRMATIONS = 3
 """Further stamps that must agree before a step is believed: a single wild stamp moves nothing."""
 PAUSE = 4.0
 """Session time [s] between the newest sample of one time base and the first of the next: more than rows look back on
-(`resampler.HISTORY`) and followers run ahead."""
+(`HISTORY`) and followers run ahead."""
 DAY = 86400.0
 LARGEST = 1e11
 """Stamps beyond this [s] are no times."""
@@ -59,7 +59,7 @@ class StreamClock:
     def __init__(self) -> None:
         self.newest = -math.inf
         self.steps = self.wild = 0
-        # The newest of which session times can be told as stamps.
+        # The newest time bases, of which session times can be turned back into stamps.
         self._bases: deque[tuple[float, float]] = deque([(-math.inf, 0.0)], maxlen=64)
         self._suspects: list[float] = []
 
@@ -86,6 +86,7 @@ class StreamClock:
         out = np.full(len(stamps), np.nan)
         at = 0
         while at < len(stamps):
+            # Stamps that go on from those before are taken together; the first that does not is looked at by itself.
             t = stamps[at : at + 256] + self._bases[-1][1]
             reached = np.maximum.accumulate(np.concatenate([[self.newest], t]))[:-1]
             strange = ~((t > reached - STEP_BACK) & (t < reached + STEP_AHEAD))
@@ -116,6 +117,7 @@ class StreamClock:
         self._suspects.append(stamp)
         if len(self._suspects) <= CONFIRMATIONS:
             return math.nan
+        # Enough agree: a pause of this time base, or a new one, which begins after a pause of session time.
         first, shift = min(self._suspects), self._bases[-1][1]
         self._suspects.clear()
         if not self.newest < first + shift <= self.newest + PAUSE_AHEAD:
@@ -168,6 +170,7 @@ class ChannelBuffer:
         if not chunks:
             return 0, 0
         reached, t, values = (np.concatenate(parts) for parts in zip(*chunks, strict=True))
+        # What came too late is left out; of equal times the sample that came first stays.
         in_time = t >= oldest
         late = int(np.count_nonzero(~in_time & (reached > since)))
         t, values = np.concatenate([self.t, t[in_time]]), np.concatenate([self.values, values[in_time]])
@@ -208,14 +211,14 @@ class ChannelBuffer:
         return Channel(name, self.t[low:high], continuous_sign(values) if name == "attitude" else values, name)
 
 
-# --- Rotor commands where nobody tells them: references through the stabiliser, as the vehicle computes them on board
+# --- Rotor commands reconstructed from references through the stabiliser, as the vehicle computes them on board
 #
 # A vehicle that publishes its references, its attitude and its rates, and whose stabiliser is known (`stabiliser:` in
-# the vehicle file), has told its rotor commands too: the control law of `quadid.attitude_controller` makes the one out
-# of the others. Commands are computed at the gyro's samples, and act from each until the next; a stabiliser that runs
+# the vehicle file), needs to publish no rotor commands: the control law of `quadid.attitude_controller` computes them
+# from the others. Commands are computed at the gyro's samples, and act from each until the next; a stabiliser that runs
 # faster than the gyro comes is run in between on interpolated measurements, and its mean is taken.
 #
-# What the integrals held when the stream began nobody tells, and a constant torque that is not there spoils inertias.
+# The integrals at the start of the stream are not published, and a constant torque that is not there spoils inertias.
 # But a vehicle that flies on does not spin up: over some seconds the torques of its rotors amount to the change of its
 # angular momentum.  What they exceed it by in the first `CALM` seconds of flight is taken off the integrals; only then
 # are commands given out.  A lasting torque, as of a CG off centre, cannot be told from the integrals that hold it.
@@ -225,7 +228,7 @@ NEEDED = ("attitude_reference", "attitude", "gyro")
 SOURCE = "references through the stabiliser"
 OLDEST = 1.0
 """References and attitude older than this [s] are not steered by, nor those that miss so many of their periods that it
-is a gap: what the integrals took in meanwhile nobody knows."""
+is a gap: the integrals after it are unknown."""
 CALM = 10.0
 """Flight from which the integrals are found [s]."""
 
@@ -257,7 +260,7 @@ class CommandReconstruction:
         return self._gains is not None
 
     def restart(self) -> None:
-        """Begins anew: the stream was interrupted, and nobody knows the integrals."""
+        """Begins anew after an interruption of the stream, with unknown integrals."""
         self._integral = np.zeros(3)
         self._newest = -math.inf
         self._rate_then: FloatArray | None = None
@@ -322,7 +325,7 @@ class CommandReconstruction:
         return np.asarray(commands.reshape(len(t) - 1, runs, -1).mean(axis=1))
 
     def _settle(self, dt: FloatArray, commands: FloatArray, rate: FloatArray) -> None:
-        """Adds up torques and angular momentum until they tell the integrals."""
+        """Adds up torques and angular momentum until they reveal the integrals."""
         square = commands**2
         # With less than half the weight nothing is learned, and the integrals rest at zero.
         if np.sum(square, axis=1).min() < 0.5 * self._hover:
@@ -421,7 +424,7 @@ class Resampler:
         time: the time base.
         counts: accepted samples by channel.
         last: newest session time by channel [s].
-        notices: channel and sentence: what is wrong with its clock; whoever tells people takes them out.
+        notices: channel and sentence: what is wrong with its clock; the session reports them and empties the list.
     """
 
     def __init__(self, vehicle: Vehicle, rate: float = 50.0) -> None:
@@ -488,6 +491,7 @@ class Resampler:
 
     def _lead(self, stamps: FloatArray, columns: Mapping[str, Measured]) -> None:
         """Takes messages with gyro, which move the clock one after the other."""
+        # A flood is cut off; the first message of all, which begins the clock, is taken by itself.
         room = MOST_SAMPLES - self._buffers[LEADER].waiting
         if len(stamps) > room:
             self.faults[f"{LEADER}: flood"] += len(stamps) - room
@@ -497,6 +501,7 @@ class Resampler:
             return
         stamps, columns = stamps[:room], _part(columns, slice(room))
         self._leads += len(stamps)
+        # Session times, and how far the stream had come before each; where it jumps, another stretch begins.
         before = self.time.newest
         t = self.time.lead(stamps)
         reached = np.fmax.accumulate(np.concatenate([[before], t]))[:-1]
@@ -508,6 +513,7 @@ class Resampler:
                 self._apart.clear()
             else:
                 self._told.discard(LEADER)
+        # The clock has begun: what came before it can be placed now.
         if before == -math.inf < self.time.newest:
             early, self._early = self._early, deque(maxlen=MOST_EARLY)
             for followers in early:
@@ -545,7 +551,7 @@ class Resampler:
                 self.last[name] = max(self.last.get(name, -math.inf), float(times.max()))
 
     def _compare(self, name: str, offsets: FloatArray) -> None:
-        """Notes how far ahead of the gyro samples of another channel are [s]; tells what is no accident."""
+        """Notes how far ahead of the gyro samples of another channel are [s]; notes what is no accident."""
         behind = SETTLE + BLOCK * self._step
         for offset in offsets.tolist() if name in self._apart or np.any(np.abs(offsets) > min(AHEAD, behind)) else ():
             if -behind <= offset <= AHEAD:

@@ -242,7 +242,7 @@ def error_over_time(score: SetScore, fitted: SetScore) -> tuple[FloatArray, Floa
 
     Args:
         score: whose residuals.
-        fitted: says how large those of a perfect model are.
+        fitted: gives the size of those of a perfect model.
     """
     perfect = np.array([c.rmse / np.sqrt(c.mse) if c.samples and c.mse > 0.0 else np.nan for c in fitted.channels])
     series = score.series

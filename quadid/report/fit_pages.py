@@ -65,18 +65,18 @@ from quadid.report.verdict import (
 from quadid.types import FloatArray, Json, JsonDict
 from quadid.vehicle import Vehicle
 
-# --- What a log tells of its flight beside the outputs: flight modes, and the spectrum of its vibration
+# --- Contents of a log beside the outputs: flight modes, and the spectrum of its vibration
 
 
 SECONDS = 2.0
-"""Length of the stretches whose spectra are averaged: lines half a hertz apart are told apart."""
+"""Length of the stretches whose spectra are averaged: lines half a hertz apart are resolved."""
 MOST_POINTS = 400
 _AXES = ("forward", "to the right", "downwards")
 _ROLES = ("measured", "before", "after")
 
 
 def flight_section(recording: Recording, vehicle: Vehicle, place: int) -> dict[str, Any] | None:
-    """Modes and vibration of one log as a section of a page; None where it tells neither.
+    """Modes and vibration of one log as a section of a page; None where it has neither.
 
     Args:
         recording: as read, each channel at its own rate.

@@ -17,7 +17,7 @@ from quadid.types import Json, JsonDict
 
 
 Tone = Literal["", "good", "fair", "poor", "title", "head", "dim"]
-"""Role of a piece of text, for whoever has colours."""
+"""Role of a piece of text, which decides its colour."""
 SPACE = "  "
 
 

@@ -211,7 +211,7 @@ def _match(ratio: float, shares: tuple[float, float] | None, where: str) -> tupl
     if ratio > ROUGH:
         return "poor", f"on {where} errors are {math.sqrt(ratio):.2g} times what this model expects of itself"
     if shares is None:
-        return "fair", f"without gyro and accelerometer nobody sees what the simulation misses on {where}"
+        return "fair", f"without gyro and accelerometer it is unknown what the simulation misses on {where}"
     if ratio <= NOISE_LEVEL and shares[0] <= SMALL_FORCE and shares[1] <= SMALL_MOMENT:
         return "good", f"nothing that counts is missing in the simulation of {where}"
     missing = f"{percent(shares[0])} of the weight and up to {percent(shares[1])} of the rotors' moment"

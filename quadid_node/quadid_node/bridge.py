@@ -2,7 +2,7 @@
 
 Every set is checked as docs/using-with-ros.md asks of a controller; what passes is mapped to parameters of one named
 node, held against limits and a largest step, and set in one transaction.  With `dry_run`, the default, the bridge only
-says what it would set.
+logs what it would set.
 """
 
 from __future__ import annotations
@@ -255,7 +255,7 @@ class BridgeNode(Node):
                 self._applied = message.sequence
 
     async def _set(self, values: Mapping[str, float], done: str) -> bool | None:
-        """Sets parameters of the controller, all or none; says `done`, or why not.  None: no answer, perhaps set."""
+        """Sets parameters of the controller, all or none; logs `done`, or why not.  None: no answer, perhaps set."""
         asked = [Parameter(name, value=value) for name, value in values.items()]
         answer = await self._ask(self._client.set_parameters_atomically, asked)
         if answer is None:

@@ -125,7 +125,7 @@ FAR_LIMIT = 5.0
 """A ground machine that does not answer a fit within this time [s] is given up for `REST`."""
 REST = 30.0
 MOST_ANSWERS, MOST_GROUNDS = 8, 256
-"""Answers that wait to be looked at, and ground machines that are told apart; more is nobody's honest work."""
+"""Answers that wait to be looked at, and ground machines that are told apart; larger numbers are rejected."""
 
 
 class Ground:
@@ -158,7 +158,7 @@ class Ground:
         )
 
     def rest(self) -> None:
-        """Asks nobody for a while."""
+        """Asks no ground machine for a while."""
         self._rests_until = self._clock() + REST
 
     def close(self) -> None:

@@ -183,7 +183,7 @@ def make_usable(path: Path) -> str:
 
 
 def is_damage(error: sqlite3.Error) -> bool:
-    """Checks whether an error says that the file is no sound database, not that it cannot be reached now."""
+    """Checks whether an error means that the file is no sound database, not that it cannot be reached now."""
     told = str(error)
     return "malformed" in told or "not a database" in told or "no such table" in told
 
@@ -378,9 +378,9 @@ def _close_unused(file: _File) -> None:
         os.close(descriptor)
 
 
-# --- The set that a history says is in force: one rule for the service that takes it up and for all who read it
+# --- The set in force by a history: one rule for the service that takes it up and for all who read it
 #
-# Nothing that a file says is believed: a set of an earlier run must be one that this run could have estimated.
+# Nothing in a file is believed: a set of an earlier run must be one that this run could have estimated.
 
 _FORCE = "state IN ('accepted', 'rolled_back')"
 _SAME_MASS = 1e-6

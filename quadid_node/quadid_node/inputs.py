@@ -41,7 +41,7 @@ def stamp(t: float) -> dict[str, int]:
     return {"sec": ns // 10**9, "nanosec": ns % 10**9}
 
 
-# --- Of several topics that tell one channel, uses the best that arrives, from the first sample on
+# --- Of several topics with one channel, the best that arrives is used, from the first sample on
 
 
 DECIDE = 1.0
@@ -78,13 +78,15 @@ class SourceSelector:
         channel, t = block.columns[0][0], block.t
         if self.other and channel in _ROTORS:
             return
+        # A worse source than the chosen one is of use once that has fallen silent.
         chosen = self._chosen.get(channel)
-        if chosen is not None and rank > chosen:  # of use once the chosen one has fallen silent
+        if chosen is not None and rank > chosen:
             late = np.flatnonzero(t > self._last[channel] + SILENT)
             if not late.size:
                 return
             block, chosen = block.part(late[0]), None
             t = block.t
+        # The chosen source, and the best that there could be, pass at once.
         if chosen is not None or rank == self._best.get(channel, 0):
             self._held.pop(channel, None)
             self._chosen[channel], self._last[channel] = rank, float(t[-1])
@@ -108,7 +110,7 @@ class SourceSelector:
             yield from self.take(block.part(stop), rank)
 
     def has(self, channel: str) -> bool:
-        """Checks whether some source tells the channel."""
+        """Checks whether a source has the channel."""
         return channel in self._chosen or channel in self._held
 
 
@@ -120,7 +122,7 @@ QUIET = 0.25
 TOGETHER = 5
 """... of so many at least."""
 AGAIN, MEMORY = 3, 10.0
-"""So many bursts within this [s] are no accident.  What was wrong with a message is told for as long."""
+"""So many bursts within this [s] are no accident.  What was wrong with a message is reported for as long."""
 STAMPS = 100
 """Newest stamps that are compared."""
 GAP = 1.0
@@ -275,7 +277,7 @@ def source(name: str) -> InputPreset:
     return InputPreset(tuple(inputs), _HINTS[name])
 
 
-# --- Between ROS messages and the core: the only file that knows message types
+# --- Between ROS messages and the core: the only file with message types
 #
 # In: the same decoders as for MCAP logs (`quadid_replay.ros_messages`) read the serialized bytes, so that a live
 # stream and its recording give the same numbers bit for bit.  Out: dictionaries of `messages` become messages.
@@ -377,6 +379,7 @@ class Decoder:
 
     def take(self, messages: Sequence[bytes]) -> Iterator[Block]:
         """Yields what may be used now of messages in order, at once where only numbers differ between them."""
+        # Messages that are not all alike are read in halves, down to single ones.
         read = self._read(messages)
         if read is None:
             for part in (messages[: len(messages) // 2], messages[len(messages) // 2 :]) if len(messages) > 1 else ():
@@ -387,6 +390,7 @@ class Decoder:
         # Notes which signals the newest messages say to have none of.
         told = (name for name, _ in read[1])
         self._denied = sorted(self._deniable.keys() - set(told)) if self._deniable else []
+        # Each signal in the core's units and frames, where this topic is its channel's source.
         for name, values in read[1]:
             channel, convert = SIGNALS[name]
             if channel == "vehicle_kind":

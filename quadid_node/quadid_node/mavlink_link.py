@@ -38,7 +38,7 @@ MOST_ROUNDS = 5
 """... and so often at most."""
 _ESC_MESSAGES = ("ESC_STATUS", "ESC_TELEMETRY")
 PATIENCE = 6.0
-"""Time after its first outputs [s] from which what an ArduPilot has not told goes without saying."""
+"""Time after its first outputs [s] from which defaults stand for what an ArduPilot has not answered."""
 
 
 class MotorOrder:
@@ -50,7 +50,7 @@ class MotorOrder:
     """
 
     def __init__(self, rotors: int) -> None:
-        """Knows nothing yet of a vehicle with `rotors` rotors."""
+        """Starts empty, for a vehicle with `rotors` rotors."""
         self.ardupilot, self.kind = False, 0
         self.problem = ""
         self._rotors = rotors
@@ -62,7 +62,7 @@ class MotorOrder:
         self._turning = [False] * ESCS
 
     def lacking(self) -> list[str]:
-        """The parameters to ask for now; none where all are told, or it does not answer."""
+        """Parameters to ask for now; none where all are known, or it does not answer."""
         names = [name for name in ASKED if self.ardupilot and name not in self._parameters]
         self._rounds += 1
         return names if self._rounds <= MOST_ROUNDS else []
@@ -162,7 +162,7 @@ class MavlinkDecoder:
     """MAVLink messages of one vehicle as blocks."""
 
     def __init__(self, rotors: int, wall: Callable[[], float] = time.time) -> None:
-        """Expects a vehicle with `rotors` rotors; `wall` tells the UNIX time [s] at which its clock is put."""
+        """Expects a vehicle with `rotors` rotors; `wall` returns the UNIX time [s] to which its clock is set."""
         self.counts: Counter[str] = Counter()
         self.order = MotorOrder(rotors)
         self._chooser = SourceSelector({channel: 0 for channel, _ in RANKS})
@@ -252,7 +252,7 @@ def parameters_of(item: OnlineSet | None) -> list[tuple[str, float]]:
     return out
 
 
-# --- Which messages to ask a vehicle for, and which it has refused: these are asked for no more
+# --- Which messages to ask a vehicle for, and which it has refused: those are not asked for again
 
 
 REPEAT = 10.0
@@ -298,7 +298,7 @@ class Requests:
         self._asked = None
 
 
-# --- The service on a MAVLink link: asks for messages, measures what comes, and tells its results as component 191
+# --- The service on a MAVLink link: asks for messages, measures what comes, and sends its results as component 191
 
 
 COMPONENT = 191
@@ -318,7 +318,7 @@ FRAMES_A_SECOND, OTHERS_A_SECOND = 4000, 1000
 FLOODED = 10.0
 """A flood is a problem for so long after its last frame [s]."""
 LIST_EVERY = 1.0
-"""All our parameters are told so often at most [s]: one short request asks for seventeen frames."""
+"""All our parameters are sent so often at most [s]: one short request asks for seventeen frames."""
 SEVERITY = {"error": 3, "warning": 4, "info": 6}
 _READ_ONLY, _UNKNOWN = dialect.MAV_PARAM_ERROR_READ_ONLY, dialect.MAV_PARAM_ERROR_DOES_NOT_EXIST
 _REAL32 = 9
@@ -587,7 +587,7 @@ class MavlinkLink:
             self._send(dialect.MAVLink_statustext_message(severity, piece, self._text, k))
 
 
-# --- The service without ROS: a MAVLink link in, MAVLink and Zenoh out, until someone says stop
+# --- The service without ROS: a MAVLink link in, MAVLink and Zenoh out, until it is stopped
 
 
 IDLE = 0.005
@@ -613,7 +613,7 @@ def run(
     service: Service, link: MavlinkLink, outlets: list[Outlet], stop: Callable[[], bool],
     clock: Callable[[], float] = time.monotonic,
 ) -> None:  # fmt: skip
-    """Serves until `stop` says so."""
+    """Serves until `stop` returns True."""
     reported = clock()
     while not stop():
         busy = False

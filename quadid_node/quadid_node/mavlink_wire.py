@@ -136,7 +136,7 @@ class VehicleSender:
         return address == self._address or now - self._heard > SILENT
 
     def take(self, address: Address | None, now: float) -> bool:
-        """True if a frame of the vehicle from an address may be believed now [s]; None where a link tells none."""
+        """True if a frame of the vehicle from an address (None on a serial link) may be believed now [s]."""
         if now - self._heard > SILENT:
             self._address = address
             self._numbers.clear()

@@ -37,7 +37,7 @@ Output = Publish | OnlineDiagnosis | HealthReport | HealthyFlight | Event
 SILENT_WARNING, SILENT_ERROR = 1.0, 5.0
 """A channel that was there and is silent for this long [s] is worth a warning, an error."""
 BEHIND = 2.0
-"""From this far behind the data [s] on people are told, at every doubling."""
+"""From this far behind the data [s] on the backlog is reported, at every doubling."""
 
 
 def lag(seconds: float) -> str:
@@ -136,7 +136,7 @@ def parameter_set(item: OnlineSet, vehicle: str, boot_id: str = "") -> Message:
 
 
 def no_set(vehicle: str, boot_id: str) -> Message:
-    """quadid_msgs/ParameterSet that says that nothing is in force."""
+    """quadid_msgs/ParameterSet of a vehicle without a set in force."""
     nan = math.nan
     return {
         "header": {"frame_id": BODY_FRAME}, "schema_version": SCHEMA_VERSION, "vehicle_id": vehicle,

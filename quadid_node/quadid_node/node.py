@@ -53,7 +53,7 @@ from quadid_node.zenoh import ZenohLink
 CATCHING_UP, BACKLOG = 10.0, 2.0
 """A step lasts longer in proportion, up to so many times, when there is a backlog of more than this much data [s]."""
 REPORT_SECONDS = 1.0
-"""Status and health are told this often [s]."""
+"""Status and health are published this often [s]."""
 TOLD_SECONDS = 5.0
 """So often [s] `configure` logs that it waits for the fit process."""
 MOST_SETS = 100
@@ -135,7 +135,7 @@ class IdentifyNode(PollingNode, LifecycleNode):
         """Declares the parameters; everything else waits for `configure`.
 
         Args:
-            stopping: says that the process is asked to end, so that nothing is waited for any more.
+            stopping: True once the process is asked to end, so that nothing is waited for any more.
         """
         super().__init__("quadid")
         self._stopping = stopping
@@ -286,7 +286,7 @@ class IdentifyNode(PollingNode, LifecycleNode):
         self._log("info", f"the fit process is warm after {time.monotonic() - begin:.1f} s")
 
     def _read_back(self, values: dict[str, Any]) -> None:
-        """Lets parameters say what is in force."""
+        """Sets parameters to what is in force."""
         self._reads_back = True
         now = {name: self.get_parameter(name).value for name in values}
         self.set_parameters(
@@ -369,7 +369,7 @@ class IdentifyNode(PollingNode, LifecycleNode):
                 return
 
     def _put(self, outputs: list[messages.Output]) -> None:
-        """Publishes what the service hands out, and tells its events."""
+        """Publishes what the service hands out, and logs its events."""
         for output in outputs:
             if output.topic == "event":
                 self._log(output.level, output.text)
@@ -391,7 +391,7 @@ class IdentifyNode(PollingNode, LifecycleNode):
         return {"sec": stamp.sec, "nanosec": stamp.nanosec}
 
     def _claim_topic(self) -> None:
-        """Looks after the topic of parameter sets; once it is ours, says what is in force."""
+        """Looks after the topic of parameter sets; once it is ours, publishes what is in force."""
         if not self._outputs.step(self._active) or self._service is None:
             return
         if self._service.published is not None:

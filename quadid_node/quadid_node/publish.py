@@ -308,7 +308,7 @@ TOPIC, TYPE = "bond", "bond/Status"
 PERIOD, TIMEOUT = 0.25, 4.0
 """Between two heartbeats, and after which the other side takes this one for dead [s]: as nav2's own nodes have them."""
 GOODBYE = 1.0
-"""The end of the bond waits so long to be received [s]; then the other side's timeout tells it."""
+"""The end of the bond waits so long to be received [s]; then the other side's timeout ends it."""
 
 
 class Bond:
@@ -340,7 +340,7 @@ class Bond:
             self._say(False)
 
     def close(self) -> None:
-        """Breaks the bond: the other side is told."""
+        """Breaks the bond, and announces that to the other side."""
         self._timer.cancel()
         self._say(False)
         self._publisher.wait_for_all_acked(Duration(seconds=GOODBYE))

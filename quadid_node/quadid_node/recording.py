@@ -180,7 +180,7 @@ def play(
 
     Args:
         pace: factor of real time; 0 for as fast as possible.
-        told: takes how many rows have been played, now and then.
+        told: called with the number of rows played, now and then.
     """
     outputs: list[Output] = []
     begin, first, count, due = time.monotonic(), math.nan, 0, 0

@@ -40,7 +40,7 @@ class TopicPlayer(TopicWriter):
     """Publishes what a `TopicWriter` would write, each message when its time has come."""
 
     def __init__(self, node: Node, speed: float, stop: Callable[[], bool]) -> None:
-        """Publishes through `node` until `stop` says so, at `speed` times the log's pace; 0: as fast as possible."""
+        """Publishes through `node` until `stop` is True, at `speed` times the log's pace; 0: as fast as possible."""
         super().__init__(BytesIO())
         self._node, self._speed, self._stop = node, speed, stop
         self._publishers: dict[str, Any] = {}
@@ -90,7 +90,7 @@ def epoch_of(recording: Recording, stamps: str) -> int:
 def play(
     recording: Recording, speed: float, stamps: str, wait: float, args: list[str] | None, stop: StopSignal
 ) -> None:
-    """Plays a recording until its end or until `stop` says so.
+    """Plays a recording until its end or until `stop` returns True.
 
     Args:
         speed: times its pace; 0: as fast as possible.

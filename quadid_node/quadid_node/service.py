@@ -99,7 +99,7 @@ class Service:
 
         Args:
             clock: seconds, monotonic; only rates and silences are measured with it.
-            restored: what an earlier run had left; default: what the history says.
+            restored: what an earlier run had left; default: that of the history.
             live: data come at their own pace, so that work is shed when behind; a replay waits for every fit.
         """
         if restored is None:
@@ -156,7 +156,7 @@ class Service:
             seconds: no piece of the session's work begins later than this [s]; one always does.
 
         Returns:
-            What to publish and tell; numbered sets are on the disk by then, or come with a later step.
+            What to publish and log; numbered sets are on the disk by then, or come with a later step.
         """
         outputs, begin = list[Output](), self._clock()
         for piece in self.pieces():
@@ -166,7 +166,7 @@ class Service:
         return outputs
 
     def pieces(self) -> Iterator[list[Output]]:
-        """As `step`, and gives control back, with what is to be published and told, after each piece of the work."""
+        """As `step`, and gives control back, with what is to be published and logged, after each piece of the work."""
         outputs, self._looked = [*self._tidy(), *self._keep_up()], self._clock()
         while True:
             outputs += self._carried_out(self.session.poll(1))
@@ -193,7 +193,7 @@ class Service:
         return outputs
 
     def idle(self) -> list[Output]:
-        """Looks after worker and history only, while nobody could hear what the session says."""
+        """Looks after worker and history only, while nothing is published."""
         self._looked = self._clock()
         return self._journalled(self._tidy())
 
@@ -222,7 +222,7 @@ class Service:
         return outputs
 
     def _keep_up(self) -> list[Event]:
-        """Lets a live session that is behind its data shed work, and tells so; a replay waits for every fit."""
+        """Lets a live session that is behind its data shed work, and reports it; a replay waits for every fit."""
         if not self._live:
             return []
         session, behind = self.session, self.session.backlog
@@ -314,7 +314,7 @@ class Service:
         return Event(self.session.status().t, level, kind, text)
 
 
-# --- What a node does again and again, cut into pieces and done in steps that keep nobody waiting for long
+# --- What a node does again and again, cut into pieces and done in short steps
 
 
 STEP_SECONDS = 0.0125

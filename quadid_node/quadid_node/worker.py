@@ -34,7 +34,7 @@ class WarmUp:
     """Watches one child until it is ready."""
 
     def __init__(self, pid: int, clock: Callable[[], float]) -> None:
-        """Begins to watch the process `pid`; `clock` tells seconds."""
+        """Begins to watch the process `pid`; `clock` returns seconds."""
         self._pid, self._clock = pid, clock
         self._used, self._moved = 0.0, clock()
 
@@ -60,7 +60,7 @@ def processor_seconds(pid: int) -> float | None:
 # --- Where fits run: a child process beside the service, or inline for replays
 #
 # The child is polled, never waited for.  One that dies, hangs or eats its memory is replaced after a growing pause, and
-# the request that it had, or that waits for it, goes to the next one; after three the session is told so.
+# the request that it had, or that waits for it, goes to the next one; after three the session is informed.
 
 
 FIT_LIMIT = 30.0
@@ -78,7 +78,7 @@ MEMORY_MB = 1000
 
 @dataclass(frozen=True)
 class Trouble:
-    """Something to tell people about the worker: level (warning, error, info) and a sentence."""
+    """Message about the worker for people: level (warning, error, info) and a sentence."""
 
     level: str
     text: str
@@ -146,11 +146,11 @@ class ProcessWorker:
         self, vehicle: Vehicle, memory_mb: int = MEMORY_MB, clock: Callable[[], float] = time.monotonic,
         name: str = "fit", limit: float = FIT_LIMIT,
     ) -> None:  # fmt: skip
-        """Starts the child; `ready` tells when its kernels are warm.
+        """Starts the child; `ready` is True once its kernels are warm.
 
         Args:
             memory_mb: most memory of the child [MiB]; 0 for no limit.
-            name: what it is called when something is told of it.
+            name: what it is called in messages.
             limit: a request that takes longer [s] counts as hung.
         """
         self._vehicle, self._memory, self._clock = vehicle, memory_mb, clock

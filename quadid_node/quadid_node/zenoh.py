@@ -55,7 +55,7 @@ def open_session(where: str) -> Any:
 def wait_for_session(
     where: str, wait: Callable[[float], bool], told: Callable[[str], None], retry: float = RETRY
 ) -> Any:
-    """Opens a session as soon as somebody listens there; None once `wait`, given a pause [s], says to stop."""
+    """Opens a session as soon as somebody listens there; None once `wait`, given a pause [s], returns True."""
     while True:
         try:
             return open_session(where)
@@ -146,17 +146,17 @@ KINDS = (*RESULTS, "health")
 COMMANDS = ("approve", "rollback", "fit_now")
 MOST_COMMANDS = 16
 REPEAT = 5
-"""Every so many reports of health the set in force and the last diagnosis are told again."""
+"""Every so many reports of health the set in force and the last diagnosis are sent again."""
 _JSON = zenoh.Encoding.APPLICATION_JSON
 
 
 class ZenohLink:
-    """Tells one vehicle's results, and keeps the latest of each kind for who comes late.
+    """Publishes one vehicle's results, and keeps the latest of each kind for late subscribers.
 
     A router that is not there yet is waited for in the background; one that goes away is found again by Zenoh itself.
 
     Attributes:
-        problem: why nothing is told at the moment, or empty.
+        problem: why nothing is sent at the moment, or empty.
     """
 
     def __init__(self, where: str, vehicle: str, service: Service, retry: float = RETRY) -> None:
@@ -188,12 +188,12 @@ class ZenohLink:
             self._publishers[kind].put(payload, encoding=_JSON)
 
     def publish(self, output: Output) -> None:
-        """Tells a result."""
+        """Publishes a result."""
         if output.topic in RESULTS:
             self._put(output.topic, RESULTS[output.topic].json(output))
 
     def report(self, health: ServiceHealth) -> None:
-        """Tells how things are."""
+        """Publishes health."""
         feeds = {name: {"rate": feed.rate, "silence": feed.silence} for name, feed in health.feeds.items()}
         self._put("health", {
             "status": status_to_dict(health.status), "feeds": feeds, "worker": health.worker,
@@ -219,7 +219,7 @@ class ZenohLink:
         self._session.close()
 
     def _repeat(self) -> None:
-        """Tells again what a crowded network may have lost, since it never waits for one."""
+        """Sends again what a crowded network may have lost, since it never waits for one."""
         with self._session.lock:
             for kind in ("parameters", "diagnosis", "vehicle_health"):
                 if kind in self._latest and kind in self._publishers:

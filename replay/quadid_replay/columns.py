@@ -252,7 +252,7 @@ class Columns:
 
 
 def spikes(speeds: FloatArray) -> BoolArray:
-    """Tells readings, shape (n,), that no rotor turns at between those before and after: counts of 65535, zeros.
+    """Finds readings, shape (n,), that no rotor turns at between those before and after: counts of 65535, zeros.
 
     More than half off the median of five neighbours, which agree with each other, and far beyond what the signal does
     elsewhere: a real jump has more than two rows.

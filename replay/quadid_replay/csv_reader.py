@@ -32,7 +32,7 @@ EULER = ("phi", "theta", "psi")
 _ROTOR = {"rotor_speed": re.compile(r"w([1-9]\d?)"), "motor_command": re.compile(r"u([1-9]\d?)")}
 _MOTOR_LIKE = re.compile(r"(?:pwm|motor|mot|esc|rpm|cmd|servo|out|m)_?([1-9]\d?)", re.IGNORECASE)
 _SLOWEST_ROW, _FEW_ROWS = 0.9, 20
-"""Slower rows [s] say nothing about a flight; of fewer rows nothing is told."""
+"""Rows further apart [s] are in another unit of time; fewer rows are not judged."""
 _LINES = 4096
 
 
@@ -168,7 +168,7 @@ def _known() -> list[str]:
 
 
 def _layout(names: list[str], origin: str) -> tuple[dict[str, tuple[str, ...]], list[str]]:
-    """Assigns columns to channels; returns the columns nobody asked for as well."""
+    """Assigns columns to channels; returns the unused columns as well."""
     layout: dict[str, tuple[str, ...]] = {}
     for channel, group in GROUPS.items():
         _take(layout, channel, group, names, origin)

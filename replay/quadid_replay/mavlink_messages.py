@@ -132,7 +132,7 @@ def two_rows(number: IntArray) -> bool:
     return returns > max(FEWEST, len(jumps) // SHARE)
 
 
-# --- What each MAVLink message tells: channel, values in core units and frames, and its own stamp
+# --- Contents of each MAVLink message: channel, values in core units and frames, and its own stamp
 #
 # MAVLink bodies are FRD and worlds NED, as the core's; only units differ (mG, mrad/s, rpm, mV, cm/s).
 
@@ -159,7 +159,7 @@ class Reading(NamedTuple):
         values: a number a column, or an array of shape (n,); in core units.
         source: message name.
         place: first column, for signals that come in several messages.
-        known: whether the message tells the signal.
+        known: whether the message holds the signal.
     """
 
     signal: str
@@ -289,7 +289,7 @@ def boot_stamp(raw: float, servo: bool, newest: float | None) -> float | None:
     """Returns a message's own stamp [s] since boot, with whole turns of a 32-bit counter added; None without one.
 
     Args:
-        raw: what `boot_seconds` says.
+        raw: result of `boot_seconds`.
         servo: it is SERVO_OUTPUT_RAW, whose counter has 32 bits.
         newest: newest stamp known of this vehicle [s].
     """
@@ -322,7 +322,7 @@ MOST_WAITING = 4096
 
 
 Placed: TypeAlias = tuple[T, float | None]
-"""An item and its time [s] on the boot clock; None where nothing tells it."""
+"""An item and its time [s] on the boot clock; None where it is unknown."""
 
 
 class BootClock(Generic[T]):
@@ -395,7 +395,7 @@ class Stamps(NamedTuple):
 
 
 class Placing(NamedTuple):
-    """Times of n messages on the boot clock [s], NaN where nothing tells it; how many are known only at the end of the
+    """Times of n messages on the boot clock [s], NaN where it is unknown; how many are known only at the end of the
     log; and how often the boot time falls."""
 
     time: FloatArray

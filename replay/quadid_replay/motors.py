@@ -28,7 +28,7 @@ class Place(NamedTuple):
 
 
 class Frame(NamedTuple):
-    """An airframe as the log tells it; `scaled` says that its size is a guess, for the autopilot stores none."""
+    """An airframe as logged; `scaled`: its size is a guess, for the autopilot stores none."""
 
     name: str
     rotors: tuple[Place, ...]
@@ -136,7 +136,7 @@ class Outputs(NamedTuple):
     Attributes:
         columns: of the rotors one by one, 0 is the first output; empty where that is not known.
         problem: why no output can be used; empty where they can, or where nothing is said of them.
-        told: whether the autopilot says so, and it is not only what goes without saying.
+        told: by the autopilot's parameters, not by default.
     """
 
     columns: list[int]

@@ -125,12 +125,12 @@ class BlockWriter:
         return bytes(self._bytes)
 
 
-# --- What each ROS 2 message type tells: runs of numbers, the signals in them, and how those become the core's
+# --- Contents of each ROS 2 message type: runs of numbers, the signals in them, and how those become the core's
 
 
 Runs = list[Sequence[float]]
 Signals = list[tuple[str, FloatArray, Any]]
-"""Names, values (n, size), and whether the messages tell the signal: of each a mask (n,), or of all one truth."""
+"""Names, values (n, size), and whether the messages hold the signal: of each a mask (n,), or of all one truth."""
 _LAST_NUMBER = re.compile(r"(\d{1,9})\D*$", re.ASCII)
 UNDECODABLE = (
     McapError, struct.error, ValueError, LookupError, TypeError, AttributeError, RecursionError, OverflowError,
@@ -156,7 +156,7 @@ class MessageType:
 
 
 def _runs(*names: str, some: bool = False) -> Callable[[list[FloatArray], Any], Signals]:
-    """Signals that are whole runs; where a type may hold `some` of them only, an empty one is not told."""
+    """Signals that are whole runs; where a type may hold `some` of them only, an empty one is absent."""
     return lambda runs, extra: [(n, run, run.shape[1] > 0 or not some) for n, run in zip(names, runs, strict=True)]
 
 

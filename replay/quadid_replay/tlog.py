@@ -283,7 +283,7 @@ def _whole(kind: str) -> str:
     return f"<{'u' if kind.startswith('u') else 'i'}{int(kind.strip('uint_')) // 8}"
 
 
-# --- What one vehicle of a telemetry log tells: its signals on one clock, parameters and type
+# --- Contents of one vehicle's telemetry: its signals on one clock, parameters and type
 
 
 _INVALID, _ARDUPILOT = 8, 3
@@ -322,7 +322,7 @@ class VehicleLog:
 
 
 def vehicle_log(told: Told, received: FloatArray) -> VehicleLog:
-    """Gathers what a vehicle tells.
+    """Gathers signals, parameters and type of a vehicle.
 
     Args:
         told: its messages.
@@ -436,10 +436,10 @@ _NAMED = 8
 
 
 def read_tlog(path: Path) -> Recording:
-    """Reads a telemetry log, whole or damaged; of several vehicles the one that tells most.
+    """Reads a telemetry log, whole or damaged; of several vehicles the one with most data.
 
     Raises:
-        LogError: no vehicle in it tells anything usable.
+        LogError: no vehicle in it sends anything usable.
     """
     frames = read_frames(path)
     which = np.flatnonzero(np.isin(frames.message, list(_WANTED)))

@@ -1,4 +1,4 @@
-"""A vehicle file to fill in, from what a log tells: airframe, motor order, meaning of the motor columns, first guesses.
+"""A vehicle file to fill in, from a log: airframe, motor order, meaning of the motor columns, first guesses.
 
 What the autopilot stores is taken over (frame, output range, on-board filter).  Mass and, with ArduPilot, arm are
 guesses marked as such; thrust follows from them and the hover in the log, inertias from the recipe of
