@@ -143,9 +143,8 @@ def inspect(
         whole = open_recording(cut.path, preset, {**named, **(columns or {})})
     found = replace(inspect_recording(cut.of(whole), described), zero=whole.first_imu_time)
     flown = flown_parts(whole, found.flying, cut)
-    if described is not None:
-        refused = _refused(whole, described, cut, flown) if found.usable else ()
-        rows = _excitation(whole, described, cut, flown)
+    if described is not None and found.usable:  # after an error nothing later is asked: it would be as wrong
+        refused, rows = _refused(whole, described, cut, flown), _excitation(whole, described, cut, flown)
         found = replace(found, excitation=rows, checks=(*found.checks, *refused))
     use = names_of(cut, flown)
     return Inspected({**found.to_dict(), "use": use, "log": str(cut.path.resolve()), "files": []}, found)

@@ -12,7 +12,7 @@ from quadid.data.window import Channel, Recording, Window
 from quadid.errors import ParameterError, QuadidError
 from quadid.flight import sensors
 from quadid.flight.airframe import PUSHES, STATES
-from quadid.flight.loop import FlightClock, LoopOutput, quaternion_of, supply, turning_at
+from quadid.flight.loop import Plan, Track, quaternion_of, supply, turning_at
 from quadid.flight.march import CRASHED, march
 from quadid.flight.outside import LogRows, Scene, apply_outside, check_outside, distort_log, random_forces
 from quadid.flight.pilot import PILOT_STEP, Pilot, Segment, band_noise, default_gains, scripted, stick_profile
@@ -83,10 +83,10 @@ class Flown:
         tilt_noise: error of the attitude there, body rotation vector [rad], shape (controls, 3).
     """
 
-    plan: FlightClock
+    plan: Plan
     setup: Setup
     outside: Effects
-    track: LoopOutput
+    track: Track
     sensor: SensorNoise
     streams: Mapping[str, np.random.Generator]
     gyro_noise: FloatArray
@@ -103,7 +103,7 @@ class Flown:
         return np.asarray(sigma * self.streams[name].standard_normal((self.plan.rows, columns)))
 
 
-def logged_rotors(track: LoopOutput, plan: FlightClock, sampling: str, late: float) -> FloatArray:
+def logged_rotors(track: Track, plan: Plan, sampling: str, late: float) -> FloatArray:
     """Rotor columns of the log [rad/s], shape (rows, n).
 
     Held: the command that acts from this row to the next (its mean where it changes faster).  Instant: the input of
@@ -214,7 +214,7 @@ class FlightError(QuadidError):
     exit_code = 3
 
 
-def _clock(seconds: float, log_rate: float, command_rate: float) -> FlightClock:
+def _clock(seconds: float, log_rate: float, command_rate: float) -> Plan:
     rows = round(seconds * log_rate)
     if rows < 2:
         raise ParameterError(f"a flight of {seconds:g} s at {log_rate:g} Hz", "at least two log rows")
@@ -234,12 +234,10 @@ def _clock(seconds: float, log_rate: float, command_rate: float) -> FlightClock:
     common = int(np.lcm(log_every, pilot_every))
     lead = int(np.ceil(LEAD_IN / (dt * common))) * common
     steps = lead + rows * log_every + log_every
-    return FlightClock(steps, dt, -lead * dt, control_every, pilot_every, log_every, lead, rows)
+    return Plan(steps, dt, -lead * dt, control_every, pilot_every, log_every, lead, rows)
 
 
-def _sticks(
-    profile: str, seed: int, plan: FlightClock, segments: Sequence[Segment] | None, altitude: float
-) -> FloatArray:
+def _sticks(profile: str, seed: int, plan: Plan, segments: Sequence[Segment] | None, altitude: float) -> FloatArray:
     lead, total = plan.first_log // plan.pilot_every, plan.steps // plan.pilot_every + 1
     if profile == "scripted":
         if segments is None:
@@ -259,9 +257,9 @@ def _sticks(
     return sticks
 
 
-def _empty_track(plan: FlightClock, rotors: int) -> LoopOutput:
+def _empty_track(plan: Plan, rotors: int) -> Track:
     k, controls = plan.steps, -(-plan.steps // plan.control_every)
-    return LoopOutput(
+    return Track(
         gyro=np.empty((k, 3)),
         accel=np.empty((k, 3)),
         attitude=np.empty((k, 4)),

@@ -23,7 +23,7 @@ NO_TIME = 1e300
 EPSILON = 1e-11
 
 
-class FlightClock(NamedTuple):
+class Plan(NamedTuple):
     """Clock of a flight.
 
     Attributes:
@@ -87,7 +87,7 @@ class Events(NamedTuple):
     faint_times: FloatArray
 
 
-class LoopOutput(NamedTuple):
+class Track(NamedTuple):
     """Output of the loop.
 
     At every step: `gyro` body rates with vibration (k, 3), `accel` running integral of the specific force at the IMU

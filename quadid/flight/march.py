@@ -10,10 +10,10 @@ from quadid.flight.jit import kernel
 from quadid.flight.loop import (
     NO_TIME,
     Events,
-    FlightClock,
-    LoopOutput,
     OnBoard,
+    Plan,
     Progress,
+    Track,
     Turning,
     fly_on,
     pull_attitude,
@@ -37,9 +37,9 @@ def copy_into(values: FloatArray, out: FloatArray) -> None:
 
 @kernel
 def march(
-    plan: FlightClock, body: Body, air: Air, odd: Oddity, drive: Drive, events: Events, on_board: OnBoard, pilot: Pilot,
+    plan: Plan, body: Body, air: Air, odd: Oddity, drive: Drive, events: Events, on_board: OnBoard, pilot: Pilot,
     gains: FloatArray, mixer: FloatArray, sticks: FloatArray, gyro_noise: FloatArray, tilt_noise: FloatArray,
-    arrival: FloatArray, pushes: FloatArray, efficiency: FloatArray, y: FloatArray, rotors: Turning, track: LoopOutput,
+    arrival: FloatArray, pushes: FloatArray, efficiency: FloatArray, y: FloatArray, rotors: Turning, track: Track,
 ) -> tuple[int, float]:  # fmt: skip
     """Flies the closed loop.
 

@@ -13,7 +13,7 @@ from scipy.signal import cont2discrete, lfilter
 from quadid.errors import ParameterError, nearest
 from quadid.flight import sensors
 from quadid.flight.airframe import PUSHES
-from quadid.flight.loop import FlightClock, LoopOutput, OnBoard
+from quadid.flight.loop import OnBoard, Plan, Track
 from quadid.flight.setup import Setup, vehicle_scales
 from quadid.rotation import continuous_sign
 from quadid.types import FloatArray
@@ -33,7 +33,7 @@ class Scene:
     """
 
     setup: Setup
-    plan: FlightClock
+    plan: Plan
     arrival: FloatArray
     pushes: FloatArray
 
@@ -179,8 +179,8 @@ class LogRows:
     accel: FloatArray
     attitude: FloatArray
     steps: FloatArray
-    track: LoopOutput
-    plan: FlightClock
+    track: Track
+    plan: Plan
     on_board: OnBoard
     thrust: FloatArray
 
@@ -224,7 +224,7 @@ def accel_clipping(rows: LogRows, v: Values, rng: np.random.Generator) -> None:
     rows.accel = np.clip(rows.accel, -v["limit"] * GRAVITY, v["limit"] * GRAVITY)
 
 
-def _reread(rows: LogRows, track: LoopOutput, steps: FloatArray) -> None:
+def _reread(rows: LogRows, track: Track, steps: FloatArray) -> None:
     """Replaces what the IMU measured by what it would have measured on `track` at `steps`; the noise stays."""
     for name, read in (("gyro", sensors.read_gyro), ("accel", sensors.read_accel)):
         was = read(rows.track, rows.plan, rows.on_board, np.inf, rows.steps)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.signal import butter, cont2discrete, lfilter, lfiltic
 
-from quadid.flight.loop import FlightClock, LoopOutput, OnBoard
+from quadid.flight.loop import OnBoard, Plan, Track
 from quadid.types import FloatArray
 
 
@@ -84,7 +84,7 @@ def quaternion_exp(vector: FloatArray) -> FloatArray:
     return np.hstack([np.cos(half), 0.5 * vector * np.sinc(half / np.pi)])
 
 
-def attitude_at(track: LoopOutput, steps: FloatArray) -> FloatArray:
+def attitude_at(track: Track, steps: FloatArray) -> FloatArray:
     """AHRS attitude at fractional step numbers, normalised linear interpolation; shape (n, 4)."""
     steps = np.clip(steps, 0.0, len(track.attitude) - 1.0)
     low = np.minimum(np.floor(steps).astype(np.int64), len(track.attitude) - 2)
@@ -103,18 +103,18 @@ def rows_at(values: FloatArray, steps: FloatArray) -> FloatArray:
     return values[low] if not part.any() else (1.0 - part) * values[low] + part * values[low + 1]
 
 
-def log_steps(plan: FlightClock) -> FloatArray:
+def log_steps(plan: Plan) -> FloatArray:
     """Step numbers of the log rows, as floats."""
     return plan.first_log + plan.log_every * np.arange(plan.rows, dtype=np.float64)
 
 
-def read_gyro(track: LoopOutput, plan: FlightClock, on_board: OnBoard, cutoff: float, steps: FloatArray) -> FloatArray:
+def read_gyro(track: Track, plan: Plan, on_board: OnBoard, cutoff: float, steps: FloatArray) -> FloatArray:
     """Gyro without white noise at the given steps, shape (rows, 3) [rad/s]."""
     rates = butterworth(track.gyro, cutoff, plan.dt) if np.isfinite(cutoff) else track.gyro
     return np.asarray(rows_at(rates, steps) @ on_board.gyro_matrix.T + on_board.gyro_bias)
 
 
-def read_accel(track: LoopOutput, plan: FlightClock, on_board: OnBoard, cutoff: float, steps: FloatArray) -> FloatArray:
+def read_accel(track: Track, plan: Plan, on_board: OnBoard, cutoff: float, steps: FloatArray) -> FloatArray:
     """Accelerometer without white noise: mean over one sample centred on the given steps, shape (rows, 3) [m/s^2]."""
     running = track.accel
     if np.isfinite(cutoff):

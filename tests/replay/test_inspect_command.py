@@ -6,6 +6,7 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from quadid_replay import write_csv
 
@@ -37,6 +38,17 @@ def test_json_alone_on_stdout(log: Path, inside: Cli) -> None:
     assert result["log"] == str(log)
     assert {row["name"] for row in result["excitation"]} == {"b", "d", "J_xx", "J_yy", "J_zz", "J_r"}
     assert all(row["relative_sigma"] > 0 for row in result["excitation"])
+
+
+def test_no_precision_is_promised_of_a_log_in_wrong_units(tmp_path: Path, inside: Cli) -> None:
+    """Of rates in degrees J_yy was promised to 0.00001 %."""
+    flown = Flight().recording(seconds=10.0)
+    gyro = flown.channels["gyro"]
+    degrees = replace(gyro, values=np.degrees(gyro.values))
+    write_csv(tmp_path / "degrees.csv", replace(flown, channels={**flown.channels, "gyro": degrees}))
+    run = inside("inspect", tmp_path / "degrees.csv", "--vehicle", "pelican", "--json", "-")
+    assert not run.data["usable"]
+    assert run.data["excitation"] == []
 
 
 def test_files_are_named_by_absolute_path(log: Path, inside: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
