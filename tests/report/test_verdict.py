@@ -63,7 +63,7 @@ def test_what_is_missing_keeps_a_result_from_green_and_is_said_in_shares(
 def test_without_gyro_or_accelerometer_nobody_knows_what_is_missing() -> None:
     verdict = identify_verdict({**_result(), "missing": None})
     assert verdict.level == "fair"
-    assert "nobody sees" in verdict.headline
+    assert "it is unknown what the simulation misses" in verdict.headline
 
 
 def test_what_the_data_do_not_show_is_said_with_the_motion_it_needs() -> None:
