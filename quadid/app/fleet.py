@@ -1,209 +1,517 @@
-"""Fleet: the work on one log, and the health of every vehicle over its flights."""
+"""`quadid fleet`: the logs of a folder identified in parallel on Dask, results on disk, and what they tell together."""
 
 from __future__ import annotations
 
+import contextlib
+import hashlib
 import json
+import logging
+import multiprocessing
 import os
+import sqlite3
 import time
-from collections.abc import Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from functools import lru_cache
+from multiprocessing.process import BaseProcess
+from pathlib import Path
+from queue import Empty, SimpleQueue
+from typing import Annotated, Any
 
-from quadid.app.logs import Log, LogPart, check_conventions, on_grid, open_recording, parse_part, require_gyro
-from quadid.data.window import Recording
-from quadid.errors import LogError, NotIdentifiableError, QuadidError
-from quadid.sanitise import one_line
+import typer
+from quadid_replay.formats import HEAD_BYTES, recognise
+
+from quadid.app.fleet import Job, Row, blank, health_trend, identify_one
+from quadid.app.fleet_page import Fleet, summarise
+from quadid.app.logs import GRID, load_vehicle, parse_columns
+from quadid.app.options import Columns, JsonTarget, OutFolder, Rate, Seed
+from quadid.cli import terminal
+from quadid.errors import LogError, QuadidError, VehicleError
 from quadid.vehicle import Vehicle
-
-if TYPE_CHECKING:
-    from quadid.condition import FlightTrim
-
-# --- What is done to one log of a fleet, wherever a worker runs: plain data in, plain data out, never an exception
+from quadid.version import __version__
 
 
-Row = dict[str, Any]
-EARLIEST = 946_684_800.0
-"""Times before the year 2000 are seconds since boot, not dates [s]."""
+def fleet(
+    folder: Annotated[
+        Path, typer.Argument(metavar="DIR", help="Folder of logs, formats auto-detected; one vehicle a folder.")
+    ],
+    vehicle: Annotated[
+        str | None,
+        typer.Option(
+            "--vehicle", metavar="V", help="Shipped name or YAML file for folders without a vehicle.yaml of their own."
+        ),
+    ] = None,
+    scheduler: Annotated[
+        str | None,
+        typer.Option("--scheduler", metavar="ADDR", help="A Dask scheduler (tcp://…); default: own workers."),
+    ] = None,
+    workers: Annotated[
+        int | None, typer.Option("--workers", metavar="N", min=1, help="Own workers; default one a core.")
+    ] = None,
+    memory: Annotated[
+        str, typer.Option("--memory", metavar="SIZE", help="Memory that one own worker may take.")
+    ] = "2GiB",
+    diagnose: Annotated[
+        bool, typer.Option("--diagnose", help="Also name what the simulation gets wrong (slower).")
+    ] = False,
+    again: Annotated[
+        bool, typer.Option("--again", help="Identify all logs again, including those already done.")
+    ] = False,
+    rate: Rate = GRID,
+    seed: Seed = 1,
+    columns: Columns = None,
+    json: JsonTarget = None,
+    out: OutFolder = Path(),
+) -> None:
+    """Identify every log of a folder on Dask; write SQLite, Parquet and a report. Run it again and it goes on."""
+    terminal.check_file(json, "--json")
+    target = terminal.out_folder(out)
+    named = parse_columns(columns or [])
+    if named and vehicle is None:
+        raise typer.BadParameter(
+            "vehicles in the folder name their own: give it with --vehicle", param_hint="--columns"
+        )
+    known = None if vehicle is None else load_vehicle(vehicle)
+    default = None if known is None else known.model_copy(update={"columns": known.columns | named}).to_yaml()
+    found = find_jobs(folder.resolve(), default, rate, seed, diagnose, target)
+    begin = time.perf_counter()
+    with open_store(target / "fleet.sqlite") as store:
+        store.keep({job.name for job in found.jobs})
+        # Not again: those whose file, vehicle and settings are what the stored result was made from.
+        ended = {} if again else store.ended()
+        waiting = [job for job in found.jobs if ended.get(job.name) != (job.size, job.modified, job.key)]
+        with terminal.progress() as advance:
+            if waiting:
+                advance("start workers", 0.0)
+                count = min(workers, len(waiting)) if workers is not None else None
+                with cluster(scheduler, count, memory) as client:
+                    for done, row in enumerate(results(client, waiting), 1):
+                        store.put(row)
+                        advance(f"{done} of {len(waiting)} logs", done / len(waiting))
+        logs, parameters, findings, trims = (store.rows(table) for table in ("logs", "parameters", "findings", "trims"))
+        files = [target / "fleet.sqlite", *store.write_parquet(target)]
+    result = {
+        "schema": "quadid.fleet/1", "logs": len(logs), "worked": len(waiting), "seconds": time.perf_counter() - begin,
+        **summarise(logs, parameters, findings, found.copies),
+        "health": health_trend(logs, trims, {job.unit: job.vehicle for job in found.jobs}),
+        "other_files": list(found.others), "files": [str(file) for file in files],
+    }  # fmt: skip
+    terminal.conclude(Fleet(result, logs, parameters), json, target / "fleet.html", target)
+
+
+# --- Jobs on Dask: an embedded cluster of processes, or one that is already there
+
+
+AHEAD = 4
+"""Jobs handed out for each worker, so that the scheduler's memory does not grow with the number of logs."""
+ATTEMPTS = 4
+"""Workers that may die with a log before it is given up; workers also die for reasons that are not the log's."""
+_ONE_THREAD = {f"{library}_NUM_THREADS": "1" for library in ("OMP", "OPENBLAS", "MKL", "NUMBA")}
+
+_QUIET = {
+    "distributed.worker.profile.enabled": False, "distributed.admin.tick.interval": "500ms",
+    "distributed.admin.system-monitor.interval": "5s", "distributed.worker.memory.monitor-interval": "500ms",
+}  # fmt: skip
+"""Dask otherwise looks at every worker's stack each 10 ms, at itself each 20 ms and at memory each 100 ms."""
+_WARM = (
+    "distributed", "distributed.nanny", "quadid.app.fleet", "quadid.app.identify", "quadid.condition.trim",
+    "quadid.condition.trim", "quadid_replay.rosbag",
+)  # fmt: skip
+"""Modules imported by the process from which all workers are forked, those that replace dead ones too."""
+
+STARTING = 180.0
+"""Time that a worker may take to start [s]: when none lives for so long, there is no cluster."""
+ANSWER = 10.0
+"""Time that a scheduler may take to answer [s]."""
+_LOOK = 2.0
+"""A worker lives when it is there at two looks, so far apart [s]."""
+
+
+class ClusterError(QuadidError):
+    """No cluster to work on."""
+
+
+@contextmanager
+def cluster(address: str | None, workers: int | None, memory: str) -> Iterator[Any]:
+    """A client of the cluster at `address`, or of an embedded one that ends with the block.
+
+    Args:
+        address: of a Dask scheduler, for example ``tcp://10.0.0.1:8786``; its workers must see the logs at the same
+            paths and have quadid of the same version.
+        workers: processes of the embedded cluster; None for one a core.
+        memory: that one worker may take before it is restarted and its log given up, for example ``2GiB``.
+
+    Raises:
+        ClusterError: nothing answers at the address, or no worker can start.
+    """
+    import dask
+    from distributed import Client, LocalCluster
+    from distributed.utils import get_mp_context
+
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)
+    settings = {
+        "distributed.scheduler.allowed-failures": 0, "distributed.nanny.pre-spawn-environ": _ONE_THREAD,
+        "distributed.scheduler.worker-ttl": None,  # a worker that compiles kernels is silent for minutes
+        "distributed.worker.multiprocessing-method": "forkserver",
+    }  # fmt: skip
+    with dask.config.set({**settings, **_QUIET}):
+        if address is not None:
+            try:
+                client = Client(address, timeout=ANSWER, set_as_default=False)
+            except (OSError, TimeoutError, ValueError) as error:
+                raise ClusterError(
+                    f"no Dask scheduler answers at {address}", "an address such as tcp://10.0.0.1:8786",
+                    "start one with `dask scheduler`, or leave --scheduler out",
+                ) from error  # fmt: skip
+            with client:
+                yield client
+            return
+        get_mp_context().set_forkserver_preload(list(_WARM))
+        count, others = workers or os.cpu_count() or 1, set(multiprocessing.active_children())
+        try:
+            own = LocalCluster(
+                n_workers=count, threads_per_worker=1, processes=True, memory_limit=memory, dashboard_address=None,
+                host="127.0.0.1", silence_logs=logging.CRITICAL, death_timeout=STARTING,
+            )  # fmt: skip
+        except (RuntimeError, OSError, TimeoutError) as error:
+            raise _no_worker(f"their processes end at once or not within {STARTING:g} s") from error
+        try:
+            with Client(own, set_as_default=False) as client:
+                yield client
+        finally:
+            _close(own, others)
+
+
+def _close(own: Any, others: set[BaseProcess]) -> None:
+    """Ends an embedded cluster and its processes; `others` are children of this process that it did not start.
+
+    Dask cannot close a cluster while the worker that replaces a dead one starts, and fails; its process is then killed,
+    and it can.
+    """
+    from distributed.core import Status
+
+    try:
+        own.close(timeout=STARTING)
+    except (AssertionError, TimeoutError):
+        for child in set(multiprocessing.active_children()) - others:
+            child.kill()
+        own.status = Status.failed  # is closed once more
+        own.close(timeout=STARTING)
+
+
+def results(client: Any, jobs: Sequence[Job], work: Callable[[Job], Row] = identify_one) -> Iterator[Row]:
+    """Runs `work` on all jobs and yields one row of each as it is ready, whichever workers die on the way.
+
+    A log whose workers die `ATTEMPTS` times, the last time with nothing else in them, costs that log only.
+
+    Raises:
+        ClusterError: no worker lives for `STARTING` seconds.
+    """
+    threads = sum(client.nthreads().values())
+    if threads == 0:
+        raise ClusterError("the cluster has no workers", "at least one", "start one with `dask worker ADDRESS`")
+    # A dying worker takes along jobs that waited in it.  So these come again, as many as there are workers, and at last
+    # one by one, where only a log that kills its worker is lost.
+    ahead = [AHEAD * threads, *[threads] * (ATTEMPTS - 2), 1]
+    for most in ahead:
+        jobs = yield from _answered(_stream(client, jobs, work, most))
+    yield from map(_lost, jobs)
+
+
+def _answered(ended: Iterator[tuple[Any, Job]]) -> Generator[Row, None, list[Job]]:
+    """Yields the rows of ended futures; returns the jobs whose worker died, or the result before it was fetched."""
+    from distributed import KilledWorker
+    from distributed.client import FutureCancelledError
+
+    died = []
+    for future, job in ended:
+        try:
+            row = dict(future.result()) if future.status == "finished" else None
+        except (KilledWorker, FutureCancelledError):
+            row = None
+        if row is None:
+            died.append(job)
+        else:
+            yield row
+    return died
+
+
+def _stream(
+    client: Any, jobs: Sequence[Job], work: Callable[[Job], Row], ahead: int
+) -> Iterator[tuple[Any, Job]]:  # fmt: skip
+    """Ended futures with their jobs, in the order in which they end; at most `ahead` are handed out."""
+    waiting = iter(jobs)
+    ended: SimpleQueue[Any] = SimpleQueue()
+    running: dict[str, Job] = {}
+
+    def hand_out(job: Job) -> None:
+        future = client.submit(work, job, pure=False, retries=0)
+        running[future.key] = job
+        future.add_done_callback(ended.put)
+
+    for _, job in zip(range(ahead), waiting, strict=False):
+        hand_out(job)
+    while running:
+        future = _next_of(ended, client)
+        yield future, running.pop(future.key)
+        following = next(waiting, None)
+        if following is not None:
+            hand_out(following)
+
+
+def _next_of(ended: SimpleQueue[Any], client: Any) -> Any:
+    """The next future that ends."""
+    lived, before = time.monotonic(), set[str]()
+    while True:
+        with contextlib.suppress(Empty):
+            return ended.get(timeout=_LOOK)
+        there = set(client.sync(client.scheduler.ncores_running))
+        if there & before:
+            lived = time.monotonic()
+        elif time.monotonic() - lived > STARTING:
+            raise _no_worker(f"none lived for {_LOOK:g} s in the last {STARTING:g} s")
+        before = there
+
+
+def _no_worker(how: str) -> ClusterError:
+    return ClusterError(
+        f"no worker can start: {how}", "at least one worker with memory for one log",
+        "use more --memory, or fewer --workers; finished logs are kept",
+    )  # fmt: skip
+
+
+def _lost(job: Job) -> Row:
+    reason = f"{ATTEMPTS} workers died with this log: too much memory (see --memory), or a crash in a library"
+    return {**blank(job), "status": "failed", "reason": reason, "took": None}
+
+
+# --- The logs of a folder, and which vehicle of the fleet each belongs to
+
+
+VEHICLE_FILE = "vehicle.yaml"
+SUFFIXES = (".mcap", ".tlog", ".bin", ".ulg")
+"""Suffixes of logs: such a file is tried, and its refusal reported, even if its content is not recognised."""
 
 
 @dataclass(frozen=True)
-class Job:
-    """One log to identify.
+class Found:
+    """Logs of a folder as jobs, files that are no logs, and logs with the bytes of a job's (name of copy and job)."""
 
-    Attributes:
-        path: absolute, with a span if wanted; every worker must see it there.
-        name: relative to the folder of the fleet.
-        unit: which vehicle of the fleet it belongs to.
-        size, modified: of the file [bytes], [ns]; with `key` they tell whether a stored result is still good.
-        key: hash of everything else that decides the result.
-        rate: of the grid [Hz]; seed: of the search; diagnose: name what the simulation gets wrong too.
-    """
-
-    path: str
-    name: str
-    unit: str
-    vehicle: str
-    size: int
-    modified: int
-    key: str
-    rate: float
-    seed: int
-    diagnose: bool
+    jobs: tuple[Job, ...]
+    others: tuple[str, ...]
+    copies: tuple[tuple[str, str], ...] = ()
 
 
-def identify_one(job: Job) -> Row:
-    """Identifies one log.
+def find_jobs(
+    root: Path, default: str | None, rate: float, seed: int, diagnose: bool, leave_out: Path | None = None
+) -> Found:
+    """Lists all logs below `root`, recognised by content.
 
-    Returns:
-        ``status`` ``done``, ``refused`` (the data cannot support an answer), ``unreadable`` or ``failed`` (a defect
-        of this program), ``reason``, and what was found; nothing is raised, so that no log can stop the others.
-    """
-    begin = time.perf_counter()
-    row = blank(job)
-    try:
-        cut = parse_part(job.path)
-        vehicle, recording = _opened(job, cut)
-        checked = check_conventions(recording, vehicle, cut)
-        row |= _seen(cut.of(recording), vehicle, checked.doubts)
-        require_gyro(recording)
-        log = on_grid(cut.path, recording, vehicle, job.rate, cut, checked)
-        row |= {"seconds": log.grid.seconds_used, "warnings": list(dict.fromkeys([*row["warnings"], *log.warnings]))}
-        row |= {"status": "done", "reason": "", **_identified(job, log)}
-    except NotIdentifiableError as error:
-        row |= {"status": "refused", "reason": _line(error)}
-    except (QuadidError, OSError) as error:
-        status = "refused" if row["trims"] else "unreadable"  # what shows its trim has been read
-        row |= {"status": status, "reason": _line(error)}
-    except Exception as error:  # noqa: BLE001 - one log's defect is reported in its row and must not stop the rest
-        row |= {"status": "failed", "reason": f"{type(error).__name__}: {_line(error)}"}
-    return {**row, "took": time.perf_counter() - begin, "worker": os.getpid()}
-
-
-def blank(job: Job) -> Row:
-    """The row of a log of which nothing is known yet but its file."""
-    return {
-        "name": job.name, "unit": job.unit, "size": job.size, "modified": job.modified, "key": job.key,
-        "sha256": None, "started": 1e-9 * job.modified, "dated_by": "file", "format": None, "seconds": None,
-        "mse_initial": None, "mse_fitted": None, "verdict": None, "parameters": [], "findings": [], "trims": [],
-        "warnings": [],
-    }  # fmt: skip
-
-
-def _opened(job: Job, cut: LogPart) -> tuple[Vehicle, Recording]:
-
-    vehicle = Vehicle.from_yaml(job.vehicle, job.unit)
-    if cut.path.stat().st_size == 0:
-        raise LogError("empty file", fix="check that the logger finished writing, then copy it again")
-    return vehicle, open_recording(cut.path, columns=vehicle.columns)
-
-
-def _seen(recording: Recording, vehicle: Vehicle, doubts: Sequence[str]) -> Row:
-    """Facts of a flight, whether or not anything can be fitted to it; its trim where it flew steadily."""
-    from quadid.condition.trim import flight_to_dict, flight_trim
-
-    row: Row = {
-        "vehicle": vehicle.name,
-        "sha256": recording.sha256,
-        "format": recording.format,
-        "warnings": [f"{recording.name}: {text}" for text in (*recording.warnings, *doubts)],
-        **_when(recording),
-    }
-    try:
-        trim = flight_trim(recording, vehicle)
-    except NotIdentifiableError as error:
-        return row | {"warnings": [*row["warnings"], f"no trim: {error.found}"]}
-    return row | {"trims": [{"trim": json.dumps(flight_to_dict(trim))}]}
-
-
-def _identified(job: Job, log: Log) -> Row:
-    from quadid.app.identify import identify
-
-    result = identify(log, seed=job.seed).result
-    error = result["sets"][0]["mse"]
-    row: Row = {
-        "mse_initial": error["initial"],
-        "mse_fitted": error["fitted"],
-        "parameters": [
-            {"parameter": p["name"], "unit": p["unit"], "value": p["value"], "low": p["ci95"][0], "high": p["ci95"][1],
-             "status": p["status"]}
-            for p in result["parameters"]
-        ],
-    }  # fmt: skip
-    return row | (_diagnosed(job, log) if job.diagnose else {})
-
-
-def _when(recording: Recording) -> Row:
-    """Date of the flight, where the log's clock knows dates."""
-    first, _ = recording.span
-    return {"started": first, "dated_by": "log"} if first > EARLIEST else {}
-
-
-def _diagnosed(job: Job, log: Log) -> Row:
-    from quadid.app.diagnose import diagnose
-
-    done = diagnose(log, seed=job.seed)
-    kept = ("effect", "confident", "parameter", "unit", "value", "low", "high", "mse_before", "mse_after")
-    return {"verdict": done.result["verdict"], "findings": [{k: row[k] for k in kept} for row in done.records()]}
-
-
-def _line(error: Exception) -> str:
-    return one_line(str(error), 500)
-
-
-# --- Health of every vehicle of a fleet over its flights: each flight against the vehicle's first ones
-
-
-HealthRow = Mapping[str, Any]
-
-BASELINE = 5
-"""The first flights of a vehicle are its baseline, so many where there are more."""
-FEWEST = 3
-"""Baseline flights that a trend takes at least."""
-
-
-def health_trend(
-    logs: Sequence[HealthRow], trims: Sequence[HealthRow], vehicles: Mapping[str, str]
-) -> list[dict[str, Any]]:
-    """Compares each flight of a vehicle with its first flights.
+    The vehicle of a log is described by the nearest ``vehicle.yaml`` in its folder or above it, up to `root`, else by
+    `default`.  A vehicle of the fleet is a folder: logs of one folder belong to the same one.  Logs with the same bytes
+    are one flight, and one job.
 
     Args:
-        logs: rows with name, unit, started [s since 1970].
-        trims: rows with log and trim (JSON).
-        vehicles: text of the vehicle file by unit.
+        default: text of the vehicle file for folders without one.
+        rate: of the grid [Hz].
+        leave_out: folder that is not looked into, for the results.
 
-    Returns:
-        A row a flight, in the order of time: unit, log, started, baseline (whether it is part of it), and, for the
-        others, score, verdict, baseline_lacking, unfamiliar, p_value and changes as in ``quadid.health/1``; none for
-        vehicles with too few flights.
+    Raises:
+        LogError: no folder, or no log in it.
+        VehicleError: a log without a vehicle.
     """
-    from quadid.condition.trim import flight_from_dict
+    if not root.is_dir():
+        raise LogError(f"no folder {root}", "a folder with flight logs", "check the path")
+    jobs, others, texts = list[Job](), list[str](), dict[Path, str]()
+    for path in _files(root, leave_out):
+        name = path.relative_to(root).as_posix()
+        if not _is_log(path):
+            others.append(name)
+            continue
+        text = _vehicle_text(path.parent, root, default, texts)
+        folder = path.parent.relative_to(root).as_posix()
+        status = path.stat()
+        jobs.append(Job(
+            str(path), name, _vehicle_name(text, folder), text, status.st_size, status.st_mtime_ns,
+            _key(text, rate, seed, diagnose), rate, seed, diagnose,
+        ))  # fmt: skip
+    if not jobs:
+        raise LogError(f"no flight log below {root} ({len(others)} other files)", "MCAP, tlog, DataFlash, ULog or CSV")
+    copies = _copies(jobs)
+    return Found(tuple(job for job in jobs if job.name not in copies), tuple(others), tuple(copies.items()))
 
-    flown = {row["log"]: flight_from_dict(json.loads(row["trim"])) for row in trims}
-    by_unit: dict[str, list[HealthRow]] = {}
-    for log in sorted(logs, key=lambda row: (float(row["started"]), row["name"])):
-        if log["name"] in flown and log["unit"] in vehicles:
-            by_unit.setdefault(log["unit"], []).append(log)
-    out = []
-    for unit, mine in sorted(by_unit.items()):
-        count = min(BASELINE, len(mine) - 1)
-        if count >= FEWEST:
-            out += _trend(Vehicle.from_yaml(vehicles[unit], unit), unit, mine, flown, count)
-    return out
+
+def _copies(jobs: Sequence[Job]) -> dict[str, str]:
+    """Logs with the bytes of another, and which: the file that was changed first, as a copy may have a later date."""
+    same_size: dict[int, list[Job]] = defaultdict(list)
+    for job in sorted(jobs, key=lambda job: (job.modified, job.name)):
+        same_size[job.size].append(job)
+    first: dict[bytes, str] = {}
+    out = {}
+    for job in (job for some in same_size.values() if len(some) > 1 for job in some if job.size):
+        try:
+            with open(job.path, "rb") as file:
+                digest = hashlib.file_digest(file, "sha256").digest()
+        except OSError:
+            continue  # its row says why it cannot be read
+        if first.setdefault(digest, job.name) != job.name:
+            out[job.name] = first[digest]
+    return dict(sorted(out.items()))
 
 
-def _trend(
-    vehicle: Vehicle, unit: str, logs: Sequence[HealthRow], flown: Mapping[str, FlightTrim], count: int
-) -> list[dict[str, Any]]:
-    from quadid.condition.changes import assess
+def _files(root: Path, leave_out: Path | None) -> Iterator[Path]:
+    for folder, inner, names in os.walk(root):
+        here = Path(folder)
+        inner[:] = sorted(n for n in inner if not n.startswith(".") and here / n != leave_out)
+        for name in sorted(names):
+            # Results beside the logs: `--out` may be the folder itself.
+            if not name.startswith((".", "fleet.")) and (here / name).is_file():
+                yield here / name
 
-    baseline = [flown[log["name"]] for log in logs[:count]]
-    rows: list[dict[str, Any]] = []
-    for k, log in enumerate(logs):
-        row = {"unit": unit, "log": log["name"], "started": log["started"], "baseline": k < count}
-        if k >= count:
-            found = assess([flown[log["name"]]], baseline, vehicle).to_dict()
-            row |= {
-                key: found[key] for key in ("score", "verdict", "baseline_lacking", "unfamiliar", "p_value", "changes")
-            }
-        rows.append(row)
-    return rows
+
+def _is_log(path: Path) -> bool:
+
+    if path.suffix.lower() in SUFFIXES:
+        return True
+    try:
+        with path.open("rb") as file:
+            recognise(file.read(HEAD_BYTES), path.name)
+    except OSError:
+        return True  # its row says why it cannot be read
+    except LogError:
+        return path.suffix.lower() == ".csv"
+    return True
+
+
+def _vehicle_text(folder: Path, root: Path, default: str | None, texts: dict[Path, str]) -> str:
+    for place in (folder, *folder.parents):
+        file = place / VEHICLE_FILE
+        if file in texts:
+            return texts[file]
+        if file.is_file():
+            texts[file] = load_vehicle(str(file)).to_yaml()
+            return texts[file]
+        if place == root:
+            break
+    if default is None:
+        raise VehicleError(
+            f"no vehicle for {folder}", f"a {VEHICLE_FILE} in that folder or above it", "add one, or give --vehicle"
+        )
+    return default
+
+
+@lru_cache(maxsize=64)
+def _vehicle_name(text: str, folder: str) -> str:
+
+    return Vehicle.from_yaml(text).name if folder == "." else folder
+
+
+def _key(vehicle: str, rate: float, seed: int, diagnose: bool) -> str:
+
+    parts = (vehicle, f"{rate!r}", str(seed), str(diagnose), __version__)
+    return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:16]
+
+
+# --- Results of a fleet on disk: SQLite while it runs, so that a stopped run goes on where it was; Parquet at its end
+
+
+LOGS: dict[str, str] = {
+    "name": "TEXT PRIMARY KEY", "unit": "TEXT", "vehicle": "TEXT", "status": "TEXT", "reason": "TEXT",
+    "started": "REAL", "dated_by": "TEXT", "format": "TEXT", "seconds": "REAL", "mse_initial": "REAL",
+    "mse_fitted": "REAL", "verdict": "TEXT", "size": "INTEGER", "modified": "INTEGER", "sha256": "TEXT", "key": "TEXT",
+    "took": "REAL", "warnings": "TEXT",
+}  # fmt: skip
+"""Columns of the table of logs: times in [s], started since 1970, size in bytes, modified in ns."""
+PARAMETERS: dict[str, str] = {
+    "log": "TEXT", "parameter": "TEXT", "unit": "TEXT", "value": "REAL", "low": "REAL", "high": "REAL",
+    "status": "TEXT",
+}  # fmt: skip
+FINDINGS: dict[str, str] = {
+    "log": "TEXT", "effect": "TEXT", "confident": "INTEGER", "parameter": "TEXT", "unit": "TEXT", "value": "REAL",
+    "low": "REAL", "high": "REAL", "mse_before": "REAL", "mse_after": "REAL",
+}  # fmt: skip
+TRIMS: dict[str, str] = {"log": "TEXT", "trim": "TEXT"}
+"""Trim of a flight as JSON, for the comparison with other flights of its vehicle."""
+TABLES = {"logs": LOGS, "parameters": PARAMETERS, "findings": FINDINGS, "trims": TRIMS}
+PARTS = ("parameters", "findings", "trims")
+"""Tables with rows of a log."""
+ENDED = ("done", "refused", "unreadable")
+"""Outcomes that the same file would have again."""
+
+
+class Store:
+    """The results of one fleet; every log is written in one transaction as it arrives."""
+
+    def __init__(self, connection: sqlite3.Connection) -> None:
+        self._connection = connection
+        self._connection.execute("PRAGMA journal_mode=WAL")
+        for table, columns in TABLES.items():
+            listed = ", ".join(f'"{name}" {kind}' for name, kind in columns.items())
+            self._connection.execute(f"CREATE TABLE IF NOT EXISTS {table} ({listed})")
+        for table in PARTS:
+            self._connection.execute(f"CREATE INDEX IF NOT EXISTS {table}_log ON {table} (log)")
+
+    def ended(self) -> dict[str, tuple[int, int, str]]:
+        """Logs that need not be done again: size, time of change and key by name."""
+        marks = ", ".join("?" * len(ENDED))
+        found = self._connection.execute(f"SELECT name, size, modified, key FROM logs WHERE status IN ({marks})", ENDED)
+        return {name: (size, modified, key) for name, size, modified, key in found}
+
+    def put(self, row: Mapping[str, Any]) -> None:
+        """Writes one log's outcome in place of an older one."""
+        name = row["name"]
+        with self._connection:
+            for table in PARTS:
+                self._connection.execute(f"DELETE FROM {table} WHERE log = ?", (name,))
+                self._insert(table, [{"log": name, **part} for part in row[table]])
+            warnings = json.dumps(row["warnings"], ensure_ascii=False)
+            self._connection.execute("DELETE FROM logs WHERE name = ?", (name,))
+            self._insert("logs", [{"vehicle": None, **row, "warnings": warnings}])
+
+    def keep(self, names: set[str]) -> None:
+        """Forgets logs that are no longer in the folder."""
+        gone = [(n,) for (n,) in self._connection.execute("SELECT name FROM logs") if n not in names]
+        with self._connection:
+            self._connection.executemany("DELETE FROM logs WHERE name = ?", gone)
+            for table in PARTS:
+                self._connection.executemany(f"DELETE FROM {table} WHERE log = ?", gone)
+
+    def rows(self, table: str) -> list[Row]:
+        """All rows of a table, in the order of their log's name."""
+        columns = list(TABLES[table])
+        first = "name" if table == "logs" else "log"
+        quoted = ", ".join(f'"{c}"' for c in columns)
+        found = self._connection.execute(f"SELECT {quoted} FROM {table} ORDER BY {first}, rowid")
+        return [dict(zip(columns, values, strict=True)) for values in found]
+
+    def write_parquet(self, folder: Path) -> list[Path]:
+        """Writes every table as a Parquet file that pandas, polars, DuckDB and Spark read; returns their paths."""
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+
+        kinds = {"TEXT": pa.string(), "REAL": pa.float64(), "INTEGER": pa.int64()}
+        files = []
+        for table, columns in TABLES.items():
+            schema = pa.schema([(name, kinds[kind.split()[0]]) for name, kind in columns.items()])
+            path = folder / f"fleet.{table}.parquet"
+            pq.write_table(pa.Table.from_pylist(self.rows(table), schema=schema), path, compression="zstd")
+            files.append(path)
+        return files
+
+    def _insert(self, table: str, rows: list[Row]) -> None:
+        columns = list(TABLES[table])
+        listed, marks = ", ".join(f'"{c}"' for c in columns), ", ".join("?" * len(columns))
+        values = [[row[c] for c in columns] for row in rows]
+        self._connection.executemany(f"INSERT INTO {table} ({listed}) VALUES ({marks})", values)
+
+
+@contextmanager
+def open_store(path: Path) -> Iterator[Store]:
+    """Opens or makes the SQLite file."""
+    connection = sqlite3.connect(path)
+    try:
+        yield Store(connection)
+    finally:
+        connection.close()

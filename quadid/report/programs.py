@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from markupsafe import Markup
+from scipy.spatial.transform import Rotation
 
 from quadid.chi_square import Z95
 from quadid.effects import EFFECTS, rotor_losses
@@ -276,22 +277,22 @@ def px4(facts: Facts) -> dict[str, Any]:
     MPC_THR_HOVER is a share of command, not of thrust.
     """
     lost = () if facts.max_speed is not None else ("weak_rotor",)
-    refused = _not_sih(facts)
+    refused = _no_cross(facts, "no SIH_*: PX4 simulates")
     rows = [] if refused else _in_hardware(facts)
     return {"lost": lost, "rows": [*rows, *_drag_fusion(facts)], "refused": refused}
 
 
-def _not_sih(facts: Facts) -> str:
-    """Reason why PX4's simulation in hardware cannot be this vehicle; empty where its X and motor order hold."""
-    shape = "four alike rotors in an X: front right and back left counterclockwise, then front left and back right"
+def _no_cross(facts: Facts, what: str) -> str:
+    """Reason why a program that knows only PX4's X and motor order cannot fly it, after `what`; empty where it can."""
+    shape = f"{what} four alike rotors in an X, front right and back left counterclockwise, front left and back right"
     if len(facts.rotors) != _SIH.shape[1]:
-        return f"no SIH_*: PX4 simulates {shape}, this vehicle has {len(facts.rotors)} rotors"
+        return f"{shape}; this vehicle has {len(facts.rotors)} rotors"
     pull = facts.thrust / np.mean(facts.thrust)
     moments = np.array([-facts.arms[:, 1], facts.arms[:, 0], facts.vehicle.spins]) * pull
     size = np.mean(np.abs(facts.arms[:, 1])), np.mean(np.abs(facts.arms[:, 0])), 1.0
     wrong = np.abs(moments - _SIH * np.array(size)[:, None]).max(axis=1) > SAME_MOMENT * np.abs(moments).max(axis=1)
     axes = [axis for axis, off in zip(("roll", "pitch", "yaw"), wrong, strict=True) if off]
-    return f"no SIH_*: PX4 simulates {shape}; {', '.join(axes)} of this vehicle would come out wrong" if axes else ""
+    return f"{shape}; {', '.join(axes)} of this vehicle would come out wrong" if axes else ""
 
 
 def _in_hardware(facts: Facts) -> list[tuple[str, float]]:
@@ -411,10 +412,7 @@ def drone_models(facts: Facts) -> dict[str, Any]:
     Raises:
         ParameterError: not four rotors, which the program takes for granted.
     """
-    if len(facts.rotors) != 4:
-        raise ParameterError(
-            f"{len(facts.rotors)} rotors", "four, which drone-models takes for granted", "use rotorpy or mujoco"
-        )
+    _four(facts, "drone-models")
     arms, arm = facts.arms_flu, facts.vehicle.arm
     drag = (facts.effect("rotor_drag", "k_x"), facts.effect("rotor_drag", "k_y"), facts.effect("axial_inflow", "k_z"))
     mixing = np.array([arms[:, 1], -arms[:, 0], [r.turn_flu * arm for r in facts.rotors]]) / arm
@@ -422,6 +420,46 @@ def drone_models(facts: Facts) -> dict[str, Any]:
     return {
         "section": Markup(name or "vehicle"), "gravity": GRAVITY, "per_rpm": 2.0 * math.pi / 60.0, "mixing": mixing,
         "drag": -facts.vehicle.mass * np.diag(drag),
+    }  # fmt: skip
+
+
+def _four(facts: Facts, program: str) -> None:
+    if len(facts.rotors) != 4:
+        raise ParameterError(
+            f"{len(facts.rotors)} rotors", f"four, which {program} takes for granted", "use rotorpy or mujoco"
+        )
+
+
+def airsim(facts: Facts) -> dict[str, Any]:
+    """Coefficients that are b and d with propellers as long as an arm, and drag that is right in level flight.
+
+    The front that drag acts on is that of the box and of the propellers (`MultiRotorPhysicsBody.hpp`).
+    """
+    arm, turn, height = facts.vehicle.arm, 2.0 * math.pi, 0.01
+    front = 0.2 * arm**2 + len(facts.rotors) * math.pi * arm * height
+    return {
+        "density": AIR_DENSITY, "turn": turn, "diameter": arm, "height": height, "box": (arm, arm, 0.2 * arm),
+        "c_t": facts.value("b") * turn**2 / (AIR_DENSITY * arm**4),
+        "c_p": facts.value("d") * turn**3 / (AIR_DENSITY * arm**5),
+        "drag": 2.0 * facts.vehicle.mass * facts.effect("parasitic_drag", "c") / (AIR_DENSITY * front),
+        "refused": _no_cross(facts, "not for SimpleFlight, but behind PX4 or ArduPilot: SimpleFlight mixes for"),
+    }  # fmt: skip
+
+
+def pegasus(facts: Facts) -> dict[str, Any]:
+    """Links as for Gazebo; principal moments and axes (wxyz) of the body, torque of every rotor, drag at hover speed.
+
+    Raises:
+        ParameterError: not four rotors, which the program takes for granted.
+    """
+    _four(facts, "Pegasus")
+    links = gazebo(facts)
+    moments, axes = np.linalg.eigh(links["body_inertia"])
+    x, y, z, w = Rotation.from_matrix(np.linalg.det(axes) * axes).as_quat()
+    drag = (facts.effect("rotor_drag", "k_x"), facts.effect("rotor_drag", "k_y"), facts.effect("axial_inflow", "k_z"))
+    return links | {
+        "moments": moments, "axes": (w, x, y, z), "torques": facts.torque_per_thrust * facts.thrust,
+        "drag": facts.vehicle.mass * np.array(drag),
     }  # fmt: skip
 
 
@@ -514,6 +552,18 @@ FORMS: dict[str, Form] = {
         tuple(name for name in ALL if not name.startswith(("random", "battery_sag"))),
         {"_fmu.py": "fmu.py"},
         lambda facts: {"vehicle_file": facts.vehicle.to_yaml()},
+    ),
+    "airsim": Form(
+        "AirSim, Colosseum, Cosys-AirSim, cosysairsim",
+        (*_BODY, "motor_lag", "parasitic_drag"),
+        {".airsim.hpp": "airsim.hpp"},
+        airsim,
+    ),
+    "pegasus": Form(
+        "Pegasus, Isaac-Sim",
+        (*_BODY, "weak_rotor", "rotor_drag", "rotor_drag.central", "axial_inflow", "axial_inflow.central"),
+        {".usda": "pegasus.usda", "_pegasus.py": "pegasus.py"},
+        pegasus,
     ),
     "isaac-lab": Form("Isaac Lab", (*_BODY, *_LAGS, "random"), {"_isaaclab.py": "isaac_lab.py"}, isaac_lab),
 }

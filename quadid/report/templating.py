@@ -57,6 +57,11 @@ def _frame_comment(text: str) -> str:
     return _comment(text).translate({ord("{"): "(", ord("}"): ")"})
 
 
+def _cpp_comment(text: str) -> str:
+    """A backslash, or what once stood for one, at the end of a line would take the next one into the comment."""
+    return re.sub(r"\\|\?+/", "/", _comment(text))
+
+
 def _no_literal(text: str) -> str:
     raise ValueError(f"{text[:40]!r}: files of this kind hold no strings")
 
@@ -87,6 +92,7 @@ _LANGUAGES = {
     "lua": _Language(literal=_lua_literal),
     "py": _Language(_python_comment, _python_literal),
     "json": _Language(_frame_comment),
+    "hpp": _Language(_cpp_comment),
     "xml": _Language(_xml_comment, bare=_xml),
 }
 _LANGUAGES |= {"sdf": _LANGUAGES["xml"], "urdf": _LANGUAGES["xml"]}

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import math
+import shutil
+import subprocess
 import tomllib
 import xml.etree.ElementTree as ET
 from pathlib import Path
@@ -11,9 +13,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
+from quadid.app.export import export as exported
 from quadid.app.init import init as begin
-from quadid.errors import VehicleError
+from quadid.errors import ParameterError, VehicleError
 from quadid.report.programs import FORMATS, export
 from quadid.vehicle import GRAVITY, Command, ParameterPrior, Proof, RandomForces, RandomInput, ResidualTerm, Vehicle
 from tests.commands import Cli, one_line
@@ -276,8 +280,8 @@ def test_optional_numbers_that_have_no_place_are_named_too(vehicle: Vehicle, for
     rotors, effects = Vehicle.shipped("pelican_x").rotors, {"motor_lag": lag, "axial_inflow": inflow}
     for text in export(vehicle.model_copy(update={"rotors": rotors, "effects": effects}), form, "x").values():
         told = "".join(line for line in text.splitlines() if "have no place here" in line)
-        assert ("k_climb" in told) == (form in {"rotorpy", "drone-models"})
-        assert ("tau_down" in told) == (form in {"px4", "rotorpy", "agilicious"})
+        assert ("k_climb" in told) == (form in {"rotorpy", "drone-models", "pegasus"})
+        assert ("tau_down" in told) == (form in {"px4", "rotorpy", "agilicious", "airsim"})
         assert "central" not in told, "neutral: nothing is left out"
 
 
@@ -319,6 +323,128 @@ def test_isaac_lab_randomises_over_what_acts_at_random(vehicle: Vehicle) -> None
     assert facts["RANDOM_TORQUE_TIME"] == (0.2, 0.2, 1.5)
     assert "RANDOM" not in next(iter(export(vehicle, "isaac-lab", "x").values()))
     assert "random" in "".join(export(gusty, "px4", "x").values()).split("no place here")[1].split("\n")[0]
+
+
+AIRSIM = """
+#include <cmath>
+#include <cstdio>
+#include <vector>
+namespace msr { namespace airlib {
+struct Vector3r { float x, y, z; Vector3r(double a = 0, double b = 0, double c = 0) : x(a), y(b), z(c) {} };
+struct Matrix3x3r { float m[3][3]; float& operator()(int i, int j) { return m[i][j]; } };
+enum class RotorTurningDirection : int { RotorTurningDirectionCCW = -1, RotorTurningDirectionCW = 1 };
+struct RotorPose {
+    Vector3r at, normal; RotorTurningDirection turn;
+    RotorPose(Vector3r a, Vector3r n, RotorTurningDirection t) : at(a), normal(n), turn(t) {}
+};
+struct RotorParams {
+    float C_T, C_P, air_density, max_rpm, propeller_diameter, propeller_height, control_signal_filter_tc;
+    void calculateMaxThrust() {}
+};
+struct MultiRotorParams { struct Params {
+    unsigned rotor_count; std::vector<RotorPose> rotor_poses; float mass; Matrix3x3r inertia; Vector3r body_box;
+    float linear_drag_coefficient, angular_drag_coefficient; RotorParams rotor_params;
+}; };
+}}
+"""
+"""The types of AirLib's MultiRotorParams.hpp and RotorParams.hpp that a vehicle is held in."""
+SHOWN = """
+#include "vehicle.hpp"
+int main() {
+    msr::airlib::MultiRotorParams::Params p; msr::airlib::setupFrameQuadid(p); auto& r = p.rotor_params;
+    std::printf("{\\"mass\\": %g, \\"count\\": %u, \\"drag\\": %g, \\"box\\": [%g, %g, %g], \\"inertia\\": [",
+                p.mass, p.rotor_count, p.linear_drag_coefficient, p.body_box.x, p.body_box.y, p.body_box.z);
+    for (int i = 0; i < 9; ++i) std::printf(i ? ", %.8g" : "%.8g", p.inertia.m[i / 3][i % 3]);
+    std::printf("], \\"C\\": [%.8g, %.8g], \\"rho\\": %g, \\"rpm\\": %.8g, \\"D\\": %.8g, "
+                "\\"h\\": %g, \\"tc\\": %g, \\"rotors\\": [",
+                r.C_T, r.C_P, r.air_density, r.max_rpm, r.propeller_diameter, r.propeller_height,
+                r.control_signal_filter_tc);
+    for (auto& o : p.rotor_poses)
+        std::printf("%s[%.8g, %.8g, %.8g, %g, %d]", &o == &p.rotor_poses[0] ? "" : ", ", o.at.x, o.at.y, o.at.z,
+                    o.normal.z, static_cast<int>(o.turn));
+    std::printf("]}");
+}
+"""
+
+
+def test_airsim_compiles_it_and_makes_the_same_wrench(vehicle: Vehicle, tmp_path: Path) -> None:
+    compiler = shutil.which("c++") or pytest.skip("no C++ compiler")
+    flown = vehicle.model_copy(update={"effects": {**vehicle.effects, "parasitic_drag": {"c": 0.03}}})
+    (tmp_path / "vehicles" / "multirotor").mkdir(parents=True)
+    (tmp_path / "vehicles" / "multirotor" / "MultiRotorParams.hpp").write_text(AIRSIM, encoding="utf-8")
+    (tmp_path / "vehicle.hpp").write_text(export(flown, "airsim", "x \\")[".airsim.hpp"], encoding="utf-8")
+    (tmp_path / "main.cpp").write_text(SHOWN, encoding="utf-8")
+    subprocess.run([compiler, "-std=c++11", "-I.", "main.cpp", "-o", "main"], cwd=tmp_path, check=True)
+    q = json.loads(subprocess.run([tmp_path / "main"], capture_output=True, check=True).stdout)
+    # RotorParams.hpp, RotorActuator.hpp: what a rotor makes of a control signal
+    speeds, n, rho, D = np.array([400.0, 420.0, 380.0, 450.0]), q["rpm"] / 60.0, q["rho"], q["D"]
+    control = (speeds / SPEED) ** 2
+    thrust = control * q["C"][0] * rho * n**2 * D**4
+    torque = control * q["C"][1] * rho * n**2 * D**5 / (2.0 * np.pi)
+    rotors = np.array(q["rotors"])
+    assert q["count"] == len(rotors) == 4
+    forces = np.outer(thrust, [0.0, 0.0, 1.0]) * rotors[:, 3:4]
+    moment = np.cross(rotors[:, :3], forces).sum(axis=0) + [0.0, 0.0, np.sum(rotors[:, 3] * rotors[:, 4] * torque)]
+    total, expected = _wrench(vehicle, speeds)
+    assert thrust.sum() == pytest.approx(total)
+    np.testing.assert_allclose(moment, expected, rtol=1e-5)
+    J = np.array([[8e-3, -1e-3, -2e-4], [-1e-3, 8e-3, 3e-4], [-2e-4, 3e-4, 1.5e-2]])
+    np.testing.assert_allclose(np.reshape(q["inertia"], (3, 3)), J, rtol=1e-6)
+    assert (q["mass"], q["tc"]) == pytest.approx((1.3, 0.03))
+    # MultiRotorPhysicsBody.hpp, FastPhysicsEngine.hpp: drag of the front at 5 m/s
+    front = q["box"][1] * q["box"][2] + 4 * np.pi * D * q["h"]
+    assert front * q["drag"] / 2.0 * rho * 5.0**2 == pytest.approx(1.3 * 0.03 * 5.0**2, rel=1e-4)
+
+
+def test_airsim_flies_behind_simple_flight_only_what_it_mixes_for() -> None:
+    cross = Vehicle.shipped("pelican_x")
+    ordered = cross.model_copy(update={"rotors": tuple(cross.rotors[i] for i in (0, 2, 3, 1))})
+    for flown, fits in ((ordered, True), (cross, False), (Vehicle.shipped("hexacopter"), False)):
+        done = exported(flown, "cosysairsim")
+        assert any("SimpleFlight mixes for four alike rotors" in text for text in done.result["warnings"]) != fits
+
+
+def test_pegasus_has_the_same_mass_inertia_and_wrench(vehicle: Vehicle, tmp_path: Path) -> None:
+    Usd = pytest.importorskip("pxr.Usd", reason="pip install usd-core (extra dev)")
+    from pxr import UsdGeom, UsdPhysics
+
+    weak = vehicle.model_copy(update={"effects": {**vehicle.effects, "weak_rotor": {"loss_2": 0.1}}})
+    texts = export(weak, "pegasus", "x")
+    (tmp_path / "v.usda").write_text(texts[".usda"], encoding="utf-8")
+    stage = Usd.Stage.Open(str(tmp_path / "v.usda"))
+    assert UsdGeom.GetStageUpAxis(stage) == "Z"
+    total, inertia, places = 0.0, np.zeros((3, 3)), []
+    for name in ("body", *(f"rotor{i}" for i in range(4))):
+        link = UsdPhysics.MassAPI(stage.GetPrimAtPath(f"/vehicle/{name}"))
+        mass, axes = link.GetMassAttr().Get(), link.GetPrincipalAxesAttr().Get()
+        turn = Rotation.from_quat([*axes.imaginary, axes.real]).as_matrix() if axes.real else np.eye(3)
+        at = np.array(UsdGeom.Xformable(link).GetLocalTransformation().ExtractTranslation())
+        total += mass
+        inertia += turn @ np.diag(link.GetDiagonalInertiaAttr().Get()) @ turn.T
+        inertia += mass * (at @ at * np.eye(3) - np.outer(at, at))
+        places.append(at)
+    for i, at in enumerate(places[1:]):
+        joint = UsdPhysics.RevoluteJoint(stage.GetPrimAtPath(f"/vehicle/joint{i}"))
+        assert joint.GetBody1Rel().GetTargets() == [f"/vehicle/rotor{i}"]
+        np.testing.assert_allclose(joint.GetLocalPos0Attr().Get(), at, atol=1e-6)
+    assert total == pytest.approx(1.3)
+    J = np.array([[8e-3, 1e-3, 2e-4], [1e-3, 8e-3, 3e-4], [2e-4, 3e-4, 1.5e-2]])  # FLU
+    np.testing.assert_allclose(inertia, J, rtol=1e-5, atol=1e-8)
+    # quadratic_thrust_curve.py, multirotor.py: thrust up at each rotor, the torques about z of the body
+    lines = [line for line in texts["_pegasus.py"].split("\n") if not line.startswith("from pegasus")]
+    space: dict[str, Any] = {}
+    exec("\n".join(lines), space)
+    q, speeds = space["THRUST_CURVE"], np.array([400.0, 420.0, 380.0, 450.0])
+    forces = np.outer(q["rotor_constant"] * speeds**2, [0.0, 0.0, 1.0])
+    moment = np.cross(places[1:], forces).sum(axis=0)
+    moment[2] += np.sum(np.array(q["rolling_moment_coefficient"]) * speeds**2 * q["rot_dir"])
+    thrust, expected = _wrench(vehicle, speeds * [1.0, math.sqrt(0.9), 1.0, 1.0])
+    assert forces[:, 2].sum() == pytest.approx(thrust)
+    np.testing.assert_allclose(moment * [1.0, -1.0, -1.0], expected, rtol=1e-5)
+    assert space["DRAG"] == pytest.approx([0.3 * 1.3, 0.3 * 1.3, 0.0])
+    assert space["PX4"]["input_scaling"] == q["max_rotor_velocity"] == [SPEED] * 4
+    with pytest.raises(ParameterError, match="four, which Pegasus takes for granted"):
+        export(Vehicle.shipped("hexacopter"), "isaac-sim", "x")
 
 
 def test_px4_hover_is_what_px4_itself_learned_in_a_recorded_flight(data_dir: Path) -> None:

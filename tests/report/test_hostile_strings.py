@@ -57,6 +57,7 @@ HOSTILE = {
     "encoding of emacs": f"-*- coding=utf_7 -*- +AAo-{MARK}",
     "yaml": f"x: {{y: [{MARK}]}}\n- !!python/object:os.{MARK} &a *a",
     "toml": f'x]\n[{MARK}]\ny = "',
+    "trigraph": f"x\n{MARK} = 1; ????/",
     "tab and comma": f"x\t1\t{MARK},2",
     "surrogate": f"x\ud800\ufffe\uffff{MARK}",
     "format": f"%s %({MARK})s {{0.__class__}} {{{MARK}}}",
@@ -131,6 +132,14 @@ def check_lines(text: str, form: str, separator: str) -> None:
             assert separator in line
 
 
+def check_code(text: str, sign: str) -> None:
+    """Strangers' text stands in comments of one line only."""
+    assert text.isprintable() or {c for c in text if not c.isprintable()} == {"\n"}
+    for line in text.split("\n"):
+        assert MARK not in line.split(sign)[0]
+        assert sign == "#" or not re.search(r"(\\|\?\?/)$", line), "the next line would belong to the comment"
+
+
 def check_json(text: str) -> None:
     data = json.loads(text[text.index("{") :])
     assert set(data) - {"hoverThrOut", "propExpo"} == {"mass", "diagonal_size", "moment_inertia", "num_motors"}
@@ -156,6 +165,7 @@ CHECKS: dict[str, Callable[[str], None]] = {
     ".lua": check_lua, ".py": check_python, ".sdf": check_xml, ".xml": check_xml, ".urdf": check_xml,
     ".params": lambda t: check_lines(t, r"1\t1\t[A-Z0-9_]+\t[-+.e\d]+\t[69]", "\t"),
     ".param": lambda t: check_lines(t, r"[A-Z0-9_]+,[-+.e\d]+", ","),
+    ".hpp": lambda t: check_code(t, "//"), ".usda": lambda t: check_code(t, "#"),
     ".json": check_json, ".toml": check_toml, ".yaml": check_yaml,
     ".txt": lambda t: check_lines("".join(f"# {line}\n" for line in t.split("\n")), "", ""),
 }  # fmt: skip
