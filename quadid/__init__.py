@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from quadid.app.diagnose import diagnose as diagnose
     from quadid.app.excite import propose as excite
     from quadid.app.export import export as export
+    from quadid.app.fleet import fleet as fleet
     from quadid.app.gains import gains as gains
     from quadid.app.health import health as health
     from quadid.app.identify import identify as identify
@@ -48,6 +49,7 @@ _PUBLIC = {
     "score": "quadid.app.score",
     "simulate": "quadid.app.simulate",
     "export": "quadid.app.export",
+    "fleet": "quadid.app.fleet",
     "compare_vehicles": "quadid.app.compare_vehicles",
     "gains": "quadid.app.gains",
     "Simulator": "quadid.model.step",

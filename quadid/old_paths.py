@@ -68,7 +68,7 @@ MOVED = {
     "quadid.data.window": "quadid.window quadid.data.mounting quadid.mounting quadid.data.faults "
     "quadid.data_faults quadid.saturation",
     "quadid.cli.terminal": "quadid_cli.failure quadid_cli.output quadid_cli.tables",
-    "quadid.cli.fleet": "quadid_cli.fleet_cluster quadid_cli.fleet_folder quadid_cli.fleet_store",
+    "quadid.app.fleet": "quadid_cli.fleet_cluster quadid_cli.fleet_folder quadid_cli.fleet_store",
     "quadid.identification.problem": "quadid.identify.parameterization quadid.identify.segment_cost "
     "quadid.identify.segment_jacobian quadid.identify.shooting quadid.identify.priors",
     "quadid.identification.elimination": "quadid.identify.elimination_kernel quadid.identify.schur_complement",
@@ -155,7 +155,7 @@ MOVED = {
     "quadid.report.verdict": "quadid_report.words",
     "quadid.app.logs": "quadid_workflow.files quadid_workflow.loading quadid_workflow.log_parts "
     "quadid_workflow.overlap",
-    "quadid.app.fleet": "quadid_workflow.fleet_health",
+    "quadid.app.fleet_work": "quadid_workflow.fleet_health",
     "quadid.app.outcome": "quadid_workflow.progress quadid_workflow.reporting quadid_workflow.series",
     "quadid.app.identify": "quadid_workflow.searching",
 }

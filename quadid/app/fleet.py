@@ -1,4 +1,4 @@
-"""`quadid fleet`: the logs of a folder identified in parallel on Dask, results on disk, and what they tell together."""
+"""Fleet: the logs of a folder identified in parallel on Dask, results on disk, and what they tell together."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import logging
 import multiprocessing
 import os
 import sqlite3
+import sys
 import time
 from collections import defaultdict
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
@@ -18,78 +19,71 @@ from functools import lru_cache
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 from queue import Empty, SimpleQueue
-from typing import Annotated, Any
+from typing import Any
 
-import typer
 from quadid_replay.formats import HEAD_BYTES, recognise
 
-from quadid.app.fleet import Job, Row, blank, health_trend, identify_one
 from quadid.app.fleet_page import Fleet, summarise
-from quadid.app.logs import GRID, load_vehicle, parse_columns
-from quadid.app.options import Columns, JsonTarget, OutFolder, Rate, Seed
-from quadid.cli import terminal
+from quadid.app.fleet_work import Job, Row, blank, health_trend, identify_one
+from quadid.app.logs import GRID, as_vehicle, load_vehicle, make_folder
+from quadid.app.options import Described
+from quadid.app.outcome import Advance, silent
 from quadid.errors import LogError, QuadidError, VehicleError
 from quadid.vehicle import Vehicle
 from quadid.version import __version__
 
 
 def fleet(
-    folder: Annotated[
-        Path, typer.Argument(metavar="DIR", help="Folder of logs, formats auto-detected; one vehicle a folder.")
-    ],
-    vehicle: Annotated[
-        str | None,
-        typer.Option(
-            "--vehicle", metavar="V", help="Shipped name or YAML file for folders without a vehicle.yaml of their own."
-        ),
-    ] = None,
-    scheduler: Annotated[
-        str | None,
-        typer.Option("--scheduler", metavar="ADDR", help="A Dask scheduler (tcp://…); default: own workers."),
-    ] = None,
-    workers: Annotated[
-        int | None, typer.Option("--workers", metavar="N", min=1, help="Own workers; default one a core.")
-    ] = None,
-    memory: Annotated[
-        str, typer.Option("--memory", metavar="SIZE", help="Memory that one own worker may take.")
-    ] = "2GiB",
-    diagnose: Annotated[
-        bool, typer.Option("--diagnose", help="Also name what the simulation gets wrong (slower).")
-    ] = False,
-    again: Annotated[
-        bool, typer.Option("--again", help="Identify all logs again, including those already done.")
-    ] = False,
-    rate: Rate = GRID,
-    seed: Seed = 1,
-    columns: Columns = None,
-    json: JsonTarget = None,
-    out: OutFolder = Path(),
-) -> None:
-    """Identify every log of a folder on Dask; write SQLite, Parquet and a report. Run it again and it goes on."""
-    terminal.check_file(json, "--json")
-    target = terminal.out_folder(out)
-    named = parse_columns(columns or [])
-    if named and vehicle is None:
-        raise typer.BadParameter(
-            "vehicles in the folder name their own: give it with --vehicle", param_hint="--columns"
-        )
-    known = None if vehicle is None else load_vehicle(vehicle)
-    default = None if known is None else known.model_copy(update={"columns": known.columns | named}).to_yaml()
-    found = find_jobs(folder.resolve(), default, rate, seed, diagnose, target)
+    folder: str | Path, out: str | Path, vehicle: Described | None = None, *, scheduler: str | None = None,
+    workers: int | None = None, memory: str = "2GiB", diagnose: bool = False, again: bool = False, rate: float = GRID,
+    seed: int = 1, columns: Mapping[str, str] | None = None, advance: Advance = silent,
+) -> Fleet:  # fmt: skip
+    """Identifies every log of a folder in parallel on Dask; run again, it goes on where it was.
+
+    Args:
+        folder: of logs, formats auto-detected; a vehicle of the fleet is a folder, described by the nearest
+            ``vehicle.yaml`` in it or above it.
+        out: folder for ``fleet.sqlite`` and its tables as Parquet; made where it does not exist.
+        vehicle: for folders without a ``vehicle.yaml``.
+        scheduler: address of a Dask scheduler (``tcp://...``), whose workers see the logs at the same paths; by default
+            own workers.
+        workers: how many own ones; one a core by default.
+        memory: that one own worker may take.
+        diagnose: also name what the simulation gets wrong (slower).
+        again: identify all logs again, including those already done.
+        rate: of the uniform grid [Hz].
+        seed: of all random numbers.
+        columns: what a CSV calls a column, by its name in the contract; needs `vehicle`.
+        advance: called with the stage and the share done.
+
+    Returns:
+        Rows of logs, parameters of every vehicle, drifts, health of every vehicle against its first flights.
+
+    Raises:
+        LogError: no such folder, or no log in it.
+        VehicleError: a log without a vehicle.
+        ClusterError: nothing answers at `scheduler`, or no worker can start.
+    """
+    if columns and vehicle is None:
+        raise VehicleError("columns without a vehicle", "columns of the vehicle that is given", "give vehicle, too")
+    known = None if vehicle is None else as_vehicle(vehicle)
+    default = None if known is None else known.model_copy(update={"columns": known.columns | (columns or {})}).to_yaml()
+    target = Path(out).resolve()
+    make_folder(target)
+    found = find_jobs(Path(folder).resolve(), default, rate, seed, diagnose, target)
     begin = time.perf_counter()
     with open_store(target / "fleet.sqlite") as store:
         store.keep({job.name for job in found.jobs})
         # Not again: those whose file, vehicle and settings are what the stored result was made from.
         ended = {} if again else store.ended()
         waiting = [job for job in found.jobs if ended.get(job.name) != (job.size, job.modified, job.key)]
-        with terminal.progress() as advance:
-            if waiting:
-                advance("start workers", 0.0)
-                count = min(workers, len(waiting)) if workers is not None else None
-                with cluster(scheduler, count, memory) as client:
-                    for done, row in enumerate(results(client, waiting), 1):
-                        store.put(row)
-                        advance(f"{done} of {len(waiting)} logs", done / len(waiting))
+        if waiting:
+            advance("start workers", 0.0)
+            count = min(workers, len(waiting)) if workers is not None else None
+            with cluster(scheduler, count, memory) as client:
+                for done, row in enumerate(results(client, waiting), 1):
+                    store.put(row)
+                    advance(f"{done} of {len(waiting)} logs", done / len(waiting))
         logs, parameters, findings, trims = (store.rows(table) for table in ("logs", "parameters", "findings", "trims"))
         files = [target / "fleet.sqlite", *store.write_parquet(target)]
     result = {
@@ -98,7 +92,7 @@ def fleet(
         "health": health_trend(logs, trims, {job.unit: job.vehicle for job in found.jobs}),
         "other_files": list(found.others), "files": [str(file) for file in files],
     }  # fmt: skip
-    terminal.conclude(Fleet(result, logs, parameters), json, target / "fleet.html", target)
+    return Fleet(result, logs, parameters)
 
 
 # --- Jobs on Dask: an embedded cluster of processes, or one that is already there
@@ -116,8 +110,8 @@ _QUIET = {
 }  # fmt: skip
 """Dask otherwise looks at every worker's stack each 10 ms, at itself each 20 ms and at memory each 100 ms."""
 _WARM = (
-    "distributed", "distributed.nanny", "quadid.app.fleet", "quadid.app.identify", "quadid.condition.trim",
-    "quadid.condition.trim", "quadid_replay.rosbag",
+    "distributed", "distributed.nanny", "quadid.app.fleet_work", "quadid.app.identify", "quadid.condition.trim",
+    "quadid_replay.rosbag",
 )  # fmt: skip
 """Modules imported by the process from which all workers are forked, those that replace dead ones too."""
 
@@ -156,7 +150,7 @@ def cluster(address: str | None, workers: int | None, memory: str) -> Iterator[A
         "distributed.scheduler.worker-ttl": None,  # a worker that compiles kernels is silent for minutes
         "distributed.worker.multiprocessing-method": "forkserver",
     }  # fmt: skip
-    with dask.config.set({**settings, **_QUIET}):
+    with dask.config.set({**settings, **_QUIET}), _program_unseen():
         if address is not None:
             try:
                 client = Client(address, timeout=ANSWER, set_as_default=False)
@@ -182,6 +176,19 @@ def cluster(address: str | None, workers: int | None, memory: str) -> Iterator[A
                 yield client
         finally:
             _close(own, others)
+
+
+@contextmanager
+def _program_unseen() -> Iterator[None]:
+    """Keeps processes that start from running the caller's script first, which would start more of them."""
+    main = vars(sys.modules["__main__"])
+    kept = {name: main[name] for name in ("__file__", "__spec__") if name in main}
+    main |= {"__file__": None, "__spec__": None}
+    try:
+        yield
+    finally:
+        del main["__file__"], main["__spec__"]
+        main |= kept
 
 
 def _close(own: Any, others: set[BaseProcess]) -> None:
@@ -314,8 +321,11 @@ def find_jobs(
     are one flight, and one job.
 
     Args:
+        root: folder.
         default: text of the vehicle file for folders without one.
         rate: of the grid [Hz].
+        seed: of the search.
+        diagnose: name what the simulation gets wrong, too.
         leave_out: folder that is not looked into, for the results.
 
     Raises:

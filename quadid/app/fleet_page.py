@@ -301,8 +301,8 @@ class Fleet(Reported):
     """A fleet of flights.
 
     Attributes:
-        result: of the form ``quadid.fleet/1``: that of `summarise`, ``health`` of `quadid.app.fleet.health_trend`, and
-            how much was done.
+        result: of the form ``quadid.fleet/1``: that of `summarise`, ``health`` of
+            `quadid.app.fleet_work.health_trend`, and how much was done.
         logs, parameters: rows that it was made from.
     """
 

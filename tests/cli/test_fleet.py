@@ -9,6 +9,8 @@ import random
 import shutil
 import signal
 import sqlite3
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +19,9 @@ import pyarrow.parquet as pq
 import pytest
 from quadid_replay import write_csv, write_mcap
 
-from quadid.app.fleet import Job, Row, identify_one
-from quadid.cli import fleet as fleet_cluster
-from quadid.cli.fleet import ClusterError, cluster, find_jobs, open_store, results
+from quadid.app import fleet as fleet_cluster
+from quadid.app.fleet import ClusterError, cluster, find_jobs, open_store, results
+from quadid.app.fleet_work import Job, Row, identify_one
 from quadid.errors import LogError, VehicleError
 from quadid.flight import fly
 from quadid.vehicle import Vehicle
@@ -78,6 +80,30 @@ def test_every_vehicle_has_its_parameters(ran: tuple[dict[str, Any], Path]) -> N
         b = next(p for p in unit["parameters"] if p["parameter"] == "b")
         assert b["flights"] == 2
         assert b["median"] == pytest.approx(2.33e-5, rel=0.01)
+
+
+def test_a_script_without_a_guard_gets_it_in_python_and_goes_on(
+    folder: Path, ran: tuple[dict[str, Any], Path], tmp_path: Path
+) -> None:
+    """Workers that start as others do run the script that starts them first."""
+    result, out = ran
+    own, script = tmp_path / "out", tmp_path / "script.py"
+    shutil.copytree(out, own)
+    for done, options in ((0, "workers=1"), (8, "workers=1, again=True")):
+        script.write_text(
+            "import json, pathlib, quadid\nprint('once')\n"
+            f"fleet = quadid.fleet({str(folder)!r}, {str(own)!r}, 'pelican', {options})\n"
+            f"pathlib.Path({str(tmp_path / 'frame.json')!r}).write_text(fleet.to_frame().to_json())\n"
+            f"fleet.to_json({str(tmp_path / 'fleet.json')!r})\nassert __file__ and '__spec__' in globals()\n",
+            encoding="utf-8",
+        )
+        run = subprocess.run([sys.executable, script], capture_output=True, text=True, check=False)
+        assert run.returncode == 0, run.stderr
+        assert run.stdout == "once\n"
+        found = json.loads((tmp_path / "fleet.json").read_text(encoding="utf-8"))
+        assert (found["worked"], found["counts"]) == (done, result["counts"])
+    frame = json.loads((tmp_path / "frame.json").read_text(encoding="utf-8"))
+    assert frame["status"]["alpha/flight1.mcap"] == "done"
 
 
 def test_sqlite_and_parquet_hold_the_same_rows(ran: tuple[dict[str, Any], Path]) -> None:

@@ -13,7 +13,7 @@ from quadid_evaluation.studies.health.flights import Wrong, hover
 from quadid_replay import write_csv
 
 import quadid
-from quadid.app.fleet import BASELINE, FEWEST, Job, health_trend, identify_one
+from quadid.app.fleet_work import BASELINE, FEWEST, Job, health_trend, identify_one
 from quadid.condition import flight_trim
 from quadid.condition.trim import flight_to_dict
 from quadid.errors import LogError
