@@ -244,18 +244,18 @@ class ThrustPoint(Strict):
 # thousand and more.  The limits leave a factor of twenty on both sides.
 
 
-DENSITY = (1.0, 3.0e4)
+DENSITY, USUAL_DENSITY = (1.0, 3.0e4), 170.0
 """Mass over the cube of the arm [kg/m^3]."""
 MASSES = (1e-3, 5e3)
 """[kg]."""
 SPEEDS = (5.0, 2.0e4)
 """Rotor speed in hover [rad/s]: helicopters of 10 m and motors of a gram lie inside."""
 _UNITS = (
-    ("mass", 1e-3, "grams", "mass"),
-    ("arm", 1e-3, "millimetres", "rotor positions"),
-    ("arm", 1e-2, "centimetres", "rotor positions"),
-    ("arm", 0.1, "decimetres, or slipped by one digit", "rotor positions"),
-    ("arm", 0.0254, "inches", "rotor positions"),
+    ("mass", 1e-3, "grams", "mass", "kg"),
+    ("arm", 1e-3, "millimetres", "rotor positions", "m"),
+    ("arm", 1e-2, "centimetres", "rotor positions", "m"),
+    ("arm", 0.1, "decimetres, or slipped by one digit", "rotor positions", "m"),
+    ("arm", 0.0254, "inches", "rotor positions", "m"),
 )
 
 
@@ -268,11 +268,14 @@ def impossible_size(mass: float, arm: float) -> str:
     if _fits(mass, arm):
         return ""
     found = f"mass {mass:.4g} kg with rotors {arm:.4g} m from the centre"
-    for what, factor, unit, where in _UNITS:
-        scaled = (mass * factor, arm) if what == "mass" else (mass, arm * factor)
-        if _fits(*scaled):
-            value, si = (scaled[0], "kg") if what == "mass" else (scaled[1], "m")
-            return f"{found}: {where} in {unit}? {value:.4g} {si} would fit"
+    slips = [
+        (abs(math.log(m / a**3 / USUAL_DENSITY)), f"{where} in {unit}? {m if what == 'mass' else a:.4g} {si} would fit")
+        for what, factor, unit, where, si in _UNITS
+        for m, a in [(mass * factor, arm) if what == "mass" else (mass, arm * factor)]
+        if _fits(m, a)
+    ]
+    if slips:
+        return f"{found}: {min(slips)[1]}"
     return f"{found}: such a vehicle cannot fly; write mass in kg and positions in m"
 
 
@@ -524,6 +527,11 @@ class Vehicle(Strict):
             rotor_drag_losses(self.effects.get("weak_rotor", {}), len(self.rotors))
         except ParameterError as error:
             raise ValueError(str(error)) from error
+        if (lever := self.parameters["d"].initial / self.parameters["b"].initial) > self.arm:
+            raise ValueError(
+                f"d / b, drag torque over thrust of a rotor, is {lever:.3g} m, beyond the arm of {self.arm:.3g} m: "
+                "are b and d exchanged, or one over rpm^2?"
+            )
         if why := impossible_inertia([self.parameters[n].initial for n in INERTIAS]):
             raise ValueError(f"impossible inertia: {why}")
         small, large = (share * self.mass * self.arm**2 for share in INERTIA_SHARE)
@@ -533,7 +541,7 @@ class Vehicle(Strict):
                 raise ValueError(
                     f"impossible inertia: {name} is {least:.3g} to {most:.3g}, but {self.mass:g} kg with rotors "
                     f"{self.arm:.3g} m from the centre have {small:.2g} to {large:.2g} kg m^2; "
-                    "is it in g m^2 or kg cm^2?"
+                    "is it in g m^2, kg cm^2 or g cm^2?"
                 )
         if self.stand_thrust is not None and not low < self.stand_thrust[0] < high:
             raise ValueError(

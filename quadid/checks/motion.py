@@ -353,6 +353,8 @@ _JUMP = 8.0
 """An attitude step of so many times the usual one, beside half as much of the gyro's, is no motion."""
 _FARTHEST, _LAG, _TOO_LATE = 0.3, 0.02, 0.08
 """Gyro and attitude are compared at times so far apart at most [s], in these steps; more than the last is an error."""
+_TILT, _PARTS = np.radians(4.0), 5
+"""Least angle [rad] between gyro and attitude that is told; it must be as many times its error as there are parts."""
 _AXES = ("x", "y", "z")
 
 
@@ -504,12 +506,12 @@ def attitude_check(recording: Recording) -> Check:
     accel, attitude = recording.channels.get("accel"), recording.channels.get("attitude")
     if rates.verdict is CheckResult.ERROR or accel is None or attitude is None or len(attitude.t) < 2:
         return rates
-    vertical = _in_world(accel, attitude)[:, 2]
-    vertical = vertical[np.abs(vertical) < 20.0 * GRAVITY]  # single wild readings are no scale
+    tame = np.linalg.norm(accel.values, axis=1) < 20.0 * GRAVITY  # single wild readings are no scale
+    vertical = _in_world(accel, attitude)[tame, 2]
     if not len(vertical):
         return rates
     down, up, seconds = float(np.median(vertical)), -float(np.mean(vertical)), float(np.ptp(accel.t))
-    # What is felt upwards makes up for gravity on the average, but for 5 m/s of vertical speed.
+    # What is felt makes up for gravity on the average, upwards and along the body's axes, but for 5 m/s of speed.
     most = 0.7 + 5.0 / max(seconds, 1e-3)
     if down < 0.5 * GRAVITY and most < abs(up - GRAVITY) < 0.5 * GRAVITY:
         return Check(
@@ -519,7 +521,16 @@ def attitude_check(recording: Recording) -> Check:
             f"calibrate it; if it is the scale, multiply acceleration by {GRAVITY / up:.3g}", {"up": up},
         )  # fmt: skip
     if down < 0.5 * GRAVITY:
-        return rates
+        aside = np.mean((accel.values - _of_gravity(accel, attitude))[tame], axis=0)[:2]
+        size = float(np.linalg.norm(aside))
+        if rates.verdict is CheckResult.WARNING or size < most:
+            return rates
+        return Check(
+            "gravity", CheckResult.ERROR if size > 3.0 * most else CheckResult.WARNING,
+            f"specific force is {aside[0]:+.2g} m/s^2 along x and {aside[1]:+.2g} along y on the average of "
+            f"{seconds:.3g} s, beyond what gravity and attitude leave: the accelerometer's zero is wrong, or the "
+            "attitude", "calibrate it level, or subtract this", {"aside": size},
+        )  # fmt: skip
     return Check(
         rates.name, CheckResult.ERROR,
         f"the attitude turns what the accelerometer reads to point down ({down:.3g} m/s^2): its world has z up",
@@ -555,7 +566,7 @@ def gyro_check(recording: Recording) -> Check:
     late = _apart(gyro, attitude, best[1].r2) if best[0] == "as given" else None
     return (
         late or _angle_rates(gyro, attitude) or _one_axis(gyro, attitude) or _bias_step(gyro, attitude)
-        or _judge_rates(*best)
+        or (best[1].straight and _turned(gyro, attitude)) or _judge_rates(*best)
     )  # fmt: skip
 
 
@@ -594,6 +605,31 @@ def _one_axis(gyro: Channel, attitude: Channel) -> Check | None:
     return check(
         CheckResult.WARNING, message, "calibrate it at rest, or subtract this", {"offset": float(offset[worst])}
     )
+
+
+def _turned(gyro: Channel, attitude: Channel) -> Check | None:
+    """A gyro that is turned by some degrees against the attitude, in all parts of the log alike (Kabsch 1976)."""
+    rows = _without_jumps(*_moving_rates(gyro, attitude.t, attitude.values))
+    if len(rows[0]) < 2 * FEWEST_SAMPLES:
+        return None
+
+    def turning(measured: FloatArray, derived: FloatArray) -> FloatArray:
+        u, _, v = np.linalg.svd((measured - measured.mean(axis=0)).T @ (derived - derived.mean(axis=0)))
+        m = (u @ np.diag([1.0, 1.0, np.linalg.det(u @ v)]) @ v).T
+        return np.array([np.arctan2(m[2, 1], m[2, 2]), -np.arcsin(m[2, 0]), np.arctan2(m[1, 0], m[0, 0])])
+
+    parts = [turning(*part) for part in zip(*(np.array_split(r, _PARTS) for r in rows), strict=True)]
+    angles, error = turning(*rows), np.linalg.norm(np.std(parts, axis=0)) / np.sqrt(_PARTS)
+    size = float(np.linalg.norm(angles))
+    if size < max(_TILT, _PARTS * float(error)):
+        return None
+    roll, pitch, yaw = np.degrees(angles)
+    rotation = ", ".join(f"{angle:.3f}" for angle in angles)
+    return Check(
+        "gyro_attitude", CheckResult.ERROR if size > 2.0 * _TILT else CheckResult.WARNING,
+        f"gyro is turned against the attitude: roll {roll:.2g}, pitch {pitch:.2g}, yaw {yaw:.2g} deg",
+        f"mounting: {{rotation: [{rotation}]}} in the vehicle file, or correct the attitude", {"angle_rad": size},
+    )  # fmt: skip
 
 
 def _bias_step(gyro: Channel, attitude: Channel) -> Check | None:
@@ -740,7 +776,7 @@ def _moving_rates(gyro: Channel, t: FloatArray, q: FloatArray) -> tuple[FloatArr
     White attitude noise adds a variance that falls with the square of the step and motion one that does not, so two
     steps separate them: motion = (4 var(2 step) - var(step)) / 3.
     """
-    stride = max(1, round(_STEP / sample_period(t)))
+    stride = max(1, round(min(_STEP, float(np.ptp(t)) / 60.0) / sample_period(t)))
     measured, derived = _without_jumps(*_rates(gyro, t[::stride], q[::stride]))
     longer = _without_jumps(*_rates(gyro, t[:: 2 * stride], q[:: 2 * stride]))[1]
     if len(longer) < 20:
@@ -783,6 +819,10 @@ def _judge_rates(reading: str, fit: AxisMap) -> Check:
         if (fit.axes, fit.signs) == ((1, 0, 2), (1, 1, -1)):
             remedy = "that is an attitude in world axes east, north, up (ENU): turn it, velocity and position into NED"
         return check(CheckResult.ERROR, message, remedy)
+    for scale, unit in ((60.0, "minutes"), (3600.0, "hours")):
+        if fit.r2 > 0.9 and 0.97 < fit.scale / scale < 1.03:
+            message = f"attitude rate / gyro = {fit.scale:.4g}: time seems to be in {unit}"
+            return check(CheckResult.ERROR, message, f"multiply times by {scale:g}")
     for scale, what in ((1.0 / DEGREES, "gyro seems to be in deg/s"), (DEGREES, "attitude seems to be in degrees")):
         if 0.75 < fit.scale / scale < 1.33:
             return check(CheckResult.ERROR, f"{what} (attitude rate / gyro = {fit.scale:.3g})", "convert to radians")
@@ -871,6 +911,13 @@ def _in_world(accel: Channel, attitude: Channel) -> FloatArray:
     """Specific force in the attitude's world [m/s^2], shape (n, 3), at the accelerometer's times."""
     q = linear(attitude.t, attitude.values, accel.t)
     return rotated(q / np.linalg.norm(q, axis=1, keepdims=True), accel.values)
+
+
+def _of_gravity(accel: Channel, attitude: Channel) -> FloatArray:
+    """Specific force in body axes that only makes up for gravity [m/s^2], shape (n, 3), at the same times."""
+    q = linear(attitude.t, attitude.values, accel.t)
+    upwards = np.broadcast_to([0.0, 0.0, -GRAVITY], accel.values.shape)
+    return rotated(conjugate(q / np.linalg.norm(q, axis=1, keepdims=True)), upwards)
 
 
 def usable_steps(t: FloatArray, other: FloatArray) -> BoolArray:

@@ -246,7 +246,8 @@ def readings_check(recording: Recording, vehicle: Vehicle, spans: Spans) -> Chec
     if step:
         message = f"rotor speeds come in steps of {step:.3g} rad/s: too coarse for the motion ({signal.source})"
         return Check(_NAME, CheckResult.WARNING, message, "log them finer, or motor commands", {"step_rad_s": step})
-    problem = _dead(values, most) or _same(values, vehicle, commands) or _stuck(signal, recording, inside)
+    problem = (not commands and _other_unit(values)) or _dead(values, most) or _same(values, vehicle, commands)
+    problem = problem or _stuck(signal, recording, inside)
     fix = "check which outputs drive the motors, and that all of them were logged" if commands else _FIX
     return problem and Check(_NAME, CheckResult.ERROR, f"{problem[0]} ({signal.source})", fix, problem[1])
 
@@ -258,6 +259,22 @@ def _coarse(speeds: FloatArray) -> float:
         return 0.0
     step = float(np.median(np.concatenate([np.diff(values) for values in levels])))
     return step if step > 0.5 * float(np.median(np.std(speeds, axis=0))) else 0.0
+
+
+def _other_unit(speeds: FloatArray) -> Problem | None:
+    """A rotor that turns, and reads five times what the others read, or a fifth: no balance is so far."""
+    usual = np.median(np.abs(speeds), axis=0)
+    for rotor, own in enumerate(usual):
+        others = float(np.median(np.delete(usual, rotor)))
+        ratio = own / max(others, 1e-9)
+        if np.ptp(speeds[:, rotor]) > 0.0 < own and others > 0.0 and not 0.2 < ratio < 5.0:
+            likely = (
+                ("in rpm", 30.0 / np.pi), ("a square", others), ("a command from 0 to 1", 0.5 / others),
+                ("in rev/s", 0.5 / np.pi),
+            )  # fmt: skip
+            unit = next((f": is it {name}?" for name, r in likely if 0.5 < ratio / r < 2.0), "")
+            return f"rotor {rotor + 1} reads {ratio:.3g} times what the others read{unit}", {"rotor": rotor + 1.0}
+    return None
 
 
 def _same(speeds: FloatArray, vehicle: Vehicle, commands: bool) -> Problem | None:
@@ -418,7 +435,7 @@ def _against_thrust(
 
 _UNITS = (
     ("in rpm", 2.0 * np.pi / 60.0), ("in rev/s", 2.0 * np.pi), ("of the electrical field (14 poles)", 1.0 / 7.0),
-    ("ten times too low, or b to be per rpm^2", 10.0),
+    ("ten times too low, or b to be per rpm^2", 10.0), ("in thousands of rpm", 1e3 * 2.0 * np.pi / 60.0),
 )  # fmt: skip
 """Units that speeds may be in instead of rad/s, and the factor that mends each."""
 _SLOW_MOTION = 0.4
@@ -458,19 +475,17 @@ def hover_check(recording: Recording, vehicle: Vehicle, spans: Spans) -> Check:
     message = f"rotors turn at {speed:.4g} rad/s in flight (rms), so b would be {needed:.3g} N s^2/rad^2"
     if low <= needed <= high:
         return check(CheckResult.OK, f"{message}; bounds {low:.3g} to {high:.3g}")
-    fitting = [(unit, factor) for unit, factor in _UNITS if low <= needed / factor**2 <= high]
-    if fitting:
-        units, factors = (" or ".join(parts) for parts in zip(*((u, f"{f:.6g}") for u, f in fitting), strict=True))
-        slip = f"{message}, outside {low:.3g} to {high:.3g}: speeds seem to be {units}"
-        return check(
-            CheckResult.ERROR,
-            slip,
-            f"multiply rotor speeds by {factors}{', or b by 91.2' * ('rpm^2' in slip)}, or use "
-            "the vehicle file of this log",
-        )
+    fitting = [(unit, f"{factor:.6g}") for unit, factor in _UNITS if low <= needed / factor**2 <= high]
+    units, factors = [unit for unit, _ in fitting], " or ".join(factor for _, factor in fitting)
+    fixes = [f"multiply rotor speeds by {factors}"] * bool(units) + ["b by 91.2"] * ("rpm^2" in "".join(units))
     root = ThrustModel.stated(vehicle).total(np.sqrt(np.abs(speeds)))
     if low <= guess.initial * vehicle.mass * GRAVITY / max(float(np.mean(root)), 1e-300) <= high:
-        return check(CheckResult.ERROR, f"{message}: speeds seem to be squared", "take their square roots")
+        units, fixes = [*units, "squared"], [*fixes, "take their square roots"]
+    if 0.7 < float(np.mean(np.sum(speeds, axis=1))) / (vehicle.mass * GRAVITY) < 1.4:
+        units, fixes = [*units, "thrusts in N"], [*fixes, "take the square roots of thrust over b"]
+    if units:
+        slip = f"{message}, outside {low:.3g} to {high:.3g}: speeds seem to be {' or '.join(units)}"
+        return check(CheckResult.ERROR, slip, f"{', or '.join(fixes)}, or use the vehicle file of this log")
     few = "did it fly? Else " if needed > high else ""
     fix = few + "check mass, the unit of the rotor speeds, max_speed of the command, or the bounds of b"
     verdict = CheckResult.WARNING if low / HOPELESS < needed < high * HOPELESS else CheckResult.ERROR

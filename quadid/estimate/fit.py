@@ -188,6 +188,8 @@ def scoring(
                     2.0 * problem.noise_information(z, psi, gains) + np.diag(problem.noise_curvature(psi)),
                     log,
                 )
+        if not (np.isfinite(information).all() and np.isfinite(curvature).all()):
+            break  # readings so wild that they overflow lead nowhere
         for _ in range(PATIENCE):
             step = newton_step(information, gradient, damping, np.maximum(least - z, -far), np.minimum(most - z, far))
             bold = newton_step(curvature, slope, damping, np.maximum(low - log, -reach), np.minimum(high - log, reach))

@@ -158,13 +158,17 @@ _AROUND = 5
 """A rotor speed is compared with so many, itself among them."""
 _ABSURD = 1e9
 """No channel holds a number of this size in SI units; damage does."""
+_MEASURED = ("gyro", "accel", "rotor_speed", "velocity", "position", "battery")
+"""Channels of bodies that move steadily; a command may be anything."""
+_SLOW = 0.05
+"""Between rows so far apart [s] a body turns and stops again."""
 _REASONS = {
     "duplicate": "with a repeated stamp",
     "backwards": "out of order in time",
     "not_finite": "not finite",
     "absurd": "beyond any physical value",
     "bad_stamp": "with a wild stamp",
-    "impossible_rotor_speed": "with a rotor speed far from those before and after it",
+    "impossible": "far from those before and after",
     "not_attitude": "that are no attitude (quaternion far from unit length)",
 }
 
@@ -251,19 +255,22 @@ class Columns:
         return t, values.reshape(-1, self.width)
 
 
-def spikes(speeds: FloatArray) -> BoolArray:
-    """Finds readings, shape (n,), that no rotor turns at between those before and after: counts of 65535, zeros.
+def spikes(values: FloatArray, rotor: bool = False) -> BoolArray:
+    """Finds readings, shape (n,), that cannot be true between those before and after: a real jump has more than two.
 
-    More than half off the median of five neighbours, which agree with each other, and far beyond what the signal does
-    elsewhere: a real jump has more than two rows.
+    Off the median of five neighbours by twenty times all that these medians span.  A rotor does not read 65535 or
+    nothing either: more than half off neighbours that agree, and far beyond what the signal does elsewhere.
     """
-    if len(speeds) < _AROUND:
-        return np.zeros(len(speeds), dtype=np.bool_)
-    usual = _running_median(speeds)
-    spread = _running_median(np.abs(speeds - usual))
-    size = np.maximum(usual, np.median(speeds))
-    off = np.abs(speeds - usual)
-    return np.asarray((usual > 0.0) & (off > 0.5 * size) & (spread < 0.1 * size) & (off > 20.0 * np.mean(off)))
+    if len(values) < _AROUND:
+        return np.zeros(len(values), dtype=np.bool_)
+    usual = _running_median(values)
+    off = np.abs(values - usual)
+    spread = _running_median(off)
+    far = (np.ptp(usual) > 0.0) & (off > 20.0 * np.ptp(usual)) & (spread < 0.1 * off)
+    if rotor:
+        size = np.maximum(usual, np.median(values))
+        far |= (usual > 0.0) & (off > 0.5 * size) & (spread < 0.1 * size) & (off > 20.0 * np.mean(off))
+    return np.asarray(far)
 
 
 def _running_median(values: FloatArray) -> FloatArray:
@@ -305,8 +312,8 @@ def _confirmed(t: FloatArray) -> tuple[int, int]:
 def clean_channel(raw: RawChannel) -> Channel | None:
     """Makes a channel of raw samples: drops and counts what cannot be used.
 
-    Dropped: refused stamps, values that are not finite or absurd, single impossible rotor speeds, repeated stamps,
-    samples out of order, quaternions that are none.
+    Dropped: refused stamps, values that are not finite or absurd, single impossible readings, repeated stamps, samples
+    out of order, quaternions that are none.
     Returns None when nothing remains.
     """
     stamped = np.isfinite(raw.t)
@@ -317,10 +324,11 @@ def clean_channel(raw: RawChannel) -> Channel | None:
     absurd = finite & (np.abs(values) > _ABSURD).any(axis=1)
     faults["absurd"] = int(np.count_nonzero(absurd))
     finite &= ~absurd
-    if raw.name == "rotor_speed":
-        known = np.flatnonzero(finite)
-        far = np.array([spikes(column) for column in values[known].T]).any(axis=0)
-        faults["impossible_rotor_speed"] = raw.spikes + int(np.count_nonzero(far))
+    known = np.flatnonzero(finite)
+    slow = len(known) > 1 and raw.name in ("gyro", "accel") and float(np.median(np.diff(t[known]))) > _SLOW
+    if raw.name in _MEASURED and not slow:
+        far = np.array([spikes(column, raw.name == "rotor_speed") for column in values[known].T]).any(axis=0)
+        faults["impossible"] = raw.spikes + int(np.count_nonzero(far))
         finite[known[far]] = False
     if raw.name == "attitude":
         values, good = unit_quaternions(values)

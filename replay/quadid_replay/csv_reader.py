@@ -123,10 +123,12 @@ def _check_seconds(t: FloatArray, origin: str) -> None:
         return
     units = (("milliseconds", 1e-3), ("microseconds", 1e-6), ("nanoseconds", 1e-9))
     unit, factor = units[int(step >= 500.0) + int(step >= 500e3)]
+    fix = f"multiply t by {factor:g}"
+    if np.all(np.diff(known) == 1.0):
+        unit, fix = "row numbers, or milliseconds", "divide t by the rows a second"
     raise LogError(
-        f"{origin}: column t rises by {step:.8g} a row: {unit}?", f"seconds, rows at most {_SLOWEST_ROW} s apart",
-        f"multiply t by {factor:g}",
-    )  # fmt: skip
+        f"{origin}: column t rises by {step:.8g} a row: {unit}?", f"seconds, rows at most {_SLOWEST_ROW} s apart", fix
+    )
 
 
 def _header(path: Path, columns: Mapping[str, str]) -> tuple[list[str], str]:

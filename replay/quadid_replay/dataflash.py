@@ -433,7 +433,7 @@ def _esc(
     for motor in found.columns:
         rows = np.flatnonzero((instance == motor) & np.isfinite(t) & np.isfinite(rpm))
         rows = rows[rising(t[rows])]
-        far = spikes(rpm[rows])  # before others are interpolated to
+        far = spikes(rpm[rows], rotor=True)  # before others are interpolated to
         dropped += int(np.count_nonzero(far))
         series.append((t[rows[~far]], rpm[rows[~far]] * RPM))
     at, values = merge_instances(series)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from quadid_replay.columns import RawChannel, clean_channel
 from quadid_replay.frames import from_euler
 from quadid_replay.motors import active_outputs, frame_of, in_pulses, motor_columns, no_multirotor
 from quadid_replay.vehicle_from_log import vehicle_text
+from scipy.spatial.transform import Rotation
 
 import quadid
 from quadid.app.logs import LogPart, check_conventions
@@ -78,8 +80,100 @@ def test_single_impossible_readings_are_dropped_and_counted(flight: Recording, w
     speeds[50::100, 1] = wrong
     cleaned = clean_channel(RawChannel("rotor_speed", channel.t, speeds, "made"))
     assert cleaned is not None
-    assert cleaned.faults == {"impossible_rotor_speed": 15}
+    assert cleaned.faults == {"impossible": 15}
     np.testing.assert_array_equal(cleaned.values, np.delete(channel.values, np.s_[50::100], axis=0))
+
+
+@pytest.mark.parametrize(
+    ("name", "wrong"), [("gyro", 1e6), ("gyro", 200.0), ("accel", -1e6), ("velocity", 1e6), ("position", -1e6)]
+)
+def test_single_wild_readings_of_motion_are_dropped_and_counted(flight: Recording, name: str, wrong: float) -> None:
+    """They once ended in "does not follow about x", in unreliable values without a reason, or in a traceback."""
+    channel = flight.channels[name]
+    values = channel.values.copy()
+    values[[300, 700, 1100], 2] = wrong
+    cleaned = clean_channel(RawChannel(name, channel.t, values, "made"))
+    assert cleaned is not None
+    assert cleaned.faults == {"impossible": 3}
+    np.testing.assert_array_equal(cleaned.values, np.delete(channel.values, [300, 700, 1100], axis=0))
+    untouched = clean_channel(RawChannel(name, channel.t, channel.values, "made"))
+    assert untouched is not None
+    assert not untouched.faults
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+@pytest.mark.parametrize(("degrees", "result"), [(5.0, CheckResult.WARNING), (12.0, CheckResult.ERROR)])
+def test_a_turned_imu_is_named_with_its_angles_and_the_advice_mends_it(
+    flight: Recording, axis: int, degrees: float, result: CheckResult
+) -> None:
+    turned = {"gyro", "accel"}
+    matrix = Rotation.from_rotvec(np.radians(degrees) * np.eye(3)[axis]).as_matrix()
+    channels = {
+        name: replace(c, values=c.values @ matrix.T) if name in turned else c for name, c in flight.channels.items()
+    }
+    log = replace(flight, channels=channels)
+    found = verdict(log, "gyro_attitude")
+    assert found.verdict is result
+    told = [float(angle) for angle in re.findall(r"(?:roll|pitch|yaw) (\S+?),? ", found.message)]
+    np.testing.assert_allclose(told, -degrees * np.eye(3)[axis], atol=0.2)
+    pelican = Vehicle.shipped("pelican").to_yaml()
+    mended = Vehicle.from_yaml(f"{pelican}\n{re.sub(' in the .*', '', found.fix)}\n")
+    assert verdict(log, "gyro_attitude", mended).verdict is CheckResult.OK
+
+
+def test_an_accelerometer_off_zero_is_named(flight: Recording) -> None:
+    """Its drag-like force was "identified" as it was."""
+    for off, result in ((1.5, CheckResult.WARNING), (3.0, CheckResult.ERROR)):
+        log = with_channel(flight, "accel", flight.channels["accel"].values + [off, 0.0, 0.0])
+        found = [c for c in inspect(log, Vehicle.shipped("pelican")).checks if c.name == "gravity"][-1]
+        assert found.verdict is result
+        assert f"specific force is +{off:.2g} m/s^2 along x" in found.message
+
+
+@pytest.mark.parametrize("vehicle", ["pelican", "hexacopter"])
+@pytest.mark.parametrize(
+    ("unit", "made"),
+    [
+        ("in rpm", lambda w: w * 30.0 / np.pi), ("a square", lambda w: w**2), ("in rev/s", lambda w: w * 0.5 / np.pi),
+        ("a command from 0 to 1", lambda w: w / 900.0),
+    ],
+)  # fmt: skip
+def test_one_rotor_in_another_unit_is_named(vehicle: str, unit: str, made: Callable[[FloatArray], FloatArray]) -> None:
+    """On a hexacopter all rotors were to be multiplied by 1/7, or the rotor was dead."""
+    recording = quadid.simulate(vehicle, seconds=20.0, seed=5).flight.recording
+    speeds = recording.channels["rotor_speed"].values.copy()
+    speeds[:, 1] = made(speeds[:, 1])
+    found = verdict(with_channel(recording, "rotor_speed", speeds), "rotor_speed", Vehicle.shipped(vehicle))
+    assert found.verdict is CheckResult.ERROR
+    assert found.message.startswith("rotor 2 reads")
+    assert f"is it {unit}?" in found.message
+
+
+def test_thousands_of_rpm_and_thrusts_are_named(flight: Recording) -> None:
+    speeds = flight.channels["rotor_speed"].values
+    for unit, values in (("in thousands of rpm", 0.03 / np.pi * speeds), ("thrusts in N", 2.33e-5 * speeds**2)):
+        found = verdict(with_channel(flight, "rotor_speed", values), "hover")
+        assert found.verdict is CheckResult.ERROR
+        assert unit in found.message
+
+
+@pytest.mark.parametrize(("factor", "unit"), [(60.0, "minutes"), (3600.0, "hours")])
+def test_times_in_minutes_are_named(flight: Recording, factor: float, unit: str) -> None:
+    """It said that the log was too short, and to log at a steady rate."""
+    channels = {name: replace(c, t=c.t / factor) for name, c in flight.channels.items()}
+    found = verdict(replace(flight, channels=channels), "gyro_attitude")
+    assert found.verdict is CheckResult.ERROR
+    assert f"time seems to be in {unit}" in found.message
+
+
+def test_slips_of_a_vehicle_file_are_named() -> None:
+    file = yaml.safe_load(Vehicle.shipped("pelican").to_yaml())
+    b, d = (file["parameters"][name] for name in "bd")
+    with pytest.raises(QuadidError, match="are b and d exchanged"):
+        Vehicle.from_yaml(yaml.safe_dump({**file, "parameters": {**file["parameters"], "b": d, "d": b}}))
+    inches = [{**rotor, "position": [x / 0.0254 for x in rotor["position"]]} for rotor in file["rotors"]]
+    with pytest.raises(QuadidError, match="rotor positions in inches"):
+        Vehicle.from_yaml(yaml.safe_dump({**file, "rotors": inches}))
 
 
 def test_a_signal_that_moves_keeps_every_reading(flight: Recording) -> None:
@@ -162,7 +256,9 @@ def test_inertia_in_grams_and_thrust_per_rpm_are_named(flight: Recording) -> Non
         made["parameters"][name] = 1e3 * Vehicle.shipped("pelican").parameters[name].initial
     with pytest.raises(QuadidError, match="is it in g m"):
         Vehicle.from_yaml(yaml.safe_dump(made), "mine")
-    made = yaml.safe_load(text) | {"parameters": yaml.safe_load(text)["parameters"] | {"b": 2.0e-5 / 91.2}}
+    made = yaml.safe_load(text) | {
+        "parameters": yaml.safe_load(text)["parameters"] | {"b": 2.0e-5 / 91.2, "d": 4.0e-7 / 91.2}
+    }
     check = verdict(flight, "hover", Vehicle.from_yaml(yaml.safe_dump(made), "mine"))
     assert "b by 91.2" in check.fix
 
@@ -173,7 +269,7 @@ def test_inertia_in_grams_and_thrust_per_rpm_are_named(flight: Recording) -> Non
         ("gyro", 1e3, "gyro_attitude", "scale of one is wrong"),
         ("gyro", 10.0, "gyro_attitude", "multiply gyro by 0."),
         ("position", 1e3, "position_velocity", "different units"), ("velocity", 3.6, "velocity_attitude", "by 3."),
-        ("rotor_speed", 60.0, "hover", "check mass, the unit"), ("rotor_speed", 0.01, "hover", "check mass, the unit"),
+        ("rotor_speed", 60.0, "hover", "check mass, the unit"), ("rotor_speed", 0.004, "hover", "check mass, the unit"),
     ],
 )  # fmt: skip
 def test_a_unit_that_nobody_named_is_an_error_all_the_same(

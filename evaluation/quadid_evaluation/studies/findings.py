@@ -165,7 +165,7 @@ LOGS: tuple[Finding, ...] = (
     Finding("logs/esc_rpm_scale", "a tenth of the speed", initialised("rpm10.bin"), says("ten times too low")),
     Finding(
         "logs/esc_rpm_spikes", "five readings of 65535 rpm", initialised("gl01.bin"),
-        lambda a: usable(a) and channel(a, "rotor_speed")["dropped"].get("impossible_rotor_speed", 0) >= 4,
+        lambda a: usable(a) and channel(a, "rotor_speed")["dropped"].get("impossible", 0) >= 4,
         lambda a: str(channel(a, "rotor_speed").get("dropped")),
     ),
     Finding(
@@ -222,7 +222,7 @@ VEHICLES: tuple[Finding, ...] = (
     Finding(_HEXA, "motors 1 and 3 exchanged", changed("clean.csv", "vehicle.yaml", exchanged),
             says("columns 3, 2, 1, 4, 5, 6")),
     Finding(_HEXA, "frames of zeros", changed("clean.csv", "vehicle.yaml", dropped),
-            lambda a: usable(a) and channel(a, "rotor_speed")["dropped"].get("impossible_rotor_speed", 0) > 10),
+            lambda a: usable(a) and channel(a, "rotor_speed")["dropped"].get("impossible", 0) > 10),
     Finding(
         _X8, "rotor 6 of 8 weak, hover", compared("damaged_hover.csv"),
         lambda a: a[2].get("verdict") == "changed" and "rotor 6: 14 % less" in a[1],
