@@ -245,9 +245,7 @@ def _answered(ended: Iterator[tuple[Any, Job]]) -> Generator[Row, None, list[Job
     return died
 
 
-def _stream(
-    client: Any, jobs: Sequence[Job], work: Callable[[Job], Row], ahead: int
-) -> Iterator[tuple[Any, Job]]:  # fmt: skip
+def _stream(client: Any, jobs: Sequence[Job], work: Callable[[Job], Row], ahead: int) -> Iterator[tuple[Any, Job]]:
     """Ended futures with their jobs, in the order in which they end; at most `ahead` are handed out."""
     waiting = iter(jobs)
     ended: SimpleQueue[Any] = SimpleQueue()
