@@ -566,7 +566,7 @@ def gyro_check(recording: Recording) -> Check:
     late = _apart(gyro, attitude, best[1].r2) if best[0] == "as given" else None
     return (
         late or _angle_rates(gyro, attitude) or _one_axis(gyro, attitude) or _bias_step(gyro, attitude)
-        or (best[1].straight and _turned(gyro, attitude)) or _judge_rates(*best)
+        or (best[0] == "as given" and best[1].straight and _turned(gyro, attitude)) or _judge_rates(*best)
     )  # fmt: skip
 
 

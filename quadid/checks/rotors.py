@@ -246,8 +246,9 @@ def readings_check(recording: Recording, vehicle: Vehicle, spans: Spans) -> Chec
     if step:
         message = f"rotor speeds come in steps of {step:.3g} rad/s: too coarse for the motion ({signal.source})"
         return Check(_NAME, CheckResult.WARNING, message, "log them finer, or motor commands", {"step_rad_s": step})
-    problem = (not commands and _other_unit(values)) or _dead(values, most) or _same(values, vehicle, commands)
-    problem = problem or _stuck(signal, recording, inside)
+    if problem := _other_unit(values):
+        return Check(_NAME, CheckResult.ERROR, f"{problem[0]} ({signal.source})", "log all in one unit", problem[1])
+    problem = _dead(values, most) or _same(values, vehicle, commands) or _stuck(signal, recording, inside)
     fix = "check which outputs drive the motors, and that all of them were logged" if commands else _FIX
     return problem and Check(_NAME, CheckResult.ERROR, f"{problem[0]} ({signal.source})", fix, problem[1])
 

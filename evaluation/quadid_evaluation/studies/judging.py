@@ -22,7 +22,7 @@ from scipy.signal import butter, filtfilt
 import quadid
 from quadid.app.logs import LogPart, check_conventions, load_vehicle
 from quadid.checks import CheckResult, inspect
-from quadid.data.window import Channel, Recording, sample_period
+from quadid.data.window import Channel, Recording, mounting_matrix, sample_period
 from quadid.errors import LogError
 from quadid.rotation import conjugate, continuous_sign, euler, product
 from quadid.types import FloatArray
@@ -147,6 +147,12 @@ def flu(r: Recording, v: Vehicle) -> Log:
     half = np.array([0.0, 1.0, 0.0, 0.0])
     q = product(values(r, "attitude"), np.broadcast_to(half, values(r, "attitude").shape))
     return changed(r, attitude=q, **turned), v
+
+
+def imu_turned(r: Recording, v: Vehicle) -> Log:
+    """Gyro and accelerometer stand 10 deg further about z than the attitude."""
+    turn = mounting_matrix((0.0, 0.0, np.radians(10.0)))
+    return changed(r, **{n: values(r, n) @ turn.T for n in ("gyro", "accel")}), v
 
 
 def ros(r: Recording, v: Vehicle) -> Log:
@@ -316,6 +322,7 @@ MISTAKES: tuple[Mistake, ...] = (
     Mistake("attitude in steps of 5 deg", attitude(
         lambda q: from_euler(np.radians(5.0 * np.round(np.degrees(euler(q)) / 5.0)))), "in steps"),
     Mistake("attitude held at 10 Hz", held("attitude", 10.0), "^$|attitude.*Hz"),
+    Mistake("IMU turned by 10 deg", imu_turned, "turned against the attitude"),
     Mistake("gyro clipped", clipped, "limit of its range"),
     Mistake("gyro smoothed at 4 Hz", smoothed, "smoothed without a delay"),
     Mistake("rotors in rpm", scaled("rotor_speed", 30.0 / np.pi), "in rpm"),
@@ -324,6 +331,7 @@ MISTAKES: tuple[Mistake, ...] = (
     Mistake("rotors squared", squared, "squared"),
     Mistake("rotor 2 dead", one_rotor(1, lambda w: 0.0), "rotor 2 reads nothing"),
     Mistake("rotor 2 stuck", one_rotor(1, lambda w: float(np.median(w))), "rotor 2 holds"),
+    Mistake("rotor 2 in rpm", one_rotor(1, lambda w: w * 30.0 / np.pi), "rotor 2 reads|neither shares"),
     Mistake("rotor 2 at half speed", half_speed, "rotor 2 reads"),
     Mistake("one column for all", of_rotors(lambda w: np.repeat(w[:, :1], w.shape[1], axis=1)), "are the same"),
     Mistake("rotors 30 ms late", rotor_late(0.03), LATE_ROTORS),
