@@ -67,7 +67,9 @@ def fleet(
     if columns and vehicle is None:
         raise VehicleError("columns without a vehicle", "columns of the vehicle that is given", "give vehicle, too")
     known = None if vehicle is None else as_vehicle(vehicle)
-    default = None if known is None else known.model_copy(update={"columns": known.columns | (columns or {})}).to_yaml()
+    default = (
+        None if known is None else known.model_copy(update={"columns": {**known.columns, **(columns or {})}}).to_yaml()
+    )
     target = Path(out).resolve()
     make_folder(target)
     found = find_jobs(Path(folder).resolve(), default, rate, seed, diagnose, target)
@@ -182,13 +184,13 @@ def cluster(address: str | None, workers: int | None, memory: str) -> Iterator[A
 def _program_unseen() -> Iterator[None]:
     """Keeps processes that start from running the caller's script first, which would start more of them."""
     main = vars(sys.modules["__main__"])
-    kept = {name: main[name] for name in ("__file__", "__spec__") if name in main}
-    main |= {"__file__": None, "__spec__": None}
+    kept: dict[str, Any] = {name: main[name] for name in ("__file__", "__spec__") if name in main}
+    main.update({"__file__": None, "__spec__": None})
     try:
         yield
     finally:
         del main["__file__"], main["__spec__"]
-        main |= kept
+        main.update(kept)
 
 
 def _close(own: Any, others: set[BaseProcess]) -> None:
