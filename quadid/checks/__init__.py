@@ -25,6 +25,7 @@ from quadid.checks.motion import flying_spans as flying_spans
 from quadid.checks.motion import proposed_cuts as proposed_cuts
 from quadid.checks.rotors import (
     Lagged,
+    balance_check,
     better_description,
     geometry_check,
     gyro_filter_check,
@@ -171,6 +172,7 @@ STAGES: tuple[tuple[Question, ...], ...] = (
             lambda log: geometry_check(log.lagged, log.known, log.hover.numbers.get("b_from_hover")),
             fatal=False,
         ),
+        Question("balance", lambda log: balance_check(log.recording, log.known, log.spans), fatal=False),
         Question("gyro_source", lambda log: gyro_filter_check(log.recording, log.known, log.spans), fatal=False),
     ),
 )

@@ -382,30 +382,57 @@ def _unbalanced(squares: FloatArray, vehicle: Vehicle) -> Problem | None:
     Of one hovering rotor's moment, a rotor of four that reads half its speed makes 0.75; one that lost 45 % of its
     thrust, and turns faster for it, 0.64.  Yaw is left free, for a vehicle may turn for long.
 
-    One rotor is named: that whose square, set to what balance
-    needs, agrees best with the others.
+    One rotor is named.
     """
     lever = vehicle.torque_arms[:, :2] / vehicle.arm
     share = squares / np.maximum(squares.sum(axis=1, keepdims=True), 1e-9)
     odd = np.linalg.norm(share @ lever, axis=1) > 0.72 / (len(lever) - 0.25)
     if odd.mean() < 0.1:
         return None
-    typical = np.median(share[odd], axis=0)
-    fits = []
-    for rotor, arm in enumerate(lever):
-        needed = typical.copy()
-        needed[rotor] -= float(typical @ lever @ arm / (arm @ arm))
-        if needed[rotor] > 0.0:
-            fits.append(
-                (float(np.std(needed) / np.mean(needed)), rotor, float(np.sqrt(typical[rotor] / needed[rotor])))
-            )
-    if not fits:
+    found = _off_balance(np.median(share[odd], axis=0), lever)
+    if found is None:
         return "the rotor speeds are far from balance", {"share": float(odd.mean())}
-    _, rotor, ratio = min(fits)
+    rotor, ratio = found
     return (
         f"rotor {rotor + 1} reads {ratio:.2f} times the speed that balance needs for {odd.mean():.0%} of the flight",
         {"rotor": rotor + 1.0, "speed_ratio": ratio, "share": float(odd.mean())},
     )
+
+
+def _off_balance(share: FloatArray, lever: FloatArray) -> tuple[int, float] | None:
+    """The rotor whose square, set to what balance needs, agrees best with the others, and its speed over that."""
+    fits = []
+    for rotor, arm in enumerate(lever):
+        needed = share.copy()
+        needed[rotor] -= float(share @ lever @ arm / (arm @ arm))
+        if needed[rotor] > 0.0:
+            fits.append((float(np.std(needed) / np.mean(needed)), rotor, float(np.sqrt(share[rotor] / needed[rotor]))))
+    return min(fits)[1:] if fits else None
+
+
+def balance_check(recording: Recording, vehicle: Vehicle, spans: Spans) -> Check | None:
+    """A warning where rotors balance on the average so far from the centre as a quarter more thrust of one moves it.
+
+    With right files of recorded vehicles it is a fifth at most.
+    """
+    signal = rotor_signal(recording, vehicle)
+    inside = within(signal.t, spans)
+    if not inside.any() or {"cg_offset", "weak_rotor"} & set(vehicle.effects):
+        return None
+    lever, squares = vehicle.torque_arms[:, :2] / vehicle.arm, np.mean(signal.values[inside] ** 2, axis=0)
+    share = squares / max(float(squares.sum()), 1e-9)
+    off = float(np.linalg.norm(share @ lever))
+    found = _off_balance(share, lever)
+    if off < 0.25 / len(lever) or found is None:
+        return None
+    rotor, ratio = found
+    return Check(
+        "balance", CheckResult.WARNING,
+        f"the rotors balance {100.0 * off:.2g} % of the arm from the centre, as if rotor {rotor + 1} read {ratio:.2f} "
+        "times its speed: then b and inertias are wrong, else the centre of gravity is there",
+        "check that rotor's reading, propeller and place in the vehicle file, and where the vehicle balances",
+        {"off": off, "rotor": rotor + 1.0, "speed_ratio": ratio},
+    )  # fmt: skip
 
 
 def _against_thrust(

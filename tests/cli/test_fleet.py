@@ -82,28 +82,23 @@ def test_every_vehicle_has_its_parameters(ran: tuple[dict[str, Any], Path]) -> N
         assert b["median"] == pytest.approx(2.33e-5, rel=0.01)
 
 
-def test_a_script_without_a_guard_gets_it_in_python_and_goes_on(
-    folder: Path, ran: tuple[dict[str, Any], Path], tmp_path: Path
-) -> None:
+def test_a_script_without_a_guard_gets_it_in_python_and_goes_on(folder: Path, tmp_path: Path) -> None:
     """Workers that start as others do run the script that starts them first."""
-    result, out = ran
-    own, script = tmp_path / "out", tmp_path / "script.py"
-    shutil.copytree(out, own)
-    for done, options in ((0, "workers=1"), (8, "workers=1, again=True")):
-        script.write_text(
-            "import json, pathlib, quadid\nprint('once')\n"
-            f"fleet = quadid.fleet({str(folder)!r}, {str(own)!r}, 'pelican', {options})\n"
-            f"pathlib.Path({str(tmp_path / 'frame.json')!r}).write_text(fleet.to_frame().to_json())\n"
-            f"fleet.to_json({str(tmp_path / 'fleet.json')!r})\nassert __file__ and '__spec__' in globals()\n",
-            encoding="utf-8",
-        )
+    (tmp_path / "logs").mkdir()
+    shutil.copy(folder / "alpha" / "short.csv", tmp_path / "logs" / "short.csv")
+    script = tmp_path / "script.py"
+    script.write_text(
+        "import json, quadid\nprint('once')\n"
+        f"fleet = quadid.fleet({str(tmp_path / 'logs')!r}, {str(tmp_path / 'out')!r}, 'pelican', workers=1)\n"
+        "print(json.dumps([fleet.result['worked'], fleet.to_frame()['status']['short.csv']]))\n"
+        "assert __file__ and '__spec__' in globals()\n",
+        encoding="utf-8",
+    )
+    for worked in (1, 0):
         run = subprocess.run([sys.executable, script], capture_output=True, text=True, check=False)
         assert run.returncode == 0, run.stderr
-        assert run.stdout == "once\n"
-        found = json.loads((tmp_path / "fleet.json").read_text(encoding="utf-8"))
-        assert (found["worked"], found["counts"]) == (done, result["counts"])
-    frame = json.loads((tmp_path / "frame.json").read_text(encoding="utf-8"))
-    assert frame["status"]["alpha/flight1.mcap"] == "done"
+        first, answer = run.stdout.splitlines()
+        assert (first, json.loads(answer)) == ("once", [worked, "refused"])
 
 
 def test_sqlite_and_parquet_hold_the_same_rows(ran: tuple[dict[str, Any], Path]) -> None:
