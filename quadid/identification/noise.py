@@ -11,6 +11,7 @@ rotors.  How much of a rate is theirs shows whether `quadid.identification.filte
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -233,8 +234,9 @@ def correlation(length: int, step: float) -> FloatArray:
 
 
 def estimate_noise(
-    residuals: FloatArray, weights: FloatArray, dt: float, freedom: float, slow_time: float = SLOW_TIME
-) -> NoiseModel:
+    residuals: FloatArray, weights: FloatArray, dt: float, freedom: float, slow_time: float = SLOW_TIME,
+    slow: Sequence[int] = ATTITUDE,
+) -> NoiseModel:  # fmt: skip
     """Estimates the noise from residuals of a fit flexible enough to leave only noise.
 
     Args:
@@ -243,13 +245,14 @@ def estimate_noise(
         dt: grid step [s].
         freedom: fraction of the residual's degrees of freedom left after the parameters were fitted, 0..1.
         slow_time: correlation time of the slow part [s].
+        slow: channels that may have a slow part; all of them where random forces count as noise.
 
     Returns:
         The noise; a channel without enough data keeps the typical value.
     """
     segments, length, channels = residuals.shape
     guess = NoiseModel.guess(channels)
-    white, slow = guess.white.copy(), np.zeros(channels)
+    white, lasting = guess.white.copy(), np.zeros(channels)
     for c in range(channels):
         complete = np.all(weights[:, :, c] > 0.0, axis=1)
         basis, forms = _forms(length, round(float(dt) / slow_time, 9), min(TREND[c // 3], length - 2))
@@ -271,12 +274,12 @@ def estimate_noise(
         # Rao's two quadratic forms r' I r and r' R r, set equal to their expectations.
         moments = np.array([np.mean(np.sum((r @ f) * r, axis=1)) for f in forms[:2]]) / (freedom * keep)
         var_white, var_slow = moments[0] / forms[2][0, 0], 0.0
-        if c in ATTITUDE and length >= 8:
+        if c in slow and length >= 8:
             solution = np.linalg.solve(forms[2], moments)
             if solution[1] > 0.0 and solution[0] > 0.0:
                 var_white, var_slow = float(solution[0]), float(solution[1])
-        white[c], slow[c] = np.sqrt(max(var_white, 1e-18)), np.sqrt(var_slow)
-    return NoiseModel(white, slow, slow_time)
+        white[c], lasting[c] = np.sqrt(max(var_white, 1e-18)), np.sqrt(var_slow)
+    return NoiseModel(white, lasting, slow_time)
 
 
 @lru_cache(maxsize=64)

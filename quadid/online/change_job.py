@@ -7,13 +7,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from quadid.chi_square import exceeded, survival
+from quadid.data.window import Window
 from quadid.effects import NEVER
 from quadid.identification.gauss_newton import polish
 from quadid.identification.initial_states import InitialStates
-from quadid.identification.noise import NoiseModel
-from quadid.identification.problem import Prior, Shooting, posterior_covariance
+from quadid.identification.noise import NoiseModel, estimate_noise
+from quadid.identification.problem import Linearised, Prior, Shooting, posterior_covariance
 from quadid.model import layout as ix
 from quadid.model.layout import LOSS, Layout, ThrustModel
+from quadid.online.fit_job import FEWEST_SEGMENTS
 from quadid.online.records import Job, JobReply, OnlineAlternative, OnlineFinding
 from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray
@@ -62,6 +64,7 @@ class ChangeRequest(Job):
         noise: sensor noise.
         change: what was seen.
         time: when; in the time of the stream's stamps [s].
+        before: data before the change: what moves the vehicle there, wind and all, moves it afterwards, too.
         speed: of each rotor before the change [rad/s], shape (rotors,), where effects were fitted along; else None.
     """
 
@@ -72,6 +75,7 @@ class ChangeRequest(Job):
     noise: NoiseModel | None
     change: ChangePoint
     time: float
+    before: tuple[Window, ...] = ()
     speed: FloatArray | None = None
 
     def answer(self) -> ChangeReply:
@@ -80,7 +84,8 @@ class ChangeRequest(Job):
         Effects that were fitted along to quiet flight are hardly known, though held: a thrust curve that is too flat
         makes every loss too small.  So the plain law is asked, too, and whichever leaves less is believed.
         """
-        return min((_explain(r) for r in (self, *self._plain())), key=_left)
+        asked = replace(self, noise=_beside_wind(self))
+        return min((_explain(r) for r in (asked, *asked._plain())), key=_left)
 
     def _plain(self) -> tuple[ChangeRequest, ...]:
         """The same with the vehicle file's own effects, and the thrust before the change as it was found."""
@@ -112,6 +117,9 @@ class _Cause:
     rotor: int = 0
 
 
+NOTHING = _Cause("", (), ())
+
+
 @dataclass(frozen=True)
 class _Outcome:
     cause: _Cause
@@ -119,7 +127,20 @@ class _Outcome:
     sigma: FloatArray
     deviance: float
     mse: float
-    states: InitialStates
+    lin: Linearised
+
+
+def _beside_wind(request: ChangeRequest) -> NoiseModel | None:
+    """Noise of sensors, random forces and moments together, from what no change leaves before the change."""
+    if not request.before:
+        return request.noise
+    shooting = Shooting.cut(request.before, request.vehicle, SEGMENT, request.noise, Layout(request.vehicle))
+    if shooting.count < FEWEST_SEGMENTS:
+        return request.noise
+    lin = _fit(shooting, request, NOTHING).lin
+    if not np.isfinite(lin.total_cost):
+        return request.noise
+    return estimate_noise(lin.residuals, lin.weights, shooting.dt, 1.0, slow=range(lin.residuals.shape[2]))
 
 
 def _explain(request: ChangeRequest) -> ChangeReply:
@@ -127,10 +148,10 @@ def _explain(request: ChangeRequest) -> ChangeReply:
     shooting = Shooting.cut(request.windows, request.vehicle, SEGMENT, request.noise, layout)
     if shooting.count < 3:
         return ChangeReply(request.number, "too little data after the change")
-    nothing = _fit(shooting, request, _Cause("", (), ()))
+    nothing = _fit(shooting, request, NOTHING)
     outcomes = []
     for cause in _causes(request):
-        outcome = _fit(shooting, request, cause, nothing.states)
+        outcome = _fit(shooting, request, cause, nothing.lin.states)
         if np.isfinite(outcome.deviance):
             outcomes.append(outcome)
     outcomes = _without_idle(outcomes)
@@ -210,7 +231,7 @@ def _fit(shooting: Shooting, request: ChangeRequest, cause: _Cause, states: Init
     result = polish(shooting, theta, free, prior, states, iterations=8)
     sigma = np.sqrt(np.diag(posterior_covariance(result.lin.information, prior))) * free.jacobian(result.theta)
     mse = result.lin.reduced_chi_square
-    return _Outcome(cause, result.theta, sigma[len(NOMINAL_NAMES) :], result.cost, mse, result.states)
+    return _Outcome(cause, result.theta, sigma[len(NOMINAL_NAMES) :], result.cost, mse, result.lin)
 
 
 def _finding(request: ChangeRequest, nothing: _Outcome, outcomes: list[_Outcome]) -> OnlineFinding:

@@ -1,9 +1,10 @@
 """Sudden changes, seen within seconds: effective thrust per weight, and roll and pitch moments that nothing commands.
 
 Every half second gives three numbers that need no fit: the specific force per sum of squared rotor speeds (its level is
-b / m), and the roll and pitch acceleration that the rotors do not explain.  A step in one of them is found by comparing
-means before and after every moment of the last seconds (generalised likelihood ratio for a step in a mean of unknown
-time: Basseville and Nikiforov, *Detection of Abrupt Changes*, 1993, ch. 2.4).
+b / m), and the roll and pitch acceleration that the rotors do not explain.  In wind they wander: how far, and for how
+long, is learned from the flight before the last seconds, and a step is a change of mean of what the number before does
+not tell (generalised likelihood ratio for a step of unknown time in innovations: Basseville and Nikiforov, *Detection
+of Abrupt Changes*, 1993, ch. 2.4 and 7.2).
 
 All three also change with how the vehicle flies: thrust with rotor speed (thrust curve), climb (inflow, drag) and
 sideways speed, moments with what is commanded (b / J is not known exactly), rate and sideways speed.  A step is what
@@ -26,6 +27,7 @@ import math
 from collections import deque
 from collections.abc import Generator
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -43,12 +45,12 @@ CHUNK = 0.5
 """Time that gives one set of numbers [s]."""
 BASELINE = 40.0
 """Time before a change that it is compared with, at most [s]; at least a fifth of it."""
-LOOK_BACK = 4.0
-"""A change is looked for in this much past [s]."""
+LOOK_BACK = 8.0
+"""A change is looked for in this much past [s], and compared with what was learned before."""
 AFTER = 3
-"""Chunks after a change before it is believed."""
-SIGNIFICANT = 7.0
-"""Standard errors by which the means must differ."""
+"""Chunks after that in which a change happens before it is believed."""
+SIGNIFICANT = 5.0
+"""Standard errors of a change."""
 LEAST = 0.03
 """Smallest step worth a word: share of thrust; roll and pitch moment over what losing half the thrust would give."""
 ASTRAY = 0.5
@@ -57,6 +59,10 @@ SETTLED = 0.01
 """A reweighted regression is done when no coefficient moves by more than this share of its standard deviation,"""
 MOST_ROUNDS = 50
 """... or after so many fits."""
+MOST_MEMORY = 0.9
+"""Largest correlation of random forces from chunk to chunk: what lasts longer is no force, but a constant."""
+_FREE = 1e-9
+"""Precision of a constant of which nothing is known."""
 AFTER_CHANGE = 3.0
 """Data that a change is explained from [s]."""
 ASK_FLYING = 2.2
@@ -137,64 +143,123 @@ class FlightState:
         )
 
 
-def step_beside(
-    y: FloatArray, x: FloatArray, typical: FloatArray, split: int, least: float, astray: FloatArray | None = None
-) -> tuple[float, float]:  # fmt: skip
-    """Step of `y` at `split` beside what regressors explain: its size in standard errors, and the step.
+class Learned(NamedTuple):
+    """Constant and slopes of a series on its regressors, learned from its past, and the random forces in it.
 
-    The coefficients are zero to within their typical sizes, or what the values before the step say; their uncertainty
-    counts as that of the step.  Every value after it must lie on the same side.
+    Attributes:
+        middle: mean of the regressors, shape (k,).
+        value: the series there, then its slopes, shape (k + 1,).
+        covariance: of these, shape (k + 1, k + 1).
+        memory: correlation of what is left with what was left one value before.
+        spread: standard deviation of what the value before does not tell of it (innovation).
+    """
+
+    middle: FloatArray
+    value: FloatArray
+    covariance: FloatArray
+    memory: float
+    spread: float
+
+    def design(self, x: FloatArray) -> FloatArray:
+        """What the coefficients are multiplied with, shape (n, k + 1)."""
+        return np.column_stack([np.ones(len(x)), x - self.middle])
+
+
+def learned(y: FloatArray, x: FloatArray, typical: FloatArray, least: float) -> Learned:
+    """Regression beside first-order random forces, in which outliers count for next to nothing (Cauchy).
+
+    A gust moves the vehicle, and its autopilot the rotors, within the same value: taken as they are, regressors that
+    follow the gust would explain it, and later half of every step.  What the value before does not tell of a regressor
+    may be the gust's doing, so it has a coefficient of its own beside, as large as if all of the force were in it
+    (control function: two-stage least squares where forces rule, least squares where the sticks do).
 
     Args:
         y: series, shape (n,).
         x: its regressors, shape (n, k).
         typical: standard deviations of their coefficients before any data, shape (k,).
-        split: index of the first value after the step.
+        least: smallest spread.
+    """
+    size = x.shape[1] + 1
+    middle = x.mean(axis=0)
+    apart = x - middle
+    follows = np.sum(apart[1:] * apart[:-1], axis=0) / np.maximum(np.sum(apart[:-1] ** 2, axis=0), 1e-300)
+    sudden = apart[1:] - follows * apart[:-1]
+    power = np.mean(sudden**2, axis=0)
+    memory, spread, weight = 0.0, max(1.4826 * median(np.abs(y - median(y))), least), np.ones(len(y) - 1)
+    found = Learned(middle, np.zeros(size), np.eye(size), memory, spread)
+    for done in range(MOST_ROUNDS):
+        rows = np.column_stack([np.full(len(y) - 1, 1.0 - memory), apart[1:] - memory * apart[:-1], sudden])
+        prior = np.concatenate([[_FREE], typical**-2.0, power / spread**2 + 1e-300])
+        # Weights of this kind leave a normal's mean 1.25 times as uncertain.
+        weighted = rows.T * (weight / (1.25 * spread) ** 2)
+        covariance = np.linalg.inv(weighted @ rows + np.diag(prior))
+        value = (covariance @ (weighted @ (y[1:] - memory * y[:-1])))[:size]
+        covariance = covariance[:size, :size]
+        settled = np.abs(value - found.value) <= SETTLED * np.sqrt(np.diag(covariance))
+        left = y - found.design(x) @ value
+        new = left[1:] - memory * left[:-1]
+        spread = max(1.4826 * median(np.abs(new)), least)
+        weight = 1.0 / (1.0 + (new / (2.0 * spread)) ** 2)
+        wide = 3.0 * spread / math.sqrt(1.0 - memory**2)
+        tame = np.clip(left - median(left), -wide, wide)
+        memory = min(max(float(tame[1:] @ tame[:-1]) / max(float(tame @ tame), 1e-300), 0.0), MOST_MEMORY)
+        found = Learned(middle, value, covariance, memory, spread)
+        if done and settled.all():
+            break
+    return found
+
+
+def step_beside(
+    y: FloatArray, x: FloatArray, typical: FloatArray, first: int, least: float, astray: FloatArray | None = None
+) -> tuple[float, float, int]:  # fmt: skip
+    """Clearest step of `y` from `first` on, beside what its regressors and random forces explain.
+
+    Coefficients and random forces are those of the values before `first`.  A step is a change of the mean of the
+    innovations after it (generalised likelihood ratio beside coloured noise); the value in which it happens holds any
+    part of it.  Where these innovations scatter more than was learned, beside the step, their own scatter counts.
+
+    Args:
+        y: series, shape (n,).
+        x: its regressors, shape (n, k).
+        typical: standard deviations of their coefficients before any data, shape (k,).
+        first: index of the first value in which a step is looked for.
         least: smallest step; a smaller one counts as none.  No value is trusted to better than a fifth of it, because
             what no regressor describes does not average out.
         astray: ways in which the regressors may all be off together, each by one standard deviation, shape (n, m, k).
-    """
-    slope, centre, covariance, spread = _reweighted(y[:split], x[:split], typical, least / 5.0)
-    left, far = y - x @ slope, x[split:].mean(axis=0) - centre
-    left -= median(left[:split])
-    size, count = median(left[split:]), len(y) - split
-    if abs(size) < least or not np.all(np.sign(size) * left[split:] > 2.0 * spread):
-        return 0.0, size
-    # What no regressor describes lasts: means over as long a time scatter by more than single values would have it.
-    means = np.convolve(left[:split], np.full(count, 1.0 / count), "valid")
-    scatter = max(1.4826 * median(np.abs(means)), spread / math.sqrt(count))
-    variance = 1.25**2 * (scatter**2 + spread**2 / split) + far @ covariance @ far
-    if astray is not None:
-        variance += float(np.sum((astray[split:].mean(axis=0) @ slope) ** 2))
-    return abs(size) / math.sqrt(variance), size
-
-
-def _reweighted(
-    y: FloatArray, x: FloatArray, typical: FloatArray, least: float
-) -> tuple[FloatArray, FloatArray, FloatArray, float]:
-    """Regression with an intercept in which outliers count for next to nothing (Cauchy), however they lie.
-
-    It begins with all values counting alike, and goes on until it has settled.  Begun at zero slope, where most values
-    are of one state, as in a long climb, all others would be outliers, and what is left of that looks like a step.
 
     Returns:
-        Coefficients, shape (k,), weighted mean of the regressors, shape (k,), covariance (k, k), and scatter of the
-        residuals, no less than `least`.
+        Its size in standard errors, the step, and the index of the value in which it happens.
     """
-    slope, weight = np.zeros(x.shape[1]), np.ones(len(y))
-    for done in range(MOST_ROUNDS):
-        left = y - x @ slope
-        left -= median(left)
-        spread = max(1.4826 * median(np.abs(left)), least)
-        centre = weight @ x / weight.sum()
-        weighted = (x - centre).T * (weight / spread**2)
-        covariance = np.linalg.inv(weighted @ (x - centre) + np.diag(typical**-2.0))
-        before, slope = slope, covariance @ (weighted @ y)
-        if done and np.all(np.abs(slope - before) <= SETTLED * np.sqrt(np.diag(covariance))):
-            break
-        left = y - x @ slope
-        weight = 1.0 / (1.0 + ((left - median(left)) / (2.0 * spread)) ** 2)
-    return slope, centre, covariance, spread
+    found = learned(y[:first], x[:first], typical, least / 5.0)
+    design = found.design(x)
+    left = y - design @ found.value
+    new = left[first:] - found.memory * left[first - 1 : -1]
+    unsure = design[first:] - found.memory * design[first - 1 : -1]
+    count, splits = len(new), len(new) - 1
+    weight = np.linalg.inv(found.spread**2 * np.eye(count) + unsure @ found.covariance @ unsure.T)
+    # Innovations by one odd value (a column for each), and by a step that lasts; the odd value is taken out of both.
+    odd = np.eye(count) - found.memory * np.eye(count, k=-1)
+    step, odd = (odd @ np.tri(count))[:, :splits], odd[:, :splits]
+    seen, own = weight @ odd, np.sum(odd * (weight @ odd), axis=0)
+    gain = weight @ step - seen * (np.sum(seen * step, axis=0) / own)
+    power = np.sum(step * gain, axis=0)
+    size = new @ gain / power
+    rest = new @ weight @ new - (new @ seen) ** 2 / own - size**2 * power
+    scatter = np.maximum(rest / (count - 2), 1.0)
+    variance = scatter / power
+    if astray is not None:
+        after = np.array([astray[first + j :].mean(axis=0) @ found.value[1:] for j in range(splits)])
+        variance += np.sum(after**2, axis=1)
+    # Few values tell the spread: Student's t, as a normal deviate as rare (the part of the variance that rests on it).
+    share = found.spread**2 * scatter * np.sum(gain**2, axis=0) / power**2 / variance
+    freedom = (first - 1) / share**2
+    errors = np.sqrt(freedom * np.log1p(size**2 / variance / freedom))
+    # What is left tells the size best: the test leans on the first moments, in which rotors lag and drag swings.
+    lasting = np.array([left[first + j + 1 :].mean() for j in range(splits)])
+    errors *= (np.abs(lasting) >= least) & (lasting * size > 0.0)
+    best = int(np.argmax(errors))
+    # Where the newest values alone would be the step, those to come tell it better.
+    return float(errors[best]) * (best + AFTER < count), float(lasting[best]), first + best
 
 
 # --- Numbers every half second, and the strongest step in them
@@ -292,19 +357,17 @@ class ChangeDetector:
             doubt: standard deviations of log(b / J_xx) and log(b / J_yy); None: nothing is known of them, and moments
                 are not judged.
         """
-        if len(self._chunks) < BASELINE / 5.0 / CHUNK + AFTER:
+        if len(self._chunks) <= BASELINE / 5.0 / CHUNK + AFTER:
             return None
-        t = np.array([c.t for c in self._chunks])
         seen = [self._thrust()]
         if doubt is not None:
             seen += [self._moment(axis, b, inertia, float(doubt[axis])) for axis in (0, 1)]
-        first = max(len(t) - round(LOOK_BACK / CHUNK), round(BASELINE / 5.0 / CHUNK))
+        first = max(len(self._chunks) - round(LOOK_BACK / CHUNK), round(BASELINE / 5.0 / CHUNK))
         best: ChangePoint | None = None
-        for split in range(first, len(t) - AFTER + 1):
-            for name, (y, x, typical, astray) in zip(CHANNELS, seen, strict=False):
-                errors, size = step_beside(y, x, typical, split, LEAST, astray)
-                if errors > SIGNIFICANT and (best is None or errors > best.errors):
-                    best = ChangePoint(float(t[split]) - 0.5 * CHUNK, name, size, errors)
+        for name, (y, x, typical, astray) in zip(CHANNELS, seen, strict=False):
+            errors, size, place = step_beside(y, x, typical, first, LEAST, astray)
+            if errors > max(SIGNIFICANT, best.errors if best is not None else 0.0):
+                best = ChangePoint(self._chunks[place].t, name, size, errors)
         return best
 
     def _thrust(self) -> _Series:
@@ -394,5 +457,6 @@ class ChangeWatch:
         speed = None if before is None else np.sqrt(np.nanmean(before.columns["rotor_speed"] ** 2, axis=0))
         return ChangeRequest(
             number, estimator.model, cut.windows, at, tick, estimator.theta, estimator.z_sigma,
-            estimator.noise_of(cut.windows), self.seen, stamp, speed,
+            estimator.noise_of(cut.windows), self.seen, stamp,
+            self._rows.cut(at - LOOK_BACK, at - CHUNK).windows, speed,
         )  # fmt: skip

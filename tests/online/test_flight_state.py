@@ -13,7 +13,7 @@ from quadid_node.recording import stream
 from quadid_replay import open_log
 
 from quadid.online.change_job import ChangePoint
-from quadid.online.changes import CHUNK, ChangeDetector, ChangeWatch, FlightState, Velocity, step_beside
+from quadid.online.changes import CHUNK, ChangeDetector, ChangeWatch, FlightState, Velocity, learned, step_beside
 from quadid.online.fusion import Estimator
 from quadid.online.grid_buffer import GridBuffer, Rows
 from quadid.online.stream import Resampler
@@ -130,7 +130,7 @@ def test_in_the_same_flight_a_real_step_is_seen(scale: float, data_dir: Path) ->
     (when, channel, size), *others = seen
     assert not others
     assert channel == "thrust"
-    assert 120.0 < when < 123.5
+    assert 120.0 < when < 125.0
     assert size == pytest.approx(np.log(scale), abs=0.05)
 
 
@@ -159,6 +159,20 @@ def test_without_attitude_velocity_is_not_known() -> None:
     assert not Velocity().body(blind).any()
 
 
+def test_payload_and_weak_motors_of_a_recorded_flight_are_seen_and_nothing_else(data_dir: Path) -> None:
+    """Weak motor 3 from 313.6 to 328.6 s, 0.25 kg more from 378.7 to 398.8 s, weak motor 2 from 423.8 s (boot time)."""
+    folder = data_dir / "findings" / "ardupilot"
+    log, file = folder / "payload_hover_378s_no_alarm.tlog", folder / "mine_pwm.yaml"
+    begin = float(next(rows_of(log, file)).t[0])
+    truth = np.array([313.6, 328.6, 378.7, 398.8, 423.8]) - begin
+    seen = steps(log, file)
+    delays = [min(when - at for at in truth if at < when) for when, _, _ in seen]
+    assert max(delays) < 5.0
+    taken, dropped = ([size for when, _, size in seen if at < when < at + 5.0] for at in truth[2:4])
+    assert taken == pytest.approx([-np.log(1.0 + 0.25 / 1.35)], abs=0.03)
+    assert dropped == pytest.approx([np.log(1.0 + 0.25 / 1.35)], abs=0.04)
+
+
 def test_a_step_that_a_regressor_explains_is_none_and_its_doubt_counts() -> None:
     rng = np.random.default_rng(1)
     x = np.concatenate([rng.normal(0.0, 0.004, 60), rng.normal(0.4, 0.02, 8)])[:, None]
@@ -166,9 +180,7 @@ def test_a_step_that_a_regressor_explains_is_none_and_its_doubt_counts() -> None
     sized = np.array([0.3])
     assert step_beside(y, x, sized, 60, 0.03)[0] < 3.0
     assert step_beside(y, np.zeros_like(x), sized, 60, 0.03)[0] > 7.0, "without the regressor it is a step"
-    errors, size = step_beside(y - 0.2 * (np.arange(68) >= 60), x, sized, 60, 0.03)
-    assert errors < 7.0, "the coefficient may be that much off"
-    assert size == pytest.approx(-0.2, abs=0.1)
+    assert step_beside(y - 0.2 * (np.arange(68) >= 60), x, sized, 60, 0.03)[0] < 5.0, "the coefficient may be so large"
 
 
 @pytest.mark.parametrize("climb", [4.0, 5.0])
@@ -183,19 +195,55 @@ def test_what_follows_a_long_climb_is_no_step_and_a_real_one_is_seen(climb: floa
         drag = np.sqrt(flat + along**2) * along
         x = np.column_stack([-1.0 / speed, along / GRAVITY, flat / GRAVITY, drag / GRAVITY])
         y = x @ [0.0, 0.25, 0.008, 0.03] + rng.normal(0.0, 0.001, 37)
-        assert step_beside(y, x, state.typical, 33, 0.03)[0] < 2.0
-        errors, size = step_beside(y - 0.1 * (np.arange(37) >= 33), x, state.typical, 33, 0.03)
-        assert errors > 7.0
+        assert step_beside(y, x, state.typical, 30, 0.03)[0] < 2.0
+        errors, size, place = step_beside(y - 0.1 * (np.arange(37) >= 32), x, state.typical, 30, 0.03)
+        assert errors > 5.0
         assert size == pytest.approx(-0.1, abs=0.02)
+        assert place in (31, 32)
 
 
-def test_what_lasts_in_the_past_is_no_step_now() -> None:
-    rng = np.random.default_rng(2)
-    walk = np.convolve(rng.normal(0.0, 0.03, 91), np.ones(8) / 2.0, "valid")
-    white = rng.permutation(walk)
-    nothing = np.zeros((84, 0))
-    for y in (walk, white):
-        y[80:] = np.median(y[:80]) + 2.2 * 1.4826 * np.median(np.abs(y[:80] - np.median(y[:80])))
-    lasting, _ = step_beside(walk, nothing, np.zeros(0), 80, 0.03)
-    fresh, _ = step_beside(white, nothing, np.zeros(0), 80, 0.03)
-    assert lasting < 0.8 * fresh
+def gusts(count: int, seed: int, memory: float = 0.5) -> FloatArray:
+    """Random force with a memory, standard deviation 0.03, shape (count,)."""
+    new = 0.03 * np.sqrt(1.0 - memory**2) * np.random.default_rng(seed).standard_normal(count + 50)
+    out = np.zeros(count + 50)
+    for k in range(1, len(out)):
+        out[k] = memory * out[k - 1] + new[k]
+    return out[50:]
+
+
+def test_what_the_autopilot_does_about_a_gust_is_not_learned_as_an_effect_of_the_rotors() -> None:
+    """The rotors give way to the gust within the same value, which as a slope would take up half of every step."""
+    slopes, found = [], 0
+    for seed in range(10):
+        force, own = gusts(90, seed), gusts(90, 100 + seed, 0.8)
+        x = (own - 0.7 * force)[:, None]
+        slopes.append(float(learned(force[:80], x[:80], np.array([1.0]), 0.006).value[1]))
+        payload = force - 0.16 * (np.arange(90) >= 81)
+        found += step_beside(payload, x, np.array([1.0]), 80, 0.03)[0] > 5.0
+        assert step_beside(force, x, np.array([1.0]), 80, 0.03)[0] < 4.0
+    assert abs(np.mean(slopes)) < 0.25
+    assert found == 10
+
+
+@pytest.mark.parametrize(("memory", "large"), [(0.0, 10.0), (0.5, 8.0), (0.9, 8.0)])
+def test_a_step_counts_by_the_memory_of_the_random_forces(memory: float, large: float) -> None:
+    nothing, told = np.zeros((90, 0)), []
+    for seed in range(10):
+        force = gusts(90, seed, memory)
+        told.append(step_beside(force - 0.15 * (np.arange(90) >= 80), nothing, np.zeros(0), 78, 0.03)[0])
+        assert step_beside(force, nothing, np.zeros(0), 78, 0.03)[0] < 4.5
+    assert 0.6 * large < np.median(told) < 1.6 * large
+
+
+def test_forces_larger_than_those_that_were_learned_are_no_step() -> None:
+    for seed in range(20):
+        force = gusts(90, seed)
+        force[80:] *= 4.0
+        assert step_beside(force, np.zeros((90, 0)), np.zeros(0), 80, 0.03)[0] < 5.0
+
+
+def test_one_odd_value_is_no_step() -> None:
+    for place in range(80, 90):
+        force = gusts(90, 3)
+        force[place] += 1.0
+        assert step_beside(force, np.zeros((90, 0)), np.zeros(0), 80, 0.03)[0] < 5.0

@@ -55,7 +55,7 @@ def test_a_change_is_announced_explained_and_nothing_older_is_learned_from() -> 
     assert told is not None, seen.text
     size, errors = float(told[1]) / 100.0, float(told[2])
     assert size == pytest.approx(np.log(0.85), abs=2.0 * abs(size) / errors)
-    assert errors > 20.0
+    assert errors > 7.0, "after fourteen seconds of flight few values tell the spread"
     status = session.status()
     assert status.phase is Phase.CANDIDATE
     assert "a change of thrust is being looked into" in status.reason
