@@ -70,7 +70,7 @@ class Held:
         for name, p in self.parameters.items():
             here[self.short.layout.entry(name).index] = p.value
         doubt = alone.uncertainty.differing([free.step(here, alone.theta)])
-        return replace(self, parameters=_shown(self.short, alone._replace(theta=here, uncertainty=doubt), free))
+        return replace(self, parameters=_shown(self.short, replace(alone, theta=here, uncertainty=doubt), free))
 
     @property
     def sentence(self) -> str:

@@ -19,8 +19,8 @@ FIRST_SECONDS, NEAR_SECONDS = 20.0, 60.0
 """Of all flights together, what the very first and the first steps look at [s]."""
 NEAR, MOST = 4, 40
 """Steps with random forces held large, and most steps after that."""
-ENOUGH = 0.1
-"""Gain in -2 ln L that no step is worth taking for."""
+ENOUGH, FINE = 0.5, 0.1
+"""Gain in -2 ln L that no step of the noise is worth taking for, and none of the physics."""
 ALL_NOISE, NO_NOISE = np.ones(k.N_NOISE, dtype=np.bool_), np.zeros(k.N_NOISE, dtype=np.bool_)
 """Noise numbers that a step may change."""
 ROUNDS = 4
@@ -29,6 +29,10 @@ CHANCE = 4.0
 """Standard errors of the kurtosis beyond which innovations have outliers."""
 PATIENCE = 8
 """Times a step is shortened before the search ends."""
+POOR = 0.25
+"""Share of the gain that a step promises below which the next one is shorter."""
+ACTS = 3.0
+"""Times its least value beyond which a random force acts."""
 FLAT = 1e-12
 """Curvature of scaled numbers below which a direction is as good as flat."""
 STALE = 0.2
@@ -81,28 +85,41 @@ def estimate(problem: Problem, start: FloatArray | None = None) -> Estimate:
     whole, z = problem.based_on(z)
     # 2. Let them shrink: noise and physics together, until the likelihood stays; near it, over all flights.
     part = whole.liveliest(NEAR_SECONDS)
-    z, psi, _ = settle_noise(part.along(z, psi), z, psi)
+    near = part.along(z, psi)
+    z, psi, _ = settle_noise(near, z, psi)
     problem = whole.along(z, psi)
+    if part is whole and not problem.objective(z, psi) <= near.objective(z, psi):  # effects that run away
+        problem = near
     z, psi, value, gains, information = scoring(problem, z, psi, MOST, ALL_NOISE)
     # 3. Where innovations have outliers, their density has tails.
     tail = tails([whitened(g) for g in gains])
     if np.any(tail > 0.0):
-        problem = replace(problem, tail=tail)
-        z, psi, value, gains, information = scoring(problem, z, psi, MOST, ALL_NOISE)
+        heavy = replace(problem, tail=tail)
+        tried = scoring(heavy, z, psi, MOST, ALL_NOISE)
+        if np.isfinite(tried[2]):
+            problem, (z, psi, value, gains, information) = heavy, tried
     # 4. Noise of logged rotor speeds makes inertias too large by as much as it explains.
     for _ in range(ROUNDS):
-        problem = problem.unbiased(z, psi, gains)
-        taken, noise = problem.taken
-        if taken @ np.linalg.solve(information, taken) < ENOUGH:
+        tilted = problem.unbiased(z, psi, gains)
+        slope = tilted.taken[0]
+        step = np.linalg.solve(information, slope)
+        if np.max(np.abs(step), initial=0.0) > BOLD:  # rotors hardly move: that noise is all there is
+            break
+        if slope @ step < FINE:
+            problem = tilted
+            break
+        tried = scoring(tilted, z, psi, MOST, ALL_NOISE)
+        if not np.isfinite(tried[2]):
             break
         before = z
-        z, psi, value, gains, information = scoring(problem, z, psi, MOST, ALL_NOISE)
-        if (z - before) @ information @ (z - before) < ENOUGH:
+        problem, (z, psi, value, gains, information) = tilted, tried
+        if (z - before) @ information @ (z - before) < FINE:
             break
+    taken, noise = problem.taken
     # 5. A loop faster than the log answers a random moment within a step: by half of what it may, give or take as much.
     within = problem.within_a_step(z, gains)
     inverse = np.linalg.inv(information)
-    z = z + 0.5 * inverse @ within.sum(axis=0)
+    z = np.clip(z + 0.5 * inverse @ within.sum(axis=0), *problem.limits)
     # 6. Intervals: score over slope, and how well the noise of rotor speeds and that answer are known.
     by_square = taken * _of_square(problem, z, psi, gains)
     score = information + noise + 0.25 * within.T @ within + np.outer(by_square, by_square)
@@ -117,13 +134,16 @@ def settle_noise(problem: Problem, z: FloatArray, psi: FloatArray) -> tuple[Floa
     """
     exact = psi.copy()
     exact[k.ROTOR] = problem.noise_bounds[k.ROTOR, 0]
-    others = np.arange(k.N_NOISE) != k.ROTOR
+    others, sizes = np.arange(k.N_NOISE) != k.ROTOR, np.arange(k.N_NOISE) < k.TIME
     # Noise of about the right size before physics moves, or a long lag takes it for what it makes of the rotors.
-    exact = scoring(problem, z, exact, MOST, others, physics=False)[1]
+    exact = scoring(problem, z, exact, NEAR, others & sizes, physics=False)[1]
     first = scoring(problem, z, exact, MOST, others)
     noisy = first[1].copy()
     noisy[k.ROTOR] = psi[k.ROTOR]
-    z, psi, _, gains, _ = min((first, scoring(problem, first[0], noisy, MOST, ALL_NOISE)), key=lambda found: found[2])
+    noisy = scoring(problem, first[0], noisy, NEAR, sizes, physics=False)[1]
+    if noisy[k.ROTOR] > ACTS * exact[k.ROTOR]:
+        first = min((first, scoring(problem, first[0], noisy, MOST, ALL_NOISE)), key=lambda found: found[2])
+    z, psi, _, gains, _ = first
     return z, psi, gains
 
 
@@ -170,13 +190,10 @@ def scoring(
     Returns:
         Scaled parameters, noise numbers, objective, gains there; information (P, P) before the last step.
     """
-    low, high = np.log(problem.noise_bounds.T)
-    least, most = problem.limits
     value, gains = problem.passes(z, psi)
     information, gradient = np.eye(len(z)), np.zeros(len(z))
     curvature, slope, at, damping = np.eye(len(psi)), np.zeros(len(psi)), np.full(len(psi), np.inf), 0.0
     far = BOLD if physics else 0.0
-    reach = np.where(noise, BOLD, 0.0)
     for _ in range(turns if np.isfinite(value) else 0):
         if physics:
             information, gradient = problem.normal_equations(z, psi, gains)
@@ -190,22 +207,48 @@ def scoring(
                 )
         if not (np.isfinite(information).all() and np.isfinite(curvature).all()):
             break  # readings so wild that they overflow lead nowhere
+        below, above = problem.corner(z, psi, gains, gradient)
         for _ in range(PATIENCE):
-            step = newton_step(information, gradient, damping, np.maximum(least - z, -far), np.minimum(most - z, far))
-            bold = newton_step(curvature, slope, damping, np.maximum(low - log, -reach), np.minimum(high - log, reach))
-            expected = -float(gradient @ step) - 0.5 * float(slope @ bold)
-            moved, changed = z + step, np.exp(log + bold)
+            step = newton_step(information, gradient, damping, np.maximum(below, -far), np.minimum(above, far))
+            bold = newton_step(curvature, slope, damping, *noise_box(problem.noise_bounds, psi, noise))
+            by_physics, by_noise = -float(gradient @ step), -0.5 * float(slope @ bold)
+            done = by_physics < FINE and by_noise < ENOUGH
+            moved, changed = z + step, changed_noise(psi, bold)
             better, renewed = problem.passes(moved, changed, gains)
-            if better < value or expected < ENOUGH:
+            if better < value or done:
                 break
             damping = max(4.0 * damping, 0.1)
         if not better < value:
             break
-        damping = 0.25 * damping if damping > 0.02 else 0.0
+        if value - better > POOR * (by_physics + by_noise):
+            damping = 0.25 * damping if damping > 0.02 else 0.0
+        else:
+            damping = max(4.0 * damping, 0.1)
         z, psi, value, gains = moved, changed, better, renewed
-        if expected < ENOUGH:
+        if done:
             break
     return z, psi, value, gains, information
+
+
+def noise_box(bounds: FloatArray, psi: FloatArray, free: BoolArray) -> tuple[FloatArray, FloatArray]:
+    """Least and most step of the noise numbers, as `changed_noise` takes it: up by a factor, down to the bound."""
+    low, high = bounds[:, 0] / psi, np.minimum(bounds[:, 1] / psi, np.exp(BOLD))
+    low[k.TIME :] = np.maximum(low[k.TIME :], np.exp(-BOLD))
+    box = np.array([low, high])
+    box = np.where(np.arange(k.N_NOISE) < k.TIME, 0.5 * (box**2 - 1.0), np.log(box))
+    # What does not act has no correlation time.
+    acts = psi[k.SIGMA : k.ROTOR] > ACTS * bounds[k.SIGMA : k.ROTOR, 0]
+    free = free.copy()
+    free[k.TIME :] &= np.append(acts[:4], acts[4:].any())
+    least, most = np.where(free, box, 0.0)
+    return least, most
+
+
+def changed_noise(psi: FloatArray, step: FloatArray) -> FloatArray:
+    """Noise numbers after a step of logarithms, as one of variances, where the likelihood is nearly a parabola."""
+    out = psi * np.exp(step)
+    out[: k.TIME] = psi[: k.TIME] * np.sqrt(1.0 + 2.0 * step[: k.TIME])
+    return out
 
 
 def newton_step(

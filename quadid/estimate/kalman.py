@@ -45,10 +45,10 @@ TH, OM, VE, FO, AL, AE, N = 0, 3, 6, 9, 12, 15, 18
 N_MEAN = N + 1
 # Scalar measurements: gyro, attitude (rotation vector), accelerometer, velocity.
 GYRO, ATTITUDE, ACCEL, VELOCITY, M = 0, 3, 6, 9, 12
-# Physics: the six, trim [rad/s^2], gyro bias, accelerometer bias, rotor drag [1/s], damping [1/s], centre of gravity
-# [m], how late rotor speeds act [s] and their first-order lag [s].
-B, D, JX, JY, JZ, JR, TRIM, GYRO_BIAS, ACCEL_BIAS, DRAG, DAMP, CG, DELAY, LAG, N_PHYSICS = (
-    0, 1, 2, 3, 4, 5, 6, 9, 12, 15, 17, 20, 22, 23, 24,
+# Physics: the six, trim [rad/s^2], gyro bias, accelerometer bias, rotor drag [1/s], height above the centre of gravity
+# at which it acts [m], damping [1/s], centre of gravity [m], how late rotor speeds act and their first-order lag [s].
+B, D, JX, JY, JZ, JR, TRIM, GYRO_BIAS, ACCEL_BIAS, DRAG, TILTING, DAMP, CG, DELAY, LAG, N_PHYSICS = (
+    0, 1, 2, 3, 4, 5, 6, 9, 12, 15, 17, 19, 22, 24, 25, 26,
 )  # fmt: skip
 # Noise: white of every scalar measurement; standard deviations of f (horizontal, vertical), alpha (roll and pitch,
 # yaw), e (tilt, heading) and of logged rotor speeds [rad/s]; correlation times of f, f, alpha, alpha, e [s].
@@ -202,7 +202,7 @@ def moments(track: Track, delay: float, lag: float) -> FloatArray:
 @nb.njit(**_FAST)
 def _constants(p: FloatArray, track: Track) -> FloatArray:
     """Constants of Eqs. 2 and 3."""
-    c = np.empty(20)
+    c = np.empty(21)
     hover = math.sqrt(track.mass * GRAVITY / track.rotors / p[B])
     c[0], c[1], c[2], c[3] = p[B] / track.mass, p[B] / p[JX], p[B] / p[JY], p[D] / p[JZ]
     c[4], c[5] = p[JR] / p[JX], p[JR] / p[JY]
@@ -211,6 +211,7 @@ def _constants(p: FloatArray, track: Track) -> FloatArray:
     c[12], c[13] = p[DRAG] / (track.rotors * hover), p[DRAG + 1] / (track.rotors * hover)
     c[14], c[15], c[16] = p[DAMP], p[DAMP + 1], p[DAMP + 2]
     c[17], c[18] = p[CG], p[CG + 1]
+    c[19], c[20] = track.mass * p[TILTING] * c[12] / p[JY], track.mass * p[TILTING + 1] * c[13] / p[JX]
     return c
 
 
@@ -280,10 +281,14 @@ def _advance(c: FloatArray, row: FloatArray, h: float, keep: FloatArray, air: bo
     z2, o1 = 0.5 * (row[3] + row[MOMENTS + 3]), 0.5 * (row[4] + row[MOMENTS + 4])
     ds, dx, dy = row[0] - row[MOMENTS], row[1] - row[MOMENTS + 1], row[2] - row[MOMENTS + 2]
     dz, do = row[3] - row[MOMENTS + 3], row[4] - row[MOMENTS + 4]
-    # Mean over the step of a Gauss-Markov process without its noise.
+    # Mean over the step of a Gauss-Markov process without its noise; the moment of drag as at the step's begin.
     gx = 0.5 * (1.0 + keep[3]) * x[AL + 1]
     gy = 0.5 * (1.0 + keep[4]) * x[AL + 2]
     gz = 0.5 * (1.0 + keep[5]) * x[AL + 3]
+    if air:
+        s1 = 0.5 * (row[5] + row[MOMENTS + 5])
+        _, _, _, u, v, _ = _force(c, s2, s1, x[0], x[1], x[2], x[3], x[VE + 1], x[VE + 2], x[VE + 3])
+        gx, gy = gx - c[20] * s1 * v, gy + c[19] * s1 * u
     qw, qx, qy, qz, p, q, r = x[0], x[1], x[2], x[3], x[4], x[5], x[6]
     a1, b1, c1 = _turning(c, s2 + ds, x2 + dx, y2 + dy, z2 + dz, o1 + do, p, q, r)
     a1, b1, c1 = a1 + gx, b1 + gy, c1 + gz
@@ -305,7 +310,6 @@ def _advance(c: FloatArray, row: FloatArray, h: float, keep: FloatArray, air: bo
     k4 = _spin(w4, x4, y4, z4, p4, q4, r4)
     sixth = h / 6.0
     if air:
-        s1 = 0.5 * (row[5] + row[MOMENTS + 5])
         d1 = row[5] - row[MOMENTS + 5]
         fx = 0.5 * (1.0 + keep[0]) * x[FO + 1]
         fy = 0.5 * (1.0 + keep[1]) * x[FO + 2]
@@ -486,9 +490,15 @@ def _transition(c, row, h, keep, air, x, after, F, turn):  # type: ignore[no-unt
                 for m in range(3):
                     F[VE + i, TH + j] += h * R[3 * i + m] * B[m][j]
             F[VE + i, VE + i] += 1.0
-        for i in range(3):
-            for j in range(3):
+        # d (body velocity x, y) / d rotation vector and velocity, of which drag makes a moment.
+        along = ((0.0, -down, v), (down, 0.0, -u))
+        for j in range(3):
+            for i in range(3):
                 F[VE + i, OM + j] = 0.5 * h * F[VE + i, TH + j]
+            F[OM, TH + j] -= h * c[20] * s1 * along[1][j]
+            F[OM + 1, TH + j] += h * c[19] * s1 * along[0][j]
+            F[OM, VE + j] -= h * c[20] * s1 * R[3 * j + 1]
+            F[OM + 1, VE + j] += h * c[19] * s1 * R[3 * j]
     else:
         for i in range(3):
             F[VE + i, VE + i] = 1.0

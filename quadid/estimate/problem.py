@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
@@ -29,6 +29,7 @@ PLACES: dict[str, int] = {
     **{f"gyro_bias.{a}": k.GYRO_BIAS + i for i, a in enumerate(AXES)},
     **{f"accel_bias.{a}": k.ACCEL_BIAS + i for i, a in enumerate(AXES)},
     **{f"rotor_drag.k_{a}": k.DRAG + i for i, a in enumerate("xy")},
+    **{f"rotor_drag_moment.h_{a}": k.TILTING + i for i, a in enumerate("xy")},
     **{f"rate_damping.{a}": k.DAMP + i for i, a in enumerate(("l_p", "m_q", "n_r"))},
     **{f"cg_offset.{a}": k.CG + i for i, a in enumerate("xy")},
     "command_delay.delay": k.DELAY,
@@ -62,7 +63,7 @@ SHORTEST, LONGEST = 3.0, 0.1
 """Correlation times that can be identified: from so many samples to such a share of the flight."""
 WHITE = np.repeat([0.02, 0.003, 0.2, 0.05], 3)
 """First guess of the sensors' white noise."""
-STRETCH, SETTLED, NUDGE = 400, 30, 1e-3
+STRETCH, SETTLED, NUDGE = 200, 30, 1e-3
 """Rows that stand for a flight where only variances matter, those until they are stationary, and a small change."""
 PAST = 3
 """Samples from which rotor moments are foreseen."""
@@ -112,6 +113,14 @@ def floor_of(tracks: Sequence[Track]) -> FloatArray:
     columns = [0, 1, 2, 4, 5, 6, 7, 8, 9, 10, 11, 12]
     steps = [[quantum(t.y[t.seen[:, m // 3], column]) for t in tracks] for m, column in enumerate(columns)]
     return np.asarray(np.maximum(np.max(steps, axis=1), 1e-5))
+
+
+class Sensitivities(NamedTuple):
+    """Of one flight: entries, whitened innovations (n, M), their derivatives by the entries (entries, n, M)."""
+
+    entries: list[int]
+    plain: FloatArray
+    J: FloatArray
 
 
 @dataclass(frozen=True)
@@ -225,6 +234,7 @@ class Problem:
                 out[i] = self.layout.entry(name).typical
             elif place >= k.TRIM:
                 own = {"cg_offset": OFF_CENTRE * self.vehicle.arm}
+                own |= {effect: self.layout.entry(name).typical} if effect == "rotor_drag_moment" else {}
                 own |= {"trim_moment": float(self.control[place % 3])} if effect == "trim_moment" else {}
                 out[i] = (_SIZE | own)[effect]
         return out
@@ -501,22 +511,61 @@ class Problem:
 
         Sensitivities are differences of innovations over `nudge`, one for all parameters or one each, shape (P,).
         """
-        steps = np.diag(np.broadcast_to(nudge, len(z)))
         mean, sigma = self.prior
-        # Expected information of a Student-t density against that of a Gaussian as wide.
-        expected = np.repeat(np.sqrt((1.0 + self.tail) / (1.0 + 3.0 * self.tail)), 3)
         information, gradient = np.diag(1.0 / sigma**2) - self.taken[1], (z - mean) / sigma**2 - self.taken[0]
         for j, g in enumerate(gains):
-            mine = [i for i, (_, _, where) in enumerate(self.entries) if where in (-1, j)]
-            plain, *moved = self._several(j, [z, *(z + steps[i] for i in mine)], psi, g)
-            J = np.array([(w - plain) / steps[i, i] for w, i in zip(moved, mine, strict=True)])
+            mine, plain, J = self.sensitivities(j, z, psi, g, nudge)
             gradient[mine] += J.reshape(len(mine), -1) @ plain.ravel()
-            J *= expected
+            J *= self.expected
             information[np.ix_(mine, mine)] += J.reshape(len(mine), -1) @ J.reshape(len(mine), -1).T
         # What noise of rotor speeds explains is no information, but there is never less than the prior's.
         own, turned = np.linalg.eigh(sigma[:, None] * information * sigma - np.eye(len(z)))
         turned = turned / sigma[:, None]
         return np.diag(1.0 / sigma**2) + (turned * np.maximum(own, 0.0)) @ turned.T, gradient
+
+    @property
+    def expected(self) -> FloatArray:
+        """Roots of the expected information of a Student-t density against that of a Gaussian as wide, shape (M,)."""
+        return np.repeat(np.sqrt((1.0 + self.tail) / (1.0 + 3.0 * self.tail)), 3)
+
+    def sensitivities(
+        self, j: int, z: FloatArray, psi: FloatArray, g: Gains, nudge: float | FloatArray = 1e-5,
+        only: Collection[int] | None = None,
+    ) -> Sensitivities:  # fmt: skip
+        """Whitened innovations of flight j and their derivatives, by `only` these of its entries; default all."""
+        steps = np.diag(np.broadcast_to(nudge, len(z)))
+        mine = [i for i, (_, _, where) in enumerate(self.entries) if where in (-1, j) and (only is None or i in only)]
+        plain, *moved = self._several(j, [z, *(z + steps[i] for i in mine)], psi, g)
+        return Sensitivities(
+            mine, plain, np.array([(w - plain) / steps[i, i] for w, i in zip(moved, mine, strict=True)])
+        )
+
+    def corner(
+        self, z: FloatArray, psi: FloatArray, gains: Sequence[Gains], gradient: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Least and most step of the scaled parameters, shape (P,) each: bounds, and none beyond a corner.
+
+        Rotor speeds that are held and measurements at the same times give a likelihood with a corner where nothing is
+        late: it may rise to either side.
+
+        Args:
+            z: scaled parameters.
+            psi: noise numbers.
+            gains: of a pass there.
+            gradient: towards larger parameters, see `normal_equations`.
+        """
+        least, most = self.limits[0] - z, self.limits[1] - z
+        for i, (_, place, _) in enumerate(self.entries):
+            if place == k.DELAY and z[i] == 0.0:
+                before = 0.0
+                for j, g in enumerate(gains):
+                    plain, early = self._several(j, [z, z - 1e-5 * (np.arange(len(z)) == i)], psi, g)
+                    before += float(np.sum((plain - early) / 1e-5 * plain))
+                most[i] = most[i] if gradient[i] < min(-before, 0.0) else 0.0
+                least[i] = least[i] if before > max(-gradient[i], 0.0) else 0.0
+            elif place == k.DELAY:
+                least[i], most[i] = (-z[i], most[i]) if z[i] > 0.0 else (least[i], -z[i])
+        return least, most
 
     def _several(self, j: int, points: Sequence[FloatArray], psi: FloatArray, g: Gains) -> list[FloatArray]:
         return _each(lambda i: self._whitened(j, points[i], psi, g), len(points))

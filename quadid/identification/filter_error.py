@@ -1,51 +1,96 @@
-"""The fit beside random forces and moments, for vehicles that something turns which their model lacks.
+"""The fit by innovations: the likelihood of a Kalman filter with random forces and moments, and how far it holds.
 
-Where turbulence, the wake of rotors or a missing cause rules the motion, simulated runs take what the controller does
+Where turbulence, the wake of rotors or a missing cause moves the vehicle, simulated runs take what the controller does
 against it for inertia (an error of closed loop: U. Forssell and L. Ljung, Automatica 35 (1999) 1215).  Innovations of a
-Kalman filter with random forces do not.  What acts on every vehicle beside the six is fitted along, so that intervals
-hold it: what makes rotors or gyro late passes for inertia, drag and damping for drag torque.
+Kalman filter with random forces do not, and where nothing random acts they hold all that a whole flight shows.  What
+acts on every vehicle beside the six is fitted along: what makes rotors or gyro late passes for inertia, drag and
+damping for drag torque.
+
+Random forces hold what comes and goes.  What a missing cause makes in step with the rotors or the motion they do not:
+parts of the flight, and models with each cause of the catalogue added, estimate the same parameters, and intervals are
+as wide as their differences.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from quadid.chi_square import exceeded
 from quadid.data.window import Window
-from quadid.estimate.fit import estimate
-from quadid.estimate.problem import LATE, Problem
+from quadid.effects import EFFECTS
+from quadid.estimate import kalman as k
+from quadid.estimate.fit import NEAR_SECONDS, Estimate, estimate, newton_step
+from quadid.estimate.problem import LATE, Problem, Sensitivities
 from quadid.estimate.track import from_window
 from quadid.identification.gauss_newton import Polished
 from quadid.identification.noise import LEAST_WHITE, RATES, likeliest
 from quadid.identification.problem import Free, Shooting
+from quadid.identification.reliability import (
+    BLOCKS,
+    CHANCE,
+    NEAR_BEST,
+    SHARE,
+    WIDE,
+    Reliability,
+    coarse,
+    random_effects,
+)
 from quadid.identification.uncertainty import SPREAD_LIMIT, Uncertainty
 from quadid.model.layout import Layout
 from quadid.parameters import NOMINAL_NAMES
-from quadid.types import FloatArray
+from quadid.types import FloatArray, IndexArray
 from quadid.vehicle import Vehicle
 
 WHITE_SHARE = 0.5
 """Random moments rule where less than this share of what short segments leave of roll or pitch rate is white noise."""
 ALONG = (
-    "rotor_drag.k_x", "rotor_drag.k_y", "rate_damping.l_p", "rate_damping.m_q", "rate_damping.n_r", "cg_offset.x",
-    "cg_offset.y", *LATE,
+    "rotor_drag.k_x", "rotor_drag.k_y", "rotor_drag_moment.h_x", "rotor_drag_moment.h_y", "rate_damping.l_p",
+    "rate_damping.m_q", "rate_damping.n_r", "cg_offset.x", "cg_offset.y",
 )  # fmt: skip
-"""Fitted along, unless the model has numbers of that effect."""
+"""Fitted along, with what is late, unless the model has numbers of that effect."""
 MOST_SECONDS = 600.0
 """Of longer flights the liveliest so many seconds are fitted: then a minute's interval is a third."""
+MET = 3.0
+"""Standard deviations of a cause's number that are met: beyond, something else passes for it."""
+SELDOM = 1e-4
+"""Probability with which a cause that is not there takes away so much."""
+LARGE = 0.5
+"""Random moments in units of their prior, a tenth of the control moment, from which people are told of them."""
+LOST = 3.0
+"""The same of the vertical force, a twentieth of the weight, beyond which no number is to be used."""
 
 
-class Filtered(NamedTuple):
-    """Full parameter vector, nothing of what was fitted along in it, and covariance of what is free.
+@dataclass(frozen=True)
+class Filtered:
+    """Parameters by the likelihood of innovations.
 
-    `late`: parameters that are otherwise where nothing is late.
+    Attributes:
+        theta: full vector, nothing of what was fitted along in it.
+        uncertainty: covariance of what is free.
+        prompt: step of what is free to where nothing is late, scaled parameters, shape (P,).
+        trust: what other estimates differ by.
+        moved, turned: random moments act about roll or pitch; about yaw.
     """
 
     theta: FloatArray
     uncertainty: Uncertainty
-    late: tuple[str, ...]
+    prompt: FloatArray
+    trust: Reliability
+    moved: bool
+    turned: bool
+
+    def held(self, uncertainty: Uncertainty) -> Uncertainty:
+        """An uncertainty of these parameters with what other estimates differ by."""
+        return self.trust.widened(uncertainty.differing([self.prompt]))
+
+    def doubts(self, free: Free, uncertainty: Uncertainty) -> tuple[str, ...]:
+        """Sentences on parameters whose estimates differ too much."""
+        late = [n for n, step in zip(free.names, self.prompt, strict=True) if abs(step) > SPREAD_LIMIT]
+        otherwise = f"{', '.join(late)}: more than {SPREAD_LIMIT:.0%} different where nothing is late"
+        return (*((otherwise,) if late else ()), *self.trust.reasons(free, uncertainty))
 
 
 def has_unmodelled_moments(short: Shooting, plain: Polished) -> bool:
@@ -76,35 +121,167 @@ def filtered(windows: Sequence[Window], vehicle: Vehicle, theta: FloatArray, fre
     Returns:
         None where the filter has no finite answer.
     """
-    layout = Layout(vehicle)
-    known = {e.name.split(".")[0] for e in layout.entries.values() if theta[e.index] != e.neutral}
-    along = [n for n in ALONG if n.split(".")[0] not in known and n not in free.names]
-    nominal = [n for n in free.names if n in NOMINAL_NAMES]
-    beside = [n for n in free.names if n not in NOMINAL_NAMES]
-    tracks = [from_window(w, vehicle, air=True) for w in windows]
-    problem = Problem.of(tracks, vehicle, (*beside, *along), windows, theta, nominal).liveliest(MOST_SECONDS)
     try:
-        found = estimate(problem, problem.at(theta))
+        with np.errstate(over="ignore", invalid="ignore"):
+            return _filtered(windows, vehicle, theta, free)
     except np.linalg.LinAlgError:  # the filter ran away
         return None
-    names = [name for name, *_ in problem.entries]
-    places = [names.index(n) for n in free.names]
-    values = np.array([found.value(n, 0)[0] for n in free.names])
-    if not (np.isfinite(found.objective) and np.isfinite(values).all() and np.isfinite(found.covariance).all()):
+
+
+def _filtered(windows: Sequence[Window], vehicle: Vehicle, theta: FloatArray, free: Free) -> Filtered | None:
+    # 1. The estimate, with what acts on every vehicle fitted along.
+    layout = Layout(vehicle)
+    known = {e.name.split(".")[0] for e in layout.entries.values() if theta[e.index] != e.neutral}
+    stated = known | {n.split(".")[0] for n in free.names}
+    # A delay and a lag pass for one another: what the model says of one is all that is late.
+    late = () if any(n.split(".")[0] in stated for n in LATE) else LATE
+    along = [n for n in (*ALONG, *late) if n.split(".")[0] not in stated]
+    nominal = [n for n in free.names if n in NOMINAL_NAMES]
+    beside = [*(n for n in free.names if n not in NOMINAL_NAMES), *along]
+
+    def problem_of(windows: Sequence[Window], names: Sequence[str] = ()) -> Problem:
+        tracks = [from_window(w, vehicle, air=True) for w in windows]
+        return Problem.of(tracks, vehicle, (*beside, *names), windows, theta, nominal).liveliest(MOST_SECONDS)
+
+    whole = problem_of(windows)
+    found = estimate(whole, whole.at(theta))
+    if not (np.isfinite(found.objective) and np.isfinite(found.z).all() and np.isfinite(found.covariance).all()):
         return None
-    out = theta.copy()
-    out[free.index] = values
-    # Both scale the six by logarithms, but effects by sizes of their own.
+    problem, names = found.problem, [name for name, *_ in whole.entries]
+    out, places = theta.copy(), np.array([names.index(n) for n in free.names])
+    out[free.index] = [found.value(n, 0)[0] for n in free.names]
+    # 2. Its covariance: both scale the six by logarithms, but effects by sizes of their own.
     unit = np.where(free.is_log, 1.0, problem.size[places] / free.scale)
     covariance = found.covariance[np.ix_(places, places)] * np.outer(unit, unit)
     own = Uncertainty(covariance, np.ones(len(unit)), unit * problem.prior[1][places])
-    # What is late may be the rotors or a filter of the gyro, of which a J each follows: where nothing is late, a third.
-    late = [names.index(n) for n in along if n in LATE]
+    # 3. What is late may be the rotors or a filter of the gyro, of which a J each follows: where nothing is, a third.
+    where = np.array([names.index(n) for n in late], dtype=np.intp)
     prompt = np.zeros(len(places))
     if late:
-        prompt = -unit * (
-            found.covariance[np.ix_(places, late)]
-            @ np.linalg.solve(found.covariance[np.ix_(late, late)], found.z[late])
-        )
-    moved = tuple(n for n, step in zip(free.names, prompt, strict=True) if abs(step) > SPREAD_LIMIT)
-    return Filtered(out, own.differing([prompt]), moved)
+        pull = np.linalg.solve(found.covariance[np.ix_(where, where)], found.z[where])
+        prompt = -unit * (found.covariance[np.ix_(places, where)] @ pull)
+    # 4. Parts of the flights, every second row, and models with one cause more.
+    more = [n for n in _catalogue(layout, windows) if n not in whole.names and n.split(".")[0] not in known]
+    wide, half = problem_of(windows, more), problem_of([coarse(w) for w in windows])
+    trust = _compared(found, wide, half, places, unit)
+    share = found.psi[k.SIGMA : k.TIME] / problem.noise_scale
+    return Filtered(out, own, prompt, trust, bool(share[2] > LARGE), bool(share[3] > LARGE))
+
+
+def _catalogue(layout: Layout, windows: Sequence[Window]) -> list[str]:
+    """Entries of every cause that these data may hold; each rotor's loss is one."""
+    measured = {name for name in ("velocity", "position") if all(getattr(w, name) is not None for w in windows)}
+    # Without an attitude the scale of the gyro and an inertia are one number; a delay is a lag's twin.
+    twins = {"command_delay", "weak_rotor"} | ({"gyro_scale"} if any(w.attitude is None for w in windows) else set())
+    effects = [e for e in EFFECTS.values() if measured.issuperset(e.needs) and not e.timed and e.name not in twins]
+    losses = [name for name in layout.entries if name.startswith("weak_rotor.loss_")]
+    return [*(name for e in effects for name in e.entries), *losses]
+
+
+def _compared(found: Estimate, wide: Problem, half: Problem, places: IndexArray, unit: FloatArray) -> Reliability:
+    """Compares the estimate with those from parts of the flights, and from models with one cause more.
+
+    Args:
+        found: the estimate.
+        wide: the same flights with the whole catalogue free.
+        half: every second row of them.
+        places: of the parameters that are compared, shape (P,).
+        unit: their scale over that of the estimate, shape (P,).
+    """
+    problem, psi = found.problem, found.psi
+    wide, half = (
+        replace(other, base=problem.base, control=problem.control, tail=problem.tail) for other in (wide, half)
+    )
+    # 1. Parts of the flights: the step of each block of time from the optimum of all, and its variance.
+    whole = _sensitivities(problem, found.z, psi)
+    grams, slopes = _blocks(problem, whole)
+    inverses = np.linalg.inv(grams + np.diag(1.0 / (BLOCKS * problem.prior[1] ** 2)))
+    steps = -np.einsum("bij,bj->bi", inverses, slopes - slopes.mean(axis=0))[:, places] * unit
+    _, between = random_effects(steps, np.diagonal(inverses, axis1=1, axis2=2)[:, places] * unit**2)
+    # 2. Every second row: what inputs do within a row is a third of the step to rows twice as long.
+    lost = bool(found.psi[k.SIGMA + 1] > LOST * problem.noise_scale[1])
+    try:
+        rows = _on_coarse_grid(found, half)[places] * unit
+    except np.linalg.LinAlgError:  # it runs away there
+        rows, lost = np.zeros(len(places)), True
+    # 3. The whole catalogue, linearised at the estimate on the liveliest minute.
+    part, wide = problem.liveliest(NEAR_SECONDS), wide.liveliest(NEAR_SECONDS)
+    index = {(name, flight): i for i, (name, _, flight) in enumerate(wide.entries)}
+    own = [index[name, flight] for name, _, flight in problem.entries]
+    z, nudge = np.zeros(len(index)), np.full(len(index), 1e-5)
+    z[own] = found.z
+    causes: dict[str, list[int]] = {}
+    for (name, _), i in index.items():
+        effect = EFFECTS.get(name.split(".")[0])
+        if i not in own and effect is not None:
+            causes.setdefault(name if effect.name == "weak_rotor" else effect.name, []).append(i)
+            if effect.start and effect.name != "weak_rotor":  # what has no slope at nothing has one to where it starts
+                nudge[i] = effect.start[effect.entries.index(name)] / wide.size[i]
+    added = [i for entries in causes.values() for i in entries]
+    near = whole if part is problem else _sensitivities(part, found.z, psi)
+    mean, sigma = wide.prior
+    if problem.vehicle.mass_sigma > 0.0 or problem.vehicle.arm_sigma > 0.0:
+        # Sharp priors pull against a wrong mass or arm, which is no cause: see `with_scale_uncertainty`.
+        sigma = np.maximum(sigma, WIDE)
+    information, gradient = np.diag(1.0 / sigma**2), (z - mean) / sigma**2
+    for j, (mine, g) in enumerate(zip(near, wide.passes(z, psi)[1], strict=True)):
+        more = wide.sensitivities(j, z, psi, g, nudge, added)
+        entries = [*(own[i] for i in mine.entries), *more.entries]
+        J = np.concatenate([mine.J, more.J])
+        gradient[entries] += J.reshape(len(J), -1) @ mine.plain.ravel()
+        J = (J * problem.expected).reshape(len(J), -1)
+        information[np.ix_(entries, entries)] += J @ J.T
+    # What runs away if it is in the model is no cause.
+    finite = np.isfinite(np.diag(information)) & np.isfinite(gradient)
+    least, most = wide.limits - z
+    least[added], most[added] = np.maximum(least[added], -MET), np.minimum(most[added], MET)
+
+    def best(free: list[int]) -> tuple[FloatArray, float]:
+        """Step within bounds with these entries free, and how much of the objective it takes away."""
+        at = np.ix_(free, free)
+        step = newton_step(information[at], gradient[free], 0.0, least[free], most[free])
+        return step[: len(own)][places] * unit, -float(2.0 * gradient[free] @ step + step @ information[at] @ step)
+
+    # 4. Causes that take away much, beside the one that takes away most, and how far each would move the parameters.
+    start, least_gain = best(own)
+    promises = [(name, *best([*own, *entries])) for name, entries in causes.items() if finite[entries].all()]
+    most_gain = max((gain - least_gain for *_, gain in promises), default=0.0)
+    asked = [
+        (f"when {name} is in the model", step - start)
+        for name, step, gain in promises
+        if gain - least_gain > max(exceeded(SELDOM, len(causes[name])), NEAR_BEST * most_gain)
+    ]
+    asked.append(("when the flight is fitted on a finer grid", rows))
+    moved = np.array([step for _, step in asked])
+    farthest = np.max(np.abs(moved), axis=0)
+    by = np.hypot(between, farthest)
+    return Reliability(np.maximum(between, farthest), by, moved, tuple(name for name, _ in asked), False, lost)
+
+
+def _on_coarse_grid(found: Estimate, half: Problem) -> FloatArray:
+    """What rows may be off by, by the step of the parameters on every second row; none where chance explains it."""
+    z, psi = found.z, found.psi
+    information, gradient = half.normal_equations(z, psi, half.passes(z, psi)[1])
+    step = -np.linalg.solve(information, gradient)
+    chance = exceeded(CHANCE, 1) * (np.diag(np.linalg.inv(information)) + np.diag(found.covariance))
+    return np.where(step**2 > chance, SHARE * step, 0.0)
+
+
+def _sensitivities(problem: Problem, z: FloatArray, psi: FloatArray) -> list[Sensitivities]:
+    return [problem.sensitivities(j, z, psi, g) for j, g in enumerate(problem.passes(z, psi)[1])]
+
+
+def _blocks(problem: Problem, found: Sequence[Sensitivities]) -> tuple[FloatArray, FloatArray]:
+    """Information (BLOCKS, P, P) and slope (BLOCKS, P) of half the objective, without the prior, by blocks of time."""
+    count = len(problem.entries)
+    grams, slopes = np.zeros((BLOCKS, count, count)), np.zeros((BLOCKS, count))
+    rows, begin = sum(len(track.t) for track in problem.tracks), 0
+    for mine, plain, J in found:
+        block = (begin + np.arange(len(plain))) * BLOCKS // rows
+        begin += len(plain)
+        for b in np.unique(block):
+            part = J[:, block == b].reshape(len(mine), -1)
+            slopes[b, mine] += part @ plain[block == b].ravel()
+            part = (J[:, block == b] * problem.expected).reshape(len(mine), -1)
+            grams[b][np.ix_(mine, mine)] += part @ part.T
+    return grams, slopes

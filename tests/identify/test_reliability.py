@@ -27,7 +27,7 @@ def test_a_right_model_keeps_its_statuses_and_nearly_its_intervals() -> None:
         assert {p.status for p in found.parameters} == {Status.IDENTIFIED}
         assert found.uncertainty.grown is not None
         grown.append(found.uncertainty.grown)
-    assert np.median(grown) == 1.0
+    assert np.median(grown) < 1.001
     assert np.mean(grown) < 1.2
 
 
@@ -49,10 +49,10 @@ def test_what_is_called_identified_holds_the_truth_although_the_model_lacks_an_e
     assert np.max(found.uncertainty.grown) > 2.0 or len(named) < len(NOMINAL_NAMES)
 
 
-def test_a_model_that_misses_slow_moments_does_not_call_its_inertias_identified() -> None:
+def test_slow_moments_of_an_offset_do_not_pass_for_inertia() -> None:
     found, truth = fitted(23, {"cg_offset": {"x": 0.01, "y": -0.01}})
     for name in ("J_xx", "J_yy"):
         p = found.parameters[name]
-        inside = p.ci95[0] <= truth[name] <= p.ci95[1]
-        assert inside or p.status is not Status.IDENTIFIED
-    assert any("random forces" in w for w in found.warnings)
+        assert p.status is Status.IDENTIFIED
+        assert p.ci95[0] <= truth[name] <= p.ci95[1]
+        assert p.sigma < 0.002 * p.value
