@@ -345,8 +345,9 @@ _CLEAR = 0.5
 """R^2 above which a relation between two channels is believed."""
 _MOTION = 0.03
 """Rotation rate [rad/s] an axis must have, as standard deviation, to be checked."""
-_STEP = 0.1
-"""Attitudes are compared over steps of at least this [s]: noise and repeated readings matter little then."""
+_STEP, _FEWEST_STEPS, _MOST_ROWS = 0.1, 20, 100
+"""Attitudes are compared over steps of at least this [s], of which there must be so many: noise and repeated readings
+matter little then.  Steps of more rows are in another unit of time: no attitude comes at more than 1 kHz."""
 _UNIT = 1.5
 """Two channels of one motion whose sizes are farther apart are of no use together."""
 _JUMP = 8.0
@@ -776,10 +777,12 @@ def _moving_rates(gyro: Channel, t: FloatArray, q: FloatArray) -> tuple[FloatArr
     White attitude noise adds a variance that falls with the square of the step and motion one that does not, so two
     steps separate them: motion = (4 var(2 step) - var(step)) / 3.
     """
-    stride = max(1, round(min(_STEP, float(np.ptp(t)) / 60.0) / sample_period(t)))
+    stride = max(1, round(_STEP / sample_period(t)))
+    if stride > _MOST_ROWS:  # times in minutes or hours
+        stride = len(t) // (3 * _FEWEST_STEPS) + 1
     measured, derived = _without_jumps(*_rates(gyro, t[::stride], q[::stride]))
     longer = _without_jumps(*_rates(gyro, t[:: 2 * stride], q[:: 2 * stride]))[1]
-    if len(longer) < 20:
+    if len(longer) < _FEWEST_STEPS:
         return longer[:0], longer[:0]
     total = np.var(derived, axis=0)
     motion = np.maximum((4.0 * np.var(longer, axis=0) - total) / 3.0, 0.0)

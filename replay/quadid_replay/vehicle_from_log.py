@@ -134,12 +134,13 @@ def _possible_thrust(frame: Frame) -> tuple[float, float]:
 
 def _bounded(b: float, low: float, high: float) -> str:
     bounds = f"[{0.995 * low:.3g}, {1.005 * high:.3g}]"
-    return f"  b: {{initial: {min(max(b, low), high):.3g}, bounds: {bounds}}}    # of propellers that fit this frame"
+    return f"  b: {{initial: {b:.3g}, bounds: {bounds}}}    # of propellers that fit this frame"
 
 
 def _guesses(frame: Frame, mass: float, b: float, possible: tuple[float, float] | None) -> list[str]:
     arm = float(np.mean([np.hypot(r.x, r.y) for r in frame.rotors]))
     inertia, blade = 0.25 * mass * arm**2, _BLADE * arm
+    b = b if possible is None else min(max(b, possible[0]), possible[1])
     return [
         "parameters:             # first guesses: docs/new-vehicle.md",
         f"  b: {b:.3g}" if possible is None else _bounded(b, *possible),

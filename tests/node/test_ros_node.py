@@ -72,7 +72,7 @@ def test_a_late_subscriber_gets_the_latched_set_and_the_replay_gives_the_same_bi
     with Process(
         str(Path(sys.executable).with_name("quadid")), "replay", str(recorded), "--vehicle", "pelican", *options
     ) as again:
-        assert again.child.wait(120) == 0, again.text
+        assert again.child.wait(600) == 0, again.text
     replayed = json.loads(out.read_text())["candidates"]
     live = [(list(c.values), c.log_hash) for c in candidates]
     assert len(live) > 5
