@@ -1,4 +1,4 @@
-"""Fleet: the logs of a folder identified in parallel on Dask, results on disk, and what they tell together."""
+"""Fleet: the logs of a folder identified in parallel on Dask, results on disk, and their summary."""
 
 from __future__ import annotations
 
@@ -365,7 +365,7 @@ def _copies(jobs: Sequence[Job]) -> dict[str, str]:
             with open(job.path, "rb") as file:
                 digest = hashlib.file_digest(file, "sha256").digest()
         except OSError:
-            continue  # its row says why it cannot be read
+            continue  # its row has the reason
         if first.setdefault(digest, job.name) != job.name:
             out[job.name] = first[digest]
     return dict(sorted(out.items()))
@@ -389,7 +389,7 @@ def _is_log(path: Path) -> bool:
         with path.open("rb") as file:
             recognise(file.read(HEAD_BYTES), path.name)
     except OSError:
-        return True  # its row says why it cannot be read
+        return True  # its row has the reason
     except LogError:
         return path.suffix.lower() == ".csv"
     return True

@@ -34,7 +34,7 @@ class Job:
         path: absolute, with a span if wanted; every worker must see it there.
         name: relative to the folder of the fleet.
         unit: which vehicle of the fleet it belongs to.
-        size, modified: of the file [bytes], [ns]; with `key` they tell whether a stored result is still good.
+        size, modified: of the file [bytes], [ns]; with `key` they decide whether a stored result is still good.
         key: hash of everything else that decides the result.
         rate: of the grid [Hz]; seed: of the search; diagnose: name what the simulation gets wrong too.
     """
@@ -133,7 +133,7 @@ def _identified(job: Job, log: Log) -> Row:
 
 
 def _when(recording: Recording) -> Row:
-    """Date of the flight, where the log's clock knows dates."""
+    """Date of the flight, where the log has one."""
     first, _ = recording.span
     return {"started": first, "dated_by": "log"} if first > EARLIEST else {}
 

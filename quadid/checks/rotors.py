@@ -962,11 +962,11 @@ def _judge_scale(vehicle: Vehicle, scale: float, hover: float, numbers: dict[str
     thrust, inertias = _known_thrust(vehicle), [_known(vehicle, n) for n in ("J_xx", "J_yy")]
     turned = f"rotor positions agree with the motion within {abs(math.degrees(numbers['turned_rad'])):.0f} deg"
     if thrust is None or not all(inertias):
-        (least, most), told = INERTIA_SHARE, vehicle.command
+        (least, most), command = INERTIA_SHARE, vehicle.command
         size = float(np.mean(vehicle.initial[2:4])) * hover / max(scale, 1e-300) / (vehicle.mass * vehicle.arm**2)
         # A lag of motors, and noise of the torque, make it too large.
-        large = told.sampling == "instant" and size * numbers["explained"] > most
-        if told.kind == "rotor_speed" and (large or 0.0 < size < least):
+        large = command.sampling == "instant" and size * numbers["explained"] > most
+        if command.kind == "rotor_speed" and (large or 0.0 < size < least):
             return Check(
                 "geometry", CheckResult.WARNING,
                 f"weight, arm and motion make the inertia about x and y {size:.2g} times mass times arm squared, which "

@@ -228,15 +228,12 @@ class Problem:
     def size(self) -> FloatArray:
         """Unit of every scaled parameter and standard deviation of its prior; the six are logarithms, of unit 1."""
         out = np.ones(len(self.entries))
+        own = _SIZE | {"cg_offset": OFF_CENTRE * self.vehicle.arm}
+        own |= {f"trim_moment.{a}": float(size) for a, size in zip(AXES, self.control, strict=True)}
         for i, (name, place, _) in enumerate(self.entries):
-            effect = name.split(".")[0]
-            if place >= k.N_PHYSICS:
-                out[i] = self.layout.entry(name).typical
-            elif place >= k.TRIM:
-                own = {"cg_offset": OFF_CENTRE * self.vehicle.arm}
-                own |= {effect: self.layout.entry(name).typical} if effect == "rotor_drag_moment" else {}
-                own |= {"trim_moment": float(self.control[place % 3])} if effect == "trim_moment" else {}
-                out[i] = (_SIZE | own)[effect]
+            if place >= k.TRIM:
+                size = own.get(name, own.get(name.split(".")[0])) if place < k.N_PHYSICS else None
+                out[i] = self.layout.entry(name).typical if size is None else size
         return out
 
     @cached_property

@@ -36,6 +36,7 @@ from quadid.identification.reliability import (
     WIDE,
     Reliability,
     coarse,
+    promised,
     random_effects,
 )
 from quadid.identification.uncertainty import SPREAD_LIMIT, Uncertainty
@@ -58,7 +59,7 @@ MET = 3.0
 SELDOM = 1e-4
 """Probability with which a cause that is not there takes away so much."""
 LARGE = 0.5
-"""Random moments in units of their prior, a tenth of the control moment, from which people are told of them."""
+"""Random moments in units of their prior, a tenth of the control moment, from which they are reported."""
 LOST = 3.0
 """The same of the vertical force, a twentieth of the weight, beyond which no number is to be used."""
 
@@ -72,15 +73,15 @@ class Filtered:
         uncertainty: covariance of what is free.
         prompt: step of what is free to where nothing is late, scaled parameters, shape (P,).
         trust: what other estimates differ by.
-        moved, turned: random moments act about roll or pitch; about yaw.
+        tilting, turning: random moments act about roll or pitch; about yaw.
     """
 
     theta: FloatArray
     uncertainty: Uncertainty
     prompt: FloatArray
     trust: Reliability
-    moved: bool
-    turned: bool
+    tilting: bool
+    turning: bool
 
     def held(self, uncertainty: Uncertainty) -> Uncertainty:
         """An uncertainty of these parameters with what other estimates differ by."""
@@ -133,7 +134,7 @@ def _filtered(windows: Sequence[Window], vehicle: Vehicle, theta: FloatArray, fr
     layout = Layout(vehicle)
     known = {e.name.split(".")[0] for e in layout.entries.values() if theta[e.index] != e.neutral}
     stated = known | {n.split(".")[0] for n in free.names}
-    # A delay and a lag pass for one another: what the model says of one is all that is late.
+    # A delay and a lag pass for one another: where the model has one, nothing else is late.
     late = () if any(n.split(".")[0] in stated for n in LATE) else LATE
     along = [n for n in (*ALONG, *late) if n.split(".")[0] not in stated]
     nominal = [n for n in free.names if n in NOMINAL_NAMES]
@@ -188,28 +189,48 @@ def _compared(found: Estimate, wide: Problem, half: Problem, places: IndexArray,
         places: of the parameters that are compared, shape (P,).
         unit: their scale over that of the estimate, shape (P,).
     """
-    problem, psi = found.problem, found.psi
+    problem = found.problem
     wide, half = (
         replace(other, base=problem.base, control=problem.control, tail=problem.tail) for other in (wide, half)
     )
     # 1. Parts of the flights: the step of each block of time from the optimum of all, and its variance.
-    whole = _sensitivities(problem, found.z, psi)
+    whole = _sensitivities(problem, found)
     grams, slopes = _blocks(problem, whole)
     inverses = np.linalg.inv(grams + np.diag(1.0 / (BLOCKS * problem.prior[1] ** 2)))
     steps = -np.einsum("bij,bj->bi", inverses, slopes - slopes.mean(axis=0))[:, places] * unit
     _, between = random_effects(steps, np.diagonal(inverses, axis1=1, axis2=2)[:, places] * unit**2)
-    # 2. Every second row: what inputs do within a row is a third of the step to rows twice as long.
+    # 2. The whole catalogue, linearised at the estimate on the liveliest minute.
+    part = problem.liveliest(NEAR_SECONDS)
+    near = whole if part is problem else _sensitivities(part, found)
+    others = [
+        (f"when {name} is in the model", step[places] * unit)
+        for name, step in _with_causes(found, near, wide.liveliest(NEAR_SECONDS))
+    ]
+    # 3. Every second row: what inputs do within a row is a third of the step to rows twice as long.
     lost = bool(found.psi[k.SIGMA + 1] > LOST * problem.noise_scale[1])
     try:
-        rows = _on_coarse_grid(found, half)[places] * unit
+        others.append(("when the flight is fitted on a finer grid", _on_coarse_grid(found, half)[places] * unit))
     except np.linalg.LinAlgError:  # it runs away there
-        rows, lost = np.zeros(len(places)), True
-    # 3. The whole catalogue, linearised at the estimate on the liveliest minute.
-    part, wide = problem.liveliest(NEAR_SECONDS), wide.liveliest(NEAR_SECONDS)
+        lost = True
+    moved = np.array([step for _, step in others]).reshape(-1, len(unit))
+    farthest = np.max(np.abs(moved), axis=0, initial=0.0)
+    by = np.hypot(between, farthest)
+    return Reliability(np.maximum(between, farthest), by, moved, tuple(name for name, _ in others), False, lost)
+
+
+def _with_causes(found: Estimate, near: Sequence[Sensitivities], wide: Problem) -> list[tuple[str, FloatArray]]:
+    """Causes that take much off the likelihood, beside the one that takes off most, and the step of all parameters.
+
+    Args:
+        found: the estimate.
+        near: sensitivities by its own parameters.
+        wide: the same rows with the whole catalogue free.
+    """
     index = {(name, flight): i for i, (name, _, flight) in enumerate(wide.entries)}
-    own = [index[name, flight] for name, _, flight in problem.entries]
+    own = [index[name, flight] for name, _, flight in found.problem.entries]
     z, nudge = np.zeros(len(index)), np.full(len(index), 1e-5)
     z[own] = found.z
+    # Entries of a cause are freed together; rotors are causes by themselves.
     causes: dict[str, list[int]] = {}
     for (name, _), i in index.items():
         effect = EFFECTS.get(name.split(".")[0])
@@ -218,21 +239,18 @@ def _compared(found: Estimate, wide: Problem, half: Problem, places: IndexArray,
             if effect.start and effect.name != "weak_rotor":  # what has no slope at nothing has one to where it starts
                 nudge[i] = effect.start[effect.entries.index(name)] / wide.size[i]
     added = [i for entries in causes.values() for i in entries]
-    near = whole if part is problem else _sensitivities(part, found.z, psi)
     mean, sigma = wide.prior
-    if problem.vehicle.mass_sigma > 0.0 or problem.vehicle.arm_sigma > 0.0:
+    if wide.vehicle.mass_sigma > 0.0 or wide.vehicle.arm_sigma > 0.0:
         # Sharp priors pull against a wrong mass or arm, which is no cause: see `with_scale_uncertainty`.
         sigma = np.maximum(sigma, WIDE)
     information, gradient = np.diag(1.0 / sigma**2), (z - mean) / sigma**2
-    for j, (mine, g) in enumerate(zip(near, wide.passes(z, psi)[1], strict=True)):
-        more = wide.sensitivities(j, z, psi, g, nudge, added)
+    for j, (mine, g) in enumerate(zip(near, wide.passes(z, found.psi)[1], strict=True)):
+        more = wide.sensitivities(j, z, found.psi, g, nudge, added)
         entries = [*(own[i] for i in mine.entries), *more.entries]
         J = np.concatenate([mine.J, more.J])
         gradient[entries] += J.reshape(len(J), -1) @ mine.plain.ravel()
-        J = (J * problem.expected).reshape(len(J), -1)
+        J = (J * wide.expected).reshape(len(J), -1)
         information[np.ix_(entries, entries)] += J @ J.T
-    # What runs away if it is in the model is no cause.
-    finite = np.isfinite(np.diag(information)) & np.isfinite(gradient)
     least, most = wide.limits - z
     least[added], most[added] = np.maximum(least[added], -MET), np.minimum(most[added], MET)
 
@@ -240,26 +258,17 @@ def _compared(found: Estimate, wide: Problem, half: Problem, places: IndexArray,
         """Step within bounds with these entries free, and how much of the objective it takes away."""
         at = np.ix_(free, free)
         step = newton_step(information[at], gradient[free], 0.0, least[free], most[free])
-        return step[: len(own)][places] * unit, -float(2.0 * gradient[free] @ step + step @ information[at] @ step)
+        return step, -float(2.0 * gradient[free] @ step + step @ information[at] @ step)
 
-    # 4. Causes that take away much, beside the one that takes away most, and how far each would move the parameters.
-    start, least_gain = best(own)
-    promises = [(name, *best([*own, *entries])) for name, entries in causes.items() if finite[entries].all()]
-    most_gain = max((gain - least_gain for *_, gain in promises), default=0.0)
-    asked = [
-        (f"when {name} is in the model", step - start)
-        for name, step, gain in promises
-        if gain - least_gain > max(exceeded(SELDOM, len(causes[name])), NEAR_BEST * most_gain)
-    ]
-    asked.append(("when the flight is fitted on a finer grid", rows))
-    moved = np.array([step for _, step in asked])
-    farthest = np.max(np.abs(moved), axis=0)
-    by = np.hypot(between, farthest)
-    return Reliability(np.maximum(between, farthest), by, moved, tuple(name for name, _ in asked), False, lost)
+    # What runs away if it is in the model is no cause.
+    finite = np.isfinite(np.diag(information)) & np.isfinite(gradient)
+    promises = promised(best, own, {name: entries for name, entries in causes.items() if finite[entries].all()})
+    limit = NEAR_BEST * max((gain for _, gain, _ in promises), default=0.0)
+    return [(n, step) for n, gain, step in promises if gain > max(exceeded(SELDOM, len(causes[n])), limit)]
 
 
 def _on_coarse_grid(found: Estimate, half: Problem) -> FloatArray:
-    """What rows may be off by, by the step of the parameters on every second row; none where chance explains it."""
+    """Errors by the length of rows: a share of the step to every second row, none where chance explains that."""
     z, psi = found.z, found.psi
     information, gradient = half.normal_equations(z, psi, half.passes(z, psi)[1])
     step = -np.linalg.solve(information, gradient)
@@ -267,8 +276,10 @@ def _on_coarse_grid(found: Estimate, half: Problem) -> FloatArray:
     return np.where(step**2 > chance, SHARE * step, 0.0)
 
 
-def _sensitivities(problem: Problem, z: FloatArray, psi: FloatArray) -> list[Sensitivities]:
-    return [problem.sensitivities(j, z, psi, g) for j, g in enumerate(problem.passes(z, psi)[1])]
+def _sensitivities(problem: Problem, found: Estimate) -> list[Sensitivities]:
+    """Sensitivities of each flight of a problem at an estimate."""
+    gains = problem.passes(found.z, found.psi)[1]
+    return [problem.sensitivities(j, found.z, found.psi, g) for j, g in enumerate(gains)]
 
 
 def _blocks(problem: Problem, found: Sequence[Sensitivities]) -> tuple[FloatArray, FloatArray]:

@@ -286,8 +286,8 @@ def beside_random_forces(short: Shooting, found: Filtered, free: Free) -> Fit:
     """The answer of the fit beside random forces: its parameters, intervals and statuses."""
     # An uncertain mass or arm moves what the data show; what estimates differ by comes after.
     theta, unc = with_scale_uncertainty(short.vehicle, free, default_prior(short, free), found.theta, found.uncertainty)
-    remarks = (*((_RANDOM,) if found.moved else ()), *found.doubts(free, unc))
+    remarks = (*((_RANDOM,) if found.tilting else ()), *found.doubts(free, unc))
     unc = found.held(unc)
     rows = parameter_set(free, theta, short.layout.initial(short.vehicle), unc)
-    rows = rows.unreliable(YAW) if found.turned else rows
+    rows = rows.unreliable(YAW) if found.turning else rows
     return Fit(short.vehicle, theta, rows, short.noise, unc, Convergence.CONVERGED, 0, (*remarks, *on_bounds(rows)))

@@ -8,7 +8,7 @@ intervals are widened by it, between blocks as random effects (DerSimonian and L
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -240,6 +240,24 @@ def _with_causes(
             yield name, free.step(base.theta, trial.theta), after / trial.lin.total_rows
 
 
+def promised(
+    best: Callable[[list[int]], tuple[FloatArray, float]], own: list[int], causes: Mapping[str, list[int]]
+) -> list[tuple[str, float, FloatArray]]:
+    """Each cause, how much of the cost it takes away, and the step of the parameters beside it.
+
+    Args:
+        best: step of the entries at these places, and how much of the cost it takes away.
+        own: places of what is free already, shape (P,); both are beyond what these take away alone.
+        causes: places of the entries of each.
+    """
+    none, start = best(own)
+    out = []
+    for name, entries in causes.items():
+        step, gain = best([*own, *entries])
+        out.append((name, gain - start, step[: len(own)] - none))
+    return out
+
+
 def _asked_for(few: Shooting, theta: FloatArray, states: InitialStates, free: Free) -> list[tuple[str, list[str]]]:
     """Causes by a linearisation of the whole catalogue: the one that promises most, and those that move most."""
     everything = few.free(list(dict.fromkeys([*free.names, *flexible_names(few.layout, few)])))
@@ -247,22 +265,20 @@ def _asked_for(few: Shooting, theta: FloatArray, states: InitialStates, free: Fr
     h, g = normal_equations(lin, everything, default_prior(few, everything), theta)
 
     def best(place: list[int]) -> tuple[FloatArray, float]:
-        """Step within bounds with these entries free, and the cost that it leads to less the present one."""
+        """Step within bounds with these entries free, and how much of the cost it takes away."""
         at = np.ix_(place, place)
         z = bounded_step(Free(tuple(everything.entries[i] for i in place)), theta, h[at], g[place])
-        return z, float(2.0 * g[place] @ z + z @ h[at] @ z)
+        return z, -float(2.0 * g[place] @ z + z @ h[at] @ z)
 
     # Entries of a cause are freed together; rotors are causes by themselves.
     own = list(range(len(free.entries)))
     causes: dict[str, list[int]] = {}
     for i, name in enumerate(everything.names[len(own) :], len(own)):
         causes.setdefault(name if "loss" in name else name.split(".")[0], []).append(i)
-    none, start = best(own)
-    promises: list[tuple[float, float, str]] = []
-    for name, place in causes.items():
-        z, cost = best([*own, *place])
-        if start - cost > LEAST_GAIN * max(lin.reduced_chi_square, 1.0):
-            promises.append((start - cost, float(np.max(np.abs(z[: len(own)] - none))), name))
+    least = LEAST_GAIN * max(lin.reduced_chi_square, 1.0)
+    promises = [
+        (gain, float(np.max(np.abs(step))), name) for name, gain, step in promised(best, own, causes) if gain > least
+    ]
     promises.sort(key=lambda p: -p[0])
     rest = sorted((p for p in promises[1:] if p[0] > NEAR_BEST * promises[0][0]), key=lambda p: -p[1])
     chosen = [name for *_, name in (*promises[:1], *rest[: MOST_CAUSES - 1])]

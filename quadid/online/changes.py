@@ -2,9 +2,9 @@
 
 Every half second gives three numbers that need no fit: the specific force per sum of squared rotor speeds (its level is
 b / m), and the roll and pitch acceleration that the rotors do not explain.  In wind they wander: how far, and for how
-long, is learned from the flight before the last seconds, and a step is a change of mean of what the number before does
-not tell (generalised likelihood ratio for a step of unknown time in innovations: Basseville and Nikiforov, *Detection
-of Abrupt Changes*, 1993, ch. 2.4 and 7.2).
+long, is learned from the flight before the last seconds, and a step is a change of mean of what does not follow from
+the number before (generalised likelihood ratio for a step of unknown time in innovations: Basseville and Nikiforov,
+*Detection of Abrupt Changes*, 1993, ch. 2.4 and 7.2).
 
 All three also change with how the vehicle flies: thrust with rotor speed (thrust curve), climb (inflow, drag) and
 sideways speed, moments with what is commanded (b / J is not known exactly), rate and sideways speed.  A step is what
@@ -151,7 +151,7 @@ class Learned(NamedTuple):
         value: the series there, then its slopes, shape (k + 1,).
         covariance: of these, shape (k + 1, k + 1).
         memory: correlation of what is left with what was left one value before.
-        spread: standard deviation of what the value before does not tell of it (innovation).
+        spread: standard deviation of it beside what follows from the value before (innovation).
     """
 
     middle: FloatArray
@@ -161,7 +161,7 @@ class Learned(NamedTuple):
     spread: float
 
     def design(self, x: FloatArray) -> FloatArray:
-        """What the coefficients are multiplied with, shape (n, k + 1)."""
+        """Factors of the coefficients, shape (n, k + 1)."""
         return np.column_stack([np.ones(len(x)), x - self.middle])
 
 
@@ -169,9 +169,9 @@ def learned(y: FloatArray, x: FloatArray, typical: FloatArray, least: float) -> 
     """Regression beside first-order random forces, in which outliers count for next to nothing (Cauchy).
 
     A gust moves the vehicle, and its autopilot the rotors, within the same value: taken as they are, regressors that
-    follow the gust would explain it, and later half of every step.  What the value before does not tell of a regressor
-    may be the gust's doing, so it has a coefficient of its own beside, as large as if all of the force were in it
-    (control function: two-stage least squares where forces rule, least squares where the sticks do).
+    follow the gust would explain it, and later half of every step.  The part of a regressor that does not follow from
+    its value before may be the gust's doing, so it has a coefficient of its own beside, as large as if all of the force
+    were in it (control function: two-stage least squares where forces rule, least squares where the sticks do).
 
     Args:
         y: series, shape (n,).
