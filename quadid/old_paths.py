@@ -1,4 +1,4 @@
-"""Import paths of the release before: they work for one release more, with a DeprecationWarning."""
+"""Import paths of release 0.1.0: they work for one release more, with a DeprecationWarning."""
 
 from __future__ import annotations
 
@@ -16,10 +16,6 @@ ROOMS = {
     "quadid.workflow": "quadid.app",
     "quadid.baselines": "quadid_evaluation.paper",
     "quadid_cli": "quadid.cli",
-    "quadid_report": "quadid.report",
-    "quadid_workflow": "quadid.app",
-    "quadid_paper": "quadid_evaluation.paper",
-    "quadid.optimisers": "quadid_evaluation.optimisers",
     "quadid.identify": "quadid.identification",
     "quadid.diagnose": "quadid.diagnosis",
     "quadid.health": "quadid.condition",
@@ -28,60 +24,45 @@ ROOMS = {
 """Packages that moved as they were, by their old names."""
 MOVED = {
     "quadid.effects": "quadid.effects.kinds quadid.effects.table",
-    "quadid.flight.airframe": "quadid.flight.airframe_constants",
     "quadid.flight.setup": "quadid.flight.draw quadid.flight.truth",
     "quadid.flight.outside": "quadid.flight.outside_flight quadid.flight.outside_log",
     "quadid.flight.pilot": "quadid.flight.profiles quadid.flight.stabiliser",
     "quadid.flight.fly": "quadid.flight.record",
-    "quadid.data.grid": "quadid.grid quadid.resampling_plan quadid.resample quadid.data.resample",
-    "quadid.condition.changes": "quadid.health.change_evidence quadid.health.hypotheses",
-    "quadid.condition.trim": "quadid.health.spread quadid.health.stored quadid.health.trim_estimation",
-    "quadid.checks.motion": "quadid.inspection.airborne quadid.inspection.conventions "
-    "quadid.inspection.position quadid.inspection.timing",
-    "quadid.checks.rotors": "quadid.inspection.geometry quadid.inspection.motor_checks "
-    "quadid.inspection.rotor_checks quadid.inspection.rotor_timing",
+    "quadid.data.grid": "quadid.grid quadid.resampling_plan quadid.resample",
+    "quadid.condition.changes": "quadid.health.hypotheses",
+    "quadid.condition.trim": "quadid.health.spread",
+    "quadid.checks.motion": "quadid.inspection.airborne quadid.inspection.conventions quadid.inspection.timing",
+    "quadid.checks.rotors": "quadid.inspection.geometry quadid.inspection.motor_checks quadid.inspection.rotor_checks "
+    "quadid.inspection.rotor_timing",
     "quadid.checks.findings": "quadid.inspection.outlook",
     "quadid.data.intersample": "quadid.intersample",
-    "quadid.model.rollout": "quadid.model.array_cache quadid.model.channels quadid.model.packing "
-    "quadid.model.segments quadid.model.shared_rollout",
-    "quadid.model.rollout_kernel": "quadid.model.compare_kernel",
+    "quadid.model.rollout": "quadid.model.packing",
     "quadid.model.rotor_kernel": "quadid.model.lag_kernel",
     "quadid.model.kernel": "quadid.model.needs_kernel",
     "quadid.model.body_kernel": "quadid.model.residual_kernel",
-    "quadid.model.step": "quadid.model.simulate quadid.model.step_kernel",
-    "quadid.model.layout": "quadid.model.supply quadid.model.thrust",
-    "quadid.condition.watch": "quadid.online.health_supervisor",
+    "quadid.model.step": "quadid.model.simulate",
     "quadid.online.change_job": "quadid.online.fault_isolation",
-    "quadid.online.changes": "quadid.online.change_detection quadid.online.change_supervisor "
-    "quadid.online.flight_state",
-    "quadid.online.fit_job": "quadid.online.flexible_fit quadid.online.lack_of_fit "
-    "quadid.online.reply_validation quadid.online.window_fit",
+    "quadid.online.changes": "quadid.online.change_detection quadid.online.change_supervisor",
+    "quadid.online.fit_job": "quadid.online.window_fit",
     "quadid.online.fusion": "quadid.online.estimator",
-    "quadid.online.session": "quadid.online.settings quadid.online.supervisor quadid.online.window_supervisor",
-    "quadid.online.stream": "quadid.online.channel_buffer quadid.online.clock "
-    "quadid.online.command_reconstruction quadid.online.resampler",
-    "quadid.online.checks": "quadid.online.consistency quadid.online.quality",
+    "quadid.online.session": "quadid.online.settings quadid.online.supervisor",
+    "quadid.online.stream": "quadid.online.channel_buffer quadid.online.clock quadid.online.command_reconstruction "
+    "quadid.online.resampler",
+    "quadid.online.checks": "quadid.online.quality",
     "quadid.online.records": "quadid.online.jobs quadid.online.outbox",
-    "quadid.online.grid_buffer": "quadid.online.rows",
-    "quadid.vehicle": "quadid.provenance quadid.residual quadid.vehicle_parts quadid.vehicle_size",
+    "quadid.vehicle": "quadid.residual quadid.vehicle_size",
     "quadid.data.rotor_signal": "quadid.rotor_signal",
-    "quadid.data.window": "quadid.window quadid.data.mounting quadid.mounting quadid.data.faults "
-    "quadid.data_faults quadid.saturation",
+    "quadid.data.window": "quadid.window quadid.data_faults quadid.saturation",
     "quadid.cli.terminal": "quadid_cli.failure quadid_cli.output quadid_cli.tables",
     "quadid.app.fleet": "quadid_cli.fleet_cluster quadid_cli.fleet_folder quadid_cli.fleet_store",
     "quadid.identification.problem": "quadid.identify.parameterization quadid.identify.segment_cost "
-    "quadid.identify.segment_jacobian quadid.identify.shooting quadid.identify.priors",
-    "quadid.identification.elimination": "quadid.identify.elimination_kernel quadid.identify.schur_complement",
+    "quadid.identify.segment_jacobian quadid.identify.shooting",
+    "quadid.identification.elimination": "quadid.identify.elimination_kernel",
     "quadid.identification.gauss_newton": "quadid.identify.box_qp",
     "quadid.identification.search": "quadid.identify.global_search",
-    "quadid.identification.noise": "quadid.identify.process_noise quadid.identify.noise_model",
-    "quadid.identification.noise_fit": "quadid.identify.noise_spectrum quadid.identify.noise_estimation "
-    "quadid.identify.noise_memory",
-    "quadid.identification.filter_error": "quadid.identify.torque_coherence",
-    "quadid.identification.uncertainty": "quadid.identify.covariance quadid.identify.composite_likelihood "
-    "quadid.identify.scale_uncertainty",
-    "quadid.identification.reliability": "quadid.identify.richardson",
-    "quadid.identification.fit": "quadid.identify.identifiability quadid.identify.long_logs",
+    "quadid.identification.noise": "quadid.identify.noise_model",
+    "quadid.identification.noise_fit": "quadid.identify.noise_spectrum quadid.identify.noise_estimation",
+    "quadid.identification.uncertainty": "quadid.identify.covariance quadid.identify.composite_likelihood",
     "quadid.identification.excitation": "quadid.identify.optimal_input",
     "quadid.identification.predict": "quadid.identify.open_loop quadid.identify.prediction "
     "quadid.identify.prediction_floor",
@@ -90,79 +71,47 @@ MOVED = {
     "quadid_evaluation.paper.state_space",
     "quadid_evaluation.paper.black_box": "quadid_evaluation.paper.quadrotor_io",
     "quadid_evaluation.paper.compare": "quadid_evaluation.paper.comparison",
-    "quadid_evaluation.paper.protocol": "quadid_evaluation.paper.result",
-    "quadid_evaluation.paper.page": "quadid_evaluation.paper.tables",
-    "quadid.diagnosis.hypotheses": "quadid.diagnose.candidates quadid.diagnose.cross_validation quadid.diagnose.model",
+    "quadid.diagnosis.hypotheses": "quadid.diagnose.cross_validation quadid.diagnose.model",
     "quadid.diagnosis.evidence": "quadid.diagnose.log_evidence quadid.diagnose.score_test quadid.diagnose.plausibility",
     "quadid.diagnosis.search": "quadid.diagnose.segment_schedule quadid.diagnose.selection",
     "quadid.diagnosis.residual_tests": "quadid.diagnose.residual_regressors",
     "quadid.model.closed_loop": "quadid.model.closed_loop_kernel",
-    "quadid_node.inputs": "quadid_node.chooser quadid_node.convert quadid_node.intake quadid_node.pace "
-    "quadid_node.presets quadid_node.stamps",
-    "quadid_node.publish": "quadid_node.bond quadid_node.claim quadid_node.neighbours quadid_node.speaker",
+    "quadid_node.inputs": "quadid_node.chooser quadid_node.convert quadid_node.intake quadid_node.presets "
+    "quadid_node.stamps",
+    "quadid_node.publish": "quadid_node.claim quadid_node.neighbours quadid_node.speaker",
     "quadid_node.node": "quadid_node.commands quadid_node.polling",
     "quadid_node.process": "quadid_node.stopping quadid_node.transport",
     "quadid_node.recording": "quadid_node.playback quadid_node.recorder",
-    "quadid_node.replay_node": "quadid_node.topic_player",
     "quadid_node.service": "quadid_node.publication quadid_node.rounds",
     "quadid_node.settings": "quadid_node.node_parameters",
-    "quadid_node.messages": "quadid_node.codec quadid_node.vehicle_health",
-    "quadid_node.history": "quadid_node.history_writer quadid_node.restored_set quadid_node.store "
-    "quadid_node.store_file quadid_node.store_lock",
-    "quadid_node.mavlink_link": "quadid_node.mavlink_decode quadid_node.mavlink_parameters "
-    "quadid_node.mavlink_requests quadid_node.motor_order quadid_node.serve",
-    "quadid_node.mavlink_wire": "quadid_node.mavlink_peers quadid_node.signing_memory",
-    "quadid_node.wire_format": "quadid_node.failures quadid_node.parcel",
-    "quadid_node.ground": "quadid_node.remote_worker quadid_node.workers",
+    "quadid_node.messages": "quadid_node.codec",
+    "quadid_node.history": "quadid_node.history_writer quadid_node.store quadid_node.store_file",
+    "quadid_node.mavlink_link": "quadid_node.mavlink_decode quadid_node.serve",
+    "quadid_node.wire_format": "quadid_node.parcel",
+    "quadid_node.ground": "quadid_node.remote_worker",
     "quadid_node.worker": "quadid_node.warm_up",
-    "quadid_node.zenoh": "quadid_node.zenoh_fleet quadid_node.zenoh_link quadid_node.zenoh_session",
+    "quadid_node.zenoh": "quadid_node.zenoh_link",
     "quadid_replay.motors": "quadid_replay.airframes",
     "quadid_replay.rosbag": "quadid_replay.bag_folder quadid_replay.mcap_reader quadid_replay.rosbag2_files",
     "quadid_replay.mcap_file": "quadid_replay.bag_topics quadid_replay.mcap_metadata quadid_replay.mcap_order "
     "quadid_replay.mcap_records",
-    "quadid_replay.blackbox": "quadid_replay.blackbox_frames quadid_replay.blackbox_reader",
-    "quadid_replay.ros_messages": "quadid_replay.cdr_blocks quadid_replay.mcap_decode "
-    "quadid_replay.mcap_messages quadid_replay.signal_columns",
+    "quadid_replay.ros_messages": "quadid_replay.cdr_blocks quadid_replay.mcap_decode quadid_replay.mcap_messages "
+    "quadid_replay.signal_columns",
     "quadid_replay.columns": "quadid_replay.clocks",
     "quadid_replay.formats": "quadid_replay.recognise",
-    "quadid_replay.opening": "quadid_replay.answer quadid_replay.reader_process quadid_replay.reading",
-    "quadid_replay.writers": "quadid_replay.compared_writer quadid_replay.csv_writer "
-    "quadid_replay.mcap_writer quadid_replay.tlog_writer quadid_replay.topic_writer quadid_replay.writing",
+    "quadid_replay.opening": "quadid_replay.reading",
+    "quadid_replay.writers": "quadid_replay.csv_writer quadid_replay.mcap_writer quadid_replay.tlog_writer "
+    "quadid_replay.topic_writer quadid_replay.writing",
     "quadid_replay.dataflash": "quadid_replay.dataflash_index quadid_replay.dataflash_reader",
-    "quadid_replay.mavlink_messages": "quadid_replay.boot_clock quadid_replay.esc_messages "
-    "quadid_replay.frame_numbers quadid_replay.message_times quadid_replay.tlog_messages quadid_replay.tlog_times",
-    "quadid_replay.tlog": "quadid_replay.mavlink_decode quadid_replay.mavlink_frames "
-    "quadid_replay.tlog_reader quadid_replay.tlog_vehicle",
-    "quadid_replay.ulog": "quadid_replay.px4_allocation quadid_replay.ulog_check quadid_replay.ulog_reader",
+    "quadid_replay.mavlink_messages": "quadid_replay.boot_clock quadid_replay.esc_messages quadid_replay.tlog_messages",
+    "quadid_replay.tlog": "quadid_replay.mavlink_frames quadid_replay.tlog_reader",
+    "quadid_replay.ulog": "quadid_replay.ulog_check quadid_replay.ulog_reader",
     "quadid_replay.usd": "quadid_replay.usd_reader quadid_replay.usd_records",
-    "quadid.app.health": "quadid_report.airframe_picture quadid_report.health_page",
     "quadid.app.options": "quadid_cli.options",
-    "quadid.app.gains": "quadid_report.gains_page",
-    "quadid.app.excite": "quadid_cli.excite quadid_report.excite_page",
-    "quadid.app.compare_vehicles": "quadid_report.compare_page",
-    "quadid.report.fit_pages": "quadid_report.diagnose_page quadid_report.excitation_part "
-    "quadid_report.flight_part quadid_report.identify_page",
-    "quadid.app.failure": "quadid_report.failure_page",
-    "quadid.app.fleet_page": "quadid_report.fleet quadid_report.fleet_page quadid_report.fleet_summary "
-    "quadid_report.fleet_tables",
-    "quadid.report.tables": "quadid_report.result_tables quadid_report.text_table",
-    "quadid.app.inspect": "quadid_report.inspect_tables",
-    "quadid.report.manoeuvres": "quadid_report.manoeuvres.forms quadid_report.manoeuvres.plan",
-    "quadid.report.figures": "quadid_report.plotly_figure",
-    "quadid.report.page": "quadid_report.parts quadid_report.plotly_source",
-    "quadid.report.programs": "quadid_report.programs.facts quadid_report.programs.forms "
-    "quadid_report.programs.particulars",
-    "quadid.report.verdict": "quadid_report.words",
-    "quadid.app.logs": "quadid_workflow.files quadid_workflow.loading quadid_workflow.log_parts "
-    "quadid_workflow.overlap",
-    "quadid.app.fleet_work": "quadid_workflow.fleet_health",
-    "quadid.app.outcome": "quadid_workflow.progress quadid_workflow.reporting quadid_workflow.series",
-    "quadid.app.identify": "quadid_workflow.searching",
+    "quadid.app.excite": "quadid_cli.excite",
 }
 """Old modules of each new one."""
 _NEW = {old: new for new, olds in MOVED.items() for old in olds.split()}
-_FILES = ("quadid.effects", "quadid.report.manoeuvres", "quadid.report.programs")
-"""Packages that are one file now."""
 _FUNCTIONS = ("quadid.identify", "quadid.diagnose", "quadid.health")
 """Old packages whose names are functions now: these carry what the packages held."""
 
@@ -185,7 +134,7 @@ class _OldPaths(MetaPathFinder, Loader):
     def find_spec(
         self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
     ) -> ModuleSpec | None:
-        if fullname in _FILES:
+        if fullname == "quadid.effects":  # a package then, a file now
             spec = PathFinder.find_spec(fullname, path)
             if spec is not None:
                 spec.submodule_search_locations = []  # what was within is asked for here

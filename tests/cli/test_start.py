@@ -149,7 +149,7 @@ def test_a_library_refuses_them_too_also_in_a_folder_that_it_changes_to(tmp_path
     assert "ImportError: .numba_config.yaml in this folder" in done.stderr
 
 
-# --- Import paths of the release before: each works and warns; public names stay functions
+# --- Import paths of release 0.1.0: each works and warns; public names stay functions
 
 
 @pytest.mark.parametrize("old", sorted(old for old in old_paths.new_paths() if not old.startswith("quadid_node")))
@@ -169,7 +169,7 @@ def test_no_reader_of_logs_is_found_by_an_old_path(one: LogFormat) -> None:
 def test_names_of_rooms_are_functions_also_after_an_old_import(name: str) -> None:
     code = (
         f"import warnings, quadid; warnings.simplefilter('ignore'); import quadid.{name}; "
-        f"from quadid_workflow.{name} import {name} as function; assert quadid.{name} is function"
+        f"from quadid.workflow.{name} import {name} as function; assert quadid.{name} is function"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
     function = getattr(quadid, name)
@@ -178,10 +178,8 @@ def test_names_of_rooms_are_functions_also_after_an_old_import(name: str) -> Non
 
 
 @pytest.mark.parametrize("statement", [
-    "from quadid_report.page import render", "import quadid_cli.main", "import quadid_paper.subspace",
-    "import quadid_paper.hankel", "import quadid.baselines.order",
-    "from quadid.identify.fit import fit", "from quadid.diagnose import Diagnosis",
-    "from quadid.health.trim_estimation import FlightTrim",
+    "import quadid_cli.main", "import quadid.baselines.order", "from quadid.identify.fit import fit",
+    "from quadid.diagnose import Diagnosis",
 ])  # fmt: skip
 def test_old_statements_work_alone(statement: str) -> None:
     done = subprocess.run([sys.executable, "-W", "always", "-c", statement], check=True, capture_output=True, text=True)

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 PACKAGES = ("quadid", "quadid_replay", "quadid_node", "quadid_evaluation")
-OLD_NAMES = {"quadid_command.py", "quadid_cli.py", "quadid_report.py", "quadid_workflow.py", "quadid_paper.py"}
+OLD_NAMES = {"quadid_command.py", "quadid_cli.py"}
 """Modules that stand in for packages of the release before."""
 HEAVY = ("numba", "scipy", "pandas", "plotly", "dask", "distributed", "zenoh", "pymavlink", "mcap", "pyulog", "rclpy")
 

@@ -1,5 +1,0 @@
-"""Old name of `quadid.report`, for one release."""
-
-from quadid.old_paths import stand_in
-
-stand_in(__name__)

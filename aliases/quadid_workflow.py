@@ -1,5 +1,0 @@
-"""Old name of `quadid.app`, for one release."""
-
-from quadid.old_paths import stand_in
-
-stand_in(__name__)

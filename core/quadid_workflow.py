@@ -1,1 +1,0 @@
-../aliases/quadid_workflow.py
