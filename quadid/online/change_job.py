@@ -1,49 +1,79 @@
-"""Cause of a sudden change: look-alikes fitted to the seconds after it, everything known before held fast."""
+"""Cause of a sudden change: every cause moves what the detector watches along a known direction.
+
+To what `quadid.online.changes` looks for steps in, yaw is added, and how specific force follows the squared speeds
+within each half second.  After a change each cause adds to them what is linear in its numbers (l lost thrust, q lost
+drag torque, u logarithm of the mass, e change of inertias, x and y of the CG, a steady pull over the mass, v of lost
+thrust, i.e. -log(1 - fraction)), with f the specific force, M_i b omega_i^2 by arms, M their sum:
+
+    cause          log(f / sum omega^2)           roll; pitch and yaw alike               cov(log f, log sum omega^2)
+    weak_rotor     -l omega_i^2 / sum omega^2     -l M_i / J, in yaw -q M_i / J
+    mass_change    -u                             -e M / J, with an offset as cg_offset
+    thrust_drop    -v                             -v M / J
+    steady_pull    -a / f                                                                 a var(log sum omega^2) / f
+    cg_offset                                     roll y b sum omega^2 / J_xx, pitch -x b sum omega^2 / J_yy
+
+Random forces with what was learned of them before the change, their own scatter after it, and priors from physics give
+the probability of each cause in closed form (Student t, as `quadid.condition.changes`): an explanation that needs more
+numbers, or larger ones, has to spread its probability over more outcomes.
+"""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
-from quadid.chi_square import exceeded, survival
+from quadid.chi_square import survival
+from quadid.condition.changes import DRAG_APART, LOSS, REACH, SHIFT
 from quadid.data.window import Window
-from quadid.effects import NEVER
-from quadid.identification.gauss_newton import polish
-from quadid.identification.initial_states import InitialStates
-from quadid.identification.noise import NoiseModel, estimate_noise
-from quadid.identification.problem import Linearised, Prior, Shooting, posterior_covariance
 from quadid.model import layout as ix
-from quadid.model.layout import LOSS, Layout, ThrustModel
-from quadid.online.fit_job import FEWEST_SEGMENTS
+from quadid.online.changes import (
+    AFTER,
+    BASELINE,
+    CHUNK,
+    LEAST,
+    ChangeDetector,
+    ChangePoint,
+    Chunk,
+    FlightState,
+    learned,
+)
+from quadid.online.checks import Quality, judge
+from quadid.online.fusion import DRIFT, Estimator
+from quadid.online.grid_buffer import GridBuffer, Rows
 from quadid.online.records import Job, JobReply, OnlineAlternative, OnlineFinding
-from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray
-from quadid.vehicle import GRAVITY
+from quadid.vehicle import GRAVITY, Vehicle
 
-SEGMENT = 0.5
-"""Length of the shooting segments [s]."""
-CLEAR = 12.0
-"""Deviance by which a cause must beat its look-alikes to be named with confidence."""
+AFTER_CHANGE = 3.0
+"""Data that a change is explained from [s]."""
+ASK_FLYING = 2.2
+"""Flight judged before a change is looked for [s]."""
+CONFIRMED = 2
+"""Windows without a common sample that must agree before moments are judged."""
+SURE = 0.95
+"""Probability from which a cause is named with confidence."""
 PULL = "steady_pull"
 """Not an effect of a vehicle: what holds or draws it, such as a line; in the finding as a force downwards [N]."""
-
-
-@dataclass(frozen=True)
-class ChangePoint:
-    """A step in what the rotors explain (`quadid.online.changes`).
-
-    Attributes:
-        time: when [s]; to a row in thrust, to half a second in a moment.
-        channel: thrust, roll moment or pitch moment.
-        size: share of thrust (log), or moment over half the hover moment of one side.
-        errors: its size in standard errors.
-    """
-
-    time: float
-    channel: str
-    size: float
-    errors: float
+NOTHING = "nothing"
+_ODDS = {
+    "weak_rotor": 0.35, "mass_change": 0.4, PULL: 0.1, "cg_offset": 0.06, "thrust_drop": 0.06, NOTHING: 0.3,
+}  # fmt: skip
+"""Prior odds of what changes suddenly in flight, and of a step that was none."""
+_SIZE = 0.2
+"""Prior standard deviation of what a mass, a pull or lost thrust changes, as a share of the weight."""
+_MASSES = 0.02 * np.exp(0.3 * np.arange(10))
+"""Changes of mass that are tried, up and down (logarithms), each with half the step between them as deviation."""
+_LOADED = 0.05
+"""Prior standard deviation of the change of each inertia that comes with a mass."""
+_LAG = 0.05
+"""Rotors may follow what is logged of them this much later [s]."""
+_FEWEST = 10
+"""Half seconds of flight before a change without which nothing is known of its random forces."""
+_EPS = 1e-6
 
 
 @dataclass(frozen=True)
@@ -57,113 +87,54 @@ class ChangeReply(JobReply):
 class ChangeRequest(Job):
     """A change to be explained.
 
-    The windows hold data from the change on.
+    The windows hold data from before the change to after it.
 
     Attributes:
         theta: full vector known before; z_sigma: standard deviations of its nominal entries, log scale, shape (6,).
-        noise: sensor noise.
         change: what was seen.
         time: when; in the time of the stream's stamps [s].
-        before: data before the change: what moves the vehicle there, wind and all, moves it afterwards, too.
-        speed: of each rotor before the change [rad/s], shape (rotors,), where effects were fitted along; else None.
     """
 
     reply = ChangeReply
 
     theta: FloatArray
     z_sigma: FloatArray
-    noise: NoiseModel | None
     change: ChangePoint
     time: float
-    before: tuple[Window, ...] = ()
-    speed: FloatArray | None = None
 
     def answer(self) -> ChangeReply:
-        """Fits every look-alike to the data after the change.
-
-        Effects that were fitted along to quiet flight are hardly known, though held: a thrust curve that is too flat
-        makes every loss too small.  So the plain law is asked, too, and whichever leaves less is believed.
-        """
-        asked = replace(self, noise=_beside_wind(self))
-        return min((_explain(r) for r in (asked, *asked._plain())), key=_left)
-
-    def _plain(self) -> tuple[ChangeRequest, ...]:
-        """The same with the vehicle file's own effects, and the thrust before the change as it was found."""
-        if self.speed is None or not self.speed.all():
-            return ()
-        layout = Layout(self.vehicle)
-        theta, given = layout.initial(self.vehicle), self.vehicle.parameters
-        # Before the change thrust and moments were in balance: rotors that turned otherwise gave otherwise.
-        total, arms = ThrustModel(layout, self.theta).total(self.speed[None]), self.vehicle.torque_arms
-        balance = np.column_stack([np.ones(layout.rotors), arms / np.abs(arms).max(axis=0)])
-        each = np.linalg.pinv(balance.T)[:, 0] * total / self.speed**2
-        theta[0] = np.median(each)
-        theta[LOSS : LOSS + layout.rotors] = 1.0 - each / theta[0]
-        sigma = np.array([given[name].log_sigma for name in NOMINAL_NAMES])
-        sigma[0] = self.z_sigma[0]
-        return (replace(self, theta=theta, z_sigma=sigma, speed=None),)
-
-
-def _left(reply: ChangeReply) -> float:
-    mse = np.nan if reply.finding is None else reply.finding.mse_after
-    return float(mse) if np.isfinite(mse) else np.inf
-
-
-@dataclass(frozen=True)
-class _Cause:
-    effect: str
-    names: tuple[str, ...]
-    start: tuple[float, ...]
-    rotor: int = 0
-
-
-NOTHING = _Cause("", (), ())
-
-
-@dataclass(frozen=True)
-class _Outcome:
-    cause: _Cause
-    theta: FloatArray
-    sigma: FloatArray
-    deviance: float
-    mse: float
-    lin: Linearised
-
-
-def _beside_wind(request: ChangeRequest) -> NoiseModel | None:
-    """Noise of sensors, random forces and moments together, from what no change leaves before the change."""
-    if not request.before:
-        return request.noise
-    shooting = Shooting.cut(request.before, request.vehicle, SEGMENT, request.noise, Layout(request.vehicle))
-    if shooting.count < FEWEST_SEGMENTS:
-        return request.noise
-    lin = _fit(shooting, request, NOTHING).lin
-    if not np.isfinite(lin.total_cost):
-        return request.noise
-    return estimate_noise(lin.residuals, lin.weights, shooting.dt, 1.0, slow=range(lin.residuals.shape[2]))
-
-
-def _explain(request: ChangeRequest) -> ChangeReply:
-    layout = Layout(request.vehicle)
-    shooting = Shooting.cut(request.windows, request.vehicle, SEGMENT, request.noise, layout)
-    if shooting.count < 3:
-        return ChangeReply(request.number, "too little data after the change")
-    nothing = _fit(shooting, request, NOTHING)
-    outcomes = []
-    for cause in _causes(request):
-        outcome = _fit(shooting, request, cause, nothing.lin.states)
-        if np.isfinite(outcome.deviance):
-            outcomes.append(outcome)
-    outcomes = _without_idle(outcomes)
-    best = outcomes[0] if outcomes else nothing
-    drop = nothing.deviance - best.deviance
-    if (
-        not outcomes
-        or not np.isfinite(nothing.deviance)
-        or drop < exceeded(1e-3 / len(outcomes), max(len(best.cause.names), 1))
-    ):
-        return ChangeReply(request.number, "no known cause explains it", carried(request))
-    return ChangeReply(request.number, finding=_finding(request, nothing, outcomes))
+        """Compares all causes by the probability of what the data show after the change."""
+        # 1. Half seconds on either side of the one around the change, which belongs to neither.
+        before, after = _chunks(self)
+        if len(before) < _FEWEST or len(after) < AFTER:
+            return ChangeReply(self.number, "too little data before or after the change", carried(self))
+        # 2. What is left after the change of what was learned before it, with its covariance, by channel.
+        b = self.vehicle.mass * float(np.median(np.exp([c.thrust for c in before])))
+        channels = [_Left(series, len(before)) for series in _series(self, [*before, *after], b)]
+        causes = _causes(self, after, b)
+        for channel, effects in zip(channels, _any(causes), strict=True):
+            channel.widened(effects)
+        # 3. Probability of each explanation, those of one effect (and rotor) together.
+        total, own = np.concatenate([c.left for c in channels]), np.concatenate([c.scale for c in channels])
+        spread = np.zeros((len(total),) * 2)
+        for k, channel in enumerate(channels):
+            part = slice(k * len(after), (k + 1) * len(after))
+            spread[part, part] = channel.covariance
+        freedom = float(len(before) - 1)
+        explained = [_explained(cause, channels, total, spread, freedom, own) for cause in causes]
+        evidence = np.array([one.evidence for one in explained])
+        shares = np.exp(evidence - evidence.max()) / np.sum(np.exp(evidence - evidence.max()))
+        groups: dict[tuple[str, int], list[tuple[float, _Explained]]] = {}
+        for share, one in zip(shares.tolist(), explained, strict=True):
+            groups.setdefault((one.cause.effect, one.cause.rotor), []).append((share, one))
+        ranked = sorted(
+            ((sum(s for s, _ in group), max(group, key=lambda g: g[0])[1]) for group in groups.values()),
+            key=lambda g: -g[0],
+        )
+        # 4. The most probable one, unless it is that nothing has changed.
+        if ranked[0][1].cause.effect == NOTHING:
+            return ChangeReply(self.number, "no known cause explains it", carried(self))
+        return ChangeReply(self.number, finding=_finding(self, ranked, len(groups)))
 
 
 def carried(request: ChangeRequest) -> OnlineFinding | None:
@@ -182,101 +153,333 @@ def carried(request: ChangeRequest) -> OnlineFinding | None:
     )  # fmt: skip
 
 
-def _causes(request: ChangeRequest) -> list[_Cause]:
-    size = request.change.size if request.change.channel == "thrust" else -0.05
-    rotors = len(request.vehicle.rotors)
+# --- Series before and after a change
+
+
+def _chunks(request: ChangeRequest) -> tuple[list[Chunk], list[Chunk]]:
+    """Half seconds before and after the one around the change, of the stretch of data that holds it."""
+    at, reader = request.change.time, ChangeDetector(request.vehicle)
+    for window in request.windows:
+        if not window.t0 < at < window.t[-1] or window.gyro is None or window.accel is None:
+            continue
+        size = round(CHUNK / window.dt)
+        middle = int(np.searchsorted(window.t, at)) - size // 2
+        before, after = list[Chunk](), list[Chunk]()
+        for k in range(middle % size, len(window) - size + 1, size):
+            chunk = reader.chunk(_rows(window, k, k + size))
+            if chunk is not None and k != middle:
+                (before if k < middle else after).append(chunk)
+        return before, after
+    return [], []
+
+
+def _rows(window: Window, first: int, last: int) -> Rows:
+    names = ("rotor_speed", "gyro", "accel", "attitude", "velocity")
+    given = {name: getattr(window, name) for name in names}
+    return Rows(
+        window.t[first:last], {n: v[first:last] for n, v in given.items() if v is not None}, window.sampling, ""
+    )
+
+
+class _Series(NamedTuple):
+    """Values (n,), regressors (n, k), deviations of their coefficients (k,), least spread, doubt (n, m, k) or None."""
+
+    y: FloatArray
+    x: FloatArray
+    typical: FloatArray
+    least: float
+    astray: FloatArray | None = None
+
+
+def _series(request: ChangeRequest, chunks: Sequence[Chunk], b: float) -> list[_Series]:
+    """Thrust, roll, pitch, yaw, and how force follows squared speed."""
+    state, vehicle = FlightState(request.vehicle), request.vehicle
+    square, growth = np.array([c.square for c in chunks]), np.array([c.growth for c in chunks])
+    rate, turning = np.array([c.rate for c in chunks]), np.array([c.gyroscopic for c in chunks])
+    lagging = growth.sum(axis=1) / square.sum(axis=1)
+    out = [
+        _Series(
+            np.array([c.thrust for c in chunks]), np.column_stack([[c.state for c in chunks], lagging]),
+            np.append(state.typical, _LAG), LEAST / 5.0, np.array([np.pad(c.astray, ((0, 0), (0, 1))) for c in chunks]),
+        )
+    ]  # fmt: skip
+    j, scale = request.theta[2:5], _per_square(request, b)
+    couple = np.clip([(j[2] - j[1]) / j[0], (j[0] - j[2]) / j[1], (j[1] - j[0]) / j[2]], -1.0, 1.0)
+    sigma = request.z_sigma
+    doubt = np.hypot(DRIFT, [*np.hypot(sigma[0], sigma[2:4]), math.hypot(sigma[1], sigma[4])])
+    for axis in range(3):
+        arms = scale[axis] * vehicle.torque_arms[:, axis]
+        moment, half = square @ arms, 0.25 * float(np.abs(arms).sum() * square.mean())
+        y = np.array([c.acceleration[axis] for c in chunks]) + couple[axis] * turning[:, axis] - moment
+        damping, high = state.typical_moment
+        beside, typical = [moment, growth @ arms, rate[:, axis], turning[:, axis]], [doubt[axis], _LAG, damping, 1.0]
+        if axis < 2:
+            beside, typical = [*beside, np.array([c.across[axis] for c in chunks]) / j[axis]], [*typical, high]
+        else:  # the rotors' own angular momentum
+            spinning = growth @ vehicle.spins / (2.0 * np.sqrt(square.mean())) / j[2]
+            beside, typical = [*beside, spinning], [*typical, float(request.theta[5])]
+        out.append(_Series(y, np.column_stack(beside), np.array(typical), LEAST / 5.0 * half))
+    shared, power = np.array([c.shared for c in chunks]), np.array([c.power for c in chunks])
     return [
-        _Cause("mass_change", ("mass_change.fraction",), (float(np.clip(np.expm1(-size), -0.5, 0.8)),)),
-        _Cause("thrust_drop", ("thrust_drop.fraction",), (float(np.clip(-np.expm1(size), -0.5, 0.5)),)),
-        # A pull that stays takes off the specific force what it adds to the thrust.
-        _Cause(PULL, ("accel_bias.z",), (float(np.clip(np.expm1(-size), -0.5, 0.8)) * GRAVITY,)),
-        _Cause("cg_offset", ("cg_offset.x", "cg_offset.y"), (0.0, 0.0)),
-        _Cause("mass_change", ("mass_change.fraction", "cg_offset.x", "cg_offset.y"), (0.0, 0.0, 0.0)),
-        *(_Cause("weak_rotor", (f"weak_rotor.loss_{i + 1}",), (0.05,), i + 1) for i in range(rotors)),
+        *out,
+        _Series(shared - power, power[:, None], np.array([0.5]), 1e-4 * math.sqrt(float(power.mean())) + 1e-9),
     ]
 
 
-def _without_idle(outcomes: list[_Outcome]) -> list[_Outcome]:
-    """Most likely first, without causes whose extra numbers earn nothing over a simpler one that they contain."""
-
-    def idle(outcome: _Outcome) -> bool:
-        mine = set(outcome.cause.names)
-        return any(
-            set(o.cause.names) < mine and o.deviance < outcome.deviance + CLEAR * max(o.mse, 1.0) for o in outcomes
-        )
-
-    # A free number has to earn a deviance of 2 (Akaike).
-    return sorted((o for o in outcomes if not idle(o)), key=lambda o: o.deviance + 2.0 * len(o.cause.names))
+def _per_square(request: ChangeRequest, b: float) -> FloatArray:
+    """Acceleration per squared speed and arm, shape (3,): b / J_xx, b / J_yy, d / J_zz."""
+    return np.array([b, b, float(request.theta[1])]) / request.theta[2:5]
 
 
-def _fit(shooting: Shooting, request: ChangeRequest, cause: _Cause, states: InitialStates | None = None) -> _Outcome:
-    free = shooting.free([*NOMINAL_NAMES, *cause.names])
-    theta = request.theta.copy()
-    theta[[ix.MASS_TIME, ix.DROP_TIME]] = -NEVER
-    place = free.index[len(NOMINAL_NAMES) :]
-    theta[place] += cause.start
-    # Nominal parameters may differ by 1 % from what was known before the change, b by less.
-    known = np.hypot(request.z_sigma, 0.01)
-    known[0] = np.hypot(request.z_sigma[0], 0.003)
-    if cause.effect == "mass_change":
-        loaded = [NOMINAL_NAMES.index(n) for n in ("J_xx", "J_yy", "J_zz")]
-        # A mass that was taken up changes inertias, too.
-        known[loaded] = np.hypot(request.z_sigma[loaded], 0.05)
-    width = 0.3 / free.scale[len(NOMINAL_NAMES) :] * (GRAVITY if cause.effect == PULL else 1.0)
-    if "cg_offset.x" in cause.names:
-        width[-2:] = 20.0
-    prior = Prior(
-        np.concatenate([request.theta[: len(NOMINAL_NAMES)], request.theta[place]]), np.concatenate([known, width])
-    )
-    result = polish(shooting, theta, free, prior, states, iterations=8)
-    sigma = np.sqrt(np.diag(posterior_covariance(result.lin.information, prior))) * free.jacobian(result.theta)
-    mse = result.lin.reduced_chi_square
-    return _Outcome(cause, result.theta, sigma[len(NOMINAL_NAMES) :], result.cost, mse, result.lin)
+class _Left:
+    """What is left of a series after the change, less what follows from the value before (innovations).
+
+    Attributes:
+        left: shape (n,).
+        covariance: from random forces and coefficients as learned before, wider where the values themselves scatter
+            more, beside any cause; shape (n, n).
+        scale: deviations of the random forces alone, shape (n,).
+    """
+
+    def __init__(self, series: _Series, count: int) -> None:
+        """Learns from the first `count` values; the change lies between them and the others, one value long."""
+        found = learned(series.y[:count], series.x[:count], series.typical, series.least)
+        left, design = series.y - found.design(series.x) @ found.value, found.design(series.x)
+        memory, n = found.memory, len(series.y) - count
+        # The first value follows one that is two back.
+        self._memory = np.concatenate([[memory**2], np.full(n - 1, memory)])
+        self.left = self._new(left[count:], left[count - 1 : count])
+        unsure = self._new(design[count:], design[count - 1 : count])
+        self.scale = found.spread * np.sqrt(np.concatenate([[1.0 + memory**2], np.ones(n - 1)]))
+        self.covariance = np.diag(self.scale**2) + unsure @ found.covariance @ unsure.T
+        if series.astray is not None:
+            off = self._new(series.astray[count:] @ found.value[1:], np.zeros((1, series.astray.shape[1])))
+            self.covariance += off @ off.T
+
+    def _new(self, values: FloatArray, first: FloatArray) -> FloatArray:
+        before = np.concatenate([first, values[:-1]])
+        return np.asarray(values - (self._memory * before.T).T)
+
+    def of(self, effect: FloatArray) -> FloatArray:
+        """Innovations that an effect makes which is zero before the change, shape (n, numbers) as given."""
+        return self._new(effect, np.zeros((1, effect.shape[1])))
+
+    def widened(self, effects: FloatArray) -> None:
+        """Lets the values' own scatter beside `effects`, shape (n, m), count where it is larger."""
+        root = np.linalg.cholesky(self.covariance)
+        basis, size, _ = np.linalg.svd(np.linalg.solve(root, self.of(effects)), full_matrices=False)
+        basis = basis[:, size > 1e-6 * max(float(size[0]), 1e-300)]
+        white = np.linalg.solve(root, self.left)
+        rest = float(white @ white - np.sum((basis.T @ white) ** 2))
+        self.covariance *= max(rest / max(len(white) - basis.shape[1], 1), 1.0)
 
 
-def _finding(request: ChangeRequest, nothing: _Outcome, outcomes: list[_Outcome]) -> OnlineFinding:
-    best = outcomes[0]
-    rivals: dict[str, _Outcome] = {}
-    for outcome in outcomes[1:]:
-        if outcome.cause.effect != best.cause.effect:
-            rivals.setdefault(outcome.cause.effect, outcome)
-    scale = max(best.mse, 1.0)
-    lead = min((r.deviance - best.deviance for r in rivals.values()), default=np.inf) / scale
-    drop = (nothing.deviance - best.deviance) / scale
+# --- Explanations, and their probability
+
+
+class _Cause(NamedTuple):
+    """One explanation.
+
+    Attributes:
+        effect: its name; rotor: from 1, 0 for none.
+        columns: change of the five series by its numbers, shape (5, n, numbers).
+        prior: covariance of the numbers; centre: their mean.
+        odds: prior probability, but for a factor.
+    """
+
+    effect: str
+    rotor: int
+    columns: FloatArray
+    prior: FloatArray
+    centre: FloatArray
+    odds: float
+
+
+def _causes(request: ChangeRequest, after: Sequence[Chunk], b: float) -> list[_Cause]:
+    """Every explanation, by the table above."""
+    vehicle, rotors, n = request.vehicle, len(request.vehicle.rotors), len(after)
+    square = np.array([c.square for c in after])
+    lift, power = np.array([c.lift for c in after]), np.array([c.power for c in after])
+    # Acceleration by rotor and axis, shape (3, n, rotors).
+    each = np.einsum("a,nr,ra->anr", _per_square(request, b), square, vehicle.torque_arms)
+    whole, none, flat = each.sum(axis=2), np.zeros(n), -np.ones(n)
+    along = _per_square(request, b)[:2, None] * square.sum(axis=1)
+
+    def columns(*numbers: tuple[FloatArray, ...]) -> FloatArray:
+        return np.stack([np.stack([*number, none][:5]) for number in numbers], axis=2)
+
+    shift = (none, none, -along[1], none), (none, along[0], none, none)
+    grown = (none, -whole[0], none, none), (none, none, -whole[1], none), (none, none, none, -whole[2])
+    sigma = request.z_sigma
+    out = [_Cause(NOTHING, 0, np.zeros((5, n, 0)), np.zeros((0, 0)), np.zeros(0), _ODDS[NOTHING])]
+
+    def add(effect: str, effects: FloatArray, deviation: Sequence[float], part: float = 1.0, mean: float = 0.0) -> None:
+        centre = np.zeros(len(deviation))
+        centre[0] = mean
+        out.append(_Cause(effect, 0, effects, np.diag(np.square(deviation)), centre, _ODDS[effect] * part))
+
+    for k in range(rotors):
+        thrust = -square[:, k] / square.sum(axis=1), -each[0, :, k], -each[1, :, k], none
+        effects = columns(thrust, (none, none, none, -each[2, :, k]))
+        for apart, part in DRAG_APART:
+            drag = math.hypot(apart, LOSS * math.hypot(sigma[1], sigma[4]))  # d / J_zz may be a mere guess
+            prior = LOSS**2 + np.diag([0.0, drag**2])
+            out.append(_Cause("weak_rotor", k + 1, effects, prior, np.zeros(2), _ODDS["weak_rotor"] * part / rotors))
+    add("cg_offset", columns(*shift), [SHIFT * vehicle.arm] * 2)
+    add("thrust_drop", columns((flat, *(-whole))), [_SIZE])
+    add(PULL, columns((-1.0 / lift, none, none, none, power / lift)), [_SIZE * GRAVITY])
+    weight = _MASSES * np.exp(-0.5 * (_MASSES / _SIZE) ** 2)
+    for mass, part in zip(_MASSES.tolist(), (weight / weight.sum() / 4.0).tolist(), strict=True):
+        for sign in (1.0, -1.0):  # in the middle, and somewhere
+            sizes = [0.15 * mass, *[_LOADED] * 3]
+            central = (flat, none, none, none), *grown
+            add("mass_change", columns(*central), sizes, part, sign * mass)
+            add(
+                "mass_change", columns(*central, *shift), [*sizes, *[REACH * mass * vehicle.arm] * 2], part, sign * mass
+            )
+    return out
+
+
+def _any(causes: Sequence[_Cause]) -> list[FloatArray]:
+    """All that any cause may do, by series, shape (n, numbers)."""
+    return [np.hstack([cause.columns[k] for cause in causes]) for k in range(5)]
+
+
+class _Explained(NamedTuple):
+    """A cause after the fact: log evidence with its odds, numbers, their deviations, mean square left over noise."""
+
+    cause: _Cause
+    evidence: float
+    value: FloatArray
+    sigma: FloatArray
+    left: float
+
+
+def _explained(
+    cause: _Cause, channels: Sequence[_Left], total: FloatArray, spread: FloatArray, freedom: float, own: FloatArray
+) -> _Explained:
+    """Student-t evidence of what is left after the change, and posterior of the cause's numbers."""
+    effects = np.concatenate([c.of(part) for c, part in zip(channels, cause.columns, strict=True)])
+    beyond = total - effects @ cause.centre
+    expected = spread + effects @ cause.prior @ effects.T
+    gain = np.linalg.solve(expected, effects @ cause.prior).T
+    quadratic = float(beyond @ np.linalg.solve(expected, beyond))
+    evidence = -0.5 * (freedom + len(total)) * math.log1p(quadratic / freedom) + math.log(cause.odds)
+    evidence -= 0.5 * float(np.linalg.slogdet(expected)[1])
+    value = cause.centre + gain @ beyond
+    sigma = np.sqrt(np.maximum(np.diag(cause.prior - gain @ effects @ cause.prior), 0.0))
+    return _Explained(cause, evidence, value, sigma, float(np.mean(((total - effects @ value) / own) ** 2)))
+
+
+def _finding(request: ChangeRequest, ranked: Sequence[tuple[float, _Explained]], tried: int) -> OnlineFinding:
+    share, best = ranked[0]
+    nothing = next(one for _, one in ranked if one.cause.effect == NOTHING)
+    rivals: dict[str, OnlineAlternative] = {}
+    for _, one in ranked[1:]:
+        if one.cause.effect not in (best.cause.effect, NOTHING):
+            rivals.setdefault(one.cause.effect, OnlineAlternative(one.cause.effect, one.left))
     values, sigma, units = _numbers(request, best)
-    p_value = min(1.0, survival(drop, len(best.cause.names)) * len(outcomes))
-    alternatives = tuple(OnlineAlternative(name, r.mse) for name, r in rivals.items())
+    gained = 2.0 * max(best.evidence - nothing.evidence, 0.0)
+    p_value = min(1.0, survival(gained, max(len(best.value), 1)) * tried)
     seen = request.change
     text = (
         f"{seen.channel} stepped by {seen.size:+.1%} ({seen.errors:.0f} standard errors) at {request.time:.1f} s; "
-        f"residual {nothing.mse:.2f} falls to {best.mse:.2f} with {best.cause.effect}"
+        f"residual {nothing.left:.2f} falls to {best.left:.2f} with {best.cause.effect}, which is {share:.0%} probable"
     )
     if values.get("loss", 0.0) < 0.0:
         text += f"; rotor {values['rotor']:.0f} gives {-values['loss']:.0%} more than before: it has recovered"
     if seen.channel == "thrust":
         text += f" ({np.expm1(-seen.size) * request.vehicle.mass * GRAVITY:+.2f} N to hold the vehicle up)"
-    if rivals:
-        text += f", to {min(r.mse for r in rivals.values()):.2f} with the next look-alike"
     return OnlineFinding(
-        best.cause.effect, values, sigma, units, nothing.mse, best.mse, p_value, alternatives, text, lead > CLEAR
-    )
+        best.cause.effect, values, sigma, units, nothing.left, best.left, p_value, tuple(rivals.values()), text,
+        share >= SURE,
+    )  # fmt: skip
 
 
-def _numbers(request: ChangeRequest, best: _Outcome) -> tuple[dict[str, float], dict[str, float], dict[str, str]]:
+def _numbers(request: ChangeRequest, best: _Explained) -> tuple[dict[str, float], dict[str, float], dict[str, str]]:
     """Values, standard deviations and units in the form of the vehicle file."""
-    cause = best.cause
-    if cause.effect == "weak_rotor":
-        loss, before = (float(theta[LOSS + cause.rotor - 1]) for theta in (best.theta, request.theta))
-        loss = (loss - before) / (1.0 - before)
-        return {"rotor": float(cause.rotor), "loss": loss}, {"loss": float(best.sigma[0])}, {"rotor": "", "loss": ""}
-    if cause.effect == "cg_offset":
-        x, y = (best.theta - request.theta)[[ix.CGX, ix.CGY]].tolist()
-        sigma = {"x": float(best.sigma[0]), "y": float(best.sigma[1])}
-        return {"x": x, "y": y}, sigma, {"x": "m", "y": "m"}
-    if cause.effect == PULL:
-        mass = request.vehicle.mass
-        values = {"time": request.time, "force": mass * float(best.theta[ix.ABZ])}
-        return values, {"time": 0.05, "force": mass * float(best.sigma[0])}, {"time": "s", "force": "N"}
-    place = ix.MASS_FRACTION if cause.effect == "mass_change" else ix.DROP_FRACTION
-    values = {"time": request.time, "fraction": float(best.theta[place])}
-    return values, {"time": 0.05, "fraction": float(best.sigma[0])}, {"time": "s", "fraction": ""}
+    effect, first, sigma = best.cause.effect, float(best.value[0]), float(best.sigma[0])
+    if effect == "weak_rotor":
+        left = 1.0 - float(request.theta[ix.LOSS + best.cause.rotor - 1])  # a recovery is told as part of what was left
+        values = {"rotor": float(best.cause.rotor), "loss": first / left}
+        return values, {"loss": sigma / left}, {"rotor": "", "loss": ""}
+    if effect == "cg_offset":
+        place = {name: float(v) for name, v in zip("xy", best.value, strict=True)}
+        return place, {name: float(v) for name, v in zip("xy", best.sigma, strict=True)}, {"x": "m", "y": "m"}
+    if effect == PULL:
+        mass, units = request.vehicle.mass, {"time": "s", "force": "N"}
+        return {"time": request.time, "force": mass * first}, {"time": 0.05, "force": mass * sigma}, units
+    fraction = math.expm1(first) if effect == "mass_change" else -math.expm1(-first)
+    slope = 1.0 + fraction if effect == "mass_change" else 1.0 - fraction
+    units = {"time": "s", "fraction": ""}
+    return {"time": request.time, "fraction": fraction}, {"time": 0.05, "fraction": slope * sigma}, units
+
+
+# --- When a change is looked for, and what is asked once it was seen
+
+
+class ChangeWatch:
+    """Watches one vehicle for sudden changes.
+
+    Attributes:
+        seen: the change that is being looked into, or None.
+    """
+
+    def __init__(self, vehicle: Vehicle, rows: GridBuffer) -> None:
+        """Watches `rows`, which are of `vehicle`."""
+        self._vehicle, self._rows = vehicle, rows
+        self._detector = ChangeDetector(vehicle)
+        self._carried = self._since = 0.0
+        self.seen: ChangePoint | None = None
+
+    def restart(self) -> None:
+        """Begins anew: the stream was interrupted, or a change was dealt with."""
+        self._detector.restart()
+        self.seen = None
+
+    def look(self, tick: float, length: float, estimator: Estimator) -> Generator[None, None, ChangePoint | None]:
+        """Takes in the last `length` [s] of rows before `tick` [s], piece by piece; returns a change seen just now."""
+        for i in reversed(range(round(length / CHUNK))):
+            self._detector.add(self._rows.span(tick - (i + 1) * CHUNK - _EPS, tick - i * CHUNK - _EPS))
+        if self.seen is not None:
+            return None
+        yield
+        recent = self._rows.cut(tick - ASK_FLYING, tick - _EPS)
+        yield
+        quality = judge(recent, self._vehicle, estimator.thrust, estimator.learned)
+        # A load taken up or dropped in hover looks like a floor while the step is in what is judged, and no longer.
+        self._carried = self._carried + length if quality.carried else 0.0
+        if recent.reason or (quality != Quality() and not 0.0 < self._carried <= ASK_FLYING):
+            self._detector.restart()
+            return None
+        if quality.carried:
+            return None
+        yield
+        inertia = np.array([estimator.value(n) for n in ("J_xx", "J_yy", "J_zz")])
+        # One window may have moved too little for its own interval to be right: another has to say the same.
+        known = estimator.learned and estimator.fusion.agreement(CONFIRMED)[0] == CONFIRMED
+        doubt = np.hypot(DRIFT, estimator.torque_sigma) if known else None
+        step = self._detector.look(estimator.value("b"), inertia, doubt)
+        if step is not None:
+            self._since = self._detector.since
+            if step.channel == "thrust":
+                step = replace(step, time=self._rows.onset(step.time))
+        self.seen = step
+        return step
+
+    def ask(self, number: int, tick: float, estimator: Estimator, stamp: float) -> ChangeRequest | None:
+        """The question what the change was that is `seen`, once there is enough data after it.
+
+        Args:
+            number: of the request.
+            tick: now [s].
+            estimator: what was known before.
+            stamp: time of the change as a stamp [s].
+        """
+        if self.seen is None or tick < self.seen.time + AFTER_CHANGE - _EPS:
+            return None
+        cut = self._rows.cut(max(self.seen.time - BASELINE, self._since) - _EPS, tick - _EPS)
+        return ChangeRequest(
+            number, estimator.model, cut.windows, self.seen.time, tick, estimator.theta, estimator.z_sigma, self.seen,
+            stamp,
+        )  # fmt: skip

@@ -25,18 +25,14 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Generator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from quadid.data.window import median
 from quadid.model.layout import Layout
-from quadid.online.change_job import ChangePoint, ChangeRequest
-from quadid.online.checks import Quality, judge
-from quadid.online.fusion import DRIFT, Estimator
-from quadid.online.grid_buffer import GridBuffer, Rows
+from quadid.online.grid_buffer import Rows
 from quadid.rotation import conjugate, rotated
 from quadid.types import BoolArray, FloatArray
 from quadid.vehicle import GRAVITY, Vehicle
@@ -63,13 +59,6 @@ MOST_MEMORY = 0.9
 """Largest correlation of random forces from chunk to chunk: what lasts longer is no force, but a constant."""
 _FREE = 1e-9
 """Precision of a constant of which nothing is known."""
-AFTER_CHANGE = 3.0
-"""Data that a change is explained from [s]."""
-ASK_FLYING = 2.2
-"""Flight judged before a change is looked for [s]."""
-CONFIRMED = 2
-"""Windows without a common sample that must agree before moments are judged."""
-_EPS = 1e-6
 
 
 # --- How a vehicle flies, as regressors of what a change is looked for in, and a step beside them
@@ -272,23 +261,52 @@ _Series = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
 
 
 @dataclass(frozen=True)
-class _Chunk:
-    """Means over one chunk: time [s], log thrust per squared speed, its regressors; by roll and pitch the rest.
+class ChangePoint:
+    """A step in what the rotors explain.
 
-    `astray`: change of the regressors of thrust by a standard deviation of each axis of velocity, shape (3, 4);
-    `sigma`: that deviation [m/s].
+    Attributes:
+        time: when [s]; to a row in thrust, to half a second in a moment.
+        channel: thrust, roll moment or pitch moment.
+        size: share of thrust (log), or moment over half the hover moment of one side.
+        errors: its size in standard errors.
+    """
+
+    time: float
+    channel: str
+    size: float
+    errors: float
+
+
+@dataclass(frozen=True)
+class Chunk:
+    """Means over one chunk.
+
+    Attributes:
+        t: its middle [s].
+        lift: specific force along -z [m/s^2].
+        thrust: log thrust per squared speed; state: its regressors, shape (4,).
+        astray: change of these by a standard deviation of each axis of velocity, shape (3, 4); sigma: that deviation
+            [m/s].
+        shared: covariance of log thrust and log squared speed within the chunk; power: variance of the latter.
+        acceleration: slope of the rates [rad/s^2], shape (3,); rate: [rad/s], shape (3,).
+        gyroscopic: q r, p r, p q [rad^2/s^2], shape (3,); across: velocity v, u [m/s], shape (2,).
+        square: squared rotor speeds weighed as the slope weighs accelerations, and their slope, shape (rotors,).
     """
 
     t: float
+    lift: float
     thrust: float
     state: FloatArray
-    acceleration: FloatArray
-    moment: FloatArray
-    gyroscopic: FloatArray
-    rate: FloatArray
-    across: FloatArray
     astray: FloatArray
     sigma: float
+    shared: float
+    power: float
+    acceleration: FloatArray
+    rate: FloatArray
+    gyroscopic: FloatArray
+    across: FloatArray
+    square: FloatArray
+    growth: FloatArray
 
 
 class ChangeDetector:
@@ -300,7 +318,7 @@ class ChangeDetector:
         self._arms = vehicle.torque_arms[:, :2]
         self._state = FlightState(vehicle)
         self._velocity = Velocity()
-        self._chunks: deque[_Chunk] = deque(maxlen=round((BASELINE + LOOK_BACK) / CHUNK))
+        self._chunks: deque[Chunk] = deque(maxlen=round((BASELINE + LOOK_BACK) / CHUNK))
 
     def restart(self) -> None:
         """Forgets the past: a change was dealt with, or the flight was interrupted."""
@@ -309,13 +327,19 @@ class ChangeDetector:
 
     def add(self, rows: Rows | None) -> None:
         """Takes the rows of one chunk; an incomplete one restarts the watch."""
-        chunk = None if rows is None else self._chunk(rows)
+        chunk = None if rows is None else self.chunk(rows)
         if chunk is None:
             self.restart()
         else:
             self._chunks.append(chunk)
 
-    def _chunk(self, rows: Rows) -> _Chunk | None:
+    @property
+    def since(self) -> float:
+        """Begin of the data that are compared [s]."""
+        return self._chunks[0].t - 0.5 * CHUNK
+
+    def chunk(self, rows: Rows) -> Chunk | None:
+        """Means over the rows that follow those of the last call; None where they are not complete."""
         gyro, accel = rows.columns.get("gyro"), rows.columns.get("accel")
         if gyro is None or accel is None or rows.fresh:
             return None
@@ -333,19 +357,22 @@ class ChangeDetector:
         if not (lift > 0.0 and total > 0.0):
             return None
         t = rows.t - rows.t.mean()
-        slope = (t[rate] @ (gyro[rate, :2] - gyro[rate, :2].mean(axis=0))) / (t[rate] @ t[rate])
+        slope = _slope(t[rate], gyro[rate])
         # The slope of the rate weighs the acceleration with a parabola; the moments must be weighed alike.
         weight = np.maximum((t[-1] + 0.5 * step) ** 2 - t**2, 0.0) * good
         weight /= weight.sum()
-        moment = weight @ np.where(good[:, None], square @ self._arms, 0.0)
+        weighed = weight @ np.where(good[:, None], square, 0.0)
         p, q, r = gyro[rate].T
         state, sigma = self._state.thrust(speed[good], velocity[good], lift), self._velocity.sigma
         axes = sigma * np.eye(3)
         astray = [self._state.thrust(speed[good], velocity[good] + axis, lift) - state for axis in axes]
-        return _Chunk(
-            float(rows.t.mean()), float(np.log(lift / total)), state, np.asarray(slope), np.asarray(moment),
-            np.array([np.mean(q * r), np.mean(p * r)]), gyro[rate, :2].mean(axis=0), velocity[:, 1::-1].mean(axis=0),
-            np.array(astray), sigma,
+        logs = np.log([np.maximum(force[good], 0.1 * lift), square[good].sum(axis=1)])
+        spread = np.cov(logs, bias=True)
+        return Chunk(
+            float(rows.t.mean()), lift, float(np.log(lift / total)), state, np.array(astray), sigma,
+            float(spread[0, 1]), float(spread[1, 1]), slope, gyro[rate].mean(axis=0),
+            np.array([np.mean(q * r), np.mean(p * r), np.mean(p * q)]), velocity[:, 1::-1].mean(axis=0),
+            np.asarray(weighed), _slope(t[good], square[good]),
         )  # fmt: skip
 
     def look(self, b: float, inertia: FloatArray, doubt: FloatArray | None) -> ChangePoint | None:
@@ -381,7 +408,7 @@ class ChangeDetector:
         couple = float(np.clip((inertia[2] - inertia[1], inertia[0] - inertia[2])[axis] / j, -1.0, 1.0))
         half = float(np.abs(self._arms[:, axis]).sum()) * 0.25 * b * self._vehicle.hover_speed(b) ** 2 / j
         chunks = self._chunks
-        moment = b / j * np.array([c.moment[axis] for c in chunks])
+        moment = b / j * np.array([c.square for c in chunks]) @ self._arms[:, axis]
         y = np.array([c.acceleration[axis] + couple * c.gyroscopic[axis] for c in chunks]) - moment
         beside = [(c.rate[axis], c.across[axis] / j, c.gyroscopic[axis]) for c in chunks]
         x = np.column_stack([moment, beside])
@@ -390,73 +417,7 @@ class ChangeDetector:
         return y / half, x / half, np.array([doubt, *self._state.typical_moment, 1.0]), astray
 
 
-# --- When a change is looked for, and what is asked once it was seen
-
-
-class ChangeWatch:
-    """Watches one vehicle for sudden changes.
-
-    Attributes:
-        seen: the change that is being looked into, or None.
-    """
-
-    def __init__(self, vehicle: Vehicle, rows: GridBuffer) -> None:
-        """Watches `rows`, which are of `vehicle`."""
-        self._vehicle, self._rows = vehicle, rows
-        self._detector = ChangeDetector(vehicle)
-        self._carried = 0.0
-        self.seen: ChangePoint | None = None
-
-    def restart(self) -> None:
-        """Begins anew: the stream was interrupted, or a change was dealt with."""
-        self._detector.restart()
-        self.seen = None
-
-    def look(self, tick: float, length: float, estimator: Estimator) -> Generator[None, None, ChangePoint | None]:
-        """Takes in the last `length` [s] of rows before `tick` [s], piece by piece; returns a change seen just now."""
-        for i in reversed(range(round(length / CHUNK))):
-            self._detector.add(self._rows.span(tick - (i + 1) * CHUNK - _EPS, tick - i * CHUNK - _EPS))
-        if self.seen is not None:
-            return None
-        yield
-        recent = self._rows.cut(tick - ASK_FLYING, tick - _EPS)
-        yield
-        quality = judge(recent, self._vehicle, estimator.thrust, estimator.learned)
-        # A load taken up or dropped in hover looks like a floor while the step is in what is judged, and no longer.
-        self._carried = self._carried + length if quality.carried else 0.0
-        if recent.reason or (quality != Quality() and not 0.0 < self._carried <= ASK_FLYING):
-            self._detector.restart()
-            return None
-        if quality.carried:
-            return None
-        yield
-        inertia = np.array([estimator.value(n) for n in ("J_xx", "J_yy", "J_zz")])
-        # One window may have moved too little for its own interval to be right: another has to say the same.
-        known = estimator.learned and estimator.fusion.agreement(CONFIRMED)[0] == CONFIRMED
-        doubt = np.hypot(DRIFT, estimator.torque_sigma) if known else None
-        step = self._detector.look(estimator.value("b"), inertia, doubt)
-        if step is not None and step.channel == "thrust":
-            step = replace(step, time=self._rows.onset(step.time))
-        self.seen = step
-        return step
-
-    def ask(self, number: int, tick: float, estimator: Estimator, stamp: float) -> ChangeRequest | None:
-        """The question what the change was that is `seen`, once there is enough data after it.
-
-        Args:
-            number: of the request.
-            tick: now [s].
-            estimator: what was known before.
-            stamp: time of the change as a stamp [s].
-        """
-        if self.seen is None or tick < self.seen.time + AFTER_CHANGE - _EPS:
-            return None
-        at = self.seen.time
-        cut = self._rows.cut(at + 0.1, tick - _EPS)
-        before = self._rows.span(at - ASK_FLYING, at - 0.1) if estimator.flexible else None
-        speed = None if before is None else np.sqrt(np.nanmean(before.columns["rotor_speed"] ** 2, axis=0))
-        return ChangeRequest(
-            number, estimator.model, cut.windows, at, tick, estimator.theta, estimator.z_sigma,
-            estimator.noise_of(cut.windows), self.seen, stamp,
-            self._rows.cut(at - LOOK_BACK, at - CHUNK).windows, speed,
-        )  # fmt: skip
+def _slope(t: FloatArray, values: FloatArray) -> FloatArray:
+    """Least-squares slope of columns over time."""
+    t = t - t.mean()
+    return np.asarray(t @ (values - values.mean(axis=0)) / (t @ t))

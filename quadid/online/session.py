@@ -28,8 +28,8 @@ from quadid.condition.watch import HealthWatch
 from quadid.data.window import Block
 from quadid.online.active_set import ActiveSet, Answer
 from quadid.online.background_diagnosis import DIAGNOSED_SECONDS, BackgroundDiagnosis
-from quadid.online.change_job import PULL, ChangePoint, ChangeReply, ChangeRequest, carried
-from quadid.online.changes import LEAST, ChangeWatch
+from quadid.online.change_job import PULL, ChangeReply, ChangeRequest, ChangeWatch, carried
+from quadid.online.changes import BASELINE, LEAST, ChangePoint
 from quadid.online.checks import LEAD, Consistency, Quality, judge, mistake
 from quadid.online.fit_job import FitReply, FitRequest, is_excited
 from quadid.online.fusion import Estimator
@@ -116,7 +116,7 @@ class Session:
         self.active_set = ActiveSet(self.settings.gate.approval, restored, next_sequence, baseline)
         self._vehicle, self._outbox = vehicle, Outbox(self.resampler.time.stamp)
         studied = DIAGNOSED_SECONDS if self.settings.diagnose else 0.0
-        self._rows = GridBuffer(self.settings.rate, max(self.settings.window, studied) + 10.0)
+        self._rows = GridBuffer(self.settings.rate, max(self.settings.window, studied, BASELINE) + 10.0)
         self._consistency = Consistency()
         self._changes = ChangeWatch(vehicle, self._rows)
         self._health, self._health_until = HealthWatch(vehicle, healthy), math.nan

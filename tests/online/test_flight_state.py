@@ -12,8 +12,8 @@ import pytest
 from quadid_node.recording import stream
 from quadid_replay import open_log
 
-from quadid.online.change_job import ChangePoint
-from quadid.online.changes import CHUNK, ChangeDetector, ChangeWatch, FlightState, Velocity, learned, step_beside
+from quadid.online.change_job import ChangeWatch
+from quadid.online.changes import CHUNK, ChangeDetector, ChangePoint, FlightState, Velocity, learned, step_beside
 from quadid.online.fusion import Estimator
 from quadid.online.grid_buffer import GridBuffer, Rows
 from quadid.online.stream import Resampler

@@ -11,7 +11,7 @@ import pytest
 
 from quadid.data.window import Recording
 from quadid.online import Session, SessionSettings
-from quadid.online.change_job import ChangePoint
+from quadid.online.changes import ChangePoint
 from quadid.online.records import OnlineFinding
 from quadid.online.session import mass_factor
 from quadid.vehicle import GRAVITY

@@ -18,10 +18,9 @@ import numpy as np
 from scipy.stats import chi2
 
 from quadid.flight import Flight, draw_truth, fly
-from quadid.identification.noise import NoiseModel
 from quadid.model.layout import Layout, ThrustModel
-from quadid.online.change_job import ChangePoint, ChangeRequest
-from quadid.online.changes import AFTER_CHANGE, ASK_FLYING, CHUNK, LOOK_BACK, ChangeDetector
+from quadid.online.change_job import AFTER_CHANGE, ASK_FLYING, ChangeRequest
+from quadid.online.changes import BASELINE, CHUNK, ChangeDetector, ChangePoint
 from quadid.online.checks import judge
 from quadid.online.grid_buffer import Rows, WindowCut
 from quadid.online.records import OnlineFinding
@@ -45,7 +44,6 @@ CHANGES: dict[str, dict[str, dict[str, float]]] = {
 }
 LOSS = 0.12
 """Loss of a rotor that is looked for."""
-NOISE = NoiseModel(np.repeat([0.021, 0.003, 0.21], 3), np.repeat([0.0, 0.003, 0.0], 3))
 
 
 @dataclass(frozen=True)
@@ -100,13 +98,10 @@ def named(vehicle: Vehicle, flight: Flight, seen: Seen) -> OnlineFinding | None:
     """Report of a session on a change, `AFTER_CHANGE` [s] after it."""
     window, theta = flight.window, Layout(vehicle).initial(vehicle)
     theta[: len(NOMINAL_NAMES)] = list(flight.truth.parameters.as_dict().values())
-    first = int(np.searchsorted(window.t, seen.change.time + 0.1))
-    part = window.slice(first, first + round(AFTER_CHANGE / window.dt))
-    begin, end = np.searchsorted(window.t, seen.change.time - np.array([LOOK_BACK, CHUNK])).tolist()
-    request = ChangeRequest(
-        1, vehicle, (part,), part.t0, part.t0 + AFTER_CHANGE, theta, SIGMA, NOISE, seen.change, seen.change.time,
-        (window.slice(begin, end),),
-    )  # fmt: skip
+    at = seen.change.time
+    first, last = np.searchsorted(window.t, [at - BASELINE, at + AFTER_CHANGE]).tolist()
+    part = window.slice(first, last)
+    request = ChangeRequest(1, vehicle, (part,), part.t0, part.t0 + AFTER_CHANGE, theta, SIGMA, seen.change, at)
     return request.answer().finding
 
 
