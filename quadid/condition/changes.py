@@ -178,9 +178,11 @@ class _Fitted(NamedTuple):
     scale: FloatArray
 
 
-def _log_student(quadratic: FloatArray, log_determinant: FloatArray, freedom: float) -> FloatArray:
-    """Student-t density of `quadratic` in as many dimensions as a trim has, to a constant."""
-    return np.asarray(-0.5 * (freedom + len(AXES)) * np.log1p(quadratic / freedom) - 0.5 * log_determinant)
+def log_student(
+    quadratic: FloatArray, log_determinant: FloatArray, freedom: float, dimensions: int = len(AXES)
+) -> FloatArray:
+    """Logarithm of a Student-t density, to a constant; by default in as many dimensions as a trim has."""
+    return np.asarray(-0.5 * (freedom + dimensions) * np.log1p(quadratic / freedom) - 0.5 * log_determinant)
 
 
 def _fit(changes: FloatArray, deviation: FloatArray, freedom: float, alike: Sequence[Hypothesis]) -> _Fitted:
@@ -204,7 +206,7 @@ def _fit(changes: FloatArray, deviation: FloatArray, freedom: float, alike: Sequ
     quadratic = (beyond @ inverse * beyond).sum(axis=-1)
     scale = (freedom + quadratic) / (freedom + len(AXES))
     covariance = p - p @ a.transpose(0, 2, 1) @ gain
-    evidence = _log_student(quadratic, np.linalg.slogdet(spread)[1][:, None], freedom)
+    evidence = log_student(quadratic, np.linalg.slogdet(spread)[1][:, None], freedom)
     deviations = np.sqrt(scale[..., None] * np.diagonal(covariance, axis1=1, axis2=2)[:, None])
     some = positive.any(axis=0)
     odds = (log_ndtr((value / deviations)[..., some]) + np.log(2.0)) * positive[:, None, some]
@@ -224,7 +226,7 @@ def _changed_over_unchanged(
     deviation, freedom = healthy.predictive(flights), float(healthy.freedom.mean())
     fitted = [_fit(changes, deviation, freedom, alike).log_evidence for alike in _by_size(offered)]
     quadratic, log_determinant = ((changes / deviation) ** 2).sum(axis=1), 2.0 * np.log(deviation).sum()
-    unchanged = _log_student(quadratic, log_determinant, freedom)
+    unchanged = log_student(quadratic, log_determinant, freedom)
     return np.asarray(np.logaddexp.reduce(np.vstack(fitted)) - unchanged)
 
 

@@ -11,7 +11,6 @@ rotors.  How much of a rate is theirs shows whether `quadid.identification.filte
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -234,9 +233,8 @@ def correlation(length: int, step: float) -> FloatArray:
 
 
 def estimate_noise(
-    residuals: FloatArray, weights: FloatArray, dt: float, freedom: float, slow_time: float = SLOW_TIME,
-    slow: Sequence[int] = ATTITUDE,
-) -> NoiseModel:  # fmt: skip
+    residuals: FloatArray, weights: FloatArray, dt: float, freedom: float, slow_time: float = SLOW_TIME
+) -> NoiseModel:
     """Estimates the noise from residuals of a fit flexible enough to leave only noise.
 
     Args:
@@ -245,7 +243,6 @@ def estimate_noise(
         dt: grid step [s].
         freedom: fraction of the residual's degrees of freedom left after the parameters were fitted, 0..1.
         slow_time: correlation time of the slow part [s].
-        slow: channels that may have a slow part; all of them where random forces count as noise.
 
     Returns:
         The noise; a channel without enough data keeps the typical value.
@@ -274,7 +271,7 @@ def estimate_noise(
         # Rao's two quadratic forms r' I r and r' R r, set equal to their expectations.
         moments = np.array([np.mean(np.sum((r @ f) * r, axis=1)) for f in forms[:2]]) / (freedom * keep)
         var_white, var_slow = moments[0] / forms[2][0, 0], 0.0
-        if c in slow and length >= 8:
+        if c in ATTITUDE and length >= 8:
             solution = np.linalg.solve(forms[2], moments)
             if solution[1] > 0.0 and solution[0] > 0.0:
                 var_white, var_slow = float(solution[0]), float(solution[1])

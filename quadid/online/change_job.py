@@ -27,7 +27,7 @@ from typing import NamedTuple
 import numpy as np
 
 from quadid.chi_square import survival
-from quadid.condition.changes import DRAG_APART, LOSS, REACH, SHIFT
+from quadid.condition.changes import DRAG_APART, LOSS, REACH, SHIFT, log_student
 from quadid.data.window import Window
 from quadid.model import layout as ix
 from quadid.online.changes import (
@@ -112,7 +112,7 @@ class ChangeRequest(Job):
         b = self.vehicle.mass * float(np.median(np.exp([c.thrust for c in before])))
         channels = [_Left(series, len(before)) for series in _series(self, [*before, *after], b)]
         causes = _causes(self, after, b)
-        for channel, effects in zip(channels, _any(causes), strict=True):
+        for channel, effects in zip(channels, np.concatenate([c.columns for c in causes], axis=2), strict=True):
             channel.widened(effects)
         # 3. Probability of each explanation, those of one effect (and rotor) together.
         total, own = np.concatenate([c.left for c in channels]), np.concatenate([c.scale for c in channels])
@@ -138,7 +138,7 @@ class ChangeRequest(Job):
 
 
 def carried(request: ChangeRequest) -> OnlineFinding | None:
-    """Finding for a step of thrust where no fit can name its cause: a force; None for a step of a moment."""
+    """Finding for a step of thrust where no cause explains it: a force; None for a step of a moment."""
     change = request.change
     if change.channel != "thrust":
         return None
@@ -176,9 +176,8 @@ def _chunks(request: ChangeRequest) -> tuple[list[Chunk], list[Chunk]]:
 def _rows(window: Window, first: int, last: int) -> Rows:
     names = ("rotor_speed", "gyro", "accel", "attitude", "velocity")
     given = {name: getattr(window, name) for name in names}
-    return Rows(
-        window.t[first:last], {n: v[first:last] for n, v in given.items() if v is not None}, window.sampling, ""
-    )
+    columns = {name: values[first:last] for name, values in given.items() if values is not None}
+    return Rows(window.t[first:last], columns, window.sampling, "")
 
 
 class _Series(NamedTuple):
@@ -220,10 +219,8 @@ def _series(request: ChangeRequest, chunks: Sequence[Chunk], b: float) -> list[_
             beside, typical = [*beside, spinning], [*typical, float(request.theta[5])]
         out.append(_Series(y, np.column_stack(beside), np.array(typical), LEAST / 5.0 * half))
     shared, power = np.array([c.shared for c in chunks]), np.array([c.power for c in chunks])
-    return [
-        *out,
-        _Series(shared - power, power[:, None], np.array([0.5]), 1e-4 * math.sqrt(float(power.mean())) + 1e-9),
-    ]
+    least = 1e-4 * math.sqrt(float(power.mean())) + 1e-9
+    return [*out, _Series(shared - power, power[:, None], np.array([0.5]), least)]
 
 
 def _per_square(request: ChangeRequest, b: float) -> FloatArray:
@@ -232,7 +229,7 @@ def _per_square(request: ChangeRequest, b: float) -> FloatArray:
 
 
 class _Left:
-    """What is left of a series after the change, less what follows from the value before (innovations).
+    """Remainder of a series after the change, less what follows from the value before (innovations).
 
     Attributes:
         left: shape (n,).
@@ -334,15 +331,9 @@ def _causes(request: ChangeRequest, after: Sequence[Chunk], b: float) -> list[_C
             sizes = [0.15 * mass, *[_LOADED] * 3]
             central = (flat, none, none, none), *grown
             add("mass_change", columns(*central), sizes, part, sign * mass)
-            add(
-                "mass_change", columns(*central, *shift), [*sizes, *[REACH * mass * vehicle.arm] * 2], part, sign * mass
-            )
+            aside = [REACH * mass * vehicle.arm] * 2
+            add("mass_change", columns(*central, *shift), [*sizes, *aside], part, sign * mass)
     return out
-
-
-def _any(causes: Sequence[_Cause]) -> list[FloatArray]:
-    """All that any cause may do, by series, shape (n, numbers)."""
-    return [np.hstack([cause.columns[k] for cause in causes]) for k in range(5)]
 
 
 class _Explained(NamedTuple):
@@ -363,9 +354,8 @@ def _explained(
     beyond = total - effects @ cause.centre
     expected = spread + effects @ cause.prior @ effects.T
     gain = np.linalg.solve(expected, effects @ cause.prior).T
-    quadratic = float(beyond @ np.linalg.solve(expected, beyond))
-    evidence = -0.5 * (freedom + len(total)) * math.log1p(quadratic / freedom) + math.log(cause.odds)
-    evidence -= 0.5 * float(np.linalg.slogdet(expected)[1])
+    quadratic, size = beyond @ np.linalg.solve(expected, beyond), np.linalg.slogdet(expected)[1]
+    evidence = float(log_student(quadratic, size, freedom, len(total))) + math.log(cause.odds)
     value = cause.centre + gain @ beyond
     sigma = np.sqrt(np.maximum(np.diag(cause.prior - gain @ effects @ cause.prior), 0.0))
     return _Explained(cause, evidence, value, sigma, float(np.mean(((total - effects @ value) / own) ** 2)))
@@ -400,7 +390,7 @@ def _numbers(request: ChangeRequest, best: _Explained) -> tuple[dict[str, float]
     """Values, standard deviations and units in the form of the vehicle file."""
     effect, first, sigma = best.cause.effect, float(best.value[0]), float(best.sigma[0])
     if effect == "weak_rotor":
-        left = 1.0 - float(request.theta[ix.LOSS + best.cause.rotor - 1])  # a recovery is told as part of what was left
+        left = 1.0 - float(request.theta[ix.LOSS + best.cause.rotor - 1])  # a recovery is a part of what was left
         values = {"rotor": float(best.cause.rotor), "loss": first / left}
         return values, {"loss": sigma / left}, {"rotor": "", "loss": ""}
     if effect == "cg_offset":

@@ -18,13 +18,15 @@ EPOCH = 1_700_000_000.0
 
 @lru_cache(maxsize=16)
 def flight(
-    seconds: float, seed: int = 1, profile: str = "excited", effects: tuple[tuple[str, str, float], ...] = ()
-) -> Flight:
-    """A Pelican flight; effects as (effect, parameter, value)."""
+    seconds: float, seed: int = 1, profile: str = "excited", effects: tuple[tuple[str, str, float], ...] = (),
+    gusts: float = 0.0,
+) -> Flight:  # fmt: skip
+    """A Pelican flight; effects as (effect, parameter, value), gusts in m/s^2 (rms)."""
     named: dict[str, dict[str, float]] = {}
     for effect, parameter, value in effects:
         named.setdefault(effect, {})[parameter] = value
-    return fly(Vehicle.shipped("pelican"), seconds=seconds, seed=seed, profile=profile, effects=named)
+    outside = {"gusts": {"push": gusts, "turn": 1.3 * gusts, "time": 0.6}} if gusts else None
+    return fly(Vehicle.shipped("pelican"), seconds=seconds, seed=seed, profile=profile, effects=named, outside=outside)
 
 
 def samples(recording: Recording, shift: float = 0.0) -> list[Sample]:

@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from quadid.flight import draw_truth, fly
 from quadid.model.layout import LOSS, Layout
 from quadid.online.change_job import ChangeRequest
 from quadid.online.changes import BASELINE, ChangeDetector, ChangePoint
@@ -80,14 +79,7 @@ def explained(
     """
     timed = {e for e, name, _ in effects if name == "time"}
     numbers = {name: value for effect, name, value in effects if effect not in timed}
-    made = flight(50.0, seed, profile, tuple(e for e in effects if e[0] in timed))
-    if gusts:
-        acting: dict[str, dict[str, float]] = {}
-        for effect, name, value in effects:
-            if effect in timed:
-                acting.setdefault(effect, {})[name] = value
-        outside = {"gusts": {"push": gusts, "turn": 1.3 * gusts, "time": 0.6}}
-        made = fly(PELICAN, draw_truth(PELICAN, seed), 50.0, seed, profile, effects=acting, outside=outside)
+    made = flight(50.0, seed, profile, tuple(e for e in effects if e[0] in timed), gusts)
     window, truth, theta = made.window, made.truth.parameters, Layout(PELICAN).initial(PELICAN)
     square, moved = window.rotor_speed**2, (window.t > AT) == begins
     if "loss" in numbers:
@@ -175,7 +167,7 @@ def test_a_thrust_curve_made_up_from_quiet_flight_does_not_make_a_loss_small() -
 @pytest.mark.parametrize("profile", ["hover", "excited"])
 @pytest.mark.parametrize("seed", [11, 12])
 def test_in_gusts_no_wrong_cause_is_named_with_confidence(profile: str, seed: int) -> None:
-    """A weak rotor was once told as a moved centre of gravity there, and a change of mass where nothing had changed."""
+    """A weak rotor was once reported as a moved centre of gravity, and a change of mass where nothing had changed."""
     weak = (("weak_rotor", "rotor", 2.0), ("weak_rotor", "loss", 0.12))
     finding = explained(profile, weak, ChangePoint(AT, "roll moment", 0.1, 8.0), gusts=0.6, seed=seed).answer().finding
     assert finding is not None

@@ -3,8 +3,8 @@
     python -m quadid_evaluation.studies.alarms --hours 6 --out docs/results
 
 Alarms are those of the watch for sudden changes, which knows the vehicle as a session does after its first set, and
-faults that the checks of a window find (stuck, frame, motor order), every second.  Detections are named by the fit that
-a session asks for three seconds after the change.
+faults that the checks of a window find (stuck, frame, motor order), every second.  Detections are named by what a
+session asks three seconds after the change.
 """
 
 from __future__ import annotations
