@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import re
 import time
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Annotated, Any
@@ -68,8 +69,9 @@ def watch(
 
 def _command(fleet: FleetView, vehicle: str, name: str) -> dict[str, Any]:
     """Answer of the vehicle to a command that it carried out, of the form ``quadid.command/1``."""
-    vehicle, _, number = vehicle.partition("=")
-    sequence = int(number) if number.isdigit() else None
+    sequence = None
+    if name == "approve" and (numbered := re.fullmatch(r"(.+)=([0-9]{1,18})", vehicle)):
+        vehicle, sequence = numbered[1], int(numbered[2])
     if name == "approve" and sequence is None:
         end = time.monotonic() + SETTLE
         while not (sequence := fleet.waiting(vehicle)) and time.monotonic() < end:

@@ -107,7 +107,7 @@ def read_settings(values: dict[str, Any]) -> SessionSettings:
 
 def vehicle_id(given: str, namespace: str, vehicle: Vehicle) -> str:
     """Name of one vehicle of a fleet."""
-    return given or namespace.strip("/").replace("/", "_") or vehicle.name
+    return given or namespace.strip("/") or vehicle.name
 
 
 def check_change(name: str, value: Any) -> str:

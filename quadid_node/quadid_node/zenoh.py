@@ -9,10 +9,12 @@ import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote, unquote
 
 import zenoh
 
 from quadid.errors import QuadidError
+from quadid.sanitise import LONGEST_NAME, plain
 from quadid_node.messages import RESULTS, Output, ServiceHealth, status_to_dict
 from quadid_node.service import Service
 
@@ -125,8 +127,23 @@ def config_of(where: str) -> Any:
 
 
 def key_of(vehicle: str, kind: str) -> str:
-    """Key of one kind of one vehicle; what a key may not hold becomes ``_``."""
-    return f"{ROOT}/{re.sub(r'[^A-Za-z0-9_.-]', '_', vehicle) or '_'}/{kind}"
+    """Key of one kind of one vehicle, another for every name; raises ZenohError for a name that cannot be shown.
+
+    Letters, digits and ``_.-~`` stay, everything else is percent-encoded as in a URL (RFC 3986).
+    """
+    if not (vehicle.isprintable() and 0 < len(vehicle) <= LONGEST_NAME):
+        raise ZenohError(f"vehicle id '{plain(vehicle, 60)}'", f"1 to {LONGEST_NAME} printable characters")
+    return f"{ROOT}/{quote(vehicle, safe='')}/{kind}"
+
+
+def _vehicle_of(key: str) -> str | None:
+    """The name that `key_of` made a key of; None for any other key."""
+    parts = key.split("/")
+    name = unquote(parts[1]) if len(parts) == 3 else ""
+    try:
+        return name if key_of(name, parts[-1]) == key else None
+    except ZenohError:
+        return None
 
 
 # --- Results between machines over Zenoh: one key a vehicle and kind, the latest value for who comes late, liveliness
@@ -166,9 +183,10 @@ class ZenohLink:
             retry: pause between two attempts [s].
 
         Raises:
-            ZenohError: a configuration that is none.
+            ZenohError: a configuration that is none, or a name that no key can be made of.
         """
         self._vehicle, self._service = vehicle, service
+        self._keys = {kind: key_of(vehicle, kind) for kind in (*KINDS, "*", "command/*", "alive")}
         self._latest: dict[str, bytes] = {}
         self._commands: queue.Queue[tuple[str, Any]] = queue.Queue(MOST_COMMANDS)
         self._publishers: dict[str, Any] = {}
@@ -178,11 +196,11 @@ class ZenohLink:
 
     def _declare(self, session: Any) -> None:
         self.problem = ""
-        self._publishers = {kind: session.declare_publisher(key_of(self._vehicle, kind)) for kind in KINDS}
+        self._publishers = {kind: session.declare_publisher(self._keys[kind]) for kind in KINDS}
         self._open = [
-            session.declare_queryable(key_of(self._vehicle, "*"), self._on_query),
-            session.declare_queryable(key_of(self._vehicle, "command/*"), self._on_command),
-            session.liveliness().declare_token(key_of(self._vehicle, "alive")),
+            session.declare_queryable(self._keys["*"], self._on_query),
+            session.declare_queryable(self._keys["command/*"], self._on_command),
+            session.liveliness().declare_token(self._keys["alive"]),
         ]
         for kind, payload in self._latest.items():
             self._publishers[kind].put(payload, encoding=_JSON)
@@ -249,7 +267,7 @@ class ZenohLink:
     def _on_query(self, query: Any) -> None:
         with query:
             for kind, payload in list(self._latest.items()):
-                key = key_of(self._vehicle, kind)
+                key = self._keys[kind]
                 if query.key_expr.intersects(zenoh.KeyExpr(key)):
                     query.reply(key, payload, encoding=_JSON)
 
@@ -329,24 +347,24 @@ class FleetView:
             self._take(str(reply.ok.key_expr), reply.ok.payload, only_if_new=True)
 
     def _on_token(self, sample: Any) -> None:
-        vehicle = str(sample.key_expr).split("/")[1]
-        if vehicle in self.alive or len(self.alive) < self.MOST:
+        vehicle = _vehicle_of(str(sample.key_expr))
+        if vehicle is not None and (vehicle in self.alive or len(self.alive) < self.MOST):
             self.alive[vehicle] = sample.kind == zenoh.SampleKind.PUT
 
     def _take(self, key: str, payload: Any, only_if_new: bool = False) -> None:
-        parts = key.split("/")
+        vehicle, kind = _vehicle_of(key), key.rsplit("/", 1)[-1]
         data = _parse(payload)
-        if len(parts) != 3 or parts[2] not in KINDS or data is None:
+        if vehicle is None or kind not in KINDS or data is None:
             self.refused += 1
             return
-        place = parts[1], parts[2]
+        place = vehicle, kind
         held = sum(self._sizes.values()) - self._sizes.get(place, 0) + len(payload)
-        if held > self.MOST_BYTES or (parts[1] not in self.latest and len(self.latest) >= self.MOST):
+        if held > self.MOST_BYTES or (vehicle not in self.latest and len(self.latest) >= self.MOST):
             self.refused += 1
             return
-        kinds = self.latest.setdefault(parts[1], {})
-        if not (only_if_new and parts[2] in kinds):
-            kinds[parts[2]], self._sizes[place] = data, len(payload)
+        kinds = self.latest.setdefault(vehicle, {})
+        if not (only_if_new and kind in kinds):
+            kinds[kind], self._sizes[place] = data, len(payload)
 
 
 def _parse(payload: Any) -> dict[str, Any] | None:

@@ -89,7 +89,8 @@ def test_the_namespace_names_the_vehicle_of_a_fleet() -> None:
 
     pelican = Vehicle.shipped("pelican")
     assert vehicle_id("", "/", pelican) == "pelican"
-    assert vehicle_id("", "/fleet/quad1", pelican) == "fleet_quad1"
+    assert vehicle_id("", "/fleet/quad1", pelican) == "fleet/quad1"
+    assert vehicle_id("", "/fleet_quad1", pelican) == "fleet_quad1", "another vehicle"
     assert vehicle_id("mine", "/quad1", pelican) == "mine"
 
 

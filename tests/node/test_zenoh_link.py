@@ -15,7 +15,7 @@ import pytest
 import zenoh
 from quadid_node.zenoh import KINDS, FleetView, ZenohError, ZenohLink, key_of
 
-from quadid.cli.watch import snapshot, table
+from quadid.cli.watch import snapshot, table, watch
 from quadid.online.records import OnlineDiagnosis, OnlineFinding
 from quadid_node import zenoh as zenoh_fleet
 from tests.faults.evidence import Happened
@@ -256,7 +256,74 @@ def test_a_watcher_is_not_filled_up_nor_upset_by_strangers(monkeypatch: pytest.M
     happened(16, f"300 values of 256 KiB from strangers: {held >> 20} MiB kept; a number of 4000 digits is shown")
 
 
+SAME_ONCE = [
+    "a*",
+    "a_",
+    "a/b",
+    "a_b",
+    "a#",
+    "a$",
+    "a?",
+    "a b",
+    "a%2A",
+    "a%2a",
+    "%",
+    "é",
+    "e\u0301",
+    "機",
+    "@a",
+    "a=1",
+    ".",
+]
+"""Names of which an earlier version made the same key, or none that Zenoh takes."""
+
+
+def test_every_name_has_a_key_of_its_own_and_is_shown_by_its_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    names = [*SAME_ONCE, "x" * 200, "機" * 200]
+    assert len({key_of(name, "parameters") for name in names}) == len(names)
+    session = _Listening()
+    monkeypatch.setattr(zenoh_fleet, "open_session", lambda where: session)
+    fleet = FleetView("local")
+    for k, name in enumerate(names):
+        key = key_of(name, "parameters")
+        assert zenoh.KeyExpr("quadid/*/*").includes(zenoh.KeyExpr(key))
+        session.take(_Heard(key, _Bytes(json.dumps({"sequence": k}).encode())))
+    shown = {name: kinds["parameters"]["sequence"] for name, kinds in fleet.latest.items()}
+    assert shown == {name: k for k, name in enumerate(names)}
+    for forged in ("quadid/a%2a/parameters", "quadid/a b/parameters", "quadid/%0a/parameters", "quadid/%ff/parameters"):
+        session.take(_Heard(forged, _Bytes(b"{}")))
+    assert len(fleet.latest) == len(names)
+    assert key_of("Quad-1.b_c", "health") == "quadid/Quad-1.b_c/health", "plain names as ever: certificates name them"
+
+
+@pytest.mark.parametrize("name", ["", "a\nb", "\x1b[31m", "\udcff", "x" * 201])
+def test_a_name_that_no_screen_shows_is_refused(name: str) -> None:
+    with pytest.raises(ZenohError, match="vehicle id .* allowed: 1 to 200 printable characters"):
+        ZenohLink("local", name, service())
+
+
 # --- `quadid watch`, run as a user runs it, through a router with TLS
+
+
+def test_a_command_goes_to_the_vehicle_that_was_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[tuple[str, str, int | None]] = []
+
+    class Fleet:
+        def waiting(self, vehicle: str) -> int:
+            return 7
+
+        def command(self, vehicle: str, name: str, sequence: int | None) -> tuple[bool, str]:
+            asked.append((vehicle, name, sequence))
+            return True, ""
+
+        def close(self) -> None:
+            pass
+
+    monkeypatch.setattr(zenoh_fleet, "FleetView", lambda where: Fleet())
+    watch(rollback="a=1")
+    for named in ("a=1=2", "a=b", "a=2"):
+        watch(approve=named)
+    assert asked == [("a=1", "rollback", None), ("a=1", "approve", 2), ("a=b", "approve", 7), ("a", "approve", 2)]
 
 
 def quadid(*arguments: str) -> Process:
