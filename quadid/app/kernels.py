@@ -144,8 +144,6 @@ def _estimate() -> None:
     _, gains = kalman.kalman(track, p, psi, problem.tail, True)
     kalman.replay(track, p, psi, gains, gains.table, np.empty((0, kalman.M)), np.empty((0, kalman.N_MEAN)))
     kalman.backward(track, p, psi, gains, True)
-    kalman.single_steps(track, p, gains.mean)
-    kalman.specific_force(track, p, gains.mean)
 
 
 def _flight() -> None:
@@ -165,10 +163,7 @@ PARTS = {
     ),
     "estimate": Part(
         _estimate,
-        tuple(
-            f"estimate.kalman:{name}"
-            for name in ("moments", "kalman", "replay", "backward", "single_steps", "specific_force")
-        ),
+        tuple(f"estimate.kalman:{name}" for name in ("moments", "kalman", "replay", "backward")),
         30,
     ),
     "flight": Part(_flight, ("flight.march:march",), 30),

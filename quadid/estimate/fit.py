@@ -24,7 +24,7 @@ ENOUGH, FINE = 0.5, 0.1
 ALL_NOISE, NO_NOISE = np.ones(k.N_NOISE, dtype=np.bool_), np.zeros(k.N_NOISE, dtype=np.bool_)
 """Noise numbers that a step may change."""
 ROUNDS = 4
-"""Most times that the noise of rotor speeds is taken out anew."""
+"""Most times that effects are simulated anew, and that the noise of rotor speeds is taken out anew."""
 CHANCE = 4.0
 """Standard errors of the kurtosis beyond which innovations have outliers."""
 PATIENCE = 8
@@ -91,14 +91,23 @@ def estimate(problem: Problem, start: FloatArray | None = None) -> Estimate:
     if part is whole and not problem.objective(z, psi) <= near.objective(z, psi):  # effects that run away
         problem = near
     z, psi, value, gains, information = scoring(problem, z, psi, MOST, ALL_NOISE)
-    # 3. Where innovations have outliers, their density has tails.
+    # 3. Effects stay as simulated along states: simulate them anew where the search ended, until both stay.
+    for _ in range(0 if problem is whole else ROUNDS):
+        anew, before = whole.along(z, psi), z
+        tried = scoring(anew, z, psi, MOST, ALL_NOISE)
+        if not np.isfinite(tried[2]):
+            break
+        problem, (z, psi, value, gains, information) = anew, tried
+        if (z - before) @ information @ (z - before) < FINE:
+            break
+    # 4. Where innovations have outliers, their density has tails.
     tail = tails([whitened(g) for g in gains])
     if np.any(tail > 0.0):
         heavy = replace(problem, tail=tail)
         tried = scoring(heavy, z, psi, MOST, ALL_NOISE)
         if np.isfinite(tried[2]):
             problem, (z, psi, value, gains, information) = heavy, tried
-    # 4. Noise of logged rotor speeds makes inertias too large by as much as it explains.
+    # 5. Noise of logged rotor speeds makes inertias too large by as much as it explains.
     for _ in range(ROUNDS):
         tilted = problem.unbiased(z, psi, gains)
         slope = tilted.taken[0]
@@ -116,11 +125,11 @@ def estimate(problem: Problem, start: FloatArray | None = None) -> Estimate:
         if (z - before) @ information @ (z - before) < FINE:
             break
     taken, noise = problem.taken
-    # 5. A loop faster than the log answers a random moment within a step: by half of what it may, give or take as much.
+    # 6. A loop faster than the log answers a random moment within a step: by half of what it may, give or take as much.
     within = problem.within_a_step(z, gains)
     inverse = np.linalg.inv(information)
     z = np.clip(z + 0.5 * inverse @ within.sum(axis=0), *problem.limits)
-    # 6. Intervals: score over slope, and how well the noise of rotor speeds and that answer are known.
+    # 7. Intervals: score over slope, and how well the noise of rotor speeds and that answer are known.
     by_square = taken * _of_square(problem, z, psi, gains)
     score = information + noise + 0.25 * within.T @ within + np.outer(by_square, by_square)
     covariance = inverse @ score @ inverse

@@ -45,8 +45,8 @@ TH, OM, VE, FO, AL, AE, N = 0, 3, 6, 9, 12, 15, 18
 N_MEAN = N + 1
 # Scalar measurements: gyro, attitude (rotation vector), accelerometer, velocity.
 GYRO, ATTITUDE, ACCEL, VELOCITY, M = 0, 3, 6, 9, 12
-# Physics: the six, trim [rad/s^2], gyro bias, accelerometer bias, rotor drag [1/s], height above the centre of gravity
-# at which it acts [m], damping [1/s], centre of gravity [m], how late rotor speeds act and their first-order lag [s].
+# Physics: the six, trim [rad/s^2], gyro bias, accelerometer bias, rotor drag [1/s], height above the hubs at which
+# it acts [m], damping [1/s], centre of gravity [m], how late rotor speeds act and their first-order lag [s].
 B, D, JX, JY, JZ, JR, TRIM, GYRO_BIAS, ACCEL_BIAS, DRAG, TILTING, DAMP, CG, DELAY, LAG, N_PHYSICS = (
     0, 1, 2, 3, 4, 5, 6, 9, 12, 15, 17, 19, 22, 24, 25, 26,
 )  # fmt: skip
@@ -76,6 +76,7 @@ class Track(NamedTuple):
         piece: integral up to there of each moment, and its polynomial from there, shape (pieces, MOMENTS, 4).
         mass: [kg].
         rotors: number of rotors.
+        hubs: means of x^2, y^2 [m^2] and z [m] of their hubs in body axes, from the centre of gravity.
         waver: see `track.wavering`.
         period: time between rotor samples [s].
         speed_noise: least and most standard deviation of a logged rotor speed [rad/s].
@@ -92,6 +93,7 @@ class Track(NamedTuple):
     piece: FloatArray
     mass: float
     rotors: int
+    hubs: tuple[float, float, float]
     waver: FloatArray
     period: float
     speed_noise: tuple[float, float]
@@ -202,7 +204,7 @@ def moments(track: Track, delay: float, lag: float) -> FloatArray:
 @nb.njit(**_FAST)
 def _constants(p: FloatArray, track: Track) -> FloatArray:
     """Constants of Eqs. 2 and 3."""
-    c = np.empty(21)
+    c = np.empty(24)
     hover = math.sqrt(track.mass * GRAVITY / track.rotors / p[B])
     c[0], c[1], c[2], c[3] = p[B] / track.mass, p[B] / p[JX], p[B] / p[JY], p[D] / p[JZ]
     c[4], c[5] = p[JR] / p[JX], p[JR] / p[JY]
@@ -211,17 +213,21 @@ def _constants(p: FloatArray, track: Track) -> FloatArray:
     c[12], c[13] = p[DRAG] / (track.rotors * hover), p[DRAG + 1] / (track.rotors * hover)
     c[14], c[15], c[16] = p[DAMP], p[DAMP + 1], p[DAMP + 2]
     c[17], c[18] = p[CG], p[CG + 1]
-    c[19], c[20] = track.mass * p[TILTING] * c[12] / p[JY], track.mass * p[TILTING + 1] * c[13] / p[JX]
+    # Drag acts at the hubs: as high as they are, and against their own motion in a turn.
+    xx, yy, z = track.hubs
+    c[19], c[20] = track.mass * (p[TILTING] - z) * c[12] / p[JY], track.mass * (p[TILTING + 1] - z) * c[13] / p[JX]
+    c[21] = track.mass * (yy * c[12] + xx * c[13]) / p[JZ]
+    c[22], c[23] = track.mass / p[JZ], 0.5 * track.rotors
     return c
 
 
 @nb.njit(**_FAST)
-def _turning(c, s2, x2, y2, z2, o1, p, q, r):  # type: ignore[no-untyped-def]
+def _turning(c, s2, x2, y2, z2, o1, s1, p, q, r):  # type: ignore[no-untyped-def]
     """Eq. 2 without alpha: angular acceleration for these rotor moments and rates."""
     return (
         c[6] * q * r + c[1] * (c[18] * s2 - y2) + c[4] * o1 * q - c[14] * p + c[9],
         c[7] * p * r + c[2] * (x2 - c[17] * s2) - c[5] * o1 * p - c[15] * q + c[10],
-        c[8] * p * q + c[3] * z2 - c[16] * r + c[11],
+        c[8] * p * q + c[3] * z2 - (c[16] + c[21] * s1) * r + c[11],
     )
 
 
@@ -279,6 +285,7 @@ def _advance(c: FloatArray, row: FloatArray, h: float, keep: FloatArray, air: bo
     half = 0.5 * h
     s2, x2, y2 = 0.5 * (row[0] + row[MOMENTS]), 0.5 * (row[1] + row[MOMENTS + 1]), 0.5 * (row[2] + row[MOMENTS + 2])
     z2, o1 = 0.5 * (row[3] + row[MOMENTS + 3]), 0.5 * (row[4] + row[MOMENTS + 4])
+    s1 = 0.5 * (row[5] + row[MOMENTS + 5])
     ds, dx, dy = row[0] - row[MOMENTS], row[1] - row[MOMENTS + 1], row[2] - row[MOMENTS + 2]
     dz, do = row[3] - row[MOMENTS + 3], row[4] - row[MOMENTS + 4]
     # Mean over the step of a Gauss-Markov process without its noise; the moment of drag as at the step's begin.
@@ -286,25 +293,27 @@ def _advance(c: FloatArray, row: FloatArray, h: float, keep: FloatArray, air: bo
     gy = 0.5 * (1.0 + keep[4]) * x[AL + 2]
     gz = 0.5 * (1.0 + keep[5]) * x[AL + 3]
     if air:
-        s1 = 0.5 * (row[5] + row[MOMENTS + 5])
         _, _, _, u, v, _ = _force(c, s2, s1, x[0], x[1], x[2], x[3], x[VE + 1], x[VE + 2], x[VE + 3])
         gx, gy = gx - c[20] * s1 * v, gy + c[19] * s1 * u
+        # Sums of x and y times speed about the centre of gravity: that of squares over twice the mean speed.
+        x1, y1 = c[23] * x2 / s1 - c[17] * s1, c[23] * y2 / s1 - c[18] * s1
+        gz += c[22] * (c[12] * u * y1 - c[13] * v * x1)
     qw, qx, qy, qz, p, q, r = x[0], x[1], x[2], x[3], x[4], x[5], x[6]
-    a1, b1, c1 = _turning(c, s2 + ds, x2 + dx, y2 + dy, z2 + dz, o1 + do, p, q, r)
+    a1, b1, c1 = _turning(c, s2 + ds, x2 + dx, y2 + dy, z2 + dz, o1 + do, s1, p, q, r)
     a1, b1, c1 = a1 + gx, b1 + gy, c1 + gz
     k1 = _spin(qw, qx, qy, qz, p, q, r)
     p2, q2, r2 = p + half * a1, q + half * b1, r + half * c1
-    a2, b2, c2 = _turning(c, s2, x2, y2, z2, o1, p2, q2, r2)
+    a2, b2, c2 = _turning(c, s2, x2, y2, z2, o1, s1, p2, q2, r2)
     a2, b2, c2 = a2 + gx, b2 + gy, c2 + gz
     w2, x2_, y2_, z2_ = qw + half * k1[0], qx + half * k1[1], qy + half * k1[2], qz + half * k1[3]
     k2 = _spin(w2, x2_, y2_, z2_, p2, q2, r2)
     p3, q3, r3 = p + half * a2, q + half * b2, r + half * c2
-    a3, b3, c3 = _turning(c, s2, x2, y2, z2, o1, p3, q3, r3)
+    a3, b3, c3 = _turning(c, s2, x2, y2, z2, o1, s1, p3, q3, r3)
     a3, b3, c3 = a3 + gx, b3 + gy, c3 + gz
     w3, x3, y3, z3 = qw + half * k2[0], qx + half * k2[1], qy + half * k2[2], qz + half * k2[3]
     k3 = _spin(w3, x3, y3, z3, p3, q3, r3)
     p4, q4, r4 = p + h * a3, q + h * b3, r + h * c3
-    a4, b4, c4 = _turning(c, s2 - ds, x2 - dx, y2 - dy, z2 - dz, o1 - do, p4, q4, r4)
+    a4, b4, c4 = _turning(c, s2 - ds, x2 - dx, y2 - dy, z2 - dz, o1 - do, s1, p4, q4, r4)
     a4, b4, c4 = a4 + gx, b4 + gy, c4 + gz
     w4, x4, y4, z4 = qw + h * k3[0], qx + h * k3[1], qy + h * k3[2], qz + h * k3[3]
     k4 = _spin(w4, x4, y4, z4, p4, q4, r4)
@@ -443,9 +452,10 @@ def _transition(c, row, h, keep, air, x, after, F, turn):  # type: ignore[no-unt
     """Writes F of Eq. 5, from a step's begin and end, and the rotation in its middle (3, 3)."""
     F[:] = 0.0
     p, q, r = 0.5 * (x[4] + after[4]), 0.5 * (x[5] + after[5]), 0.5 * (x[6] + after[6])
-    o1 = 0.5 * (row[4] + row[MOMENTS + 4])
+    o1, s1 = 0.5 * (row[4] + row[MOMENTS + 4]), 0.5 * (row[5] + row[MOMENTS + 5])
     A = (
-        (-c[14], c[6] * r + c[4] * o1, c[6] * q), (c[7] * r - c[5] * o1, -c[15], c[7] * p), (c[8] * q, c[8] * p, -c[16])
+        (-c[14], c[6] * r + c[4] * o1, c[6] * q), (c[7] * r - c[5] * o1, -c[15], c[7] * p),
+        (c[8] * q, c[8] * p, -c[16] - c[21] * s1),
     )  # fmt: skip
     turned = (h * p, h * q, h * r)
     square = turned[0] ** 2 + turned[1] ** 2 + turned[2] ** 2
@@ -733,39 +743,6 @@ def _sandwich(F: FloatArray, P: FloatArray, FP: FloatArray, turned: bool) -> Non
     for i in range(N):  # or rounding, which is not symmetric, grows
         for j in range(i):
             P[i, j] = P[j, i] = 0.5 * (P[i, j] + P[j, i])
-
-
-@nb.njit(**_FAST)
-def single_steps(track: Track, p: FloatArray, means: FloatArray) -> FloatArray:
-    """Each mean one step on without random forces, shape (n, N_MEAN); the last stays.
-
-    Args:
-        track: the flight.
-        p: physics, shape (N_PHYSICS,).
-        means: shape (n, N_MEAN).
-    """
-    air = track.still > 0.0 or track.seen[:, 3].any()
-    c, keep, table, after = _constants(p, track), np.ones(9), moments(track, p[DELAY], p[LAG]), means.copy()
-    for k in range(len(means)):
-        after[k, FO + 1 :] = 0.0
-        if k + 1 < len(means):
-            _advance(c, table[k], track.t[k + 1] - track.t[k], keep, air, after[k])
-    return after
-
-
-@nb.njit(**_FAST)
-def specific_force(track: Track, p: FloatArray, means: FloatArray) -> FloatArray:
-    """Accelerometer readings at these means without random forces, shape (n, 3)."""
-    air = track.still > 0.0 or track.seen[:, 3].any()
-    c, table, out = _constants(p, track), moments(track, p[DELAY], p[LAG]), np.zeros((len(means), 3))
-    for k in range(len(means)):
-        out[k, 2] = -c[0] * table[k, 2 * MOMENTS]
-        if air:
-            x = means[k]
-            out[k, 0], out[k, 1], out[k, 2], _, _, _ = _force(
-                c, table[k, 2 * MOMENTS], table[k, 2 * MOMENTS + 5], x[0], x[1], x[2], x[3], x[7], x[8], x[9]
-            )
-    return out
 
 
 @nb.njit(**_FAST)

@@ -191,8 +191,9 @@ class Problem:
         for name, place in PLACES.items():
             if place >= k.DRAG:
                 base[place] = theta[layout.entry(name).index]
-        wider = bool(windows) and (not set(names) <= set(PLACES) or bool(np.any(theta[6:] != layout.neutral()[6:])))
-        models = tuple(WholeModel(w, vehicle) for w in windows) if wider else ()
+        more = [e for e in layout.entries.values() if e.name not in PLACES]
+        acts = not set(names) <= set(PLACES) or any(theta[e.index] != e.neutral for e in more)
+        models = tuple(WholeModel(w, vehicle, PLACES) for w in windows) if acts else ()
         return cls(tuple(tracks), vehicle, names, base, theta, models, np.zeros(4), control_moment(tracks, base))
 
     def based_on(self, z: FloatArray) -> tuple[Problem, FloatArray]:
@@ -449,7 +450,7 @@ class Problem:
         """Contribution of the whole model at these means of flight j."""
         if not self.models:
             return self.tracks[j].beyond
-        return self.models[j].beyond(self.tracks[j], self.physics(z, j), self.vector(z, j), means)
+        return self.models[j].beyond(self.vector(z, j), means)
 
     def score(self, z: FloatArray, psi: FloatArray, gains: Sequence[Gains]) -> FloatArray:
         """Derivative of the objective by the noise numbers."""

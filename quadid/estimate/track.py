@@ -90,10 +90,13 @@ def _track(
     piece_t, piece = _pieces(rotor_t, speed, slope, held, vehicle)
     new = _new(speed)
     still = STILL if air and not seen[:, 3].any() else 0.0
+    hub_x, hub_y, hub_z = vehicle.rotor_positions.T
+    hubs = float(np.mean(hub_x**2)), float(np.mean(hub_y**2)), float(np.mean(hub_z))
     between = np.diff(rotor_t[new]) if new.sum() > 1 else np.diff(rotor_t)
     return Track(
-        t, y, seen, 0.5 * period, piece_t, piece, vehicle.mass, len(vehicle.rotors), wavering(vehicle, vehicle.initial),
-        float(np.median(between)), _speed_noise(speed[new]), still, np.empty((0, 9 + M)),
+        t, y, seen, 0.5 * period, piece_t, piece, vehicle.mass, len(vehicle.rotors), hubs,
+        wavering(vehicle, vehicle.initial), float(np.median(between)), _speed_noise(speed[new]), still,
+        np.empty((0, 9 + M)),
     )  # fmt: skip
 
 

@@ -9,13 +9,12 @@ sensitivities by any entry of the vector are those of both (`problem.Problem.nor
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import numpy as np
 
 from quadid.data.window import Window
 from quadid.estimate import kalman as k
-from quadid.estimate.kalman import Track
 from quadid.model.layout import ATT_DELAY, IMU_PERIOD, Layout
 from quadid.model.rollout import Rollout, Segments
 from quadid.rotation import turn
@@ -34,7 +33,8 @@ _SETTLED = 1.0
 class WholeModel:
     """Parameter vectors of `quadid.model` along one window, as additions to the filter's own equations."""
 
-    def __init__(self, window: Window, vehicle: Vehicle) -> None:
+    def __init__(self, window: Window, vehicle: Vehicle, own: Collection[str]) -> None:
+        """Prepares a window; `own` names the entries that the filter has in its own equations."""
         zero = np.zeros((len(window), 3))
         level = np.tile([1.0, 0.0, 0.0, 0.0], (len(window), 1))
         # Against measurements of zero, residuals are the measurements that the model predicts.
@@ -42,38 +42,35 @@ class WholeModel:
             window.t0, window.dt, window.rotor_speed, zero, level, zero, zero, zero, window.battery,
             sampling=window.sampling, rotor_slope=window.rotor_slope, log_span=window.log_span,
         )  # fmt: skip
-        self._window, self._vehicle, self._rollout = window, vehicle, Rollout(blank, vehicle)
+        self._window, self._vehicle, self._own, self._rollout = window, vehicle, own, Rollout(blank, vehicle)
         entries = Layout(vehicle).entries.values()
         self._sensors = [(e.index, e.neutral) for e in entries if e.name.split(".")[0] in IN_SENSORS]
+        self._more = [(e.index, e.neutral) for e in entries if e.name not in own]
 
     def cut(self, first: int, last: int) -> WholeModel:
         """The same along rows `first` to before `last`."""
-        return WholeModel(self._window.slice(first, last), self._vehicle)
+        return WholeModel(self._window.slice(first, last), self._vehicle, self._own)
 
-    def beyond(self, track: Track, p: FloatArray, theta: FloatArray, means: FloatArray) -> FloatArray:
-        """`Track.beyond` of a full parameter vector at filtered means (n, N_MEAN); the filter's own physics is p.
+    def beyond(self, theta: FloatArray, means: FloatArray) -> FloatArray:
+        """`Track.beyond` of a full parameter vector at filtered means (n, N_MEAN).
 
-        Trim moment and biases of p are the filter's own alone.
+        The difference of two models, so that it holds no difference of two integrations.
         """
-        own_p = p.copy()
-        own_p[k.TRIM : k.DRAG] = 0.0
-        motion = theta.copy()
+        motion, plain = theta.copy(), theta.copy()
         for index, neutral in self._sensors:
             motion[index] = neutral
-        # 1. One step of the motion from every mean, beside the filter's own.
+        for index, neutral in self._more:
+            plain[index] = neutral
+        # 1. One step of the motion from every mean, beside one without what the filter has not.
         n = len(means)
         late = _SETTLED * max(theta[IMU_PERIOD], 0.0) + max(theta[ATT_DELAY], 0.0)
         sensed = not np.array_equal(theta, motion)
-        moved, *read = self._rolled([motion, theta] if sensed and late == 0.0 else [motion], means, 1)
-        there = np.zeros((n, k.N_MEAN))
-        there[:, 0] = 1.0
-        there[1:-1, :4], there[1:-1, 4:7], there[1:-1, 7:10] = _attitude(moved), moved[:, :3], moved[:, 9:12]
-        own = k.single_steps(track, own_p, means)[:-2]
+        own, moved, *read = self._rolled([plain, motion, *([theta] if sensed and late == 0.0 else [])], means, 1)
         out = np.zeros((n, 9 + k.M))
-        out[:-2, :3] = moved[:, :3] - own[:, 4:7]
-        out[:-2, 3:6] = turn(own[:, :4], there[1:-1, :4])
-        out[:-2, 6:9] = moved[:, 9:12] - own[:, 7:10]
-        out[1:-1, 15:18] = moved[:, 6:9] - k.specific_force(track, own_p, there)[1:-1]
+        out[:-2, :3] = moved[:, :3] - own[:, :3]
+        out[:-2, 3:6] = turn(_attitude(own), _attitude(moved))
+        out[:-2, 6:9] = moved[:, 9:12] - own[:, 9:12]
+        out[1:-1, 15:18] = moved[:, 6:9] - own[:, 6:9]
         # 2. What sensors make of it; those with a memory look back over as many steps.
         if sensed:
             lead = 1 + int(np.ceil(late / self._window.dt))

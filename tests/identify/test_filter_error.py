@@ -85,6 +85,23 @@ def test_a_calm_flight_is_fitted_whole() -> None:
     assert not any("random forces" in w for w in fitted(window).warnings)
 
 
+HIDDEN = {"rotor_drag": {"k_x": 0.3, "k_y": 0.3}, "weak_rotor": {"rotor": 2.0, "loss": 0.04}}
+
+
+@pytest.mark.parametrize("known", [("rotor_drag", "weak_rotor"), ("weak_rotor",)], ids=["both", "the rotor alone"])
+def test_behind_causes_in_the_vehicle_file_the_six_are_as_sharp_as_without(known: tuple[str, ...]) -> None:
+    """Drag of the hubs passed for drag torque, and an effect stayed as simulated where the search began."""
+    truth = draw_truth(PELICAN, SEED)
+    window = fly(PELICAN, truth, 60.0, SEED, effects=HIDDEN).window
+    vehicle = guessed(truth, SEED).model_copy(update={"effects": {name: HIDDEN[name] for name in known}})
+    found = fit([window], vehicle, FitOptions(iterations=0))
+    for name, width in {"b": 0.001, "d": 0.005, "J_xx": 0.003, "J_yy": 0.003, "J_zz": 0.005, "J_r": 0.02}.items():
+        p, true = found.parameters[name], truth.as_dict()[name]
+        assert p.status == Status.IDENTIFIED, name
+        assert abs(np.log(p.value / true)) < 0.75 * (p.ci95[1] - p.ci95[0]) / true, name
+        assert p.ci95[1] - p.ci95[0] < 2.0 * width * true, name
+
+
 def crazyflie(data_dir: Path, log: str, start: float | None = None, stop: float | None = None) -> quadid.ParameterSet:
     """The fit of a flight, or of seconds of it."""
     folder = data_dir / "crazyflie_rpm"
