@@ -20,17 +20,17 @@ from quadid.diagnosis.hypotheses import Model, fit_model, free_names, without
 from quadid.diagnosis.search import Search, Stage, pruned
 from quadid.estimate.problem import LATE
 from quadid.identification.filter_error import Filtered, filtered, has_unmodelled_moments
-from quadid.identification.fit import MOST_SEGMENTS, YAW, beside_random_forces
+from quadid.identification.fit import MOST_SEGMENTS, beside_random_forces
 from quadid.identification.gauss_newton import polish
 from quadid.identification.noise_fit import residual_noise
 from quadid.identification.problem import Free, Shooting
 from quadid.model.layout import Layout
-from quadid.parameters import INERTIAS, NOMINAL_NAMES, UNKNOWN, Parameter, ParameterSet, unreliable
+from quadid.parameters import INERTIAS, NOMINAL_NAMES, UNKNOWN, Parameter, unreliable
 from quadid.types import FloatArray
 from quadid.vehicle import ParameterPrior, Vehicle
 
-SHOWN = tuple(n for n in NOMINAL_NAMES if n not in YAW)
-"""Parameters that are held."""
+HELD = ("b", "J_xx", "J_yy")
+"""Parameters at which the causes are refitted."""
 
 
 @dataclass(frozen=True)
@@ -38,8 +38,8 @@ class Held:
     """Parameters held at what the fit beside random forces shows.
 
     Attributes:
-        parameters: by name, as an identification gives them.
-        vehicle: with these values.
+        parameters: all six by name, as an identification gives them.
+        vehicle: with those of `HELD`.
         windows, short: the data, and their short segments.
         theta: nominal values of the selected model among neutral ones.
     """
@@ -55,16 +55,15 @@ class Held:
         return replace(shooting, vehicle=self.vehicle, layout=Layout(self.vehicle))
 
     def among(self, parameters: Sequence[Parameter]) -> tuple[Parameter, ...]:
-        """Parameters with those held in their place, and no trust in the rest."""
-        listed = ParameterSet(tuple(parameters), np.zeros((len(parameters), len(parameters)))).unreliable(YAW)
-        return tuple(self.parameters.get(p.name, p) for p in listed)
+        """Parameters with those of the filter in their place."""
+        return tuple(self.parameters.get(p.name, p) for p in parameters)
 
     def beside_doubt(self) -> Held:
         """The same where causes leave much or are doubtful: as uncertain as without any, and by the step to that."""
         free = self.short.free(NOMINAL_NAMES)
         alone = filtered(self.windows, self.short.vehicle, self.theta, free)
         if alone is None:
-            lost = unreliable(self.parameters.values(), SHOWN)
+            lost = unreliable(self.parameters.values(), NOMINAL_NAMES)
             return replace(self, parameters={p.name: p for p in lost})
         here = alone.theta.copy()
         for name, p in self.parameters.items():
@@ -77,7 +76,7 @@ class Held:
         """Why they are."""
         return (
             f"something that the model lacks moves the vehicle: {', '.join(self.parameters)} were estimated beside "
-            f"random forces and moments, which leave {', '.join(YAW)} open"
+            "random forces and moments"
         )
 
 
@@ -99,7 +98,7 @@ def held_by_filter(windows: Sequence[Window], short: Shooting, model: Model) -> 
         return None
     shown = _shown(short, found, free)
     values = dict(zip(model.free.names, model.theta[model.free.index].tolist(), strict=True))
-    if all(p.status not in UNKNOWN and p.ci95[0] <= values[n] <= p.ci95[1] for n, p in shown.items()):
+    if all(shown[n].status not in UNKNOWN and shown[n].ci95[0] <= values[n] <= shown[n].ci95[1] for n in HELD):
         return None
     neutral = short.layout.initial(short.vehicle)
     neutral[short.free(NOMINAL_NAMES).index] = model.theta[short.free(NOMINAL_NAMES).index]
@@ -109,13 +108,14 @@ def held_by_filter(windows: Sequence[Window], short: Shooting, model: Model) -> 
 
 def _shown(short: Shooting, found: Filtered, free: Free) -> dict[str, Parameter]:
     """Parameters by name that a fit beside random forces shows."""
-    return {p.name: p for p in beside_random_forces(short, found, free).parameters if p.name in SHOWN}
+    return {p.name: p for p in beside_random_forces(short, found, free).parameters if p.name in NOMINAL_NAMES}
 
 
 def _holding(vehicle: Vehicle, held: Mapping[str, Parameter]) -> Vehicle:
     """The vehicle with parameters that stay where they are, and J_zz no larger than a rigid body's can be then."""
     priors = dict(vehicle.parameters)
-    for name, p in held.items():
+    for name in HELD:
+        p = held[name]
         priors[name] = ParameterPrior(initial=p.value, bounds=(p.value, p.value), sigma=p.sigma)
     *flat, upright = INERTIAS
     low, high = vehicle.limits(upright)

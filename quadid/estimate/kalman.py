@@ -46,9 +46,10 @@ N_MEAN = N + 1
 # Scalar measurements: gyro, attitude (rotation vector), accelerometer, velocity.
 GYRO, ATTITUDE, ACCEL, VELOCITY, M = 0, 3, 6, 9, 12
 # Physics: the six, trim [rad/s^2], gyro bias, accelerometer bias, rotor drag [1/s], height above the hubs at which
-# it acts [m], damping [1/s], centre of gravity [m], how late rotor speeds act and their first-order lag [s].
-B, D, JX, JY, JZ, JR, TRIM, GYRO_BIAS, ACCEL_BIAS, DRAG, TILTING, DAMP, CG, DELAY, LAG, N_PHYSICS = (
-    0, 1, 2, 3, 4, 5, 6, 9, 12, 15, 17, 19, 22, 24, 25, 26,
+# it acts [m], damping [1/s], centre of gravity [m], how late rotor speeds act and their first-order lag [s],
+# share of its arm by which drag acts nearer to the centre of gravity than a hub.
+B, D, JX, JY, JZ, JR, TRIM, GYRO_BIAS, ACCEL_BIAS, DRAG, TILTING, DAMP, CG, DELAY, LAG, CENTRAL, N_PHYSICS = (
+    0, 1, 2, 3, 4, 5, 6, 9, 12, 15, 17, 19, 22, 24, 25, 26, 27,
 )  # fmt: skip
 # Noise: white of every scalar measurement; standard deviations of f (horizontal, vertical), alpha (roll and pitch,
 # yaw), e (tilt, heading) and of logged rotor speeds [rad/s]; correlation times of f, f, alpha, alpha, e [s].
@@ -213,11 +214,13 @@ def _constants(p: FloatArray, track: Track) -> FloatArray:
     c[12], c[13] = p[DRAG] / (track.rotors * hover), p[DRAG + 1] / (track.rotors * hover)
     c[14], c[15], c[16] = p[DAMP], p[DAMP + 1], p[DAMP + 2]
     c[17], c[18] = p[CG], p[CG + 1]
-    # Drag acts at the hubs: as high as they are, and against their own motion in a turn.
+    # Drag acts at the hubs: as high as they are, against their own motion in a turn, more where a rotor turns faster.
     xx, yy, z = track.hubs
-    c[19], c[20] = track.mass * (p[TILTING] - z) * c[12] / p[JY], track.mass * (p[TILTING + 1] - z) * c[13] / p[JX]
-    c[21] = track.mass * (yy * c[12] + xx * c[13]) / p[JZ]
-    c[22], c[23] = track.mass / p[JZ], 0.5 * track.rotors
+    share = 1.0 - p[CENTRAL]
+    c[19] = track.mass * (p[TILTING] - share * z) * c[12] / p[JY]
+    c[20] = track.mass * (p[TILTING + 1] - share * z) * c[13] / p[JX]
+    c[21] = track.mass * share**2 * (yy * c[12] + xx * c[13]) / p[JZ]
+    c[22], c[23] = track.mass * share / p[JZ], 0.5 * track.rotors
     return c
 
 

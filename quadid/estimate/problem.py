@@ -34,6 +34,7 @@ PLACES: dict[str, int] = {
     **{f"cg_offset.{a}": k.CG + i for i, a in enumerate("xy")},
     "command_delay.delay": k.DELAY,
     "motor_lag.tau": k.LAG,
+    "rotor_drag.central": k.CENTRAL,
 }
 """Entries of the physics vector by name: those that the filter has in its own equations."""
 LATE = ("command_delay.delay", "motor_lag.tau")
@@ -229,7 +230,10 @@ class Problem:
     def size(self) -> FloatArray:
         """Unit of every scaled parameter and standard deviation of its prior; the six are logarithms, of unit 1."""
         out = np.ones(len(self.entries))
-        own = _SIZE | {"cg_offset": OFF_CENTRE * self.vehicle.arm}
+        own = _SIZE | {
+            "rotor_drag.central": self.layout.entry("rotor_drag.central").typical,
+            "cg_offset": OFF_CENTRE * self.vehicle.arm,
+        }
         own |= {f"trim_moment.{a}": float(size) for a, size in zip(AXES, self.control, strict=True)}
         for i, (name, place, _) in enumerate(self.entries):
             if place >= k.TRIM:

@@ -48,8 +48,8 @@ from quadid.vehicle import Vehicle
 WHITE_SHARE = 0.5
 """Random moments rule where less than this share of what short segments leave of roll or pitch rate is white noise."""
 ALONG = (
-    "rotor_drag.k_x", "rotor_drag.k_y", "rotor_drag_moment.h_x", "rotor_drag_moment.h_y", "rate_damping.l_p",
-    "rate_damping.m_q", "rate_damping.n_r", "cg_offset.x", "cg_offset.y",
+    "rotor_drag.k_x", "rotor_drag.k_y", "rotor_drag.central", "rotor_drag_moment.h_x", "rotor_drag_moment.h_y",
+    "rate_damping.l_p", "rate_damping.m_q", "rate_damping.n_r", "cg_offset.x", "cg_offset.y",
 )  # fmt: skip
 """Fitted along, with what is late, unless the model has numbers of that effect."""
 MOST_SECONDS = 600.0
@@ -73,7 +73,7 @@ class Filtered:
         uncertainty: covariance of what is free.
         prompt: step of what is free to where nothing is late, scaled parameters, shape (P,).
         trust: what other estimates differ by.
-        tilting, turning: random moments act about roll or pitch; about yaw.
+        tilting: random moments act about roll or pitch.
     """
 
     theta: FloatArray
@@ -81,7 +81,6 @@ class Filtered:
     prompt: FloatArray
     trust: Reliability
     tilting: bool
-    turning: bool
 
     def held(self, uncertainty: Uncertainty) -> Uncertainty:
         """An uncertainty of these parameters with what other estimates differ by."""
@@ -145,7 +144,10 @@ def _filtered(windows: Sequence[Window], vehicle: Vehicle, theta: FloatArray, fr
         return Problem.of(tracks, vehicle, (*beside, *names), windows, theta, nominal).liveliest(MOST_SECONDS)
 
     whole = problem_of(windows)
-    found = estimate(whole, whole.at(theta))
+    begin = theta.copy()
+    if "rotor_drag.central" in along:  # where hubs have no part, the accelerometer alone tells the sign of drag
+        begin[layout.entry("rotor_drag.central").index] = 1.0
+    found = estimate(whole, whole.at(begin))
     if not (np.isfinite(found.objective) and np.isfinite(found.z).all() and np.isfinite(found.covariance).all()):
         return None
     problem, names = found.problem, [name for name, *_ in whole.entries]
@@ -166,7 +168,7 @@ def _filtered(windows: Sequence[Window], vehicle: Vehicle, theta: FloatArray, fr
     wide, half = problem_of(windows, more), problem_of([coarse(w) for w in windows])
     trust = _compared(found, wide, half, places, unit)
     share = found.psi[k.SIGMA : k.TIME] / problem.noise_scale
-    return Filtered(out, own, prompt, trust, bool(share[2] > LARGE), bool(share[3] > LARGE))
+    return Filtered(out, own, prompt, trust, bool(share[2] > LARGE))
 
 
 def _catalogue(layout: Layout, windows: Sequence[Window]) -> list[str]:

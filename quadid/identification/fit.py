@@ -183,8 +183,6 @@ def spread(windows: Sequence[Window]) -> tuple[list[Window], tuple[str, ...]]:
 
 
 FIT_SECONDS = 1.0
-YAW = ("d", "J_zz", "J_r")
-"""Not to be used beside random moments about z: rotors turn a vehicle there by drag, slowly, and such moments rule."""
 MOST_SEGMENTS = 1000
 """Most segments of the first polish; a start needs no more."""
 _RANDOM = (
@@ -289,5 +287,4 @@ def beside_random_forces(short: Shooting, found: Filtered, free: Free) -> Fit:
     remarks = (*((_RANDOM,) if found.tilting else ()), *found.doubts(free, unc))
     unc = found.held(unc)
     rows = parameter_set(free, theta, short.layout.initial(short.vehicle), unc)
-    rows = rows.unreliable(YAW) if found.turning else rows
     return Fit(short.vehicle, theta, rows, short.noise, unc, Convergence.CONVERGED, 0, (*remarks, *on_bounds(rows)))

@@ -120,9 +120,12 @@ def inertia_warnings(parameters: ParameterSet) -> list[str]:
 def answered(parameters: ParameterSet) -> bool:
     """True when the data add to the vehicle file for at least one parameter.
 
-    A sharp prior may decide a value on which the data are informative, too.
+    A value measured before may be decided by that on data that are informative, too.
     """
-    return any(p.status is not Status.PRIOR_DOMINATED or p.prior_share < NOTHING_NEW for p in parameters)
+    return any(
+        p.status is not Status.PRIOR_DOMINATED or (p.measured_before and p.prior_share < NOTHING_NEW)
+        for p in parameters
+    )
 
 
 def fitted_vehicle(fit: Fit) -> Vehicle:

@@ -162,6 +162,7 @@ def test_any_other_model_moves_the_means_as_it_says() -> None:
     p[:6] = vehicle.initial
     p[k.DRAG : k.DRAG + 2], p[k.CG : k.CG + 2] = (0.3, 0.4), (0.004, -0.003)
     p[k.DAMP : k.DAMP + 3] = 0.5, 0.8, 0.2
+    p[k.CENTRAL] = 1.0
     own = PLACES.keys() - {"motor_lag.tau"}
     whole, theta = WholeModel(flight.window, vehicle, own), Layout(vehicle).initial(vehicle)
     track = blind(flight, vehicle)
