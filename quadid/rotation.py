@@ -60,16 +60,16 @@ def exponential(vector: FloatArray) -> FloatArray:
 
 
 def turn(before: FloatArray, after: FloatArray) -> FloatArray:
-    """Rotation vectors [rad] in the body axes of `before`, shape (n, 3), the shorter way round to `after`.
+    """Rotation vectors [rad] in the body axes of `before`, shape (..., 3), the shorter way round to `after`.
 
-    Both are unit quaternions, body to world, shape (n, 4).
+    Both are unit quaternions, body to world, shape (..., 4).
     """
     between = product(conjugate(before), after)
-    scalar = between[:, 0]
-    vector = between[:, 1:] * np.where(scalar < 0.0, -1.0, 1.0)[:, None]
-    sine = np.linalg.norm(vector, axis=1)
+    scalar = between[..., :1]
+    vector = between[..., 1:] * np.where(scalar < 0.0, -1.0, 1.0)
+    sine = np.linalg.norm(vector, axis=-1, keepdims=True)
     angle = 2.0 * np.arctan2(sine, np.abs(scalar))
-    return np.asarray(vector * np.where(sine > 1e-9, angle / np.maximum(sine, 1e-9), 2.0)[:, None])
+    return np.asarray(vector * np.where(sine > 1e-9, angle / np.maximum(sine, 1e-9), 2.0))
 
 
 def integrated(rate: FloatArray, step: float) -> FloatArray:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import NamedTuple, TypeVar
 
 import numpy as np
@@ -75,6 +75,8 @@ ACTS = np.array([
     [0.0, 1.0, 0.0, 0.0, -1.0, 0.0],
 ])  # fmt: skip
 """Powers of the six in what rotors make of specific thrust and of the angular accelerations."""
+AT_ONCE = 16
+"""Points whose effects are simulated together: more would only take more memory."""
 SETTLING = 2
 """Times that effects are simulated anew along the states that they move."""
 LEAST = 1e-2
@@ -443,18 +445,18 @@ class Problem:
             near = near or k.kalman(track, p, psi, self.tail, True)[1]
             mean = near.mean
             for _ in range(SETTLING):
-                track = track._replace(beyond=self._beyond(z, j, mean))
+                track = track._replace(beyond=self._beyond([z], j, mean)[0])
                 mean = np.empty_like(mean)
                 k.replay(track, p, psi, near, self._table(track, near, p), _NO_ROWS, mean)
-            track = track._replace(beyond=self._beyond(z, j, mean))
+            track = track._replace(beyond=self._beyond([z], j, mean)[0])
         value, gains = k.kalman(track, p, psi, self.tail, store)
         return float(value), gains
 
-    def _beyond(self, z: FloatArray, j: int, means: FloatArray) -> FloatArray:
-        """Contribution of the whole model at these means of flight j."""
+    def _beyond(self, points: Sequence[FloatArray], j: int, means: FloatArray) -> Sequence[FloatArray]:
+        """Contribution of the whole model at each of several z and the means of flight j."""
         if not self.models:
-            return self.tracks[j].beyond
-        return self.models[j].beyond(self.vector(z, j), means)
+            return [self.tracks[j].beyond] * len(points)
+        return list(self.models[j].beyond(np.array([self.vector(z, j) for z in points]), means))
 
     def score(self, z: FloatArray, psi: FloatArray, gains: Sequence[Gains]) -> FloatArray:
         """Derivative of the objective by the noise numbers."""
@@ -497,7 +499,8 @@ class Problem:
         def one(i: int) -> float:
             total = self.penalty(points[i])
             for j, (track, g) in enumerate(zip(self.tracks, gains, strict=True)):
-                p, track = self.physics(points[i], j), track._replace(beyond=self._beyond(points[i], j, g.mean))
+                p, (beyond,) = self.physics(points[i], j), self._beyond([points[i]], j, g.mean)
+                track = track._replace(beyond=beyond)
                 total += float(k.replay(track, p, psi, g, self._table(track, g, p), _NO_ROWS, _NO_MEANS))
             return total
 
@@ -570,16 +573,20 @@ class Problem:
         return least, most
 
     def _several(self, j: int, points: Sequence[FloatArray], psi: FloatArray, g: Gains) -> list[FloatArray]:
-        return _each(lambda i: self._whitened(j, points[i], psi, g), len(points))
+        """Whitened innovations of flight j at points near that of the gains, effects along the states there."""
+        out: list[FloatArray] = []
+        for first in range(0, len(points), AT_ONCE):
+            some = points[first : first + AT_ONCE]
+            beyond = self._beyond(some, j, g.mean)
+            out += _each(partial(self._whitened, j, psi, g, some, beyond), len(some))
+        return out
 
-    def _whitened(self, j: int, z: FloatArray, psi: FloatArray, g: Gains) -> FloatArray:
-        """Whitened innovations of flight j at z under the gains of a point nearby, effects along the states there."""
-        track, p, mean = self.tracks[j], self.physics(z, j), g.mean
+    def _whitened(
+        self, j: int, psi: FloatArray, g: Gains, points: Sequence[FloatArray], beyond: Sequence[FloatArray], i: int
+    ) -> FloatArray:  # fmt: skip
+        track, p = self.tracks[j]._replace(beyond=beyond[i]), self.physics(points[i], j)
         out = np.zeros((len(track.t), k.M))
-        for _ in range(SETTLING if self.models else 1):
-            track = track._replace(beyond=self._beyond(z, j, mean))
-            mean = np.empty_like(g.mean)
-            k.replay(track, p, psi, g, self._table(track, g, p), out, mean)
+        k.replay(track, p, psi, g, self._table(track, g, p), out, _NO_MEANS)
         return out
 
 

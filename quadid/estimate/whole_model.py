@@ -51,48 +51,48 @@ class WholeModel:
         """The same along rows `first` to before `last`."""
         return WholeModel(self._window.slice(first, last), self._vehicle, self._own)
 
-    def beyond(self, theta: FloatArray, means: FloatArray) -> FloatArray:
-        """`Track.beyond` of a full parameter vector at filtered means (n, N_MEAN).
+    def beyond(self, thetas: FloatArray, means: FloatArray) -> FloatArray:
+        """`Track.beyond` of full parameter vectors (m, size) at filtered means (n, N_MEAN), shape (m, n, 9 + M).
 
         The difference of two models, so that it holds no difference of two integrations.
         """
-        motion, plain = theta.copy(), theta.copy()
+        motion, plain = thetas.copy(), thetas.copy()
         for index, neutral in self._sensors:
-            motion[index] = neutral
+            motion[:, index] = neutral
         for index, neutral in self._more:
-            plain[index] = neutral
+            plain[:, index] = neutral
         # 1. One step of the motion from every mean, beside one without what the filter has not.
-        n = len(means)
-        late = _SETTLED * max(theta[IMU_PERIOD], 0.0) + max(theta[ATT_DELAY], 0.0)
-        sensed = not np.array_equal(theta, motion)
-        own, moved, *read = self._rolled([plain, motion, *([theta] if sensed and late == 0.0 else [])], means, 1)
-        out = np.zeros((n, 9 + k.M))
-        out[:-2, :3] = moved[:, :3] - own[:, :3]
-        out[:-2, 3:6] = turn(_attitude(own), _attitude(moved))
-        out[:-2, 6:9] = moved[:, 9:12] - own[:, 9:12]
-        out[1:-1, 15:18] = moved[:, 6:9] - own[:, 6:9]
+        late = _SETTLED * max(thetas[:, IMU_PERIOD].max(), 0.0) + max(thetas[:, ATT_DELAY].max(), 0.0)
+        sensed = not np.array_equal(thetas, motion)
+        own, moved, *read = self._rolled([plain, motion, *([thetas] if sensed and late == 0.0 else [])], means, 1)
+        out = np.zeros((len(thetas), len(means), 9 + k.M))
+        out[:, :-2, :3] = moved[..., :3] - own[..., :3]
+        out[:, :-2, 3:6] = turn(_attitude(own), _attitude(moved))
+        out[:, :-2, 6:9] = moved[..., 9:12] - own[..., 9:12]
+        out[:, 1:-1, 15:18] = moved[..., 6:9] - own[..., 6:9]
         # 2. What sensors make of it; those with a memory look back over as many steps.
         if sensed:
             lead = 1 + int(np.ceil(late / self._window.dt))
-            true, sensors = self._rolled([motion, theta], means, lead) if late > 0.0 else (moved, read[0])
-            out[lead:-1, 9:12] = sensors[:, :3] - true[:, :3]
-            out[lead:-1, 12:15] = turn(_attitude(true), _attitude(sensors))
-            out[lead:-1, 15:21] += sensors[:, 6:12] - true[:, 6:12]
+            true, sensors = self._rolled([motion, thetas], means, lead) if late > 0.0 else (moved, read[0])
+            out[:, lead:-1, 9:12] = sensors[..., :3] - true[..., :3]
+            out[:, lead:-1, 12:15] = turn(_attitude(true), _attitude(sensors))
+            out[:, lead:-1, 15:21] += sensors[..., 6:12] - true[..., 6:12]
         return out
 
-    def _rolled(self, thetas: Sequence[FloatArray], means: FloatArray, lead: int) -> list[FloatArray]:
-        """Measurements `lead` steps after every mean but the last two, a (n - 1 - lead, 12) array a vector."""
+    def _rolled(self, vectors: Sequence[FloatArray], means: FloatArray, lead: int) -> list[FloatArray]:
+        """Measurements `lead` steps after every mean but the last two, a (m, n - 1 - lead, 12) array each."""
         states = np.zeros((len(means) - 1 - lead, 13))
         states[:, :10] = means[: len(states), :10]
         if self._window.position is not None:
             states[:, 10:] = np.nan_to_num(self._window.position[: len(states)])
         cut = Segments(1, lead, np.arange(lead, len(means) - 1, dtype=np.int64))
-        residual, _ = self._rollout.roll(cut, np.stack(thetas), states, n_pre=lead)
-        return [residual[0, :, 0, :, i] for i in range(len(thetas))]
+        lanes, _ = self._rollout.roll(cut, np.concatenate(vectors), states, n_pre=lead)
+        each = np.moveaxis(lanes[:, :, 0], 3, 1).reshape(-1, *lanes.shape[1:2], lanes.shape[3])
+        return [each[i : i + len(v)] for v, i in zip(vectors, range(0, len(each), len(vectors[0])), strict=False)]
 
 
 def _attitude(read: FloatArray) -> FloatArray:
-    """Unit quaternions of residuals against no rotation, which are twice their vector parts, shape (n, 4)."""
-    half = 0.5 * read[:, 3:6]
-    scalar = np.sqrt(np.maximum(1.0 - np.sum(half**2, axis=1), 0.0))
-    return np.column_stack([scalar, half])
+    """Unit quaternions of residuals against no rotation, which are twice their vector parts, shape (..., 4)."""
+    half = 0.5 * read[..., 3:6]
+    scalar = np.sqrt(np.maximum(1.0 - np.sum(half**2, axis=-1, keepdims=True), 0.0))
+    return np.concatenate([scalar, half], axis=-1)

@@ -151,10 +151,11 @@ FREED = {
 }  # fmt: skip
 
 
-def test_gradient_by_any_entry_is_the_slope_of_the_likelihood() -> None:
-    """In every stage from command to sensor; what frozen gains leave out is a hundredth.
+def test_gradient_by_any_entry_is_the_slope_of_the_squares() -> None:
+    """In every stage from command to sensor, under the gains and along the states of the pass it is taken at.
 
-    In yaw drag is damping, which gains follow: there the slope is that of the squares under the gains as they are.
+    What that leaves out, gains and states that follow the entry, is none on average at the truth; here, a fifth off in
+    several causes, it is half a standard error at most, but for drag, which is damping in yaw and moves the gains.
     """
     window = fly(PELICAN, None, 10.0, 3, effects=STRONG, extras=("velocity",)).window
     problem = Problem.of([from_window(window, PELICAN)], PELICAN, tuple(FREED), [window])
@@ -165,14 +166,14 @@ def test_gradient_by_any_entry_is_the_slope_of_the_likelihood() -> None:
         z[i] += FREED.get(name, 0.0) / problem.size[i]
     _, gains = problem.passes(z, psi)
     information, gradient = problem.normal_equations(z, psi, gains)
+    sigma = 1.0 / np.sqrt(np.diag(information))
     for i, (name, _, _) in enumerate(problem.entries):
-        step = 1e-3 * (np.arange(len(z)) == i)
-        if name.startswith("rotor_drag"):
-            up, down = problem.replayed(np.array([z + step, z - step]), psi, gains)
-        else:
-            up, down = (problem.passes(z + s * step, psi, gains)[0] for s in (1.0, -1.0))
-        error = abs(gradient[i] - (up - down) / 4e-3) / np.sqrt(information[i, i])
-        assert error < max(0.02 * abs(gradient[i]) / np.sqrt(information[i, i]), 0.3), name
+        steps = z + np.outer([1e-3, -1e-3], np.arange(len(z)) == i)
+        up, down = problem.replayed(steps, psi, gains)
+        assert gradient[i] * sigma[i] == pytest.approx((up - down) / 4e-3 * sigma[i], rel=1e-3, abs=0.01), name
+        if not name.startswith("rotor_drag"):
+            up, down = (problem.passes(x, psi, gains)[0] for x in steps)
+            assert gradient[i] * sigma[i] == pytest.approx((up - down) / 4e-3 * sigma[i], rel=0.02, abs=0.5), name
 
 
 def test_a_motor_lag_among_the_late_causes_leaves_the_inertias_alone() -> None:

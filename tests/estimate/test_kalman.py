@@ -167,7 +167,7 @@ def test_any_other_model_moves_the_means_as_it_says() -> None:
     whole, theta = WholeModel(flight.window, vehicle, own), Layout(vehicle).initial(vehicle)
     track = blind(flight, vehicle)
     for _ in range(12):
-        track = track._replace(beyond=whole.beyond(theta, still(p, track).mean))
+        track = track._replace(beyond=whole.beyond(theta[None], still(p, track).mean)[0])
     mean = still(p, track).mean[1:41]
     np.testing.assert_allclose(mean[:, k.VE + 1 : k.VE + 4], wanted.velocity[:40], atol=3e-3)
     sensed = mean[:, 4:7] + track.beyond[1:41, 9:12]
