@@ -298,8 +298,9 @@ def _advance(c: FloatArray, row: FloatArray, h: float, keep: FloatArray, air: bo
     if air:
         _, _, _, u, v, _ = _force(c, s2, s1, x[0], x[1], x[2], x[3], x[VE + 1], x[VE + 2], x[VE + 3])
         gx, gy = gx - c[20] * s1 * v, gy + c[19] * s1 * u
-        # Sums of x and y times speed about the centre of gravity: that of squares over twice the mean speed.
-        x1, y1 = c[23] * x2 / s1 - c[17] * s1, c[23] * y2 / s1 - c[18] * s1
+        # Sums of x and y times speed about the centre of gravity: of squares over twice the mean speed; 0 at rest.
+        each = c[23] / s1 if s1 > 0.0 else 0.0
+        x1, y1 = each * x2 - c[17] * s1, each * y2 - c[18] * s1
         gz += c[22] * (c[12] * u * y1 - c[13] * v * x1)
     qw, qx, qy, qz, p, q, r = x[0], x[1], x[2], x[3], x[4], x[5], x[6]
     a1, b1, c1 = _turning(c, s2 + ds, x2 + dx, y2 + dy, z2 + dz, o1 + do, s1, p, q, r)

@@ -1,8 +1,8 @@
 """The whole table of effects in the filter: what `quadid.model` makes of each filtered state, beyond the filter's own.
 
-The filter carries the nominal vehicle and a few effects in its own equations.  Of any other model it takes the means:
-every filtered state is simulated by one step with `quadid.model`, all rows at once, and the difference to the filter's
-own step is added there.  The filter then runs anew, and its states change a little; a few rounds settle both
+The filter carries the nominal vehicle and a few effects in its own equations.  Any other effect it takes as an addition
+to its means: from every filtered state `quadid.model` simulates one step with it and one without, all rows at once, and
+the difference is added there.  The filter then runs anew, and its states change a little; a few rounds settle both
 (fixed-point iteration, as in an iterated Kalman filter).  The filter's covariance is that of its own equations;
 sensitivities by any entry of the vector are those of both (`problem.Problem.normal_equations`).
 """

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -109,6 +111,17 @@ def test_a_replay_of_the_same_physics_gives_the_same_innovations() -> None:
     seen = g.S > 0.0
     np.testing.assert_allclose(out[seen], (g.nu * np.sqrt(g.w / np.where(seen, g.S, 1.0)))[seen], atol=1e-9)
     assert total == pytest.approx(float(np.sum(out**2)))
+
+
+def test_rotors_that_stand_still_have_no_drag() -> None:
+    """The yaw moment of drag divides by their mean speed."""
+    flight = fly(PELICAN, seconds=2.0, seed=1, extras=("velocity",))
+    speed = np.zeros_like(flight.window.rotor_speed)
+    p = physics()
+    p[k.DRAG] = p[k.DRAG + 1] = 0.3
+    value, gains = k.kalman(from_window(replace(flight.window, rotor_speed=speed), PELICAN), p, NOISE, GAUSS, True)
+    assert np.isfinite(value)
+    assert np.isfinite(gains.mean).all()
 
 
 EFFECTS = {
