@@ -12,29 +12,17 @@ A controller is software: it is the same in the flown vehicle and in a simulatio
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from typing import Any, TypeVar, cast
+from collections.abc import Mapping
 
-import numba
 import numpy as np
 
 from quadid.errors import ParameterError, nearest
+from quadid.on_disk import kept
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 
-F = TypeVar("F", bound=Callable[..., object])
 
-
-def _kernel(function: F) -> F:
-    """Compiles with IEEE arithmetic, cached on disk where something can be written there."""
-    options: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
-    try:
-        return cast(F, numba.njit(cache=True, **options)(function))
-    except RuntimeError:
-        return cast(F, numba.njit(**options)(function))
-
-
-@numba.njit(cache=True, inline="always")
+@kept(inline="always")
 def write_rotation(w: float, x: float, y: float, z: float, out: FloatArray) -> None:
     """Writes the rotation matrix of a unit quaternion into `out`, shape (3, 3)."""
     out[0, 0], out[0, 1], out[0, 2] = 1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)
@@ -86,7 +74,7 @@ def mixer_matrix(vehicle: Vehicle, gains: Mapping[str, float]) -> FloatArray:
     return np.ascontiguousarray(np.linalg.pinv(effect))
 
 
-@_kernel
+@kept()
 def rotation_of(roll: float, pitch: float, yaw: float, out: FloatArray) -> None:
     """Writes the rotation matrix (body to world, 3-2-1 Euler angles [rad]) into `out`, shape (3, 3)."""
     sr, cr = np.sin(roll), np.cos(roll)
@@ -97,7 +85,7 @@ def rotation_of(roll: float, pitch: float, yaw: float, out: FloatArray) -> None:
     out[2, 0], out[2, 1], out[2, 2] = -sp, cp * sr, cp * cr
 
 
-@_kernel
+@kept()
 def steer(
     gains: FloatArray,
     mixer: FloatArray,
@@ -147,7 +135,7 @@ def steer(
         command[i] = np.sqrt(min(max(square, floor), ceiling))
 
 
-@_kernel
+@kept()
 def stabilise(
     gains: FloatArray,
     mixer: FloatArray,
@@ -175,7 +163,7 @@ def stabilise(
     steer(gains, mixer, wanted, reference[3], attitude, rate, dt, integral, torque, command)
 
 
-@_kernel
+@kept()
 def stabilise_rows(
     gains: FloatArray,
     mixer: FloatArray,
@@ -204,7 +192,7 @@ def stabilise_rows(
         stabilise(gains, mixer, reference[k], matrix, rate[k], dt[k], integral, command[k])
 
 
-@_kernel
+@kept()
 def stabilise_each(
     gains: FloatArray,
     mixer: FloatArray,

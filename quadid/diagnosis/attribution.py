@@ -184,7 +184,7 @@ def left_out_error(scorer: Shooting, theta: FloatArray, names: Sequence[str]) ->
     """Error of each block with what the block itself did to the parameters undone, to first order.
 
     Args:
-        scorer: the data in segments of `SCORE_SECONDS`, with the noise that counts.
+        scorer: the data in segments that decide (`pipeline.DECIDE_SECONDS`), with the noise that counts.
         theta: fitted to these data, full vector.
         names: what was fitted.
     """

@@ -247,7 +247,7 @@ def _predicted_attitude(part: Columns, measured: FloatArray) -> FloatArray:
 
 # --- What remains after the named causes: is it noise, and does it contradict them?
 #
-# Two looks: does the residual follow anything the vehicle did (`residual_regressors`), and does its power stand above
+# Two looks: does the residual follow anything the vehicle did (`follows`), and does its power stand above
 # the noise?  For the second, the whitened residual of each segment, initial state eliminated, is taken apart into
 # cosine modes.  Pure noise leaves every mode with the power that the elimination itself leaves it, which is computed
 # with the same projection on drawn noise.  Modes that stand above the noise model by more than chance are structure,

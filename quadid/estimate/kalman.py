@@ -33,9 +33,9 @@ from __future__ import annotations
 import math
 from typing import Any, NamedTuple
 
-import numba as nb
 import numpy as np
 
+from quadid.on_disk import kept
 from quadid.types import BoolArray, FloatArray
 from quadid.vehicle import GRAVITY
 
@@ -62,7 +62,7 @@ _CLOCK = np.array([0, 0, 1, 2, 2, 3, 4, 4, 4])
 MOMENTS = 6
 STILL_TIME = 1.0
 """Correlation time of a velocity that nobody measures [s]; see `Track.still`."""
-_FAST: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy", "fastmath": {"contract", "nsz"}}
+_fast: Any = kept(fastmath={"contract", "nsz"})
 
 
 class Track(NamedTuple):
@@ -126,7 +126,7 @@ class Gains(NamedTuple):
     beyond: FloatArray
 
 
-@nb.njit(**_FAST)
+@_fast
 def _lagged(piece_t: FloatArray, piece: FloatArray, lag: float) -> FloatArray:
     """Moments at the begin of every piece behind a first-order lag [s], shape (pieces, MOMENTS).
 
@@ -142,7 +142,7 @@ def _lagged(piece_t: FloatArray, piece: FloatArray, lag: float) -> FloatArray:
     return out
 
 
-@nb.njit(**_FAST)
+@_fast
 def _behind(polynomial: FloatArray, lag: float, s: float, begin: float) -> float:
     """Moment behind a lag, s after the begin of a piece: y' = (M - y) / lag with M a parabola."""
     c = 3.0 * polynomial[3]
@@ -151,7 +151,7 @@ def _behind(polynomial: FloatArray, lag: float, s: float, begin: float) -> float
     return float(a + s * (b + s * c) + (begin - a) * math.exp(-s / lag))
 
 
-@nb.njit(**_FAST)
+@_fast
 def _integrals(
     piece_t: FloatArray, piece: FloatArray, lag: float, begin: FloatArray, t: float, at: int, out: FloatArray
 ) -> int:
@@ -171,7 +171,7 @@ def _integrals(
     return at
 
 
-@nb.njit(**_FAST)
+@_fast
 def moments(track: Track, delay: float, lag: float) -> FloatArray:
     """Mean rotor moments, shape (n, 3 MOMENTS): both halves of the step from each time; while the accelerometer reads.
 
@@ -202,7 +202,7 @@ def moments(track: Track, delay: float, lag: float) -> FloatArray:
     return out
 
 
-@nb.njit(**_FAST)
+@_fast
 def _constants(p: FloatArray, track: Track) -> FloatArray:
     """Constants of Eqs. 2 and 3."""
     c = np.empty(24)
@@ -224,7 +224,7 @@ def _constants(p: FloatArray, track: Track) -> FloatArray:
     return c
 
 
-@nb.njit(**_FAST)
+@_fast
 def _turning(c, s2, x2, y2, z2, o1, s1, p, q, r):  # type: ignore[no-untyped-def]
     """Eq. 2 without alpha: angular acceleration for these rotor moments and rates."""
     return (
@@ -234,7 +234,7 @@ def _turning(c, s2, x2, y2, z2, o1, s1, p, q, r):  # type: ignore[no-untyped-def
     )
 
 
-@nb.njit(**_FAST)
+@_fast
 def _rotation(w, x, y, z):  # type: ignore[no-untyped-def]
     """Body to world, row by row."""
     return (
@@ -244,7 +244,7 @@ def _rotation(w, x, y, z):  # type: ignore[no-untyped-def]
     )  # fmt: skip
 
 
-@nb.njit(**_FAST)
+@_fast
 def _force(c, s2, s1, w, x, y, z, vn, ve, vd):  # type: ignore[no-untyped-def]
     """Specific force of rotors and drag in body axes, and velocity there."""
     r = _rotation(w, x, y, z)
@@ -252,7 +252,7 @@ def _force(c, s2, s1, w, x, y, z, vn, ve, vd):  # type: ignore[no-untyped-def]
     return -c[12] * s1 * u, -c[13] * s1 * v, -c[0] * s2, u, v, r[2] * vn + r[5] * ve + r[8] * vd
 
 
-@nb.njit(**_FAST)
+@_fast
 def _falling(c, s2, s1, w, x, y, z, vn, ve, vd, fx, fy, fz):  # type: ignore[no-untyped-def]
     """Eq. 3."""
     r = _rotation(w, x, y, z)
@@ -264,7 +264,7 @@ def _falling(c, s2, s1, w, x, y, z, vn, ve, vd, fx, fy, fz):  # type: ignore[no-
     )  # fmt: skip
 
 
-@nb.njit(**_FAST)
+@_fast
 def _spin(w, x, y, z, p, q, r):  # type: ignore[no-untyped-def]
     """Eq. 2: rate of the quaternion."""
     return (
@@ -273,7 +273,7 @@ def _spin(w, x, y, z, p, q, r):  # type: ignore[no-untyped-def]
     )  # fmt: skip
 
 
-@nb.njit(**_FAST)
+@_fast
 def _advance(c: FloatArray, row: FloatArray, h: float, keep: FloatArray, air: bool, x: FloatArray) -> None:
     """Eqs. 2 to 4 over one step: classical Runge-Kutta, rotor moments linear through their means over both halves.
 
@@ -348,7 +348,7 @@ def _advance(c: FloatArray, row: FloatArray, h: float, keep: FloatArray, air: bo
         x[FO + 1 + i] *= keep[i]
 
 
-@nb.njit(**_FAST)
+@_fast
 def _go_beyond(track: Track, k: int, room: FloatArray, x: FloatArray) -> None:
     """Adds what a larger model makes of step k; `room` (N,) is overwritten."""
     if len(track.beyond) > 0:
@@ -359,7 +359,7 @@ def _go_beyond(track: Track, k: int, room: FloatArray, x: FloatArray) -> None:
         _correct(room, x)
 
 
-@nb.njit(**_FAST)
+@_fast
 def _read_beyond(track: Track, k: int, nu: FloatArray) -> None:
     """Takes what a larger model makes of each measurement off the innovations of row k."""
     if len(track.beyond) > 0:
@@ -367,7 +367,7 @@ def _read_beyond(track: Track, k: int, nu: FloatArray) -> None:
             nu[m] -= track.beyond[k, 9 + m]
 
 
-@nb.njit(**_FAST)
+@_fast
 def _expected(c, p, y, seen, row, air, x, out):  # type: ignore[no-untyped-def]
     """Writes y - h(x) of what was measured, shape (M,), a rotation vector of the attitude."""
     for i in range(3):
@@ -398,7 +398,7 @@ def _expected(c, p, y, seen, row, air, x, out):  # type: ignore[no-untyped-def]
         out[VELOCITY + i] = (y[10 + i] if seen[3] else 0.0) - x[VE + 1 + i]
 
 
-@nb.njit(**_FAST)
+@_fast
 def _correct(dx: FloatArray, x: FloatArray) -> None:
     """X <- x + dx, the attitude by its rotation vector."""
     a, b, e = 0.5 * dx[0], 0.5 * dx[1], 0.5 * dx[2]
@@ -416,7 +416,7 @@ def _correct(dx: FloatArray, x: FloatArray) -> None:
         x[m + 1] += dx[m]
 
 
-@nb.njit(**_FAST)
+@_fast
 def _start(track: Track, p: FloatArray) -> FloatArray:
     """First mean: as first measured, level and at rest where nothing was; its covariance is wide."""
     x = np.zeros(N_MEAN)
@@ -434,13 +434,13 @@ def _start(track: Track, p: FloatArray) -> FloatArray:
     return x
 
 
-@nb.njit(**_FAST)
+@_fast
 def _keep(psi: FloatArray, h: float, keep: FloatArray) -> None:
     for i in range(9):
         keep[i] = math.exp(-h / psi[TIME + _CLOCK[i]])
 
 
-@nb.njit(**_FAST)
+@_fast
 def _cross(a, b, e, scale, row, col, F):  # type: ignore[no-untyped-def]
     """Adds scale [(a, b, e)]x to a block of F."""
     F[row, col + 1] -= scale * e
@@ -451,7 +451,7 @@ def _cross(a, b, e, scale, row, col, F):  # type: ignore[no-untyped-def]
     F[row + 2, col + 1] += scale * a
 
 
-@nb.njit(**_FAST)
+@_fast
 def _transition(c, row, h, keep, air, x, after, F, turn):  # type: ignore[no-untyped-def]
     """Writes F of Eq. 5, from a step's begin and end, and the rotation in its middle (3, 3)."""
     F[:] = 0.0
@@ -518,7 +518,7 @@ def _transition(c, row, h, keep, air, x, after, F, turn):  # type: ignore[no-unt
             F[VE + i, VE + i] = 1.0
 
 
-@nb.njit(**_FAST)
+@_fast
 def _kick(h, air, i, turn, G):  # type: ignore[no-untyped-def]
     """Writes the column of G in Eq. 5 of Gauss-Markov state i: its noise acts by half within the step."""
     G[:] = 0.0
@@ -532,7 +532,7 @@ def _kick(h, air, i, turn, G):  # type: ignore[no-untyped-def]
         G[OM + i - 3] = 0.5 * h
 
 
-@nb.njit(**_FAST)
+@_fast
 def _wavering(track, row, h, out):  # type: ignore[no-untyped-def]
     """Writes what rotor speeds of noise 1 rad/s make of the specific thrust and the angular accelerations of a step.
 
@@ -542,7 +542,7 @@ def _wavering(track, row, h, out):  # type: ignore[no-untyped-def]
         out[i] = 2.0 * (row[0] + row[MOMENTS]) * track.period / h * track.waver[i]
 
 
-@nb.njit(**_FAST)
+@_fast
 def _push(h, air, i, turn, G):  # type: ignore[no-untyped-def]
     """Writes the column of G of rotor noise `i` of `_wavering`, constant over the step."""
     G[:] = 0.0
@@ -553,7 +553,7 @@ def _push(h, air, i, turn, G):  # type: ignore[no-untyped-def]
             G[VE + j] = h * turn[j, 2]
 
 
-@nb.njit(**_FAST)
+@_fast
 def _places(channel, slope, where, what):  # type: ignore[no-untyped-def]
     """Writes the non-zero places and values of H of one scalar measurement; returns how many there are."""
     axis = channel % 3
@@ -576,7 +576,7 @@ def _places(channel, slope, where, what):  # type: ignore[no-untyped-def]
     return 1
 
 
-@nb.njit(**_FAST)
+@_fast
 def _accel_slope(c, row, air, x, slope):  # type: ignore[no-untyped-def]
     """Writes the derivative of the accelerometer by rotation vector and velocity, (3, 6)."""
     slope[:] = 0.0
@@ -589,13 +589,13 @@ def _accel_slope(c, row, air, x, slope):  # type: ignore[no-untyped-def]
             slope[0, 3 + j], slope[1, 3 + j] = -kx * r[3 * j], -ky * r[3 * j + 1]
 
 
-@nb.njit(**_FAST)
+@_fast
 def _is_measured(track: Track, k: int, channel: int) -> bool:
     """Presence of such a measurement; a velocity that nobody measures is about zero (see `Track.still`)."""
     return track.seen[k, channel // 3] or (channel >= VELOCITY and track.still > 0.0)
 
 
-@nb.njit(**_FAST)
+@_fast
 def _white(track: Track, psi: FloatArray, k: int, channel: int) -> float:
     """Variance r of a scalar measurement."""
     if channel >= VELOCITY and not track.seen[k, 3]:
@@ -604,13 +604,13 @@ def _white(track: Track, psi: FloatArray, k: int, channel: int) -> float:
     return float(psi[channel] * psi[channel])
 
 
-@nb.njit(**_FAST)
+@_fast
 def _normaliser(degrees: float) -> float:
     """-2 ln of the Student-t density at 0 against the Gaussian's."""
     return 2.0 * (math.lgamma(0.5 * degrees) - math.lgamma(0.5 * (degrees + 1.0))) + math.log(0.5 * degrees)
 
 
-@nb.njit(**_FAST)
+@_fast
 def kalman(track: Track, p: FloatArray, psi: FloatArray, tail: FloatArray, store: bool) -> tuple[float, Gains]:
     """Filter pass over a flight.
 
@@ -721,7 +721,7 @@ def kalman(track: Track, p: FloatArray, psi: FloatArray, tail: FloatArray, store
     return total, g
 
 
-@nb.njit(**_FAST)
+@_fast
 def _product(F: FloatArray, P: FloatArray, turned: bool, out: FloatArray) -> None:
     """Writes F P, or F' P, of the sparse F of `_transition`."""
     for i in range(N):
@@ -736,7 +736,7 @@ def _product(F: FloatArray, P: FloatArray, turned: bool, out: FloatArray) -> Non
                     out[a, j] += f * P[b, j]
 
 
-@nb.njit(**_FAST)
+@_fast
 def _sandwich(F: FloatArray, P: FloatArray, FP: FloatArray, turned: bool) -> None:
     """P <- F P F' of a symmetric P, or F' P F; FP is room, and holds (F P)' afterwards."""
     _product(F, P, turned, FP)
@@ -749,7 +749,7 @@ def _sandwich(F: FloatArray, P: FloatArray, FP: FloatArray, turned: bool) -> Non
             P[i, j] = P[j, i] = 0.5 * (P[i, j] + P[j, i])
 
 
-@nb.njit(**_FAST)
+@_fast
 def replay(
     track: Track, p: FloatArray, psi: FloatArray, g: Gains, table: FloatArray, out: FloatArray, mean: FloatArray
 ) -> float:
@@ -800,7 +800,7 @@ def replay(
     return total
 
 
-@nb.njit(**_FAST)
+@_fast
 def _quadratic(G, l, L):  # type: ignore[no-untyped-def]
     """G' l and G' L G of a column with few entries."""
     along, spread = 0.0, 0.0
@@ -812,7 +812,7 @@ def _quadratic(G, l, L):  # type: ignore[no-untyped-def]
     return along, spread
 
 
-@nb.njit(**_FAST)
+@_fast
 def backward(
     track: Track, p: FloatArray, psi: FloatArray, g: Gains, smooth: bool
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:

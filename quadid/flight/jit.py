@@ -8,16 +8,11 @@ therefore covers all sources of this room.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
 from functools import cache
 from importlib import resources
-from typing import Any, TypeVar, cast
 
-import numba
-
+from quadid.on_disk import F, kept
 from quadid.vehicle import GRAVITY
-
-F = TypeVar("F", bound=Callable[..., object])
 
 
 @cache
@@ -32,15 +27,8 @@ def fingerprint() -> str:
 
 
 def kernel(function: F) -> F:
-    """Compiles `function` with numba: no interpreter lock, cached on disk, IEEE arithmetic (no fastmath).
+    """Compiles `function` with numba, in IEEE arithmetic (no fastmath).
 
-    The truth is a reference, so no arithmetic is re-ordered: the same seed gives the same bits.  Where nothing can be
-    written to disk, every start compiles anew.
+    The truth is a reference, so no arithmetic is re-ordered: the same seed gives the same bits.
     """
-    try:
-        compiled: Any = numba.njit(cache=True, nogil=True, error_model="numpy")(function)
-    except RuntimeError:
-        return cast(F, numba.njit(nogil=True, error_model="numpy")(function))
-    file = compiled._cache._cache_file
-    file._source_stamp = f"{file._source_stamp} {fingerprint()}"
-    return cast(F, compiled)
+    return kept(fingerprint())(function)

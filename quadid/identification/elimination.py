@@ -291,7 +291,7 @@ def _largest(g: FloatArray) -> float:
 
 
 def _on_disk(sources: int) -> Any:
-    @nb.njit(**cached)
+    @cached
     def reduce(
         out: FloatArray, inverse: FloatArray, weights: FloatArray, precision: FloatArray, coloured: BoolArray,
         matrix: FloatArray, reach: IntArray, lane: IndexArray, prior: StatePrior, into: Reduced,

@@ -88,7 +88,7 @@ def _keep_half(half: int, halves: int, place: int, force: FloatArray, s: FloatAr
 
 
 def _on_disk(sources: int) -> Any:
-    @nb.njit(**cached)
+    @cached
     def fly_closed_loop(
         references: FloatArray, gains: FloatArray, mixer: FloatArray, substeps: int, lanes: int, geometry: FloatArray,
         terms: IntArray, flight: Flight, theta: FloatArray, need: Needs, x0: FloatArray, out: FloatArray,

@@ -97,7 +97,7 @@ def _any_of(theta: FloatArray, entries: IntArray) -> bool:
 
 
 def _on_disk(sources: int) -> Any:
-    @nb.njit(**cached)
+    @cached
     def needs_of(theta: FloatArray, rotors: int, channels: int) -> Needs:
         """Returns what a block of parameter vectors (LANES, size) needs of the model."""
         _ = sources

@@ -204,7 +204,7 @@ def _settle_force(s: FloatArray) -> None:
 
 
 def _on_disk(sources: int) -> Any:
-    @nb.njit(**cached)
+    @cached
     def roll_segments(
         drive: Drive, terms: IntArray, flight: Flight, table: FloatArray,
         measured: FloatArray, scale: FloatArray, memory: int, starts: IntArray, n_pre: int, x0: FloatArray,

@@ -381,7 +381,7 @@ def spread_moments(table: FloatArray, k: int, moments: int, s: FloatArray) -> No
 
 
 def _on_disk(sources: int) -> Any:
-    @nb.njit(**cached)
+    @cached
     def rotor_table(drive: Drive, need: Needs, theta: FloatArray, table: FloatArray) -> None:
         """Moments of every step of a window for lanes that share all that acts on rotors.
 

@@ -15,6 +15,7 @@ from numba.core import cgutils, types
 from numba.extending import intrinsic
 
 from quadid.effects import EFFECTS
+from quadid.on_disk import kept
 from quadid.types import FloatArray
 
 LANES = 16
@@ -31,8 +32,8 @@ FREE = {"contract", "nnan", "ninf", "nsz"}
 would round differently, and flights replayed after a restart would not be the same bit for bit."""
 whole: dict[str, Any] = {"nogil": True, "fastmath": FREE, "error_model": "numpy"}
 """Options of functions that Python calls."""
-cached: dict[str, Any] = {**whole, "cache": True}
-"""Options of the kernels on disk."""
+cached: Any = kept(fastmath=FREE)
+"""Compiles such a function as one of the kernels on disk."""
 jit: dict[str, Any] = {**whole, "_nrt": False}
 """Options of the pieces of kernels: no reference counts, whose atomic updates cost more than a short lane loop."""
 exact: dict[str, Any] = {**jit, "fastmath": False}

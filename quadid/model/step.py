@@ -159,7 +159,7 @@ def _read_sensors(first: bool, dt: float, need: Needs, s: FloatArray, past: Floa
 
 
 def _on_disk(sources: int) -> Any:
-    @nb.njit(**cached)
+    @cached
     def write_constants(
         theta: FloatArray, flight: Flight, coefficients: FloatArray, constants: FloatArray, rot: FloatArray
     ) -> None:
@@ -185,7 +185,7 @@ def _on_disk(sources: int) -> Any:
             residual_coefficients(theta[block], rot.shape[1], coefficients[block])
             constants[block] = s[:STATE]
 
-    @nb.njit(**cached)
+    @cached
     def step_blocks(
         commands: FloatArray, geometry: FloatArray, theta: FloatArray, terms: IntArray, coefficients: FloatArray,
         needs: BoolArray, constants: FloatArray, walk: FloatArray, time: float, span: float, dt: float, seed: int,

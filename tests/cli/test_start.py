@@ -56,6 +56,40 @@ def test_a_fit_calls_what_was_compiled_and_nothing_else(flights: Flights, inside
     assert inside("warmup").out == "Kernels: compiled already.\n"
 
 
+KERNEL = """
+from typing import NamedTuple
+from quadid.on_disk import kept
+
+class {name}(NamedTuple):
+    x: float
+
+@kept()
+def twice(of):
+    return 2.0 * of.x
+
+if __name__ != "__main__":
+    print(twice({name}(1.5)), sum(twice.stats.cache_hits.values()))
+"""
+
+
+def test_machine_code_on_disk_that_cannot_be_read_is_compiled_again(tmp_path: Path) -> None:
+    """A named tuple renamed by an upgrade, and files that a full disk cut short."""
+    module, cache = tmp_path / "kernel_on_disk.py", tmp_path / "cache"
+    text = "import sys; sys.path.insert(0, sys.argv[1]); import kernel_on_disk"
+
+    def run() -> str:
+        return python(text, str(tmp_path), NUMBA_CACHE_DIR=str(cache), PYTHONDONTWRITEBYTECODE="1").strip()
+
+    module.write_text(KERNEL.format(name="Before"))
+    assert run() == "3.0 0"
+    module.write_text(KERNEL.format(name="Renamed"))
+    assert [run(), run()] == ["3.0 0", "3.0 1"]
+    for kind in ("nbi", "nbc"):
+        for file in cache.rglob(f"*.{kind}"):
+            file.write_bytes(file.read_bytes()[:40])
+        assert [run(), run()] == ["3.0 0", "3.0 1"], kind
+
+
 # --- The folder a command is run in may have been packed by a stranger: nothing in it is run
 
 
