@@ -165,7 +165,7 @@ def _filtered(windows: Sequence[Window], vehicle: Vehicle, theta: FloatArray, fr
         prompt = -unit * (found.covariance[np.ix_(places, where)] @ pull)
     # 4. Parts of the flights, every second row, and models with one cause more.
     more = [n for n in _catalogue(layout, windows) if n not in whole.names and n.split(".")[0] not in known]
-    wide, half = problem_of(windows, more), problem_of([coarse(w) for w in windows])
+    wide, half = problem_of(windows, more), replace(problem_of([coarse(w) for w in windows]), names=whole.names)
     trust = _compared(found, wide, half, places, unit)
     share = found.psi[k.SIGMA : k.TIME] / problem.noise_scale
     return Filtered(out, own, prompt, trust, bool(share[2] > LARGE))

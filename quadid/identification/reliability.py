@@ -55,8 +55,12 @@ def on_coarse_grid(problem: Shooting, found: Polished, free: Free, prior: Prior)
 def coarse(window: Window) -> Window:
     """Every second row of `window`; forces and held speeds are means over the longer rows."""
     n = len(window) // 2 * 2
-    even: dict[str, Any] = {name: None if (x := getattr(window, name)) is None else x[:n:2] for name in _INSTANTS}
-    accel = None if window.accel is None else _smoothed(window.accel)[:n:2]
+    even: dict[str, Any] = {name: None if (x := getattr(window, name)) is None else x[:n:2] for name in _REFERENCES}
+    even |= {name: None if (x := getattr(window, name)) is None else _every_second(x[:n]) for name in _INSTANTS}
+    if window.attitude is not None:
+        between = np.isnan(window.attitude[:n:2, 0])
+        even["attitude"][between] /= np.linalg.norm(even["attitude"][between], axis=1, keepdims=True)
+    accel = None if window.accel is None else _every_second(_smoothed(window.accel)[:n])
     speed, slope = window.rotor_speed[:n:2], None
     if window.sampling == "held":
         first, second = window.rotor_speed[:n:2], window.rotor_speed[1:n:2]
@@ -67,7 +71,23 @@ def coarse(window: Window) -> Window:
     return replace(window, dt=2.0 * window.dt, rotor_speed=speed, rotor_slope=slope, accel=accel, **even)
 
 
-_INSTANTS = ("gyro", "attitude", "velocity", "position", "battery", "attitude_reference")
+_INSTANTS = ("gyro", "attitude", "velocity", "position")
+_REFERENCES = ("battery", "attitude_reference")
+
+
+def _every_second(values: FloatArray) -> FloatArray:
+    """Every second row; of a channel slower than the rows also what was measured between, on the line through it.
+
+    Otherwise nothing may be left: 25 Hz on rows of 50 Hz can lie in the odd ones alone.
+    """
+    known = np.asarray(np.isfinite(values).all(axis=1))
+    rows, out = np.flatnonzero(known), values[::2].copy()
+    if 0 < 2 * len(rows) <= len(known):
+        between = np.flatnonzero(~known[::2] & known[1::2])
+        between = between[2 * between > rows[0]]
+        for c, column in enumerate(values.T):
+            out[between, c] = np.interp(2 * between, rows, column[rows])
+    return out
 
 
 def _smoothed(accel: FloatArray) -> FloatArray:

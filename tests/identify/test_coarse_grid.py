@@ -39,6 +39,28 @@ def test_held_speeds_keep_their_thrust_and_a_straight_line_its_slope() -> None:
     np.testing.assert_allclose(coarse(line).rotor_slope, np.full((10, 4), 30.0))  # type: ignore[arg-type]
 
 
+@pytest.mark.parametrize("first", [0, 1])
+def test_channels_at_half_the_rate_of_the_rows_stay_wherever_they_lie(first: int) -> None:
+    """A motion at constant velocity and rate about z."""
+    t = 0.02 * np.arange(100)
+    line, angle = np.column_stack([3.0 * t, -t, 1.0 + t]), 0.5 * 6.0 * t
+    turn = np.column_stack([np.cos(angle), 0.0 * t, 0.0 * t, np.sin(angle)])
+    slow = {"velocity": line, "position": line, "accel": line, "attitude": turn}
+    seen = {name: np.where((np.arange(100) % 2 == first)[:, None], values, np.nan) for name, values in slow.items()}
+    half = coarse(Window(0.0, 0.02, np.full((100, 4), 400.0), gyro=np.zeros((100, 3)), **seen))  # type: ignore[arg-type]
+    for name, values in slow.items():
+        np.testing.assert_allclose(getattr(half, name)[1:], values[2::2], atol=1e-12, err_msg=name)
+
+
+def test_a_velocity_in_the_odd_rows_alone_is_compared_too() -> None:
+    """25 Hz on a grid of 50 Hz: every second row had no velocity, and other parameters."""
+    window = fly(PELICAN, seconds=30.0, seed=5, extras=("velocity",)).window
+    assert window.velocity is not None
+    odd = np.where((np.arange(len(window)) % 2 == 1)[:, None], window.velocity, np.nan)
+    found = fit([replace(window, velocity=odd)], PELICAN, FitOptions(iterations=0))
+    assert all(p.status is Status.IDENTIFIED for p in list(found.parameters)[:5])
+
+
 @pytest.fixture(scope="module")
 def behind_a_delay() -> list[tuple[Fit, FloatArray]]:
     """Fits of the nominal parameters and the delay to flights whose stabiliser acts at 1 kHz, and the truth."""
