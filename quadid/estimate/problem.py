@@ -595,5 +595,10 @@ _THREADS = ThreadPoolExecutor(max_workers=2, thread_name_prefix="filter")
 
 
 def _each(function: Callable[[int], T], count: int) -> list[T]:
-    """Calls a function of 0 to `count` - 1, several at a time."""
-    return list(_THREADS.map(function, range(count))) if count > 1 else [function(0)]
+    """Calls a function of 0 to `count` - 1, several at a time; a filter that runs away is seen by its value."""
+
+    def quiet(i: int) -> T:
+        with np.errstate(over="ignore", invalid="ignore"):  # each thread has its own
+            return function(i)
+
+    return list(_THREADS.map(quiet, range(count))) if count > 1 else [quiet(0)]
