@@ -195,11 +195,11 @@ def _compared(found: Estimate, wide: Problem, half: Problem, places: IndexArray,
     wide, half = (
         replace(other, base=problem.base, control=problem.control, tail=problem.tail) for other in (wide, half)
     )
-    # 1. Parts of the flights: the step of each block of time from the estimate, and its variance.
+    # 1. Parts of the flights: the step of each block of time from the optimum of all, and its variance.
     whole = _sensitivities(problem, found)
     grams, slopes = _blocks(problem, whole)
     inverses = np.linalg.inv(grams + np.diag(1.0 / (BLOCKS * problem.prior[1] ** 2)))
-    steps = -np.einsum("bij,bj->bi", inverses, slopes)[:, places] * unit
+    steps = -np.einsum("bij,bj->bi", inverses, slopes - slopes.mean(axis=0))[:, places] * unit
     _, between = random_effects(steps, np.diagonal(inverses, axis1=1, axis2=2)[:, places] * unit**2)
     # 2. The whole catalogue, linearised at the estimate on the liveliest minute.
     part = problem.liveliest(NEAR_SECONDS)

@@ -61,17 +61,6 @@ def test_a_velocity_in_the_odd_rows_alone_is_compared_too() -> None:
     assert all(p.status is Status.IDENTIFIED for p in list(found.parameters)[:5])
 
 
-def test_a_calm_part_of_a_flight_widens_no_interval() -> None:
-    """A cause that is missing leaves a slope at the optimum: of blocks that show little it was no small part."""
-    weak = {"weak_rotor": {"rotor": 2, "loss": 0.1}}
-    calm, lively = (
-        fly(PELICAN, seconds=30.0 * k, seed=k, profile=profile, effects=weak, noise_scale=0.1).window
-        for k, profile in ((1, "hover"), (2, "excited"))
-    )
-    alone, both = (fit(windows, PELICAN, FitOptions(iterations=0)) for windows in ([lively], [calm, lively]))
-    assert np.all(both.uncertainty.sigma[2:5] < 1.2 * alone.uncertainty.sigma[2:5])
-
-
 @pytest.fixture(scope="module")
 def behind_a_delay() -> list[tuple[Fit, FloatArray]]:
     """Fits of the nominal parameters and the delay to flights whose stabiliser acts at 1 kHz, and the truth."""
