@@ -46,8 +46,8 @@ UPRIGHT = "accel_bias.z"
 TRIMMED = tuple(name for name in PLACES if name.split(".")[0] in PER_FLIGHT and name != UPRIGHT)
 """Parameters free in every model beside its own: a constant moment and the sensors' biases."""
 _SIZE = {
-    "gyro_bias": 0.05, "accel_bias": 0.5, "rotor_drag": 0.5, "rate_damping": 2.0, "command_delay": 0.01,
-    "motor_lag": 0.02,
+    "gyro_bias": 0.05, "accel_bias": 0.5, "rotor_drag.k_x": 0.5, "rotor_drag.k_y": 0.5, "rate_damping": 2.0,
+    "command_delay": 0.01, "motor_lag": 0.02,
 }  # fmt: skip
 """Standard deviation of the prior, in the parameter's unit; about what is met on real vehicles."""
 OFF_CENTRE = 0.05
@@ -232,10 +232,7 @@ class Problem:
     def size(self) -> FloatArray:
         """Unit of every scaled parameter and standard deviation of its prior; the six are logarithms, of unit 1."""
         out = np.ones(len(self.entries))
-        own = _SIZE | {
-            "rotor_drag.central": self.layout.entry("rotor_drag.central").typical,
-            "cg_offset": OFF_CENTRE * self.vehicle.arm,
-        }
+        own = _SIZE | {"cg_offset": OFF_CENTRE * self.vehicle.arm}
         own |= {f"trim_moment.{a}": float(size) for a, size in zip(AXES, self.control, strict=True)}
         for i, (name, place, _) in enumerate(self.entries):
             if place >= k.TRIM:
@@ -492,19 +489,6 @@ class Problem:
             share = n / max(len(part.t) - SETTLED, 1)
             out += share * (0.5 * by_s @ by_s.T + by_nu @ by_nu.T)
         return out
-
-    def replayed(self, points: FloatArray, psi: FloatArray, gains: Sequence[Gains]) -> FloatArray:
-        """Sum of squared whitened innovations of many z (m, n) under the gains of one, with their prior, shape (m,)."""
-
-        def one(i: int) -> float:
-            total = self.penalty(points[i])
-            for j, (track, g) in enumerate(zip(self.tracks, gains, strict=True)):
-                p, (beyond,) = self.physics(points[i], j), self._beyond([points[i]], j, g.mean)
-                track = track._replace(beyond=beyond)
-                total += float(k.replay(track, p, psi, g, self._table(track, g, p), _NO_ROWS, _NO_MEANS))
-            return total
-
-        return np.array(_each(one, len(points)))
 
     def _table(self, track: Track, g: Gains, p: FloatArray) -> FloatArray:
         return g.table if set(LATE).isdisjoint(self.names) else k.moments(track, p[k.DELAY], p[k.LAG])

@@ -145,7 +145,7 @@ def _filtered(windows: Sequence[Window], vehicle: Vehicle, theta: FloatArray, fr
 
     whole = problem_of(windows)
     begin = theta.copy()
-    if "rotor_drag.central" in along:  # where hubs have no part, the accelerometer alone tells the sign of drag
+    if "rotor_drag.central" in along:  # without the hubs' part only the accelerometer determines the sign of drag
         begin[layout.entry("rotor_drag.central").index] = 1.0
     found = estimate(whole, whole.at(begin))
     if not (np.isfinite(found.objective) and np.isfinite(found.z).all() and np.isfinite(found.covariance).all()):
