@@ -11,6 +11,7 @@ from quadid.app.logs import Log, file_name, settled
 from quadid.app.missing import Beside, MissingForces, compared
 from quadid.app.options import Logs, OfVehicle, Seed, Validate
 from quadid.app.outcome import LIBRARY, NUMBER_COLUMNS, Advance, Fitted, number_rows, provenance, quality, silent
+from quadid.checks.doubts import farthest
 from quadid.effects import EFFECTS
 from quadid.model.layout import Layout, with_reference_voltage
 from quadid.parameters import INERTIAS, Status, unreliable
@@ -165,7 +166,7 @@ def diagnose(
     )  # fmt: skip
     nominal = NominalFit(fit.vehicle, fit.theta, fit.noise)
     found, selection = diagnose_windows(windows, described, unseen, seed, advance, nominal=nominal)
-    found, model = _within_reach(found, unreachable), selection.model
+    found, model = _within_reach(found, unreachable, farthest([log.off for log in train])), selection.model
     models = {"nominal": fit.theta, "extended": model.theta}
     # What force and moment the vehicle misses without and with the causes: too little taken off, and none is confident.
     forces, squares = compared(train, held, fit.vehicle, models, {}, advance)
@@ -228,11 +229,16 @@ def scored(log: Log, role: str, fit: Fit, extended: FloatArray) -> ScoredSet:
     return ScoredSet(log.recording.name, role, before, after)
 
 
-def _within_reach(found: Diagnosis, unreachable: Mapping[str, str]) -> Diagnosis:
-    """The diagnosis without trust in what the channels of its logs cannot show, by parameter, and why."""
+def _within_reach(found: Diagnosis, unreachable: Mapping[str, str], off: Mapping[str, float]) -> Diagnosis:
+    """The diagnosis without trust in what the channels of its logs cannot show, by parameter, and why.
+
+    Intervals hold the truth if what is doubted of the logs is wrong and puts estimates `off`.
+    """
+    from quadid.identification.uncertainty import doubted
+
     trusted = [p.name for p in found.parameters if p.name in unreachable and p.status is not Status.PRIOR_DOMINATED]
-    told = [f"{name} is not to be used: {unreachable[name]}" for name in trusted]
-    parameters = unreliable(found.parameters, trusted)
+    parameters, doubts = doubted(unreliable(found.parameters, trusted), off)
+    told = [*doubts, *(f"{name} is not to be used: {unreachable[name]}" for name in trusted)]
     late = [
         f.effect for f in found.findings if EFFECTS[f.effect].needs_fast_rotors and set(INERTIAS) & set(unreachable)
     ]

@@ -17,6 +17,7 @@ from quadid.app.logs import Log, file_name, remembered, settled
 from quadid.app.missing import Beside, MissingForces, compared
 from quadid.app.options import Bounds, Fix, Free, KnownEffects, Logs, OfVehicle, Priors, Seed, Validate
 from quadid.app.outcome import LIBRARY, Advance, Fitted, UnansweredError, known, provenance, quality, silent, told
+from quadid.checks.doubts import farthest
 from quadid.data.window import Window
 from quadid.errors import ParameterError, nearest
 from quadid.model.layout import Layout, with_reference_voltage
@@ -62,12 +63,13 @@ def check_seed(seed: int) -> None:
 def search(
     name: str, windows: Sequence[Window], vehicle: Vehicle, seed: int, advance: Advance,
     out_of_reach: Mapping[str, str] | None = None, names: Sequence[str] | None = None,
+    off: Mapping[str, float] | None = None,
 ) -> Fit:  # fmt: skip
     """Identifies the parameters with the search called `name`.
 
     The sensor noise, which decides intervals and scores, always comes from the standard fit; with the other searches
     the parameters are where that search ended, not where the standard fit ends.  Parameters `out_of_reach` of the
-    channels, with the reason, keep the file's value.
+    channels, with the reason, keep the file's value; intervals hold how far the log's doubts put estimates `off`.
 
     Raises:
         ParameterError: another search with `names` to free.
@@ -75,7 +77,7 @@ def search(
     from quadid.identification.fit import FitOptions, final_answer, fit
 
     if name == OPTIMIZERS[0]:
-        return fit(windows, vehicle, FitOptions(seed=seed), names, advance, out_of_reach)
+        return fit(windows, vehicle, FitOptions(seed=seed), names, advance, out_of_reach, off)
     if names is not None:
         raise ParameterError(f"free or fix with {name}, which fits the six", OPTIMIZERS[0], "leave optimizer out")
 
@@ -86,7 +88,7 @@ def search(
     problem = BoxProblem(windows, vehicle)
     found = minimise(name, problem.cost, problem.start, problem.lower, problem.upper, BUDGET, seed, problem.residual)
     at = fit_at(windows, vehicle, problem.theta(found.x), standard.noise, found.evaluations, str(found.stop))
-    return final_answer(at, out_of_reach or {})
+    return final_answer(at, out_of_reach or {}, off)
 
 
 # --- Identification: fits the parameters of a vehicle to flight logs, and scores the fit on them and on others
@@ -267,7 +269,8 @@ def identify(
     names = freed(described, free, fix)
     # The fit.
     begin = time.perf_counter()
-    fit = search(optimizer, windows, described, seed, advance, out_of_reach(train), names)
+    off = farthest([log.off for log in train])
+    fit = search(optimizer, windows, described, seed, advance, out_of_reach(train), names, off)
     seconds = time.perf_counter() - begin
     # How well guess and fit predict each log, and what force and moment they miss.
     guess = Layout(fit.vehicle).initial(fit.vehicle)

@@ -6,8 +6,9 @@ import math
 import os
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -215,6 +216,7 @@ class Log:
         grid: how the windows were made.
         cut: the part that is used.
         doubts: what looks wrong about units, frames, motors or clock, each with what to do.
+        off: natural logarithm of estimate over truth by parameter if the worst of the doubts is right.
         flown: what is used of a log that also stands on the ground [s, after its first IMU sample]; empty: all of
             the part that was asked for.
     """
@@ -227,6 +229,7 @@ class Log:
     cut: LogPart
     doubts: tuple[str, ...] = ()
     flown: Spans = ()
+    off: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def name(self) -> str:
@@ -381,10 +384,10 @@ def on_grid(
     path: Path, recording: Recording, vehicle: Vehicle, rate: float | None, cut: LogPart, checked: Checked
 ) -> Log:
     """A checked log on the grid; of one that also stands on the ground, what is in the air."""
-    doubts, flown = checked
+    doubts, flown, off = checked
     windows, report = gridded(recording, vehicle, rate, cut, flown)
     left_out = [left_on_ground(names_of(cut, flown))] if flown else []
-    return Log(path, recording, vehicle, windows, report, cut, (*doubts, *left_out), flown)
+    return Log(path, recording, vehicle, windows, report, cut, (*doubts, *left_out), flown, off)
 
 
 def gridded(
@@ -414,10 +417,11 @@ def parse_columns(texts: Sequence[str]) -> dict[str, str]:
 
 
 class Checked(NamedTuple):
-    """A log that means what is believed: what looks wrong but need not be, and its parts to use (`Log.flown`)."""
+    """A log that means what is believed: what looks wrong but need not be, its parts to use, what may be off."""
 
     doubts: tuple[str, ...] = ()
     flown: Spans = ()
+    off: Mapping[str, float] = MappingProxyType({})
 
 
 def check_conventions(recording: Recording, vehicle: Vehicle, cut: LogPart) -> Checked:
@@ -430,6 +434,7 @@ def check_conventions(recording: Recording, vehicle: Vehicle, cut: LogPart) -> C
         LogError: units, frames or a motor order that cannot be right; names the fix.
     """
     from quadid.checks import FATAL, CheckResult, inspect
+    from quadid.checks.doubts import farthest
 
     found, doubts = inspect(recording, vehicle), []
     flown = flown_parts(recording, found.flying, cut)
@@ -446,7 +451,7 @@ def check_conventions(recording: Recording, vehicle: Vehicle, cut: LogPart) -> C
             raise LogError(f"{recording.name}: {'; '.join(filter(None, (of_rotors, check.message)))}", fix=fix)
         if check.verdict in (CheckResult.ERROR, CheckResult.WARNING):
             doubts.append(f"{check.message}{'; ' * bool(check.fix)}{check.fix}")
-    return Checked(tuple(doubts), flown)
+    return Checked(tuple(doubts), flown, farthest([check.off for check in found.checks]))
 
 
 # --- Whether a flight was fitted before: the same log, a copy of it, a part of it, a second recorder

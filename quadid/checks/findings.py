@@ -74,6 +74,7 @@ class Check:
         message: one sentence with numbers and units.
         fix: what to do, empty when nothing.
         numbers: the numbers behind it.
+        off: natural logarithm of estimate over truth of each parameter if its doubt is right; empty where nothing is.
     """
 
     name: str
@@ -81,6 +82,7 @@ class Check:
     message: str
     fix: str = ""
     numbers: Mapping[str, float] = field(default_factory=dict)
+    off: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

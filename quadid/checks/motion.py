@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from quadid.checks.doubts import estimates_off
 from quadid.checks.findings import ChannelFacts, Check, CheckResult
 from quadid.data.grid import GAP, holes, linear, longest_step, moving_mean, true_runs
 from quadid.data.rotor_signal import rotor_channel
@@ -520,6 +521,7 @@ def attitude_check(recording: Recording) -> Check:
             f"specific force is {up:.3g} m/s^2 upwards on the average of {seconds:.3g} s, which must be "
             f"{GRAVITY:.2f}: scale or zero of the accelerometer is wrong, and b with it",
             f"calibrate it; if it is the scale, multiply acceleration by {GRAVITY / up:.3g}", {"up": up},
+            estimates_off(mass=up / GRAVITY) if up > 0.0 else {},
         )  # fmt: skip
     if down < 0.5 * GRAVITY:
         aside = np.mean((accel.values - _of_gravity(accel, attitude))[tame], axis=0)[:2]
@@ -835,7 +837,9 @@ def _judge_rates(reading: str, fit: AxisMap) -> Check:
     if fit.absurd:
         remedy = f"multiply gyro by {fit.scale:.3g}, or correct the attitude"
         return check(CheckResult.ERROR, f"{message}: the scale of one is wrong", remedy)
-    return check(CheckResult.WARNING, message, "check scales and filters")
+    return check(
+        CheckResult.WARNING, message, "check scales and filters", off=estimates_off(turning=[1.0 / fit.scale] * 3)
+    )
 
 
 def velocity_check(recording: Recording) -> Check:

@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from quadid.checks.doubts import Off, estimates_off, farthest, rotors_off
 from quadid.checks.findings import Check, CheckResult
 from quadid.checks.motion import HOPELESS, Spans, within
 from quadid.data.grid import linear, moving_mean, to_windows, true_runs
@@ -389,50 +390,97 @@ def _unbalanced(squares: FloatArray, vehicle: Vehicle) -> Problem | None:
     odd = np.linalg.norm(share @ lever, axis=1) > 0.72 / (len(lever) - 0.25)
     if odd.mean() < 0.1:
         return None
-    found = _off_balance(np.median(share[odd], axis=0), lever)
+    found = _misread(np.median(share[odd], axis=0), lever)
     if found is None:
         return "the rotor speeds are far from balance", {"share": float(odd.mean())}
-    rotor, ratio = found
     return (
-        f"rotor {rotor + 1} reads {ratio:.2f} times the speed that balance needs for {odd.mean():.0%} of the flight",
-        {"rotor": rotor + 1.0, "speed_ratio": ratio, "share": float(odd.mean())},
-    )
+        f"rotor {found.rotor + 1} reads {found.ratio:.2f} times the speed that balance needs for {odd.mean():.0%} of "
+        "the flight", {"rotor": found.rotor + 1.0, "speed_ratio": found.ratio, "share": float(odd.mean())},
+    )  # fmt: skip
 
 
-def _off_balance(share: FloatArray, lever: FloatArray) -> tuple[int, float] | None:
-    """The rotor whose square, set to what balance needs, agrees best with the others, and its speed over that."""
+class _Odd(NamedTuple):
+    """What differs from its neighbours and from balance, of each rotor's share, once one rotor is corrected.
+
+    With that rotor (from 0) and its number as believed over that which balance needs.
+    """
+
+    misfit: float
+    rotor: int
+    ratio: float
+
+
+def _misfit(share: FloatArray, lever: FloatArray) -> float:
+    return float(np.hypot(np.std(share), np.linalg.norm(share @ lever)) / np.mean(share))
+
+
+def _misread(share: FloatArray, lever: FloatArray) -> _Odd | None:
+    """The rotor whose square, set to what balance needs, leaves the least, and its speed over that."""
     fits = []
     for rotor, arm in enumerate(lever):
         needed = share.copy()
         needed[rotor] -= float(share @ lever @ arm / (arm @ arm))
         if needed[rotor] > 0.0:
-            fits.append((float(np.std(needed) / np.mean(needed)), rotor, float(np.sqrt(share[rotor] / needed[rotor]))))
-    return min(fits)[1:] if fits else None
+            fits.append(_Odd(_misfit(needed, lever), rotor, float(np.sqrt(share[rotor] / needed[rotor]))))
+    return min(fits, default=None)
+
+
+def _misplaced(share: FloatArray, lever: FloatArray) -> list[_Odd]:
+    """Each rotor with its arm set to what balance needs, and the arm's length over that."""
+    fits = []
+    for rotor, arm in enumerate(lever):
+        needed = 1.0 - float(share @ lever @ arm / (share[rotor] * (arm @ arm)))
+        if needed > 0.0:
+            scale = np.where(np.arange(len(lever)) == rotor, needed, 1.0)[:, None]
+            fits.append(_Odd(_misfit(share, lever * scale), rotor, 1.0 / needed))
+    return sorted(fits)
 
 
 def balance_check(recording: Recording, vehicle: Vehicle, spans: Spans) -> Check | None:
     """A warning where rotors balance on the average so far from the centre as a quarter more thrust of one moves it.
 
-    With right files of recorded vehicles it is a fifth at most.
+    With right files of recorded vehicles it is a fifth at most.  Named is what a rotor's reading or place explains.
     """
     signal = rotor_signal(recording, vehicle)
     inside = within(signal.t, spans)
     if not inside.any() or {"cg_offset", "weak_rotor"} & set(vehicle.effects):
         return None
-    lever, squares = vehicle.torque_arms[:, :2] / vehicle.arm, np.mean(signal.values[inside] ** 2, axis=0)
+    speeds = signal.values[inside]
+    lever, squares = vehicle.torque_arms[:, :2] / vehicle.arm, np.mean(speeds**2, axis=0)
     share = squares / max(float(squares.sum()), 1e-9)
     off = float(np.linalg.norm(share @ lever))
-    found = _off_balance(share, lever)
-    if off < 0.25 / len(lever) or found is None:
+    read = _misread(share, lever)
+    if off < 0.25 / len(lever) or read is None:
         return None
-    rotor, ratio = found
-    return Check(
-        "balance", CheckResult.WARNING,
-        f"the rotors balance {100.0 * off:.2g} % of the arm from the centre, as if rotor {rotor + 1} read {ratio:.2f} "
-        "times its speed: then b and inertias are wrong, else the centre of gravity is there",
+    here = f"the rotors balance {100.0 * off:.2g} % of the arm from the centre, as if rotor"
+    check = partial(Check, "balance", CheckResult.WARNING)
+    if placed := [odd for odd in _misplaced(share, lever) if odd < read]:
+        farther = " or ".join(f"{odd.rotor + 1} stood {1.0 / odd.ratio:.2f}" for odd in placed)
+        return check(
+            f"{here} {farther} times as far from it as the vehicle file says: then inertias are wrong, else the centre "
+            "of gravity is there",
+            "measure where that rotor is, and where the vehicle balances",
+            {"off": off, "rotor": placed[0].rotor + 1.0, "arm_ratio": placed[0].ratio},
+            farthest([rotors_off(vehicle, speeds, speeds, _moved_rotor(vehicle, odd)) for odd in placed]),
+        )
+    true = speeds / np.where(np.arange(len(lever)) == read.rotor, read.ratio, 1.0)
+    return check(
+        f"{here} {read.rotor + 1} read {read.ratio:.2f} times its speed: then b and inertias are wrong, else the "
+        "centre of gravity is there",
         "check that rotor's reading, propeller and place in the vehicle file, and where the vehicle balances",
-        {"off": off, "rotor": rotor + 1.0, "speed_ratio": ratio},
+        {"off": off, "rotor": read.rotor + 1.0, "speed_ratio": read.ratio}, rotors_off(vehicle, speeds, true),
     )  # fmt: skip
+
+
+def _moved_rotor(vehicle: Vehicle, odd: _Odd) -> Vehicle:
+    """The vehicle with that rotor's arm as balance needs it."""
+    rotors = [
+        r.model_copy(update={"position": (r.position[0] / odd.ratio, r.position[1] / odd.ratio, r.position[2])})
+        if k == odd.rotor
+        else r
+        for k, r in enumerate(vehicle.rotors)
+    ]
+    return vehicle.model_copy(update={"rotors": tuple(rotors)})
 
 
 def _against_thrust(
@@ -493,7 +541,7 @@ def hover_check(recording: Recording, vehicle: Vehicle, spans: Spans) -> Check:
         most = float(np.max(ThrustModel.stated(vehicle).total(signal.values))) / (vehicle.mass * GRAVITY)
         message = f"no flight in this log: its rotor speeds carry at most {most:.0%} of the weight"
         fix = "did it fly? Else check mass, the unit of the rotor speeds, and b"
-        return Check("hover", CheckResult.WARNING, message, fix, {"most_load": most})
+        return Check("hover", CheckResult.WARNING, message, fix, {"most_load": most}, _heavier(1.0 / most))
     speeds = signal.values[inside] * _supply(recording, vehicle, signal.t[inside])
     guess, thrust = vehicle.parameters["b"], float(np.mean(ThrustModel.stated(vehicle).total(speeds)))
     needed = guess.initial * vehicle.mass * GRAVITY / thrust if thrust > 0.0 else np.inf
@@ -517,7 +565,13 @@ def hover_check(recording: Recording, vehicle: Vehicle, spans: Spans) -> Check:
     few = "did it fly? Else " if needed > high else ""
     fix = few + "check mass, the unit of the rotor speeds, max_speed of the command, or the bounds of b"
     verdict = CheckResult.WARNING if low / HOPELESS < needed < high * HOPELESS else CheckResult.ERROR
-    return check(verdict, f"{message}, outside its bounds {low:.3g} to {high:.3g}", fix)
+    outside = f"{message}, outside its bounds {low:.3g} to {high:.3g}"
+    return check(verdict, outside, fix, off=_heavier(needed / guess.initial))
+
+
+def _heavier(factor: float) -> Off:
+    """What is off if the vehicle file's mass is so many times the true one; nothing where no factor is known."""
+    return estimates_off(mass=factor) if 0.0 < factor < np.inf else {}
 
 
 def _supply(recording: Recording, vehicle: Vehicle, t: FloatArray) -> FloatArray:
@@ -899,7 +953,7 @@ def mass_check(recording: Recording, vehicle: Vehicle, spans: Spans, b_from_hove
     if abs(factor - 1.0) <= max(0.08, 3.0 * sigma):
         return Check("mass", CheckResult.OK, message, numbers=numbers)
     fix = f"weigh the vehicle: {mass:.3g} kg would fit; or check the thrust stand and the unit of the rotor speeds"
-    return Check("mass", CheckResult.WARNING, message, fix, numbers)
+    return Check("mass", CheckResult.WARNING, message, fix, numbers, _heavier(1.0 / factor))
 
 
 def _known_thrust(vehicle: Vehicle) -> tuple[float, float] | None:
@@ -972,7 +1026,7 @@ def _judge_scale(vehicle: Vehicle, scale: float, hover: float, numbers: dict[str
                 f"weight, arm and motion make the inertia about x and y {size:.2g} times mass times arm squared, which "
                 f"is {least:g} to {most:g} on other vehicles: are the rotors {vehicle.arm:.3g} m from the centre?",
                 f"measure the arm: {size / most * vehicle.arm:.2g} to {size / least * vehicle.arm:.2g} m would fit",
-                {**numbers, "size": size},
+                {**numbers, "size": size}, _farther(size / math.sqrt(least * most)),
             )  # fmt: skip
         return Check(
             "geometry", CheckResult.OK, f"{turned}; the arm itself shows only relative to the inertia", numbers=numbers
@@ -985,4 +1039,9 @@ def _judge_scale(vehicle: Vehicle, scale: float, hover: float, numbers: dict[str
         f"roll and pitch answer {factor:.2f} times as strongly as the stated arm of {vehicle.arm:.3g} m lets expect"
     )
     fix = f"measure the arm: {factor * vehicle.arm:.3g} m, {factor:.2f} times it, would fit; or the inertias are wrong"
-    return Check("geometry", CheckResult.WARNING, message, fix, numbers)
+    return Check("geometry", CheckResult.WARNING, message, fix, numbers, _farther(factor))
+
+
+def _farther(factor: float) -> Off:
+    """What is off if the rotors are so many times as far from the centre as the vehicle file says."""
+    return estimates_off(torque=(factor, factor, 1.0))

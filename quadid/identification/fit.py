@@ -20,6 +20,7 @@ from quadid.identification.problem import Free, Shooting, default_prior
 from quadid.identification.search import SWARM_SECONDS, Progress, swarm_search
 from quadid.identification.uncertainty import (
     Uncertainty,
+    doubted,
     parameter_set,
     uncertainty,
     with_scale_uncertainty,
@@ -66,17 +67,24 @@ class Fit:
     warnings: tuple[str, ...] = ()
 
 
-def final_answer(fit: Fit, out_of_reach: Mapping[str, str]) -> Fit:
+def final_answer(fit: Fit, out_of_reach: Mapping[str, str], off: Mapping[str, float] | None = None) -> Fit:
     """The fit as every command, the library and the node give it.
 
-    Parameters that these data cannot identify keep the vehicle file's values, with the prior's interval, the status
-    ``prior_dominated`` and a warning; moments of inertia are those of a rigid body, see `possible_moments`.
+    Intervals hold the truth if a doubt about the log is right.  Parameters that these data cannot identify keep the
+    vehicle file's values, with the prior's interval, the status ``prior_dominated`` and a warning; moments of inertia
+    are those of a rigid body, see `possible_moments`.
 
     Args:
         fit: of all parameters together, so that those kept do not suffer from wrong guesses of the others.
         out_of_reach: parameters that the channels of the log cannot show, and why, in words.
+        off: natural logarithm of estimate over truth by parameter if what is doubted of the log is wrong.
     """
-    rows, covariance, warnings = list(fit.parameters), np.array(fit.parameters.covariance), fit.warnings
+    held, told = doubted(fit.parameters.parameters, off or {})
+    rows, warnings = list(held), (*told, *fit.warnings)
+    grown = np.array(
+        [1.0 if new is old else new.sigma / old.sigma for new, old in zip(held, fit.parameters, strict=True)]
+    )
+    covariance = fit.parameters.covariance * np.outer(grown, grown)
     lost = [n for n in fit.parameters.names if n in out_of_reach]
     for j, p in enumerate(rows):
         if p.name in lost:
@@ -229,6 +237,7 @@ def check_windows(windows: Sequence[Window]) -> None:
 def fit(
     windows: Sequence[Window], vehicle: Vehicle, options: FitOptions | None = None, names: Sequence[str] | None = None,
     progress: Progress | None = None, out_of_reach: Mapping[str, str] | None = None,
+    off: Mapping[str, float] | None = None,
 ) -> Fit:  # fmt: skip
     """Identifies parameters from flight data.
 
@@ -239,6 +248,7 @@ def fit(
         names: parameters to free; by default the paper's six.
         progress: called with a stage and a fraction done.
         out_of_reach: parameters that the channels of the log cannot show, and why; they keep the file's value.
+        off: natural logarithm of estimate over truth by parameter if what is doubted of the log is wrong.
 
     Raises:
         WindowError: no gyro, or several grids.
@@ -277,7 +287,7 @@ def fit(
     )
     report("polish", 1.0)
     found = replace(found, noise=noise, evaluations=evaluations + first.simulated, warnings=(*thinned, *found.warnings))
-    return final_answer(found, out_of_reach or {})
+    return final_answer(found, out_of_reach or {}, off)
 
 
 def beside_random_forces(short: Shooting, found: Filtered, free: Free) -> Fit:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,7 +11,7 @@ import numpy as np
 from quadid.chi_square import Z95
 from quadid.identification.elimination import eliminated
 from quadid.identification.problem import Free, Linearised, Prior, posterior_covariance
-from quadid.parameters import MAY_VANISH, NOMINAL_NAMES, Parameter, ParameterSet, Status, at_bound
+from quadid.parameters import MAY_VANISH, NOMINAL_NAMES, Parameter, ParameterSet, Status, at_bound, unreliable
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 
@@ -174,6 +174,35 @@ def _status(
     if best <= min(RATIO_SIGMA, RATIO_GAIN * sigma[j]):
         return Status.RATIO_ONLY, partner
     return Status.IDENTIFIED, None
+
+
+# --- What a doubt about the log does to the result
+
+
+def doubted(parameters: Sequence[Parameter], off: Mapping[str, float]) -> tuple[tuple[Parameter, ...], tuple[str, ...]]:
+    """Parameters whose intervals hold the truth if a doubt about the log is right, too, and a sentence that says so.
+
+    Args:
+        parameters: as the log shows them.
+        off: natural logarithm of estimate over truth by parameter if the doubt is right.
+    """
+    out = tuple(_off_by(p, off[p.name]) if off.get(p.name) else p for p in parameters)
+    moved = {p.name: round(100.0 * math.expm1(off[p.name])) for p in parameters if p.name in off}
+    listed = ", ".join(f"{name} {percent:+d} %" for name, percent in moved.items() if percent)
+    told = f"if the log is wrong as said, these estimates are off, which their intervals hold: {listed}"
+    return out, (told,) if listed else ()
+
+
+def _off_by(p: Parameter, step: float) -> Parameter:
+    """The parameter with an interval that holds a step (log scale), which counts as spread; none is beyond bounds."""
+    (low, high), (least, most) = p.ci95, p.bounds
+    own, step = math.log(high / low) / (2.0 * Z95), min(abs(step), math.log(most / least))
+    wide = math.hypot(own, step)
+    ci = (p.value * math.exp(-Z95 * wide), p.value * math.exp(Z95 * wide))
+    wider = replace(p, sigma=wide * p.value, ci95=ci)
+    if step <= SPREAD_LIMIT and least <= ci[0] and ci[1] <= most:
+        return wider
+    return unreliable([wider], [p.name])[0]
 
 
 # --- What an uncertain mass or arm does to the result
