@@ -930,12 +930,13 @@ def _of_gravity(accel: Channel, attitude: Channel) -> FloatArray:
 def usable_steps(t: FloatArray, other: FloatArray) -> BoolArray:
     """True for steps of `t` without a gap, neither in `t` nor, as long as a quarter of one, in the other's times."""
     steps = np.diff(t)
-    longest = max(GAP * sample_period(other), 0.25 * float(np.median(steps)) if len(steps) else 0.0)
+    usual = float(np.median(steps)) if len(steps) else 0.0
+    longest = max(GAP * sample_period(other), 0.25 * usual)
     holes = np.flatnonzero(np.diff(other) > longest)
     following = np.searchsorted(other[holes + 1], t[:-1], "right")
     spoiled = np.append(other[holes], np.inf)[following] < t[1:]
     inside = (t[:-1] >= other[0]) & (t[1:] <= other[-1])
-    return np.asarray(inside & ~spoiled & (steps < GAP * np.median(steps)))
+    return np.asarray(inside & ~spoiled & (steps < GAP * usual))
 
 
 def running_integral(channel: Channel, at: FloatArray) -> FloatArray:

@@ -13,7 +13,7 @@ import numpy as np
 from quadid.checks.doubts import Off, estimates_off, farthest, rotors_off
 from quadid.checks.findings import Check, CheckResult
 from quadid.checks.motion import HOPELESS, Spans, within
-from quadid.data.grid import linear, moving_mean, to_windows, true_runs
+from quadid.data.grid import bridged, linear, moving_mean, to_windows, true_runs
 from quadid.data.rotor_signal import INERTIA_RATE, RotorSignal, rotor_channel, rotor_signal
 from quadid.data.window import Channel, Recording, Window, measured_period, sample_period
 from quadid.errors import QuadidError
@@ -182,6 +182,8 @@ def gyro_filter_check(recording: Recording, vehicle: Vehicle, spans: Spans) -> C
     cross, acted, turned = (
         np.sum(x, axis=0) for x in (motion * torque.conj(), np.abs(torque) ** 2, np.abs(motion) ** 2)
     )
+    if not min(acted[1:].min(), turned[1:].min()) > 0.0:  # no torque, or no motion at all
+        return None
     place = np.digitize(np.fft.rfftfreq(rows, _STEP), _OCTAVES)
     slowest = max(measured_period(signal.t, signal.values), sample_period(gyro.t))
     bands = [k for k in range(1, len(_OCTAVES)) if _OCTAVES[k] < 0.4 / slowest]
@@ -658,7 +660,7 @@ def _in_band(windows: Sequence[Window], thrust: list[FloatArray], lag: int, slow
     parts: list[Rows] = []
     for w, acted in zip(windows, thrust, strict=True):
         width, smooth = max(3, round(slowest / w.dt)), max(1, round(fastest / w.dt) | 1)
-        if w.gyro is None or len(w) < 2 * width + lag or np.isnan(w.gyro).any():
+        if w.gyro is None or len(w) < 2 * width + lag or np.isnan(rates := bridged(w.gyro)).any():
             continue
         # The change over two steps against what acted in between: the row itself and its neighbours' halves.
         acted = (
@@ -666,7 +668,7 @@ def _in_band(windows: Sequence[Window], thrust: list[FloatArray], lag: int, slow
             if w.sampling == "held"
             else 0.25 * (acted[:-2] + 2 * acted[1:-1] + acted[2:])
         )
-        gained, spun = ((rows[2:] - rows[:-2]) / (2.0 * w.dt) for rows in (w.gyro, w.rotor_speed))
+        gained, spun = ((rows[2:] - rows[:-2]) / (2.0 * w.dt) for rows in (rates, w.rotor_speed))
         rows = acted[: len(acted) - lag], gained[lag:], spun[: len(spun) - lag]
         smoothed = [moving_mean(r, smooth) for r in rows]
         acted, gained, spun = (r - moving_mean(r, width, mirrored=True) for r in smoothed)

@@ -280,6 +280,14 @@ def holes(t: FloatArray, grid_step: float) -> int:
     return int(np.count_nonzero((steps > HOLE * median(steps)) & (steps <= longest_step(t, grid_step))))
 
 
+def bridged(values: FloatArray) -> FloatArray:
+    """Rows on a grid (n, columns), lost ones by straight lines; as they are where a third and more was not measured."""
+    good, rows = np.isfinite(values).all(axis=1), np.arange(len(values), dtype=np.float64)
+    if bool(good.all()) or float(good.mean()) * HOLE < 1.0:
+        return values
+    return linear(rows[good], values[good], rows)
+
+
 def _distinct(t: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray]:
     rising = t[1:] > t[:-1]
     if bool(rising.all()):
@@ -326,10 +334,12 @@ def _stretch_on_grid(name: str, track: ChannelTrack, cut: slice, at: FloatArray,
         out = lowpass(t, values, at, step, track.held)
     elif track.held:
         out = hold_mean(t, values, at, step)
-    elif name == "rotor_speed" or track.period <= 1.33 * step:
-        out = interpolate(t, values, at, smooth=track.period <= 1.33 * step)
     else:
-        out = _at_nearest(t, interpolate(t, values, at, smooth=False), at, step)
+        fast = track.period <= 1.33 * step
+        out = interpolate(t, values, at, smooth=fast)
+        # Inputs act between their samples; what is measured is known there only, lost samples least.
+        if name != "rotor_speed" and not (fast and name == "attitude_reference"):
+            out = _at_nearest(t, out, at, step)
     if name == "attitude":
         out = out / np.linalg.norm(out, axis=1, keepdims=True)
     elif name == "attitude_reference":
@@ -375,7 +385,7 @@ class GridReport:
         rotor_source: where the rotor speeds came from.
         rotor_rate: their own rate in the log [Hz].
         filtered: whether the channels were low-passed for the grid.
-        bridged: number of holes in rotor signal, gyro and accelerometer too short for a gap, read between neighbours.
+        bridged: number of holes in rotor signal, gyro and accelerometer too short for a gap; nothing is measured there.
     """
 
     rate: float

@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from quadid.attitude_controller import GAIN_NAMES
+from quadid.data.grid import bridged
 from quadid.data.window import Window
 from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray
@@ -111,8 +112,8 @@ def _rows(window: Window) -> _Rows | None:
     reference, attitude, gyro = window.attitude_reference, window.attitude, window.gyro
     if reference is None or attitude is None or gyro is None or window.sampling != "held":
         return None
-    good = np.isfinite(np.column_stack([reference, attitude, gyro])).all(axis=1)
-    if not good.all():
+    reference, attitude, gyro = (bridged(rows) for rows in (reference, attitude, gyro))
+    if not np.isfinite(np.column_stack([reference, attitude, gyro])).all():
         return None
     is_ = Rotation.from_quat(attitude, scalar_first=True).as_matrix()
     wanted = Rotation.from_euler("ZYX", reference[:, 2::-1]).as_matrix()

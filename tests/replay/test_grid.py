@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from quadid.data.grid import grid_recording, to_windows
+from quadid.data.grid import bridged, grid_recording, to_windows
 from quadid.data.window import Channel, Recording
 from quadid.errors import LogError, NotIdentifiableError
 from quadid.types import FloatArray, IndexArray
@@ -68,13 +68,17 @@ def test_a_gap_is_more_than_three_and_a_half_steps_in_every_format(kind: str) ->
 
 
 @pytest.mark.parametrize("kind", ["csv", "mcap"])
-def test_single_lost_rows_are_bridged_and_counted(kind: str) -> None:
+def test_single_lost_rows_end_no_window_and_are_no_measurement(kind: str) -> None:
     whole = FLIGHT.recording(seconds=6.0, kind=kind)
     gridded = grid_recording(without_rows(whole, np.array([50, 100, 101])), PELICAN, 50.0)
     (window,) = gridded.windows
     assert (gridded.report.gaps, gridded.report.bridged) == (0, 6)  # two holes in each of three channels
     assert window.gyro is not None
-    np.testing.assert_allclose(window.gyro, whole.channels["gyro"].values, atol=0.02)
+    lost = np.isin(np.arange(len(window)), [50, 100, 101])
+    assert np.isnan(window.gyro[lost]).all(), "a value between neighbours is as good as none, and no measurement"
+    np.testing.assert_allclose(window.gyro[~lost], whole.channels["gyro"].values[~lost], rtol=1e-9)
+    np.testing.assert_allclose(bridged(window.gyro)[50], 0.5 * (window.gyro[49] + window.gyro[51]))
+    assert np.isnan(bridged(np.where(np.arange(10)[:, None] % 2, window.gyro[:10], np.nan))).any(), "a slow channel"
     held = whole.channels["rotor_speed"].values
     np.testing.assert_allclose(window.rotor_speed[51:100], held[51:100], rtol=1e-9)
     np.testing.assert_allclose(window.rotor_speed[100:102], held[[99, 99]], rtol=1e-9)  # a held value goes on acting

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -249,3 +250,16 @@ def test_one_rotor_read_too_fast_is_a_question_of_balance(name: str) -> None:
     assert found.numbers["speed_ratio"] == pytest.approx(1.15, abs=0.01)
     known = vehicle.model_copy(update={"effects": {"cg_offset": {"x": 0.01, "y": 0.0}}})
     assert asked(fast, known) == [], "the file says where it balances"
+
+
+@pytest.mark.parametrize("still", ["rotor_speed", "gyro"])
+def test_the_gyro_filter_is_not_asked_for_without_torque_or_motion(still: str) -> None:
+    """0 / 0 was printed as a warning of NumPy."""
+    recording, vehicle = simulate("pelican", seconds=20.0, seed=3).flight.recording, Vehicle.shipped("pelican")
+    spans, channel = flying_spans(recording, vehicle), recording.channels[still]
+    held = replace(channel, values=np.full_like(channel.values, 450.0))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert (
+            gyro_filter_check(replace(recording, channels={**recording.channels, still: held}), vehicle, spans) is None
+        )
