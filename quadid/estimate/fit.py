@@ -130,7 +130,7 @@ def estimate(problem: Problem, start: FloatArray | None = None) -> Estimate:
     inverse = np.linalg.inv(information)
     z = np.clip(z + 0.5 * inverse @ within.sum(axis=0), *problem.limits)
     # 7. Intervals: score over slope, and how well the noise of rotor speeds and that answer are known.
-    by_square = taken * _of_square(problem, z, psi, gains)
+    by_square = taken * of_square(problem, z, psi, gains)
     score = information + noise + 0.25 * within.T @ within + np.outer(by_square, by_square)
     covariance = inverse @ score @ inverse
     return Estimate(problem, z, psi, np.asarray(covariance), value, tuple(whitened(g) for g in gains))
@@ -156,7 +156,7 @@ def settle_noise(problem: Problem, z: FloatArray, psi: FloatArray) -> tuple[Floa
     return z, psi, gains
 
 
-def _of_square(problem: Problem, z: FloatArray, psi: FloatArray, gains: Sequence[Gains]) -> float:
+def of_square(problem: Problem, z: FloatArray, psi: FloatArray, gains: Sequence[Gains]) -> float:
     """Relative standard deviation of the variance of rotor speeds: none at its floor, no more than its bounds leave."""
     low, high = problem.noise_bounds[k.ROTOR]
     if psi[k.ROTOR] <= 1.01 * low:

@@ -470,6 +470,6 @@ class ChangeWatch:
             return None
         cut = self._rows.cut(max(self.seen.time - BASELINE, self._since) - _EPS, tick - _EPS)
         return ChangeRequest(
-            number, estimator.model, cut.windows, self.seen.time, tick, estimator.theta, estimator.z_sigma, self.seen,
+            number, estimator.vehicle, cut.windows, self.seen.time, tick, estimator.theta, estimator.z_sigma, self.seen,
             stamp,
         )  # fmt: skip

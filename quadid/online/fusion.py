@@ -1,31 +1,49 @@
-"""Estimate of one vehicle while it flies: fusion of window estimates, requests for their fits, the case for the gate.
+"""Estimate of one vehicle while it flies: sums of what windows say, requests for their fits, the case for the gate.
 
-Every window gives a quadratic model of its cost around its estimate.  In scaled parameters z (logarithms of the nominal
-six) that is a Fisher information matrix H and a vector h = H z - g; both add.  Windows overlap, so each counts with the
-share of its time that no earlier window has counted.  Old information fades, and a window that contradicts it is seen.
+Every window gives a quadratic model of what its new rows say: in scaled parameters z a Fisher information H and a
+vector h = H z - g; both add.  Old information fades.  Differences of the sums are what a stretch of the flight says by
+itself, so that one which contradicts the others is seen.
+
+All are linearised at one point: what together no window tells (how large all six, and a support, are) would else be
+told by the differences of where they were (as in mapping: Huang et al., International Journal of Robotics Research 29
+(2010) 502).  That point is the likelihood's maximum over what had been flown, and is taken anew, with all that was said
+there, whenever twice as much has been.
 """
 
 from __future__ import annotations
 
 import hashlib
 import math
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
 from quadid.chi_square import Z95, exceeded
 from quadid.data.window import Window
-from quadid.identification.noise import NoiseModel
 from quadid.identification.problem import Free
+from quadid.identification.reliability import CHANCE, SHARE
 from quadid.identification.uncertainty import Uncertainty, parameter_set
-from quadid.model.layout import LOSS, B, D, Layout, ThrustModel
-from quadid.model.rollout import channels_of
+from quadid.model.layout import B, Layout, ThrustModel
 from quadid.online.active_set import ActiveSet
-from quadid.online.fit_job import FitReply, FitRequest, WindowEstimate, prior_of, with_room
+from quadid.online.fit_job import (
+    LOOSE,
+    SIX,
+    FitReply,
+    FitRequest,
+    Noise,
+    WindowEstimate,
+    names_of,
+    own_names,
+    prior_of,
+    thrust_names,
+)
 from quadid.online.gate import Case
-from quadid.online.grid_buffer import WindowCut
+from quadid.online.grid_buffer import GridBuffer, WindowCut
 from quadid.online.records import OnlineSet
 from quadid.parameters import NOMINAL_NAMES, TANGENT, ParameterSet, Status
 from quadid.types import FloatArray
@@ -34,22 +52,61 @@ from quadid.vehicle import GRAVITY, Vehicle
 DRIFT = 0.02
 """Parameters may honestly differ this much (log scale) from window to window: what no simulation of this kind has."""
 SCATTER_PRIOR = 30.0
-"""Degrees of freedom with which windows are believed to scatter as they claim."""
-KEPT_WINDOWS = 120
-"""Window estimates kept for agreement and held-out gain."""
-YAW = ("d", "J_zz", "J_r")
-"""Parameters that a set may leave at the vehicle file's guess."""
-_YAW_PLACES = [NOMINAL_NAMES.index(n) for n in YAW]
-ANY = 1.0
-"""Difference (log scale) that is allowed where an estimate says nothing."""
+"""Degrees of freedom with which stretches are believed to scatter as they claim."""
+KEPT = 600
+"""Sums kept for agreement and held-out gain."""
+POOLED = 24
+"""The newest of so many measured noises counts fully."""
+_YAW = [NOMINAL_NAMES.index(n) for n in ("d", "J_zz", "J_r")]
+_EPS = 1e-6
+WIDTH = 3.0
+"""Prior width of what thrust may have beside b, in its typical size."""
+
+
+class Sum(NamedTuple):
+    """Accumulated information up to a time [s], of `flown` [s] of data; else as `WindowEstimate`.
+
+    `information` is without `noise`; vectors are h = H z - g.
+    """
+
+    stop: float
+    flown: float
+    information: FloatArray
+    vector: FloatArray
+    noise: FloatArray
+    loose: FloatArray
+    half_information: FloatArray
+    half_vector: FloatArray
+
+    @classmethod
+    def none(cls, stop: float, count: int) -> Sum:
+        """Nothing yet."""
+        square, vector = np.zeros((count, count)), np.zeros(count)
+        return cls(stop, 0.0, square, vector, square, np.zeros((LOOSE, count)), square, vector)
+
+    @classmethod
+    def told(cls, e: WindowEstimate, flown: float) -> Sum:
+        """The new rows of a window; where they are noisier than was known, they count for less."""
+        net = e.information - e.noise
+        arrays = net, net @ e.z - e.score, e.noise, e.loose, e.half_information, e.half_information @ e.z - e.half_score
+        return cls(e.stop, flown, *(a / max(e.mse, 1.0) for a in arrays))
+
+    def and_(self, share: float, later: Sum) -> Sum:
+        """`share` of this and all of a later one."""
+        return Sum(later.stop, later.flown, *(share * a + b for a, b in zip(self[2:], later[2:], strict=True)))
 
 
 @dataclass(frozen=True)
 class Fused:
-    """A fused estimate: scaled parameters and covariance (prior included), shapes (P,) and (P, P)."""
+    """An estimate: scaled parameters and covariance (prior included), shapes (P,) and (P, P).
+
+    Attributes:
+        between_rows: standard deviations by what happens between two rows, in the covariance, shape (P,).
+    """
 
     z: FloatArray
     covariance: FloatArray
+    between_rows: FloatArray
 
     @property
     def sigma(self) -> FloatArray:
@@ -58,156 +115,196 @@ class Fused:
 
 
 @dataclass(frozen=True)
-class _Sum:
-    """Accumulated information up to a time."""
+class Stretch:
+    """What a stretch of the flight says of the six by itself, whatever the others are there.
 
+    Attributes:
+        start, stop: its time [s].
+        z, covariance: with the prior of all, shapes (6,) and (6, 6).
+        best, information: without that of the six.
+    """
+
+    start: float
     stop: float
-    matrix: FloatArray
-    vector: FloatArray
+    z: FloatArray
+    covariance: FloatArray
+    best: FloatArray
+    information: FloatArray
+
+    def deviance(self, z: FloatArray) -> float:
+        """Cost of six scaled parameters in this stretch above that of its own estimate."""
+        step = z - self.best
+        return float(step @ self.information @ step)
+
+    def distance(self, z: FloatArray, covariance: FloatArray | float = 0.0) -> float:
+        """Squared Mahalanobis distance from an estimate of the six, which has a covariance too."""
+        difference = self.z - z
+        return float(difference @ np.linalg.solve(self.covariance + covariance, difference))
 
 
 class Fusion:
     """Running estimate of one vehicle.
 
     Attributes:
-        windows: estimates that were taken in, oldest first.
+        newest: what was taken in last, or None; taken: how many windows.
         counted: end of the data taken in [s].
-        drift: honest difference between windows by parameter, log scale, shape (P,).
     """
 
-    def __init__(self, mean: FloatArray, sigma: FloatArray, memory: float) -> None:
+    def __init__(self, mean: FloatArray, sigma: FloatArray, own: int, memory: float, length: float) -> None:
         """Starts from the prior.
 
         Args:
-            mean: scaled parameters of the prior, shape (P,).
+            mean: scaled parameters of the prior, shape (P,), the six first.
             sigma: its standard deviations, shape (P,).
+            own: so many are estimated; the others are looked at beside them.
             memory: time constant of forgetting [s] of data taken in.
+            length: of stretches that are compared [s].
         """
-        self._mean, self._precision = mean, np.diag(1.0 / sigma**2)
-        self._memory = memory
-        self.drift: FloatArray = np.full(len(mean), DRIFT)
-        self.windows: deque[WindowEstimate] = deque(maxlen=KEPT_WINDOWS)
-        self._sums: deque[_Sum] = deque(maxlen=KEPT_WINDOWS)
-        self.counted = -math.inf
-
-    def forget(self) -> None:
-        """Drops everything learned: the vehicle has changed."""
-        self.windows.clear()
-        self._sums.clear()
+        self._mean, self._sigma = mean, sigma
+        self._own, self._memory, self._length = own, memory, length
+        self._sums: deque[Sum] = deque(maxlen=KEPT)
+        self._known: dict[bool, Fused] = {}
+        self._stretches: dict[tuple[float, float], Stretch] = {}
+        self.newest: WindowEstimate | None = None
+        self.taken, self.counted = 0, -math.inf
 
     def agrees(self, window: WindowEstimate) -> bool:
-        """True if a window fits the estimate from data before it, where there is one (chi-square)."""
-        earlier = self._before(window.start)
-        if earlier is None:
+        """True if the last stretch, a window included, fits what is known from before it, where that is something."""
+        total = self._with(window)
+        before = self._begin(total)
+        if before is None or before.flown == 0.0:
             return True
-        before = self._solve(earlier)
-        distance = self._distance(window, before.z, before.covariance + np.diag(self.drift**2))
-        return distance <= exceeded(1e-5, len(self._mean))  # less probable: a change, if the next window agrees
+        known = self._solve(before, self._own)
+        allowed = known.covariance[:SIX, :SIX] + np.eye(SIX) * DRIFT**2
+        # Less probable: a change, if the next window agrees.
+        return self._stretch(before, total).distance(known.z[:SIX], allowed) <= exceeded(1e-5, SIX)
 
     def add(self, window: WindowEstimate) -> None:
-        """Takes a window in, with the share of its time that is new."""
-        fresh = window.stop - max(window.start, self.counted)
-        share = min(max(fresh / (window.stop - window.start), 0.0), 1.0)
-        size = len(self._mean)
-        old = self._sums[-1] if self._sums else _Sum(-math.inf, np.zeros((size, size)), np.zeros(size))
-        fade = math.exp(-max(fresh, 0.0) / self._memory) if math.isfinite(old.stop) else 0.0
-        weight = share * window.scale
-        matrix = fade * old.matrix + weight * window.information
-        vector = fade * old.vector + weight * (window.information @ window.z - window.score)
-        self._sums.append(_Sum(window.stop, matrix, vector))
-        self.windows.append(window)
+        """Takes a window in."""
+        total = self._with(window)
+        if not self._sums:
+            self._sums.append(Sum.none(window.start, len(self._mean)))
+        self._sums.append(total)
+        self._known.clear()
+        self.newest, self.taken = window, self.taken + 1
         self.counted = max(self.counted, window.stop)
 
-    def estimate(self) -> Fused | None:
-        """The fused estimate, its covariance widened where windows scatter more than they should; None before data."""
+    @property
+    def flown(self) -> float:
+        """Time of the data taken in [s]."""
+        return self._sums[-1].flown if self._sums else 0.0
+
+    def _with(self, window: WindowEstimate) -> Sum:
+        old = self._sums[-1] if self._sums else Sum.none(window.start, len(self._mean))
+        fresh = max(window.stop - max(window.start, self.counted), 0.0)
+        return old.and_(self._fade(fresh), Sum.told(window, old.flown + fresh))
+
+    def _fade(self, seconds: float) -> float:
+        return math.exp(-seconds / self._memory)
+
+    def estimate(self, wide: bool = False) -> Fused | None:
+        """The estimate, its covariance widened where stretches scatter more than they should; None before data.
+
+        Args:
+            wide: with what thrust may have beside b; else that is taken to be none.
+        """
         if not self._sums:
             return None
-        fused = self._solve(self._sums[-1])
-        return Fused(fused.z, fused.covariance * self.scatter(fused.z))
+        if wide not in self._known:
+            fused = self._solve(self._sums[-1], len(self._mean) if wide else self._own)
+            six = fused.z if not wide or (plain := self.estimate()) is None else plain.z
+            self._known[wide] = replace(fused, covariance=fused.covariance * self.scatter(six[:SIX]))
+        return self._known[wide]
+
+    def spans(self) -> list[tuple[float, float]]:
+        """Begin and end [s] of the data taken in, in parts of a quarter of a stretch or a little longer."""
+        told = [(new.stop - (new.flown - old.flown), new.stop) for old, new in pairwise(self._sums)]
+        return _joined(told, self._length / 4)
 
     def before(self, start: float) -> FloatArray | None:
-        """Scaled parameters from windows that ended by `start`; None when there are none."""
-        earlier = self._before(start)
-        return None if earlier is None else self._solve(earlier).z
+        """The six from data up to `start`, shape (6,); None when there are none."""
+        earlier = next((s for s in reversed(self._sums) if s.stop <= start + 1e-6 and s.flown > 0.0), None)
+        return None if earlier is None else self._solve(earlier, self._own).z[:SIX]
 
-    def disjoint(self, most: int = 12) -> list[WindowEstimate]:
-        """Newest windows that share no sample, newest first."""
-        out: list[WindowEstimate] = []
-        for window in reversed(self.windows):
-            if not out or window.stop <= out[-1].start + 1e-6:
-                out.append(window)
-                if len(out) == most:
-                    break
+    def disjoint(self, most: int = 12) -> list[Stretch]:
+        """Newest stretches that share no sample, newest first."""
+        out: list[Stretch] = []
+        last = self._sums[-1] if self._sums else None
+        while last is not None and len(out) < most and (first := self._begin(last)) is not None:
+            key = first.stop, last.stop
+            if key not in self._stretches:
+                self._stretches[key] = self._stretch(first, last)
+            out.append(self._stretches[key])
+            last = first
         return out
 
     def scatter(self, z: FloatArray) -> float:
-        """Variance of disjoint windows about `z` relative to what they claim, at least 1, shrunk towards 1."""
-        windows = self.disjoint()
-        if len(windows) < 3:
+        """Variance of stretches about six parameters relative to what they claim, at least 1, shrunk towards 1."""
+        told = self.disjoint()
+        if len(told) < 3:
             return 1.0
-        total = sum(self._distance(window, z, 0.0) for window in windows)
-        freedom = len(z) * (len(windows) - 1)
-        return max((total + SCATTER_PRIOR) / (freedom + SCATTER_PRIOR), 1.0)
-
-    def _distance(self, window: WindowEstimate, z: FloatArray, covariance: FloatArray | float) -> float:
-        """Squared Mahalanobis distance of a window's own estimate from `z`, which has a covariance too."""
-        own = self._alone(window)
-        difference = own.z - z
-        return float(difference @ np.linalg.solve(own.covariance + covariance, difference))
-
-    def left_out(self) -> FloatArray | None:
-        """Mean `WindowEstimate.left_out` of disjoint windows, widened where they scatter, shape (2, R + 1)."""
-        told = np.array([w.left_out for w in self.disjoint()])
-        if not len(told):
-            return None
-        weight = 1.0 / told[:, 1] ** 2
-        mean = np.sum(weight * told[:, 0], axis=0) / weight.sum(axis=0)
-        scatter = np.sum(weight * (told[:, 0] - mean) ** 2, axis=0) / max(len(told) - 1, 1)
-        return np.stack([mean, np.sqrt(np.maximum(scatter, 1.0) / weight.sum(axis=0))])
+        total = sum(s.distance(z) for s in told)
+        return max((total + SCATTER_PRIOR) / (SIX * (len(told) - 1) + SCATTER_PRIOR), 1.0)
 
     def agreement(self, most: int) -> tuple[int, tuple[int, float] | None]:
-        """Number of the newest disjoint windows that agree in a row with the fused estimate, `most` at most.
+        """Number of the newest disjoint stretches that agree in a row with the estimate, `most` at most.
 
         And of the first that does not: which parameter is farthest off, and by how much, log scale.
         """
-        fused = self.estimate()
-        windows = self.disjoint(most) if fused is not None else []
-        limit = exceeded(1e-3, len(self._mean))
-        for agreeing, window in enumerate(windows):
-            if fused is not None and self._distance(window, fused.z, np.diag(self.drift**2)) > limit:
-                spread = np.sqrt(np.maximum(np.diag(np.linalg.pinv(window.information)), 1e-12) + self.drift**2)
-                away = window.z - fused.z
-                farthest = int(np.argmax(np.abs(away) / spread))
+        fused, limit = self.estimate(), exceeded(1e-3, SIX)
+        told = self.disjoint(most) if fused is not None else []
+        for agreeing, one in enumerate(told):
+            if fused is not None and one.distance(fused.z[:SIX], np.eye(SIX) * DRIFT**2) > limit:
+                away = one.z - fused.z[:SIX]
+                farthest = int(np.argmax(np.abs(away) / np.sqrt(np.diag(one.covariance) + DRIFT**2)))
                 return agreeing, (farthest, float(away[farthest]))
-        return len(windows), None
+        return len(told), None
 
     def walked(self, share: FloatArray, most: int) -> tuple[float, float] | None:
-        """Change of a sum of parameters from the oldest to the newest of disjoint windows, and its deviation.
+        """Change, from the oldest to the newest of `most` stretches, of a sum with `share` (6,) of each of the six.
 
-        Args:
-            share: of each parameter in the sum, shape (P,).
-            most: windows at most; None where there are fewer than two.
+        And its standard deviation; None where there are fewer than two.
         """
-        windows = self.disjoint(most)
-        if len(windows) < 2:
+        told = self.disjoint(most)
+        if len(told) < 2:
             return None
-        newest, oldest = self._alone(windows[0]), self._alone(windows[-1])
-        variance = share @ (newest.covariance + oldest.covariance) @ share
-        return float(share @ (newest.z - oldest.z)), math.sqrt(variance)
+        newest, oldest = told[0], told[-1]
+        return float(share @ (newest.z - oldest.z)), math.sqrt(share @ (newest.covariance + oldest.covariance) @ share)
 
-    def _before(self, start: float) -> _Sum | None:
-        return next((s for s in reversed(self._sums) if s.stop <= start + 1e-6), None)
+    def _begin(self, last: Sum) -> Sum | None:
+        """The newest sum after which a whole stretch follows up to `last`; the first window may be a little shorter."""
+        return next((s for s in reversed(self._sums) if s.flown <= last.flown - self._length + 0.5), None)
 
-    def _alone(self, window: WindowEstimate) -> Fused:
-        """Estimate of a window by itself and the prior."""
-        matrix = window.scale * window.information
-        vector = window.scale * (window.information @ window.z - window.score)
-        return self._solve(_Sum(window.stop, matrix, vector))
+    def _stretch(self, first: Sum, last: Sum) -> Stretch:
+        """What was told from the end of one sum to that of another."""
+        part = first.and_(-self._fade(last.flown - first.flown), last)
+        alone = self._solve(part, self._own)
+        covariance = alone.covariance[:SIX, :SIX]
+        prior, both = np.diag(1.0 / self._sigma[:SIX] ** 2), np.linalg.inv(covariance)
+        information = both - prior
+        best = np.linalg.lstsq(information, both @ alone.z[:SIX] - prior @ self._mean[:SIX], rcond=None)[0]
+        return Stretch(first.stop, last.stop, alone.z[:SIX], covariance, np.asarray(best), information)
 
-    def _solve(self, total: _Sum) -> Fused:
-        matrix = total.matrix + self._precision
-        z = np.linalg.solve(matrix, total.vector + self._precision @ self._mean)
-        return Fused(np.asarray(z), np.asarray(np.linalg.inv(matrix)))
+    def _solve(self, total: Sum, own: int) -> Fused:
+        """Estimate from a sum by the first `own` parameters, the rest taken to be none."""
+        part, mean, sigma = slice(own), self._mean[:own], self._sigma[:own]
+        precision, net, loose = 1.0 / sigma**2, total.information[part, part], total.loose[:, part]
+        # What noise of the rotors explains is no information, but there is never less than the prior's.
+        size, turned = np.linalg.eigh(sigma[:, None] * net * sigma)
+        turned = turned / sigma[:, None]
+        inverse = np.linalg.inv(np.diag(precision) + (turned * np.maximum(size, 0.0)) @ turned.T)
+        # A loop faster than the log answers a random moment within a step: by half of what it may, give or take that.
+        z = inverse @ (total.vector[part] + precision * mean + loose[:-1].sum(axis=0))
+        spread = net + total.noise[part, part] + np.diag(precision) + loose.T @ loose
+        covariance = inverse @ spread @ inverse
+        # Errors by the length of rows: a share of the step to every second row, none where chance explains that.
+        own = min(own, self._own)
+        precision, mean, between = precision[:own], mean[:own], np.zeros(len(z))
+        twice = np.linalg.inv(total.half_information[:own, :own] + np.diag(precision))
+        step = twice @ (total.half_vector[:own] + precision * mean) - z[:own]
+        chance = exceeded(CHANCE, 1) * (np.diag(twice) + np.diag(covariance)[:own])
+        between[:own] = np.where(step**2 > chance, SHARE * np.abs(step), 0.0)
+        return Fused(z, covariance + np.diag(between**2), between)
 
 
 # --- Estimate of one vehicle: requests fits, fuses their replies, and states the case for the gate
@@ -218,57 +315,46 @@ class Estimator:
 
     Attributes:
         vehicle: of the vehicle file.
-        model: the same, with room for its bare guesses once effects are fitted along; windows are fitted with it.
-        flexible: every effect that moves the vehicle is fitted along, as the vehicle file's model misses the flight.
-        fusion: the fused windows.
-        misfit: residual variance of gyro and accelerometer over that of their own noise, shape (6,); NaN: not measured.
+        fusion: what windows said.
         theta: full parameter vector, the best at hand.
-        noises: pooled sensor noise by number of residual channels, as velocity and position come and go in flight.
-        learned: whether `theta` rests on data.
+        noise: noise numbers; None: the next fit searches for everything.
         excitation: of the newest window, shape (6,); NaN before.
         start: first time of the data learned from [s]; NaN before.
         rows: grid rows learned from.
         input_hash: SHA-256 over seed and windows learned from.
     """
 
-    def __init__(self, vehicle: Vehicle, memory: float, seed: int) -> None:
-        """Starts from the vehicle file."""
-        self.vehicle, self._memory, self._seed = vehicle, memory, seed
-        self.excitation = np.full(len(NOMINAL_NAMES), np.nan)
+    def __init__(self, vehicle: Vehicle, memory: float, length: float, seed: int) -> None:
+        """Starts from the vehicle file; windows have `length` [s]."""
+        self.vehicle, self._seed = vehicle, seed
+        self.excitation = np.full(SIX, np.nan)
         self._hash = hashlib.sha256(f"quadid {vehicle.to_yaml()} {seed}".encode()).digest()
+        self._layout = Layout(vehicle)
+        self._initial = self._layout.initial(vehicle)
+        self._free = Free(tuple(self._layout.entry(n) for n in NOMINAL_NAMES))
+        prior, count, own = prior_of(vehicle), len(names_of(vehicle)), len(own_names(vehicle))
+        self._prior_sigma = prior.sigma
+        mean, sigma = np.zeros(count), np.ones(count)
+        mean[:SIX], sigma[:SIX], sigma[own:] = np.log(prior.mean), prior.sigma, WIDTH
+        self._nothing = partial(Fusion, mean, sigma, own, memory, length)
+        self._z = mean
         self.reset()
 
     def reset(self) -> None:
-        """Begins as from the vehicle file: nothing that was learned is kept, not even the noise."""
-        self._begin(self.vehicle, flexible=False)
-
-    def fit_along(self) -> None:
-        """Later windows are fitted with every effect that moves the vehicle; what was learned is forgotten."""
-        self._begin(with_room(self.vehicle), flexible=True)
-
-    def _begin(self, model: Vehicle, flexible: bool) -> None:
-        self.model, self.flexible = model, flexible
-        self._layout = Layout(model)
-        self._initial = self._layout.initial(model)
-        self._free = Free(tuple(self._layout.entry(n) for n in NOMINAL_NAMES))
-        prior = prior_of(model)
-        self._prior_sigma = prior.sigma
-        self.fusion = Fusion(np.log(prior.mean), prior.sigma, self._memory)
-        self.noises: dict[int, NoiseModel] = {}
-        self._pooled: Counter[int] = Counter()
+        """Begins as from the vehicle file: nothing that was learned is kept."""
         self.theta = self._initial
-        self.misfit = np.full(6, np.nan)
         self.forget()
 
-    @property
-    def _scatter(self) -> float:
-        fused = self.fusion.estimate()
-        return 1.0 if fused is None else self.fusion.scatter(fused.z)
+    def forget(self) -> None:
+        """The vehicle has changed: what was learned no longer holds; the next fit searches globally."""
+        self.fusion = self._nothing()
+        self.noise: Noise | None = None
+        self.start, self.rows, self._measured, self._enough = math.nan, 0, 0, 0.0
 
     @property
-    def _yaw_missed(self) -> bool:
-        # Residuals twice the sensors' noise outweigh the small couplings that yaw parameters rest on.
-        return self.flexible or bool(self.misfit.max() > 2.0)
+    def learned(self) -> bool:
+        """Whether `theta` rests on data of this flight."""
+        return self.fusion.newest is not None
 
     @property
     def thrust(self) -> ThrustModel:
@@ -289,10 +375,13 @@ class Estimator:
     def _slope_beyond_b(self) -> tuple[float, float] | None:
         """Change of thrust with speed at hover over that by b (log), mean of the rotors, and its standard deviation.
 
-        None while no effects are fitted along.
+        None where that is nothing as far as is known.
         """
-        left_out = self.fusion.left_out() if self.flexible else None
-        return None if left_out is None else (float(left_out[0, :-1].mean()), float(left_out[1, :-1].mean()))
+        left_out = self.left_out()
+        if left_out is None:
+            return None
+        value, sigma = left_out[:, :-1].mean(axis=1).tolist()
+        return (value, sigma) if value**2 > exceeded(CHANCE, 1) * sigma**2 else None
 
     @property
     def input_hash(self) -> str:
@@ -303,7 +392,7 @@ class Estimator:
     def z_sigma(self) -> FloatArray:
         """Standard deviations of the nominal six, log scale; the prior's before anything was learned."""
         fused = self.fusion.estimate()
-        return self._prior_sigma if fused is None else fused.sigma
+        return self._prior_sigma if fused is None else fused.sigma[:SIX]
 
     @property
     def torque_sigma(self) -> FloatArray:
@@ -326,105 +415,140 @@ class Estimator:
                 self.theta = self.theta.copy()
                 self.theta[self._layout.entry(p.name).index] = min(max(p.value, p.bounds[0]), p.bounds[1])
 
-    def forget(self) -> None:
-        """The vehicle has changed: what was learned no longer holds; the next fit searches globally."""
-        self.fusion.forget()
-        self.start, self.rows, self._search, self.learned = math.nan, 0, True, False
+    def request(
+        self, number: int, cut: WindowCut, start: float, stop: float, rows: GridBuffer | None = None
+    ) -> FitRequest:
+        """The fit of a window from `start` to `stop` [s]; every fifth one measures the noise anew.
 
-    def request(self, number: int, cut: WindowCut, start: float, stop: float) -> FitRequest:
-        """The fit of a window."""
-        # Every fifth window measures the sensor noise anew.
-        measure = len(self.fusion.windows) % 5 == 0
+        Where enough was learned from since, and all of it is in the `rows` of the flight, the point is taken anew.
+        """
+        spans: tuple[tuple[float, float], ...] = ((max(start, self.fusion.counted), stop),)
+        learned: tuple[Window, ...] = ()
+        flown = self.fusion.flown
+        if rows is not None and 0.0 < self._enough <= flown and rows.start <= self.start:
+            spans, self._enough = (*self.fusion.spans(), *spans), 2.0 * flown
+            learned = tuple(w for run in _joined(spans) for w in rows.cut(run[0] - _EPS, run[1] - _EPS).windows)
+        z, best = self._z, self.fusion.estimate()
+        if learned and best is not None:
+            z = np.append(best.z, np.zeros(len(z) - len(best.z)))
         return FitRequest(
-            number, self.model, cut.windows, start, stop, self.theta, self.noise_of(cut.windows), self._search,
-            self._seed, measure, self.flexible, cut.spacing,
+            number, self.vehicle, cut.windows, start, stop, self.theta, z, self.noise, self._seed, spans, learned,
+            self.fusion.taken % 5 == 0,
         )  # fmt: skip
 
-    def noise_of(self, windows: Sequence[Window]) -> NoiseModel | None:
-        """Sensor noise of the channels that these windows have; None where no such window was fitted yet."""
-        return self.noises.get(min(map(channels_of, windows), default=0))
+    def agrees(self, request: FitRequest, reply: FitReply) -> bool:
+        """True if what a reply says of its newest rows fits what is known from before them."""
+        return self._before(request, reply).agrees(reply.estimates[-1])
+
+    def _before(self, request: FitRequest, reply: FitReply) -> Fusion:
+        """What is known from before the newest rows, linearised as they are."""
+        if not request.learned:
+            return self.fusion
+        fusion = self._nothing()
+        for earlier in reply.estimates[:-1]:
+            fusion.add(earlier)
+        return fusion
 
     def take(self, request: FitRequest, reply: FitReply) -> None:
-        """Fuses a reply, where it holds an estimate."""
+        """Takes in a reply, where it holds an estimate."""
         if reply.excitation is not None:
             self.excitation = reply.excitation
-        if reply.estimate is None or reply.theta is None:
+        if not reply.estimates or reply.theta is None:
             return
-        self._pool_noise(reply)
-        if reply.misfit is not None:
-            self.misfit = reply.misfit
-        self.fusion.drift[_YAW_PLACES] = ANY if self._yaw_missed else DRIFT
+        self._pool(reply.noise, bool(request.learned))
         for window in request.windows:
             self._hash = hashlib.sha256(self._hash + _bytes(window)).digest()
-            self.start = window.t0 if math.isnan(self.start) else self.start
-        new = reply.estimate.stop - max(self.fusion.counted, reply.estimate.start)
-        self.rows += round(max(new, 0.0) / request.windows[0].dt)
-        self.fusion.add(reply.estimate)
-        self._search = False
+        start, stop = request.spans[-1]
+        self.start = start if math.isnan(self.start) else self.start
+        self.rows += round((stop - start) / request.windows[0].dt)
+        self.fusion = self._before(request, reply)
+        self.fusion.add(reply.estimates[-1])
+        self._enough = self._enough or 2.0 * self.fusion.flown
         fused = self.fusion.estimate()
         assert fused is not None
-        best = reply.theta if reply.excited or not self.learned else self.theta
-        self.theta, self.learned = self._free.placed(best, fused.z), True
-        # Windows tell the b of the vehicle file's model; the curve and the losses that are fitted along have their own.
-        self.theta[B] = self.published.like(ThrustModel(self._layout, self.theta), self.vehicle.mass * GRAVITY)
-        # Thrust knows b and the losses by their products only: the mean of the losses is the vehicle file's.
-        losses = slice(LOSS, LOSS + self._layout.rotors)
-        share = float(np.mean(1.0 - self.theta[losses]) / np.mean(1.0 - self._initial[losses]))
-        self.theta[losses] = 1.0 - (1.0 - self.theta[losses]) / share
-        self.theta[[B, D]] *= share
+        self._z = reply.estimates[-1].z
+        self.theta = self._free.placed(reply.theta, fused.z[:SIX])
 
-    def _pool_noise(self, reply: FitReply) -> None:
-        if reply.noise is None:
+    def _pool(self, found: Noise | None, of_all: bool) -> None:
+        """Takes in noise that a fit found: that of all that was flown, or of one more window."""
+        if found is None:
             return
-        channels = len(reply.noise.white)
-        known = self.noises.get(channels)
-        if known is None or self._search or not np.array_equal(reply.noise.white, known.white):
-            self.noises[channels], self._pooled[channels] = reply.noise, 1  # the first, or the fit had to find it anew
-            return
-        if reply.measured is None:
-            return
-        # The newest of 24 windows counts fully.
-        self._pooled[channels] = min(self._pooled[channels] + 1, 24)
-        share = 1.0 / self._pooled[channels]
-        white, slow = (
-            np.sqrt((1.0 - share) * old**2 + share * new**2)
-            for old, new in ((known.white, reply.measured.white), (known.slow, reply.measured.slow))
-        )
-        self.noises[channels] = NoiseModel(white, slow, known.slow_time)
+        self._measured = min(self._measured + 1, POOLED)
+        known, share = self.noise, 1.0 / self._measured
+        if known is not None and not of_all:
+            psi = np.sqrt((1.0 - share) * known.psi**2 + share * found.psi**2)
+            found = replace(known, psi=psi)
+        self.noise = found
 
-    def parameters(self) -> ParameterSet | None:
-        """The fused estimate with intervals and status; None before data."""
+    def parameters(self, most: float = math.inf) -> ParameterSet | None:
+        """The estimate with intervals and status; None before data.
+
+        Args:
+            most: d, J_zz and J_r whose 95 % interval is wider than this, relative, stay as uncertain as they were.
+        """
         fused = self.fusion.estimate()
         if fused is None:
             return None
-        theta = self._free.placed(self._initial, fused.z)
-        covariance = fused.covariance
-        if self._yaw_missed:
-            theta, covariance = self._without_yaw(theta, covariance)
-        unc = Uncertainty(covariance, np.ones(len(fused.z)), self._prior_sigma)
+        theta, covariance = self._free.placed(self._initial, fused.z[:SIX]), fused.covariance[:SIX, :SIX].copy()
+        vague = [i for i in _YAW if Z95 * fused.sigma[i] > most]
+        theta[vague] = self._initial[vague]
+        flat, zz = theta[[NOMINAL_NAMES.index("J_xx"), NOMINAL_NAMES.index("J_yy")]].sum(), NOMINAL_NAMES.index("J_zz")
+        theta[zz] = min(theta[zz], flat) if zz in vague else theta[zz]
+        covariance[vague, :] = covariance[:, vague] = 0.0
+        covariance[vague, vague] = self._prior_sigma[vague] ** 2
+        unc = Uncertainty(covariance, np.ones(SIX), self._prior_sigma)
         six = parameter_set(self._free, theta, self._initial, unc)
         beyond = self._slope_beyond_b
         return six if beyond is None else with_tangent(six, *beyond)
 
-    def _without_yaw(self, theta: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """The estimate with what couples into yaw alone as uncertain as before the flight, where the model misses it.
+    def left_out(self) -> FloatArray | None:
+        """Thrust beyond b w^2: a row of values and one of their standard deviations, shape (2, R + 1).
 
-        Roll and pitch rest on torque over inertia; d, J_zz and J_r on small couplings, which what is missed outweighs.
-        Where every effect is fitted along, the coupling itself is free, and yaw knows their ratios only.
+        The value of a rotor is the logarithm of its thrust's change with speed at hover, with what thrust may have
+        beside b, over that by the b that carries as much.  A thrust curve, a support force and an accelerometer of
+        another scale give all rotors the same, a weak rotor itself.  The last value tells them apart: the thrust that
+        there is where no rotor turns, over the weight.  A rotor's own curve has none there; what a support carries, or
+        the bias that hides a wrong scale, is there.
         """
-        theta, covariance, place = theta.copy(), covariance.copy(), _YAW_PLACES
-        theta[place] = self.vehicle.initial[place]
-        flat = theta[NOMINAL_NAMES.index("J_xx")] + theta[NOMINAL_NAMES.index("J_yy")]
-        theta[NOMINAL_NAMES.index("J_zz")] = min(theta[NOMINAL_NAMES.index("J_zz")], flat)
-        covariance[place, :] = covariance[:, place] = 0.0
-        covariance[place, place] = self._prior_sigma[place] ** 2
-        return theta, covariance
+        fused = self.fusion.estimate(wide=True)
+        if fused is None:
+            return None
+        weight, stated = self.vehicle.mass * GRAVITY, ThrustModel.stated(self.vehicle)
+        places = [*range(SIX), *range(len(own_names(self.vehicle)), len(fused.z))]
+        entries = [self._layout.entry(name) for name in thrust_names(self.vehicle)]
 
-    def deviance(self, window: WindowEstimate, known: OnlineSet | None) -> float:
-        """Deviance of a set, or of the first guess, in a window, relative to how windows scatter."""
-        return window.deviance(self._z(known)) / self._scatter
+        at = math.exp(self._z[B])
+        dead, rest = (self._layout.entry(f"thrust_curve.{n}").index for n in ("dead_speed", "offset"))
 
-    def _z(self, known: OnlineSet | None) -> FloatArray:
+        def value(z: FloatArray) -> FloatArray:
+            theta = self._initial.copy()
+            for entry, effect in zip(entries, z[SIX:], strict=True):
+                theta[entry.index] += effect * entry.typical
+            # What was linearised is b w^2, its slope and what is at rest: that is a parabola, whose root is this.
+            b, was = max(at * (1.0 + z[B] - self._z[B]), 0.1 * at), self._initial[dead]
+            theta[B], theta[dead] = b, was + (theta[dead] - was) * at / b
+            theta[rest] += b * (was**2 - theta[dead] ** 2)
+            full = ThrustModel(self._layout, theta)
+            six = stated.with_b(full.like(stated, weight))
+            own = np.log(np.maximum(full.slope(weight), 1e-12) / six.slope(weight))
+            return np.append(own, (full.at_rest - six.at_rest) / weight)
+
+        z, step = fused.z[places], 1e-5
+        here = value(z)
+        slopes = np.array([(value(z + one) - here) / step for one in step * np.eye(len(z))])
+        covariance = fused.covariance[np.ix_(places, places)]
+        return np.stack([here, np.sqrt(np.einsum("pr,pq,qr->r", slopes, covariance, slopes))])
+
+    def deviance(self, stretch: Stretch, known: OnlineSet | None) -> float:
+        """Deviance of a set, or of the first guess, in a stretch, relative to how stretches scatter."""
+        return stretch.deviance(self._scaled(known)) / self._scatter
+
+    @property
+    def _scatter(self) -> float:
+        fused = self.fusion.estimate()
+        return 1.0 if fused is None else self.fusion.scatter(fused.z[:SIX])
+
+    def _scaled(self, known: OnlineSet | None) -> FloatArray:
         theta = self._initial.copy()
         for p in known.parameters if known is not None else ():
             if p.name in NOMINAL_NAMES:
@@ -445,9 +569,10 @@ class Estimator:
         most = max(windows, 3)
         agreeing, odd = self.fusion.agreement(most)
         disagreement = f"{NOMINAL_NAMES[odd[0]]} differs by {np.expm1(odd[1]):+.1%} in one of them" if odd else ""
-        missed = () if reply.between_rows is None else zip(NOMINAL_NAMES, reply.between_rows.tolist(), strict=True)
-        left_out = self.fusion.left_out()
+        fused, left_out = self.fusion.estimate(), self.left_out()
+        assert fused is not None
         assert left_out is not None
+        missed = zip(NOMINAL_NAMES, fused.between_rows[:SIX].tolist(), strict=True)
         return Case(
             parameters, reply.excited, self._thrust_ratio(request.windows), agreeing, disagreement,
             self._held_out(sets.in_force, sets.seen), sets.in_force, sets.baseline, sets.approval,
@@ -456,20 +581,22 @@ class Estimator:
         )  # fmt: skip
 
     def scores(self) -> tuple[float, float]:
-        """Mean squared residual of the newest window: fitted, and under an estimate that had not seen it, or NaN."""
-        if not self.fusion.windows:
+        """Mean squared innovation of the newest rows: as fitted, and by the six of data before the window, or NaN."""
+        newest = self.fusion.newest
+        if newest is None:
             return math.nan, math.nan
-        newest = self.fusion.windows[-1]
         earlier = self.fusion.before(newest.start)
         if earlier is None:
             return newest.mse, math.nan
-        return newest.mse, newest.mse + newest.deviance(earlier) / newest.scale / max(newest.rows, 1.0)
+        step = earlier - newest.z[:SIX]
+        more = 2.0 * newest.score[:SIX] @ step + step @ newest.information[:SIX, :SIX] @ step
+        return newest.mse, newest.mse + float(more) / max(newest.rows, 1.0)
 
     def _walked(self, most: int) -> dict[str, tuple[float, float]]:
         """Change of torque over inertia (log) from the oldest to the newest of the windows, and its deviation."""
         out = {}
         for name in ("J_xx", "J_yy"):
-            share = np.zeros(len(NOMINAL_NAMES))
+            share = np.zeros(SIX)
             share[B], share[NOMINAL_NAMES.index(name)] = 1.0, -1.0
             walked = self.fusion.walked(share, most)
             if walked is not None:
@@ -478,13 +605,11 @@ class Estimator:
 
     def _held_out(self, in_force: OnlineSet | None, seen: float) -> tuple[float, ...]:
         """Gain over the set in force in disjoint windows after `seen` [s], by estimates that had not seen them."""
-        reference, scatter, out = self._z(in_force), self._scatter, []
-        for window in self.fusion.disjoint(4):
-            earlier = self.fusion.before(window.start)
-            if earlier is not None and window.start >= seen - 1e-6:
-                if self._yaw_missed:
-                    earlier[_YAW_PLACES] = reference[_YAW_PLACES]
-                out.append((window.deviance(reference) - window.deviance(earlier)) / scatter)
+        reference, scatter, out = self._scaled(in_force), self._scatter, []
+        for stretch in self.fusion.disjoint(4):
+            earlier = self.fusion.before(stretch.start)
+            if earlier is not None and stretch.start >= seen - 1e-6:
+                out.append((stretch.deviance(reference) - stretch.deviance(earlier)) / scatter)
         return tuple(out)
 
     def _thrust_ratio(self, windows: Sequence[Window]) -> float:
@@ -507,6 +632,18 @@ def with_tangent(six: ParameterSet, share: float, sigma: float) -> ParameterSet:
     spread[-1, :-1] = spread[:-1, -1] = six.covariance[six.names.index("b")] * value / b.value
     spread[-1, -1] = new.sigma**2
     return ParameterSet((*six.parameters, new), spread)
+
+
+def _joined(spans: Sequence[tuple[float, float]], enough: float = math.inf) -> list[tuple[float, float]]:
+    """Begins and ends [s], joined where they touch until they are long enough [s]."""
+    out: list[tuple[float, float]] = []
+    for start, stop in spans:
+        begin, end = out[-1] if out else (start, -math.inf)
+        if start - end < _EPS and end - begin < enough - _EPS:
+            out[-1] = begin, stop
+        else:
+            out.append((start, stop))
+    return out
 
 
 def _bytes(window: Window) -> bytes:

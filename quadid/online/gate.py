@@ -39,7 +39,7 @@ class GateSettings(BaseModel):
         approval: ``auto``: what passes is published; ``manual``: it waits for a person.
         windows: windows without a common sample that must agree.
         width: largest half-width of the 95 % interval of b, J_xx, J_yy, relative.
-        yaw_width: the same of d, J_zz, J_r where the data claim to know them.
+        yaw_width: the same of d, J_zz, J_r, beyond which they stay at the vehicle file's values.
         step: largest change of a parameter from the set in force, relative.
         creep: largest change from the last set that a person approved, or the first of this flight.
         reference: largest change of torque over inertia from that set, from the vehicle file before the first, and
@@ -89,7 +89,7 @@ class Case:
         walked: change of torque over inertia (log) from the oldest to the newest agreeing window and its standard
             deviation, by the inertia's name.
         between_rows: relative standard deviation by what the rotors do between readings, newest window, by name.
-        left_out: of thrust by b w^2 and standard deviations, shape (2, R + 1) (`fit_job.left_out`).
+        left_out: of thrust by b w^2 and standard deviations, shape (2, R + 1) (`Estimator.left_out`).
         loaded: why the vehicle may have another mass than the vehicle file says, or empty.
     """
 
@@ -175,15 +175,12 @@ def _bounds(case: Case, settings: GateSettings) -> str | None:
 def _width(case: Case, settings: GateSettings) -> str | None:
     for p in case.parameters:
         half = Z95 * p.sigma / max(abs(p.value), 1e-300)
-        if p.name in MUST_BE_KNOWN:
-            if p.status in UNKNOWN or half > settings.width:
-                missed = Z95 * case.between_rows.get(p.name, 0.0)
-                text = f"{p.name} is known to {half:.2%} only, wanted {settings.width:.2%}: keep flying"
-                unseen = f"; what the rotors do between readings moves it by {missed:.0%}"
-                way = "log motors faster (80 Hz, not 50), or fly more smoothly"
-                return f"{text}{unseen}: {way}" if missed > settings.width else text
-        elif p.name in NOMINAL_NAMES and p.status is Status.IDENTIFIED and half > settings.yaw_width:
-            return f"{p.name} is known to {half:.0%} only, wanted {settings.yaw_width:.0%}: yaw more"
+        if p.name in MUST_BE_KNOWN and (p.status in UNKNOWN or half > settings.width):
+            missed = Z95 * case.between_rows.get(p.name, 0.0)
+            text = f"{p.name} is known to {half:.2%} only, wanted {settings.width:.2%}: keep flying"
+            unseen = f"; what the rotors do between readings moves it by {missed:.0%}"
+            way = "log motors faster (80 Hz, not 50), or fly more smoothly"
+            return f"{text}{unseen}: {way}" if missed > settings.width else text
     return None
 
 
@@ -223,9 +220,10 @@ def _is_sharper(case: Case, settings: GateSettings) -> bool:
 
 
 def _too_far(off: FloatArray, sigma: FloatArray, settings: GateSettings) -> tuple[bool, bool]:
-    """True if something may be off by more than a parameter's interval may be wide; and if data would show it."""
-    far = np.abs(off) + Z95 * sigma > settings.width
-    return bool(far.any()), bool((far & (Z95 * sigma > 0.5 * settings.width)).any())
+    """True if something may be off by more than a parameter's interval may be wide; and if more data would show it."""
+    half = Z95 * sigma
+    far, surely = np.abs(off) + half > settings.width, np.abs(off) - half > settings.width
+    return bool(far.any()), bool((far & ~surely & (half > 0.5 * settings.width)).any())
 
 
 def _unproven(case: Case, settings: GateSettings) -> str | None:

@@ -110,6 +110,11 @@ class GridBuffer:
         self._most = round(seconds * rate)
         self._blocks: list[Rows] = []
 
+    @property
+    def start(self) -> float:
+        """Time of the oldest row [s]; infinite before there is one."""
+        return float(self._blocks[0].t[0]) if self._blocks else math.inf
+
     def add(self, rows: Rows) -> None:
         """Appends a block of rows and forgets the oldest."""
         self._blocks.append(rows)

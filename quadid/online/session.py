@@ -59,6 +59,8 @@ WARM_UP = 0.22
 """Flight before a window in which filters and delays settle [s]."""
 STARTING = 3.0
 """Time from the begin of a stream [s] in which channels may still come, once the vehicle sends what was asked."""
+FOUND_AFTER = 3.0
+"""An answer that takes long is used so long after it was asked for [s], so that a replay does what was done live."""
 _EPS = 1e-6
 _DONE = object()
 
@@ -123,14 +125,17 @@ class Session:
         self._diagnosis = BackgroundDiagnosis(
             vehicle, self._rows, self.settings.diagnose, self.settings.seed, self._outbox.stamp
         )
-        self._estimator = Estimator(vehicle, self.settings.memory, self.settings.seed)
+        self._estimator = Estimator(vehicle, self.settings.memory, self.settings.window, self.settings.seed)
         # The walk: data read up to `_now` [s], the next tick [s], and the pieces of work that have begun.
         self._now, self._tick_at = -math.inf, math.nan
         self._work: Iterator[None] | None = None
-        # Jobs: the one that is waited for, its reply, one that is too late; replies up to `_outdated` are ignored.
+        # Jobs: the one that is waited for, its reply, one that is too late; a long fit, whose reply is waited for when
+        # it is due, and that reply; replies up to `_outdated` are ignored.
         self._waiting: Job | None = None
         self._reply: JobReply | None = None
         self._late: Job | None = None
+        self._search: FitRequest | None = None
+        self._found: JobReply | None = None
         self._number = self._outdated = 0
         self._hurried, self.skipped = False, 0
         # Learning: nothing before `_learn_from` [s] counts; since when [s] windows have disagreed with the estimate.
@@ -158,6 +163,8 @@ class Session:
         """Takes the answer to a running job; an answer to any other is ignored."""
         if self._waiting is not None and reply.number == self._waiting.number:
             self._reply = reply
+        elif self._search is not None and reply.number == self._search.number:
+            self._found = reply
         elif self._late is not None and reply.number == self._late.number and self._waiting is None:
             self._waiting, self._reply, self._late = self._late, reply, None
         else:
@@ -199,8 +206,8 @@ class Session:
 
     @property
     def running(self) -> Job | None:
-        """The job whose reply the session waits for."""
-        return self._waiting
+        """The job whose reply the session waits for, or will."""
+        return self._waiting or (self._search if self._found is None else None)
 
     @property
     def backlog(self) -> float:
@@ -234,17 +241,17 @@ class Session:
     def status(self) -> SessionStatus:
         """Status of the session now."""
         newest, active_set = self.resampler.time.newest, self.active_set
-        windows, cut = self._estimator.fusion.windows, self._cut
+        window, cut = self._estimator.fusion.newest, self._cut
         force, pending = active_set.in_force, active_set.pending
         return SessionStatus(
             t=self._outbox.stamp(newest),
-            phase=Phase.FITTING if self._waiting is not None else self._outbox.phase,
+            phase=Phase.FITTING if self.running is not None else self._outbox.phase,
             reason=self._outbox.reason,
             excitation=self._estimator.excitation,
             samples=sum(len(w) for w in cut.windows),
             window_seconds=cut.seconds,
             gaps=cut.gaps,
-            mse=windows[-1].mse if windows else math.nan,
+            mse=window.mse if window is not None else math.nan,
             fits=self._fits,
             rejected=self._rejected,
             in_force=force.sequence if force else 0,
@@ -313,6 +320,9 @@ class Session:
         yield
         if self._changes.seen is not None:
             self._explain_change(tick)
+        elif self._search is not None:
+            if tick >= self._search.stop + FOUND_AFTER - _EPS:
+                self._waiting, self._reply, self._search, self._found = self._search, self._found, None, None
         elif self._asked_now or (self._errors < MOST_ERRORS and tick - self._last_fit >= self.settings.refit - _EPS):
             if self._hurried or self._late is not None or self._waiting is not None:
                 self.skipped += 1
@@ -364,7 +374,7 @@ class Session:
         request = self._changes.ask(self._number + 1, tick, self._estimator, stamp)
         if request is None:
             return
-        self._number, self._waiting, self._late = request.number, request, None
+        self._number, self._waiting, self._late, self._search = request.number, request, None, None
         if not request.windows:
             self._reply = request.failed("too little data after the change")
         elif not self._estimator.learned:
@@ -397,8 +407,13 @@ class Session:
             return
         yield
         self._last_fit = tick
-        request = self._estimator.request(self._number + 1, cut, max(start, tick - self.settings.window), tick)
-        self._number, self._waiting = request.number, request
+        start = max(start, tick - self.settings.window)
+        request = self._estimator.request(self._number + 1, cut, start, tick, self._rows)
+        self._number = request.number
+        if request.is_long:
+            self._search, self._found = request, None
+        else:
+            self._waiting = request
         self._outbox.act(request)
 
     # --- what replies bring
@@ -432,7 +447,7 @@ class Session:
         if reply.problem:
             outbox.note(request.stop, Phase.FAILED, reply.problem)
             return
-        if reply.estimate is None:
+        if not reply.estimates:
             estimator.take(request, reply)
             assert reply.excitation is not None
             worst = sorted(zip(reply.excitation, NOMINAL_NAMES, strict=True), reverse=True)[:3]
@@ -440,18 +455,11 @@ class Session:
             outbox.note(request.stop, Phase.NOT_EXCITED, f"roll and pitch move too little: {known}")
             return
         self._fits += 1
-        if not reply.estimate.finite:
+        if not reply.finite:
             # Information adds up: one such window would spoil every estimate after it.
             outbox.note(request.stop, Phase.FAILED, "the fit of the newest window gave no numbers")
             return
-        if reply.flexible and not estimator.flexible:
-            # From now on effects are fitted along; what was learned without them is forgotten.
-            estimator.fit_along()
-            self._disagrees_since = math.inf
-            share = f"{reply.lack.share:.0%} of what" if reply.lack is not None else "what"
-            text = f"effects that the vehicle file lacks explain {share} its model misses: every one is fitted along"
-            outbox.say(request.stop, "info", "model", text)
-        if not estimator.fusion.agrees(reply.estimate):
+        if not estimator.agrees(request, reply):
             # It is left out; when one without a common sample disagrees too, the vehicle has changed.
             since = self._disagrees_since = min(self._disagrees_since, request.stop)
             outbox.state(Phase.CANDIDATE, "the newest window disagrees with what was known: held back")
@@ -463,8 +471,9 @@ class Session:
         estimator.take(request, reply)
         yield
         # The set in force is taken back when its predecessor predicts new windows better.
-        sets, new = self.active_set, reply.estimate
-        if sets.predecessor is not None:
+        sets, told = self.active_set, estimator.fusion.disjoint(1)
+        if sets.predecessor is not None and told:
+            new = told[0]
             loss = estimator.deviance(new, sets.in_force) - estimator.deviance(new, sets.predecessor)
             if sets.watch(new.start, new.stop, loss) and sets.watched > self.settings.gate.watch:
                 why = f"it predicts new windows worse than its predecessor (deviance {sets.watched:.0f})"
@@ -476,7 +485,7 @@ class Session:
     def _judge(self, request: FitRequest, reply: FitReply) -> None:
         """Asks the gate, and publishes, holds or refuses the estimate."""
         sets, outbox, estimator = self.active_set, self._outbox, self._estimator
-        parameters = estimator.parameters()
+        parameters = estimator.parameters(self.settings.gate.yaw_width)
         if parameters is None:
             return
         scale, mass, loaded = self._diagnosis.wrong_scale, estimator.vehicle.mass, ""
@@ -521,6 +530,7 @@ class Session:
     def _relearn(self, start: float, why: str) -> None:
         """Forgets what was learned; learns from `start` [s] on."""
         self._estimator.forget()
+        self._search = None
         self._learn_only_from(start)
         self.active_set.drop_pending()
         self._outbox.state(Phase.COLLECTING, f"{why}: learning restarts")

@@ -11,6 +11,7 @@ from quadid_node.wire_format import MOST, ParcelError, folder_of, keep, repeat
 from quadid_node.worker import InlineWorker, Trouble
 
 from quadid.online import FitReply, FitRequest
+from quadid.online.grid_buffer import WindowCut
 from quadid.online.records import JobReply
 from tests.faults.evidence import Happened
 from tests.online.made_up import PELICAN, QUICK, light_flight
@@ -43,9 +44,7 @@ def test_the_input_of_an_unexpected_error_is_kept_for_replay(tmp_path: Path, hap
     assert isinstance(reply, FitReply)
     assert not reply.is_unexpected
     size = kept[0].stat().st_size
-    request = service.session.running or FitRequest(
-        1, PELICAN, (), 0.0, 1.0, service.session._estimator.theta, None, True, 0
-    )
+    request = service.session.running or service.session._estimator.request(1, WindowCut((), 1.0, 0), 0.0, 1.0)
     for _ in range(3 * MOST):
         assert "its input is in" in keep(store.path, request)
     assert len(list(folder_of(store.path).iterdir())) <= MOST

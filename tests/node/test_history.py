@@ -419,7 +419,7 @@ def test_a_disk_that_is_full_is_said_and_what_came_meanwhile_is_written_later(
         while True:
             file.write(b"x" * 4096)
     service = Service(PELICAN, SessionSettings(window=5.0, diagnose=0.0), InlineWorker(), store)
-    for sample in samples(flight(8.0, 6).recording):
+    for sample in samples(flight(10.0, 6).recording):
         service.push(sample.block)
     said: list[Output] = []
     while service.session.running is not None or not service.session.status().fits:

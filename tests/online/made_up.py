@@ -14,9 +14,10 @@ from itertools import accumulate
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from quadid.estimate.kalman import N_NOISE
 from quadid.online import FitReply, FitRequest, GateSettings, Session, SessionSettings
 from quadid.online.change_job import ChangeRequest
-from quadid.online.fit_job import WindowEstimate
+from quadid.online.fit_job import LOOSE, Noise, WindowEstimate, names_of
 from quadid.online.records import Action, Job, JobReply
 from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray
@@ -89,9 +90,21 @@ def between(stream: Iterable[Sample], start: float, stop: float = math.inf, shif
     return [s._replace(t=s.t + shift) for s in stream if start - 1e-9 <= s.t < stop - 1e-9]
 
 
-def nothing_left_out(sigma: float = 0.005) -> FloatArray:
-    """Answer of a fit that knows the thrust of four rotors to be b w^2, each to `sigma`, and nothing at rest."""
-    return np.stack([np.zeros(5), np.append(np.full(4, sigma), 1.0)])
+NOISE = Noise(np.ones(N_NOISE), np.zeros(4), np.ones(3), 0.0)
+
+
+def told(request: FitRequest, z: FloatArray, sigma: float) -> tuple[WindowEstimate, ...]:
+    """Answer of a fit: a whole window tells the six as z, each to `sigma`, and that thrust has nothing beside b."""
+    count, rows = len(names_of(request.vehicle)), 2000.0
+    at, known = np.zeros(count), np.full(count, sigma)
+    at[:6], known[6:] = z, 0.1
+    zero, none, loose = np.zeros(count), np.zeros((count, count)), np.zeros((LOOSE, count))
+    shares = ((stop - start) / (request.stop - request.start) for start, stop in request.spans)
+    squares = (share * np.diag(1.0 / known**2) for share in shares)
+    return tuple(
+        WindowEstimate(*span, at, square, zero, rows, rows, none, loose, square, zero)
+        for span, square in zip(request.spans, squares, strict=True)
+    )
 
 
 def tells(sigma: float = 0.005, **factors: float) -> Worker:
@@ -101,13 +114,10 @@ def tells(sigma: float = 0.005, **factors: float) -> Worker:
         if not isinstance(request, FitRequest):
             return request.failed("made up")
         values = np.array([TRUE[n] * factors.get(n, 1.0) for n in NOMINAL_NAMES])
-        window = WindowEstimate(
-            request.start, request.stop, np.log(values), np.eye(6) / sigma**2, np.zeros(6), 2000.0, 2000.0,
-            nothing_left_out(),
-        )  # fmt: skip
+        window = told(request, np.log(values), sigma)
         theta = request.theta.copy()
         theta[:6] = values
-        return FitReply(request.number, "", np.full(6, sigma), True, window, theta)
+        return FitReply(request.number, "", np.full(6, sigma), True, window, theta, NOISE)
 
     return work
 

@@ -42,7 +42,7 @@ def test_a_channel_that_begins_or_ends_in_flight_ends_no_fit(
     name: str, start: float, stop: float, happened: Happened
 ) -> None:
     extras = (name,) if name in ("velocity", "position") else ()
-    flown = fly(PELICAN, seconds=24.0, seed=3, extras=extras)
+    flown = fly(PELICAN, seconds=28.0, seed=3, extras=extras)
     session = Session(PELICAN, SETTINGS)
     actions = drive(session, samples(within(flown.recording, name, start, stop)))
     assert not events(actions, "unexpected")
@@ -50,7 +50,7 @@ def test_a_channel_that_begins_or_ends_in_flight_ends_no_fit(
     assert late, session.status()
     error = late[-1].parameters["J_xx"].value / flown.truth.parameters.J_xx - 1.0
     assert abs(error) < 0.08
-    happened(41, f"{name} there from {start:g} to {min(stop, 24.0):g} s of 24 s: fits go on, J_xx {error:+.1%}")
+    happened(41, f"{name} there from {start:g} to {min(stop, 28.0):g} s of 28 s: fits go on, J_xx {error:+.1%}")
 
 
 def test_noise_of_fewer_channels_than_the_data_have_leaves_the_others_out() -> None:

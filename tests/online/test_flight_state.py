@@ -51,7 +51,7 @@ def steps(
 ) -> list[tuple[float, str, float]]:
     """Changes seen: when [s], channel, size; from `at` [s] on rotors give only `scale` as much for their speed."""
     vehicle = Vehicle.from_yaml(file.read_text())
-    store, estimator = GridBuffer(RATE, 60.0), Estimator(vehicle, 60.0, 0)
+    store, estimator = GridBuffer(RATE, 60.0), Estimator(vehicle, 60.0, 10.0, 0)
     supervisor, seen, first, tick = ChangeWatch(vehicle, store), list[tuple[float, str, float]](), 0.0, 0.0
     for rows in rows_of(log, file):
         if rows.fresh:

@@ -364,17 +364,6 @@ def test_thrust_that_the_accelerometer_did_not_feel(ratio: float, passes: bool) 
     assert (decide(good(thrust_ratio=ratio), GateSettings()).state is SetState.ACCEPTED) is passes
 
 
-@pytest.mark.parametrize(
-    ("status", "passes"),
-    [(Status.IDENTIFIED, False), (Status.RATIO_ONLY, True), (Status.PRIOR_DOMINATED, True)],
-)
-def test_a_wide_yaw_parameter_is_refused_only_where_it_claims_to_be_known(status: Status, passes: bool) -> None:
-    case = good(parameters=changed(parameter_set(TRUE), "d", sigma=0.4 * TRUE["d"], status=status))
-    decision = decide(case, GateSettings())
-    assert (decision.state is SetState.ACCEPTED) is passes
-    assert passes or "yaw more" in decision.reason
-
-
 @pytest.mark.parametrize(("gains", "news"), [((6.0, 6.0), False), ((6.0, 6.1), True), ((4.0, 3.0, 3.0), False)])
 def test_a_gain_counts_by_the_window(gains: tuple[float, ...], news: bool) -> None:
     case = good(in_force=online_set(TRUE), held_out=gains)

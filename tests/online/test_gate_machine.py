@@ -30,13 +30,12 @@ from quadid_node.service import Service
 from quadid_node.worker import Trouble
 
 from quadid.online import FitReply, FitRequest, GateSettings, Publish, SessionSettings, SetState
-from quadid.online.fit_job import WindowEstimate
 from quadid.online.records import Job, JobReply, OnlineSet
 from quadid.parameters import NOMINAL_NAMES, impossible_inertia
 from quadid.vehicle import Vehicle
 from tests.faults.evidence import Happened
 from tests.online.driving import flight, samples
-from tests.online.made_up import nothing_left_out
+from tests.online.made_up import NOISE, told
 from tests.online.test_gate import TRUE
 from tests.samples import Sample
 
@@ -81,13 +80,10 @@ def estimate(request: FitRequest, factors: dict[str, float], sigma: float) -> Fi
     values = np.array([TRUE[n] * factors.get(n, 1.0) for n in NOMINAL_NAMES])
     with np.errstate(invalid="ignore"):
         z = np.log(values)
-    window = WindowEstimate(
-        request.start, request.stop, z, np.eye(6) / sigma**2, np.zeros(6), 2000.0, 2000.0,
-        nothing_left_out(),
-    )  # fmt: skip
+    window = told(request, z, sigma)
     theta = request.theta.copy()
     theta[:6] = values
-    return FitReply(request.number, "", np.full(6, sigma), True, window, theta)
+    return FitReply(request.number, "", np.full(6, sigma), True, window, theta, NOISE)
 
 
 class Machine(RuleBasedStateMachine):

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from quadid.data.window import Recording
-from quadid.model.layout import Layout
-from quadid.online import FitRequest, Session, SessionSettings
-from quadid.online.fit_job import with_room
+from quadid.online import Session, SessionSettings
+from quadid.online.fusion import Estimator
+from quadid.online.grid_buffer import WindowCut
 from quadid.online.records import OnlineSet, SetState
 from quadid.types import FloatArray
 from quadid.vehicle import GRAVITY, ParameterPrior, Vehicle
@@ -109,12 +109,12 @@ def test_what_a_support_carries_shows_at_rest_and_a_curve_of_the_rotors_own_does
     plain = flight(24.0, 3)
     held_up = replace(plain.window, rotor_speed=supported(0.15)(plain.window.rotor_speed))
     for window, sloped, carried in ((flight(24.0, 3, effects=bent).window, slope, 0.0), (held_up, None, 0.15)):
-        model = with_room(PELICAN)
-        theta = Layout(model).initial(model)
-        asked = FitRequest(1, model, (window,), 0.0, 24.0, theta, None, True, 0, flexible=True)
-        reply = asked.answer()
-        assert reply.estimate is not None, reply.problem
-        (*rotors, at_rest), (*_, sigma) = reply.estimate.left_out
+        learner = Estimator(PELICAN, 120.0, 10.0, 0)
+        asked = learner.request(1, WindowCut((window,), 24.0, 0), 0.0, 24.0)
+        learner.take(asked, asked.answer())
+        left_out = learner.left_out()
+        assert left_out is not None
+        (*rotors, at_rest), (*_, sigma) = left_out
         assert at_rest == pytest.approx(carried, abs=3.0 * sigma)
         assert sigma < 0.03
         assert sloped is None or np.mean(rotors) == pytest.approx(sloped, abs=0.03)
@@ -145,11 +145,15 @@ def test_three_sensors_each_within_its_limit_do_not_move_a_set_by_seven_per_cent
 def test_a_support_beside_two_sensors_within_their_limits_waits(
     accel: Callable[[FloatArray], FloatArray], gyro: Callable[[FloatArray], FloatArray], told: str, happened: Happened
 ) -> None:
-    """Each alone is within its limit; b was published 7 % and the inertias 5 and 6 % high."""
+    """Each alone is within its limit; b was published 7 % and the inertias 5 and 6 % high.
+
+    Where the scale hides the support, no sensor shows the 4 % that both then are off by.
+    """
     made = with_channel(flight(SECONDS, 3).recording, "rotor_speed", supported(0.04))
     session, sets = flown(with_channel(with_channel(made, "accel", accel), "gyro", gyro))
-    assert not sets
-    happened(39, f"support 4 %, {told}: nothing published; '{session.status().reason[:90]}'")
+    assert not sets or told.startswith("hidden")
+    assert all(abs(off(s, n)) < 0.05 for s in sets for n in ("b", "J_xx", "J_yy"))
+    happened(39, f"support 4 %, {told}: {len(sets)} published; '{session.status().reason[:90]}'")
 
 
 def test_an_attitude_that_comes_late_leaves_the_inertias_alone() -> None:

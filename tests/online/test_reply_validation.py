@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from quadid.identification.noise import NoiseModel
+from quadid.estimate.kalman import N_NOISE
 from quadid.online import FitReply, FitRequest, Session
 from quadid.online.background_diagnosis import _is_wrong_scale
 from quadid.online.records import Job, JobReply, OnlineFinding
 from tests.faults.evidence import Happened
 from tests.online.driving import published
-from tests.online.made_up import PELICAN, QUICK, light_flight, tells, works
+from tests.online.made_up import NOISE, PELICAN, QUICK, light_flight, tells, works
 from tests.online.test_gate import TRUE
 
 FLIGHT = light_flight(20.0)
@@ -25,8 +25,8 @@ Spoil = Callable[[FitReply], FitReply]
 
 def estimate(**fields: Any) -> Spoil:
     def spoil(reply: FitReply) -> FitReply:
-        assert reply.estimate is not None
-        return replace(reply, estimate=replace(reply.estimate, **fields))
+        *before, last = reply.estimates
+        return replace(reply, estimates=(*before, replace(last, **fields)))
 
     return spoil
 
@@ -35,8 +35,8 @@ def fields(**changed: Any) -> Spoil:
     return lambda reply: replace(reply, **changed)
 
 
-def noise(white: int, slow: int | None = None, memory: float = 0.66) -> NoiseModel:
-    return NoiseModel(np.full(white, 0.1), np.zeros(white if slow is None else slow), memory)
+def noise(**changed: Any) -> Spoil:
+    return fields(noise=replace(NOISE, **changed))
 
 
 SPOILT: dict[str, Spoil] = {
@@ -46,12 +46,13 @@ SPOILT: dict[str, Spoil] = {
     "information of one axis": estimate(information=np.ones(6)),
     "information below zero": estimate(information=-1e6 * np.eye(6)), "score of two": estimate(score=np.zeros(2)),
     "no time": estimate(start=4.0, stop=4.0), "time without end": estimate(stop=1e300),
+    "an estimate too many": lambda reply: replace(reply, estimates=2 * reply.estimates),
     "theta of three": fields(theta=np.ones(3)), "theta of two axes": fields(theta=np.ones((4, 4))),
     "theta that is no number": fields(theta=np.full(200, math.nan)),
-    "excitation of two": fields(excitation=np.zeros(2)), "misfit of none": fields(misfit=np.zeros(0)),
-    "noise of three": fields(noise=noise(3)), "noise of two lengths": fields(noise=noise(9, 3)),
-    "noise without memory": fields(noise=noise(9, memory=0.0)), "measured of three": fields(measured=noise(3)),
-    "spectrum of one": fields(noise=replace(noise(9), shape=np.ones((1, 1)))),
+    "excitation of two": fields(excitation=np.zeros(2)), "half of three": estimate(half_information=np.eye(3)),
+    "loose of one": estimate(loose=np.zeros(1)), "rows of none": estimate(rows=0.0),
+    "noise of three": noise(psi=np.ones(3)), "noise below zero": noise(psi=np.full(N_NOISE, -1.0)),
+    "tails of two": noise(tail=np.zeros(2)), "a doubt without end": noise(doubt=math.inf),
 }  # fmt: skip
 
 

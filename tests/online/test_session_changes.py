@@ -125,8 +125,8 @@ def test_an_answer_of_the_wrong_kind_is_ignored_and_the_question_asked_again() -
     actions = works(session, between(DROPPED, 0.0, 4.7), confused)
     assert numbers(actions) == [1]
     assert not diagnosed(actions)
-    assert numbers(works(session, between(DROPPED, 4.7, 5.7), tells())) == [2]
-    works(session, between(DROPPED, 5.7, 16.7), tells())
+    assert numbers(works(session, between(DROPPED, 4.7, 8.7), tells())) == [2]
+    works(session, between(DROPPED, 8.7, 16.7), tells())
     actions = works(session, between(DROPPED, 16.7, 18.7), confused)
     assert [a.stop for a in actions if isinstance(a, ChangeRequest)] == [18.0]
     assert not diagnosed(actions)

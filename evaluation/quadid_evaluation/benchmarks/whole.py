@@ -6,7 +6,6 @@ import os
 import pickle
 import tempfile
 from collections.abc import Callable
-from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -21,7 +20,8 @@ from quadid.identification.fit import Fit, FitOptions, fit
 from quadid.identification.particle_swarm import SwarmOptions
 from quadid.identification.score import mse_score
 from quadid.model.layout import Layout
-from quadid.online.fit_job import FitRequest
+from quadid.online.fusion import Estimator
+from quadid.online.grid_buffer import WindowCut
 from quadid.parameters import NOMINAL_NAMES
 from quadid.vehicle import Vehicle
 from quadid_evaluation.benchmarks.timing import child, command, interleaved
@@ -97,13 +97,13 @@ def identification(rounds: int) -> dict[str, Any]:
 def refits(rounds: int) -> dict[str, Any]:
     """A window of 10 s: from nothing (swarm, noise), and refitted from the last estimate."""
     vehicle, window = Vehicle.shipped("pelican"), flight(60.0).slice(500, 1000)
-    start = Layout(vehicle).initial(vehicle)
-    cold = FitRequest(1, vehicle, (window,), 10.0, 20.0, start, None, True, 1)
+    estimator = Estimator(vehicle, 120.0, 10.0, 1)
+    cold = estimator.request(1, WindowCut((window,), 10.0, 0), 10.0, 20.0)
     first = cold.answer()
     if first.theta is None:
         raise AssertionError(first.problem)
-    warm = replace(cold, theta=first.theta, noise=first.noise, search=False)
-    later = replace(warm, windows=(flight(60.0).slice(550, 1050),))
+    estimator.take(cold, first)
+    later = estimator.request(2, WindowCut((flight(60.0).slice(550, 1050),), 10.0, 0), 11.0, 21.0)
     cases = {"cold": cold.run, "warm, one second later": later.run}
     return {"times": interleaved(cases, rounds)}
 
