@@ -339,7 +339,7 @@ def _stretch_on_grid(name: str, track: ChannelTrack, cut: slice, at: FloatArray,
         out = interpolate(t, values, at, smooth=fast)
         # Inputs act between their samples; what is measured is known there only, lost samples least.
         if name != "rotor_speed" and not (fast and name == "attitude_reference"):
-            out = _at_nearest(t, out, at, step)
+            out = _at_nearest(t, out, at, HOLE * step if fast else step)
     if name == "attitude":
         out = out / np.linalg.norm(out, axis=1, keepdims=True)
     elif name == "attitude_reference":
@@ -348,7 +348,7 @@ def _stretch_on_grid(name: str, track: ChannelTrack, cut: slice, at: FloatArray,
 
 
 def _at_nearest(t: FloatArray, values: FloatArray, at: FloatArray, step: float) -> FloatArray:
-    """Keeps only the grid rows nearest to a real sample."""
+    """Keeps only the grid rows within half a `step` [s] of a real sample."""
     after = np.clip(np.searchsorted(t, at), 0, len(t) - 1)
     before = np.maximum(after - 1, 0)
     distance = np.minimum(np.abs(t[after] - at), np.abs(at - t[before]))
