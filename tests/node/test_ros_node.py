@@ -35,6 +35,17 @@ PELICAN = Vehicle.shipped("pelican")
 SPEED = 2.0
 
 
+def seconds(stamp: Any) -> float:
+    """Time of a stamp [s]."""
+    return float(stamp.sec + 1e-9 * stamp.nanosec)
+
+
+def left_out(diagnostics: Any) -> bool:
+    """Whether fits were left out because the machine was too slow."""
+    told = [v.value for s in diagnostics.status for v in s.values if v.key == "fits left out"]
+    return any(value != "0" for value in told)
+
+
 def test_a_late_subscriber_gets_the_latched_set_and_the_replay_gives_the_same_bits(
     log: Path, tmp_path: Path, ear: Ear
 ) -> None:
@@ -76,8 +87,13 @@ def test_a_late_subscriber_gets_the_latched_set_and_the_replay_gives_the_same_bi
     replayed = json.loads(out.read_text())["candidates"]
     live = [(list(c.values), c.log_hash) for c in candidates]
     assert len(live) > 5
-    assert live == [([p["value"] for p in c["parameters"]], c["input_hash"]) for c in replayed][: len(live)]
-    assert len(replayed) - len(live) <= 1, "the run was stopped while its last fit ran, if at all"
+    repeated = [([p["value"] for p in c["parameters"]], c["input_hash"]) for c in replayed]
+    if (hurried := next((seconds(d.header.stamp) for d in health if left_out(d)), None)) is None:
+        assert live == repeated[: len(live)]
+        assert len(repeated) - len(live) <= 1, "the run was stopped while its last fit ran, if at all"
+    else:  # a busy machine leaves out fits, a replay none: the same up to there
+        same = sum(seconds(c.published) < hurried - 2.0 for c in candidates)
+        assert live[:same] == repeated[:same]
 
     with node(history) as restarted:
         stale = ear.listen("quadid/parameters", ParameterSet, latched())
