@@ -1,4 +1,4 @@
-"""How far the estimates of a fit are off if a doubt about a log is right.
+"""Errors of the estimates of a fit if a doubt about a log is right.
 
 With believed (') and true numbers in b'S'/m' = bS/m (S: sum of the squared speeds), J' s dw/dt = b' tau' + gyroscopic
 terms, and J dw/dt = b tau + the same ones (tau: torque over thrust or drag; s: gyro reading over true rate).

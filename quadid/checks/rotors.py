@@ -402,7 +402,7 @@ def _unbalanced(squares: FloatArray, vehicle: Vehicle) -> Problem | None:
 
 
 class _Odd(NamedTuple):
-    """What differs from its neighbours and from balance, of each rotor's share, once one rotor is corrected.
+    """Remaining difference of the rotors' shares from each other and from balance, once one rotor is corrected.
 
     With that rotor (from 0) and its number as believed over that which balance needs.
     """
@@ -572,7 +572,7 @@ def hover_check(recording: Recording, vehicle: Vehicle, spans: Spans) -> Check:
 
 
 def _heavier(factor: float) -> Off:
-    """What is off if the vehicle file's mass is so many times the true one; nothing where no factor is known."""
+    """Errors of the estimates if the vehicle file's mass is so many times the true one; none without a factor."""
     return estimates_off(mass=factor) if 0.0 < factor < np.inf else {}
 
 
@@ -1045,5 +1045,5 @@ def _judge_scale(vehicle: Vehicle, scale: float, hover: float, numbers: dict[str
 
 
 def _farther(factor: float) -> Off:
-    """What is off if the rotors are so many times as far from the centre as the vehicle file says."""
+    """Errors of the estimates if the rotors are so many times as far from the centre as the vehicle file says."""
     return estimates_off(torque=(factor, factor, 1.0))

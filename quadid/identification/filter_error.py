@@ -13,7 +13,7 @@ as wide as their differences.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -132,10 +132,8 @@ def _filtered(windows: Sequence[Window], vehicle: Vehicle, theta: FloatArray, fr
     # 1. The estimate, with what acts on every vehicle fitted along.
     layout = Layout(vehicle)
     known = {e.name.split(".")[0] for e in layout.entries.values() if theta[e.index] != e.neutral}
-    stated = known | {n.split(".")[0] for n in free.names}
-    # A delay and a lag pass for one another: where the model has one, nothing else is late.
-    late = () if any(n.split(".")[0] in stated for n in LATE) else LATE
-    along = [n for n in (*ALONG, *late) if n.split(".")[0] not in stated]
+    along = fitted_along(known | {n.split(".")[0] for n in free.names})
+    late = [n for n in along if n in LATE]
     nominal = [n for n in free.names if n in NOMINAL_NAMES]
     beside = [*(n for n in free.names if n not in NOMINAL_NAMES), *along]
 
@@ -144,10 +142,7 @@ def _filtered(windows: Sequence[Window], vehicle: Vehicle, theta: FloatArray, fr
         return Problem.of(tracks, vehicle, (*beside, *names), windows, theta, nominal).liveliest(MOST_SECONDS)
 
     whole = problem_of(windows)
-    begin = theta.copy()
-    if "rotor_drag.central" in along:  # without the hubs' part only the accelerometer determines the sign of drag
-        begin[layout.entry("rotor_drag.central").index] = 1.0
-    found = estimate(whole, whole.at(begin))
+    found = estimate(whole, start_of(whole, theta, along))
     if not (np.isfinite(found.objective) and np.isfinite(found.z).all() and np.isfinite(found.covariance).all()):
         return None
     problem, names = found.problem, [name for name, *_ in whole.entries]
@@ -169,6 +164,24 @@ def _filtered(windows: Sequence[Window], vehicle: Vehicle, theta: FloatArray, fr
     trust = _compared(found, wide, half, places, unit)
     share = found.psi[k.SIGMA : k.TIME] / problem.noise_scale
     return Filtered(out, own, prompt, trust, bool(share[2] > LARGE))
+
+
+def fitted_along(stated: Collection[str]) -> tuple[str, ...]:
+    """Names of what acts on every vehicle beside the nominal six, but for the effects `stated` by name."""
+    # A delay and a lag pass for one another: where the model has one, nothing else is late.
+    late = () if any(n.split(".")[0] in stated for n in LATE) else LATE
+    return tuple(n for n in (*ALONG, *late) if n.split(".")[0] not in stated)
+
+
+def start_of(problem: Problem, theta: FloatArray, along: Collection[str]) -> FloatArray:
+    """Scaled parameters of a full vector, where a search begins: drag fitted `along` acts at the centre of gravity.
+
+    Without the hubs' part only the accelerometer determines the sign of drag.
+    """
+    begin = theta.copy()
+    if "rotor_drag.central" in along:
+        begin[problem.layout.entry("rotor_drag.central").index] = 1.0
+    return problem.at(begin)
 
 
 def _catalogue(layout: Layout, windows: Sequence[Window]) -> list[str]:

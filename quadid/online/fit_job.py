@@ -6,7 +6,7 @@ over all that there is, noise and random forces with it.  Every later one is a s
 over the window with the gains of the noise numbers at hand, and what its newest rows say is handed back: information
 and slope, which add.  Rows before them only bring the filter's state, and its derivatives, to where the new ones begin,
 so that none is counted twice, and no border takes information away.  All are linearised at one point; where twice as
-much was flown as it rests on, steps to the maximum over all of that lead to another, where what all rows say is told.
+much was flown as it rests on, steps to the maximum over all of that lead to another, where all rows are estimated anew.
 
 Free are the nominal six, trim moment, biases, and what acts on every vehicle beside them (`filter_error.ALONG`).  What
 else thrust may have is looked at beside that and never published: each rotor's loss, a thrust curve, a support.
@@ -24,10 +24,10 @@ from quadid.data.window import Window
 from quadid.estimate import kalman as k
 from quadid.estimate.fit import ALL_NOISE, NEAR, estimate, of_square, scoring
 from quadid.estimate.kalman import Gains
-from quadid.estimate.problem import LATE, TRIMMED, UPRIGHT, Problem
+from quadid.estimate.problem import TRIMMED, UPRIGHT, Problem
 from quadid.estimate.track import from_window
 from quadid.identification.excitation import bounds_of
-from quadid.identification.filter_error import ALONG
+from quadid.identification.filter_error import fitted_along, start_of
 from quadid.identification.particle_swarm import SwarmOptions
 from quadid.identification.problem import Prior, Shooting
 from quadid.identification.reliability import coarse
@@ -45,7 +45,7 @@ EXCITED = 0.02
 """A window is excited when it would give roll and pitch inertia to this relative standard deviation by itself, in calm
 air and with usual sensors."""
 EXCITED_SECONDS = 1.66
-"""Length of the runs that tell so [s]."""
+"""Length of the runs from which that is computed [s]."""
 TURNS = 1
 """Steps in which the noise numbers follow those of a window: what is pooled settles."""
 ROOM = 16.0
@@ -149,7 +149,7 @@ class FitRequest(Job):
         z: scaled parameters (`names_of`) where to linearise, or to begin, shape (P,).
         noise: None: nothing is known yet, or the vehicle has changed: search first.
         seed: of the swarm.
-        spans: begin and end [s] of the rows that each estimate is to tell of.
+        spans: begin and end [s] of the rows of each estimate.
         learned: stretches of all of them where steps to the maximum over these lead to where to linearise, else none.
         measure: let the noise numbers follow this window.
     """
@@ -212,7 +212,7 @@ def _are_estimates(estimates: tuple[WindowEstimate, ...], request: FitRequest) -
 
 
 def _is_estimate(estimate: WindowEstimate, vehicle: Vehicle) -> bool:
-    """An estimate of this vehicle; one that is no numbers is told as such later."""
+    """An estimate of this vehicle; one without finite numbers is refused later, with that reason."""
     P = len(names_of(vehicle))
     vectors = estimate.z, estimate.score, estimate.half_score
     squares = estimate.information, estimate.noise, estimate.half_information
@@ -237,12 +237,11 @@ def own_names(vehicle: Vehicle) -> tuple[str, ...]:
     layout = Layout(vehicle)
     initial, neutral = layout.initial(vehicle), layout.neutral()
     stated = {name.split(".")[0] for name, e in layout.entries.items() if initial[e.index] != neutral[e.index]}
-    late = () if any(n.split(".")[0] in stated for n in LATE) else LATE
-    return (*NOMINAL_NAMES, *TRIMMED, UPRIGHT, *(n for n in (*ALONG, *late) if n.split(".")[0] not in stated))
+    return (*NOMINAL_NAMES, *TRIMMED, UPRIGHT, *fitted_along(stated))
 
 
 def thrust_names(vehicle: Vehicle) -> tuple[str, ...]:
-    """What thrust may have beside b: a loss of each rotor, a curve, and what is there while no rotor turns."""
+    """Effects of thrust beside b: a loss of each rotor, a curve, and what is there while no rotor turns."""
     losses = [n for n in Layout(vehicle).entries if n.startswith("weak_rotor.loss_")]
     return (*losses, "thrust_curve.dead_speed", "thrust_curve.offset")
 
@@ -263,7 +262,7 @@ def with_room(vehicle: Vehicle) -> Vehicle:
 
 
 def prior_of(vehicle: Vehicle) -> Prior:
-    """Prior of the nominal six: the vehicle file's, but no tighter than 20 %, as the file knows other flights only."""
+    """Prior of the nominal six: the vehicle file's, but no tighter than 20 %, as the file rests on other flights."""
     given = [vehicle.parameters[name] for name in NOMINAL_NAMES]
     return Prior(vehicle.initial, np.array([min(max(p.log_sigma, 0.2), p.log_halfwidth) for p in given]))
 
@@ -298,7 +297,7 @@ def fit(request: FitRequest) -> FitReply:
         z, found = _renewed(request, noise)
         noise = found if request.learned else noise
     # 4. What the new rows say.
-    estimates, theta = _told(request, z, noise)
+    estimates, theta = _estimates(request, z, noise)
     return FitReply(request.number, "", bounds, True, estimates, theta, found)
 
 
@@ -326,10 +325,8 @@ def _maximum(request: FitRequest) -> tuple[FloatArray, Noise]:
     # 48 particles find six parameters that are known to a factor of 4 each way.
     swarm, free = SwarmOptions(iterations=40), short.free(NOMINAL_NAMES)
     theta, _ = swarm_search(short, request.theta, free, swarm, 48, request.seed, lambda stage, share: None)
-    problem, theta = problem_of(max(request.windows, key=len), vehicle), theta.copy()
-    if "rotor_drag.central" in problem.names:  # without the hubs' part only the accelerometer tells the sign of drag
-        theta[problem.layout.entry("rotor_drag.central").index] = 1.0
-    found = estimate(problem, problem.at(theta))
+    problem = problem_of(max(request.windows, key=len), vehicle)
+    found = estimate(problem, start_of(problem, theta, own_names(vehicle)))
     z = np.zeros(len(names_of(vehicle)))
     z[_places(found.problem, vehicle)] = found.z
     gains = found.problem.passes(found.z, found.psi)[1]
@@ -362,11 +359,11 @@ def _renewed(request: FitRequest, noise: Noise) -> tuple[FloatArray, Noise]:
     return z, replace(noise, psi=psi, doubt=of_square(problem, own, psi, gains) if physics else noise.doubt)
 
 
-def _told(request: FitRequest, z: FloatArray, noise: Noise) -> tuple[tuple[WindowEstimate, ...], FloatArray]:
-    """What the rows of each span say, by all parameters; full vector where that is linearised."""
+def _estimates(request: FitRequest, z: FloatArray, noise: Noise) -> tuple[tuple[WindowEstimate, ...], FloatArray]:
+    """Estimate of the rows of each span, by all parameters; full vector where they are linearised."""
     vehicle, names, count, theta = request.vehicle, names_of(request.vehicle), len(z), request.theta
     vector, square, loose = np.zeros(count), np.zeros((count, count)), np.zeros((LOOSE, count))
-    told = [WindowEstimate(*span, z, square, vector, 0.0, 0.0, square, loose, square, vector) for span in request.spans]
+    out = [WindowEstimate(*span, z, square, vector, 0.0, 0.0, square, loose, square, vector) for span in request.spans]
     for window in request.learned or request.windows:
         # 1. By what is estimated, and by what thrust may have beside that.
         problem, own = _like(problem_of(window, vehicle), vehicle, z, noise)
@@ -385,12 +382,12 @@ def _told(request: FitRequest, z: FloatArray, noise: Noise) -> tuple[tuple[Windo
         sparse = coarse(window)
         other, _ = _like(problem_of(sparse, vehicle), vehicle, z, noise)
         _, half, half_J = other.sensitivities(0, own, noise.psi, other.passes(own, noise.psi)[1][0])
-        for i, e in enumerate(told):
+        for i, e in enumerate(out):
             start, stop = e.start - 0.5 * window.dt, e.stop - 0.5 * window.dt
             new, half_new = ((w.t > start) & (w.t < stop) for w in (window, sparse))
             share, (information, score) = float(np.mean(new)), _quadratic(J, plain, new, problem.expected)
             of_half = _quadratic(half_J, half, half_new, problem.expected)
-            told[i] = replace(
+            out[i] = replace(
                 e, information=e.information + information, score=e.score + score - share * slope,
                 cost=e.cost + float(np.sum(plain[new] ** 2)),
                 rows=e.rows + 3.0 * np.count_nonzero(problem.tracks[0].seen[new]), noise=e.noise + share * curvature,
@@ -398,7 +395,7 @@ def _told(request: FitRequest, z: FloatArray, noise: Noise) -> tuple[tuple[Windo
                 half_score=e.half_score + of_half[1] @ E,
             )  # fmt: skip
         theta = problem.vector(own, 0)
-    return tuple(told), theta
+    return tuple(out), theta
 
 
 def _quadratic(J: FloatArray, plain: FloatArray, rows: BoolArray, root: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -451,6 +448,6 @@ def warm_up(vehicle: Vehicle) -> None:
         request = FitRequest(0, vehicle, (window,), *span, theta, z, None, 0, (span,))
         try:
             z, noise = _maximum(request)
-            _told(request, z, noise)
+            _estimates(request, z, noise)
         except np.linalg.LinAlgError:
             pass

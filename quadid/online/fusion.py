@@ -116,7 +116,7 @@ class Fused:
 
 @dataclass(frozen=True)
 class Stretch:
-    """What a stretch of the flight says of the six by itself, whatever the others are there.
+    """Estimate of the six from a stretch of the flight by itself, whatever the others are there.
 
     Attributes:
         start, stop: its time [s].
@@ -276,7 +276,7 @@ class Fusion:
         return next((s for s in reversed(self._sums) if s.flown <= last.flown - self._length + 0.5), None)
 
     def _stretch(self, first: Sum, last: Sum) -> Stretch:
-        """What was told from the end of one sum to that of another."""
+        """Stretch from the end of one sum to that of another."""
         part = first.and_(-self._fade(last.flown - first.flown), last)
         alone = self._solve(part, self._own)
         covariance = alone.covariance[:SIX, :SIX]
@@ -353,7 +353,7 @@ class Estimator:
 
     @property
     def learned(self) -> bool:
-        """Whether `theta` rests on data of this flight."""
+        """True if `theta` rests on data of this flight."""
         return self.fusion.newest is not None
 
     @property
@@ -441,7 +441,7 @@ class Estimator:
         return self._before(request, reply).agrees(reply.estimates[-1])
 
     def _before(self, request: FitRequest, reply: FitReply) -> Fusion:
-        """What is known from before the newest rows, linearised as they are."""
+        """Fusion of the rows before the newest ones, linearised as they are."""
         if not request.learned:
             return self.fusion
         fusion = self._nothing()

@@ -41,7 +41,7 @@ def seconds(stamp: Any) -> float:
 
 
 def left_out(diagnostics: Any) -> bool:
-    """Whether fits were left out because the machine was too slow."""
+    """True if fits were left out because the machine was too slow."""
     told = [v.value for s in diagnostics.status for v in s.values if v.key == "fits left out"]
     return any(value != "0" for value in told)
 
