@@ -211,9 +211,11 @@ def _compared(found: Estimate, wide: Problem, half: Problem, places: IndexArray,
     # 1. Parts of the flights: the step of each block of time from the optimum of all, and its variance.
     whole = _sensitivities(problem, found)
     grams, slopes = _blocks(problem, whole)
-    inverses = np.linalg.inv(grams + np.diag(1.0 / (BLOCKS * problem.prior[1] ** 2)))
-    steps = -np.einsum("bij,bj->bi", inverses, slopes - slopes.mean(axis=0))[:, places] * unit
-    _, between = random_effects(steps, np.diagonal(inverses, axis1=1, axis2=2)[:, places] * unit**2)
+    grams, slopes = grams + np.diag(1.0 / (BLOCKS * problem.prior[1] ** 2)), slopes - slopes.mean(axis=0)
+    box = problem.limits - found.z
+    steps = np.array([newton_step(gram, slope, 0.0, *box) for gram, slope in zip(grams, slopes, strict=True)])
+    variances = np.diagonal(np.linalg.inv(grams), axis1=1, axis2=2)
+    _, between = random_effects(steps[:, places] * unit, variances[:, places] * unit**2)
     # 2. The whole catalogue, linearised at the estimate on the liveliest minute.
     part = problem.liveliest(NEAR_SECONDS)
     near = whole if part is problem else _sensitivities(part, found)
@@ -286,7 +288,7 @@ def _on_coarse_grid(found: Estimate, half: Problem) -> FloatArray:
     """Errors by the length of rows: a share of the step to every second row, none where chance explains that."""
     z, psi = found.z, found.psi
     information, gradient = half.normal_equations(z, psi, half.passes(z, psi)[1])
-    step = -np.linalg.solve(information, gradient)
+    step = newton_step(information, gradient, 0.0, *(half.limits - z))
     chance = exceeded(CHANCE, 1) * (np.diag(np.linalg.inv(information)) + np.diag(found.covariance))
     return np.where(step**2 > chance, SHARE * step, 0.0)
 

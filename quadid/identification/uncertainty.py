@@ -195,9 +195,9 @@ def doubted(parameters: Sequence[Parameter], off: Mapping[str, float]) -> tuple[
 
 def _off_by(p: Parameter, step: float) -> Parameter:
     """The parameter with an interval that holds a step (log scale), which counts as spread; none is beyond bounds."""
-    (low, high), (least, most) = p.ci95, p.bounds
-    own, step = math.log(high / low) / (2.0 * Z95), min(abs(step), math.log(most / least))
-    wide = math.hypot(own, step)
+    least, most = p.bounds
+    step = min(abs(step), math.log(most / least))
+    wide = math.hypot(p.sigma / p.value, step)
     ci = (p.value * math.exp(-Z95 * wide), p.value * math.exp(Z95 * wide))
     wider = replace(p, sigma=wide * p.value, ci95=ci)
     if step <= SPREAD_LIMIT and least <= ci[0] and ci[1] <= most:

@@ -82,7 +82,7 @@ def test_twelve_recipes_run_one_after_the_other(
     assert names["ahead"].between(0.0, 1.0)[["error", "inside_95"]].all()  # type: ignore[attr-defined]
     assert names["ahead"]["low"] < names["ahead"]["error"] < names["ahead"]["high"]  # type: ignore[index]
     assert "rotor 2" in str(names["health"])
-    assert names["flown"]["status"]["today.csv"] == "done"  # type: ignore[index]
+    assert names["flown"]["status"]["today.csv"] == "done", names["flown"]["reason"]  # type: ignore[index]
     assert (names["spread"] > 0.0).any()  # type: ignore[operator, attr-defined]
     for file in ("mine.yaml", "diagnosis.html", "mine.params", "gains.params", "plan"):
         assert (tmp_path / file).exists(), file

@@ -89,6 +89,15 @@ def test_a_calm_flight_is_fitted_whole() -> None:
 HIDDEN = {"rotor_drag": {"k_x": 0.3, "k_y": 0.3}, "weak_rotor": {"rotor": 2.0, "loss": 0.04}}
 
 
+def test_where_nothing_moves_intervals_are_wide_but_end(tmp_path: Path) -> None:
+    quadid.simulate(
+        "pelican", seconds=30.0, seed=5, profile="hover", effects=["weak_rotor:rotor=2,loss=0.1"]
+    ).save(tmp_path / "hover.csv")  # fmt: skip
+    for p in quadid.identify(tmp_path / "hover.csv", vehicle="pelican").parameters:
+        least, most = p.bounds
+        assert least / 20.0 < p.ci95[0] < p.ci95[1] < 20.0 * most, p
+
+
 @pytest.mark.parametrize("known", [("rotor_drag", "weak_rotor"), ("weak_rotor",)], ids=["both", "the rotor alone"])
 def test_behind_causes_in_the_vehicle_file_the_six_are_as_sharp_as_without(known: tuple[str, ...]) -> None:
     """Drag of the hubs passed for drag torque, and an effect stayed as simulated where the search began."""
