@@ -24,17 +24,19 @@ import subprocess
 import sys
 import threading
 import traceback
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import msgspec
 import numpy as np
 import numpy.ma
+from numpy.typing import ArrayLike
 
-from quadid.data.window import CHANNELS, Channel, Recording
+from quadid.data.window import Recording
 from quadid.errors import LogError, QuadidError
 from quadid.sanitise import LONGEST_LINE, plain
+from quadid.types import FloatArray
 from quadid_replay.formats import kind_of, parts_of, read_here, reader_of
 from quadid_replay.presets import AUTO, preset_rank
 
@@ -201,64 +203,23 @@ class ReaderError(LogError):
     """A reader that failed on a log in a way that it should have reported; a fault of the program."""
 
 
-class _Channel(msgspec.Struct):
-    name: str
-    source: str
-    faults: dict[str, int]
-    columns: int
-    t: memoryview
-    values: memoryview
+class Answer(msgspec.Struct, omit_defaults=True):
+    """One of these: the recording, why there is none (as of `LogError`), how the reader failed, the limit it met."""
+
+    recording: Recording | None = None
+    refused: tuple[str, str, str] | None = None
+    failed: str = ""
+    limit: Literal["", "memory", "written", "open files"] = ""
 
 
-class _Recording(msgspec.Struct, tag=True):
-    name: str
-    format: str
-    breaks: tuple[float, ...]
-    warnings: tuple[str, ...]
-    sha256: str
-    grid: float | None
-    autopilot: dict[str, float]
-    epoch: float | None
-    modes: tuple[tuple[float, str], ...]
-    other: str
-    channels: list[_Channel]
+def pack(answer: Answer) -> bytes:
+    """An answer as bytes."""
+    return msgspec.msgpack.encode(
+        answer, enc_hook=lambda rows: (rows.shape, np.ascontiguousarray(rows, _DOUBLE).data.cast("B"))
+    )
 
 
-class _Refused(msgspec.Struct, tag=True):
-    """Why there is no recording, as of `LogError`."""
-
-    parts: tuple[str, str, str]
-
-
-class _Fault(msgspec.Struct, tag=True):
-    """Failure of the reader."""
-
-    what: str
-
-
-class _Limit(msgspec.Struct, tag=True):
-    """The limit that the reader met and noticed."""
-
-    name: Literal["memory", "written", "open files"]
-
-
-def pack(told: Recording | _Refused | _Fault | _Limit) -> bytes:
-    """A recording, or what there is instead, as an answer."""
-    if not isinstance(told, Recording):
-        return msgspec.msgpack.encode(told)
-    channels = [
-        _Channel(
-            c.name, _text(c.source), dict(c.faults), c.values.shape[1],
-            *(np.ascontiguousarray(a, _DOUBLE).data.cast("B") for a in (c.t, c.values)),
-        ) for c in told.channels.values()
-    ]  # fmt: skip
-    return msgspec.msgpack.encode(_Recording(
-        _text(told.name), told.format, told.breaks, tuple(map(_text, told.warnings)), told.sha256, told.grid,
-        dict(told.autopilot), told.epoch, told.modes, _text(told.other), channels,
-    ))  # fmt: skip
-
-
-def unpack(answer: memoryview) -> Recording | str:
+def unpack(data: bytes | memoryview) -> Recording | str:
     """Checks an answer; returns the recording, or the name of the limit that its reader met.
 
     Raises:
@@ -266,44 +227,40 @@ def unpack(answer: memoryview) -> Recording | str:
         ReaderError: the failure that it holds.
         BadAnswerError: anything that is no answer.
     """
+
+    def shown(value: Any) -> Any:
+        """Text that may be shown, wherever it stands."""
+        if isinstance(value, str):
+            return plain(value, LONGEST_LINE)
+        if isinstance(value, dict):
+            return {shown(key): shown(inner) for key, inner in value.items()}
+        return [shown(inner) for inner in value] if isinstance(value, list) else value
+
+    def rows_of(kind: Any, value: tuple[Sequence[int], bytes]) -> FloatArray:
+        rows = np.frombuffer(value[1], _DOUBLE).reshape(value[0])
+        finite(rows)
+        return rows
+
+    def finite(numbers: ArrayLike) -> None:
+        if not np.isfinite(numbers).all():
+            raise ValueError("numbers that are not finite")
+
     try:
-        told = msgspec.msgpack.decode(answer, type=_Recording | _Refused | _Fault | _Limit)
-    except (msgspec.DecodeError, RecursionError) as error:
+        told = msgspec.convert(shown(msgspec.msgpack.decode(data)), Answer, dec_hook=rows_of)
+        if (found := told.recording) is not None:
+            finite([*found.breaks, *(t for t, _ in found.modes), *filter(None, (found.grid, found.epoch))])
+            for name, channel in found.channels.items():
+                if name != channel.name or min(channel.faults.values(), default=0) < 0:
+                    raise ValueError("a channel under another's name, or a count that is none")
+    except (msgspec.DecodeError, RecursionError, ValueError, QuadidError) as error:
         raise BadAnswerError(str(error)) from error
-    if isinstance(told, _Limit):
-        return told.name
-    if isinstance(told, _Refused):
-        raise LogError(*map(_text, told.parts))
-    if isinstance(told, _Fault):
-        raise ReaderError(_text(told.what), "", "report it with the file: the reader of this format failed on it")
-    _finite([*told.breaks, *(t for t, _ in told.modes), *(v for v in (told.grid, told.epoch) if v is not None)])
-    channels = {}
-    for c in told.channels:
-        if c.name not in CHANNELS or min([c.columns, *c.faults.values()]) < 0:
-            raise BadAnswerError("a channel that is not known, or a count that is none")
-        try:
-            t, values = np.frombuffer(c.t, _DOUBLE), np.frombuffer(c.values, _DOUBLE)
-            values = values.reshape(len(t), c.columns)
-            channels[c.name] = Channel(
-                c.name, _finite(t), _finite(values), _text(c.source), {_text(r): n for r, n in c.faults.items()}
-            )
-        except (ValueError, QuadidError) as error:
-            raise BadAnswerError(f"sizes that do not fit ({error})") from error
-    return Recording(
-        _text(told.name), _text(told.format), channels, told.breaks, tuple(map(_text, told.warnings)),
-        _text(told.sha256), told.grid, {_text(name): value for name, value in told.autopilot.items()}, told.epoch,
-        tuple((t, _text(mode)) for t, mode in told.modes), _text(told.other),
-    )  # fmt: skip
-
-
-def _finite(numbers: Any) -> Any:
-    if not np.isfinite(numbers).all():
-        raise BadAnswerError("numbers that are not finite")
-    return numbers
-
-
-def _text(value: str) -> str:
-    return plain(value, LONGEST_LINE)
+    if told.refused is not None:
+        raise LogError(*told.refused)
+    if told.failed:
+        raise ReaderError(told.failed, "", "report it with the file: the reader of this format failed on it")
+    if found is None and not told.limit:
+        raise BadAnswerError("nothing in it")
+    return found or told.limit
 
 
 # --- The process that stands ready, as the program sees it
@@ -454,21 +411,18 @@ def _read(
     file = Path(path)
     try:
         try:
-            told = pack(read_here(file, preset, columns))
+            told = Answer(read_here(file, preset, columns))
         except QuadidError as error:
             noticed = _BY_ERROR.get(getattr(error.__cause__, "errno", 0) or 0)
-            told = pack(
-                _Limit(noticed) if noticed else _Refused((_text(error.found), _text(error.allowed), _text(error.fix)))
-            )
+            told = Answer(limit=noticed) if noticed else Answer(refused=(error.found, error.allowed, error.fix))
         except MemoryError:
             raise
         except Exception as error:  # noqa: BLE001 - the reader of a stranger's file: told, with the place it is met at
             where = " < ".join(f"{f.filename}:{f.lineno}" for f in traceback.extract_tb(error.__traceback__)[:-4:-1])
-            what = f"{file.name}: its reader failed ({type(error).__name__}: {error}) at {where}"
-            told = pack(_Fault(_text(what)))
-        answer.sendall(told)
+            told = Answer(failed=f"{file.name}: its reader failed ({type(error).__name__}: {error}) at {where}")
+        answer.sendall(pack(told))
     except MemoryError:
-        answer.sendall(pack(_Limit("memory")))
+        answer.sendall(pack(Answer(limit="memory")))
     os._exit(0)
 
 

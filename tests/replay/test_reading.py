@@ -19,7 +19,7 @@ import pytest
 import quadid_replay.opening
 from quadid_replay import open_log, write_csv, write_mcap, write_tlog
 from quadid_replay.formats import read_here
-from quadid_replay.opening import BadAnswerError, ReadLimits, limits, pack, unpack
+from quadid_replay.opening import Answer, BadAnswerError, ReadLimits, limits, pack, unpack
 
 from quadid.data.window import Recording
 from quadid.errors import LogError
@@ -156,25 +156,27 @@ def test_a_reading_process_that_was_killed_is_started_again(tmp_path: Path) -> N
 
 def test_an_answer_is_checked_at_the_door() -> None:
     recording = full_recording(0.1, 50.0)
-    whole = pack(recording)
-    same(recording, cast(Recording, unpack(memoryview(whole))))
-    line = msgspec.msgpack.decode(whole)
-    first = line["channels"][0]
+    whole = pack(Answer(recording))
+    same(recording, cast(Recording, unpack(whole)))
+    line = msgspec.msgpack.decode(whole)["recording"]
+    name, first = next(iter(line["channels"].items()))
+    (rows, columns), values = first["values"]
 
     def changed(channel: Mapping[str, object] | None = None, **fields: object) -> bytes:
-        channels = [{**first, **(channel or {})}, *line["channels"][1:]]
-        return msgspec.msgpack.encode({**line, "channels": channels, **fields})
+        channels = {**line["channels"], name: {**first, **(channel or {})}}
+        return msgspec.msgpack.encode({"recording": {**line, "channels": channels, **fields}})
 
-    not_finite = np.full(len(first["values"]) // 8, np.nan).tobytes()
+    not_finite = np.full(rows * columns, np.nan).tobytes()
     for bad in (
-        b"", b"\x80\x04.", whole[:-8], whole + bytes(8), changed({"values": not_finite}), changed({"name": "os"}),
-        changed({"columns": 1 << 60}), changed({"columns": -2}), changed({"t": first["t"][:-8]}),
-        changed({"t": first["t"][:-3]}), changed({"faults": {"x": -1}}), changed(epoch="now"), changed(epoch=np.inf),
-        changed(warnings=[["x"]]), changed(breaks=[np.nan]), changed(modes=None),
+        b"", b"\x80", b"\x80\x04.", whole[:-8], whole + bytes(8), changed({"values": ((rows, columns), not_finite)}),
+        changed({"name": "os"}), changed({"name": "battery"}), changed({"values": ((rows, 1 << 60), values)}),
+        changed({"t": ((rows - 1,), first["t"][1][:-8])}),
+        changed({"t": ((rows,), first["t"][1][:-3])}), changed({"faults": {"x": -1}}), changed(epoch="now"),
+        changed(epoch=np.inf), changed(warnings=[["x"]]), changed(breaks=[np.nan]), changed(modes=None),
     ):  # fmt: skip
         with pytest.raises(BadAnswerError):
-            unpack(memoryview(bad))
-    told = unpack(memoryview(changed(warnings=["a\x1b[2Jb\nc" + "x" * 10_000])))
+            unpack(bad)
+    told = unpack(changed(warnings=["a\x1b[2Jb\nc" + "x" * 10_000]))
     assert isinstance(told, Recording)
     assert told.warnings[0].startswith("a?[2Jb?c")
     assert len(told.warnings[0]) <= 2000
