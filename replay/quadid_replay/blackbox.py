@@ -18,7 +18,7 @@ from quadid.data.window import Recording
 from quadid.errors import LogError
 from quadid.sanitise import plain
 from quadid.types import FloatArray
-from quadid_replay.columns import LogClock, RawChannel, assemble
+from quadid_replay.columns import LogClock, RawChannel, assemble, damage
 from quadid_replay.frames import GRAVITY, flip_body
 from quadid_replay.motors import RPM
 
@@ -369,8 +369,7 @@ def read_blackbox(path: Path) -> Recording:
     notes = []
     if len(starts) > 1:
         notes.append(f"{len(starts)} logs in this file: the longest is read")
-    if best[1].skipped:
-        notes.append(f"{best[1].skipped} of {len(data)} bytes are damaged and were skipped")
+    notes += damage(len(data), best[1].skipped, cut=False)
     if not best[1].ended:
         notes.append("no end-of-log mark: power was cut or the file is not whole; everything before is used")
     clock = LogClock(apart=0.0)

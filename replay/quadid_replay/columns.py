@@ -13,7 +13,7 @@ import numpy as np
 from quadid.data.window import Channel, Recording, sample_period
 from quadid.errors import LogError
 from quadid.rotation import continuous_sign
-from quadid.types import BoolArray, FloatArray
+from quadid.types import BoolArray, FloatArray, IntArray
 from quadid_replay.frames import unit_quaternions
 
 # --- Time from untrusted logs: reboots and clock steps found, wild stamps refused
@@ -74,6 +74,16 @@ class LogClock:
         for k in range(begin, len(raw), _TOGETHER):
             out[k : k + _TOGETHER] = self._mapped(raw[k : k + _TOGETHER])
         return out
+
+    def times_of(self, stamps: Mapping[str, FloatArray], places: Mapping[str, IntArray]) -> dict[str, FloatArray]:
+        """Maps the stamps [s] of several kinds of records, in the order in which all of them stand in the file."""
+        if not stamps:
+            return {}
+        order = np.argsort(np.concatenate([places[name] for name in stamps]), kind="stable")
+        mapped = np.empty(len(order))
+        mapped[order] = self.times(np.concatenate(list(stamps.values()))[order])
+        ends = np.cumsum([len(each) for each in stamps.values()])
+        return dict(zip(stamps, np.split(mapped, ends[:-1]), strict=True))
 
     def _mapped(self, raw: FloatArray) -> FloatArray:
         first = raw[0] if self._newest is None else self._newest
@@ -379,8 +389,20 @@ def assemble(
             f"{name}: no usable flight data in it{why}", "gyro, attitude, accelerometer or rotor signals",
             "see docs/logs.md for the messages that are read",
         )  # fmt: skip
-    warnings = (*notes, *filter(None, [other]), *clock.warnings(), *fault_warnings(channels))
-    return Recording(name, kind, channels, tuple(clock.breaks), warnings, autopilot=dict(autopilot or {}), other=other)
+    warnings = [*notes, *filter(None, [other]), *clock.warnings()]
+    for channel in channels.values():
+        if parts := [f"{count} {_REASONS[reason]}" for reason, count in channel.faults.items()]:
+            warnings.append(f"{channel.name}: dropped samples: {', '.join(parts)}")
+    return Recording(
+        name, kind, channels, tuple(clock.breaks), tuple(warnings), autopilot=dict(autopilot or {}), other=other
+    )
+
+
+def damage(size: int, skipped: int, cut: bool, *others: str, unit: str = "record") -> list[str]:
+    """Sentences about what of a file of `size` bytes could not be read; `others`, where there are any, among them."""
+    notes = [f"{skipped} of {size} bytes are damaged and were skipped"] if skipped else []
+    notes += filter(None, others)
+    return notes + [f"the file ends inside a {unit}: it was cut; everything before is used"] * cut
 
 
 def fastest_first(raw: Sequence[RawChannel], advantage: float = 1.3) -> list[RawChannel]:
@@ -398,16 +420,6 @@ def fastest_first(raw: Sequence[RawChannel], advantage: float = 1.3) -> list[Raw
 
 def _period(entry: RawChannel) -> float:
     return sample_period(np.sort(entry.t[np.isfinite(entry.t)]))
-
-
-def fault_warnings(channels: Mapping[str, Channel]) -> list[str]:
-    """Says in sentences which samples were dropped from which channel."""
-    out = []
-    for channel in channels.values():
-        parts = [f"{count} {_REASONS[reason]}" for reason, count in channel.faults.items()]
-        if parts:
-            out.append(f"{channel.name}: dropped samples: {', '.join(parts)}")
-    return out
 
 
 def mode_changes(t: FloatArray, numbers: FloatArray, names: dict[int, str]) -> tuple[tuple[float, str], ...]:

@@ -205,7 +205,9 @@ def _table(path: Path, width: int, delimiter: str) -> tuple[FloatArray, list[str
     bad: list[int] = []
     cut = False
     for number, lines, unfinished in _blocks(path):
-        if unfinished and _looks_cut(lines):
+        # A last line without line end whose last number is shorter than in those before may lack digits.
+        width_of_last = [len(line.rstrip().rpartition(",")[2]) for line in lines[-20:]] if unfinished else []
+        if len(width_of_last) > 1 and width_of_last[-1] < min(width_of_last[:-1]):
             lines, cut = lines[:-1], True
         try:
             block = np.loadtxt(lines, delimiter=delimiter, ndmin=2, comments=None) if lines else np.empty((0, width))
@@ -240,12 +242,6 @@ def _blocks(path: Path) -> Iterator[tuple[int, list[str], bool]]:
                 yield first, lines, False
                 lines, first = [], number + 1
     yield first, lines, bool(lines) and not last.endswith("\n")
-
-
-def _looks_cut(lines: list[str]) -> bool:
-    """A last line without line end whose last number is shorter than in the lines before: its digits may be missing."""
-    width = [len(line.rstrip().rpartition(",")[2]) for line in lines[-20:]]
-    return len(width) > 1 and width[-1] < min(width[:-1])
 
 
 def _line_by_line(lines: list[str], first: int, width: int, delimiter: str, bad: list[int]) -> FloatArray:

@@ -21,6 +21,7 @@ from quadid_replay.columns import (
     Source,
     assemble,
     channels_of,
+    damage,
     mode_changes,
     rising,
     spikes,
@@ -206,10 +207,6 @@ _OUTPUT = re.compile(r"Ch?(\d{1,2})")
 _EKF = ("XKF1", "NKF1", "EKF1")
 
 
-def _from_degrees(angles: FloatArray) -> FloatArray:
-    return from_euler(np.radians(angles))
-
-
 def _volts(volts: FloatArray) -> FloatArray:
     """Battery voltage [V]; old CURR counts centivolts, and a monitor that is not there says zero."""
     if not len(volts) or np.max(volts) <= 0.0:
@@ -222,7 +219,10 @@ SOURCES = (
     # The rate controller's input: at the loop's rate where the IMU is logged slowly.
     Source("gyro", "RATE", ("R", "P", "Y"), np.radians, "(degrees/s, filtered on board)"),
     *(Source("accel", name, ("AccX", "AccY", "AccZ"), note="instance 0") for name in ("IMU", "ACC")),
-    *(Source("attitude", name, ("Roll", "Pitch", "Yaw"), _from_degrees, "(degrees)") for name in ("ATT", "ANG")),
+    *(
+        Source("attitude", name, ("Roll", "Pitch", "Yaw"), lambda rows: from_euler(np.radians(rows)), "(degrees)")
+        for name in ("ATT", "ANG")
+    ),
     *(Source("attitude", name, ("Q1", "Q2", "Q3", "Q4")) for name in ("XKQ", "XKQ1", "NKQ1")),
     *(
         Source("attitude_reference", name, ("DesRoll", "DesPitch", "DesYaw", column), note=f"Des*, CTUN {column}")
@@ -253,10 +253,19 @@ def read_dataflash(path: Path) -> Recording:
     """
     index = index_dataflash(path)
     clock = LogClock()
-    times = _recording_times(index, clock)
+    stamps = {
+        name: index.column(name, column) * unit
+        for name in _STAMPED for column, unit in (("TimeUS", 1e-6), ("TimeMS", 1e-3)) if index.has(name, column)
+    }  # fmt: skip
+    times = clock.times_of(stamps, {name: index.rows(name) for name in stamps})
     names, values = _parameters(index)
     parameters = dict(zip(names, values, strict=True))
-    notes = _damage(index)
+    damaged, redefined = (", ".join(sorted(set(names))[:8]) for names in (index.damaged, index.redefined))
+    notes = damage(
+        len(index.data), index.skipped, index.cut,
+        damaged and f"damaged message descriptions: {damaged}",
+        redefined and f"{redefined} redefined within the log: data after the change are not used",
+    )  # fmt: skip
     sources = SOURCES
     if parameters.get("AHRS_EKF_TYPE") == 2.0:
         sources = tuple(sorted(SOURCES, key=lambda source: source.records != "NKF1"))
@@ -273,51 +282,13 @@ def read_dataflash(path: Path) -> Recording:
         raw += [*_outputs(index, times, parameters, notes), *_esc(index, times, parameters, notes)]
     changed = changed_within(names, values)
     notes += [changed] if changed else []
-    recording = assemble(_name(path), "dataflash", raw, clock, notes, parameters, other)
-    return replace(recording, modes=_modes(index, times))
-
-
-def _modes(index: DataflashIndex, times: dict[str, FloatArray]) -> tuple[tuple[float, str], ...]:
-    column = next((c for c in ("ModeNum", "Mode") if index.has("MODE", c)), None)
-    if column is None or "MODE" not in times:
-        return ()
-    return mode_changes(times["MODE"], index.column("MODE", column), ARDUCOPTER)
-
-
-def _name(path: Path) -> str:
-    """ArduPilot numbers its logs from 1 on every vehicle: such a name only tells something with its folder's."""
-    return f"{path.absolute().parent.name}/{path.name}" if path.stem.isdigit() else path.name
-
-
-def _damage(index: DataflashIndex) -> list[str]:
-    notes = []
-    if index.skipped:
-        notes.append(f"{index.skipped} of {len(index.data)} bytes are damaged and were skipped")
-    if index.damaged:
-        notes.append(f"damaged message descriptions: {', '.join(sorted(set(index.damaged))[:8])}")
-    if index.redefined:
-        names = ", ".join(sorted(set(index.redefined))[:8])
-        notes.append(f"{names} redefined within the log: data after the change are not used")
-    if index.cut:
-        notes.append("the file ends inside a record: it was cut; everything before is used")
-    return notes
-
-
-def _recording_times(index: DataflashIndex, clock: LogClock) -> dict[str, FloatArray]:
-    """Runs the stamps of all records that are used through one clock, in file order."""
-    stamps: dict[str, FloatArray] = {}
-    for name in _STAMPED:
-        for column, unit in (("TimeUS", 1e-6), ("TimeMS", 1e-3)):
-            if index.has(name, column):
-                stamps[name] = index.column(name, column) * unit
-    if not stamps:
-        return {}
-    order = np.argsort(np.concatenate([index.rows(name) for name in stamps]), kind="stable")
-    mapped = clock.times(np.concatenate(list(stamps.values()))[order])
-    unsorted = np.empty_like(mapped)
-    unsorted[order] = mapped
-    ends = np.cumsum([len(s) for s in stamps.values()])
-    return dict(zip(stamps, np.split(unsorted, ends[:-1]), strict=True))
+    # ArduPilot numbers its logs from 1 on every vehicle: such a name tells something only with its folder's.
+    name = f"{path.absolute().parent.name}/{path.name}" if path.stem.isdigit() else path.name
+    recording = assemble(name, "dataflash", raw, clock, notes, parameters, other)
+    mode = next((c for c in ("ModeNum", "Mode") if index.has("MODE", c)), None)
+    if mode is None or "MODE" not in times:
+        return recording
+    return replace(recording, modes=mode_changes(times["MODE"], index.column("MODE", mode), ARDUCOPTER))
 
 
 def _parameters(index: DataflashIndex) -> tuple[list[str], list[float]]:

@@ -167,7 +167,11 @@ def read_here(file: Path, preset: str, columns: Mapping[str, str] | None = None)
     given: dict[str, Any] = {"preset": preset, "columns": columns}
     try:
         recording = reader_of(kind.name)(file, **{name: given[name] for name in kind.takes})
-        return replace(recording, sha256=_sha256(file))
+        digest = hashlib.sha256()
+        for part in parts_of(file):
+            with part.open("rb") as stream:
+                hashlib.file_digest(stream, lambda: digest)
+        return replace(recording, sha256=digest.hexdigest())
     except OSError as error:
         raise _unreadable(file, error) from error
 
@@ -183,6 +187,7 @@ def kind_of(file: Path, columns: Mapping[str, str] | None) -> LogFormat:
 
 
 def parts_of(file: Path) -> list[Path]:
+    """The files of a log: of a folder those of its recording."""
     return bag_files(file) if file.is_dir() else [file]
 
 
@@ -208,12 +213,3 @@ def _head(file: Path) -> bytes:
 
 def _unreadable(file: Path, error: OSError) -> LogError:
     return LogError(f"{file} cannot be read ({error.strerror or error})", ALLOWED, "check its permissions")
-
-
-def _sha256(file: Path) -> str:
-    digest = hashlib.sha256()
-    for part in parts_of(file):
-        with part.open("rb") as stream:
-            while block := stream.read(1 << 20):
-                digest.update(block)
-    return digest.hexdigest()

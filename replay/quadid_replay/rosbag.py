@@ -53,7 +53,6 @@ def bag_files(folder: Path) -> list[Path]:
 
 
 SQLITE_MAGIC = b"SQLite format 3\x00"
-_SHORTEST = 1 << 12
 _DAMAGE = (sqlite3.Error, UnicodeDecodeError)
 """The second comes where SQLite's message quotes bytes that are no text."""
 
@@ -83,11 +82,6 @@ class Database:
         self._path = path
         try:
             self._connection = sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro&immutable=1", uri=True)
-            self._connection.execute("PRAGMA trusted_schema=OFF")
-            self._connection.execute("PRAGMA temp_store=MEMORY")
-            self._size = path.stat().st_size
-            # No value is larger than the file that holds it; what an expression makes would be.
-            self._connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, max(self._size, _SHORTEST))
             self.topics: dict[int, Topic] = self._read_topics()
         except (*_DAMAGE, MemoryError) as error:  # the latter for a row that claims to be larger than memory
             raise self._damaged(error) from error
@@ -100,7 +94,7 @@ class Database:
         """
         marks = ",".join(str(int(number)) for number in sorted(wanted))
         rows = f"SELECT timestamp, rowid, topic_id FROM messages WHERE topic_id IN ({marks})"
-        payload, left = "SELECT data FROM messages WHERE rowid = ?", self._size
+        payload, left = "SELECT data FROM messages WHERE rowid = ?", self._path.stat().st_size
         try:
             found = [row for row in self._connection.execute(rows) if isinstance(row[0], int)]
             for stamp, row, number in sorted(found):
@@ -118,13 +112,9 @@ class Database:
         return []
 
     def _read_topics(self) -> dict[int, Topic]:
-        stored = "SELECT name FROM sqlite_master WHERE type = 'table' AND rootpage > 0"
-        tables = {name for (name,) in self._connection.execute(stored)}
+        tables = {name for (name,) in self._connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
         if not {"topics", "messages"} <= tables:
             raise LogError(f"{self._path.name}: an SQLite database, but no rosbag2", "tables topics and messages")
-        for table in {"topics", "messages", "message_definitions"} & tables:
-            if any(hidden for *_, hidden in self._connection.execute(f"PRAGMA table_xinfo({table})")):
-                raise LogError(f"{self._path.name}: columns of {table} are computed", "what ros2 bag record writes")
         definitions: dict[str, tuple[str, str]] = {}
         if "message_definitions" in tables:
             query = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
@@ -260,7 +250,8 @@ def _channels(
         topic = sources[number].topic
         rank = preset_rank(preset, channel, topic.name)
         t, values = kept.arrays()
-        values = _motor_columns(signal, values)
+        if signal in ("outputs", "actuator_motors"):  # of messages with room for more, the columns that are motors
+            values = values[:, active_outputs(values) if signal == "outputs" else np.isfinite(values).any(axis=0)]
         if rank is None or len(t) == 0 or values.shape[1] == 0 or _unused(signal, topic, values):
             continue
         source = f"{topic.name} ({type_name(topic.type)})"
@@ -272,18 +263,10 @@ def _channels(
     for entries in ranked.values():
         ordered = [entry for _, entry in sorted(entries, key=lambda pair: pair[0])]
         if ordered[0].name in ("gyro", "accel"):
-            ordered.sort(key=_repeats)
+            # A topic that repeats readings goes last, as MAVROS' imu/data repeats the acceleration.
+            ordered.sort(key=lambda entry: len(fresh_rows(entry.values)) < 0.9 * len(entry.values))
         out += ordered if preset != AUTO else fastest_first(ordered, 1.5)
     return out
-
-
-def _motor_columns(signal: str, values: np.ndarray[Any, np.dtype[np.float64]]) -> np.ndarray[Any, np.dtype[np.float64]]:
-    """Keeps the columns that are motors, of messages with room for more."""
-    if signal == "outputs":
-        return values[:, active_outputs(values)]
-    if signal == "actuator_motors":
-        return values[:, np.isfinite(values).any(axis=0)]
-    return values
 
 
 def _unused(signal: str, topic: Topic, values: np.ndarray[Any, np.dtype[np.float64]]) -> bool:
@@ -293,11 +276,6 @@ def _unused(signal: str, topic: Topic, values: np.ndarray[Any, np.dtype[np.float
     if signal == "motor_command" and type_name(topic.type) == "sensor_msgs/JointState":
         return bool(np.nanmin(values) < -0.05 or not np.any(values))
     return signal == "velocity" and "body" in topic.name
-
-
-def _repeats(entry: RawChannel) -> bool:
-    """Tells a topic that repeats readings, as MAVROS' imu/data repeats the acceleration."""
-    return len(fresh_rows(entry.values)) < 0.9 * len(entry.values)
 
 
 def _no_topic(path: Path, bag: Bag, preset: str, notes: list[str]) -> LogError:

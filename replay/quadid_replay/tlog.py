@@ -16,7 +16,7 @@ from pymavlink.dialects.v20 import ardupilotmega
 from quadid.data.window import Recording
 from quadid.errors import LogError
 from quadid.types import BoolArray, FloatArray, IntArray
-from quadid_replay.columns import LogClock, RawChannel, assemble, fastest_first
+from quadid_replay.columns import LogClock, RawChannel, assemble, damage, fastest_first
 from quadid_replay.mavlink_messages import (
     PREFERENCE,
     READERS,
@@ -98,7 +98,9 @@ def read_frames(path: Path) -> Frames:
     with path.open("rb") as file:
         data = np.frombuffer(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ), dtype=np.uint8)
     marks = _marks(data)
-    received = _receive_times(data, marks)
+    received = np.zeros(len(marks), dtype=np.int64)  # [us, UNIX], its highest byte zero
+    for k in range(1, _STAMP):
+        received = received << 8 | data[marks + k]
     possible = (received > _EARLIEST_US) & (received < _LATEST_US) & (marks + _HEAD <= len(data))
     places, received = marks[possible], received[possible]
     version_1 = data[places + _STAMP] == 0xFE
@@ -129,14 +131,6 @@ def _marks(data: Bytes) -> IntArray:
         looks = (mark >= 0xFD) & (mark != 0xFF) & (data[begin:end] == 0) & (high >= 0x03) & (high <= 0x0E)
         found.append(np.flatnonzero(looks) + begin)
     return np.concatenate(found)
-
-
-def _receive_times(data: Bytes, places: IntArray) -> IntArray:
-    """Receive times [us, UNIX] at these places."""
-    time = np.zeros(len(places), dtype=np.int64)
-    for k in range(1, _STAMP):
-        time = time << 8 | data[places + k]
-    return time
 
 
 def _walk(places: IntArray, stops: IntArray, size: int) -> tuple[IntArray, int, bool]:
@@ -453,7 +447,9 @@ def read_tlog(path: Path) -> Recording:
             "IMU, attitude, servo or ESC messages", "ask the autopilot for them (SR*_RAW_SENS, SR*_EXTRA1, MAV_*_MODE)",
         )  # fmt: skip
     who = max(vehicles, key=lambda key: sum(len(t) for t, _ in vehicles[key].signals.values()))
-    notes = _notes(frames, len(which) - int(np.count_nonzero(whole)))
+    bad = len(which) - int(np.count_nonzero(whole))
+    refused = f"{bad} frames with a wrong checksum were refused" if bad else ""
+    notes = damage(len(frames.data), frames.skipped, frames.cut, refused, unit="frame")
     if vehicles[who].backwards > _MOST_BACKWARDS:
         raise LogError(
             f"{path.name}: boot time under system {who[0]} component {who[1]} falls back {vehicles[who].backwards} "
@@ -493,17 +489,6 @@ def _vehicles(frames: Frames, which: IntArray) -> dict[tuple[int, int], VehicleL
             told[kind.msgname] = of_it, decode(frames, kind, of_it)
         out[int(one) >> 8, int(one) & 0xFF] = vehicle_log(told, frames.received)
     return out
-
-
-def _notes(frames: Frames, bad: int) -> list[str]:
-    notes = []
-    if frames.skipped:
-        notes.append(f"{frames.skipped} of {len(frames.data)} bytes are damaged and were skipped")
-    if bad:
-        notes.append(f"{bad} frames with a wrong checksum were refused")
-    if frames.cut:
-        notes.append("the file ends inside a frame: it was cut; everything before is used")
-    return notes
 
 
 def _channels(vehicle: VehicleLog) -> list[RawChannel]:

@@ -20,7 +20,16 @@ from quadid.data.window import Recording
 from quadid.errors import LogError
 from quadid.sanitise import plain
 from quadid.types import FloatArray, IntArray
-from quadid_replay.columns import LogClock, RawChannel, Source, assemble, channels_of, fastest_first, mode_changes
+from quadid_replay.columns import (
+    LogClock,
+    RawChannel,
+    Source,
+    assemble,
+    channels_of,
+    damage,
+    fastest_first,
+    mode_changes,
+)
 from quadid_replay.frames import to_euler
 
 # isort: off
@@ -312,32 +321,22 @@ def read_ulog(path: Path) -> Recording:
     """
     records = collect_records(path, _TOPICS)
     log = _load(path, records)
-    notes = _notes(records, path.stat().st_size)
+    again = records.described_anew
+    notes = damage(
+        path.stat().st_size, records.skipped, records.cut,
+        again and f"{again} redefined within the log: data after the change are not used",
+    )  # fmt: skip
     raw = channels_of(SOURCES, lambda source: _rows(log, source), 2.0)
     other = no_multirotor(log.parameters)
     if not other:
         raw += fastest_first([*_actuator_motors(log), *_actuator_outputs(log), *_allocated(log)], 2.0)
         raw += _esc(log, notes)
     recording = assemble(path.name, "ulog", raw, LogClock(), notes, log.parameters, other)
-    return replace(recording, modes=_modes(log))
-
-
-def _modes(log: _Log) -> tuple[tuple[float, str], ...]:
-    key = ("vehicle_status", 0)
-    if not _has(log, key, "nav_state"):
-        return ()
-    return mode_changes(_times(log.topics[key], "timestamp"), log.topics[key]["nav_state"].astype(np.float64), _MODES)
-
-
-def _notes(records: UlogRecords, size: int) -> list[str]:
-    notes = []
-    if records.skipped:
-        notes.append(f"{records.skipped} of {size} bytes are damaged and were skipped")
-    if records.described_anew:
-        notes.append(f"{records.described_anew} redefined within the log: data after the change are not used")
-    if records.cut:
-        notes.append("the file ends inside a record: it was cut; everything before is used")
-    return notes
+    status = log.topics.get(("vehicle_status", 0), {})
+    if not {"timestamp", "nav_state"} <= status.keys():
+        return recording
+    modes = mode_changes(_times(status, "timestamp"), status["nav_state"].astype(np.float64), _MODES)
+    return replace(recording, modes=modes)
 
 
 def _load(path: Path, records: UlogRecords) -> _Log:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import struct
 import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -150,7 +150,8 @@ def _field(variable: str) -> tuple[str, str]:
 # --- Crazyflie µSD logs: which of the firmware's variables are which channel, in core units and frames
 #
 # The firmware's body frame is x forward, y left, z up and its world z up; what its `controller` group holds is in the
-# frame of the old controllers: roll and pitch positive to the right and nose up, yaw positive to the left.
+# frame of the old controllers: roll and pitch positive to the right and nose up, yaw positive to the left.  World and
+# body are turned alike, about their x axis.
 
 
 FULL_SCALE = 65535.0
@@ -163,11 +164,6 @@ def _axes(prefix: str, names: str) -> tuple[str, ...]:
 
 def _scaled(factor: float) -> Callable[[FloatArray], FloatArray]:
     return lambda rows: rows * factor
-
-
-def _level(rows: FloatArray) -> FloatArray:
-    """World vectors, z up to z down about the x axis, which stays."""
-    return flip_body(rows)
 
 
 def _specific_force(rows: FloatArray) -> FloatArray:
@@ -199,8 +195,8 @@ SOURCES: tuple[Source, ...] = (
     Source("attitude", "", _axes("stateEstimate.", "qw qx qy qz"), _quaternion),
     Source("attitude", "", _axes("stateEstimate.", "roll pitch yaw"), _attitude),
     Source("attitude", "", _axes("stabilizer.", "roll pitch yaw"), _attitude),
-    Source("velocity", "", _axes("stateEstimate.", "vx vy vz"), _level),
-    Source("position", "", _axes("stateEstimate.", "x y z"), _level),
+    Source("velocity", "", _axes("stateEstimate.", "vx vy vz"), flip_body),
+    Source("position", "", _axes("stateEstimate.", "x y z"), flip_body),
     Source("rotor_speed", "", _axes("rpm.", "m1 m2 m3 m4"), _scaled(RPM)),
     Source("motor_command", "", _axes("motor.", "m1 m2 m3 m4"), _scaled(1.0 / FULL_SCALE)),
     Source("motor_command", "", _axes("pwm.", "m1_pwm m2_pwm m3_pwm m4_pwm"), _scaled(1.0 / FULL_SCALE)),
@@ -224,7 +220,7 @@ def read_usd(path: Path) -> Recording:
         title: table for title, table in records.tables.items()
         if title == "fixedFrequency" or any(_holds(table, s) for s in SOURCES)
     }  # fmt: skip
-    times = _on_one_clock(tables, records.places, clock)
+    times = clock.times_of({title: table["t"] * 1e-6 for title, table in tables.items()}, records.places)
 
     def rows(source: Source) -> tuple[FloatArray, FloatArray] | None:
         title = next((title for title, table in tables.items() if _holds(table, source)), None)
@@ -244,19 +240,6 @@ def read_usd(path: Path) -> Recording:
             "list them in the µSD card's config.txt",
         )
     return assemble(path.name, "usdlog", raw, clock, [*records.notes, *_partial(left, {entry.name for entry in raw})])
-
-
-def _on_one_clock(
-    tables: Mapping[str, NDArray[np.void]], places: Mapping[str, IntArray], clock: LogClock
-) -> dict[str, FloatArray]:
-    """Recording times [s] of each table's records: all stamps run through one clock, in file order."""
-    if not tables:
-        return {}
-    order = np.argsort(np.concatenate([places[title] for title in tables]))
-    mapped = np.empty(len(order))
-    mapped[order] = clock.times(np.concatenate([table["t"] for table in tables.values()])[order] * 1e-6)
-    ends = np.cumsum([len(table) for table in tables.values()])
-    return dict(zip(tables, np.split(mapped, ends[:-1]), strict=True))
 
 
 def _holds(table: NDArray[np.void], source: Source) -> bool:

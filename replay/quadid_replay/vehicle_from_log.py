@@ -66,13 +66,14 @@ def vehicle_text(recording: Recording, name: str, mass: float | None = None, arm
     weight = mass if mass is not None else _MASS
     command = _command(recording, channel)
     b = _hover_thrust(recording, channel, command, weight, len(frame.rotors))
+    known_size = arm is not None or not frame.scaled
+    judged = known_size and channel is not None and channel.name == "rotor_speed"
     text = "\n".join([
         f"name: {json.dumps(name)}",
         f"mass: {weight:g}             {'# kg' if mass is not None else '# kg  FILL IN: weigh it as it flies'}",
         *_rotor_lines(frame, arm),
         f"command: {command.line}",
-        *_guesses(frame, weight, b, _possible_thrust(frame) if channel is not None and _known_size(frame, arm) and
-                  channel.name == "rotor_speed" else None),
+        *_guesses(frame, weight, b, _possible_thrust(frame) if judged else None),
         *_effects(recording),
         *(f"# {note}" for note in notes),
         *_remarks(recording),
@@ -117,10 +118,6 @@ def _hover_thrust(recording: Recording, channel: Channel | None, command: _Comma
     return mass * GRAVITY / squares
 
 
-def _known_size(frame: Frame, arm: float | None) -> bool:
-    return arm is not None or not frame.scaled
-
-
 def _possible_thrust(frame: Frame) -> tuple[float, float]:
     """Thrust coefficients [N s^2/rad^2] that propellers of this frame can have: of its size, not of the logged speeds,
     which they are to judge.
@@ -132,18 +129,17 @@ def _possible_thrust(frame: Frame) -> tuple[float, float]:
     return low, high
 
 
-def _bounded(b: float, low: float, high: float) -> str:
-    bounds = f"[{0.995 * low:.3g}, {1.005 * high:.3g}]"
-    return f"  b: {{initial: {b:.3g}, bounds: {bounds}}}    # of propellers that fit this frame"
-
-
 def _guesses(frame: Frame, mass: float, b: float, possible: tuple[float, float] | None) -> list[str]:
     arm = float(np.mean([np.hypot(r.x, r.y) for r in frame.rotors]))
     inertia, blade = 0.25 * mass * arm**2, _BLADE * arm
-    b = b if possible is None else min(max(b, possible[0]), possible[1])
+    thrust = f"  b: {b:.3g}"
+    if possible is not None:  # of propellers that fit this frame
+        b = min(max(b, possible[0]), possible[1])
+        bounds = f"[{0.995 * possible[0]:.3g}, {1.005 * possible[1]:.3g}]"
+        thrust = f"  b: {{initial: {b:.3g}, bounds: {bounds}}}    # of propellers that fit this frame"
     return [
         "parameters:             # first guesses: docs/new-vehicle.md",
-        f"  b: {b:.3g}" if possible is None else _bounded(b, *possible),
+        thrust,
         f"  d: {{initial: {b * blade / 6.0:.3g}, bounds: [{b * blade / 60.0:.3g}, {b * blade / 0.6:.3g}]}}",
         f"  J_xx: {inertia:.3g}",
         f"  J_yy: {inertia:.3g}",
