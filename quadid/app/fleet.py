@@ -23,12 +23,24 @@ from typing import Any
 
 from quadid_replay.formats import HEAD_BYTES, recognise
 
-from quadid.app.fleet_page import Fleet, summarise
-from quadid.app.fleet_work import Job, Row, blank, health_trend, identify_one
-from quadid.app.logs import GRID, as_vehicle, load_vehicle, make_folder
+from quadid.app.fleet_page import Fleet, Row, health_trend, summarise
+from quadid.app.logs import (
+    GRID,
+    Log,
+    as_vehicle,
+    check_conventions,
+    load_vehicle,
+    make_folder,
+    on_grid,
+    open_recording,
+    parse_part,
+    require_gyro,
+)  # fmt: skip
 from quadid.app.options import Described
 from quadid.app.outcome import Advance, silent
-from quadid.errors import LogError, QuadidError, VehicleError
+from quadid.data.window import Recording
+from quadid.errors import LogError, NotIdentifiableError, QuadidError, VehicleError
+from quadid.sanitise import one_line
 from quadid.vehicle import Vehicle
 from quadid.version import __version__
 
@@ -97,6 +109,118 @@ def fleet(
     return Fleet(result, logs, parameters)
 
 
+# --- What is done to one log of a fleet, wherever a worker runs: plain data in, plain data out, never an exception
+
+
+EARLIEST = 946_684_800.0
+"""Times before the year 2000 are seconds since boot, not dates [s]."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """One log to identify.
+
+    Attributes:
+        path: absolute, with a span if wanted; every worker must see it there.
+        name: relative to the folder of the fleet.
+        unit: which vehicle of the fleet it belongs to.
+        size, modified: of the file [bytes], [ns]; with `key` they decide whether a stored result is still good.
+        key: hash of everything else that decides the result.
+        rate: of the grid [Hz]; seed: of the search; diagnose: name what the simulation gets wrong too.
+    """
+
+    path: str
+    name: str
+    unit: str
+    vehicle: str
+    size: int
+    modified: int
+    key: str
+    rate: float
+    seed: int
+    diagnose: bool
+
+
+def identify_one(job: Job) -> Row:
+    """Identifies one log.
+
+    Returns:
+        ``status`` ``done``, ``refused`` (the data cannot support an answer), ``unreadable`` or ``failed`` (a defect
+        of this program), ``reason``, and what was found; nothing is raised, so that no log can stop the others.
+    """
+    begin = time.perf_counter()
+    row = blank(job)
+    try:
+        cut, vehicle = parse_part(job.path), Vehicle.from_yaml(job.vehicle, job.unit)
+        recording = open_recording(cut.path, columns=vehicle.columns)
+        checked = check_conventions(recording, vehicle, cut)
+        row |= _seen(cut.of(recording), vehicle, checked.doubts)
+        require_gyro(recording)
+        log = on_grid(cut.path, recording, vehicle, job.rate, cut, checked)
+        row |= {"seconds": log.grid.seconds_used, "warnings": list(dict.fromkeys([*row["warnings"], *log.warnings]))}
+        row |= {"status": "done", "reason": "", **_identified(job, log)}
+    except NotIdentifiableError as error:
+        row |= {"status": "refused", "reason": one_line(str(error), 500)}
+    except (QuadidError, OSError) as error:
+        status = "refused" if row["trims"] else "unreadable"  # what shows its trim has been read
+        row |= {"status": status, "reason": one_line(str(error), 500)}
+    except Exception as error:  # noqa: BLE001 - one log's defect is reported in its row and must not stop the rest
+        row |= {"status": "failed", "reason": f"{type(error).__name__}: {one_line(str(error), 500)}"}
+    return {**row, "took": time.perf_counter() - begin, "worker": os.getpid()}
+
+
+def blank(job: Job) -> Row:
+    """The row of a log of which nothing is known yet but its file."""
+    return {
+        "name": job.name, "unit": job.unit, "size": job.size, "modified": job.modified, "key": job.key,
+        "sha256": None, "started": 1e-9 * job.modified, "dated_by": "file", "format": None, "seconds": None,
+        "mse_initial": None, "mse_fitted": None, "verdict": None, "parameters": [], "findings": [], "trims": [],
+        "warnings": [],
+    }  # fmt: skip
+
+
+def _seen(recording: Recording, vehicle: Vehicle, doubts: Sequence[str]) -> Row:
+    """Facts of a flight, whether or not anything can be fitted to it; its trim where it flew steadily."""
+    from quadid.condition.trim import flight_to_dict, flight_trim
+
+    row: Row = {
+        "vehicle": vehicle.name,
+        "sha256": recording.sha256,
+        "format": recording.format,
+        "warnings": [f"{recording.name}: {text}" for text in (*recording.warnings, *doubts)],
+    }
+    if (first := recording.span[0]) > EARLIEST:  # the log has a date
+        row |= {"started": first, "dated_by": "log"}
+    try:
+        trim = flight_trim(recording, vehicle)
+    except NotIdentifiableError as error:
+        return row | {"warnings": [*row["warnings"], f"no trim: {error.found}"]}
+    return row | {"trims": [{"trim": json.dumps(flight_to_dict(trim))}]}
+
+
+def _identified(job: Job, log: Log) -> Row:
+    from quadid.app.identify import identify
+
+    result = identify(log, seed=job.seed).result
+    error = result["sets"][0]["mse"]
+    row: Row = {
+        "mse_initial": error["initial"],
+        "mse_fitted": error["fitted"],
+        "parameters": [
+            {"parameter": p["name"], "unit": p["unit"], "value": p["value"], "low": p["ci95"][0], "high": p["ci95"][1],
+             "status": p["status"]}
+            for p in result["parameters"]
+        ],
+    }  # fmt: skip
+    if job.diagnose:
+        from quadid.app.diagnose import diagnose
+
+        done = diagnose(log, seed=job.seed)
+        kept = ("effect", "confident", "parameter", "unit", "value", "low", "high", "mse_before", "mse_after")
+        row |= {"verdict": done.result["verdict"], "findings": [{k: r[k] for k in kept} for r in done.records()]}
+    return row
+
+
 # --- Jobs on Dask: an embedded cluster of processes, or one that is already there
 
 
@@ -112,7 +236,7 @@ _QUIET = {
 }  # fmt: skip
 """Dask otherwise looks at every worker's stack each 10 ms, at itself each 20 ms and at memory each 100 ms."""
 _WARM = (
-    "distributed", "distributed.nanny", "quadid.app.fleet_work", "quadid.app.identify", "quadid.condition.trim",
+    "distributed", "distributed.nanny", "quadid.app.fleet", "quadid.app.identify", "quadid.condition.trim",
     "quadid_replay.rosbag",
 )  # fmt: skip
 """Modules imported by the process from which all workers are forked, those that replace dead ones too."""
@@ -343,9 +467,11 @@ def find_jobs(
         text = _vehicle_text(path.parent, root, default, texts)
         folder = path.parent.relative_to(root).as_posix()
         status = path.stat()
+        parts = (text, f"{rate!r}", str(seed), str(diagnose), __version__)
+        key = hashlib.sha256("\0".join(parts).encode()).hexdigest()[:16]
         jobs.append(Job(
             str(path), name, _vehicle_name(text, folder), text, status.st_size, status.st_mtime_ns,
-            _key(text, rate, seed, diagnose), rate, seed, diagnose,
+            key, rate, seed, diagnose,
         ))  # fmt: skip
     if not jobs:
         raise LogError(f"no flight log below {root} ({len(others)} other files)", "MCAP, tlog, DataFlash, ULog or CSV")
@@ -382,7 +508,6 @@ def _files(root: Path, leave_out: Path | None) -> Iterator[Path]:
 
 
 def _is_log(path: Path) -> bool:
-
     if path.suffix.lower() in SUFFIXES:
         return True
     try:
@@ -414,14 +539,7 @@ def _vehicle_text(folder: Path, root: Path, default: str | None, texts: dict[Pat
 
 @lru_cache(maxsize=64)
 def _vehicle_name(text: str, folder: str) -> str:
-
     return Vehicle.from_yaml(text).name if folder == "." else folder
-
-
-def _key(vehicle: str, rate: float, seed: int, diagnose: bool) -> str:
-
-    parts = (vehicle, f"{rate!r}", str(seed), str(diagnose), __version__)
-    return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:16]
 
 
 # --- Results of a fleet on disk: SQLite while it runs, so that a stopped run goes on where it was; Parquet at its end

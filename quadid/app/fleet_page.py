@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import shlex
 from collections import Counter, defaultdict
@@ -22,10 +23,12 @@ from quadid.report.tables import Cell, Column, TextTable
 from quadid.report.tables import number as plain_number
 from quadid.report.verdict import ROUGH, Level, Verdict, percent
 from quadid.types import Json, JsonDict
+from quadid.vehicle import Vehicle
 
 # --- What many flights say together: parameters of every vehicle over time, drift, outliers, findings they share
 
 
+Row = dict[str, Any]
 FEWEST_FOR_DRIFT = 5
 """Flights on different days or hours that a drift takes at least."""
 FEWEST_FOR_OUTLIERS = 5
@@ -184,6 +187,52 @@ def _copied(copies: Sequence[tuple[str, str]]) -> list[dict[str, Any]]:
     ]
 
 
+# --- Health of every vehicle of a fleet over its flights: each flight against the vehicle's first ones
+
+
+BASELINE = 5
+"""The first flights of a vehicle are its baseline, so many where there are more."""
+FEWEST = 3
+"""Baseline flights that a trend takes at least."""
+_JUDGED = ("score", "verdict", "baseline_lacking", "unfamiliar", "p_value", "changes")
+
+
+def health_trend(logs: Sequence[Json], trims: Sequence[Json], vehicles: Mapping[str, str]) -> list[Row]:
+    """Compares each flight of a vehicle with its first flights.
+
+    Args:
+        logs: rows with name, unit, started [s since 1970].
+        trims: rows with log and trim (JSON).
+        vehicles: text of the vehicle file by unit.
+
+    Returns:
+        A row a flight, in the order of time: unit, log, started, baseline (whether it is part of it), and, for the
+        others, score, verdict, baseline_lacking, unfamiliar, p_value and changes as in ``quadid.health/1``; none for
+        vehicles with too few flights.
+    """
+    from quadid.condition.changes import assess
+    from quadid.condition.trim import flight_from_dict
+
+    flown = {row["log"]: flight_from_dict(json.loads(row["trim"])) for row in trims}
+    by_unit: dict[str, list[Json]] = {}
+    for log in sorted(logs, key=lambda row: (float(row["started"]), row["name"])):
+        if log["name"] in flown and log["unit"] in vehicles:
+            by_unit.setdefault(log["unit"], []).append(log)
+    out: list[Row] = []
+    for unit, mine in sorted(by_unit.items()):
+        count = min(BASELINE, len(mine) - 1)
+        if count < FEWEST:
+            continue
+        vehicle, healthy = Vehicle.from_yaml(vehicles[unit], unit), [flown[log["name"]] for log in mine[:count]]
+        for k, log in enumerate(mine):
+            row = {"unit": unit, "log": log["name"], "started": log["started"], "baseline": k < count}
+            if k >= count:
+                found = assess([flown[log["name"]]], healthy, vehicle).to_dict()
+                row |= {key: found[key] for key in _JUDGED}
+            out.append(row)
+    return out
+
+
 # --- Tables of the report of a fleet: a row a thing, folded where they are long, so that a phone shows them too
 
 
@@ -302,7 +351,7 @@ class Fleet(Reported):
 
     Attributes:
         result: of the form ``quadid.fleet/1``: that of `summarise`, ``health`` of
-            `quadid.app.fleet_work.health_trend`, and how much was done.
+            `health_trend`, and how much was done.
         logs, parameters: rows that it was made from.
     """
 

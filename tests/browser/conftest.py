@@ -89,7 +89,7 @@ def fleet_page(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The report of a fleet of two vehicles, one of which wears; of two others one has a propeller cut."""
     import numpy as np
 
-    from quadid.app.fleet_work import health_trend
+    from quadid.app.fleet_page import health_trend
     from tests.cli.test_health import PELICAN_X, fleet
     from tests.report.test_fleet_page import rows, summed
 

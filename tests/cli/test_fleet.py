@@ -20,8 +20,7 @@ import pytest
 from quadid_replay import write_csv, write_mcap
 
 from quadid.app import fleet as fleet_cluster
-from quadid.app.fleet import ClusterError, cluster, find_jobs, open_store, results
-from quadid.app.fleet_work import Job, Row, identify_one
+from quadid.app.fleet import ClusterError, Job, Row, cluster, find_jobs, identify_one, open_store, results
 from quadid.errors import LogError, VehicleError
 from quadid.flight import fly
 from quadid.vehicle import Vehicle

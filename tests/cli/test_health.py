@@ -13,7 +13,8 @@ from quadid_evaluation.studies.health.flights import Wrong, hover
 from quadid_replay import write_csv
 
 import quadid
-from quadid.app.fleet_work import BASELINE, FEWEST, Job, health_trend, identify_one
+from quadid.app.fleet import Job, identify_one
+from quadid.app.fleet_page import BASELINE, FEWEST, health_trend
 from quadid.condition import flight_trim
 from quadid.condition.trim import flight_to_dict
 from quadid.errors import LogError
