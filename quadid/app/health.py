@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import typer
-from markupsafe import Markup
 
 from quadid.app.logs import Flight, Given, Log, check_conventions, listed, open_recording, parse_part, vehicle_of
 from quadid.app.options import LogNames, OfVehicle, Preset, Typed, Unchecked
@@ -18,6 +17,7 @@ from quadid.data.window import Recording
 from quadid.errors import LogError, NotIdentifiableError
 from quadid.report.page import axis, figure, rows_of, section
 from quadid.report.tables import Cell, Column, TextTable
+from quadid.report.templating import render
 from quadid.report.verdict import Level, Verdict
 from quadid.types import Json
 from quadid.vehicle import Vehicle
@@ -389,10 +389,9 @@ def trim_figure(rows: Sequence[tuple[str, str, Sequence[float]]], names: Sequenc
 # --- The airframe from above as inline SVG: every rotor with its load against the baseline, damage and shift marked
 
 
-_SIZE, _MARGIN = 420.0, 92.0
-_LARGEST = 30.0
-"""Pixels; a disc grows and shrinks with its rotor's load around `_DISC`."""
-_DISC = 44.0
+_SIZE, _MARGIN = 420, 92
+_DISC, _LARGEST = 44, 30
+"""Radius of a rotor's disc, and how far it may grow and shrink with its load [pixels]."""
 _SHIFT = 6.0
 """A shift of the CG is drawn this many times its size."""
 
@@ -408,63 +407,30 @@ def airframe_picture(
         changes: entries of ``quadid.health/1``.
     """
     scale = (0.5 * _SIZE - _MARGIN) / max(abs(c) for r in vehicle.rotors for c in r.position[:2])
-    centre = 0.5 * _SIZE
-    places = [(centre + scale * r.position[1], centre - scale * r.position[0]) for r in vehicle.rotors]
+
+    def place(ahead: float, right: float) -> dict[str, Any]:
+        return {"x": round(0.5 * _SIZE + scale * right), "y": round(0.5 * _SIZE - scale * ahead)}
+
     weak = {int(change_value(c, "rotor")) - 1: c for c in changes if c["effect"] == "weak_rotor"}
-    parts = [
-        Markup(
-            '<svg class="airframe" viewBox="0 0 {0:.0f} {0:.0f}" role="img" aria-label="Airframe from above, nose up">'
-        ).format(_SIZE),
-        *(_line(centre, centre, x, y) for x, y in places),
-        Markup('<path class="nose" d="M{0:.0f} {1:.0f} l-9 18 h18 z"/>').format(centre, centre - 30.0),
-        *(_rotor(j, x, y, load[j] / baseline[j] - 1.0, weak.get(j), centre) for j, (x, y) in enumerate(places)),
-        *_shift(changes, centre, scale),
-        Markup("</svg>"),
-    ]
-    return str(Markup("").join(parts))
+    rotors = []
+    for j, rotor in enumerate(vehicle.rotors):
+        at, more = place(*rotor.position[:2]), 100.0 * (load[j] / baseline[j] - 1.0)
+        at |= {"kind": "", "radius": _DISC + round(max(-_LARGEST, min(_LARGEST, more)), 1), "loss": ""}
+        at["load"] = f"{more:+.1f} %".replace("-", "−")
+        if (found := weak.get(j)) is not None:
+            low, high = next(p["ci95"] for p in found["parameters"] if p["name"] == "loss")
+            words = f"loss {100.0 * change_value(found, 'loss'):.0f} % ({100.0 * low:.0f} … {100.0 * high:.0f})"
+            at |= {"kind": " damaged" if found["confident"] else " suspect", "loss": words.replace("-", "−")}
+            at["below"] = at["y"] + (_DISC + _LARGEST + 12 if at["y"] > _SIZE / 2 else -_DISC - _LARGEST - 2)
+        rotors.append(at)
+    shift: dict[str, Any] = {}
+    for change in changes:
+        if change["effect"] == "cg_offset":
+            ahead, right = (change_value(change, axis) for axis in "xy")
+            shift = {**place(_SHIFT * ahead, _SHIFT * right), "words": f"CG {1e3 * math.hypot(ahead, right):.1f} mm"}
+    return render("airframe.svg", {"size": _SIZE, "disc": _DISC, "rotors": rotors, "shift": shift})
 
 
 def change_value(change: Json, name: str) -> float:
     """A number of a change."""
     return float(next(p["value"] for p in change["parameters"] if p["name"] == name))
-
-
-def _line(x1: float, y1: float, x2: float, y2: float) -> str:
-    return Markup('<line class="arm" x1="{:.0f}" y1="{:.0f}" x2="{:.0f}" y2="{:.0f}"/>').format(x1, y1, x2, y2)
-
-
-def _rotor(j: int, x: float, y: float, more: float, weak: Json | None, centre: float) -> str:
-    """One rotor: its healthy disc, its disc now, its number, its load, and its loss where it is damaged."""
-    kind = "" if weak is None else " damaged" if weak["confident"] else " suspect"
-    radius = _DISC + max(-_LARGEST, min(_LARGEST, 100.0 * more))
-    out = [
-        Markup('<circle class="disc{}" cx="{:.0f}" cy="{:.0f}" r="{:.1f}"/>').format(kind, x, y, radius),
-        Markup('<circle class="healthy" cx="{:.0f}" cy="{:.0f}" r="{:.0f}"/>').format(x, y, _DISC),
-        _text(x, y - 4.0, f"M{j + 1}", "name"),
-        _text(x, y + 14.0, f"{100.0 * more:+.1f} %".replace("-", "−"), "load"),
-    ]
-    if weak is not None:
-        below = y + _DISC + _LARGEST + 12.0 if y > centre else y - _DISC - _LARGEST - 2.0
-        low, high = next(p["ci95"] for p in weak["parameters"] if p["name"] == "loss")
-        words = f"loss {100.0 * change_value(weak, 'loss'):.0f} % ({100.0 * low:.0f} … {100.0 * high:.0f})"
-        out.append(_text(x, below, words.replace("-", "−"), "loss" + kind))
-    return Markup("").join(out)
-
-
-def _text(x: float, y: float, words: str, kind: str) -> str:
-    return Markup('<text class="{}" x="{:.0f}" y="{:.0f}">{}</text>').format(kind, x, y, words)
-
-
-def _shift(changes: Sequence[Json], centre: float, scale: float) -> Sequence[str]:
-    """An arrow from the centre towards where the CG went, enlarged."""
-    found = [c for c in changes if c["effect"] == "cg_offset"]
-    if not found:
-        return ()
-    ahead, right = (change_value(found[0], axis) for axis in "xy")
-    x, y = centre + _SHIFT * scale * right, centre - _SHIFT * scale * ahead
-    words = f"CG {1e3 * (ahead**2 + right**2) ** 0.5:.1f} mm"
-    return (
-        Markup('<line class="shift" x1="{0:.0f}" y1="{0:.0f}" x2="{1:.0f}" y2="{2:.0f}"/>').format(centre, x, y),
-        Markup('<circle class="cg" cx="{:.0f}" cy="{:.0f}" r="7"/>').format(x, y),
-        _text(x, y + 24.0, words, "loss"),
-    )

@@ -38,30 +38,6 @@ def _word(value: str) -> Markup:
     return Markup(value)
 
 
-def _comment(text: str) -> str:
-    return plain(text, LONGEST_LINE)
-
-
-def _python_comment(text: str) -> str:
-    """In its first two lines Python takes ``coding: NAME`` for the encoding of what follows."""
-    return re.sub("coding(?=[:=])", "coding ", _comment(text))
-
-
-def _xml_comment(text: str) -> str:
-    """Two hyphens end a comment of XML."""
-    return re.sub("-(?=-)", "- ", _comment(text))
-
-
-def _frame_comment(text: str) -> str:
-    """SITL takes the first brace for the beginning of its JSON."""
-    return _comment(text).translate({ord("{"): "(", ord("}"): ")"})
-
-
-def _cpp_comment(text: str) -> str:
-    """A backslash, or what once stood for one, at the end of a line would take the next one into the comment."""
-    return re.sub(r"\\|\?+/", "/", _comment(text))
-
-
 def _no_literal(text: str) -> str:
     raise ValueError(f"{text[:40]!r}: files of this kind hold no strings")
 
@@ -75,12 +51,16 @@ def _python_literal(text: str) -> str:
     return f'"{ascii(text)[1:-1]}"' if '"' not in text and "'" not in text else ascii(text)
 
 
-def _xml(text: str) -> Markup:
-    return escape(plain(text, LONGEST_LINE))
-
-
 class _Language(NamedTuple):
-    comment: Callable[[str], str] = _comment
+    """A language of files.
+
+    Attributes:
+        comment: what may not stand in a comment, as a regular expression, and what replaces it.
+        literal: a string with its quotes.
+        bare: text without either.
+    """
+
+    comment: tuple[str, str] = ("$^", "")
     literal: Callable[[str], str] = _no_literal
     bare: Callable[[str], Markup] = _word
     number: Callable[[float], str] = number
@@ -90,12 +70,16 @@ _LANGUAGES = {
     "html": _Language(bare=escape, number=str),
     "yaml": _Language(number=yaml_number),
     "lua": _Language(literal=_lua_literal),
-    "py": _Language(_python_comment, _python_literal),
-    "json": _Language(_frame_comment),
-    "hpp": _Language(_cpp_comment),
-    "xml": _Language(_xml_comment, bare=_xml),
+    # In its first two lines Python takes ``coding: NAME`` for the encoding of what follows.
+    "py": _Language((r"coding(?=[:=])", "coding "), _python_literal),
+    # SITL takes the first brace for the beginning of its JSON.
+    "json": _Language((r"[{}]", "|")),
+    # A backslash, or what once stood for one, at the end of a line would take the next one into the comment.
+    "hpp": _Language((r"\\|\?+/", "/")),
+    # Two hyphens end a comment of XML.
+    "xml": _Language((r"-(?=-)", "- "), bare=lambda text: escape(plain(text, LONGEST_LINE))),
 }
-_LANGUAGES |= {"sdf": _LANGUAGES["xml"], "urdf": _LANGUAGES["xml"]}
+_LANGUAGES |= dict.fromkeys(("sdf", "urdf", "svg"), _LANGUAGES["xml"])
 """By the ending of a template's name; any other ending has line comments and numbers only."""
 
 
@@ -129,7 +113,7 @@ def environment(ending: str) -> Environment:
         keep_trailing_newline=True, loader=PackageLoader("quadid.report"),
     )  # fmt: skip
     out.filters |= {
-        "comment": lambda text: Markup(language.comment(str(text))),
+        "comment": lambda text: Markup(re.sub(*language.comment, plain(str(text), LONGEST_LINE))),
         "literal": lambda text: Markup(language.literal(str(text))),
         "digits": lambda value, digits: Markup(f"{float(value) + 0.0:.{digits}g}"),
         "row": row,
