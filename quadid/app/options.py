@@ -184,8 +184,8 @@ Gate = Annotated[
 
 
 def gate_settings(pairs: str) -> dict[str, float]:
-    """Arguments of `quadid_node.settings.session_settings` that `Gate` stands for; raises ParameterError."""
-    return {f"gate_{name}": value for name, value in key_numbers(pairs, pairs, "NAME=NUMBER,NAME=NUMBER").items()}
+    """What `Gate` stands for; raises ParameterError."""
+    return key_numbers(pairs, pairs, "NAME=NUMBER,NAME=NUMBER")
 
 
 Horizons = Annotated[

@@ -75,7 +75,7 @@ def replay(
     pace = _pace(speed)
     described = load_vehicle(vehicle)
     settings = session_settings(
-        approval, rate=rate, window=window, refit=refit, diagnose=diagnose, seed=seed, **options.gate_settings(gate)
+        approval, options.gate_settings(gate), rate=rate, window=window, refit=refit, diagnose=diagnose, seed=seed
     )
     cut = parse_part(log)
     if as_recorded and cut.path != Path(log):

@@ -75,7 +75,7 @@ def serve(
     terminal.check_file(json, "--json")
     described = load_vehicle(vehicle)
     settings = session_settings(
-        approval, window=window, refit=refit, diagnose=diagnose, seed=seed, **options.gate_settings(gate)
+        approval, options.gate_settings(gate), window=window, refit=refit, diagnose=diagnose, seed=seed
     )
     known = name or described.name
     end = time.monotonic() + seconds if seconds > 0.0 else float("inf")

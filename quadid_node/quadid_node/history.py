@@ -338,8 +338,10 @@ class HistoryLock:
                 if self._vehicle in vehicles:
                     raise BlockingIOError
                 fcntl.fcntl(descriptor, _LOCK, _flock(fcntl.F_RDLCK, _NAMES + known))
-                beside = (_NAMES, known), (_NAMES + known + 1, (1 << 32) - known - 1)
-                if name != known or any(_is_locked(descriptor, *part) for part in beside):
+                # Nobody else may have a lock on the byte of another name, before or behind ours.
+                beside = [(_NAMES, known), (_NAMES + known + 1, (1 << 32) - known - 1)]
+                tests = [fcntl.fcntl(descriptor, _TEST, _flock(fcntl.F_WRLCK, *part)) for part in beside if part[1]]
+                if name != known or any(lock[:2] != _FREE for lock in tests):
                     raise StoreError(
                         f"another service has the history {self._path} open by another name (as by a bind mount of the "
                         "file): by each it would be another database",
@@ -364,11 +366,6 @@ class HistoryLock:
 def _flock(kind: int, first: int, count: int = 1) -> bytes:
     """A `struct flock` of some bytes."""
     return struct.pack("hhqqi", kind, os.SEEK_SET, first, count, 0)
-
-
-def _is_locked(descriptor: int, first: int, count: int) -> bool:
-    """True if somebody else has a lock on one of some bytes."""
-    return bool(count) and fcntl.fcntl(descriptor, _TEST, _flock(fcntl.F_WRLCK, first, count))[:2] != _FREE
 
 
 def _close_unused(file: _File) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,25 +17,21 @@ class SettingsError(QuadidError):
     """A setting outside its range, or an unknown one."""
 
 
-def session_settings(approval: str = "auto", **given: Any) -> SessionSettings:
+def session_settings(approval: str = "auto", gate: Mapping[str, Any] | None = None, **given: Any) -> SessionSettings:
     """Session settings from loose arguments.
 
     Args:
-        given: fields of `SessionSettings`, or of `GateSettings` with ``gate_`` before.
+        gate: further fields of `GateSettings`; given: of `SessionSettings`.
 
     Raises:
         SettingsError: naming the setting, what was found and what is allowed.
     """
-    gate = {"approval": approval}
-    rest: dict[str, Any] = {}
-    for name, value in given.items():
-        known = GateSettings.model_fields if name.startswith("gate_") else SessionSettings.model_fields
-        bare = name.removeprefix("gate_")
-        if bare not in known:
-            raise SettingsError(f"unknown setting '{name}'", fix=nearest(bare, list(known)))
-        (gate if name.startswith("gate_") else rest)[bare] = value
+    of_gate = {"approval": approval, **(gate or {})}
+    for model, values in ((GateSettings, of_gate), (SessionSettings, given)):
+        for name in values.keys() - model.model_fields.keys():
+            raise SettingsError(f"unknown setting '{name}'", fix=nearest(name, list(model.model_fields)))
     try:
-        return SessionSettings(gate=GateSettings.model_validate(gate), **rest)
+        return SessionSettings(gate=GateSettings.model_validate(of_gate), **given)
     except ValidationError as error:
         first = error.errors()[0]
         place = ".".join(str(part) for part in first["loc"])
@@ -102,7 +99,8 @@ def as_declared(parameter: NodeParameter, value: Any) -> Any:
 def read_settings(values: dict[str, Any]) -> SessionSettings:
     """Settings of the session from parameter values; raises QuadidError."""
     given = {n: values[n] for n in ("approval", "window", "refit", "rate", "memory", "diagnose", "seed")}
-    return session_settings(**given, **{n.replace(".", "_"): v for n, v in values.items() if n.startswith("gate.")})
+    gate = {n.removeprefix("gate."): v for n, v in values.items() if n.startswith("gate.")}
+    return session_settings(**given, gate=gate)
 
 
 def vehicle_id(given: str, namespace: str, vehicle: Vehicle) -> str:

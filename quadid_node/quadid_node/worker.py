@@ -1,10 +1,18 @@
-"""Child process that fits beside the service, and inline fits for replays."""
+"""Child process that fits beside the service, and inline fits for replays.
+
+The child is this module run as a program (`python -m quadid_node.worker MEBIBYTES`): it lowers its priority, leaves a
+core to others, bounds its memory, warms the kernels, says that it is ready, and ends when its input ends.  Requests and
+replies are pickles.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import os
 import pickle
+import resource
+import signal
 import subprocess
 import sys
 import threading
@@ -17,7 +25,6 @@ from typing import Any, Protocol
 
 from quadid.online.records import UNEXPECTED, Job, JobReply
 from quadid.vehicle import Vehicle
-from quadid_node.worker_main import READY, THREADS
 
 # --- Whether a child that starts gets anywhere: compiling may take long on a slow machine, standing still may not
 
@@ -74,6 +81,10 @@ BACKOFF = (0.2, 1.0, 5.0, 20.0, 60.0)
 CALM = 60.0
 """Failures this long ago [s] are forgiven."""
 MEMORY_MB = 1000
+NICE = 15
+THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
+READY = "ready"
+_PR_SET_PDEATHSIG = 1
 
 
 @dataclass(frozen=True)
@@ -205,7 +216,7 @@ class ProcessWorker:
     def _start(self) -> None:
         environment = {**os.environ, **dict.fromkeys(THREADS, "1")}
         self._child = subprocess.Popen(
-            [sys.executable, "-P", "-m", "quadid_node.worker_main", str(self._memory)],
+            [sys.executable, "-P", "-m", "quadid_node.worker", str(self._memory)],
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment, start_new_session=True,
         )  # fmt: skip
         self._asked, self._heard = SimpleQueue(), SimpleQueue()
@@ -281,3 +292,39 @@ def _talk(child: subprocess.Popen[bytes], asked: SimpleQueue[Any], heard: Simple
             pickle.dump(item, child.stdin, pickle.HIGHEST_PROTOCOL)
             child.stdin.flush()
             heard.put(pickle.load(child.stdout))
+
+
+def main() -> None:
+    """Serves requests until the input ends: the child."""
+    answers = os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)  # whatever prints must not end up between replies
+    requests = os.fdopen(os.dup(0), "rb")
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    # Lowers priority, leaves the first core to others, bounds memory.
+    os.nice(NICE)
+    if hasattr(os, "sched_getaffinity") and len(cores := sorted(os.sched_getaffinity(0))) > 1:
+        os.sched_setaffinity(0, cores[1:])
+    if sys.platform.startswith("linux"):  # dies with its parent even while kernels compile and nobody reads the input
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    if limit := int(sys.argv[1]) << 20:
+        resource.setrlimit(resource.RLIMIT_DATA, (limit, limit))
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    from quadid.online.fit_job import warm_up  # the parent needs no kernels
+
+    def answer(item: object) -> None:
+        pickle.dump(item, answers, pickle.HIGHEST_PROTOCOL)
+        answers.flush()
+
+    try:
+        warm_up(pickle.load(requests))
+        answer(READY)
+        while True:
+            answer(pickle.load(requests).run())
+    except (EOFError, pickle.UnpicklingError):  # the parent has ended
+        return
+    except MemoryError:
+        sys.exit("the fit process needs more memory than it may have")  # one line; the parent says what follows
+
+
+if __name__ == "__main__":
+    main()

@@ -310,7 +310,9 @@ class FleetView:
         self._sizes: dict[tuple[str, str], int] = {}
         everything = f"{ROOT}/*/*"
         self._open = [
-            self._session.declare_subscriber(everything, self._on_sample),
+            self._session.declare_subscriber(
+                everything, lambda sample: self._take(str(sample.key_expr), sample.payload)
+            ),
             self._session.liveliness().declare_subscriber(f"{ROOT}/*/alive", self._on_token, history=True),
         ]
         self._session.get(everything, self._on_reply)
@@ -338,9 +340,6 @@ class FleetView:
     def close(self) -> None:
         """Leaves."""
         self._session.close()
-
-    def _on_sample(self, sample: Any) -> None:
-        self._take(str(sample.key_expr), sample.payload)
 
     def _on_reply(self, reply: Any) -> None:
         if reply.ok is not None:
