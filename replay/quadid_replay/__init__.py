@@ -12,17 +12,8 @@ if TYPE_CHECKING:
 
 __all__ = ["TopicWriter", "open_log", "write_compared", "write_csv", "write_mcap", "write_tlog"]
 
-_HOME = {
-    "TopicWriter": "writers",
-    "open_log": "opening",
-    "write_compared": "writers",
-    "write_csv": "writers",
-    "write_mcap": "writers",
-    "write_tlog": "writers",
-}
-
 
 def __getattr__(name: str) -> Any:
-    if name not in _HOME:
+    if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_HOME[name]}"), name)
+    return getattr(import_module(f"{__name__}.{'opening' if name == 'open_log' else 'writers'}"), name)

@@ -81,14 +81,8 @@ def preset_rank(preset: str, channel: str, topic: str) -> int | None:
         return (0 if "raw" in topic.rsplit("/", 1)[-1] else 1) + (min(ranks) if ranks else 10)
     if preset not in PRESETS:
         raise LogError(f"unknown preset '{preset}'", f"{AUTO}, {', '.join(PRESETS)}", nearest(preset, PRESETS))
-    for rank, name in enumerate(PRESETS[preset].get(channel, ())):
-        if _matches(topic, name):
-            return rank
-    return None
-
-
-def _matches(topic: str, name: str) -> bool:
-    """A topic ends with the name, whole path elements only; PX4 may append its message version (_v1)."""
+    # A topic ends with the name, whole path elements only; PX4 may append its message version (_v1).
     stem, _, version = topic.rpartition("_v")
-    bare = stem if stem and version.isdecimal() else topic
-    return any(t == name or t.endswith("/" + name) for t in (topic, bare))
+    ends = [f"/{topic}", *([f"/{stem}"] if stem and version.isdecimal() else [])]
+    names = PRESETS[preset].get(channel, ())
+    return next((rank for rank, name in enumerate(names) if any(end.endswith(f"/{name}") for end in ends)), None)

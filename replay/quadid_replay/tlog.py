@@ -12,6 +12,7 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 from pymavlink.dialects.v20 import ardupilotmega
+from pymavlink.generator.mavcrc import x25crc
 
 from quadid.data.window import Recording
 from quadid.errors import LogError
@@ -178,9 +179,9 @@ def _members(runs: list[tuple[int, int]], count: int) -> IntArray:
     return np.flatnonzero(np.cumsum(steps[:-1]))
 
 
-# --- MAVLink messages of one kind to columns, and their checksums, all at once, from the dialect's own descriptions
+# --- MAVLink messages of one kind to columns, all at once, from the dialect's own descriptions
 #
-# Fields, their order, padding, text and checksum are pymavlink's, message by message; a test compares both.
+# Fields, their order, padding and text are pymavlink's, message by message; a test compares both.
 
 
 _TYPES = {"float": "<f4", "double": "<f8", "char": "u1"}
@@ -224,42 +225,12 @@ def decode(frames: Frames, kind: Any, which: IntArray) -> Messages:
 
 def intact(frames: Frames, which: IntArray, seeds: IntArray) -> BoolArray:
     """Tells which of these frames have the right checksum; `seeds` are their messages' (`crc_extra`), shape (n,)."""
-    out = np.empty(len(which), dtype=np.bool_)
-    for a in range(0, len(which), _AT_ONCE):
-        some = which[a : a + _AT_ONCE]
-        end = frames.end[some]
-        told = frames.data[end].astype(np.uint16) | frames.data[end + 1].astype(np.uint16) << 8
-        out[a : a + _AT_ONCE] = told == _checksums(frames.data, frames.start[some] + 1, end, seeds[a : a + _AT_ONCE])
-    return out
-
-
-def _checksums(data: Bytes, begin: IntArray, end: IntArray, seeds: IntArray) -> NDArray[np.uint16]:
-    """CRC-16/MCRF4XX of these bytes and of a seed behind each, two bytes at a time, the longest first."""
-    order = np.argsort(begin - end)
-    begin, length = begin[order], (end - begin)[order]
-    by_byte, by_two = _tables()
-    crc = np.full(len(begin), 0xFFFF, dtype=np.uint16)
-    for k in range(int(length.max()) // 2):
-        active = int(np.searchsorted(-length, -2 * (k + 1), side="right"))
-        at = begin[:active] + 2 * k
-        two = data.take(at).astype(np.uint16) | data.take(at + 1).astype(np.uint16) << 8
-        crc[:active] = by_two.take(crc[:active] ^ two)
-    odd = length % 2 == 1
-    crc[odd] = by_byte.take((crc[odd] ^ data.take((begin + length - 1)[odd])) & 0xFF) ^ crc[odd] >> 8
-    out = np.empty_like(crc)
-    out[order] = by_byte.take((crc ^ seeds[order].astype(np.uint16)) & 0xFF) ^ crc >> 8
-    return out
-
-
-@cache
-def _tables() -> tuple[NDArray[np.uint16], NDArray[np.uint16]]:
-    """Tables of one and of two bytes of a checksum: shapes (256,) and (65536,)."""
-    bits = np.arange(256)
-    for _ in range(8):
-        bits = np.where(bits & 1, bits >> 1 ^ 0x8408, bits >> 1)
-    one, every = bits.astype(np.uint16), np.arange(65536, dtype=np.uint16)
-    first = one[every & 0xFF] ^ every >> 8
-    return one, one[first & 0xFF] ^ first >> 8
+    view = frames.data.data
+    each = zip(frames.start[which].tolist(), frames.end[which].tolist(), seeds.tolist(), strict=True)
+    return np.array([
+        x25crc(bytes(view[start + 1 : end]) + bytes((seed,))).crc == view[end] | view[end + 1] << 8
+        for start, end, seed in each
+    ], dtype=np.bool_)  # fmt: skip
 
 
 @cache
