@@ -2,15 +2,31 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated, Any
 
 import typer
 
+from quadid.app.diagnose import Diagnosed, diagnose
+from quadid.app.identify import Identified, identify
+from quadid.app.logs import Log, as_vehicle, load, write_recording, write_text
 from quadid.app.options import JsonTarget, OutFolder, Seed
+from quadid.app.outcome import Advance, provenance, quality, told
+from quadid.cli import terminal
+from quadid.flight import TruthParameters, fly
+from quadid.report.fit_pages import diagnosis_part, findings_section, identify_page
+from quadid.report.page import render
+from quadid.report.verdict import effects_words
+from quadid.vehicle import Vehicle
 
-if TYPE_CHECKING:
-    from quadid.app.demo import Shown
+VEHICLE = "pelican"
+SECONDS, QUICK_SECONDS = 500.0, 60.0
+HIDDEN = {"motor_lag": {"tau": 0.04}}
+HIDDEN_SECONDS = 120.0
+TRUE_SECTION = "The same three flights"
+HIDDEN_SECTION = "A second vehicle, with something hidden in it"
 
 
 def demo(
@@ -20,17 +36,13 @@ def demo(
     out: OutFolder = Path(),
 ) -> None:
     """Fly three Pelican flights, identify on the first, validate on the others, diagnose; write logs and a report."""
-    from quadid.app import demo as work
-    from quadid.app.logs import write_text
-    from quadid.cli import terminal
-
     terminal.check_file(json, "--json")
     folder = terminal.out_folder(out)
     with terminal.progress(("simulation", "statistics", "estimate", "flight")) as advance:
-        shown = work.run(work.QUICK_SECONDS if quick else work.SECONDS, seed, folder, advance)
+        shown = run(QUICK_SECONDS if quick else SECONDS, seed, folder, advance)
     page = folder / "report.html"
-    result = work.summary(shown, str(page))
-    write_text(page, work.html(shown, seed, terminal.command_line()))
+    result = summary(shown, str(page))
+    write_text(page, html(shown, seed, terminal.command_line()))
     terminal.write_json(result, str(folder / "result.json"))
     terminal.write_json(result, json)
     show(shown, page, quiet=json == "-")
@@ -38,9 +50,6 @@ def demo(
 
 def show(shown: Shown, page: Path, quiet: bool) -> None:
     """Prints both results beside the truth, and where the files are."""
-    from quadid.app.demo import HIDDEN_SECTION, TRUE_SECTION
-    from quadid.cli import terminal
-
     console = terminal.console(quiet)
     terminal.print_tables(console, shown.identified.tables(shown.truth))
     terminal.print_verdict(console, shown.identified.verdict)
@@ -50,3 +59,99 @@ def show(shown: Shown, page: Path, quiet: bool) -> None:
         terminal.print_verdict(console, part.verdict)
     console.print(f"\nLogs and vehicle files: {page.parent}", soft_wrap=True)
     console.print(f"Report: {page}", soft_wrap=True)
+
+
+@dataclass(frozen=True)
+class Shown:
+    """Results of the demonstration.
+
+    Attributes:
+        identified: from the first flights.
+        diagnosed: of the same flights, which the model describes fully.
+        hidden: of flights with a hidden effect.
+        truth: true parameters of the simulated vehicle.
+    """
+
+    identified: Identified
+    diagnosed: Diagnosed
+    hidden: Diagnosed
+    truth: Mapping[str, float]
+
+
+def run(seconds: float, seed: int, folder: Path, advance: Advance) -> Shown:
+    """Flies, logs, identifies and diagnoses.
+
+    Args:
+        seconds: length of each of the three flights.
+    """
+    vehicle = as_vehicle(VEHICLE)
+    truth = TruthParameters.of(vehicle).as_dict()
+    flights = [
+        fly_and_load(vehicle, folder / f"set{i + 1}.mcap", seconds, 10 * seed + i, {}, advance) for i in range(3)
+    ]
+    same, apart = (folder / name for name in ("diagnosis", "hidden_effect"))
+    for made in (same, apart):
+        made.mkdir(exist_ok=True)
+    shorter = min(seconds, HIDDEN_SECONDS)
+    other = [
+        fly_and_load(vehicle, apart / f"flight{i + 1}.mcap", shorter, 10 * seed + 5 + i, HIDDEN, advance)
+        for i in range(2)
+    ]
+
+    def named(task: str) -> Advance:
+        return lambda stage, share: advance(f"{task}: {stage}", share)
+
+    identified = identify(flights[:1], flights[1:], seed=seed, advance=named("identify"))
+    diagnosed = diagnose(flights[:1], flights[1:], seed=seed, advance=named("diagnose"))
+    hidden = diagnose(other[:1], other[1:], seed=seed, advance=named("diagnose hidden effect"))
+    for done, place in ((identified, folder), (diagnosed, same), (hidden, apart)):
+        done.result["vehicle_file"] = str(done.vehicle.save(place / done.file_name))
+    return Shown(identified, diagnosed, hidden, truth)
+
+
+def fly_and_load(
+    vehicle: Vehicle, path: Path, seconds: float, seed: int, effects: Mapping[str, Mapping[str, float]],
+    advance: Advance,
+) -> Log:  # fmt: skip
+    """Flies once, writes the log as MCAP, and reads it back as any other log."""
+    advance(f"fly {path.stem}", 0.0)
+    flight = fly(vehicle, seconds=seconds, seed=seed, effects=effects)
+    write_recording(path, flight.recording)
+    advance(f"fly {path.stem}", 1.0)
+    return load(path, vehicle)
+
+
+def summary(shown: Shown, page: str) -> dict[str, Any]:
+    """The demonstration as JSON: both results as their commands give them, beside the truth."""
+    return {
+        "schema": "quadid.demo/1",
+        "truth": {"parameters": shown.truth, "hidden_effect": HIDDEN},
+        "identify": shown.identified.result,
+        "diagnose": shown.diagnosed.result,
+        "diagnose_hidden": shown.hidden.result,
+        "logs": [str(log.path) for log in (*shown.identified.logs, *shown.hidden.logs)],
+        "report": page,
+    }
+
+
+def html(shown: Shown, seed: int, command: str) -> str:
+    """The report: identification with the truth beside it, then both diagnoses."""
+    done = shown.identified
+    logs: Sequence[Log] = [*done.logs, *shown.hidden.logs]
+    rows = [*provenance(logs, command), {"name": "seed", "value": str(seed)}]
+    hidden = shown.hidden
+    same = diagnosis_part(
+        shown.diagnosed.result, shown.diagnosed.sets, "same", TRUE_SECTION,
+        "Nothing was hidden in this vehicle, so nothing should be found.",
+    )  # fmt: skip
+    apart = diagnosis_part(
+        hidden.result, hidden.sets[-1:], "hidden", HIDDEN_SECTION,
+        f"This vehicle flew with {effects_words(HIDDEN)}, which the model lacks.", hidden.maps(),
+        None if hidden.forces is None else hidden.forces.section(),
+    )  # fmt: skip
+    page = identify_page(
+        done.result, done.sets, done.fit.noise, [quality(log) for log in logs], rows, shown.truth,
+        more=[findings_section([same, apart])], excitation=told(done.fit, done.logs[:1]),
+    )  # fmt: skip
+    page["title"] = "Demonstration: a simulated Pelican"
+    return render(page)
