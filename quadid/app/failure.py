@@ -5,15 +5,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import asdict
 
-import numpy as np
+from quadid_replay import open_log
 
-from quadid.app.logs import open_recording, parse_part
+from quadid.app.logs import parse_part
 from quadid.app.outcome import LIBRARY, provenance
 from quadid.checks import Inspection, inspect
-from quadid.data.window import CHANNELS, Channel, Recording
+from quadid.data.window import CHANNELS, Recording
 from quadid.errors import QuadidError
 from quadid.report.figures import WHOLE_POINTS, thinned
-from quadid.report.page import axis, render, rows_of, section, short
+from quadid.report.page import axis, figure, render, rows_of, section, trace
 from quadid.report.verdict import Verdict
 from quadid.types import JsonDict
 from quadid.vehicle import Vehicle
@@ -36,7 +36,7 @@ def failure_html(
     missing = []
     for i, text in enumerate(texts):
         try:
-            recording = open_recording(parse_part(text).path, preset)
+            recording = open_log(parse_part(text).path, preset)
         except (QuadidError, OSError) as unreadable:
             rows.append({"name": text, "value": f"cannot be read: {unreadable}"})
             continue
@@ -64,31 +64,18 @@ def failure_html(
 
 def _data(recording: Recording, place: int) -> JsonDict:
     """Every channel as it was read."""
-    figures = [
-        _figure(name, channel, f"raw{place}-{i}")
-        for i, (name, channel) in enumerate(recording.channels.items())
-        if len(channel.t) > 1 and i < MOST_FIGURES
-    ]
+    figures = []
+    for i, (name, channel) in enumerate(recording.channels.items()):
+        if len(channel.t) > 1 and i < MOST_FIGURES:
+            rows = thinned(channel.values, WHOLE_POINTS)
+            t, columns = channel.t[rows] - channel.t[0], channel.values[rows].T
+            data = [trace(f"unit{k}", f"{name} {k + 1}", t, column) for k, column in enumerate(columns)]
+            layout, title = {"xaxis": axis("time [s]")}, name.replace("_", " ")
+            figures.append(figure(f"raw{place}-{i}", title, data, layout, 220, caption=CHANNELS[name][1]))
     intro = f"{recording.format}, {len(recording.channels)} channels."
     if recording.warnings:
         intro += " Notes: " + "; ".join(recording.warnings) + "."
     return section(f"raw{place}", recording.name, intro, figures)
-
-
-def _figure(name: str, channel: Channel, identifier: str) -> JsonDict:
-    values = channel.values.reshape(len(channel.t), -1)
-    rows = thinned(values, WHOLE_POINTS)
-    data = [
-        {
-            "role": f"unit{i}", "name": f"{name} {i + 1}", "type": "scatter", "mode": "lines",
-            "y": short(np.asarray(values[rows, i], dtype=np.float64)),
-        }
-        for i in range(values.shape[1])
-    ]  # fmt: skip
-    t = short(np.asarray(channel.t[rows] - channel.t[0], dtype=np.float64))
-    views = [{"label": "", "x": t, "data": data, "layout": {"xaxis": axis("time [s]")}}]
-    title, caption = name.replace("_", " "), CHANNELS[name][1]
-    return {"id": identifier, "title": title, "caption": caption, "views": views, "height": 220}
 
 
 def _checks(log: str, found: Inspection, place: int) -> JsonDict:

@@ -21,6 +21,7 @@ from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import Any
 
+from quadid_replay import open_log
 from quadid_replay.formats import HEAD_BYTES, recognise
 
 from quadid.app.fleet_page import Fleet, Row, health_trend, summarise
@@ -32,7 +33,6 @@ from quadid.app.logs import (
     load_vehicle,
     make_folder,
     on_grid,
-    open_recording,
     parse_part,
     require_gyro,
 )  # fmt: skip
@@ -152,7 +152,7 @@ def identify_one(job: Job) -> Row:
     row = blank(job)
     try:
         cut, vehicle = parse_part(job.path), Vehicle.from_yaml(job.vehicle, job.unit)
-        recording = open_recording(cut.path, columns=vehicle.columns)
+        recording = open_log(cut.path, columns=vehicle.columns)
         checked = check_conventions(recording, vehicle, cut)
         row |= _seen(cut.of(recording), vehicle, checked.doubts)
         require_gyro(recording)

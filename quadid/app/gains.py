@@ -12,9 +12,10 @@ from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import typer
+from quadid_replay import open_log
 
 from quadid.app.export import UnprovenError
-from quadid.app.logs import as_vehicle, file_name, load_vehicle, open_recording, write_texts
+from quadid.app.logs import as_vehicle, file_name, load_vehicle, write_texts
 from quadid.app.options import VEHICLE, Described, Typed
 from quadid.app.outcome import LIBRARY, Reported, provenance
 from quadid.chi_square import Z95
@@ -448,7 +449,7 @@ def _told(current: str | Path | Mapping[str, float] | None, autopilot: Autopilot
         text = head.decode("utf-8", "replace")
         found = {m[1]: float(m[2]) for m in _LINE.finditer(text)}
     if not wanted & set(found):
-        found = dict(open_recording(path).autopilot)
+        found = dict(open_log(path).autopilot)
     if not wanted & set(found):
         raise LogError(
             f"{path.name}: no rate gains of {autopilot.program}", f"parameters such as {autopilot.names[0][0]}",

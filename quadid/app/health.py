@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import typer
+from quadid_replay import open_log
 
-from quadid.app.logs import Flight, Given, Log, check_conventions, listed, open_recording, parse_part, vehicle_of
+from quadid.app.logs import Flight, Given, Log, check_conventions, listed, parse_part, vehicle_of
 from quadid.app.options import LogNames, OfVehicle, Preset, Typed, Unchecked
 from quadid.app.outcome import LIBRARY, NUMBER_COLUMNS, Reported, number_rows, provenance
 from quadid.data.window import Recording
@@ -180,7 +181,7 @@ def _open(given: Flight, vehicle: Vehicle, preset: str, unchecked: bool, warning
         recording, cut = given.recording, given.cut
     else:
         cut = parse_part(str(given))
-        recording = open_recording(cut.path, preset, vehicle.columns)
+        recording = open_log(cut.path, preset, vehicle.columns)
     doubts = () if unchecked or not cut.checked else check_conventions(recording, vehicle, cut).doubts
     warnings += [f"{recording.name}: {text}" for text in (*recording.warnings, *doubts)]
     return cut.of(recording)
@@ -192,17 +193,12 @@ def _distinct(tested: Sequence[Recording], healthy: Sequence[Recording]) -> None
     for place, part in (("in question", tested), ("in the baseline", healthy)):
         for one in part:
             for before, other in seen:
-                if one.sha256 and one.sha256 == other.sha256 and _overlap(one, other):
+                shared = one.span[0] < other.span[1] and other.span[0] < one.span[1]  # parts of a log may be apart
+                if one.sha256 and one.sha256 == other.sha256 and shared:
                     copy = "is" if one.name == other.name else f"holds the bytes of {other.name}: the flight is"
                     where = f"twice {place}" if place == before else f"{before} and {place}"
                     raise LogError(f"{one.name} {copy} {where}", "each flight once", "leave one of the two out")
             seen.append((place, one))
-
-
-def _overlap(one: Recording, other: Recording) -> bool:
-    """Checks whether two parts of a log share time."""
-    (a, b), (c, d) = one.span, other.span
-    return a < d and c < b
 
 
 # --- Health for people: verdict, tables, and the page with a picture of the airframe

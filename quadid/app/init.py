@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from quadid_replay import open_log
 
-from quadid.app.logs import file_name, open_recording, write_text
+from quadid.app.logs import file_name, write_text
 from quadid.app.options import Preset, Typed
 from quadid.app.outcome import Outcome
 from quadid.errors import ParameterError, VehicleError
@@ -111,7 +112,7 @@ def init(
     else:
         from quadid_replay.vehicle_from_log import vehicle_text
 
-        recording = open_recording(Path(log), preset)
+        recording = open_log(Path(log), preset)
         text = vehicle_text(recording, name, mass, arm)
     blanks = [line.split(":")[0].strip(" -#") for line in text.splitlines() if "FILL IN" in line]
     source = None if log is None else str(Path(log).absolute())

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from quadid_replay import open_log
 
 from quadid.app.logs import (
     GRID,
@@ -19,7 +20,6 @@ from quadid.app.logs import (
     gridded,
     left_on_ground,
     names_of,
-    open_recording,
     parse_part,
     write_text,
 )
@@ -140,7 +140,7 @@ def inspect(
     described = None if vehicle is None else as_vehicle(vehicle)
     if whole is None:
         named = {} if described is None else described.columns
-        whole = open_recording(cut.path, preset, {**named, **(columns or {})})
+        whole = open_log(cut.path, preset, {**named, **(columns or {})})
     found = replace(inspect_recording(cut.of(whole), described), zero=whole.first_imu_time)
     flown = flown_parts(whole, found.flying, cut)
     if described is not None and found.usable:  # after an error nothing later is asked: it would be as wrong

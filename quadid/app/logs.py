@@ -347,7 +347,7 @@ def load(
     start_reading()
     described = as_vehicle(vehicle)
     cut = replace(parse_part(str(log), start, stop), checked=not unchecked)
-    recording = open_recording(cut.path, preset, {**described.columns, **(columns or {})})
+    recording = open_log(cut.path, preset, {**described.columns, **(columns or {})})
     require_gyro(recording)
     return _read(cut.path.resolve(), recording, described, rate, cut)
 
@@ -360,11 +360,6 @@ def require_gyro(recording: Recording) -> None:
             f"{recording.name}: no gyro in the data{unused}", "p q r [rad/s]",
             "log the IMU at 50 Hz or faster, or name the columns of a CSV: --columns gyro_x=p,gyro_y=q,gyro_z=r",
         )  # fmt: skip
-
-
-def open_recording(path: Path, preset: str = "auto", columns: Mapping[str, str] | None = None) -> Recording:
-    """Reads a log of any kind."""
-    return open_log(path, preset, columns)
 
 
 def write_recording(path: str | Path, recording: Recording) -> Path:

@@ -169,15 +169,10 @@ def number_rows(found: Sequence[Json]) -> Iterator[tuple[Json, tuple[Any, ...]]]
 def json_text(result: Any) -> str:
     """A result as JSON for people and programs; numbers that JSON has no word for become null."""
     text = json.dumps(jsonable(result), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
-    return text if text.isascii() else _UNSHOWN.sub(_escaped, text)
-
-
-_UNSHOWN = re.compile(r"[^\x20-\x7e\n]")
-
-
-def _escaped(found: re.Match[str]) -> str:
-    """A character that prints, or JSON's escape of it: a terminal acts on some, and no file holds a surrogate."""
-    return found[0] if found[0].isprintable() else json.dumps(found[0])[1:-1]
+    if text.isascii():
+        return text
+    # JSON's escape of what does not print: a terminal acts on some characters, and no file holds a surrogate.
+    return re.sub(r"[^\x20-\x7e\n]", lambda m: m[0] if m[0].isprintable() else json.dumps(m[0])[1:-1], text)
 
 
 def data_frame(records: list[dict[str, Any]], columns: Sequence[str] = ()) -> pd.DataFrame:

@@ -150,7 +150,9 @@ def _thrust(channel: Channel, vehicle: Vehicle | None, felt: FloatArray | None) 
     if channel.name == "motor_command" and np.median(np.abs(values)) > 100.0:
         low, high = vehicle.command.range if vehicle is not None else (1000.0, 2000.0)
         values = np.clip((values - low) / (high - low), 0.0, None)
-    values = _beside_others(values)
+    # A rotor that is ignored, for it is dead or its signal is, has the others' median; no ground carries.
+    usual = np.median(values, axis=1, keepdims=True)
+    values = np.where(values < _NOTHING * usual, usual, values)
     thrust = np.asarray(np.sum(values**2, axis=1))
     # Commands that never exceed 15 % of full are idling motors.
     if channel.name == "motor_command" and np.quantile(thrust, 0.95) < 0.15**2 * values.shape[1]:
@@ -166,12 +168,6 @@ def _thrust(channel: Channel, vehicle: Vehicle | None, felt: FloatArray | None) 
         return thrust, float(np.median(thrust[strong] / felt[strong]))
     powered = thrust[thrust > 0.25 * np.quantile(thrust, 0.95)]
     return thrust, float(np.median(powered)) if len(powered) else 0.0
-
-
-def _beside_others(speeds: FloatArray) -> FloatArray:
-    """Speeds with the others' median for a rotor that is ignored: it is dead, or its signal is; no ground carries."""
-    usual = np.median(speeds, axis=1, keepdims=True)
-    return np.asarray(np.where(speeds < _NOTHING * usual, usual, speeds))
 
 
 def _load(accel: Channel) -> FloatArray | None:
@@ -524,7 +520,10 @@ def attitude_check(recording: Recording) -> Check:
             estimates_off(mass=up / GRAVITY) if up > 0.0 else {},
         )  # fmt: skip
     if down < 0.5 * GRAVITY:
-        aside = np.mean((accel.values - _of_gravity(accel, attitude))[tame], axis=0)[:2]
+        q = linear(attitude.t, attitude.values, accel.t)
+        upwards = np.broadcast_to([0.0, 0.0, -GRAVITY], accel.values.shape)  # makes up for gravity alone
+        felt = rotated(conjugate(q / np.linalg.norm(q, axis=1, keepdims=True)), upwards)
+        aside = np.mean((accel.values - felt)[tame], axis=0)[:2]
         size = float(np.linalg.norm(aside))
         if rates.verdict is CheckResult.WARNING or size < most:
             return rates
@@ -918,13 +917,6 @@ def _in_world(accel: Channel, attitude: Channel) -> FloatArray:
     """Specific force in the attitude's world [m/s^2], shape (n, 3), at the accelerometer's times."""
     q = linear(attitude.t, attitude.values, accel.t)
     return rotated(q / np.linalg.norm(q, axis=1, keepdims=True), accel.values)
-
-
-def _of_gravity(accel: Channel, attitude: Channel) -> FloatArray:
-    """Specific force in body axes that only makes up for gravity [m/s^2], shape (n, 3), at the same times."""
-    q = linear(attitude.t, attitude.values, accel.t)
-    upwards = np.broadcast_to([0.0, 0.0, -GRAVITY], accel.values.shape)
-    return rotated(conjugate(q / np.linalg.norm(q, axis=1, keepdims=True)), upwards)
 
 
 def usable_steps(t: FloatArray, other: FloatArray) -> BoolArray:

@@ -61,7 +61,9 @@ def rotor_timing_check(recording: Recording, vehicle: Vehicle, spans: Spans) -> 
     width = max(3, round(2.5 * slowest / _STEP) | 1)
     blocks, about = list[list[_Peak]](), 0.0
     for times in _blocks(spans):
-        near = _peaks(signal._replace(t=signal.t + about), gyro, vehicle, times, width)
+        answered = _answered(signal._replace(t=signal.t + about), gyro, vehicle, times)
+        torque, motion = (_quick(rows, width) for rows in answered)
+        near = [_peak(torque[:, axis], motion[:, axis]) for axis in range(2)]
         blocks.append([peak._replace(lag=peak.lag + about) for peak in near])
         clearest = max(near, key=lambda peak: peak.correlation)
         if clearest.correlation > 0.5 and abs(clearest.lag) > 0.1:  # a clock that drifts leaves what is searched
@@ -114,12 +116,6 @@ def _blocks(spans: Spans) -> list[FloatArray]:
         bounds = np.linspace(a, b, parts + 1)
         out += [np.arange(c, d, _STEP) for c, d in zip(bounds[:-1], bounds[1:], strict=True)]
     return [times for times in out if len(times) > 8 * _FARTHEST]
-
-
-def _peaks(signal: RotorSignal, gyro: Channel, vehicle: Vehicle, at: FloatArray, width: int) -> list[_Peak]:
-    """Peaks of one block at times `at`, with both signals smoothed over `width` of its rows."""
-    torque, motion = (_quick(rows, width) for rows in _answered(signal, gyro, vehicle, at))
-    return [_peak(torque[:, axis], motion[:, axis]) for axis in range(2)]
 
 
 def _answered(signal: RotorSignal, gyro: Channel, vehicle: Vehicle, at: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -609,7 +605,7 @@ def motor_order_check(lagged: Lagged | str, vehicle: Vehicle, other: Other | Non
         return Check("motor_order", CheckResult.UNKNOWN, lagged)
     if _still(lagged):
         return Check("motor_order", CheckResult.UNKNOWN, "too little rotation to check the motor order")
-    own = _described(lagged, vehicle)
+    own = _best([_Gram.of(rows) for rows in lagged.fast], vehicle, [tuple(range(len(vehicle.rotors)))], 1.0)[0][1]
     numbers = {f"correlation_{axis}": float(c) for axis, c in zip(("roll", "pitch", "yaw"), own, strict=True)}
     numbers |= {} if other is None else {"turned_rad": other.turned}
     check = partial(Check, "motor_order", numbers=numbers)
@@ -762,12 +758,6 @@ class _Gram(NamedTuple):
         """Products of one lag's rows."""
         thrust, motion, _ = rows
         return cls(thrust.T @ thrust, thrust.T @ motion, np.sum(motion**2, axis=0))
-
-
-def _described(lagged: Lagged, vehicle: Vehicle) -> FloatArray:
-    """Correlation of the vehicle as it is described, in roll, pitch and yaw, at its best lag, shape (3,)."""
-    grams = [_Gram.of(rows) for rows in lagged.fast]
-    return _best(grams, vehicle, [tuple(range(len(vehicle.rotors)))], 1.0)[0][1]
 
 
 def _best(

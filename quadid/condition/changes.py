@@ -490,7 +490,8 @@ def _changes(found: Sequence[Explained], vehicle: Vehicle, changed: bool, steady
     """
     shares = np.exp([one.log_evidence - found[0].log_evidence for one in found])
     shares /= shares.sum()
-    best, lost = found[0], _rivals(found, shares)
+    others = zip(found[1 : _RIVALS + 1], shares[1 : _RIVALS + 1], strict=True)
+    best, lost = found[0], tuple(Rival(*_names(one), one.p_value, float(share)) for one, share in others)
 
     def held(*rotors: int) -> float:
         """Probability of the explanations that hold one of these rotors."""
@@ -513,12 +514,6 @@ def _coaxial(vehicle: Vehicle, rotor: int) -> int | None:
     away = np.linalg.norm(vehicle.rotor_positions[:, :2] - vehicle.rotor_positions[rotor, :2], axis=1)
     near = [k for k in np.flatnonzero(away < 0.1 * vehicle.arm).tolist() if k != rotor]
     return int(near[0]) if near else None
-
-
-def _rivals(found: Sequence[Explained], shares: FloatArray) -> tuple[Rival, ...]:
-    """Explanations other than the first, the most probable ones."""
-    others = zip(found[1 : _RIVALS + 1], shares[1 : _RIVALS + 1], strict=True)
-    return tuple(Rival(*_names(one), one.p_value, float(share)) for one, share in others)
 
 
 def _names(one: Explained) -> tuple[tuple[str, ...], tuple[int, ...]]:

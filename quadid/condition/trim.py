@@ -11,7 +11,7 @@ import numpy as np
 from quadid.checks.motion import flying_spans
 from quadid.data.grid import linear, moving_mean
 from quadid.data.rotor_signal import rotor_signal
-from quadid.data.window import Channel, Recording, sample_period
+from quadid.data.window import Recording, sample_period
 from quadid.errors import NotIdentifiableError
 from quadid.jsonable import jsonable
 from quadid.types import BoolArray, FloatArray, IndexArray
@@ -171,7 +171,8 @@ def _velocity(recording: Recording, edges: FloatArray) -> FloatArray | None:
     if velocity is not None and len(velocity.t) > 1:
         means, _ = _block_means(velocity.t, velocity.values, edges)
     elif position is not None and len(position.t) > 1:
-        means = _gained(position, edges) / BLOCK
+        begin, end = (linear(position.t, position.values, edges + late) for late in (0.0, BLOCK))
+        means = (end - begin) / BLOCK
     else:
         return None
     attitude = recording.channels.get("attitude")
@@ -181,11 +182,6 @@ def _velocity(recording: Recording, edges: FloatArray) -> FloatArray | None:
         c, s = np.cos(heading), np.sin(heading)
         means = np.column_stack([c * means[:, 0] + s * means[:, 1], c * means[:, 1] - s * means[:, 0], means[:, 2]])
     return means
-
-
-def _gained(channel: Channel, edges: FloatArray) -> FloatArray:
-    """By how much a channel grows over each block, shape (blocks, columns)."""
-    return linear(channel.t, channel.values, edges + BLOCK) - linear(channel.t, channel.values, edges)
 
 
 def _at_rest(trims: FloatArray, motion: FloatArray) -> tuple[FloatArray, FloatArray]:

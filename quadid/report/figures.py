@@ -226,15 +226,10 @@ def error_figure(scored: ScoredSet, identifier: str, labels: tuple[str, str] = P
     ):
         t, ratio = error_over_time(score, scored.fitted)
         data.append(trace(role, name, t - zero, ratio))
-    ends = series_ends(scored) - zero
+    ends = scored.fitted.series.t[[0, -1]] - zero
     data.append(trace("floor", "sensor noise alone", ends, np.ones(2)))
     layout = {"xaxis": axis("time [s]"), "yaxis": axis("squared error / noise", type="log", dtick=1)}
     return figure(identifier, "Error over the flight", data, layout, 240)
-
-
-def series_ends(scored: ScoredSet) -> FloatArray:
-    """First and last scored time [s], shape (2,)."""
-    return scored.fitted.series.t[[0, -1]]
 
 
 def error_over_time(score: SetScore, fitted: SetScore) -> tuple[FloatArray, FloatArray]:

@@ -248,6 +248,8 @@ def identify_page(
         excitation: of `excitation_part`.
     """
     stuck, parameters = at_bounds(result), result["parameters"]
+    fitted, held = ([s["role"] for s in result["sets"]].count(role) for role in ("train", "validate"))
+    search = f"search {result['optimizer']}, {result['seconds']:.1f} s"
     fit = section(
         "fit", "How well the simulation predicts", _PREDICTION, (), [fit_table(result["sets"])],
         parts=set_parts(result["sets"], sets), menu="Prediction",
@@ -255,19 +257,12 @@ def identify_page(
     shown = parameter_section(parameters, truth, stuck, [parameter_figure(parameters, truth)])
     return {
         "title": f"Identification of {result['vehicle']}",
-        "subtitle": _subtitle(result),
+        "subtitle": f"{fitted} log{'s' * (fitted != 1)} fitted, {held or 'none'} held out for validation; {search}",
         "verdict": asdict(identify_verdict(result)),
         "sections": [s for s in (missing, shown, *more, fit, excitation, quality_section(quality, noise)) if s],
         "warnings": result["warnings"],
         "provenance": provenance,
     }
-
-
-def _subtitle(result: Json) -> str:
-    roles = [s["role"] for s in result["sets"]]
-    fitted, held = roles.count("train"), roles.count("validate")
-    text = f"{fitted} log{'s' * (fitted != 1)} fitted, {held or 'none'} held out for validation"
-    return f"{text}; search {result['optimizer']}, {result['seconds']:.1f} s"
 
 
 _APPLIED = "Nothing has been applied to any vehicle. The interval is where the value lies in 95 of 100 such flights."

@@ -42,10 +42,14 @@ def render(page: Json) -> str:
         table = rows_of((), [(row["name"], row["value"]) for row in rows], "", "cards narrow", ("", "wrap"))
         sections.append(section("provenance", "Where this comes from", tables=[table], menu="Provenance"))
     figures = {one["id"]: one for part in sections for one in figures_of(part)}
-    scripts = {
-        name: closed(text) for name, text in (("plotly", _plotly() if figures else ""), ("page", _asset("page.js")))
-    }
-    policy = " ".join(f"'sha256-{_digest(text)}'" for text in scripts.values())
+    plotly = ""
+    if figures:  # the bundle that comes with plotly: 4.8 MB a page, for a drawing library that the page need not load
+        from plotly.offline import get_plotlyjs
+
+        plotly = get_plotlyjs()
+    scripts = {"plotly": closed(plotly), "page": closed(_asset("page.js"))}
+    digests = [hashlib.sha256(text.encode()).digest() for text in scripts.values()]
+    policy = " ".join(f"'sha256-{base64.b64encode(digest).decode()}'" for digest in digests)
     return language.get_template("page.html.j2").render(
         page={"subtitle": "", "verdict": None, **page, "sections": sections},
         figures=packed(figures),
@@ -126,17 +130,6 @@ _RAISED = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
 def closed(script: str) -> str:
     """A script that cannot end its element early; in a string or comment the escaped form means the same."""
     return script.replace("</script", "<\\/script")
-
-
-def _digest(text: str) -> str:
-    return base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
-
-
-def _plotly() -> str:
-    """The bundle that comes with plotly: 4.8 MB a page, for a drawing library that the page need not load."""
-    from plotly.offline import get_plotlyjs
-
-    return str(get_plotlyjs())
 
 
 @lru_cache(maxsize=4)

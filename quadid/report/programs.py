@@ -263,11 +263,6 @@ _AGILICIOUS = {"fr": (1, -1, 1), "bl": (-1, 1, 1), "br": (-1, -1, -1), "fl": (1,
 """Rotors of Agilicious in its order: signs of x forward and y left, and the spin, in ours, that it allocates for."""
 
 
-def own_file(facts: Facts) -> dict[str, Any]:
-    """The vehicle file as it is written anywhere."""
-    return {"file": Markup(facts.vehicle.to_yaml())}
-
-
 def px4(facts: Facts) -> dict[str, Any]:
     """Rows of parameters that stand for the whole vehicle.
 
@@ -514,7 +509,7 @@ _BODY = ("cg_offset", "product_of_inertia")
 _LAGS = ("motor_lag", "motor_lag.tau_down")
 
 FORMS: dict[str, Form] = {
-    "yaml": Form("quadid", ALL, {".yaml": "quadid.yaml"}, own_file),
+    "yaml": Form("quadid", ALL, {".yaml": "quadid.yaml"}, lambda facts: {"file": Markup(facts.vehicle.to_yaml())}),
     "px4": Form(
         "PX4, SIH, EKF2",
         (*_BODY, "weak_rotor", "rotor_drag", "parasitic_drag", "rate_damping", "motor_lag"),

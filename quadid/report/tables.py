@@ -52,7 +52,9 @@ class TextTable:
 
     def lines(self, width: int) -> list[tuple[Cell, ...]]:
         """Lines of pieces with their tones, for a terminal of `width` columns."""
-        out: list[tuple[Cell, ...]] = [(Cell(line, "title"),) for line in _folded(self.title, width)]
+        out: list[tuple[Cell, ...]] = [
+            (Cell(line, "title"),) for line in textwrap.wrap(self.title, max(width, 20)) or [""]
+        ]
         for n, kept in enumerate(self._blocks(width)):
             out += [(Cell(""),)] * (n > 0)
             widths = [self._width(i) for i in kept]
@@ -114,10 +116,6 @@ def _cell(value: str | Cell) -> Cell:
 
 def _put(text: str, width: int, right: bool) -> str:
     return text.rjust(width) if right else text.ljust(width)
-
-
-def _folded(text: str, width: int) -> Sequence[str]:
-    return textwrap.wrap(text, max(width, 20)) or [""]
 
 
 # --- Results as tables for people: the same on a terminal, in a notebook and in a text

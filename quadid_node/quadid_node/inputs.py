@@ -239,17 +239,6 @@ _TYPES = {
     },
 }
 _PREFIX = {"mavros": "mavros/"}
-_VERSIONED = {
-    f"fmu/out/{name}"
-    for name in (
-        "vehicle_attitude",
-        "vehicle_attitude_setpoint",
-        "vehicle_local_position",
-        "battery_status",
-        "vehicle_status",
-    )
-}
-"""Topics to which newer PX4 appends the version of their messages: `_v1` is listened to as well."""
 _HINTS = {
     "canonical": "publish rotor_speeds (sensor_msgs/JointState, rad/s) or motor_command (quadid_msgs/MotorCommand)",
     "mavros": "mavros/rc/out carries the motor outputs: ask the autopilot for SERVO_OUTPUT_RAW at 80 Hz "
@@ -272,7 +261,7 @@ def source(name: str) -> InputPreset:
     inputs = []
     for topic, kind in _TYPES[name].items():
         ranks = [(channel, names.index(topic)) for channel, names in PRESETS[name].items() if topic in names]
-        for version in ("", "_v1") if topic in _VERSIONED else ("",):
+        for version in ("", "_v1") if name == "px4" else ("",):  # newer PX4 appends the version of its messages
             inputs.append(Input(_PREFIX.get(name, "") + topic + version, kind, tuple(ranks)))
     return InputPreset(tuple(inputs), _HINTS[name])
 

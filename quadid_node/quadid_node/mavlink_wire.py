@@ -367,6 +367,7 @@ class Wire:
         drained: whether nothing of the vehicle was left unread when messages were looked for last.
         listened: for how long somebody has listened to everything that came [s].
         held_back: when a message was last not sent because too much is asked for [s].
+        memory: of time stamps of signatures over a restart; None without a key, or a file for them.
     """
 
     def __init__(
@@ -398,12 +399,12 @@ class Wire:
         if self._serves:
             self._conn.port.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVED)
         self.mav = SafeMavlink(None, srcSystem=system, srcComponent=component)
-        self._memory: SigningMemory | None = None
+        self.memory: SigningMemory | None = None
         if key is not None:
             self.mav.signing.secret_key = key
             self.mav.signing.sign_outgoing = True
             self.mav.signing.timestamp = int((time.time() - SIGNING_EPOCH) * UNITS)
-            self._memory = SigningMemory(memory, self.mav.signing) if memory is not None else None
+            self.memory = SigningMemory(memory, self.mav.signing) if memory is not None else None
         self._buffer = bytearray()
         self._own: socket.socket | None = None
         self._own_address: Any = None
@@ -415,11 +416,6 @@ class Wire:
         self.peers = Peers()
         self.signed = False
         self.drained = True
-
-    @property
-    def memory_problem(self) -> str:
-        """Why time stamps of signatures are not kept over a restart, or empty."""
-        return self._memory.problem if self._memory is not None else ""
 
     def receive(
         self, wanted: Container[int], admits: Callable[[bytes], bool], now: float,
@@ -461,8 +457,8 @@ class Wire:
             if port is ports[0]:
                 self.drained = drained
                 self.listened += min(pause, STALL) * drained
-        if self._memory is not None:
-            self._memory.keep()
+        if self.memory is not None:
+            self.memory.keep()
 
     def follow(self, address: Any) -> None:
         """Gives what comes from one address a buffer of its own, so that the others' floods leave it alone.
@@ -513,8 +509,8 @@ class Wire:
 
     def close(self) -> None:
         """Closes the link."""
-        if self._memory is not None:
-            self._memory.keep(at_once=True)
+        if self.memory is not None:
+            self.memory.keep(at_once=True)
         if self._own is not None:
             self._own.close()
         self._conn.close()

@@ -234,11 +234,6 @@ def fit_status(status: SessionStatus, vehicle: str, seconds: float = math.nan) -
     }
 
 
-def idle_status(vehicle: str, reason: str) -> Message:
-    """quadid_msgs/FitStatus of a node that is not active, or was not configured."""
-    return {"vehicle_id": vehicle, "reason": reason, "cost": math.nan, "seconds": math.nan}
-
-
 def diagnostics(
     health: ServiceHealth | None, name: str, hardware: str, now: Message, notes: dict[str, str], hints: dict[str, str],
     idle: str = "", problem: str = "",

@@ -116,17 +116,6 @@ class PollingNode(Node):
         """
         return time.monotonic() - self._broken_at.get(topic, -math.inf)
 
-    def publisher_counts(self) -> dict[str, int]:
-        """Publishers that send to each polled topic now; one is counted before its first message can be taken."""
-        return {s.topic_name: s.get_publisher_count() for s in self._polled}
-
-    def destroy_polled(self) -> None:
-        """Ends all polled subscriptions."""
-        for subscription in self._polled:
-            self.destroy_subscription(subscription)
-        self._polled.clear()
-        self._broken_at.clear()
-
 
 class IdentifyNode(PollingNode, LifecycleNode):
     """Identifies one vehicle from its topics and publishes the parameter sets that passed the gate."""
@@ -319,7 +308,9 @@ class IdentifyNode(PollingNode, LifecycleNode):
         self._break_bond()
         self._scheduler.drop()
         self._intake.clear()
-        self.destroy_polled()
+        while self._polled:
+            self.destroy_subscription(self._polled.pop())
+        self._broken_at.clear()
         while self._offered:
             self.destroy_service(self._offered.pop())
         self._outputs.close()
@@ -347,8 +338,8 @@ class IdentifyNode(PollingNode, LifecycleNode):
         # What has arrived since the last round, topic by topic; while two publish an input it is forgotten.
         waiting = self._intake.take()
         if graph is not None:
-            for topic, publishers in self.publisher_counts().items():
-                graph.count(topic, publishers)
+            for polled in self._polled:  # a publisher is counted before its first message can be taken
+                graph.count(polled.topic_name, polled.get_publisher_count())
         yield
         if service is not None and graph is not None and self._active and not graph.paused:
             for items in self._intake.read(waiting, recorder.take if recorder is not None else None):
@@ -418,7 +409,8 @@ class IdentifyNode(PollingNode, LifecycleNode):
         name, idle = self.get_fully_qualified_name(), ""
         if not self._active:
             idle = f"{self._state}: {IDLE.get(self._state, 'changes its state').format(name=name)}"
-        status, health, notes = messages.idle_status(self._id, idle), None, dict[str, str]()
+        status: messages.Message = {"vehicle_id": self._id, "reason": idle, "cost": math.nan, "seconds": math.nan}
+        health, notes = None, dict[str, str]()
         if self._service is not None and self._graph is not None:
             self._graph.look(self._outputs.deaf())
             self._claim_topic()

@@ -52,12 +52,12 @@ def hostile_page(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def demo_page(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The report that `quadid demo --quick` writes."""
-    from quadid.app import demo
     from quadid.app.logs import write_text
+    from quadid.cli import demo
 
     folder = tmp_path_factory.mktemp("demo")
     shown = demo.run(demo.QUICK_SECONDS, 1, folder, lambda stage, share: None)
-    return write_text(folder / "report.html", demo.html(shown, 1))
+    return write_text(folder / "report.html", demo.html(shown, 1, "quadid demo"))
 
 
 @pytest.fixture(scope="session")

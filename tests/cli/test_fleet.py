@@ -20,7 +20,8 @@ import pytest
 from quadid_replay import write_csv, write_mcap
 
 from quadid.app import fleet as fleet_cluster
-from quadid.app.fleet import ClusterError, Job, Row, cluster, find_jobs, identify_one, open_store, results
+from quadid.app.fleet import ClusterError, Job, cluster, find_jobs, identify_one, open_store, results
+from quadid.app.fleet_page import Row
 from quadid.errors import LogError, VehicleError
 from quadid.flight import fly
 from quadid.vehicle import Vehicle

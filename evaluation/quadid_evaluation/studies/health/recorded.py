@@ -14,11 +14,11 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
+from quadid_replay import open_log
 from scipy.stats import spearmanr
 
 import quadid
 from quadid.app.health import has_changed
-from quadid.app.logs import open_recording
 from quadid.condition import FlightTrim, Health, assess, flight_trim
 from quadid.data.window import Recording
 from quadid.errors import QuadidError
@@ -85,7 +85,7 @@ def read(folder: Path) -> list[Flown]:
     out = []
     with (folder / "labels.csv").open(encoding="utf-8") as table:
         for row in csv.DictReader(table):
-            recording = open_recording(folder / row["file"])
+            recording = open_log(folder / row["file"])
             if recording.sha256 in seen:
                 print(f"{row['file']}: the bytes of another file, left out")
                 continue
