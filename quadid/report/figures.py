@@ -16,7 +16,7 @@ from quadid.estimate.missing import Missing
 from quadid.identification.result import ScoredSet
 from quadid.identification.score import SCORE_SECONDS, SetScore
 from quadid.model.rollout import CHANNEL_NAMES, CHANNEL_UNITS
-from quadid.report.page import axis, band, figure, short, stacked, trace, upright
+from quadid.report.page import axis, band, figure, listed, stacked, trace, upright
 from quadid.types import FloatArray, IndexArray, JsonDict
 
 # --- Figures of results: channels over time, errors, parameters, gains; see `quadid.report.page` for their form
@@ -109,9 +109,8 @@ def _stack(
         for role, label, y in lines:
             # A poor first guess may run far away; what leaves the picture need not be kept.
             inside = np.clip(y, low - 3.0 * (high - low), high + 3.0 * (high - low))
-            line = trace(role, label, None, inside, legendgroup=role, showlegend=i == 0, **where)
-            data.append({**line, "y": short(inside, (high - low) / 2000.0)})
-    return {"x": short(t), "data": data, "layout": layout}
+            data.append(trace(role, label, None, inside, legendgroup=role, showlegend=i == 0, **where))
+    return {"x": listed(t), "data": data, "layout": layout}
 
 
 def _spectra(scored: ScoredSet, channels: Sequence[int], labels: tuple[str, str]) -> JsonDict:
@@ -258,16 +257,16 @@ def parameter_figure(parameters: Sequence[Mapping[str, Any]], truth: Mapping[str
     interval = (
         np.array([[np.nan if v is None else v for v in p["ci95"]] for p in shown]).reshape(-1, 2) / scale[:, None]
     )
-    upper, lower = short(interval[:, 1] - value, 1e-5), short(value - interval[:, 0], 1e-5)
+    upper, lower = listed(interval[:, 1] - value), listed(value - interval[:, 0])
     bars = {"type": "data", "symmetric": False, "array": upper, "arrayminus": lower}
     common = {"y": names, "mode": "markers", "type": "scatter"}
     data: list[JsonDict] = [
         {"role": "before", "name": "current", "x": [1.0] * len(names), **common},
-        {"role": "after", "name": "proposed, 95 % interval", "x": short(value), "error_x": bars, **common},
+        {"role": "after", "name": "proposed, 95 % interval", "x": listed(value), "error_x": bars, **common},
     ]
     if truth:
         known = np.array([truth.get(n, np.nan) for n in names]) / scale
-        data.append({"role": "truth", "name": "truth", "x": short(known), **common})
+        data.append({"role": "truth", "name": "truth", "x": listed(known), **common})
     layout = {"xaxis": axis("value / current value"), "yaxis": {"type": "category"}}
     return figure("parameters", "Proposed against current", data, layout, 120 + 38 * len(names))
 

@@ -10,21 +10,6 @@
     return colours.get(name);
   }
 
-  // Long rows of numbers travel as 16 bit integers; see packed() in page.py.
-  function unpacked(value) {
-    if (Array.isArray(value)) return value.map(unpacked);
-    if (value === null || typeof value !== "object") return value;
-    if (typeof value.i2 === "string") {
-      const raw = atob(value.i2), out = new Array(raw.length / 2);
-      for (let i = 0; i < out.length; i++) {
-        const n = (raw.charCodeAt(2 * i) | raw.charCodeAt(2 * i + 1) << 8) << 16 >> 16; // with its sign
-        out[i] = n === -32768 ? null : value.low + value.step * (n + 32767);
-      }
-      return out;
-    }
-    return Object.fromEntries(Object.entries(value).map(([key, inner]) => [key, unpacked(inner)]));
-  }
-
   // Vehicles of a fleet, columns of a raw channel: colours that colour-blind eyes tell apart (Okabe and Ito), of middling lightness.
   const units = ["#0b78c4", "#d55e00", "#00916b", "#b8629a", "#8a7a00", "#3f9fd8", "#a05a2c", "#6a6fd0", "#5c8a2e", "#c0392b", "#00838f", "#7f7f7f"];
 
@@ -78,7 +63,7 @@
 
   function draw(box) {
     const figure = figures[box.dataset.figure], number = chosen.get(figure.id) || 0;
-    const view = figure.views[number] = unpacked(figure.views[number]);
+    const view = figure.views[number];
     box.dataset.drawn = "yes";
     const size = { width: box.clientWidth, height: box.clientHeight };
     return Plotly.react(box, view.data.map((trace) => painted(trace, view)), { ...layoutOf(view), ...size }, { responsive: true, displaylogo: false, displayModeBar: false });
