@@ -291,7 +291,7 @@ def test_signals_end_it_cleanly_within_two_seconds(tmp_path: Path, number: int, 
 def worker_of(pid: int) -> int:
     """Process id of the fit process of a node."""
     children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
-    return next(int(c) for c in children if b"quadid_node.worker" in Path(f"/proc/{c}/cmdline").read_bytes())
+    return next(int(c) for c in children if b"node.worker" in Path(f"/proc/{c}/cmdline").read_bytes())
 
 
 def restarts(health: list[Any]) -> int:

@@ -285,7 +285,7 @@ def _watch(
         except subprocess.TimeoutExpired:
             pass
         children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
-        workers = (int(c) for c in children if b"quadid_node.worker" in Path(f"/proc/{c}/cmdline").read_bytes())
+        workers = (int(c) for c in children if b"node.worker" in Path(f"/proc/{c}/cmdline").read_bytes())
         worker = next(workers, 0)
         points.append({
             "hours": (time.monotonic() - begin) / 3600.0, "memory_mib": resident(pid),

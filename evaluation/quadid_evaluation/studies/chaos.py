@@ -103,9 +103,7 @@ class Running:
         pid = self.child.pid
         try:
             children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
-            return next(
-                (int(c) for c in children if b"quadid_node.worker" in Path(f"/proc/{c}/cmdline").read_bytes()), 0
-            )
+            return next((int(c) for c in children if b"node.worker" in Path(f"/proc/{c}/cmdline").read_bytes()), 0)
         except OSError:
             return 0
 
