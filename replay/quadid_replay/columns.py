@@ -1,9 +1,8 @@
-"""Columns and clocks that a reader keeps of an untrusted log while it streams through it."""
+"""Channels and clocks of untrusted logs: what every reader does with the columns that it found."""
 
 from __future__ import annotations
 
 import math
-from array import array
 from bisect import bisect_left
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import NamedTuple
@@ -161,7 +160,7 @@ class LogClock:
         return out
 
 
-# --- Growing columns: what a reader keeps of a log while it streams through it; and the recording made of them
+# --- The recording made of what a reader found
 
 
 _AROUND = 5
@@ -237,32 +236,6 @@ def channels_of(
                 entry = RawChannel(source.channel, told[0], source.convert(told[1]), name)
             found.setdefault(source.channel, []).append(entry)
     return [entry for entries in found.values() for entry in fastest_first(entries, advantage)]
-
-
-class Columns:
-    """Times and values of one signal, appended as packed doubles.
-
-    Args:
-        width: number of values a sample.
-    """
-
-    def __init__(self, width: int) -> None:
-        self.width = width
-        self._t = array("d")
-        self._values = array("d")
-
-    def add(self, t: FloatArray, values: FloatArray) -> None:
-        """Appends samples: times (n,), NaN where refused, and values (n, width)."""
-        if values.shape != (len(t), self.width):
-            raise ValueError(f"values of shape {values.shape} for {len(t)} times and {self.width} columns")
-        self._t.frombytes(t.tobytes())
-        self._values.frombytes(values.tobytes())
-
-    def arrays(self) -> tuple[FloatArray, FloatArray]:
-        """Returns times (n,) and values (n, width), as added."""
-        t = np.frombuffer(self._t, dtype=np.float64) if self._t else np.empty(0)
-        values = np.frombuffer(self._values, dtype=np.float64) if self._values else np.empty(0)
-        return t, values.reshape(-1, self.width)
 
 
 def spikes(values: FloatArray, rotor: bool = False) -> BoolArray:

@@ -12,7 +12,7 @@ import numpy as np
 from mcap.exceptions import McapError
 
 from quadid.types import BoolArray, FloatArray, IndexArray, IntArray
-from quadid_replay.columns import Columns, LogClock
+from quadid_replay.columns import LogClock
 from quadid_replay.frames import cross, flip_attitude, flip_body, flip_world, from_euler, to_euler
 from quadid_replay.mcap_file import Message, Topic
 from quadid_replay.motors import RPM, motor_columns
@@ -422,9 +422,10 @@ class TopicSource(NamedTuple):
 
 
 class Decoded(NamedTuple):
-    """Columns by topic and signal, the clock, and how many messages could not be decoded."""
+    """Times (n,), NaN where refused, and values (n, size) by topic and signal, the clock, and how many messages could
+    not be decoded."""
 
-    columns: dict[tuple[int, str], Columns]
+    columns: dict[tuple[int, str], tuple[FloatArray, FloatArray]]
     stamps: Stamps
     failed: int
 
@@ -445,7 +446,7 @@ def decode_messages(messages: Iterable[Message], sources: Mapping[int, TopicSour
         messages: of the topics in `sources`, in file order.
         sources: what reads them, by channel id.
     """
-    columns: dict[tuple[int, str], Columns] = {}
+    parts_of: dict[tuple[int, str], list[tuple[FloatArray, FloatArray]]] = {}
     stamps, failed = Stamps(), 0
     for batch in _batches(messages):
         numbers = np.array([number for number, _, _ in batch])
@@ -466,10 +467,15 @@ def decode_messages(messages: Iterable[Message], sources: Mapping[int, TopicSour
         failed += len(batch) - int(np.count_nonzero(decoded))
         for part in sorted((p for p in parts if len(p.rows)), key=lambda p: (p.rows[0], p.order)):
             width = part.values.shape[1]
-            if width == 0 or (kept := columns.setdefault(part.key, Columns(width))).width != width:
+            kept = parts_of.setdefault(part.key, []) if width else []
+            if width == 0 or (kept and kept[0][1].shape[1] != width):
                 failed += len(part.rows)
             else:
-                kept.add(times[part.rows], part.values)
+                kept.append((times[part.rows], part.values.copy()))  # of the batch only what is kept
+    columns = {
+        key: (np.concatenate([t for t, _ in kept]), np.concatenate([values for _, values in kept]))
+        for key, kept in parts_of.items()
+    }
     return Decoded(columns, stamps, failed)
 
 

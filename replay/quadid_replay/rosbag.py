@@ -9,7 +9,7 @@ from dataclasses import replace
 from functools import lru_cache
 from heapq import merge
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, TypeAlias
 
 import numpy as np
 from mcap_ros2._dynamic import generate_dynamic
@@ -17,7 +17,8 @@ from mcap_ros2._dynamic import generate_dynamic
 from quadid.data.window import Recording, fresh_rows
 from quadid.errors import LogError
 from quadid.sanitise import plain
-from quadid_replay.columns import Columns, RawChannel, assemble, fastest_first
+from quadid.types import FloatArray
+from quadid_replay.columns import RawChannel, assemble, fastest_first
 from quadid_replay.mcap_file import McapFile, Message, Topic, usable_definition
 from quadid_replay.motors import active_outputs, no_multirotor
 from quadid_replay.presets import AUTO, preset_rank
@@ -55,20 +56,6 @@ def bag_files(folder: Path) -> list[Path]:
 SQLITE_MAGIC = b"SQLite format 3\x00"
 _DAMAGE = (sqlite3.Error, UnicodeDecodeError)
 """The second comes where SQLite's message quotes bytes that are no text."""
-
-
-class Bag(Protocol):
-    """Topics by number and their messages in order of log time: an MCAP, a database, or a folder of them."""
-
-    @property
-    def topics(self) -> Mapping[int, Topic]:
-        """Topics by number."""
-
-    def messages(self, wanted: Set[int]) -> Iterator[Message]:
-        """Number, log time [ns] and payload of the messages on the wanted topics."""
-
-    def damage(self) -> list[str]:
-        """Sentences about what could not be read."""
 
 
 class Database:
@@ -172,6 +159,10 @@ class Folder:
         return [note for bag, _ in self._members for note in bag.damage()]
 
 
+Bag: TypeAlias = "McapFile | Database | Folder"
+"""Topics by number, messages in order of log time, and what could not be read."""
+
+
 def open_bag(path: Path) -> Bag:
     """Opens an MCAP file, a database or a folder of them."""
     if path.is_dir():
@@ -241,15 +232,14 @@ def _decoder(kind: str, definition: str) -> Callable[[bytes], Any]:
 
 
 def _channels(
-    columns: dict[tuple[int, str], Columns], sources: dict[int, TopicSource], preset: str
+    columns: Mapping[tuple[int, str], tuple[FloatArray, FloatArray]], sources: dict[int, TopicSource], preset: str
 ) -> list[RawChannel]:
     """Makes channels of the columns; of several topics for one channel the best comes first."""
     ranked: dict[str, list[tuple[int, RawChannel]]] = {}
-    for (number, signal), kept in columns.items():
+    for (number, signal), (t, values) in columns.items():
         channel, convert = SIGNALS[signal]
         topic = sources[number].topic
         rank = preset_rank(preset, channel, topic.name)
-        t, values = kept.arrays()
         if signal in ("outputs", "actuator_motors"):  # of messages with room for more, the columns that are motors
             values = values[:, active_outputs(values) if signal == "outputs" else np.isfinite(values).any(axis=0)]
         if rank is None or len(t) == 0 or values.shape[1] == 0 or _unused(signal, topic, values):
@@ -269,7 +259,7 @@ def _channels(
     return out
 
 
-def _unused(signal: str, topic: Topic, values: np.ndarray[Any, np.dtype[np.float64]]) -> bool:
+def _unused(signal: str, topic: Topic, values: FloatArray) -> bool:
     """Fields that a driver left alone: a constant identity attitude, efforts that are no commands, body twists."""
     if signal in ("attitude", "pose_attitude"):
         return bool(np.all(values == values[0]) and np.isin(values[0], (0.0, 1.0)).all())

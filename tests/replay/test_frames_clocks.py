@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from quadid_replay.columns import Columns, LogClock, RawChannel, clean_channel, fastest_first
+from quadid_replay.columns import LogClock, RawChannel, clean_channel, fastest_first
 from quadid_replay.frames import (
     flip_attitude,
     flip_body,
@@ -176,17 +176,6 @@ def test_samples_that_cannot_be_used_are_dropped_and_counted() -> None:
     absurd = clean_channel(RawChannel("position", np.array([0.0, 1.0]), np.array([[0.0, 1, 2], [1e200, 0, 0]]), "x"))
     assert absurd is not None
     assert (len(absurd.t), dict(absurd.faults)) == (1, {"absurd": 1})
-
-
-def test_columns_keep_doubles_and_refuse_other_widths() -> None:
-    columns = Columns(2)
-    columns.add(np.array([1.0]), np.array([[2.0, 3.0]]))
-    t, values = columns.arrays()
-    assert (list(t), values.tolist()) == ([1.0], [[2.0, 3.0]])
-    with pytest.raises(ValueError, match="for 1 times and 2 columns"):
-        columns.add(np.array([2.0]), np.array([[1.0, 2.0, 3.0]]))
-    empty_t, empty_values = Columns(3).arrays()
-    assert (empty_t.shape, empty_values.shape) == ((0,), (0, 3))
 
 
 def test_a_source_must_be_clearly_faster_to_be_preferred() -> None:
