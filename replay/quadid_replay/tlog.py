@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
+from fastcrc.crc16 import mcrf4xx
 from numpy.typing import NDArray
 from pymavlink.dialects.v20 import ardupilotmega
-from pymavlink.generator.mavcrc import x25crc
 
 from quadid.data.window import Recording
 from quadid.errors import LogError
@@ -225,12 +225,11 @@ def decode(frames: Frames, kind: Any, which: IntArray) -> Messages:
 
 def intact(frames: Frames, which: IntArray, seeds: IntArray) -> BoolArray:
     """Tells which of these frames have the right checksum; `seeds` are their messages' (`crc_extra`), shape (n,)."""
-    view = frames.data.data
+    data, seed = frames.data.tobytes(), [bytes([k]) for k in range(256)]
     each = zip(frames.start[which].tolist(), frames.end[which].tolist(), seeds.tolist(), strict=True)
-    return np.array([
-        x25crc(bytes(view[start + 1 : end]) + bytes((seed,))).crc == view[end] | view[end + 1] << 8
-        for start, end, seed in each
-    ], dtype=np.bool_)  # fmt: skip
+    crc = np.array([mcrf4xx(data[begin + 1 : end] + seed[k], 0xFFFF) for begin, end, k in each], dtype=np.uint16)
+    at = frames.end[which]
+    return np.asarray(crc == (frames.data[at].astype(np.uint16) | frames.data[at + 1].astype(np.uint16) << 8))
 
 
 @cache
