@@ -89,7 +89,7 @@ MOVED = {
     "quadid_node.mavlink_link": "quadid_node.mavlink_decode quadid_node.serve",
     "quadid_node.wire_format": "quadid_node.parcel",
     "quadid_node.ground": "quadid_node.remote_worker",
-    "quadid_node.worker": "quadid_node.warm_up",
+    "quadid_node.worker": "quadid_node.warm_up quadid_node.worker_main",
     "quadid_node.zenoh": "quadid_node.zenoh_link",
     "quadid_replay.motors": "quadid_replay.airframes",
     "quadid_replay.rosbag": "quadid_replay.bag_folder quadid_replay.mcap_reader quadid_replay.rosbag2_files",
@@ -109,6 +109,8 @@ MOVED = {
     "quadid_replay.usd": "quadid_replay.usd_reader quadid_replay.usd_records",
     "quadid.app.options": "quadid_cli.options",
     "quadid.app.excite": "quadid_cli.excite",
+    "quadid.app.init": "quadid_replay.vehicle_from_log",
+    "quadid.cli.demo": "quadid.app.demo",
 }
 """Old modules of each new one."""
 _NEW = {old: new for new, olds in MOVED.items() for old in olds.split()}

@@ -7,38 +7,24 @@ import math
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
+import numpy as np
 import typer
+from markupsafe import Markup
 from quadid_replay import open_log
+from quadid_replay.motors import Frame, frame_of
 
 from quadid.app.logs import file_name, write_text
 from quadid.app.options import Preset, Typed
 from quadid.app.outcome import Outcome
-from quadid.errors import ParameterError, VehicleError
+from quadid.checks.motion import flying_spans, within
+from quadid.data.rotor_signal import rotor_channel
+from quadid.data.window import Channel, Recording
+from quadid.errors import LogError, ParameterError, VehicleError
 from quadid.report.tables import Cell, Column, TextTable
-from quadid.vehicle import Vehicle
-
-_TEMPLATE = """\
-# A vehicle file to fill in; docs/new-vehicle.md has a recipe for every line.
-name: {name}
-mass: 1.3               # kg  FILL IN: weigh it as it flies
-rotors:                 # forward, right, down [m]; spin +1: seen from above it turns counter-clockwise.  FILL IN
-  - {{position: [ 0.15,  0.15, 0.0], spin: +1}}
-  - {{position: [-0.15, -0.15, 0.0], spin: +1}}
-  - {{position: [ 0.15, -0.15, 0.0], spin: -1}}
-  - {{position: [-0.15,  0.15, 0.0], spin: -1}}
-command: {{kind: rotor_speed, sampling: held}}  # sampling: instant for measured speeds; other kinds:
-                        # {{kind: normalized, max_speed: 900}}, {{kind: pwm, range: [1000, 2000], max_speed: 900}}
-parameters:             # first guesses, a factor of 4 each way
-  b: 1.6e-5             # N s^2/rad^2: mass * 9.81 / (rotors * hover speed^2)
-  d: 2.0e-7             # N m s^2/rad^2: b * propeller radius / 6
-  J_xx: 1.5e-2          # kg m^2: mass * arm^2 / 4
-  J_yy: 1.5e-2
-  J_zz: 2.8e-2
-  J_r: 4.0e-5
-# columns: {{p: gyro_x}}  # what a CSV of yours calls a column
-"""
+from quadid.report.templating import render
+from quadid.vehicle import GRAVITY, Vehicle
 
 
 @dataclass(frozen=True, repr=False)
@@ -105,13 +91,9 @@ def init(
         if size is not None and not (math.isfinite(size) and size > 0.0):
             raise ParameterError(f"{what} {size:g} {unit}", f"more than 0 {unit}")
     if log is None:
-        text = _TEMPLATE.format(name=json.dumps(name))
-        if mass is not None:
-            text = text.replace("mass: 1.3               # kg  FILL IN: weigh it as it flies", f"mass: {mass:g}  # kg")
+        text = render("new_vehicle.yaml", {"name": Markup(json.dumps(name)), "mass": mass})
         Vehicle.from_yaml(text, name)
     else:
-        from quadid_replay.vehicle_from_log import vehicle_text
-
         recording = open_log(Path(log), preset)
         text = vehicle_text(recording, name, mass, arm)
     blanks = [line.split(":")[0].strip(" -#") for line in text.splitlines() if "FILL IN" in line]
@@ -161,3 +143,158 @@ def shipped() -> list[dict[str, Any]]:
             "description": text.splitlines()[0].removeprefix("# ").split(".")[0],
         })  # fmt: skip
     return out
+
+
+# --- A vehicle file from a log: airframe, motor order, meaning of the motor columns, first guesses
+#
+# What the autopilot stores is taken over (frame, output range, on-board filter).  Mass and, with ArduPilot, arm are
+# guesses marked as such; thrust follows from them and the hover in the log, inertias from the recipe of
+# docs/new-vehicle.md.
+
+
+_MASS, _ARM, _MAX_SPEED = 1.5, 0.25, 900.0
+_BLADE = 0.5
+"""Propeller radius over arm, for first guesses."""
+_RADIUS = (0.55, 1.0)
+"""Propeller radius over the largest that does not touch its neighbour's."""
+_THRUST = (0.006, 0.03)
+"""Thrust over air density, disc area and squared tip speed, of propellers made for it."""
+_AIR = 1.2
+
+
+class _Command(NamedTuple):
+    """The `command` line and the rotor speed [rad/s] that one unit of the logged columns stands for."""
+
+    line: str
+    low: float
+    scale: float
+
+
+def vehicle_text(recording: Recording, name: str, mass: float | None = None, arm: float | None = None) -> str:
+    """Returns the text of a vehicle file for the vehicle that flew this log.
+
+    Args:
+        recording: a log; of an autopilot, with its parameters, for the airframe.
+        mass: as it flies [kg]; without it a guess, marked to be filled in.
+        arm: distance of the rotors from the centre [m], where the autopilot does not store it.
+
+    Raises:
+        LogError: neither airframe nor rotor signal in the log, or it is no multirotor's.
+    """
+    if recording.other:
+        raise LogError(f"{recording.name}: {recording.other}", "a log of a multirotor", "choose another log")
+    frame = frame_of(recording.autopilot, arm or _ARM)
+    channel, notes = rotor_channel(recording, None)
+    if frame is None:
+        raise LogError(
+            f"{recording.name}: no parameters that describe the airframe",
+            "a log with the autopilot's parameters: ArduPilot FRAME_CLASS and FRAME_TYPE, PX4 CA_ROTOR*",
+            "write the file by hand: docs/new-vehicle.md",
+        )
+    if channel is not None and channel.values.shape[1] != len(frame.rotors):
+        raise LogError(
+            f"{recording.name}: {channel.values.shape[1]} motor columns ({channel.source}), {frame.name} has "
+            f"{len(frame.rotors)}", "as many columns as rotors", "write the file by hand: docs/new-vehicle.md",
+        )  # fmt: skip
+    weight = mass if mass is not None else _MASS
+    command = _command(recording, channel)
+    b = _hover_thrust(recording, channel, command, weight, len(frame.rotors))
+    known_size = arm is not None or not frame.scaled
+    judged = known_size and channel is not None and channel.name == "rotor_speed"
+    text = "\n".join([
+        f"name: {json.dumps(name)}",
+        f"mass: {weight:g}             {'# kg' if mass is not None else '# kg  FILL IN: weigh it as it flies'}",
+        *_rotor_lines(frame, arm),
+        f"command: {command.line}",
+        *_guesses(frame, weight, b, _possible_thrust(frame) if judged else None),
+        *_effects(recording),
+        *(f"# {note}" for note in notes),
+        *_remarks(recording),
+    ]) + "\n"  # fmt: skip
+    Vehicle.from_yaml(text, name)  # what is handed out is valid
+    return text
+
+
+def _rotor_lines(frame: Frame, arm: float | None) -> list[str]:
+    mark = "  FILL IN: the arm is a guess; the autopilot stores none" if frame.scaled and arm is None else ""
+    lines = [f"rotors:                 # forward, right, down [m]; {frame.name}{mark}"]
+    for r in frame.rotors:
+        lines.append(f"  - {{position: [{r.x:.4f}, {r.y:.4f}, {r.z:.4f}], spin: {r.spin:+d}}}")
+    return lines
+
+
+def _command(recording: Recording, channel: Channel | None) -> _Command:
+    """Measured speeds are readings; pulse widths have the range that the autopilot uses in flight."""
+    known = recording.autopilot
+    if channel is None or channel.name == "rotor_speed":
+        return _Command("{kind: rotor_speed, sampling: instant}", 0.0, 1.0)
+    speed = f"max_speed: {_MAX_SPEED:g}}}  # rad/s at full command, anything near it"
+    if float(np.median(np.abs(channel.values))) < 100.0:
+        return _Command(f"{{kind: normalized, {speed}", 0.0, _MAX_SPEED)
+    low, high = known.get("MOT_PWM_MIN", 1000.0), known.get("MOT_PWM_MAX", 2000.0)
+    if not 500.0 <= low < high <= 2500.0:
+        low, high = 1000.0, 2000.0
+    spin_min, spin_max = known.get("MOT_SPIN_MIN", 0.0), known.get("MOT_SPIN_MAX", 1.0)
+    if 0.0 <= spin_min < spin_max <= 1.0:  # thrust begins at the one and ends at the other
+        low, high = low + spin_min * (high - low), low + spin_max * (high - low)
+    return _Command(f"{{kind: pwm, range: [{low:g}, {high:g}], {speed}", low, _MAX_SPEED / (high - low))
+
+
+def _hover_thrust(recording: Recording, channel: Channel | None, command: _Command, mass: float, rotors: int) -> float:
+    """Thrust coefficient [N s^2/rad^2] that carries the weight at the speeds of the flight; else at 0.55 of full."""
+    squares = rotors * (0.55 * _MAX_SPEED) ** 2
+    spans = flying_spans(recording, None)
+    if channel is not None and spans:
+        inside = within(channel.t, spans)
+        speed = np.maximum(channel.values[inside] - command.low, 0.0) * command.scale
+        squares = float(np.mean(np.sum(speed**2, axis=1))) if inside.any() and speed.any() else squares
+    return mass * GRAVITY / squares
+
+
+def _possible_thrust(frame: Frame) -> tuple[float, float]:
+    """Thrust coefficients [N s^2/rad^2] that propellers of this frame can have.
+
+    They follow from its size, not from the logged speeds, which they are to judge.
+    """
+    place = np.array([(r.x, r.y) for r in frame.rotors])
+    apart = np.linalg.norm(place[:, None] - place[None, :], axis=2)
+    radius = 0.5 * float(np.min(apart[apart > 0.1 * np.max(apart)]))  # those of one axle are none
+    low, high = (c * _AIR * np.pi * (share * radius) ** 4 for c, share in zip(_THRUST, _RADIUS, strict=True))
+    return low, high
+
+
+def _guesses(frame: Frame, mass: float, b: float, possible: tuple[float, float] | None) -> list[str]:
+    arm = float(np.mean([np.hypot(r.x, r.y) for r in frame.rotors]))
+    inertia, blade = 0.25 * mass * arm**2, _BLADE * arm
+    thrust = f"  b: {b:.3g}"
+    if possible is not None:  # of propellers that fit this frame
+        b = min(max(b, possible[0]), possible[1])
+        bounds = f"[{0.995 * possible[0]:.3g}, {1.005 * possible[1]:.3g}]"
+        thrust = f"  b: {{initial: {b:.3g}, bounds: {bounds}}}    # of propellers that fit this frame"
+    return [
+        "parameters:             # first guesses: docs/new-vehicle.md",
+        thrust,
+        f"  d: {{initial: {b * blade / 6.0:.3g}, bounds: [{b * blade / 60.0:.3g}, {b * blade / 0.6:.3g}]}}",
+        f"  J_xx: {inertia:.3g}",
+        f"  J_yy: {inertia:.3g}",
+        f"  J_zz: {1.9 * inertia:.3g}",
+        f"  J_r: {{initial: {inertia / 400.0:.3g}, bounds: [{inertia / 40000.0:.3g}, {inertia / 20.0:.3g}]}}",
+    ]
+
+
+def _effects(recording: Recording) -> list[str]:
+    """The autopilot's own filter of gyro and accelerometer, where the log holds what has passed it."""
+    gyro = recording.channels.get("gyro")
+    known = recording.autopilot
+    filtered = gyro is not None and gyro.source.startswith(("IMU", "RAW_IMU", "SCALED_IMU", "HIGHRES_IMU"))
+    cutoff = known.get("INS_GYRO_FILTER", 0.0)
+    if not filtered or not 1.0 <= cutoff <= 500.0 or known.get("INS_ACCEL_FILTER") != cutoff:
+        return []
+    return ["effects:", f"  imu_lag: {{cutoff: {cutoff:g}}}    # INS_GYRO_FILTER, INS_ACCEL_FILTER of this log"]
+
+
+def _remarks(recording: Recording) -> list[str]:
+    """Assumptions of the autopilot on thrust and battery, for the reader."""
+    names = ("MOT_THST_EXPO", "MOT_SPIN_MIN", "MOT_THST_HOVER", "MOT_BAT_VOLT_MAX", "MOT_BAT_VOLT_MIN", "THR_MDL_FAC")
+    held = [f"{name} {recording.autopilot[name]:g}" for name in names if name in recording.autopilot]
+    return [f"# The autopilot assumes: {', '.join(held)}"] if held else []

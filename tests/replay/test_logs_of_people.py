@@ -14,10 +14,10 @@ from quadid_replay import open_log, write_csv
 from quadid_replay.columns import RawChannel, clean_channel
 from quadid_replay.frames import from_euler
 from quadid_replay.motors import active_outputs, frame_of, in_pulses, motor_columns, no_multirotor
-from quadid_replay.vehicle_from_log import vehicle_text
 from scipy.spatial.transform import Rotation
 
 import quadid
+from quadid.app.init import vehicle_text
 from quadid.app.logs import LogPart, check_conventions
 from quadid.checks import Check, CheckResult, inspect
 from quadid.checks.motion import attitude_steps_check

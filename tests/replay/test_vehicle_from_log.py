@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from quadid_replay import open_log
 from quadid_replay.motors import ARDUPILOT, frame_of
-from quadid_replay.vehicle_from_log import vehicle_text
 
+from quadid.app.init import vehicle_text
 from quadid.checks import CheckResult, inspect
 from quadid.errors import LogError
 from quadid.vehicle import Vehicle
