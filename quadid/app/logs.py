@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     import pandas as pd
     import xarray as xr
 
+    from quadid.checks import Check
     from quadid.checks.motion import Spans
     from quadid.data.grid import GridReport
 
@@ -431,7 +432,7 @@ def check_conventions(recording: Recording, vehicle: Vehicle, cut: LogPart) -> C
     from quadid.checks import FATAL, CheckResult, inspect
     from quadid.checks.doubts import farthest
 
-    found, doubts = inspect(recording, vehicle), []
+    found = inspect(recording, vehicle)
     flown = flown_parts(recording, found.flying, cut)
     # Rotors at a speed that cannot carry this vehicle: what else is wrong about them is that of another one.
     stranger = next((c.message for c in found.checks if c.name == "hover" and c.verdict is CheckResult.WARNING), "")
@@ -444,9 +445,12 @@ def check_conventions(recording: Recording, vehicle: Vehicle, cut: LogPart) -> C
             parts = " ".join(names_of(cut, flown))
             fix = f"{fix}; or leave out the ground: use {parts}" if parts else fix
             raise LogError(f"{recording.name}: {'; '.join(filter(None, (of_rotors, check.message)))}", fix=fix)
-        if check.verdict in (CheckResult.ERROR, CheckResult.WARNING):
-            doubts.append(f"{check.message}{'; ' * bool(check.fix)}{check.fix}")
-    return Checked(tuple(doubts), flown, farthest([check.off for check in found.checks]))
+    return Checked(tuple(doubts_of(found.checks)), flown, farthest([check.off for check in found.checks]))
+
+
+def doubts_of(checks: Sequence[Check]) -> list[str]:
+    """What looks wrong, each with what to do."""
+    return [f"{c.message}{'; ' * bool(c.fix)}{c.fix}" for c in checks if c.verdict.value in ("error", "warning")]
 
 
 # --- Whether a flight was fitted before: the same log, a copy of it, a part of it, a second recorder

@@ -12,7 +12,8 @@ import numpy as np
 
 from quadid.checks.doubts import estimates_off
 from quadid.checks.findings import ChannelFacts, Check, CheckResult
-from quadid.data.grid import GAP, holes, linear, longest_step, moving_mean, true_runs
+from quadid.checks.turns import FEWEST, TURN, Factor, Turns, factors
+from quadid.data.grid import GAP, holes, linear, longest_step, moving_mean
 from quadid.data.rotor_signal import rotor_channel
 from quadid.data.window import (
     CHANNELS,
@@ -23,6 +24,7 @@ from quadid.data.window import (
     fresh_rows,
     measured_period,
     sample_period,
+    true_runs,
 )
 from quadid.model.layout import ThrustModel
 from quadid.rotation import conjugate, euler, rotated, turn
@@ -568,7 +570,8 @@ def gyro_check(recording: Recording) -> Check:
     late = _apart(gyro, attitude, best[1].r2) if best[0] == "as given" else None
     return (
         late or _angle_rates(gyro, attitude) or _one_axis(gyro, attitude) or _bias_step(gyro, attitude)
-        or (best[0] == "as given" and best[1].straight and _turned(gyro, attitude)) or _judge_rates(*best)
+        or (best[0] == "as given" and best[1].straight and _turned(gyro, attitude))
+        or _judge_rates(gyro, attitude, *best)
     )  # fmt: skip
 
 
@@ -609,6 +612,23 @@ def _one_axis(gyro: Channel, attitude: Channel) -> Check | None:
     )
 
 
+def _sizes(gyro: Channel, attitude: Channel) -> list[Factor]:
+    """Turns of the attitude over those of the gyro about x, y and z; empty where they are too slow or too few."""
+    step = max(sample_period(attitude.t), 0.1 * TURN)
+    at = np.arange(max(gyro.t[0], attitude.t[0]), min(gyro.t[-1], attitude.t[-1]), step)
+    if step > 0.25 * TURN or len(at) < FEWEST * TURN / step:
+        return []
+    q = linear(attitude.t, attitude.values, at)
+    q[~usable_steps(attitude.t, gyro.t)[np.searchsorted(attitude.t[1:-1], at, "right")]] = np.nan
+    turns = Turns.of(linear(gyro.t, gyro.values, at), q, step)
+    felt, turned, rate = _without_jumps(turns.gyro, turns.attitude, turns.rate)
+    turns = Turns(felt, rate, turned)
+    seconds = len(turns.gyro) * step
+    if seconds < FEWEST * TURN:
+        return []
+    return [factors(axis, seconds, turns.moments(axis, step))[0] for axis in range(3)]
+
+
 def _turned(gyro: Channel, attitude: Channel) -> Check | None:
     """A gyro that is turned by some degrees against the attitude, in all parts of the log alike (Kabsch 1976)."""
     rows = _without_jumps(*_moving_rates(gyro, attitude.t, attitude.values))
@@ -617,20 +637,27 @@ def _turned(gyro: Channel, attitude: Channel) -> Check | None:
 
     def turning(measured: FloatArray, derived: FloatArray) -> FloatArray:
         u, _, v = np.linalg.svd((measured - measured.mean(axis=0)).T @ (derived - derived.mean(axis=0)))
-        m = (u @ np.diag([1.0, 1.0, np.linalg.det(u @ v)]) @ v).T
+        return np.asarray((u @ np.diag([1.0, 1.0, np.linalg.det(u @ v)]) @ v).T)
+
+    def angles_of(m: FloatArray) -> FloatArray:
         return np.array([np.arctan2(m[2, 1], m[2, 2]), -np.arcsin(m[2, 0]), np.arctan2(m[1, 0], m[0, 0])])
 
-    parts = [turning(*part) for part in zip(*(np.array_split(r, _PARTS) for r in rows), strict=True)]
-    angles, error = turning(*rows), np.linalg.norm(np.std(parts, axis=0)) / np.sqrt(_PARTS)
+    parts = [angles_of(turning(*part)) for part in zip(*(np.array_split(r, _PARTS) for r in rows), strict=True)]
+    m, error = turning(*rows), np.linalg.norm(np.std(parts, axis=0)) / np.sqrt(_PARTS)
+    angles = angles_of(m)
     size = float(np.linalg.norm(angles))
     if size < max(_TILT, _PARTS * float(error)):
         return None
+    # What an axis reads of the others' acceleration is no answer to its torque.
+    read = np.diff(rows[0], axis=0)
+    sizes = np.sum(read**2, axis=0) / np.sum(read * (read @ m.T), axis=0)
     roll, pitch, yaw = np.degrees(angles)
     rotation = ", ".join(f"{angle:.3f}" for angle in angles)
     return Check(
         "gyro_attitude", CheckResult.ERROR if size > 2.0 * _TILT else CheckResult.WARNING,
         f"gyro is turned against the attitude: roll {roll:.2g}, pitch {pitch:.2g}, yaw {yaw:.2g} deg",
         f"mounting: {{rotation: [{rotation}]}} in the vehicle file, or correct the attitude", {"angle_rad": size},
+        estimates_off(turning=sizes.tolist()) if sizes.min() > 0.0 else {},
     )  # fmt: skip
 
 
@@ -808,7 +835,7 @@ def _likely(reading: str, fit: AxisMap) -> float:
     return fit.r2 + (0.1 if fit.straight else 0.0) + (0.05 if reading == "as given" else 0.0)
 
 
-def _judge_rates(reading: str, fit: AxisMap) -> Check:
+def _judge_rates(gyro: Channel, attitude: Channel, reading: str, fit: AxisMap) -> Check:
     check = partial(Check, "gyro_attitude", numbers={"scale": fit.scale, "r2": fit.r2})
     if fit.r2 < _CLEAR:
         message = f"gyro does not follow the attitude (R^2 {fit.r2:.2f})"
@@ -831,14 +858,16 @@ def _judge_rates(reading: str, fit: AxisMap) -> Check:
         if 0.75 < fit.scale / scale < 1.33:
             return check(CheckResult.ERROR, f"{what} (attitude rate / gyro = {fit.scale:.3g})", "convert to radians")
     message = f"attitude rate / gyro = {fit.scale:.3f} (R^2 {fit.r2:.2f})"
-    if 0.85 < fit.scale < 1.15:
-        return check(CheckResult.OK, message)
     if fit.absurd:
         remedy = f"multiply gyro by {fit.scale:.3g}, or correct the attitude"
         return check(CheckResult.ERROR, f"{message}: the scale of one is wrong", remedy)
-    return check(
-        CheckResult.WARNING, message, "check scales and filters", off=estimates_off(turning=[1.0 / fit.scale] * 3)
-    )
+    told = _sizes(gyro, attitude)
+    sizes = np.array([f.value if f.disagrees else 1.0 for f in told] or [fit.scale] * 3)
+    message = ", ".join(str(f) for f in told if f.known) or message
+    if np.all(sizes == 1.0) or not told and 0.85 < fit.scale < 1.15:
+        return check(CheckResult.OK, message)
+    remedy = "check scales and filters of both; multiply the gyro by this if the attitude is right"
+    return check(CheckResult.WARNING, message, remedy, off=estimates_off(turning=(1.0 / sizes).tolist()))
 
 
 def velocity_check(recording: Recording) -> Check:
@@ -964,12 +993,13 @@ def position_check(recording: Recording) -> Check | None:
     moved, flown, independent = _changes(position, velocity)
     if independent < 4.0:
         return Check("position_velocity", CheckResult.UNKNOWN, "too few stretches without a gap to compare")
-    horizontal = fit_axes(moved[:, :2], flown[:, :2])
-    if np.max(np.std(moved[:, :2], axis=0)) > LEAST_MOTION and horizontal.r2 > CLEAR**2 and not horizontal.straight:
+    fit = fit_axes(moved, flown)
+    turned = fit.axes != (0, 1, 2) or min(fit.signs[:2]) < 0
+    if np.max(np.std(moved[:, :2], axis=0)) > LEAST_MOTION and fit.r2 > CLEAR**2 and turned:
         return Check(
             "position_velocity", CheckResult.WARNING,
-            f"world axes of velocity differ from those of position: {horizontal} (R^2 {horizontal.r2:.2f})",
-            "use NED for both; ROS' ENU swaps x and y", {"r2": horizontal.r2},
+            f"world axes of velocity differ from those of position: {fit} (R^2 {fit.r2:.2f})",
+            "use NED for both; ROS' ENU swaps x and y", {"r2": fit.r2},
         )  # fmt: skip
     numbers: dict[str, float] = {}
     scales: list[str] = []

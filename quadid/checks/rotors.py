@@ -13,9 +13,9 @@ import numpy as np
 from quadid.checks.doubts import Off, estimates_off, farthest, rotors_off
 from quadid.checks.findings import Check, CheckResult
 from quadid.checks.motion import HOPELESS, Spans, within
-from quadid.data.grid import bridged, linear, moving_mean, to_windows, true_runs
+from quadid.data.grid import bridged, linear, moving_mean, to_windows
 from quadid.data.rotor_signal import INERTIA_RATE, RotorSignal, rotor_channel, rotor_signal
-from quadid.data.window import Channel, Recording, Window, measured_period, sample_period
+from quadid.data.window import Channel, Recording, Window, measured_period, sample_period, true_runs
 from quadid.errors import QuadidError
 from quadid.model.layout import ThrustModel, voltage_at
 from quadid.types import BoolArray, FloatArray
@@ -241,10 +241,13 @@ def readings_check(recording: Recording, vehicle: Vehicle, spans: Spans) -> Chec
     commands = _commanded(recording, vehicle)
     most = 0.5 if commands else 0.05
     values = signal.values[inside]
-    step = _coarse(values)
+    step, noise = _coarse(signal.t[inside], values)
     if step:
         message = f"rotor speeds come in steps of {step:.3g} rad/s: too coarse for the motion ({signal.source})"
-        return Check(_NAME, CheckResult.WARNING, message, "log them finer, or motor commands", {"step_rad_s": step})
+        off = estimates_off(torque=[1.0 / (1.0 + noise)] * 3, spinning=1.0 / (1.0 + noise))
+        return Check(
+            _NAME, CheckResult.WARNING, message, "log them finer, or motor commands", {"step_rad_s": step}, off
+        )
     if problem := _other_unit(values):
         return Check(_NAME, CheckResult.ERROR, f"{problem[0]} ({signal.source})", "log all in one unit", problem[1])
     problem = _dead(values, most) or _same(values, vehicle, commands) or _stuck(signal, recording, inside)
@@ -252,13 +255,19 @@ def readings_check(recording: Recording, vehicle: Vehicle, spans: Spans) -> Chec
     return problem and Check(_NAME, CheckResult.ERROR, f"{problem[0]} ({signal.source})", fix, problem[1])
 
 
-def _coarse(speeds: FloatArray) -> float:
-    """Step [rad/s] between the few values that rotors read; 0 where it is finer than half their spread."""
+def _coarse(t: FloatArray, speeds: FloatArray) -> tuple[float, float]:
+    """Step [rad/s] between the few values that rotors read, and power of its noise over that of their quick motion.
+
+    0 where the step is finer than half of that motion: then noise in the torque makes inertias 2 % too large.
+    """
     levels = [np.unique(column) for column in speeds.T]
     if max(map(len, levels)) > _LEVELS or min(map(len, levels)) < 3:
-        return 0.0
+        return 0.0, 0.0
     step = float(np.median(np.concatenate([np.diff(values) for values in levels])))
-    return step if step > 0.5 * float(np.median(np.std(speeds, axis=0))) else 0.0
+    quick = speeds - moving_mean(speeds, round(_SLOW_MOTION / sample_period(t)) | 1, mirrored=True)
+    noise = step**2 / 12.0
+    share = noise / max(float(np.median(np.var(quick, axis=0))) - noise, 0.1 * noise)
+    return (step, share) if share > 0.02 else (0.0, 0.0)
 
 
 def _other_unit(speeds: FloatArray) -> Problem | None:
@@ -343,14 +352,14 @@ def _stuck(signal: RotorSignal, recording: Recording, inside: BoolArray) -> Prob
     """A value held while the vehicle moves, unless it is a limit that all rotors share."""
     gyro = recording.channels.get("gyro")
     t, values = signal.t[inside], signal.values[inside]
-    low, high = np.min(values), np.max(values)
     if np.ptp(values, axis=0).max() == 0.0 and gyro is not None and _moves(gyro, t[0], t[-1]):
         return (
             "no rotor ever changes its speed, though the vehicle moves: the speed signal is stuck",
             {"stuck_s": float(t[-1] - t[0])},
         )  # fmt: skip
     for rotor, column in enumerate(values.T):
-        same = np.append(column[1:] == column[:-1], False) & (column > low) & (column < high)
+        others = np.delete(values, rotor, axis=1)
+        same = np.append(column[1:] == column[:-1], False) & (column != others.min()) & (column != others.max())
         begin, end = _longest(t, same)
         if end - begin > _STUCK and gyro is not None and _moves(gyro, begin, end):
             return (

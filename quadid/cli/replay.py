@@ -131,6 +131,9 @@ def summary(
     """The replay as JSON, of the form ``quadid.replay/1``; times [s, UNIX], or since boot in a log that has no more."""
     from quadid_node.messages import diagnosis_to_dict, set_to_dict, status_to_dict
 
+    from quadid.app.logs import doubts_of
+    from quadid.checks import inspect
+
     sets = [o.item for o in outputs if o.topic == "parameters"]
     estimates = [o.item for o in outputs if o.topic == "candidate"]
     refused: dict[str, int] = {}
@@ -148,7 +151,7 @@ def summary(
         "diagnoses": [diagnosis_to_dict(o) for o in outputs if o.topic == "diagnosis"],
         "events": [dict(vars(o)) for o in outputs if o.topic == "event"],
         "status": status_to_dict(service.session.status()),
-        "warnings": list(recording.warnings),
+        "warnings": [*recording.warnings, *doubts_of(inspect(recording, service.vehicle).checks)],
     }
 
 

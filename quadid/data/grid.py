@@ -24,7 +24,7 @@ from quadid.data.window import (
     sample_period,
 )
 from quadid.errors import LogError, NotIdentifiableError
-from quadid.types import BoolArray, FloatArray, IndexArray
+from quadid.types import FloatArray, IndexArray
 from quadid.vehicle import Vehicle
 
 # --- One channel: stretches without gaps, interpolation, and the low-pass for all
@@ -183,12 +183,6 @@ def lowpass_span(t: FloatArray, step: float, held: bool) -> tuple[float, float]:
     """Returns the first and last time [s] at which `lowpass` sees samples on both sides for its whole half-width."""
     tail = sample_period(t) if held and len(t) > 1 else 0.0
     return float(t[0]) + HALF_WIDTH * step, float(t[-1]) + tail - HALF_WIDTH * step
-
-
-def true_runs(true: BoolArray) -> tuple[IndexArray, IndexArray]:
-    """Places where each run of True in an array (n,) begins, and where it has ended, shapes (runs,)."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], true, [False]]).astype(np.int8)))
-    return edges[::2], edges[1::2]
 
 
 # --- Channels on their way to the grid: what each one's samples are worth there, and how it is read at grid times

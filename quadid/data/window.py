@@ -352,6 +352,12 @@ def copied(values: FloatArray) -> BoolArray:
     return np.asarray(np.all(values[1:] == values[:-1], axis=1))
 
 
+def true_runs(true: BoolArray) -> tuple[IndexArray, IndexArray]:
+    """Places where each run of True in an array (n,) begins, and where it has ended, shapes (runs,)."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], true, [False]]).astype(np.int8)))
+    return edges[::2], edges[1::2]
+
+
 def fresh_rows(values: FloatArray) -> IndexArray:
     """Returns the rows that bring a new reading, where a log repeats each reading several times; else all rows.
 

@@ -11,10 +11,10 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, ClassVar
 
+from quadid.checks.turns import ALLOWED
 from quadid.chi_square import Z95
 from quadid.data.rotor_signal import INERTIA_RATE
 from quadid.effects import EFFECTS
-from quadid.online.checks import ALLOWED
 from quadid.online.grid_buffer import COMPLETE, GridBuffer
 from quadid.online.records import MOST_ERRORS, Job, JobReply, OnlineAlternative, OnlineDiagnosis, OnlineFinding
 from quadid.vehicle import Vehicle

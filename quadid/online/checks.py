@@ -10,20 +10,18 @@ import numpy as np
 
 from quadid.checks import STAGES, CheckResult, Log
 from quadid.checks.rotors import better_description, lagged_of, motor_order_check
-from quadid.data.grid import moving_mean, true_runs
-from quadid.data.window import Window, as_recording, at_limit, copied
+from quadid.checks.turns import ALLOWED, AXES, FEWEST, MOVING, TURN, TURN_FACTOR, Factor, Turns, factors
+from quadid.data.grid import moving_mean
+from quadid.data.window import Window, as_recording, at_limit, copied, true_runs
 from quadid.model.layout import ThrustModel
 from quadid.online.grid_buffer import Rows, WindowCut
-from quadid.rotation import down, integrated, turn
+from quadid.rotation import down, turn
 from quadid.types import FloatArray, IndexArray
 from quadid.vehicle import GRAVITY, Vehicle
 
 # --- Do the sensors agree?  Factors of channels against each other, from physics that needs no model of the vehicle
 #
-# * Gyro against attitude: by how much the turns over `TURN` change, as the gyro adds up to them and as the attitude has
-# them, about each axis.  Changes of turns have neither the gyro's bias nor the slow pull of an attitude filter in them,
-# and lie where inertias are seen.  All axes of the gyro are regressors, so that one that leaks into another shows; the
-# change of rate takes up a delay, so that the factor is a ratio of sizes.
+# * Gyro against attitude: `quadid.checks.turns`.
 # * Accelerometer against gravity: the vertical specific force of a flight is g on average, because velocity stays
 #   small.
 #
@@ -32,59 +30,11 @@ from quadid.vehicle import GRAVITY, Vehicle
 # channel that was wrong by a thousand would outweigh for minutes all that is right after it.
 
 
-ALLOWED = 0.03
-"""Calibrated sensors differ by less than this share."""
-ERRORS = 2.0
-"""... and these many standard deviations, when they are compared."""
 MEMORY, GONE = 30.0, 45.0
 """Data that tell a factor fade with this time constant, and are gone at this age [s of such data]."""
-TURN = 0.2
-"""Gyro and attitude are compared over turns of this length [s]."""
 LEAD = 2.0 * TURN
 """A change of turn needs so much of the past [s]."""
-MOVING = 0.1
-"""An axis that turns slower than this on average [rad/s] is not used: gyro noise would make the factor too small."""
-FEWEST = 15
-"""Turns that tell a factor, at least,"""
-KNOWN = 0.05
-"""... and the standard deviation from which on it is used: noise makes a ratio of small turns too large."""
-AXES = ("roll", "pitch", "yaw")
-TURN_FACTOR = "turn by the attitude over that by the gyro"
 GRAVITY_FACTOR = "accelerometer over gravity by the attitude"
-
-
-@dataclass(frozen=True)
-class Factor:
-    """Size of one channel over that of another.
-
-    Attributes:
-        what: the two, in words.
-        value: of the factor; sigma: its standard deviation, infinite where no data show it.
-        ideal: what it is where they agree.
-    """
-
-    what: str
-    value: float
-    sigma: float
-    ideal: float = 1.0
-
-    @property
-    def known(self) -> bool:
-        """True if it is known well enough to be compared."""
-        return self.sigma <= KNOWN
-
-    @property
-    def off(self) -> float:
-        """Distance from where it ought to be."""
-        return self.value - self.ideal
-
-    @property
-    def disagrees(self) -> bool:
-        """True if it is known, and cannot be what it ought to be."""
-        return self.known and abs(self.off) > ALLOWED + ERRORS * self.sigma
-
-    def __str__(self) -> str:
-        return f"{self.what} = {self.value:.3f} +- {self.sigma:.3f}"
 
 
 class _Fading:
@@ -136,26 +86,19 @@ class Consistency:
                 self._force.add(len(force) * step, np.asarray(force.sum() * step))
 
     def _add_turns(self, gyro: FloatArray, q: FloatArray, step: float) -> None:
-        long = max(round(TURN / step), 1)
-        # A turn from every row: readings in step with the sticks would put all others at one phase of their motion.
-        starts = np.arange(len(gyro) - long)
-        if len(starts) <= long:
-            return
-        turns = (
-            integrated(np.stack([gyro[k : k + long + 1] for k in starts], axis=1), step),
-            gyro[starts + long] - gyro[starts],
-            turn(q[starts], q[starts + long]),
-        )
-        by_gyro, rate, by_attitude = (t[long:] - t[:-long] for t in turns)
-        good = np.isfinite(by_gyro + rate + by_attitude).all(axis=1)
+        turns = Turns.of(gyro, q, step)
         moving = np.sqrt(np.mean(gyro[np.isfinite(gyro).all(axis=1)] ** 2, axis=0)) > MOVING
-        for axis in np.flatnonzero(moving) if good.any() else ():
-            rows = np.column_stack([by_gyro, rate[:, axis], by_attitude[:, axis]])[good]
-            self._turns[axis].add(len(rows) * step, rows.T @ rows / long)
+        for axis in np.flatnonzero(moving).tolist() if len(turns.gyro) else ():
+            self._turns[axis].add(len(turns.gyro) * step, turns.moments(axis, step))
 
     def factors(self) -> tuple[Factor, ...]:
         """Every factor of which there are data: of the gyro by axis, what leaks into it, of the accelerometer."""
-        found = [f for axis, t in enumerate(self._turns) if t.seconds > FEWEST * TURN for f in _gyro_factors(axis, t)]
+        found = [
+            f
+            for axis, t in enumerate(self._turns)
+            if t.seconds > FEWEST * TURN
+            for f in factors(axis, t.seconds, t.sum)
+        ]
         if self._force.seconds > 0.0:
             # The mean of an acceleration is a change of velocity over a time.
             # ... which stays within 1.5 m/s.
@@ -187,7 +130,7 @@ class Consistency:
         for axis, told in enumerate(self._turns[:2]):
             turns, leaked = Factor(f"{AXES[axis]} {TURN_FACTOR}", 1.0, math.inf), 0.0
             if told.seconds > FEWEST * TURN:
-                (turns, *leaks), size = _gyro_factors(axis, told), np.sqrt(np.diag(told.sum))
+                (turns, *leaks), size = factors(axis, told.seconds, told.sum), np.sqrt(np.diag(told.sum))
                 beyond = [max(abs(f.value) - f.sigma, 0.0) for f in leaks]
                 leaked = float(np.array(beyond) @ np.delete(size[:3], axis) / size[axis])
             what, value, sigma = turns.what, turns.value, turns.sigma
@@ -195,22 +138,6 @@ class Consistency:
                 what, value, sigma = f"{force.what} times {what}", force.value * value, math.hypot(force.sigma, sigma)
             found.append(Factor(what, value + math.copysign(leaked, value - 1.0), sigma))
         return tuple(found)
-
-
-def _gyro_factors(axis: int, told: _Fading) -> list[Factor]:
-    """Size of the attitude's turns over the gyro's about an axis, then what it has of the gyro's other axes."""
-    gram, cross = told.sum[:4, :4], told.sum[:4, 4]
-    inverse = np.linalg.pinv(gram, hermitian=True)
-    slope = inverse @ cross
-    left = max(float(told.sum[4, 4] - slope @ cross), 0.0) / (told.seconds / TURN - 4.0)
-    sigma = np.sqrt(left * np.diag(inverse))
-    own = [axis, 3]
-    size = math.sqrt(float(slope[own] @ gram[np.ix_(own, own)] @ slope[own]) / gram[axis, axis])
-    found = [Factor(f"{AXES[axis]} {TURN_FACTOR}", math.copysign(size, slope[axis]), float(sigma[axis]))]
-    return found + [
-        Factor(f"part of the gyro's {AXES[k]} in the attitude's {AXES[axis]}", float(slope[k]), float(sigma[k]), 0.0)
-        for k in range(3) if k != axis
-    ]  # fmt: skip
 
 
 # --- Is this window fit to be learned from?  Stuck, saturated or mis-scaled sensors, and whether the vehicle flies

@@ -10,9 +10,9 @@ from typing import Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
+from quadid.checks.turns import Factor
 from quadid.chi_square import Z95
 from quadid.identification.uncertainty import PRIOR_SHARE
-from quadid.online.checks import Factor
 from quadid.online.records import WAITS, OnlineSet, SetState
 from quadid.parameters import (
     MAY_VANISH,

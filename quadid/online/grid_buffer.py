@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from quadid.data.grid import GAP, OPTIONAL, REQUIRED, ChannelTrack, GridPlan, on_grid, split_stretches, true_runs
-from quadid.data.window import Sampling, Window
+from quadid.data.grid import GAP, OPTIONAL, REQUIRED, ChannelTrack, GridPlan, on_grid, split_stretches
+from quadid.data.window import Sampling, Window, true_runs
 from quadid.types import BoolArray, FloatArray
 
 # --- Rows of the grid, and channels of a live stream read on them, piece by piece

@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 from bisect import bisect_left
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
-from quadid.data.window import Channel, Recording, sample_period
+from quadid.data.window import Channel, Recording, copied, sample_period, true_runs
 from quadid.errors import LogError
 from quadid.rotation import continuous_sign
 from quadid.types import BoolArray, FloatArray, IntArray
@@ -169,6 +170,9 @@ _ABSURD = 1e9
 """No channel holds a number of this size in SI units; damage does."""
 _MEASURED = ("gyro", "accel", "rotor_speed", "velocity", "position", "battery")
 """Channels of bodies that move steadily; a command may be anything."""
+_STATES = ("attitude", "velocity", "position")
+_HELD, _TURNS = 5.0, 0.05
+"""A state that stays the same for longer than this [s] while rates vary by this [rad/s, standard deviation] is none."""
 _SLOW = 0.05
 """Between rows so far apart [s] a body turns and stops again."""
 _REASONS = {
@@ -179,6 +183,7 @@ _REASONS = {
     "bad_stamp": "with a wild stamp",
     "impossible": "far from those before and after",
     "not_attitude": "that are no attitude (quaternion far from unit length)",
+    "held": "that stay the same for seconds while the gyro turns: nobody measured them",
 }
 
 
@@ -292,12 +297,11 @@ def _confirmed(t: FloatArray) -> tuple[int, int]:
     return edges[0], edges[-1]
 
 
-def clean_channel(raw: RawChannel) -> Channel | None:
+def clean_channel(raw: RawChannel) -> Channel:
     """Makes a channel of raw samples: drops and counts what cannot be used.
 
     Dropped: refused stamps, values that are not finite or absurd, single impossible readings, repeated stamps, samples
     out of order, quaternions that are none.
-    Returns None when nothing remains.
     """
     stamped = np.isfinite(raw.t)
     t, values = (raw.t, raw.values) if stamped.all() else (raw.t[stamped], raw.values[stamped])
@@ -319,7 +323,7 @@ def clean_channel(raw: RawChannel) -> Channel | None:
         finite &= good
     t, values = t[finite], values[finite]
     if len(t) == 0:
-        return None
+        return Channel(raw.name, t, values, raw.source, {k: n for k, n in faults.items() if n})
     kept = rising(t)
     before = np.maximum.accumulate(np.where(kept, np.arange(len(t)), 0))
     faults["duplicate"] = int(np.count_nonzero(t[~kept] == t[before[~kept]]))
@@ -351,21 +355,22 @@ def assemble(
     """
     channels: dict[str, Channel] = {}
     for entry in raw:
-        if entry.name in channels or len(entry.t) == 0 or (other and entry.name in ("rotor_speed", "motor_command")):
-            continue
-        channel = clean_channel(entry)
-        if channel is not None:
-            channels[entry.name] = channel
-    if not channels:
+        found = entry.name in channels and len(channels[entry.name].t) > 0
+        if not (found or len(entry.t) == 0 or (other and entry.name in ("rotor_speed", "motor_command"))):
+            channels[entry.name] = clean_channel(entry)
+    if not any(len(channel.t) for channel in channels.values()):
         why = f" ({notes[0]})" if notes else ""
         raise LogError(
             f"{name}: no usable flight data in it{why}", "gyro, attitude, accelerometer or rotor signals",
             "see docs/logs.md for the messages that are read",
         )  # fmt: skip
+    channels = {n: _without_held(c, channels.get("gyro")) for n, c in channels.items()}
     warnings = [*notes, *filter(None, [other]), *clock.warnings()]
     for channel in channels.values():
         if parts := [f"{count} {_REASONS[reason]}" for reason, count in channel.faults.items()]:
+            parts += ["none is left"] * (not len(channel.t))
             warnings.append(f"{channel.name}: dropped samples: {', '.join(parts)}")
+    channels = {n: c for n, c in channels.items() if len(c.t)}
     return Recording(
         name, kind, channels, tuple(clock.breaks), tuple(warnings), autopilot=dict(autopilot or {}), other=other
     )
@@ -376,6 +381,25 @@ def damage(size: int, skipped: int, cut: bool, *others: str, unit: str = "record
     notes = [f"{skipped} of {size} bytes are damaged and were skipped"] if skipped else []
     notes += filter(None, others)
     return notes + [f"the file ends inside a {unit}: it was cut; everything before is used"] * cut
+
+
+def _without_held(channel: Channel, gyro: Channel | None) -> Channel:
+    """A state without rows of stretches in which it stays the same although the gyro turns: a logger filled them.
+
+    Nor is a velocity measured one axis of which never changes.
+    """
+    if channel.name not in _STATES or gyro is None:
+        return channel
+    first, end = true_runs(copied(channel.values))
+    long = [(a, b) for a, b in zip(first, end, strict=True) if channel.t[b] - channel.t[a] > _HELD]
+    if channel.name == "velocity" and len(channel.t) > 1 and np.min(np.ptp(channel.values, axis=0)) == 0.0:
+        long = [(0, len(channel.t) - 1)]
+    kept = np.ones(len(channel.t), dtype=np.bool_)
+    for a, b in long:
+        turns = gyro.values[(gyro.t >= channel.t[a]) & (gyro.t <= channel.t[b])]
+        kept[a : b + 1] = not len(turns) or bool(np.max(np.std(turns, axis=0)) < _TURNS)
+    held = {"held": int(np.count_nonzero(~kept))} if not kept.all() else {}
+    return replace(channel, t=channel.t[kept], values=channel.values[kept], faults={**channel.faults, **held})
 
 
 def fastest_first(raw: Sequence[RawChannel], advantage: float = 1.3) -> list[RawChannel]:

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+from quadid_replay import open_log
 
 import quadid
+from quadid.checks import inspect
 from quadid.checks.doubts import estimates_off, rotors_off
+from quadid.errors import LogError
 from quadid.flight.setup import TABLE_2
 from quadid.vehicle import Vehicle
 from tests.cli.mistakes import Place
@@ -32,6 +36,15 @@ def read_too_fast(place: Place) -> tuple[Path, str]:
 
 def gyro_too_small(place: Place) -> tuple[Path, str]:
     return place.scaled("p q r", 0.8), "pelican"
+
+
+def gyro_tilted(place: Place) -> tuple[Path, str]:
+    """By 6 degrees about x: J_zz was -2.7 [-5.0, -0.3] %, `identified`."""
+    names, rows = place.table()
+    gyro = [names.index(n) for n in "pqr"]
+    (cos, sin) = (math.cos(math.radians(6.0)), math.sin(math.radians(6.0)))
+    rows[:, gyro] = rows[:, gyro] @ np.array([[1.0, 0.0, 0.0], [0.0, cos, sin], [0.0, -sin, cos]])
+    return place.write(names, rows), "pelican"
 
 
 def mass_in_pounds(place: Place) -> tuple[Path, str]:
@@ -56,6 +69,22 @@ def test_no_value_is_called_identified_whose_interval_lacks_the_truth(
     assert any("these estimates are off" in text for text in result["warnings"])
 
 
+def test_a_tilted_gyro_moves_the_yaw_axis_by_what_it_reads_of_the_others(place: Place) -> None:
+    log, vehicle = gyro_tilted(place)
+    result = quadid.identify(log, vehicle=vehicle).result
+    rows = {p["name"]: p for p in result["parameters"]}
+    assert [n for n, p in rows.items() if not p["ci95"][0] <= TABLE_2[n] <= p["ci95"][1]] == []
+    assert any("gyro is turned against the attitude: roll -5.9" in text for text in result["warnings"])
+
+
+def test_axes_of_velocity_that_are_exchanged_are_named_also_with_the_vertical_one(place: Place) -> None:
+    """Forward and down exchanged: b was 10 % low, unreliable, and no word of why."""
+    log = place.moved("vx vz", "vz vx")
+    assert any(
+        "velocity differ from those of position: x = z, y = y, z = x" in w for w in quadid.load(log, "pelican").doubts
+    )
+
+
 def test_a_log_that_lost_a_third_of_its_rows_has_the_same_parameters(place: Place) -> None:
     """Rows between lost ones passed for measurements: J_xx was 16 % low and J_r 28 % high, `identified`."""
     names, rows = place.table()
@@ -67,6 +96,69 @@ def test_a_log_that_lost_a_third_of_its_rows_has_the_same_parameters(place: Plac
     assert [found[n]["value"] for n in ("J_xx", "J_yy")] == pytest.approx(
         [TABLE_2[n] for n in ("J_xx", "J_yy")], rel=0.03
     )
+
+
+@pytest.mark.parametrize(("columns", "scale"), [("p q r", 0.95), ("p q r", 1.06), ("q", 0.9)])
+def test_a_scale_of_the_gyro_is_named_from_five_percent_on(columns: str, scale: float, place: Place) -> None:
+    """All from 0.85 to 1.15 was "ok"; beside an attitude of its own a minute tells it to 1 %."""
+    sizes = 1.0 / np.array([scale if axis in columns else 1.0 for axis in "pqr"])
+    found = {c.name: c for c in inspect(open_log(place.scaled(columns, scale)), PELICAN).checks}
+    check = found["gyro_attitude"]
+    assert check.verdict.value == "warning"
+    told = [float(text) for text in re.findall(r"= ([0-9.]+) \+-", check.message)]
+    assert told == pytest.approx(sizes.tolist(), abs=0.02)
+    assert check.off["J_yy"] == pytest.approx(math.log(sizes[1]), abs=0.02)
+
+
+def filled(place: Place, columns: str, last: float = math.inf) -> Path:
+    """The flight with zeros in some columns up to a time [s]."""
+    names, rows = place.table()
+    for name in columns.split():
+        rows[rows[:, 0] <= last, names.index(name)] = float(name == "qw")
+    return place.write(names, rows)
+
+
+@pytest.mark.parametrize(
+    ("columns", "last"), [("vx vy vz", math.inf), ("vz", math.inf), ("vx vy vz", 30.0), ("qw qx qy qz", math.inf)]
+)
+def test_a_state_that_a_logger_filled_is_no_measurement(columns: str, last: float, place: Place) -> None:
+    """With a velocity of zeros b was 57 % low, with vz alone 4 % and `identified`."""
+    result = quadid.identify(filled(place, columns, last), vehicle="pelican").result
+    found = {p["name"]: p for p in result["parameters"]}
+    assert [n for n, p in found.items() if not p["ci95"][0] <= TABLE_2[n] <= p["ci95"][1]] == []
+    assert found["b"]["value"] == pytest.approx(TABLE_2["b"], rel=0.01)
+    assert any("stay the same for seconds while the gyro turns" in text for text in result["warnings"])
+
+
+def test_speeds_in_steps_make_inertias_as_much_too_large_as_their_noise(place: Place) -> None:
+    """In steps of 10 rad/s J_xx was 15 % high [1.5, 31], `identified`, and nothing was said."""
+    log = place.of_rotors(lambda w: 10.0 * np.round(w / 10.0))
+    result = quadid.identify(f"{log}@0:20", vehicle="pelican").result
+    found = {p["name"]: p for p in result["parameters"]}
+    assert [n for n, p in found.items() if not p["ci95"][0] <= TABLE_2[n] <= p["ci95"][1]] == []
+    assert any("come in steps of 10 rad/s" in text for text in result["warnings"])
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda w: w * [1, 1, 0, 1] + [0, 0, 450, 0], "rotor 3 holds 450 rad/s"),
+        (lambda w: w * [1, 0, 1, 1] + [0, 300, 0, 0], "rotor 2 holds 300 rad/s"),
+    ],
+)
+def test_a_rotor_that_holds_a_value_no_other_reaches_is_stuck(
+    change: Callable[[np.ndarray], np.ndarray], said: str, place: Place
+) -> None:
+    """The largest and smallest speed of all passed for limits, also where it was of the rotor that is stuck."""
+    with pytest.raises(LogError, match=said):
+        quadid.load(place.of_rotors(change), "pelican")
+
+
+def test_a_channel_of_which_nothing_is_left_is_named(place: Place) -> None:
+    """Quaternions of zeros went without a word."""
+    log = place.scaled("qw qx qy qz", 0.0)
+    (text,) = [w for w in quadid.load(log, "pelican").warnings if "attitude:" in w]
+    assert "that are no attitude (quaternion far from unit length), none is left" in text
 
 
 def test_a_diagnosis_holds_the_doubt_as_an_identification_does(place: Place) -> None:

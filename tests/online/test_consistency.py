@@ -13,9 +13,10 @@ from quadid_replay import open_log
 from scipy.signal import butter, sosfiltfilt
 
 from quadid.app.logs import load_vehicle
+from quadid.checks.turns import ALLOWED, AXES, Factor
 from quadid.data.window import Recording
 from quadid.online import Phase, Session
-from quadid.online.checks import ALLOWED, AXES, LEAD, Consistency, Factor
+from quadid.online.checks import LEAD, Consistency
 from quadid.online.gate import GateSettings, decide
 from quadid.online.grid_buffer import GridBuffer
 from quadid.online.records import SetState

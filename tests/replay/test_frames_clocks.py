@@ -172,7 +172,8 @@ def test_samples_that_cannot_be_used_are_dropped_and_counted() -> None:
     assert channel is not None
     np.testing.assert_array_equal(channel.t, [0.0, 0.1, 0.2, 0.4])
     assert dict(channel.faults) == {"bad_stamp": 1, "not_finite": 1, "duplicate": 1, "backwards": 1}
-    assert clean_channel(RawChannel("gyro", t, values * np.nan, "x")) is None
+    nothing = clean_channel(RawChannel("gyro", t, values * np.nan, "x"))
+    assert (len(nothing.t), nothing.faults) == (0, {"bad_stamp": 1, "not_finite": 7})
     absurd = clean_channel(RawChannel("position", np.array([0.0, 1.0]), np.array([[0.0, 1, 2], [1e200, 0, 0]]), "x"))
     assert absurd is not None
     assert (len(absurd.t), dict(absurd.faults)) == (1, {"absurd": 1})
