@@ -19,8 +19,9 @@ from functools import lru_cache
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 from queue import Empty, SimpleQueue
-from typing import Any
+from typing import Annotated, Any
 
+import typer
 from quadid_replay import open_log
 from quadid_replay.formats import HEAD_BYTES, recognise
 
@@ -36,7 +37,7 @@ from quadid.app.logs import (
     parse_part,
     require_gyro,
 )  # fmt: skip
-from quadid.app.options import Described
+from quadid.app.options import OUT, Described, NamedColumns, Rate, Seed, Typed
 from quadid.app.outcome import Advance, silent
 from quadid.data.window import Recording
 from quadid.errors import LogError, NotIdentifiableError, QuadidError, VehicleError
@@ -46,10 +47,47 @@ from quadid.version import __version__
 
 
 def fleet(
-    folder: str | Path, out: str | Path, vehicle: Described | None = None, *, scheduler: str | None = None,
-    workers: int | None = None, memory: str = "2GiB", diagnose: bool = False, again: bool = False, rate: float = GRID,
-    seed: int = 1, columns: Mapping[str, str] | None = None, advance: Advance = silent,
-) -> Fleet:  # fmt: skip
+    folder: Annotated[
+        str | Path,
+        Typed(
+            Path,
+            typer.Argument(metavar="DIR", help="Folder of logs, formats auto-detected; one vehicle a folder."),
+            ...,
+        ),
+    ],
+    out: Annotated[str | Path, Typed(Path, OUT, Path())],
+    vehicle: Annotated[
+        Described | None,
+        Typed(
+            str | None,
+            typer.Option(
+                "--vehicle", metavar="V", help="Shipped name or YAML file for folders without a vehicle.yaml."
+            ),
+            read=load_vehicle,
+        ),
+    ] = None,
+    *,
+    scheduler: Annotated[
+        str | None,
+        typer.Option("--scheduler", metavar="ADDR", help="A Dask scheduler (tcp://…); default: own workers."),
+    ] = None,
+    workers: Annotated[
+        int | None, typer.Option("--workers", metavar="N", min=1, help="Own workers; default one a core.")
+    ] = None,
+    memory: Annotated[
+        str, typer.Option("--memory", metavar="SIZE", help="Memory that one own worker may take.")
+    ] = "2GiB",
+    diagnose: Annotated[
+        bool, typer.Option("--diagnose", help="Also name what the simulation gets wrong (slower).")
+    ] = False,
+    again: Annotated[
+        bool, typer.Option("--again", help="Identify all logs again, including those already done.")
+    ] = False,
+    rate: Rate = GRID,
+    seed: Seed = 1,
+    columns: NamedColumns = None,
+    advance: Advance = silent,
+) -> Fleet:
     """Identifies every log of a folder in parallel on Dask; run again, it goes on where it was.
 
     Args:

@@ -355,6 +355,7 @@ class Fleet(Reported):
         logs, parameters: rows that it was made from.
     """
 
+    page_name = "fleet.html"
     result: dict[str, Any]
     logs: Sequence[Json]
     parameters: Sequence[Json]

@@ -202,7 +202,8 @@ JsonTarget = Annotated[
         "--json", metavar="FILE", help="Write the result as JSON; '-' for stdout, which then carries nothing else."
     ),
 ]
-OutFolder = Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for written files.")]
+OUT = typer.Option("--out", metavar="DIR", help="Folder for written files.")
+OutFolder = Annotated[Path, OUT]
 ReportFile = Annotated[
     Path | None, typer.Option("--report", metavar="F.html", help="Write a self-contained HTML report.")
 ]

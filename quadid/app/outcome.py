@@ -220,7 +220,13 @@ _LIBRARIES = ("numpy", "numba", "scipy", "plotly")
 
 
 class Reported(Outcome):
-    """A result that has an HTML report."""
+    """A result that has an HTML report.
+
+    Attributes:
+        page_name: of the report that the command always writes into its folder; empty where `--report` names it.
+    """
+
+    page_name: ClassVar[str] = ""
 
     @abstractmethod
     def page(self, command: str = LIBRARY) -> str:

@@ -192,7 +192,9 @@ COMMANDS = {
             "quadid fleet logs --vehicle pelican --workers 4 --out fleet-out",
             "quadid fleet logs --scheduler tcp://10.0.0.1:8786 --diagnose",
         ),
-        "quadid.cli.fleet:fleet",
+        "quadid.app.fleet:fleet",
+        "Identify every log of a folder on Dask; write SQLite, Parquet and a report. Run it again and it goes on.",
+        out="",
     ),
     "warmup": Command("Compile now what the first fit would compile.", ("quadid warmup",), "quadid.cli.warmup:warmup"),
 }
@@ -237,7 +239,8 @@ def of_library(command: Command, function: Callable[..., Outcome]) -> Callable[.
                 typed[name] = options.Typed(None, told)
                 shown[name] = parameter.annotation, ... if parameter.default is parameter.empty else parameter.default
     shown |= {name: options.READING[name] for name in command.reading}
-    shown |= {"report": (options.ReportFile, None)} if issubclass(outcome, Reported) else {}
+    page_name = outcome.page_name if issubclass(outcome, Reported) else None
+    shown |= {"report": (options.ReportFile, None)} if page_name == "" else {}
     shown |= {"series": (options.SeriesFolder, None)} if issubclass(outcome, Fitted) else {}
     shown |= {"json": (options.JsonTarget, None)}
     if command.out:
@@ -245,6 +248,8 @@ def of_library(command: Command, function: Callable[..., Outcome]) -> Callable[.
         shown |= {"out": (options.OutFolder, Path()) if command.out == FOLDER else (asked, None)}
 
     def run(**given: Any) -> None:
+        if page_name:
+            given["report"] = given["out"] / page_name
         _run(command, function, outcome, signature, typed, given)
 
     parameters = [
@@ -271,8 +276,8 @@ def _run(
     # Places to write to are looked at before any work.
     json, report, series, out = (given.get(name) for name in ("json", "report", "series", "out"))
     terminal.check_file(json, "--json")
-    terminal.check_file(report, "--report")
     folder, _ = (None if place is None else terminal.out_folder(place) for place in (out, series))
+    terminal.check_file(report, "--report")
 
     # What was not typed is as the function has it.
     told = {name: how.read(given[name]) for name, how in typed.items() if given[name] not in (None, [])}
