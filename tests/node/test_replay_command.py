@@ -70,6 +70,15 @@ def test_nothing_published_is_exit_code_3_with_the_reason(tmp_path: Path, inside
     assert "move too little" in done.out
 
 
+def test_what_is_wrong_with_the_log_is_said_beside_what_it_would_have_published(tmp_path: Path, inside: Cli) -> None:
+    """The service waits for narrower intervals; that a rotor reads 1.3 times its speed was said by all but `replay`."""
+    made = flight(20.0, 12).recording
+    speeds = replace(made.channels["rotor_speed"], values=made.channels["rotor_speed"].values * [1.0, 1.3, 1.0, 1.0])
+    write_mcap(tmp_path / "read.mcap", replace(made, channels={**made.channels, "rotor_speed": speeds}))
+    done = inside("replay", str(tmp_path / "read.mcap"), "--vehicle", "pelican", "--diagnose", "0")
+    assert "as if rotor 2 read 1.30 times its speed" in done.err
+
+
 @pytest.mark.parametrize(
     ("arguments", "word"),
     [
