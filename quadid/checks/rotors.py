@@ -241,16 +241,18 @@ def readings_check(recording: Recording, vehicle: Vehicle, spans: Spans) -> Chec
     commands = _commanded(recording, vehicle)
     most = 0.5 if commands else 0.05
     values = signal.values[inside]
-    step, noise = _coarse(signal.t[inside], values)
-    if step:
-        message = f"rotor speeds come in steps of {step:.3g} rad/s: too coarse for the motion ({signal.source})"
-        off = estimates_off(torque=[1.0 / (1.0 + noise)] * 3, spinning=1.0 / (1.0 + noise))
-        return Check(
-            _NAME, CheckResult.WARNING, message, "log them finer, or motor commands", {"step_rad_s": step}, off
-        )
     if problem := _other_unit(values):
         return Check(_NAME, CheckResult.ERROR, f"{problem[0]} ({signal.source})", "log all in one unit", problem[1])
-    problem = _dead(values, most) or _same(values, vehicle, commands) or _stuck(signal, recording, inside)
+    problem = _dead(values, most) or _same(values, vehicle, commands)
+    step, noise = _coarse(signal.t[inside], values)
+    if step and not problem:  # such a signal rests between its steps
+        return Check(
+            _NAME, CheckResult.WARNING,
+            f"rotor speeds come in steps of {step:.3g} rad/s: too coarse for the motion ({signal.source})",
+            "log them finer, or motor commands", {"step_rad_s": step},
+            estimates_off(torque=[1.0 / (1.0 + noise)] * 3, spinning=1.0 / (1.0 + noise)),
+        )  # fmt: skip
+    problem = problem or _stuck(signal, recording, inside)
     fix = "check which outputs drive the motors, and that all of them were logged" if commands else _FIX
     return problem and Check(_NAME, CheckResult.ERROR, f"{problem[0]} ({signal.source})", fix, problem[1])
 

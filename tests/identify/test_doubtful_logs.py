@@ -144,12 +144,16 @@ def test_speeds_in_steps_make_inertias_as_much_too_large_as_their_noise(place: P
     [
         (lambda w: w * [1, 1, 0, 1] + [0, 0, 450, 0], "rotor 3 holds 450 rad/s"),
         (lambda w: w * [1, 0, 1, 1] + [0, 300, 0, 0], "rotor 2 holds 300 rad/s"),
+        (lambda w: 20.0 * np.round(w[:, [0, 0, 2, 3]] / 20.0), "rotor columns 1 and 2 are the same"),
     ],
 )
 def test_a_rotor_that_holds_a_value_no_other_reaches_is_stuck(
     change: Callable[[np.ndarray], np.ndarray], said: str, place: Place
 ) -> None:
-    """The largest and smallest speed of all passed for limits, also where it was of the rotor that is stuck."""
+    """The largest and smallest speed of all passed for limits, also where it was of the rotor that is stuck.
+
+    Columns that are one are no less so in coarse steps, of which alone a warning spoke.
+    """
     with pytest.raises(LogError, match=said):
         quadid.load(place.of_rotors(change), "pelican")
 
