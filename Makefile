@@ -84,7 +84,7 @@ STUDY = OPENBLAS_NUM_THREADS=1 $(BIN)/python -m
 truth: venv ## errors against their bound, coverage, bias with noise, status (an hour)
 	$(STUDY) quadid_evaluation.studies.truth --out docs/results
 
-filter-error: venv ## the filter-error estimator beside today's fit: coverage, recorded vehicles, a fast loop, speed (an hour)
+filter-error: venv ## the estimator: coverage, guesses, recorded vehicles, a fast loop, hidden lag, speed (an hour)
 	$(STUDY) quadid_evaluation.studies.filter_error --out docs/results
 
 bands: venv ## coverage of predicted bands on recorded flights that were not fitted (ten minutes)

@@ -149,7 +149,6 @@ def diagnose(
         NotIdentifiableError: too little data.
         LogError: a log that does not fit the vehicle.
     """
-    from quadid.diagnosis.attribution import NominalFit
     from quadid.diagnosis.pipeline import diagnose as diagnose_windows
     from quadid.diagnosis.result import Explanation
     from quadid.identification.result import with_values
@@ -164,8 +163,7 @@ def diagnose(
         OPTIMIZERS[0], windows, with_reference_voltage(described, windows), seed,
         lambda _, share: advance("nominal fit", share), unreachable,
     )  # fmt: skip
-    nominal = NominalFit(fit.vehicle, fit.theta, fit.noise)
-    found, selection = diagnose_windows(windows, described, unseen, seed, advance, nominal=nominal)
+    found, selection = diagnose_windows(windows, described, unseen, seed, advance, nominal=fit)
     found, model = _within_reach(found, unreachable, farthest([log.off for log in train])), selection.model
     models = {"nominal": fit.theta, "extended": model.theta}
     # What force and moment the vehicle misses without and with the causes: too little taken off, and none is confident.

@@ -30,15 +30,17 @@ from quadid.diagnosis.hypotheses import (
     sum_by_block,
 )
 from quadid.effects import EFFECTS
+from quadid.identification.fit import Fit
 from quadid.identification.gauss_newton import polish
 from quadid.identification.noise import NoiseModel
 from quadid.identification.problem import Shooting, default_prior, posterior_covariance
-from quadid.identification.reliability import MISFIT
 from quadid.identification.score import Tally, mse_score, scored_problem, settle_states, tallied
 from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 
+WORSE = 1.1
+"""Error of unseen data with the findings over that without, beyond which they are contradicted."""
 UNTIDY = 0.2
 """Distance from neutral, in typical sizes, of an effect's numbers on any vehicle."""
 
@@ -152,7 +154,7 @@ class NominalFit(NamedTuple):
 
 
 def stated_errors(
-    nominal: NominalFit, model: Model, windows: Sequence[Window], validation: Sequence[Window],
+    nominal: NominalFit | Fit, model: Model, windows: Sequence[Window], validation: Sequence[Window],
     deciding: tuple[float, float],
 ) -> Validation:  # fmt: skip
     """Errors without and with the findings, as `mse_score` has them; without validation logs, of blocks left out.
@@ -176,7 +178,7 @@ def stated_errors(
     # What happens at a moment of one flight happens at none of another.
     comparable = bool(model.causes) and not (validation and any(c.timed is not None for c in model.causes))
     without, refitted = halves or (before, after)
-    contradicted = comparable and refitted > MISFIT * without
+    contradicted = comparable and refitted > WORSE * without
     return Validation(before, after, on, deciding, refitted if halves else None, contradicted)
 
 
@@ -203,7 +205,7 @@ def left_out_error(scorer: Shooting, theta: FloatArray, names: Sequence[str]) ->
     return reduce(add, parts).mse
 
 
-def _second_halves(nominal: NominalFit, model: Model, logs: Sequence[Window]) -> tuple[float, float] | None:
+def _second_halves(nominal: NominalFit | Fit, model: Model, logs: Sequence[Window]) -> tuple[float, float] | None:
     """Errors of second halves of logs without and with the findings, what belongs to a flight refitted on the first.
 
     None where nothing belongs to a flight, or no log is long enough.

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from quadid.chi_square import Z95, exceeded
+from quadid.chi_square import Z95, exceeded, survival
 from quadid.diagnosis.attribution import UNTIDY, untidy_sized
 from quadid.diagnosis.hypotheses import Candidate, Model, free_names, paired_gain, taken_out_causes, unset_times
 from quadid.effects import EFFECTS
@@ -301,6 +301,13 @@ def slight_causes(model: Model) -> dict[str, str]:
     push = "in still air, a vertical of the attitude that is off by a degree does the same"
     small = [c for c in model.causes if untidy_sized(model, c)]
     return {c.label: push if c.timed is None else step for c in small if c.timed is not None or c.effect == "wind"}
+
+
+def unproven_causes(model: Model, tests: int) -> dict[str, str]:
+    """Causes of `model` whose numbers may as well be none, of as many `tests`, by label, and why."""
+    reason = "its numbers may be none beside random forces"
+    chance = {c.label: survival(model.wald(c), len(c.names)) * tests for c in model.causes if not c.refines}
+    return {label: reason for label, p in chance.items() if p > FALSE_ALARM}
 
 
 def impossible(model: Model, cause: Candidate) -> str:

@@ -254,6 +254,7 @@ class Model(Polished):
         held_out: deviance of each block in the density that the others predict.
         rest: deviance of all blocks but one under parameters fitted to them, for each block.
         tried: how many alternatives (causes, and onsets of them) were looked at when each cause was, by label.
+        known: uncertainty of the parameters by the likelihood of innovations, once they are fitted so.
     """
 
     causes: tuple[Candidate, ...]
@@ -262,6 +263,7 @@ class Model(Polished):
     held_out: FloatArray
     rest: FloatArray
     tried: Mapping[str, float] = field(default_factory=dict)
+    known: Uncertainty | None = None
 
     @property
     def deviance(self) -> float:
@@ -280,8 +282,8 @@ class Model(Polished):
 
     @cached_property
     def uncertainty(self) -> Uncertainty:
-        """Covariance of the scaled parameters, widened where scores of segments are larger or more alike than noise."""
-        return uncertainty(self.lin, self.prior)
+        """Covariance of the scaled parameters; that of segments is widened where their scores are more than noise."""
+        return self.known or uncertainty(self.lin, self.prior)
 
     @property
     def deviations(self) -> dict[str, float]:

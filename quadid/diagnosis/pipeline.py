@@ -9,24 +9,24 @@ import numpy as np
 
 from quadid.data.window import Window, data_faults, without_copies
 from quadid.diagnosis.attribution import NominalFit, cause_gains, stated_errors
-from quadid.diagnosis.evidence import better, impossible_causes, late_unknown, slight_causes
+from quadid.diagnosis.evidence import better, impossible_causes, late_unknown, slight_causes, unproven_causes
 from quadid.diagnosis.hypotheses import BLOCKS, Model, candidates, free_names, refit, without
+from quadid.diagnosis.innovations import fit_numbers, with_numbers
 from quadid.diagnosis.residual_tests import Remainder, inconstant_causes, remainder
 from quadid.diagnosis.result import Diagnosis, Explanation, describe
 from quadid.diagnosis.search import LINEAR_MISFIT, Search, from_everything, pruned, select
-from quadid.diagnosis.unmodelled_moments import Held, held_by_filter, refitted
 from quadid.effects import EFFECTS
-from quadid.identification.fit import FitOptions, check_windows, on_bounds, possible_moments, tied
+from quadid.identification.fit import LOST, Fit, FitOptions, check_windows, possible_moments, tied
 from quadid.identification.gauss_newton import polish
 from quadid.identification.noise import NoiseModel
 from quadid.identification.noise_fit import FAR_ITERATIONS, flexible_fit, residual_noise, with_memory
 from quadid.identification.problem import Shooting
-from quadid.identification.reliability import reliability
 from quadid.identification.result import with_values
 from quadid.identification.search import SWARM_SECONDS, Progress, swarm_search
 from quadid.identification.uncertainty import SPREAD_LIMIT, parameter_set
 from quadid.model.layout import with_reference_voltage
-from quadid.parameters import INERTIAS, NOMINAL_NAMES, UNKNOWN, Parameter, unreliable
+from quadid.parameters import NOMINAL_NAMES, Parameter
+from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 
 DECIDE_SECONDS = (4.0, 2.0, 1.0, 0.5)
@@ -46,7 +46,7 @@ LEAST_OF_EXPLAINED = 1e-3
 
 def diagnose(
     windows: Sequence[Window], vehicle: Vehicle, validation: Sequence[Window] = (), seed: int = 0,
-    progress: Progress | None = None, swarm: bool = False, nominal: NominalFit | None = None,
+    progress: Progress | None = None, swarm: bool = False, nominal: Fit | None = None,
 ) -> tuple[Diagnosis, Search]:  # fmt: skip
     """Says what the simulation of `vehicle` gets wrong on `windows`, why, and what a better one gains.
 
@@ -57,7 +57,7 @@ def diagnose(
         seed: for the swarm, where asked for, and drawn noise.
         progress: called with a stage and a fraction.
         swarm: search globally first, for poor initial guesses.
-        nominal: identification of `windows` that errors are stated with; by default that of the selection.
+        nominal: identification of `windows`, where there is one: errors are stated with it.
 
     Raises:
         WindowError, NotIdentifiableError: as `quadid.identification.fit.fit`.
@@ -67,33 +67,39 @@ def diagnose(
     faults = data_faults([*windows, *validation])
     windows, validation = without_copies(windows), without_copies(validation)
     vehicle = with_reference_voltage(vehicle, windows)
-    # Which causes, and where moments that no model has rule: what the filter shows is held, the causes refitted.
+    # Which causes, on short segments; their numbers and the vehicle's, by the likelihood of innovations.
     schedule, search = _selected(windows, vehicle, FitOptions(seed=seed) if swarm else None, report)
-    held = held_by_filter(windows, schedule[-1], search.model)
-    if held is not None:
-        schedule, search = refitted(held, schedule, search)
+    short = schedule[-1]
+    report("numbers", 0.0)
+    found = nominal if nominal and not search.model.causes else fit_numbers(windows, short, search.model)
     # What remains, and what each cause gains on unseen data.
-    decisive, model = search.shooting, search.model
-    left = remainder(decisive, model, seed)
+    decisive, selected = search.shooting, search.model
+    model = selected if found is None else with_numbers(selected, found)
+    left = remainder(decisive, selected, seed)
     report("validation", 0.0)
-    fewer = {c.label: without(decisive, model, c) for c in model.causes}
-    deciding, worth = cause_gains(decisive, search.nominal, model, fewer, validation)
-    nominal = nominal or NominalFit(vehicle, search.nominal.theta, decisive.noise)
-    outcome = stated_errors(nominal, model, windows, validation, deciding)
+    fewer = {c.label: without(decisive, selected, c) for c in selected.causes}
+    deciding, worth = cause_gains(decisive, search.nominal, selected, fewer, validation)
+    plain = model if validation and not model.causes else search.nominal
+    stated = nominal or NominalFit(vehicle, plain.theta, decisive.noise)
+    outcome = stated_errors(stated, model, windows, validation, deciding)
     # The verdict; causes with numbers that no vehicle has, or of another form, count as left.
-    doubts = impossible_causes(model) | inconstant_causes(model, left)
+    doubts = impossible_causes(model) | inconstant_causes(selected, left)
     unnamed = sum(max(w.deviance, 0.0) for w in worth if w.cause.label in doubts)
-    verdict = judge(search.nominal, model, left, unnamed)
+    verdict = judge(search.nominal, selected, left, unnamed)
     saturated = any(f.kind == "saturated" for f in faults)
     if model.causes and (outcome.contradicted or saturated or len(doubts) == len(model.causes)):
         verdict = Explanation.UNKNOWN
     # Parameters beside the causes, and findings; those are confident that nothing speaks against.
-    doubted = {label: m for label, m in fewer.items() if label in doubts}
-    parameters, reasons = _nominal_parameters(decisive, schedule[-1], model, verdict, doubted, held)
+    doubted = {label: selected.free.step(selected.theta, fewer[label].theta) for label in doubts}
+    fits = [found]
+    if doubts or verdict is Explanation.UNKNOWN:
+        fits.append(nominal or fit_numbers(windows, short, search.nominal))
+    parameters, reasons = _nominal_parameters(short, model, fits, doubted)
     parameters, moved = possible_moments(parameters)
-    weak = late_unknown(model, parameters) | slight_causes(model)
+    weak = late_unknown(model, parameters) | slight_causes(model) | unproven_causes(model, search.tests)
     alike = {c.family for c in model.causes if c.label in doubts}
     believed = [c for c in model.causes if c.family not in alike and c.label not in weak]
+    search = replace(search, model=model)
     findings = describe(decisive, search, worth, [] if verdict is Explanation.UNKNOWN else believed)
     warnings = [
         *(f.text for f in faults),
@@ -111,41 +117,33 @@ def diagnose(
 
 
 def _nominal_parameters(
-    decisive: Shooting, short: Shooting, model: Model, verdict: Explanation, doubted: Mapping[str, Model] | None = None,
-    held: Held | None = None,
-) -> tuple[tuple[Parameter, ...], tuple[str, ...]]:  # fmt: skip
-    """The nominal six beside the findings, as an identification gives them, and why some are not to be used.
+    short: Shooting, model: Model, fits: Sequence[Fit | None], doubted: Mapping[str, FloatArray]
+) -> tuple[tuple[Parameter, ...], tuple[str, ...]]:
+    """The nominal six beside the findings, as an identification gives them, and remarks on them.
 
-    Estimates must agree as those of an identification, and with models without each cause `doubted` (by label).  Where
-    the cause of the error is unknown, none is to be used, nor an inertia beside a doubtful moment, but what is `held`,
-    whose intervals hold such doubt.
+    Args:
+        short: segments, for names and the vehicle's guess.
+        model: the selected one, with its final numbers.
+        fits: its fit; where causes are doubtful or leave what has no name, also that without any cause: then numbers
+            are as uncertain as in this one, and by the step to it.  None: the filter has no finite answer.
+        doubted: step of the scaled parameters to a fit without each doubtful cause, by label.
     """
-    brief = polish(short, model.theta, model.free, model.prior, iterations=8)
-    trust = reliability(decisive, model, model.free, model.prior, brief)
-    uncertain, reasons = trust.widened(model.uncertainty), trust.reasons(model.free, model.uncertainty)
-    initial = decisive.layout.initial(decisive.vehicle)
-    steps = {label: model.free.step(model.theta, less.theta) for label, less in (doubted or {}).items()}
-    uncertain = uncertain.differing(list(steps.values()))
-    for label, step in steps.items():
-        moved = [n for n, s in zip(model.free.names, step, strict=True) if n in NOMINAL_NAMES and abs(s) > SPREAD_LIMIT]
+    free, initial = short.free(NOMINAL_NAMES), short.layout.initial(short.vehicle)
+    finite = [f for f in fits if f is not None]
+    if len(finite) < len(fits):
+        rows = parameter_set(model.free, model.theta, initial, model.uncertainty).unreliable(NOMINAL_NAMES)
+        return tuple(p for p in rows if p.name in NOMINAL_NAMES), (LOST,)
+    found, *alone = finite
+    nominal, reasons = tuple(p for p in found.parameters if p.name in NOMINAL_NAMES), found.warnings
+    for without_causes in alone:
+        steps = [free.step(model.theta, without_causes.theta), *(step[: len(nominal)] for step in doubted.values())]
+        nominal = parameter_set(free, model.theta, initial, without_causes.uncertainty.differing(steps)).parameters
+    for label, step in doubted.items():
+        moved = [n for n, s in zip(NOMINAL_NAMES, step, strict=False) if abs(s) > SPREAD_LIMIT]
         if moved:
             reasons = (*reasons, f"{', '.join(moved)}: more than {SPREAD_LIMIT:.0%} different without {label}")
-    everything = parameter_set(model.free, model.theta, initial, uncertain)
-    nominal = tuple(p for p in everything if p.name in NOMINAL_NAMES)
-    spoilt = {NOMINAL_NAMES: "the cause of the error is unknown"} if verdict is Explanation.UNKNOWN else {}
-    if turning := [c.label for c in model.causes if c.label in steps and EFFECTS[c.effect].turns]:
-        spoilt |= {INERTIAS: f"something else passes for {' and '.join(turning)}"}
-    if held is not None:
-        held = held if not spoilt and verdict is Explanation.EXPLAINED else held.beside_doubt()
-        nominal, reasons = held.among(nominal), (held.sentence, *reasons)
-    reasons = (*on_bounds(nominal), *reasons)
     for cause in model.causes:
         nominal = tied(nominal, EFFECTS[cause.effect].ties)
-    for names, why in spoilt.items():
-        open_to_it = set(names) - set(held.parameters if held else ())
-        if lost := [p.name for p in nominal if p.status not in UNKNOWN and p.name in open_to_it]:
-            nominal = unreliable(nominal, lost)
-            reasons = (*reasons, f"{', '.join(lost)}: not to be used while {why}")
     return nominal, reasons
 
 

@@ -16,7 +16,7 @@ from quadid.types import BoolArray, FloatArray
 BOLD = 1.5
 """Longest step of a logarithm: less than a factor of five."""
 FIRST_SECONDS, NEAR_SECONDS = 20.0, 60.0
-"""Of all flights together, what the very first and the first steps look at [s]."""
+"""Of all flights together, what the first steps look at, and what stands for all of it where that is enough [s]."""
 NEAR, MOST = 4, 40
 """Steps with random forces held large, and most steps after that."""
 ENOUGH, FINE = 0.5, 0.1
@@ -84,7 +84,7 @@ def estimate(problem: Problem, start: FloatArray | None = None) -> Estimate:
     z = scoring(part.along(z, psi), z, psi, NEAR, NO_NOISE)[0]
     whole, z = problem.based_on(z)
     # 2. Let them shrink: noise and physics together, until the likelihood stays; near it, over all flights.
-    part = whole.liveliest(NEAR_SECONDS)
+    part = whole.liveliest(FIRST_SECONDS)
     near = part.along(z, psi)
     z, psi, _ = settle_noise(near, z, psi)
     problem = whole.along(z, psi)

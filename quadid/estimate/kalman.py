@@ -65,6 +65,27 @@ STILL_TIME = 1.0
 _fast: Any = kept(fastmath={"contract", "nsz"})
 
 
+class Beyond(NamedTuple):
+    """What a larger model adds to the filter's own equations, linear in rates and velocity; no rows: nothing.
+
+    Attributes:
+        added: to rate, rotation vector and velocity at the end of each step, to the measurements at its begin, shape
+            (n, 9 + M).
+        slope: derivative of what it adds in a step, to these nine and to the accelerometer at its end, by rates and
+            velocity at its begin, shape (n, 12, 6).
+        at: rates and velocity where it was linearised, shape (n, 6).
+    """
+
+    added: FloatArray
+    slope: FloatArray
+    at: FloatArray
+
+
+def nothing_beyond() -> Beyond:
+    """Of a filter with its own equations alone."""
+    return Beyond(np.empty((0, 9 + M)), np.empty((0, 12, 6)), np.empty((0, 6)))
+
+
 class Track(NamedTuple):
     """One stretch of flight: what was measured when, and what the rotors did meanwhile.
 
@@ -74,7 +95,8 @@ class Track(NamedTuple):
         seen: whether each of the four was measured then, shape (n, 4).
         half: half the time over which the accelerometer averages, centred on t [s].
         piece_t: where the pieces begin on which rotor speeds are straight lines, shape (pieces,).
-        piece: integral up to there of each moment, and its polynomial from there, shape (pieces, MOMENTS, 4).
+        speed: of each rotor at the begin of a piece [rad/s], and how fast it rises, shape (pieces, rotors, 2).
+        share: of each rotor's square in the first four moments, shape (4, rotors).
         mass: [kg].
         rotors: number of rotors.
         hubs: means of x^2, y^2 [m^2] and z [m] of their hubs in body axes, from the centre of gravity.
@@ -82,8 +104,7 @@ class Track(NamedTuple):
         period: time between rotor samples [s].
         speed_noise: least and most standard deviation of a logged rotor speed [rad/s].
         still: standard deviation of a velocity that nobody measures [m/s]; 0: velocity plays no part.
-        beyond: what a larger model adds: to rate, rotation vector and velocity at the end of each step, to the
-            measurements at its begin, shape (n, 9 + M); no rows: nothing.  See `whole_model`.
+        beyond: what a larger model adds, see `whole_model`.
     """
 
     t: FloatArray
@@ -91,7 +112,8 @@ class Track(NamedTuple):
     seen: BoolArray
     half: float
     piece_t: FloatArray
-    piece: FloatArray
+    speed: FloatArray
+    share: FloatArray
     mass: float
     rotors: int
     hubs: tuple[float, float, float]
@@ -99,7 +121,7 @@ class Track(NamedTuple):
     period: float
     speed_noise: tuple[float, float]
     still: float
-    beyond: FloatArray
+    beyond: Beyond
 
 
 class Gains(NamedTuple):
@@ -123,51 +145,64 @@ class Gains(NamedTuple):
     mean: FloatArray
     P: FloatArray
     table: FloatArray
-    beyond: FloatArray
+    beyond: Beyond
 
 
 @_fast
-def _lagged(piece_t: FloatArray, piece: FloatArray, lag: float) -> FloatArray:
-    """Moments at the begin of every piece behind a first-order lag [s], shape (pieces, MOMENTS).
+def _courses(track: Track, lag: float) -> FloatArray:
+    """Integral of every rotor moment up to each piece, and its course from there, shape (pieces, MOMENTS, 7).
 
-    On a piece the lag follows a parabola, and forgets what it was before.
+    Behind a first-order lag T a rotor that should turn at u + r s turns at y = a + r s + c exp(-s / T), a = u - r T.
+    The integrals of y and y^2 are a cubic in s and three decays, see `_integral`; the lag forgets what was before.
     """
-    out = np.empty((len(piece_t), MOMENTS))
-    for m in range(MOMENTS):
-        out[0, m] = piece[0, m, 1]
-    for k in range(len(piece_t) - 1):
-        s = piece_t[k + 1] - piece_t[k]
+    pieces, rotors = track.speed.shape[0], track.speed.shape[1]
+    out, turning = np.zeros((pieces, MOMENTS, 7)), track.speed[0, :, 0].copy()
+    for k in range(pieces):
+        s = track.piece_t[k + 1] - track.piece_t[k] if k + 1 < pieces else 0.0
+        for i in range(rotors):
+            r = track.speed[k, i, 1]
+            a = track.speed[k, i, 0] - lag * r
+            c = turning[i] - a if lag > 0.0 else 0.0
+            for m in range(4):
+                w = track.share[m, i]
+                out[k, m, 1] += w * a * a
+                out[k, m, 2] += w * a * r
+                out[k, m, 3] += w * r * r / 3.0
+                out[k, m, 4] += 2.0 * w * a * c
+                out[k, m, 5] += 2.0 * w * r * c
+                out[k, m, 6] += w * c * c
+            for m in range(4, MOMENTS):
+                w = track.share[3 if m == 4 else 0, i]
+                out[k, m, 1] += w * a
+                out[k, m, 2] += 0.5 * w * r
+                out[k, m, 4] += w * c
+            turning[i] = a + r * s + (c * math.exp(-s / lag) if lag > 0.0 else 0.0)
         for m in range(MOMENTS):
-            out[k + 1, m] = _behind(piece[k, m], lag, s, out[k, m])
+            if k + 1 < pieces:
+                out[k + 1, m, 0] = _integral(out[k, m], lag, s)
     return out
 
 
 @_fast
-def _behind(polynomial: FloatArray, lag: float, s: float, begin: float) -> float:
-    """Moment behind a lag, s after the begin of a piece: y' = (M - y) / lag with M a parabola."""
-    c = 3.0 * polynomial[3]
-    b = 2.0 * (polynomial[2] - lag * c)
-    a = polynomial[1] - lag * b
-    return float(a + s * (b + s * c) + (begin - a) * math.exp(-s / lag))
+def _integral(course: FloatArray, lag: float, s: float) -> float:
+    """Integral of a moment up to s after the begin of a piece."""
+    total = course[0] + s * (course[1] + s * (course[2] + s * course[3]))
+    if lag > 0.0 and s > 0.0:
+        fade = math.exp(-s / lag)
+        gone = lag * (1.0 - fade)
+        total += gone * course[4] + lag * (gone - s * fade) * course[5] + 0.5 * lag * (1.0 - fade * fade) * course[6]
+    return float(total)
 
 
 @_fast
-def _integrals(
-    piece_t: FloatArray, piece: FloatArray, lag: float, begin: FloatArray, t: float, at: int, out: FloatArray
-) -> int:
-    """Writes the integral of every moment up to time t; returns its piece, looked for from piece `at` on.
-
-    Behind a lag the integral is that without, less lag times the moment, but for a constant.
-    """
+def _integrals(piece_t: FloatArray, courses: FloatArray, lag: float, t: float, at: int, out: FloatArray) -> int:
+    """Writes the integral of every moment up to time t; returns its piece, looked for from piece `at` on."""
     while at > 0 and piece_t[at] > t:
         at -= 1
     while at + 1 < len(piece_t) and piece_t[at + 1] <= t:
         at += 1
-    s = t - piece_t[at]
     for m in range(MOMENTS):
-        out[m] = piece[at, m, 0] + s * (piece[at, m, 1] + s * (piece[at, m, 2] + s * piece[at, m, 3]))
-        if lag > 0.0:
-            out[m] -= lag * (_behind(piece[at, m], lag, s, begin[at, m]) if s > 0.0 else begin[at, m])
+        out[m] = _integral(courses[at, m], lag, t - piece_t[at])
     return at
 
 
@@ -180,22 +215,22 @@ def moments(track: Track, delay: float, lag: float) -> FloatArray:
         delay: by which rotor speeds act later than the log has them [s].
         lag: with which they follow [s].
     """
-    begin = _lagged(track.piece_t, track.piece, lag) if lag > 0.0 else np.empty((0, MOMENTS))
+    courses = _courses(track, lag)
     n = len(track.t)
     out = np.zeros((n, 3 * MOMENTS))
     a, b, c = np.empty(MOMENTS), np.empty(MOMENTS), np.empty(MOMENTS)
     d, e = np.empty(MOMENTS), np.empty(MOMENTS)
-    at = _integrals(track.piece_t, track.piece, lag, begin, track.t[0] - delay, 0, a)
+    at = _integrals(track.piece_t, courses, lag, track.t[0] - delay, 0, a)
     for k in range(n):
         t = track.t[k] - delay
-        _integrals(track.piece_t, track.piece, lag, begin, t - track.half, at, d)
-        _integrals(track.piece_t, track.piece, lag, begin, t + track.half, at, e)
+        _integrals(track.piece_t, courses, lag, t - track.half, at, d)
+        _integrals(track.piece_t, courses, lag, t + track.half, at, e)
         for m in range(MOMENTS):
             out[k, 2 * MOMENTS + m] = (e[m] - d[m]) / (2.0 * track.half)
         if k + 1 < n:
             h = 0.5 * (track.t[k + 1] - track.t[k])
-            at = _integrals(track.piece_t, track.piece, lag, begin, t + h, at, b)
-            at = _integrals(track.piece_t, track.piece, lag, begin, t + 2.0 * h, at, c)
+            at = _integrals(track.piece_t, courses, lag, t + h, at, b)
+            at = _integrals(track.piece_t, courses, lag, t + 2.0 * h, at, c)
             for m in range(MOMENTS):
                 out[k, m], out[k, MOMENTS + m] = (b[m] - a[m]) / h, (c[m] - b[m]) / h
                 a[m] = c[m]
@@ -349,22 +384,44 @@ def _advance(c: FloatArray, row: FloatArray, h: float, keep: FloatArray, air: bo
 
 
 @_fast
-def _go_beyond(track: Track, k: int, room: FloatArray, x: FloatArray) -> None:
-    """Adds what a larger model makes of step k; `room` (N,) is overwritten."""
-    if len(track.beyond) > 0:
+def _step_beyond(beyond: Beyond, k: int, x: FloatArray, out: FloatArray) -> None:
+    """Writes what a larger model adds in step k from mean x, shape (12,)."""
+    if len(beyond.added) > 0:
+        for i in range(12):
+            out[i] = beyond.added[k, i] if i < 9 else 0.0
+            for j in range(6):
+                out[i] += beyond.slope[k, i, j] * (x[4 + j] - beyond.at[k, j])
+
+
+@_fast
+def _go_beyond(beyond: Beyond, step: FloatArray, room: FloatArray, x: FloatArray) -> None:
+    """Adds a `step` of a larger model to the mean after it; `room` (N,) is overwritten."""
+    if len(beyond.added) > 0:
         room[:] = 0.0
         for i in range(3):
-            room[OM + i], room[TH + i] = track.beyond[k, i], track.beyond[k, 3 + i]
-            room[VE + i] = track.beyond[k, 6 + i]
+            room[OM + i], room[TH + i], room[VE + i] = step[i], step[3 + i], step[6 + i]
         _correct(room, x)
 
 
 @_fast
-def _read_beyond(track: Track, k: int, nu: FloatArray) -> None:
-    """Takes what a larger model makes of each measurement off the innovations of row k."""
-    if len(track.beyond) > 0:
+def _read_beyond(beyond: Beyond, k: int, step: FloatArray, nu: FloatArray) -> None:
+    """Takes what a larger model makes of the measurements off the innovations of row k, after a `step` up to there."""
+    if len(beyond.added) > 0:
         for m in range(M):
-            nu[m] -= track.beyond[k, 9 + m]
+            nu[m] -= beyond.added[k, 9 + m]
+        for i in range(3):
+            nu[ACCEL + i] -= step[9 + i]
+
+
+@_fast
+def _bend(beyond: Beyond, k: int, F: FloatArray) -> None:
+    """Adds the slope of what a larger model makes of step k to F of Eq. 5."""
+    if len(beyond.added) > 0:
+        for i in range(3):
+            for j in range(6):
+                F[OM + i, OM + j] += beyond.slope[k, i, j]
+                F[TH + i, OM + j] += beyond.slope[k, 3 + i, j]
+                F[VE + i, OM + j] += beyond.slope[k, 6 + i, j]
 
 
 @_fast
@@ -637,7 +694,7 @@ def kalman(track: Track, p: FloatArray, psi: FloatArray, tail: FloatArray, store
     x, after = _start(track, p), np.empty(N_MEAN)
     P, FP, F, turn = np.zeros((N, N)), np.zeros((N, N)), np.zeros((N, N)), np.zeros((3, 3))
     dx, PH, G, nu = np.empty(N), np.empty(N), np.empty(N), np.zeros(M)
-    where, what, loose = np.zeros(7, dtype=np.int64), np.zeros(7), np.empty(4)
+    where, what, loose, step = np.zeros(7, dtype=np.int64), np.zeros(7), np.empty(4), np.zeros(12)
     for i in range(3):
         P[TH + i, TH + i], P[OM + i, OM + i] = 0.09, 1.0
         P[VE + i, VE + i] = max(track.still, 1.0) ** 2 if air else 0.0
@@ -650,7 +707,7 @@ def kalman(track: Track, p: FloatArray, psi: FloatArray, tail: FloatArray, store
         # Update by all that was measured now, Eq. 6.
         _accel_slope(c, g.table[k], air, x, slope)
         _expected(c, p, track.y[k], track.seen[k], g.table[k], air, x, nu)
-        _read_beyond(track, k, nu)
+        _read_beyond(track.beyond, k, step, nu)
         dx[:] = 0.0
         for m in range(M):
             if not _is_measured(track, k, m):
@@ -700,8 +757,10 @@ def kalman(track: Track, p: FloatArray, psi: FloatArray, tail: FloatArray, store
         after[:] = x
         _advance(c, g.table[k], h, keep, air, after)
         _transition(c, g.table[k], h, keep, air, x, after, F, turn)
+        _bend(track.beyond, k, F)
+        _step_beyond(track.beyond, k, x, step)
         x[:] = after
-        _go_beyond(track, k, dx, x)
+        _go_beyond(track.beyond, step, dx, x)
         _sandwich(F, P, FP, False)
         for i in range(9):
             _kick(h, air, i, turn, G)
@@ -767,12 +826,12 @@ def replay(
     n = len(track.t)
     air = track.still > 0.0 or track.seen[:, 3].any()
     c, keep, x = _constants(p, track), np.empty(9), _start(track, p)
-    dx, nu = np.empty(N), np.zeros(M)
+    dx, nu, step = np.empty(N), np.zeros(M), np.zeros(12)
     where, what = np.zeros(7, dtype=np.int64), np.zeros(7)
     total, before = 0.0, -1.0
     for k in range(n):
         _expected(c, p, track.y[k], track.seen[k], table[k], air, x, nu)
-        _read_beyond(track, k, nu)
+        _read_beyond(track.beyond, k, step, nu)
         dx[:] = 0.0
         for m in range(M):
             if g.S[k, m] == 0.0:
@@ -795,8 +854,9 @@ def replay(
             if abs(h - before) > 1e-12:
                 _keep(psi, h, keep)
                 before = h
+            _step_beyond(track.beyond, k, x, step)
             _advance(c, table[k], h, keep, air, x)
-            _go_beyond(track, k, dx, x)
+            _go_beyond(track.beyond, step, dx, x)
     return total
 
 
@@ -846,6 +906,7 @@ def backward(
             after[:] = g.mean[k]
             _advance(c, g.table[k], h, keep, air, after)
             _transition(c, g.table[k], h, keep, air, g.mean[k], after, F, turn)
+            _bend(g.beyond, k, F)
             _wavering(track, g.table[k], h, loose)
             for i in range(4):
                 _push(h, air, i, turn, G)

@@ -13,7 +13,7 @@ import numpy as np
 from quadid.data.window import Window
 from quadid.effects import EFFECTS
 from quadid.estimate import kalman as k
-from quadid.estimate.kalman import Gains, Track
+from quadid.estimate.kalman import Beyond, Gains, Track
 from quadid.estimate.track import quantum, wavering
 from quadid.estimate.whole_model import WholeModel
 from quadid.model.layout import Layout
@@ -99,7 +99,8 @@ def _of_flight(name: str) -> bool:
 def cut(track: Track, first: int, last: int) -> Track:
     """Rows `first` to before `last`; rotor speeds are kept whole."""
     rows = slice(first, last)
-    return track._replace(t=track.t[rows], y=track.y[rows], seen=track.seen[rows], beyond=track.beyond[rows])
+    beyond = Beyond(*(array[rows] for array in track.beyond))
+    return track._replace(t=track.t[rows], y=track.y[rows], seen=track.seen[rows], beyond=beyond)
 
 
 def _rows(track: Track, share: float) -> tuple[int, int]:
@@ -172,7 +173,9 @@ class Problem:
             theta = layout.initial(vehicle) if windows else layout.neutral()
             theta[:6] = vehicle.initial
         upright = (UPRIGHT,) if any(t.seen[:, 3].any() for t in tracks) else ()
-        return cls._beside(tracks, vehicle, theta, (*nominal, *TRIMMED, *upright, *names), windows)
+        return cls._beside(
+            tracks, vehicle, theta, tuple(dict.fromkeys((*nominal, *TRIMMED, *upright, *names))), windows
+        )
 
     @classmethod
     def fixed(
@@ -188,11 +191,10 @@ class Problem:
         windows: Sequence[Window],
     ) -> Problem:  # fmt: skip
         base, layout = np.zeros(k.N_PHYSICS), Layout(vehicle)
-        base[:6] = theta[:6]
         # What the filter has in its own equations it also differentiates: drag tells it the velocity through the
         # accelerometer, which what is only added along its states cannot.
         for name, place in PLACES.items():
-            if place >= k.DRAG:
+            if name in layout.entries:
                 base[place] = theta[layout.entry(name).index]
         more = [e for e in layout.entries.values() if e.name not in PLACES]
         acts = not set(names) <= set(PLACES) or any(theta[e.index] != e.neutral for e in more)
@@ -210,7 +212,15 @@ class Problem:
         total = sum(float(track.t[-1] - track.t[0]) for track in self.tracks)
         if total <= 1.2 * seconds:
             return self
-        rows = [_rows(track, seconds / total) for track in self.tracks]
+        return self._cut([_rows(track, seconds / total) for track in self.tracks])
+
+    def settled(self, seconds: float) -> Problem:
+        """The same flights without their first `seconds`, a tenth at most: rotors behind a lag begin unknown."""
+        rows = [(min(int(np.searchsorted(t.t, t.t[0] + seconds)), len(t.t) // 10), len(t.t)) for t in self.tracks]
+        return self._cut(rows)
+
+    def _cut(self, rows: Sequence[tuple[int, int]]) -> Problem:
+        """The same flights, of each the rows from a first one to before a last one."""
         tracks = tuple(cut(track, *span) for track, span in zip(self.tracks, rows, strict=True))
         models = tuple(model.cut(*span) for model, span in zip(self.models, rows, strict=True)) if self.models else ()
         return replace(self, tracks=tracks, models=models)
@@ -274,13 +284,16 @@ class Problem:
         return p
 
     def vector(self, z: FloatArray, flight: int) -> FloatArray:
-        """Full vector of one flight; what the filter has of its own and frees is in both, trim and biases are not."""
+        """Full vector of one flight, without the biases; what the filter has of its own is in both else."""
         theta, p = self.theta.copy(), self.physics(z, flight)
-        theta[:6] = p[:6]
-        for (name, place, where), value, size in zip(self.entries, z, self.size, strict=True):
-            if where in (-1, flight) and name in self.layout.entries and name.split(".")[0] not in PER_FLIGHT:
+        for name, place in PLACES.items():
+            if name in self.layout.entries:
                 entry = self.layout.entry(name)
-                theta[entry.index] = p[place] if place < k.N_PHYSICS else entry.neutral + value * size
+                theta[entry.index] = entry.neutral if name.split(".")[0] in PER_FLIGHT else p[place]
+        for (name, place, where), value, size in zip(self.entries, z, self.size, strict=True):
+            if where in (-1, flight) and place >= k.N_PHYSICS:
+                entry = self.layout.entry(name)
+                theta[entry.index] = entry.neutral + value * size
         return theta
 
     def start(self) -> FloatArray:
@@ -423,15 +436,10 @@ class Problem:
         return (total if np.isfinite(total) else np.inf), [g for _, g in found]
 
     def along(self, z: FloatArray, psi: FloatArray) -> Problem:
-        """The problem in which effects stay as simulated along the states at z, unless one of them is free.
-
-        First along states that follow the measurements: where random forces are small, those of a model without its
-        effects run away.
-        """
+        """The problem in which effects stay linear in the states, as simulated at z, unless one of them is free."""
         if not self.models or not set(self.names) <= set(PLACES):
             return self
-        _, near = replace(self, models=()).passes(z, self.first_noise())
-        tracks = [t._replace(beyond=g.beyond) for t, g in zip(self.tracks, self.passes(z, psi, near)[1], strict=True)]
+        tracks = [t._replace(beyond=g.beyond) for t, g in zip(self.tracks, self.passes(z, psi)[1], strict=True)]
         return replace(self, tracks=tuple(tracks), models=())
 
     def _pass(
@@ -439,21 +447,17 @@ class Problem:
     ) -> tuple[float, Gains]:
         track, p = self.tracks[j], self.physics(z, j)
         if self.models:
-            near = near or k.kalman(track, p, psi, self.tail, True)[1]
-            mean = near.mean
+            # First along states that follow the measurements: where random forces are small, those without effects run
+            # away.
+            near = near or k.kalman(track, p, self.first_noise(), self.tail, True)[1]
+            model, theta, mean = self.models[j], self.vector(z, j), near.mean
             for _ in range(SETTLING):
-                track = track._replace(beyond=self._beyond([z], j, mean)[0])
+                track = track._replace(beyond=model.along(theta, mean))
                 mean = np.empty_like(mean)
                 k.replay(track, p, psi, near, self._table(track, near, p), _NO_ROWS, mean)
-            track = track._replace(beyond=self._beyond([z], j, mean)[0])
+            track = track._replace(beyond=model.along(theta, mean))
         value, gains = k.kalman(track, p, psi, self.tail, store)
         return float(value), gains
-
-    def _beyond(self, points: Sequence[FloatArray], j: int, means: FloatArray) -> Sequence[FloatArray]:
-        """Contribution of the whole model at each of several z and the means of flight j."""
-        if not self.models:
-            return [self.tracks[j].beyond] * len(points)
-        return list(self.models[j].beyond(np.array([self.vector(z, j) for z in points]), means))
 
     def score(self, z: FloatArray, psi: FloatArray, gains: Sequence[Gains]) -> FloatArray:
         """Derivative of the objective by the noise numbers."""
@@ -561,14 +565,18 @@ class Problem:
         out: list[FloatArray] = []
         for first in range(0, len(points), AT_ONCE):
             some = points[first : first + AT_ONCE]
-            beyond = self._beyond(some, j, g.mean)
-            out += _each(partial(self._whitened, j, psi, g, some, beyond), len(some))
+            track = self.tracks[j]
+            tracks = [track] * len(some)
+            if self.models:
+                added = self.models[j].beyond(np.array([self.vector(z, j) for z in some]), g.mean)
+                tracks = [track._replace(beyond=Beyond(a, g.beyond.slope, g.mean[:, 4:10].copy())) for a in added]
+            out += _each(partial(self._whitened, j, psi, g, some, tracks), len(some))
         return out
 
     def _whitened(
-        self, j: int, psi: FloatArray, g: Gains, points: Sequence[FloatArray], beyond: Sequence[FloatArray], i: int
-    ) -> FloatArray:  # fmt: skip
-        track, p = self.tracks[j]._replace(beyond=beyond[i]), self.physics(points[i], j)
+        self, j: int, psi: FloatArray, g: Gains, points: Sequence[FloatArray], tracks: Sequence[Track], i: int
+    ) -> FloatArray:
+        track, p = tracks[i], self.physics(points[i], j)
         out = np.zeros((len(track.t), k.M))
         k.replay(track, p, psi, g, self._table(track, g, p), out, _NO_MEANS)
         return out

@@ -6,7 +6,7 @@ import numpy as np
 
 from quadid.data.rotor_signal import rotor_signal
 from quadid.data.window import Recording, Window, copied, in_body_axes, sample_period
-from quadid.estimate.kalman import MOMENTS, M, Track
+from quadid.estimate.kalman import Track, nothing_beyond
 from quadid.types import BoolArray, FloatArray
 from quadid.vehicle import Vehicle
 
@@ -87,16 +87,17 @@ def _track(
             times, values = channels[name]
             at = np.searchsorted(t, times + 0.5 * TOGETHER, side="right") - 1
             y[at, first:last], seen[at, group] = values, True
-    piece_t, piece = _pieces(rotor_t, speed, slope, held, vehicle)
     new = _new(speed)
     still = STILL if air and not seen[:, 3].any() else 0.0
     hub_x, hub_y, hub_z = vehicle.rotor_positions.T
+    share = np.ascontiguousarray([np.ones_like(hub_x), hub_x, hub_y, vehicle.spins])
     hubs = float(np.mean(hub_x**2)), float(np.mean(hub_y**2)), float(np.mean(hub_z))
     between = np.diff(rotor_t[new]) if new.sum() > 1 else np.diff(rotor_t)
     return Track(
-        t, y, seen, 0.5 * period, piece_t, piece, vehicle.mass, len(vehicle.rotors), hubs,
+        t, y, seen, 0.5 * period, np.ascontiguousarray(rotor_t), _lines(rotor_t, speed, slope, held), share,
+        vehicle.mass, len(vehicle.rotors), hubs,
         wavering(vehicle, vehicle.initial), float(np.median(between)), _speed_noise(speed[new]), still,
-        np.empty((0, 9 + M)),
+        nothing_beyond(),
     )  # fmt: skip
 
 
@@ -127,25 +128,11 @@ def _speed_noise(speed: FloatArray) -> tuple[float, float]:
     return quantum(speed), float(np.sqrt(np.mean(left**2)))
 
 
-def _pieces(
-    t: FloatArray, speed: FloatArray, slope: FloatArray | None, held: bool, vehicle: Vehicle
-) -> tuple[FloatArray, FloatArray]:
-    """Integrals of the rotor moments, exact for speeds that are straight lines between samples, or held."""
-    step = np.append(np.diff(t), np.median(np.diff(t)))
+def _lines(t: FloatArray, speed: FloatArray, slope: FloatArray | None, held: bool) -> FloatArray:
+    """`Track.speed` of speeds that are straight lines between samples, or held with a `slope` about their mean."""
+    step = np.append(np.diff(t), np.median(np.diff(t)))[:, None]
     if held:
         rise = np.zeros_like(speed) if slope is None else slope
-        begin = speed - 0.5 * rise * step[:, None]
-    else:
-        begin = speed
-        rise = np.vstack([np.diff(speed, axis=0), np.zeros((1, speed.shape[1]))]) / step[:, None]
-    x, y = vehicle.rotor_positions[:, :2].T
-    one = np.ones_like(x)
-    squares, speeds = np.stack([one, x, y, vehicle.spins]), np.stack([vehicle.spins, one])
-    piece = np.zeros((len(t), MOMENTS, 4))
-    piece[:, :4, 1], piece[:, 4:, 1] = begin**2 @ squares.T, begin @ speeds.T
-    piece[:, :4, 2], piece[:, 4:, 2] = (begin * rise) @ squares.T, 0.5 * rise @ speeds.T
-    piece[:, :4, 3] = rise**2 @ squares.T / 3.0
-    h = step[:, None]
-    whole = h * (piece[:, :, 1] + h * (piece[:, :, 2] + h * piece[:, :, 3]))
-    piece[1:, :, 0] = np.cumsum(whole, axis=0)[:-1]
-    return np.ascontiguousarray(t), piece
+        return np.stack([speed - 0.5 * rise * step, rise], axis=-1)
+    rise = np.vstack([np.diff(speed, axis=0), np.zeros((1, speed.shape[1]))]) / step
+    return np.stack([speed, rise], axis=-1)

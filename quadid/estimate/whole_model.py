@@ -2,9 +2,9 @@
 
 The filter carries the nominal vehicle and a few effects in its own equations.  Any other effect it takes as an addition
 to its means: from every filtered state `quadid.model` simulates one step with it and one without, all rows at once, and
-the difference is added there.  The filter then runs anew, and its states change a little; a few rounds settle both
-(fixed-point iteration, as in an iterated Kalman filter).  The filter's covariance is that of its own equations;
-sensitivities by any entry of the vector are those of both (`problem.Problem.normal_equations`).
+the difference is added there, with its slope by rates and velocity, so that air which brakes does so in the filter too.
+The filter then runs anew, and its states change a little; a few rounds settle both (Newton's, as in an iterated Kalman
+filter).  Sensitivities by any entry of the vector are those of both (`problem.Problem.normal_equations`).
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import numpy as np
 
 from quadid.data.window import Window
 from quadid.estimate import kalman as k
+from quadid.estimate.kalman import Beyond
 from quadid.model.layout import ATT_DELAY, IMU_PERIOD, Layout
 from quadid.model.rollout import Rollout, Segments
 from quadid.rotation import turn
@@ -26,6 +27,8 @@ IN_SENSORS = (
     "ahrs_acceleration_error", "velocity_scale",
 )  # fmt: skip
 """Effects that leave the motion alone."""
+NUDGE = 1e-3
+"""Step of derivatives by rates [rad/s] and velocity [m/s]."""
 _SETTLED = 1.0
 """Periods of the cutoff after which a low-pass has forgotten how it began."""
 
@@ -52,24 +55,18 @@ class WholeModel:
         return WholeModel(self._window.slice(first, last), self._vehicle, self._own)
 
     def beyond(self, thetas: FloatArray, means: FloatArray) -> FloatArray:
-        """`Track.beyond` of full parameter vectors (m, size) at filtered means (n, N_MEAN), shape (m, n, 9 + M).
+        """`Beyond.added` of full parameter vectors (m, size) at filtered means (n, N_MEAN), shape (m, n, 9 + M).
 
         The difference of two models, so that it holds no difference of two integrations.
         """
-        motion, plain = thetas.copy(), thetas.copy()
-        for index, neutral in self._sensors:
-            motion[:, index] = neutral
-        for index, neutral in self._more:
-            plain[:, index] = neutral
+        plain, motion = self._models(thetas)
         # 1. One step of the motion from every mean, beside one without what the filter has not.
         late = _SETTLED * max(thetas[:, IMU_PERIOD].max(), 0.0) + max(thetas[:, ATT_DELAY].max(), 0.0)
         sensed = not np.array_equal(thetas, motion)
         own, moved, *read = self._rolled([plain, motion, *([thetas] if sensed and late == 0.0 else [])], means, 1)
-        out = np.zeros((len(thetas), len(means), 9 + k.M))
-        out[:, :-2, :3] = moved[..., :3] - own[..., :3]
-        out[:, :-2, 3:6] = turn(_attitude(own), _attitude(moved))
-        out[:, :-2, 6:9] = moved[..., 9:12] - own[..., 9:12]
-        out[:, 1:-1, 15:18] = moved[..., 6:9] - own[..., 6:9]
+        out, step = np.zeros((len(thetas), len(means), 9 + k.M)), _step(own, moved)
+        out[:, :-2, :9] = step[..., :9]
+        out[:, 1:-1, 9 + k.ACCEL : 9 + k.VELOCITY] = step[..., 9:]
         # 2. What sensors make of it; those with a memory look back over as many steps.
         if sensed:
             lead = 1 + int(np.ceil(late / self._window.dt))
@@ -79,16 +76,50 @@ class WholeModel:
             out[:, lead:-1, 15:21] += sensors[..., 6:12] - true[..., 6:12]
         return out
 
-    def _rolled(self, vectors: Sequence[FloatArray], means: FloatArray, lead: int) -> list[FloatArray]:
-        """Measurements `lead` steps after every mean but the last two, a (m, n - 1 - lead, 12) array each."""
+    def along(self, theta: FloatArray, means: FloatArray) -> Beyond:
+        """Addition of a full parameter vector (size,) along filtered means (n, N_MEAN), with its slope there."""
+        return Beyond(self.beyond(theta[None], means)[0], self._slope(theta, means), means[:, 4:10].copy())
+
+    def _slope(self, theta: FloatArray, means: FloatArray) -> FloatArray:
+        """`Beyond.slope` of a full parameter vector (size,) at filtered means (n, N_MEAN), shape (n, 12, 6)."""
+        moves = np.zeros((7, 12))
+        moves[1:, 3:9] = NUDGE * np.eye(6)
+        own, moved = self._rolled([np.tile(v, (7, 1)) for v in self._models(theta[None])], means, 1, moves)
+        step, out = _step(own, moved), np.zeros((len(means), 12, 6))
+        out[:-2] = np.moveaxis((step[1:] - step[0]) / NUDGE, 0, -1)
+        return out
+
+    def _models(self, thetas: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Full vectors of the filter's own equations, and of the motion with all effects, of (m, size) each."""
+        plain, motion = thetas.copy(), thetas.copy()
+        for index, neutral in self._sensors:
+            motion[:, index] = neutral
+        for index, neutral in self._more:
+            plain[:, index] = neutral
+        return plain, motion
+
+    def _rolled(
+        self, vectors: Sequence[FloatArray], means: FloatArray, lead: int, moves: FloatArray | None = None
+    ) -> list[FloatArray]:
+        """Measurements `lead` steps after every mean but the last two, a (m, n - 1 - lead, 12) array each.
+
+        `moves` (m, 12) are added to the means, as rotation vector, rates, velocity and position.
+        """
         states = np.zeros((len(means) - 1 - lead, 13))
         states[:, :10] = means[: len(states), :10]
         if self._window.position is not None:
             states[:, 10:] = np.nan_to_num(self._window.position[: len(states)])
         cut = Segments(1, lead, np.arange(lead, len(means) - 1, dtype=np.int64))
-        lanes, _ = self._rollout.roll(cut, np.concatenate(vectors), states, n_pre=lead)
+        dx = None if moves is None else np.tile(moves, (len(vectors), 1))
+        lanes, _ = self._rollout.roll(cut, np.concatenate(vectors), states, dx, n_pre=lead)
         each = np.moveaxis(lanes[:, :, 0], 3, 1).reshape(-1, *lanes.shape[1:2], lanes.shape[3])
         return [each[i : i + len(v)] for v, i in zip(vectors, range(0, len(each), len(vectors[0])), strict=False)]
+
+
+def _step(own: FloatArray, moved: FloatArray) -> FloatArray:
+    """Differences in rate, rotation vector, velocity and specific force of predicted measurements, shape (..., 12)."""
+    turned = turn(_attitude(own), _attitude(moved))
+    return np.concatenate([(moved - own)[..., :3], turned, (moved - own)[..., 9:12], (moved - own)[..., 6:9]], axis=-1)
 
 
 def _attitude(read: FloatArray) -> FloatArray:

@@ -25,9 +25,7 @@ from quadid.estimate import kalman as k
 from quadid.estimate.fit import NEAR_SECONDS, Estimate, estimate, newton_step
 from quadid.estimate.problem import LATE, Problem, Sensitivities
 from quadid.estimate.track import from_window
-from quadid.identification.gauss_newton import Polished
-from quadid.identification.noise import LEAST_WHITE, RATES, likeliest
-from quadid.identification.problem import Free, Shooting
+from quadid.identification.problem import Free
 from quadid.identification.reliability import (
     BLOCKS,
     CHANCE,
@@ -45,8 +43,6 @@ from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray, IndexArray
 from quadid.vehicle import Vehicle
 
-WHITE_SHARE = 0.5
-"""Random moments rule where less than this share of what short segments leave of roll or pitch rate is white noise."""
 ALONG = (
     "rotor_drag.k_x", "rotor_drag.k_y", "rotor_drag.central", "rotor_drag_moment.h_x", "rotor_drag_moment.h_y",
     "rate_damping.l_p", "rate_damping.m_q", "rate_damping.n_r", "cg_offset.x", "cg_offset.y",
@@ -54,6 +50,8 @@ ALONG = (
 """Fitted along, with what is late, unless the model has numbers of that effect."""
 MOST_SECONDS = 600.0
 """Of longer flights the liveliest so many seconds are fitted: then a minute's interval is a third."""
+FORGOTTEN = 4.0
+"""Lags after which rotors hardly turn any more as they began."""
 MET = 3.0
 """Standard deviations of a cause's number that are met: beyond, something else passes for it."""
 SELDOM = 1e-4
@@ -86,30 +84,16 @@ class Filtered:
         """An uncertainty of these parameters with what other estimates differ by."""
         return self.trust.widened(uncertainty.differing([self.prompt]))
 
-    def doubts(self, free: Free, uncertainty: Uncertainty) -> tuple[str, ...]:
+    def doubts(self, free: Free) -> tuple[str, ...]:
         """Sentences on parameters whose estimates differ too much."""
         late = [n for n, step in zip(free.names, self.prompt, strict=True) if abs(step) > SPREAD_LIMIT]
         otherwise = f"{', '.join(late)}: more than {SPREAD_LIMIT:.0%} different where nothing is late"
-        return (*((otherwise,) if late else ()), *self.trust.reasons(free, uncertainty))
+        return (*((otherwise,) if late else ()), *self.trust.reasons(free))
 
 
-def has_unmodelled_moments(short: Shooting, plain: Polished) -> bool:
-    """Checks whether moments that the model lacks rule the rates: as random ones they explain most of what it leaves.
-
-    Args:
-        short: short segments, with the noise that the model leaves there.
-        plain: the model fitted to them.
-    """
-    for c in RATES[:2]:
-        complete = np.all(plain.lin.weights[:, :, c] > 0.0, axis=1)
-        if complete.any() and np.isfinite(plain.cost):
-            white, _ = likeliest(plain.lin.residuals[complete, :, c], short.dt)
-            if max(white, LEAST_WHITE) ** 2 < WHITE_SHARE * short.noise.variance[c]:
-                return True
-    return False
-
-
-def filtered(windows: Sequence[Window], vehicle: Vehicle, theta: FloatArray, free: Free) -> Filtered | None:
+def filtered(
+    windows: Sequence[Window], vehicle: Vehicle, theta: FloatArray, free: Free, per_flight: Sequence[str] = ()
+) -> Filtered | None:
     """Fits `free` parameters by the likelihood of innovations, random forces and all noise with them.
 
     Args:
@@ -117,32 +101,42 @@ def filtered(windows: Sequence[Window], vehicle: Vehicle, theta: FloatArray, fre
         vehicle: geometry, mass, priors and bounds.
         theta: where to start, full vector; holds the numbers of what is not free.
         free: the parameters.
+        per_flight: entries that are free beside them, with a value for each flight.
 
     Returns:
         None where the filter has no finite answer.
     """
     try:
         with np.errstate(over="ignore", invalid="ignore"):
-            return _filtered(windows, vehicle, theta, free)
+            return _filtered(windows, vehicle, theta, free, per_flight)
     except np.linalg.LinAlgError:  # the filter ran away
         return None
 
 
-def _filtered(windows: Sequence[Window], vehicle: Vehicle, theta: FloatArray, free: Free) -> Filtered | None:
+def _filtered(
+    windows: Sequence[Window], vehicle: Vehicle, theta: FloatArray, free: Free, per_flight: Sequence[str]
+) -> Filtered | None:
     # 1. The estimate, with what acts on every vehicle fitted along.
     layout = Layout(vehicle)
     known = {e.name.split(".")[0] for e in layout.entries.values() if theta[e.index] != e.neutral}
     along = fitted_along(known | {n.split(".")[0] for n in free.names})
     late = [n for n in along if n in LATE]
     nominal = [n for n in free.names if n in NOMINAL_NAMES]
-    beside = [*(n for n in free.names if n not in NOMINAL_NAMES), *along]
+    beside = [*(n for n in free.names if n not in NOMINAL_NAMES), *per_flight, *along]
 
     def problem_of(windows: Sequence[Window], names: Sequence[str] = ()) -> Problem:
         tracks = [from_window(w, vehicle, air=True) for w in windows]
         return Problem.of(tracks, vehicle, (*beside, *names), windows, theta, nominal).liveliest(MOST_SECONDS)
 
-    whole = problem_of(windows)
+    # How rotors behind a lag began is not known.
+    unsettled = FORGOTTEN * float(theta[layout.entry("motor_lag.tau").index])
+    whole = problem_of(windows).settled(unsettled)
     found = estimate(whole, start_of(whole, theta, along))
+    lag = found.value("motor_lag.tau")[0] if "motor_lag.tau" in whole.names else 0.0
+    if FORGOTTEN * lag > unsettled + windows[0].dt:
+        unsettled = FORGOTTEN * lag
+        again = problem_of(windows).settled(unsettled)
+        found = estimate(again, found.z * found.problem.size / again.size)
     if not (np.isfinite(found.objective) and np.isfinite(found.z).all() and np.isfinite(found.covariance).all()):
         return None
     problem, names = found.problem, [name for name, *_ in whole.entries]
@@ -161,6 +155,7 @@ def _filtered(windows: Sequence[Window], vehicle: Vehicle, theta: FloatArray, fr
     # 4. Parts of the flights, every second row, and models with one cause more.
     more = [n for n in _catalogue(layout, windows) if n not in whole.names and n.split(".")[0] not in known]
     wide, half = problem_of(windows, more), replace(problem_of([coarse(w) for w in windows]), names=whole.names)
+    wide, half = wide.settled(unsettled), half.settled(unsettled)
     trust = _compared(found, wide, half, places, unit)
     share = found.psi[k.SIGMA : k.TIME] / problem.noise_scale
     return Filtered(out, own, prompt, trust, bool(share[2] > LARGE))
@@ -168,8 +163,12 @@ def _filtered(windows: Sequence[Window], vehicle: Vehicle, theta: FloatArray, fr
 
 def fitted_along(stated: Collection[str]) -> tuple[str, ...]:
     """Names of what acts on every vehicle beside the nominal six, but for the effects `stated` by name."""
-    # A delay and a lag pass for one another: where the model has one, nothing else is late.
-    late = () if any(n.split(".")[0] in stated for n in LATE) else LATE
+    # Delays and lags of rotors pass for one another: where the model has one, nothing else is late.
+    late = (
+        ()
+        if any(EFFECTS[n].family == "late" and EFFECTS[n].acts == "command" for n in stated & EFFECTS.keys())
+        else LATE
+    )
     return tuple(n for n in (*ALONG, *late) if n.split(".")[0] not in stated)
 
 
@@ -232,7 +231,7 @@ def _compared(found: Estimate, wide: Problem, half: Problem, places: IndexArray,
     moved = np.array([step for _, step in others]).reshape(-1, len(unit))
     farthest = np.max(np.abs(moved), axis=0, initial=0.0)
     by = np.hypot(between, farthest)
-    return Reliability(np.maximum(between, farthest), by, moved, tuple(name for name, _ in others), False, lost)
+    return Reliability(np.maximum(between, farthest), by, moved, tuple(name for name, _ in others), lost)
 
 
 def _with_causes(found: Estimate, near: Sequence[Sensitivities], wide: Problem) -> list[tuple[str, FloatArray]]:

@@ -197,7 +197,7 @@ _RANDOM = (
     "something that the model lacks moves the vehicle: its parameters were estimated beside random forces and moments, "
     "with drag, damping, centre of gravity and what is late fitted along; `quadid diagnose` looks for the cause"
 )
-_LOST = "a filter with this model has no finite answer on this flight: its numbers are not to be used"
+LOST = "a filter with this model has no finite answer on this flight: its numbers are not to be used"
 
 
 @dataclass(frozen=True)
@@ -276,7 +276,7 @@ def fit(
     if beside is None:
         unc = uncertainty(first.lin, default_prior(short, free))
         rows = parameter_set(free, first.theta, short.layout.initial(vehicle), unc).unreliable(free.names)
-        found = Fit(vehicle, first.theta, rows, short.noise, unc, first.outcome, 0, (_LOST, *on_bounds(rows)))
+        found = Fit(vehicle, first.theta, rows, short.noise, unc, first.outcome, 0, (LOST, *on_bounds(rows)))
     else:
         found = beside_random_forces(short, beside, free)
     # 4. Sensor noise, in which errors are stated: what the whole catalogue leaves.
@@ -294,7 +294,7 @@ def beside_random_forces(short: Shooting, found: Filtered, free: Free) -> Fit:
     """The answer of the fit beside random forces: its parameters, intervals and statuses."""
     # An uncertain mass or arm moves what the data show; what estimates differ by comes after.
     theta, unc = with_scale_uncertainty(short.vehicle, free, default_prior(short, free), found.theta, found.uncertainty)
-    remarks = (*((_RANDOM,) if found.tilting else ()), *found.doubts(free, unc))
+    remarks = (*((_RANDOM,) if found.tilting else ()), *found.doubts(free))
     unc = found.held(unc)
     rows = parameter_set(free, theta, short.layout.initial(short.vehicle), unc)
     return Fit(short.vehicle, theta, rows, short.noise, unc, Convergence.CONVERGED, 0, (*remarks, *on_bounds(rows)))

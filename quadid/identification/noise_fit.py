@@ -201,14 +201,9 @@ def reweighted_fit(
 
 
 def flexible_names(layout: Layout, shooting: Shooting) -> list[str]:
-    """Everything the catalogue can free at once on these data: the model that leaves only noise.
-
-    With attitude left out the scale of the gyro and an inertia are one number; then it is not among them.
-    """
+    """Everything the catalogue can free at once on these data: the model that leaves only noise."""
     kinds = ("always", "with_velocity") if shooting.has_velocity else ("always",)
     effects = [e for e in EFFECTS.values() if e.flexible in kinds]
-    if set(ATTITUDE) <= set(shooting.left_out):
-        effects.remove(EFFECTS["gyro_scale"])
     out = [*NOMINAL_NAMES, *(n for e in effects for n in e.flexible_entries)]
     losses = [n for n in layout.entries if n.startswith("weak_rotor.loss_")]
     return out + losses[1:]

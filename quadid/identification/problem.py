@@ -252,7 +252,6 @@ class Shooting:
         noise: noise model used for weights.
         robust: weights against outliers, 0 where nothing was measured, (segments of all windows, length, channels);
             or None.
-        left_out: residual channels that do not count, as if nothing had been measured but where segments begin.
     """
 
     vehicle: Vehicle
@@ -265,7 +264,6 @@ class Shooting:
     dt: float
     noise: NoiseModel
     robust: FloatArray | None = None
-    left_out: tuple[int, ...] = ()
 
     @classmethod
     def cut(
@@ -322,10 +320,6 @@ class Shooting:
     def with_robust(self, weights: FloatArray | None) -> Shooting:
         """The same problem with other weights against outliers."""
         return replace(self, robust=weights)
-
-    def leaving_out(self, channels: Sequence[int]) -> Shooting:
-        """The same problem without the residuals of these channels, and only these."""
-        return replace(self, left_out=tuple(channels))
 
     def on(self, windows: Sequence[Window]) -> Shooting:
         """The same problem on other data."""
@@ -393,10 +387,8 @@ class Shooting:
         )  # fmt: skip
 
     def measured_weights(self, i: int) -> FloatArray:
-        """1 where a window's segments were measured and count, 0 elsewhere, shape (segments, length, channels)."""
-        weights = np.array(self.rollouts[i].valid[self.segments[i].rows][..., : self.channels], dtype=np.float64)
-        weights[..., list(self.left_out)] = 0.0
-        return weights
+        """1 where a window's segments were measured, 0 elsewhere, shape (segments, length, channels)."""
+        return np.array(self.rollouts[i].valid[self.segments[i].rows][..., : self.channels], dtype=np.float64)
 
     def _directions(self, theta: FloatArray, free: Free, k: int) -> tuple[FloatArray, FloatArray, FloatArray]:
         """One lane for the base and for each direction: vectors (1 + k + P, size), offsets (…, 12), steps (k + P,)."""

@@ -150,7 +150,9 @@ class Fusion:
         counted: end of the data taken in [s].
     """
 
-    def __init__(self, mean: FloatArray, sigma: FloatArray, own: int, memory: float, length: float) -> None:
+    def __init__(
+        self, mean: FloatArray, sigma: FloatArray, own: int, memory: float, length: float, positive: Sequence[int] = ()
+    ) -> None:
         """Starts from the prior.
 
         Args:
@@ -159,8 +161,9 @@ class Fusion:
             own: so many are estimated; the others are looked at beside them.
             memory: time constant of forgetting [s] of data taken in.
             length: of stretches that are compared [s].
+            positive: places of those that are not negative.
         """
-        self._mean, self._sigma = mean, sigma
+        self._mean, self._sigma, self._positive = mean, sigma, positive
         self._own, self._memory, self._length = own, memory, length
         self._sums: deque[Sum] = deque(maxlen=KEPT)
         self._known: dict[bool, Fused] = {}
@@ -295,6 +298,8 @@ class Fusion:
         inverse = np.linalg.inv(np.diag(precision) + (turned * np.maximum(size, 0.0)) @ turned.T)
         # A loop faster than the log answers a random moment within a step: by half of what it may, give or take that.
         z = inverse @ (total.vector[part] + precision * mean + loose[:-1].sum(axis=0))
+        for i in self._positive:
+            z = z - inverse[:, i] / inverse[i, i] * min(z[i], 0.0)
         spread = net + total.noise[part, part] + np.diag(precision) + loose.T @ loose
         covariance = inverse @ spread @ inverse
         # Errors by the length of rows: a share of the step to every second row, none where chance explains that.
@@ -336,7 +341,8 @@ class Estimator:
         self._prior_sigma = prior.sigma
         mean, sigma = np.zeros(count), np.ones(count)
         mean[:SIX], sigma[:SIX], sigma[own:] = np.log(prior.mean), prior.sigma, WIDTH
-        self._nothing = partial(Fusion, mean, sigma, own, memory, length)
+        lags = [i for i, name in enumerate(own_names(vehicle)) if name == "motor_lag.tau"]
+        self._nothing = partial(Fusion, mean, sigma, own, memory, length, lags)
         self._z = mean
         self.reset()
 

@@ -10,12 +10,12 @@ import pytest
 
 from quadid.diagnosis.evidence import impossible_causes, late_unknown, slight_causes
 from quadid.diagnosis.hypotheses import Model, Start, candidates, extend, free_names, without
+from quadid.diagnosis.innovations import fit_numbers
 from quadid.diagnosis.pipeline import _nominal_parameters
 from quadid.diagnosis.residual_tests import inconstant_causes, remainder
-from quadid.diagnosis.result import Explanation
-from quadid.identification.fit import possible_moments
+from quadid.identification.fit import LOST, possible_moments
 from quadid.identification.result import with_values
-from quadid.parameters import Status
+from quadid.parameters import Parameter, Status
 from quadid.vehicle import Vehicle
 from tests.diagnose.hidden import answer, of_class
 from tests.diagnose.problems import Problem, cause, clean, fitted, window_with
@@ -133,8 +133,8 @@ def test_an_extended_file_holds_moments_of_inertia_that_a_body_can_have() -> Non
     layout, vehicle = problem.shooting.layout, problem.shooting.vehicle
     theta[layout.entry("J_zz").index] *= 8.0
     far = replace(problem.nominal, theta=theta)
-    nominal, reasons = _nominal_parameters(problem.shooting, problem.shooting, far, Explanation.UNKNOWN)
-    assert reasons[-1].endswith("not to be used while the cause of the error is unknown")
+    nominal, reasons = _nominal_parameters(problem.shooting, far, [None], {})
+    assert reasons == (LOST,)
     parameters, said = possible_moments(nominal)
     assert said is not None
     assert "J_zz: moved" in said
@@ -145,32 +145,35 @@ def test_an_extended_file_holds_moments_of_inertia_that_a_body_can_have() -> Non
     assert moved.status is Status.UNRELIABLE
 
 
-def test_numbers_beside_a_cause_that_stands_for_something_else_are_not_to_be_used() -> None:
-    """Without the moment of the drag the inertias change, and nobody knows what is in its place; thrust stays."""
+def numbers(problem: Problem, model: Model, *doubted: str) -> tuple[dict[str, Parameter], str]:
+    """The nominal six beside a model, some of whose causes are doubtful, and the remarks."""
+    fits = [fit_numbers([problem.window], problem.shooting, m) for m in (model, problem.nominal)[: 1 + bool(doubted)]]
+    less = {label: without(problem.shooting, model, cause(problem, label)).theta for label in doubted}
+    steps = {label: model.free.step(model.theta, theta) for label, theta in less.items()}
+    found, reasons = _nominal_parameters(problem.shooting, model, fits, steps)
+    return {p.name: p for p in found}, " ".join(reasons)
+
+
+def test_numbers_beside_a_cause_that_stands_for_something_else_hold_what_they_are_without_it() -> None:
+    """Without the moment of the drag the inertias change, and nobody knows what is in its place."""
     problem, model = dragged()
-
-    def told(*labels: str) -> tuple[dict[str, Status], str]:
-        doubted = {label: without(problem.shooting, model, cause(problem, label)) for label in labels}
-        numbers, reasons = _nominal_parameters(
-            problem.shooting, problem.shooting, model, Explanation.PARTLY_EXPLAINED, doubted
-        )
-        return {p.name: p.status for p in numbers}, " ".join(reasons)
-
-    assert told()[0]["J_xx"] is told()[0]["b"] is Status.IDENTIFIED
-    status, reasons = told("rotor_drag_moment")
-    assert {status[name] for name in ("J_xx", "J_yy", "J_zz")} == {Status.UNRELIABLE}
-    assert status["b"] is Status.IDENTIFIED
-    assert "rotor_drag_moment" in reasons
+    plain, doubtful = numbers(problem, model)[0], numbers(problem, model, "rotor_drag_moment")[0]
+    assert plain["J_xx"].status is plain["b"].status is Status.IDENTIFIED
+    less = without(problem.shooting, model, cause(problem, "rotor_drag_moment"))
+    for name in ("J_xx", "J_yy", "J_zz"):
+        low, high = doubtful[name].ci95
+        assert high - low > plain[name].ci95[1] - plain[name].ci95[0]
+        assert low < less.theta[problem.shooting.layout.entry(name).index] < high
 
 
 def test_what_is_late_is_not_known_beside_inertias_that_are_not_to_be_used() -> None:
     problem = fitted(window_with({"motor_lag": {"tau": 0.04}}), clean().shooting.noise)
     model = extend(problem.shooting, problem.nominal, cause(problem, "motor_lag"), iterations=12)
-    numbers, _ = _nominal_parameters(problem.shooting, problem.shooting, model, Explanation.EXPLAINED)
-    assert late_unknown(model, numbers) == {}
-    useless = [replace(p, status=Status.UNRELIABLE) for p in numbers]
+    found = tuple(numbers(problem, model)[0].values())
+    assert late_unknown(model, found) == {}
+    useless = [replace(p, status=Status.UNRELIABLE) for p in found]
     assert list(late_unknown(model, useless)) == ["motor_lag"]
-    one = [replace(p, status=Status.UNRELIABLE) if p.name == "J_xx" else p for p in numbers]
+    one = [replace(p, status=Status.UNRELIABLE) if p.name == "J_xx" else p for p in found]
     assert late_unknown(model, one) == {}
 
 
@@ -194,19 +197,7 @@ def test_what_any_flight_may_have_is_no_event_and_no_wind(name: str, value: floa
 def test_without_gyroscopic_coupling_yaw_inertia_is_known_relative_to_the_drag_torque() -> None:
     problem = fitted(window_with({"no_gyroscopic_coupling": {"share": 1.0}}), clean().shooting.noise)
     model = extend(problem.shooting, problem.nominal, cause(problem, "no_gyroscopic_coupling"), iterations=12)
-    numbers, _ = _nominal_parameters(problem.shooting, problem.shooting, model, Explanation.EXPLAINED)
-    yaw = next(p for p in numbers if p.name == "J_zz")
-    assert yaw.status is not Status.IDENTIFIED
-    assert yaw.relative_to in ("d", None)
-    assert {p.name: p.status for p in numbers}["J_xx"] is Status.IDENTIFIED
-
-
-def test_why_a_number_on_its_bound_is_not_to_be_used_is_said() -> None:
-    problem = clean()
-    theta = problem.nominal.theta.copy()
-    entry = problem.shooting.layout.entry("J_xx")
-    theta[entry.index] = entry.lower
-    low = replace(problem.nominal, theta=theta)
-    numbers, reasons = _nominal_parameters(problem.shooting, problem.shooting, low, Explanation.EXPLAINED)
-    assert {p.name: p.status for p in numbers}["J_xx"] is Status.UNRELIABLE
-    assert any(r.startswith("J_xx = ") and "rests on its bound" in r for r in reasons)
+    found, _ = numbers(problem, model)
+    assert found["J_zz"].status is not Status.IDENTIFIED
+    assert found["J_zz"].relative_to in ("d", None)
+    assert found["J_xx"].status is Status.IDENTIFIED

@@ -13,32 +13,13 @@ import quadid
 from quadid.data.window import Window
 from quadid.flight import draw_truth, fly
 from quadid.identification.fit import Fit, FitOptions, fit
-from quadid.identification.noise import likeliest
 from quadid.parameters import Status
-from quadid.types import FloatArray
 from tests.identify.flights import PELICAN, guessed
 
-DT = 0.02
 SEED = 2
 GUSTS = {"gusts": {"push": 0.5, "turn": 1.0, "time": 0.5}}
 """Turbulence that turns the vehicle by 1 rad/s^2, with a memory of half a second."""
 SURE = (Status.IDENTIFIED, Status.RATIO_ONLY)
-
-
-def rates(white: float, walk: float, segments: int = 400, length: int = 25) -> FloatArray:
-    """Rates of segments whose acceleration walks from anywhere, with white noise on them (segments, length)."""
-    rng = np.random.default_rng(1)
-    steps = walk * np.sqrt(DT) * rng.standard_normal((segments, length))
-    acceleration = 5.0 * rng.standard_normal((segments, 1)) + np.cumsum(steps, axis=1)
-    rate = np.cumsum(np.column_stack([np.zeros(segments), acceleration[:, :-1]]), axis=1) * DT
-    return np.asarray(rate + white * rng.standard_normal((segments, length)))
-
-
-@pytest.mark.parametrize(("white", "walk"), [(0.01, 10.0), (0.03, 2.0), (0.02, 0.0)])
-def test_noise_and_walk_are_told_apart(white: float, walk: float) -> None:
-    found = likeliest(rates(white, walk), DT)
-    assert found[0] == pytest.approx(white, rel=0.15)
-    assert found[1] == pytest.approx(walk, rel=0.2, abs=0.3)
 
 
 def in_gusts(change: str = "") -> Window:

@@ -194,7 +194,7 @@ RULES: dict[str, dict[str, Any]] = {
     "ordinary sizes last": {"ordinary": _given(False)},
     "contradiction by unseen data": {"stated_errors": _uncontradicted},
     "what the rest follows": {"follows": _given(())},
-    "the filter beside unmodelled moments": {"held_by_filter": _given(None)},
+    "numbers by the likelihood of innovations": {"fit_numbers": _given(None)},
     "moments that a rigid body can have": {"possible_moments": _as_fitted},
     "slight steps and winds": {"slight_causes": _given({})},
     "lags beside unreliable inertias": {"late_unknown": _given({})},

@@ -1,1 +1,1 @@
-"""The filter-error estimator on simulated and recorded flights, beside today's fit."""
+"""The estimator of `identify` (filter error) on simulated and recorded flights."""

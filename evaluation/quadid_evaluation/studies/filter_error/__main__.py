@@ -1,17 +1,16 @@
-"""Filter-error estimation before it takes the place of today's fit: what both answer, on the same flights.
+"""The estimator of `identify` (filter error) on simulated and recorded flights.
 
     python -m quadid_evaluation.studies.filter_error --out docs/results
     python -m quadid_evaluation.studies.filter_error --parts exact speed --flights 20
 
 Parts: exact and gusty simulated flights, guesses far off, a loop faster than its log, a hidden motor lag, causes,
-recorded vehicles, speed.  A part
-that is run alone replaces its own section of the page and leaves the others.
+recorded vehicles, speed.  A part that is run alone replaces its own section of the page and leaves the others.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +24,6 @@ from quadid.estimate.track import from_recording, from_window
 from quadid.flight import draw_truth, fly
 from quadid.identification.fit import FitOptions, fit
 from quadid.parameters import NOMINAL_NAMES
-from quadid.types import FloatArray
 from quadid.vehicle import ParameterPrior, Vehicle
 from quadid_evaluation.harness import Given, options, pooled, put
 from quadid_evaluation.studies.filter_error.causes import search
@@ -66,41 +64,24 @@ KNOWN = {
 }  # fmt: skip
 
 
-def table(rows: Sequence[tuple[str, FloatArray]]) -> list[str]:
-    """Bias, coverage and half-width of each estimator, shape (flights, 2, 6) each."""
-    lines = ["| estimator | | " + " | ".join(NOMINAL_NAMES) + " |", "|---|---|" + "---|" * len(NOMINAL_NAMES)]
-    for name, found in rows:
-        error, sigma = found[:, 0], found[:, 1]
-        spread = np.std(error, axis=0) / np.sqrt(len(error))
-        inside = np.abs(error) <= 1.96 * sigma
-        lines += [
-            f"| {name} | bias ± s.e. [%] | "
-            + " | ".join(f"{100 * m:+.2f} ± {100 * s:.2f}" for m, s in zip(error.mean(axis=0), spread, strict=True))
-            + " |",
-            "| | inside 95 % [%] | " + " | ".join(f"{100 * c:.0f}" for c in inside.mean(axis=0)) + " |",
-            "| | half-width, median [%] | " + " | ".join(f"{196 * s:.2f}" for s in np.median(sigma, axis=0)) + " |",
-        ]
-    return lines
-
-
 def simulated(gusty: bool, flights: int, processes: int) -> str:
-    """Flights of drawn vehicles, guesses off by up to a third: ours and today's fit."""
-    found = pooled(exact, [(100 + seed, gusty) for seed in range(flights)], processes)
-    ours, today = np.array([f[0] for f in found]), np.array([f[1] for f in found])
-    sizes = np.median([f[2] for f in found], axis=0)
+    """Flights of drawn vehicles, guesses off by up to a third: bias, coverage and half-width of each parameter."""
+    found = np.array(pooled(exact, [(100 + seed, gusty) for seed in range(flights)], processes))
+    error, sigma = found[:, 0], found[:, 1]
+    inside = np.abs(error) <= 1.96 * sigma
     truth = "0.6, 0.3 m/s^2, 1.0, 0.3 rad/s^2" if gusty else "none"
+    rows = {
+        "bias ± s.e. [%]": [f"{100 * e.mean():+.2f} ± {100 * e.std() / np.sqrt(flights):.2f}" for e in error.T],
+        "inside 95 % [%]": [f"{100 * share:.0f}" for share in inside.mean(axis=0)],
+        "half-width, median [%]": [f"{196 * s:.2f}" for s in np.median(sigma, axis=0)],
+    }
     return "\n".join([
         f"{flights} flights of {SECONDS:.0f} s at 50 Hz, one drawn Pelican each, seeds from 100; guesses off by up to "
-        f"35 %.  Random forces acted: {truth}; found (median): horizontal {sizes[0]:.3f}, vertical {sizes[1]:.3f} "
-        f"m/s^2, roll and pitch {sizes[2]:.4f}, yaw {sizes[3]:.4f} rad/s^2.  The new estimator also frees a trim "
-        "moment and biases of gyro and horizontal accelerometer.", "",
-        *table([("filter error", ours), ("today's fit", today)]), "",
-        f"All six together: filter error {_share(ours)}, today's fit {_share(today)} inside 95 %.",
+        f"35 %.  Random forces and moments that acted (horizontal, vertical; roll and pitch, yaw): {truth}.", "",
+        "| | " + " | ".join(NOMINAL_NAMES) + " |", "|---|" + "---|" * len(NOMINAL_NAMES),
+        *(f"| {name} | " + " | ".join(cells) + " |" for name, cells in rows.items()), "",
+        f"All six together: {100 * inside.mean():.1f} % inside 95 %.",
     ])  # fmt: skip
-
-
-def _share(found: FloatArray) -> str:
-    return f"{100 * np.mean(np.abs(found[:, 0]) <= 1.96 * found[:, 1]):.1f} %"
 
 
 def guesses(count: int) -> str:
@@ -129,17 +110,17 @@ def feedback(flights: int, processes: int) -> str:
     lines = [
         f"{flights} flights of {SECONDS:.0f} s each: a stabiliser at 500 Hz reads a gyro of 0.01 rad/s and an attitude "
         "estimator fed by it; the log holds mean commands.  Random moments of 0.3 s.", "",
-        "| log | random moments | noise of speeds | J_xx, filter error [%] | inside 95 % | J_xx, today [%] | inside |",
-        "|---|---|---|---|---|---|---|",
+        "| log | random moments | noise of speeds | J_xx [%] | inside 95 % | half-width, median [%] |",
+        "|---|---|---|---|---|---|",
     ]  # fmt: skip
     for every, share, speed in ((10, 0.0, 0.0), (10, 0.2, 0.0), (10, 0.2, 0.005), (5, 0.2, 0.005), (50, 0.2, 0.005)):
         found = np.array(pooled(fast_loop, [(s, every, share, speed) for s in range(flights)], processes))
-        cells = []
-        for which in (0, 1):
-            error, sigma = found[:, which, 0, 2], found[:, which, 1, 2]
-            cells += [f"{100 * error.mean():+.1f} ± {100 * error.std() / np.sqrt(flights):.1f}",
-                      f"{100 * np.mean(np.abs(error) < 1.96 * sigma):.0f} %"]  # fmt: skip
-        lines.append(f"| {500 / every:.0f} Hz | {share:.0%} | {speed:.1%} | " + " | ".join(cells) + " |")
+        error, sigma = found[:, 0, 2], found[:, 1, 2]
+        lines.append(
+            f"| {500 / every:.0f} Hz | {share:.0%} | {speed:.1%} | "
+            f"{100 * error.mean():+.1f} ± {100 * error.std() / np.sqrt(flights):.1f} | "
+            f"{100 * np.mean(np.abs(error) < 1.96 * sigma):.0f} % | {196 * np.median(sigma):.2f} |"
+        )
     return "\n".join(lines)
 
 
@@ -280,4 +261,4 @@ if __name__ == "__main__":
         title, run = PARTS[part]
         command = f"`python -m quadid_evaluation.studies.filter_error --parts {part} --flights {given.flights}`"
         lines = [f"## {title}", "", command, "", run(given)]
-        put(given, "filter-error.md", "Filter error beside today's fit", part, lines)
+        put(given, "filter-error.md", "The estimator", part, lines)
