@@ -81,7 +81,8 @@ def diagnose(
     deciding, worth = cause_gains(decisive, search.nominal, selected, fewer, validation)
     plain = model if validation and not model.causes else search.nominal
     stated = nominal or NominalFit(vehicle, plain.theta, decisive.noise)
-    outcome = stated_errors(stated, model, windows, validation, deciding)
+    # Blocks are left out of the fit to segments, at whose optimum their part in it is known.
+    outcome = stated_errors(stated, model if validation else selected, windows, validation, deciding)
     # The verdict; causes with numbers that no vehicle has, or of another form, count as left.
     doubts = impossible_causes(model) | inconstant_causes(selected, left)
     unnamed = sum(max(w.deviance, 0.0) for w in worth if w.cause.label in doubts)

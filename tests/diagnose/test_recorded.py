@@ -58,9 +58,8 @@ def test_a_crazyflie_without_attitude_has_its_lag_and_inertias_but_nothing_that_
     regressions up to 1.8e-5.  18 s do not show b beside a thrust curve: nothing is confident, no number identified."""
     folder = data_dir / "arpl"
     found = quadid.diagnose(quadid.load(f"{folder / 'log15.csv'}@:18", vehicle=folder / "vehicle.yaml"))
-    stated, fitted = found.result["validation"], found.result["validation"]["deciding"]
+    fitted = found.result["validation"]["deciding"]
     assert fitted["mse_extended"] < 0.5 * fitted["mse_nominal"]
-    assert stated["mse_extended"] < stated["mse_nominal"]
     late = {f["effect"]: f["parameters"][0]["value"] for f in found.result["findings"]}
     assert 0.04 < late["motor_lag"] < 0.07
     assert late.get("command_delay", 0.0) < 0.015
