@@ -209,10 +209,9 @@ def _attitude_target(m: Any) -> list[Reading]:
 
 
 def _local_position(m: Any) -> list[Reading]:
-    return [
-        Reading("position", (m.x, m.y, m.z), "LOCAL_POSITION_NED"),
-        Reading("velocity", (m.vx, m.vy, m.vz), "LOCAL_POSITION_NED"),
-    ]
+    read = {"position": (m.x, m.y, m.z), "velocity": (m.vx, m.vy, m.vz)}
+    # NaN stands for what is not measured.
+    return [Reading(n, v, "LOCAL_POSITION_NED") for n, v in read.items() if not np.isnan(v).all()]
 
 
 def _servo_output(m: Any) -> list[Reading]:
