@@ -210,8 +210,11 @@ def _attitude_target(m: Any) -> list[Reading]:
 
 def _local_position(m: Any) -> list[Reading]:
     read = {"position": (m.x, m.y, m.z), "velocity": (m.vx, m.vy, m.vz)}
-    # NaN stands for what is not measured.
-    return [Reading(n, v, "LOCAL_POSITION_NED") for n, v in read.items() if not np.isnan(v).all()]
+    # Three NaN stand for what is not measured; a number equals itself.
+    return [
+        Reading(n, (a, b, c), "LOCAL_POSITION_NED", known=(a == a) | (b == b) | (c == c))
+        for n, (a, b, c) in read.items()
+    ]
 
 
 def _servo_output(m: Any) -> list[Reading]:

@@ -117,6 +117,16 @@ def test_velocity_without_attitude_stays_in_the_world(tmp_path: Path) -> None:
     same(recording, open_log(tmp_path / "log"), "mcap")
 
 
+def test_positions_in_every_other_message_lose_nothing(tmp_path: Path) -> None:
+    t = np.arange(0.0, 2.0, 0.02)
+    channels = [Channel("gyro", t, np.zeros((100, 3))), Channel("velocity", t, np.sin(t[:, None] + np.arange(3)))]
+    channels += [Channel("position", t[::2], np.cos(t[::2, None] + np.arange(3)))]
+    write_tlog(tmp_path / "log", Recording("quad", "x", {c.name: c for c in channels}))
+    read = open_log(tmp_path / "log")
+    assert len(read.channels["position"].t) == 50
+    assert not any("position" in warning for warning in read.warnings), read.warnings
+
+
 def test_what_cannot_be_written_is_said(tmp_path: Path) -> None:
     recording = Flight().recording(seconds=1.0)
     for write in WRITERS.values():
