@@ -449,7 +449,7 @@ def check_conventions(recording: Recording, vehicle: Vehicle, cut: LogPart) -> C
 
 
 def doubts_of(checks: Sequence[Check]) -> list[str]:
-    """What looks wrong, each with what to do."""
+    """Sentences of checks that warn or fail, each with its remedy."""
     return [f"{c.message}{'; ' * bool(c.fix)}{c.fix}" for c in checks if c.verdict.value in ("error", "warning")]
 
 

@@ -184,7 +184,7 @@ Gate = Annotated[
 
 
 def gate_settings(pairs: str) -> dict[str, float]:
-    """What `Gate` stands for; raises ParameterError."""
+    """Settings that `Gate` lists; raises ParameterError."""
     return key_numbers(pairs, pairs, "NAME=NUMBER,NAME=NUMBER")
 
 

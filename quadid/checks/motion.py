@@ -861,10 +861,10 @@ def _judge_rates(gyro: Channel, attitude: Channel, reading: str, fit: AxisMap) -
     if fit.absurd:
         remedy = f"multiply gyro by {fit.scale:.3g}, or correct the attitude"
         return check(CheckResult.ERROR, f"{message}: the scale of one is wrong", remedy)
-    told = _sizes(gyro, attitude)
-    sizes = np.array([f.value if f.disagrees else 1.0 for f in told] or [fit.scale] * 3)
-    message = ", ".join(str(f) for f in told if f.known) or message
-    if np.all(sizes == 1.0) or not told and 0.85 < fit.scale < 1.15:
+    by_axis = _sizes(gyro, attitude)
+    sizes = np.array([f.value if f.disagrees else 1.0 for f in by_axis] or [fit.scale] * 3)
+    message = ", ".join(str(f) for f in by_axis if f.known) or message
+    if np.all(sizes == 1.0) or not by_axis and 0.85 < fit.scale < 1.15:
         return check(CheckResult.OK, message)
     remedy = "check scales and filters of both; multiply the gyro by this if the attitude is right"
     return check(CheckResult.WARNING, message, remedy, off=estimates_off(turning=(1.0 / sizes).tolist()))

@@ -26,7 +26,7 @@ TURN = 0.2
 MOVING = 0.1
 """An axis that turns slower than this on average [rad/s] is not used: gyro noise would make the factor too small."""
 FEWEST = 15
-"""Turns that tell a factor, at least,"""
+"""Turns from which a factor is computed, at least,"""
 KNOWN = 0.05
 """... and the standard deviation from which on it is used: noise makes a ratio of small turns too large."""
 AXES = ("roll", "pitch", "yaw")

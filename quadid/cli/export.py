@@ -10,19 +10,14 @@ import typer
 from quadid.app.export import export as exported
 from quadid.app.export import forms
 from quadid.app.logs import load_vehicle
-from quadid.app.options import JsonTarget, OutFolder, shipped_names
+from quadid.app.options import VEHICLE, JsonTarget, OutFolder
 from quadid.cli import terminal
 from quadid.report.programs import FORMATS
 from quadid.vehicle import Vehicle
 
 
 def export(
-    vehicle: Annotated[
-        str | None,
-        typer.Option(
-            "--vehicle", metavar="V", help="A shipped name (pelican, ...) or a YAML file.", autocompletion=shipped_names
-        ),
-    ] = None,
+    vehicle: Annotated[str | None, VEHICLE] = None,
     form: Annotated[
         str,
         typer.Option(

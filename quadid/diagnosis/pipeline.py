@@ -94,7 +94,7 @@ def diagnose(
     doubted = {label: selected.free.step(selected.theta, fewer[label].theta) for label in doubts}
     fits = [found]
     if doubts or verdict is Explanation.UNKNOWN:
-        fits.append(nominal or fit_numbers(windows, short, search.nominal))
+        fits.append(nominal or (fit_numbers(windows, short, search.nominal) if model.causes else found))
     parameters, reasons = _nominal_parameters(short, model, fits, doubted)
     parameters, moved = possible_moments(parameters)
     weak = late_unknown(model, parameters) | slight_causes(model) | unproven_causes(model, search.tests)

@@ -66,7 +66,7 @@ _fast: Any = kept(fastmath={"contract", "nsz"})
 
 
 class Beyond(NamedTuple):
-    """What a larger model adds to the filter's own equations, linear in rates and velocity; no rows: nothing.
+    """Additions of a larger model to the filter's own equations, linear in rates and velocity; no rows: none.
 
     Attributes:
         added: to rate, rotation vector and velocity at the end of each step, to the measurements at its begin, shape
@@ -82,7 +82,7 @@ class Beyond(NamedTuple):
 
 
 def nothing_beyond() -> Beyond:
-    """Of a filter with its own equations alone."""
+    """Additions to a filter with its own equations alone: none."""
     return Beyond(np.empty((0, 9 + M)), np.empty((0, 12, 6)), np.empty((0, 6)))
 
 

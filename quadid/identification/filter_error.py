@@ -164,11 +164,8 @@ def _filtered(
 def fitted_along(stated: Collection[str]) -> tuple[str, ...]:
     """Names of what acts on every vehicle beside the nominal six, but for the effects `stated` by name."""
     # Delays and lags of rotors pass for one another: where the model has one, nothing else is late.
-    late = (
-        ()
-        if any(EFFECTS[n].family == "late" and EFFECTS[n].acts == "command" for n in stated & EFFECTS.keys())
-        else LATE
-    )
+    effects = [EFFECTS[n] for n in stated if n in EFFECTS]
+    late = () if any(e.family == "late" and e.acts == "command" for e in effects) else LATE
     return tuple(n for n in (*ALONG, *late) if n.split(".")[0] not in stated)
 
 

@@ -83,7 +83,7 @@ def test_they_are_sharper_than_those_of_segments() -> None:
 
 
 def test_what_brakes_vertically_is_found_in_a_calm_flight() -> None:
-    """Where nothing random acts, states follow the model alone for the whole flight, and so must what air does."""
+    """States follow the model alone for the whole flight where nothing random acts, and so must what air does."""
     hidden = {"rotor_drag": {"k_x": 0.4, "k_y": 0.4}, "axial_inflow": {"k_z": 0.8}}
     truth = draw_truth(PELICAN, SEED)
     window = fly(PELICAN, truth, 40.0, SEED, effects=hidden, extras=("velocity",)).window
