@@ -612,21 +612,21 @@ def _one_axis(gyro: Channel, attitude: Channel) -> Check | None:
     )
 
 
-def _sizes(gyro: Channel, attitude: Channel) -> list[Factor]:
+def _sizes(gyro: Channel, attitude: Channel, over: float = TURN) -> list[Factor]:
     """Turns of the attitude over those of the gyro about x, y and z; empty where they are too slow or too few."""
-    step = max(sample_period(attitude.t), 0.1 * TURN)
+    step = max(sample_period(attitude.t), 0.1 * over)
     at = np.arange(max(gyro.t[0], attitude.t[0]), min(gyro.t[-1], attitude.t[-1]), step)
-    if step > 0.25 * TURN or len(at) < FEWEST * TURN / step:
+    if step > 0.25 * over or len(at) < FEWEST * over / step:
         return []
     q = linear(attitude.t, attitude.values, at)
     q[~usable_steps(attitude.t, gyro.t)[np.searchsorted(attitude.t[1:-1], at, "right")]] = np.nan
-    turns = Turns.of(linear(gyro.t, gyro.values, at), q, step)
+    turns = Turns.of(linear(gyro.t, gyro.values, at), q, step, over)
     felt, turned, rate = _without_jumps(turns.gyro, turns.attitude, turns.rate)
-    turns = Turns(felt, rate, turned)
-    seconds = len(turns.gyro) * step
-    if seconds < FEWEST * TURN:
+    turns = Turns(felt, rate, turned, over)
+    number = len(felt) * step / over
+    if number < FEWEST:
         return []
-    return [factors(axis, seconds, turns.moments(axis, step))[0] for axis in range(3)]
+    return [factors(axis, number, turns.moments(axis, step))[0] for axis in range(3)]
 
 
 def _turned(gyro: Channel, attitude: Channel) -> Check | None:
@@ -867,6 +867,12 @@ def _judge_rates(gyro: Channel, attitude: Channel, reading: str, fit: AxisMap) -
     if np.all(sizes == 1.0) or not by_axis and 0.85 < fit.scale < 1.15:
         return check(CheckResult.OK, message)
     remedy = "check scales and filters of both; multiply the gyro by this if the attitude is right"
+    # A scale is that of long turns too; what only short ones show was filtered, in the channel that turns less.
+    longer = _sizes(gyro, attitude, 2.0 * TURN)
+    if longer and all(f.known and not f.disagrees for f in longer):
+        filtered = "gyro" if sizes.mean() > 1.0 else "attitude"
+        message += f" over {TURN:g} s, right over {2.0 * TURN:g} s: the {filtered} was smoothed without a delay"
+        remedy = f"log the raw {filtered}, else inertias come out wrong"
     return check(CheckResult.WARNING, message, remedy, off=estimates_off(turning=(1.0 / sizes).tolist()))
 
 

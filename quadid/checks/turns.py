@@ -68,20 +68,24 @@ class Factor:
 
 
 class Turns(NamedTuple):
-    """Changes of turn by the gyro (n, 3), of its rate (n, 3), and of turn by the attitude (n, 3), from every row."""
+    """Changes of turn by the gyro (n, 3), of its rate (n, 3), and of turn by the attitude (n, 3), from every row.
+
+    `over` [s] is the length of each turn.
+    """
 
     gyro: FloatArray
     rate: FloatArray
     attitude: FloatArray
+    over: float = TURN
 
     @classmethod
-    def of(cls, gyro: FloatArray, q: FloatArray, step: float) -> Turns:
+    def of(cls, gyro: FloatArray, q: FloatArray, step: float, over: float = TURN) -> Turns:
         """Changes of turn of rates (n, 3) [rad/s] and attitudes (n, 4), `step` [s] apart; rows of NaN are left out."""
-        long = max(round(TURN / step), 1)
+        long = max(round(over / step), 1)
         # A turn from every row: readings in step with the sticks would put all others at one phase of their motion.
         starts = np.arange(max(len(gyro) - long, 0))
         if len(starts) <= long:
-            return cls(*np.empty((3, 0, 3)))
+            return cls(none := np.empty((0, 3)), none, none, over)
         turns = (
             integrated(np.stack([gyro[k : k + long + 1] for k in starts], axis=1), step),
             gyro[starts + long] - gyro[starts],
@@ -89,26 +93,26 @@ class Turns(NamedTuple):
         )
         by_gyro, rate, by_attitude = (t[long:] - t[:-long] for t in turns)
         good = np.isfinite(by_gyro + rate + by_attitude).all(axis=1)
-        return cls(by_gyro[good], rate[good], by_attitude[good])
+        return cls(by_gyro[good], rate[good], by_attitude[good], over)
 
     def moments(self, axis: int, step: float) -> FloatArray:
         """Sums of products of (changes of turn by the gyro about x, y, z, of rate, of turn by the attitude), (5, 5)."""
         rows = np.column_stack([self.gyro, self.rate[:, axis], self.attitude[:, axis]])
-        return rows.T @ rows / max(round(TURN / step), 1)
+        return rows.T @ rows / max(round(self.over / step), 1)
 
 
-def factors(axis: int, seconds: float, moments: FloatArray) -> list[Factor]:
+def factors(axis: int, turns: float, moments: FloatArray) -> list[Factor]:
     """Size of the attitude's turns over the gyro's about an axis, then what it has of the gyro's other axes.
 
     Args:
         axis: 0, 1 or 2.
-        seconds: of data in the moments.
+        turns: in the moments, by the seconds of data over the length of a turn.
         moments: as of `Turns.moments`, (5, 5).
     """
     gram, cross = moments[:4, :4], moments[:4, 4]
     inverse = np.linalg.pinv(gram, hermitian=True)
     slope = inverse @ cross
-    left = max(float(moments[4, 4] - slope @ cross), 0.0) / (seconds / TURN - 4.0)
+    left = max(float(moments[4, 4] - slope @ cross), 0.0) / (turns - 4.0)
     sigma = np.sqrt(left * np.diag(inverse))
     own = [axis, 3]
     size = math.sqrt(float(slope[own] @ gram[np.ix_(own, own)] @ slope[own]) / gram[axis, axis])

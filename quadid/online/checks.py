@@ -97,7 +97,7 @@ class Consistency:
             f
             for axis, t in enumerate(self._turns)
             if t.seconds > FEWEST * TURN
-            for f in factors(axis, t.seconds, t.sum)
+            for f in factors(axis, t.seconds / TURN, t.sum)
         ]
         if self._force.seconds > 0.0:
             # The mean of an acceleration is a change of velocity over a time.
@@ -130,7 +130,7 @@ class Consistency:
         for axis, told in enumerate(self._turns[:2]):
             turns, leaked = Factor(f"{AXES[axis]} {TURN_FACTOR}", 1.0, math.inf), 0.0
             if told.seconds > FEWEST * TURN:
-                (turns, *leaks), size = factors(axis, told.seconds, told.sum), np.sqrt(np.diag(told.sum))
+                (turns, *leaks), size = factors(axis, told.seconds / TURN, told.sum), np.sqrt(np.diag(told.sum))
                 beyond = [max(abs(f.value) - f.sigma, 0.0) for f in leaks]
                 leaked = float(np.array(beyond) @ np.delete(size[:3], axis) / size[axis])
             what, value, sigma = turns.what, turns.value, turns.sigma
