@@ -248,8 +248,12 @@ ARDUPILOT: tuple[Finding, ...] = tuple(
     )
 )  # fmt: skip
 FINDINGS = (*LOGS, *VEHICLES, *ARDUPILOT)
-MOVED = {"push_block": "push", "resampler._due": "resampler._stretches"}
-"""Imports of the attacks' scripts by an old name; old paths of modules are known once quadid is imported."""
+MOVED = {
+    "push_block": "push", "resampler._due": "resampler._stretches",
+    'x.channel=="gyro"': '"gyro" in dict(x.columns)', 's.channel=="gyro"': '"gyro" in dict(s.columns)',
+    "s.values[0]": 'dict(s.columns)["gyro"][0, 0]',
+}  # fmt: skip
+"""What the attacks' scripts call by an old name; old paths of modules are known once quadid is imported."""
 
 
 def attack(lines: str) -> Callable[[Path, Path], Sequence[str | Path]]:
@@ -376,7 +380,7 @@ ATTACKS: tuple[Finding, ...] = (
     ),
     Finding(
         "attacks/mavlink-flood-locks-out", "heartbeats of another", attack("$P flood.py 190"),
-        lambda a: min(map(int, re.findall(r"taken \d+ \((\d+)%", a[1]))) >= 95,
+        lambda a: min(map(int, re.findall(r"taken \d+ \((\d+)%", a[1])), default=0) >= 95,
     ),
     Finding(
         "attacks/mavlink-param-storm", "PARAM_SET", attack("$P storm.py"),
