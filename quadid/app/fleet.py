@@ -37,7 +37,7 @@ from quadid.app.logs import (
     parse_part,
     require_gyro,
 )  # fmt: skip
-from quadid.app.options import OUT, Described, NamedColumns, Rate, Seed, Typed
+from quadid.app.options import OUT, Described, NamedColumns, Rate, Seed, Typed, vehicle_if
 from quadid.app.outcome import Advance, silent
 from quadid.data.window import Recording
 from quadid.errors import LogError, NotIdentifiableError, QuadidError, VehicleError
@@ -56,16 +56,7 @@ def fleet(
         ),
     ],
     out: Annotated[str | Path, Typed(Path, OUT, Path())],
-    vehicle: Annotated[
-        Described | None,
-        Typed(
-            str | None,
-            typer.Option(
-                "--vehicle", metavar="V", help="Shipped name or YAML file for folders without a vehicle.yaml."
-            ),
-            read=load_vehicle,
-        ),
-    ] = None,
+    vehicle: Annotated[Described | None, vehicle_if(", for folders without a vehicle.yaml.")] = None,
     *,
     scheduler: Annotated[
         str | None,

@@ -23,7 +23,7 @@ from quadid.app.logs import (
     parse_part,
     write_text,
 )
-from quadid.app.options import Described, NamedColumns, Preset, Start, Stop, Typed
+from quadid.app.options import Described, NamedColumns, Preset, Start, Stop, Typed, vehicle_if
 from quadid.app.outcome import Outcome, json_text
 from quadid.data.window import Recording, beginning
 from quadid.errors import QuadidError
@@ -104,16 +104,7 @@ def inspect(
             ...,
         ),
     ],
-    vehicle: Annotated[
-        Described | None,
-        Typed(
-            str | None,
-            typer.Option(
-                "--vehicle", metavar="V", help="A shipped name or a YAML file: checks motors and excitation too."
-            ),
-            read=as_vehicle,
-        ),
-    ] = None,
+    vehicle: Annotated[Described | None, vehicle_if(": checks motors and excitation too.")] = None,
     *, start: Start = None, stop: Stop = None, preset: Preset = "auto", columns: NamedColumns = None,
 ) -> Inspected:  # fmt: skip
     """Inspects a log, and never refuses one that can be read.

@@ -59,14 +59,25 @@ Validate = Annotated[
         opened=True,
     ),
 ]
-VEHICLE = typer.Option(
-    "--vehicle", metavar="V", help="A shipped name (pelican, ...) or a YAML file.", autocompletion=shipped_names
-)
+
+
+def _vehicle(about: str = ".") -> ParameterInfo:
+    text = f"A shipped name (pelican, ...) or a YAML file{about}"
+    return typer.Option("--vehicle", metavar="V", help=text, autocompletion=shipped_names)
+
+
+VEHICLE = _vehicle()
 VehicleName = Annotated[str, VEHICLE]
 Described = str | Path | Vehicle
 """A shipped name, a YAML file or the vehicle itself."""
 OfVehicle = Annotated[Described | None, Typed(str, VEHICLE, ..., load_vehicle)]
 """The vehicle of the logs: a caller of the library may have it in a loaded log."""
+
+
+def vehicle_if(about: str) -> Typed:
+    """A vehicle that need not be given; its help ends with `about`."""
+    return Typed(str | None, _vehicle(about), read=load_vehicle)
+
 
 # --- How a log is read
 

@@ -180,3 +180,25 @@ def _check_unit(recording: Recording, command: Channel, vehicle: Vehicle) -> Non
     full = next((f"{count:g}" for count in _COUNTS if high <= count), "its value")
     fix = f"write shares of the full command: divide by {full}" if low > -0.1 * high else "write 0 for standing still"
     raise LogError(f"{found} neither shares of the full command nor pulses", allowed, fix)
+
+
+def px4_allocation(place: FloatArray, axis: FloatArray, strength: FloatArray, drag: FloatArray) -> FloatArray:
+    """PX4's matrix from torque and thrust setpoints (x, y, z each, FRD) to motors, shape (rotors, 6).
+
+    The pseudo-inverse of what the rotors do, scaled (ControlAllocationPseudoInverse.cpp of its sources).
+
+    Args:
+        place: of the rotors [m], FRD, shape (rotors, 3).
+        axis: of their thrusts, shape (rotors, 3), none zero.
+        strength: thrusts at full command, shape (rotors,).
+        drag: torque over thrust [m], positive for rotors of spin +1, shape (rotors,).
+    """
+    axis = axis / np.linalg.norm(axis, axis=1, keepdims=True)
+    mix = np.linalg.pinv((strength[:, None] * np.hstack([np.cross(place, axis) - drag[:, None] * axis, axis])).T)
+    # Roll and pitch by the larger of their sizes, over the motors that have a part in the torque.
+    taking_part = np.count_nonzero(np.abs(mix[:, :2]) > 1e-3, axis=0)
+    mix[:, :2] /= np.sqrt(np.sum(mix[:, :2] ** 2, axis=0) / np.maximum(0.5 * taking_part, 1e-300)).max() or 1.0
+    mix[:, 2] /= np.max(mix[:, 2]) or 1.0
+    lifting = np.abs(mix[:, 5]) > np.finfo(np.float32).eps
+    mix[:, 3:] /= np.mean(np.abs(mix[lifting, 5])) if lifting.any() else 1.0
+    return np.asarray(mix)

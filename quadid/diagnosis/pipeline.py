@@ -16,7 +16,7 @@ from quadid.diagnosis.residual_tests import Remainder, inconstant_causes, remain
 from quadid.diagnosis.result import Diagnosis, Explanation, describe
 from quadid.diagnosis.search import LINEAR_MISFIT, Search, from_everything, pruned, select
 from quadid.effects import EFFECTS
-from quadid.identification.fit import LOST, Fit, FitOptions, check_windows, possible_moments, tied
+from quadid.identification.fit import NO_FILTER, Fit, FitOptions, check_windows, possible_moments, tied
 from quadid.identification.gauss_newton import polish
 from quadid.identification.noise import NoiseModel
 from quadid.identification.noise_fit import FAR_ITERATIONS, flexible_fit, residual_noise, with_memory
@@ -133,7 +133,7 @@ def _nominal_parameters(
     finite = [f for f in fits if f is not None]
     if len(finite) < len(fits):
         rows = parameter_set(model.free, model.theta, initial, model.uncertainty).unreliable(NOMINAL_NAMES)
-        return tuple(p for p in rows if p.name in NOMINAL_NAMES), (LOST,)
+        return tuple(p for p in rows if p.name in NOMINAL_NAMES), (NO_FILTER,)
     found, *alone = finite
     nominal, reasons = tuple(p for p in found.parameters if p.name in NOMINAL_NAMES), found.warnings
     for without_causes in alone:

@@ -197,7 +197,7 @@ _RANDOM = (
     "something that the model lacks moves the vehicle: its parameters were estimated beside random forces and moments, "
     "with drag, damping, centre of gravity and what is late fitted along; `quadid diagnose` looks for the cause"
 )
-LOST = "a filter with this model has no finite answer on this flight: its numbers are not to be used"
+NO_FILTER = "a filter with this model has no finite answer on this flight: its numbers are not to be used"
 
 
 @dataclass(frozen=True)
@@ -276,7 +276,7 @@ def fit(
     if beside is None:
         unc = uncertainty(first.lin, default_prior(short, free))
         rows = parameter_set(free, first.theta, short.layout.initial(vehicle), unc).unreliable(free.names)
-        found = Fit(vehicle, first.theta, rows, short.noise, unc, first.outcome, 0, (LOST, *on_bounds(rows)))
+        found = Fit(vehicle, first.theta, rows, short.noise, unc, first.outcome, 0, (NO_FILTER, *on_bounds(rows)))
     else:
         found = beside_random_forces(short, beside, free)
     # 4. Sensor noise, in which errors are stated: what the whole catalogue leaves.

@@ -23,6 +23,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from quadid.data.rotor_signal import px4_allocation
 from quadid.errors import ParameterError
 from quadid.model.layout import ThrustModel
 from quadid.report.programs import SITL_FRAMES, Facts, sitl_frame
@@ -114,13 +115,9 @@ def authority(facts: Facts, at: Hover) -> FloatArray:
 
 
 def _px4(facts: Facts, known: Known, at: Hover) -> FloatArray:
-    """Pseudo-inverse of what the CA_ROTOR* of `quadid export` say, scaled as PX4 scales it."""
-    x, y, z = facts.arms.T
-    drag = facts.vehicle.spins * facts.torque_per_thrust
-    effect = at.most[:, None] * np.column_stack([-y, x, drag, 0.0 * x, 0.0 * x, 0.0 * x - 1.0])
-    mix = np.linalg.pinv(effect.T)[:, :3]
-    share = [math.sqrt(float(np.sum(c**2)) / (0.5 * np.count_nonzero(np.abs(c) > 1e-3))) for c in mix.T[:2]]
-    mix /= [max(share), max(share), float(np.max(mix[:, 2]))]
+    """Allocation of what the CA_ROTOR* of `quadid export` say."""
+    upwards = np.tile([0.0, 0.0, -1.0], (len(at.most), 1))
+    mix = px4_allocation(facts.arms, upwards, at.most, facts.vehicle.spins * facts.torque_per_thrust)[:, :3]
     factor = known.get("THR_MDL_FAC", 0.0)
     bend = 1.0 if facts.vehicle.command.kind == "thrust" else 1.0 / ((1.0 - factor) + 2.0 * factor * at.command)
     return np.asarray(mix * bend * [known.get(f"MC_{a.upper()}RATE_K", 1.0) for a in AXES])

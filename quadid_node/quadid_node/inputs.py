@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from quadid_replay.motors import no_multirotor
-from quadid_replay.presets import PRESETS
+from quadid_replay.presets import TOPICS, sources
 from quadid_replay.ros_messages import SIGNALS, TYPES, MessageReader
 
 from quadid.data.window import Block
@@ -197,47 +197,6 @@ class InputPreset:
     motor_hint: str
 
 
-_TYPES = {
-    "canonical": {
-        "imu": "sensor_msgs/Imu",
-        "attitude": "geometry_msgs/QuaternionStamped",
-        "rotor_speeds": "sensor_msgs/JointState",
-        "motor_command": "quadid_msgs/MotorCommand",
-        "command": "quadid_msgs/AttitudeCommand",
-        "odom": "nav_msgs/Odometry",
-        "battery": "sensor_msgs/BatteryState",
-    },
-    "mavros": {
-        "imu/data_raw": "sensor_msgs/Imu",
-        "imu/data": "sensor_msgs/Imu",
-        "esc_status/status": "mavros_msgs/ESCStatus",
-        "esc_telemetry/telemetry": "mavros_msgs/ESCTelemetry",
-        "rc/out": "mavros_msgs/RCOut",
-        "setpoint_raw/target_attitude": "mavros_msgs/AttitudeTarget",
-        "local_position/odom": "nav_msgs/Odometry",
-        "battery": "sensor_msgs/BatteryState",
-    },
-    "px4": {
-        "fmu/out/sensor_combined": "px4_msgs/SensorCombined",
-        "fmu/out/vehicle_attitude": "px4_msgs/VehicleAttitude",
-        "fmu/out/esc_status": "px4_msgs/EscStatus",
-        "fmu/out/actuator_motors": "px4_msgs/ActuatorMotors",
-        "fmu/out/vehicle_attitude_setpoint": "px4_msgs/VehicleAttitudeSetpoint",
-        "fmu/out/vehicle_local_position": "px4_msgs/VehicleLocalPosition",
-        "fmu/out/battery_status": "px4_msgs/BatteryStatus",
-        "fmu/out/vehicle_status": "px4_msgs/VehicleStatus",
-    },
-    "ardupilot": {
-        "ap/imu/experimental/data": "sensor_msgs/Imu",
-        "ap/pose/filtered": "geometry_msgs/PoseStamped",
-        "ap/battery": "sensor_msgs/BatteryState",
-    },
-    "rotors": {
-        "imu": "sensor_msgs/Imu",
-        "motor_speed": "actuator_msgs/Actuators",
-        "odometry_sensor1/odometry": "nav_msgs/Odometry",
-    },
-}
 _PREFIX = {"mavros": "mavros/"}
 _HINTS = {
     "canonical": "publish rotor_speeds (sensor_msgs/JointState, rad/s) or motor_command (quadid_msgs/MotorCommand)",
@@ -256,11 +215,13 @@ def source(name: str) -> InputPreset:
     Raises:
         QuadidError: unknown preset, with the nearest one.
     """
-    if name not in _TYPES:
-        raise QuadidError(f"unknown source '{name}'", ", ".join(_TYPES), nearest(name, _TYPES))
+    if name not in TOPICS:
+        raise QuadidError(f"unknown source '{name}'", ", ".join(TOPICS), nearest(name, TOPICS))
     inputs = []
-    for topic, kind in _TYPES[name].items():
-        ranks = [(channel, names.index(topic)) for channel, names in PRESETS[name].items() if topic in names]
+    for topic, (kind, channels) in TOPICS[name].items():
+        if not kind:
+            continue
+        ranks = [(channel, sources(name, channel).index(topic)) for channel in channels.split()]
         for version in ("", "_v1") if name == "px4" else ("",):  # newer PX4 appends the version of its messages
             inputs.append(Input(_PREFIX.get(name, "") + topic + version, kind, tuple(ranks)))
     return InputPreset(tuple(inputs), _HINTS[name])

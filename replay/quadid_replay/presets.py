@@ -1,4 +1,4 @@
-"""Topic names of the stacks that quadid reads from; a preset lists, per channel, the topics to look for in order.
+"""Topics of the stacks that quadid reads from, with their types and the channels that they feed.
 
 Names are relative: they match a topic that ends with them, so that a namespace before makes no difference.
 """
@@ -9,60 +9,67 @@ from functools import lru_cache
 
 from quadid.errors import LogError, nearest
 
-PRESETS: dict[str, dict[str, tuple[str, ...]]] = {
+TOPICS: dict[str, dict[str, tuple[str, str]]] = {
     "canonical": {
-        "gyro": ("imu",),
-        "accel": ("imu",),
-        "attitude": ("attitude", "imu"),
-        "rotor_speed": ("rotor_speeds",),
-        "motor_command": ("motor_command",),
-        "attitude_reference": ("command",),
-        "velocity": ("odom",),
-        "position": ("odom",),
-        "battery": ("battery",),
+        "attitude": ("geometry_msgs/QuaternionStamped", "attitude"),
+        "imu": ("sensor_msgs/Imu", "gyro accel attitude"),
+        "rotor_speeds": ("sensor_msgs/JointState", "rotor_speed"),
+        "motor_command": ("quadid_msgs/MotorCommand", "motor_command"),
+        "command": ("quadid_msgs/AttitudeCommand", "attitude_reference"),
+        "odom": ("nav_msgs/Odometry", "velocity position"),
+        "battery": ("sensor_msgs/BatteryState", "battery"),
     },
     "mavros": {
-        "gyro": ("imu/data_raw", "imu/data"),
-        "accel": ("imu/data_raw", "imu/data"),
-        "attitude": ("imu/data", "local_position/pose"),
-        "rotor_speed": ("esc_status/status", "esc_telemetry/telemetry"),
-        "motor_command": ("rc/out",),
-        "attitude_reference": ("setpoint_raw/target_attitude",),
-        "velocity": ("local_position/odom", "local_position/velocity_local"),
-        "position": ("local_position/pose", "local_position/odom"),
-        "battery": ("battery",),
+        "imu/data_raw": ("sensor_msgs/Imu", "gyro accel"),
+        "imu/data": ("sensor_msgs/Imu", "gyro accel attitude"),
+        "esc_status/status": ("mavros_msgs/ESCStatus", "rotor_speed"),
+        "esc_telemetry/telemetry": ("mavros_msgs/ESCTelemetry", "rotor_speed"),
+        "rc/out": ("mavros_msgs/RCOut", "motor_command"),
+        "setpoint_raw/target_attitude": ("mavros_msgs/AttitudeTarget", "attitude_reference"),
+        "local_position/pose": ("", "attitude position"),
+        "local_position/odom": ("nav_msgs/Odometry", "velocity position"),
+        "local_position/velocity_local": ("", "velocity"),
+        "battery": ("sensor_msgs/BatteryState", "battery"),
     },
     "px4": {
-        "gyro": ("fmu/out/sensor_combined",),
-        "accel": ("fmu/out/sensor_combined",),
-        "attitude": ("fmu/out/vehicle_attitude", "fmu/out/vehicle_odometry"),
-        "rotor_speed": ("fmu/out/esc_status",),
-        "motor_command": ("fmu/out/actuator_motors", "fmu/out/actuator_outputs"),
-        "attitude_reference": ("fmu/out/vehicle_attitude_setpoint",),
-        "velocity": ("fmu/out/vehicle_local_position", "fmu/out/vehicle_odometry"),
-        "position": ("fmu/out/vehicle_local_position", "fmu/out/vehicle_odometry"),
-        "battery": ("fmu/out/battery_status",),
-        "vehicle_kind": ("fmu/out/vehicle_status",),
+        "fmu/out/sensor_combined": ("px4_msgs/SensorCombined", "gyro accel"),
+        "fmu/out/vehicle_attitude": ("px4_msgs/VehicleAttitude", "attitude"),
+        "fmu/out/esc_status": ("px4_msgs/EscStatus", "rotor_speed"),
+        "fmu/out/actuator_motors": ("px4_msgs/ActuatorMotors", "motor_command"),
+        "fmu/out/actuator_outputs": ("", "motor_command"),
+        "fmu/out/vehicle_attitude_setpoint": ("px4_msgs/VehicleAttitudeSetpoint", "attitude_reference"),
+        "fmu/out/vehicle_local_position": ("px4_msgs/VehicleLocalPosition", "velocity position"),
+        "fmu/out/vehicle_odometry": ("", "attitude velocity position"),
+        "fmu/out/battery_status": ("px4_msgs/BatteryStatus", "battery"),
+        "fmu/out/vehicle_status": ("px4_msgs/VehicleStatus", "vehicle_kind"),
     },
     "ardupilot": {
-        "gyro": ("ap/imu/experimental/data",),
-        "accel": ("ap/imu/experimental/data",),
-        "attitude": ("ap/imu/experimental/data", "ap/pose/filtered"),
-        "velocity": ("ap/twist/filtered",),
-        "position": ("ap/pose/filtered",),
-        "battery": ("ap/battery",),
+        "ap/imu/experimental/data": ("sensor_msgs/Imu", "gyro accel attitude"),
+        "ap/pose/filtered": ("geometry_msgs/PoseStamped", "attitude position"),
+        "ap/twist/filtered": ("", "velocity"),
+        "ap/battery": ("sensor_msgs/BatteryState", "battery"),
     },
     "rotors": {
-        "gyro": ("imu", "imu/data_raw"),
-        "accel": ("imu", "imu/data_raw"),
-        "attitude": ("imu", "odometry_sensor1/odometry", "ground_truth/odometry"),
-        "rotor_speed": ("motor_speed", "rotors"),
-        "motor_command": ("gazebo/command/motor_speed", "rotors"),
-        "velocity": ("odometry_sensor1/odometry", "ground_truth/odometry"),
-        "position": ("odometry_sensor1/odometry", "ground_truth/odometry"),
+        "imu": ("sensor_msgs/Imu", "gyro accel attitude"),
+        "imu/data_raw": ("", "gyro accel"),
+        "motor_speed": ("actuator_msgs/Actuators", "rotor_speed"),
+        "gazebo/command/motor_speed": ("", "motor_command"),
+        "rotors": ("", "rotor_speed motor_command"),
+        "odometry_sensor1/odometry": ("nav_msgs/Odometry", "attitude velocity position"),
+        "ground_truth/odometry": ("", "attitude velocity position"),
     },
 }
-"""Topics by preset and channel."""
+"""By preset and topic: the type for live subscription, empty where it is read from logs only, and channels.
+
+Of several topics with one channel the first is the best.
+"""
+
+
+def sources(preset: str, channel: str) -> tuple[str, ...]:
+    """Topics of a preset with a channel, the best first."""
+    return tuple(topic for topic, (_, channels) in TOPICS[preset].items() if channel in channels.split())
+
+
 AUTO = "auto"
 
 
@@ -76,13 +83,13 @@ def preset_rank(preset: str, channel: str, topic: str) -> int | None:
         LogError: unknown preset.
     """
     if preset == AUTO:
-        known = [preset_rank(name, channel, topic) for name in PRESETS]
+        known = [preset_rank(name, channel, topic) for name in TOPICS]
         ranks = [rank for rank in known if rank is not None]
         return (0 if "raw" in topic.rsplit("/", 1)[-1] else 1) + (min(ranks) if ranks else 10)
-    if preset not in PRESETS:
-        raise LogError(f"unknown preset '{preset}'", f"{AUTO}, {', '.join(PRESETS)}", nearest(preset, PRESETS))
+    if preset not in TOPICS:
+        raise LogError(f"unknown preset '{preset}'", f"{AUTO}, {', '.join(TOPICS)}", nearest(preset, TOPICS))
     # A topic ends with the name, whole path elements only; PX4 may append its message version (_v1).
     stem, _, version = topic.rpartition("_v")
     ends = [f"/{topic}", *([f"/{stem}"] if stem and version.isdecimal() else [])]
-    names = PRESETS[preset].get(channel, ())
-    return next((rank for rank, name in enumerate(names) if any(end.endswith(f"/{name}") for end in ends)), None)
+    names = enumerate(sources(preset, channel))
+    return next((rank for rank, name in names if any(end.endswith(f"/{name}") for end in ends)), None)

@@ -179,7 +179,7 @@ def read_mcap(path: Path, preset: str = AUTO) -> Recording:
     """Reads a ROS 2 log, whole or damaged: an MCAP file, a rosbag2 database or a rosbag2 folder.
 
     Args:
-        preset: key of `quadid_replay.presets.PRESETS`, or ``auto``.
+        preset: key of `quadid_replay.presets.TOPICS`, or ``auto``.
 
     Raises:
         LogError: no topic of a known type, or unknown preset.
