@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 FloatArray: TypeAlias = NDArray[np.float64]
 ComplexArray: TypeAlias = NDArray[np.complex128]
 BoolArray: TypeAlias = NDArray[np.bool_]
-SingleArray: TypeAlias = NDArray[np.float32]
-"""Numbers for which half the digits do, and the room counts."""
 IntArray: TypeAlias = NDArray[np.int64]
 """Numbers kept as such, as in a log or a file."""
 IndexArray: TypeAlias = NDArray[np.intp]

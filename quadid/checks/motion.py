@@ -97,11 +97,11 @@ def proposed_cuts(spans: Spans, first: float, last: float) -> Spans:
     return () if last - first - whole < _GROUND else _trimmed(joined, first, last)
 
 
-def _joined(spans: Spans, most: float) -> list[tuple[float, float]]:
-    """Spans with those less than `most` [s] apart as one."""
+def _joined(spans: Sequence[tuple[float, float]], most: float) -> list[tuple[float, float]]:
+    """Spans with those up to `most` [s] apart as one."""
     out: list[tuple[float, float]] = []
     for a, b in spans:
-        if out and a - out[-1][1] < most:
+        if out and a - out[-1][1] <= most:
             out[-1] = (out[-1][0], b)
         else:
             out.append((a, b))
@@ -203,14 +203,9 @@ def _from_carried(span: tuple[float, float], carried: FloatArray) -> tuple[float
 
 
 def _spans(t: FloatArray, on: BoolArray) -> Spans:
-    spans: list[tuple[float, float]] = []
-    for first, end in zip(*true_runs(on), strict=True):
-        a, b = float(t[first]), float(t[end - 1])
-        if spans and a - spans[-1][1] <= 0.5:  # a shorter interruption ends no span
-            spans[-1] = (spans[-1][0], b)
-        else:
-            spans.append((a, b))
-    return tuple(span for span in spans if span[1] - span[0] >= _SHORTEST)
+    runs = [(float(t[first]), float(t[end - 1])) for first, end in zip(*true_runs(on), strict=True)]
+    # An interruption of half a second ends no span.
+    return tuple((a, b) for a, b in _joined(runs, 0.5) if b - a >= _SHORTEST)
 
 
 # --- Timing of channels and values that do not move: rates, gaps, jitter, stuck and saturated signals, clock faults
@@ -450,7 +445,8 @@ def gravity_check(recording: Recording, spans: Spans) -> Check:
             return check(CheckResult.ERROR, f"{message}: gravity is missing", fix)
         if not 0.5 < length / GRAVITY < 2.0:
             return check(CheckResult.ERROR, f"{message}: this is no specific force in m/s^2", "log raw acceleration")
-    flown = z > 0.5 * length and bool(spans) and _turns(recording.channels.get("gyro"), spans)
+    # A vehicle that lies on its back does not turn.
+    flown = z > 0.5 * length and bool(spans) and is_turning(recording.channels.get("gyro"), spans, _MOTION)
     if z > -0.5 * length and not flown and _attitude_explains(accel, recording.channels.get("attitude"), inside):
         return check(CheckResult.UNKNOWN, f"{message}; its attitude says that the vehicle lies or turns so")
     if not spans and z > -0.8 * length:
@@ -484,10 +480,10 @@ def _downwards(recording: Recording, accel: Channel, inside: BoolArray) -> str:
     return " or ".join(fixes)
 
 
-def _turns(gyro: Channel | None, spans: Spans) -> bool:
-    """Tests for a vehicle that moves while its rotors carry it, as none does that lies on its back."""
+def is_turning(gyro: Channel | None, spans: Spans, least: float) -> bool:
+    """True if rates about one axis vary by more than `least` [rad/s] in the spans, as standard deviation."""
     inside = np.zeros(0, dtype=bool) if gyro is None else within(gyro.t, spans)
-    return gyro is not None and bool(inside.any() and np.max(np.std(gyro.values[inside], axis=0)) > _MOTION)
+    return gyro is not None and bool(inside.any() and np.max(np.std(gyro.values[inside], axis=0)) > least)
 
 
 def _attitude_explains(accel: Channel, attitude: Channel | None, inside: BoolArray) -> bool:
@@ -555,9 +551,10 @@ def gyro_check(recording: Recording) -> Check:
         attitude = replace(attitude, t=attitude.t[fresh], values=attitude.values[fresh])
     best: tuple[str, AxisMap] | None = None
     given = attitude.values
+    own = _moving_rates(gyro, attitude.t, given)
     readings = {"as given": given, "world to body": conjugate(given), "x y z w (scalar last)": given[:, [3, 0, 1, 2]]}
     for name, q in readings.items():
-        measured, derived = _moving_rates(gyro, attitude.t, q)
+        measured, derived = own if q is given else _moving_rates(gyro, attitude.t, q)
         if len(measured) < 20:
             if name == "as given":  # as much noise moves every reading of it: no other is more likely for it
                 break
@@ -567,17 +564,20 @@ def gyro_check(recording: Recording) -> Check:
             best = (name, fit)
     if best is None:
         return Check("gyro_attitude", CheckResult.UNKNOWN, "too little rotation to compare gyro and attitude")
-    late = _apart(gyro, attitude, best[1].r2) if best[0] == "as given" else None
+    late, rows = _apart(gyro, attitude, best[1].r2) if best[0] == "as given" else None, _without_jumps(*own)
     return (
-        late or _angle_rates(gyro, attitude) or _one_axis(gyro, attitude) or _bias_step(gyro, attitude)
-        or (best[0] == "as given" and best[1].straight and _turned(gyro, attitude))
+        late or _angle_rates(gyro, attitude) or _one_axis(rows) or _bias_step(*own)
+        or (best[0] == "as given" and best[1].straight and _turned(rows))
         or _judge_rates(gyro, attitude, *best)
     )  # fmt: skip
 
 
-def _one_axis(gyro: Channel, attitude: Channel) -> Check | None:
-    """An error where one axis is still or has a scale of its own, a warning where one is far off zero."""
-    rows = _without_jumps(*_moving_rates(gyro, attitude.t, attitude.values))
+def _one_axis(rows: tuple[FloatArray, ...]) -> Check | None:
+    """An error where one axis is still or has a scale of its own, a warning where one is far off zero.
+
+    Args:
+        rows: rates by gyro and attitude, both (m, 3).
+    """
     if len(rows[0]) < FEWEST_SAMPLES:
         return None
     (size, turned), offset = (np.std(x, axis=0) for x in rows), np.mean(rows[0] - rows[1], axis=0)
@@ -629,9 +629,8 @@ def _sizes(gyro: Channel, attitude: Channel, over: float = TURN) -> list[Factor]
     return [factors(axis, number, turns.moments(axis, step))[0] for axis in range(3)]
 
 
-def _turned(gyro: Channel, attitude: Channel) -> Check | None:
+def _turned(rows: tuple[FloatArray, ...]) -> Check | None:
     """A gyro that is turned by some degrees against the attitude, in all parts of the log alike (Kabsch 1976)."""
-    rows = _without_jumps(*_moving_rates(gyro, attitude.t, attitude.values))
     if len(rows[0]) < 2 * FEWEST_SAMPLES:
         return None
 
@@ -661,10 +660,8 @@ def _turned(gyro: Channel, attitude: Channel) -> Check | None:
     )  # fmt: skip
 
 
-def _bias_step(gyro: Channel, attitude: Channel) -> Check | None:
+def _bias_step(measured: FloatArray, derived: FloatArray) -> Check | None:
     """An error where the gyro follows the attitude, or both stand still, but for one step of its bias."""
-    t = attitude.t
-    measured, derived = _moving_rates(gyro, t, attitude.values)
     n = len(measured)
     if n < 20 or fit_axes(measured, derived).r2 >= _CLEAR:
         return None

@@ -12,7 +12,7 @@ import numpy as np
 
 from quadid.checks.doubts import Off, estimates_off, farthest, rotors_off
 from quadid.checks.findings import Check, CheckResult
-from quadid.checks.motion import HOPELESS, Spans, within
+from quadid.checks.motion import HOPELESS, Spans, is_turning, within
 from quadid.data.grid import bridged, linear, moving_mean, to_windows
 from quadid.data.rotor_signal import INERTIA_RATE, RotorSignal, rotor_channel, rotor_signal
 from quadid.data.window import Channel, Recording, Window, measured_period, sample_period, true_runs
@@ -216,7 +216,9 @@ _BIN = 0.5
 _LEVELS = 40
 """Rotors that read fewer different values may be too coarse."""
 _STUCK = 1.0
-"""A rotor that holds one value this long [s] while the vehicle moves is stuck."""
+"""A rotor that holds one value this long [s] while the vehicle moves is stuck …"""
+_MOVING = 0.1
+"""… by rates that vary so much [rad/s]."""
 
 Bins = tuple[FloatArray, BoolArray]
 """Means (m, columns) and which bins hold samples (m,)."""
@@ -354,7 +356,7 @@ def _stuck(signal: RotorSignal, recording: Recording, inside: BoolArray) -> Prob
     """A value held while the vehicle moves, unless it is a limit that all rotors share."""
     gyro = recording.channels.get("gyro")
     t, values = signal.t[inside], signal.values[inside]
-    if np.ptp(values, axis=0).max() == 0.0 and gyro is not None and _moves(gyro, t[0], t[-1]):
+    if np.ptp(values, axis=0).max() == 0.0 and is_turning(gyro, ((t[0], t[-1]),), _MOVING):
         return (
             "no rotor ever changes its speed, though the vehicle moves: the speed signal is stuck",
             {"stuck_s": float(t[-1] - t[0])},
@@ -363,7 +365,7 @@ def _stuck(signal: RotorSignal, recording: Recording, inside: BoolArray) -> Prob
         others = np.delete(values, rotor, axis=1)
         same = np.append(column[1:] == column[:-1], False) & (column != others.min()) & (column != others.max())
         begin, end = _longest(t, same)
-        if end - begin > _STUCK and gyro is not None and _moves(gyro, begin, end):
+        if end - begin > _STUCK and is_turning(gyro, ((begin, end),), _MOVING):
             return (
                 f"rotor {rotor + 1} holds {column[np.searchsorted(t, begin)]:.4g} rad/s for {end - begin:.2g} s of "
                 "moving flight: its speed signal is stuck",
@@ -379,11 +381,6 @@ def _longest(t: FloatArray, same: BoolArray) -> tuple[float, float]:
     begins, ends = t[first], t[np.minimum(end, len(t) - 1)]
     longest = int(np.argmax(ends - begins))
     return float(begins[longest]), float(ends[longest])
-
-
-def _moves(gyro: Channel, begin: float, end: float) -> bool:
-    inside = (gyro.t >= begin) & (gyro.t <= end)
-    return bool(inside.any() and np.max(np.std(gyro.values[inside], axis=0)) > 0.1)
 
 
 def _unbalanced(squares: FloatArray, vehicle: Vehicle) -> Problem | None:

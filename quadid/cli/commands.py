@@ -283,7 +283,8 @@ def _run(
     told = {name: how.read(given[name]) for name, how in typed.items() if given[name] not in (None, [])}
     if command.check:
         check = _imported(command.check)
-        check(**{name: told.get(name, p.default) for name, p in signature.parameters.items() if name in _names(check)})
+        asked = inspect.signature(check).parameters
+        check(**{name: told.get(name, p.default) for name, p in signature.parameters.items() if name in asked})
     vehicle = next((value for value in told.values() if isinstance(value, Vehicle)), None)
     logs = [name for name in typed if typed[name].opened and name in told]
     how = {name: given[name] for name in ("rate", *command.reading) if name in given}
@@ -314,10 +315,6 @@ def _run(
             terminal.warn([f"no answer; why, and the data as they are: {write_text(report, text)}"])
         raise
     conclude(done)
-
-
-def _names(function: Callable[..., Any]) -> Sequence[str]:
-    return tuple(inspect.signature(function).parameters)
 
 
 def opened(texts: Sequence[str], vehicle: Vehicle, columns: Sequence[str] | None = None, **how: Any) -> list[Log]:
