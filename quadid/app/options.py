@@ -61,7 +61,7 @@ Validate = Annotated[
 ]
 
 
-def _vehicle(about: str = ".") -> ParameterInfo:
+def _vehicle(about: str = ".") -> Any:
     text = f"A shipped name (pelican, ...) or a YAML file{about}"
     return typer.Option("--vehicle", metavar="V", help=text, autocompletion=shipped_names)
 
