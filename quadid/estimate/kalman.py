@@ -134,6 +134,7 @@ class Gains(NamedTuple):
         mean: after the updates, shape (n, N_MEAN).
         P: columns of the covariance there that belong to f, alpha, e, shape (n, N, 9).
         table: rotor moments, see `moments`.
+        late: delay and lag of these moments [s].
         beyond: see `Track.beyond`.
     """
 
@@ -145,6 +146,7 @@ class Gains(NamedTuple):
     mean: FloatArray
     P: FloatArray
     table: FloatArray
+    late: tuple[float, float]
     beyond: Beyond
 
 
@@ -688,7 +690,7 @@ def kalman(track: Track, p: FloatArray, psi: FloatArray, tail: FloatArray, store
     g = Gains(
         np.zeros((rows, M, N)), np.zeros((rows, M)), np.zeros((rows, M)), np.zeros((rows, M)),
         np.zeros((rows, 3, 6)), np.zeros((rows, N_MEAN)), np.zeros((rows, N, 9)),
-        moments(track, p[DELAY], p[LAG]), track.beyond,
+        moments(track, p[DELAY], p[LAG]), (p[DELAY], p[LAG]), track.beyond,
     )  # fmt: skip
     c, keep = _constants(p, track), np.empty(9)
     x, after = _start(track, p), np.empty(N_MEAN)

@@ -97,10 +97,15 @@ def _of_flight(name: str) -> bool:
 
 
 def cut(track: Track, first: int, last: int) -> Track:
-    """Rows `first` to before `last`; rotor speeds are kept whole."""
+    """Rows `first` to before `last`, with rotor speeds from as long before and after: what is late moves them."""
     rows = slice(first, last)
-    beyond = Beyond(*(array[rows] for array in track.beyond))
-    return track._replace(t=track.t[rows], y=track.y[rows], seen=track.seen[rows], beyond=beyond)
+    t, beyond = track.t[rows], Beyond(*(array[rows] for array in track.beyond))
+    early, late = np.searchsorted(track.piece_t, [2.0 * t[0] - t[-1], 2.0 * t[-1] - t[0]], side="right")
+    pieces = slice(max(early - 1, 0), late)
+    return track._replace(
+        t=t, y=track.y[rows], seen=track.seen[rows], beyond=beyond, piece_t=track.piece_t[pieces],
+        speed=track.speed[pieces],
+    )  # fmt: skip
 
 
 def _rows(track: Track, share: float) -> tuple[int, int]:
@@ -454,7 +459,7 @@ class Problem:
             for _ in range(SETTLING):
                 track = track._replace(beyond=model.along(theta, mean))
                 mean = np.empty_like(mean)
-                k.replay(track, p, psi, near, self._table(track, near, p), _NO_ROWS, mean)
+                k.replay(track, p, psi, near, _table(track, near, p), _NO_ROWS, mean)
             track = track._replace(beyond=model.along(theta, mean))
         value, gains = k.kalman(track, p, psi, self.tail, store)
         return float(value), gains
@@ -493,9 +498,6 @@ class Problem:
             share = n / max(len(part.t) - SETTLED, 1)
             out += share * (0.5 * by_s @ by_s.T + by_nu @ by_nu.T)
         return out
-
-    def _table(self, track: Track, g: Gains, p: FloatArray) -> FloatArray:
-        return g.table if set(LATE).isdisjoint(self.names) else k.moments(track, p[k.DELAY], p[k.LAG])
 
     def normal_equations(
         self, z: FloatArray, psi: FloatArray, gains: Sequence[Gains], nudge: float | FloatArray = 1e-5
@@ -578,8 +580,14 @@ class Problem:
     ) -> FloatArray:
         track, p = tracks[i], self.physics(points[i], j)
         out = np.zeros((len(track.t), k.M))
-        k.replay(track, p, psi, g, self._table(track, g, p), out, _NO_MEANS)
+        k.replay(track, p, psi, g, _table(track, g, p), out, _NO_MEANS)
         return out
+
+
+def _table(track: Track, g: Gains, p: FloatArray) -> FloatArray:
+    """Rotor moments at physics p: those of the gains where nothing moved in time."""
+    delay, lag = p[[k.DELAY, k.LAG]]
+    return g.table if (delay, lag) == g.late else k.moments(track, delay, lag)
 
 
 _NO_ROWS, _NO_MEANS = np.empty((0, k.M)), np.empty((0, k.N_MEAN))
