@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from quadid.data.window import Channel, Recording, Sampling, measured_period, sample_period
 from quadid.errors import LogError, NotIdentifiableError
 from quadid.types import FloatArray
-from quadid.vehicle import Vehicle
+
+if TYPE_CHECKING:  # readers of logs do without pydantic
+    from quadid.vehicle import Vehicle
 
 _COUNTS = (100.0, 255.0, 1000.0, 2047.0, 65535.0)
 """Full commands that programs count to."""

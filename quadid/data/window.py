@@ -63,9 +63,23 @@ class Block:
         """One message of one channel at `t` [s]."""
         return cls(np.array([t]), ((channel, np.array([values])),))
 
+    @property
+    def channel(self) -> str:
+        """Name of the first channel, which was that of a `Sample` in release 0.1.0."""
+        return self.columns[0][0]
+
+    @property
+    def values(self) -> tuple[float, ...]:
+        """Values of the first message in that channel."""
+        return tuple(self.columns[0][1][0].tolist())
+
     def part(self, start: int, stop: int | None = None) -> Block:
         """Messages `start` to before `stop`."""
         return Block(self.t[start:stop], tuple((name, values[start:stop]) for name, values in self.columns))
+
+
+Sample = Block.one
+"""One message, by its name of release 0.1.0."""
 
 
 def _never_changes(values: ArrayLike) -> TypeGuard[FloatArray]:

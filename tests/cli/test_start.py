@@ -220,6 +220,15 @@ def test_old_statements_work_alone(statement: str) -> None:
     assert "DeprecationWarning" in done.stderr
 
 
+def test_a_sample_of_release_0_1_0_is_a_message() -> None:
+    code = (
+        "import quadid.online, quadid.vehicle; from quadid.window import Sample; s = Sample(1.5, 'gyro', (0.1, 0.2, 3)); "
+        "assert (s.channel, s.values, s.t[0]) == ('gyro', (0.1, 0.2, 3.0), 1.5); "
+        "quadid.online.Session(quadid.vehicle.Vehicle.shipped('pelican')).push(s)"
+    )
+    subprocess.run([sys.executable, "-W", "ignore", "-c", code], check=True)
+
+
 def test_what_never_was_is_not_found() -> None:
     with pytest.raises(ModuleNotFoundError):
         importlib.import_module("quadid.identify.never_there")

@@ -248,11 +248,7 @@ ARDUPILOT: tuple[Finding, ...] = tuple(
     )
 )  # fmt: skip
 FINDINGS = (*LOGS, *VEHICLES, *ARDUPILOT)
-MOVED = {
-    "push_block": "push", "resampler._due": "resampler._stretches",
-    'x.channel=="gyro"': '"gyro" in dict(x.columns)', 's.channel=="gyro"': '"gyro" in dict(s.columns)',
-    "s.values[0]": 'dict(s.columns)["gyro"][0, 0]',
-}  # fmt: skip
+MOVED = {"push_block": "push", "resampler._due": "resampler._stretches"}
 """What the attacks' scripts call by an old name; old paths of modules are known once quadid is imported."""
 
 
