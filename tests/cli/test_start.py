@@ -222,7 +222,7 @@ def test_old_statements_work_alone(statement: str) -> None:
 
 def test_a_sample_of_release_0_1_0_is_a_message() -> None:
     code = (
-        "import quadid.online, quadid.vehicle; from quadid.window import Sample; s = Sample(1.5, 'gyro', (0.1, 0.2, 3)); "
+        "import quadid.online, quadid.vehicle, quadid.window; s = quadid.window.Sample(1.5, 'gyro', (0.1, 0.2, 3)); "
         "assert (s.channel, s.values, s.t[0]) == ('gyro', (0.1, 0.2, 3.0), 1.5); "
         "quadid.online.Session(quadid.vehicle.Vehicle.shipped('pelican')).push(s)"
     )
