@@ -564,7 +564,8 @@ def gyro_check(recording: Recording) -> Check:
             best = (name, fit)
     if best is None:
         return Check("gyro_attitude", CheckResult.UNKNOWN, "too little rotation to compare gyro and attitude")
-    late, rows = _apart(gyro, attitude, best[1].r2) if best[0] == "as given" else None, _without_jumps(*own)
+    late = _apart(gyro, attitude, best[1].r2) if best[0] == "as given" else None
+    rows = _without_jumps(*own)
     return (
         late or _angle_rates(gyro, attitude) or _one_axis(rows) or _bias_step(*own)
         or (best[0] == "as given" and best[1].straight and _turned(rows))

@@ -76,7 +76,7 @@ class Turns(NamedTuple):
     gyro: FloatArray
     rate: FloatArray
     attitude: FloatArray
-    over: float = TURN
+    over: float
 
     @classmethod
     def of(cls, gyro: FloatArray, q: FloatArray, step: float, over: float = TURN) -> Turns:

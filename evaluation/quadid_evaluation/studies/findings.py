@@ -249,7 +249,7 @@ ARDUPILOT: tuple[Finding, ...] = tuple(
 )  # fmt: skip
 FINDINGS = (*LOGS, *VEHICLES, *ARDUPILOT)
 MOVED = {"push_block": "push", "resampler._due": "resampler._stretches"}
-"""What the attacks' scripts call by an old name; old paths of modules are known once quadid is imported."""
+"""Names that the attacks' scripts call by an old one; old paths of modules are known once quadid is imported."""
 
 
 def attack(lines: str) -> Callable[[Path, Path], Sequence[str | Path]]:
