@@ -174,7 +174,7 @@ def stabilise_rows(
     integral: FloatArray,
     command: FloatArray,
 ) -> None:
-    """Many steps of the stabiliser in a row, in place.
+    """Many steps in place: of one vehicle in a row, or one step of each of many vehicles.
 
     Args:
         gains: `pack_gains`.
@@ -182,40 +182,12 @@ def stabilise_rows(
         reference: roll, pitch, yaw [rad], throttle 0..1, shape (n, 4).
         attitude: measured unit quaternions, body to world, scalar first, shape (n, 4).
         rate: measured body rates [rad/s], shape (n, 3).
-        dt: time to the next step [s], shape (n,).
-        integral: integral torques [N m], shape (3,); updated.
+        dt: time that each step acts for [s], shape (n,).
+        integral: integral torques [N m], shape (1, 3) of one vehicle, (n, 3) of many; updated.
         command: rotor speeds [rad/s], shape (n, rotors); written.
     """
     matrix = np.empty((3, 3))
     for k in range(reference.shape[0]):
         write_rotation(attitude[k, 0], attitude[k, 1], attitude[k, 2], attitude[k, 3], matrix)
-        stabilise(gains, mixer, reference[k], matrix, rate[k], dt[k], integral, command[k])
-
-
-@kept()
-def stabilise_each(
-    gains: FloatArray,
-    mixer: FloatArray,
-    reference: FloatArray,
-    attitude: FloatArray,
-    rate: FloatArray,
-    dt: float,
-    integral: FloatArray,
-    command: FloatArray,
-) -> None:
-    """One step of the stabilisers of many vehicles, in place.
-
-    Args:
-        gains: `pack_gains`.
-        mixer: `mixer_matrix`.
-        reference: roll, pitch, yaw [rad], throttle 0..1, shape (n, 4).
-        attitude: measured unit quaternions, body to world, scalar first, shape (n, 4).
-        rate: measured body rates [rad/s], shape (n, 3).
-        dt: time since the last step [s].
-        integral: integral torques [N m], shape (n, 3); updated.
-        command: rotor speeds [rad/s], shape (n, rotors); written.
-    """
-    matrix = np.empty((3, 3))
-    for k in range(reference.shape[0]):
-        write_rotation(attitude[k, 0], attitude[k, 1], attitude[k, 2], attitude[k, 3], matrix)
-        stabilise(gains, mixer, reference[k], matrix, rate[k], dt, integral[k], command[k])
+        own = integral[k % integral.shape[0]]
+        stabilise(gains, mixer, reference[k], matrix, rate[k], dt[k], own, command[k])

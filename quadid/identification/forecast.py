@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from quadid.attitude_controller import mixer_matrix, pack_gains, stabilise_each
+from quadid.attitude_controller import mixer_matrix, pack_gains, stabilise_rows
 from quadid.chi_square import Z95
 from quadid.data.window import Window
 from quadid.errors import NotIdentifiableError
@@ -174,7 +174,7 @@ def _flown_in_loop(
     )  # fmt: skip
     gains, mixer = pack_gains(autopilot.gains), mixer_matrix(vehicle, autopilot.gains)
     integral = np.repeat(_integrals_at(vehicle, window, autopilot, rows), DRAWS, axis=0)
-    command = np.empty((many, len(vehicle.rotors)))
+    command, lasting = np.empty((many, len(vehicle.rotors))), np.full(many, step)
     bias, noise = p[k.GYRO_BIAS : k.GYRO_BIAS + 3], psi[k.GYRO : k.GYRO + 3]
     # 3. Fly.
     out = {}
@@ -183,7 +183,7 @@ def _flown_in_loop(
         reference = np.repeat(window.attitude_reference[rows + h], DRAWS, axis=0)
         for _ in range(turns):
             rate = state.rate + bias + noise * rng.standard_normal((many, 3))
-            stabilise_each(gains, mixer, reference, state.attitude, rate, step, integral, command)
+            stabilise_rows(gains, mixer, reference, state.attitude, rate, lasting, integral, command)
             simulator.advance(state, command, step)
         if h + 1 in samples:
             flown = np.column_stack([state.attitude, state.rate, state.velocity, state.position])
@@ -198,7 +198,7 @@ def _integrals_at(vehicle: Vehicle, window: Window, autopilot: Autopilot, rows: 
     free = dict(autopilot.gains) | {f"{axis}_rate_i": 0.0 for axis in ("roll", "pitch", "yaw")}
     gains, mixer = pack_gains(free), mixer_matrix(vehicle, free)
     command, some = np.empty((len(rows), len(vehicle.rotors))), np.zeros((len(rows), 3))
-    stabilise_each(gains, mixer, reference, attitude, rate, window.dt, some, command)
+    stabilise_rows(gains, mixer, reference, attitude, rate, np.full(len(rows), window.dt), some, command)
     beyond = window.rotor_speed[rows] ** 2 - command**2
     scale = [free["thrust_coefficient"], free["thrust_coefficient"], free["drag_coefficient"]]
     return np.asarray(np.nan_to_num(beyond) @ vehicle.torque_arms * scale)

@@ -250,7 +250,7 @@ class CommandReconstruction:
         if self._gains is not None:  # compiled before the first flight, not in it
             still, level = np.zeros((1, 4)), np.array([[1.0, 0.0, 0.0, 0.0]])
             stabilise_rows(
-                self._gains, self._mixer, still, level, np.zeros((1, 3)), np.full(1, 0.02), np.zeros(3),
+                self._gains, self._mixer, still, level, np.zeros((1, 3)), np.full(1, 0.02), np.zeros((1, 3)),
                 np.empty((1, len(self._mixer))),
             )  # fmt: skip
 
@@ -320,7 +320,7 @@ class CommandReconstruction:
         commands = np.empty((len(at), len(self._mixer)))
         stabilise_rows(
             self._gains, self._mixer, np.ascontiguousarray(reference.values[held]), _turned(attitude, at),
-            linear(gyro.t, gyro.values, at), np.repeat(np.diff(t) / runs, runs), self._integral, commands,
+            linear(gyro.t, gyro.values, at), np.repeat(np.diff(t) / runs, runs), self._integral[None], commands,
         )  # fmt: skip
         return np.asarray(commands.reshape(len(t) - 1, runs, -1).mean(axis=1))
 

@@ -28,7 +28,7 @@ def steps(
 ) -> FloatArray:  # fmt: skip
     """Rotor speeds (n, rotors) of n steps in a row from integral torques (3,)."""
     command = np.empty((len(reference), len(mixer)))
-    after = np.array(integral, dtype=np.float64)
+    after = np.array(integral[None], dtype=np.float64)
     stabilise_rows(pack_gains(gains), mixer, reference, attitude, rate, np.full(len(reference), dt), after, command)
     return command
 
