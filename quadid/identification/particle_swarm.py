@@ -81,23 +81,6 @@ class SwarmOptions:
         if self.iterations < 1 or (self.patience is not None and self.patience < 1):
             raise ParameterError(f"iterations {self.iterations}, patience {self.patience}", "at least 1")
 
-    @classmethod
-    def algorithm_1(
-        cls, iterations: int = 200, w: float | tuple[float, float] = (0.9, 0.4), c1: float = 2.0, c2: float = 2.0
-    ) -> SwarmOptions:
-        """The paper's Algorithm 1 as printed: global best, inertia weight, particles in turn, positions clamped.
-
-        The paper prints no values for the weight and the coefficients; the defaults are those of Shi & Eberhart.
-
-        Args:
-            iterations: T.
-            w: inertia weight, constant, or at the first and last iteration.
-            c1: individual acceleration coefficient.
-            c2: social acceleration coefficient.
-        """
-        start, end = w if isinstance(w, tuple) else (w, w)
-        return cls("inertia", c1, c2, start, end, "in_turn", "clamp", None, iterations, patience=None)
-
     @property
     def chi(self) -> float:
         """Constriction coefficient of Clerc & Kennedy with kappa = 1: 2 / |2 - phi - sqrt(phi^2 - 4 phi)|."""

@@ -125,19 +125,6 @@ def lengths(misses: FloatArray) -> FloatArray:
     return out
 
 
-def mean_errors(windows: Sequence[Window], vehicle: Vehicle, theta: FloatArray, samples: int) -> dict[str, float]:
-    """Mean error `samples` after every start, by quantity; NaN for what the logs lack, infinite where a run went away.
-
-    Args:
-        windows: of one or more files, on one grid.
-        vehicle: geometry and mass.
-        theta: full parameter vector, shape (size,).
-        samples: after the start.
-    """
-    at = np.array([samples])
-    return _by_quantity([lengths(OpenLoop(w, vehicle, samples).misses(theta[None], at)[0, :, 0]) for w in windows])
-
-
 def no_change(windows: Sequence[Window], vehicle: Vehicle, samples: int) -> dict[str, float]:
     """Mean error of predicting that nothing changes for `samples`, by quantity; NaN for what the logs lack.
 
@@ -147,11 +134,7 @@ def no_change(windows: Sequence[Window], vehicle: Vehicle, samples: int) -> dict
         samples: after the start.
     """
     at = np.array([samples])
-    return _by_quantity([OpenLoop(w, vehicle, samples).no_change(at)[:, 0] for w in windows])
-
-
-def _by_quantity(errors: Sequence[FloatArray]) -> dict[str, float]:
-    """Means over all starts of errors (starts, 4), without those that are NaN; NaN where all are."""
+    errors = [OpenLoop(w, vehicle, samples).no_change(at)[:, 0] for w in windows]
     rows = np.concatenate([np.zeros((0, 4)), *errors])
     known = ~np.isnan(rows)
     total, count = np.where(known, rows, 0.0).sum(axis=0), known.sum(axis=0)

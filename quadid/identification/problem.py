@@ -213,12 +213,6 @@ class Columns:
     weights: FloatArray
     noise: NoiseModel
 
-    @property
-    def projected(self) -> FloatArray:
-        """Sensitivity to `parameters` that the initial state cannot undo, shape (segments, length, channels, P)."""
-        flat = self.parameters - self.basis @ (self.basis.transpose(0, 2, 1) @ self.parameters)
-        return flat.reshape(*self.weights.shape, -1)
-
     def whiten(self, rows: FloatArray, channel: int) -> FloatArray:
         """Weights and whitens changes of one channel, shape (segments, length, columns)."""
         return self.noise.channel_whitened(channel, rows, self.weights[:, :, channel], self.window.dt)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -143,9 +143,8 @@ def test_algorithm_1_line_by_line(seed: int, batch: bool) -> None:
         return sum((xi - 1.0) ** 2 + 3.0 * math.cos(5.0 * xi) for xi in x)
 
     expected = algorithm_1(cost, lower, upper, n, iterations, w, c1, c2, seed, batch)
-    options = SwarmOptions.algorithm_1(iterations, w, c1, c2)
-    if batch:
-        options = SwarmOptions("inertia", c1, c2, *w, "batch", "clamp", None, iterations, 0.0, None)
+    update: Literal["batch", "in_turn"] = "batch" if batch else "in_turn"
+    options = SwarmOptions("inertia", c1, c2, *w, update, "clamp", None, iterations, 0.0, None)
     swarm, history, seen = Swarm(lower, upper, n, seed, options), [], -1
     while swarm.stop in (Stop.RUNNING, Stop.CONVERGED) and swarm.iteration < iterations:
         swarm.tell([cost(list(x)) for x in swarm.ask()])

@@ -212,11 +212,16 @@ def _pso(ledger: Ledger, start: FloatArray, seed: int) -> Stop:
     return _swarm(ledger, start, seed, particles, options)
 
 
+def algorithm_1(iterations: int) -> SwarmOptions:
+    """The paper's Algorithm 1 as printed; the weight and the coefficients, not printed, are those of Shi & Eberhart."""
+    return SwarmOptions("inertia", 2.0, 2.0, 0.9, 0.4, "in_turn", "clamp", None, iterations, patience=None)
+
+
 def _pso_algorithm_1(ledger: Ledger, start: FloatArray, seed: int) -> Stop:
     """The paper's Algorithm 1 as printed: one particle at a time, all particles random, inertia weight 0.9 to 0.4."""
     particles = _particles(len(start), ledger.budget)
     ledger.cost(start[None])
-    return _swarm(ledger, start, seed, particles, SwarmOptions.algorithm_1(ledger.budget // particles))
+    return _swarm(ledger, start, seed, particles, algorithm_1(ledger.budget // particles))
 
 
 def _pso_polish(ledger: Ledger, start: FloatArray, seed: int) -> Stop:

@@ -18,7 +18,7 @@ from quadid.flight import fly
 from quadid.identification.controller_gains import find_autopilot
 from quadid.identification.fit import FitOptions, fit
 from quadid.identification.paper_objective import PaperScore
-from quadid.identification.particle_swarm import Stop, Swarm, SwarmOptions
+from quadid.identification.particle_swarm import Stop, Swarm
 from quadid.identification.score import mse_score
 from quadid.model.layout import Layout
 from quadid.parameters import NOMINAL_NAMES
@@ -26,7 +26,7 @@ from quadid.types import FloatArray, JsonDict
 from quadid.vehicle import Stabiliser, Vehicle
 from quadid.version import __version__
 from quadid_evaluation.optimisers.box import PaperBox
-from quadid_evaluation.optimisers.minimise import minimise
+from quadid_evaluation.optimisers.minimise import algorithm_1, minimise
 from quadid_evaluation.paper.black_box import fit_black_box, score_black_box
 from quadid_evaluation.paper.subspace import METHODS
 
@@ -191,9 +191,7 @@ def _algorithm_1(problem: PaperBox, plan: Plan, seed: int) -> tuple[float, Colum
     evaluated together and not one after the other.
     """
     begin = time.perf_counter()
-    options = replace(
-        SwarmOptions.algorithm_1(plan.iterations), update="batch", initial_points=problem.start[None], tolerance=1e-4
-    )
+    options = replace(algorithm_1(plan.iterations), update="batch", initial_points=problem.start[None], tolerance=1e-4)
     swarm = Swarm(problem.lower, problem.upper, plan.particles, seed, options)
     while swarm.stop is Stop.RUNNING:
         swarm.tell(problem.cost(swarm.ask()))

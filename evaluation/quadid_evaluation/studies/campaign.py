@@ -33,8 +33,9 @@ from quadid.effects import EFFECTS
 from quadid.errors import QuadidError
 from quadid.flight import OUTSIDE, FlightError, draw_effect, draw_outside, draw_truth, fly
 from quadid.parameters import NOMINAL_NAMES
-from quadid.vehicle import Command, ParameterPrior, Vehicle
+from quadid.vehicle import Command, Vehicle
 from quadid_evaluation.harness import options, share, table
+from quadid_evaluation.studies.truth import with_values
 
 # --- The cases
 
@@ -140,11 +141,8 @@ GROUPS = {
 def guessed_vehicle(case: Case, truth: dict[str, float]) -> Vehicle:
     """The vehicle file handed to the diagnosis: geometry and mass right, parameters a poor guess."""
     rng = np.random.default_rng([case.seed, 77])
-    priors = {
-        n: ParameterPrior(initial=float(f"{truth[n] * np.exp(GUESS * rng.uniform(-1.7, 1.7)):.3e}"))
-        for n in NOMINAL_NAMES
-    }
-    return shipped(case).model_copy(update={"parameters": priors})
+    guesses = [float(f"{truth[n] * np.exp(GUESS * rng.uniform(-1.7, 1.7)):.3e}") for n in NOMINAL_NAMES]
+    return with_values(shipped(case), np.array(guesses))
 
 
 def needs(case: Case) -> set[str]:

@@ -21,12 +21,12 @@ from quadid.app.logs import load_vehicle
 from quadid.data.window import Window
 from quadid.diagnosis import diagnose
 from quadid.errors import QuadidError
-from quadid.identification.predict import QUANTITIES, lengths, mean_errors, no_change
-from quadid.model.layout import Layout
+from quadid.identification.predict import QUANTITIES, lengths
 from quadid.parameters import Parameter, Status
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 from quadid_evaluation.harness import options, table
+from quadid_evaluation.studies.ahead import shares_of_no_change
 from quadid_evaluation.studies.cases import FOLDERS, windows
 from quadid_evaluation.studies.flight_sets import SETS, FlightSet
 from quadid_evaluation.studies.rotorpy_flight import fly, hummingbird
@@ -459,8 +459,9 @@ def measured(one: FlightSet, data: Path) -> Row:
     velocity = (float("nan"), float("nan"))
     if one.unseen:
         seen, new = ([w for log in part for w in _fine(data, log, vehicle)] for part in (one.train, one.unseen))
-        prediction = {name: _ahead_of(new, v, AHEAD) for name, v in files.items()} | learners(seen, new)
-        soon = {name: _ahead_of(new, v, SOON)[3] for name, v in files.items()}
+        ours = {name: [*shares_of_no_change(new, v, AHEAD).values()] for name, v in files.items()}
+        prediction = ours | learners(seen, new)
+        soon = {name: shares_of_no_change(new, v, SOON)["rate"] for name, v in files.items()}
         velocity = velocity_against_position(new)
     first, second = ({key: r[key] for key in _KEPT if key in r} for r in (identified, found.result))
     terms = tuple(t.formula for t in found.vehicle.residual)
@@ -478,14 +479,6 @@ def learners(seen: Sequence[Window], new: Sequence[Window]) -> dict[str, list[fl
     learn, test = runs_of(seen), runs_of(new)
     guesses = {"ridge": ridge(learn), "random features": ridge(learn, FEATURES)}
     return {name: shares(guess, test).tolist() for name, guess in guesses.items()}
-
-
-def _ahead_of(windows: Sequence[Window], vehicle: Vehicle, seconds: float) -> list[float]:
-    """Errors so long after a measured state, as shares of no change."""
-    steps = round(seconds / windows[0].dt)
-    errors = mean_errors(windows, vehicle, Layout(vehicle).initial(vehicle), steps)
-    still = no_change(windows, vehicle, steps)
-    return [errors[q] / still[q] for q in QUANTITIES]
 
 
 if __name__ == "__main__":

@@ -24,9 +24,10 @@ from quadid.model.layout import Layout
 from quadid.model.rollout import NUMBERS, Rollout, Segments
 from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray
-from quadid.vehicle import ParameterPrior, Vehicle
+from quadid.vehicle import Vehicle
 from quadid_evaluation.harness import options, table
 from quadid_evaluation.optimisers.minimise import NAMES, minimise
+from quadid_evaluation.studies.truth import with_values
 
 BUDGET = {"smooth": 1500, "non-smooth": 1000}
 """Simulations of the flight that a run may spend."""
@@ -159,8 +160,7 @@ def problem(kind: str, bounds: str, seed: int) -> Problem:
     base = Vehicle.shipped("pelican")
     truth = draw_truth(base, seed)
     values = np.array([truth.as_dict()[n] for n in NOMINAL_NAMES])
-    priors = {n: ParameterPrior(initial=float(v)) for n, v in zip(NOMINAL_NAMES, values, strict=True)}
-    vehicle = base.model_copy(update={"parameters": priors})
+    vehicle = with_values(base, values)
     if kind == "smooth":
         return Problem(fly(base, truth, SECONDS[kind], seed).window, vehicle, values, BOUNDS[bounds], seed)
     flight = fly(

@@ -46,11 +46,16 @@ class Outcome:
     status: tuple[str, ...]
 
 
+def with_values(vehicle: Vehicle, values: FloatArray) -> Vehicle:
+    """The vehicle with these as initial values of the six, and nothing else known of them."""
+    priors = {n: ParameterPrior(initial=float(v)) for n, v in zip(NOMINAL_NAMES, values, strict=True)}
+    return vehicle.model_copy(update={"parameters": priors})
+
+
 def poor_guess(vehicle: Vehicle, truth: Mapping[str, float], seed: int, spread: float = 0.3) -> Vehicle:
     """The vehicle with each initial value off by a log-uniform factor up to exp(`spread`)."""
     rng = np.random.default_rng([seed, 5])
-    priors = {n: ParameterPrior(initial=truth[n] * float(np.exp(rng.uniform(-spread, spread)))) for n in NOMINAL_NAMES}
-    return vehicle.model_copy(update={"parameters": priors})
+    return with_values(vehicle, np.array([truth[n] * np.exp(rng.uniform(-spread, spread)) for n in NOMINAL_NAMES]))
 
 
 def bound(window: Window, vehicle: Vehicle, truth: FloatArray) -> FloatArray:

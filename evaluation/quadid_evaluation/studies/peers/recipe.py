@@ -19,18 +19,17 @@ import quadid
 from quadid.app.logs import load_vehicle
 from quadid.data.grid import linear
 from quadid.data.window import Recording
-from quadid.identification.predict import mean_errors, no_change
-from quadid.model.layout import Layout
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
+from quadid_evaluation.studies.ahead import shares_of_no_change
 
 LOG, CUT, MODEL = "arpl/log15.csv", 18.0, "arpl/vehicle.yaml"
 """The log, fitted up to the cut [s] and predicted from there."""
 RATE, LAGS = 1000.0, np.arange(0.01, 0.151, 0.005)
 SMOOTH = 41
 """Samples of the smoothed derivative."""
-AHEAD = {0.1: 5, 0.5: 25}
-"""Horizons [s], and steps of our grid."""
+AHEAD = (0.1, 0.5)
+"""Horizons [s]."""
 
 
 class Fitted(NamedTuple):
@@ -122,11 +121,7 @@ def section(data: Path) -> list[str]:
     rows.append(_row("recipe", [miss / still for miss, still in theirs]))
     identified, diagnosed = quadid.identify([train]), quadid.diagnose([train])
     for name, model in (("quadid identify", identified.vehicle), ("quadid diagnose", diagnosed.vehicle)):
-        theta = Layout(model).initial(model)
-        cells = [
-            mean_errors(log.windows, model, theta, n)["rate"] / no_change(log.windows, model, n)["rate"]
-            for log in (train, other) for n in AHEAD.values()
-        ]  # fmt: skip
+        cells = [shares_of_no_change(log.windows, model, s)["rate"] for log in (train, other) for s in AHEAD]
         rows.append(_row(name, cells))
     j = 1.0 / found.scale[:2]
     ours = {p["name"]: p for p in diagnosed.result["parameters"]}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,14 +14,13 @@ import numpy as np
 import quadid
 from quadid.app.logs import Log, load_vehicle
 from quadid.data.window import Window
-from quadid.identification.predict import mean_errors, no_change
-from quadid.model.layout import Layout
 from quadid.parameters import NOMINAL_NAMES
-from quadid.types import FloatArray
-from quadid.vehicle import ParameterPrior, Vehicle
+from quadid.vehicle import Vehicle
 from quadid_evaluation.studies import rotorpy_flight
+from quadid_evaluation.studies.ahead import shares_of_no_change
 from quadid_evaluation.studies.flight_sets import SETS
 from quadid_evaluation.studies.peers import mujoco_sysid
+from quadid_evaluation.studies.truth import with_values
 
 SECONDS = 60.0
 """Length of a flight of RotorPy."""
@@ -107,7 +106,7 @@ def _rows(name: str, flights: Flights) -> list[str]:
         low, value, high = (np.exp(theirs.values + k * theirs.half) for k in (-1.0, 0.0, 1.0))
         told = {n: (value[k], low[k], high[k], "") for k, n in enumerate(NOMINAL_NAMES)}
         program = f"mujoco.sysid, {chunk:g} s"
-        rows.append(_row("" if rows else name, program, told, _with(vehicle, value), flights, theirs.seconds))
+        rows.append(_row("" if rows else name, program, told, with_values(vehicle, value), flights, theirs.seconds))
     for program, answer, spent in (("identify", identified, seconds), ("diagnose", diagnosed, longer)):
         told = {p["name"]: (p["value"], *p["ci95"], p["status"]) for p in answer.result["parameters"]}
         rows.append(_row("", f"quadid {program}", told, answer.vehicle, flights, spent))
@@ -123,11 +122,6 @@ _Told = Mapping[str, tuple[float, float, float, str]]
 """Value, interval and status by parameter."""
 
 
-def _with(vehicle: Vehicle, values: FloatArray) -> Vehicle:
-    parameters = {n: ParameterPrior(initial=float(v)) for n, v in zip(NOMINAL_NAMES, values, strict=True)}
-    return vehicle.model_copy(update={"parameters": parameters})
-
-
 def _row(name: str, program: str, told: _Told, model: Vehicle, flights: Flights, seconds: float) -> str:
     cells, held = [], 0
     known = [n for n in NOMINAL_NAMES if n in flights.truth]
@@ -136,12 +130,6 @@ def _row(name: str, program: str, told: _Told, model: Vehicle, flights: Flights,
         off = 100.0 * (value / np.clip(value, low, high) - 1.0)
         cells.append(f"{n} {off:+.1f}" + (f" ({status})" if status not in ("", "identified") else ""))
         held += bool(least <= high and low <= most)
-    ahead = _ahead([w for log in flights.unseen for w in log.windows], model)
+    ahead = shares_of_no_change([w for log in flights.unseen for w in log.windows], model, AHEAD)["rate"]
     row = [name, program, ", ".join(cells), f"{held} of {len(known)}", f"{ahead:.2f}", f"{seconds:.1f}"]
     return f"| {' | '.join(row)} |".replace("|  |", "| |")
-
-
-def _ahead(windows: Sequence[Window], model: Vehicle) -> float:
-    steps = round(AHEAD / windows[0].dt)
-    theta = Layout(model).initial(model)
-    return mean_errors(windows, model, theta, steps)["rate"] / no_change(windows, model, steps)["rate"]

@@ -13,19 +13,18 @@ import numpy as np
 from quadid.data.window import Window
 from quadid.flight import SensorNoise, TruthParameters, draw_truth, fly
 from quadid.identification.fit import FitOptions, fit
-from quadid.identification.predict import mean_errors, no_change
-from quadid.model.layout import Layout
 from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 from quadid_evaluation.harness import share, table
+from quadid_evaluation.studies.ahead import shares_of_no_change
 from quadid_evaluation.studies.peers import mujoco_sysid, output_error
 from quadid_evaluation.studies.peers.mujoco_sysid import Answer
-from quadid_evaluation.studies.truth import poor_guess
+from quadid_evaluation.studies.truth import poor_guess, with_values
 
 SECONDS = 60.0
-AHEAD = 25
-"""Steps of 20 ms over which an unseen flight is predicted."""
+AHEAD = 0.5
+"""Horizon of the predictions of an unseen flight [s]."""
 CASES: dict[str, tuple[SensorNoise, dict[str, dict[str, float]]]] = {
     "white noise": (SensorNoise(attitude_slow=0.0, gyro_shake=0.0, accel_shake=0.0), {}),
     "coloured noise": (SensorNoise(), {}),
@@ -73,9 +72,7 @@ def record(case: str, seed: int, program: str) -> Record:
         fly(vehicle, truth, SECONDS, s, noise=noise, effects=effects).window for s in (seed, 10**6 + seed)
     )
     answer, statuses = PROGRAMS[program](window, poor_guess(vehicle, numbers, seed))
-    theta = Layout(vehicle).initial(vehicle)
-    theta[: len(NOMINAL_NAMES)] = np.exp(answer.values)
-    ahead = mean_errors([unseen], vehicle, theta, AHEAD)["rate"] / no_change([unseen], vehicle, AHEAD)["rate"]
+    ahead = shares_of_no_change([unseen], with_values(vehicle, np.exp(answer.values)), AHEAD)["rate"]
     error = answer.values - np.log([numbers[n] for n in NOMINAL_NAMES])
     return {
         "case": case, "seed": seed, "program": program, "error": rounded(error), "half": rounded(answer.half),
