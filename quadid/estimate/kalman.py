@@ -130,7 +130,7 @@ class Gains(NamedTuple):
     Attributes:
         gain: K of each scalar measurement, shape (n, M, N).
         nu, S, w: innovation, its variance (0: not measured), its weight, shapes (n, M).
-        slope: derivative of the accelerometer by rotation vector and velocity, shape (n, 3, 6).
+        slope: derivative of the accelerometer by rotation vector, velocity and alpha, shape (n, 3, 9).
         mean: after the updates, shape (n, N_MEAN).
         P: columns of the covariance there that belong to f, alpha, e, shape (n, N, 9).
         table: rotor moments, see `moments`.
@@ -272,6 +272,15 @@ def _turning(c, s2, x2, y2, z2, o1, s1, p, q, r):  # type: ignore[no-untyped-def
 
 
 @_fast
+def _dragged(c, x2, y2, s1, u, v):  # type: ignore[no-untyped-def]
+    """Angular acceleration by drag at the hubs, at velocity u, v in body axes."""
+    # Sums of x and y times speed about the centre of gravity: of squares over twice the mean speed; 0 at rest.
+    each = c[23] / s1 if s1 > 0.0 else 0.0
+    x1, y1 = each * x2 - c[17] * s1, each * y2 - c[18] * s1
+    return -c[20] * s1 * v, c[19] * s1 * u, c[22] * (c[12] * u * y1 - c[13] * v * x1)
+
+
+@_fast
 def _rotation(w, x, y, z):  # type: ignore[no-untyped-def]
     """Body to world, row by row."""
     return (
@@ -334,11 +343,8 @@ def _advance(c: FloatArray, row: FloatArray, h: float, keep: FloatArray, air: bo
     gz = 0.5 * (1.0 + keep[5]) * x[AL + 3]
     if air:
         _, _, _, u, v, _ = _force(c, s2, s1, x[0], x[1], x[2], x[3], x[VE + 1], x[VE + 2], x[VE + 3])
-        gx, gy = gx - c[20] * s1 * v, gy + c[19] * s1 * u
-        # Sums of x and y times speed about the centre of gravity: of squares over twice the mean speed; 0 at rest.
-        each = c[23] / s1 if s1 > 0.0 else 0.0
-        x1, y1 = each * x2 - c[17] * s1, each * y2 - c[18] * s1
-        gz += c[22] * (c[12] * u * y1 - c[13] * v * x1)
+        dp, dq, dr = _dragged(c, x2, y2, s1, u, v)
+        gx, gy, gz = gx + dp, gy + dq, gz + dr
     qw, qx, qy, qz, p, q, r = x[0], x[1], x[2], x[3], x[4], x[5], x[6]
     a1, b1, c1 = _turning(c, s2 + ds, x2 + dx, y2 + dy, z2 + dz, o1 + do, s1, p, q, r)
     a1, b1, c1 = a1 + gx, b1 + gy, c1 + gz
@@ -445,11 +451,21 @@ def _expected(c, p, y, seen, row, air, x, out):  # type: ignore[no-untyped-def]
         out[ATTITUDE] = scale * a - x[AE + 1]
         out[ATTITUDE + 1] = scale * b - x[AE + 2]
         out[ATTITUDE + 2] = scale * e - x[AE + 3]
-    fx, fy, fz = 0.0, 0.0, -c[0] * row[2 * MOMENTS]
+    s2, x2, y2, z2, o1, s1 = row[2 * MOMENTS :]
+    fx, fy, fz, u, v = 0.0, 0.0, -c[0] * s2, 0.0, 0.0
     if air:
-        fx, fy, fz, _, _, _ = _force(
-            c, row[2 * MOMENTS], row[2 * MOMENTS + 5], x[0], x[1], x[2], x[3], x[VE + 1], x[VE + 2], x[VE + 3]
-        )
+        fx, fy, fz, u, v, _ = _force(c, s2, s1, x[0], x[1], x[2], x[3], x[VE + 1], x[VE + 2], x[VE + 3])
+    rx, ry = -c[17], -c[18]
+    if rx != 0.0 or ry != 0.0:
+        # The IMU is fixed to the frame, at r from the centre of gravity: omega' x r + omega x (omega x r).
+        p_, q_, r_ = x[4], x[5], x[6]
+        dp, dq, dr = _turning(c, s2, x2, y2, z2, o1, s1, p_, q_, r_)
+        ap, aq, ar = _dragged(c, x2, y2, s1, u, v)
+        ap, aq, ar = ap + dp + x[AL + 1], aq + dq + x[AL + 2], ar + dr + x[AL + 3]
+        along, square = p_ * rx + q_ * ry, p_ * p_ + q_ * q_ + r_ * r_
+        fx += p_ * along - rx * square - ar * ry
+        fy += q_ * along - ry * square + ar * rx
+        fz += r_ * along + ap * ry - aq * rx
     out[ACCEL] = y[7] - fx - x[FO + 1] - p[ACCEL_BIAS]
     out[ACCEL + 1] = y[8] - fy - x[FO + 2] - p[ACCEL_BIAS + 1]
     out[ACCEL + 2] = y[9] - fz - x[FO + 3] - p[ACCEL_BIAS + 2]
@@ -624,21 +640,21 @@ def _places(channel, slope, where, what):  # type: ignore[no-untyped-def]
         where[0], where[1] = TH + axis, AE + axis
         return 2
     if channel < VELOCITY:
-        where[0] = FO + axis
-        if axis == 2 or slope[axis, 3] == 0.0 and slope[axis, 4] == 0.0 and slope[axis, 5] == 0.0:
-            return 1
-        for j in range(6):
-            where[1 + j] = TH + j if j < 3 else VE + j - 3
-            what[1 + j] = slope[axis, j]
-        return 7
+        where[0], count = FO + axis, 1
+        for j in range(9):
+            if slope[axis, j] != 0.0:
+                where[count], what[count] = (TH if j < 3 else VE - 3 if j < 6 else AL - 6) + j, slope[axis, j]
+                count += 1
+        return count
     where[0] = VE + axis
     return 1
 
 
 @_fast
 def _accel_slope(c, row, air, x, slope):  # type: ignore[no-untyped-def]
-    """Writes the derivative of the accelerometer by rotation vector and velocity, (3, 6)."""
+    """Writes the derivative of the accelerometer by rotation vector, velocity and random alpha, (3, 9)."""
     slope[:] = 0.0
+    slope[0, 8], slope[1, 8], slope[2, 6], slope[2, 7] = c[18], -c[17], -c[18], c[17]
     if air:
         r = _rotation(x[0], x[1], x[2], x[3])
         _, _, _, u, v, w = _force(c, 0.0, 0.0, x[0], x[1], x[2], x[3], x[VE + 1], x[VE + 2], x[VE + 3])
@@ -689,14 +705,14 @@ def kalman(track: Track, p: FloatArray, psi: FloatArray, tail: FloatArray, store
     rows = n if store else 1
     g = Gains(
         np.zeros((rows, M, N)), np.zeros((rows, M)), np.zeros((rows, M)), np.zeros((rows, M)),
-        np.zeros((rows, 3, 6)), np.zeros((rows, N_MEAN)), np.zeros((rows, N, 9)),
+        np.zeros((rows, 3, 9)), np.zeros((rows, N_MEAN)), np.zeros((rows, N, 9)),
         moments(track, p[DELAY], p[LAG]), (p[DELAY], p[LAG]), track.beyond,
     )  # fmt: skip
     c, keep = _constants(p, track), np.empty(9)
     x, after = _start(track, p), np.empty(N_MEAN)
     P, FP, F, turn = np.zeros((N, N)), np.zeros((N, N)), np.zeros((N, N)), np.zeros((3, 3))
     dx, PH, G, nu = np.empty(N), np.empty(N), np.empty(N), np.zeros(M)
-    where, what, loose, step = np.zeros(7, dtype=np.int64), np.zeros(7), np.empty(4), np.zeros(12)
+    where, what, loose, step = np.zeros(10, dtype=np.int64), np.zeros(10), np.empty(4), np.zeros(12)
     for i in range(3):
         P[TH + i, TH + i], P[OM + i, OM + i] = 0.09, 1.0
         P[VE + i, VE + i] = max(track.still, 1.0) ** 2 if air else 0.0
@@ -829,7 +845,7 @@ def replay(
     air = track.still > 0.0 or track.seen[:, 3].any()
     c, keep, x = _constants(p, track), np.empty(9), _start(track, p)
     dx, nu, step = np.empty(N), np.zeros(M), np.zeros(12)
-    where, what = np.zeros(7, dtype=np.int64), np.zeros(7)
+    where, what = np.zeros(10, dtype=np.int64), np.zeros(10)
     total, before = 0.0, -1.0
     for k in range(n):
         _expected(c, p, track.y[k], track.seen[k], table[k], air, x, nu)
@@ -897,7 +913,7 @@ def backward(
     l, fl, L, FL = np.zeros(N), np.zeros(N), np.zeros((N, N)), np.zeros((N, N))
     NK, G, turn, F = np.empty(N), np.empty(N), np.zeros((3, 3)), np.zeros((N, N))
     c, after, before = _constants(p, track), np.empty(N_MEAN), -1.0
-    where, what, keep = np.zeros(7, dtype=np.int64), np.zeros(7), np.empty(9)
+    where, what, keep = np.zeros(10, dtype=np.int64), np.zeros(10), np.empty(9)
     loose, borrowed = np.empty(4), np.zeros(4)
     for k in range(n - 1, -1, -1):
         if k + 1 < n:

@@ -166,6 +166,16 @@ def test_motion_is_the_simulations() -> None:
     np.testing.assert_allclose(mean[1:50, k.VE + 1 : k.VE + 4], wanted.velocity[:49], atol=3e-3)
 
 
+def test_an_imu_beside_the_centre_of_gravity_reads_what_the_flown_one_does() -> None:
+    """It is fixed to the frame, so a vehicle that turns about a centre of gravity beside it accelerates it."""
+    truth, shift = draw_truth(PELICAN, 2), {"x": 0.02, "y": -0.03}
+    window = fly(PELICAN, truth, 8.0, 2, effects={"cg_offset": shift}, noise_scale=0.0).window
+    p = np.zeros(k.N_PHYSICS)
+    p[:6], p[k.CG : k.CG + 2] = list(truth.as_dict().values()), tuple(shift.values())
+    read = still(p, from_window(window, PELICAN)).nu[5:-1, k.ACCEL : k.VELOCITY]
+    assert np.sqrt(np.mean(read**2, axis=0)).max() < 5e-4
+
+
 def test_a_lag_is_one_of_rotor_speeds() -> None:
     """Not of their squares, of which the mean behind a lag is more where commands jump."""
     vehicle = PELICAN.model_copy(update={"effects": {"motor_lag": {"tau": 0.06}}})
