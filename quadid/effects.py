@@ -275,7 +275,7 @@ TABLE: tuple[Effect, ...] = (
     Effect(
         "weak_rotor", "rotor",
         (
-            P("rotor", "", 0.0, 1.0, 12.0, 1.0),
+            P("rotor", "", 0.0, 1.0, 16.0, 1.0),
             P("loss", "", 0.0, -0.6, 0.6, 0.05, sign=1, factor=1e2),
             P("drag_loss", "", 0.0, -1.0, 1.0, 0.1, optional=True, entry="extra", beside="loss", factor=1e2),
         ),

@@ -21,7 +21,7 @@ from pydantic import (
     model_validator,
 )
 
-from quadid.effects import EFFECTS, known_keys, rotor_drag_losses
+from quadid.effects import EFFECTS, Scale, known_keys, rotor_drag_losses
 from quadid.errors import ParameterError, VehicleError, nearest
 from quadid.files import unwaited
 from quadid.parameters import INERTIAS, MAY_VANISH, NOMINAL_NAMES, VANISHED, impossible_inertia
@@ -483,6 +483,8 @@ class Vehicle(Strict):
         for name in (n for one, others in value.items() for n in (one, *others)):
             if name not in NOMINAL_NAMES:
                 raise ValueError(f"unknown parameter '{name}'; {nearest(name, NOMINAL_NAMES)}")
+        if own := [name for name, others in value.items() if name in others]:
+            raise ValueError(f"{own[0]} beside itself, which is always 1; leave that entry out")
         return value
 
     @field_validator("effects", mode="before")
@@ -525,6 +527,7 @@ class Vehicle(Strict):
             raise ValueError(slip)
         try:
             rotor_drag_losses(self.effects.get("weak_rotor", {}), len(self.rotors))
+            self._check_effects()
         except ParameterError as error:
             raise ValueError(str(error)) from error
         if (lever := self.parameters["d"].initial / self.parameters["b"].initial) > self.arm:
@@ -543,6 +546,9 @@ class Vehicle(Strict):
                     f"{self.arm:.3g} m from the centre have {small:.2g} to {large:.2g} kg m^2; "
                     "is it in g m^2, kg cm^2 or g cm^2?"
                 )
+        for name, sigma, size in (("mass", self.mass_sigma, self.mass), ("arm", self.arm_sigma, self.arm)):
+            if sigma >= size:
+                raise ValueError(f"{name}_sigma {sigma:g} is no less than the {name}, {size:.3g}; give one sigma in SI")
         if self.stand_thrust is not None and not low < self.stand_thrust[0] < high:
             raise ValueError(
                 f"thrust_stand yields b = {self.stand_thrust[0]:.3g}, outside its bounds [{low:.3g}, {high:.3g}]; "
@@ -560,6 +566,39 @@ class Vehicle(Strict):
         if np.ptp(self.spins) == 0.0:
             raise ValueError("all rotors spin the same way: yaw cannot be balanced; use both +1 and -1")
         return self
+
+    def _check_effects(self) -> None:
+        """Refuses numbers beyond the catalogue's bounds for any vehicle of this size that the priors allow.
+
+        Raises:
+            ParameterError: with entry, value and range.
+        """
+        # A fit moves the guesses that give its box, within their bounds: so these, in which every fitted value lies.
+        most = {name: prior.limits[1] for name, prior in self.parameters.items()}
+        scales = self.scales(most | {"b": self.parameters["b"].limits[0]})
+        scales["rotor_inertia"] = max(scales["rotor_inertia"], most["J_zz"] / 1.5e-2)  # a fitted J_r may vanish
+        for name, numbers in self.effects.items():
+            for key, value in numbers.items():
+                # Bounds are those of the parameter vector, where a number may be counted from another one.
+                plain_key, _, rotor = key.partition("loss_")
+                p = EFFECTS[name].parameter(f"{plain_key}loss" if rotor else key)
+                beside = f"{p.beside}_{rotor}" if p.beside and rotor else p.beside
+                low, high = (numbers.get(beside, 0.0) + bound * scales[p.scale] for bound in (p.lower, p.upper))
+                inside = low <= value <= high or any(math.isclose(value, end, rel_tol=1e-4) for end in (low, high))
+                if not (inside or value == p.neutral or p.name == "time"):  # files round, and times are of any clock
+                    allowed = f"{low:.3g} to {high:.3g}{p.unit and ' '}{p.unit} on a vehicle of this size"
+                    raise ParameterError(f"effects.{name}.{key} = {value:g}", allowed)
+
+    def scales(self, at: Mapping[str, float]) -> dict[Scale, float]:
+        """Factors from the sizes in the table of effects, a Pelican's, to this airframe's with parameters `at`."""
+        return {
+            "": 1.0,
+            "arm": float(np.max(np.linalg.norm(self.rotor_positions[:, :2], axis=1))) / 0.21,
+            "inertia": at["J_xx"] / 8e-3,
+            "rotor_inertia": at["J_r"] / 3e-5,
+            "hover_speed": self.hover_speed(at["b"]) / 400.0,
+            "rotor_weight": self.mass * GRAVITY / len(self.rotors) / 3.2,
+        }
 
     @property
     def mixing(self) -> FloatArray:

@@ -14,7 +14,7 @@ from quadid.effects import EFFECTS, NEVER, Effect, EffectParameter, Scale, param
 from quadid.errors import ParameterError, WindowError, nearest
 from quadid.parameters import NOMINAL_NAMES, NOMINAL_UNITS
 from quadid.types import FloatArray, IntArray
-from quadid.vehicle import GRAVITY, MOST_FACTORS, SIGNALS, TARGETS, Vehicle
+from quadid.vehicle import MOST_FACTORS, SIGNALS, TARGETS, Vehicle
 
 # --- One vector for everything: the paper's six parameters, then every effect parameter at its neutral value
 #
@@ -91,7 +91,7 @@ class Layout:
         """Lays out the vector for `vehicle`; its scale (arm, weight, inertia) sets bounds and typical sizes."""
         self.rotors = len(vehicle.rotors)
         self.size = LOSS + 2 * self.rotors + len(vehicle.residual)
-        scale = _scales(vehicle)
+        scale = vehicle.scales({name: p.initial for name, p in vehicle.parameters.items()})
         entries: list[Entry] = []
         for index, name in enumerate(NOMINAL_NAMES):
             low, high = vehicle.limits(name)
@@ -196,20 +196,6 @@ def residual_terms(vehicle: Vehicle) -> IntArray:
         for t in vehicle.residual
     ]
     return np.array(rows, dtype=np.int64).reshape(-1, 1 + MOST_FACTORS)
-
-
-def _scales(vehicle: Vehicle) -> dict[Scale, float]:
-    """Factors from the table's sizes, a Pelican's, to this airframe's."""
-    arm = float(np.max(np.linalg.norm(vehicle.rotor_positions[:, :2], axis=1)))
-    p = vehicle.parameters
-    return {
-        "": 1.0,
-        "arm": arm / 0.21,
-        "inertia": p["J_xx"].initial / 8e-3,
-        "rotor_inertia": p["J_r"].initial / 3e-5,
-        "hover_speed": vehicle.hover_speed() / 400.0,
-        "rotor_weight": vehicle.mass * GRAVITY / len(vehicle.rotors) / 3.2,
-    }
 
 
 def _effect_entry(dotted: str, p: EffectParameter, scale: Mapping[Scale, float]) -> Entry:

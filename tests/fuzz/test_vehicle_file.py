@@ -12,10 +12,12 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from quadid.effects import EFFECTS
 from quadid.errors import QuadidError, VehicleError
 from quadid.model.layout import Layout
+from quadid.parameters import VANISHED
 from quadid.report.programs import FORMATS, export
-from quadid.vehicle import Vehicle
+from quadid.vehicle import ParameterPrior, Vehicle
 from quadid.yaml_text import LARGEST, read_mapping
 from tests.faults.evidence import Happened
 
@@ -108,6 +110,10 @@ def with_mass(value: str) -> str:
     return TEXT.replace("mass: 1.3", f"mass: {value}")
 
 
+def with_effects(value: str) -> str:
+    return TEXT.replace("effects: {}", f"effects: {{{value}}}")
+
+
 TRAPS = {
     "a key twice": (TEXT.replace("mass:", "mass: 1.0\nmass:"), "key 'mass' appears twice"),
     "a merge bomb": ("a: &a [x]\nb: &b [*a, *a]\n<<: *b\n" + TEXT, "anchors and aliases"),
@@ -131,6 +137,14 @@ SLIPS = {
     "millimetres": (TEXT.replace("0.21", "210.0"), "rotor positions in millimetres? 0.21 m would fit"),
     "centimetres": (TEXT.replace("0.21", "21.0"), "rotor positions in "),
     "a wrong key": (TEXT.replace("mass:", "mas:"), "unknown key 'mas'; did you mean 'mass'"),
+    "a lag before its command": (with_effects("motor_lag: {tau: -0.05}"), "effects.motor_lag.tau = -0.05"),
+    "a lag of a minute": (with_effects("motor_lag: {tau: 50}"), "allowed: 0 to 0.3 s on a vehicle of this"),
+    "a slower lag in ms": (with_effects("motor_lag: {tau: 0.03, tau_down: 40}"), "motor_lag.tau_down = 40"),
+    "a loss in percent": (with_effects("weak_rotor: {rotor: 3, loss: 20}"), "weak_rotor.loss = 20"),
+    "losses in percent": (with_effects("weak_rotor: {loss_1: 0.1, loss_2: 20}"), "weak_rotor.loss_2 = 20"),
+    "an IMU in mm": (TEXT + "mounting: {position: [40, 0, 0]}\n", "effects.imu_lever_arm.x = 40"),
+    "a mass that may be none": (TEXT + "mass_sigma: 1.4\n", "mass_sigma 1.4 is no less than the mass"),
+    "a correlation with itself": (TEXT + "correlation: {b: {b: 0.5}}\n", "b beside itself"),
     "b of another unit": (
         TEXT.replace("2.0e-05", "2.0e-19").replace("1.0e-05, 5.0e-05", "1.0e-19, 5.0e-19"), "b within its bounds"
     ),
@@ -161,3 +175,20 @@ def test_every_vehicle_file_at_hand_is_read(data_dir: Path) -> None:
     for file in files:
         vehicle = Vehicle.from_yaml(file.read_text(encoding="utf-8"), file.name)
         np.testing.assert_array_equal(Vehicle.from_yaml(vehicle.to_yaml()).initial, vehicle.initial)
+
+
+@pytest.mark.parametrize("corner", [0.251, 1.0, 3.99])
+def test_what_a_fit_within_its_box_may_find_is_read_again(corner: float) -> None:
+    """Every number of every effect at both of its bounds, wherever the six went, and J_r vanished."""
+    pelican = Vehicle.shipped("pelican")
+    layout = Layout(pelican)
+    moved = {n: ParameterPrior(initial=p.initial * corner) for n, p in pelican.parameters.items()}
+    moved["J_r"] = ParameterPrior(initial=pelican.parameters["J_r"].initial * VANISHED)
+    for entry in layout.entries.values():
+        effect = entry.name.split(".")[0]
+        for value in (entry.lower, entry.upper) if effect in EFFECTS else ():
+            theta = layout.neutral()
+            theta[entry.index] = value
+            numbers = {k: float(f"{v:.4g}") for k, v in layout.read_effect(theta, effect).items() if np.isfinite(v)}
+            written = pelican.model_copy(update={"parameters": moved, "effects": {effect: numbers}}).to_yaml()
+            assert Vehicle.from_yaml(written).effects == {effect: numbers}
