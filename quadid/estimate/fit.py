@@ -202,10 +202,12 @@ def scoring(
     value, gains = problem.passes(z, psi)
     information, gradient = np.eye(len(z)), np.zeros(len(z))
     curvature, slope, at, damping = np.eye(len(psi)), np.zeros(len(psi)), np.full(len(psi), np.inf), 0.0
-    far = BOLD if physics else 0.0
+    below = above = np.zeros(len(z))
     for _ in range(turns if np.isfinite(value) else 0):
         if physics:
-            information, gradient = problem.normal_equations(z, psi, gains)
+            below, above, nudge = problem.corner(z, psi, gains)
+            information, gradient = problem.normal_equations(z, psi, gains, nudge)
+            below, above = np.maximum(below, -BOLD), np.minimum(above, BOLD)
         log = np.log(psi)
         if noise.any():
             slope = problem.score(z, psi, gains) * psi
@@ -216,9 +218,8 @@ def scoring(
                 )
         if not (np.isfinite(information).all() and np.isfinite(curvature).all()):
             break  # readings so wild that they overflow lead nowhere
-        below, above = problem.corner(z, psi, gains, gradient)
         for _ in range(PATIENCE):
-            step = newton_step(information, gradient, damping, np.maximum(below, -far), np.minimum(above, far))
+            step = newton_step(information, gradient, damping, below, above)
             bold = newton_step(curvature, slope, damping, *noise_box(problem.noise_bounds, psi, noise))
             by_physics, by_noise = -float(gradient @ step), -0.5 * float(slope @ bold)
             done = by_physics < FINE and by_noise < ENOUGH

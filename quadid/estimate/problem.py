@@ -80,7 +80,7 @@ AT_ONCE = 16
 SETTLING = 2
 """Times that effects are simulated anew along the states that they move."""
 LEAST = 1e-2
-"""A random force this small against its prior is none."""
+"""What is this small against its prior is none: a random force, a delay."""
 
 
 def control_moment(tracks: Sequence[Track], p: FloatArray) -> FloatArray:
@@ -536,31 +536,36 @@ class Problem:
         )
 
     def corner(
-        self, z: FloatArray, psi: FloatArray, gains: Sequence[Gains], gradient: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
-        """Least and most step of the scaled parameters, shape (P,) each: bounds, and none beyond a corner.
+        self, z: FloatArray, psi: FloatArray, gains: Sequence[Gains]
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Least and most step of the scaled parameters, bounds and none beyond a corner, and differences to take there.
 
         Rotor speeds that are held and measurements at the same times give a likelihood with a corner where nothing is
-        late: it may rise to either side.
+        late: it may rise to either side, and has the slope of the side that a step goes to.
 
         Args:
             z: scaled parameters.
             psi: noise numbers.
             gains: of a pass there.
-            gradient: towards larger parameters, see `normal_equations`.
+
+        Returns:
+            Least and most step, and `nudge` of `normal_equations`, shape (P,) each.
         """
-        least, most = self.limits[0] - z, self.limits[1] - z
+        least, most, nudge = self.limits[0] - z, self.limits[1] - z, np.full(len(z), 1e-5)
         for i, (_, place, _) in enumerate(self.entries):
             if place == k.DELAY and z[i] == 0.0:
-                before = 0.0
+                early = late = 0.0  # how the objective rises to either side; a short lag makes the corner round
                 for j, g in enumerate(gains):
-                    plain, early = self._several(j, [z, z - 1e-5 * (np.arange(len(z)) == i)], psi, g)
-                    before += float(np.sum((plain - early) / 1e-5 * plain))
-                most[i] = most[i] if gradient[i] < min(-before, 0.0) else 0.0
-                least[i] = least[i] if before > max(-gradient[i], 0.0) else 0.0
+                    step = LEAST * (np.arange(len(z)) == i)
+                    plain, before, after = self._several(j, [z, z - step, z + step], psi, g)
+                    early += float(np.sum(before**2 - plain**2))
+                    late += float(np.sum(after**2 - plain**2))
+                most[i] = most[i] if late < min(early, 0.0) else 0.0
+                least[i] = least[i] if early < min(late, 0.0) else 0.0
+                nudge[i] = -LEAST if least[i] < 0.0 else nudge[i]
             elif place == k.DELAY:
                 least[i], most[i] = (-z[i], most[i]) if z[i] > 0.0 else (least[i], -z[i])
-        return least, most
+        return least, most, nudge
 
     def _several(self, j: int, points: Sequence[FloatArray], psi: FloatArray, g: Gains) -> list[FloatArray]:
         """Whitened innovations of flight j at points near that of the gains, effects along the states there."""

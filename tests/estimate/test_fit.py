@@ -192,3 +192,19 @@ def test_a_motor_lag_among_the_late_causes_leaves_the_inertias_alone() -> None:
         assert abs(np.log(value / truth.as_dict()[name])) < 3.0 * sigma, name
     lag, spread = family.value("motor_lag.tau")
     assert lag == pytest.approx(0.03, abs=max(3.0 * spread, 0.002))
+
+
+def test_the_search_stays_in_a_corner_of_the_delay_that_a_short_lag_rounds() -> None:
+    """The objective rises to either side of no delay, though its slope there points to negative ones."""
+    truth = draw_truth(PELICAN, 1)
+    vehicle = guessed(truth.as_dict(), 1.2, 1)
+    window = fly(PELICAN, truth, 2.0 * SECONDS, 1, outside=GUSTS).window
+    found = estimate(Problem.of([from_window(window, vehicle)], vehicle, LATE, [window]))
+    names = [name for name, *_ in found.problem.entries]
+    at, delay = found.z.copy(), names.index("command_delay.delay")
+    at[delay], at[names.index("motor_lag.tau")] = 0.0, 0.002
+    value, gains = found.problem.passes(at, found.psi)
+    beside = 0.01 * (np.arange(len(at)) == delay)
+    assert min(found.problem.objective(at + side, found.psi) for side in (-beside, beside)) > value + 0.1
+    below, above, _ = found.problem.corner(at, found.psi, gains)
+    assert below[delay] == above[delay] == 0.0
