@@ -129,16 +129,9 @@ class Compared(Reported):
 
 
 def compare_vehicles(
-    a: Annotated[
-        Described, Typed(str, typer.Argument(metavar="A", help="A shipped vehicle or a YAML file."), ..., load_vehicle)
-    ],
-    b: Annotated[Described, Typed(str, typer.Argument(metavar="B", help="The other one."), ..., load_vehicle)],
-    on: Annotated[
-        Given,
-        Typed(
-            list[str], typer.Option("--on", metavar="LOG", help="A flight to predict; repeatable."), ..., opened=True
-        ),
-    ],
+    a: Annotated[Described, Typed(str, typer.Argument(metavar="A"), ..., load_vehicle)],
+    b: Annotated[Described, Typed(str, typer.Argument(metavar="B"), ..., load_vehicle)],
+    on: Annotated[Given, Typed(list[str], typer.Option(metavar="LOG"), ..., opened=True)],
     *, horizons: Horizons = HORIZONS, rate: OwnRate = None, seed: Seed = 0,
 ) -> Compared:  # fmt: skip
     """Predicts the same flights with two vehicle files, from the same starts.
@@ -147,9 +140,9 @@ def compare_vehicles(
     both (paired block bootstrap): runs that overlap err alike, and a hard stretch is hard for both.
 
     Args:
-        a: a shipped name, a YAML file or a `Vehicle`; its values are taken as they are.
-        b: likewise.
-        on: a log or several, as paths or from `load`.
+        a: a shipped vehicle or a vehicle file; its values are taken as they are.
+        b: the other one, likewise.
+        on: a flight to predict, or several.
         horizons: samples of the grid after the start of each run, or times, as ``0.1s``.
         rate: of the grid [Hz]; None for each log's own.
         seed: decides the draws.

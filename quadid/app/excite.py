@@ -225,50 +225,32 @@ def knowledge(
 
 
 def propose(
-    logs: Annotated[
-        Given,
-        Typed(list[str] | None, typer.Argument(metavar="LOG", help="Flights so far, if any."), opened=True),
-    ] = (),
+    logs: Annotated[Given, Typed(list[str] | None, typer.Argument(metavar="LOG"), opened=True)] = (),
     *,
     vehicle: Annotated[Described, Typed(str, VEHICLE, "pelican", load_vehicle)] = "pelican",
-    seconds: Annotated[float, typer.Option("--seconds", metavar="S", help="Length of the manoeuvre.")] = 60.0,
-    tilt: Annotated[float, typer.Option("--tilt", metavar="DEG", help="Largest tilt.")] = 25.0,
-    rate_limit: Annotated[float, typer.Option("--rate-limit", metavar="DEG/S", help="Largest body rate.")] = 150.0,
-    height: Annotated[
-        tuple[float, float],
-        Typed(
-            str,
-            typer.Option("--height", metavar="M:M", help="Lowest and highest height above take-off."),
-            "10:40",
-            parse_height,
-        ),
-    ] = (10.0, 40.0),
-    battery: Annotated[float, typer.Option("--battery", metavar="%", help="What must remain of the battery.")] = 40.0,
-    forms: Annotated[
-        Sequence[str],
-        Typed(
-            list[str] | None,
-            typer.Option(
-                "--format",
-                metavar="NAME",
-                help="Also write what flies it: ardupilot-lua, ardupilot-sid, px4, sticks; repeatable.",
-            ),
-        ),
-    ] = (),
+    seconds: Annotated[float, typer.Option(metavar="S")] = 60.0,
+    tilt: Annotated[float, typer.Option(metavar="DEG")] = 25.0,
+    rate_limit: Annotated[float, typer.Option(metavar="DEG/S")] = 150.0,
+    height: Annotated[tuple[float, float], Typed(str, typer.Option(metavar="M:M"), "10:40", parse_height)] = (
+        10.0,
+        40.0,
+    ),
+    battery: Annotated[float, typer.Option(metavar="%")] = 40.0,
+    forms: Annotated[Sequence[str], Typed(list[str] | None, typer.Option("--format", metavar="NAME"))] = (),
     seed: Seed = 1,
     advance: Advance = silent,
 ) -> Proposed:
     """Proposes the manoeuvre that shrinks the intervals most, within tilt and rate limits.
 
     Args:
-        logs: flights so far, as paths or from `load`.
+        logs: flights so far, if any.
         vehicle: what is believed before them.
         seconds: length of the manoeuvre [s].
         tilt: largest tilt [degrees].
         rate_limit: largest body rate [degrees/s].
-        height: lowest and highest above take-off [m].
-        battery: what must remain [per cent].
-        forms: what flies it is written in these as well (`quadid.report.manoeuvres.FORMS`).
+        height: lowest and highest height above take-off [m].
+        battery: what must remain of the battery [%].
+        forms: also write what flies it: ardupilot-lua, ardupilot-sid, px4, sticks.
         seed: of all random numbers.
         advance: told how far it is.
 

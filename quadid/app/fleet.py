@@ -47,33 +47,15 @@ from quadid.version import __version__
 
 
 def fleet(
-    folder: Annotated[
-        str | Path,
-        Typed(
-            Path,
-            typer.Argument(metavar="DIR", help="Folder of logs, formats auto-detected; one vehicle a folder."),
-            ...,
-        ),
-    ],
+    folder: Annotated[str | Path, Typed(Path, typer.Argument(metavar="DIR"), ...)],
     out: Annotated[str | Path, Typed(Path, OUT, Path())],
     vehicle: Annotated[Described | None, vehicle_if(", for folders without a vehicle.yaml.")] = None,
     *,
-    scheduler: Annotated[
-        str | None,
-        typer.Option("--scheduler", metavar="ADDR", help="A Dask scheduler (tcp://…); default: own workers."),
-    ] = None,
-    workers: Annotated[
-        int | None, typer.Option("--workers", metavar="N", min=1, help="Own workers; default one a core.")
-    ] = None,
-    memory: Annotated[
-        str, typer.Option("--memory", metavar="SIZE", help="Memory that one own worker may take.")
-    ] = "2GiB",
-    diagnose: Annotated[
-        bool, typer.Option("--diagnose", help="Also name what the simulation gets wrong (slower).")
-    ] = False,
-    again: Annotated[
-        bool, typer.Option("--again", help="Identify all logs again, including those already done.")
-    ] = False,
+    scheduler: Annotated[str | None, typer.Option(metavar="ADDR")] = None,
+    workers: Annotated[int | None, typer.Option(metavar="N", min=1)] = None,
+    memory: Annotated[str, typer.Option(metavar="SIZE")] = "2GiB",
+    diagnose: Annotated[bool, typer.Option("--diagnose")] = False,
+    again: Annotated[bool, typer.Option("--again")] = False,
     rate: Rate = GRID,
     seed: Seed = 1,
     columns: NamedColumns = None,
@@ -81,15 +63,17 @@ def fleet(
 ) -> Fleet:
     """Identifies every log of a folder in parallel on Dask; run again, it goes on where it was.
 
+    Rows of all logs and vehicles are written as SQLite and Parquet.
+
     Args:
-        folder: of logs, formats auto-detected; a vehicle of the fleet is a folder, described by the nearest
+        folder: folder of logs, formats auto-detected; a vehicle of the fleet is a folder, described by the nearest
             ``vehicle.yaml`` in it or above it.
         out: folder for ``fleet.sqlite`` and its tables as Parquet; made where it does not exist.
         vehicle: for folders without a ``vehicle.yaml``.
         scheduler: address of a Dask scheduler (``tcp://...``), whose workers see the logs at the same paths; by default
             own workers.
-        workers: how many own ones; one a core by default.
-        memory: that one own worker may take.
+        workers: number of own workers; one a core by default.
+        memory: memory that one own worker may take.
         diagnose: also name what the simulation gets wrong (slower).
         again: identify all logs again, including those already done.
         rate: of the uniform grid [Hz].

@@ -111,14 +111,7 @@ class HealthOutcome(Reported):
 
 def health(
     logs: LogNames,
-    baseline: Annotated[
-        Given,
-        Typed(
-            list[str],
-            typer.Option("--baseline", metavar="LOG", help="A healthy flight of this vehicle; repeatable."),
-            ...,
-        ),
-    ],
+    baseline: Annotated[Given, Typed(list[str], typer.Option(metavar="LOG"), ...)],
     *, vehicle: OfVehicle = None, preset: Preset = "auto", unchecked: Unchecked = False,
 ) -> HealthOutcome:  # fmt: skip
     """Compares flights with healthy flights of the same vehicle: which rotor, mass, centre of gravity, thrust.
@@ -128,7 +121,7 @@ def health(
 
     Args:
         logs: a flight or several in question, as paths or from `load`.
-        baseline: a healthy flight or, much better, several.
+        baseline: a healthy flight of this vehicle or, much better, several.
         vehicle: a shipped name, a YAML file or a `Vehicle`; geometry counts, its parameters may be poorly known;
             default that of the first loaded log.
         preset: topic names of ROS logs.

@@ -58,27 +58,19 @@ class Initial(Outcome):
 
 
 def init(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="Name of the vehicle, and of its file.")],
-    log: Annotated[
-        str | Path | None,
-        Typed(
-            str | None,
-            typer.Option("--from", metavar="LOG", help="Take geometry, frame, motor order and limits from this log."),
-        ),
-    ] = None,
+    name: Annotated[str, typer.Argument(metavar="NAME")],
+    log: Annotated[str | Path | None, Typed(str | None, typer.Option("--from", metavar="LOG"))] = None,
     *,
-    mass: Annotated[float | None, typer.Option("--mass", metavar="KG", min=0.001, help="Mass as it flies.")] = None,
-    arm: Annotated[
-        float | None, typer.Option("--arm", metavar="M", min=0.001, help="Distance of the rotors from the centre.")
-    ] = None,
+    mass: Annotated[float | None, typer.Option(metavar="KG", min=0.001)] = None,
+    arm: Annotated[float | None, typer.Option(metavar="M", min=0.001)] = None,
     preset: Preset = "auto",
 ) -> Initial:
-    """A vehicle file to fill in.
+    """A vehicle file to fill in; with a log, filled with what the autopilot's logged parameters describe.
 
     Args:
-        name: of the vehicle.
-        log: its autopilot's parameters give geometry, frame, motor order and limits.
-        mass: as it flies [kg].
+        name: name of the vehicle, and of its file.
+        log: log whose autopilot's parameters give geometry, frame, motor order and limits.
+        mass: mass as it flies [kg].
         arm: distance of the rotors from the centre [m], where the autopilot does not store it.
         preset: topic names of ROS logs.
 
@@ -125,7 +117,7 @@ class Shipped(Outcome):
 
 
 def vehicles() -> Shipped:
-    """Lists the vehicles that ship."""
+    """Lists the vehicles that ship; a command takes each by its name, as ``--vehicle pelican``."""
     return Shipped({"schema": "quadid.vehicles/1", "vehicles": shipped()})
 
 

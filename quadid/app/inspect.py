@@ -93,24 +93,17 @@ class Inspected(Outcome):
 
 
 def inspect(
-    log: Annotated[
-        Flight,
-        Typed(
-            str,
-            typer.Argument(
-                metavar="LOG",
-                help="A flight log: ROS 2 MCAP, .tlog, DataFlash, ULog, CSV, format auto-detected. LOG@76:216: a span.",
-            ),
-            ...,
-        ),
-    ],
+    log: Annotated[Flight, Typed(str, typer.Argument(metavar="LOG"), ...)],
     vehicle: Annotated[Described | None, vehicle_if(": checks motors and excitation too.")] = None,
     *, start: Start = None, stop: Stop = None, preset: Preset = "auto", columns: NamedColumns = None,
 ) -> Inspected:  # fmt: skip
-    """Inspects a log, and never refuses one that can be read.
+    """Says what a log holds: channels, rates, gaps, faults, units and frames, excitation, what is missing.
+
+    No log that can be read is refused.
 
     Args:
-        log: path, path with a span as in ``flight.bin@76:216``, or a log from `load`.
+        log: a flight log: ROS 2 MCAP, .tlog, DataFlash, ULog or CSV, format auto-detected; or a span of one, as
+            ``flight.bin@76:216``.
         vehicle: with it, motors and excitation are checked too; default the one a loaded log has.
         start: first time to look at [s], after the log's first IMU sample.
         stop: last time [s], likewise.

@@ -2,7 +2,7 @@
 
 A command is a function of the library (`quadid.cli.commands`).  A parameter annotated with an option of typer is typed
 as it is; `Typed` says how to type one to which a caller of the library gives something else; any other parameter is for
-callers only.
+callers only.  An option without help has that of the function's docstring.
 """
 
 from __future__ import annotations

@@ -120,12 +120,7 @@ class Scored(Reported):
 
 def score(
     logs: Logs, *, vehicle: OfVehicle = None, horizons: Horizons = HORIZONS, rate: OwnRate = None,
-    closed_loop: Annotated[
-        bool,
-        typer.Option(
-            "--closed-loop", help="Predict bands with the autopilot in the loop: gains of the file, or found."
-        ),
-    ] = False,
+    closed_loop: Annotated[bool, typer.Option("--closed-loop")] = False,
 ) -> Scored:  # fmt: skip
     """Open-loop prediction error after h samples: every sample starts one run from the measured state.
 
@@ -134,7 +129,7 @@ def score(
         vehicle: whose values are scored as they are; default that of the first loaded log.
         horizons: samples of the grid after the start of each run, or times, as ``0.1s``.
         rate: of the grid [Hz]; None for each log's own, whatever it was loaded with.
-        closed_loop: bands are predicted with the autopilot in the loop, as the vehicle file or the logs know it.
+        closed_loop: predict bands with the autopilot in the loop, as the vehicle file or the logs know it.
 
     Raises:
         LogError: a log that does not fit the vehicle.

@@ -1,13 +1,16 @@
 """The commands: a table, and how a function of the library becomes one.
 
 Options are the parameters of the function (`quadid.app.options`), how its logs are read, and where its `Outcome` goes.
+Its docstring is the help of the command, and what it says of a parameter that of the option, where the option has none.
 Nothing that a command needs is imported before it is called.
 """
 
 from __future__ import annotations
 
+import copy
 import importlib
 import inspect
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any, get_args
 
 import typer
 from typer.main import get_command
-from typer.models import ParameterInfo
+from typer.models import OptionInfo, ParameterInfo
 
 if TYPE_CHECKING:
     from quadid.app.logs import Log
@@ -33,7 +36,6 @@ class Command:
 
     Attributes:
         function: ``module:name`` of a function of the library, or of the command line itself.
-        long: what the help of a function of the library begins with; others have it in their docstring.
         reading: options of how its logs are read.
         check: ``module:name`` of what refuses wrong arguments before any log is read.
         out: help of ``--out``; files that are not written without it have one of their own; none has no such option.
@@ -42,7 +44,6 @@ class Command:
     short: str
     examples: tuple[str, ...]
     function: str
-    long: str = ""
     reading: tuple[str, ...] = ()
     check: str = ""
     out: str = FOLDER
@@ -67,20 +68,17 @@ COMMANDS = {
         "A vehicle file to fill in, or filled in from a log.",
         ("quadid init mine", "quadid init mine --from flight.bin --mass 1.9"),
         "quadid.app.init:init",
-        "Write a vehicle file to fill in; with a log, filled with what the autopilot's logged parameters describe.",
     ),
     "vehicles": Command(
         "The vehicles that ship.",
         ("quadid vehicles",),
         "quadid.app.init:vehicles",
-        "List the vehicles that ship; each name may be given to --vehicle.",
         out="",
     ),
     "inspect": Command(
         "What a log holds, whether it can be true, and what is missing.",
         ("quadid inspect flight.bin", "quadid inspect flight.ulg@76:216 --vehicle mine.yaml --json -"),
         "quadid.app.inspect:inspect",
-        "What a log holds: channels, rates, gaps, faults, units and frames, excitation, what is missing.",
         out="Also write the inspection as JSON into this folder.",
     ),
     "identify": Command(
@@ -91,7 +89,6 @@ COMMANDS = {
             "quadid identify a.bin --vehicle mine.yaml --effect motor_lag:tau=0.03 --free motor_lag.tau --fix J_r",
         ),
         "quadid.app.identify:identify",
-        "Fit b, d, J_xx, J_yy, J_zz and J_r to flight logs; say how well each is known and how well they predict.",
         READING,
         "quadid.app.identify:check_optimizer",
     ),
@@ -99,14 +96,12 @@ COMMANDS = {
         "Open-loop prediction error of a vehicle file on logs.",
         ("quadid score other.mcap --vehicle pelican.fitted.yaml --horizons 1,10,50",),
         "quadid.app.score:score",
-        "Open-loop prediction error after h samples: every sample starts one run from the measured state.",
         READING[1:],
     ),
     "compare": Command(
         "All optimisers and subspace methods on the same data.",
         ("quadid compare flight.mcap --validate other.mcap --vehicle pelican",),
         "quadid_evaluation.paper.compare:compare",
-        "Set the initial guess, quasi-Newton, least squares, swarms, evolution, CVA and MOESP side by side.",
         READING,
         "quadid_evaluation.paper.compare:check_names",
     ),
@@ -114,21 +109,17 @@ COMMANDS = {
         "What the simulation gets wrong, why, and the gain of correcting it.",
         ("quadid diagnose flight.mcap --validate other.mcap --vehicle pelican --report diagnosis.html",),
         "quadid.app.diagnose:diagnose",
-        "Name what the simulation gets wrong, extend the model by it, and measure the gain on data the fit did not "
-        "see.",
         READING,
     ),
     "health": Command(
         "What changed in the vehicle since the baseline flights.",
         ("quadid health today.usd --baseline a.usd --baseline b.usd --vehicle crazyflie --report health.html",),
         "quadid.app.health:health",
-        "What changed since the baseline flights: which rotor, mass, centre of gravity, thrust, how much, how sure.",
     ),
     "excite": Command(
         "Which manoeuvre to fly next, and what it would gain.",
         ("quadid excite flight.mcap --vehicle pelican",),
         "quadid.app.excite:propose",
-        "Propose the manoeuvre that shrinks the intervals most, within limits; write it, and what flies it.",
         ("rate", "preset", "columns", "unchecked"),
         "quadid.app.excite:check_limits",
     ),
@@ -173,7 +164,6 @@ COMMANDS = {
         "Two vehicle files on the same flights.",
         ("quadid compare-vehicles old.yaml new.yaml --on flight.mcap --report compared.html",),
         "quadid.app.compare_vehicles:compare_vehicles",
-        "Which of two vehicle files predicts the same flights better, by how much, and how they differ.",
         ("preset", "unchecked"),
     ),
     "gains": Command(
@@ -183,7 +173,6 @@ COMMANDS = {
             "quadid gains --vehicle mine.yaml --format ardupilot --from flight.bin --bandwidth 5",
         ),
         "quadid.app.gains:gains",
-        "Propose rate and attitude gains, with margins over the intervals; nothing is sent to a vehicle.",
         out="Write the proposed parameters as a file into it.",
     ),
     "fleet": Command(
@@ -193,7 +182,6 @@ COMMANDS = {
             "quadid fleet logs --scheduler tcp://10.0.0.1:8786 --diagnose",
         ),
         "quadid.app.fleet:fleet",
-        "Identify every log of a folder on Dask; write SQLite, Parquet and a report. Run it again and it goes on.",
         out="",
     ),
     "warmup": Command("Compile now what the first fit would compile.", ("quadid warmup",), "quadid.cli.warmup:warmup"),
@@ -210,7 +198,7 @@ def load(name: str) -> Any:
     alone = typer.Typer(rich_markup_mode=None, add_completion=False)
     # A backspace character alone on a line keeps click from joining the lines.
     examples = "\n".join(("\b", "Examples:", *(f"  {line}" for line in command.examples)))
-    alone.command(name, help=command.long or None, epilog=examples)(function)
+    alone.command(name, epilog=examples)(function)
     return get_command(alone)
 
 
@@ -222,22 +210,40 @@ def _imported(path: str) -> Any:
 # --- A function of the library as a command
 
 
+def told_by(function: Callable[..., Any]) -> tuple[str, dict[str, str]]:
+    """What a docstring says of its function, and of each parameter, without marks of code."""
+    about, *sections = re.split(r"\n(?=(?:Args|Returns|Raises):\n)", (inspect.getdoc(function) or "").replace("`", ""))
+    entries = re.findall(r"^ {4}(\w+): (.+(?:\n {8}.+)*)", sections[0] if sections else "", re.MULTILINE)
+    return about, {name: " ".join(text.split()) for name, text in entries}
+
+
+def with_help(option: ParameterInfo, text: str, kind: Any) -> ParameterInfo:
+    """The option with its own help, else with this text about it."""
+    if option.help or not text:
+        return option
+    option = copy.copy(option)
+    several = isinstance(option, OptionInfo) and "list" in str(kind)
+    option.help = f"{text[0].upper()}{text[1:].rstrip('.')}{'; repeatable' * several}."
+    return option
+
+
 def of_library(command: Command, function: Callable[..., Outcome]) -> Callable[..., None]:
     """The function with the parameters of its command, which prints and writes its outcome."""
     from quadid.app import options
     from quadid.app.outcome import Fitted, Reported
 
-    signature = inspect.signature(function, eval_str=True)
+    signature, (about, words) = inspect.signature(function, eval_str=True), told_by(function)
     outcome: type[Outcome] = signature.return_annotation
     typed: dict[str, options.Typed] = {}
     shown: dict[str, tuple[Any, Any]] = {}
     for name, parameter in signature.parameters.items():
         for told in get_args(parameter.annotation)[1:]:
+            if isinstance(told, ParameterInfo):
+                default = ... if parameter.default is parameter.empty else parameter.default
+                told = options.Typed(get_args(parameter.annotation)[0], told, default)
             if isinstance(told, options.Typed):
-                typed[name], shown[name] = told, (Annotated[told.kind, told.option], told.default)
-            elif isinstance(told, ParameterInfo):
-                typed[name] = options.Typed(None, told)
-                shown[name] = parameter.annotation, ... if parameter.default is parameter.empty else parameter.default
+                typed[name] = told
+                shown[name] = Annotated[told.kind, with_help(told.option, words.get(name, ""), told.kind)], told.default
     shown |= {name: options.READING[name] for name in command.reading}
     page_name = outcome.page_name if issubclass(outcome, Reported) else None
     shown |= {"report": (options.ReportFile, None)} if page_name == "" else {}
@@ -259,6 +265,7 @@ def of_library(command: Command, function: Callable[..., Outcome]) -> Callable[.
         )
         for n, (told, default) in shown.items()
     ]  # fmt: skip
+    run.__doc__ = about
     run.__dict__["__signature__"] = inspect.Signature(parameters)
     run.__annotations__ = {name: told for name, (told, _) in shown.items()}
     return run

@@ -96,36 +96,24 @@ def check_names(methods: Sequence[str] | None, objective: str) -> Sequence[str]:
 def compare(
     logs: Logs, validate: Validate = (), *, vehicle: OfVehicle = None,
     methods: Annotated[
-        Sequence[str] | None,
-        Typed(
-            list[str] | None,
-            typer.Option("--method", metavar="NAME", help="Only this method; repeatable. Default: all ten."),
-        ),
+        Sequence[str] | None, Typed(list[str] | None, typer.Option("--method", metavar="NAME"))
     ] = None,
-    seeds: Annotated[int, typer.Option("--seeds", metavar="N", min=1, help="Runs of each random method.")] = 3,
-    budget: Annotated[
-        int, typer.Option("--budget", metavar="N", min=100, help="Simulations of the data that each run may spend.")
-    ] = 4000,
-    objective: Annotated[
-        str,
-        typer.Option(
-            "--objective",
-            metavar="NAME",
-            help="What optimisers minimise: shooting (short stretches, initial states estimated) or closed_loop (the "
-            "paper's: the whole set under its stabiliser, from references and throttle).",
-        ),
-    ] = OBJECTIVES[0],
+    seeds: Annotated[int, typer.Option(metavar="N", min=1)] = 3,
+    budget: Annotated[int, typer.Option(metavar="N", min=100)] = 4000,
+    objective: Annotated[str, typer.Option(metavar="NAME")] = OBJECTIVES[0],
     seed: Seed = 1, advance: Advance = silent,
 ) -> Methods:  # fmt: skip
-    """Runs every method and scores what it found.
+    """Sets the initial guess, quasi-Newton, least squares, swarms, evolution, CVA and MOESP side by side.
 
     Args:
         logs: a log or several to fit, as paths or from `load`.
         validate: flights that are scored only.
         vehicle: initial guess, bounds, known effects; default that of the first loaded log.
+        methods: only these; all ten by default.
         seeds: runs of each random method.
-        budget: simulations of the data a run may spend.
-        objective: one of `OBJECTIVES`.
+        budget: simulations of the data that each run may spend.
+        objective: what optimisers minimise: shooting (short stretches, initial states estimated) or closed_loop (the
+            paper's: the whole set under its stabiliser, from references and throttle).
         seed: of the first run; the others have the following ones.
 
     Raises:
