@@ -429,12 +429,6 @@ TABLE: tuple[Effect, ...] = (
 )  # fmt: skip
 
 
-# --- The effects a simulation may lack: one table with all properties of each (`quadid.effects`)
-#
-# It is the vocabulary shared by the vehicle file, the model, the diagnosis, its reports and the flown truth.  It holds
-# no equations: those of the model under test are in `quadid.model`, those of the flown vehicle in `quadid.flight`.
-
-
 EFFECTS: dict[str, Effect] = {e.name: e for e in TABLE}
 """Every effect by name; `docs/effects.md` explains each."""
 

@@ -18,13 +18,12 @@ from quadid.parameters import INERTIAS, Status, unreliable
 from quadid.report.page import render
 from quadid.report.tables import Cell, Column, TextTable, number, parameter_table
 from quadid.report.verdict import Verdict, digits
-from quadid.types import FloatArray, Json
+from quadid.types import Json
 from quadid.vehicle import Vehicle
 
 if TYPE_CHECKING:
     from quadid.diagnosis import Diagnosis
     from quadid.diagnosis.search import Search
-    from quadid.identification.fit import Fit
     from quadid.identification.noise import NoiseModel
     from quadid.identification.result import ScoredSet
     from quadid.report.residual_maps import ResidualMap
@@ -151,7 +150,8 @@ def diagnose(
     """
     from quadid.diagnosis.pipeline import diagnose as diagnose_windows
     from quadid.diagnosis.result import Explanation
-    from quadid.identification.result import with_values
+    from quadid.identification.result import ScoredSet, with_values
+    from quadid.identification.score import mse_score
 
     check_seed(seed)
     given = settled(logs, validate, vehicle)
@@ -184,9 +184,11 @@ def diagnose(
     result["warnings"] = [*result.get("warnings", []), *given.warnings]
     result["seed"] = seed
     advance("scores", 0.0)
-    sets = [
-        scored(log, role, fit, model.theta) for role, part in (("train", train), ("validate", held)) for log in part
-    ]
+    sets = []
+    roles = ["train"] * len(train) + ["validate"] * len(held)
+    for log, role in zip([*train, *held], roles, strict=True):
+        then, now = (mse_score(log.windows, fit.vehicle, theta, fit.noise) for theta in models.values())
+        sets.append(ScoredSet(log.recording.name, role, then, now))
     result["sets"] = [
         {"log": s.log, "role": s.role, "mse": {**square, "noise_floor": 1.0}}
         for s, square in zip(sets, squares, strict=True)
@@ -216,15 +218,6 @@ def _removed(forces: MissingForces, found: Diagnosis, selection: Search, vehicle
     trusted = {f.effect for f in found.findings if f.confident} or {f.effect for f in found.findings}
     doubtful = [n for c in selection.model.causes if c.effect not in trusted for n in c.names]
     return forces.removed(Layout(vehicle).without(selection.model.theta, doubtful))
-
-
-def scored(log: Log, role: str, fit: Fit, extended: FloatArray) -> ScoredSet:
-    """Scores the nominal fit, and the parameter vector with the findings, on one log."""
-    from quadid.identification.result import ScoredSet
-    from quadid.identification.score import mse_score
-
-    before, after = (mse_score(log.windows, fit.vehicle, theta, fit.noise) for theta in (fit.theta, extended))
-    return ScoredSet(log.recording.name, role, before, after)
 
 
 def _within_reach(found: Diagnosis, unreachable: Mapping[str, str], off: Mapping[str, float]) -> Diagnosis:

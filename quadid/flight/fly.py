@@ -18,7 +18,7 @@ from quadid.flight.outside import LogRows, Scene, apply_outside, check_outside, 
 from quadid.flight.pilot import PILOT_STEP, Pilot, Segment, band_noise, default_gains, scripted, stick_profile
 from quadid.flight.sensors import SensorNoise, coloured
 from quadid.flight.setup import Effects, Setup, TruthParameters, prepare
-from quadid.rotation import continuous_sign
+from quadid.rotation import continuous_sign, exponential, product
 from quadid.types import FloatArray
 from quadid.vehicle import RandomForces, Vehicle
 
@@ -137,7 +137,7 @@ def write_window(flown: Flown, extras: Sequence[str]) -> Window:
     hover = setup.air.hover_sum / rotor.shape[1]
     gyro = sensors.read_gyro(track, plan, setup.on_board, setup.imu_cutoff, steps)
     accel = sensors.read_accel(track, plan, setup.on_board, setup.imu_cutoff, steps)
-    attitude = sensors.quaternion_multiply(lagged, sensors.quaternion_exp(flown.tilt_noise[at]))
+    attitude = product(lagged, exponential(flown.tilt_noise[at]))
     rows = LogRows(
         gyro + flown.gyro_noise[at], accel + flown.noise("accel", flown.sensor.accel, 3), continuous_sign(attitude),
         steps, track, plan, setup.on_board, np.mean((rotor / hover) ** 2, axis=1),

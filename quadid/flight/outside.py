@@ -15,7 +15,7 @@ from quadid.flight import sensors
 from quadid.flight.airframe import PUSHES
 from quadid.flight.loop import OnBoard, Plan, Track
 from quadid.flight.setup import Setup, vehicle_scales
-from quadid.rotation import continuous_sign
+from quadid.rotation import conjugate, continuous_sign, euler, exponential, product
 from quadid.types import FloatArray
 from quadid.vehicle import GRAVITY, RandomForces, Vehicle
 
@@ -252,29 +252,21 @@ def compass_throttle(rows: LogRows, v: Values, rng: np.random.Generator) -> None
     """Heading error proportional to the departure of thrust from hover."""
     half = 0.5 * v["gain"] * (rows.thrust - 1.0)
     turn = np.column_stack([np.cos(half), np.zeros_like(half), np.zeros_like(half), np.sin(half)])
-    rows.attitude = sensors.quaternion_multiply(turn, rows.attitude)
+    rows.attitude = product(turn, rows.attitude)
 
 
 def attitude_steps(rows: LogRows, v: Values, rng: np.random.Generator) -> None:
     """Rounds roll, pitch and yaw to multiples of a coarse step."""
-    w, x, y, z = rows.attitude.T
-    roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
-    pitch = np.arcsin(np.clip(2 * (w * y - z * x), -1, 1))
-    yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-    angles = np.rint(np.column_stack([roll, pitch, yaw]) / v["step"]) * v["step"]
-    zero = np.zeros(len(angles))
-    parts = [sensors.quaternion_exp(np.column_stack(c)) for c in (
-        (angles[:, 0], zero, zero), (zero, angles[:, 1], zero), (zero, zero, angles[:, 2]))]  # fmt: skip
-    turned = sensors.quaternion_multiply(sensors.quaternion_multiply(parts[2], parts[1]), parts[0])
-    rows.attitude = continuous_sign(turned)
+    angles = np.rint(euler(rows.attitude) / v["step"]) * v["step"]
+    roll, pitch, yaw = (exponential(angles * axis) for axis in np.eye(3))
+    rows.attitude = continuous_sign(product(product(yaw, pitch), roll))
 
 
 def clock_jitter(rows: LogRows, v: Values, rng: np.random.Generator) -> None:
     """Measures gyro, accelerometer and attitude at instants scattered about the stamped ones."""
     steps = rows.steps + np.clip(rng.normal(0.0, v["sigma"], len(rows.steps)), -0.01, 0.01) / rows.plan.dt
     before, after = sensors.attitude_at(rows.track, rows.steps), sensors.attitude_at(rows.track, steps)
-    step = sensors.quaternion_multiply(before * np.array([1.0, -1.0, -1.0, -1.0]), after)
-    rows.attitude = continuous_sign(sensors.quaternion_multiply(rows.attitude, step))
+    rows.attitude = continuous_sign(product(rows.attitude, product(conjugate(before), after)))
     _reread(rows, rows.track, steps)
 
 

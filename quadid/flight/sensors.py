@@ -71,19 +71,6 @@ def butterworth(signal: FloatArray, cutoff: float, dt: float) -> FloatArray:
     return np.column_stack(columns)
 
 
-def quaternion_multiply(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Hamilton product, scalar first, row by row; shapes (n, 4).  The truth has its own, apart from what fits use."""
-    scalar = a[:, 0] * b[:, 0] - np.einsum("ij,ij->i", a[:, 1:], b[:, 1:])
-    vector = a[:, :1] * b[:, 1:] + b[:, :1] * a[:, 1:] + np.cross(a[:, 1:], b[:, 1:])
-    return np.column_stack([scalar, vector])
-
-
-def quaternion_exp(vector: FloatArray) -> FloatArray:
-    """Unit quaternions of rotation vectors [rad], shape (n, 3) to (n, 4)."""
-    half = 0.5 * np.linalg.norm(vector, axis=1, keepdims=True)
-    return np.hstack([np.cos(half), 0.5 * vector * np.sinc(half / np.pi)])
-
-
 def attitude_at(track: Track, steps: FloatArray) -> FloatArray:
     """AHRS attitude at fractional step numbers, normalised linear interpolation; shape (n, 4)."""
     steps = np.clip(steps, 0.0, len(track.attitude) - 1.0)

@@ -8,9 +8,8 @@ from typing import Any
 
 import numpy as np
 from scipy.signal import welch
-from scipy.stats import chi2
 
-from quadid.chi_square import Z95
+from quadid.chi_square import Z95, exceeded
 from quadid.errors import ParameterError
 from quadid.estimate.missing import Missing
 from quadid.identification.result import ScoredSet
@@ -122,7 +121,7 @@ def _spectra(scored: ScoredSet, channels: Sequence[int], labels: tuple[str, str]
     step = float(np.median(np.diff(after.t)))
     rows = min(max(round(2.0 * SCORE_SECONDS / step), 8), SPECTRUM_ROWS, len(after.t))
     parts = len(after.t) // rows
-    low, high = np.sqrt(chi2.ppf((0.025, 0.975), 2 * parts) / (2 * parts))
+    low, high = (math.sqrt(exceeded(p, 2 * parts) / (2 * parts)) for p in (0.975, 0.025))
     panels = [(f"{_label(c)} [{CHANNEL_UNITS[c]}/√Hz]", {"type": "log"}) for c in channels]
     places, layout = stacked(panels, "frequency [Hz]")
     data = []
