@@ -412,7 +412,7 @@ class Shooting:
         """Linearises the segments of one window and eliminates the initial state of each."""
         segments = self.segments[i]
         thetas, dx, steps = self._directions(theta, free, k)
-        lane = packing(thetas, self.layout.rotors, self.channels)
+        lane = packing(thetas, self.layout.rotors)
         thetas, dx = packed(thetas, lane), packed(dx, lane)
         whitening = self.noise.whitening(self.length, self.dt)
 

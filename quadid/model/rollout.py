@@ -6,11 +6,10 @@ import itertools
 import math
 import os
 from collections import OrderedDict
-from collections.abc import Callable, Hashable, Iterator
+from collections.abc import Callable, Hashable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache
-from itertools import permutations
 from queue import SimpleQueue
 from threading import Lock
 from typing import NamedTuple
@@ -154,31 +153,24 @@ class ArrayCache:
 # --- Which parameter vectors share a block of lanes: those that need the same of the model, so that no block needs all
 
 
-_AIR, _HUB, _SOLID, _RARE, _ROTORS, _DELAYED, _FILTER, _LATE, _AHRS = range(9)
-_PLAIN, _AIR_COST, _HUB_COST, _SOLID_COST, _RARE_COST = 10.0, 7.0, 6.0, 10.0, 7.0
-_ROTOR_COST, _DELAYED_COST, _FILTER_COST, _LATE_COST, _AHRS_COST = 10.0, 22.0, 7.0, 14.0, 10.0
-"""Nanoseconds a particle and step, beside the plain ones; `python -m quadid_evaluation.benchmarks.speed --parts pieces`
-measures them."""
-
-
-def packing(thetas: FloatArray, rotors: int, channels: int) -> IndexArray:
+def packing(thetas: FloatArray, rotors: int) -> IndexArray:
     """Lane of each of these parameter vectors (m, size), the first one in lane 0, shape (m,).
 
-    Of a few orders by what a vector needs beyond the first one, the one that should take least time.  Lanes beyond the
-    last vector are free to repeat the first.
+    The others are sorted by what they need of the model.  Lanes beyond the last vector are free to repeat the first.
     """
     if len(thetas) <= LANES:
         return np.arange(len(thetas))
-    features = np.zeros((len(thetas), 9), dtype=bool)
-    groups = ((_HUB, HUB_ENTRIES + RARE_ENTRIES), (_SOLID, SOLID_ENTRIES + FACTOR_ENTRIES), (_RARE, RARE_ENTRIES))
-    for feature, entries in groups:
-        features[:, feature] = (thetas[:, list(entries)] != 0.0).any(axis=1)
-    features[:, _AIR] = features[:, _HUB] | (channels > 9)
-    own = np.concatenate([thetas[:, list(ROTOR_ENTRIES)], thetas[:, ix.LOSS : ix.LOSS + 2 * rotors]], axis=1)
-    features[:, _ROTORS] = (own != own[0]).any(axis=1)
-    for feature, entry in ((_DELAYED, ix.DELAY), (_FILTER, ix.IMU_PERIOD), (_LATE, ix.ATT_DELAY), (_AHRS, ix.AHRS_K)):
-        features[:, feature] = thetas[:, entry] != 0.0
-    return _cheapest(features.tobytes(), len(thetas))
+    others = thetas[1:]
+    entries = (
+        (ix.IMU_PERIOD,), (ix.ATT_DELAY,), (ix.AHRS_K,), HUB_ENTRIES + RARE_ENTRIES, SOLID_ENTRIES + FACTOR_ENTRIES,
+        RARE_ENTRIES,
+    )  # fmt: skip
+    needs = [np.any(others[:, list(group)] != 0.0, axis=1) for group in entries]
+    driving = [*ROTOR_ENTRIES, *range(ix.LOSS, ix.LOSS + 2 * rotors)]
+    needs += [np.any(others[:, driving] != thetas[0, driving], axis=1), others[:, ix.DELAY] != 0.0]
+    lane = np.zeros(len(thetas), dtype=np.intp)
+    lane[1 + np.lexsort(needs)] = np.arange(1, len(thetas))
+    return lane
 
 
 def packed(vectors: FloatArray, lane: IndexArray) -> FloatArray:
@@ -186,46 +178,6 @@ def packed(vectors: FloatArray, lane: IndexArray) -> FloatArray:
     out = np.repeat(vectors[:1], -(-len(vectors) // LANES) * LANES, axis=0)
     out[lane] = vectors
     return out
-
-
-@lru_cache(maxsize=512)
-def _cheapest(features: bytes, m: int) -> IndexArray:
-    needs = np.frombuffer(features, dtype=bool).reshape(m, -1)
-    best = min(_orders(needs), key=lambda order: _cost(needs, order))
-    place = np.empty(m, dtype=np.intp)
-    lanes = np.flatnonzero(best >= 0)
-    place[best[lanes]] = lanes
-    place.setflags(write=False)
-    return place
-
-
-def _orders(needs: BoolArray) -> Iterator[IndexArray]:
-    """Vectors by lane, -1 for those that repeat the first: sorted by groups of needs, spare lanes early or late."""
-    m = len(needs)
-    spare = np.full(-(-m // LANES) * LANES - m, -1)
-    groups = ([_ROTORS, _DELAYED], [_FILTER, _LATE, _AHRS], [_AIR, _HUB, _SOLID, _RARE])
-    for keys in permutations(groups):
-        columns = [needs[1:, f] for group in reversed(keys) for f in group]
-        order = 1 + np.lexsort(columns)
-        yield np.concatenate([[0], order, spare])
-        yield np.concatenate([[0], spare, order])
-
-
-def _cost(needs: BoolArray, order: IndexArray) -> float:
-    """Time of all blocks, nanoseconds a lane and step."""
-    total = 0.0
-    for first in range(0, len(order), LANES):
-        need: BoolArray = np.any(needs[np.maximum(order[first : first + LANES], 0)], axis=0)
-        total += (
-            _PLAIN
-            + need[_AIR] * _AIR_COST
-            + need[_HUB] * _HUB_COST
-            + need[_SOLID] * _SOLID_COST
-            + need[_RARE] * _RARE_COST
-        )
-        total += (_DELAYED_COST if need[_DELAYED] else _ROTOR_COST) * need[_ROTORS]
-        total += need[_FILTER] * _FILTER_COST + need[_LATE] * _LATE_COST + need[_AHRS] * _AHRS_COST
-    return total
 
 
 # --- Typed wrapper of the kernel: segments of a window, initial states, many parameter vectors at once

@@ -30,7 +30,7 @@ def one_each() -> FloatArray:
 
 def test_vectors_that_need_little_are_not_beside_those_that_need_much() -> None:
     thetas = one_each()
-    spread = packed(thetas, packing(thetas, 4, 9))
+    spread = packed(thetas, packing(thetas, 4))
     blocks = [needs_of(spread[i : i + LANES], 4, 9) for i in range(0, len(spread), LANES)]
     assert sum(b.shared for b in blocks) >= len(blocks) - 1
     assert sum(b.air for b in blocks) <= 2
@@ -48,7 +48,7 @@ def test_the_lane_does_not_change_the_result(channels: int) -> None:
         out, _ = rollout.roll(segments, vectors, x0, n_pre=8)
         return np.moveaxis(out, -1, 1).reshape(-1, *out.shape[1:4])
 
-    lane = packing(thetas, 4, channels)
+    lane = packing(thetas, 4)
     difference = rolled(packed(thetas, lane))[lane] - rolled(thetas)[: len(thetas)]
     assert np.abs(difference).max() < 1e-11
 
