@@ -21,6 +21,8 @@ from quadid_replay.frames import unit_quaternions
 # A log has one `LogClock`; stamps are fed in file order and come back as recording time [s], which never starts over.
 
 
+EARLIEST_US, LATEST_US = 946_684_800_000_000, 4_102_444_800_000_000
+"""Years 2000 to 2100 [us since 1970], between which a receive time can be true."""
 STEP_BACK = 1.0
 """A stamp this far [s] before the newest one means a reboot or a clock step."""
 SOON = 1.0

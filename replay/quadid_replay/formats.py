@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 from quadid.data.window import Recording
 from quadid.errors import LogError
 from quadid.sanitise import plain
+from quadid_replay.columns import EARLIEST_US, LATEST_US
 from quadid_replay.rosbag import bag_files, is_bag_folder
 
 HEAD_BYTES = 65536
@@ -35,7 +36,6 @@ _FOREIGN: tuple[tuple[bytes, str, str], ...] = (
 )
 _FEW_COLUMNS = 3
 """Text with more commas than these in its first line is a table."""
-_EARLIEST_US, _LATEST_US = 946_684_800_000_000, 4_102_444_800_000_000  # years 2000 to 2100
 
 
 class LogFormat(NamedTuple):
@@ -115,7 +115,7 @@ def _frame_length(head: bytes, at: int) -> int | None:
     if at + 12 > len(head) or head[at + 8] not in (0xFE, 0xFD):
         return None
     stamp = int.from_bytes(head[at : at + 8], "big")
-    if not _EARLIEST_US < stamp < _LATEST_US:
+    if not EARLIEST_US < stamp < LATEST_US:
         return None
     payload = head[at + 9]
     if head[at + 8] == 0xFE:

@@ -17,7 +17,7 @@ from pymavlink.dialects.v20 import ardupilotmega
 from quadid.data.window import Recording
 from quadid.errors import LogError
 from quadid.types import BoolArray, FloatArray, IntArray
-from quadid_replay.columns import LogClock, RawChannel, assemble, damage, fastest_first
+from quadid_replay.columns import EARLIEST_US, LATEST_US, LogClock, RawChannel, assemble, damage, fastest_first
 from quadid_replay.mavlink_messages import (
     PREFERENCE,
     READERS,
@@ -51,7 +51,6 @@ from quadid_replay.motors import (
 
 Bytes: TypeAlias = NDArray[np.uint8]
 
-_EARLIEST_US, _LATEST_US = 946_684_800_000_000, 4_102_444_800_000_000  # years 2000 to 2100
 _STAMP = 8
 _SIGNED = 1
 _SIGNATURE = 13
@@ -102,7 +101,7 @@ def read_frames(path: Path) -> Frames:
     received = np.zeros(len(marks), dtype=np.int64)  # [us, UNIX], its highest byte zero
     for k in range(1, _STAMP):
         received = received << 8 | data[marks + k]
-    possible = (received > _EARLIEST_US) & (received < _LATEST_US) & (marks + _HEAD <= len(data))
+    possible = (received > EARLIEST_US) & (received < LATEST_US) & (marks + _HEAD <= len(data))
     places, received = marks[possible], received[possible]
     version_1 = data[places + _STAMP] == 0xFE
     head = np.where(version_1, 6, 10)

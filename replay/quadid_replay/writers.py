@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from types import SimpleNamespace, TracebackType
 from typing import Any, BinaryIO, NamedTuple, TypeAlias
@@ -79,6 +80,11 @@ def open_for_writing(path: str | Path) -> BinaryIO:
         raise LogError(
             f"cannot write {path} ({error.strerror})", "a file in a folder that exists", "create the folder first"
         ) from error
+
+
+def _stream(file: str | Path | BinaryIO) -> AbstractContextManager[BinaryIO]:
+    """A file opened here is closed, one of the caller's stays open."""
+    return open_for_writing(file) if isinstance(file, str | Path) else nullcontext(file)
 
 
 # --- Writes ROS 2 messages of any type to MCAP without ROS: profile ros2, schemas ros2msg, CDR, zstd chunks with CRC
@@ -427,15 +433,11 @@ def column_names(recording: Recording) -> dict[str, tuple[str, ...]]:
 
 def write_table(file: str | Path | BinaryIO, header: Sequence[str], table: FloatArray) -> None:
     """Writes numbers (rows, columns) under their names; cells of NaN stay empty."""
-    stream = open_for_writing(file) if isinstance(file, str | Path) else file
-    try:
+    with _stream(file) as stream:
         stream.write((",".join(header) + "\n").encode())
         for begin in range(0, len(table), _ROWS):
             lines = (",".join("" if v != v else repr(v) for v in row) for row in table[begin : begin + _ROWS].tolist())
             stream.write(("\n".join(lines) + "\n").encode())
-    finally:
-        if stream is not file:
-            stream.close()
 
 
 # --- Writes a recording as MAVLink 2 messages: a telemetry log, or one by one for a live link
@@ -463,15 +465,11 @@ def write_tlog(file: str | Path | BinaryIO, source: Source) -> None:
     """
     recording = recording_of(source)
     mav = dialect.MAVLink(None, srcSystem=SYSTEM, srcComponent=COMPONENT)
-    stream = open_for_writing(file) if isinstance(file, str | Path) else file
-    try:
+    with _stream(file) as stream:
         for t, message in mavlink_messages(recording):
             frame = message.pack(mav)
             mav.seq = (mav.seq + 1) % 256
             stream.write(struct.pack(">Q", _UNIX_START_US + round(t * 1e6)) + frame)
-    finally:
-        if stream is not file:
-            stream.close()
 
 
 def mavlink_messages(recording: Recording) -> Iterator[tuple[float, Any]]:
