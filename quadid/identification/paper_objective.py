@@ -19,9 +19,6 @@ from quadid.rotation import euler
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 
-OUTPUT_NAMES = ("phi", "theta", "psi", "p", "q", "r", "a_x", "a_y", "a_z")
-"""The paper's outputs."""
-OUTPUT_UNITS = ("deg",) * 3 + ("deg/s",) * 3 + ("m/s^2",) * 3
 RUNAWAY = 1e6
 """Squared errors are cut here, so that the score of a simulation that ran away stays a number."""
 

@@ -233,11 +233,6 @@ TERMS: tuple[Term, ...] = (
     Term(("residual",), _residual),
 )
 """Forces and moments, in the order in which they are added."""
-AROUND = (
-    "motor_lag", "supply_voltage", "wind", "cg_offset", "product_of_inertia", "no_gyroscopic_coupling", "rate_damping",
-    "mass_change", "thrust_drop", "battery_sag",
-)  # fmt: skip
-"""Effects that change what the terms act on: `derivative` has them."""
 
 
 class Frame:

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from quadid.identification.paper_objective import OUTPUT_NAMES, OUTPUT_UNITS, PaperScore
-from quadid.report.figures import LABELS, liveliest
+from quadid.identification.paper_objective import PaperScore
+from quadid.report.figures import liveliest
 from quadid.report.page import axis, trace
 from quadid.types import FloatArray, JsonDict
 
@@ -22,6 +22,10 @@ GROUPS: dict[str, tuple[str, slice]] = {
     "accelerations": ("body accelerations", slice(6, 9)),
     "rates": ("body rates", slice(3, 6)),
 }
+OUTPUTS = (
+    "φ [deg]", "θ [deg]", "ψ [deg]", "p [deg/s]", "q [deg/s]", "r [deg/s]", "a_x [m/s²]", "a_y [m/s²]", "a_z [m/s²]",
+)  # fmt: skip
+"""The paper's outputs with their units."""
 SECONDS = 20.0
 """Length of the time segments that are shown [s]."""
 # As in the paper: measurement blue, the earlier quasi-Newton estimate dashed red, the swarm yellow.
@@ -74,11 +78,6 @@ def _lines(scores: Mapping[str, Sequence[PaperScore]], number: int) -> tuple[Flo
     return some.t[rows] - some.t[0], lines
 
 
-def label(output: int) -> str:
-    """Name and unit of one of the nine outputs."""
-    return f"{LABELS.get(OUTPUT_NAMES[output], OUTPUT_NAMES[output])} [{OUTPUT_UNITS[output].replace('^2', '²')}]"
-
-
 def draw(figure: PaperFigure, scores: Mapping[str, Sequence[PaperScore]]) -> Figure:
     """Draws a figure for print; the caller saves it.
 
@@ -96,7 +95,7 @@ def draw(figure: PaperFigure, scores: Mapping[str, Sequence[PaperScore]]) -> Fig
             plot = axes[row, column]
             for name, values in lines.items():
                 plot.plot(t, values[:, output], label=NAMES[name], **_STYLES[name])
-            plot.set_ylabel(label(output))
+            plot.set_ylabel(OUTPUTS[output])
             plot.grid(alpha=0.3)
         axes[0, column].set_title(f"Set {number} ({'training' if number == 1 else 'validation'})", fontsize=10)
         axes[-1, column].set_xlabel("time [s]")
@@ -115,7 +114,9 @@ def interactive(figure: PaperFigure, scores: Mapping[str, Sequence[PaperScore]])
         layout: JsonDict = {"xaxis": axis("time [s]", anchor="y3")}
         for row, output in enumerate(outputs):
             place = "" if row == 0 else str(row + 1)
-            layout[f"yaxis{place}"] = axis(label(output), domain=[1.0 - (row + 1) / 3.0 + 0.03, 1.0 - row / 3.0 - 0.01])
+            layout[f"yaxis{place}"] = axis(
+                OUTPUTS[output], domain=[1.0 - (row + 1) / 3.0 + 0.03, 1.0 - row / 3.0 - 0.01]
+            )
             for name, values in lines.items():
                 where = {"xaxis": "x", "yaxis": f"y{place}", "showlegend": row == 0, "legendgroup": name}
                 data.append(trace(_ROLES[name], NAMES[name], t, values[:, output], **where))
