@@ -31,7 +31,8 @@ MOVED = {
     "quadid.data.grid": "quadid.grid quadid.resampling_plan quadid.resample",
     "quadid.condition.changes": "quadid.health.hypotheses",
     "quadid.condition.trim": "quadid.health.spread",
-    "quadid.checks.motion": "quadid.inspection.airborne quadid.inspection.conventions quadid.inspection.timing",
+    "quadid.checks.frames": "quadid.inspection.conventions",
+    "quadid.checks.motion": "quadid.inspection.airborne quadid.inspection.timing",
     "quadid.checks.rotors": "quadid.inspection.geometry quadid.inspection.motor_checks quadid.inspection.rotor_checks "
     "quadid.inspection.rotor_timing",
     "quadid.checks.findings": "quadid.inspection.outlook",

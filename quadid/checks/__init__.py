@@ -11,16 +11,8 @@ from quadid.checks.findings import Check as Check
 from quadid.checks.findings import CheckResult as CheckResult
 from quadid.checks.findings import Inspection as Inspection
 from quadid.checks.findings import missing_signals, parameter_outlook
-from quadid.checks.motion import (
-    Spans,
-    attitude_check,
-    channel_facts,
-    gravity_check,
-    gyro_source_check,
-    position_check,
-    timing_checks,
-    velocity_check,
-)
+from quadid.checks.frames import attitude_check, gravity_check, gyro_source_check, position_check, velocity_check
+from quadid.checks.motion import Spans, channel_facts, timing_checks
 from quadid.checks.motion import flying_spans as flying_spans
 from quadid.checks.motion import proposed_cuts as proposed_cuts
 from quadid.checks.rotors import (
@@ -151,7 +143,7 @@ STAGES: tuple[tuple[Question, ...], ...] = (
         Question("gyro_attitude", lambda log: attitude_check(log.recording), vehicle=False, live=True),
         Question("velocity_attitude", lambda log: velocity_check(log.recording), vehicle=False, live=True),
         Question("position_velocity", lambda log: position_check(log.read), vehicle=False),
-        Question("gyro_source", lambda log: gyro_source_check(log.recording), vehicle=False),
+        Question("gyro_source", lambda log: gyro_source_check(log.recording, log.vehicle), vehicle=False),
     ),
     # rotors that read nothing, or always the same; then the unit of their speeds
     (Question("rotor_speed", lambda log: readings_check(log.recording, log.known, log.spans)),),

@@ -198,10 +198,15 @@ def gyro_filter_check(recording: Recording, vehicle: Vehicle, spans: Spans) -> C
     if left > _FLAT or not (smoothed or measured):
         return None
     slower, quicker = (math.sqrt(_OCTAVES[k - 1] * _OCTAVES[k]) for k in (low, high))
+    # With what is late fitted along, inertias are too large by what the gyro misses of all acceleration by torque.
+    along, acted = (np.array([band[k] for band in sums]) for k in (0, 1))
+    answer = np.abs(along) / acted
+    read = np.sum(np.abs(along), axis=0) / np.sum(acted * answer[bands.index(low)], axis=0)
     message = f"gyro answers torque at {quicker:.2g} Hz by {left:.0%} of what it does at {slower:.2g} Hz: it was "
     message += "smoothed without a delay" if smoothed else "low-passed"
     fix = "log the raw gyro, else inertias come out too large" + ("" if smoothed else "; `imu_lag` models a filter")
-    return Check("gyro_source", CheckResult.WARNING, message, fix, {"left": left, "lag_rad": lag})
+    off = estimates_off(turning=(*np.minimum(read, 1.0).tolist(), min(1.0, float(read.mean()))))
+    return Check("gyro_source", CheckResult.WARNING, message, fix, {"left": left, "lag_rad": lag}, off)
 
 
 # --- Rotor signals against each other, the thrust felt and the motion: dead, stuck, halved, and out of time

@@ -12,7 +12,8 @@ import pytest
 from quadid_replay import open_log
 
 from quadid.checks import Check, CheckResult, Inspection, inspect, proposed_cuts
-from quadid.checks.motion import Spans, fit_axes, gyro_check
+from quadid.checks.frames import fit_axes, gyro_check
+from quadid.checks.motion import Spans
 from quadid.data.window import Channel, Recording
 from quadid.flight import fly
 from quadid.types import FloatArray

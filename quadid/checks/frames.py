@@ -1,0 +1,812 @@
+"""Checks of units and frames, by physics: gravity, gyro, attitude, velocity and position against each other."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import partial
+from itertools import permutations, product
+from typing import NamedTuple
+
+import numpy as np
+
+from quadid.checks.doubts import estimates_off
+from quadid.checks.findings import Check, CheckResult
+from quadid.checks.motion import FEWEST_SAMPLES, Spans, attitude_steps_check, is_turning, within
+from quadid.checks.turns import FEWEST, TURN, Factor, Turns, factors
+from quadid.data.grid import GAP, linear
+from quadid.data.window import Channel, Recording, fresh_rows, measured_period, sample_period
+from quadid.rotation import conjugate, euler, rotated, turn
+from quadid.types import BoolArray, FloatArray
+from quadid.vehicle import GRAVITY, Vehicle
+
+# --- Units and frames, tested by physics: gravity, gyro against attitude, velocity against attitude and accelerometer
+
+
+DEGREES = 57.29577951308232
+"""Degrees in a radian."""
+_CLEAR = 0.5
+"""R^2 above which a relation between two channels is believed."""
+_MOTION = 0.03
+"""Rotation rate [rad/s] an axis must have, as standard deviation, to be checked."""
+_STEP, _FEWEST_STEPS, _MOST_ROWS = 0.1, 20, 100
+"""Attitudes are compared over steps of at least this [s], of which there must be so many: noise and repeated readings
+matter little then.  Steps of more rows are in another unit of time: no attitude comes at more than 1 kHz."""
+_UNIT = 1.5
+"""Two channels of one motion whose sizes are farther apart are of no use together."""
+_JUMP = 8.0
+"""An attitude step of so many times the usual one, beside half as much of the gyro's, is no motion."""
+_FARTHEST, _LATE, _TOO_LATE = 0.3, 0.013, 0.08
+"""Gyro and attitude are compared at times so far apart at most [s]; more than the second is named, for an autopilot's
+own filter at 20 Hz makes 12 ms, more than the third an error."""
+_BANDS = np.geomspace(0.4, 23.0, 11)
+"""Edges of bands of frequency [Hz] in which they are compared."""
+_SURE = 0.8
+"""Coherence of a band that tells of time; less is motion beside errors of the attitude that have a memory."""
+_SMOOTHED = 0.8
+"""Share that a smoothed gyro reads at most, somewhere, of what it reads of slow turning."""
+_TILT, _PARTS = np.radians(4.0), 5
+"""Least angle [rad] between gyro and attitude that is told; it must be as many times its error as there are parts."""
+_AXES = ("x", "y", "z")
+
+
+class AxisMap(NamedTuple):
+    """The signed permutation of axes, times a scale, that turns one vector signal into another best.
+
+    Attributes:
+        axes: for each output axis, the input axis it follows.
+        signs: its sign, +1 or -1.
+        scale: common factor.
+        r2: fraction of the output's variance explained.
+    """
+
+    axes: tuple[int, ...]
+    signs: tuple[int, ...]
+    scale: float
+    r2: float
+
+    @property
+    def straight(self) -> bool:
+        """Each axis follows itself with its own sign."""
+        return self.axes == tuple(range(len(self.axes))) and all(s > 0 for s in self.signs)
+
+    @property
+    def absurd(self) -> bool:
+        """The scale is wrong by more than `_UNIT`, whichever of the signals the noise is in."""
+        return self.scale > _UNIT or self.scale < self.r2 / _UNIT
+
+    def __str__(self) -> str:
+        return ", ".join(
+            f"{_AXES[i]} = {'-' if s < 0 else ''}{_AXES[a]}"
+            for i, (a, s) in enumerate(zip(self.axes, self.signs, strict=True))
+        )
+
+
+def fit_axes(source: FloatArray, target: FloatArray) -> AxisMap:
+    """Finds the signed permutation and scale that explain `target` (n, k) by `source` (n, k) best, k = 2 or 3.
+
+    Axes stay where they are unless one follows another axis, or its own reversed, clearly: what hardly moves is noise,
+    which any axis explains as well as any other.
+    """
+    x, y = source - source.mean(axis=0), target - target.mean(axis=0)
+    cross, power, total = y.T @ x, np.sum(x**2, axis=0), float(np.sum(y**2))
+    straight = tuple(range(x.shape[1]))
+    clear = cross**2 > _CLEAR * np.outer(np.sum(y**2, axis=0), power)
+    best = AxisMap(straight, (1,) * x.shape[1], np.nan, 0.0)
+    for axes in permutations(range(x.shape[1])):
+        for signs in product((1, -1), repeat=x.shape[1]):
+            moved = [(i, a) for i, a, s in zip(straight, axes, signs, strict=True) if a != i or s < 0]
+            if moved and not any(clear[place] for place in moved):
+                continue
+            gain = sum(s * cross[i, a] for i, (a, s) in enumerate(zip(axes, signs, strict=True)))
+            norm = float(sum(power[a] for a in axes))
+            if gain > 0.0 and norm > 0.0 and total > 0.0:
+                r2 = float(gain**2 / norm / total)
+                if r2 > best.r2 + 1e-9:
+                    best = AxisMap(axes, signs, float(gain / norm), r2)
+    return best
+
+
+def _fit_without_jumps(source: FloatArray, target: FloatArray) -> AxisMap:
+    """Fits twice, the second time without rows far off (estimators reset their heading, and rows jump with it)."""
+    fit = fit_axes(source, target)
+    if not np.isfinite(fit.scale):
+        return fit
+    miss = np.linalg.norm(target - fit.scale * source[:, fit.axes] * np.array(fit.signs), axis=1)
+    return fit_axes(*(rows[miss <= _JUMP * np.median(miss)] for rows in (source, target)))
+
+
+def gravity_check(recording: Recording, spans: Spans) -> Check:
+    """Length and direction of the mean specific force: 9.8 m/s^2 along -z in FRD."""
+    accel = recording.channels.get("accel")
+    if accel is None:
+        return Check("gravity", CheckResult.UNKNOWN, "no accelerometer")
+    inside = within(accel.t, spans) if spans else np.ones(len(accel.t), dtype=np.bool_)
+    values = accel.values[inside]
+    if not len(values):
+        return Check("gravity", CheckResult.UNKNOWN, "no accelerometer sample in flight")
+    length = float(np.median(np.linalg.norm(values, axis=1)))
+    z = float(np.median(values[:, 2]))
+    steady = float(np.linalg.norm(np.median(values, axis=0)))
+    check = partial(Check, "gravity", numbers={"length": length, "z": z})
+    message = f"specific force has length {length:.4g} and z {z:.4g} (medians; about 9.81 and -9.81 m/s^2 expected)"
+    # Specific force on the ground has the length that it must have, where there are samples enough to tell.
+    resting = np.linalg.norm(accel.values[~inside], axis=1)
+    if not (len(resting) >= 50 and abs(float(np.median(resting)) / GRAVITY - 1.0) < 0.1):
+        for unit, factor in (("g", GRAVITY), ("milli-g (or cm/s^2)", GRAVITY * 1e-3)):
+            if 0.7 < length * factor / GRAVITY < 1.6 and steady > 0.5 * length:
+                fix = f"multiply acceleration by {factor:.6g}"
+                return check(CheckResult.ERROR, f"{message}: it seems to be in {unit}", fix)
+        if spans and steady < 0.3 * GRAVITY:
+            fix = "log specific force, not linear acceleration"
+            return check(CheckResult.ERROR, f"{message}: gravity is missing", fix)
+        if not 0.5 < length / GRAVITY < 2.0:
+            return check(CheckResult.ERROR, f"{message}: this is no specific force in m/s^2", "log raw acceleration")
+    # A vehicle that lies on its back does not turn.
+    flown = z > 0.5 * length and bool(spans) and is_turning(recording.channels.get("gyro"), spans, _MOTION)
+    if z > -0.5 * length and not flown and _attitude_explains(accel, recording.channels.get("attitude"), inside):
+        return check(CheckResult.UNKNOWN, f"{message}; its attitude says that the vehicle lies or turns so")
+    if not spans and z > -0.8 * length:
+        return check(CheckResult.UNKNOWN, f"{message}; the vehicle does not fly in this log: it may lie so")
+    if z > 0.5 * length:
+        turned = f"{message}: z points up (FLU, as ROS has it) or the sign is reversed"
+        return check(CheckResult.ERROR, turned, _downwards(recording, accel, inside))
+    if z > -0.5 * length:
+        return check(CheckResult.ERROR, f"{message}: gravity is not along z", "check the axes of the IMU")
+    return check(CheckResult.OK, message)
+
+
+def _downwards(recording: Recording, accel: Channel, inside: BoolArray) -> str:
+    """Advice what to turn where the specific force points up: what gyro, attitude and velocity agree with."""
+    attitude, velocity = recording.channels.get("attitude"), recording.channels.get("velocity")
+    body = "turn body vectors to FRD: negate y and z"
+    if attitude is None or len(attitude.t) < 2 or gyro_check(recording).verdict is not CheckResult.OK:
+        return body
+    if float(np.median(_in_world(accel, attitude)[inside, 2])) < 0.0:
+        return f"{body}, and turn the attitude with them"
+    fixes = {
+        "negate y and z of the accelerometer alone": replace(accel, values=accel.values * [1.0, -1.0, -1.0]),
+        "turn all of it to FRD and NED: this is ROS' FLU and ENU": accel,
+    }
+    if velocity is not None and len(velocity.t) >= FEWEST_SAMPLES:
+        tried = {fix: _velocity_gains(trial, attitude, velocity) for fix, trial in fixes.items()}
+        fits = {fix: fit_axes(derived[:, :2], gained[:, :2]) for fix, (gained, derived) in tried.items()}
+        clear = [fix for fix, fit in fits.items() if fit.straight and fit.r2 > _CLEAR]
+        if len(clear) == 1:
+            return clear[0]
+    return " or ".join(fixes)
+
+
+def _attitude_explains(accel: Channel, attitude: Channel | None, inside: BoolArray) -> bool:
+    """Tests that the attitude turns the specific force of the rows `inside` to one g upwards."""
+    if attitude is None or len(attitude.t) < 2:
+        return False
+    world = np.median(_in_world(accel, attitude)[inside], axis=0)
+    return bool(np.linalg.norm(world + [0.0, 0.0, GRAVITY]) < 0.3 * GRAVITY)
+
+
+def attitude_check(recording: Recording) -> Check:
+    """Attitude against gyro (axes, signs, degrees for radians) and against gravity (a world with z down)."""
+    rates, coarse = gyro_check(recording), attitude_steps_check(recording)
+    if coarse is not None and rates.numbers.get("r2", 1.0) < _CLEAR:
+        rates = Check(rates.name, CheckResult.UNKNOWN, f"{coarse.message}: too coarse to compare with the gyro")
+    accel, attitude = recording.channels.get("accel"), recording.channels.get("attitude")
+    if rates.verdict is CheckResult.ERROR or accel is None or attitude is None or len(attitude.t) < 2:
+        return rates
+    tame = np.linalg.norm(accel.values, axis=1) < 20.0 * GRAVITY  # single wild readings are no scale
+    vertical = _in_world(accel, attitude)[tame, 2]
+    if not len(vertical):
+        return rates
+    down, up, seconds = float(np.median(vertical)), -float(np.mean(vertical)), float(np.ptp(accel.t))
+    # What is felt makes up for gravity on the average, upwards and along the body's axes, but for 5 m/s of speed.
+    most = 0.7 + 5.0 / max(seconds, 1e-3)
+    if down < 0.5 * GRAVITY and most < abs(up - GRAVITY) < 0.5 * GRAVITY:
+        return Check(
+            "gravity", CheckResult.ERROR if abs(up - GRAVITY) > 2.0 * most else CheckResult.WARNING,
+            f"specific force is {up:.3g} m/s^2 upwards on the average of {seconds:.3g} s, which must be "
+            f"{GRAVITY:.2f}: scale or zero of the accelerometer is wrong, and b with it",
+            f"calibrate it; if it is the scale, multiply acceleration by {GRAVITY / up:.3g}", {"up": up},
+            estimates_off(mass=up / GRAVITY) if up > 0.0 else {},
+        )  # fmt: skip
+    if down < 0.5 * GRAVITY:
+        q = linear(attitude.t, attitude.values, accel.t)
+        upwards = np.broadcast_to([0.0, 0.0, -GRAVITY], accel.values.shape)  # makes up for gravity alone
+        felt = rotated(conjugate(q / np.linalg.norm(q, axis=1, keepdims=True)), upwards)
+        aside = np.mean((accel.values - felt)[tame], axis=0)[:2]
+        size = float(np.linalg.norm(aside))
+        if rates.verdict is CheckResult.WARNING or size < most:
+            return rates
+        return Check(
+            "gravity", CheckResult.ERROR if size > 3.0 * most else CheckResult.WARNING,
+            f"specific force is {aside[0]:+.2g} m/s^2 along x and {aside[1]:+.2g} along y on the average of "
+            f"{seconds:.3g} s, beyond what gravity and attitude leave: the accelerometer's zero is wrong, or the "
+            "attitude", "calibrate it level, or subtract this", {"aside": size},
+        )  # fmt: skip
+    return Check(
+        rates.name, CheckResult.ERROR,
+        f"the attitude turns what the accelerometer reads to point down ({down:.3g} m/s^2): its world has z up",
+        "convert attitude, velocity and position to NED; ROS uses east, north, up (ENU)", {"down": down},
+    )  # fmt: skip
+
+
+def gyro_check(recording: Recording) -> Check:
+    """Gyro against differentiated attitude: axes, signs and scale (degrees for radians)."""
+    gyro, attitude = recording.channels.get("gyro"), recording.channels.get("attitude")
+    if gyro is None or attitude is None or min(len(gyro.t), len(attitude.t)) < 20:
+        return Check("gyro_attitude", CheckResult.UNKNOWN, "needs gyro and attitude")
+    if (period := measured_period(gyro.t, gyro.values)) > _STEP:
+        slow = f"gyro at {1.0 / period:.2g} Hz is too slow to compare with the attitude"
+        return Check("gyro_attitude", CheckResult.UNKNOWN, slow)
+    if measured_period(attitude.t, attitude.values) > 0.5 * _STEP:  # slow readings may be written again and again
+        fresh = fresh_rows(attitude.values)
+        attitude = replace(attitude, t=attitude.t[fresh], values=attitude.values[fresh])
+    best: tuple[str, AxisMap] | None = None
+    given = attitude.values
+    own = _moving_rates(gyro, attitude.t, given)
+    readings = {"as given": given, "world to body": conjugate(given), "x y z w (scalar last)": given[:, [3, 0, 1, 2]]}
+    for name, q in readings.items():
+        measured, derived = own if q is given else _moving_rates(gyro, attitude.t, q)
+        if len(measured) < 20:
+            if name == "as given":  # as much noise moves every reading of it: no other is more likely for it
+                break
+            continue
+        fit = _fit_without_jumps(measured, derived)
+        if best is None or _likely(name, fit) > _likely(*best):
+            best = (name, fit)
+    if best is None:
+        return Check("gyro_attitude", CheckResult.UNKNOWN, "too little rotation to compare gyro and attitude")
+    late = _apart(response(gyro, attitude)) if best[0] == "as given" else None
+    rows = _without_jumps(*own)
+    return (
+        late or _angle_rates(gyro, attitude) or _one_axis(rows) or _bias_step(*own)
+        or (best[0] == "as given" and best[1].straight and _turned(rows))
+        or _judge_rates(gyro, attitude, *best)
+    )  # fmt: skip
+
+
+def _one_axis(rows: tuple[FloatArray, ...]) -> Check | None:
+    """An error where one axis is still or has a scale of its own, a warning where one is far off zero.
+
+    Args:
+        rows: rates by gyro and attitude, both (m, 3).
+    """
+    if len(rows[0]) < FEWEST_SAMPLES:
+        return None
+    (size, turned), offset = (np.std(x, axis=0) for x in rows), np.mean(rows[0] - rows[1], axis=0)
+    together = np.mean((rows[0] - rows[0].mean(axis=0)) * (rows[1] - rows[1].mean(axis=0)), axis=0)
+    correlation = together / (size * turned + 1e-12)
+    follows = correlation > 0.9
+    scale = turned / np.maximum(size, 1e-300)
+    agrees = follows & (scale < _UNIT) & (scale > 1.0 / _UNIT) & (size > _MOTION)
+    if not agrees.any():
+        return None
+    check = partial(Check, "gyro_attitude")
+    for axis, name in enumerate(_AXES):
+        still = [which for which, x in (("gyro", size), ("attitude", turned)) if x[axis] < 1e-6]
+        numbers = {"scale": float(scale[axis]), "offset": float(offset[axis])}
+        if len(still) == 1 and max(size[axis], turned[axis]) > 3.0 * _MOTION:
+            message = f"{still[0]} does not turn about {name}, where the other does"
+            return check(CheckResult.ERROR, message, "log all of its axes", numbers)
+        if abs(correlation[axis]) < 0.3 and size[axis] > 0.2 and np.count_nonzero(agrees) == 2:
+            message = f"gyro does not follow the attitude about {name} (correlation {correlation[axis]:.2f})"
+            return check(CheckResult.ERROR, message, f"check {name} of both, or a heading that was held", numbers)
+        if follows[axis] and not agrees[axis] and size[axis] > _MOTION:
+            message = f"attitude rate / gyro = {scale[axis]:.3g} about {name}, not about every axis"
+            return check(
+                CheckResult.ERROR, message, f"multiply the gyro's {name} by it, or correct the attitude", numbers
+            )
+    worst = int(np.argmax(np.abs(offset)))
+    if abs(offset[worst]) < 0.1 or not agrees[worst]:  # [rad/s]; of recorded flights up to 0.04
+        return None
+    message = f"gyro reads {offset[worst]:+.2g} rad/s about {_AXES[worst]} more than the attitude turns"
+    return check(
+        CheckResult.WARNING, message, "calibrate it at rest, or subtract this", {"offset": float(offset[worst])}
+    )
+
+
+def _sizes(gyro: Channel, attitude: Channel, over: float = TURN) -> list[Factor]:
+    """Turns of the attitude over those of the gyro about x, y and z; empty where they are too slow or too few."""
+    step = max(sample_period(attitude.t), 0.1 * over)
+    at, q = _on_steps(gyro, attitude, step)
+    if step > 0.25 * over or len(at) < FEWEST * over / step:
+        return []
+    turns = Turns.of(linear(gyro.t, gyro.values, at), q, step, over)
+    felt, turned, rate = _without_jumps(turns.gyro, turns.attitude, turns.rate)
+    turns = Turns(felt, rate, turned, over)
+    number = len(felt) * step / over
+    if number < FEWEST:
+        return []
+    return [factors(axis, number, turns.moments(axis, step))[0] for axis in range(3)]
+
+
+def _on_steps(gyro: Channel, attitude: Channel, step: float) -> tuple[FloatArray, FloatArray]:
+    """Times `step` [s] apart (n,) at which both are known, and the attitude there (n, 4), NaN in gaps of either."""
+    at = np.arange(max(gyro.t[0], attitude.t[0]), min(gyro.t[-1], attitude.t[-1]), step)
+    q = linear(attitude.t, attitude.values, at)
+    q[~usable_steps(attitude.t, gyro.t)[np.searchsorted(attitude.t[1:-1], at, "right")]] = np.nan
+    return at, q
+
+
+def _turned(rows: tuple[FloatArray, ...]) -> Check | None:
+    """A gyro that is turned by some degrees against the attitude, in all parts of the log alike (Kabsch 1976)."""
+    if len(rows[0]) < 2 * FEWEST_SAMPLES:
+        return None
+
+    def turning(measured: FloatArray, derived: FloatArray) -> FloatArray:
+        u, _, v = np.linalg.svd((measured - measured.mean(axis=0)).T @ (derived - derived.mean(axis=0)))
+        return np.asarray((u @ np.diag([1.0, 1.0, np.linalg.det(u @ v)]) @ v).T)
+
+    def angles_of(m: FloatArray) -> FloatArray:
+        return np.array([np.arctan2(m[2, 1], m[2, 2]), -np.arcsin(m[2, 0]), np.arctan2(m[1, 0], m[0, 0])])
+
+    parts = [angles_of(turning(*part)) for part in zip(*(np.array_split(r, _PARTS) for r in rows), strict=True)]
+    m, error = turning(*rows), np.linalg.norm(np.std(parts, axis=0)) / np.sqrt(_PARTS)
+    angles = angles_of(m)
+    size = float(np.linalg.norm(angles))
+    if size < max(_TILT, _PARTS * float(error)):
+        return None
+    # What an axis reads of the others' acceleration is no answer to its torque.
+    read = np.diff(rows[0], axis=0)
+    sizes = np.sum(read**2, axis=0) / np.sum(read * (read @ m.T), axis=0)
+    roll, pitch, yaw = np.degrees(angles)
+    rotation = ", ".join(f"{angle:.3f}" for angle in angles)
+    return Check(
+        "gyro_attitude", CheckResult.ERROR if size > 2.0 * _TILT else CheckResult.WARNING,
+        f"gyro is turned against the attitude: roll {roll:.2g}, pitch {pitch:.2g}, yaw {yaw:.2g} deg",
+        f"mounting: {{rotation: [{rotation}]}} in the vehicle file, or correct the attitude", {"angle_rad": size},
+        estimates_off(turning=sizes.tolist()) if sizes.min() > 0.0 else {},
+    )  # fmt: skip
+
+
+def _bias_step(measured: FloatArray, derived: FloatArray) -> Check | None:
+    """An error where the gyro follows the attitude, or both stand still, but for one step of its bias."""
+    n = len(measured)
+    if n < 20 or fit_axes(measured, derived).r2 >= _CLEAR:
+        return None
+    apart = measured - derived
+    count = np.arange(5, n - 4)[:, None]
+    before = np.cumsum(apart, axis=0)[4 : n - 5] / count
+    size = (apart.sum(axis=0) - before * count) / (n - count) - before
+    share = size**2 * count * (n - count) / n
+    k, axis = (int(i) for i in np.unravel_index(np.argmax(share), share.shape))
+    after = np.arange(n) >= count[k, 0]
+    left = measured - np.outer(after, np.where(np.arange(3) == axis, size[k], 0.0))
+    fit, noise = fit_axes(left, derived), float(np.var((left - derived)[:, axis]))
+    still = np.max(np.std(left, axis=0)) < _MOTION
+    if share[k, axis] < 8.0**2 * noise or not (still or (fit.straight and fit.r2 >= _CLEAR)):
+        return None
+    return Check(
+        "gyro_attitude", CheckResult.ERROR,
+        f"the gyro's bias about {_AXES[axis]} stepped by {size[k, axis]:+.2g} rad/s; without that the attitude agrees",
+        "use the flight before it, and calibrate the gyro at rest", {"step": float(size[k, axis])},
+    )  # fmt: skip
+
+
+def _angle_rates(gyro: Channel, attitude: Channel) -> Check | None:
+    """An error where the gyro holds the rates of roll, pitch and yaw angle, not those about the body's axes.
+
+    Both differ by a part that grows with tilt; what the gyro differs from the body's rates is compared with it.
+    """
+    stride = max(1, round(_STEP / sample_period(attitude.t)))
+    t, q = attitude.t[::stride], attitude.values[::stride]
+    measured, turned = _rates(gyro, t, q)
+    keep = usable_steps(t, gyro.t)
+    angles = np.diff(np.unwrap(euler(q), axis=0), axis=0)[keep] / np.diff(t)[keep, None]
+    measured, turned, angles = _without_jumps(measured, turned, angles)
+    apart, missed = angles - turned, measured - turned
+    size = float(np.sum(apart**2))
+    if len(apart) < FEWEST_SAMPLES or float(np.mean(apart**2)) < _MOTION**2:
+        return None
+    like = float(np.sum(apart * missed))
+    if like < 0.5 * size or like**2 < _CLEAR * size * float(np.sum(missed**2)):
+        return None
+    return Check(
+        "gyro_attitude", CheckResult.ERROR,
+        "gyro holds the rates of roll, pitch and yaw angle (Euler rates), not those about the body's axes",
+        "log the gyro; or p = phi' - psi' sin(theta), q = theta' cos(phi) + psi' sin(phi) cos(theta), "
+        "r = psi' cos(phi) cos(theta) - theta' sin(phi)", {"share": like / size},
+    )  # fmt: skip
+
+
+class Response(NamedTuple):
+    """The gyro beside the turning of the attitude, by frequency.
+
+    Attributes:
+        late: time of the gyro after the attitude [s]; sigma: its standard deviation.
+        left: least share that the gyro has, in any band, of what it reads of slow turning, at the top of its error.
+        read: share that it has of all angular acceleration.
+    """
+
+    late: float
+    sigma: float
+    left: float
+    read: float
+
+
+def response(gyro: Channel, attitude: Channel) -> Response | None:
+    """Gyro beside differentiated attitude in bands of frequency, by cross-spectra; None where too few are clear.
+
+    Both are means over the same steps, so that rates and steps of the channels do not matter.  Noise of the gyro makes
+    the share that it reads too large and that of the attitude leaves it, so that a share below 1 is a filter's.
+    """
+    fresh = fresh_rows(attitude.values)
+    attitude = replace(attitude, t=attitude.t[fresh], values=attitude.values[fresh])
+    step = max(0.01, sample_period(attitude.t))
+    slowest = max(step, measured_period(gyro.t, gyro.values))
+    rows = round(float(np.clip(np.ptp(attitude.t) / 6.0, 1.0, 2.0)) / step)
+    hz, lags = np.fft.rfftfreq(rows, step)[1:], np.arange(-_FARTHEST, _FARTHEST + 1e-9, 0.005)
+    late = 0.0
+    for first in (True, False):  # once more where both agree best: else parts hold different ends of the motion
+        shifted = Channel("gyro", gyro.t - late, gyro.values)
+        at, q = _on_steps(shifted, attitude, step)
+        if len(at) <= rows or rows < 4:
+            return None
+        felt, turned = (x / step for x in (np.diff(running_integral(shifted, at), axis=0), turn(q[:-1], q[1:])))
+        felt[_jumps(felt, turned)] = np.nan
+        parts = np.lib.stride_tricks.sliding_window_view(np.hstack([felt, turned]), rows, axis=0)[:: rows // 2]
+        parts = parts[np.isfinite(parts).all(axis=(1, 2))]
+        if len(parts) < 5:
+            return None
+        one, other = np.split(np.fft.rfft((parts - parts.mean(-1, keepdims=True)) * np.hanning(rows))[..., 1:], 2, 1)
+        cross, power, beside = (np.sum(x, axis=(0, 1)) for x in (other * one.conj(), abs(one) ** 2, abs(other) ** 2))
+        agree = np.real(np.exp(-2j * np.pi * np.outer(lags, hz)) @ cross)
+        late += float(lags[np.argmax(agree)]) if first else 0.0
+    # Sums over bands that both can hold: phase, the gyro's share and its relative error, and coherence.
+    place = np.digitize(hz, _BANDS) * (hz < 0.4 / slowest)
+    bands = [place == k for k in np.unique(place) if 0 < k < len(_BANDS)]
+    both, own, its, hz = (np.array([np.sum(x[k]) for k in bands]) for x in (cross, power, beside, hz * abs(cross)))
+    hz, coherence = hz / (abs(both) + 1e-300), abs(both) ** 2 / (own * its + 1e-300) + 1e-12
+    error = np.sqrt(
+        np.maximum(1.0 - coherence, 0.0) / (2.0 * coherence) / [0.7 * len(parts) * np.count_nonzero(k) for k in bands]
+    )
+    clear = coherence > _SURE
+    if np.count_nonzero(clear) < 2:
+        return None
+    # Time by the phases, weighted by their errors, of half a millisecond at least; what scatters more is less sure.
+    lag = np.angle(both[clear]) / (2.0 * np.pi * hz[clear])
+    weight = 1.0 / ((error[clear] / (2.0 * np.pi * hz[clear])) ** 2 + 5e-4**2)
+    lag_mean = float(np.average(lag, weights=weight))
+    scatter = float(np.average((lag - lag_mean) ** 2, weights=weight)) / (len(lag) - 1)
+    sigma = float(np.sqrt(max(1.0 / weight.sum(), scatter)))
+    # Sampling takes its share of motion beyond a tenth of the rate.
+    share = own / (abs(both) + 1e-300)
+    share = share / share[np.flatnonzero(clear)[0]]
+    known = (error < 0.1) & (hz < 0.1 / slowest)
+    quick = np.where(known, abs(both) * hz**2, 0.0)
+    return Response(
+        late + lag_mean, sigma,
+        float(np.min((share * (1.0 + 2.0 * error))[known], initial=1.0)),
+        float(quick.sum() / np.sum(quick / np.minimum(share, 1.0))) if known.any() else 1.0,
+    )  # fmt: skip
+
+
+def _filtered(found: Response | None, known: Mapping[str, Mapping[str, float]]) -> Check | None:
+    """A warning where gyro or attitude are late beyond `known` effects, or the gyro misses quick turning."""
+    if found is None:
+        return None
+    lag = known.get("imu_lag", {}).get("cutoff", math.inf)
+    late = found.late - math.sqrt(0.5) / (math.pi * lag) + known.get("attitude_delay", {}).get("delay", 0.0)
+    smoothed = found.left < _SMOOTHED and "imu_lag" not in known
+    sure = _LATE < abs(late) - 3.0 * found.sigma < _TOO_LATE
+    if not (smoothed or sure):
+        return None
+    which = ("attitude", "gyro") if late < 0.0 else ("gyro", "attitude")
+    told = []
+    if sure:
+        told.append(f"{which[0]} comes {1e3 * abs(late):.0f} ms after the {which[1]}")
+        # A second-order Butterworth filter makes slow motion late by 1 / (sqrt(2) pi cutoff).
+        told[0] += f", as low-passed at {math.sqrt(0.5) / (math.pi * abs(late)):.2g} Hz or stamped late"
+    if smoothed:
+        told.append(f"gyro has {found.left:.0%} of the attitude's quick turning: it was " + (
+            "low-passed" if sure and late > 0.0 else "smoothed without a delay"
+        ))  # fmt: skip
+    models = "`attitude_delay` models a delay" if sure and late < 0.0 else "`imu_lag` models a filter"
+    fix = f"log the raw {which[0] if sure else 'gyro'}" + f"; {models}" * sure
+    return Check(
+        "gyro_source", CheckResult.WARNING, "; ".join(told), fix, {"late_s": late, "left": found.left},
+        estimates_off(turning=(found.read,) * 3) if which[0] == "gyro" or smoothed else {},
+    )  # fmt: skip
+
+
+def gyro_source_check(recording: Recording, vehicle: Vehicle | None) -> Check | None:
+    """A warning where the gyro is the attitude, differentiated, an error where its noise rules, or it was filtered.
+
+    Noise of the attitude is then that of the gyro, row by row: their difference is far below what changes from one
+    row to the next but one, which is what a sensor of its own and a central difference leave.
+    """
+    gyro, attitude = recording.channels.get("gyro"), recording.channels.get("attitude")
+    if gyro is None or attitude is None or min(len(gyro.t), len(attitude.t)) < FEWEST_SAMPLES:
+        return None
+    fresh = fresh_rows(attitude.values)
+    t, q = attitude.t[fresh], attitude.values[fresh]
+    inside = (t >= gyro.t[0]) & (t <= gyro.t[-1])
+    t, q = t[inside], q[inside]
+    if len(t) < FEWEST_SAMPLES or np.min(np.diff(t)) <= 0.0:
+        return None
+    rates = turn(q[:-1], q[1:]) / np.diff(t)[:, None]
+    bends = float(np.median(np.linalg.norm(np.diff(rates, 2, axis=0), axis=1)))
+    at_rows = linear(gyro.t, gyro.values, t)
+    missed = (at_rows[:-1] - rates, at_rows[1:] - rates, at_rows[1:-1] - 0.5 * (rates[1:] + rates[:-1]))
+    least = min(float(np.median(np.linalg.norm(rows, axis=1))) for rows in missed)
+    if least >= 0.05 * bends:
+        return _filtered(response(gyro, attitude), {} if vehicle is None else vehicle.effects)
+    noisy = bends > 0.5 * float(np.median(np.linalg.norm(rates, axis=1)))
+    return Check(
+        "gyro_source", CheckResult.ERROR if noisy else CheckResult.WARNING,
+        "gyro is the attitude, differentiated: it measures nothing by itself" + ", and is mostly noise" * noisy,
+        "log the gyro; noise and delay of the attitude are in both", {"missed_rad_s": least, "bends_rad_s": bends},
+    )  # fmt: skip
+
+
+def _moving_rates(gyro: Channel, t: FloatArray, q: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Rates as of `_rates` over steps long enough for the motion to stand above the attitude's noise; none if still.
+
+    White attitude noise adds a variance that falls with the square of the step and motion one that does not, so two
+    steps separate them: motion = (4 var(2 step) - var(step)) / 3.
+    """
+    stride = max(1, round(_STEP / sample_period(t)))
+    if stride > _MOST_ROWS:  # times in minutes or hours
+        stride = len(t) // (3 * _FEWEST_STEPS) + 1
+    measured, derived = _without_jumps(*_rates(gyro, t[::stride], q[::stride]))
+    longer = _without_jumps(*_rates(gyro, t[:: 2 * stride], q[:: 2 * stride]))[1]
+    if len(longer) < _FEWEST_STEPS:
+        return longer[:0], longer[:0]
+    total = np.var(derived, axis=0)
+    motion = np.maximum((4.0 * np.var(longer, axis=0) - total) / 3.0, 0.0)
+    if max(np.max(np.sqrt(motion)), np.max(np.std(measured, axis=0))) < _MOTION:
+        return longer[:0], longer[:0]
+    if np.sum(motion) > 0.8 * np.sum(total) or len(t) < 20 * 4 * stride:
+        return measured, derived
+    return _rates(gyro, t[:: 4 * stride], q[:: 4 * stride])
+
+
+def _without_jumps(measured: FloatArray, derived: FloatArray, *more: FloatArray) -> tuple[FloatArray, ...]:
+    """Rates without rows in which the attitude jumps and the gyro does not: an estimator reset its heading there."""
+    if not len(derived):
+        return measured, derived, *more
+    jumps = _jumps(measured, derived)
+    return tuple(rows[~jumps] for rows in (measured, derived, *more))
+
+
+def _jumps(measured: FloatArray, derived: FloatArray) -> BoolArray:
+    """True for rows in which the attitude jumps and the gyro does not."""
+    turned, felt = (np.linalg.norm(rows, axis=1) for rows in (derived, measured))
+    return np.asarray((turned > _JUMP * np.nanmedian(turned)) & (felt < 0.5 * _JUMP * np.nanmedian(felt)))
+
+
+def _apart(found: Response | None) -> Check | None:
+    """An error where the gyro follows the attitude at another time only."""
+    if found is None or abs(found.late) - 3.0 * found.sigma < _TOO_LATE:
+        return None
+    which = ("gyro", "attitude") if found.late > 0.0 else ("attitude", "gyro")
+    return Check(
+        "gyro_attitude", CheckResult.ERROR,
+        f"{which[0]} comes {1e3 * abs(found.late):.0f} ms after the {which[1]}",
+        f"stamp the {which[0]} when it is measured, on the clock of the {which[1]}", {"lag_s": found.late},
+    )  # fmt: skip
+
+
+def _likely(reading: str, fit: AxisMap) -> float:
+    """R^2, with a bonus for axes that agree and one for taking the numbers as given."""
+    return fit.r2 + (0.1 if fit.straight else 0.0) + (0.05 if reading == "as given" else 0.0)
+
+
+def _judge_rates(gyro: Channel, attitude: Channel, reading: str, fit: AxisMap) -> Check:
+    check = partial(Check, "gyro_attitude", numbers={"scale": fit.scale, "r2": fit.r2})
+    if fit.r2 < _CLEAR:
+        message = f"gyro does not follow the attitude (R^2 {fit.r2:.2f})"
+        remedy = "check units, axes and time stamps of both; quaternions are scalar first, body to world"
+        return check(CheckResult.ERROR, message, remedy)
+    if reading != "as given":
+        message = f"attitude fits the gyro only when read as {reading} (R^2 {fit.r2:.2f})"
+        return check(CheckResult.ERROR, message, "write wxyz quaternions, body to world, FRD to NED")
+    if not fit.straight:
+        message = f"gyro axes differ from the attitude's: {fit} (R^2 {fit.r2:.2f})"
+        remedy = "body axes must be FRD for both; ROS' FLU has y and z reversed"
+        if (fit.axes, fit.signs) == ((1, 0, 2), (1, 1, -1)):
+            remedy = "that is an attitude in world axes east, north, up (ENU): turn it, velocity and position into NED"
+        return check(CheckResult.ERROR, message, remedy)
+    for scale, unit in ((60.0, "minutes"), (3600.0, "hours")):
+        if fit.r2 > 0.9 and 0.97 < fit.scale / scale < 1.03:
+            message = f"attitude rate / gyro = {fit.scale:.4g}: time seems to be in {unit}"
+            return check(CheckResult.ERROR, message, f"multiply times by {scale:g}")
+    for scale, what in ((1.0 / DEGREES, "gyro seems to be in deg/s"), (DEGREES, "attitude seems to be in degrees")):
+        if 0.75 < fit.scale / scale < 1.33:
+            return check(CheckResult.ERROR, f"{what} (attitude rate / gyro = {fit.scale:.3g})", "convert to radians")
+    message = f"attitude rate / gyro = {fit.scale:.3f} (R^2 {fit.r2:.2f})"
+    if fit.absurd:
+        remedy = f"multiply gyro by {fit.scale:.3g}, or correct the attitude"
+        return check(CheckResult.ERROR, f"{message}: the scale of one is wrong", remedy)
+    by_axis = _sizes(gyro, attitude)
+    sizes = np.array([f.value if f.disagrees else 1.0 for f in by_axis] or [fit.scale] * 3)
+    message = ", ".join(str(f) for f in by_axis if f.known) or message
+    if np.all(sizes == 1.0) or not by_axis and 0.85 < fit.scale < 1.15:
+        return check(CheckResult.OK, message)
+    remedy = "check scales and filters of both; multiply the gyro by this if the attitude is right"
+    return check(CheckResult.WARNING, message, remedy, off=estimates_off(turning=(1.0 / sizes).tolist()))
+
+
+def velocity_check(recording: Recording) -> Check:
+    """Change of world velocity against rotated specific force and gravity: world frame of attitude and velocity.
+
+    Where no velocity is logged, it is that of the position.
+    """
+    channels = recording.channels
+    accel, attitude = channels.get("accel"), channels.get("attitude")
+    velocity = channels.get("velocity") or _flown(channels.get("position"))
+    if accel is None or attitude is None or velocity is None or min(map(len, (accel.t, attitude.t, velocity.t))) < 20:
+        return Check("velocity_attitude", CheckResult.UNKNOWN, "needs accelerometer, attitude and velocity or position")
+    if not 0.5 < np.median(np.linalg.norm(accel.values, axis=1)) / GRAVITY < 2.0:
+        return Check("velocity_attitude", CheckResult.UNKNOWN, "needs specific force in m/s^2")
+    gained, derived = _velocity_gains(accel, attitude, velocity)
+    level = _level_velocity(gained, derived, velocity.name)
+    if level.verdict is CheckResult.ERROR or len(gained) < 20:
+        return level
+    # Vertical changes that are clearly the reverse of what the force makes.
+    up, down = gained[:, 2], derived[:, 2]
+    if not (min(np.std(up), np.std(down)) > 0.2 and np.corrcoef(up, down)[0, 1] < -0.7):
+        return level
+    return Check(
+        "velocity_attitude", CheckResult.ERROR,
+        f"vertical {velocity.name} rises where the force pushes down: it points up",
+        f"negate {'vz, and z if it points up too' if velocity.name == 'velocity' else 'z'}: the world is NED",
+        {"vertical": -1.0},
+    )  # fmt: skip
+
+
+def _flown(position: Channel | None) -> Channel | None:
+    """Change of the position [m/s] over steps of at least 0.5 s, at their middles, as a channel of its name."""
+    if position is None or len(position.t) < FEWEST_SAMPLES:
+        return None
+    stride = max(1, round(0.5 / sample_period(position.t)))
+    t, place = position.t[::stride], position.values[::stride]
+    return Channel("position", 0.5 * (t[1:] + t[:-1]), np.diff(place, axis=0) / np.diff(t)[:, None], position.source)
+
+
+def _level_velocity(gained: FloatArray, derived: FloatArray, name: str) -> Check:
+    """Horizontal axes of `velocity_check`, of the channel `name`."""
+    if len(gained) < 20 or np.max(np.std(gained[:, :2], axis=0)) < 0.2:
+        return Check("velocity_attitude", CheckResult.UNKNOWN, "too little horizontal acceleration to compare")
+    fit = fit_axes(derived[:, :2], gained[:, :2])
+    check = partial(Check, "velocity_attitude", numbers={"scale": fit.scale, "r2": fit.r2})
+    if fit.r2 < _CLEAR:
+        return check(CheckResult.UNKNOWN, f"{name} does not follow tilt and thrust clearly (R^2 {fit.r2:.2f})")
+    if not fit.straight:
+        message = f"world axes of {name} differ from the attitude's: {fit} (R^2 {fit.r2:.2f})"
+        return check(CheckResult.ERROR, message, "use NED for both; ROS' ENU swaps x and y")
+    message = f"{name} follows tilt and thrust (scale {fit.scale:.3g}, R^2 {fit.r2:.2f})"
+    if fit.absurd:
+        return check(CheckResult.ERROR, f"{message}: its scale is wrong", f"divide {name} by {fit.scale:.3g}")
+    return check(CheckResult.OK, message)
+
+
+def _rates(gyro: Channel, t: FloatArray, q: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Returns mean gyro and rotation over each interval between attitudes [rad/s], both (m, 3)."""
+    keep = usable_steps(t, gyro.t)
+    mean = np.diff(running_integral(gyro, t), axis=0)[keep] / np.diff(t)[keep, None]
+    return mean, turn(q[:-1], q[1:])[keep] / np.diff(t)[keep, None]
+
+
+def _velocity_gains(accel: Channel, attitude: Channel, velocity: Channel) -> tuple[FloatArray, FloatArray]:
+    """Returns mean acceleration [m/s^2] over steps of at least 0.2 s, of the velocity and from force, both (m, 3)."""
+    force = _in_world(accel, attitude) + np.array([0.0, 0.0, GRAVITY])
+    stride = max(1, round(0.2 / sample_period(velocity.t)))
+    t, speed = velocity.t[::stride], velocity.values[::stride]
+    keep = usable_steps(t, accel.t) & usable_steps(t, attitude.t)
+    world = Channel("accel", accel.t, force)
+    derived = np.diff(running_integral(world, t), axis=0)[keep] / np.diff(t)[keep, None]
+    return np.diff(speed, axis=0)[keep] / np.diff(t)[keep, None], derived
+
+
+def _in_world(accel: Channel, attitude: Channel) -> FloatArray:
+    """Specific force in the attitude's world [m/s^2], shape (n, 3), at the accelerometer's times."""
+    q = linear(attitude.t, attitude.values, accel.t)
+    return rotated(q / np.linalg.norm(q, axis=1, keepdims=True), accel.values)
+
+
+def usable_steps(t: FloatArray, other: FloatArray) -> BoolArray:
+    """True for steps of `t` without a gap, neither in `t` nor, as long as a quarter of one, in the other's times."""
+    steps = np.diff(t)
+    usual = float(np.median(steps)) if len(steps) else 0.0
+    longest = max(GAP * sample_period(other), 0.25 * usual)
+    holes = np.flatnonzero(np.diff(other) > longest)
+    following = np.searchsorted(other[holes + 1], t[:-1], "right")
+    spoiled = np.append(other[holes], np.inf)[following] < t[1:]
+    inside = (t[:-1] >= other[0]) & (t[1:] <= other[-1])
+    return np.asarray(inside & ~spoiled & (steps < GAP * usual))
+
+
+def running_integral(channel: Channel, at: FloatArray) -> FloatArray:
+    """Running integral (trapezoidal) of a channel, read at times `at`, shape (m, columns)."""
+    area = 0.5 * (channel.values[1:] + channel.values[:-1]) * np.diff(channel.t)[:, None]
+    total = np.concatenate([np.zeros((1, area.shape[1])), np.cumsum(area, axis=0)])
+    return linear(channel.t, total, at)
+
+
+# --- Whether logged velocity is the change of logged position: an estimator that scales one of them is wrong in one
+
+
+STRETCH = 1.0
+"""Changes are compared over this time [s]: slow enough for delays and low-passes of either channel not to count."""
+CLEAR = 0.98
+"""Correlation above which two changes are the same motion, seen by two channels."""
+LEAST_MOTION = 0.1
+"""Change of position [m], as standard deviation, below which its noise may decide."""
+SCALE = 0.03
+"""Deviation from scale 1 that matters to whoever predicts positions …"""
+
+
+def position_check(recording: Recording) -> Check | None:
+    """Integral of the velocity against the change of position: scale and correlation; None where one is not logged.
+
+    Horizontal axes together, the vertical one by itself.
+    """
+    position, velocity = (recording.channels.get(n) for n in ("position", "velocity"))
+    if position is None or velocity is None or min(len(position.t), len(velocity.t)) < FEWEST_SAMPLES:
+        return None
+    moved, flown, independent = _changes(position, velocity)
+    if independent < 4.0:
+        return Check("position_velocity", CheckResult.UNKNOWN, "too few stretches without a gap to compare")
+    fit = fit_axes(moved, flown)
+    turned = fit.axes != (0, 1, 2) or min(fit.signs[:2]) < 0
+    if np.max(np.std(moved[:, :2], axis=0)) > LEAST_MOTION and fit.r2 > CLEAR**2 and turned:
+        return Check(
+            "position_velocity", CheckResult.WARNING,
+            f"world axes of velocity differ from those of position: {fit} (R^2 {fit.r2:.2f})",
+            "use NED for both; ROS' ENU swaps x and y", {"r2": fit.r2},
+        )  # fmt: skip
+    numbers: dict[str, float] = {}
+    scales: list[str] = []
+    off: list[str] = []
+    unit = False
+    for where, axes in (("horizontally", (0, 1)), ("vertically", (2,))):
+        p, v = (x[:, axes] - x[:, axes].mean(axis=0) for x in (moved, flown))
+        correlation = float(np.sum(p * v) / np.sqrt(max(np.sum(p * p) * np.sum(v * v), 1e-300)))
+        if where == "vertically" and np.max(np.std(p, axis=0)) > LEAST_MOTION and correlation < -0.8:
+            return Check(
+                "position_velocity", CheckResult.ERROR,
+                f"position rises where velocity falls (correlation {correlation:.2f}): one of them points up",
+                "negate z or vz: the world is NED, its z down", {"correlation": correlation},
+            )  # fmt: skip
+        if np.max(np.std(p, axis=0)) < LEAST_MOTION or correlation < CLEAR:
+            continue
+        # Both have errors: the ratio of their sizes, not a regression of one on the other.
+        scale = float(np.sqrt(np.sum(v * v) / np.sum(p * p)))
+        error = scale * np.sqrt(max(1.0 - correlation**2, 0.0) / (independent * len(axes)))
+        numbers |= {f"scale {where}": scale, f"correlation {where}": correlation}
+        scales.append(f"{scale:.3f} ± {error:.3f} {where} (correlation {correlation:.4f})")
+        # Beyond chance, and enough to matter to whoever predicts positions.
+        unit |= not 1.0 / _UNIT < scale < _UNIT
+        if abs(scale - 1.0) > max(SCALE, 4.0 * error):
+            off.append(f"{abs(scale - 1.0):.1%} {'larger' if scale > 1.0 else 'smaller'} {where}")
+    if not scales:
+        message = "velocity does not follow the change of position clearly, or the vehicle hardly moves"
+        return Check("position_velocity", CheckResult.UNKNOWN, message)
+    measured = f"velocity against change of position: {', '.join(scales)}"
+    if unit:
+        fix = "write position in m and velocity in m/s"
+        return Check("position_velocity", CheckResult.ERROR, f"{measured}: they are in different units", fix, numbers)
+    if not off:
+        return Check("position_velocity", CheckResult.OK, measured, numbers=numbers)
+    return Check(
+        "position_velocity", CheckResult.WARNING,
+        f"the logged velocity is {' and '.join(off)} than the logged change of position ({measured}): the scale of one "
+        "of them is wrong; a simulation fitted to such a log misses positions by as much, unless it has "
+        "`velocity_scale`",
+        "check the scale of the positioning system and of the estimator's velocity (flow sensor, marker distances)",
+        numbers,
+    )  # fmt: skip
+
+
+def _changes(position: Channel, velocity: Channel) -> tuple[FloatArray, FloatArray, float]:
+    """Changes of position and integrals of velocity over overlapping stretches, both (m, 3), and independent ones."""
+    period = sample_period(position.t)
+    steps, every = max(round(STRETCH / period), 1), max(round(0.1 * STRETCH / period), 1)
+    broken = np.concatenate([[0], np.cumsum(~usable_steps(position.t, velocity.t))])
+    start = np.arange(0, len(position.t) - steps, every)
+    start = start[broken[start + steps] == broken[start]]
+    path = running_integral(velocity, position.t)
+    moved, flown = (x[start + steps] - x[start] for x in (position.values, path))
+    known = np.isfinite(moved).all(axis=1) & np.isfinite(flown).all(axis=1)
+    return moved[known], flown[known], float(np.count_nonzero(known)) * every / steps

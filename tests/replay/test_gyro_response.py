@@ -1,0 +1,114 @@
+"""Gyros and attitudes that were filtered or come late are named by kinematics alone, with the error of estimates."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from quadid_replay import open_log
+from scipy.signal import butter, filtfilt, lfilter
+
+import quadid
+from quadid.app.logs import load_vehicle
+from quadid.checks import Check, CheckResult, inspect
+from quadid.checks.frames import response
+from quadid.data.window import Channel, Recording, sample_period
+from quadid.types import FloatArray
+from quadid.vehicle import Vehicle
+
+Flight = tuple[Recording, Vehicle]
+FLIGHTS = {
+    "pelican": None, "cases": "cases/case_001/train.csv", "hexacopter": "findings/vehicles/2_hexa_wrong_logs/clean.csv",
+    "figure8": "crazyflie_rpm/figure8_27.csv", "brushed": "brushed/jana00.csv",
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module", params=FLIGHTS)
+def flight(request: pytest.FixtureRequest) -> Flight:
+    """A flight of our simulator, of two others, and two recorded ones."""
+    place = FLIGHTS[request.param]
+    if place is None:
+        made = quadid.simulate(seconds=60.0, seed=3, extras=("velocity", "position"))
+        return made.flight.recording, Vehicle.shipped("pelican")
+    path: Path = request.getfixturevalue("data_dir") / place
+    return open_log(path), load_vehicle(str(path.parent / "vehicle.yaml"))
+
+
+def sources(
+    flight: Flight, name: str, change: Callable[[Channel], FloatArray], **effects: dict[str, float]
+) -> list[Check]:
+    """What is said of the source of gyro and attitude once a channel was changed."""
+    recording, vehicle = flight
+    channel = recording.channels[name]
+    changed = {**recording.channels, name: replace(channel, values=np.asarray(change(channel)))}
+    known = vehicle.model_copy(update={"effects": {**vehicle.effects, **effects}})
+    return [c for c in inspect(replace(recording, channels=changed), known).checks if c.name == "gyro_source"]
+
+
+def late(seconds: float) -> Callable[[Channel], FloatArray]:
+    return lambda c: np.column_stack([np.interp(c.t - seconds, c.t, x) for x in c.values.T])
+
+
+def low_passed(cutoff: float, order: int = 2) -> Callable[[Channel], FloatArray]:
+    return lambda c: np.asarray(lfilter(*butter(order, cutoff, fs=1.0 / sample_period(c.t)), c.values, axis=0))
+
+
+def test_a_gyro_as_it_came_has_nothing_said_of_it(flight: Flight) -> None:
+    assert sources(flight, "gyro", lambda c: c.values) == []
+
+
+@pytest.mark.parametrize(("cutoff", "order"), [(4.0, 2), (8.0, 2), (12.0, 2), (6.0, 1)])
+def test_a_low_pass_of_the_gyro_is_named_with_its_delay_and_what_it_does(
+    flight: Flight, cutoff: float, order: int
+) -> None:
+    """At 12 Hz it was named by no check, and by others without a word of how far estimates are off."""
+    (check, *_) = sources(flight, "gyro", low_passed(cutoff, order))
+    analog = (math.sqrt(2.0) if order == 2 else 1.0) / (2.0 * math.pi * cutoff)
+    assert check.verdict is CheckResult.WARNING
+    assert "imu_lag" in check.fix
+    assert check.numbers["late_s"] == pytest.approx(analog, abs=0.007)  # a filter of sampled rates is not quite as late
+    assert {"J_xx", "J_yy", "J_zz", "d"} <= set(check.off)
+    assert 0.0 <= check.off["J_xx"] < 1.0
+
+
+def test_smoothing_without_a_delay_is_told_from_one_with(flight: Flight) -> None:
+    def smooth(c: Channel) -> FloatArray:
+        return np.asarray(filtfilt(*butter(2, 4.0, fs=1.0 / sample_period(c.t)), c.values, axis=0))
+
+    check = sources(flight, "gyro", smooth)[0]
+    assert "smoothed without a delay" in check.message
+    assert check.off["J_xx"] > 0.02
+
+
+@pytest.mark.parametrize("seconds", [0.03, 0.05, 0.07])
+def test_an_attitude_that_comes_late_is_no_gyro_that_was_filtered(flight: Flight, seconds: float) -> None:
+    (check,) = sources(flight, "attitude", late(seconds))
+    assert "attitude comes" in check.message
+    assert check.numbers["late_s"] == pytest.approx(-seconds, abs=0.009)
+    assert check.off == {}
+    assert sources(flight, "attitude", late(seconds), attitude_delay={"delay": seconds}) == []
+
+
+def test_a_filter_that_the_vehicle_file_has_is_not_named(flight: Flight) -> None:
+    assert sources(flight, "gyro", low_passed(8.0), imu_lag={"cutoff": 8.0}) == []
+
+
+def test_late_and_early_are_measured_to_milliseconds(flight: Flight) -> None:
+    recording, _ = flight
+    gyro, attitude = recording.channels["gyro"], recording.channels["attitude"]
+    own = response(gyro, attitude)
+    for seconds in (-0.11, -0.04, 0.02, 0.16):
+        moved = response(replace(gyro, values=late(seconds)(gyro)), attitude)
+        assert own is not None
+        assert moved is not None
+        assert moved.late - own.late == pytest.approx(seconds, abs=0.004)
+
+
+def test_attitude_of_which_only_noise_is_left_tells_nothing() -> None:
+    """A heading that drifts in hover goes with the gyro's noise by chance."""
+    hover = quadid.simulate("pelican_x", seconds=40.0, seed=3, profile="hover", rate=100.0).flight.recording
+    assert response(hover.channels["gyro"], hover.channels["attitude"]) is None
