@@ -28,6 +28,7 @@ from quadid.checks.rotors import (
     readings_check,
     rotor_speed_check,
     rotor_timing_check,
+    rotors_earlier,
 )
 from quadid.data.window import Recording, in_body_axes
 from quadid.vehicle import Vehicle
@@ -97,23 +98,31 @@ class Log:
         """Time, order and spins of the motors, and rotors one by one.
 
         Another order is only judged, and advised, of a signal that is in time with it and in balance: else the time is
-        wrong, or a rotor.
+        wrong, or a rotor.  Where no order is in time, the same is asked of an earlier signal: then both are wrong.
         """
         recording, vehicle, spans, lagged = self.recording, self.known, self.spans, self.lagged
-        time, other = rotor_timing_check(recording, vehicle, spans), better_description(lagged, vehicle)
-        balance = rotor_speed_check(recording, vehicle, spans)
-        if other is not None:
-            again = rotor_timing_check(recording, other.vehicle, spans)
+        time, balance = rotor_timing_check(recording, vehicle, spans), rotor_speed_check(recording, vehicle, spans)
+        first = better_description(lagged, vehicle)
+        for early in (0.0, 0.05, 0.1) if first is not None else ():
+            moved = rotors_earlier(recording, early)
+            other = first if not early else better_description(
+                lagged_motion(rotors_earlier(self.read, early), vehicle, spans), vehicle
+            )  # fmt: skip
+            if other is None:
+                break
+            again = rotor_timing_check(moved, other.vehicle, spans)
             own, its = (check.numbers.get("correlation", 0.0) for check in (time, again))
             fits = again.verdict is CheckResult.OK and its >= own - 1e-9
             out_of_balance = (CheckResult.ERROR, CheckResult.WARNING)
-            if fits and rotor_speed_check(recording, other.vehicle, spans).verdict not in out_of_balance:
-                return {"motor_order": motor_order_check(lagged, vehicle, other)}
+            if fits and rotor_speed_check(moved, other.vehicle, spans).verdict not in out_of_balance:
+                late = rotor_timing_check(recording, other.vehicle, spans)
+                order = motor_order_check(lagged, vehicle, other)
+                return {"motor_order": order} | ({"rotor_timing": late} if early else {})
         wrong = [check for check in (time, balance) if check.verdict is CheckResult.ERROR]
         if wrong:
             return {wrong[0].name: wrong[0]}
         order = motor_order_check(lagged, vehicle, None)
-        if other is not None:
+        if first is not None:
             strange = "no order of the motors explains the motion at one lag"
             order = Check("motor_order", CheckResult.UNKNOWN, strange)
         return {check.name: check for check in (order, time, balance)}

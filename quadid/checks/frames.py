@@ -344,7 +344,9 @@ def _turned(rows: tuple[FloatArray, ...]) -> Check | None:
     m, error = turning(*rows), np.linalg.norm(np.std(parts, axis=0)) / np.sqrt(_PARTS)
     angles = angles_of(m)
     size = float(np.linalg.norm(angles))
-    if size < max(_TILT, _PARTS * float(error)):
+    if (
+        not max(_TILT, _PARTS * float(error)) <= size < 0.5 * np.pi
+    ):  # where each axis goes with its own, noise turns more
         return None
     # What an axis reads of the others' acceleration is no answer to its torque.
     read = np.diff(rows[0], axis=0)
@@ -619,9 +621,9 @@ def _judge_rates(gyro: Channel, attitude: Channel, reading: str, fit: AxisMap) -
         remedy = f"multiply gyro by {fit.scale:.3g}, or correct the attitude"
         return check(CheckResult.ERROR, f"{message}: the scale of one is wrong", remedy)
     by_axis = _sizes(gyro, attitude)
-    sizes = np.array([f.value if f.disagrees else 1.0 for f in by_axis] or [fit.scale] * 3)
+    sizes = np.array([f.value if f.disagrees and f.value > 0.0 else 1.0 for f in by_axis] or [fit.scale] * 3)
     message = ", ".join(str(f) for f in by_axis if f.known) or message
-    if np.all(sizes == 1.0) or not by_axis and 0.85 < fit.scale < 1.15:
+    if np.all(sizes == 1.0) or not by_axis and 0.85 * fit.r2 < fit.scale < 1.15:
         return check(CheckResult.OK, message)
     remedy = "check scales and filters of both; multiply the gyro by this if the attitude is right"
     return check(CheckResult.WARNING, message, remedy, off=estimates_off(turning=(1.0 / sizes).tolist()))

@@ -360,7 +360,7 @@ def attitude_steps_check(recording: Recording) -> Check | None:
     attitude = recording.channels.get("attitude")
     if attitude is None or len(attitude.t) < FEWEST_SAMPLES:
         return None
-    step = max(min(_quantum(c) for c in euler(attitude.values)[:, :2].T), _turn_quantum(attitude.values))
+    step = max(*(_quantum(c) for c in euler(attitude.values).T), _turn_quantum(attitude.values))
     if step < 0.005:
         return None
     return Check(

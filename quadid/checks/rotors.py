@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from itertools import combinations, permutations
 from typing import NamedTuple
@@ -106,6 +107,13 @@ def rotor_timing_check(recording: Recording, vehicle: Vehicle, spans: Spans) -> 
     if lag > 0.2:
         return Check(name, CheckResult.ERROR, f"{message}: no motor answers that late", fix, numbers)
     return Check(name, CheckResult.OK, message, numbers=numbers)
+
+
+def rotors_earlier(recording: Recording, seconds: float) -> Recording:
+    """The recording with its rotor signals so much earlier."""
+    rotors = {n: c for n, c in recording.channels.items() if n in ("rotor_speed", "motor_command")}
+    earlier = {name: replace(channel, t=channel.t - seconds) for name, channel in rotors.items()}
+    return replace(recording, channels={**recording.channels, **earlier})
 
 
 def _blocks(spans: Spans) -> list[FloatArray]:
@@ -715,7 +723,9 @@ def better_description(lagged: Lagged | str, vehicle: Vehicle) -> Other | None:
     own = max((one for one in named if one[2] == rotors), key=lambda one: one[0])
     # The most likely orders, and the own one, with the frame turned as roll and pitch then answer.
     for order in {rotors, *(one[2] for one in sorted(named, key=lambda one: -one[0])[:_TURNED])}:
-        if abs(angle := _turn(grams, reordered(vehicle, order))) > math.radians(20.0):  # a smaller turn is none
+        if abs(angle := _answer(grams, reordered(vehicle, order)).turned) > math.radians(
+            20.0
+        ):  # a smaller turn is none
             for sign in (1.0, -1.0):
                 ((_, axes),) = _best(grams, _rotated(vehicle, angle), [order], sign)
                 named.append((float(_gain(axes)) - _CHANGE * (_moved(order) + (sign < 0.0) + 1.5), angle, order, axes))
@@ -729,6 +739,8 @@ def better_description(lagged: Lagged | str, vehicle: Vehicle) -> Other | None:
     if not angle and order == rotors and (min(axes[0], axes[1]) < _SETTLED or not spins):
         return None
     axes = np.append(axes[:2], yaw)
+    if _gain(axes) <= _gain(np.append(own[3][:2], _drag_explains(lagged.slow, vehicle))):
+        return None  # with yaw judged by drag alone it is no better
     told, fix = [], []
     if angle:
         degrees = math.degrees(angle)
@@ -891,20 +903,30 @@ def _drag_explains(slow: Rows, vehicle: Vehicle, alone: bool = True) -> float:
     return float(yaw @ drag / np.sqrt(yaw @ yaw * (drag @ drag) + 1e-300))
 
 
-def _turn(grams: Sequence[_Gram], vehicle: Vehicle) -> float:
-    """Angle [rad] by which the vehicle answers in roll and pitch as if its frame were turned about z.
+class _Answer(NamedTuple):
+    """Answer of the vehicle in roll and pitch to torque over b: inertia times acceleration = A torque, A = k R(alpha).
 
-    With A the least-squares map from torque over b to inertia times acceleration, A = k R(alpha).
+    Attributes:
+        explained: share of the variance of roll and pitch, (2,).
+        scale: k, b times the factor by which arms (or inertias) are wrong.
+        turned: alpha [rad]: the frame stands so much further about z.
     """
-    arms, inertia = vehicle.torque_arms[:, :2], vehicle.initial[2:4]
-    best, angle = 0.0, 0.0
+
+    explained: FloatArray
+    scale: float
+    turned: float
+
+
+def _answer(grams: Sequence[_Gram], vehicle: Vehicle) -> _Answer:
+    """Least-squares map from torque to motion at the lag at which it explains most."""
+    arms, inertia, found = vehicle.torque_arms[:, :2], vehicle.initial[2:4], []
     for gram in grams:
         cross = arms.T @ gram.motion[:, :2] * inertia
         a = np.linalg.lstsq(arms.T @ gram.thrust @ arms, cross, rcond=None)[0]
-        explained = float(np.sum(a * cross / (gram.power[:2] * inertia**2 + 1e-300)))
-        if explained > best:
-            best, angle = explained, math.atan2(a[0, 1] - a[1, 0], a[0, 0] + a[1, 1])
-    return angle
+        along, across = 0.5 * (a[0, 0] + a[1, 1]), 0.5 * (a[0, 1] - a[1, 0])
+        explained = np.sum(a * cross, axis=0) / (gram.power[:2] * inertia**2 + 1e-300)
+        found.append(_Answer(explained, math.hypot(along, across), math.atan2(across, along)))
+    return max(found, key=lambda answer: float(np.sum(answer.explained)))
 
 
 def _rotated(vehicle: Vehicle, angle: float) -> Vehicle:
@@ -988,33 +1010,21 @@ def _load(recording: Recording, spans: Spans) -> float:
 def geometry_check(lagged: Lagged | str, vehicle: Vehicle, b_from_hover: float | None = None) -> Check:
     """Roll and pitch acceleration (of `lagged_motion`) against the torque that the stated rotor positions give.
 
-    With A the least-squares map from torque over b to inertia times acceleration, A = k R(alpha): the frame is turned
-    by alpha about z, and k is b times the factor by which arms (or inertias) are wrong.  With the b that carries the
-    weight, inertia over mass and squared arm follows: where no vehicle has it, the arm is asked for.
+    With the b that carries the weight, inertia over mass and squared arm follows: where no vehicle has it, the arm is
+    asked for.
     """
     name = "geometry"
     if isinstance(lagged, str):
         return Check(name, CheckResult.UNKNOWN, lagged)
-    arms, inertia = vehicle.torque_arms[:, :2], vehicle.initial[2:4]
-    fits = [_map(squares @ arms, motion[:, :2] * inertia) for squares, motion, _ in lagged.fast]
-    share, a = max(fits, key=lambda fit: float(np.min(fit[0])))
-    if float(np.min(share)) < 0.1:
-        axis = ("roll", "pitch")[int(np.argmin(share))]
+    explained, scale, angle = _answer([_Gram.of(rows) for rows in lagged.fast], vehicle)
+    if float(np.min(explained)) < 0.1:
+        axis = ("roll", "pitch")[int(np.argmin(explained))]
         return Check(
             name, CheckResult.UNKNOWN,
-            f"rotor torques explain only {np.min(share):.0%} of the {axis} motion: too little to judge positions",
+            f"rotor torques explain only {np.min(explained):.0%} of the {axis} motion: too little to judge positions",
         )  # fmt: skip
-    angle = math.atan2(a[0, 1] - a[1, 0], a[0, 0] + a[1, 1])
-    scale = 0.5 * math.hypot(a[0, 1] - a[1, 0], a[0, 0] + a[1, 1])
-    numbers = {"turned_rad": angle, "explained": float(np.min(share))}
+    numbers = {"turned_rad": angle, "explained": float(np.min(explained))}
     return _judge_scale(vehicle, scale, b_from_hover or 0.0, numbers)
-
-
-def _map(torque: FloatArray, answer: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Least-squares map (2, 2) from torque (n, 2) to answer (n, 2), and the share of variance it explains per axis."""
-    a = np.asarray(np.linalg.lstsq(torque, answer, rcond=None)[0], dtype=np.float64)
-    total = np.maximum(np.sum(answer**2, axis=0), 1e-300)
-    return np.asarray(1.0 - np.sum((answer - torque @ a) ** 2, axis=0) / total), a
 
 
 def _judge_scale(vehicle: Vehicle, scale: float, hover: float, numbers: dict[str, float]) -> Check:
@@ -1023,9 +1033,9 @@ def _judge_scale(vehicle: Vehicle, scale: float, hover: float, numbers: dict[str
     if thrust is None or not all(inertias):
         (least, most), command = INERTIA_SHARE, vehicle.command
         size = float(np.mean(vehicle.initial[2:4])) * hover / max(scale, 1e-300) / (vehicle.mass * vehicle.arm**2)
-        # A lag of motors, and noise of the torque, make it too large.
+        # A lag of motors, and noise of the torque, make it too large; a loop that answers noise of the gyro, too small.
         large = command.sampling == "instant" and size * numbers["explained"] > most
-        if command.kind == "rotor_speed" and (large or 0.0 < size < least):
+        if command.kind == "rotor_speed" and (large or 0.0 < size < least * numbers["explained"]):
             return Check(
                 "geometry", CheckResult.WARNING,
                 f"weight, arm and motion make the inertia about x and y {size:.2g} times mass times arm squared, which "
