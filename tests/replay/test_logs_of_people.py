@@ -535,6 +535,21 @@ def test_rounded_quaternions_are_named_as_such(flight: Recording, digits: float,
     assert "attitude_steps" not in names(flight)
 
 
+@pytest.mark.parametrize(("degrees", "axes"), [(10.0, "roll pitch yaw"), (5.0, "roll pitch yaw"), (5.0, "yaw")])
+@pytest.mark.parametrize("profile", ["excited", "hover"])
+def test_angles_in_steps_are_named_and_nothing_else_is_told_of_them(degrees: float, axes: str, profile: str) -> None:
+    """Turns in steps of 10 deg ended in a mathematical error; those of a heading alone were none; a hover was refused."""
+    flown = quadid.simulate(seconds=40.0, seed=3, profile=profile).flight.recording
+    angles, step = euler(flown.channels["attitude"].values), np.radians(degrees)
+    which = [k for k, axis in enumerate(("roll", "pitch", "yaw")) if axis in axes]
+    angles[:, which] = step * np.round(angles[:, which] / step)
+    found = inspect(with_channel(flown, "attitude", from_euler(angles)), Vehicle.shipped("pelican"))
+    told = {c.name: c.verdict for c in found.checks}
+    assert told["gyro_attitude"] in (CheckResult.UNKNOWN, CheckResult.OK)
+    assert profile == "hover" or told["attitude_steps"] is CheckResult.WARNING
+    assert CheckResult.ERROR not in told.values()
+
+
 def test_a_second_of_flight_is_not_usable_as_identify_refuses_it(flight: Recording, tmp_path: Path) -> None:
     write_csv(tmp_path / "flight.csv", flight)
     found = quadid.inspect(tmp_path / "flight.csv", vehicle="pelican", start=5.0, stop=6.5).found

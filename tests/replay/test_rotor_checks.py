@@ -263,3 +263,34 @@ def test_the_gyro_filter_is_not_asked_for_without_torque_or_motion(still: str) -
         assert (
             gyro_filter_check(replace(recording, channels={**recording.channels, still: held}), vehicle, spans) is None
         )
+
+
+@pytest.mark.parametrize("late", [0.03, 0.06])
+def test_an_order_that_is_wrong_beside_a_signal_that_is_late_is_named_with_it(
+    flight: tuple[Recording, Vehicle], late: float
+) -> None:
+    """No order explained the motion at one lag, the log was usable, and once the arm was asked for."""
+    recording, vehicle = flight
+    speed = recording.channels["rotor_speed"]
+    values = np.column_stack([np.interp(speed.t - late, speed.t, x) for x in speed.values.T])
+    other = vehicle.model_copy(update={"rotors": tuple(vehicle.rotors[k] for k in (1, 0, 2, 3))})
+    moved = replace(recording, channels={**recording.channels, "rotor_speed": replace(speed, values=values)})
+    found = {c.name: c for c in inspect(moved, other).checks}
+    assert "order 2, 1, 3, 4" in found["motor_order"].message
+    assert "turn" not in found["motor_order"].fix
+    assert found["rotor_timing"].numbers["lag_s"] == pytest.approx(0.01 - late, abs=0.005)
+    assert "motor_order" not in {c.name for c in inspect(moved, vehicle).checks if c.verdict is CheckResult.ERROR}
+
+
+@pytest.mark.parametrize(
+    ("name", "profile"), [("pelican_x", "hover"), ("hexacopter", "gentle"), ("hexacopter", "hover")]
+)
+def test_a_loop_that_answers_the_noise_of_its_gyro_asks_for_no_arm_and_no_order(name: str, profile: str) -> None:
+    """Inertias seemed half as large, for the motion is mostly noise that the torque follows."""
+    vehicle = Vehicle.shipped(name)
+    recording = simulate(name, seconds=40.0, seed=3, profile=profile, rate=100.0).flight.recording
+    assert [c.name for c in inspect(recording, vehicle).checks if c.off] == []
+    gyro = recording.channels["gyro"]
+    slow = np.asarray(lfilter(*butter(2, 4.0, fs=1.0 / sample_period(gyro.t)), gyro.values, axis=0))
+    filtered = replace(recording, channels={**recording.channels, "gyro": replace(gyro, values=slow)})
+    assert [c.message for c in inspect(filtered, vehicle).checks if c.verdict is CheckResult.ERROR] == []
