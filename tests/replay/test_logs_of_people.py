@@ -538,7 +538,7 @@ def test_rounded_quaternions_are_named_as_such(flight: Recording, digits: float,
 @pytest.mark.parametrize(("degrees", "axes"), [(10.0, "roll pitch yaw"), (5.0, "roll pitch yaw"), (5.0, "yaw")])
 @pytest.mark.parametrize("profile", ["excited", "hover"])
 def test_angles_in_steps_are_named_and_nothing_else_is_told_of_them(degrees: float, axes: str, profile: str) -> None:
-    """Turns in steps of 10 deg ended in a mathematical error; those of a heading alone were none; a hover was refused."""
+    """Steps of 10 deg ended in a mathematical error, those of a heading alone were none, and a hover was refused."""
     flown = quadid.simulate(seconds=40.0, seed=3, profile=profile).flight.recording
     angles, step = euler(flown.channels["attitude"].values), np.radians(degrees)
     which = [k for k, axis in enumerate(("roll", "pitch", "yaw")) if axis in axes]
