@@ -647,7 +647,7 @@ def velocity_check(recording: Recording) -> Check:
         return level
     # Vertical changes that are clearly the reverse of what the force makes.
     up, down = gained[:, 2], derived[:, 2]
-    if not (min(np.std(up), np.std(down)) > 0.2 and np.corrcoef(up, down)[0, 1] < -0.7):
+    if not (min(np.std(up), np.std(down)) > 0.05 and np.corrcoef(up, down)[0, 1] < -0.8):
         return level
     return Check(
         "velocity_attitude", CheckResult.ERROR,
@@ -765,7 +765,7 @@ def position_check(recording: Recording) -> Check | None:
     for where, axes in (("horizontally", (0, 1)), ("vertically", (2,))):
         p, v = (x[:, axes] - x[:, axes].mean(axis=0) for x in (moved, flown))
         correlation = float(np.sum(p * v) / np.sqrt(max(np.sum(p * p) * np.sum(v * v), 1e-300)))
-        if where == "vertically" and np.max(np.std(p, axis=0)) > LEAST_MOTION and correlation < -0.8:
+        if where == "vertically" and np.max(np.std(p, axis=0)) > 0.2 * LEAST_MOTION and correlation < -0.8:
             return Check(
                 "position_velocity", CheckResult.ERROR,
                 f"position rises where velocity falls (correlation {correlation:.2f}): one of them points up",

@@ -550,6 +550,16 @@ def test_angles_in_steps_are_named_and_nothing_else_is_told_of_them(degrees: flo
     assert CheckResult.ERROR not in told.values()
 
 
+@pytest.mark.parametrize("log", ["iris/sideways.csv", "brushed/jana00.csv"])
+def test_a_velocity_upwards_is_named_in_flights_that_hardly_climb(data_dir: Path, log: str) -> None:
+    """A tenth of a m/s^2 went for too little motion."""
+    recording = open_log(data_dir / log)
+    vehicle = Vehicle.from_yaml((data_dir / log).with_name("vehicle.yaml").read_text(encoding="utf-8"))
+    assert verdict(recording, "velocity_attitude", vehicle).verdict is not CheckResult.ERROR
+    upwards = with_channel(recording, "velocity", recording.channels["velocity"].values * [1.0, 1.0, -1.0])
+    assert "points up" in verdict(upwards, "velocity_attitude", vehicle).message
+
+
 def test_a_second_of_flight_is_not_usable_as_identify_refuses_it(flight: Recording, tmp_path: Path) -> None:
     write_csv(tmp_path / "flight.csv", flight)
     found = quadid.inspect(tmp_path / "flight.csv", vehicle="pelican", start=5.0, stop=6.5).found
