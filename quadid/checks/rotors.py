@@ -160,7 +160,7 @@ def _peak(torque: FloatArray, motion: FloatArray) -> _Peak:
 
 _OCTAVES = 1.0, 1.5, 2.25, 3.4, 5.0, 7.5, 11.0
 """Edges of bands [Hz] in which the motion that torque makes is compared: its size over that of the torque."""
-_FLAT = 0.45
+_FLAT = 0.4
 """Share of a slower band's answer that is left where the gyro was filtered; bodies answer torque alike at each."""
 
 
@@ -739,8 +739,10 @@ def better_description(lagged: Lagged | str, vehicle: Vehicle) -> Other | None:
     if not angle and order == rotors and (min(axes[0], axes[1]) < _SETTLED or not spins):
         return None
     axes = np.append(axes[:2], yaw)
-    if _gain(axes) <= _gain(np.append(own[3][:2], _drag_explains(lagged.slow, vehicle))):
-        return None  # with yaw judged by drag alone it is no better
+    # By the same measure, with yaw judged by drag alone, it must be better, too.
+    gained = _gain(axes) - _gain(np.append(own[3][:2], _drag_explains(lagged.slow, vehicle)))
+    if gained <= (least if angle or order != rotors else 0.0):
+        return None
     told, fix = [], []
     if angle:
         degrees = math.degrees(angle)
