@@ -261,8 +261,14 @@ MISTAKES = (
     Mistake("height in place of z", fit(lambda p: p.scaled("z", -1.0)), "points up"),
     Mistake("spins reversed", of(lambda p: p.spins()), "negate the spins"),
     Mistake("rotor speeds 60 ms late", fit(lambda p: p.late("w1 w2 w3 w4", 3)), "lags its effect"),
-    Mistake("gyro 160 ms late", fit(lambda p: p.late("p q r", 8)), "gyro comes 160 ms after the attitude"),
-    Mistake("attitude 160 ms late", fit(lambda p: p.late("qw qx qy qz", 8)), "attitude comes 160 ms after the gyro"),
+    Mistake(
+        "gyro 160 ms late", fit(lambda p: p.late("p q r", 8)), "gyro comes 1(5[789]|6[0123]) ms after the attitude"
+    ),
+    Mistake(
+        "attitude 160 ms late",
+        fit(lambda p: p.late("qw qx qy qz", 8)),
+        "attitude comes 1(5[789]|6[0123]) ms after the gyro",
+    ),
     Mistake("rates of Euler angles as gyro", fit(lambda p: p.euler_rates()), "rates of roll, pitch and yaw"),
     Mistake("one axis of the gyro in degrees", fit(lambda p: p.scaled("r", 57.3)), "about z"),
     Mistake("one axis of the gyro not logged", fit(lambda p: p.scaled("q", 0.0)), "does not turn about y"),
