@@ -80,7 +80,7 @@ reproduce: venv ## the paper's tables and figures, into docs/results
 
 STUDY = OPENBLAS_NUM_THREADS=1 $(BIN)/python -m
 
-.PHONY: findings mpc alarms autopilot peers health health-hours truth filter-error bands cases campaign ablation foreign paper-scale excite optimisers subspace control kernel-speed bench
+.PHONY: findings mpc gains alarms autopilot peers health health-hours truth filter-error bands cases campaign ablation foreign paper-scale excite optimisers subspace control kernel-speed bench
 truth: venv ## errors against their bound, coverage, bias with noise, status (an hour)
 	$(STUDY) quadid_evaluation.studies.truth --out docs/results
 
@@ -112,6 +112,9 @@ autopilot: venv ## ArduCopter's and others' flights through the online session, 
 
 mpc: dev ## a predictive controller with guesses and with the identified file, on a fast circle (two minutes)
 	$(BIN)/python examples/casadi_mpc.py
+
+gains: venv ## proposed gains, flown by each autopilot's own law around the truth, beside their promise (five minutes)
+	$(STUDY) quadid_evaluation.studies.gains --out docs/results
 
 alarms: venv ## false alarms on healthy flights in wind, payloads and weak rotors named (half an hour)
 	$(STUDY) quadid_evaluation.studies.alarms --out docs/results

@@ -262,32 +262,34 @@ def gains(
     fixed = _on_board(autopilot, known, described)
     used = [*_measured(facts), *late, *fixed.values()]
     # Axis by axis: the fastest loop that keeps its margins, slower where that is wanted, in the autopilot's parameters.
-    loops, before, axes, chosen = {}, {}, [], []
+    designed, gain = list[Loops](), dict[str, float]()
+    cutoff, per = fixed["derivative filter"].value, turning / inertia  # angular acceleration of one unit of output
     for k, axis in enumerate(AXES):
         plant = _plant(facts, k, late, fixed)
-        cutoff, names = fixed["derivative filter"].value, autopilot.names[k]
         try:
             best = design(plant, phase_margin, float(most[k]), cutoff, derivative, autopilot.on_error)
             wanted = bandwidth if k < 2 or bandwidth is None else min(bandwidth, float(best.bandwidth()[0]))
             found = best if wanted is None else slowed(best, wanted, phase_margin, derivative)
         except ParameterError as error:
             raise ParameterError(f"{axis}: {error.found}", error.allowed, _remedy(plant, phase_margin)) from error
-        per = turning[k] / inertia[k]  # angular acceleration of one unit of output
-        values = _parameters(found, per, autopilot)
-        loops[axis] = _loops(plant, values, per, autopilot, cutoff)
+        designed.append(best)
+        for name, value in zip(autopilot.names[k], _parameters(found, per[k], autopilot), strict=True):
+            gain[name] = min(gain.get(name, math.inf), value)  # one that axes share is that of the slowest
+    gain[""] = 0.0  # there is no such loop
+    loops, before, axes, chosen = {}, {}, [], dict[str, JsonDict]()
+    for k, (axis, names, best) in enumerate(zip(AXES, autopilot.names, designed, strict=True)):
+        loops[axis] = _loops(best.plant, [gain[name] for name in names], per[k], autopilot, cutoff)
         now = [known.get(name) for name in names]
         if None not in now[:3]:
-            before[axis] = _loops(plant, [v or 0.0 for v in now], per, autopilot, cutoff)
-        held = bool(best.rate.p >= 0.999 * most[k])
-        axes.append(_axis(axis, loops[axis], before.get(axis), best, held))
-        terms = zip(("P", "I", "D", "attitude"), names, values, now, strict=True)
-        chosen += [
-            {"name": n, "axis": axis, "term": term, "value": v, "current": old} for term, n, v, old in terms if n
-        ]
-    chosen = list({g["name"]: g for g in reversed(chosen)}.values())[::-1]  # roll and pitch share one in Betaflight
+            before[axis] = _loops(best.plant, [v or 0.0 for v in now], per[k], autopilot, cutoff)
+        axes.append(_axis(axis, loops[axis], before.get(axis), best, bool(best.rate.p >= 0.999 * most[k])))
+        for term, n, old in zip(("P", "I", "D", "attitude"), names, now, strict=True):
+            if n:
+                chosen.setdefault(n, {"name": n, "axis": axis, "term": term, "value": gain[n], "current": old})
     result = {
         "schema": "quadid.gains/1", "vehicle": described.name, "format": format, "program": autopilot.program,
-        "phase_margin": phase_margin, "bandwidth": bandwidth, "gains": chosen, "axes": axes, "file": None,
+        "phase_margin": phase_margin, "bandwidth": bandwidth, "axes": axes, "file": None,
+        "gains": list(chosen.values()),
         "used": [{"name": u.name, "unit": u.unit, "value": u.value, "ci95": [u.low, u.high], "source": u.source}
                  for u in used],
         "warnings": warnings + [f"{a}: the present gains are unstable" for a, b in before.items() if not b.stable],

@@ -349,7 +349,7 @@ class ChangeDetector:
         if len(rows.t) < 4 or abs(step * len(rows.t) - CHUNK) > 1.5 * step:
             return None
         force = -accel[:, 2]
-        good: BoolArray = np.isfinite(force) & np.isfinite(square).all(axis=1)
+        good: BoolArray = np.isfinite(force) & np.isfinite(square).all(axis=1) & square.any(axis=1)
         rate: BoolArray = np.asarray(np.isfinite(gyro).all(axis=1))
         if np.count_nonzero(good) < 0.7 * len(good) or np.count_nonzero(rate) < 0.7 * len(rate):
             return None

@@ -54,6 +54,8 @@ BEYOND = 2.0
 """An estimate may lie so far outside the bounds, log scale: the step from where it was linearised."""
 NUDGE = 1e-3
 """Difference of a scaled effect of thrust for its derivative."""
+INFLOW = "axial_inflow.k_z"
+"""Thrust lost in a climb, free where velocity is measured: seconds of climb would else make b smaller, and sure."""
 LOOSE = 4
 """Rows of `WindowEstimate.loose`: an answer of the rotors within a step about each axis, and their noise."""
 
@@ -237,7 +239,8 @@ def own_names(vehicle: Vehicle) -> tuple[str, ...]:
     layout = Layout(vehicle)
     initial, neutral = layout.initial(vehicle), layout.neutral()
     stated = {name.split(".")[0] for name, e in layout.entries.items() if initial[e.index] != neutral[e.index]}
-    return (*NOMINAL_NAMES, *TRIMMED, UPRIGHT, *fitted_along(stated))
+    climbing = (INFLOW,) if INFLOW.split(".")[0] not in stated else ()
+    return (*NOMINAL_NAMES, *TRIMMED, UPRIGHT, *fitted_along(stated), *climbing)
 
 
 def thrust_names(vehicle: Vehicle) -> tuple[str, ...]:
@@ -269,7 +272,7 @@ def prior_of(vehicle: Vehicle) -> Prior:
 
 def problem_of(window: Window, vehicle: Vehicle, more: tuple[str, ...] = ()) -> Problem:
     """Likelihood of a window by what is estimated, and `more`."""
-    along = own_names(vehicle)[SIX + len(TRIMMED) + 1 :]
+    along = [n for n in own_names(vehicle)[SIX + len(TRIMMED) + 1 :] if n != INFLOW or window.velocity is not None]
     theta = Layout(vehicle).initial(vehicle)
     return Problem.of([from_window(window, vehicle, air=True)], vehicle, (*along, *more), [window], theta)
 

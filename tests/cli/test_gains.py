@@ -3,32 +3,23 @@
 from __future__ import annotations
 
 import json
-import math
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from quadid_replay.ulog import allocation
-from scipy.signal import butter, lfilter
+from quadid_evaluation.studies.gains import LATE, RATE, bandwidth, margins, step
 
 import quadid
 from quadid.app.export import UnprovenError
 from quadid.errors import LogError, ParameterError
-from quadid.flight import SteppedFlight, TruthParameters
+from quadid.flight import TruthParameters
 from quadid.report.autopilots import AUTOPILOTS
-from quadid.report.programs import export
-from quadid.types import FloatArray
 from quadid.vehicle import Command, ParameterPrior, Vehicle
 from tests.commands import Cli
 
 FULL = 800.0
 TRUTH = TruthParameters.of(Vehicle.shipped("pelican"))
-LATE = {"motor_lag": {"tau": 0.03}, "command_delay": {"delay": 0.006}}
-RATE = {"px4": ("IMU_GYRO_RATEMAX", 400.0), "ardupilot": ("SCHED_LOOP_RATE", 400.0), "betaflight": ("pid_rate", 1000.0)}
-STEP = 0.2
-"""Asked for [rad/s]: small, so that thrust stays linear."""
 
 
 def identified(name: str = "pelican", **more: Any) -> Vehicle:
@@ -40,90 +31,13 @@ def identified(name: str = "pelican", **more: Any) -> Vehicle:
     return vehicle.model_copy(update=more)
 
 
-Mixer = Callable[[FloatArray, float], FloatArray]
-"""From outputs about the axes and the command in hover to motor commands 0..1."""
-
-
-def px4_mixer(vehicle: Vehicle) -> Mixer:
-    """PX4's allocation by what `quadid export` tells it, as the reader of its logs repeats it."""
-    rows = [line.split("\t") for line in export(vehicle, "px4", "x")[".params"].splitlines() if line[:1] == "1"]
-    mix = allocation({"CA_AIRFRAME": 0.0, **{row[2]: float(row[3]) for row in rows}})
-    assert mix is not None
-    return lambda out, hover: mix @ np.array([*out, 0.0, 0.0, -hover])
-
-
-def ardupilot_mixer(vehicle: Vehicle) -> Mixer:
-    """Factors of the motors of a plus, from the places of the rotors; thrust to command by MOT_THST_EXPO 1."""
-    x, y, _ = vehicle.rotor_positions.T / 0.21
-    factors = 0.5 * np.column_stack([-y, x, vehicle.spins])
-
-    def mixed(out: FloatArray, hover: float) -> FloatArray:
-        thrust = ((hover - 0.15) / 0.8) ** 2 + factors @ out
-        return np.asarray(0.15 + 0.8 * np.sqrt(thrust))
-
-    return mixed
-
-
-def betaflight_mixer(vehicle: Vehicle) -> Mixer:
-    """QUADP, above the idle of 5.5 %."""
-    x, y, _ = np.sign(np.round(vehicle.rotor_positions.T, 6))
-    return lambda out, hover: hover + 0.945 * np.column_stack([-y, x, vehicle.spins]) @ out
-
-
-MIXERS = {"px4": px4_mixer, "ardupilot": ardupilot_mixer, "betaflight": betaflight_mixer}
-
-
-def flown(
-    found: Any, vehicle: Vehicle, form: str, axis: int, truth: TruthParameters = TRUTH,
-    effects: dict[str, dict[str, float]] = LATE, seconds: float = 1.5,
-) -> tuple[float, FloatArray]:  # fmt: skip
-    """Rate of one axis after a step of what is asked for, over it, at the controller's rate; its period first [s]."""
-    hz, autopilot = RATE[form][1], AUTOPILOTS[form]
-    p, i, d = (np.asarray([found.values[names[k]] for names in autopilot.names]) for k in range(3))
-    if form == "betaflight":  # sums of thousandths, errors in degrees
-        p, i, d = (np.degrees(k * g) / 1000.0 for k, g in ((0.032029, p), (0.244381, i), (0.000529, d)))
-    flight, mixed = SteppedFlight(vehicle, truth, effects=effects), MIXERS[form](vehicle)
-    hover = float(flight.rotor_speed[0]) / FULL
-    filters = [butter(2, autopilot.gyro[1], fs=hz), butter(1, autopilot.derivative[1], fs=hz)]
-    if form == "ardupilot":
-        filters.append(butter(1, autopilot.yaw_error[1], fs=hz))
-    memory = [np.zeros((len(f[0]) - 1, 3)) for f in filters]
-    asked: FloatArray = STEP * np.eye(3)[axis]
-    integral, last, out = np.zeros(3), np.zeros(3), []
-
-    def passed(k: int, values: FloatArray) -> FloatArray:
-        result, memory[k] = lfilter(*filters[k], values[None], axis=0, zi=memory[k])
-        return np.asarray(result[0])
-
-    for _ in range(round(seconds * hz)):
-        out.append(flight.rate[axis] / STEP)
-        gyro = passed(0, flight.rate)
-        error = asked - gyro
-        if form == "ardupilot":
-            error[2] = passed(2, error)[2]
-        seen = error if autopilot.on_error else -gyro
-        change, last = (seen - last) * hz, seen
-        integral = integral + error / hz
-        demand = p * error + i * integral + d * passed(1, change)
-        flight.step(FULL * np.clip(mixed(demand, hover), 0.0, 1.0), 1.0 / hz)
-    return 1.0 / hz, np.array(out)
-
-
-def bandwidth(period: float, response: FloatArray) -> float:
-    """Frequency at which the response has fallen by 3 dB for good [Hz], from that to a step."""
-    hz = np.arange(0.2, 12.0, 0.01)
-    t = period * (np.arange(len(response) - 1) + 0.5)
-    size = np.abs(np.exp(-2j * np.pi * np.outer(hz, t)) @ np.diff(response))
-    return float(hz[np.flatnonzero(size >= math.sqrt(0.5))[-1]])
-
-
 @pytest.mark.parametrize("form", AUTOPILOTS)
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_the_loop_around_the_truth_is_as_promised(form: str, axis: int) -> None:
     vehicle = identified()
     found = quadid.gains(vehicle, form, current={RATE[form][0]: RATE[form][1]})
     promised = found.result["axes"][axis]["rate"]
-    period, response = flown(found, vehicle, form, axis, seconds=2.5)
+    period, response = step(found, vehicle, TRUTH, LATE, axis)
     assert bandwidth(period, response) == pytest.approx(promised["bandwidth"], rel=0.06)
     assert response.max() - 1.0 == pytest.approx(promised["overshoot"], abs=0.04)
     t, steps = found.loops[found.result["axes"][axis]["axis"]].step()
@@ -140,17 +54,31 @@ def test_margins_hold_over_the_intervals_and_end_where_they_are_said_to(form: st
     assert promised["phase_margin_least"] >= 54.0
     worst = TruthParameters(**{**TRUTH.as_dict(), "J_xx": used["J_xx"][0], "b": used["b"][1]})
     late = {"motor_lag": {"tau": used["motor lag"][1]}, "command_delay": {"delay": used["command delay"][1]}}
-    _, response = flown(found, vehicle, form, 0, worst, late)
+    _, response = step(found, vehicle, worst, late, 0, seconds=1.5)
     assert response.max() - 1.0 <= promised["overshoot_most"] + 0.05
     # Delay that takes the phase margin at the crossover: a little less is stable, a little more is not.
     loops = found.loops["roll"].margins()
     spare = float(loops.phase[0] / 360.0 / loops.crossover[0])
     for share, grows in ((0.85, False), (1.15, True)):
         more = {**LATE, "command_delay": {"delay": LATE["command_delay"]["delay"] + share * spare}}
-        _, response = flown(found, vehicle, form, 0, effects=more, seconds=3.0)
+        _, response = step(found, vehicle, TRUTH, more, 0, seconds=3.0)
         swing = np.abs(response - 1.0)
         third = len(swing) // 3
         assert (swing[-third:].max() > swing[third : 2 * third].max()) == grows, share
+
+
+@pytest.mark.parametrize("form", AUTOPILOTS)
+@pytest.mark.parametrize("loop", ["rate", "attitude"])
+def test_open_loops_that_tones_show_have_the_margins_of_the_promise(form: str, loop: str) -> None:
+    vehicle = identified()
+    found = quadid.gains(vehicle, form, current={RATE[form][0]: RATE[form][1]})
+    flew = margins(found, vehicle, TRUTH, LATE, loop == "attitude")
+    for axis, (phase, gain) in zip(found.result["axes"], flew, strict=True):
+        if form == "betaflight" and (axis["axis"], loop) == ("yaw", "attitude"):
+            assert axis[loop] is None, "Betaflight holds no heading"
+            continue
+        assert phase == pytest.approx(axis[loop]["phase_margin"], abs=3.0)
+        assert gain == pytest.approx(axis[loop]["gain_margin"], abs=1.5)
 
 
 def test_a_wanted_bandwidth_is_kept_or_refused_with_the_largest() -> None:
