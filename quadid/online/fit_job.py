@@ -451,6 +451,7 @@ def warm_up(vehicle: Vehicle) -> None:
         request = FitRequest(0, vehicle, (window,), *span, theta, z, None, 0, (span,))
         try:
             z, noise = _maximum(request)
-            _estimates(request, z, noise)
+            for velocity in (None, np.zeros((rows, 3))):
+                _estimates(replace(request, windows=(replace(window, velocity=velocity),)), z, noise)
         except np.linalg.LinAlgError:
             pass

@@ -46,12 +46,12 @@ from quadid_node.inputs import (
 )
 from quadid_node.publish import NO_SUBSCRIPTION_EVENTS, Bond, GraphMonitor, Offer, Publishers, bond_of
 from quadid_node.recording import WRITTEN, Beginning, Recorder
-from quadid_node.service import ROUND_SECONDS, STEP_SECONDS, WORK_SECONDS, Scheduler, Service
+from quadid_node.service import PATIENCE, ROUND_SECONDS, STEP_SECONDS, WORK_SECONDS, Scheduler, Service
 from quadid_node.settings import PARAMETERS, READ_BACK, as_declared, check_change, descriptor, read_settings, vehicle_id
 from quadid_node.zenoh import ZenohLink
 
-CATCHING_UP, BACKLOG = 10.0, 2.0
-"""A step lasts longer in proportion, up to so many times, when there is a backlog of more than this much data [s]."""
+CATCHING_UP = 10.0
+"""A step lasts longer, up to so many times, in proportion to a backlog beyond the service's patience."""
 REPORT_SECONDS = 1.0
 """Status and health are published this often [s]."""
 TOLD_SECONDS = 5.0
@@ -329,7 +329,7 @@ class IdentifyNode(PollingNode, LifecycleNode):
 
     def _step(self) -> None:
         """Goes on with the round, for longer when the session is far behind its data."""
-        behind = self._service.session.backlog / BACKLOG if self._service is not None else 1.0
+        behind = self._service.session.backlog / PATIENCE if self._service is not None else 1.0
         self._scheduler.step(WORK_SECONDS * min(max(behind, 1.0), CATCHING_UP))
 
     def _round(self) -> Iterator[None]:
