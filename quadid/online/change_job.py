@@ -34,6 +34,7 @@ from quadid.online.changes import (
     AFTER,
     BASELINE,
     CHUNK,
+    LAG,
     LEAST,
     ChangeDetector,
     ChangePoint,
@@ -69,8 +70,6 @@ _MASSES = 0.02 * np.exp(0.3 * np.arange(10))
 """Changes of mass that are tried, up and down (logarithms), each with half the step between them as deviation."""
 _LOADED = 0.05
 """Prior standard deviation of the change of each inertia that comes with a mass."""
-_LAG = 0.05
-"""Rotors may follow what is logged of them this much later [s]."""
 _FEWEST = 10
 """Half seconds of flight before a change without which nothing is known of its random forces."""
 _EPS = 1e-6
@@ -199,7 +198,7 @@ def _series(request: ChangeRequest, chunks: Sequence[Chunk], b: float) -> list[_
     out = [
         _Series(
             np.array([c.thrust for c in chunks]), np.column_stack([[c.state for c in chunks], lagging]),
-            np.append(state.typical, _LAG), LEAST / 5.0, np.array([np.pad(c.astray, ((0, 0), (0, 1))) for c in chunks]),
+            np.append(state.typical, LAG), LEAST / 5.0, np.array([np.pad(c.astray, ((0, 0), (0, 1))) for c in chunks]),
         )
     ]  # fmt: skip
     j, scale = request.theta[2:5], _per_square(request, b)
@@ -211,7 +210,7 @@ def _series(request: ChangeRequest, chunks: Sequence[Chunk], b: float) -> list[_
         moment, half = square @ arms, 0.25 * float(np.abs(arms).sum() * square.mean())
         y = np.array([c.acceleration[axis] for c in chunks]) + couple[axis] * turning[:, axis] - moment
         damping, high = state.typical_moment
-        beside, typical = [moment, growth @ arms, rate[:, axis], turning[:, axis]], [doubt[axis], _LAG, damping, 1.0]
+        beside, typical = [moment, growth @ arms, rate[:, axis], turning[:, axis]], [doubt[axis], LAG, damping, 1.0]
         if axis < 2:
             beside, typical = [*beside, np.array([c.across[axis] for c in chunks]) / j[axis]], [*typical, high]
         else:  # the rotors' own angular momentum

@@ -47,6 +47,8 @@ AFTER = 3
 """Chunks after that in which a change happens before it is believed."""
 SIGNIFICANT = 5.0
 """Standard errors of a change."""
+LAG = 0.05
+"""Rotors may follow what is logged of them this much later [s]."""
 LEAST = 0.03
 """Smallest step worth a word: share of thrust; roll and pitch moment over what losing half the thrust would give."""
 ASTRAY = 0.5
@@ -408,13 +410,14 @@ class ChangeDetector:
         couple = float(np.clip((inertia[2] - inertia[1], inertia[0] - inertia[2])[axis] / j, -1.0, 1.0))
         half = float(np.abs(self._arms[:, axis]).sum()) * 0.25 * b * self._vehicle.hover_speed(b) ** 2 / j
         chunks = self._chunks
-        moment = b / j * np.array([c.square for c in chunks]) @ self._arms[:, axis]
+        arms = b / j * self._arms[:, axis]
+        moment, later = np.array([c.square for c in chunks]) @ arms, np.array([c.growth for c in chunks]) @ arms
         y = np.array([c.acceleration[axis] + couple * c.gyroscopic[axis] for c in chunks]) - moment
         beside = [(c.rate[axis], c.across[axis] / j, c.gyroscopic[axis]) for c in chunks]
-        x = np.column_stack([moment, beside])
-        astray = np.zeros((len(chunks), 1, 4))
-        astray[:, 0, 2] = [c.sigma / j / half for c in chunks]
-        return y / half, x / half, np.array([doubt, *self._state.typical_moment, 1.0]), astray
+        x = np.column_stack([moment, later, beside])
+        astray = np.zeros((len(chunks), 1, 5))
+        astray[:, 0, 3] = [c.sigma / j / half for c in chunks]
+        return y / half, x / half, np.array([doubt, LAG, *self._state.typical_moment, 1.0]), astray
 
 
 def _slope(t: FloatArray, values: FloatArray) -> FloatArray:

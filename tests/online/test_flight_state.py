@@ -9,9 +9,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from quadid_evaluation.studies.alarms import watched
 from quadid_node.recording import stream
 from quadid_replay import open_log
 
+from quadid.flight import Segment, draw_truth, fly
 from quadid.online.change_job import ChangeWatch
 from quadid.online.changes import CHUNK, ChangeDetector, ChangePoint, FlightState, Velocity, learned, step_beside
 from quadid.online.fusion import Estimator
@@ -247,3 +249,26 @@ def test_one_odd_value_is_no_step() -> None:
         force = gusts(90, 3)
         force[place] += 1.0
         assert step_beside(force, np.zeros((90, 0)), np.zeros(0), 80, 0.03)[0] < 5.0
+
+
+@pytest.mark.parametrize("name", ["hummingbird", "pelican_x", "pelican"])
+def test_first_sticks_after_a_hover_are_no_step_of_a_moment(name: str) -> None:
+    """Rotors follow commands 35 ms late, which forty seconds of calm hover did not show."""
+    vehicle = Vehicle.shipped(name)
+    sticks = [Segment("roll", "doublet", 41.0, 1.5, 0.35), Segment("pitch", "doublet", 43.0, 1.5, 0.35)]
+    effects = {
+        "motor_lag": {"tau": 0.035}, "rotor_drag": {"k_x": 0.3, "k_y": 0.2}, "axial_inflow": {"k_z": 0.3},
+    }  # fmt: skip
+    flight = fly(vehicle, draw_truth(vehicle, 7001), 48.0, 7001, "scripted", segments=sticks, effects=effects)
+    assert list(watched(vehicle, flight, 7001)) == []
+
+
+def test_a_row_of_stopped_rotors_is_left_out() -> None:
+    vehicle, rows = Vehicle.shipped("pelican"), 25
+    speed = np.full((rows, 4), vehicle.hover_speed())
+    speed[7] = 0.0
+    columns = {"rotor_speed": speed, "gyro": np.zeros((rows, 3)), "accel": np.tile([0.0, 0.0, -GRAVITY], (rows, 1))}
+    with np.errstate(divide="raise", invalid="raise"):
+        chunk = ChangeDetector(vehicle).chunk(Rows(np.arange(rows) / RATE, columns, "held", ""))
+    assert chunk is not None
+    assert np.isfinite([chunk.thrust, chunk.shared, chunk.power]).all()

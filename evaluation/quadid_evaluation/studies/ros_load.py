@@ -247,7 +247,8 @@ def run(source: str, log: Path, seconds: float, environment: dict[str, str]) -> 
     executor.shutdown()
     ear.destroy_node()
     context.shutdown()
-    errors = [[abs(v / TABLE_2[n] - 1.0) for n, v in zip(m.names, m.values, strict=True)] for _, m in sets]
+    told = [dict(zip(m.names, m.values, strict=True)) for _, m in sets]
+    errors = [[abs(values[n] / TABLE_2[n] - 1.0) for n in NOMINAL_NAMES] for values in told]
     return Seen(
         sets[0][0] - begin if sets else math.nan, len(sets),
         np.max(errors, axis=0) if errors else np.full(len(NOMINAL_NAMES), np.nan),
