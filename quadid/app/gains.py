@@ -199,30 +199,18 @@ def step_figure(name: str, angle: bool, now: Loops, before: Loops | None) -> Jso
 
 def gains(
     vehicle: Annotated[Described, Typed(str, VEHICLE, ..., load_vehicle)],
-    format: Annotated[str, typer.Option("--format", metavar="F", help=f"{', '.join(AUTOPILOTS)}.")] = "px4",
+    format: Annotated[str, typer.Option("--format", metavar="F")] = "px4",
     *,
-    bandwidth: Annotated[
-        float | None,
-        typer.Option("--bandwidth", metavar="HZ", help="Of roll and pitch rate; default the largest possible."),
-    ] = None,
-    phase_margin: Annotated[
-        float, typer.Option("--phase-margin", metavar="DEG", help="Least one of the rate loops, over the intervals.")
-    ] = PHASE_MARGIN,
-    derivative: Annotated[bool, typer.Option("--derivative/--no-derivative", help="Use the D term.")] = True,
-    motor_lag: Annotated[
-        float | None, typer.Option("--motor-lag", metavar="S", help="Where the vehicle file has none.")
-    ] = None,
-    delay: Annotated[
-        float | None, typer.Option("--delay", metavar="S", help="From command to rotor, where the file has none.")
-    ] = None,
+    bandwidth: Annotated[float | None, typer.Option("--bandwidth", metavar="HZ")] = None,
+    phase_margin: Annotated[float, typer.Option("--phase-margin", metavar="DEG")] = PHASE_MARGIN,
+    derivative: Annotated[bool, typer.Option("--derivative/--no-derivative")] = True,
+    motor_lag: Annotated[float | None, typer.Option("--motor-lag", metavar="S")] = None,
+    delay: Annotated[float | None, typer.Option("--delay", metavar="S")] = None,
     current: Annotated[
         str | Path | Mapping[str, float] | None,
-        Typed(
-            Path | None,
-            typer.Option("--from", metavar="LOG|PARAMS", help="Filters, loop rate and present gains of the autopilot."),
-        ),
+        Typed(Path | None, typer.Option("--from", metavar="LOG|PARAMS")),
     ] = None,
-    anyway: Annotated[bool, typer.Option("--anyway", help="Take guesses and unproven values, too.")] = False,
+    anyway: Annotated[bool, typer.Option("--anyway")] = False,
 ) -> Gains:
     """Proposes rate and attitude gains from the identified vehicle; nothing is sent to a vehicle.
 
@@ -230,12 +218,12 @@ def gains(
 
     Args:
         vehicle: a fitted file, a shipped name or a `Vehicle`; with `command.max_speed`.
-        format: px4, ardupilot or betaflight: in whose parameters.
+        format: whose parameters: px4, ardupilot or betaflight.
         bandwidth: wanted of roll and pitch rate [Hz], at -3 dB; default the largest that keeps the margin.
         phase_margin: least one of the rate loops [deg], 20 to 80.
         derivative: use the D term, which takes motor lag back.
         motor_lag: time constant [s] where the file has none, because the log showed no commands.
-        delay: from command to rotor [s], likewise.
+        delay: time from command to rotor [s] where the file has none.
         current: log, parameter file or parameters of the autopilot: its filters and rates, and its gains to compare.
         anyway: take guesses of the file as if they were identified.
 
