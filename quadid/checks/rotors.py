@@ -856,8 +856,6 @@ def _spins(lagged: Lagged, vehicle: Vehicle) -> tuple[list[tuple[int, ...]], flo
     """
     count = len(vehicle.rotors)
     turned = [which for size in (0, 1, 2, count) for which in combinations(range(count), size)]
-    if len(lagged.slow[0]) < 100:
-        return [], 0.0
     found = np.array([_drag_explains(lagged.slow, _spun(vehicle, which)) for which in turned])
     wrong = np.array([len(which) for which in turned])
     # Without turning on purpose, what yaw follows is a matter of chance.
@@ -877,7 +875,7 @@ def _tilted_pairs(lagged: Lagged, vehicle: Vehicle) -> list[tuple[int, ...]]:
     Torques of such a pair add up to roll and pitch, which `_spins` takes out.
     """
     pairs = list(combinations(range(len(vehicle.rotors)), 2))
-    if len(vehicle.rotors) <= 4 or len(lagged.slow[0]) < 100:
+    if len(vehicle.rotors) <= 4:
         return []
     found = [_drag_explains(lagged.slow, _spun(vehicle, pair), alone=False) for pair in pairs]
     own = [_drag_explains(lagged.slow, vehicle, alone) for alone in (False, True)]
@@ -891,13 +889,13 @@ def _listed(rotors: Sequence[tuple[int, ...]]) -> str:
 
 
 def _drag_explains(slow: Rows, vehicle: Vehicle, alone: bool = True) -> float:
-    """Correlation of yaw acceleration with the drag of the rotors; 0 where all turn the same way.
+    """Correlation of yaw acceleration with the drag of the rotors; 0 where all turn the same way, or little is flown.
 
     What follows their spin-up has no part in it: a loop against disturbances makes that look reversed.  Nor, `alone`,
     has what follows roll and pitch: a tilted gyro makes it.
     """
     squares, motion, spun = slow
-    if len(set(vehicle.spins)) < 2:
+    if len(squares) < 100 or len(set(vehicle.spins)) < 2:
         return 0.0
     both = np.column_stack([motion[:, 2], squares @ vehicle.torque_arms[:, 2]])
     others = np.linalg.qr(np.column_stack([*motion[:, : 2 * alone].T, spun @ vehicle.spins]))[0]
