@@ -16,9 +16,12 @@ import numpy as np
 from quadid.data.window import Window
 from quadid.estimate import kalman as k
 from quadid.estimate.kalman import Beyond
-from quadid.model.layout import ATT_DELAY, IMU_PERIOD, Layout
+from quadid.model.layout import AHRS_K, ATT_DELAY, IMU_PERIOD, Layout
 from quadid.model.rollout import Rollout, Segments
-from quadid.rotation import turn
+from quadid.model.sensor_kernel import tilt_errors
+from quadid.model.simd import LANES
+from quadid.model.work_array import N_ROWS
+from quadid.rotation import product, turn
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 
@@ -62,6 +65,8 @@ class WholeModel:
         plain, motion = self._models(thetas)
         # 1. One step of the motion from every mean, beside one without what the filter has not.
         late = _SETTLED * max(thetas[:, IMU_PERIOD].max(), 0.0) + max(thetas[:, ATT_DELAY].max(), 0.0)
+        pull, thetas = thetas[:, AHRS_K], thetas.copy()
+        thetas[:, AHRS_K] = 0.0
         sensed = not np.array_equal(thetas, motion)
         own, moved, *read = self._rolled([plain, motion, *([thetas] if sensed and late == 0.0 else [])], means, 1)
         out, step = np.zeros((len(thetas), len(means), 9 + k.M)), _step(own, moved)
@@ -74,6 +79,25 @@ class WholeModel:
             out[:, lead:-1, 9:12] = sensors[..., :3] - true[..., :3]
             out[:, lead:-1, 12:15] = turn(_attitude(true), _attitude(sensors))
             out[:, lead:-1, 15:21] += sensors[..., 6:12] - true[..., 6:12]
+        # 3. The attitude filter remembers a whole flight.
+        if pull.any():
+            out[:, 1:-1, 12:15] += self._pulled(pull, means, moved[0, :, 6:9])
+        return out
+
+    def _pulled(self, gain: FloatArray, means: FloatArray, force: FloatArray) -> FloatArray:
+        """Rotation vectors by which an AHRS of each gain (m,) [1/s] is off in body axes, shape (m, n - 2, 3).
+
+        Args:
+            gain: of the accelerometer in the attitude filter [1/s].
+            means: filtered means, shape (n, N_MEAN).
+            force: mean specific force over the step to each of the samples in between [m/s^2], shape (n - 2, 3).
+        """
+        attitude, out = np.ascontiguousarray(means[:-1, :4]), np.zeros((len(gain), len(means) - 2, 3))
+        for first in range(0, len(gain), LANES):
+            some = gain[first : first + LANES]
+            error, work = np.zeros((LANES, len(attitude), 4)), np.zeros(N_ROWS * LANES)
+            tilt_errors(np.resize(some, LANES), self._window.dt, attitude, np.ascontiguousarray(force), work, error)
+            out[first : first + LANES] = turn(attitude, product(error, attitude))[: len(some), 1:]
         return out
 
     def along(self, theta: FloatArray, means: FloatArray) -> Beyond:

@@ -172,6 +172,35 @@ def step_tilt_error(s: FloatArray) -> None:
 
 
 @nb.njit(**jit)
+def tilt_errors(
+    gain: FloatArray, dt: float, attitude: FloatArray, force: FloatArray, s: FloatArray, out: FloatArray
+) -> None:
+    """Follows the AHRS tilt error along a whole flight.
+
+    Args:
+        gain: k of each lane [1/s], shape (LANES,).
+        dt: step [s].
+        attitude: unit quaternions, body to world, shape (n, 4).
+        force: mean specific force over the step from each sample to the next [m/s^2], shape (n - 1, 3).
+        s: work array of zeros, shape (N_ROWS * LANES,).
+        out: tilt errors, quaternions in world axes, shape (LANES, n, 4); none at the begin.
+    """
+    for lane in range(LANES):
+        s[C_AHRS + lane], s[E_QW + lane] = -math.expm1(-dt * gain[lane]), 1.0
+        out[lane, 0, 0] = 1.0
+    for i in range(len(force)):
+        for lane in range(LANES):
+            for c in range(4):
+                s[S_QW + c * LANES + lane], s[X_QW + c * LANES + lane] = attitude[i, c], attitude[i + 1, c]
+            for c in range(3):
+                s[F1_X + c * LANES + lane] = s[F2_X + c * LANES + lane] = force[i, c]
+        step_tilt_error(s)
+        for lane in range(LANES):
+            for c in range(4):
+                s[E_QW + c * LANES + lane] = out[lane, i + 1, c] = s[N_QW + c * LANES + lane]
+
+
+@nb.njit(**jit)
 def tilt_attitude(s: FloatArray) -> None:
     """Turns the attitude that the AHRS reports by its tilt error, and takes up the error of the next sample."""
     lane_kernel()
