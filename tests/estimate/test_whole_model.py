@@ -50,6 +50,7 @@ def simulated(window: Window, vehicle: Vehicle, thetas: np.ndarray) -> np.ndarra
         sampling=window.sampling, rotor_slope=window.rotor_slope, log_span=window.log_span,
     )  # fmt: skip
     assert window.attitude is not None
+    assert window.gyro is not None
     start = np.concatenate([window.attitude[0], window.gyro[0], np.zeros(6)])
     rows = Segments(100, 1, np.array([1]))
     lanes, _ = Rollout(blank, vehicle).roll(rows, thetas, start[None], None, n_pre=1)
