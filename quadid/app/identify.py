@@ -235,7 +235,7 @@ def identify(
     seed: Seed = 1, free: Free = (), fix: Fix = (), bounds: Bounds = None, priors: Priors = None,
     effects: KnownEffects = None, advance: Advance = silent,
 ) -> Identified:  # fmt: skip
-    """Fits b, d, J_xx, J_yy, J_zz and J_r to flight logs; says how well each is known, and how well they predict.
+    """Fits b, d, J_xx, J_yy, J_zz and J_r to flight logs; states how well each is known, and how well they predict.
 
     Args:
         logs: a log or several, as paths or from `load`.

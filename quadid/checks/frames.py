@@ -43,7 +43,7 @@ own filter at 20 Hz makes 12 ms, more than the third an error."""
 _BANDS = np.geomspace(0.4, 23.0, 11)
 """Edges of bands of frequency [Hz] in which they are compared."""
 _SURE = 0.8
-"""Coherence of a band that tells of time; less is motion beside errors of the attitude that have a memory."""
+"""Least coherence of a band that shows a delay; less is motion beside errors of the attitude that have a memory."""
 _SMOOTHED = 0.8
 """Share that a smoothed gyro reads at most, somewhere, of what it reads of slow turning."""
 _TILT, _PARTS = np.radians(4.0), 5
@@ -344,9 +344,8 @@ def _turned(rows: tuple[FloatArray, ...]) -> Check | None:
     m, error = turning(*rows), np.linalg.norm(np.std(parts, axis=0)) / np.sqrt(_PARTS)
     angles = angles_of(m)
     size = float(np.linalg.norm(angles))
-    if (
-        not max(_TILT, _PARTS * float(error)) <= size < 0.5 * np.pi
-    ):  # where each axis goes with its own, noise turns more
+    # Where each axis goes with its own, noise turns more.
+    if not max(_TILT, _PARTS * float(error)) <= size < 0.5 * np.pi:
         return None
     # What an axis reads of the others' acceleration is no answer to its torque.
     read = np.diff(rows[0], axis=0)
@@ -493,21 +492,22 @@ def _filtered(found: Response | None, known: Mapping[str, Mapping[str, float]]) 
     sure = _LATE < abs(late) - 3.0 * found.sigma < _TOO_LATE
     if not (smoothed or sure):
         return None
-    which = ("attitude", "gyro") if late < 0.0 else ("gyro", "attitude")
-    told = []
+    later, sooner = ("attitude", "gyro") if late < 0.0 else ("gyro", "attitude")
+    notes = []
     if sure:
-        told.append(f"{which[0]} comes {1e3 * abs(late):.0f} ms after the {which[1]}")
         # A second-order Butterworth filter makes slow motion late by 1 / (sqrt(2) pi cutoff).
-        told[0] += f", as low-passed at {math.sqrt(0.5) / (math.pi * abs(late)):.2g} Hz or stamped late"
+        cutoff = math.sqrt(0.5) / (math.pi * abs(late))
+        delay = f"{later} comes {1e3 * abs(late):.0f} ms after the {sooner}"
+        notes.append(f"{delay}, as low-passed at {cutoff:.2g} Hz or stamped late")
     if smoothed:
-        told.append(f"gyro has {found.left:.0%} of the attitude's quick turning: it was " + (
+        notes.append(f"gyro has {found.left:.0%} of the attitude's quick turning: it was " + (
             "low-passed" if sure and late > 0.0 else "smoothed without a delay"
         ))  # fmt: skip
     models = "`attitude_delay` models a delay" if sure and late < 0.0 else "`imu_lag` models a filter"
-    fix = f"log the raw {which[0] if sure else 'gyro'}" + f"; {models}" * sure
+    fix = f"log the raw {later if sure else 'gyro'}" + f"; {models}" * sure
     return Check(
-        "gyro_source", CheckResult.WARNING, "; ".join(told), fix, {"late_s": late, "left": found.left},
-        estimates_off(turning=(found.read,) * 3) if which[0] == "gyro" or smoothed else {},
+        "gyro_source", CheckResult.WARNING, "; ".join(notes), fix, {"late_s": late, "left": found.left},
+        estimates_off(turning=(found.read,) * 3) if later == "gyro" or smoothed else {},
     )  # fmt: skip
 
 

@@ -723,9 +723,8 @@ def better_description(lagged: Lagged | str, vehicle: Vehicle) -> Other | None:
     own = max((one for one in named if one[2] == rotors), key=lambda one: one[0])
     # The most likely orders, and the own one, with the frame turned as roll and pitch then answer.
     for order in {rotors, *(one[2] for one in sorted(named, key=lambda one: -one[0])[:_TURNED])}:
-        if abs(angle := _answer(grams, reordered(vehicle, order)).turned) > math.radians(
-            20.0
-        ):  # a smaller turn is none
+        angle = _answer(grams, reordered(vehicle, order)).turned
+        if abs(angle) > math.radians(20.0):  # a smaller turn is none
             for sign in (1.0, -1.0):
                 ((_, axes),) = _best(grams, _rotated(vehicle, angle), [order], sign)
                 named.append((float(_gain(axes)) - _CHANGE * (_moved(order) + (sign < 0.0) + 1.5), angle, order, axes))

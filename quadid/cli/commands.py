@@ -210,8 +210,8 @@ def _imported(path: str) -> Any:
 # --- A function of the library as a command
 
 
-def told_by(function: Callable[..., Any]) -> tuple[str, dict[str, str]]:
-    """What a docstring says of its function, and of each parameter, without marks of code."""
+def documented(function: Callable[..., Any]) -> tuple[str, dict[str, str]]:
+    """Description of a function and of each of its parameters, from its docstring, without marks of code."""
     about, *sections = re.split(r"\n(?=(?:Args|Returns|Raises):\n)", (inspect.getdoc(function) or "").replace("`", ""))
     entries = re.findall(r"^ {4}(\w+): (.+(?:\n {8}.+)*)", sections[0] if sections else "", re.MULTILINE)
     return about, {name: " ".join(text.split()) for name, text in entries}
@@ -232,18 +232,19 @@ def of_library(command: Command, function: Callable[..., Outcome]) -> Callable[.
     from quadid.app import options
     from quadid.app.outcome import Fitted, Reported
 
-    signature, (about, words) = inspect.signature(function, eval_str=True), told_by(function)
+    signature, (about, words) = inspect.signature(function, eval_str=True), documented(function)
     outcome: type[Outcome] = signature.return_annotation
     typed: dict[str, options.Typed] = {}
     shown: dict[str, tuple[Any, Any]] = {}
     for name, parameter in signature.parameters.items():
-        for told in get_args(parameter.annotation)[1:]:
-            if isinstance(told, ParameterInfo):
+        for option in get_args(parameter.annotation)[1:]:
+            if isinstance(option, ParameterInfo):
                 default = ... if parameter.default is parameter.empty else parameter.default
-                told = options.Typed(get_args(parameter.annotation)[0], told, default)
-            if isinstance(told, options.Typed):
-                typed[name] = told
-                shown[name] = Annotated[told.kind, with_help(told.option, words.get(name, ""), told.kind)], told.default
+                option = options.Typed(get_args(parameter.annotation)[0], option, default)
+            if isinstance(option, options.Typed):
+                typed[name] = option
+                described = with_help(option.option, words.get(name, ""), option.kind)
+                shown[name] = Annotated[option.kind, described], option.default
     shown |= {name: options.READING[name] for name in command.reading}
     page_name = outcome.page_name if issubclass(outcome, Reported) else None
     shown |= {"report": (options.ReportFile, None)} if page_name == "" else {}

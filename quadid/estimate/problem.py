@@ -80,7 +80,7 @@ AT_ONCE = 16
 SETTLING = 2
 """Times that effects are simulated anew along the states that they move."""
 LEAST = 1e-2
-"""What is this small against its prior is none: a random force, a delay."""
+"""Share of its prior below which a random force or a delay is none."""
 
 
 def control_moment(tracks: Sequence[Track], p: FloatArray) -> FloatArray:

@@ -7,10 +7,10 @@ import numpy as np
 from quadid.data.window import Window
 from quadid.estimate import kalman as k
 from quadid.estimate.problem import PLACES
-from quadid.estimate.whole_model import WholeModel
+from quadid.estimate.whole_model import WholeModel, _attitude
 from quadid.flight import draw_truth, fly
 from quadid.model.layout import Layout
-from quadid.model.rollout import Rollout, Segments
+from quadid.model.rollout import Segments
 from quadid.rotation import turn
 from quadid.vehicle import ParameterPrior, Vehicle
 from tests.estimate.test_fit import PELICAN
@@ -32,32 +32,20 @@ def test_the_pull_of_the_attitude_filter_is_followed_along_a_whole_flight() -> N
     pulled[layout.entry("ahrs_acceleration_error.k").index] = 0.3
     read = simulated(window, vehicle, np.array([plain, pulled]))
     means = np.zeros((read.shape[1] + 2, k.N_MEAN))
-    means[1:-1, :4], means[1:-1, 4:7], means[1:-1, 7:10] = attitude(read[0]), read[0, :, :3], read[0, :, 9:12]
+    means[1:-1, :4], means[1:-1, 4:7], means[1:-1, 7:10] = _attitude(read[0]), read[0, :, :3], read[0, :, 9:12]
     means[0, 0] = 1.0
     means[0, :4], means[-1] = means[1, :4], means[-2]
     added = WholeModel(window.slice(0, len(means)), vehicle, PLACES).beyond(pulled[None], means)[0, 1:-1, 12:15]
-    differs = turn(attitude(read[0]), attitude(read[1]))
+    differs = turn(_attitude(read[0]), _attitude(read[1]))
     assert np.max(np.abs(differs)) > 0.02
     np.testing.assert_allclose(added, differs, atol=0.03 * np.max(np.abs(differs)))
 
 
 def simulated(window: Window, vehicle: Vehicle, thetas: np.ndarray) -> np.ndarray:
     """Gyro, attitude, accelerometer and velocity of two seconds without measurements, shape (vectors, rows, 12)."""
-    n = len(window)
-    zero, level = np.zeros((n, 3)), np.tile([1.0, 0.0, 0.0, 0.0], (n, 1))
-    blank = Window(
-        window.t0, window.dt, window.rotor_speed, zero, level, zero, zero, zero, None,
-        sampling=window.sampling, rotor_slope=window.rotor_slope, log_span=window.log_span,
-    )  # fmt: skip
     assert window.attitude is not None
     assert window.gyro is not None
     start = np.concatenate([window.attitude[0], window.gyro[0], np.zeros(6)])
-    rows = Segments(100, 1, np.array([1]))
-    lanes, _ = Rollout(blank, vehicle).roll(rows, thetas, start[None], None, n_pre=1)
+    rollout = WholeModel(window, vehicle, PLACES)._rollout
+    lanes, _ = rollout.roll(Segments(100, 1, np.array([1])), thetas, start[None])
     return np.moveaxis(lanes[:, 0], 3, 1).reshape(-1, *lanes.shape[2:4])[: len(thetas)]
-
-
-def attitude(read: np.ndarray) -> np.ndarray:
-    """Unit quaternions of residuals against no rotation, twice their vector parts."""
-    half = 0.5 * read[:, 3:6]
-    return np.concatenate([np.sqrt(1.0 - np.sum(half**2, axis=1, keepdims=True)), half], axis=1)

@@ -41,7 +41,7 @@ def flight(request: pytest.FixtureRequest) -> Flight:
 def sources(
     flight: Flight, name: str, change: Callable[[Channel], FloatArray], **effects: dict[str, float]
 ) -> list[Check]:
-    """What is said of the source of gyro and attitude once a channel was changed."""
+    """Check of the source of gyro and attitude once a channel was changed."""
     recording, vehicle = flight
     channel = recording.channels[name]
     changed = {**recording.channels, name: replace(channel, values=np.asarray(change(channel)))}
