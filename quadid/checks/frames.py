@@ -256,12 +256,12 @@ def gyro_check(recording: Recording) -> Check:
             best = (name, fit)
     if best is None:
         return Check("gyro_attitude", CheckResult.UNKNOWN, "too little rotation to compare gyro and attitude")
-    late = _apart(response(gyro, attitude)) if best[0] == "as given" else None
+    found = response(gyro, attitude) if best[0] == "as given" else None
     rows = _without_jumps(*own)
     return (
-        late or _angle_rates(gyro, attitude) or _one_axis(rows) or _bias_step(*own)
+        _apart(found) or _angle_rates(gyro, attitude) or _one_axis(rows) or _bias_step(*own)
         or (best[0] == "as given" and best[1].straight and _turned(rows))
-        or _judge_rates(gyro, attitude, *best)
+        or _judge_rates(gyro, attitude, *best, smoothed=found is not None and found.left < _SMOOTHED)
     )  # fmt: skip
 
 
@@ -594,7 +594,8 @@ def _likely(reading: str, fit: AxisMap) -> float:
     return fit.r2 + (0.1 if fit.straight else 0.0) + (0.05 if reading == "as given" else 0.0)
 
 
-def _judge_rates(gyro: Channel, attitude: Channel, reading: str, fit: AxisMap) -> Check:
+def _judge_rates(gyro: Channel, attitude: Channel, reading: str, fit: AxisMap, smoothed: bool) -> Check:
+    """What axes and scale of the best fit say; a smoothed gyro lacks quick turning, which is no matter of scale."""
     check = partial(Check, "gyro_attitude", numbers={"scale": fit.scale, "r2": fit.r2})
     if fit.r2 < _CLEAR:
         message = f"gyro does not follow the attitude (R^2 {fit.r2:.2f})"
@@ -620,10 +621,10 @@ def _judge_rates(gyro: Channel, attitude: Channel, reading: str, fit: AxisMap) -
     if fit.absurd:
         remedy = f"multiply gyro by {fit.scale:.3g}, or correct the attitude"
         return check(CheckResult.ERROR, f"{message}: the scale of one is wrong", remedy)
-    by_axis = _sizes(gyro, attitude)
+    by_axis = () if smoothed else _sizes(gyro, attitude)
     sizes = np.array([f.value if f.disagrees and f.value > 0.0 else 1.0 for f in by_axis] or [fit.scale] * 3)
     message = ", ".join(str(f) for f in by_axis if f.known) or message
-    if np.all(sizes == 1.0) or not by_axis and 0.85 * fit.r2 < fit.scale < 1.15:
+    if smoothed or np.all(sizes == 1.0) or not by_axis and 0.85 * fit.r2 < fit.scale < 1.15:
         return check(CheckResult.OK, message)
     remedy = "check scales and filters of both; multiply the gyro by this if the attitude is right"
     return check(CheckResult.WARNING, message, remedy, off=estimates_off(turning=(1.0 / sizes).tolist()))

@@ -156,7 +156,8 @@ class ArrayCache:
 def packing(thetas: FloatArray, rotors: int) -> IndexArray:
     """Lane of each of these parameter vectors (m, size), the first one in lane 0, shape (m,).
 
-    The others are sorted by what they need of the model.  Lanes beyond the last vector are free to repeat the first.
+    The others are sorted by what they need of the model; those with rotors of their own fill the last lanes, and so
+    the fewest blocks.  Lanes left over, between them and the rest, repeat the first.
     """
     if len(thetas) <= LANES:
         return np.arange(len(thetas))
@@ -167,9 +168,10 @@ def packing(thetas: FloatArray, rotors: int) -> IndexArray:
     )  # fmt: skip
     needs = [np.any(others[:, list(group)] != 0.0, axis=1) for group in entries]
     driving = [*ROTOR_ENTRIES, *range(ix.LOSS, ix.LOSS + 2 * rotors)]
-    needs += [np.any(others[:, driving] != thetas[0, driving], axis=1), others[:, ix.DELAY] != 0.0]
-    lane = np.zeros(len(thetas), dtype=np.intp)
-    lane[1 + np.lexsort(needs)] = np.arange(1, len(thetas))
+    own = np.any(others[:, driving] != thetas[0, driving], axis=1)
+    lane, last = np.zeros(len(thetas), dtype=np.intp), len(thetas) - np.count_nonzero(own)
+    lane[1 + np.lexsort([*needs, others[:, ix.DELAY] != 0.0, own])] = np.arange(1, len(thetas))
+    lane[lane >= last] += -len(thetas) % LANES
     return lane
 
 

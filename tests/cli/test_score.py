@@ -68,9 +68,9 @@ def test_without_torque_the_rate_error_is_that_of_no_change(inside: Cli, data_di
 def test_a_vehicle_that_runs_away_is_called_that_and_warns_of_nothing_else(
     inside: Cli, data_dir: Path, tmp_path: Path
 ) -> None:
-    """Rates that grow by themselves, fifty-fold a second: squares of such misses leave the range of numbers."""
+    """Rates that grow by themselves, e^30-fold a second: squares of such misses leave the range of numbers."""
     vehicle = yaml.safe_load((data_dir / "nanodrone" / "vehicle.yaml").read_text(encoding="utf-8"))
-    vehicle["effects"] = {"rate_damping": {"l_p": -50.0, "m_q": -50.0, "n_r": -50.0}}
+    vehicle["effects"] = {"rate_damping": {"l_p": -30.0, "m_q": -30.0, "n_r": -30.0}}
     file = tmp_path / "wild.yaml"
     file.write_text(yaml.safe_dump(vehicle), encoding="utf-8")
     with warnings.catch_warnings():
