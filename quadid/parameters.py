@@ -9,6 +9,7 @@ from enum import StrEnum
 
 import numpy as np
 
+from quadid.chi_square import Z95
 from quadid.errors import ParameterError, nearest
 from quadid.types import FloatArray
 
@@ -91,6 +92,13 @@ def unreliable(parameters: Iterable[Parameter], names: Collection[str]) -> tuple
     )
 
 
+def _wider(p: Parameter, sigma: float) -> Parameter:
+    """A parameter whose logarithm has this standard deviation besides."""
+    down, up = (math.hypot(math.log(end / p.value), Z95 * sigma) for end in p.ci95)
+    interval = p.value * math.exp(-down), p.value * math.exp(up)
+    return replace(p, sigma=math.hypot(p.sigma, sigma * p.value), ci95=interval)
+
+
 @dataclass(frozen=True)
 class ParameterSet:
     """Parameters with their joint covariance.
@@ -113,6 +121,12 @@ class ParameterSet:
     def unreliable(self, names: Sequence[str]) -> ParameterSet:
         """The same, with the identified ones of `names` marked unreliable."""
         return ParameterSet(unreliable(self.parameters, names), np.array(self.covariance))
+
+    def scaled_together(self, sigma: float) -> ParameterSet:
+        """The same, where one factor on all that the data determine is known to `sigma` (log scale) only."""
+        values = np.where([p.status in UNKNOWN for p in self.parameters], 0.0, self.values)
+        wider = tuple(p if p.status in UNKNOWN else _wider(p, sigma) for p in self.parameters)
+        return ParameterSet(wider, self.covariance + sigma**2 * np.outer(values, values))
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -60,7 +60,7 @@ def _in_force(vehicle: Vehicle, history: Path, name: str) -> tuple[Vehicle, str,
     """The vehicle with the values that a service put in force last, where they come from, and what speaks against."""
     from quadid_node.history import StoreError, read_history, read_in_force
 
-    from quadid.identification.result import with_values
+    from quadid.identification.result import with_correlation, with_values
     from quadid.model.layout import ThrustModel
     from quadid.parameters import TANGENT
     from quadid.vehicle import GRAVITY
@@ -82,4 +82,5 @@ def _in_force(vehicle: Vehicle, history: Path, name: str) -> tuple[Vehicle, str,
                 "parameters": {**fitted.parameters, "b": prior}, "effects": {**fitted.effects, "thrust_curve": curve},
             }
         )  # fmt: skip
+    fitted = with_correlation(fitted, found.item.parameters)
     return fitted, f"{history.name}, set {found.item.sequence} of {name}", found.doubt

@@ -13,6 +13,7 @@ import typer
 from quadid.app.logs import load_vehicle
 from quadid.app.options import JsonTarget, shipped_names
 from quadid.app.outcome import Outcome
+from quadid.chi_square import Z95
 from quadid.cli import terminal
 from quadid.errors import VehicleError
 from quadid.report.tables import Cell, Column, TextTable, number
@@ -95,11 +96,12 @@ def _story(sets: Sequence[dict[str, Any]], title: str) -> TextTable:
     """Time, author and data of a set."""
     columns = (
         Column("set", right=True), Column("when"), Column("state"), Column("by"), Column("data [s]", right=True),
-        Column("error", right=True),
+        Column("error", right=True), Column("rests on"),
     )  # fmt: skip
     rows = tuple(
         (str(item["sequence"]), _when(item["wall"]), item["state"], item["approved_by"],
-         f"{(item['stop'] or 0.0) - (item['start'] or 0.0):.0f}", number(item["mse"], 3))
+         f"{(item['stop'] or 0.0) - (item['start'] or 0.0):.0f}", number(item["mse"], 3),
+         f"{item['reference']}, +-{Z95 * item['reference_sd']:.0%}")
         for item in sets
     )  # fmt: skip
     return TextTable(title, columns, rows)

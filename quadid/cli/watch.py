@@ -116,7 +116,8 @@ def table(found: Mapping[str, Any]) -> Table:
         status = _mapping(health.get("status"))
         color = "green" if kinds["alive"] else "red"
         state = f"{_plain(status.get('phase', 'unknown'))}: {_plain(status.get('reason', ''))}"
-        old = f"\nout of date: {_plain(force['outdated'])}" if force.get("outdated") else ""
+        notes = f"\nrests on {_plain(force['reference'])}" if force.get("reference") else ""
+        notes += f"\nout of date: {_plain(force['outdated'])}" if force.get("outdated") else ""
         diagnosis = kinds.get("diagnosis", {})
         lines = []
         for finding in _listing(diagnosis.get("findings"))[:5]:
@@ -124,7 +125,7 @@ def table(found: Mapping[str, Any]) -> Table:
             lines.append(f"{_plain(finding.get('effect'))}{sure}: {_plain(finding.get('evidence'))}")
         out.add_row(
             Text(_plain(name), style=color), Text(state if kinds["alive"] else "gone"),
-            Text(_plain(f"{force.get('sequence', '-')} {force.get('state', '')}") + old), Text(_parameters(force)),
+            Text(_plain(f"{force.get('sequence', '-')} {force.get('state', '')}") + notes), Text(_parameters(force)),
             Text("\n".join(lines)), Text(_feeds(health)),
         )  # fmt: skip
     return out

@@ -131,14 +131,18 @@ def answered(parameters: ParameterSet) -> bool:
 def fitted_vehicle(fit: Fit) -> Vehicle:
     """The vehicle with fitted values as initial guess, their standard deviations and correlations, fitted effects."""
     effects = [p.name.split(".")[0] for p in fit.parameters if p.name not in NOMINAL_NAMES]
-    out = with_values(fit.vehicle, fit.parameters, effects, fit.theta)
-    names, found = fit.parameters.names, fit.parameters.correlation
-    known = [i for i, n in enumerate(names) if n in NOMINAL_NAMES and out.parameters[n].sigma is not None]
+    return with_correlation(with_values(fit.vehicle, fit.parameters, effects, fit.theta), fit.parameters)
+
+
+def with_correlation(vehicle: Vehicle, parameters: ParameterSet) -> Vehicle:
+    """The vehicle with correlations of those of its values that have a standard deviation."""
+    names, found = parameters.names, parameters.correlation
+    known = [i for i, n in enumerate(names) if n in NOMINAL_NAMES and vehicle.parameters[n].sigma is not None]
     together = {
         names[i]: {names[j]: round(float(found[i, j]), 3) for j in known if j < i and abs(found[i, j]) >= CORRELATED}
         for i in known
     }  # fmt: skip
-    return out.model_copy(update={"correlation": {one: others for one, others in together.items() if others}})
+    return vehicle.model_copy(update={"correlation": {one: others for one, others in together.items() if others}})
 
 
 def with_values(

@@ -45,7 +45,7 @@ from quadid.online.fit_job import (
 from quadid.online.gate import Case
 from quadid.online.grid_buffer import GridBuffer, WindowCut
 from quadid.online.records import OnlineSet
-from quadid.parameters import NOMINAL_NAMES, TANGENT, ParameterSet, Status
+from quadid.parameters import NOMINAL_NAMES, NOMINAL_UNITS, TANGENT, Parameter, ParameterSet, Status
 from quadid.types import FloatArray
 from quadid.vehicle import GRAVITY, Vehicle
 
@@ -406,9 +406,12 @@ class Estimator:
         return np.asarray(np.hypot(self.z_sigma[0], self.z_sigma[2:4]))
 
     @property
-    def stated(self) -> dict[str, tuple[float, float]]:
-        """Value and standard deviation of the parameters that the vehicle file claims to know."""
-        return {n: (p.initial, p.sigma) for n, p in self.vehicle.parameters.items() if p.sigma}
+    def stated(self) -> ParameterSet:
+        """Parameters that the vehicle file claims to know."""
+        priors = self.vehicle.parameters
+        at = [i for i, n in enumerate(NOMINAL_NAMES) if priors[n].sigma]
+        known = (Parameter(n, NOMINAL_UNITS[n], priors[n].initial, priors[n].sigma or 0.0) for n in NOMINAL_NAMES)
+        return ParameterSet(tuple(p for p in known if p.sigma), self.vehicle.covariance[np.ix_(at, at)])
 
     def value(self, name: str) -> float:
         """A nominal parameter, the best at hand."""

@@ -85,7 +85,7 @@ class Case:
         age: time since the data that the set in force rests on [s].
         unexplained: what speaks against the model: a sensor's scale that a diagnosis found, or empty.
         doubts: factors that b, J_xx and J_yy may be off by, as the sensors disagree.
-        stated: value and standard deviation of the parameters that the vehicle file claims to know.
+        stated: parameters that the vehicle file claims to know.
         walked: change of torque over inertia (log) from the oldest to the newest agreeing window and its standard
             deviation, by the inertia's name.
         between_rows: relative standard deviation by what the rotors do between readings, newest window, by name.
@@ -105,7 +105,7 @@ class Case:
     age: float = math.inf
     unexplained: str = ""
     doubts: tuple[Factor, ...] = ()
-    stated: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    stated: ParameterSet = field(default_factory=lambda: ParameterSet((), np.zeros((0, 0))))
     walked: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     between_rows: Mapping[str, float] = field(default_factory=dict)
     left_out: FloatArray = field(default_factory=lambda: np.zeros((2, 2)))
@@ -211,11 +211,11 @@ def _held_out(case: Case, settings: GateSettings) -> str | None:
 
 def _is_sharper(case: Case, settings: GateSettings) -> bool:
     assert case.in_force is not None
-    old = case.in_force.parameters
+    old = case.in_force
     return case.age >= settings.pause and any(
-        p.sigma < settings.sharper * old[p.name].sigma and p.status not in UNKNOWN
+        p.sigma < settings.sharper * old.told_by_flight(p.name) and p.status not in UNKNOWN
         for p in case.parameters
-        if p.name in old.names
+        if p.name in old.parameters.names
     )
 
 
@@ -296,7 +296,8 @@ def _step(case: Case, settings: GateSettings, times: float = 1.0) -> str | None:
             known = not UNKNOWN & {p.status, old.status}
             change = p.value / old.value - 1.0 if p.name in LIMITED and old.value > 0.0 else 0.0
             # What was only guessed before may be learned: its own interval says how far it may move.
-            room = limit + (2.0 * old.sigma / old.value if known and old.value > 0.0 else math.inf)
+            own = reference.told_by_flight(p.name)
+            room = limit + (2.0 * own / old.value if known and old.value > 0.0 else math.inf)
             if abs(math.log1p(change)) > math.log1p(room):
                 return f"{p.name} would change by {change:+.0%} from {what}, allowed {limit:.0%}"
     return None
@@ -305,21 +306,25 @@ def _step(case: Case, settings: GateSettings, times: float = 1.0) -> str | None:
 def _reference(case: Case, settings: GateSettings) -> str | None:
     """First trusted values: inertias, and torque over inertia, a controller's gain, which mass leaves as it is.
 
-    Room is left for what the reference did not know. The estimate's own deviation gives none: rotor speeds that drift
-    widen it, and what it cannot tell apart from the reference it has not shown to be near it.
+    Room is left for what the reference did not know of itself. The estimate's own deviation gives none: rotor speeds
+    that drift widen it, and what it cannot tell apart from the reference it has not shown to be near it. Nor does what
+    a set's own reference left open: a support or another mass changes that from flight to flight.
     """
-    known, what = case.stated, "the vehicle file"
+    known, common, what = case.stated, 0.0, "the vehicle file"
     if case.baseline is not None:
-        known = {p.name: (p.value, p.sigma) for p in case.baseline.parameters if p.status not in UNKNOWN}
+        known, common = case.baseline.parameters, case.baseline.reference_sd
         what = "the first accepted or last approved set"
+    covariance = known.covariance / np.outer(known.values, known.values) - common**2
     for name in ("J_xx", "J_yy"):
         for shares, limit, of, looks in (
             ({"b": 1.0, name: -1.0}, settings.reference, f"torque over inertia ({name})", "rotor speeds"),
             ({name: 1.0}, settings.width, name, "a mass, an accelerometer or a gyro"),
         ):
-            both = [(case.parameters[n].value, *known[n], share) for n, share in shares.items() if n in known]
-            change = sum(share * math.log(now / old) for now, old, _, share in both)
-            if _far(change, math.hypot(*(sigma / old for _, old, sigma, _ in both)), limit):
+            at = [k for k, p in enumerate(known) if p.name in shares and p.status not in UNKNOWN]
+            share = np.array([shares[known.names[k]] for k in at])
+            now = np.array([case.parameters[known.names[k]].value for k in at])
+            change = float(share @ np.log(now / known.values[at]))
+            if _far(change, math.sqrt(max(share @ covariance[np.ix_(at, at)] @ share, 0.0)), limit):
                 off = f"{of} is {math.expm1(change):+.1%} off {what}, allowed {limit:.1%}"
                 return f"{off}: {looks} wrong by a factor would look like this"
     return None

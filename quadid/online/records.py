@@ -77,6 +77,8 @@ class OnlineSet:
         outdated: why a set in force is known to be out of date; empty: it is not known to be.
         outdated_code: the same for programs: an effect's name, ``unknown_cause`` or ``disagreement``.
         reference: what rotor speeds, force and mass were checked against.
+        reference_sd: standard deviation (log scale) of a factor that b, d and the inertias have in common, as far as
+            the reference tells it; `parameters` hold it.
     """
 
     sequence: int
@@ -95,6 +97,12 @@ class OnlineSet:
     outdated: str = ""
     outdated_code: str = ""
     reference: Reference = "none"
+    reference_sd: float = 0.0
+
+    def told_by_flight(self, name: str) -> float:
+        """Standard deviation of a parameter beside that of the reference, of the same unit."""
+        p = self.parameters[name]
+        return math.sqrt(max(p.sigma**2 - (self.reference_sd * p.value) ** 2, 0.0))
 
 
 @dataclass(frozen=True)

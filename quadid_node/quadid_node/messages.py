@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import msgspec
@@ -18,6 +18,7 @@ from quadid.chi_square import Z95
 from quadid.condition.changes import Change
 from quadid.condition.watch import HealthReport
 from quadid.jsonable import jsonable
+from quadid.online.active_set import FORCE
 from quadid.online.records import (
     Event,
     HealthyFlight,
@@ -317,6 +318,8 @@ def set_from_dict(data: Mapping[str, Any]) -> OnlineSet:
     covariance = data.get("covariance") or np.diag([p["sigma"] ** 2 for p in parameters])
     found["parameters"] = {"parameters": parameters, "covariance": covariance}
     made: OnlineSet = msgspec.convert(found, OnlineSet, dec_hook=lambda _, rows: np.array(rows, dtype=np.float64))
+    if "reference_sd" not in data:  # of a version that did not ask
+        made = replace(made, parameters=made.parameters.scaled_together(FORCE), reference_sd=FORCE)
     if not 0 <= made.samples < 1 << 32 or any(abs(t) >= 1 << 31 for t in (made.start, made.stop)):
         raise ValueError(f"a set of {made.samples} samples from {made.start:g} to {made.stop:g} s")
     return made

@@ -27,6 +27,7 @@ from quadid_node.worker import InlineWorker
 from quadid.condition.trim import FlightTrim
 from quadid.online import SessionSettings, SetState
 from quadid.online.active_set import ActiveSet
+from quadid.online.active_set import FORCE
 from quadid.online.records import Event, OnlineDiagnosis, OnlineFinding, OnlineSet, Publish
 from quadid.vehicle import Vehicle
 from quadid_node import history as storing
@@ -336,7 +337,7 @@ def test_a_history_of_an_earlier_version_is_read_as_it_is(tmp_path: Path) -> Non
     """Sets once had no mass, reference, run, or reason to be out of date; some have no covariance."""
     path = tmp_path / "h.sqlite"
     filled(path).close(60.0)
-    later = ("mass", "outdated", "outdated_code", "reference", "boot_id", "covariance")
+    later = ("mass", "outdated", "outdated_code", "reference", "reference_sd", "boot_id", "covariance")
     with closing(sqlite3.connect(path)) as db, db:
         for (data,) in db.execute("SELECT data FROM sets").fetchall():
             old = {name: value for name, value in json.loads(data).items() if name not in later}
@@ -347,8 +348,11 @@ def test_a_history_of_an_earlier_version_is_read_as_it_is(tmp_path: Path) -> Non
     store.close(60.0)
     assert not store.notes
     assert restored.item is not None
-    assert restored.item.parameters.covariance[0, 0] == restored.item.parameters["b"].sigma ** 2
-    assert restored.item.reference == "none"
+    b = restored.item.parameters["b"]
+    assert restored.item.parameters.covariance[0, 0] == pytest.approx(b.sigma**2)
+    assert (restored.item.reference, restored.item.reference_sd) == ("none", FORCE)
+    assert b.sigma / b.value == pytest.approx(FORCE, rel=0.01), "it does not say that force was measured"
+    assert restored.item.told_by_flight("b") == pytest.approx(0.005 * b.value)
     assert restored.item.outdated.startswith("it rests on a mass that it does not state")
     with closing(sqlite3.connect(path)) as db:
         assert db.execute("PRAGMA user_version").fetchone() == (VERSION,)

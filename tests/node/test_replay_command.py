@@ -116,7 +116,8 @@ def test_history_shows_what_was_stored(tmp_path: Path, inside: Cli, monkeypatch:
 def test_a_vehicle_of_a_fleet_is_found_by_its_name_and_its_set_exported(tmp_path: Path, inside: Cli) -> None:
     path = tmp_path / "h.sqlite"
     store = Store(path, "quad1")
-    store.numbered(replace(online_set(TRUE), sequence=1, approved_by="ann"))
+    wide = online_set(TRUE).parameters.scaled_together(0.09)
+    store.numbered(replace(online_set(TRUE), parameters=wide, reference_sd=0.09, sequence=1, approved_by="ann"))
     store.close()
     told = inside("history", "--vehicle", "quad1", "--history", str(path), "--json", "-")
     assert [s["sequence"] for s in json.loads(told.out)["sets"]] == [1]
@@ -129,7 +130,8 @@ def test_a_vehicle_of_a_fleet_is_found_by_its_name_and_its_set_exported(tmp_path
     (file,) = json.loads(done.out)["files"]
     exported = Vehicle.from_yaml(Path(file).read_text(encoding="utf-8"))
     assert exported.parameters["b"].initial == pytest.approx(TRUE["b"], rel=1e-6)
-    assert exported.parameters["b"].sigma is not None
+    assert exported.parameters["b"].sigma == pytest.approx(0.09 * TRUE["b"], rel=0.01)
+    assert exported.correlation["J_xx"]["b"] > 0.99, "one factor on all, or a later gate compares nothing with the file"
     assert "set 1 of quad1" in Path(file).read_text(encoding="utf-8")
     other = inside("export", *where)
     assert other.code == 2

@@ -13,6 +13,7 @@ from quadid.online import Session, SessionSettings
 from quadid.online.fusion import Estimator
 from quadid.online.grid_buffer import WindowCut
 from quadid.online.records import OnlineSet, SetState
+from quadid.parameters import ParameterSet
 from quadid.types import FloatArray
 from quadid.vehicle import GRAVITY, ParameterPrior, Vehicle
 from tests.faults.evidence import Happened
@@ -156,6 +157,23 @@ def test_a_support_beside_two_sensors_within_their_limits_waits(
     happened(39, f"support 4 %, {told}: {len(sets)} published; '{session.status().reason[:90]}'")
 
 
+@pytest.mark.parametrize(("carried", "scale"), [(0.08, 1.06), (-0.08, 0.92), (0.15, 1.17)])
+def test_an_interval_holds_a_support_that_an_accelerometer_hides(
+    carried: float, scale: float, happened: Happened
+) -> None:
+    """In thrust the two cancel: nothing on board tells them from another b and other inertias."""
+    made = with_channel(flight(SECONDS, 3).recording, "rotor_speed", supported(carried))
+    _, sets = flown(with_channel(made, "accel", about_the_mean(scale)))
+    for s in sets:
+        for p in (s.parameters[n] for n in ("b", "J_xx", "J_yy")):
+            assert p.ci95[0] < TRUE[p.name] < p.ci95[1]
+            assert abs(p.value - TRUE[p.name]) < 1.96 * p.sigma
+    worst = max((abs(off(s, n)) for s in sets for n in ("b", "J_xx", "J_yy")), default=0.0)
+    happened(
+        39, f"support {carried:+.0%}, accelerometer x {scale:g} under a bias: {worst:.1%} off, within the interval"
+    )
+
+
 def test_an_attitude_that_comes_late_leaves_the_inertias_alone() -> None:
     made = flight(SECONDS, 3).recording
     late = made.channels["attitude"]
@@ -169,17 +187,27 @@ def test_a_set_says_what_it_was_compared_with(happened: Happened) -> None:
     knows = PELICAN.parameters | {"b": ParameterPrior(initial=TRUE["b"], sigma=TRUE["b"] * 0.02)}
     measured = PELICAN.model_copy(update={"parameters": knows})
 
-    def reference(vehicle: Vehicle, restored: OnlineSet | None = None) -> str:
-        session = Session(vehicle, QUICK, restored)
-        return published(works(session, stream, tells()))[-1].reference
+    def told(vehicle: Vehicle, restored: OnlineSet | None = None) -> OnlineSet:
+        return published(works(Session(vehicle, QUICK, restored), stream, tells()))[-1]
 
-    assert reference(PELICAN) == "none"
-    assert reference(measured) == "vehicle_file"
-    assert reference(PELICAN, online_set(TRUE)) == "history"
-    happened(40, "first flight: none; with a b of known deviation: vehicle_file; with an earlier set: history")
+    def known(item: OnlineSet) -> list[float]:
+        return [round(item.parameters[n].sigma / item.parameters[n].value, 2) for n in ("b", "J_xx", "J_yy")]
+
+    first = told(PELICAN)
+    assert (first.reference, known(first)) == ("none", [0.09, 0.09, 0.09])
+    assert first.parameters.correlation[0, 2] > 0.99, "one factor on all: torque over inertia is as sharp as before"
+    item = told(measured)
+    assert (item.reference, known(item)) == ("vehicle_file", [0.02, 0.02, 0.02])
+    item = told(PELICAN, online_set(TRUE))
+    assert item.reference == "history"
+    assert max(known(item)) < 0.02
+    later = told(PELICAN, first)
+    assert (later.reference, known(later)) == ("history", [0.09, 0.09, 0.09]), "a restart measures nothing"
+    happened(40, "first flight: none, b and J to 9 %; a b of known deviation: vehicle_file; an earlier set: history")
     manual = Session(PELICAN, QUICK.model_copy(update={"gate": GATE.model_copy(update={"approval": "manual"})}))
     works(manual, stream, tells())
     assert manual.approve("ann").done
     assert manual.active_set.in_force is not None
     assert manual.active_set.in_force.reference == "none"
-    assert manual.active_set.reference(()) == "history", "what a person approved is trusted"
+    trusted = manual.active_set.reference(ParameterSet((), np.zeros((0, 0))))
+    assert trusted == ("history", 0.09), "what a person approved is trusted, and measures no force"

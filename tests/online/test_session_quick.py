@@ -144,7 +144,7 @@ def test_windows_the_gate_and_memory_follow_the_settings() -> None:
         published(works(Session(PELICAN, QUICK.model_copy(update={"memory": m})), FLIGHT, tells()), "candidate")[-1]
         for m in (1e6, 20.0)
     )
-    ratio = blunt.parameters["b"].sigma / sharp.parameters["b"].sigma
+    ratio = blunt.told_by_flight("b") / sharp.told_by_flight("b")
     assert 1.1 < ratio < 2.0, "who forgets claims to know less"
 
 

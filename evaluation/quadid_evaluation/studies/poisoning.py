@@ -185,7 +185,7 @@ WEIGHT, B = 1.3 * 9.80665, 2.33e-5
 """Of the flown vehicle [N], [N s^2/rad^2]."""
 SINGLE: dict[str, Spoil] = {
     **{f"support {f:+.0%} of weight": supported(f * WEIGHT, B) for f in (0.04, 0.08, 0.15, -0.08, -0.15)},
-    **{f"accelerometer scale {f:g} under a bias": about_the_mean(f) for f in (0.9, 1.06, 1.12, 1.3)},
+    **{f"accelerometer scale {f:g} under a bias": about_the_mean(f) for f in (0.9, 1.06, 1.12, 1.17, 1.3)},
     "leak p to q 15 %": leaking(0, 1, 0.15), "leak q to p 5 %": leaking(1, 0, 0.05),
     "leak r to p 15 %": leaking(2, 0, 0.15),
     **{f"gyro smoothed {f:g} Hz": smoothed(f) for f in (3.0, 4.0, 4.5, 5.0)},
@@ -206,6 +206,7 @@ TOGETHER = [c for n in (2, 3) for c in combinations(PARTS, n) if len({p.split()[
 HIDING = [
     ("support +8% of weight", "accelerometer scale 1.06 under a bias"),
     ("support +15% of weight", "accelerometer scale 1.12 under a bias"),
+    ("support +15% of weight", "accelerometer scale 1.17 under a bias"),
     ("support -8% of weight", "accelerometer scale 0.9 under a bias"),
 ]
 """Faults that hide each other where thrust is compared: by no sensor of this flight can they be told."""
@@ -241,6 +242,11 @@ class Study:
         """Relative errors of what must be known."""
         return {n: item.parameters[n].value / getattr(self.flight.truth.parameters, n) - 1.0 for n in MUST}
 
+    def holds(self, item: OnlineSet, name: str) -> bool:
+        """True if the 95 % interval of a parameter holds the truth."""
+        low, high = item.parameters[name].ci95
+        return low <= float(getattr(self.flight.truth.parameters, name)) <= high
+
     def run(self, cell: Cell) -> Cell:
         """Flies a cell and notes the errors of what was published after the poison had begun."""
         if cell["when"] == "first flight":
@@ -270,6 +276,7 @@ class Study:
             "flown": time.strftime("%Y-%m-%d"),
             "sets": len(fresh),
             "worst": worst,
+            "held": all(self.holds(s, n) for s in fresh for n in MUST),
             "says": session.status().reason,
             "known": known,
         }
@@ -312,6 +319,8 @@ def page(cells: list[Cell], done: list[Cell], healthy: list[tuple[float, dict[st
         f"* Cases with no published error of b, J_xx or J_yy above {GOAL:.0%}: **{held} of {len(done)}** flown "
         f"({len(cells)} in all); largest error: **{max(worst, default=0.0):.1%}**. In {sum(w > 0.0 for w in worst)} "
         "something was accepted.",
+        f"* Beyond {GOAL:.0%}: **{sum(d.get('held', False) for d, w in zip(done, worst, strict=True) if w > GOAL)} of "
+        f"{len(done) - held}** have the truth in the 95 % intervals that were published.",
         f"* Without poison: {len(healthy)} sets in the first 60 s, the first after {first[0]:.0f} s of flight.", "",
         "Largest error [%] of b, J_xx and J_yy among sets accepted after the poison began, over all factors; `–`: none "
         "was accepted. Channels without an accepted set are left out; `poisoning.json` has every case.", "",
