@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import hmac
 import json
 import logging
 import multiprocessing
@@ -29,6 +30,7 @@ from quadid.app.fleet_page import Fleet, Row, health_trend, summarise
 from quadid.app.logs import (
     GRID,
     Log,
+    OutputError,
     as_vehicle,
     check_conventions,
     load_vehicle,
@@ -36,11 +38,13 @@ from quadid.app.logs import (
     on_grid,
     parse_part,
     require_gyro,
+    written_whole,
 )  # fmt: skip
 from quadid.app.options import OUT, Described, NamedColumns, Rate, Seed, Typed, vehicle_if
 from quadid.app.outcome import Advance, silent
 from quadid.data.window import Recording
 from quadid.errors import LogError, NotIdentifiableError, QuadidError, VehicleError
+from quadid.files import read_regular
 from quadid.sanitise import one_line
 from quadid.vehicle import Vehicle
 from quadid.version import __version__
@@ -95,12 +99,12 @@ def fleet(
     default = (
         None if known is None else known.model_copy(update={"columns": {**known.columns, **(columns or {})}}).to_yaml()
     )
-    target = Path(out).resolve()
+    target = Path(os.path.realpath(out))
     make_folder(target)
-    found = find_jobs(Path(folder).resolve(), default, rate, seed, diagnose, target)
+    found = find_jobs(Path(os.path.realpath(folder)), default, rate, seed, diagnose, target)
     begin = time.perf_counter()
     with open_store(target / "fleet.sqlite") as store:
-        store.keep({job.name for job in found.jobs})
+        store.keep(found.jobs)
         # Not again: those whose file, vehicle and settings are what the stored result was made from.
         ended = {} if again else store.ended()
         waiting = [job for job in found.jobs if ended.get(job.name) != (job.size, job.modified, job.key)]
@@ -471,7 +475,7 @@ def find_jobs(
     """
     if not root.is_dir():
         raise LogError(f"no folder {root}", "a folder with flight logs", "check the path")
-    jobs, others, texts = list[Job](), list[str](), dict[Path, str]()
+    jobs, others, texts, secret = list[Job](), list[str](), dict[Path, str](), _secret()
     for path in _files(root, leave_out):
         name = path.relative_to(root).as_posix()
         if not _is_log(path):
@@ -480,8 +484,8 @@ def find_jobs(
         text = _vehicle_text(path.parent, root, default, texts)
         folder = path.parent.relative_to(root).as_posix()
         status = path.stat()
-        parts = (text, f"{rate!r}", str(seed), str(diagnose), __version__)
-        key = hashlib.sha256("\0".join(parts).encode()).hexdigest()[:16]
+        made_from = f"{status.st_size} {status.st_mtime_ns} {rate!r} {seed} {diagnose} {__version__}"
+        key = hmac.new(secret, "\0".join((name, made_from, text)).encode(errors="replace"), "sha256").hexdigest()[:32]
         jobs.append(Job(
             str(path), name, _vehicle_name(text, folder), text, status.st_size, status.st_mtime_ns,
             key, rate, seed, diagnose,
@@ -490,6 +494,22 @@ def find_jobs(
         raise LogError(f"no flight log below {root} ({len(others)} other files)", "MCAP, tlog, DataFlash, ULog or CSV")
     copies = _copies(jobs)
     return Found(tuple(job for job in jobs if job.name not in copies), tuple(others), tuple(copies.items()))
+
+
+def _secret() -> bytes:
+    """Random bytes of this user: results that somebody packed beside the logs are not taken for ours without them.
+
+    Where they cannot be kept, every run has its own, and does every log.
+    """
+    path = Path(os.environ.get("XDG_DATA_HOME") or os.path.expanduser("~/.local/share"), "quadid", "fleet.key")
+    try:
+        if not path.exists():
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with open(path, "xb", opener=lambda name, flags: os.open(name, flags, 0o600)) as file:
+                file.write(os.urandom(32))
+        return read_regular(path, 32)
+    except OSError:
+        return os.urandom(32)
 
 
 def _copies(jobs: Sequence[Job]) -> dict[str, str]:
@@ -575,9 +595,19 @@ FINDINGS: dict[str, str] = {
 }  # fmt: skip
 TRIMS: dict[str, str] = {"log": "TEXT", "trim": "TEXT"}
 """Trim of a flight as JSON, for the comparison with other flights of its vehicle."""
+
+
+def _columns(kinds: Mapping[str, str]) -> str:
+    return ", ".join(f'"{name}" {kind}' for name, kind in kinds.items())
+
+
 TABLES = {"logs": LOGS, "parameters": PARAMETERS, "findings": FINDINGS, "trims": TRIMS}
 PARTS = ("parameters", "findings", "trims")
 """Tables with rows of a log."""
+SCHEMA = "".join([
+    *(f"CREATE TABLE IF NOT EXISTS {table} ({_columns(kinds)});" for table, kinds in TABLES.items()),
+    *(f"CREATE INDEX IF NOT EXISTS {table}_log ON {table} (log);" for table in PARTS),
+])  # fmt: skip
 ENDED = ("done", "refused", "unreadable")
 """Outcomes that the same file would have again."""
 
@@ -586,13 +616,17 @@ class Store:
     """The results of one fleet; every log is written in one transaction as it arrives."""
 
     def __init__(self, connection: sqlite3.Connection) -> None:
+        """Makes the tables; raises sqlite3.DatabaseError for a file that is none, or holds what computes."""
         self._connection = connection
-        self._connection.execute("PRAGMA journal_mode=WAL")
-        for table, columns in TABLES.items():
-            listed = ", ".join(f'"{name}" {kind}' for name, kind in columns.items())
-            self._connection.execute(f"CREATE TABLE IF NOT EXISTS {table} ({listed})")
-        for table in PARTS:
-            self._connection.execute(f"CREATE INDEX IF NOT EXISTS {table}_log ON {table} (log)")
+        connection.execute("PRAGMA trusted_schema = OFF")
+        whole = "SELECT type, name, sql FROM sqlite_master"
+        with contextlib.closing(sqlite3.connect(":memory:")) as made:
+            made.executescript(SCHEMA)
+            ours = set(made.execute(whole))
+        if strange := {name for kind, name, sql in connection.execute(whole) if (kind, name, sql) not in ours}:
+            raise sqlite3.DatabaseError(f"{one_line(str(min(strange)))} in it is not as `fleet` makes it")
+        connection.execute("PRAGMA journal_mode=WAL")
+        connection.executescript(SCHEMA)
 
     def ended(self) -> dict[str, tuple[int, int, str]]:
         """Logs that need not be done again: size, time of change and key by name."""
@@ -611,13 +645,15 @@ class Store:
             self._connection.execute("DELETE FROM logs WHERE name = ?", (name,))
             self._insert("logs", [{"vehicle": None, **row, "warnings": warnings}])
 
-    def keep(self, names: set[str]) -> None:
-        """Forgets logs that are no longer in the folder."""
-        gone = [(n,) for (n,) in self._connection.execute("SELECT name FROM logs") if n not in names]
+    def keep(self, jobs: Sequence[Job]) -> None:
+        """Forgets all that is not a result of one of these jobs: of other files, settings or authors."""
+        ours = {(job.name, job.size, job.modified, job.key) for job in jobs}
+        found = self._connection.execute("SELECT rowid, name, size, modified, key FROM logs")
+        gone = [(row,) for row, *known in found if tuple(known) not in ours]
         with self._connection:
-            self._connection.executemany("DELETE FROM logs WHERE name = ?", gone)
+            self._connection.executemany("DELETE FROM logs WHERE rowid = ?", gone)
             for table in PARTS:
-                self._connection.executemany(f"DELETE FROM {table} WHERE log = ?", gone)
+                self._connection.execute(f"DELETE FROM {table} WHERE log IS NULL OR log NOT IN (SELECT name FROM logs)")
 
     def rows(self, table: str) -> list[Row]:
         """All rows of a table, in the order of their log's name."""
@@ -636,9 +672,9 @@ class Store:
         files = []
         for table, columns in TABLES.items():
             schema = pa.schema([(name, kinds[kind.split()[0]]) for name, kind in columns.items()])
-            path = folder / f"fleet.{table}.parquet"
-            pq.write_table(pa.Table.from_pylist(self.rows(table), schema=schema), path, compression="zstd")
-            files.append(path)
+            files.append(folder / f"fleet.{table}.parquet")
+            with written_whole(files[-1]) as part:
+                pq.write_table(pa.Table.from_pylist(self.rows(table), schema=schema), part, compression="zstd")
         return files
 
     def _insert(self, table: str, rows: list[Row]) -> None:
@@ -650,9 +686,12 @@ class Store:
 
 @contextmanager
 def open_store(path: Path) -> Iterator[Store]:
-    """Opens or makes the SQLite file."""
-    connection = sqlite3.connect(path)
+    """Opens or makes the SQLite file; raises OutputError for one that `fleet` has not made, or that fails."""
     try:
-        yield Store(connection)
-    finally:
-        connection.close()
+        if path.is_symlink() or (path.exists() and not path.is_file()):
+            raise sqlite3.DatabaseError("it is no regular file")
+        with contextlib.closing(sqlite3.connect(path)) as connection:
+            yield Store(connection)
+    except sqlite3.Error as error:
+        fix = "remove it or free space, or use another --out"
+        raise OutputError(f"{path} cannot be used ({error})", "results of `fleet`", fix) from error

@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
@@ -41,14 +42,21 @@ class OutputError(QuadidError):
     """A place that cannot be written to."""
 
 
-def write_text(path: str | Path, text: str) -> Path:
-    """Writes a file whole or not at all; into a pipe or device where one stands there. Returns its absolute path."""
-    target = Path(path).absolute()
+@contextmanager
+def written_whole(target: Path) -> Iterator[Path]:
+    """A name under which to write a file whole or not at all; a pipe or device is written to where one stands there.
+
+    Where a link stands, it is the link that is replaced.
+
+    Raises:
+        OutputError: it cannot be written.
+    """
     there = target.exists() and not target.is_file()
     part = target if there else target.with_name(f".{os.getpid()}.{file_name(target.name)}.part")
     try:
-        with open(part, "w", encoding="utf-8", errors="replace", opener=unwaited) as file:
-            file.write(text)
+        if not there:
+            part.unlink(missing_ok=True)  # a link that somebody laid there would be followed
+        yield part
         if not there:
             os.replace(part, target)
     except OSError as error:
@@ -57,6 +65,13 @@ def write_text(path: str | Path, text: str) -> Path:
         raise OutputError(
             f"{target} cannot be written ({error.strerror})", fix="check permissions and free space"
         ) from error
+
+
+def write_text(path: str | Path, text: str) -> Path:
+    """Writes a file whole or not at all; into a pipe or device where one stands there. Returns its absolute path."""
+    target = Path(path).absolute()
+    with written_whole(target) as place, open(place, "w", encoding="utf-8", errors="replace", opener=unwaited) as file:
+        file.write(text)
     return target
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import multiprocessing
 import os
@@ -20,12 +21,24 @@ import pytest
 from quadid_replay import write_csv, write_mcap
 
 from quadid.app import fleet as fleet_cluster
-from quadid.app.fleet import ClusterError, Job, cluster, find_jobs, identify_one, open_store, results
+from quadid.app.fleet import (
+    PARTS,
+    TABLES,
+    ClusterError,
+    Job,
+    cluster,
+    find_jobs,
+    identify_one,
+    open_store,
+    results,
+)
 from quadid.app.fleet_page import Row
+from quadid.app.logs import OutputError, write_text
 from quadid.errors import LogError, VehicleError
 from quadid.flight import fly
 from quadid.vehicle import Vehicle
 from tests.commands import Cli, one_line
+from tests.faults.evidence import Happened
 
 DAY_NS = 86_400 * 10**9
 
@@ -172,6 +185,81 @@ def test_outcomes_are_stored_as_they_come_so_that_a_killed_run_goes_on(folder: P
         store.put(identify_one(empty))
         with open_store(tmp_path / "fleet.sqlite") as other:  # before the first is closed
             assert other.ended() == {empty.name: (0, empty.modified, empty.key)}
+
+
+def test_results_that_a_stranger_packed_beside_the_logs_are_forgotten(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, happened: Happened
+) -> None:
+    """Whoever made the folder knows names, sizes and times of its files, and not this user's secret."""
+    text = Vehicle.shipped("pelican").to_yaml()
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "stranger"))
+    forged = next(j for j in find_jobs(folder, text, 50.0, 1, False).jobs if j.name.endswith("empty.bin"))
+    row = {**identify_one(forged), "reason": "forged"}
+    with open_store(tmp_path / "fleet.sqlite") as store:
+        store.put(row)
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "mine"))
+    jobs = find_jobs(folder, text, 50.0, 1, False).jobs
+    assert {j.key for j in jobs} == {j.key for j in find_jobs(folder, text, 50.0, 1, False).jobs}, (
+        "a second run knows it"
+    )
+    with open_store(tmp_path / "fleet.sqlite") as store:
+        for table in PARTS:
+            store._connection.execute(f"INSERT INTO {table} (log) VALUES (NULL), ('none')")
+        store.keep(jobs)
+        assert not any(store.rows(table) for table in TABLES)
+    happened(35, "fleet.sqlite packed beside the logs: its rows forgotten, the logs done")
+
+
+@pytest.mark.parametrize("what", ["a view", "a trigger", "a pipe", "a link", "a folder", "text"])
+def test_a_store_that_fleet_has_not_made_is_refused(tmp_path: Path, what: str, happened: Happened) -> None:
+    path, other = tmp_path / "fleet.sqlite", tmp_path / "other"
+    with contextlib.closing(sqlite3.connect(other)) as db, db:
+        db.execute("CREATE TABLE mine (x)")
+    kept = other.read_bytes()
+    computes = {
+        "a view": "CREATE VIEW logs AS WITH RECURSIVE c(x) AS (SELECT 1 UNION ALL SELECT x FROM c) SELECT x FROM c",
+        "a trigger": "CREATE TABLE t (x); CREATE TRIGGER y AFTER INSERT ON t BEGIN DELETE FROM t; END",
+    }
+    if what in computes:
+        with contextlib.closing(sqlite3.connect(path)) as db:
+            db.executescript(computes[what])
+    elif what == "a pipe":
+        os.mkfifo(path)
+    elif what == "a link":
+        path.symlink_to(other)
+    elif what == "a folder":
+        path.mkdir()
+    else:
+        path.write_text("no database" * 100)
+    with pytest.raises(OutputError, match="cannot be used"), open_store(path):
+        pass
+    assert other.read_bytes() == kept
+    happened(35, f"fleet.sqlite is {what}: refused")
+
+
+def test_a_link_where_results_are_written_is_replaced_and_not_followed(tmp_path: Path, happened: Happened) -> None:
+    mine = tmp_path / "mine"
+    mine.write_text("precious")
+    out = tmp_path / "out"
+    out.mkdir()
+    for name in (*(f"fleet.{table}.parquet" for table in TABLES), "fleet.html", f".{os.getpid()}.fleet.html.part"):
+        (out / name).symlink_to(mine)
+    with open_store(out / "fleet.sqlite") as store:
+        store.write_parquet(out)
+    write_text(out / "fleet.html", "page")
+    assert mine.read_text() == "precious"
+    assert pq.read_table(out / "fleet.logs.parquet").num_rows == 0
+    assert (out / "fleet.html").read_text() == "page"
+    happened(35, "links under the names of results: replaced, what they pointed to untouched")
+
+
+def test_folders_that_link_to_themselves_are_one_line(tmp_path: Path, quadid: Cli) -> None:
+    (tmp_path / "a").symlink_to("b")
+    (tmp_path / "b").symlink_to("a")
+    run = quadid("fleet", tmp_path / "a", "--vehicle", "pelican", "--out", tmp_path / "out")
+    assert run.code == 2
+    assert "no folder" in run.err
+    assert len(run.err.strip().splitlines()) == 1
 
 
 def test_a_log_that_kills_its_worker_is_reported_and_the_rest_goes_on(folder: Path) -> None:

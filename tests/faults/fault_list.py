@@ -99,8 +99,9 @@ FAULTS: dict[int, Fault] = {
         "not imported; numba's settings refused",
     ),
     35: Fault(
-        "small files that point to themselves (MCAP index, SQLite overflow chains), pipes and devices as files",
-        "limits of what is read; no wait for a pipe, no device replaced",
+        "small files that point to themselves (MCAP index, SQLite overflow chains), pipes and devices as files, "
+        "results of `fleet` and links that a stranger packed beside the logs",
+        "limits of what is read; no wait for a pipe, no device replaced; results forgotten, links not followed",
     ),
     36: Fault(
         "export from a history of a set that was withdrawn, is stale, or rests on another mass",
@@ -110,9 +111,12 @@ FAULTS: dict[int, Fault] = {
     38: Fault("payload taken up or dropped in flight", "named; sets wait for a person (`mass`)"),
     39: Fault(
         "tether or support, accelerometer scale under a bias, gyro leaks, smoothing, lateness; several at once",
-        "waits, or within 5 %",
+        "waits, or within 5 %; where a support and a hidden scale cancel, within the interval that is published",
     ),
-    40: Fault("first flight with nothing to compare a set with", "`reference: none` in the message"),
+    40: Fault(
+        "first flight with nothing to compare a set with",
+        "`reference: none` in the message, force known to 9 % in every interval",
+    ),
     41: Fault("GPS lock or loss, attitude or accelerometer that begins or ends in flight", "fits go on"),
     42: Fault("one early or late stamp, a channel with another clock, stamps that race", "itself lost; named; bounded"),
     43: Fault(
