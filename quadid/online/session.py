@@ -499,11 +499,11 @@ class Session:
         )  # fmt: skip
         decision = decide(case, self.settings.gate)
         mse, unseen = estimator.scores()
-        stop, (reference, force) = outbox.stamp(request.stop), sets.reference(estimator.stated)
+        stop, (reference, spread) = outbox.stamp(request.stop), sets.reference(estimator.stated)
         item = OnlineSet(
-            0, decision.state, decision.reason, parameters.scaled_together(force), outbox.stamp(estimator.start), stop,
+            0, decision.state, decision.reason, parameters.scaled_together(spread), outbox.stamp(estimator.start), stop,
             estimator.rows, mse, unseen, estimator.input_hash, check=decision.check, mass=mass, reference=reference,
-            reference_sd=force,
+            reference_sd=spread,
         )  # fmt: skip
         if decision.state is SetState.ACCEPTED:
             outbox.act(*sets.accept(item, "auto", stop, request.stop))
