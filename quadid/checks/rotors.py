@@ -14,6 +14,7 @@ import numpy as np
 from quadid.checks.doubts import Off, estimates_off, farthest, rotors_off
 from quadid.checks.findings import Check, CheckResult
 from quadid.checks.motion import HOPELESS, Spans, is_turning, within
+from quadid.chi_square import exceeded
 from quadid.data.grid import bridged, linear, moving_mean, to_windows
 from quadid.data.rotor_signal import INERTIA_RATE, RotorSignal, rotor_channel, rotor_signal
 from quadid.data.window import Channel, Recording, Window, measured_period, sample_period, true_runs
@@ -543,6 +544,8 @@ _SETTLED = 0.25
 """Correlation in roll and pitch that settles an order."""
 _GAIN, _CHANGE = 0.3, 0.1
 """Likelihood that another order or frame, or other spins, must gain for each sample; what each change costs."""
+_CHANCE = 5e-3
+"""Probability with which chance may gain as much."""
 _TURNED = 8
 """Orders that are tried with a turned frame, too."""
 _MOST_ROTORS = 6
@@ -860,10 +863,11 @@ def _spins(lagged: Lagged, vehicle: Vehicle) -> tuple[list[tuple[int, ...]], flo
     # Without turning on purpose, what yaw follows is a matter of chance.
     gain = np.where(found > 2.0 * _SETTLED, _gain(found[:, None]) - _CHANGE * wrong.clip(max=2), -np.inf)
     best = int(np.argmax(gain[1:])) + 1
-    if gain[best] <= _gain(found[:1]):
+    own, chance = _gain(found[:1]), exceeded(_CHANCE, 1) / _independent(lagged.slow, vehicle)
+    if gain[best] <= own or _gain(found[best : best + 1]) <= own + chance:
         return [], float(found[0])
     # Which of them is told by roll and pitch, but for partners on one arm: they have one command.
-    near = 1 + np.flatnonzero(gain[1:] > gain[best] - _CHANGE)
+    near = 1 + np.flatnonzero(gain[1:] > gain[best] - max(_CHANGE, chance))
     whole = _gain(np.array([[_drag_explains(lagged.slow, _spun(vehicle, turned[k]), alone=False)] for k in near]))
     return [turned[k] for k in near[whole > whole.max() - _CHANGE]], float(found[best])
 
@@ -890,16 +894,34 @@ def _listed(rotors: Sequence[tuple[int, ...]]) -> str:
 def _drag_explains(slow: Rows, vehicle: Vehicle, alone: bool = True) -> float:
     """Correlation of yaw acceleration with the drag of the rotors; 0 where all turn the same way, or little is flown.
 
-    What follows their spin-up has no part in it: a loop against disturbances makes that look reversed.  Nor, `alone`,
-    has what follows roll and pitch: a tilted gyro makes it.
+    What follows spin-up of any rotor has no part in it: a loop against disturbances makes drag look reversed by it, and
+    motors that lag by less than a row or two answer by it.  All spins are judged without the same motion: were it only
+    the spin-up by the spins at hand, others would keep what these lose.  Nor, `alone`, has what follows roll and pitch:
+    a tilted gyro makes it.
     """
+    yaw, drag = _yaw_and_drag(slow, vehicle, alone)
+    return float(yaw @ drag / np.sqrt(yaw @ yaw * (drag @ drag) + 1e-300))
+
+
+def _yaw_and_drag(slow: Rows, vehicle: Vehicle, alone: bool) -> FloatArray:
+    """Yaw acceleration and drag torque over b without what `_drag_explains` leaves out, shape (2, n); else zeros."""
     squares, motion, spun = slow
     if len(squares) < 100 or len(set(vehicle.spins)) < 2:
-        return 0.0
+        return np.zeros((2, 1))
     both = np.column_stack([motion[:, 2], squares @ vehicle.torque_arms[:, 2]])
-    others = np.linalg.qr(np.column_stack([*motion[:, : 2 * alone].T, spun @ vehicle.spins]))[0]
-    yaw, drag = (both - others @ (others.T @ both)).T
-    return float(yaw @ drag / np.sqrt(yaw @ yaw * (drag @ drag) + 1e-300))
+    others = np.linalg.qr(np.column_stack([*motion[:, : 2 * alone].T, spun]))[0]
+    return np.asarray((both - others @ (others.T @ both)).T)
+
+
+def _independent(slow: Rows, vehicle: Vehicle) -> float:
+    """Number of independent samples in the correlation of yaw acceleration and drag: neither is white.
+
+    M. S. Bartlett, Journal of the Royal Statistical Society 98 (1935) 536.
+    """
+    both = _yaw_and_drag(slow, vehicle, True)
+    power = np.abs(np.fft.rfft(both, 2 * both.shape[1])) ** 2
+    memory = np.fft.irfft(power)[:, : both.shape[1]] / (np.sum(both**2, axis=1)[:, None] + 1e-300)
+    return both.shape[1] / max(2.0 * float(memory[0] @ memory[1]) - 1.0, 1.0)
 
 
 class _Answer(NamedTuple):

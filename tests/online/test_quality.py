@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +12,7 @@ import pytest
 from quadid.checks import inspect
 from quadid.checks.findings import CheckResult
 from quadid.data.window import Window
-from quadid.flight import fly
+from quadid.flight import draw_truth, fly
 from quadid.model.layout import Layout, ThrustModel
 from quadid.online.checks import Quality, judge, mistake
 from quadid.online.grid_buffer import WindowCut
@@ -177,3 +178,27 @@ def test_a_wrong_order_of_rotors_is_named_where_their_readings_are_quick_enough(
         (check,) = [c for c in log.checks if c.name == "motor_order"]
         assert (check.verdict is CheckResult.ERROR) == (every == 1)
     assert mistake(WindowCut((swapped,), 10.0, 0), PELICAN, known=True) == ""
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_motors_that_lag_in_a_calm_hover_turn_as_the_file_says(seed: int) -> None:
+    """Twelve and seventeen of fifty windows were refused: some pair of rotors "turned the other way"."""
+    vehicle = Vehicle.shipped("hexacopter")
+    window = fly(vehicle, draw_truth(vehicle, seed), 40.0, seed, "hover", effects={"motor_lag": {"tau": 0.05}}).window
+    for first in range(0, len(window) - 500, 50):
+        cut = WindowCut((window.slice(first, first + 500),), 10.0, 0)
+        assert mistake(cut, vehicle, known=False) == ""
+
+
+@pytest.mark.parametrize("which", [(0,), (4,), range(6)])
+def test_spins_that_are_wrong_are_named_in_gusts(which: Sequence[int]) -> None:
+    vehicle = Vehicle.shipped("hexacopter")
+    gusts = {"gusts": {"push": 0.3, "turn": 0.4, "time": 0.6}}
+    effects = {"motor_lag": {"tau": 0.035}}
+    window = fly(vehicle, draw_truth(vehicle, 0), 15.0, 0, "excited", effects=effects, outside=gusts).window
+    rotors = tuple(r.model_copy(update={"spin": -r.spin}) if k in which else r for k, r in enumerate(vehicle.rotors))
+    named = mistake(
+        WindowCut((window.slice(0, 500),), 10.0, 0), vehicle.model_copy(update={"rotors": rotors}), known=False
+    )
+    assert named.startswith("motor order:")
+    assert ("negate the spins" if len(which) == 6 else f"rotor {which[0] + 1} turns") in named
