@@ -422,6 +422,15 @@ def _read_beyond(beyond: Beyond, k: int, step: FloatArray, nu: FloatArray) -> No
 
 
 @_fast
+def _sense_beyond(beyond: Beyond, k: int, slope: FloatArray) -> None:
+    """Adds to `_accel_slope` what a larger model makes of the accelerometer at the end of step k, by velocity."""
+    if len(beyond.added) > 0 and k >= 0:
+        for i in range(3):
+            for j in range(3):
+                slope[i, 3 + j] += beyond.slope[k, 9 + i, 3 + j]
+
+
+@_fast
 def _bend(beyond: Beyond, k: int, F: FloatArray) -> None:
     """Adds the slope of what a larger model makes of step k to F of Eq. 5."""
     if len(beyond.added) > 0:
@@ -493,9 +502,11 @@ def _correct(dx: FloatArray, x: FloatArray) -> None:
 
 @_fast
 def _start(track: Track, p: FloatArray) -> FloatArray:
-    """First mean: as first measured, level and at rest where nothing was; its covariance is wide."""
+    """First mean: as first measured, else level and at rest or where a larger model is linearised; P is wide."""
     x = np.zeros(N_MEAN)
     x[0] = 1.0
+    if len(track.beyond.added) > 0:
+        x[VE + 1 : VE + 4] = track.beyond.at[0, 3:]
     for group in range(4):
         for k in range(len(track.t)):
             if track.seen[k, group]:
@@ -724,6 +735,7 @@ def kalman(track: Track, p: FloatArray, psi: FloatArray, tail: FloatArray, store
         slope = g.slope[at]
         # Update by all that was measured now, Eq. 6.
         _accel_slope(c, g.table[k], air, x, slope)
+        _sense_beyond(track.beyond, k - 1, slope)
         _expected(c, p, track.y[k], track.seen[k], g.table[k], air, x, nu)
         _read_beyond(track.beyond, k, step, nu)
         dx[:] = 0.0

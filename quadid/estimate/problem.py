@@ -18,6 +18,7 @@ from quadid.estimate.track import quantum, wavering
 from quadid.estimate.whole_model import WholeModel
 from quadid.model.layout import Layout
 from quadid.parameters import NOMINAL_NAMES
+from quadid.rotation import rotated
 from quadid.types import FloatArray
 from quadid.vehicle import GRAVITY, Vehicle
 
@@ -79,6 +80,8 @@ AT_ONCE = 16
 """Points whose effects are simulated together: more would only take more memory."""
 SETTLING = 2
 """Times that effects are simulated anew along the states that they move."""
+RECKONED = 6.0
+"""Time [s] after which drag has shown the velocity that a flight began with."""
 LEAST = 1e-2
 """Share of its prior below which a random force or a delay is none."""
 
@@ -115,6 +118,22 @@ def _rows(track: Track, share: float) -> tuple[int, int]:
     square = np.concatenate([[0.0], np.cumsum(np.sum(track.y[:, :3] ** 2, axis=1) * track.seen[:, 0])])
     first = int(np.argmax(square[rows:] - square[: n + 1 - rows]))
     return first, first + rows
+
+
+def reckoned(track: Track, mean: FloatArray) -> FloatArray:
+    """Filtered means (n, N_MEAN) whose velocity in the first seconds is reckoned back from after them.
+
+    Where velocity is not measured, drag shows it after a while; until then a larger model would be linearised at
+    velocities far off, and drag that grows with their square shows nothing at rest.
+    """
+    last = min(int(np.searchsorted(track.t, track.t[0] + RECKONED)), len(track.t) - 1)
+    if track.seen[:, 3].any() or not track.seen[: last + 1, 2].all():
+        return mean
+    out, rows = mean.copy(), slice(0, last + 1)
+    gained = rotated(mean[rows, :4], track.y[rows, 7:10]) + [0.0, 0.0, GRAVITY]
+    steps = 0.5 * (gained[1:] + gained[:-1]) * np.diff(track.t[rows])[:, None]
+    out[:last, 7:10] = mean[last, 7:10] - np.cumsum(steps[::-1], axis=0)[::-1]
+    return out
 
 
 def floor_of(tracks: Sequence[Track]) -> FloatArray:
@@ -452,17 +471,25 @@ class Problem:
     ) -> tuple[float, Gains]:
         track, p = self.tracks[j], self.physics(z, j)
         if self.models:
-            # First along states that follow the measurements: where random forces are small, those without effects run
-            # away.
-            near = near or k.kalman(track, p, self.first_noise(), self.tail, True)[1]
-            model, theta, mean = self.models[j], self.vector(z, j), near.mean
-            for _ in range(SETTLING):
-                track = track._replace(beyond=model.along(theta, mean))
-                mean = np.empty_like(mean)
-                k.replay(track, p, psi, near, _table(track, near, p), _NO_ROWS, mean)
-            track = track._replace(beyond=model.along(theta, mean))
+            if near is None:
+                # First along states that follow the measurements: where random forces are small, those without effects
+                # run away.  Then along their own.
+                near = k.kalman(track, p, self.first_noise(), self.tail, True)[1]
+                first, own = k.kalman(self._simulated(j, z, psi, near), p, psi, self.tail, True)
+                near = own if np.isfinite(first) else near
+            track = self._simulated(j, z, psi, near)
         value, gains = k.kalman(track, p, psi, self.tail, store)
         return float(value), gains
+
+    def _simulated(self, j: int, z: FloatArray, psi: FloatArray, near: Gains) -> Track:
+        """Flight j with its effects simulated at z along the states that these gains give, until both settle."""
+        track, p, model, theta = self.tracks[j], self.physics(z, j), self.models[j], self.vector(z, j)
+        mean = near.mean
+        for _ in range(SETTLING):
+            track = track._replace(beyond=model.along(theta, reckoned(track, mean)))
+            mean = np.empty_like(mean)
+            k.replay(track, p, psi, near, _table(track, near, p), _NO_ROWS, mean)
+        return track._replace(beyond=model.along(theta, reckoned(track, mean)))
 
     def score(self, z: FloatArray, psi: FloatArray, gains: Sequence[Gains]) -> FloatArray:
         """Derivative of the objective by the noise numbers."""
@@ -575,8 +602,9 @@ class Problem:
             track = self.tracks[j]
             tracks = [track] * len(some)
             if self.models:
-                added = self.models[j].beyond(np.array([self.vector(z, j) for z in some]), g.mean)
-                tracks = [track._replace(beyond=Beyond(a, g.beyond.slope, g.mean[:, 4:10].copy())) for a in added]
+                mean = reckoned(track, g.mean)
+                added = self.models[j].beyond(np.array([self.vector(z, j) for z in some]), mean)
+                tracks = [track._replace(beyond=Beyond(a, g.beyond.slope, mean[:, 4:10].copy())) for a in added]
             out += _each(partial(self._whitened, j, psi, g, some, tracks), len(some))
         return out
 

@@ -1,4 +1,4 @@
-"""The table of effects in the filter: what sensors remember."""
+"""The table of effects in the filter: what acts along its states, what sensors remember, how a flight begins."""
 
 from __future__ import annotations
 
@@ -6,16 +6,31 @@ import numpy as np
 
 from quadid.data.window import Window
 from quadid.estimate import kalman as k
-from quadid.estimate.problem import PLACES
+from quadid.estimate.fit import estimate
+from quadid.estimate.problem import PLACES, Problem
+from quadid.estimate.track import from_window
 from quadid.estimate.whole_model import WholeModel, _attitude
 from quadid.flight import draw_truth, fly
 from quadid.model.layout import Layout
 from quadid.model.rollout import Segments
 from quadid.rotation import turn
 from quadid.vehicle import ParameterPrior, Vehicle
-from tests.estimate.test_fit import PELICAN
+from tests.estimate.test_fit import PELICAN, guessed
 
 SEED = 5
+
+
+def test_drag_that_grows_with_the_square_of_a_velocity_nobody_measures_is_found_and_leaves_no_random_force() -> None:
+    """Only the accelerometer shows it, by the velocity that it depends on itself."""
+    truth = draw_truth(PELICAN, SEED)
+    window = fly(PELICAN, truth, 60.0, SEED, effects={"parasitic_drag": {"c": 0.05}}).window
+    vehicle = guessed(truth.as_dict(), 1.2, SEED)
+    name = "parasitic_drag.c"
+    found = estimate(Problem.of([from_window(window, vehicle, air=True)], vehicle, (name,), [window]))
+    value, sigma = found.value(name)
+    assert sigma < 0.003
+    assert abs(value - 0.05) < 3.0 * sigma
+    assert found.psi[k.SIGMA] < 0.03, "m/s^2, the horizontal random force"
 
 
 def test_the_pull_of_the_attitude_filter_is_followed_along_a_whole_flight() -> None:
