@@ -194,8 +194,8 @@ def scoring(
 
     Physics by sensitivities of the innovations under the gains of this turn; the noise numbers' logarithms, those that
     `noise` (N_NOISE,) frees, by the exact score of the full filter.  Gains are renewed after every step.  One that does
-    not help is damped in physics (Levenberg-Marquardt) or, where physics alone helps, reaches less far in the noise: it
-    may act so little that its expected curvature says nothing.  Without `physics` the noise alone moves.
+    not help is damped (Levenberg-Marquardt), the noise alone where physics alone helps: where it hardly acts, its
+    expected curvature says nothing.  Without `physics` the noise alone moves.
 
     Returns:
         Scaled parameters, noise numbers, objective, gains there; information (P, P) before the last step.
@@ -203,7 +203,7 @@ def scoring(
     value, gains = problem.passes(z, psi)
     information, gradient = np.eye(len(z)), np.zeros(len(z))
     curvature, slope, at = np.eye(len(psi)), np.zeros(len(psi)), np.full(len(psi), np.inf)
-    damping, reach = 0.0, np.inf
+    damping = calm = 0.0
     below = above = np.zeros(len(z))
     for _ in range(turns if np.isfinite(value) else 0):
         if physics:
@@ -222,43 +222,44 @@ def scoring(
             break  # readings so wild that they overflow lead nowhere
         for _ in range(PATIENCE):
             step = newton_step(information, gradient, damping, below, above)
-            bold = newton_step(curvature, slope, 0.0, *noise_box(problem.noise_bounds, psi, noise, reach))
+            bold = newton_step(curvature, slope, calm, *noise_box(problem.noise_bounds, psi, noise))
             by_physics, by_noise = -float(gradient @ step), -0.5 * float(slope @ bold)
             done = by_physics < FINE and by_noise < ENOUGH
             moved, changed = z + step, changed_noise(psi, bold)
-            far = float(np.max(np.abs(np.log(changed / psi))))
             better, renewed = problem.passes(moved, changed, gains)
             if better < value or done:
                 break
-            if by_physics < FINE:
-                reach = 0.5 * min(reach, far)
-                continue
-            if noise.any():
+            if by_physics > FINE and noise.any():
                 better, renewed = problem.passes(moved, psi, gains)
             if better < value:
-                changed, by_noise, reach = psi, 0.0, 0.5 * min(reach, far)
+                changed, by_noise, calm = psi, 0.0, more(calm)
                 break
-            damping = max(4.0 * damping, 0.1)
+            damping, calm = more(damping), more(calm)
         if not better < value:
             break
         if value - better > POOR * (by_physics + by_noise):
-            damping = 0.25 * damping if damping > 0.02 else 0.0
-            reach = reach if changed is psi else 2.0 * reach
+            damping, calm = less(damping), calm if changed is psi else less(calm)
         else:
-            damping, reach = max(4.0 * damping, 0.1), reach if changed is psi else 0.5 * min(reach, far)
+            damping, calm = more(damping), calm if changed is psi else more(calm)
         z, psi, value, gains = moved, changed, better, renewed
         if done:
             break
     return z, psi, value, gains, information
 
 
-def noise_box(bounds: FloatArray, psi: FloatArray, free: BoolArray, reach: float) -> tuple[FloatArray, FloatArray]:
-    """Least and most step of the noise numbers, as `changed_noise` takes it: up by a factor, down to the bound.
+def more(damping: float) -> float:
+    """Damping after a step that was too long."""
+    return max(4.0 * damping, 0.1)
 
-    No logarithm changes by more than `reach`.
-    """
-    low = np.maximum(bounds[:, 0] / psi, np.exp(-reach))
-    high = np.minimum(bounds[:, 1] / psi, np.exp(min(BOLD, reach)))
+
+def less(damping: float) -> float:
+    """Damping after a good step."""
+    return 0.25 * damping if damping > 0.02 else 0.0
+
+
+def noise_box(bounds: FloatArray, psi: FloatArray, free: BoolArray) -> tuple[FloatArray, FloatArray]:
+    """Least and most step of the noise numbers, as `changed_noise` takes it: up by a factor, down to the bound."""
+    low, high = bounds[:, 0] / psi, np.minimum(bounds[:, 1] / psi, np.exp(BOLD))
     low[k.TIME :] = np.maximum(low[k.TIME :], np.exp(-BOLD))
     box = np.array([low, high])
     box = np.where(np.arange(k.N_NOISE) < k.TIME, 0.5 * (box**2 - 1.0), np.log(box))
