@@ -921,7 +921,7 @@ def _independent(slow: Rows, vehicle: Vehicle) -> float:
     both = _yaw_and_drag(slow, vehicle, True)
     power = np.abs(np.fft.rfft(both, 2 * both.shape[1])) ** 2
     memory = np.fft.irfft(power)[:, : both.shape[1]] / (np.sum(both**2, axis=1)[:, None] + 1e-300)
-    return both.shape[1] / max(2.0 * float(memory[0] @ memory[1]) - 1.0, 1.0)
+    return float(both.shape[1] / max(2.0 * float(memory[0] @ memory[1]) - 1.0, 1.0))
 
 
 class _Answer(NamedTuple):
