@@ -226,7 +226,7 @@ PARAMETERS = [
 SET = {
     "sequence": 3, "wall": 1.7e9, "state": "rolled_back", "approved_by": "operator", "start": 1.0, "stop": 59.0,
     "mse": 1.234, "parameters": PARAMETERS, "reason": "it predicts new windows worse than its predecessor",
-    "reference": "vehicle_file",
+    "reference": "none", "reference_sd": 0.09,
 }  # fmt: skip
 METHOD = {
     "name": "differential_evolution", "mse": {"train": 1.2345, "validate": [2.3456, 3.4567]},
