@@ -94,7 +94,7 @@ def unreliable(parameters: Iterable[Parameter], names: Collection[str]) -> tuple
 
 def _wider(p: Parameter, sigma: float) -> Parameter:
     """A parameter whose logarithm has this standard deviation besides."""
-    down, up = (math.hypot(math.log(end / p.value), Z95 * sigma) for end in p.ci95)
+    down, up = (math.hypot(math.log(end) - math.log(p.value), Z95 * sigma) for end in p.ci95)
     interval = p.value * math.exp(-down), p.value * math.exp(up)
     return replace(p, sigma=math.hypot(p.sigma, sigma * p.value), ci95=interval)
 

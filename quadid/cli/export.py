@@ -70,7 +70,13 @@ def _in_force(vehicle: Vehicle, history: Path, name: str) -> tuple[Vehicle, str,
         names = ", ".join(entry["name"] for entry in read_history(history, name, sets=0)["vehicles"]) or "none"
         unread = f": {found.why_none}" if found.why_none else ""
         raise StoreError(f"no set of '{name}' was ever in force in {history}{unread}", f"one of: {names}", "give --id")
-    fitted = with_values(vehicle, found.item.parameters).model_copy(update={"proof": None})
+    try:
+        fitted = with_values(vehicle, found.item.parameters).model_copy(update={"proof": None})
+    except ValueError as error:
+        raise StoreError(
+            f"set {found.item.sequence} of '{name}' in {history} is no set that a fit makes: {found.why_none}",
+            "a set that a service has written", "fly on until the service publishes another",
+        ) from error  # fmt: skip
     if TANGENT in found.item.parameters.names:
         # The file says by a dead speed how steep thrust is at hover.
         b, steep = (found.item.parameters[n].value for n in ("b", TANGENT))

@@ -470,8 +470,13 @@ def why_none(found: OnlineSet, number: int, gate: GateSettings, vehicle: Vehicle
         return (
             f"it lacks {', '.join(missing)}" if missing else f"it has other parameters than {', '.join(NOMINAL_NAMES)}"
         )
-    if not np.isfinite(found.parameters.covariance).all():
+    covariance, sigma = found.parameters.covariance, np.array([p.sigma for p in found.parameters])
+    if not np.isfinite(covariance).all():
         return "its covariance is not a number"
+    # What it says of differences and ratios is believed by the gate.
+    most = np.outer(sigma, sigma)
+    if (np.abs(covariance) > 1.01 * most).any() or (np.abs(covariance - covariance.T) > 0.01 * most).any():
+        return "its covariance is not that of its standard deviations"
     if vehicle is None:
         return implausible(found.parameters, gate) or ""
     if not math.isnan(found.mass) and not vehicle.mass / ROOM <= found.mass <= vehicle.mass * ROOM:

@@ -320,6 +320,8 @@ def set_from_dict(data: Mapping[str, Any]) -> OnlineSet:
     made: OnlineSet = msgspec.convert(found, OnlineSet, dec_hook=lambda _, rows: np.array(rows, dtype=np.float64))
     if "reference_sd" not in data:  # of a version that did not ask
         made = replace(made, parameters=made.parameters.scaled_together(FORCE), reference_sd=FORCE)
+    if not 0.0 <= made.reference_sd <= 1.0:
+        raise ValueError(f"a set whose reference has a standard deviation of {made.reference_sd:g}")
     if not 0 <= made.samples < 1 << 32 or any(abs(t) >= 1 << 31 for t in (made.start, made.stop)):
         raise ValueError(f"a set of {made.samples} samples from {made.start:g} to {made.stop:g} s")
     return made

@@ -642,6 +642,13 @@ HOSTILE_SETS = {
     "a time that no message holds": with_all(stop=1e300), "more samples than a message holds": with_all(samples=2**40),
     "fewer samples than none": with_all(samples=-4), "half a character": with_all(reason="\ud800"),
     "half a character in a unit": with_first(unit="\udcff"),
+    "a reference known to 1e308": with_all(reference_sd=1e308),
+    "one known to less than nothing": with_all(reference_sd=-1.0),
+    "one known to no number": with_all(reference_sd=None),
+    "a covariance beyond the deviations": with_all(covariance=np.full((6, 6), 1e9).tolist()),
+    "a covariance of two minds": with_all(covariance=[[0.0] * 6] * 3 + [[2e-12, *[0.0] * 5]] + [[0.0] * 6] * 2),
+    "an old one without a value": with_first(value=0.0, ci95=[1.0, 2.0]).replace("reference_sd", "no"),
+    "an old one without an interval": with_first(ci95=[0.0, 0.0]).replace("reference_sd", "no"),
     "a parameter twice": with_all(parameters=2 * set_to_dict(online_set(TRUE))["parameters"], covariance=None),
 }  # fmt: skip
 

@@ -196,6 +196,18 @@ def test_a_set_that_is_not_in_force_is_exported_only_when_insisted(
     happened(36, f"export of a set {case}: '{refused.err.strip()[:100]}'")
 
 
+@pytest.mark.parametrize("b", [-2.33e-5, 0.0, 1e40])
+def test_a_value_that_no_vehicle_file_holds_is_refused_in_one_line(
+    b: float, tmp_path: Path, inside: Cli, happened: Happened
+) -> None:
+    path = history_of(tmp_path / "h.sqlite", replace(online_set({**TRUE, "b": b}), mass=1.3))
+    run = inside("export", "--vehicle", "pelican", "--history", path, "--out", tmp_path / "out", "--anyway")
+    assert run.code == 2
+    assert "no set that a fit makes" in run.err
+    assert len(run.err.strip().splitlines()) == 1
+    happened(36, f"export of b = {b:g}: refused")
+
+
 def test_a_set_of_a_vehicle_with_other_rotors_is_exported_only_when_insisted(
     tmp_path: Path, inside: Cli, happened: Happened
 ) -> None:

@@ -77,8 +77,8 @@ def test_creeping_there_in_small_steps_ends_at_the_baseline_even_across_restarts
             machine.restart()
     reached = max(s.parameters[name].value for s in machine.published if s.state is SetState.ACCEPTED) / start - 1.0
     told = reasons(machine)
-    first = machine.published[0].parameters
-    sigma = math.hypot(*(first[n].sigma / first[n].value for n in ("b", "J_xx")))
+    first = machine.published[0]
+    sigma = math.hypot(*(first.told_by_flight(n) / first.parameters[n].value for n in ("b", "J_xx")))
     limit = math.exp(math.log1p(machine.settings.gate.reference) + 2.0 * sigma) - 1.0
     assert reached <= limit + 1e-9, "the limit, and two standard deviations of the first set"
     assert told

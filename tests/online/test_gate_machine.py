@@ -263,7 +263,7 @@ class Machine(RuleBasedStateMachine):
         room = (2.0 if by_person else 1.0) * self.settings.gate.step
         for name in CONTROLLER:
             new, old = item.parameters[name], self.previous.parameters[name]
-            allowed = math.log1p(room + 2.0 * old.sigma / old.value) + 1e-9
+            allowed = math.log1p(room + 2.0 * self.previous.told_by_flight(name) / old.value) + 1e-9
             assert abs(math.log(new.value / old.value)) <= allowed, f"{name} jumps"
 
     @invariant()

@@ -72,7 +72,7 @@ def against_batch(seeds: range) -> dict[str, Any]:
             for first in (0, round(0.24 * FIT_SECONDS * 50))
         )
         truth = flight.truth.parameters.as_dict()
-        last = every[-1].parameters
+        last, told = every[-1].parameters, every[-1].told_by_flight
         rows.append({
             "seed": seed,
             "first_set_at": sets[0].stop if sets else None,
@@ -81,7 +81,7 @@ def against_batch(seeds: range) -> dict[str, Any]:
             "to_truth": {n: last[n].value / truth[n] - 1.0 for n in NOMINAL_NAMES},
             "batch_cut_later": {n: later[n].value / batch[n].value - 1.0 for n in NOMINAL_NAMES},
             "batch_to_truth": {n: batch[n].value / truth[n] - 1.0 for n in NOMINAL_NAMES},
-            "sigma": {n: last[n].sigma / last[n].value for n in NOMINAL_NAMES},
+            "sigma": {n: told(n) / last[n].value for n in NOMINAL_NAMES},
         })  # fmt: skip
     return {"seconds": SECONDS, "flights": rows}
 
