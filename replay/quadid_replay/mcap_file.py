@@ -67,7 +67,8 @@ def read_metadata(path: Path) -> dict[str, dict[str, str]]:
     """
     found: dict[str, dict[str, str]] = {}
     try:
-        for record in StreamReader(BytesIO(read_regular(path, LARGEST)), record_size_limit=LARGEST).records:
+        beginning = BytesIO(read_regular(path, LARGEST))
+        for record in StreamReader(beginning, emit_chunks=True, record_size_limit=LARGEST).records:  # none is unpacked
             if isinstance(record, Metadata):
                 found[record.name] = record.metadata
             elif not isinstance(record, Header):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+import tracemalloc
 from io import BytesIO
 from pathlib import Path
 
@@ -14,7 +15,7 @@ import zstandard
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 from quadid_replay import open_log, write_mcap
-from quadid_replay.mcap_file import McapFile
+from quadid_replay.mcap_file import McapFile, read_metadata
 from quadid_replay.schemas import schema_text
 
 from quadid.errors import LogError
@@ -33,6 +34,21 @@ def chunked(path: Path, body: bytes, declared: int, compression: str = "zstd") -
     chunk = struct.pack("<QQQII", 0, 1, declared, 0, len(compression)) + compression.encode()
     chunk += struct.pack("<Q", len(body)) + body
     path.write_bytes(buffer.getvalue()[:start] + struct.pack("<BQ", 6, len(chunk)) + chunk)
+
+
+def test_what_a_recording_began_with_is_sought_without_unpacking_anything(tmp_path: Path, happened: Happened) -> None:
+    """It is read in the program itself, before any child: metadata stand in front of the first chunk."""
+    path, size = tmp_path / "bomb.mcap", 64 << 20
+    packed = zstandard.compress(bytes(size))
+    chunk = struct.pack("<QQQII4sQ", 0, 1, size, 0, 4, b"zstd", len(packed)) + packed
+    header = struct.pack("<BQI4sI", 1, 12, 4, b"ros2", 0)
+    path.write_bytes(b"\x89MCAP0\r\n" + header + struct.pack("<BQ", 6, len(chunk)) + chunk)
+    tracemalloc.start()
+    assert read_metadata(path) == {}
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < size / 8
+    happened(5, f"metadata sought in a file that unpacks to {size >> 20} MiB: {peak >> 20} MiB")
 
 
 @pytest.mark.parametrize("compression", ["zstd", "lz4"])
