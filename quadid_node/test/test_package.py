@@ -52,5 +52,10 @@ def test_the_configuration_of_rosdoc2_is_where_the_manifest_says() -> None:
 
 
 def test_the_manifest_is_valid_by_its_schema() -> None:
-    xmllint = pytest.importorskip("ament_xmllint.main", reason="on no package index: runs where ROS is installed")
+    xmllint = pytest.importorskip("ament_xmllint.main", reason="one of ROS' linters: runs where ROS is installed")
     assert xmllint.main(argv=[str(PACKAGE)]) == 0
+
+
+def test_code_passes_the_linter_of_ros_with_lines_of_this_length() -> None:
+    flake8 = pytest.importorskip("ament_flake8.main", reason="one of ROS' linters: runs where ROS is installed")
+    assert flake8.main(argv=["--config", str(PACKAGE / "setup.cfg"), str(PACKAGE)]) == 0
