@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import ast
+import re
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
 import pytest
 import yaml
+from quadid_replay.ros_messages import TYPES
 
 PACKAGE = Path(__file__).resolve().parents[1]
 ROS = ("_msgs", "_interfaces", "_srvs")
 """Ends of the names of interface packages; the others begin with one of:"""
 LIBRARIES = ("rclpy", "ament_", "launch", "rosidl_", "rpyutils", "tf2_")
+OPTIONAL = {"px4_msgs", "mavros_msgs", "actuator_msgs", "mav_msgs"}
+"""Whoever has such a stack has its messages."""
 
 
 def depends(kind: str) -> set[str]:
@@ -20,18 +24,22 @@ def depends(kind: str) -> set[str]:
     return {element.text or "" for element in ET.parse(PACKAGE / "package.xml").findall(kind)}
 
 
-def test_every_ros_package_that_is_imported_is_named() -> None:
-    roots = set()
+def test_every_ros_package_that_is_imported_is_named_and_no_other() -> None:
+    roots = {kind.split("/")[0] for kind in TYPES}  # types of inputs are imported by their names
     for file in (*PACKAGE.glob("quadid_node/*.py"), *PACKAGE.glob("launch/*.py")):
         for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
             names = [a.name for a in node.names] if isinstance(node, ast.Import) else []
             names += [node.module] if isinstance(node, ast.ImportFrom) and node.module else []
+            if isinstance(node, ast.Constant) and isinstance(node.value, str):
+                names += re.findall(r"^(\w+_(?:msgs|srvs))/(?:\w+/)?\w+$", node.value)
             roots |= {name.split(".")[0] for name in names}
     used = {name for name in roots if name.endswith(ROS) or name.startswith(LIBRARIES)}
     assert {"rclpy", "launch_ros"} <= used
     used |= {"bond", "quadid"}  # imported by its name, where it is installed; the core
-    missing = used - depends("exec_depend")
+    missing = used - depends("exec_depend") - OPTIONAL
     assert not missing, f"package.xml: name {sorted(missing)} as exec_depend"
+    others = {name for name in depends("exec_depend") - used - {"ros2launch"} if not name.startswith("python3-")}
+    assert not others, f"package.xml: {sorted(others)} are imported nowhere"
     debian = {name.removeprefix("python3-") for name in depends("exec_depend") if name.startswith("python3-")}
     assert debian <= roots, "Debian's packages that the node does not import, or has in another version"
     assert "pydantic" not in debian, "Ubuntu 24.04 has version 1.10, which is too old: pip brings it"
