@@ -243,21 +243,25 @@ def page_lines(repository: Path) -> list[str]:
     return [line for line in block.splitlines() if line.startswith(("python3 -m venv", "venv/bin/"))]
 
 
-def put_debians_pydantic(folder: Path) -> None:
-    """Stands in for python3-pydantic: seen by every Python of that installation, and without the list of its files."""
-    for name, text in {
-        "pydantic/__init__.py": 'VERSION = "1.10.14"\n',
-        "pydantic-1.10.14.dist-info/METADATA": "Metadata-Version: 2.1\nName: pydantic\nVersion: 1.10.14\n",
-        "pydantic-1.10.14.dist-info/INSTALLER": "debian\n",
-    }.items():
-        (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        (folder / name).write_text(text, encoding="utf-8")
+def put_debians_packages(folder: Path) -> None:
+    """Stands in for packages of Debian that are too old: seen by every Python there, without the list of their files."""
+    for name, version, text in (
+        ("pydantic", "1.10.14", 'VERSION = "1.10.14"\n'),
+        ("coverage", "7.4.4", "class Coverage: ...\n"),  # comes with colcon; numba imports it
+    ):
+        for file, lines in {
+            f"{name}/__init__.py": text,
+            f"{name}-{version}.dist-info/METADATA": f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n",
+            f"{name}-{version}.dist-info/INSTALLER": "debian\n",
+        }.items():
+            (folder / file).parent.mkdir(parents=True, exist_ok=True)
+            (folder / file).write_text(lines, encoding="utf-8")
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
 def test_the_environment_beside_debians_packages(tmp_path: Path, repository: Path) -> None:
-    """Debian's pydantic 1.10, which cannot be uninstalled, stays; the environment has the version that quadid needs."""
+    """Debian's pydantic 1.10, which cannot be uninstalled, stays; the environment has the versions that quadid needs."""
     python = DEBIANS if DEBIANS.exists() else Path(sys.executable)
     scrubbed = {k: v for k, v in os.environ.items() if not k.startswith(("_ROS", "LD_", "VIRTUAL", "PYTHON"))}
     environment = {**scrubbed, "PATH": f"{python.parent}{os.pathsep}{os.environ['PATH']}"}
@@ -275,7 +279,7 @@ def test_the_environment_beside_debians_packages(tmp_path: Path, repository: Pat
     (tmp_path / "src").mkdir()
     (tmp_path / "src" / "quadid").symlink_to(repository)
     if not run(f"{python} -c '{SHOW}'", may_fail=True).startswith("1."):
-        put_debians_pydantic(Path(run(f"{python} -m site --user-site", may_fail=True)))
+        put_debians_packages(Path(run(f"{python} -m site --user-site", may_fail=True)))
     before = run(f"{python} -c '{SHOW}'")
     assert before.startswith("1."), "as Debian 12 and Ubuntu 24.04 have it"
     make, install, build = page_lines(repository)
@@ -287,6 +291,7 @@ def test_the_environment_beside_debians_packages(tmp_path: Path, repository: Pat
     run("venv/bin/python -m colcon build --packages-select quadid")  # the other two need ROS
     version, prefix = run(f"venv/bin/python -c '{SHOW}'").split()
     assert int(version.split(".")[0]) >= 2
+    run("venv/bin/python -c 'import numba'")
     assert Path(prefix) == tmp_path / "venv"
     assert "pelican" in run(". install/local_setup.sh && quadid vehicles")
     assert run(". install/local_setup.sh && command -v quadid") == str(tmp_path / "install/quadid/bin/quadid")
