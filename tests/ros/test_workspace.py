@@ -244,7 +244,7 @@ def page_lines(repository: Path) -> list[str]:
 
 
 def put_debians_packages(folder: Path) -> None:
-    """Stands in for packages of Debian that are too old: seen by every Python there, without the list of their files."""
+    """Stands in for packages of Debian that are too old: seen by every Python there, with no list of their files."""
     for name, version, text in (
         ("pydantic", "1.10.14", 'VERSION = "1.10.14"\n'),
         ("coverage", "7.4.4", "class Coverage: ...\n"),  # comes with colcon; numba imports it
@@ -261,7 +261,7 @@ def put_debians_packages(folder: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
 def test_the_environment_beside_debians_packages(tmp_path: Path, repository: Path) -> None:
-    """Debian's pydantic 1.10, which cannot be uninstalled, stays; the environment has the versions that quadid needs."""
+    """Debian's pydantic 1.10, which cannot be uninstalled, stays; the environment has what quadid needs."""
     python = DEBIANS if DEBIANS.exists() else Path(sys.executable)
     scrubbed = {k: v for k, v in os.environ.items() if not k.startswith(("_ROS", "LD_", "VIRTUAL", "PYTHON"))}
     environment = {**scrubbed, "PATH": f"{python.parent}{os.pathsep}{os.environ['PATH']}"}
