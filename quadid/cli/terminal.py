@@ -224,6 +224,8 @@ def explain(error: Exception) -> Failure | None:
         return Failure(
             one_line(f"{where}{error.strerror or error}; fix: check the path, its permissions and the disk"), 2
         )
+    if isinstance(error, ModuleNotFoundError) and (name := (error.name or "quadid").partition(".")[0]) != "quadid":
+        return Failure(f"{name} is not installed; fix: pip install {name}", 2)
     if type(error).__name__ == "LinAlgError":
         cause = "the equations have no unique solution: these data cannot support an answer"
         return Failure(f"{cause}; fix: look at the log with `quadid inspect`, use a livelier flight", 3)

@@ -13,6 +13,8 @@ import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
+from quadid.cli.terminal import Failure, explain
+
 LEFT_OUT = {"jinja2", "plotly", "matplotlib", "cma", "dask", "pandas", "pyarrow"}
 """Plots, reports, other optimisers, many logs at once."""
 BESIDE_UBUNTU = {"coverage"}
@@ -83,3 +85,9 @@ import quadid.cli.serve, quadid.cli.replay, quadid.cli.history, quadid.cli.watch
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
+
+
+def test_a_command_says_which_library_is_not_there() -> None:
+    lacking = explain(ModuleNotFoundError("No module named 'dask'", name="dask"))
+    assert lacking == Failure("dask is not installed; fix: pip install dask", 2)
+    assert explain(ModuleNotFoundError("No module named 'quadid.nowhere'", name="quadid.nowhere")) is None
