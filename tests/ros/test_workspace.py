@@ -228,6 +228,15 @@ def test_a_late_joiner_in_another_process_receives_the_latched_set() -> None:
     assert received == [example(2)]
 
 
+def test_the_study_of_load_builds_every_message_of_its_stacks() -> None:
+    from quadid_evaluation.studies.ros_load import MESSAGES, SOURCES
+    from quadid_node.inputs import source
+
+    heard = {entry.type for name in SOURCES for entry in source(name).inputs}
+    built = {f"{package}/{kind}" for package, kinds in MESSAGES.items() for kind in kinds}
+    assert {kind for kind in heard if kind.split("/")[0] in MESSAGES} <= built
+
+
 # --- The environment that docs/using-with-ros.md makes beside the Python packages of Debian, line by line
 
 

@@ -52,6 +52,7 @@ MESSAGES = {
         "VehicleLocalPosition": "uint64 timestamp\nuint64 timestamp_sample\nbool xy_valid\nbool v_xy_valid\n"
         "float32 x\nfloat32 y\nfloat32 z\nfloat32 vx\nfloat32 vy\nfloat32 vz",
         "BatteryStatus": "uint64 timestamp\nfloat32 voltage_v",
+        "VehicleStatus": "uint64 timestamp\nuint8 system_type",
     },
     "mavros_msgs": {
         "ESCTelemetryItem": "int32 rpm",
