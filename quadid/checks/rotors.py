@@ -863,7 +863,7 @@ def _spins(lagged: Lagged, vehicle: Vehicle) -> tuple[list[tuple[int, ...]], flo
     # Without turning on purpose, what yaw follows is a matter of chance.
     gain = np.where(found > 2.0 * _SETTLED, _gain(found[:, None]) - _CHANGE * wrong.clip(max=2), -np.inf)
     best = int(np.argmax(gain[1:])) + 1
-    own, chance = _gain(found[:1]), exceeded(_CHANCE, 1) / _independent(lagged.slow, vehicle)
+    own, chance = _gain(found[:1]), exceeded(_CHANCE, 1) / _independent(lagged.slow, _spun(vehicle, turned[best]))
     if gain[best] <= own or _gain(found[best : best + 1]) <= own + chance:
         return [], float(found[0])
     # Which of them is told by roll and pitch, but for partners on one arm: they have one command.
