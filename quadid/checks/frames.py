@@ -595,7 +595,7 @@ def _likely(reading: str, fit: AxisMap) -> float:
 
 
 def _judge_rates(gyro: Channel, attitude: Channel, reading: str, fit: AxisMap, smoothed: bool) -> Check:
-    """What axes and scale of the best fit say; a smoothed gyro lacks quick turning, which is no matter of scale."""
+    """Judgement of axes and scale of the best fit; a smoothed gyro lacks quick turning, which is no matter of scale."""
     check = partial(Check, "gyro_attitude", numbers={"scale": fit.scale, "r2": fit.r2})
     if fit.r2 < _CLEAR:
         message = f"gyro does not follow the attitude (R^2 {fit.r2:.2f})"

@@ -195,7 +195,7 @@ def scoring(
     Physics by sensitivities of the innovations under the gains of this turn; the noise numbers' logarithms, those that
     `noise` (N_NOISE,) frees, by the exact score of the full filter.  Gains are renewed after every step.  One that does
     not help is damped (Levenberg-Marquardt), the noise alone where physics alone helps: where it hardly acts, its
-    expected curvature says nothing.  Without `physics` the noise alone moves.
+    expected curvature is no guide.  Without `physics` the noise alone moves.
 
     Returns:
         Scaled parameters, noise numbers, objective, gains there; information (P, P) before the last step.

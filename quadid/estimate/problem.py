@@ -597,12 +597,12 @@ class Problem:
     def _several(self, j: int, points: Sequence[FloatArray], psi: FloatArray, g: Gains) -> list[FloatArray]:
         """Whitened innovations of flight j at points near that of the gains, effects along the states there."""
         out: list[FloatArray] = []
+        track = self.tracks[j]
+        mean = reckoned(track, g.mean) if self.models else g.mean
         for first in range(0, len(points), AT_ONCE):
             some = points[first : first + AT_ONCE]
-            track = self.tracks[j]
             tracks = [track] * len(some)
             if self.models:
-                mean = reckoned(track, g.mean)
                 added = self.models[j].beyond(np.array([self.vector(z, j) for z in some]), mean)
                 tracks = [track._replace(beyond=Beyond(a, g.beyond.slope, mean[:, 4:10].copy())) for a in added]
             out += _each(partial(self._whitened, j, psi, g, some, tracks), len(some))
