@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable
+from functools import cache
+from importlib import resources
 from typing import Any, TypeVar, cast
 
 import numba
@@ -29,6 +32,22 @@ class Files(IndexDataCacheFile):
             return super()._load_data(name)  # type: ignore[no-untyped-call]
         except Exception as error:
             raise FileNotFoundError(name) from error  # numba takes it for a file that was removed
+
+
+@cache
+def sources(package: str, also: str = "") -> str:
+    """Hash of all source files of a package, of what its kernels call outside of it, and of `also`.
+
+    numba looks at the file of the function that is called, and would run an old version of what that function calls in
+    another file: after an upgrade the old physics would go on.
+    """
+    digest = hashlib.sha256(also.encode())
+    for name in ("attitude_controller.py", "rotation.py"):
+        digest.update((resources.files("quadid") / name).read_bytes())
+    for entry in sorted(resources.files(package).iterdir(), key=lambda e: e.name):
+        if entry.name.endswith(".py"):
+            digest.update(entry.read_bytes())
+    return digest.hexdigest()
 
 
 def kept(stamp: str = "", **options: Any) -> Callable[[F], F]:

@@ -9,7 +9,7 @@ the elimination is a Cholesky factor of the initial state's own products.
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numba as nb
 import numpy as np
@@ -18,7 +18,7 @@ from quadid.types import BoolArray, FloatArray, IndexArray, IntArray, check_shap
 
 # isort: off
 from quadid.model.simd import (
-    LANES, SOURCES, TILE_COLUMNS, TILE_ROWS, cache_aligned, cached, jit, lane_kernel, scaled_lanes, tile_product,
+    LANES, TILE_COLUMNS, TILE_ROWS, cache_aligned, cached, jit, lane_kernel, scaled_lanes, tile_product,
 )  # fmt: skip
 # isort: on
 
@@ -290,56 +290,49 @@ def _largest(g: FloatArray) -> float:
     return out
 
 
-def _on_disk(sources: int) -> Any:
-    @cached
-    def reduce(
-        out: FloatArray, inverse: FloatArray, weights: FloatArray, precision: FloatArray, coloured: BoolArray,
-        matrix: FloatArray, reach: IntArray, lane: IndexArray, prior: StatePrior, into: Reduced,
-    ) -> None:  # fmt: skip
-        """The loop over segments of `reduce_segments`; `matrix` and `reach` as in `Whitening`."""
-        _ = sources
-        count, length, channels = weights.shape
-        padded = matrix.shape[1]
-        blocks = out.shape[0]
-        lanes = blocks * LANES
-        x = cache_aligned((channels * length + TILE_ROWS) * lanes)
-        plain = cache_aligned(length * lanes)
-        g = cache_aligned(lanes * lanes).reshape(lanes, lanes)
-        scales = np.empty(length)
-        own = into.offset.shape[1]
-        l, y, row = np.empty((own, own)), np.empty((own, len(lane) - own)), np.empty(len(lane) - own)
-        flat_out, flat_g, flat_matrix = out.reshape(-1), g.reshape(-1), matrix.reshape(-1)
-        for s in range(count):
-            for c in range(channels):
-                whiten = coloured[c]
+@cached
+def _reduce_on_disk(
+    out: FloatArray, inverse: FloatArray, weights: FloatArray, precision: FloatArray, coloured: BoolArray,
+    matrix: FloatArray, reach: IntArray, lane: IndexArray, prior: StatePrior, into: Reduced,
+) -> None:  # fmt: skip
+    """The loop over segments of `reduce_segments`; `matrix` and `reach` as in `Whitening`."""
+    count, length, channels = weights.shape
+    padded = matrix.shape[1]
+    blocks = out.shape[0]
+    lanes = blocks * LANES
+    x = cache_aligned((channels * length + TILE_ROWS) * lanes)
+    plain = cache_aligned(length * lanes)
+    g = cache_aligned(lanes * lanes).reshape(lanes, lanes)
+    scales = np.empty(length)
+    own = into.offset.shape[1]
+    l, y, row = np.empty((own, own)), np.empty((own, len(lane) - own)), np.empty(len(lane) - own)
+    flat_out, flat_g, flat_matrix = out.reshape(-1), g.reshape(-1), matrix.reshape(-1)
+    for s in range(count):
+        for c in range(channels):
+            whiten = coloured[c]
+            for i in range(length):
+                scales[i] = weights[s, i, c]
+                whiten = whiten and scales[i] > 0.0
+                into.base[s, i, c] = out[0, s, i, c, 0]
+            if not whiten:
                 for i in range(length):
-                    scales[i] = weights[s, i, c]
-                    whiten = whiten and scales[i] > 0.0
-                    into.base[s, i, c] = out[0, s, i, c, 0]
-                if not whiten:
-                    for i in range(length):
-                        scales[i] *= precision[c]
-                    _columns(flat_out, count, out.shape[3], inverse, scales, s, c, x, c * length)
-                    continue
-                _columns(flat_out, count, out.shape[3], inverse, scales, s, c, plain, 0)
-                # The last tile runs over into rows of the next channel, which are written after it.
-                for tile in range(padded // TILE_ROWS):
-                    begin, end = reach[c, tile], min((tile + 1) * TILE_ROWS, length)
-                    at = (c * padded + tile * TILE_ROWS) * length + begin
-                    to = (c * length + tile * TILE_ROWS) * lanes
-                    for j in range(0, lanes, TILE_COLUMNS):
-                        right = begin * lanes + j
-                        _tile(flat_matrix, at, 1, length, plain, right, lanes, end - begin, x, to + j, lanes)
-            for i in range(0, lanes, TILE_ROWS):
-                for j in range(i // TILE_COLUMNS * TILE_COLUMNS, lanes, TILE_COLUMNS):
-                    _tile(x, i, lanes, 1, x, j, lanes, channels * length, flat_g, i * lanes + j, lanes)
-            into.largest[s] = _largest(g)
-            _eliminate(g, lane, s, prior, into, l, y, row)
-
-    return reduce
-
-
-_reduce_on_disk = _on_disk(SOURCES)
+                    scales[i] *= precision[c]
+                _columns(flat_out, count, out.shape[3], inverse, scales, s, c, x, c * length)
+                continue
+            _columns(flat_out, count, out.shape[3], inverse, scales, s, c, plain, 0)
+            # The last tile runs over into rows of the next channel, which are written after it.
+            for tile in range(padded // TILE_ROWS):
+                begin, end = reach[c, tile], min((tile + 1) * TILE_ROWS, length)
+                at = (c * padded + tile * TILE_ROWS) * length + begin
+                to = (c * length + tile * TILE_ROWS) * lanes
+                for j in range(0, lanes, TILE_COLUMNS):
+                    right = begin * lanes + j
+                    _tile(flat_matrix, at, 1, length, plain, right, lanes, end - begin, x, to + j, lanes)
+        for i in range(0, lanes, TILE_ROWS):
+            for j in range(i // TILE_COLUMNS * TILE_COLUMNS, lanes, TILE_COLUMNS):
+                _tile(x, i, lanes, 1, x, j, lanes, channels * length, flat_g, i * lanes + j, lanes)
+        into.largest[s] = _largest(g)
+        _eliminate(g, lane, s, prior, into, l, y, row)
 
 
 # --- Normal equations of some parameters once others are fitted along: the Schur complement

@@ -6,7 +6,7 @@ A whole window is simulated from references and throttle only, as the paper does
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numba as nb
 import numpy as np
@@ -22,7 +22,7 @@ from quadid.model.rollout import Rollout, Segments
 from quadid.model.rollout import _threads as worker_threads
 from quadid.model.rotor_kernel import input_constants, rotor_constants, turn_rotor
 from quadid.model.sensor_kernel import distort_imu, sensor_constants, step_tilt_error, tilt_attitude
-from quadid.model.simd import LANES, SOURCES, aligned, cache_aligned, cached, jit
+from quadid.model.simd import LANES, aligned, cache_aligned, cached, jit
 from quadid.rotation import down
 from quadid.types import FloatArray, IntArray, check_shapes
 from quadid.vehicle import GRAVITY, Vehicle
@@ -87,111 +87,104 @@ def _keep_half(half: int, halves: int, place: int, force: FloatArray, s: FloatAr
             force[part, i, lane] += share * s[place + i * LANES + lane]
 
 
-def _on_disk(sources: int) -> Any:
-    @cached
-    def fly_closed_loop(
-        references: FloatArray, gains: FloatArray, mixer: FloatArray, substeps: int, lanes: int, geometry: FloatArray,
-        terms: IntArray, flight: Flight, theta: FloatArray, need: Needs, x0: FloatArray, out: FloatArray,
-    ) -> None:  # fmt: skip
-        """Flies one block of lanes through a window.
+@cached
+def fly_closed_loop(
+    references: FloatArray, gains: FloatArray, mixer: FloatArray, substeps: int, lanes: int, geometry: FloatArray,
+    terms: IntArray, flight: Flight, theta: FloatArray, need: Needs, x0: FloatArray, out: FloatArray,
+) -> None:  # fmt: skip
+    """Flies one block of lanes through a window.
 
-        Args:
-            references: roll, pitch, yaw [rad], throttle 0..1 of each row, held over it, (n, 4).
-            gains: see `quadid.attitude_controller.pack_gains`.
-            mixer: see `quadid.attitude_controller.mixer_matrix`.
-            substeps: runs of the stabiliser a row.
-            lanes: how many of the block's lanes are wanted.
-            geometry: (rotors, 4), see `rotor_kernel.Drive`.
-            terms: beyond the catalogue, (terms, 4), see `body_kernel.residual_forces`.
-            theta: parameter vectors (LANES, size).
-            x0: state at the first row (13,).
-            out: (n, OUTPUTS, LANES), written: rates, quaternion, mean specific force at each row.
-        """
-        _ = sources
-        rotors, dt = len(geometry), flight.dt / substeps
-        s = cache_aligned(N_ROWS * LANES)
-        s[:] = 0.0
-        s[A_G : A_G + 2 * LANES] = 1.0
-        s[A_G + HALF : A_G + HALF + 2 * LANES] = 1.0
-        rot = cache_aligned(rotors * ROTOR).reshape(rotors, ROTOR)
-        rot[:] = 0.0
-        body_constants(theta, flight, rotors, s)
-        sensor_constants(theta, dt, s)
-        rotor_constants(theta, dt, rot, s)
-        input_constants(theta, s)
-        for i in range(N_STATE):
-            s[X_QW + i * LANES : X_QW + (i + 1) * LANES] = x0[i]
-        s[E_QW : E_QW + LANES] = 1.0
-        coefficients = cache_aligned(len(terms) * LANES).reshape(len(terms), LANES)
-        signals = cache_aligned(N_SIGNALS * LANES).reshape(N_SIGNALS, LANES)
-        residual_coefficients(theta, rotors, coefficients)
-        sent, command = np.zeros((HISTORY, rotors, LANES)), np.zeros(rotors)
-        integral, attitude, rate = np.zeros((LANES, 3)), np.zeros((3, 3)), np.zeros(3)
-        wanted, torque = np.zeros((3, 3)), np.zeros(3)
-        force, last, kept = np.zeros((2, 3, LANES)), np.zeros((3, LANES)), np.zeros((7, LANES))
-        for k in range(len(references)):
-            copy(force[1], last)
-            force[:] = 0.0
-            rotation_of(references[k, 0], references[k, 1], references[k, 2], wanted)
-            throttle = references[k, 3]
-            for sub in range(substeps):
-                step = k * substeps + sub
-                for lane in range(lanes):
-                    _see(lane, need.ahrs, s, attitude, rate)
-                    steer(gains, mixer, wanted, throttle, attitude, rate, dt, integral[lane], torque, command)
-                    for r in range(rotors):
-                        sent[step % HISTORY, r, lane] = command[r]
-                for lane in range(lanes, LANES):
-                    for r in range(rotors):
-                        sent[step % HISTORY, r, lane] = sent[step % HISTORY, r, lanes - 1]
-                if step == 0:  # as if the first command had acted for ever
-                    for i in range(1, HISTORY):
-                        copy(sent[0], sent[i])
-                    for r in range(rotors):
-                        for lane in range(LANES):
-                            rot[r, R_SPEED + lane] = sent[0, r, lane]
-                _rotors(step, need, geometry, dt, sent, rot, s)
-                if need.factors:
-                    flight_factors(flight.t0 + dt * step, flight.span0, flight.span1, dt, s)
-                if need.learned:
-                    residual_signals(s, signals)
-                    residual_forces(terms, coefficients, signals, step == 0, s)
-                if need.payload:
-                    load_payload(flight.t0 + dt * step, dt, theta, s)
-                if need.full:
-                    step_full(dt, s)
-                else:
-                    step_core(dt, s)
-                if need.ahrs:
-                    step_tilt_error(s)
-                    tilt_attitude(s)
-                _keep_half(2 * sub, substeps, F1_X, force, s)
-                _keep_half(2 * sub + 1, substeps, F2_X, force, s)
-                if sub == 0:
-                    for i in range(7):
-                        for lane in range(LANES):
-                            kept[i, lane] = s[S_QW + i * LANES + lane]
-            if k == 0:
-                copy(force[0], last)
-            for i in range(3):
-                for lane in range(LANES):
-                    s[S_P + i * LANES + lane] = kept[4 + i, lane]
-                    # The accelerometer averages over one sample centred on t_k.
-                    s[S_FX + i * LANES + lane] = 0.5 * (last[i, lane] + force[0, i, lane])
-            if need.imu_static:
-                distort_imu(s)
-            for i in range(3):
-                for lane in range(LANES):
-                    out[k, i, lane] = s[S_P + i * LANES + lane]
-                    out[k, 7 + i, lane] = s[S_FX + i * LANES + lane]
-            for i in range(4):
-                for lane in range(LANES):
-                    out[k, 3 + i, lane] = kept[i, lane]
-
-    return fly_closed_loop
-
-
-fly_closed_loop = _on_disk(SOURCES)
+    Args:
+        references: roll, pitch, yaw [rad], throttle 0..1 of each row, held over it, (n, 4).
+        gains: see `quadid.attitude_controller.pack_gains`.
+        mixer: see `quadid.attitude_controller.mixer_matrix`.
+        substeps: runs of the stabiliser a row.
+        lanes: how many of the block's lanes are wanted.
+        geometry: (rotors, 4), see `rotor_kernel.Drive`.
+        terms: beyond the catalogue, (terms, 4), see `body_kernel.residual_forces`.
+        theta: parameter vectors (LANES, size).
+        x0: state at the first row (13,).
+        out: (n, OUTPUTS, LANES), written: rates, quaternion, mean specific force at each row.
+    """
+    rotors, dt = len(geometry), flight.dt / substeps
+    s = cache_aligned(N_ROWS * LANES)
+    s[:] = 0.0
+    s[A_G : A_G + 2 * LANES] = 1.0
+    s[A_G + HALF : A_G + HALF + 2 * LANES] = 1.0
+    rot = cache_aligned(rotors * ROTOR).reshape(rotors, ROTOR)
+    rot[:] = 0.0
+    body_constants(theta, flight, rotors, s)
+    sensor_constants(theta, dt, s)
+    rotor_constants(theta, dt, rot, s)
+    input_constants(theta, s)
+    for i in range(N_STATE):
+        s[X_QW + i * LANES : X_QW + (i + 1) * LANES] = x0[i]
+    s[E_QW : E_QW + LANES] = 1.0
+    coefficients = cache_aligned(len(terms) * LANES).reshape(len(terms), LANES)
+    signals = cache_aligned(N_SIGNALS * LANES).reshape(N_SIGNALS, LANES)
+    residual_coefficients(theta, rotors, coefficients)
+    sent, command = np.zeros((HISTORY, rotors, LANES)), np.zeros(rotors)
+    integral, attitude, rate = np.zeros((LANES, 3)), np.zeros((3, 3)), np.zeros(3)
+    wanted, torque = np.zeros((3, 3)), np.zeros(3)
+    force, last, kept = np.zeros((2, 3, LANES)), np.zeros((3, LANES)), np.zeros((7, LANES))
+    for k in range(len(references)):
+        copy(force[1], last)
+        force[:] = 0.0
+        rotation_of(references[k, 0], references[k, 1], references[k, 2], wanted)
+        throttle = references[k, 3]
+        for sub in range(substeps):
+            step = k * substeps + sub
+            for lane in range(lanes):
+                _see(lane, need.ahrs, s, attitude, rate)
+                steer(gains, mixer, wanted, throttle, attitude, rate, dt, integral[lane], torque, command)
+                for r in range(rotors):
+                    sent[step % HISTORY, r, lane] = command[r]
+            for lane in range(lanes, LANES):
+                for r in range(rotors):
+                    sent[step % HISTORY, r, lane] = sent[step % HISTORY, r, lanes - 1]
+            if step == 0:  # as if the first command had acted for ever
+                for i in range(1, HISTORY):
+                    copy(sent[0], sent[i])
+                for r in range(rotors):
+                    for lane in range(LANES):
+                        rot[r, R_SPEED + lane] = sent[0, r, lane]
+            _rotors(step, need, geometry, dt, sent, rot, s)
+            if need.factors:
+                flight_factors(flight.t0 + dt * step, flight.span0, flight.span1, dt, s)
+            if need.learned:
+                residual_signals(s, signals)
+                residual_forces(terms, coefficients, signals, step == 0, s)
+            if need.payload:
+                load_payload(flight.t0 + dt * step, dt, theta, s)
+            if need.full:
+                step_full(dt, s)
+            else:
+                step_core(dt, s)
+            if need.ahrs:
+                step_tilt_error(s)
+                tilt_attitude(s)
+            _keep_half(2 * sub, substeps, F1_X, force, s)
+            _keep_half(2 * sub + 1, substeps, F2_X, force, s)
+            if sub == 0:
+                for i in range(7):
+                    for lane in range(LANES):
+                        kept[i, lane] = s[S_QW + i * LANES + lane]
+        if k == 0:
+            copy(force[0], last)
+        for i in range(3):
+            for lane in range(LANES):
+                s[S_P + i * LANES + lane] = kept[4 + i, lane]
+                # The accelerometer averages over one sample centred on t_k.
+                s[S_FX + i * LANES + lane] = 0.5 * (last[i, lane] + force[0, i, lane])
+        if need.imu_static:
+            distort_imu(s)
+        for i in range(3):
+            for lane in range(LANES):
+                out[k, i, lane] = s[S_P + i * LANES + lane]
+                out[k, 7 + i, lane] = s[S_FX + i * LANES + lane]
+        for i in range(4):
+            for lane in range(LANES):
+                out[k, 3 + i, lane] = kept[i, lane]
 
 
 # --- Typed wrapper of the closed loop: a whole window simulated from references and throttle only, as the paper does

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numba as nb
 import numpy as np
 
 from quadid.model import layout as ix
 from quadid.model.layout import places
-from quadid.model.simd import LANES, SOURCES, cached, exact, inlined, jit, lane_kernel
+from quadid.model.simd import LANES, cached, exact, inlined, jit, lane_kernel
 from quadid.types import FloatArray, IntArray
 from quadid.vehicle import GRAVITY
 
@@ -96,37 +96,30 @@ def _any_of(theta: FloatArray, entries: IntArray) -> bool:
     return found
 
 
-def _on_disk(sources: int) -> Any:
-    @cached
-    def needs_of(theta: FloatArray, rotors: int, channels: int) -> Needs:
-        """Returns what a block of parameter vectors (LANES, size) needs of the model."""
-        _ = sources
-        rare, factors, payload = (_any_of(theta, _RARE), _any_of(theta, _FACTORS), _any_of(theta, _PAYLOAD))
-        learned = False
-        for lane in range(len(theta)):
-            for i in range(ix.LOSS + 2 * rotors, theta.shape[1]):
-                learned |= theta[lane, i] != 0.0
-        rare |= learned
-        hub = rare or _any_of(theta, _HUB)
-        air, solid = channels > 9 or hub, factors or learned or _any_of(theta, _SOLID)
-        growth = _any_of(theta, _GROWTH)
-        varied = growth
-        for lane in range(len(theta)):
-            for i in ROTOR_ENTRIES:
-                varied |= theta[lane, i] != theta[0, i]
-            for i in range(ix.LOSS, ix.LOSS + 2 * rotors):
-                varied |= theta[lane, i] != theta[0, i]
-            varied |= theta[lane, ix.OFFSET] != 0.0 and theta[lane, ix.B] != theta[0, ix.B]
-        return Needs(
-            air or solid, air, hub, solid, rare, not varied, _any_of(theta, _DELAY), _any_of(theta, _SLOWER),
-            _any_of(theta, _EXPONENT), growth, factors, payload, _any_of(theta, _IMU_LAG),
-            _any_of(theta, _ATT_DELAY), _any_of(theta, _IMU), _any_of(theta, _AHRS), learned,
-        )  # fmt: skip
-
-    return needs_of
-
-
-needs_of = _on_disk(SOURCES)
+@cached
+def needs_of(theta: FloatArray, rotors: int, channels: int) -> Needs:
+    """Returns what a block of parameter vectors (LANES, size) needs of the model."""
+    rare, factors, payload = (_any_of(theta, _RARE), _any_of(theta, _FACTORS), _any_of(theta, _PAYLOAD))
+    learned = False
+    for lane in range(len(theta)):
+        for i in range(ix.LOSS + 2 * rotors, theta.shape[1]):
+            learned |= theta[lane, i] != 0.0
+    rare |= learned
+    hub = rare or _any_of(theta, _HUB)
+    air, solid = channels > 9 or hub, factors or learned or _any_of(theta, _SOLID)
+    growth = _any_of(theta, _GROWTH)
+    varied = growth
+    for lane in range(len(theta)):
+        for i in ROTOR_ENTRIES:
+            varied |= theta[lane, i] != theta[0, i]
+        for i in range(ix.LOSS, ix.LOSS + 2 * rotors):
+            varied |= theta[lane, i] != theta[0, i]
+        varied |= theta[lane, ix.OFFSET] != 0.0 and theta[lane, ix.B] != theta[0, ix.B]
+    return Needs(
+        air or solid, air, hub, solid, rare, not varied, _any_of(theta, _DELAY), _any_of(theta, _SLOWER),
+        _any_of(theta, _EXPONENT), growth, factors, payload, _any_of(theta, _IMU_LAG),
+        _any_of(theta, _ATT_DELAY), _any_of(theta, _IMU), _any_of(theta, _AHRS), learned,
+    )  # fmt: skip
 
 
 # --- The hot kernel: one step of the rigid body for many parameter vectors ("lanes") at once

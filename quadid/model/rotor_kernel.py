@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numba as nb
 
 from quadid.model import layout as ix
 from quadid.model.kernel import Needs
 from quadid.model.layout import places
-from quadid.model.simd import LANES, SOURCES, cache_aligned, cached, exact, inlined, jit, lane_kernel
+from quadid.model.simd import LANES, cache_aligned, cached, exact, inlined, jit, lane_kernel
 from quadid.types import FloatArray
 
 # isort: off
@@ -380,31 +380,24 @@ def spread_moments(table: FloatArray, k: int, moments: int, s: FloatArray) -> No
             s[at + lane], s[at + HALF + lane] = first, second
 
 
-def _on_disk(sources: int) -> Any:
-    @cached
-    def rotor_table(drive: Drive, need: Needs, theta: FloatArray, table: FloatArray) -> None:
-        """Moments of every step of a window for lanes that share all that acts on rotors.
+@cached
+def rotor_table(drive: Drive, need: Needs, theta: FloatArray, table: FloatArray) -> None:
+    """Moments of every step of a window for lanes that share all that acts on rotors.
 
-        Args:
-            theta: the same parameter vector in every lane, (LANES, size).
-            table: (n, 2 * ALL_MOMENTS), written: moments of the first, then of the second half step.
-        """
-        _ = sources
-        s = cache_aligned(N_ROWS * LANES)
-        rotors = len(drive.geometry)
-        rot = cache_aligned(rotors * ROTOR).reshape(rotors, ROTOR)
-        rotor_constants(theta, drive.dt, rot, s)
-        input_constants(theta, s)
-        s[A_S2 : A_S2 + 2 * HALF] = 0.0
-        for k in range(len(drive.u)):
-            if k == 0:
-                rotors_start(drive, k, need, rot, s)
-            rotors_step(drive, k, need, rot, s)
-            for row in range(ALL_MOMENTS):
-                table[k, row] = s[A_S2 + row * LANES]
-                table[k, ALL_MOMENTS + row] = s[A_S2 + HALF + row * LANES]
-
-    return rotor_table
-
-
-rotor_table = _on_disk(SOURCES)
+    Args:
+        theta: the same parameter vector in every lane, (LANES, size).
+        table: (n, 2 * ALL_MOMENTS), written: moments of the first, then of the second half step.
+    """
+    s = cache_aligned(N_ROWS * LANES)
+    rotors = len(drive.geometry)
+    rot = cache_aligned(rotors * ROTOR).reshape(rotors, ROTOR)
+    rotor_constants(theta, drive.dt, rot, s)
+    input_constants(theta, s)
+    s[A_S2 : A_S2 + 2 * HALF] = 0.0
+    for k in range(len(drive.u)):
+        if k == 0:
+            rotors_start(drive, k, need, rot, s)
+        rotors_step(drive, k, need, rot, s)
+        for row in range(ALL_MOMENTS):
+            table[k, row] = s[A_S2 + row * LANES]
+            table[k, ALL_MOMENTS + row] = s[A_S2 + HALF + row * LANES]

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import math
-import zlib
 from collections.abc import Callable
-from importlib import resources
 from typing import Any
 
 import numba as nb
@@ -15,7 +13,7 @@ from numba.core import cgutils, types
 from numba.extending import intrinsic
 
 from quadid.effects import EFFECTS
-from quadid.on_disk import kept
+from quadid.on_disk import kept, sources
 from quadid.types import FloatArray
 
 LANES = 16
@@ -32,32 +30,15 @@ FREE = {"contract", "nnan", "ninf", "nsz"}
 would round differently, and flights replayed after a restart would not be the same bit for bit."""
 whole: dict[str, Any] = {"nogil": True, "fastmath": FREE, "error_model": "numpy"}
 """Options of functions that Python calls."""
-cached: Any = kept(fastmath=FREE)
-"""Compiles such a function as one of the kernels on disk."""
+_ORDER = ",".join(f"{e.name}.{p.name}" for e in EFFECTS.values() for p in e.parameters)
+cached: Any = kept(sources("quadid.model", _ORDER), fastmath=FREE)
+"""Compiles such a function as one of the kernels on disk, which the order of parameters is built into."""
 jit: dict[str, Any] = {**whole, "_nrt": False}
 """Options of the pieces of kernels: no reference counts, whose atomic updates cost more than a short lane loop."""
 exact: dict[str, Any] = {**jit, "fastmath": False}
 """Options of pieces that prepare constants, whose loops are not all vectors: fused or not, lanes must round alike."""
 inlined: dict[str, Any] = {**jit, "forceinline": True}
 """Options of pieces that are merged into what calls them."""
-
-
-def _sources() -> int:
-    """Checksum of the source of the kernels, of what one of them calls, and of the order of their parameters."""
-    folder = resources.files("quadid.model")
-    names = sorted(
-        entry.name
-        for entry in folder.iterdir()
-        if entry.name.endswith(("kernel.py", "work_array.py", "layout.py", "simd.py"))
-    )
-    outside = [(resources.files("quadid") / name).read_bytes() for name in ("attitude_controller.py", "rotation.py")]
-    order = ",".join(f"{e.name}.{p.name}" for e in EFFECTS.values() for p in e.parameters).encode()
-    return zlib.crc32(b"".join([*((folder / name).read_bytes() for name in names), *outside, order]))
-
-
-SOURCES = _sources()
-"""Captured by the kernels on disk, so that it becomes part of their key: numba alone looks at the file of the function
-that is called, and would run an old version of what that function calls."""
 
 
 def variant(which: str) -> Callable[[Any], Any]:

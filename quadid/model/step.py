@@ -26,7 +26,7 @@ from quadid.model.sensor_kernel import (
     step_tilt_error,
     tilt_attitude,
 )
-from quadid.model.simd import LANES, SOURCES, cached, jit
+from quadid.model.simd import LANES, cached, jit
 from quadid.types import BoolArray, FloatArray, IntArray
 from quadid.vehicle import RandomForces, Vehicle
 
@@ -158,139 +158,132 @@ def _read_sensors(first: bool, dt: float, need: Needs, s: FloatArray, past: Floa
         distort_imu(s)
 
 
-def _on_disk(sources: int) -> Any:
-    @cached
-    def write_constants(
-        theta: FloatArray, flight: Flight, coefficients: FloatArray, constants: FloatArray, rot: FloatArray
-    ) -> None:
-        """Writes the constants of all blocks.
+@cached
+def write_constants(
+    theta: FloatArray, flight: Flight, coefficients: FloatArray, constants: FloatArray, rot: FloatArray
+) -> None:
+    """Writes the constants of all blocks.
 
-        Args:
-            theta: parameter vectors (blocks, LANES, size).
-            flight: numbers of the vehicle, and the step.
-            coefficients: of the terms beyond the catalogue, (blocks, terms, LANES), written.
-            constants: rows (blocks, STATE), written.
-            rot: rows of the rotors (blocks, rotors, ROTOR); gains written.
-        """
-        _ = sources
-        for block in range(len(theta)):
-            s = np.zeros(N_ROWS * LANES)
-            for half in range(2):
-                for i in range(2 * LANES):
-                    s[A_G + half * HALF + i] = 1.0
-            body_constants(theta[block], flight, rot.shape[1], s)
-            input_constants(theta[block], s)
-            sensor_constants(theta[block], flight.dt, s)
-            rotor_constants(theta[block], flight.dt, rot[block], s)
-            residual_coefficients(theta[block], rot.shape[1], coefficients[block])
-            constants[block] = s[:STATE]
+    Args:
+        theta: parameter vectors (blocks, LANES, size).
+        flight: numbers of the vehicle, and the step.
+        coefficients: of the terms beyond the catalogue, (blocks, terms, LANES), written.
+        constants: rows (blocks, STATE), written.
+        rot: rows of the rotors (blocks, rotors, ROTOR); gains written.
+    """
+    for block in range(len(theta)):
+        s = np.zeros(N_ROWS * LANES)
+        for half in range(2):
+            for i in range(2 * LANES):
+                s[A_G + half * HALF + i] = 1.0
+        body_constants(theta[block], flight, rot.shape[1], s)
+        input_constants(theta[block], s)
+        sensor_constants(theta[block], flight.dt, s)
+        rotor_constants(theta[block], flight.dt, rot[block], s)
+        residual_coefficients(theta[block], rot.shape[1], coefficients[block])
+        constants[block] = s[:STATE]
 
-    @cached
-    def step_blocks(
-        commands: FloatArray, geometry: FloatArray, theta: FloatArray, terms: IntArray, coefficients: FloatArray,
-        needs: BoolArray, constants: FloatArray, walk: FloatArray, time: float, span: float, dt: float, seed: int,
-        step: int, delayed: int, s: FloatArray, state: FloatArray, out: FloatArray,
-    ) -> None:  # fmt: skip
-        """Makes one step a row of commands with every vehicle of a batch.
 
-        Args:
-            commands: rotor speeds [rad/s], held over each step, (steps, vehicles, rotors).
-            geometry: (rotors, 4), see `rotor_kernel.Drive`.
-            theta: parameter vectors (blocks, LANES, size).
-            terms: beyond the catalogue, (terms, 4).
-            coefficients: of those, (blocks, terms, LANES).
-            needs: which parts of the model any vehicle needs, in the order of `Needs`.
-            constants: rows of each block, (blocks, STATE); one row for all blocks stands in `s` already.
-            walk: of the random inputs, exp(-dt / T) and the standard deviation of what a step adds, (2, TURNS); no rows
-                where there are none.
-            time: at the start of the first step [s].
-            span: time over which a battery sags [s].
-            dt: step [s].
-            seed: of the random inputs.
-            step: number of steps made before.
-            delayed: commands that are remembered.
-            s: work array (N_ROWS * LANES), overwritten.
-            state: motion and filters, rotors, last commands, past attitudes, random inputs (blocks, width), advanced;
-                see `quadid.model.step.State`.
-            out: after each step (steps, vehicles, N_STATE + 10), written: motion, sensors; no rows: not wanted.
-        """
-        _ = sources
-        count, rotors = commands.shape[1], commands.shape[2]
-        need = Needs(
-            needs[0], needs[1], needs[2], needs[3], needs[4], needs[5], needs[6], needs[7], needs[8], needs[9],
-            needs[10], needs[11], needs[12], needs[13], needs[14], needs[15], needs[16],
-        )  # fmt: skip
-        plain = not (need.delayed or need.uneven)
-        sensing = need.imu_lag or need.ahrs or need.learned
-        moving = N_ROWS * LANES - STATE if sensing else SENSED + 10 * LANES - STATE
-        own, signals = np.empty(TURNS), np.empty((N_SIGNALS, LANES))
-        newest = delayed - 1
-        at_rotors = N_ROWS * LANES - STATE
-        at_sent = at_rotors + rotors * ROTOR
-        at_inputs = at_sent + delayed * rotors * LANES
-        at_past = at_inputs + TURNS * LANES
-        for block in range(len(state)):
-            now = state[block]
-            rot = now[at_rotors:at_sent].reshape(rotors, ROTOR)
-            sent = now[at_sent:at_inputs].reshape(delayed, rotors, LANES)
-            inputs = now[at_inputs:at_past].reshape(TURNS, LANES)
-            past = now[at_past:].reshape(-1, 7, LANES)
-            if len(constants) > 1:
-                for i in range(STATE):
-                    s[i] = constants[block, i]
-            for i in range(moving):
-                s[STATE + i] = now[i]
-            first, last = block * LANES, count - 1
-            for k in range(len(commands)):
-                if not plain:
-                    for i in range(newest):
-                        for r in range(rotors):
-                            for lane in range(LANES):
-                                sent[i, r, lane] = sent[i + 1, r, lane]
+@cached
+def step_blocks(
+    commands: FloatArray, geometry: FloatArray, theta: FloatArray, terms: IntArray, coefficients: FloatArray,
+    needs: BoolArray, constants: FloatArray, walk: FloatArray, time: float, span: float, dt: float, seed: int,
+    step: int, delayed: int, s: FloatArray, state: FloatArray, out: FloatArray,
+) -> None:  # fmt: skip
+    """Makes one step a row of commands with every vehicle of a batch.
+
+    Args:
+        commands: rotor speeds [rad/s], held over each step, (steps, vehicles, rotors).
+        geometry: (rotors, 4), see `rotor_kernel.Drive`.
+        theta: parameter vectors (blocks, LANES, size).
+        terms: beyond the catalogue, (terms, 4).
+        coefficients: of those, (blocks, terms, LANES).
+        needs: which parts of the model any vehicle needs, in the order of `Needs`.
+        constants: rows of each block, (blocks, STATE); one row for all blocks stands in `s` already.
+        walk: of the random inputs, exp(-dt / T) and the standard deviation of what a step adds, (2, TURNS); no rows
+            where there are none.
+        time: at the start of the first step [s].
+        span: time over which a battery sags [s].
+        dt: step [s].
+        seed: of the random inputs.
+        step: number of steps made before.
+        delayed: commands that are remembered.
+        s: work array (N_ROWS * LANES), overwritten.
+        state: motion and filters, rotors, last commands, past attitudes, random inputs (blocks, width), advanced;
+            see `quadid.model.step.State`.
+        out: after each step (steps, vehicles, N_STATE + 10), written: motion, sensors; no rows: not wanted.
+    """
+    count, rotors = commands.shape[1], commands.shape[2]
+    need = Needs(
+        needs[0], needs[1], needs[2], needs[3], needs[4], needs[5], needs[6], needs[7], needs[8], needs[9],
+        needs[10], needs[11], needs[12], needs[13], needs[14], needs[15], needs[16],
+    )  # fmt: skip
+    plain = not (need.delayed or need.uneven)
+    sensing = need.imu_lag or need.ahrs or need.learned
+    moving = N_ROWS * LANES - STATE if sensing else SENSED + 10 * LANES - STATE
+    own, signals = np.empty(TURNS), np.empty((N_SIGNALS, LANES))
+    newest = delayed - 1
+    at_rotors = N_ROWS * LANES - STATE
+    at_sent = at_rotors + rotors * ROTOR
+    at_inputs = at_sent + delayed * rotors * LANES
+    at_past = at_inputs + TURNS * LANES
+    for block in range(len(state)):
+        now = state[block]
+        rot = now[at_rotors:at_sent].reshape(rotors, ROTOR)
+        sent = now[at_sent:at_inputs].reshape(delayed, rotors, LANES)
+        inputs = now[at_inputs:at_past].reshape(TURNS, LANES)
+        past = now[at_past:].reshape(-1, 7, LANES)
+        if len(constants) > 1:
+            for i in range(STATE):
+                s[i] = constants[block, i]
+        for i in range(moving):
+            s[STATE + i] = now[i]
+        first, last = block * LANES, count - 1
+        for k in range(len(commands)):
+            if not plain:
+                for i in range(newest):
                     for r in range(rotors):
                         for lane in range(LANES):
-                            sent[newest, r, lane] = commands[k, min(first + lane, last), r]
+                            sent[i, r, lane] = sent[i + 1, r, lane]
                 for r in range(rotors):
-                    if plain:
-                        for lane in range(LANES):
-                            s[T_A1 + lane] = commands[k, min(first + lane, last), r]
-                    else:
-                        for lane in range(LANES):
-                            at = newest - int(s[C_SHIFT + lane])
-                            rot[r, R_PAST + lane], rot[r, R_NOW + lane] = sent[at - 1, r, lane], sent[at, r, lane]
-                            rot[r, R_NEXT + lane] = sent[at, r, lane]
-                    turn_rotor(plain, r, True, False, geometry, dt, need, rot, s)
-                begin = time + k * dt
-                if need.factors:
-                    flight_factors(begin, 0.0, span, dt, s)
-                if need.payload:
-                    load_payload(begin, dt, theta[block], s)
-                if need.learned:
-                    residual_signals(s, signals)
-                    residual_forces(terms, coefficients[block], signals, step + k == 0, s)
-                step_in_air(need, dt, s)
-                if len(walk) > 0:
-                    for lane in range(min(LANES, count - first)):
-                        for i in range(TURNS):
-                            own[i] = inputs[i, lane]
-                        _random_inputs(seed, first + lane, step + k, walk, own)
-                        for i in range(TURNS):
-                            inputs[i, lane] = own[i]
-                    _push(dt, inputs, s)
-                _read_sensors(step + k == 0, dt, need, s, past)
-                if len(out) > 0:
-                    for lane in range(min(LANES, count - first)):
-                        for i in range(N_STATE):
-                            out[k, first + lane, i] = s[X_QW + i * LANES + lane]
-                        for i in range(10):
-                            out[k, first + lane, N_STATE + i] = s[SENSED + i * LANES + lane]
-            for i in range(moving):
-                now[i] = s[STATE + i]
-
-    return write_constants, step_blocks
-
-
-write_constants, step_blocks = _on_disk(SOURCES)
+                    for lane in range(LANES):
+                        sent[newest, r, lane] = commands[k, min(first + lane, last), r]
+            for r in range(rotors):
+                if plain:
+                    for lane in range(LANES):
+                        s[T_A1 + lane] = commands[k, min(first + lane, last), r]
+                else:
+                    for lane in range(LANES):
+                        at = newest - int(s[C_SHIFT + lane])
+                        rot[r, R_PAST + lane], rot[r, R_NOW + lane] = sent[at - 1, r, lane], sent[at, r, lane]
+                        rot[r, R_NEXT + lane] = sent[at, r, lane]
+                turn_rotor(plain, r, True, False, geometry, dt, need, rot, s)
+            begin = time + k * dt
+            if need.factors:
+                flight_factors(begin, 0.0, span, dt, s)
+            if need.payload:
+                load_payload(begin, dt, theta[block], s)
+            if need.learned:
+                residual_signals(s, signals)
+                residual_forces(terms, coefficients[block], signals, step + k == 0, s)
+            step_in_air(need, dt, s)
+            if len(walk) > 0:
+                for lane in range(min(LANES, count - first)):
+                    for i in range(TURNS):
+                        own[i] = inputs[i, lane]
+                    _random_inputs(seed, first + lane, step + k, walk, own)
+                    for i in range(TURNS):
+                        inputs[i, lane] = own[i]
+                _push(dt, inputs, s)
+            _read_sensors(step + k == 0, dt, need, s, past)
+            if len(out) > 0:
+                for lane in range(min(LANES, count - first)):
+                    for i in range(N_STATE):
+                        out[k, first + lane, i] = s[X_QW + i * LANES + lane]
+                    for i in range(10):
+                        out[k, first + lane, N_STATE + i] = s[SENSED + i * LANES + lane]
+        for i in range(moving):
+            now[i] = s[STATE + i]
 
 
 @cache
