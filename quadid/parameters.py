@@ -92,11 +92,12 @@ def unreliable(parameters: Iterable[Parameter], names: Collection[str]) -> tuple
     )
 
 
-def _wider(p: Parameter, sigma: float) -> Parameter:
-    """A parameter whose logarithm has this standard deviation besides."""
-    down, up = (math.hypot(math.log(end) - math.log(p.value), Z95 * sigma) for end in p.ci95)
-    interval = p.value * math.exp(-down), p.value * math.exp(up)
-    return replace(p, sigma=math.hypot(p.sigma, sigma * p.value), ci95=interval)
+def _scaled(p: Parameter, factor: float, sigma: float) -> Parameter:
+    """A parameter times a factor whose logarithm has this standard deviation."""
+    value = p.value * factor
+    down, up = (math.hypot(math.log(max(end / p.value, 1e-300)), Z95 * sigma) for end in p.ci95)
+    interval = value * math.exp(-down), value * math.exp(up)
+    return replace(p, value=value, sigma=factor * math.hypot(p.sigma, sigma * p.value), ci95=interval)
 
 
 @dataclass(frozen=True)
@@ -122,11 +123,13 @@ class ParameterSet:
         """The same, with the identified ones of `names` marked unreliable."""
         return ParameterSet(unreliable(self.parameters, names), np.array(self.covariance))
 
-    def scaled_together(self, sigma: float) -> ParameterSet:
-        """The same, where one factor on all that the data determine is known to `sigma` (log scale) only."""
-        values = np.where([p.status in UNKNOWN for p in self.parameters], 0.0, self.values)
-        wider = tuple(p if p.status in UNKNOWN else _wider(p, sigma) for p in self.parameters)
-        return ParameterSet(wider, self.covariance + sigma**2 * np.outer(values, values))
+    def scaled_together(self, sigma: float, factor: float = 1.0, but: Collection[str] = ()) -> ParameterSet:
+        """The same times one factor, known to `sigma` (log scale), on all that the data determine but those named."""
+        fixed = [p.status is Status.PRIOR_DOMINATED or p.name in but for p in self.parameters]
+        scaled = (p if stays else _scaled(p, factor, sigma) for p, stays in zip(self.parameters, fixed, strict=True))
+        scale, values = np.where(fixed, 1.0, factor), np.where(fixed, 0.0, factor * self.values)
+        covariance = self.covariance * np.outer(scale, scale) + sigma**2 * np.outer(values, values)
+        return ParameterSet(tuple(scaled), covariance)
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -419,7 +419,7 @@ class Estimator:
 
     def start_from(self, known: OnlineSet) -> None:
         """Starts the search from a restored set instead of the vehicle file's guess."""
-        for p in known.parameters:
+        for p in by_b(known.parameters):
             if p.name in NOMINAL_NAMES:
                 self.theta = self.theta.copy()
                 self.theta[self._layout.entry(p.name).index] = min(max(p.value, p.bounds[0]), p.bounds[1])
@@ -499,15 +499,15 @@ class Estimator:
         if fused is None:
             return None
         theta, covariance = self._free.placed(self._initial, fused.z[:SIX]), fused.covariance[:SIX, :SIX].copy()
-        vague = [i for i in _YAW if Z95 * fused.sigma[i] > most]
+        vague, beyond = [i for i in _YAW if Z95 * fused.sigma[i] > most], self._slope_beyond_b
         theta[vague] = self._initial[vague]
         flat, zz = theta[[NOMINAL_NAMES.index("J_xx"), NOMINAL_NAMES.index("J_yy")]].sum(), NOMINAL_NAMES.index("J_zz")
+        flat *= math.exp(beyond[0]) if beyond is not None else 1.0
         theta[zz] = min(theta[zz], flat) if zz in vague else theta[zz]
         covariance[vague, :] = covariance[:, vague] = 0.0
         covariance[vague, vague] = self._prior_sigma[vague] ** 2
         unc = Uncertainty(covariance, np.ones(SIX), self._prior_sigma)
         six = parameter_set(self._free, theta, self._initial, unc)
-        beyond = self._slope_beyond_b
         return six if beyond is None else with_tangent(six, *beyond)
 
     def left_out(self) -> FloatArray | None:
@@ -559,7 +559,7 @@ class Estimator:
 
     def _scaled(self, known: OnlineSet | None) -> FloatArray:
         theta = self._initial.copy()
-        for p in known.parameters if known is not None else ():
+        for p in by_b(known.parameters) if known is not None else ():
             if p.name in NOMINAL_NAMES:
                 place = self._layout.entry(p.name).index
                 theta[place] = self.theta[place] if p.status is Status.PRIOR_DOMINATED else p.value
@@ -631,16 +631,22 @@ class Estimator:
 
 
 def with_tangent(six: ParameterSet, share: float, sigma: float) -> ParameterSet:
-    """The six and, beside b, the slope of thrust over speed: `share` (log) of that by b, known to `sigma`."""
-    b = six["b"]
-    value, both = b.value * math.exp(share), math.hypot(b.sigma / b.value, sigma)
-    low, high = (value * math.exp(z * both) for z in (-Z95, Z95))
-    new = replace(b, name=TANGENT, value=value, sigma=value * both, ci95=(low, high), measured_before=False)
-    spread = np.zeros((len(six.parameters) + 1,) * 2)
-    spread[:-1, :-1] = six.covariance
-    spread[-1, :-1] = spread[:-1, -1] = six.covariance[six.names.index("b")] * value / b.value
-    spread[-1, -1] = new.sigma**2
-    return ParameterSet((*six.parameters, new), spread)
+    """The six and, beside b, the slope of thrust over speed: `share` (log) of that by b, known to `sigma`.
+
+    The six are fitted with thrust b w^2, whose slope at hover is another: torque over inertia is right, and drag torque
+    and inertias are those that go with the slope.
+    """
+    beside = replace(six["b"], name=TANGENT, measured_before=False)
+    rows = [*range(len(six.parameters)), six.names.index("b")]
+    both = ParameterSet((*six.parameters, beside), six.covariance[np.ix_(rows, rows)])
+    return both.scaled_together(sigma, math.exp(share), ("b",))
+
+
+def by_b(known: ParameterSet) -> tuple[Parameter, ...]:
+    """Parameters with the values that thrust b w^2 would have them at, of a set that may state another slope."""
+    steep = known["b"].value / known[TANGENT].value if TANGENT in known.names else 1.0
+    guessed = Status.PRIOR_DOMINATED
+    return tuple(p if p.status is guessed or p.name == "b" else replace(p, value=p.value * steep) for p in known)
 
 
 def _joined(spans: Sequence[tuple[float, float]], enough: float = math.inf) -> list[tuple[float, float]]:

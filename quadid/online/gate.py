@@ -315,14 +315,16 @@ def _reference(case: Case, settings: GateSettings) -> str | None:
         known, common = case.baseline.parameters, case.baseline.reference_sd
         what = "the first accepted or last approved set"
     covariance = known.covariance / np.outer(known.values, known.values) - common**2
+    slopes = [TANGENT if TANGENT in some.names else "b" for some in (known, case.parameters)]
     for name in ("J_xx", "J_yy"):
         for shares, limit, of, looks in (
-            ({"b": 1.0, name: -1.0}, settings.reference, f"torque over inertia ({name})", "rotor speeds"),
+            ({slopes[0]: 1.0, name: -1.0}, settings.reference, f"torque over inertia ({name})", "rotor speeds"),
             ({name: 1.0}, settings.width, name, "a mass, an accelerometer or a gyro"),
         ):
             at = [k for k, p in enumerate(known) if p.name in shares and p.status not in UNKNOWN]
             share = np.array([shares[known.names[k]] for k in at])
-            now = np.array([case.parameters[known.names[k]].value for k in at])
+            names = [slopes[1] if known.names[k] == slopes[0] else known.names[k] for k in at]
+            now = np.array([case.parameters[n].value for n in names])
             change = float(share @ np.log(now / known.values[at]))
             if _far(change, math.sqrt(max(share @ covariance[np.ix_(at, at)] @ share, 0.0)), limit):
                 off = f"{of} is {math.expm1(change):+.1%} off {what}, allowed {limit:.1%}"

@@ -241,6 +241,22 @@ def test_a_curve_of_all_rotors_is_published_where_nothing_is_carried_at_rest(
         assert decide(good(left_out=left_out), GateSettings()).check == "thrust", "a set that states no curve"
 
 
+def test_torque_over_inertia_goes_with_the_slope_of_thrust() -> None:
+    """A curve that a later set tells and its reference did not know: torque and inertia are as they were."""
+    curved = with_tangent(parameter_set({**TRUE, "b": TRUE["b"] * 1.04, "J_xx": TRUE["J_xx"] * 1.04,
+                                         "J_yy": TRUE["J_yy"] * 1.04}), -math.log(1.04), 0.005)  # fmt: skip
+    assert [curved[n].value for n in ("b_tangent", "J_xx")] == pytest.approx([TRUE["b"], TRUE["J_xx"]])
+    left_out = off_by([-math.log(1.04)] * 4, at_rest=(0.0, 0.005))
+    before = online_set(TRUE, sigma=0.001)
+    case = good(parameters=curved, left_out=left_out, in_force=before, baseline=before, held_out=(50.0,))
+    assert decide(case, GateSettings()).state is ACCEPTED, decide(case, GateSettings()).reason
+    faster = good(
+        parameters=with_tangent(parameter_set(TRUE), -math.log(1.04), 0.005), left_out=left_out, baseline=before,
+        in_force=before, held_out=(50.0,),
+    )  # fmt: skip
+    assert decide(faster, GateSettings()).state is ACCEPTED, "b, and torque over inertia, are as they were"
+
+
 def off_by(values: Sequence[float], sigma: float = 0.005, at_rest: tuple[float, float] = (0.0, 1.0)) -> FloatArray:
     return np.array([[*values, at_rest[0]], [*([sigma] * len(values)), at_rest[1]]])
 

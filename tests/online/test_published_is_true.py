@@ -121,6 +121,32 @@ def test_what_a_support_carries_shows_at_rest_and_a_curve_of_the_rotors_own_does
         assert sloped is None or np.mean(rotors) == pytest.approx(sloped, abs=0.03)
 
 
+@pytest.mark.parametrize(
+    ("bent", "factor"), [(-90.0, 1.0), (0.0, 1.1), (0.0, 0.9)], ids=["thrust curve", "changes x 1.1", "changes x 0.9"]
+)
+def test_inertias_beside_a_slope_of_thrust_are_those_of_the_vehicle(
+    bent: float, factor: float, happened: Happened
+) -> None:
+    """Thrust b w^2 has another slope at hover: the inertias took up b / b_tangent, 22 and 10 % high."""
+    curve = (("thrust_curve", "dead_speed", bent), ("thrust_curve", "offset", -TRUE["b"] * bent**2))
+    window = flight(24.0, 3, effects=curve if bent else ()).window
+    read = window.rotor_speed.mean(axis=0) + factor * (window.rotor_speed - window.rotor_speed.mean(axis=0))
+    learner = Estimator(PELICAN, 120.0, 10.0, 0)
+    asked = learner.request(1, WindowCut((replace(window, rotor_speed=read),), 24.0, 0), 0.0, 24.0)
+    learner.take(asked, asked.answer())
+    found = learner.parameters()
+    assert found is not None
+    each = PELICAN.mass * GRAVITY / 4.0
+    hover = bent + np.sqrt(each / TRUE["b"] + bent**2)
+    true = {**TRUE, "b": each / hover**2, "b_tangent": TRUE["b"] * (hover - bent) / hover / factor}
+    off = {n: found[n].value / true[n] - 1.0 for n in ("b", "J_xx", "J_yy", "b_tangent")}
+    assert all(abs(o) < 0.025 for o in off.values()), off
+    assert found.correlation[2, 6] > 0.9, "torque over inertia is as sharp as before"
+    happened(
+        39, f"thrust curve of {bent:g} rad/s, changes of speed x {factor:g}: J {off['J_xx']:+.1%}, {off['J_yy']:+.1%}"
+    )
+
+
 def test_three_sensors_each_within_its_limit_do_not_move_a_set_by_seven_per_cent(happened: Happened) -> None:
     made = flight(SECONDS, 3).recording
     for name, factor in (("accel", 1.04), ("gyro", 0.97), ("rotor_speed", 0.985)):

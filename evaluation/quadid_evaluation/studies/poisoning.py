@@ -110,9 +110,9 @@ def leaking(source: int, into: int, share: float) -> Spoil:
     return changed("gyro", mixed)
 
 
-def about_the_mean(factor: float) -> Spoil:
-    """An accelerometer's scale that a bias hides at 1 g."""
-    return changed("accel", lambda force: force.mean(axis=0) + factor * (force - force.mean(axis=0)))
+def about_the_mean(factor: float, channel: str = "accel") -> Spoil:
+    """A scale that a bias hides at the mean: at 1 g, at hover."""
+    return changed(channel, lambda values: values.mean(axis=0) + factor * (values - values.mean(axis=0)))
 
 
 def smoothed(cutoff: float, rate: float = 50.0) -> Spoil:
@@ -186,6 +186,7 @@ WEIGHT, B = 1.3 * 9.80665, 2.33e-5
 SINGLE: dict[str, Spoil] = {
     **{f"support {f:+.0%} of weight": supported(f * WEIGHT, B) for f in (0.04, 0.08, 0.15, -0.08, -0.15)},
     **{f"accelerometer scale {f:g} under a bias": about_the_mean(f) for f in (0.9, 1.06, 1.12, 1.17, 1.3)},
+    **{f"changes of rotor speed x {f:g}": about_the_mean(f, "rotor_speed") for f in (0.9, 1.05, 1.1, 1.2)},
     "leak p to q 15 %": leaking(0, 1, 0.15), "leak q to p 5 %": leaking(1, 0, 0.05),
     "leak r to p 15 %": leaking(2, 0, 0.15),
     **{f"gyro smoothed {f:g} Hz": smoothed(f) for f in (3.0, 4.0, 4.5, 5.0)},
