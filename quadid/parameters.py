@@ -95,7 +95,7 @@ def unreliable(parameters: Iterable[Parameter], names: Collection[str]) -> tuple
 def _scaled(p: Parameter, factor: float, sigma: float) -> Parameter:
     """A parameter times a factor whose logarithm has this standard deviation."""
     value = p.value * factor
-    down, up = (math.hypot(math.log(max(end / p.value, 1e-300)), Z95 * sigma) for end in p.ci95)
+    down, up = (math.hypot(math.log(end) - math.log(p.value), Z95 * sigma) for end in p.ci95)
     interval = value * math.exp(-down), value * math.exp(up)
     return replace(p, value=value, sigma=factor * math.hypot(p.sigma, sigma * p.value), ci95=interval)
 

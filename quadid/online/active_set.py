@@ -40,7 +40,7 @@ class ActiveSet:
 
     def __init__(
         self, approval: str, restored: OnlineSet | None = None, next_sequence: int = 1,
-        baseline: OnlineSet | None = None,
+        baseline: OnlineSet | None = None, load: float = 1.0,
     ) -> None:  # fmt: skip
         """Starts empty, or from the last accepted set of an earlier run, which is stale until revalidated.
 
@@ -49,8 +49,9 @@ class ActiveSet:
             restored: set in force when the earlier run ended.
             next_sequence: first number not yet given.
             baseline: what creeping is measured from; default `restored`.
+            load: as an earlier run left it.
         """
-        self.approval = approval
+        self.approval, self.load = approval, load
         self._held: dict[int, tuple[OnlineSet, float]] = {}
         self.in_force: OnlineSet | None = None
         self._earlier: list[OnlineSet] = []
@@ -61,7 +62,6 @@ class ActiveSet:
             self.in_force = replace(restored, sequence=self._number(), state=SetState.STALE, reason=reason)
         self.baseline = baseline or self.in_force
         self._trusted = self.baseline is not None
-        self.load = 1.0
         self.seen = -math.inf
         self.watched, self._watch_from = 0.0, math.inf
 

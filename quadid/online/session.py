@@ -102,6 +102,7 @@ class Session:
     def __init__(
         self, vehicle: Vehicle, settings: SessionSettings | None = None, restored: OnlineSet | None = None,
         next_sequence: int = 1, baseline: OnlineSet | None = None, healthy: Sequence[FlightTrim] = (),
+        load: float = 1.0,
     ) -> None:  # fmt: skip
         """Starts a session.
 
@@ -112,10 +113,11 @@ class Session:
             next_sequence: first number not yet given to a set.
             baseline: set from which creeping is measured; default `restored`.
             healthy: trims of the vehicle's healthy flights, the oldest first.
+            load: mass over that of the vehicle file, as changes in earlier flights left it.
         """
         self.settings = settings or SessionSettings()
         self.resampler = Resampler(vehicle, self.settings.rate)
-        self.active_set = ActiveSet(self.settings.gate.approval, restored, next_sequence, baseline)
+        self.active_set = ActiveSet(self.settings.gate.approval, restored, next_sequence, baseline, load)
         self._vehicle, self._outbox = vehicle, Outbox(self.resampler.time.stamp)
         studied = DIAGNOSED_SECONDS if self.settings.diagnose else 0.0
         self._rows = GridBuffer(self.settings.rate, max(self.settings.window, studied, BASELINE) + 10.0)

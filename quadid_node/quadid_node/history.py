@@ -58,6 +58,8 @@ CREATE TABLE IF NOT EXISTS healthy_flights (
 CREATE TABLE IF NOT EXISTS decisions (
     id INTEGER PRIMARY KEY, vehicle TEXT NOT NULL, configured TEXT NOT NULL, approval TEXT NOT NULL,
     wall REAL NOT NULL);
+CREATE TABLE IF NOT EXISTS masses (
+    id INTEGER PRIMARY KEY, vehicle TEXT NOT NULL, mass REAL NOT NULL, wall REAL NOT NULL);
 """
 """A file whose tables were made by another text is refused as foreign: old ones were made by exactly this one."""
 VERSION = 2
@@ -510,6 +512,10 @@ def first_number(highest: int = 0) -> int:
     return max(highest + 1, time.time_ns() // 10**6)
 
 
+MASS = Annotated[float, msgspec.Meta(ge=0.0, lt=1e6)]
+"""A mass [kg]; 0: none."""
+
+
 @dataclass(frozen=True)
 class Restored:
     """State left by an earlier run.
@@ -520,6 +526,7 @@ class Restored:
         healthy: trims of healthy flights, the oldest first.
         approval: auto or manual where a person decided so while the earlier run was configured as this one, manual
             where that cannot be read; else empty.
+        mass: as changes in flight left it since a person last approved a set [kg]; 0: none did.
     """
 
     item: OnlineSet | None
@@ -528,6 +535,7 @@ class Restored:
     approval: str = ""
     healthy: tuple[FlightTrim, ...] = ()
     decided: str = "a person decided so in an earlier run"
+    mass: float = 0.0
 
 
 # --- The history of one vehicle, open for writing
@@ -685,10 +693,24 @@ class Store:
                 self._flights.append(self._flight_row(healthy[-1]))
             except UNREADABLE as error:
                 self.notes.append(f"a healthy flight of the history cannot be read back ({error})")
+        mass = self._mass_left(db)
         decision = "SELECT configured, approval FROM decisions WHERE vehicle = ? ORDER BY id DESC LIMIT 1"
         approval, decided = self._decided(db.execute(decision, (self.vehicle,)).fetchone(), gate)
         (highest,) = db.execute("SELECT max(sequence) FROM sets WHERE vehicle = ?", (self.vehicle,)).fetchone()
-        return Restored(last, first_number(highest or 0), approved or first, approval, tuple(healthy), decided)
+        return Restored(last, first_number(highest or 0), approved or first, approval, tuple(healthy), decided, mass)
+
+    def _mass_left(self, db: sqlite3.Connection) -> float:
+        """Mass that changes in flight left [kg]; 0: none did."""
+        made = db.execute("SELECT 1 FROM sqlite_master WHERE name = 'masses'").fetchone()
+        newest = "SELECT mass FROM masses WHERE vehicle = ? ORDER BY id DESC LIMIT 1"
+        row = db.execute(newest, (self.vehicle,)).fetchone() if made else None
+        try:
+            mass = msgspec.convert(row[0], MASS) if row is not None else 0.0
+        except UNREADABLE:
+            self._unread = True
+            return 0.0
+        self._standing["mass"] = self._row("masses", mass=mass)
+        return mass
 
     def _decided(self, row: tuple[Any, Any] | None, gate: GateSettings) -> tuple[str, str]:
         """Approval by the newest row of what people decided, and why: manual where that cannot be read."""
@@ -749,6 +771,11 @@ class Store:
         """Journals that approval is now auto or manual by a person's decision, where it was `configured` otherwise."""
         self._standing["decision"] = self._row("decisions", configured=configured, approval=approval)
         self._put(self._standing["decision"])
+
+    def mass(self, mass: float) -> None:
+        """Journals the mass that changes in flight left [kg]; 0: a person has approved a set since."""
+        self._standing["mass"] = self._row("masses", mass=mass)
+        self._put(self._standing["mass"])
 
     def flush(self, seconds: float) -> bool:
         """Waits until everything is on the disk; False when it is not after so long [s]."""

@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import msgspec
 import numpy as np
 from mcap_ros2._dynamic import generate_dynamic
 from quadid_replay import TopicWriter
@@ -27,7 +28,7 @@ from quadid.data.window import Block, Recording
 from quadid.errors import LogError
 from quadid.online import OnlineSet, SessionSettings
 from quadid.vehicle import Vehicle
-from quadid_node.history import UNREADABLE, Restored
+from quadid_node.history import MASS, UNREADABLE, Restored
 from quadid_node.inputs import Decoder, Input, SourceSelector, best_ranks, seconds, source
 from quadid_node.messages import Output, set_from_dict, set_to_dict
 from quadid_node.service import Service
@@ -118,6 +119,7 @@ def read_beginning(path: Path) -> Beginning | None:
         restored = Restored(
             _set(left["item"]), int(left["next_sequence"]), _set(left["baseline"]), str(left.get("approval", "")),
             tuple(map(flight_from_dict, left.get("healthy", ()))), str(left.get("decided", Restored.decided)),
+            msgspec.convert(left.get("mass", 0.0), MASS),
         )  # fmt: skip
         settings = SessionSettings.model_validate_json(found["settings"])
         return Beginning(Vehicle.from_yaml(found["vehicle"], path.name), settings, found["source"], restored)

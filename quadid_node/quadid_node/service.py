@@ -107,8 +107,10 @@ class Service:
         self.vehicle, self.restored = vehicle, restored
         self.boot_id = store.boot_id if store is not None else uuid.uuid4().hex
         self.session = Session(
-            vehicle, settings, restored.item, restored.next_sequence, restored.baseline, restored.healthy
-        )
+            vehicle, settings, restored.item, restored.next_sequence, restored.baseline, restored.healthy,
+            restored.mass / vehicle.mass if restored.mass else 1.0,
+        )  # fmt: skip
+        self._load = self.session.active_set.load
         self._configured: str = settings.gate.approval
         self._approval: str = self._configured
         self._publication = Publication(store)
@@ -241,14 +243,15 @@ class Service:
 
     def _journalled(self, outputs: list[Output]) -> list[Output]:
         """Gives everything to the history, decisions before what follows from them; returns what may be published."""
-        approval = self.session.active_set.approval
-        if approval != self._approval:
-            self._approval = approval
-            if self._store is not None:
-                self._store.decision(self._configured, approval)
+        sets, store = self.session.active_set, self._store
+        if store is not None and sets.approval != self._approval:
+            store.decision(self._configured, sets.approval)
+        if store is not None and sets.load != self._load:
+            store.mass(sets.load * self.vehicle.mass if sets.load != 1.0 else 0.0)
+        self._approval, self._load = sets.approval, sets.load
         for output in outputs:
-            if self._store is not None:
-                self._store.journal(output)
+            if store is not None:
+                store.journal(output)
         decided, self._decided = self._decided, []
         return [*decided, *self._publication.take(outputs)]
 

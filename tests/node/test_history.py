@@ -32,6 +32,7 @@ from quadid.vehicle import Vehicle
 from quadid_node import history as storing
 from tests.faults.evidence import Happened
 from tests.online.driving import flight, samples
+from tests.online.made_up import QUICK, between, light_flight, tells, works
 from tests.online.test_gate import TRUE, online_set
 
 PELICAN = Vehicle.shipped("pelican")
@@ -341,6 +342,7 @@ def test_a_history_of_an_earlier_version_is_read_as_it_is(tmp_path: Path) -> Non
         for (data,) in db.execute("SELECT data FROM sets").fetchall():
             old = {name: value for name, value in json.loads(data).items() if name not in later}
             db.execute("UPDATE sets SET data = ? WHERE data = ?", (json.dumps(old), data))
+        db.execute("DROP TABLE masses")
         db.execute(f"PRAGMA user_version = {VERSION - 1}")
     store = Store(path, "pelican")
     restored = store.restore(vehicle=PELICAN)
@@ -387,6 +389,43 @@ def test_after_a_history_that_cannot_be_read_approval_is_manual_for_good(
     assert last.session.active_set.approval == "auto"
     last.close()
     happened(44, f"what people decided cannot be read ({damage}): approval is manual until a person says auto")
+
+
+@pytest.mark.parametrize("damage", ["", "'x'", "-1.0", "1e999"])
+def test_a_mass_that_changed_in_flight_is_known_after_a_restart(
+    tmp_path: Path, damage: str, happened: Happened
+) -> None:
+    """With no set in force there was nothing that a restart could find it by: the old mass was published."""
+    path = tmp_path / "h.sqlite"
+
+    def service(vehicle: Vehicle = PELICAN) -> Service:
+        return Service(vehicle, QUICK, InlineWorker(), Store(path, "pelican"))
+
+    flown = service()
+    flown.session.active_set.load = 1.2  # as a change does
+    flown.step()
+    flown.close()
+    if damage:
+        with closing(sqlite3.connect(path)) as db, db:
+            db.execute(f"UPDATE masses SET mass = {damage}")
+        again = service()
+        assert (again.approval, again.session.active_set.load) == ("manual", 1.0)
+        again.close()
+        return
+    heavier = service(PELICAN.model_copy(update={"mass": 1.2 * PELICAN.mass}))
+    assert heavier.session.active_set.load == pytest.approx(1.0), "the vehicle file has that mass now"
+    heavier.close()
+    again = service()
+    works(again.session, between(light_flight(60.0), 0.0, 12.0), tells())
+    waits = again.session.active_set.pending
+    assert waits is not None
+    assert (waits.check, again.session.active_set.in_force) == ("mass", None)
+    assert again.approve("ann").done
+    again.close()
+    approved = service()
+    assert approved.session.active_set.load == 1.0, "who approved it has judged the mass"
+    approved.close()
+    happened(38, f"+20 % before any set, then a restart: '{waits.reason[:90]}'")
 
 
 # --- Disks and damage

@@ -259,7 +259,7 @@ def beginning() -> Beginning:
     last = replace(online_set(TRUE), sequence=4)
     trim = np.array([0.1, -0.2, 0.3, 1.0 / 3.0])
     healthy = FlightTrim("one", trim, np.array([trim, trim]), np.full(4, 0.25), 0.1 * trim, 60.0, "accelerometer")
-    restored = Restored(last, 5, last, healthy=(healthy,))
+    restored = Restored(last, 5, last, healthy=(healthy,), mass=1.5)
     return Beginning(PELICAN, SessionSettings(window=5.0, seed=7), "canonical", restored)
 
 
@@ -275,7 +275,7 @@ def test_what_a_session_began_with_comes_back_exactly(tmp_path: Path) -> None:
     found = read_beginning(path)
     assert found is not None
     assert (found.vehicle, found.settings, found.source) == (written.vehicle, written.settings, written.source)
-    assert found.restored.next_sequence == 5
+    assert (found.restored.next_sequence, found.restored.mass) == (5, 1.5)
     assert found.restored.item is not None
     assert written.restored.item is not None
     assert [p.value for p in found.restored.item.parameters] == [p.value for p in written.restored.item.parameters]
