@@ -284,7 +284,9 @@ def _run(
     # Places to write to are looked at before any work.
     json, report, series, out = (given.get(name) for name in ("json", "report", "series", "out"))
     terminal.check_file(json, "--json")
-    folder, _ = (None if place is None else terminal.out_folder(place) for place in (out, series))
+    folder = None if out is None else terminal.out_folder(out)
+    if series is not None:
+        terminal.out_folder(series, "--series")
     terminal.check_file(report, "--report")
 
     # What was not typed is as the function has it.

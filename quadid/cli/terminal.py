@@ -86,16 +86,20 @@ def progress(compiled: Sequence[str] = FIT) -> Iterator[Advance]:
 # --- Written results: folders that are checked before long work, and JSON that any parser accepts
 
 
-def out_folder(folder: Path) -> Path:
+def out_folder(folder: Path, option: str = "--out") -> Path:
     """Makes the folder where it does not exist, and returns its absolute path.
 
     Raises:
         OutputError: it cannot be made or written to.
     """
-    make_folder(folder, "choose another --out")
+    make_folder(folder, f"choose another {option}")
     if not os.access(folder, os.W_OK | os.X_OK):
-        raise OutputError(f"{folder} is not writable", "a folder you may write to", "choose another --out")
+        raise OutputError(f"{folder} is not writable", "a folder you may write to", f"choose another {option}")
     return folder.resolve()
+
+
+_pipes: list[int] = []
+"""Pipes to be written later: the reader of one ends when its last writer does."""
 
 
 def check_file(path: Path | str | None, option: str) -> None:
@@ -113,7 +117,15 @@ def check_file(path: Path | str | None, option: str) -> None:
     folder = file.absolute().parent
     if not folder.is_dir():
         raise OutputError(f"{option}: no folder {folder}", "an existing folder", f"mkdir -p {folder}")
-    if not os.access(file if file.exists() else folder, os.W_OK):
+    if file.exists() and not file.is_file():
+        try:
+            _pipes.append(os.open(file, os.O_WRONLY | os.O_NONBLOCK))
+        except OSError as error:
+            raise OutputError(
+                f"{option}: {file} is a pipe that nobody reads, or a socket ({error.strerror})", "a file",
+                "choose another place, or start what reads the pipe",
+            ) from error  # fmt: skip
+    elif not os.access(file if file.exists() else folder, os.W_OK):
         raise OutputError(f"{option}: {file} is not writable", "a file you may write", "choose another place")
 
 

@@ -11,6 +11,7 @@ from quadid.cli import terminal
 
 def warmup(json: JsonTarget = None) -> None:
     """Compile all kernels for this machine's processor, in processes side by side; nothing to do where that is done."""
+    terminal.check_file(json, "--json")
     begin = time.perf_counter()
     with terminal.progress(compiled=()) as advance:
         made = prepare(tuple(PARTS), advance)

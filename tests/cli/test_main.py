@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import pty
 import re
+import socket
 import subprocess
 import sys
 from collections.abc import Callable
@@ -31,7 +32,7 @@ from quadid.cli.commands import COMMANDS
 from quadid.cli.history import Stored
 from quadid.cli.main import BLAS_THREADS
 from quadid.cli.replay import Replayed
-from quadid.cli.terminal import conclude
+from quadid.cli.terminal import check_file, conclude
 from quadid.errors import QuadidError
 from quadid.parameters import NOMINAL_UNITS
 from quadid.report.tables import Column, TextTable
@@ -194,6 +195,49 @@ def test_a_pipe_that_nobody_reads_is_not_waited_for_and_stays(what: str, tmp_pat
         WRITERS[what](tmp_path / "pipe")
     assert (tmp_path / "pipe").is_fifo()
     happened(35, f"a {what} to a pipe that nobody reads: refused at once, the pipe is there")
+
+
+OUTPUTS = {
+    "--report": ("identify", "no.csv", "--vehicle", "pelican"),
+    "--series": ("identify", "no.csv", "--vehicle", "pelican"),
+    "--json": ("diagnose", "no.csv", "--vehicle", "pelican"),
+    "--out": ("replay", "no.csv", "--vehicle", "pelican"),
+}
+
+
+@pytest.mark.parametrize("option", OUTPUTS)
+@pytest.mark.parametrize("what", ["pipe", "socket", "folder", "file in no folder"])
+def test_a_place_that_cannot_be_written_is_said_before_any_work(
+    option: str, what: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, inside: Cli, happened: Happened
+) -> None:
+    """The log is not even there: only its absence was told, and of a pipe or socket only after all the work."""
+    monkeypatch.chdir(tmp_path)
+    place = Path("place.html" if option == "--report" else "place.mcap")
+    if what == "pipe":
+        os.mkfifo(place)
+    elif what == "socket":
+        socket.socket(socket.AF_UNIX).bind(str(place))
+    elif what == "folder" and option != "--series":
+        place.mkdir()
+    else:
+        place = Path("dangling")
+        place.symlink_to("nowhere/at/all")
+        place = place / "place.html"
+    done = inside(*OUTPUTS[option], option, place)
+    assert done.code == 2
+    assert done.err.count("\n") == 1
+    assert "no.csv" not in done.err
+    assert option in done.err
+    happened(35, f"{option} to a {what}: '{done.err.strip()[:90]}'")
+
+
+def test_a_pipe_that_is_read_stays_open_until_the_result(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    reader = os.open(tmp_path / "pipe", os.O_RDONLY | os.O_NONBLOCK)
+    check_file(tmp_path / "pipe", "--json")
+    with pytest.raises(BlockingIOError):  # no end of file
+        os.read(reader, 99)
+    os.close(reader)
 
 
 def test_a_pipe_that_is_read_gets_the_result_and_no_device_becomes_a_file(tmp_path: Path) -> None:
