@@ -18,7 +18,7 @@ from quadid.sanitise import LONGEST_LINE, plain
 if TYPE_CHECKING:
     from jinja2 import Environment
 
-_WORD = re.compile(r"([+-]?[\w.]+)*", re.ASCII)
+_WORD = re.compile(r"(?:[+-]?[\w.]+(?:[+-][\w.]+)*)?", re.ASCII)
 
 
 def number(value: float) -> str:

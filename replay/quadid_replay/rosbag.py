@@ -42,7 +42,8 @@ def bag_files(folder: Path) -> list[Path]:
         )
     if not files:
         raise LogError(f"{folder.name}: neither .mcap nor .db3 in it", "a folder of ros2 bag record", "check the path")
-    return sorted(files, key=lambda p: [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", p.name)])
+    parts = {p: re.split(r"(\d+)", p.name) for p in files}  # every second one is a number
+    return sorted(files, key=lambda p: [int(part) if k % 2 else part for k, part in enumerate(parts[p])])
 
 
 # --- Rosbag2 beside MCAP: SQLite databases (.db3), and the folder that `ros2 bag record` makes, of either kind

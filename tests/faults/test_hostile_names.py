@@ -20,6 +20,7 @@ from quadid_replay.schemas import schema_text
 
 from quadid.data.window import Recording
 from quadid.errors import LogError, VehicleError
+from quadid.report.templating import environment
 from quadid.sanitise import LONGEST_LINE
 from quadid.vehicle import Vehicle
 from tests.commands import Cli, inside
@@ -182,6 +183,14 @@ def test_a_name_full_of_markup_is_a_name(tmp_path: Path, inside: Cli, happened: 
     done = inside("export", "--vehicle", file, "--format", "rotorpy", "--out", tmp_path, "--json", "-")
     compile(Path(done.data["files"][0]).read_text(encoding="utf-8"), "x", "exec")
     happened(33, f"vehicle named {name[:30]}…: the same name in SDF by an XML parser, and a module that compiles")
+
+
+def test_text_without_a_filter_is_refused_at_once_whatever_its_length() -> None:
+    """Each letter more once doubled the time."""
+    for text in ("a" * LONGEST_LINE + "!", "a b", "--", "x\n"):
+        with pytest.raises(ValueError, match="without a filter"):
+            environment("param").finalize(text)
+    assert environment("param").finalize("-1.5e-3+x") == "-1.5e-3+x"
 
 
 # --- A history that a stranger filled: shown without a character that a terminal acts on, or refused in one line

@@ -98,6 +98,11 @@ def test_what_is_no_recording_is_named(tmp_path: Path) -> None:
         (tmp_path / "packed" / name).write_text("x")
     with pytest.raises(LogError, match=r"a_0\.db3\.zstd is compressed"):
         open_log(tmp_path / "packed")
+    (tmp_path / "odd").mkdir()
+    for name in ("metadata.yaml", "²1.db3", "a1.db3"):  # a digit, and no number
+        (tmp_path / "odd" / name).write_text("x")
+    with pytest.raises(LogError):
+        open_log(tmp_path / "odd")
     with pytest.raises(LogError, match="is a directory"):
         open_log(tmp_path)
 
