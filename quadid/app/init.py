@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
@@ -80,8 +79,8 @@ def init(
         ParameterError: a mass or an arm that is not positive.
     """
     for what, size, unit in (("mass", mass, "kg"), ("arm", arm, "m")):
-        if size is not None and not (math.isfinite(size) and size > 0.0):
-            raise ParameterError(f"{what} {size:g} {unit}", f"more than 0 {unit}")
+        if size is not None and not 0.0 < size < 1e6:
+            raise ParameterError(f"{what} {size:g} {unit}", f"more than 0 {unit}, less than 1e6")
     if log is None:
         text = render("new_vehicle.yaml", {"name": Markup(json.dumps(name)), "mass": mass})
         Vehicle.from_yaml(text, name)
@@ -243,14 +242,17 @@ def _hover_thrust(recording: Recording, channel: Channel | None, command: _Comma
     return mass * GRAVITY / squares
 
 
-def _possible_thrust(frame: Frame) -> tuple[float, float]:
-    """Thrust coefficients [N s^2/rad^2] that propellers of this frame can have.
+def _possible_thrust(frame: Frame) -> tuple[float, float] | None:
+    """Thrust coefficients [N s^2/rad^2] that propellers of this frame can have; None where its rotors are in one place.
 
     They follow from its size, not from the logged speeds, which they are to judge.
     """
     place = np.array([(r.x, r.y) for r in frame.rotors])
     apart = np.linalg.norm(place[:, None] - place[None, :], axis=2)
-    radius = 0.5 * float(np.min(apart[apart > 0.1 * np.max(apart)]))  # those of one axle are none
+    apart = apart[apart > 0.1 * np.max(apart)]  # those of one axle are none
+    if not apart.size:
+        return None
+    radius = 0.5 * float(np.min(apart))
     low, high = (c * _AIR * np.pi * (share * radius) ** 4 for c, share in zip(_THRUST, _RADIUS, strict=True))
     return low, high
 

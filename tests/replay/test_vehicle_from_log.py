@@ -12,7 +12,8 @@ from quadid_replay.motors import ARDUPILOT, frame_of
 
 from quadid.app.init import vehicle_text
 from quadid.checks import CheckResult, inspect
-from quadid.errors import LogError
+from quadid.data.window import Channel, Recording
+from quadid.errors import LogError, QuadidError
 from quadid.vehicle import Vehicle
 
 
@@ -24,6 +25,20 @@ def test_every_frame_balances(name: str) -> None:
     assert sum(spin for _, spin in motors) == 0
     for axis in range(2):  # roll and pitch do not turn the vehicle about z
         assert float(place[:, axis] @ [spin for _, spin in motors]) == pytest.approx(0.0, abs=1e-12)
+
+
+@pytest.mark.parametrize("place", [(0.0, 0.0), (0.1, 0.1), (1e-300, 0.0)])
+def test_rotors_in_one_place_are_no_airframe(place: tuple[float, float]) -> None:
+    t = np.arange(0.0, 20.0, 0.02)
+    rotors = {
+        f"CA_ROTOR{k}_{what}": value
+        for k in range(4)
+        for what, value in (("PX", place[0]), ("PY", place[1]), ("PZ", 0.0), ("KM", 0.05))
+    }
+    speeds = Channel("rotor_speed", t, np.full((len(t), 4), 400.0))
+    log = Recording("log", "ulog", {"rotor_speed": speeds}, autopilot={"CA_ROTOR_COUNT": 4.0, **rotors})
+    with pytest.raises(QuadidError):
+        vehicle_text(log, "mine")
 
 
 def test_the_frame_of_arducopter_is_that_of_its_truth(data_dir: Path) -> None:
