@@ -79,5 +79,5 @@ def model(vehicle: str | Path | Vehicle, *, span: float = math.inf) -> JaxModel:
         ParameterError: spin-up of rotors that do not lag, or a battery that sags without a length.
         VehicleError: no such vehicle.
     """
-    frame = Frame(vehicle if isinstance(vehicle, Vehicle) else Vehicle.named(vehicle), span)
+    frame = Frame(Vehicle.named(vehicle), span)
     return JaxModel(frame.states, tuple(map(float, frame.theta)), frame.left_out, frame)

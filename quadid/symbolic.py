@@ -93,7 +93,7 @@ def model(vehicle: str | Path | Vehicle, free: Sequence[str] = (), *, span: floa
         ParameterError: an unknown parameter, spin-up of rotors that do not lag, a battery that sags without a length.
         VehicleError: no such vehicle.
     """
-    described = vehicle if isinstance(vehicle, Vehicle) else Vehicle.named(vehicle)
+    described = Vehicle.named(vehicle)
     frame, layout = Frame(described, span), Layout(described)
     entries = [layout.entry(name) for name in free]
     x, u = casadi.SX.sym("x", len(frame.states)), casadi.SX.sym("u", len(described.rotors))

@@ -23,7 +23,7 @@ from pydantic import (
 
 from quadid.effects import EFFECTS, Scale, known_keys, rotor_drag_losses
 from quadid.errors import ParameterError, VehicleError, nearest
-from quadid.files import unwaited
+from quadid.files import read_regular, unwaited
 from quadid.parameters import INERTIAS, MAY_VANISH, NOMINAL_NAMES, VANISHED, impossible_inertia
 from quadid.sanitise import LONGEST_LINE, LONGEST_NAME, plain
 from quadid.types import FloatArray
@@ -32,6 +32,8 @@ from quadid.yaml_text import read_mapping
 # --- Parts of a vehicle file: rotors, the meaning of rotor columns, priors, noise, stabiliser, IMU, thrust stand
 
 
+_FILL_IN = "FILL IN"
+"""Marks in the file of `quadid init` what its user has to write."""
 DEFAULT_BOUND_FACTOR = 4.0
 """A bare initial guess may be wrong by this factor each way."""
 _LARGEST = 1e30
@@ -693,24 +695,53 @@ class Vehicle(Strict):
             problem, fix = _first_problem(error)
             raise VehicleError(f"{origin}: {problem}", fix=fix) from error
 
+    @staticmethod
+    def shipped_texts() -> dict[str, str]:
+        """Files of the vehicles that ship, by name, sorted."""
+        folder = resources.files("quadid") / "vehicles"
+        names = sorted(p.name[:-5] for p in folder.iterdir() if p.name.endswith(".yaml"))
+        return {name: (folder / f"{name}.yaml").read_text(encoding="utf-8") for name in names}
+
     @classmethod
     def shipped(cls, name: str) -> Vehicle:
         """Loads a shipped vehicle by name; raises VehicleError naming the nearest one."""
-        folder = resources.files("quadid") / "vehicles"
-        names = sorted(p.name[:-5] for p in folder.iterdir() if p.name.endswith(".yaml"))
-        if name not in names:
+        texts = cls.shipped_texts()
+        if name not in texts:
             raise VehicleError(
-                f"no shipped vehicle '{name}'", ", ".join(names) + ", or a YAML file", nearest(name, names)
+                f"no shipped vehicle '{name}'", ", ".join(texts) + ", or a YAML file", nearest(name, list(texts))
             )
-        return cls.from_yaml((folder / f"{name}.yaml").read_text(encoding="utf-8"), f"{name}.yaml")
+        return cls.from_yaml(texts[name], f"{name}.yaml")
 
     @classmethod
-    def named(cls, name: str | Path) -> Vehicle:
-        """Loads a vehicle file, or a shipped vehicle where there is no such file; raises VehicleError."""
-        path = Path(name)
-        if path.is_file():
-            return cls.from_yaml(path.read_text(encoding="utf-8"), path.name)
-        return cls.shipped(str(name))
+    def named(cls, given: str | Path | Vehicle) -> Vehicle:
+        """Loads a vehicle file, or the shipped vehicle of that name; of a vehicle, the vehicle itself.
+
+        Raises:
+            VehicleError: no such file or name, or a file that describes no vehicle.
+        """
+        if isinstance(given, Vehicle):
+            return given
+        name, path = str(given), Path(given)
+        looks_like_file = path.suffix.lower() in (".yaml", ".yml") or "/" in name
+        if not looks_like_file and not path.is_file():
+            return cls.shipped(name)
+        if path.is_dir():
+            raise VehicleError(f"{name} is a directory", "a shipped name or a YAML file", "name the file in it")
+        try:
+            text = read_regular(path).decode("utf-8")
+        except FileNotFoundError as error:
+            raise VehicleError(f"no vehicle file {name}", "a shipped name or a YAML file", "check the path") from error
+        except OSError as error:
+            raise VehicleError(f"{name} cannot be read ({error.strerror})", fix="check its permissions") from error
+        except UnicodeDecodeError as error:
+            raise VehicleError(f"{name}: not text", "a YAML file", "if this is the log, pass it as LOG") from error
+        if blanks := to_fill_in(text):
+            raise VehicleError(
+                f"{name}: {' and '.join(blanks)} {'is a guess' if len(blanks) == 1 else 'are guesses'} of "
+                f"`quadid init`, marked {_FILL_IN}", "measured values",
+                f"write your vehicle's and delete the words {_FILL_IN}",
+            )  # fmt: skip
+        return cls.from_yaml(text, path.name)
 
     def to_yaml(self) -> str:
         """Writes the vehicle as YAML that `from_yaml` reads back."""
@@ -735,6 +766,11 @@ class Vehicle(Strict):
         with open(target, "w", encoding="utf-8", opener=unwaited) as file:
             file.write(self.to_yaml())
         return target
+
+
+def to_fill_in(text: str) -> list[str]:
+    """Keys of a file of `quadid init` that its user has yet to write."""
+    return [line.split(":")[0].strip(" -#") for line in text.splitlines() if _FILL_IN in line]
 
 
 def _first_problem(error: ValidationError) -> tuple[str, str]:

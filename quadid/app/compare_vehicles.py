@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from quadid.app.logs import Given, Log, as_vehicle, fitted_before, listed, load_vehicle, read
+from quadid.app.logs import Given, Log, fitted_before, listed, read
 from quadid.app.options import Described, Horizons, OwnRate, Seed, Typed
 from quadid.app.outcome import LIBRARY, Reported, provenance
 from quadid.app.score import HORIZONS, ahead
@@ -129,8 +129,8 @@ class Compared(Reported):
 
 
 def compare_vehicles(
-    a: Annotated[Described, Typed(str, typer.Argument(metavar="A"), ..., load_vehicle)],
-    b: Annotated[Described, Typed(str, typer.Argument(metavar="B"), ..., load_vehicle)],
+    a: Annotated[Described, Typed(str, typer.Argument(metavar="A"), ..., Vehicle.named)],
+    b: Annotated[Described, Typed(str, typer.Argument(metavar="B"), ..., Vehicle.named)],
     on: Annotated[Given, Typed(list[str], typer.Option(metavar="LOG"), ..., opened=True)],
     *, horizons: Horizons = HORIZONS, rate: OwnRate = None, seed: Seed = 0,
 ) -> Compared:  # fmt: skip
@@ -156,7 +156,7 @@ def compare_vehicles(
 
     if not listed(on):
         raise LogError("no log", "at least one flight", "name flights with --on")
-    pair = [as_vehicle(v) for v in (a, b)]
+    pair = [Vehicle.named(v) for v in (a, b)]
     opened = [[log.at(rate) for log in read(on, vehicle)] for vehicle in pair]
     both = list(zip(pair, opened, strict=True))
     steps = ahead(horizons, [w for log in opened[0] for w in log.windows])

@@ -13,7 +13,7 @@ import numpy as np
 import typer
 
 from quadid.app.identify import check_seed, search
-from quadid.app.logs import Given, Log, as_vehicle, file_name, load_vehicle, read, write_texts
+from quadid.app.logs import Given, Log, file_name, read, write_texts
 from quadid.app.options import VEHICLE, Described, Seed, Typed
 from quadid.app.outcome import LIBRARY, Advance, Reported, provenance, silent
 from quadid.data.window import Window
@@ -227,7 +227,7 @@ def knowledge(
 def propose(
     logs: Annotated[Given, Typed(list[str] | None, typer.Argument(metavar="LOG"), opened=True)] = (),
     *,
-    vehicle: Annotated[Described, Typed(str, VEHICLE, "pelican", load_vehicle)] = "pelican",
+    vehicle: Annotated[Described, Typed(str, VEHICLE, "pelican", Vehicle.named)] = "pelican",
     seconds: Annotated[float, typer.Option(metavar="S")] = 60.0,
     tilt: Annotated[float, typer.Option(metavar="DEG")] = 25.0,
     rate_limit: Annotated[float, typer.Option(metavar="DEG/S")] = 150.0,
@@ -265,7 +265,7 @@ def propose(
     check_limits(seconds, tilt, rate_limit, height, battery, forms)
     check_seed(seed)
     limits = Limits(math.radians(tilt), math.radians(rate_limit))
-    described = as_vehicle(vehicle)
+    described = Vehicle.named(vehicle)
     given = read(logs, described)
     windows = [w for log in given for w in log.windows]
     believed, known, before = knowledge(described, windows, seed, advance)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from quadid.app.logs import OutputError, as_vehicle, file_name, write_texts
+from quadid.app.logs import OutputError, file_name, write_texts
 from quadid.app.outcome import Outcome
 from quadid.effects import EFFECTS
 from quadid.errors import QuadidError
@@ -70,7 +70,7 @@ def export(
         UnprovenError: the values are those of a fit that nothing proves, or in doubt.
         VehicleError: no such vehicle.
     """
-    described, format = as_vehicle(vehicle), form_of(format)
+    described, format = Vehicle.named(vehicle), form_of(format)
     origin = source or (Path(vehicle).name if isinstance(vehicle, str | Path) else described.name)
     lacking = doubt or (f"not proven: {described.proof.lacking}" if described.proof and described.proof.lacking else "")
     if lacking and not anyway:

@@ -31,9 +31,7 @@ from quadid.app.logs import (
     GRID,
     Log,
     OutputError,
-    as_vehicle,
     check_conventions,
-    load_vehicle,
     make_folder,
     on_grid,
     parse_part,
@@ -95,7 +93,7 @@ def fleet(
     """
     if columns and vehicle is None:
         raise VehicleError("columns without a vehicle", "columns of the vehicle that is given", "give vehicle, too")
-    known = None if vehicle is None else as_vehicle(vehicle)
+    known = None if vehicle is None else Vehicle.named(vehicle)
     default = (
         None if known is None else known.model_copy(update={"columns": {**known.columns, **(columns or {})}}).to_yaml()
     )
@@ -559,7 +557,7 @@ def _vehicle_text(folder: Path, root: Path, default: str | None, texts: dict[Pat
         if file in texts:
             return texts[file]
         if file.is_file():
-            texts[file] = load_vehicle(str(file)).to_yaml()
+            texts[file] = Vehicle.named(file).to_yaml()
             return texts[file]
         if place == root:
             break

@@ -15,7 +15,7 @@ import typer
 from quadid_replay import open_log
 
 from quadid.app.export import UnprovenError
-from quadid.app.logs import as_vehicle, file_name, load_vehicle, write_texts
+from quadid.app.logs import file_name, write_texts
 from quadid.app.options import VEHICLE, Described, Typed
 from quadid.app.outcome import LIBRARY, Reported, provenance
 from quadid.chi_square import Z95
@@ -198,7 +198,7 @@ def step_figure(name: str, angle: bool, now: Loops, before: Loops | None) -> Jso
 
 
 def gains(
-    vehicle: Annotated[Described, Typed(str, VEHICLE, ..., load_vehicle)],
+    vehicle: Annotated[Described, Typed(str, VEHICLE, ..., Vehicle.named)],
     format: Annotated[str, typer.Option("--format", metavar="F")] = "px4",
     *,
     bandwidth: Annotated[float | None, typer.Option("--bandwidth", metavar="HZ")] = None,
@@ -239,7 +239,7 @@ def gains(
     if bandwidth is not None and not 0.0 < bandwidth < math.inf:
         raise ParameterError(f"a bandwidth of {bandwidth:g} Hz", "more than 0 Hz")
     # What the gains rest on: the vehicle, the autopilot's filters and rates, and how late the rotors answer.
-    described, autopilot = as_vehicle(vehicle), AUTOPILOTS[format]
+    described, autopilot = Vehicle.named(vehicle), AUTOPILOTS[format]
     facts, known = Facts(described, ""), _told(current, autopilot)
     warnings = _check_identified(described, anyway)
     late = _lateness(described, motor_lag, delay)

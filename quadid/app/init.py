@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass
-from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -23,7 +22,7 @@ from quadid.data.window import Channel, Recording
 from quadid.errors import LogError, ParameterError, VehicleError
 from quadid.report.tables import Cell, Column, TextTable
 from quadid.report.templating import render
-from quadid.vehicle import GRAVITY, Vehicle
+from quadid.vehicle import GRAVITY, Vehicle, to_fill_in
 
 
 @dataclass(frozen=True, repr=False)
@@ -87,7 +86,7 @@ def init(
     else:
         recording = open_log(Path(log), preset)
         text = vehicle_text(recording, name, mass, arm)
-    blanks = [line.split(":")[0].strip(" -#") for line in text.splitlines() if "FILL IN" in line]
+    blanks = to_fill_in(text)
     source = None if log is None else str(Path(log).absolute())
     return Initial({"schema": "quadid.init/1", "vehicle": name, "from": source, "fill_in": blanks, "file": None}, text)
 
@@ -123,11 +122,8 @@ def vehicles() -> Shipped:
 def shipped() -> list[dict[str, Any]]:
     """The vehicles that ship, each with what sets it apart, one row a vehicle."""
     out = []
-    for entry in sorted(resources.files("quadid").joinpath("vehicles").iterdir(), key=lambda e: e.name):
-        if not entry.name.endswith(".yaml"):
-            continue
-        text = entry.read_text(encoding="utf-8")
-        vehicle = Vehicle.from_yaml(text, entry.name)
+    for name, text in Vehicle.shipped_texts().items():
+        vehicle = Vehicle.from_yaml(text, name)
         out.append({
             "name": vehicle.name, "rotors": len(vehicle.rotors), "mass": vehicle.mass, "arm": vehicle.arm,
             "command": f"{vehicle.command.kind}, {vehicle.command.sampling}",

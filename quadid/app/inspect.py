@@ -15,7 +15,6 @@ from quadid.app.logs import (
     Flight,
     Log,
     LogPart,
-    as_vehicle,
     flown_parts,
     gridded,
     left_on_ground,
@@ -121,7 +120,7 @@ def inspect(
     else:
         cut = parse_part(str(log), start, stop)
         whole = None
-    described = None if vehicle is None else as_vehicle(vehicle)
+    described = None if vehicle is None else Vehicle.named(vehicle)
     if whole is None:
         named = {} if described is None else described.columns
         whole = open_log(cut.path, preset, {**named, **(columns or {})})

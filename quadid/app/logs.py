@@ -21,7 +21,7 @@ from quadid.app.over_time import OverTime
 from quadid.data.grid import linear
 from quadid.data.window import Recording, Window
 from quadid.errors import LogError, QuadidError, VehicleError
-from quadid.files import read_regular, unwaited
+from quadid.files import unwaited
 from quadid.sanitise import LONGEST_NAME
 from quadid.types import FloatArray, IntArray
 from quadid.vehicle import MOST_FLIGHTS, FittedFlight, Vehicle
@@ -213,8 +213,6 @@ def left_on_ground(names: Sequence[str]) -> str:
 # --- From names of logs and vehicles to checked windows on a grid
 
 
-_FILL_IN = "FILL IN"
-"""Marks the guesses of `quadid init`."""
 GRID = 50.0
 """Rate of the grid unless asked otherwise [Hz], as in the paper."""
 LONGEST = 3600.0
@@ -264,7 +262,7 @@ class Log:
 
     def of(self, vehicle: str | Path | Vehicle) -> Log:
         """The same log read with another description of its vehicle: checked anew, on a grid of the same rate."""
-        described = as_vehicle(vehicle)
+        described = Vehicle.named(vehicle)
         if described == self.vehicle:
             return self
         return _read(self.path, self.recording, described, self.grid.rate, self.cut)
@@ -300,43 +298,6 @@ def _places(channel: str, width: int) -> tuple[str, Sequence[str | int]]:
     return {3: ("axis", "xyz"), 4: ("quaternion", "wxyz")}.get(width, (channel + "_column", range(1, width + 1)))
 
 
-def load_vehicle(name: str) -> Vehicle:
-    """Loads a vehicle file, or the shipped vehicle of that name.
-
-    Raises:
-        VehicleError: no such file or name, or a file that describes no vehicle.
-    """
-    path = Path(name)
-    looks_like_file = path.suffix.lower() in (".yaml", ".yml") or "/" in name
-    if not looks_like_file and not path.is_file():
-        return Vehicle.shipped(name)
-    if path.is_dir():
-        raise VehicleError(f"{name} is a directory", "a shipped name or a YAML file", "name the file in it")
-    try:
-        data = read_regular(path)
-    except FileNotFoundError as error:
-        raise VehicleError(f"no vehicle file {name}", "a shipped name or a YAML file", "check the path") from error
-    except OSError as error:
-        raise VehicleError(f"{name} cannot be read ({error.strerror})", fix="check its permissions") from error
-    try:
-        text = data.decode("utf-8")
-        blanks = [line.split(":")[0].strip(" -#") for line in text.splitlines() if _FILL_IN in line]
-        if blanks:
-            raise VehicleError(
-                f"{name}: {' and '.join(blanks)} {'is a guess' if len(blanks) == 1 else 'are guesses'} of "
-                f"`quadid init`, marked {_FILL_IN}", "measured values",
-                f"write your vehicle's and delete the words {_FILL_IN}",
-            )  # fmt: skip
-        return Vehicle.from_yaml(text, path.name)
-    except UnicodeDecodeError as error:
-        raise VehicleError(f"{name}: not text", "a YAML file", "if this is the log, pass it as LOG") from error
-
-
-def as_vehicle(vehicle: str | Path | Vehicle) -> Vehicle:
-    """The vehicle itself, or as `load_vehicle` has it."""
-    return load_vehicle(str(vehicle)) if isinstance(vehicle, str | Path) else vehicle
-
-
 def load(
     log: str | Path, vehicle: str | Path | Vehicle, *, rate: float | None = GRID, start: float | None = None,
     stop: float | None = None, preset: str = "auto", unchecked: bool = False, columns: Mapping[str, str] | None = None,
@@ -361,7 +322,7 @@ def load(
     from quadid_replay.opening import start as start_reading
 
     start_reading()
-    described = as_vehicle(vehicle)
+    described = Vehicle.named(vehicle)
     cut = replace(parse_part(str(log), start, stop), checked=not unchecked)
     recording = open_log(cut.path, preset, {**described.columns, **(columns or {})})
     require_gyro(recording)
@@ -637,7 +598,7 @@ def vehicle_of(logs: Sequence[Flight], vehicle: str | Path | Vehicle | None) -> 
         VehicleError: no such vehicle, or only paths of logs, which do not say whose they are.
     """
     if vehicle is not None:
-        return as_vehicle(vehicle)
+        return Vehicle.named(vehicle)
     for log in logs:
         if isinstance(log, Log):
             return log.vehicle

@@ -8,14 +8,13 @@ callers only.  An option without help has that of the function's docstring.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
 import typer
 from typer.models import ParameterInfo
 
-from quadid.app.logs import GRID, Given, load_vehicle, parse_columns
+from quadid.app.logs import GRID, Given, parse_columns
 from quadid.errors import ParameterError
 from quadid.vehicle import Vehicle
 
@@ -37,8 +36,7 @@ class Typed(NamedTuple):
 
 def shipped_names(incomplete: str) -> list[str]:
     """Shipped vehicles that begin so, for the shell's completion; files it completes itself."""
-    names = (Path(entry.name) for entry in files("quadid").joinpath("vehicles").iterdir())
-    return sorted(n.stem for n in names if n.suffix == ".yaml" and n.stem.startswith(incomplete))
+    return [name for name in Vehicle.shipped_texts() if name.startswith(incomplete)]
 
 
 # --- Logs and vehicles
@@ -70,13 +68,13 @@ VEHICLE = _vehicle()
 VehicleName = Annotated[str, VEHICLE]
 Described = str | Path | Vehicle
 """A shipped name, a YAML file or the vehicle itself."""
-OfVehicle = Annotated[Described | None, Typed(str, VEHICLE, ..., load_vehicle)]
+OfVehicle = Annotated[Described | None, Typed(str, VEHICLE, ..., Vehicle.named)]
 """The vehicle of the logs: a caller of the library may have it in a loaded log."""
 
 
 def vehicle_if(about: str) -> Typed:
     """A vehicle that need not be given; its help ends with `about`."""
-    return Typed(str | None, _vehicle(about), read=load_vehicle)
+    return Typed(str | None, _vehicle(about), read=Vehicle.named)
 
 
 # --- How a log is read

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from quadid.app.identify import check_seed
-from quadid.app.logs import as_vehicle, write_recording
+from quadid.app.logs import write_recording
 from quadid.app.options import key_numbers
 from quadid.app.outcome import Outcome
 from quadid.effects import EFFECTS
@@ -114,7 +114,7 @@ def simulate(
     if not 0.0 <= spread <= WIDEST:
         raise ParameterError(f"spread {spread:g}", f"a fraction from 0 to {WIDEST:g}")
     check_seed(seed)
-    described = as_vehicle(vehicle)
+    described = Vehicle.named(vehicle)
     truth = draw_truth(described, seed, spread) if spread > 0.0 else TruthParameters.of(described)
     named, outside = parse_effects(effects, described, seed, seconds)
     segments = read_manoeuvre(Path(manoeuvre)) if manoeuvre is not None else None
@@ -171,7 +171,7 @@ def simulate_draws(vehicle: str | Path | Vehicle, draws: int, seed: int = 1, **h
     if not 1 <= draws <= MOST_DRAWS:
         raise ParameterError(f"{draws} draws", f"1 to {MOST_DRAWS}")
     check_seed(seed)
-    described = as_vehicle(vehicle)
+    described = Vehicle.named(vehicle)
     values, _ = believed(described).sample(draws, seed)
     out = []
     for i, row in enumerate(values):

@@ -11,7 +11,7 @@ import typer
 
 from quadid.app.diagnose import Diagnosed, diagnose
 from quadid.app.identify import Identified, identify
-from quadid.app.logs import Log, as_vehicle, load, write_recording, write_text
+from quadid.app.logs import Log, load, write_recording, write_text
 from quadid.app.options import JsonTarget, OutFolder, Seed
 from quadid.app.outcome import Advance, provenance, quality, told
 from quadid.cli import terminal
@@ -84,7 +84,7 @@ def run(seconds: float, seed: int, folder: Path, advance: Advance) -> Shown:
     Args:
         seconds: length of each of the three flights.
     """
-    vehicle = as_vehicle(VEHICLE)
+    vehicle = Vehicle.named(VEHICLE)
     truth = TruthParameters.of(vehicle).as_dict()
     flights = [
         fly_and_load(vehicle, folder / f"set{i + 1}.mcap", seconds, 10 * seed + i, {}, advance) for i in range(3)

@@ -9,7 +9,6 @@ import typer
 
 from quadid.app.export import export as exported
 from quadid.app.export import forms
-from quadid.app.logs import load_vehicle
 from quadid.app.options import VEHICLE, JsonTarget, OutFolder
 from quadid.cli import terminal
 from quadid.report.programs import FORMATS
@@ -47,7 +46,7 @@ def export(
         return
     if vehicle is None:
         raise typer.BadParameter("no vehicle: use --vehicle, or --list", param_hint="--vehicle")
-    described, source, doubt = load_vehicle(vehicle), Path(vehicle).name, ""
+    described, source, doubt = Vehicle.named(vehicle), Path(vehicle).name, ""
     if history is not None:
         described, source, doubt = _in_force(described, history, name or described.name)
     elif name is not None:

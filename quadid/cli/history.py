@@ -10,13 +10,13 @@ from typing import Annotated, Any
 
 import typer
 
-from quadid.app.logs import load_vehicle
 from quadid.app.options import JsonTarget, shipped_names
 from quadid.app.outcome import Outcome
 from quadid.chi_square import Z95
 from quadid.cli import terminal
 from quadid.errors import VehicleError
 from quadid.report.tables import Cell, Column, TextTable, number
+from quadid.vehicle import Vehicle
 
 
 def history(
@@ -47,7 +47,7 @@ def history(
     found = read_history(path, name, candidates, events)
     names = [entry["name"] for entry in found["vehicles"]]
     try:
-        described = load_vehicle(vehicle)
+        described = Vehicle.named(vehicle)
     except VehicleError as error:
         if vehicle not in names:
             there = ", ".join(names) or "none"

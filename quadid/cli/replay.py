@@ -67,13 +67,14 @@ def replay(
     from quadid_node.settings import session_settings
     from quadid_node.worker import InlineWorker
 
-    from quadid.app.logs import load_vehicle, parse_columns, parse_part
+    from quadid.app.logs import parse_columns, parse_part
     from quadid.cli import terminal
+    from quadid.vehicle import Vehicle
 
     terminal.check_file(json, "--json")
     terminal.check_file(out, "--out")
     pace = _pace(speed)
-    described = load_vehicle(vehicle)
+    described = Vehicle.named(vehicle)
     settings = session_settings(
         approval, options.gate_settings(gate), rate=rate, window=window, refit=refit, diagnose=diagnose, seed=seed
     )

@@ -69,11 +69,11 @@ def serve(
     from quadid_node.settings import session_settings
     from quadid_node.zenoh import ZenohLink
 
-    from quadid.app.logs import load_vehicle
     from quadid.cli import terminal
+    from quadid.vehicle import Vehicle
 
     terminal.check_file(json, "--json")
-    described = load_vehicle(vehicle)
+    described = Vehicle.named(vehicle)
     settings = session_settings(
         approval, options.gate_settings(gate), window=window, refit=refit, diagnose=diagnose, seed=seed
     )

@@ -22,7 +22,6 @@ from rclpy.parameter import Parameter
 from rclpy.qos import HistoryPolicy, QoSCompatibility, QoSProfile, ReliabilityPolicy, qos_check_compatible
 from rclpy.subscription import Subscription
 
-from quadid.app.logs import load_vehicle
 from quadid.errors import QuadidError
 from quadid.online import Publish
 from quadid.online.active_set import Answer
@@ -218,7 +217,7 @@ class IdentifyNode(PollingNode, LifecycleNode):
 
     def _configure(self) -> None:
         values = {p.name: as_declared(p, self.get_parameter(p.name).value) for p in PARAMETERS}
-        vehicle, settings = load_vehicle(values["vehicle"]), read_settings(values)
+        vehicle, settings = Vehicle.named(values["vehicle"]), read_settings(values)
         preset = source(values["source"])
         self._id = vehicle_id(values["vehicle_id"], self.get_namespace(), vehicle)
         self._observer = bool(values["observer"])

@@ -26,7 +26,7 @@ from quadid_replay.writers import open_for_writing
 
 from quadid.app.excite import Proposed
 from quadid.app.fleet_page import Fleet
-from quadid.app.logs import load_vehicle, write_text
+from quadid.app.logs import write_text
 from quadid.app.simulate import read_manoeuvre
 from quadid.cli.commands import COMMANDS
 from quadid.cli.history import Stored
@@ -164,7 +164,7 @@ def test_the_shell_completes_commands_options_and_vehicles(quadid: Cli, words: s
 
 
 READERS: dict[str, Callable[[Path], object]] = {
-    "vehicle file": lambda path: load_vehicle(str(path)),
+    "vehicle file": Vehicle.named,
     "manoeuvre": read_manoeuvre,
     "signing key": read_key,
     "log": open_log,

@@ -12,7 +12,6 @@ from quadid_evaluation.studies.poisoning import Poison
 from quadid_replay import open_log
 from scipy.signal import butter, sosfiltfilt
 
-from quadid.app.logs import load_vehicle
 from quadid.checks.turns import ALLOWED, AXES, Factor
 from quadid.data.window import Recording
 from quadid.online import Phase, Session
@@ -222,7 +221,7 @@ def test_in_flight_rotor_speeds_cannot_walk_away_from_the_first_set(happened: Ha
 def test_sticks_in_step_with_the_readings_are_no_contradiction(data_dir: Path) -> None:
     """ArduCopter's rates swing at half the rate of telemetry: wherever turns are cut, the factors are 1."""
     folder = data_dir / "ardupilot_sitl"
-    log, vehicle = open_log(folder / "x.tlog"), load_vehicle(str(folder / "sitl_x.yaml"))
+    log, vehicle = open_log(folder / "x.tlog"), Vehicle.named(folder / "sitl_x.yaml")
     for shift in np.arange(0.0, 1.0, 0.14):
         channels = {}
         for name in ("gyro", "accel", "attitude", "rotor_speed"):

@@ -13,7 +13,6 @@ from quadid_replay import open_log
 from scipy.signal import butter, filtfilt, lfilter
 
 import quadid
-from quadid.app.logs import load_vehicle
 from quadid.checks import Check, CheckResult, inspect
 from quadid.checks.frames import response
 from quadid.data.window import Channel, Recording, sample_period
@@ -35,7 +34,7 @@ def flight(request: pytest.FixtureRequest) -> Flight:
         made = quadid.simulate(seconds=60.0, seed=3, extras=("velocity", "position"))
         return made.flight.recording, Vehicle.shipped("pelican")
     path: Path = request.getfixturevalue("data_dir") / place
-    return open_log(path), load_vehicle(str(path.parent / "vehicle.yaml"))
+    return open_log(path), Vehicle.named(path.parent / "vehicle.yaml")
 
 
 def sources(

@@ -14,7 +14,6 @@ from quadid_replay import open_log
 from scipy.signal import butter, filtfilt, lfilter
 
 from quadid import simulate
-from quadid.app.logs import load_vehicle
 from quadid.checks import Check, CheckResult, flying_spans, inspect
 from quadid.checks.rotors import gyro_filter_check
 from quadid.data.rotor_signal import rotor_signal
@@ -162,7 +161,7 @@ def test_speeds_that_are_all_zero_do_not_advise_another_vehicle_file(flight: tup
 @pytest.mark.parametrize("log", ["crazyflie_rpm/figure8_17.csv", "brushed/jana00.csv"])
 def test_a_gyro_that_was_smoothed_is_told_from_one_that_was_not(data_dir: Path, log: str) -> None:
     recording = open_log(data_dir / log)
-    vehicle = load_vehicle(str(data_dir / log.split("/")[0] / "vehicle.yaml"))
+    vehicle = Vehicle.named(str(data_dir / log.split("/")[0] / "vehicle.yaml"))
     gyro = recording.channels["gyro"]
 
     def told(values: FloatArray) -> list[str]:
@@ -177,7 +176,7 @@ def test_a_gyro_that_was_smoothed_is_told_from_one_that_was_not(data_dir: Path, 
 
 def test_a_gyro_behind_a_slow_filter_is_named_where_speeds_are_measured(data_dir: Path) -> None:
     recording = open_log(data_dir / "crazyflie_rpm" / "figure8_17.csv")
-    vehicle = load_vehicle(str(data_dir / "crazyflie_rpm" / "vehicle.yaml"))
+    vehicle = Vehicle.named(data_dir / "crazyflie_rpm" / "vehicle.yaml")
     gyro = recording.channels["gyro"]
     late = np.asarray(lfilter(*butter(2, 2.5, fs=1.0 / sample_period(gyro.t)), gyro.values, axis=0))
     slow = replace(recording, channels={**recording.channels, "gyro": replace(gyro, values=late)})
@@ -191,7 +190,7 @@ def test_a_gyro_behind_a_slow_filter_is_named_where_speeds_are_measured(data_dir
 
 def test_an_arm_that_no_inertia_fits_is_asked_for(data_dir: Path) -> None:
     folder = data_dir / "cases_hub" / "case_008"
-    right = load_vehicle(str(folder / "vehicle.yaml"))
+    right = Vehicle.named(folder / "vehicle.yaml")
     recording = open_log(folder / "train.csv")
     places = np.array([r.position for r in right.rotors])
     for factor, asked in ((1.0, False), (2.0, True)):

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from quadid.app.logs import GRID, load, load_vehicle, write_recording, write_text
+from quadid.app.logs import GRID, load, write_recording, write_text
 from quadid.app.outcome import Advance
 from quadid.chi_square import Z95
 from quadid.diagnosis import diagnose
@@ -89,7 +89,7 @@ def reproduce(
     """
     begin = time.perf_counter()
     # The three sets, written as logs and read back as any other log; the first trains.
-    base, sets, logs = load_vehicle(VEHICLE), [], []
+    base, sets, logs = Vehicle.named(VEHICLE), [], []
     folder.mkdir(parents=True, exist_ok=True)
     place = folder.resolve()
     for i in range(3):

@@ -30,7 +30,6 @@ from typing import Any
 
 import quadid
 import quadid.diagnosis
-from quadid.app.logs import load_vehicle
 from quadid.data.window import Window
 from quadid.diagnosis import diagnose
 from quadid.diagnosis.attribution import stated_errors
@@ -315,7 +314,7 @@ def load(flight: Flight, cache: Path | None = None) -> Windows:
         one, other, vehicle = flown(flight.case)
         train, held = [one], [other]
     else:
-        vehicle = load_vehicle(str(DATA / flight.vehicle))
+        vehicle = Vehicle.named(DATA / flight.vehicle)
         train, held = _windows(flight.train, vehicle), _windows(flight.held, vehicle)
     if kept is not None:
         kept.parent.mkdir(parents=True, exist_ok=True)

@@ -27,9 +27,9 @@ from quadid_node.worker import InlineWorker
 from quadid_replay import open_log
 from quadid_replay.tlog import read_frames
 
-from quadid.app.logs import load_vehicle
 from quadid.data.window import Block
 from quadid.online import Event, Phase, Publish
+from quadid.vehicle import Vehicle
 from quadid_evaluation.harness import QUADID, free_port, options, put, table
 from quadid_evaluation.studies.readings import telemetry
 
@@ -253,7 +253,7 @@ def flown(one: Flown, data: Path, live: bool, seconds: float) -> Outcome:
     if live:
         return serve(data / one.log, file, seconds)
     begin = time.monotonic()
-    vehicle = load_vehicle(str(file))
+    vehicle = Vehicle.named(file)
     recording = open_log(str(data / one.log), "auto", vehicle.columns)
     if one.interval:
         recording = telemetry(recording, one.interval, one.pulses)

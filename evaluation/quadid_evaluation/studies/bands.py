@@ -17,12 +17,12 @@ from pathlib import Path
 import numpy as np
 
 import quadid
-from quadid.app.logs import load_vehicle
 from quadid.chi_square import Z95
 from quadid.errors import QuadidError
 from quadid.identification.forecast import BANDS, PHASES, Forecast
 from quadid.model.layout import Layout
 from quadid.types import FloatArray
+from quadid.vehicle import Vehicle
 from quadid_evaluation.harness import options, put, table
 from quadid_evaluation.studies.flight_sets import SETS, FlightSet
 
@@ -57,7 +57,7 @@ def main() -> None:
 
 def rows(name: str, one: FlightSet, data: Path) -> list[Sequence[str]]:
     """Rows of one set, a quantity each."""
-    vehicle = load_vehicle(str(data / one.vehicle))
+    vehicle = Vehicle.named(data / one.vehicle)
     try:
         train = [quadid.load(str(data / log), vehicle) for log in one.train]
         unseen = [quadid.load(str(data / log), vehicle) for log in one.unseen]

@@ -17,7 +17,6 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 import quadid
-from quadid.app.logs import load_vehicle
 from quadid.data.window import Window
 from quadid.diagnosis import diagnose
 from quadid.errors import QuadidError
@@ -446,7 +445,7 @@ def _write(kept: Path, rows: dict[str, Any]) -> None:
 def measured(one: FlightSet, data: Path) -> Row:
     """Identifies, diagnoses and predicts one set."""
     begin = time.perf_counter()
-    vehicle = load_vehicle(str(data / one.vehicle))
+    vehicle = Vehicle.named(data / one.vehicle)
     try:
         train = [quadid.load(str(data / log), vehicle) for log in one.train]
         identified = quadid.identify(train).result

@@ -20,7 +20,7 @@ from quadid_replay.frames import from_euler
 from scipy.signal import butter, filtfilt
 
 import quadid
-from quadid.app.logs import LogPart, check_conventions, load_vehicle
+from quadid.app.logs import LogPart, check_conventions
 from quadid.checks import CheckResult, inspect
 from quadid.data.window import Channel, Recording, mounting_matrix, sample_period
 from quadid.errors import LogError
@@ -71,7 +71,7 @@ def flown(name: str, data: Path) -> Log:
     """A right log and its vehicle: flown here for 40 s, or recorded."""
     if name in RECORDED:
         log, file = (data / part for part in RECORDED[name])
-        vehicle = load_vehicle(str(file))
+        vehicle = Vehicle.named(file)
         return open_log(log, "auto", vehicle.columns), vehicle
     vehicle = described(name)
     flight = quadid.simulate(vehicle, seconds=30.0, seed=7, extras=("velocity", "position")).flight

@@ -16,7 +16,6 @@ import numpy as np
 from scipy.signal import lfilter, savgol_filter
 
 import quadid
-from quadid.app.logs import load_vehicle
 from quadid.data.grid import linear
 from quadid.data.window import Recording
 from quadid.types import FloatArray
@@ -111,7 +110,7 @@ def _row(name: str, errors: Sequence[float]) -> str:
 
 def section(data: Path) -> list[str]:
     """The part of the page."""
-    vehicle = load_vehicle(str(data / MODEL))
+    vehicle = Vehicle.named(data / MODEL)
     train, other = (quadid.load(str(data / name), vehicle) for name in (f"{LOG}@:{CUT:g}", f"{LOG}@{CUT:g}:"))
     first, new = signals(train.recording, 0.0, CUT), signals(other.recording, CUT, np.inf)
     found = fitted(first, vehicle)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 import quadid
-from quadid.app.logs import Log, load_vehicle
+from quadid.app.logs import Log
 from quadid.data.window import Window
 from quadid.parameters import NOMINAL_NAMES
 from quadid.vehicle import Vehicle
@@ -68,7 +68,7 @@ def _written(window: Window, path: Path) -> Path:
 def recorded(name: str, data: Path) -> Flights:
     """A set of `quadid_evaluation.studies.foreign`."""
     one = SETS[name]
-    vehicle = load_vehicle(str(data / one.vehicle))
+    vehicle = Vehicle.named(data / one.vehicle)
     train, unseen = ([quadid.load(str(data / log), vehicle) for log in part] for part in (one.train, one.unseen))
     return Flights(vehicle, train, unseen, one.truth)
 
