@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import os
 import stat
@@ -29,3 +30,17 @@ def read_regular(path: str | Path, most: int = 1 << 20) -> bytes:
         if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
             raise OSError(errno.EINVAL, "it is no regular file", str(path))
         return file.read(most)
+
+
+def check_beside(database: str | Path) -> None:
+    """Checks what SQLite keeps beside a database, and writes to whatever stands there.
+
+    Raises:
+        OSError: one of these files is a link, or has a second name by which it is another file of the user.
+    """
+    for end in ("-wal", "-shm", "-journal"):
+        beside = f"{os.path.realpath(database)}{end}"
+        with contextlib.suppress(FileNotFoundError):
+            found = os.lstat(beside)
+            if not stat.S_ISREG(found.st_mode) or found.st_nlink > 1:
+                raise OSError(errno.EINVAL, "it is a link, or has a second name", beside)

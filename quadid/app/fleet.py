@@ -42,7 +42,7 @@ from quadid.app.options import OUT, Described, NamedColumns, Rate, Seed, Typed, 
 from quadid.app.outcome import Advance, silent
 from quadid.data.window import Recording
 from quadid.errors import LogError, NotIdentifiableError, QuadidError, VehicleError
-from quadid.files import read_regular
+from quadid.files import check_beside, read_regular
 from quadid.sanitise import one_line
 from quadid.vehicle import Vehicle
 from quadid.version import __version__
@@ -475,12 +475,11 @@ def find_jobs(
         raise LogError(f"no folder {root}", "a folder with flight logs", "check the path")
     jobs, others, texts, secret = list[Job](), list[str](), dict[Path, str](), _secret()
     for path in _files(root, leave_out):
-        name = path.relative_to(root).as_posix()
+        name, folder = (_text(p.relative_to(root)) for p in (path, path.parent))
         if not _is_log(path):
             others.append(name)
             continue
         text = _vehicle_text(path.parent, root, default, texts)
-        folder = path.parent.relative_to(root).as_posix()
         status = path.stat()
         made_from = f"{status.st_size} {status.st_mtime_ns} {rate!r} {seed} {diagnose} {__version__}"
         key = hmac.new(secret, "\0".join((name, made_from, text)).encode(errors="replace"), "sha256").hexdigest()[:32]
@@ -492,6 +491,11 @@ def find_jobs(
         raise LogError(f"no flight log below {root} ({len(others)} other files)", "MCAP, tlog, DataFlash, ULog or CSV")
     copies = _copies(jobs)
     return Found(tuple(job for job in jobs if job.name not in copies), tuple(others), tuple(copies.items()))
+
+
+def _text(path: Path) -> str:
+    r"""A path as text that every database and page can hold; bytes that are none as ``\xff``."""
+    return os.fsencode(path.as_posix()).decode(errors="backslashreplace")
 
 
 def _secret() -> bytes:
@@ -685,6 +689,7 @@ class Store:
 @contextmanager
 def open_store(path: Path) -> Iterator[Store]:
     """Opens or makes the SQLite file; raises OutputError for one that `fleet` has not made, or that fails."""
+    check_beside(path)
     try:
         if path.is_symlink() or (path.exists() and not path.is_file()):
             raise sqlite3.DatabaseError("it is no regular file")

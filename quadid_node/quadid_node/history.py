@@ -32,6 +32,7 @@ import numpy as np
 from quadid.condition.trim import FlightTrim, flight_from_dict, flight_to_dict
 from quadid.condition.watch import MOST_FLIGHTS
 from quadid.errors import QuadidError
+from quadid.files import check_beside
 from quadid.online.fit_job import ROOM, with_room
 from quadid.online.gate import LIMITED, GateSettings, implausible
 from quadid.online.records import Event, OnlineDiagnosis, OnlineSet, SetState
@@ -81,9 +82,16 @@ def connect(path: Path, read_only: bool = False) -> sqlite3.Connection:
     """Opens the file; for writing in WAL mode, every transaction on the disk before it counts.
 
     Raises:
-        StoreError: a history of a newer version: it is not damaged, and nothing in it is changed.
+        StoreError: a history of a newer version, which is not damaged, or links beside it; nothing is changed.
         sqlite3.Error: it cannot be opened.
     """
+    try:
+        check_beside(path)
+    except OSError as error:
+        raise StoreError(
+            f"{error.filename}: {error.strerror}: what SQLite writes to it would be written elsewhere",
+            "a history with files of its own", "remove that link, or use another history",
+        ) from error  # fmt: skip
     name = f"{path.absolute().as_uri()}?mode=ro" if read_only else path
     db = sqlite3.connect(name, uri=read_only, timeout=BUSY_SECONDS)
     try:

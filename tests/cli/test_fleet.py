@@ -26,6 +26,7 @@ from quadid.app.fleet import (
     TABLES,
     ClusterError,
     Job,
+    blank,
     cluster,
     find_jobs,
     identify_one,
@@ -235,6 +236,23 @@ def test_a_store_that_fleet_has_not_made_is_refused(tmp_path: Path, what: str, h
         pass
     assert other.read_bytes() == kept
     happened(35, f"fleet.sqlite is {what}: refused")
+
+
+def test_names_that_are_no_text_are_written_as_text(tmp_path: Path, happened: Happened) -> None:
+    """One such file ended the whole fleet."""
+    inner = tmp_path / os.fsdecode(b"in\xff")
+    inner.mkdir()
+    for number, name in enumerate((b"\xff.csv", b"\xfe.csv", b"a\x1b[31m\n.csv")):
+        (inner / os.fsdecode(name)).write_text(f"t,p\n1,{number}\n")
+    jobs = find_jobs(tmp_path, Vehicle.shipped("pelican").to_yaml(), 50.0, 1, False).jobs
+    with open_store(tmp_path / "fleet.sqlite") as store:
+        for job in jobs:
+            store.put({**blank(job), "status": "unreadable", "reason": "x", "took": 0.0, "worker": 1})
+        store.write_parquet(tmp_path)
+        names = [row["name"] for row in store.rows("logs")]
+    assert sorted(names) == ["in\\xff/\\xfe.csv", "in\\xff/\\xff.csv", "in\\xff/a\x1b[31m\n.csv"]
+    assert {job.unit for job in jobs} == {"in\\xff"}
+    happened(20, f"{len(names)} logs whose names are no text, or hold escapes: each its own row in SQLite and Parquet")
 
 
 def test_a_link_where_results_are_written_is_replaced_and_not_followed(tmp_path: Path, happened: Happened) -> None:

@@ -428,6 +428,25 @@ def test_a_mass_that_changed_in_flight_is_known_after_a_restart(
     happened(38, f"+20 % before any set, then a restart: '{waits.reason[:90]}'")
 
 
+@pytest.mark.parametrize("end", ["-wal", "-shm", "-journal"])
+@pytest.mark.parametrize("link", [os.link, os.symlink])
+def test_links_beside_a_history_are_refused(
+    tmp_path: Path, end: str, link: Callable[[Path, Path], None], happened: Happened
+) -> None:
+    """SQLite made 32 KiB of its own of whatever stood there as -shm by a second name."""
+    path, precious = tmp_path / "h.sqlite", tmp_path / "precious"
+    filled(path).close(60.0)
+    precious.write_bytes(b"precious " * 1000)
+    link(precious, tmp_path / f"h.sqlite{end}")
+    for use in (lambda: Store(path, "pelican"), lambda: read_history(path, "pelican")):
+        with pytest.raises(StoreError, match="a link, or has a second name"):
+            use()
+    assert precious.read_bytes() == b"precious " * 1000
+    (tmp_path / f"h.sqlite{end}").unlink()
+    assert len(read_history(path, "pelican")["sets"]) == 2
+    happened(44, f"{link.__name__} as history{end} to another file: refused by service and reader, the file whole")
+
+
 # --- Disks and damage
 
 
