@@ -245,21 +245,31 @@ def channels_of(
     return [entry for entries in found.values() for entry in fastest_first(entries, advantage)]
 
 
-def spikes(values: FloatArray, rotor: bool = False) -> BoolArray:
+def spikes(values: FloatArray, rotor: bool = False, command: bool = False) -> BoolArray:
     """Finds readings, shape (n,), that cannot be true between those before and after: a real jump has more than two.
 
     Off the median of five neighbours by twenty times all that these medians span.  A rotor does not read 65535 or
-    nothing either: more than half off neighbours that agree, and far beyond what the signal does elsewhere.
+    nothing either: more than half off neighbours that agree, and far beyond what the signal does elsewhere; nor for a
+    while, for none stops or leaps within one reading.  Of one that often reads nothing the checks say so.  Of a command
+    only what leaps to several times all others is none.
     """
     if len(values) < _AROUND:
         return np.zeros(len(values), dtype=np.bool_)
     usual = _running_median(values)
     off = np.abs(values - usual)
     spread = _running_median(off)
-    far = (np.ptp(usual) > 0.0) & (off > 20.0 * np.ptp(usual)) & (spread < 0.1 * off)
+    far = (np.ptp(usual) > 0.0) & (off > 20.0 * np.ptp(usual)) & (spread < 0.1 * off) & (not command)
+    half = 0.5 * float(np.median(values[values > 0.0])) if (values > 0.0).any() else np.inf
+    wild = ((values > 20.0 * np.quantile(values, 0.95), 0.05),) if command else ()
     if rotor:
         size = np.maximum(usual, np.median(values))
         far |= (usual > 0.0) & (off > 0.5 * size) & (spread < 0.1 * size) & (off > 20.0 * np.mean(off))
+        wild = ((values <= 0.0, 0.05), (values > 8.0 * half, 0.3))
+    for wrong, most in wild:
+        for a, b in zip(*true_runs(wrong), strict=True) if np.mean(wrong) < most else ():
+            beside = values[[a - 1, b]] if 0 < a and b < len(values) else np.zeros(2)
+            least = min(values[a], values[b - 1])
+            far[a:b] |= beside.min() > half and (least <= 0.0 or least > 2.0 * beside.max())
     return np.asarray(far)
 
 
@@ -315,8 +325,9 @@ def clean_channel(raw: RawChannel) -> Channel:
     finite &= ~absurd
     known = np.flatnonzero(finite)
     slow = len(known) > 1 and raw.name in ("gyro", "accel") and float(np.median(np.diff(t[known]))) > _SLOW
-    if raw.name in _MEASURED and not slow:
-        far = np.array([spikes(column, raw.name == "rotor_speed") for column in values[known].T]).any(axis=0)
+    if raw.name in (*_MEASURED, "motor_command") and not slow:
+        kind = raw.name == "rotor_speed", raw.name == "motor_command"
+        far = np.array([spikes(column, *kind) for column in values[known].T]).any(axis=0)
         faults["impossible"] = raw.spikes + int(np.count_nonzero(far))
         finite[known[far]] = False
     if raw.name == "attitude":

@@ -85,6 +85,35 @@ def test_single_impossible_readings_are_dropped_and_counted(flight: Recording, w
 
 
 @pytest.mark.parametrize(
+    ("name", "wrong", "rows"),
+    [
+        ("rotor_speed", 65535.0 * 2.0 * np.pi / 60.0, 12), ("rotor_speed", 0.0, 12), ("rotor_speed", 2500.0, 3),
+        ("motor_command", 65535.0, 12), ("motor_command", 65535.0, 1),
+    ],
+)  # fmt: skip
+def test_impossible_readings_of_a_while_are_dropped_and_counted(
+    flight: Recording, name: str, wrong: float, rows: int
+) -> None:
+    """A rotor that read nothing for 0.2 s once ended in "wanders by 107 ms: not in time with the gyro"."""
+    channel = flight.channels["rotor_speed"]
+    values = channel.values * (1.0 if name == "rotor_speed" else 3.0)
+    spoilt = values.copy()
+    for k in range(5):
+        spoilt[100 + 250 * k : 100 + 250 * k + rows, k % 4] = wrong
+    cleaned = clean_channel(RawChannel(name, channel.t, spoilt, "made"))
+    assert cleaned.faults == {"impossible": 5 * rows}
+    np.testing.assert_array_equal(cleaned.values, values[(spoilt == values).all(axis=1)])
+
+
+def test_commands_that_are_closed_or_full_for_one_reading_stay() -> None:
+    commands = np.random.default_rng(1).uniform(0.1, 0.2, (1000, 4))
+    commands[100::50] = 0.0
+    commands[120::50, 1] = 1.0
+    cleaned = clean_channel(RawChannel("motor_command", 0.01 * np.arange(1000.0), commands, "made"))
+    assert not cleaned.faults
+
+
+@pytest.mark.parametrize(
     ("name", "wrong"), [("gyro", 1e6), ("gyro", 200.0), ("accel", -1e6), ("velocity", 1e6), ("position", -1e6)]
 )
 def test_single_wild_readings_of_motion_are_dropped_and_counted(flight: Recording, name: str, wrong: float) -> None:
