@@ -11,12 +11,21 @@ from quadid.checks.findings import Check as Check
 from quadid.checks.findings import CheckResult as CheckResult
 from quadid.checks.findings import Inspection as Inspection
 from quadid.checks.findings import missing_signals, parameter_outlook
-from quadid.checks.frames import attitude_check, gravity_check, gyro_source_check, position_check, velocity_check
-from quadid.checks.motion import Spans, channel_facts, timing_checks
+from quadid.checks.frames import (
+    Response,
+    attitude_check,
+    gravity_check,
+    gyro_source_check,
+    position_check,
+    response,
+    velocity_check,
+)
+from quadid.checks.motion import FEWEST_SAMPLES, Spans, channel_facts, timing_checks
 from quadid.checks.motion import flying_spans as flying_spans
 from quadid.checks.motion import proposed_cuts as proposed_cuts
 from quadid.checks.rotors import (
     Lagged,
+    accel_timing_check,
     balance_check,
     better_description,
     geometry_check,
@@ -84,6 +93,14 @@ class Log:
         return self.vehicle
 
     @cached_property
+    def response(self) -> Response | None:
+        """Gyro beside the turning of the attitude."""
+        gyro, attitude = self.recording.channels.get("gyro"), self.recording.channels.get("attitude")
+        if gyro is None or attitude is None or min(len(gyro.t), len(attitude.t)) < FEWEST_SAMPLES:
+            return None
+        return response(gyro, attitude)
+
+    @cached_property
     def hover(self) -> Check:
         """Thrust at hover against the weight."""
         return hover_check(self.recording, self.known, self.spans)
@@ -149,10 +166,10 @@ class Question(NamedTuple):
 STAGES: tuple[tuple[Question, ...], ...] = (
     (  # units and frames, without any rotor
         Question("gravity", lambda log: gravity_check(log.recording, log.spans), vehicle=False, live=True),
-        Question("gyro_attitude", lambda log: attitude_check(log.recording), vehicle=False, live=True),
+        Question("gyro_attitude", lambda log: attitude_check(log.recording, log.response), vehicle=False, live=True),
         Question("velocity_attitude", lambda log: velocity_check(log.recording), vehicle=False, live=True),
         Question("position_velocity", lambda log: position_check(log.read), vehicle=False),
-        Question("gyro_source", lambda log: gyro_source_check(log.recording, log.vehicle), vehicle=False),
+        Question("gyro_source", lambda log: gyro_source_check(log.recording, log.vehicle, log.response), vehicle=False),
     ),
     # rotors that read nothing, or always the same; then the unit of their speeds
     (Question("rotor_speed", lambda log: readings_check(log.recording, log.known, log.spans)),),
@@ -162,7 +179,12 @@ STAGES: tuple[tuple[Question, ...], ...] = (
         Question("rotor_timing", lambda log: log.motors.get("rotor_timing")),
         Question("rotor_speed", lambda log: log.motors.get("rotor_speed")),
     ),
-    (  # what the vehicle file says
+    (  # the accelerometer beside them, and what the vehicle file says
+        Question(
+            "accel_timing",
+            lambda log: accel_timing_check(log.recording, log.known, log.spans, log.motors.get("rotor_timing")),
+            fatal=False,
+        ),
         Question(
             "mass",
             lambda log: mass_check(log.recording, log.known, log.spans, log.hover.numbers.get("b_from_hover")),

@@ -68,8 +68,8 @@ class Check:
 
     Attributes:
         name: of the check: gravity, gyro_attitude, gyro_source, attitude_steps, velocity_attitude, position_velocity,
-            rotor_speed, hover, motor_order, rotor_timing, geometry, mass, clock, timing, stuck, saturated,
-            data (what `identify` would refuse).
+            rotor_speed, hover, motor_order, rotor_timing, accel_timing, geometry, mass, clock, timing, stuck,
+            saturated, data (what `identify` would refuse).
         verdict: the answer.
         message: one sentence with numbers and units.
         fix: what to do, empty when nothing.

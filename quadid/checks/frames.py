@@ -186,9 +186,14 @@ def _attitude_explains(accel: Channel, attitude: Channel | None, inside: BoolArr
     return bool(np.linalg.norm(world + [0.0, 0.0, GRAVITY]) < 0.3 * GRAVITY)
 
 
-def attitude_check(recording: Recording) -> Check:
-    """Attitude against gyro (axes, signs, degrees for radians) and against gravity (a world with z down)."""
-    rates, coarse = gyro_check(recording), attitude_steps_check(recording)
+def attitude_check(recording: Recording, found: Response | None) -> Check:
+    """Attitude against gyro (axes, signs, degrees for radians) and against gravity (a world with z down).
+
+    Args:
+        recording: the log.
+        found: of `response`.
+    """
+    rates, coarse = gyro_check(recording, found), attitude_steps_check(recording)
     if coarse is not None and rates.numbers.get("r2", 1.0) < _CLEAR:
         rates = Check(rates.name, CheckResult.UNKNOWN, f"{coarse.message}: too coarse to compare with the gyro")
     accel, attitude = recording.channels.get("accel"), recording.channels.get("attitude")
@@ -230,8 +235,8 @@ def attitude_check(recording: Recording) -> Check:
     )  # fmt: skip
 
 
-def gyro_check(recording: Recording) -> Check:
-    """Gyro against differentiated attitude: axes, signs and scale (degrees for radians)."""
+def gyro_check(recording: Recording, found: Response | None = None) -> Check:
+    """Gyro against differentiated attitude: axes, signs and scale (degrees for radians); `found` is of `response`."""
     gyro, attitude = recording.channels.get("gyro"), recording.channels.get("attitude")
     if gyro is None or attitude is None or min(len(gyro.t), len(attitude.t)) < 20:
         return Check("gyro_attitude", CheckResult.UNKNOWN, "needs gyro and attitude")
@@ -256,12 +261,12 @@ def gyro_check(recording: Recording) -> Check:
             best = (name, fit)
     if best is None:
         return Check("gyro_attitude", CheckResult.UNKNOWN, "too little rotation to compare gyro and attitude")
-    found = response(gyro, attitude) if best[0] == "as given" else None
+    found = found if best[0] == "as given" else None
     rows = _without_jumps(*own)
     return (
         _apart(found) or _angle_rates(gyro, attitude) or _one_axis(rows) or _bias_step(*own)
         or (best[0] == "as given" and best[1].straight and _turned(rows))
-        or _judge_rates(gyro, attitude, *best, smoothed=found is not None and found.left < _SMOOTHED)
+        or _judge_rates(gyro, attitude, *best, smoothed=found is not None and (found.left < _SMOOTHED or found.named))
     )  # fmt: skip
 
 
@@ -424,6 +429,11 @@ class Response(NamedTuple):
     left: float
     read: float
 
+    @property
+    def named(self) -> bool:
+        """True if one comes so much later than the other that it is said."""
+        return abs(self.late) - 3.0 * self.sigma > _LATE
+
 
 def response(gyro: Channel, attitude: Channel) -> Response | None:
     """Gyro beside differentiated attitude in bands of frequency, by cross-spectra; None where too few are clear.
@@ -511,7 +521,7 @@ def _filtered(found: Response | None, known: Mapping[str, Mapping[str, float]]) 
     )  # fmt: skip
 
 
-def gyro_source_check(recording: Recording, vehicle: Vehicle | None) -> Check | None:
+def gyro_source_check(recording: Recording, vehicle: Vehicle | None, found: Response | None) -> Check | None:
     """A warning where the gyro is the attitude, differentiated, an error where its noise rules, or it was filtered.
 
     Noise of the attitude is then that of the gyro, row by row: their difference is far below what changes from one
@@ -532,7 +542,7 @@ def gyro_source_check(recording: Recording, vehicle: Vehicle | None) -> Check | 
     missed = (at_rows[:-1] - rates, at_rows[1:] - rates, at_rows[1:-1] - 0.5 * (rates[1:] + rates[:-1]))
     least = min(float(np.median(np.linalg.norm(rows, axis=1))) for rows in missed)
     if least >= 0.05 * bends:
-        return _filtered(response(gyro, attitude), {} if vehicle is None else vehicle.effects)
+        return _filtered(found, {} if vehicle is None else vehicle.effects)
     noisy = bends > 0.5 * float(np.median(np.linalg.norm(rates, axis=1)))
     return Check(
         "gyro_source", CheckResult.ERROR if noisy else CheckResult.WARNING,
@@ -567,7 +577,9 @@ def _without_jumps(measured: FloatArray, derived: FloatArray, *more: FloatArray)
     """Rates without rows in which the attitude jumps and the gyro does not: an estimator reset its heading there."""
     if not len(derived):
         return measured, derived, *more
-    jumps = _jumps(measured, derived)
+    # Where both go together, a jump need be no faster than the motion.
+    apart, turned = (np.linalg.norm(rows, axis=1) for rows in (derived - measured, derived))
+    jumps = _jumps(measured, derived) | (apart > _JUMP * np.maximum(np.median(apart), 0.1 * np.median(turned)))
     return tuple(rows[~jumps] for rows in (measured, derived, *more))
 
 

@@ -21,7 +21,7 @@ from quadid.data.window import Channel, Recording, Window, measured_period, samp
 from quadid.errors import QuadidError
 from quadid.model.layout import ThrustModel, voltage_at
 from quadid.types import BoolArray, FloatArray
-from quadid.vehicle import GRAVITY, INERTIA_SHARE, Vehicle
+from quadid.vehicle import GRAVITY, Vehicle
 
 # --- Whether the rotor signal stands in one place in time before the motion that it causes
 #
@@ -37,6 +37,8 @@ _QUIET = 0.1
 """A block with less than this share of the motion of the liveliest is a hover: what disturbs it has lags of its own."""
 _CLEAR = 0.3
 """Correlation above which the peak of a block counts."""
+_ABOUT = -0.45, 0.45, -0.9, 0.9, -1.35, 1.35, -1.8, 1.8
+"""Lags [s] about which peaks are looked for where none is clear near 0."""
 _LATE, _TOO_LATE = 0.015, 0.025
 """Torque after its effect [s] that is named, and that is refused."""
 
@@ -59,26 +61,16 @@ def rotor_timing_check(recording: Recording, vehicle: Vehicle, spans: Spans) -> 
     slowest = max(measured_period(signal.t, signal.values), sample_period(gyro.t))
     if not slowest <= 1.0 / INERTIA_RATE:
         return Check(name, CheckResult.UNKNOWN, "rotor signal or gyro too slow to place them in time")
-    # Rows that no block takes are not read for each: the check of a long log takes time by its length.
-    width = max(3, round(2.5 * slowest / _STEP) | 1)
-    blocks, about = list[list[_Peak]](), 0.0
-    for times in _blocks(spans):
-        answered = _answered(signal._replace(t=signal.t + about), gyro, vehicle, times)
-        torque, motion = (_quick(rows, width) for rows in answered)
-        near = [_peak(torque[:, axis], motion[:, axis]) for axis in range(2)]
-        blocks.append([peak._replace(lag=peak.lag + about) for peak in near])
-        clearest = max(near, key=lambda peak: peak.correlation)
-        if clearest.correlation > 0.5 and abs(clearest.lag) > 0.1:  # a clock that drifts leaves what is searched
-            about += clearest.lag
-    if not blocks:
+    found = _placed(signal, gyro, vehicle, spans, slowest, 0.0)
+    if found is None:
         return Check(name, CheckResult.UNKNOWN, "too little flight to place the rotor signal in time")
-    lags, scores, sizes = (np.array([[peak[k] for peak in axes] for axes in blocks]) for k in range(3))
-    lively = sizes >= _QUIET * sizes.max(axis=0)
-    correlation = float(np.median(scores[lively]))
-    placed = lively & (scores > _CLEAR)
+    if found.correlation < 0.5:  # a clock of its own may be seconds off
+        far = (_placed(signal, gyro, vehicle, spans, slowest, about) for about in _ABOUT)
+        found = next((one for one in far if one is not None and one.sure), found)
+    lags, placed, correlation = found.lags, found.clear, found.correlation
     clear = lags[placed]
     numbers = {"correlation": correlation}
-    if len(clear) < max(2, int(lively.sum()) // 2):
+    if len(clear) < max(2, found.lively // 2):
         message = f"torque and angular acceleration correlate by {correlation:.2f} only, at any lag"
         return Check(name, CheckResult.UNKNOWN, message, "fly with more roll and pitch motion", numbers)
     # Lags of each axis about their own median, for other motion excites it; a clock moves both alike.
@@ -108,6 +100,76 @@ def rotor_timing_check(recording: Recording, vehicle: Vehicle, spans: Spans) -> 
     if lag > 0.2:
         return Check(name, CheckResult.ERROR, f"{message}: no motor answers that late", fix, numbers)
     return Check(name, CheckResult.OK, message, numbers=numbers)
+
+
+class _Placed(NamedTuple):
+    """Lags of roll and pitch by block [s], which are clear, both (blocks, 2); lively ones and their correlation."""
+
+    lags: FloatArray
+    clear: BoolArray
+    lively: int
+    correlation: float
+
+    @property
+    def sure(self) -> bool:
+        """True where most lags are clear and one: no chance places them so."""
+        own = self.lags[self.clear]
+        return self.correlation > 0.7 and 2 * len(own) > self.lively > 1 and bool(np.ptp(own) < 2.0 * _LATE)
+
+
+def _placed(
+    signal: RotorSignal, gyro: Channel, vehicle: Vehicle, spans: Spans, slowest: float, about: float
+) -> _Placed | None:
+    """Peaks of every block near a lag [s] of signals that come every so often [s]; None without a block."""
+    # Rows that no block takes are not read for each: the check of a long log takes time by its length.
+    width, blocks = _smoothing(slowest), list[list[_Peak]]()
+    for times in _blocks(spans):
+        answered = _answered(signal._replace(t=signal.t + about), gyro, vehicle, times)
+        torque, motion = (_quick(rows, width) for rows in answered)
+        near = [_peak(torque[:, axis], motion[:, axis]) for axis in range(2)]
+        blocks.append([peak._replace(lag=peak.lag + about) for peak in near])
+        clearest = max(near, key=lambda peak: peak.correlation)
+        if clearest.correlation > 0.5 and abs(clearest.lag) > 0.1:  # a clock that drifts leaves what is searched
+            about += clearest.lag
+    if not blocks:
+        return None
+    lags, scores, sizes = (np.array([[peak[k] for peak in axes] for axes in blocks]) for k in range(3))
+    lively = sizes >= _QUIET * sizes.max(axis=0)
+    return _Placed(lags, lively & (scores > _CLEAR), int(lively.sum()), float(np.median(scores[lively])))
+
+
+def accel_timing_check(recording: Recording, vehicle: Vehicle, spans: Spans, timing: Check | None) -> Check | None:
+    """A warning where the accelerometer answers the rotors at another time than the gyro does, else None.
+
+    Args:
+        recording: the log.
+        vehicle: whose rotors they are.
+        spans: when it flew [s].
+        timing: of `rotor_timing_check`.
+    """
+    accel, signal = recording.channels.get("accel"), rotor_signal(recording, vehicle)
+    if accel is None or timing is None or "lag_s" not in timing.numbers:
+        return None
+    width = _smoothing(max(measured_period(c.t, c.values) for c in (signal, accel)))
+    peaks = []
+    for at in _blocks(spans):
+        felt, speeds = _around(accel.t, at), _around(signal.t, at)
+        force = -linear(accel.t[felt], accel.values[felt, 2:], at)
+        thrust = np.sum(linear(signal.t[speeds], signal.values[speeds] ** 2, at), axis=1, keepdims=True)
+        peaks.append(_peak(*(_quick(rows, width)[:, 0] for rows in (thrust, force))))
+    clear = [peak.lag for peak in peaks if peak.correlation > _CLEAR + 0.1]
+    late = float(np.median(clear)) - timing.numbers["lag_s"] if clear and 2 * len(clear) >= len(peaks) else 0.0
+    if abs(late) < _LATE:
+        return None
+    later, sooner = ("accelerometer", "gyro") if late > 0.0 else ("gyro", "accelerometer")
+    message = f"{later} answers the rotors {1e3 * abs(late):.0f} ms after the {sooner}"
+    fix = f"stamp the {later} when it is measured, and log it without a filter"
+    return Check("accel_timing", CheckResult.WARNING, message, fix, {"late_s": late})
+
+
+def _smoothing(slowest: float) -> int:
+    """Rows over which signals that come every so often [s] are smoothed."""
+    return max(3, round(2.5 * slowest / _STEP) | 1)
 
 
 def rotors_earlier(recording: Recording, seconds: float) -> Recording:
@@ -261,9 +323,9 @@ def readings_check(recording: Recording, vehicle: Vehicle, spans: Spans) -> Chec
         return Check(_NAME, CheckResult.ERROR, f"{problem[0]} ({signal.source})", "log all in one unit", problem[1])
     problem = _dead(values, most) or _same(values, vehicle, commands)
     step, noise = _coarse(signal.t[inside], values)
-    if step and not problem:  # such a signal rests between its steps
+    if step and not problem:  # such a signal rests between its steps, and has lags of its own where they hide the motion
         return Check(
-            _NAME, CheckResult.WARNING,
+            _NAME, CheckResult.ERROR if noise > 0.5 else CheckResult.WARNING,
             f"rotor speeds come in steps of {step:.3g} rad/s: too coarse for the motion ({signal.source})",
             "log them finer, or motor commands", {"step_rad_s": step},
             estimates_off(torque=[1.0 / (1.0 + noise)] * 3, spinning=1.0 / (1.0 + noise)),
@@ -977,6 +1039,11 @@ def _orders(rotors: int) -> list[tuple[int, ...]]:
 
 _KNOWN = 0.1
 """Relative standard deviation up to which a parameter counts as known."""
+_SHARE, _SPREAD = 0.2, (0.25, 0.2, 0.2)
+"""J_xx over mass and squared arm of most vehicles (0.11 of a heavy octocopter, 0.32 of a light one), and how far it,
+guesses of inertia and guesses of b spread (standard deviations of the logarithm, on twenty vehicles)."""
+_ASKED, _DOUBTED = 1.9, 2.5
+"""Standard deviations from which another arm or mass is so likely that it is asked for, and that intervals hold it."""
 
 
 def mass_check(recording: Recording, vehicle: Vehicle, spans: Spans, b_from_hover: float | None) -> Check | None:
@@ -1052,21 +1119,9 @@ def _judge_scale(vehicle: Vehicle, scale: float, hover: float, numbers: dict[str
     thrust, inertias = _known_thrust(vehicle), [_known(vehicle, n) for n in ("J_xx", "J_yy")]
     turned = f"rotor positions agree with the motion within {abs(math.degrees(numbers['turned_rad'])):.0f} deg"
     if thrust is None or not all(inertias):
-        (least, most), command = INERTIA_SHARE, vehicle.command
-        size = float(np.mean(vehicle.initial[2:4])) * hover / max(scale, 1e-300) / (vehicle.mass * vehicle.arm**2)
-        # A lag of motors, and noise of the torque, make it too large; a loop that answers noise of the gyro, too small.
-        large = command.sampling == "instant" and size * numbers["explained"] > most
-        if command.kind == "rotor_speed" and (large or 0.0 < size < least * numbers["explained"]):
-            return Check(
-                "geometry", CheckResult.WARNING,
-                f"weight, arm and motion make the inertia about x and y {size:.2g} times mass times arm squared, which "
-                f"is {least:g} to {most:g} on other vehicles: are the rotors {vehicle.arm:.3g} m from the centre?",
-                f"measure the arm: {size / most * vehicle.arm:.2g} to {size / least * vehicle.arm:.2g} m would fit",
-                {**numbers, "size": size}, _farther(size / math.sqrt(least * most)),
-            )  # fmt: skip
-        return Check(
-            "geometry", CheckResult.OK, f"{turned}; the arm itself shows only relative to the inertia", numbers=numbers
-        )
+        message = f"{turned}; the arm itself shows only relative to the inertia"
+        asked = _unlikely(vehicle, scale, hover, numbers)
+        return asked or Check("geometry", CheckResult.OK, message, numbers=numbers)
     factor = scale / thrust[0]
     numbers = {**numbers, "arm_factor": factor}
     if abs(factor - 1.0) <= 0.2:
@@ -1076,6 +1131,40 @@ def _judge_scale(vehicle: Vehicle, scale: float, hover: float, numbers: dict[str
     )
     fix = f"measure the arm: {factor * vehicle.arm:.3g} m, {factor:.2f} times it, would fit; or the inertias are wrong"
     return Check("geometry", CheckResult.WARNING, message, fix, numbers, _farther(factor))
+
+
+def _unlikely(vehicle: Vehicle, scale: float, hover: float, numbers: dict[str, float]) -> Check | None:
+    """A question where another arm, or another mass, makes thrust, size and inertia more likely together; else None.
+
+    Weight gives b, and motion with it the inertia about x and y: with the stated arm over its true one, a, and m of the
+    mass, inertia over mass and squared arm comes out 1 / a times, over its guess a m times, b over its guess m times.
+    """
+    if vehicle.command.kind != "rotor_speed" or not hover > 0.0 or not scale > 0.0:
+        return None
+    inertia = float(np.mean(vehicle.initial[2:4])) * hover / scale
+    guessed, size = vehicle.parameters["b"].initial, inertia / (vehicle.mass * vehicle.arm**2)
+    off = np.log([size / _SHARE, hover / scale, hover / guessed])
+    # How far vehicles and guesses spread; what noise or lag takes from the motion is in both inertias alike.
+    hidden = math.log(max(numbers["explained"], 1e-3)) ** 2 + (0.01 if vehicle.command.sampling == "held" else 0.0)
+    weights = np.linalg.inv(np.diag(np.square(_SPREAD)) + hidden * np.outer([1.0, 1.0, 0.0], [1.0, 1.0, 0.0]))
+    ways = np.array([[-1.0, 1.0, 0.0], [0.0, 1.0, 1.0]])
+    power = np.einsum("ki,ij,kj->k", ways, weights, ways)
+    found = ways @ weights @ off / power
+    surprise = np.abs(found) * np.sqrt(power)
+    which = int(np.argmax(surprise))
+    if surprise[which] < _ASKED:
+        return None
+    what, stated, unit = (("arm", vehicle.arm, "m"), ("mass", vehicle.mass, "kg"))[which]
+    low, high = stated * np.exp(-found[which] + np.array([-2.0, 2.0]) / np.sqrt(power[which]))
+    doubt = _heavier(math.exp(found[which])) if which else _farther(math.exp(-found[which]))
+    return Check(
+        "geometry", CheckResult.WARNING,
+        f"is the {what} {stated:.3g} {unit}? Weight and motion make the inertia about x and y {size:.2g} times mass "
+        f"times arm squared ({_SHARE:g} on most vehicles) and {hover / scale:.2g} times its guess, and b "
+        f"{hover / guessed:.2g} times its guess",
+        f"measure the {what}: {low:.2g} to {high:.2g} {unit} would fit", {**numbers, "size": size},
+        doubt if surprise[which] > _DOUBTED else {},
+    )  # fmt: skip
 
 
 def _farther(factor: float) -> Off:

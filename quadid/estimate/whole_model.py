@@ -73,8 +73,8 @@ class WholeModel:
         out[:, :-2, :9] = step[..., :9]
         out[:, 1:-1, 9 + k.ACCEL : 9 + k.VELOCITY] = step[..., 9:]
         # 2. What sensors make of it; those with a memory look back over as many steps.
-        if sensed:
-            lead = 1 + int(np.ceil(late / self._window.dt))
+        lead = 1 + int(np.ceil(late / self._window.dt))
+        if sensed and lead < len(means) - 1:  # of a stretch shorter than the memory nothing is known
             true, sensors = self._rolled([motion, thetas], means, lead) if late > 0.0 else (moved, read[0])
             out[:, lead:-1, 9:12] = sensors[..., :3] - true[..., :3]
             out[:, lead:-1, 12:15] = turn(_attitude(true), _attitude(sensors))

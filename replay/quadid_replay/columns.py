@@ -267,7 +267,7 @@ def spikes(values: FloatArray, rotor: bool = False, command: bool = False) -> Bo
         wild = ((values <= 0.0, 0.05), (values > 8.0 * half, 0.3))
     for wrong, most in wild:
         for a, b in zip(*true_runs(wrong), strict=True) if np.mean(wrong) < most else ():
-            beside = values[[a - 1, b]] if 0 < a and b < len(values) else np.zeros(2)
+            beside = values[[a - 1, b]] if a > 0 and b < len(values) else np.zeros(2)
             least = min(values[a], values[b - 1])
             far[a:b] |= beside.min() > half and (least <= 0.0 or least > 2.0 * beside.max())
     return np.asarray(far)

@@ -56,6 +56,17 @@ def test_the_pull_of_the_attitude_filter_is_followed_along_a_whole_flight() -> N
     np.testing.assert_allclose(added, differs, atol=0.03 * np.max(np.abs(differs)))
 
 
+def test_a_stretch_shorter_than_the_memory_of_a_sensor_adds_nothing() -> None:
+    """Logs at 500 Hz with a gap near their begin ended in a traceback."""
+    window = fly(PELICAN, draw_truth(PELICAN, SEED), 2.0, SEED).window
+    layout = Layout(PELICAN)
+    theta = layout.initial(PELICAN)
+    theta[layout.entry("imu_lag.period").index] = 0.1
+    means = np.zeros((5, k.N_MEAN))
+    means[:, 0] = 1.0
+    assert not WholeModel(window.slice(0, 5), PELICAN, PLACES).beyond(theta[None], means)[0, :, 9:].any()
+
+
 def simulated(window: Window, vehicle: Vehicle, thetas: np.ndarray) -> np.ndarray:
     """Gyro, attitude, accelerometer and velocity of two seconds without measurements, shape (vectors, rows, 12)."""
     assert window.attitude is not None

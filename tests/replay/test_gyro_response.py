@@ -16,6 +16,7 @@ import quadid
 from quadid.checks import Check, CheckResult, inspect
 from quadid.checks.frames import response
 from quadid.data.window import Channel, Recording, sample_period
+from quadid.rotation import product
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 
@@ -72,6 +73,33 @@ def test_a_low_pass_of_the_gyro_is_named_with_its_delay_and_what_it_does(
     assert check.numbers["late_s"] == pytest.approx(analog, abs=0.007)  # a filter of sampled rates is not quite as late
     assert {"J_xx", "J_yy", "J_zz", "d"} <= set(check.off)
     assert 0.0 <= check.off["J_xx"] < 1.0
+
+
+def test_a_slow_low_pass_is_no_scale_of_the_gyro(flight: Flight) -> None:
+    """The advice was to multiply the gyro by 1.09."""
+    recording, vehicle = flight
+    gyro = recording.channels["gyro"]
+    changed = {**recording.channels, "gyro": replace(gyro, values=low_passed(3.0, 1)(gyro))}
+    (check,) = (c for c in inspect(replace(recording, channels=changed), vehicle).checks if c.name == "gyro_attitude")
+    assert "multiply" not in check.fix
+
+
+@pytest.mark.parametrize("jumps", [(5.0,), (20.0,), (90.0,), (30.0, 60.0, -90.0)])
+def test_headings_that_are_reset_in_flight_say_nothing_of_the_gyro(flight: Flight, jumps: tuple[float, ...]) -> None:
+    """Jumps that are no faster than the motion once made "multiply the gyro", or "does not follow about z"."""
+    recording, vehicle = flight
+    attitude = recording.channels["attitude"]
+    q = attitude.values.copy()
+    for k, half in enumerate(0.5 * np.radians(jumps)):
+        later = slice(len(q) * (k + 1) // (len(jumps) + 1), None)
+        turn = np.broadcast_to([math.cos(half), 0.0, 0.0, math.sin(half)], q[later].shape)
+        q[later] = product(turn, q[later])
+    changed = {**recording.channels, "attitude": replace(attitude, values=q)}
+    said, right = (
+        [c.verdict for c in inspect(log, vehicle).checks if c.name == "gyro_attitude"]
+        for log in (replace(recording, channels=changed), recording)
+    )
+    assert said == right
 
 
 def test_smoothing_without_a_delay_is_told_from_one_with(flight: Flight) -> None:

@@ -174,6 +174,48 @@ def test_a_gyro_that_was_smoothed_is_told_from_one_that_was_not(data_dir: Path, 
     assert "smoothed without a delay" in told(filtfilt(*filtered, gyro.values, axis=0))[0]
 
 
+@pytest.mark.parametrize("seconds", [-0.03, 0.02, 0.05, 0.1, 0.2])
+@pytest.mark.parametrize("log", ["cases/case_000/train.csv", "brushed/jana00.csv", "nanodrone/random_run1.csv"])
+def test_an_accelerometer_at_another_time_than_the_gyro_is_named(data_dir: Path, log: str, seconds: float) -> None:
+    """No check asked it: rotors move both."""
+    recording, vehicle = open_log(data_dir / log), load_vehicle(str((data_dir / log).parent / "vehicle.yaml"))
+    late: list[float] = []
+    for moved in (0.0, seconds):
+        accel = recording.channels["accel"]
+        channels = {**recording.channels, "accel": replace(accel, t=accel.t + moved)}
+        checks = inspect(replace(recording, channels=channels), vehicle).checks
+        late += [check.numbers["late_s"] for check in checks if check.name == "accel_timing"]
+    assert len(late) == 1, "nothing is said of the right log"
+    assert late[0] == pytest.approx(seconds, abs=0.013)  # of the right log it is up to 11 ms
+
+
+def test_a_low_passed_gyro_is_named_where_nothing_else_turns(flight: tuple[Recording, Vehicle]) -> None:
+    recording, vehicle = flight
+    channels = {n: c for n, c in recording.channels.items() if n in ("gyro", "accel", "rotor_speed")}
+    gyro = channels["gyro"]
+    late = np.asarray(lfilter(*butter(2, 10.0, fs=1.0 / sample_period(gyro.t)), gyro.values, axis=0))
+    channels["gyro"] = replace(gyro, values=late)
+    (check,) = (c for c in inspect(replace(recording, channels=channels), vehicle).checks if c.name == "accel_timing")
+    assert check.message.startswith("gyro answers the rotors 2")
+
+
+@pytest.mark.parametrize("seconds", [0.5, -0.5, 1.5])
+def test_a_rotor_signal_that_is_far_out_of_time_is_refused(flight: tuple[Recording, Vehicle], seconds: float) -> None:
+    """Beyond a quarter of a second it was "too weak to tell", and the log was usable."""
+    check = judged(flight, lambda channel: replace(channel, t=channel.t + seconds), "rotor_timing")
+    assert check.verdict is CheckResult.ERROR
+    assert check.numbers["lag_s"] == pytest.approx(-seconds, abs=0.03)
+
+
+def test_steps_that_hide_the_motion_are_no_wandering_clock() -> None:
+    made = simulate(seconds=30.0, seed=5).flight.recording
+    speeds = made.channels["rotor_speed"]
+    coarse = replace(speeds, values=40.0 * np.round(speeds.values / 40.0))
+    found = inspect(replace(made, channels={**made.channels, "rotor_speed": coarse}), Vehicle.shipped("pelican"))
+    (wrong,) = (check for check in found.checks if check.verdict is CheckResult.ERROR)
+    assert "in steps of 40 rad/s" in wrong.message
+
+
 def test_a_gyro_behind_a_slow_filter_is_named_where_speeds_are_measured(data_dir: Path) -> None:
     recording = open_log(data_dir / "crazyflie_rpm" / "figure8_17.csv")
     vehicle = Vehicle.named(data_dir / "crazyflie_rpm" / "vehicle.yaml")
@@ -203,6 +245,29 @@ def test_an_arm_that_no_inertia_fits_is_asked_for(data_dir: Path) -> None:
         if asked:
             low, high = (float(x) for x in re.findall(r"([0-9.]+) to ([0-9.]+) m would fit", geometry.fix)[0])
             assert low < right.arm < high < 2.0 * right.arm
+
+
+@pytest.mark.parametrize(
+    ("folder", "log", "arm", "mass", "asked"),
+    [
+        *(("findings/vehicles/2_hexa_wrong_logs", "clean.csv", *x) for x in ((1.0, 1.0, ""), (1.35, 1.0, "arm"))),
+        *(("findings/vehicles/6_bob_gyro_scale", "train.csv", *x) for x in ((1.0, 1.0, ""), (1.35, 1.0, "arm"))),
+        *(("cases_hub/case_001", "train.csv", *x) for x in ((1.0, 1.0, ""), (1.0, 1.3, "mass"), (0.7, 1.0, "arm"))),
+    ],
+)  # fmt: skip
+def test_an_arm_or_a_mass_that_guesses_and_motion_make_unlikely_is_asked_for(
+    data_dir: Path, folder: str, log: str, arm: float, mass: float, asked: str
+) -> None:
+    """Only an arm that leaves no possible inertia was."""
+    right = load_vehicle(str(data_dir / folder / "vehicle.yaml"))
+    rotors = tuple(
+        r.model_copy(update={"position": (arm * r.position[0], arm * r.position[1], r.position[2])})
+        for r in right.rotors
+    )
+    vehicle = right.model_copy(update={"rotors": rotors, "mass": mass * right.mass})
+    checks = inspect(open_log(data_dir / folder / log, "auto", right.columns), vehicle).checks
+    said = [check.message for check in checks if check.name == "geometry" and check.verdict is CheckResult.WARNING]
+    assert [line.split()[2] for line in said] == [asked] * bool(asked)
 
 
 @pytest.mark.parametrize("effects", [(), ("imu_misalignment",)])
