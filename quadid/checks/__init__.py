@@ -101,6 +101,11 @@ class Log:
         return response(gyro, attitude)
 
     @cached_property
+    def readings(self) -> Check | None:
+        """Rotors that read nothing, always the same, or coarse steps."""
+        return readings_check(self.recording, self.known, self.spans)
+
+    @cached_property
     def hover(self) -> Check:
         """Thrust at hover against the weight."""
         return hover_check(self.recording, self.known, self.spans)
@@ -135,6 +140,10 @@ class Log:
                 late = rotor_timing_check(recording, other.vehicle, spans)
                 order = motor_order_check(lagged, vehicle, other)
                 return {"motor_order": order} | ({"rotor_timing": late} if early else {})
+        if self.readings is not None and time.verdict is CheckResult.ERROR:  # coarse steps have lags of their own
+            time = Check(
+                time.name, CheckResult.UNKNOWN, f"{time.message}; its steps are too coarse to tell", "", time.numbers
+            )
         wrong = [check for check in (time, balance) if check.verdict is CheckResult.ERROR]
         if wrong:
             return {wrong[0].name: wrong[0]}
@@ -172,7 +181,7 @@ STAGES: tuple[tuple[Question, ...], ...] = (
         Question("gyro_source", lambda log: gyro_source_check(log.recording, log.vehicle, log.response), vehicle=False),
     ),
     # rotors that read nothing, or always the same; then the unit of their speeds
-    (Question("rotor_speed", lambda log: readings_check(log.recording, log.known, log.spans)),),
+    (Question("rotor_speed", lambda log: log.readings),),
     (Question("hover", lambda log: log.hover),),
     (  # time, order and spins of the motors, and rotors one by one
         Question("motor_order", lambda log: log.motors.get("motor_order")),

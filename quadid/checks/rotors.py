@@ -323,9 +323,9 @@ def readings_check(recording: Recording, vehicle: Vehicle, spans: Spans) -> Chec
         return Check(_NAME, CheckResult.ERROR, f"{problem[0]} ({signal.source})", "log all in one unit", problem[1])
     problem = _dead(values, most) or _same(values, vehicle, commands)
     step, noise = _coarse(signal.t[inside], values)
-    if step and not problem:  # such a signal rests between its steps, and has lags of its own where they hide the motion
+    if step and not problem:  # such a signal rests between its steps
         return Check(
-            _NAME, CheckResult.ERROR if noise > 0.5 else CheckResult.WARNING,
+            _NAME, CheckResult.WARNING,
             f"rotor speeds come in steps of {step:.3g} rad/s: too coarse for the motion ({signal.source})",
             "log them finer, or motor commands", {"step_rad_s": step},
             estimates_off(torque=[1.0 / (1.0 + noise)] * 3, spinning=1.0 / (1.0 + noise)),

@@ -264,12 +264,12 @@ def spikes(values: FloatArray, rotor: bool = False, command: bool = False) -> Bo
     if rotor:
         size = np.maximum(usual, np.median(values))
         far |= (usual > 0.0) & (off > 0.5 * size) & (spread < 0.1 * size) & (off > 20.0 * np.mean(off))
-        wild = ((values <= 0.0, 0.05), (values > 8.0 * half, 0.3))
+        wild = ((values == 0.0, 0.05), (values > 8.0 * half, 0.3))
     for wrong, most in wild:
         for a, b in zip(*true_runs(wrong), strict=True) if np.mean(wrong) < most else ():
             beside = values[[a - 1, b]] if a > 0 and b < len(values) else np.zeros(2)
             least = min(values[a], values[b - 1])
-            far[a:b] |= beside.min() > half and (least <= 0.0 or least > 2.0 * beside.max())
+            far[a:b] |= beside.min() > half and (least == 0.0 or least > 2.0 * beside.max())
     return np.asarray(far)
 
 

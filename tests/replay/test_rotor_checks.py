@@ -212,8 +212,8 @@ def test_steps_that_hide_the_motion_are_no_wandering_clock() -> None:
     speeds = made.channels["rotor_speed"]
     coarse = replace(speeds, values=40.0 * np.round(speeds.values / 40.0))
     found = inspect(replace(made, channels={**made.channels, "rotor_speed": coarse}), Vehicle.shipped("pelican"))
-    (wrong,) = (check for check in found.checks if check.verdict is CheckResult.ERROR)
-    assert "in steps of 40 rad/s" in wrong.message
+    assert not [check for check in found.checks if check.verdict is CheckResult.ERROR]
+    assert any("in steps of 40 rad/s" in check.message for check in found.checks)
 
 
 def test_a_gyro_behind_a_slow_filter_is_named_where_speeds_are_measured(data_dir: Path) -> None:
