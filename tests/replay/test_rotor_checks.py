@@ -178,7 +178,7 @@ def test_a_gyro_that_was_smoothed_is_told_from_one_that_was_not(data_dir: Path, 
 @pytest.mark.parametrize("log", ["cases/case_000/train.csv", "brushed/jana00.csv", "nanodrone/random_run1.csv"])
 def test_an_accelerometer_at_another_time_than_the_gyro_is_named(data_dir: Path, log: str, seconds: float) -> None:
     """No check asked it: rotors move both."""
-    recording, vehicle = open_log(data_dir / log), load_vehicle(str((data_dir / log).parent / "vehicle.yaml"))
+    recording, vehicle = open_log(data_dir / log), Vehicle.named((data_dir / log).parent / "vehicle.yaml")
     late: list[float] = []
     for moved in (0.0, seconds):
         accel = recording.channels["accel"]
@@ -259,7 +259,7 @@ def test_an_arm_or_a_mass_that_guesses_and_motion_make_unlikely_is_asked_for(
     data_dir: Path, folder: str, log: str, arm: float, mass: float, asked: str
 ) -> None:
     """Only an arm that leaves no possible inertia was."""
-    right = load_vehicle(str(data_dir / folder / "vehicle.yaml"))
+    right = Vehicle.named(data_dir / folder / "vehicle.yaml")
     rotors = tuple(
         r.model_copy(update={"position": (arm * r.position[0], arm * r.position[1], r.position[2])})
         for r in right.rotors
