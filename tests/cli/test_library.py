@@ -105,12 +105,21 @@ def test_drawn_vehicles_have_the_covariance_and_fly(logs: dict[str, str]) -> Non
     assert np.unique(state.velocity[:, 2]).size == 20
 
 
-def test_what_a_caller_frees_fixes_and_states_is_fitted_so(tmp_path: Path) -> None:
+def test_what_is_freed_fixed_and_stated_is_fitted_so_by_library_and_command(inside: Cli, tmp_path: Path) -> None:
     late = quadid.simulate(seconds=20.0, effects=["motor_lag:tau=0.04"]).save(tmp_path / "late.csv")
     fit = quadid.identify(
         late, vehicle="pelican", free=["motor_lag.tau"], effects={"motor_lag": {"tau": 0.02}}, fix=["J_r"],
         bounds={"J_xx": (5e-3, 3e-2)}, priors={"d": (5e-7, 1e-8)},
     )  # fmt: skip
+    run = inside(
+        "identify", late, "--vehicle", "pelican", "--effect", "motor_lag:tau=0.02", "--free", "motor_lag.tau",
+        "--fix", "J_r", "--bounds", "J_xx=5e-3:3e-2", "--prior", "d=5e-7:1e-8", "--out", tmp_path, "--json", "-",
+    )  # fmt: skip
+    assert same(run.data) == same(fit.result)
+    for typed in (["--bounds", "J_xx=5e-3"], ["--prior", "d"], ["--effect", "motor_lag:tau=fast"]):
+        refused = inside("identify", late, "--vehicle", "pelican", *typed)
+        assert refused.code == 2
+        assert f"cannot read '{typed[1].rpartition(':')[2]}'" in refused.err
     assert fit.parameters.names == ("b", "d", "J_xx", "J_yy", "J_zz", "motor_lag.tau")
     low, high = fit.parameters["motor_lag.tau"].ci95
     assert low < 0.04 < high
@@ -267,23 +276,6 @@ def test_vehicles_are_drawn_by_the_names_that_were_fitted(tmp_path: Path) -> Non
     assert drawn["J_r"][0] == 3e-5
     assert {"J_r", "rotor_drag"} <= set(floors)
     assert "motor_lag" not in floors
-
-
-def test_the_command_frees_fixes_and_states_as_the_library_does(inside: Cli, tmp_path: Path) -> None:
-    late = quadid.simulate(seconds=20.0, effects=["motor_lag:tau=0.04"]).save(tmp_path / "late.csv")
-    run = inside(
-        "identify", late, "--vehicle", "pelican", "--effect", "motor_lag:tau=0.02", "--free", "motor_lag.tau",
-        "--fix", "J_r", "--bounds", "J_xx=5e-3:3e-2", "--prior", "d=5e-7:1e-8", "--out", tmp_path, "--json", "-",
-    )  # fmt: skip
-    made = quadid.identify(
-        late, vehicle="pelican", free=["motor_lag.tau"], effects={"motor_lag": {"tau": 0.02}}, fix=["J_r"],
-        bounds={"J_xx": (5e-3, 3e-2)}, priors={"d": (5e-7, 1e-8)},
-    )  # fmt: skip
-    assert same(run.data) == same(made.result)
-    for typed in (["--bounds", "J_xx=5e-3"], ["--prior", "d"], ["--effect", "motor_lag:tau=fast"]):
-        refused = inside("identify", late, "--vehicle", "pelican", *typed)
-        assert refused.code == 2
-        assert f"cannot read '{typed[1].rpartition(':')[2]}'" in refused.err
 
 
 def test_what_a_fit_leaves_is_a_table_and_arrays(logs: dict[str, str], tmp_path: Path) -> None:
