@@ -522,6 +522,8 @@ def first_number(highest: int = 0) -> int:
 
 MASS = Annotated[float, msgspec.Meta(ge=0.0, lt=1e6)]
 """A mass [kg]; 0: none."""
+NUMBER = Annotated[int, msgspec.Meta(ge=0, lt=LARGEST_NUMBER)]
+"""A number of a set."""
 
 
 @dataclass(frozen=True)

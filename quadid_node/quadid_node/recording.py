@@ -26,9 +26,9 @@ from quadid_replay.writers import in_time_order
 from quadid.condition.trim import flight_from_dict, flight_to_dict
 from quadid.data.window import Block, Recording
 from quadid.errors import LogError
-from quadid.online import OnlineSet, SessionSettings
+from quadid.online import GateSettings, OnlineSet, SessionSettings
 from quadid.vehicle import Vehicle
-from quadid_node.history import MASS, UNREADABLE, Restored
+from quadid_node.history import MASS, NUMBER, UNREADABLE, Restored, why_none
 from quadid_node.inputs import Decoder, Input, SourceSelector, best_ranks, seconds, source
 from quadid_node.messages import Output, set_from_dict, set_to_dict
 from quadid_node.service import Service
@@ -116,19 +116,27 @@ def read_beginning(path: Path) -> Beginning | None:
         return None
     try:
         left = json.loads(found["restored"])
+        vehicle = Vehicle.from_yaml(found["vehicle"], path.name)
+        settings = SessionSettings.model_validate_json(found["settings"])
+        item, baseline = (_set(left[name], settings.gate, vehicle) for name in ("item", "baseline"))
         restored = Restored(
-            _set(left["item"]), int(left["next_sequence"]), _set(left["baseline"]), str(left.get("approval", "")),
+            item, msgspec.convert(left["next_sequence"], NUMBER), baseline, str(left.get("approval", "")),
             tuple(map(flight_from_dict, left.get("healthy", ()))), str(left.get("decided", Restored.decided)),
             msgspec.convert(left.get("mass", 0.0), MASS),
         )  # fmt: skip
-        settings = SessionSettings.model_validate_json(found["settings"])
-        return Beginning(Vehicle.from_yaml(found["vehicle"], path.name), settings, found["source"], restored)
+        return Beginning(vehicle, settings, found["source"], restored)
     except UNREADABLE as error:
         raise LogError(f"{path.name}: what its session began with cannot be read ({error})") from error
 
 
-def _set(data: object) -> OnlineSet | None:
-    return set_from_dict(data) if isinstance(data, Mapping) else None
+def _set(data: object, gate: GateSettings, vehicle: Vehicle) -> OnlineSet | None:
+    """A set that an earlier run may have left; raises one of `UNREADABLE` for what no fit makes."""
+    if not isinstance(data, Mapping):
+        return None
+    found = set_from_dict(data)
+    if why := why_none(found, msgspec.convert(found.sequence, NUMBER), gate, vehicle):
+        raise ValueError(why)
+    return found
 
 
 # --- Logs as streams, with the stamps a live service would have seen: in general in time order, a recording of the node

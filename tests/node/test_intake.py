@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import os
 import struct
 from collections import deque
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -24,6 +27,7 @@ from quadid.errors import LogError
 from quadid.flight import fly
 from quadid.online import SessionSettings
 from quadid.vehicle import Vehicle
+from tests.faults.evidence import Happened
 from tests.online.driving import flight
 from tests.online.test_gate import TRUE, online_set
 from tests.samples import Sample, flat
@@ -322,3 +326,34 @@ def test_other_files_have_no_beginning_and_damage_is_told(tmp_path: Path) -> Non
             read_beginning(path)
     os.mkfifo(tmp_path / "pipe.mcap")
     assert read_beginning(tmp_path / "pipe.mcap") is None
+
+
+def _without_b(item: dict[str, Any]) -> None:
+    item["parameters"] = [p for p in item["parameters"] if p["name"] != "b"]
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        lambda left: left.update(next_sequence=10**30),
+        lambda left: left["item"].update(sequence=10**30),
+        lambda left: left["item"]["parameters"][0].update(value=-1.0),
+        lambda left: left["baseline"]["parameters"][2].update(value=0.0),
+        lambda left: _without_b(left["item"]),
+        lambda left: left.update(mass=-1.0),
+    ],
+)
+def test_a_beginning_that_no_run_left_is_refused(
+    tmp_path: Path, spoil: Callable[[dict[str, Any]], None], happened: Happened
+) -> None:
+    """A stranger's recording began a session with whatever it said: a set without b, number 10^30."""
+    path, written = tmp_path / "r.mcap", beginning()
+    Recorder(path, written, INPUTS).close()
+    record = dict(read_metadata(path)[RECORD])
+    left = json.loads(record["restored"])
+    spoil(left)
+    with TopicWriter(path, {RECORD: {**record, "restored": json.dumps(left)}}):
+        pass
+    with pytest.raises(LogError, match="cannot be read") as caught:
+        read_beginning(path)
+    happened(44, f"a recording that begins with what no run left: '{str(caught.value)[:110]}'")
