@@ -592,7 +592,7 @@ def _against_thrust(
 
 
 _UNITS = (
-    ("in rpm", 2.0 * np.pi / 60.0), ("in rev/s", 2.0 * np.pi), ("of the electrical field (14 poles)", 1.0 / 7.0),
+    ("in rpm", 2.0 * np.pi / 60.0), ("in rev/s", 2.0 * np.pi), ("of the electrical field (if 14 poles)", 1.0 / 7.0),
     ("ten times too low, or b to be per rpm^2", 10.0), ("in thousands of rpm", 1e3 * 2.0 * np.pi / 60.0),
 )  # fmt: skip
 """Units that speeds may be in instead of rad/s, and the factor that mends each."""

@@ -260,7 +260,7 @@ def spikes(values: FloatArray, rotor: bool = False, command: bool = False) -> Bo
     spread = _running_median(off)
     far = (np.ptp(usual) > 0.0) & (off > 20.0 * np.ptp(usual)) & (spread < 0.1 * off) & (not command)
     half = 0.5 * float(np.median(values[values > 0.0])) if (values > 0.0).any() else np.inf
-    wild = ((values > 20.0 * np.quantile(values, 0.95), 0.05),) if command else ()
+    wild: tuple[tuple[BoolArray, float], ...] = ((values > 20.0 * np.quantile(values, 0.95), 0.05),) * command
     if rotor:
         size = np.maximum(usual, np.median(values))
         far |= (usual > 0.0) & (off > 0.5 * size) & (spread < 0.1 * size) & (off > 20.0 * np.mean(off))

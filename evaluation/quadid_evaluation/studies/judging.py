@@ -317,6 +317,7 @@ MISTAKES: tuple[Mistake, ...] = (
     Mistake("gyro 200 ms late", late("gyro", 0.2), "gyro comes"),
     Mistake("attitude 100 ms late", late("attitude", 0.1), "attitude comes"),
     Mistake("attitude 200 ms late", late("attitude", 0.2), "attitude comes"),
+    Mistake("accelerometer 50 ms late", late("accel", 0.05), "accelerometer answers the rotors"),
     Mistake("attitude in steps of 1 deg", attitude(
         lambda q: from_euler(np.radians(np.round(np.degrees(euler(q)))))), "in steps"),
     Mistake("attitude in steps of 5 deg", attitude(
@@ -337,6 +338,7 @@ MISTAKES: tuple[Mistake, ...] = (
     Mistake("rotors 30 ms late", rotor_late(0.03), LATE_ROTORS),
     Mistake("rotors 60 ms late", rotor_late(0.06), LATE_ROTORS),
     Mistake("rotors 120 ms late", rotor_late(0.12), LATE_ROTORS),
+    Mistake("rotors 0.5 s late", rotor_late(0.5), LATE_ROTORS),
     Mistake("rotors held at 10 Hz", rotor_held(10.0), "too slow|Hz"),
     Mistake("motors 1, 2 exchanged", exchanged(0, 1), ORDER),
     Mistake("motors 1, 3 exchanged", exchanged(0, 2), ORDER),
