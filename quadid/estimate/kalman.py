@@ -47,10 +47,12 @@ N_MEAN = N + 1
 GYRO, ATTITUDE, ACCEL, VELOCITY, M = 0, 3, 6, 9, 12
 # Physics: the six, trim [rad/s^2], gyro bias, accelerometer bias, rotor drag [1/s], height above the hubs at which
 # it acts [m], damping [1/s], centre of gravity [m], how late rotor speeds act and their first-order lag [s],
-# share of its arm by which drag acts nearer to the centre of gravity than a hub.
-B, D, JX, JY, JZ, JR, TRIM, GYRO_BIAS, ACCEL_BIAS, DRAG, TILTING, DAMP, CG, DELAY, LAG, CENTRAL, N_PHYSICS = (
+# share of its arm by which drag acts nearer to the centre of gravity than a hub, share of the gyroscopic coupling that
+# a simulator leaves out.
+B, D, JX, JY, JZ, JR, TRIM, GYRO_BIAS, ACCEL_BIAS, DRAG, TILTING, DAMP, CG, DELAY, LAG, CENTRAL, UNCOUPLED = (
     0, 1, 2, 3, 4, 5, 6, 9, 12, 15, 17, 19, 22, 24, 25, 26, 27,
 )  # fmt: skip
+N_PHYSICS = 28
 # Noise: white of every scalar measurement; standard deviations of f (horizontal, vertical), alpha (roll and pitch,
 # yaw), e (tilt, heading) and of logged rotor speeds [rad/s]; correlation times of f, f, alpha, alpha, e [s].
 SIGMA, ROTOR, TIME, N_NOISE = M, M + 6, M + 7, M + 12
@@ -247,6 +249,8 @@ def _constants(p: FloatArray, track: Track) -> FloatArray:
     c[0], c[1], c[2], c[3] = p[B] / track.mass, p[B] / p[JX], p[B] / p[JY], p[D] / p[JZ]
     c[4], c[5] = p[JR] / p[JX], p[JR] / p[JY]
     c[6], c[7], c[8] = (p[JY] - p[JZ]) / p[JX], (p[JZ] - p[JX]) / p[JY], (p[JX] - p[JY]) / p[JZ]
+    for i in range(6, 9):
+        c[i] *= 1.0 - p[UNCOUPLED]
     c[9], c[10], c[11] = p[TRIM], p[TRIM + 1], p[TRIM + 2]
     c[12], c[13] = p[DRAG] / (track.rotors * hover), p[DRAG + 1] / (track.rotors * hover)
     c[14], c[15], c[16] = p[DAMP], p[DAMP + 1], p[DAMP + 2]

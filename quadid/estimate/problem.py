@@ -36,6 +36,7 @@ PLACES: dict[str, int] = {
     "command_delay.delay": k.DELAY,
     "motor_lag.tau": k.LAG,
     "rotor_drag.central": k.CENTRAL,
+    "no_gyroscopic_coupling.share": k.UNCOUPLED,
 }
 """Entries of the physics vector by name: those that the filter has in its own equations."""
 LATE = ("command_delay.delay", "motor_lag.tau")

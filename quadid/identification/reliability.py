@@ -18,22 +18,29 @@ from quadid.chi_square import exceeded
 from quadid.data.window import Window
 from quadid.identification.problem import Free
 from quadid.identification.uncertainty import SPREAD_LIMIT, Uncertainty
+from quadid.rotation import continuous_sign
 from quadid.types import FloatArray
 
 # --- The same flight on a grid twice as coarse: how much a parameter depends on what the inputs do within a row
 #
 # A log holds one value of each input a row; what it does within the row is not known.  What that changes grows with the
 # square of the row's length: feedback that runs on within held commands, behind a lag or a delay, looks like another
-# inertia by that much, and so does a straight line between readings that turn.  Every second row of the same data
-# therefore shows three times what the rows at hand may be off by (Richardson, Phil. Trans. R. Soc. A 210 (1911) 307).
+# inertia by that much.  Every second row of the same data therefore shows three times what the rows at hand may be off
+# by (Richardson, Phil. Trans. R. Soc. A 210 (1911) 307).  Of readings, what turns too fast for them is at fault: every
+# second row of a low-pass over all channels is without it.
 
 
 SHARE = 1.0 / 3.0
 """Of the difference between two grids, of which one is twice as coarse, that the finer one is off by."""
 
 
+SLOW, REACH = 1.0 / 6.0, 9
+"""Cutoff of the low-pass before readings are halved, as a share of their rate, and the rows that it reaches."""
+
+
 def coarse(window: Window) -> Window:
-    """Every second row of `window`; forces and held speeds are means over the longer rows."""
+    """Every second row of `window`; forces and held speeds are means over the longer rows, readings low-passed."""
+    window = window if window.sampling == "held" else _slow(window)
     n = len(window) // 2 * 2
     even: dict[str, Any] = {name: None if (x := getattr(window, name)) is None else x[:n:2] for name in _REFERENCES}
     even |= {name: None if (x := getattr(window, name)) is None else _every_second(x[:n]) for name in _INSTANTS}
@@ -49,6 +56,25 @@ def coarse(window: Window) -> Window:
             own = window.rotor_slope[:n:2] + window.rotor_slope[1:n:2]
             slope = 0.75 * (second - first) / window.dt + 0.125 * own  # of the straight line with the same moment
     return replace(window, dt=2.0 * window.dt, rotor_speed=speed, rotor_slope=slope, accel=accel, **even)
+
+
+def _slow(window: Window) -> Window:
+    """Readings and all channels that are measured in every row, behind one low-pass without delay."""
+    reach = min(REACH, len(window) - 1)
+    taps = np.sinc(2.0 * SLOW * np.arange(-reach, reach + 1)) * np.hamming(2 * reach + 1)
+    taps /= taps.sum()
+
+    def passed(values: FloatArray) -> FloatArray:
+        wide = np.pad(values, ((reach, reach), (0, 0)), mode="reflect", reflect_type="odd")
+        return np.column_stack([np.convolve(column, taps, mode="valid") for column in wide.T])
+
+    whole = {name: x for name in _INSTANTS if (x := getattr(window, name)) is not None and np.isfinite(x).all()}
+    out: dict[str, Any] = {n: passed(continuous_sign(x) if n == "attitude" else x) for n, x in whole.items()}
+    if "attitude" in out:
+        out["attitude"] /= np.linalg.norm(out["attitude"], axis=1, keepdims=True)
+    if window.accel is not None and np.isfinite(window.accel).all():
+        out["accel"] = passed(window.accel)
+    return replace(window, rotor_speed=np.sqrt(np.maximum(passed(window.rotor_speed**2), 0.0)), **out)
 
 
 _INSTANTS = ("gyro", "attitude", "velocity", "position")

@@ -22,8 +22,9 @@ import numpy as np
 
 from quadid.data.window import Window
 from quadid.estimate import kalman as k
-from quadid.estimate.fit import ALL_NOISE, NEAR, estimate, of_square, scoring
+from quadid.estimate.fit import ALL_NOISE, NEAR, estimate, of_square, scoring, tails, whitened
 from quadid.estimate.kalman import Gains
+from quadid.estimate.late_imu import delay_by, delay_of, in_time
 from quadid.estimate.problem import TRIMMED, UPRIGHT, Problem
 from quadid.estimate.track import from_window
 from quadid.identification.excitation import bounds_of
@@ -32,7 +33,7 @@ from quadid.identification.particle_swarm import SwarmOptions
 from quadid.identification.problem import Prior, Shooting
 from quadid.identification.reliability import coarse
 from quadid.identification.search import SWARM_SECONDS, swarm_search
-from quadid.model.layout import Layout
+from quadid.model.layout import IMU_PERIOD, Layout
 from quadid.online.records import Job, JobReply
 from quadid.parameters import NOMINAL_NAMES
 from quadid.types import BoolArray, FloatArray
@@ -56,6 +57,8 @@ NUDGE = 1e-3
 """Difference of a scaled effect of thrust for its derivative."""
 INFLOW = "axial_inflow.k_z"
 """Thrust lost in a climb, free where velocity is measured: seconds of climb would else make b smaller, and sure."""
+UNCOUPLED = "no_gyroscopic_coupling.share"
+"""Free too, as simulators may lack it: inertias would stand in for it; without evidence fusion takes it to be none."""
 LOOSE = 4
 """Rows of `WindowEstimate.loose`: an answer of the rotors within a step about each axis, and their noise."""
 
@@ -69,12 +72,14 @@ class Noise:
         tail: see `kalman.kalman`, shape (4,).
         control: unit of what is random, see `problem.control_moment`, shape (3,).
         doubt: relative standard deviation of the variance of rotor speeds.
+        late: delay of gyro and accelerometer that is undone first [s], see `late_imu`.
     """
 
     psi: FloatArray
     tail: FloatArray
     control: FloatArray
     doubt: float
+    late: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -194,7 +199,7 @@ class FitRequest(Job):
 
 def _is_noise(noise: Noise) -> bool:
     shapes = noise.psi.shape, noise.tail.shape, noise.control.shape
-    if shapes != ((k.N_NOISE,), (4,), (3,)) or not 0.0 <= noise.doubt < math.inf:
+    if shapes != ((k.N_NOISE,), (4,), (3,)) or not all(0.0 <= x < math.inf for x in (noise.doubt, noise.late)):
         return False
     return all(bool(np.isfinite(a).all() and np.all(a >= 0.0)) for a in (noise.psi, noise.tail, noise.control))
 
@@ -239,8 +244,8 @@ def own_names(vehicle: Vehicle) -> tuple[str, ...]:
     layout = Layout(vehicle)
     initial, neutral = layout.initial(vehicle), layout.neutral()
     stated = {name.split(".")[0] for name, e in layout.entries.items() if initial[e.index] != neutral[e.index]}
-    climbing = (INFLOW,) if INFLOW.split(".")[0] not in stated else ()
-    return (*NOMINAL_NAMES, *TRIMMED, UPRIGHT, *fitted_along(stated), *climbing)
+    more = (name for name in (INFLOW, UNCOUPLED) if name.split(".")[0] not in stated)
+    return (*NOMINAL_NAMES, *TRIMMED, UPRIGHT, *fitted_along(stated), *more)
 
 
 def thrust_names(vehicle: Vehicle) -> tuple[str, ...]:
@@ -288,20 +293,45 @@ def fit(request: FitRequest) -> FitReply:
         return FitReply(request.number, "no stretch is long enough for one segment")
     if not is_excited(bounds):
         return FitReply(request.number, excitation=bounds)
-    # 2. Where nothing is known yet: global search, then the maximum over the longest stretch.
+    # 2. Gyro and accelerometer in time.
+    late, period = _late(request), request.theta[IMU_PERIOD]
+    request = _in_time(request, late)
+    # 3. Where nothing is known yet: global search, then the maximum over the longest stretch; steps to it over much
+    # more than before; now and then the noise numbers of this window.
     z, noise, found = request.z, request.noise, None
     if noise is None:
         z, noise = _maximum(request)
-        found = noise
+        noise = found = replace(noise, late=late)
         if not np.isfinite(z).all():
             return FitReply(request.number, problem="the simulation diverges at every point tried", excitation=bounds)
-    # 3. Steps to the maximum over much more than before; now and then the noise numbers of this window.
-    elif request.learned or request.measure:
-        z, found = _renewed(request, noise)
-        noise = found if request.learned else noise
+    elif request.learned:
+        z, found = _renewed(request, replace(noise, late=late))
+        noise = found
+    elif request.measure:
+        found = _followed(request, noise)
     # 4. What the new rows say.
     estimates, theta = _estimates(request, z, noise)
+    theta[IMU_PERIOD] = period
     return FitReply(request.number, "", bounds, True, estimates, theta, found)
+
+
+def _late(request: FitRequest) -> float:
+    """Delay of gyro and accelerometer [s]: by the vehicle file's low-pass, or as the flight shows it."""
+    cutoff = request.vehicle.effects.get("imu_lag", {}).get("cutoff")
+    if cutoff is not None:
+        return delay_by(cutoff)
+    if request.noise is not None and not request.learned:
+        return request.noise.late
+    return delay_of(request.learned or request.windows)
+
+
+def _in_time(request: FitRequest, late: float) -> FitRequest:
+    """The request with gyro and accelerometer as they were before a low-pass."""
+    effects = {name: values for name, values in request.vehicle.effects.items() if name != "imu_lag"}
+    windows, learned = (tuple(in_time(w, late) for w in part) for part in (request.windows, request.learned))
+    vehicle, theta = request.vehicle.model_copy(update={"effects": effects}), request.theta.copy()
+    theta[IMU_PERIOD] = 0.0
+    return replace(request, vehicle=vehicle, windows=windows, learned=learned, theta=theta)
 
 
 def is_excited(bounds: FloatArray) -> bool:
@@ -350,16 +380,23 @@ def _like(problem: Problem, vehicle: Vehicle, z: FloatArray, noise: Noise) -> tu
 
 
 def _renewed(request: FitRequest, noise: Noise) -> tuple[FloatArray, Noise]:
-    """Point and noise numbers by a few steps over all that was learned from; else noise by one over this window."""
-    window = max(request.learned or request.windows, key=len)
-    problem, own = _like(problem_of(window, request.vehicle), request.vehicle, request.z, noise)
-    turns, physics = (NEAR, True) if request.learned else (TURNS, False)
-    own, psi, value, gains, _ = scoring(problem, own, noise.psi, turns, ALL_NOISE, physics)
+    """Point and noise by steps over all that was learned from, tails too: outliers show in much data only."""
+    problem, own = _like(problem_of(max(request.learned, key=len), request.vehicle), request.vehicle, request.z, noise)
+    own, psi, _, gains, _ = scoring(problem, own, noise.psi, NEAR, ALL_NOISE)
+    problem = replace(problem, tail=tails([whitened(g) for g in gains]))
+    own, psi, value, gains, _ = scoring(problem, own, psi, NEAR, ALL_NOISE)
     if not math.isfinite(value):
         return request.z, noise
     z = request.z.copy()
     z[_places(problem, request.vehicle)] = own
-    return z, replace(noise, psi=psi, doubt=of_square(problem, own, psi, gains) if physics else noise.doubt)
+    return z, replace(noise, psi=psi, tail=problem.tail, doubt=of_square(problem, own, psi, gains))
+
+
+def _followed(request: FitRequest, noise: Noise) -> Noise:
+    """The noise numbers after one step towards those of this window."""
+    problem, own = _like(problem_of(max(request.windows, key=len), request.vehicle), request.vehicle, request.z, noise)
+    _, psi, value, *_ = scoring(problem, own, noise.psi, TURNS, ALL_NOISE, physics=False)
+    return replace(noise, psi=psi) if math.isfinite(value) else noise
 
 
 def _estimates(request: FitRequest, z: FloatArray, noise: Noise) -> tuple[tuple[WindowEstimate, ...], FloatArray]:

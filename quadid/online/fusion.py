@@ -33,6 +33,7 @@ from quadid.online.active_set import ActiveSet
 from quadid.online.fit_job import (
     LOOSE,
     SIX,
+    UNCOUPLED,
     FitReply,
     FitRequest,
     Noise,
@@ -59,6 +60,8 @@ POOLED = 24
 """The newest of so many measured noises counts fully."""
 _YAW = [NOMINAL_NAMES.index(n) for n in ("d", "J_zz", "J_r")]
 _EPS = 1e-6
+NOTHING = 1e-3
+"""Share of its prior width within which what is there without evidence is none."""
 WIDTH = 3.0
 """Prior width of what thrust may have beside b, in its typical size."""
 
@@ -151,8 +154,9 @@ class Fusion:
     """
 
     def __init__(
-        self, mean: FloatArray, sigma: FloatArray, own: int, memory: float, length: float, positive: Sequence[int] = ()
-    ) -> None:
+        self, mean: FloatArray, sigma: FloatArray, own: int, memory: float, length: float,
+        positive: Sequence[int] = (), unusual: Sequence[int] = (),
+    ) -> None:  # fmt: skip
         """Starts from the prior.
 
         Args:
@@ -162,8 +166,11 @@ class Fusion:
             memory: time constant of forgetting [s] of data taken in.
             length: of stretches that are compared [s].
             positive: places of those that are not negative.
+            unusual: of those that are none without evidence, their prior's mean being none.
         """
-        self._mean, self._sigma, self._positive = mean, sigma, positive
+        self._mean, self._sigma, self._positive, self._unusual = mean, sigma, positive, unusual
+        self._without = np.where(np.isin(np.arange(len(sigma)), unusual), NOTHING * sigma, sigma)
+        self._met = False
         self._own, self._memory, self._length = own, memory, length
         self._sums: deque[Sum] = deque(maxlen=KEPT)
         self._known: dict[bool, Fused] = {}
@@ -189,6 +196,11 @@ class Fusion:
             self._sums.append(Sum.none(window.start, len(self._mean)))
         self._sums.append(total)
         self._known.clear()
+        before, self._met = self._met, True
+        free = self._solve(total, self._own)
+        self._met = any(free.z[i] ** 2 > exceeded(CHANCE, 1) * free.covariance[i, i] for i in self._unusual)
+        if self._met != before:
+            self._stretches.clear()
         self.newest, self.taken = window, self.taken + 1
         self.counted = max(self.counted, window.stop)
 
@@ -290,7 +302,7 @@ class Fusion:
 
     def _solve(self, total: Sum, own: int) -> Fused:
         """Estimate from a sum by the first `own` parameters, the rest taken to be none."""
-        part, mean, sigma = slice(own), self._mean[:own], self._sigma[:own]
+        part, mean, sigma = slice(own), self._mean[:own], (self._sigma if self._met else self._without)[:own]
         precision, net, loose = 1.0 / sigma**2, total.information[part, part], total.loose[:, part]
         # What noise of the rotors explains is no information, but there is never less than the prior's.
         size, turned = np.linalg.eigh(sigma[:, None] * net * sigma)
@@ -341,8 +353,10 @@ class Estimator:
         self._prior_sigma = prior.sigma
         mean, sigma = np.zeros(count), np.ones(count)
         mean[:SIX], sigma[:SIX], sigma[own:] = np.log(prior.mean), prior.sigma, WIDTH
-        lags = [i for i, name in enumerate(own_names(vehicle)) if name == "motor_lag.tau"]
-        self._nothing = partial(Fusion, mean, sigma, own, memory, length, lags)
+        lags, unusual = (
+            [i for i, name in enumerate(own_names(vehicle)) if name == one] for one in ("motor_lag.tau", UNCOUPLED)
+        )
+        self._nothing = partial(Fusion, mean, sigma, own, memory, length, lags, unusual)
         self._z = mean
         self.reset()
 

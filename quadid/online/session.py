@@ -471,6 +471,9 @@ class Session:
             return
         self._disagrees_since = math.inf
         estimator.take(request, reply)
+        if request.noise is None and reply.noise is not None and reply.noise.late > 0.0:
+            late = f"gyro and accelerometer come {1e3 * reply.noise.late:.0f} ms after the attitude"
+            outbox.say(request.stop, "info", "sensors", f"{late}, as behind a low-pass: fits undo that")
         yield
         # The set in force is taken back when its predecessor predicts new windows better.
         sets, told = self.active_set, estimator.fusion.disjoint(1)

@@ -22,11 +22,23 @@ LATE = {"command_delay": {"delay": 0.027}}
 def test_instants_are_every_second_row_and_forces_means_over_the_longer_ones() -> None:
     t = 0.02 * np.arange(101)
     wave = np.column_stack([np.sin(3.0 * t), np.cos(2.0 * t), t])
-    window = Window(1.0, 0.02, np.full((101, 4), 400.0), gyro=wave, accel=wave, sampling="instant")
+    window = Window(1.0, 0.02, np.full((101, 4), 400.0), gyro=wave, accel=wave)
     half = coarse(window)
     np.testing.assert_array_equal(half.t, window.t[:100:2])
     np.testing.assert_array_equal(half.gyro, wave[:100:2])
     np.testing.assert_allclose(half.accel[1:], 0.25 * wave[1:98:2] + 0.5 * wave[2:99:2] + 0.25 * wave[3:100:2])  # type: ignore[index]
+
+
+def test_readings_keep_their_slow_part_and_lose_what_turns_too_fast_for_every_second_one() -> None:
+    """It would come back as slow motion: 20 Hz of readings at 50 Hz as 5 Hz of those at 25 Hz."""
+    t = 0.02 * np.arange(200)
+    slow, fast = 20.0 * np.sin(6.0 * t), 20.0 * np.sin(2.0 * np.pi * 20.0 * t)
+    for extra, left in ((0.0 * t, slow), (fast, slow)):
+        speed, rate = (400.0 + slow + extra)[:, None] * np.ones(4), 0.01 * (slow + extra)[:, None] * np.ones(3)
+        half = coarse(Window(0.0, 0.02, speed, gyro=rate, sampling="instant"))
+        assert half.gyro is not None
+        np.testing.assert_allclose(half.gyro[5:-5, 0], 0.01 * left[10:-10:2], atol=2e-3)
+        np.testing.assert_allclose(half.rotor_speed[5:-5, 0], 400.0 + left[10:-10:2], atol=0.6)
 
 
 def test_held_speeds_keep_their_thrust_and_a_straight_line_its_slope() -> None:

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from quadid.flight import Segment, fly
+from quadid.flight import Flight, Segment, fly
 from quadid.model.layout import B
 from quadid.online import FitReply, FitRequest, Session, SessionSettings
 from quadid.online.fit_job import LOOSE, ROLL_PITCH, SIX, WindowEstimate
@@ -16,6 +16,7 @@ from quadid.online.grid_buffer import WindowCut
 from quadid.online.records import Job, JobReply
 from quadid.parameters import NOMINAL_NAMES, Status
 from quadid.types import FloatArray
+from quadid.vehicle import Vehicle
 from tests.online.driving import flight
 from tests.online.made_up import PELICAN, light_flight, tells, works
 
@@ -183,6 +184,42 @@ def test_a_climb_does_not_pass_for_a_smaller_b() -> None:
     truth = np.log([flown.truth.parameters.as_dict()[name] for name in NOMINAL_NAMES])
     assert np.all(np.abs(found.z[:SIX] - truth) < 3.0 * found.sigma[:SIX])
     assert np.all(np.abs(found.z[:SIX] - truth)[[B, *ROLL_PITCH]] < 0.005)
+
+
+@pytest.mark.parametrize("share", [0.0, 1.0])
+def test_a_simulator_without_gyroscopic_coupling_is_seen(share: float) -> None:
+    """J_xx or J_yy stood in for it: ArduPilot's simulator has none.  Without evidence it is there, and tells J_zz."""
+    flown = fly(PELICAN, None, 24.0, 1, effects={"no_gyroscopic_coupling": {"share": share}}, noise_scale=0.1)
+    learner, off = estimated(flown)
+    found = learner.fusion.estimate()
+    assert found is not None
+    assert np.all(np.abs(off) < 3.0 * found.sigma[:SIX])
+    assert np.all(np.abs(off)[[B, *ROLL_PITCH]] < 0.01)
+    assert bool(found.sigma[NOMINAL_NAMES.index("J_zz")] < 0.05) is (share == 0.0)
+
+
+@pytest.mark.parametrize("effects", [{"imu_lag": {"cutoff": 20.0}}, {}])
+@pytest.mark.parametrize("stated", [True, False])
+def test_a_low_pass_of_the_gyro_does_not_pass_for_a_smaller_inertia(
+    effects: dict[str, dict[str, float]], stated: bool
+) -> None:
+    vehicle = PELICAN.model_copy(update={"effects": effects if stated else {}})
+    learner, off = estimated(fly(PELICAN, None, 24.0, 1, effects=effects, noise_scale=0.1), vehicle)
+    found = learner.fusion.estimate()
+    assert found is not None
+    assert np.all(np.abs(off) < 3.0 * found.sigma[:SIX])
+    assert np.all(np.abs(off)[[B, *ROLL_PITCH]] < 0.01)
+
+
+def estimated(flown: Flight, vehicle: Vehicle = PELICAN) -> tuple[Estimator, FloatArray]:
+    """What is learned from the middle of a flight, and errors of the six (log)."""
+    cut = flown.window.slice(50, 1150)
+    learner = Estimator(vehicle, 1e9, 10.0, 0)
+    asked = learner.request(1, WindowCut((cut,), 22.0, 0), cut.t0, cut.t0 + len(cut) * cut.dt)
+    learner.take(asked, asked.answer())
+    found = learner.fusion.estimate()
+    assert found is not None
+    return learner, found.z[:SIX] - np.log([flown.truth.parameters.as_dict()[name] for name in NOMINAL_NAMES])
 
 
 @pytest.mark.parametrize("sigma", [0.1, 0.2])
