@@ -6,6 +6,7 @@ under test in `quadid.model`, those of the flown vehicle in `quadid.flight`.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
@@ -450,6 +451,11 @@ def known_keys(name: str, rotors: int) -> list[str]:
     keys = [p.name for p in EFFECTS[name].parameters]
     each = [f"{key}_{i + 1}" for i in range(rotors) for key in ("loss", "drag_loss")]
     return [*keys, *each] if name == "weak_rotor" else keys
+
+
+def butterworth_delay(cutoff: float) -> float:
+    """Delay [s] of slow motion behind `imu_lag` with a cutoff [Hz]; of a delay, the cutoff."""
+    return math.sqrt(0.5) / (math.pi * cutoff)
 
 
 def rotor_losses(numbers: Mapping[str, float], rotors: int) -> list[float]:

@@ -17,6 +17,7 @@ from quadid.checks.motion import FEWEST_SAMPLES, Spans, attitude_steps_check, is
 from quadid.checks.turns import FEWEST, TURN, Factor, Turns, factors
 from quadid.data.grid import GAP, linear
 from quadid.data.window import Channel, Recording, fresh_rows, measured_period, sample_period
+from quadid.effects import butterworth_delay
 from quadid.rotation import conjugate, euler, rotated, turn
 from quadid.types import BoolArray, FloatArray
 from quadid.vehicle import GRAVITY, Vehicle
@@ -497,7 +498,7 @@ def _filtered(found: Response | None, known: Mapping[str, Mapping[str, float]]) 
     if found is None:
         return None
     lag = known.get("imu_lag", {}).get("cutoff", math.inf)
-    late = found.late - math.sqrt(0.5) / (math.pi * lag) + known.get("attitude_delay", {}).get("delay", 0.0)
+    late = found.late - butterworth_delay(lag) + known.get("attitude_delay", {}).get("delay", 0.0)
     smoothed = found.left < _SMOOTHED and "imu_lag" not in known
     sure = _LATE < abs(late) - 3.0 * found.sigma < _TOO_LATE
     if not (smoothed or sure):
@@ -505,10 +506,8 @@ def _filtered(found: Response | None, known: Mapping[str, Mapping[str, float]]) 
     later, sooner = ("attitude", "gyro") if late < 0.0 else ("gyro", "attitude")
     notes = []
     if sure:
-        # A second-order Butterworth filter makes slow motion late by 1 / (sqrt(2) pi cutoff).
-        cutoff = math.sqrt(0.5) / (math.pi * abs(late))
         delay = f"{later} comes {1e3 * abs(late):.0f} ms after the {sooner}"
-        notes.append(f"{delay}, as low-passed at {cutoff:.2g} Hz or stamped late")
+        notes.append(f"{delay}, as low-passed at {butterworth_delay(abs(late)):.2g} Hz or stamped late")
     if smoothed:
         notes.append(f"gyro has {found.left:.0%} of the attitude's quick turning: it was " + (
             "low-passed" if sure and late > 0.0 else "smoothed without a delay"

@@ -33,11 +33,6 @@ MARGIN = 50
 """Rows by which a window is continued, mirrored, beyond its ends."""
 
 
-def delay_by(cutoff: float) -> float:
-    """Delay [s] of a Butterworth filter of second order with a cutoff [Hz]."""
-    return float(np.sqrt(0.5) / (np.pi * cutoff))
-
-
 def delay_of(windows: Sequence[Window]) -> float:
     """Delay of the gyro behind the attitude [s]; 0 where none is proven, or it is not that of such a filter."""
     tau = 0.0

@@ -21,10 +21,11 @@ from typing import TypeGuard
 import numpy as np
 
 from quadid.data.window import Window
+from quadid.effects import butterworth_delay
 from quadid.estimate import kalman as k
 from quadid.estimate.fit import ALL_NOISE, NEAR, estimate, of_square, scoring, tails, whitened
 from quadid.estimate.kalman import Gains
-from quadid.estimate.late_imu import delay_by, delay_of, in_time
+from quadid.estimate.late_imu import delay_of, in_time
 from quadid.estimate.problem import TRIMMED, UPRIGHT, Problem
 from quadid.estimate.track import from_window
 from quadid.identification.excitation import bounds_of
@@ -300,13 +301,13 @@ def fit(request: FitRequest) -> FitReply:
     # more than before; now and then the noise numbers of this window.
     z, noise, found = request.z, request.noise, None
     if noise is None:
-        z, noise = _maximum(request)
-        noise = found = replace(noise, late=late)
+        z, noise = _maximum(request, late)
+        found = noise
         if not np.isfinite(z).all():
             return FitReply(request.number, problem="the simulation diverges at every point tried", excitation=bounds)
     elif request.learned:
-        z, found = _renewed(request, replace(noise, late=late))
-        noise = found
+        z, noise = _renewed(request, replace(noise, late=late))
+        found = noise
     elif request.measure:
         found = _followed(request, noise)
     # 4. What the new rows say.
@@ -319,7 +320,7 @@ def _late(request: FitRequest) -> float:
     """Delay of gyro and accelerometer [s]: by the vehicle file's low-pass, or as the flight shows it."""
     cutoff = request.vehicle.effects.get("imu_lag", {}).get("cutoff")
     if cutoff is not None:
-        return delay_by(cutoff)
+        return butterworth_delay(cutoff)
     if request.noise is not None and not request.learned:
         return request.noise.late
     return delay_of(request.learned or request.windows)
@@ -352,7 +353,7 @@ def _excitation(request: FitRequest) -> FloatArray | None:
     return bounds_of(lin.information)
 
 
-def _maximum(request: FitRequest) -> tuple[FloatArray, Noise]:
+def _maximum(request: FitRequest, late: float) -> tuple[FloatArray, Noise]:
     """Scaled parameters (P,) and noise of the largest likelihood; not finite where there is none."""
     vehicle, short = request.vehicle, Shooting.cut(request.windows, request.vehicle, SWARM_SECONDS, None)
     # 48 particles find six parameters that are known to a factor of 4 each way.
@@ -362,9 +363,8 @@ def _maximum(request: FitRequest) -> tuple[FloatArray, Noise]:
     found = estimate(problem, start_of(problem, theta, own_names(vehicle)))
     z = np.zeros(len(names_of(vehicle)))
     z[_places(found.problem, vehicle)] = found.z
-    gains = found.problem.passes(found.z, found.psi)[1]
-    doubt = of_square(found.problem, found.z, found.psi, gains)
-    return z, Noise(found.psi, found.problem.tail, found.problem.control, doubt)
+    doubt = of_square(found.problem, found.z, found.psi, found.problem.passes(found.z, found.psi)[1])
+    return z, Noise(found.psi, found.problem.tail, found.problem.control, doubt, late)
 
 
 def _places(problem: Problem, vehicle: Vehicle) -> list[int]:
@@ -487,7 +487,7 @@ def warm_up(vehicle: Vehicle) -> None:
         span, theta = (0.0, rows * dt), Layout(vehicle).initial(vehicle)
         request = FitRequest(0, vehicle, (window,), *span, theta, z, None, 0, (span,))
         try:
-            z, noise = _maximum(request)
+            z, noise = _maximum(request, 0.0)
             for velocity in (None, np.zeros((rows, 3))):
                 _estimates(replace(request, windows=(replace(window, velocity=velocity),)), z, noise)
         except np.linalg.LinAlgError:

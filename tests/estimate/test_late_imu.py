@@ -9,7 +9,8 @@ import pytest
 from scipy.signal import butter, lfilter
 
 from quadid.data.window import Window
-from quadid.estimate.late_imu import delay_by, delay_of, in_time
+from quadid.effects import butterworth_delay
+from quadid.estimate.late_imu import delay_of, in_time
 from quadid.flight import draw_truth, fly
 from quadid.vehicle import Vehicle
 
@@ -34,11 +35,12 @@ def test_a_gyro_in_time_has_no_delay(noise: float, effects: dict[str, dict[str, 
 @pytest.mark.parametrize("cutoff", [10.0, 20.0, 30.0])
 def test_the_delay_is_that_of_the_filter(cutoff: float) -> None:
     late = flown(imu_lag={"cutoff": cutoff})
-    assert delay_of([late]) == pytest.approx(delay_by(cutoff), rel=0.03)
+    assert delay_of([late]) == pytest.approx(butterworth_delay(cutoff), rel=0.03)
 
 
 def test_noise_makes_a_delay_smaller_and_none_from_nothing() -> None:
-    assert 0.6 * delay_by(20.0) < delay_of([flown(1.0, imu_lag={"cutoff": 20.0})]) < 1.2 * delay_by(20.0)
+    late, true = delay_of([flown(1.0, imu_lag={"cutoff": 20.0})]), butterworth_delay(20.0)
+    assert 0.6 * true < late < 1.2 * true
 
 
 def test_what_is_later_than_a_filter_stays() -> None:
@@ -52,7 +54,7 @@ def test_in_time_undoes_a_filter_up_to_a_third_of_the_rate() -> None:
     t = np.arange(20 * len(window)) * 1e-3
     smooth = np.column_stack([np.interp(t, window.t - window.t0, c) for c in window.gyro.T])
     filtered = lfilter(b, a, smooth, axis=0)[::20]
-    back = in_time(replace(window, gyro=filtered), delay_by(10.0))
+    back = in_time(replace(window, gyro=filtered), butterworth_delay(10.0))
     assert back.gyro is not None
     inside = slice(50, -50)
     before = np.std((filtered - window.gyro)[inside])

@@ -242,7 +242,7 @@ def test_a_curve_of_all_rotors_is_published_where_nothing_is_carried_at_rest(
 
 
 def test_torque_over_inertia_goes_with_the_slope_of_thrust() -> None:
-    """A curve that a later set tells and its reference did not know: torque and inertia are as they were."""
+    """A curve that a later set states and its reference did not know: torque and inertia are as they were."""
     curved = with_tangent(parameter_set({**TRUE, "b": TRUE["b"] * 1.04, "J_xx": TRUE["J_xx"] * 1.04,
                                          "J_yy": TRUE["J_yy"] * 1.04}), -math.log(1.04), 0.005)  # fmt: skip
     assert [curved[n].value for n in ("b_tangent", "J_xx")] == pytest.approx([TRUE["b"], TRUE["J_xx"]])
