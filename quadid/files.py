@@ -32,11 +32,19 @@ def read_regular(path: str | Path, most: int = 1 << 20) -> bytes:
         return file.read(most)
 
 
+_NAMES_ANOTHER = bytes.fromhex("d9d505f920a163d7")
+"""End of a journal that belongs to several databases: theirs is named in it, and removed once no journal names it.
+
+Ours are never written together with others.
+"""
+
+
 def check_beside(database: str | Path) -> None:
     """Checks what SQLite keeps beside a database, and writes to whatever stands there.
 
     Raises:
-        OSError: one of these files is a link, or has a second name by which it is another file of the user.
+        OSError: one of these files is a link, or has a second name by which it is another file of the user; or a
+            journal that names another file, which SQLite would remove.
     """
     for end in ("-wal", "-shm", "-journal"):
         beside = f"{os.path.realpath(database)}{end}"
@@ -44,3 +52,7 @@ def check_beside(database: str | Path) -> None:
             found = os.lstat(beside)
             if not stat.S_ISREG(found.st_mode) or found.st_nlink > 1:
                 raise OSError(errno.EINVAL, "it is a link, or has a second name", beside)
+    with contextlib.suppress(FileNotFoundError), open(beside, "rb", opener=unwaited) as journal:
+        journal.seek(max(os.fstat(journal.fileno()).st_size - len(_NAMES_ANOTHER), 0))
+        if journal.read(len(_NAMES_ANOTHER)) == _NAMES_ANOTHER:
+            raise OSError(errno.EINVAL, "it names another file, which SQLite would remove", beside)

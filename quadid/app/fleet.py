@@ -25,6 +25,7 @@ from typing import Annotated, Any
 import typer
 from quadid_replay import open_log
 from quadid_replay.formats import HEAD_BYTES, recognise
+from quadid_replay.opening import stored_size
 
 from quadid.app.fleet_page import Fleet, Row, health_trend, summarise
 from quadid.app.logs import (
@@ -32,7 +33,7 @@ from quadid.app.logs import (
     Log,
     OutputError,
     check_conventions,
-    make_folder,
+    check_folder,
     on_grid,
     parse_part,
     require_gyro,
@@ -98,7 +99,7 @@ def fleet(
         None if known is None else known.model_copy(update={"columns": {**known.columns, **(columns or {})}}).to_yaml()
     )
     target = Path(os.path.realpath(out))
-    make_folder(target)
+    check_folder(target, "out", "fleet.*.parquet")
     found = find_jobs(Path(os.path.realpath(folder)), default, rate, seed, diagnose, target)
     begin = time.perf_counter()
     with open_store(target / "fleet.sqlite") as store:
@@ -479,8 +480,12 @@ def find_jobs(
         if not _is_log(path):
             others.append(name)
             continue
+        try:
+            status = path.stat()
+        except OSError:  # its folder does not let us, or its path is too long
+            others.append(name)
+            continue
         text = _vehicle_text(path.parent, root, default, texts)
-        status = path.stat()
         made_from = f"{status.st_size} {status.st_mtime_ns} {rate!r} {seed} {diagnose} {__version__}"
         key = hmac.new(secret, "\0".join((name, made_from, text)).encode(errors="replace"), "sha256").hexdigest()[:32]
         jobs.append(Job(
@@ -523,9 +528,10 @@ def _copies(jobs: Sequence[Job]) -> dict[str, str]:
     out = {}
     for job in (job for some in same_size.values() if len(some) > 1 for job in some if job.size):
         try:
+            stored_size(Path(job.path))
             with open(job.path, "rb") as file:
                 digest = hashlib.file_digest(file, "sha256").digest()
-        except OSError:
+        except (OSError, LogError):
             continue  # its row has the reason
         if first.setdefault(digest, job.name) != job.name:
             out[job.name] = first[digest]
@@ -533,13 +539,22 @@ def _copies(jobs: Sequence[Job]) -> dict[str, str]:
 
 
 def _files(root: Path, leave_out: Path | None) -> Iterator[Path]:
-    for folder, inner, names in os.walk(root):
-        here = Path(folder)
-        inner[:] = sorted(n for n in inner if not n.startswith(".") and here / n != leave_out)
-        for name in sorted(names):
+    """Files below a folder, those of a folder before those of the folders in it; also what cannot be looked at."""
+    waiting = [root]
+    while waiting:
+        here, inner = waiting.pop(), list[Path]()
+        try:
+            names = sorted(os.listdir(here))
+        except OSError:
+            yield here
+            continue
+        for path in (here / name for name in names if not name.startswith(".")):
+            if os.path.isdir(path):
+                inner += [path] * (path != leave_out and not os.path.islink(path))
             # Results beside the logs: `--out` may be the folder itself.
-            if not name.startswith((".", "fleet.")) and (here / name).is_file():
-                yield here / name
+            elif not path.name.startswith("fleet.") and (os.path.isfile(path) or not os.path.lexists(path)):
+                yield path
+        waiting += reversed(inner)
 
 
 def _is_log(path: Path) -> bool:

@@ -6,7 +6,7 @@ import math
 import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
@@ -51,20 +51,26 @@ def written_whole(target: Path) -> Iterator[Path]:
     Raises:
         OutputError: it cannot be written.
     """
-    there = target.exists() and not target.is_file()
-    part = target if there else target.with_name(f".{os.getpid()}.{file_name(target.name)}.part")
+    # /dev/stdout is a link that the system keeps, to a file where one was redirected.
+    ways = os.path.realpath(target.parent) + "/", os.readlink(target) if target.is_symlink() else ""
+    there = target.exists() and (not target.is_file() or any(way.startswith("/proc/") for way in ways))
+    part = target if there else target.with_name(f".{os.getpid()}.{file_name(target.name[-24:])}")
     try:
-        if not there:
+        if there:
+            with open(part, "wb", opener=unwaited):  # held open: whatever writes it next need not wait for a reader
+                yield part
+        else:
             part.unlink(missing_ok=True)  # a link that somebody laid there would be followed
-        yield part
-        if not there:
+            yield part
             os.replace(part, target)
     except OSError as error:
-        if not there:
-            part.unlink(missing_ok=True)
         raise OutputError(
             f"{target} cannot be written ({error.strerror})", fix="check permissions and free space"
         ) from error
+    finally:
+        if not there:
+            with suppress(OSError):
+                part.unlink(missing_ok=True)
 
 
 def write_text(path: str | Path, text: str) -> Path:
@@ -81,6 +87,46 @@ def make_folder(folder: Path, fix: str = "choose another folder") -> None:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OutputError(f"{folder} cannot be made ({error.strerror})", "a folder", fix) from error
+
+
+_pipes: list[int] = []
+"""Pipes to be written later: the reader of one ends when its last writer does."""
+
+
+def check_place(file: Path, option: str) -> None:
+    """Raises OutputError when a file to be written later cannot be; `option` is what the user named it by."""
+    if file.is_dir():
+        raise OutputError(f"{option} {file} is a directory", "a file name", f"name a file in it: {file / 'result'}")
+    folder = file.absolute().parent
+    if not folder.is_dir():
+        raise OutputError(f"{option}: no folder {folder}", "an existing folder", f"mkdir -p {folder}")
+    if file.exists() and not file.is_file():
+        try:
+            _pipes.append(os.open(file, os.O_WRONLY | os.O_NONBLOCK))
+        except OSError as error:
+            raise OutputError(
+                f"{option}: {file} is a pipe that nobody reads, or a socket ({error.strerror})", "a file",
+                "choose another place, or start what reads the pipe",
+            ) from error  # fmt: skip
+    elif not os.access(file if file.exists() else folder, os.W_OK):
+        raise OutputError(f"{option}: {file} is not writable", "a file you may write", "choose another place")
+
+
+def check_folder(folder: Path, option: str, *names: str) -> Path:
+    """Makes a folder where there is none; returns its absolute path.
+
+    Args:
+        names: patterns of files to be written later.
+
+    Raises:
+        OutputError: it cannot be made or written to, or holds a folder or a pipe under such a name.
+    """
+    make_folder(folder, f"choose another {option}")
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise OutputError(f"{folder} is not writable", "a folder you may write to", f"choose another {option}")
+    for file in (found for name in names for found in folder.glob(name) if not found.is_file()):
+        check_place(file, option)
+    return folder.resolve()
 
 
 def write_texts(place: str | Path, texts: Mapping[str, str]) -> list[Path]:
@@ -341,9 +387,10 @@ def require_gyro(recording: Recording) -> None:
 
 def write_recording(path: str | Path, recording: Recording) -> Path:
     """Writes a log as MCAP, tlog or CSV by suffix; returns its absolute path."""
-    kind = Path(path).suffix.lower()[1:]
-    getattr(quadid_replay, f"write_{kind}")(path, recording)
-    return Path(path).absolute()
+    target = Path(path).absolute()
+    with written_whole(target) as part:
+        getattr(quadid_replay, f"write_{target.suffix.lower()[1:]}")(part, recording)
+    return target
 
 
 def _read(path: Path, recording: Recording, vehicle: Vehicle, rate: float | None, cut: LogPart) -> Log:

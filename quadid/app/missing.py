@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from quadid.app.logs import Log, free_name
+from quadid.app.logs import Log, free_name, written_whole
 from quadid.app.over_time import OverTime
 from quadid.data.window import Channel, Recording, Window, beginning
 from quadid.errors import ParameterError
@@ -185,7 +185,8 @@ class MissingForces:
             columns = ["t", *(f"{model}/{column}" for model, one in found.items() for column in one.columns)]
             table = [self._joined(i, self.models[0], "t")[:, None], *(one.table for one in found.values())]
             path = free_name(folder, log.name, "missing.csv", out)
-            np.savetxt(path, np.concatenate(table, axis=1), "%.8g", ",", header=",".join(columns), comments="")
+            with written_whole(path) as part:
+                np.savetxt(part, np.concatenate(table, axis=1), "%.8g", ",", header=",".join(columns), comments="")
             out.append(path)
         return out
 

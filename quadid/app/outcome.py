@@ -19,7 +19,7 @@ from markupsafe import Markup
 from quadid_replay import write_compared
 from quadid_replay.frames import from_euler
 
-from quadid.app.logs import LONGEST, Log, free_name, write_text
+from quadid.app.logs import LONGEST, Log, free_name, write_text, written_whole
 from quadid.app.missing import Beside, MissingForces
 from quadid.app.over_time import OverTime, imported
 from quadid.chi_square import Z95
@@ -331,9 +331,11 @@ class Fitted(Reported):
             parts = {name: _recording(log.name, t, values) for name, values in columns}
             epoch = round(1e9 * (log.recording.epoch or 0.0))
             table, bag = (free_name(folder, log.name, f"simulated.{kind}", out) for kind in ("csv", "mcap"))
-            write_compared(table, parts, epoch)
+            with written_whole(table) as path:
+                write_compared(path, parts, epoch)
             beside = {} if self.forces is None else self.forces.innovations(i)
-            write_compared(bag, parts | beside, epoch, None if self.forces is None else self.forces.wrenches(i))
+            with written_whole(bag) as path:
+                write_compared(path, parts | beside, epoch, None if self.forces is None else self.forces.wrenches(i))
             out += [table, bag]
         return [*out, *([] if self.forces is None else self.forces.save(folder))]
 

@@ -276,17 +276,22 @@ def _run(
     command: Command, function: Callable[..., Outcome], outcome: type[Outcome], signature: inspect.Signature,
     typed: Mapping[str, Any], given: Mapping[str, Any],
 ) -> None:  # fmt: skip
+    from quadid.app.logs import check_folder, file_name, parse_part, write_text
     from quadid.app.outcome import UnansweredError
     from quadid.cli import terminal
     from quadid.errors import QuadidError
     from quadid.vehicle import Vehicle
 
     # Places to write to are looked at before any work.
+    texts = [t for n in typed if typed[n].option.metavar == "LOG" for t in given[n] or ()]
     json, report, series, out = (given.get(name) for name in ("json", "report", "series", "out"))
     terminal.check_file(json, "--json")
-    folder = None if out is None else terminal.out_folder(out)
+    folder = None if out is None else check_folder(out, "--out")
     if series is not None:
-        terminal.out_folder(series, "--series")
+        names = (file_name(parse_part(text).path.name) for text in texts)
+        check_folder(
+            series, "--series", *(f"{name}.*{kind}" for name in names for kind in ("simulated.*", "missing.csv"))
+        )
     terminal.check_file(report, "--report")
 
     # What was not typed is as the function has it.
@@ -296,6 +301,8 @@ def _run(
         asked = inspect.signature(check).parameters
         check(**{name: told.get(name, p.default) for name, p in signature.parameters.items() if name in asked})
     vehicle = next((value for value in told.values() if isinstance(value, Vehicle)), None)
+    if folder is not None and vehicle is not None:
+        check_folder(folder, "--out", f"{file_name(vehicle.name)}*.yaml")
     logs = [name for name in typed if typed[name].opened and name in told]
     how = {name: given[name] for name in ("rate", *command.reading) if name in given}
 
@@ -317,9 +324,7 @@ def _run(
         # The report of an attempt that failed says why, and shows the data.
         if report is not None and vehicle is not None and outcome.title:
             from quadid.app.failure import failure_html
-            from quadid.app.logs import write_text
 
-            texts = [t for n in typed if typed[n].option.metavar == "LOG" for t in given[n] or ()]
             what, preset = f"{outcome.title} of {vehicle.name}", given.get("preset", "auto")
             text = failure_html(error, what, texts, vehicle, preset, terminal.command_line())
             terminal.warn([f"no answer; why, and the data as they are: {write_text(report, text)}"])

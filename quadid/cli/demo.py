@@ -11,7 +11,7 @@ import typer
 
 from quadid.app.diagnose import Diagnosed, diagnose
 from quadid.app.identify import Identified, identify
-from quadid.app.logs import Log, load, write_recording, write_text
+from quadid.app.logs import Log, check_folder, load, write_recording, write_text
 from quadid.app.options import JsonTarget, OutFolder, Seed
 from quadid.app.outcome import Advance, provenance, quality, told
 from quadid.cli import terminal
@@ -25,6 +25,8 @@ VEHICLE = "pelican"
 SECONDS, QUICK_SECONDS = 500.0, 60.0
 HIDDEN = {"motor_lag": {"tau": 0.04}}
 HIDDEN_SECONDS = 120.0
+FOLDERS = "diagnosis", "hidden_effect"
+WRITTEN = "set?.mcap", "flight?.mcap", f"{VEHICLE}*.yaml", "report.html", "result.json"
 TRUE_SECTION = "The same three flights"
 HIDDEN_SECTION = "A second vehicle, with something hidden in it"
 
@@ -37,7 +39,9 @@ def demo(
 ) -> None:
     """Fly three Pelican flights, identify on the first, validate on the others, diagnose; write logs and a report."""
     terminal.check_file(json, "--json")
-    folder = terminal.out_folder(out)
+    folder = check_folder(out, "--out", *WRITTEN)
+    for name in FOLDERS:
+        check_folder(folder / name, "--out", *WRITTEN)
     with terminal.progress(("simulation", "statistics", "estimate", "flight")) as advance:
         shown = run(QUICK_SECONDS if quick else SECONDS, seed, folder, advance)
     page = folder / "report.html"
@@ -89,9 +93,7 @@ def run(seconds: float, seed: int, folder: Path, advance: Advance) -> Shown:
     flights = [
         fly_and_load(vehicle, folder / f"set{i + 1}.mcap", seconds, 10 * seed + i, {}, advance) for i in range(3)
     ]
-    same, apart = (folder / name for name in ("diagnosis", "hidden_effect"))
-    for made in (same, apart):
-        made.mkdir(exist_ok=True)
+    same, apart = (folder / name for name in FOLDERS)
     shorter = min(seconds, HIDDEN_SECONDS)
     other = [
         fly_and_load(vehicle, apart / f"flight{i + 1}.mcap", shorter, 10 * seed + 5 + i, HIDDEN, advance)
@@ -105,7 +107,7 @@ def run(seconds: float, seed: int, folder: Path, advance: Advance) -> Shown:
     diagnosed = diagnose(flights[:1], flights[1:], seed=seed, advance=named("diagnose"))
     hidden = diagnose(other[:1], other[1:], seed=seed, advance=named("diagnose hidden effect"))
     for done, place in ((identified, folder), (diagnosed, same), (hidden, apart)):
-        done.result["vehicle_file"] = str(done.vehicle.save(place / done.file_name))
+        done.write(place)
     return Shown(identified, diagnosed, hidden, truth)
 
 

@@ -9,6 +9,7 @@ import typer
 
 from quadid.app.export import export as exported
 from quadid.app.export import forms
+from quadid.app.logs import check_folder
 from quadid.app.options import VEHICLE, JsonTarget, OutFolder
 from quadid.cli import terminal
 from quadid.report.programs import FORMATS
@@ -52,7 +53,7 @@ def export(
     elif name is not None:
         raise typer.BadParameter("it names sets of a history: give --history FILE too", param_hint="--id")
     done = exported(described, form, source=source, doubt=doubt, anyway=anyway)
-    terminal.conclude(done, json, folder=terminal.out_folder(out), kept=vehicle)
+    terminal.conclude(done, json, folder=check_folder(out, "--out"), kept=vehicle)
 
 
 def _in_force(vehicle: Vehicle, history: Path, name: str) -> tuple[Vehicle, str, str]:

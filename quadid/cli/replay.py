@@ -11,6 +11,7 @@ import typer
 from quadid_replay import TopicWriter, open_log
 
 from quadid.app import options
+from quadid.app.logs import written_whole
 from quadid.app.outcome import Outcome
 from quadid.errors import QuadidError
 from quadid.report.tables import Cell, TextTable, parameter_table
@@ -160,7 +161,7 @@ def write_outputs(path: Path, outputs: Sequence[Output], vehicle: str) -> None:
     """Writes what would have been published as MCAP: topics, types and stamps as of the live service."""
     from quadid_node.messages import RESULTS, TOPICS
 
-    with TopicWriter(path) as writer:
+    with written_whole(path.absolute()) as part, TopicWriter(part) as writer:
         for output in outputs:
             if output.topic in RESULTS:
                 message = RESULTS[output.topic].message(output, vehicle, "")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import product
 from pathlib import Path
 from typing import Annotated
 
@@ -11,7 +12,7 @@ from quadid_evaluation.paper import protocol
 from quadid_evaluation.paper.figures import FIGURES, draw, interactive
 from quadid_evaluation.paper.page import all_tables, paper_markdown, paper_sections
 
-from quadid.app.logs import write_text
+from quadid.app.logs import check_folder, write_text, written_whole
 from quadid.app.options import JsonTarget, OutFolder, Seed
 from quadid.cli import terminal
 from quadid.identification.paper_objective import PaperScore
@@ -30,11 +31,13 @@ def reproduce(
 ) -> None:
     """Fly the paper's three sets, fit as it does and better; write Tables 1 and 2, Figures 3 to 8, and one page."""
     terminal.check_file(json, "--json")
-    folder = terminal.out_folder(out)
+    folder = check_folder(out, "--out", "paper.json", "paper.html", "paper.md")
+    check_folder(folder / _FIGURES, "--out", "figure-*")
+    flights = check_folder(folder / "flights", "--out", "set?.mcap", "pelican.yaml")
     plan = protocol.QUICK if quick else protocol.Plan()
     with terminal.progress() as advance:
         command = f"quadid reproduce{' --quick' if quick else ''} --seed {seed}"
-        result, scores = protocol.reproduce(folder / "flights", plan, seed, advance, command)
+        result, scores = protocol.reproduce(flights, plan, seed, advance, command)
         advance("draw", 0.0)
         result["files"] = write(result, scores, folder)
     terminal.write_json(result, str(folder / "paper.json"))
@@ -47,13 +50,15 @@ def reproduce(
 
 def write(result: JsonDict, scores: Mapping[str, Sequence[PaperScore]], folder: Path) -> list[str]:
     """Writes pictures, Markdown and HTML; returns their absolute paths."""
-    pictures, files = terminal.out_folder(folder / _FIGURES), []
-    for figure in FIGURES:
-        drawn = draw(figure, scores)
-        for kind in ("png", "pdf"):
-            path = pictures / f"figure-{figure.number}.{kind}"
-            drawn.savefig(path, dpi=110)
-            files.append(str(path))
+    from matplotlib import rc_context, rcParamsDefault
+
+    pictures, files = check_folder(folder / _FIGURES, "--out"), []
+    for figure, kind in product(FIGURES, ("png", "pdf")):
+        path = pictures / f"figure-{figure.number}.{kind}"
+        # Without the settings of a matplotlibrc in this folder, which can have LaTeX run on what they hold.
+        with rc_context(rcParamsDefault), written_whole(path) as part:
+            draw(figure, scores).savefig(part, dpi=110)
+        files.append(str(path))
     page = render(paper_sections(result, [interactive(figure, scores) for figure in FIGURES]))
     files.append(str(write_text(folder / "paper.html", page)))
     files.append(str(write_text(folder / "paper.md", paper_markdown(result, _FIGURES))))

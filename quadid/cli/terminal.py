@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from quadid.app.kernels import FIT, prepare
-from quadid.app.logs import OutputError, make_folder, write_text
+from quadid.app.logs import OutputError, check_place, write_text
 from quadid.app.outcome import Advance, Outcome, json_text, silent
 from quadid.errors import QuadidError
 from quadid.report.tables import SPACE, Cell, TextTable
@@ -86,22 +86,6 @@ def progress(compiled: Sequence[str] = FIT) -> Iterator[Advance]:
 # --- Written results: folders that are checked before long work, and JSON that any parser accepts
 
 
-def out_folder(folder: Path, option: str = "--out") -> Path:
-    """Makes the folder where it does not exist, and returns its absolute path.
-
-    Raises:
-        OutputError: it cannot be made or written to.
-    """
-    make_folder(folder, f"choose another {option}")
-    if not os.access(folder, os.W_OK | os.X_OK):
-        raise OutputError(f"{folder} is not writable", "a folder you may write to", f"choose another {option}")
-    return folder.resolve()
-
-
-_pipes: list[int] = []
-"""Pipes to be written later: the reader of one ends when its last writer does."""
-
-
 def check_file(path: Path | str | None, option: str) -> None:
     """Raises OutputError when a file to be written later cannot be; ``-`` and None are fine."""
     if path is None or str(path) == "-":
@@ -112,21 +96,7 @@ def check_file(path: Path | str | None, option: str) -> None:
             f"{option} {file}: a report is an HTML page", "a name that ends in .html",
             f"{file.stem}.html; a browser prints it to PDF, in eight pages at most",
         )  # fmt: skip
-    if file.is_dir():
-        raise OutputError(f"{option} {file} is a directory", "a file name", f"name a file in it: {file / 'result'}")
-    folder = file.absolute().parent
-    if not folder.is_dir():
-        raise OutputError(f"{option}: no folder {folder}", "an existing folder", f"mkdir -p {folder}")
-    if file.exists() and not file.is_file():
-        try:
-            _pipes.append(os.open(file, os.O_WRONLY | os.O_NONBLOCK))
-        except OSError as error:
-            raise OutputError(
-                f"{option}: {file} is a pipe that nobody reads, or a socket ({error.strerror})", "a file",
-                "choose another place, or start what reads the pipe",
-            ) from error  # fmt: skip
-    elif not os.access(file if file.exists() else folder, os.W_OK):
-        raise OutputError(f"{option}: {file} is not writable", "a file you may write", "choose another place")
+    check_place(file, option)
 
 
 def command_line() -> str:

@@ -89,8 +89,8 @@ def connect(path: Path, read_only: bool = False) -> sqlite3.Connection:
         check_beside(path)
     except OSError as error:
         raise StoreError(
-            f"{error.filename}: {error.strerror}: what SQLite writes to it would be written elsewhere",
-            "a history with files of its own", "remove that link, or use another history",
+            f"{error.filename}: {error.strerror}: another file would be changed",
+            "a history with files of its own", "remove it, or use another history",
         ) from error  # fmt: skip
     name = f"{path.absolute().as_uri()}?mode=ro" if read_only else path
     db = sqlite3.connect(name, uri=read_only, timeout=BUSY_SECONDS)
@@ -138,9 +138,12 @@ def make_tables(path: Path) -> None:
         db.executescript(SCHEMA)
         db.execute(f"PRAGMA user_version = {VERSION}")
         db.commit()
-        (highest,) = db.execute("SELECT max(sequence) FROM sets").fetchone()
-        if not isinstance(highest, int | None) or (highest or 0) >= LARGEST_NUMBER:
-            raise sqlite3.DatabaseError(f"malformed: set number {highest!r}")
+        # Behind the largest row that SQLite can number, later ones would not count as newer.
+        tables = {name for name, kind in _made() if kind == "table"}
+        for what in ("sequence) FROM sets", *(f"rowid) FROM {table}" for table in tables)):
+            (highest,) = db.execute(f"SELECT max({what}").fetchone()
+            if not isinstance(highest, int | None) or (highest or 0) >= LARGEST_NUMBER:
+                raise sqlite3.DatabaseError(f"malformed: number {highest!r} in {what.rpartition(' ')[2]}")
 
 
 def check_tables(db: sqlite3.Connection) -> None:

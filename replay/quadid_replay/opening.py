@@ -73,15 +73,7 @@ def open_log(path: str | Path, preset: str = AUTO, columns: Mapping[str, str] | 
     file = Path(path)
     preset_rank(preset, "gyro", "")  # an unknown preset is an error whatever the file is
     kind = kind_of(file, columns)
-    sizes = [part.stat() for part in parts_of(file)]
-    size = sum(part.st_size for part in sizes)
-    stored = 512 * sum(part.st_blocks for part in sizes)
-    if size >= LARGE and stored < _STORED * size:
-        raise LogError(
-            f"{file.name}: {size >> 20} MiB of which {stored >> 20} MiB are stored", "a whole file",
-            "copy it again: the copy or the logger stopped before the end",
-        )  # fmt: skip
-    allowed = limits(size)
+    allowed = limits(stored_size(file))
     request = {
         "format": kind.name, "path": str(file.absolute()), "preset": preset, "columns": dict(columns or {}),
         "memory": allowed.memory, "seconds": allowed.seconds,
@@ -114,6 +106,19 @@ def open_log(path: str | Path, preset: str = AUTO, columns: Mapping[str, str] | 
     if isinstance(result, str):
         raise _limited(file, result, allowed)
     return result
+
+
+def stored_size(file: Path) -> int:
+    """Size of a log, of a folder that of its files [bytes]; raises LogError where hardly any of it is stored."""
+    sizes = [part.stat() for part in parts_of(file)]
+    size = sum(part.st_size for part in sizes)
+    stored = 512 * sum(part.st_blocks for part in sizes)
+    if size >= LARGE and stored < _STORED * size:
+        raise LogError(
+            f"{file.name}: {size >> 20} MiB of which {stored >> 20} MiB are stored", "a whole file",
+            "copy it again: the copy or the logger stopped before the end",
+        )  # fmt: skip
+    return size
 
 
 # --- Limits, and why there is no answer

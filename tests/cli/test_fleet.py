@@ -260,7 +260,7 @@ def test_a_link_where_results_are_written_is_replaced_and_not_followed(tmp_path:
     mine.write_text("precious")
     out = tmp_path / "out"
     out.mkdir()
-    for name in (*(f"fleet.{table}.parquet" for table in TABLES), "fleet.html", f".{os.getpid()}.fleet.html.part"):
+    for name in (*(f"fleet.{table}.parquet" for table in TABLES), "fleet.html", f".{os.getpid()}.fleet.html"):
         (out / name).symlink_to(mine)
     with open_store(out / "fleet.sqlite") as store:
         store.write_parquet(out)
@@ -269,6 +269,37 @@ def test_a_link_where_results_are_written_is_replaced_and_not_followed(tmp_path:
     assert pq.read_table(out / "fleet.logs.parquet").num_rows == 0
     assert (out / "fleet.html").read_text() == "page"
     happened(35, "links under the names of results: replaced, what they pointed to untouched")
+
+
+def test_files_of_which_nothing_is_stored_are_not_compared_byte_by_byte(tmp_path: Path, happened: Happened) -> None:
+    """Two of a TiB each, a few KiB in an archive, were read to their end before any log."""
+    for name in ("a.bin", "b.bin"):
+        (tmp_path / name).touch()
+        os.truncate(tmp_path / name, 64 << 20)
+    found = find_jobs(tmp_path, Vehicle.shipped("pelican").to_yaml(), 50.0, 1, diagnose=False)
+    assert [job.name for job in found.jobs] == ["a.bin", "b.bin"]
+    assert identify_one(found.jobs[0])["status"] == "unreadable"
+    happened(35, "two equal files of which nothing is stored: not read to tell whether they are copies")
+
+
+def test_folders_in_folders_without_end_cost_no_other_log(tmp_path: Path, happened: Happened) -> None:
+    """A thousand of them ended the run, as did a path that is too long, or a folder that lets nobody look."""
+    root = tmp_path / "logs"
+    root.mkdir()
+    here = os.open(root, os.O_RDONLY)
+    for depth in range(1500):
+        os.mkdir("in", dir_fd=here)
+        inside = os.open("in", os.O_RDONLY, dir_fd=here)
+        os.close(here)
+        here = inside
+        if depth % 100 == 0 or depth > 1490:
+            os.close(os.open("flight.bin", os.O_CREAT | os.O_WRONLY, dir_fd=here))
+    os.close(here)
+    found = find_jobs(root, Vehicle.shipped("pelican").to_yaml(), 50.0, 1, diagnose=False)
+    subprocess.run(["rm", "-rf", root], check=True)
+    assert len(found.jobs) > 10
+    assert any(name.endswith("/in") for name in found.others)
+    happened(35, f"1,500 folders in each other: {len(found.jobs)} logs found, the rest among other files")
 
 
 def test_folders_that_link_to_themselves_are_one_line(tmp_path: Path, quadid: Cli) -> None:

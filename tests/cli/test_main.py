@@ -26,7 +26,8 @@ from quadid_replay.writers import open_for_writing
 
 from quadid.app.excite import Proposed
 from quadid.app.fleet_page import Fleet
-from quadid.app.logs import write_text
+from quadid.app.identify import identify
+from quadid.app.logs import load, write_recording, write_text
 from quadid.app.simulate import read_manoeuvre
 from quadid.cli.commands import COMMANDS
 from quadid.cli.history import Stored
@@ -223,6 +224,58 @@ def test_a_place_that_cannot_be_written_is_said_before_any_work(
     happened(35, f"{option} to a {what}: '{done.err.strip()[:90]}'")
 
 
+INSIDE = {
+    "fleet.logs.parquet": ("fleet", "."),
+    "fleet.html": ("fleet", "."),
+    "set2.mcap": ("demo", "--quick"),
+    "hidden_effect/flight1.mcap": ("demo", "--quick"),
+    "paper/figure-3.png": ("reproduce", "--quick"),
+    "flights/set1.mcap": ("reproduce", "--quick"),
+    "pelican+ground.yaml": ("diagnose", "no.csv", "--vehicle", "pelican"),
+    "no.csv.missing.csv": ("identify", "no.csv", "--vehicle", "pelican"),
+}
+
+
+@pytest.mark.parametrize("name", INSIDE)
+@pytest.mark.parametrize("what", ["pipe", "folder"])
+def test_a_file_in_a_folder_that_cannot_be_written_is_said_before_any_work(
+    name: str, what: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, inside: Cli, happened: Happened
+) -> None:
+    """They were told when they were written, after all flights and fits; or a pipe was waited for without end."""
+    monkeypatch.chdir(tmp_path)
+    place = Path("out", name)
+    place.parent.mkdir(parents=True)
+    (os.mkfifo if what == "pipe" else os.mkdir)(place)
+    done = inside(*INSIDE[name], "--series" if "missing" in name else "--out", "out")
+    assert done.code == 2
+    assert done.err.count("\n") == 1
+    assert name in done.err
+    assert what in done.err or "directory" in done.err
+    assert [p for p in Path("out").rglob("*") if p.is_file()] == []
+    happened(35, f"{name} in the folder of results is a {what}: '{done.err.strip()[:90]}'")
+
+
+def test_links_under_the_names_of_what_is_written_over_time_are_replaced(
+    flights: Flights, tmp_path: Path, happened: Happened
+) -> None:
+    """A log of one folder, unpacked with links beside it, had a file elsewhere overwritten."""
+    mine = tmp_path / "mine"
+    mine.write_text("precious")
+    logs = [tmp_path / f"flight.{kind}" for kind in ("csv", "mcap", "tlog")]
+    log = load(flights.train, "pelican")
+    done = identify(log)
+    series = [tmp_path / f"{log.name}.{end}" for end in ("simulated.csv", "simulated.mcap", "missing.csv")]
+    for path in (*logs, *series):
+        path.symlink_to(mine)
+    for path in logs:
+        write_recording(path, log.recording)
+    assert done.save_series(tmp_path) == series
+    assert mine.read_text() == "precious"
+    assert not [path for path in (*logs, *series) if path.is_symlink()]
+    assert sorted(tmp_path.iterdir()) == sorted([mine, *logs, *series])
+    happened(35, f"links under the names of {len(logs) + len(series)} written files: replaced, not followed")
+
+
 def test_a_pipe_that_is_read_stays_open_until_the_result(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
     reader = os.open(tmp_path / "pipe", os.O_RDONLY | os.O_NONBLOCK)
@@ -243,6 +296,17 @@ def test_a_pipe_that_is_read_gets_the_result_and_no_device_becomes_a_file(tmp_pa
     write_text(tmp_path / "null", "{}")
     assert (tmp_path / "null").is_char_device()
     assert [p.name for p in tmp_path.iterdir() if p.name.startswith(".")] == []
+
+
+def test_a_link_of_the_system_to_a_redirected_file_stays(tmp_path: Path, happened: Happened) -> None:
+    """As root `--json /dev/stdout > file` put a file in the place of /dev/stdout."""
+    with (tmp_path / "file").open("w") as redirected:
+        (tmp_path / "stdout").symlink_to(f"/proc/self/fd/{redirected.fileno()}")
+        for place in (tmp_path / "stdout", Path(f"/dev/fd/{redirected.fileno()}")):
+            write_text(place, f"{place.parent}")
+            assert (tmp_path / "file").read_text() == f"{place.parent}"
+        assert (tmp_path / "stdout").is_symlink()
+    happened(35, "a result for /dev/stdout that goes to a file: written there, /dev/stdout is the link that it was")
 
 
 def test_a_pipe_where_time_stamps_of_signatures_were_kept_is_said(tmp_path: Path) -> None:

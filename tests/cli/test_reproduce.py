@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from matplotlib import rc_context
 from quadid_evaluation.paper.page import PAPER_GAIN, PAPER_MSE
 from quadid_evaluation.paper.protocol import Plan, reproduce
 
@@ -23,7 +24,8 @@ def done(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], Path
     plan = Plan(seconds=40.0, particles=32, iterations=12, seeds=1)
     found, scores = reproduce(folder / "flights", plan, 1, lambda stage, share: None, "a test")
     result = jsonable(found)
-    return {**result, "files": write(result, scores, folder)}, folder
+    with rc_context({"text.usetex": True}):  # as a matplotlibrc in the working folder has it
+        return {**result, "files": write(result, scores, folder)}, folder
 
 
 def test_the_searches_stand_in_their_order(done: tuple[dict[str, Any], Path]) -> None:

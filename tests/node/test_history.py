@@ -7,6 +7,7 @@ import json
 import math
 import os
 import sqlite3
+import struct
 import subprocess
 import sys
 import time
@@ -24,6 +25,7 @@ from quadid_node.messages import Output, set_from_dict, set_to_dict
 from quadid_node.service import Service
 from quadid_node.worker import InlineWorker
 
+from quadid.app.fleet import open_store
 from quadid.condition.trim import FlightTrim
 from quadid.online import SessionSettings, SetState
 from quadid.online.active_set import FORCE, ActiveSet
@@ -445,6 +447,46 @@ def test_links_beside_a_history_are_refused(
     (tmp_path / f"h.sqlite{end}").unlink()
     assert len(read_history(path, "pelican")["sets"]) == 2
     happened(44, f"{link.__name__} as history{end} to another file: refused by service and reader, the file whole")
+
+
+def test_a_journal_beside_a_history_has_no_other_file_removed(tmp_path: Path, happened: Happened) -> None:
+    """A journal that a stranger packs may name a file as common to several databases: SQLite removed it."""
+    path, precious = tmp_path / "h.sqlite", tmp_path / "precious"
+    filled(path).close(60.0)
+    precious.write_text("precious")
+    kept, named, magic = path.read_bytes(), str(precious).encode(), bytes.fromhex("d9d505f920a163d7")
+    page = int.from_bytes(kept[16:18], "big")
+    head = struct.pack(">8s5I", magic, 0, 1, len(kept) // page, 512, page).ljust(512, b"\0")
+    place = struct.pack(">I", (1 << 30) // page + 1)
+    journal = tmp_path / "h.sqlite-journal"
+    journal.write_bytes(head + place + named + struct.pack(">2I", len(named), sum(named)) + magic)
+    for use in (lambda: Store(path, "pelican"), lambda: read_history(path, "pelican"), open_store(path).__enter__):
+        with pytest.raises((StoreError, OSError), match="names another file"):
+            use()
+    assert precious.read_text() == "precious"
+    journal.unlink()
+    assert len(read_history(path, "pelican")["sets"]) == 2
+    happened(44, "a journal beside the history that names a file of the user: refused, the file is there")
+
+
+@pytest.mark.parametrize("table", ["sets", "decisions", "masses"])
+def test_rows_behind_the_last_that_can_be_numbered_do_not_stay_the_newest(
+    tmp_path: Path, table: str, happened: Happened
+) -> None:
+    """SQLite numbers rows at random once one has the largest number: a person's decision was older than that one."""
+    path = tmp_path / "h.sqlite"
+    filled(path).close(60.0)
+    with contextlib.closing(sqlite3.connect(path)) as db, db:
+        values = {"sets": "1, 'rejected', '', '', 0, 0, '{}'", "decisions": "'auto', 'auto', 0"}.get(table, "0, 0")
+        columns = ", ".join(row[1] for row in db.execute(f"PRAGMA table_info({table})") if row[1] != "id")
+        db.execute(f"INSERT INTO {table} (rowid, {columns}) VALUES ({(1 << 63) - 1}, 'pelican', {values})")
+    store = Store(path, "pelican")
+    assert "malformed" in store.notes[0]
+    store.restore()
+    store.decision("auto", "manual")
+    store.close(60.0)
+    assert Store(path, "pelican").restore().approval == "manual"
+    happened(44, f"a row of {table} with the largest number there is: '{store.notes[0][:90]}'")
 
 
 # --- Disks and damage
