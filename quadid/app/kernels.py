@@ -108,24 +108,11 @@ def _simulation() -> None:
     rollout.roll(segments, theta, states)
 
 
-def _statistics() -> None:
-    import numpy as np
-
+def _closed_loop() -> None:
     from quadid.flight.pilot import default_gains
-    from quadid.identification.elimination import Reduced, StatePrior, Whitening, reduce_segments
     from quadid.model.closed_loop import ClosedLoop
     from quadid.model.layout import Layout
-    from quadid.model.simd import LANES, aligned
 
-    own, rows, channels = 9, 8, 9
-    out = aligned((1, 1, rows, channels, LANES))
-    out[:] = np.random.default_rng(1).standard_normal(out.shape)
-    eye = np.repeat(np.eye(rows)[None], channels, axis=0)
-    reduce_segments(
-        out, np.arange(own + 2), np.ones(own + 1), np.ones((1, rows, channels)),
-        Whitening(np.ones(channels), np.zeros(channels, dtype=bool), eye),
-        StatePrior(np.ones(own), 0.0, np.zeros((1, 3))), Reduced.room(1, own, 1, rows, channels),
-    )  # fmt: skip
     vehicle, window = _hover()
     ClosedLoop(window, vehicle, default_gains(vehicle)).fly(Layout(vehicle).initial(vehicle)[None])
 
@@ -158,9 +145,7 @@ PARTS = {
         ("model.kernel:needs_of", "model.rollout_kernel:roll_segments", "model.rotor_kernel:rotor_table"),
         100,
     ),
-    "statistics": Part(
-        _statistics, ("identification.elimination:_reduce_on_disk", "model.closed_loop:fly_closed_loop"), 100
-    ),
+    "closed loop": Part(_closed_loop, ("model.closed_loop:fly_closed_loop",), 80),
     "estimate": Part(
         _estimate,
         tuple(f"estimate.kalman:{name}" for name in ("moments", "kalman", "replay", "backward")),
@@ -169,7 +154,7 @@ PARTS = {
     "flight": Part(_flight, ("flight.march:march",), 30),
 }
 """Kernels of an identification or a diagnosis, in three parts, and the flown vehicle of `quadid simulate`."""
-FIT = ("simulation", "statistics", "estimate")
+FIT = ("simulation", "closed loop", "estimate")
 
 
 # --- Compiling what a command needs before it works, in processes side by side

@@ -42,7 +42,7 @@ def demo(
     folder = check_folder(out, "--out", *WRITTEN)
     for name in FOLDERS:
         check_folder(folder / name, "--out", *WRITTEN)
-    with terminal.progress(("simulation", "statistics", "estimate", "flight")) as advance:
+    with terminal.progress(("simulation", "closed loop", "estimate", "flight")) as advance:
         shown = run(QUICK_SECONDS if quick else SECONDS, seed, folder, advance)
     page = folder / "report.html"
     result = summary(shown, str(page))

@@ -11,13 +11,13 @@ rotors.  How much of a rate is theirs shows whether `quadid.identification.filte
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 
 from quadid.chi_square import lower_mean
-from quadid.identification.elimination import Whitening
 from quadid.types import BoolArray, FloatArray
 from quadid.vehicle import Noise
 
@@ -82,50 +82,35 @@ class NoiseModel:
         """
         return _whitener(self, length, dt)
 
-    def whitening(self, length: int, dt: float) -> Whitening:
-        """Weights and whitening of the channels of a segment; see `whitener`."""
-        return _whitening(self, length, dt)
-
-    def whitened(self, rows: FloatArray, weights: FloatArray, dt: float) -> FloatArray:
-        """Rows weighted and whitened, channel by channel as `channel_whitened`.
+    def whitened(
+        self, rows: FloatArray, weights: FloatArray, dt: float, channels: Sequence[int] | None = None
+    ) -> FloatArray:
+        """Rows weighted and whitened; a channel of a segment with masked samples stays unwhitened.
 
         Args:
             rows: shape (segments, length, channels, columns).
             weights: 1 where measured, 0 elsewhere, shape (segments, length, channels).
             dt: time between samples [s].
+            channels: whose rows they are; by default those of the model, in order.
         """
-        out = np.empty_like(rows)
-        for c in range(rows.shape[2]):
-            out[:, :, c] = self.channel_whitened(c, rows[:, :, c], weights[:, :, c], dt)
-        return out
-
-    def channel_whitened(self, channel: int, rows: FloatArray, weights: FloatArray, dt: float) -> FloatArray:
-        """Rows of one channel (segments, length, columns), weighted (segments, length) and whitened.
-
-        Segments with masked samples stay unwhitened.
-        """
-        out = rows * (weights / self.deviation[channel])[..., None]
-        if self.coloured[channel]:
-            full = np.all(weights > 0.0, axis=1)
-            out[full] = np.matmul(self.whitener(rows.shape[1], dt)[channel], rows[full] * weights[full, :, None])
+        of = np.arange(len(self.white)) if channels is None else np.asarray(channels)
+        out = rows * (weights / self.deviation[of])[..., None]
+        whole = np.all(weights > 0.0, axis=1)
+        for i in np.flatnonzero(self.coloured[of]):
+            white = np.matmul(self.deviation[of[i]] * self.whitener(rows.shape[1], dt)[of[i]], out[:, :, i])
+            out[:, :, i] = white if whole[:, i].all() else np.where(whole[:, i, None, None], white, out[:, :, i])
         return np.asarray(out)
 
-    @property
+    @cached_property
     def deviation(self) -> FloatArray:
         """Standard deviation of each channel, shape (channels,)."""
         return np.asarray(np.sqrt(self.variance))
 
-    @property
+    @cached_property
     def coloured(self) -> BoolArray:
         """True for channels that are not white, shape (channels,)."""
         mask = self.slow > 0.0
         return mask if self.shape is None else mask | (np.ptp(self.shape, axis=1) > 0.0)
-
-
-@lru_cache(maxsize=16)
-def _whitening(noise: NoiseModel, length: int, dt: float) -> Whitening:
-    """`NoiseModel.whitening`."""
-    return Whitening(noise.deviation, noise.coloured, _whitener(noise, length, dt))
 
 
 @lru_cache(maxsize=16)

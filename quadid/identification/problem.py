@@ -19,7 +19,7 @@ import numpy as np
 
 from quadid.data.window import Window
 from quadid.effects import EFFECTS
-from quadid.identification.elimination import Reduced, StatePrior, reduce_segments
+from quadid.identification.elimination import Reduced, StatePrior, columns_of, reduce_segments
 from quadid.identification.initial_states import InitialStates, Starts, frozen
 from quadid.identification.noise import NoiseModel
 from quadid.model.layout import Entry, Layout, places
@@ -215,7 +215,7 @@ class Columns:
 
     def whiten(self, rows: FloatArray, channel: int) -> FloatArray:
         """Weights and whitens changes of one channel, shape (segments, length, columns)."""
-        return self.noise.channel_whitened(channel, rows, self.weights[:, :, channel], self.window.dt)
+        return self.noise.whitened(rows[:, :, None], self.weights[:, :, [channel]], self.window.dt, [channel])[:, :, 0]
 
 
 LEAD_SECONDS = 0.2
@@ -414,10 +414,13 @@ class Shooting:
         thetas, dx, steps = self._directions(theta, free, k)
         lane = packing(thetas, self.layout.rotors)
         thetas, dx = packed(thetas, lane), packed(dx, lane)
-        whitening = self.noise.whitening(self.length, self.dt)
 
+        @np.errstate(over="ignore", invalid="ignore")
         def use(which: slice, out: FloatArray) -> None:
-            reduce_segments(out, lane, steps, weights[which], whitening, prior.part(which), into.part(which))
+            rows, part = columns_of(out, lane, steps, self.channels), into.part(which)
+            part.base[:] = rows[..., 0]
+            white = self.noise.whitened(rows, weights[which], self.dt)
+            reduce_segments(white.reshape(len(white), -1, len(lane)), prior.part(which), part)
 
         self.rollouts[i].roll_parts(segments, thetas, x0, dx, n_pre, use)
         if not np.max(into.largest, initial=0.0) < RAN_AWAY:
@@ -439,19 +442,16 @@ class Shooting:
         for i, x0 in enumerate(self.starts(n_pre, states).x0):
             out, steps = self.roll_directions(i, theta, free, x0.copy(), n_pre, k)
             weights = self.measured_weights(i)
-            lanes = out[..., : self.channels, :].transpose(1, 2, 3, 0, 4).reshape(*weights.shape, -1)
+            rows = columns_of(out, np.arange(1 + len(steps)), steps, self.channels)
             del out  # of a long log each of these is a large part of all memory
-            base = lanes[..., :1].copy()
-            rows = np.concatenate([(lanes[..., 1 : 1 + len(steps)] - base) / steps, base], axis=3)
-            del lanes
-            white = self.noise.whitened(rows, weights, self.dt)
+            white, base = self.noise.whitened(rows, weights, self.dt), rows[..., 0].copy()
             del rows
-            flat = white.reshape(len(white), -1, len(steps) + 1)
+            flat = white.reshape(len(white), -1, 1 + len(steps))
             ridge = np.repeat(np.diag(1.0 / RIDGE[:k])[None], len(flat), axis=0)
-            basis = np.linalg.qr(np.concatenate([flat[..., :k], ridge], axis=1))[0][:, :-k]
+            basis = np.linalg.qr(np.concatenate([flat[..., 1 : 1 + k], ridge], axis=1))[0][:, :-k]
             yield Columns(
-                self.rollouts[i].window, self.segments[i].rows, basis, white[..., -1], np.all(weights > 0.0, axis=1),
-                flat[..., k:-1], base[..., 0], weights, self.noise,
+                self.rollouts[i].window, self.segments[i].rows, basis, white[..., 0], np.all(weights > 0.0, axis=1),
+                flat[..., 1 + k :], base, weights, self.noise,
             )  # fmt: skip
 
 

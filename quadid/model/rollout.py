@@ -16,6 +16,7 @@ from typing import NamedTuple
 from weakref import WeakValueDictionary
 
 import numpy as np
+from threadpoolctl import ThreadpoolController
 
 from quadid.data.window import Window
 from quadid.errors import WindowError
@@ -200,6 +201,11 @@ def _threads() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(max_workers=os.cpu_count(), thread_name_prefix="rollout")
 
 
+@lru_cache(maxsize=1)
+def _linear_algebra() -> ThreadpoolController:
+    return ThreadpoolController()
+
+
 _NO_TABLE = np.empty((0, 2 * ALL_MOMENTS))
 _NO_BASIS, _NO_ENDS, _NOTHING = np.empty((0, 0, 0)), np.empty((0, 0, 0)), np.empty(0)
 
@@ -333,7 +339,11 @@ class Rollout:
             room.put(space)
 
         starts = range(0, count, step)
-        list(_threads().map(part, starts) if len(starts) > 1 else map(part, starts))
+        if len(starts) == 1:
+            part(0)
+            return
+        with _linear_algebra().limit(limits=1):  # threads of its own in each of ours only wait for each other
+            list(_threads().map(part, starts))
 
     def costs(
         self, segments: Segments, theta: FloatArray, x0: FloatArray, weights: FloatArray, basis: FloatArray,

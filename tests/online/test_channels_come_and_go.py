@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
 import pytest
 
 from quadid.data.window import Recording
 from quadid.flight import fly
-from quadid.identification.elimination import Reduced, StatePrior, Whitening, reduce_segments
 from quadid.identification.noise import NoiseModel
 from quadid.identification.problem import Shooting
 from quadid.model.layout import Layout
@@ -63,20 +61,6 @@ def test_noise_of_fewer_channels_than_the_data_have_leaves_the_others_out() -> N
 
 
 def test_kernels_refuse_arrays_that_they_would_overrun() -> None:
-    own, rows, channels, lanes = 9, 8, 9, 16
-    out, eye = np.zeros((1, 1, rows, channels, lanes)), np.repeat(np.eye(rows)[None], channels, axis=0)
-
-    def reduced(wide: int = channels, lane: int = 0, long: int = rows, segments: int = 1) -> None:
-        reduce_segments(
-            out, np.arange(own + 2) + lane, np.ones(own + 1), np.ones((1, rows, wide)),
-            Whitening(np.ones(channels), np.zeros(channels, dtype=bool), eye),
-            StatePrior(np.ones(own), 0.0, np.zeros((segments, 3))), Reduced.room(1, own, 1, long, wide),
-        )  # fmt: skip
-
-    reduced()
-    for wrong in ({"wide": 12}, {"lane": 10}, {"long": 4}, {"segments": 2}):
-        with pytest.raises((ValueError, IndexError)):
-            reduced(**wrong)
     window = flight(4.0).window
     rollout = Rollout(window, PELICAN)
     problem = Shooting.cut([window], PELICAN, 0.5)
