@@ -19,11 +19,12 @@ import rclpy
 import rclpy.parameter
 from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
 from rclpy.callback_groups import ReentrantCallbackGroup
-from rclpy.executors import ExternalShutdownException
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.parameter_client import AsyncParameterClient
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 
 from quadid.errors import QuadidError
@@ -31,7 +32,7 @@ from quadid.sanitise import one_line
 from quadid_node import messages
 from quadid_node.inputs import message_class, service_class, to_message
 from quadid_node.messages import PARAMETER_SET, SCHEMA_VERSION, TOPICS
-from quadid_node.process import without_shared_memory
+from quadid_node.process import SPIN_SECONDS, StopSignal, end_middleware, without_shared_memory
 
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL, reliability=ReliabilityPolicy.RELIABLE)
 SAME_MASS = 0.02
@@ -284,21 +285,33 @@ class BridgeNode(Node):
 
 
 def main(args: list[str] | None = None) -> int:
-    """Runs the bridge; returns the exit code: 0 done, 2 bad options."""
+    """Runs the bridge until SIGINT or SIGTERM; returns the exit code: 0 done, 2 bad options."""
+    code = _run(args, StopSignal())
+    end_middleware()
+    return code
+
+
+def _run(args: list[str] | None, stop: StopSignal) -> int:
     without_shared_memory()
-    rclpy.init(args=args)
-    code = 0
+    rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
     try:
-        rclpy.spin(BridgeNode())
+        node = BridgeNode()
     except QuadidError as error:
         print(f"bridge: {error}", file=sys.stderr)  # noqa: T201 - a command's last word
-        code = 2
-    except (KeyboardInterrupt, ExternalShutdownException):
+        return 2
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    try:
+        while not stop():
+            executor.spin_once(timeout_sec=SPIN_SECONDS)
+    except ExternalShutdownException:
         pass
     finally:
-        with contextlib.suppress(KeyboardInterrupt):
-            rclpy.try_shutdown()
-    return code
+        stop.ignore_more()
+        executor.shutdown()
+        node.destroy_node()
+        rclpy.try_shutdown()
+    return 0
 
 
 if __name__ == "__main__":

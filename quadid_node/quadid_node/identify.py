@@ -6,10 +6,7 @@ import contextlib
 import importlib
 import sys
 
-from quadid_node.process import StopSignal, end_middleware, without_shared_memory
-
-SPIN_SECONDS = 0.2
-"""Longest wait before signals are looked at [s]; the executor of these wheels needs a limit to deliver anything."""
+from quadid_node.process import SPIN_SECONDS, StopSignal, end_middleware, without_shared_memory
 
 
 def main(args: list[str] | None = None) -> int:

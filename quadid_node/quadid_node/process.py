@@ -10,6 +10,8 @@ import os
 import signal
 from types import FrameType
 
+SPIN_SECONDS = 0.2
+"""Longest wait before signals are looked at [s]; the executor of these wheels needs a limit to deliver anything."""
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _CHOSEN_BY_USER = ("FASTDDS_BUILTIN_TRANSPORTS", "FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PROFILES_FILE")
 

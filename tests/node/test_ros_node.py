@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from quadid_node.history import read_history
+from quadid_node.history import read_history, read_in_force
 from quadid_node.messages import WARN
 from quadid_node.process import without_shared_memory
 from quadid_node.zenoh import FleetView
@@ -70,7 +70,11 @@ def test_a_late_subscriber_gets_the_latched_set_and_the_replay_gives_the_same_bi
         shown = [branch for s in health[-1].status for branch in branches(s.name)]
         assert shown == ["quadid/Session", "quadid/Inputs", "quadid/Fit process", "quadid/History"]
         assert identify.end()[0] == 0
-    accepted = [c for c in candidates if c.state == ParameterSet.STATE_ACCEPTED][-1]
+    last = read_in_force(history, "pelican", None).item
+    assert last is not None
+    assert ear.until(lambda: any(c.sequence == last.sequence for c in candidates)), "said while nobody listened"
+    accepted = next(c for c in candidates if c.sequence == last.sequence)
+    assert accepted.state == ParameterSet.STATE_ACCEPTED
     assert dict(zip(accepted.names, accepted.values, strict=True))["b"] == pytest.approx(2.33e-5, rel=0.01)
     assert accepted.schema_version == ParameterSet.SCHEMA_VERSION
     assert len(accepted.boot_id) == 32
