@@ -358,8 +358,10 @@ class Decoder:
             yield Block(t, tuple(together))
 
     def _read(self, messages: Sequence[bytes]) -> tuple[IntArray, list[tuple[str, FloatArray]]] | None:
-        """Stamps [ns] and signals of messages; None where they must be looked at in smaller parts, and of a single one
-        that cannot be used, which is counted."""
+        """Stamps [ns] and signals of messages; None where they must be looked at in smaller parts.
+
+        A single message that cannot be used is counted.
+        """
         try:
             read = self._reader.read(messages)
             told = [] if read is None else self._kind.signals(read.blocks, read.extra)

@@ -120,7 +120,7 @@ class MotorOrder:
         return motor_outputs(self._parameters, self._rotors, width, message, self.ardupilot)
 
     def esc_groups(self) -> list[str]:
-        """ArduPilot's messages of ESCs that may be motors: those on their outputs, and the first ones."""
+        """Messages of ArduPilot's ESCs that may be motors: those on their outputs, and the first ones."""
         columns = motor_outputs(self._parameters, self._rotors, ESCS, "ESC", self.ardupilot).columns
         return [ESC_GROUPS[k] for k in sorted({k // 4 for k in (*columns, *range(self._rotors))})]
 
@@ -148,9 +148,7 @@ _MOTORS = {"esc": "rotor_speed", "servo": "motor_command", "actuator": "motor_co
 
 @dataclass
 class _Round:
-    """Values of the messages of one round, by output, how many outputs they tell, where the last one began, and the
-    time of the first [s].
-    """
+    """Values of one round's messages by output, their number, begin of the last message, time of the first [s]."""
 
     row: list[float] = field(default_factory=lambda: [math.nan] * ESCS)
     width: int = 0

@@ -65,5 +65,12 @@ def test_the_manifest_is_valid_by_its_schema() -> None:
 
 
 def test_code_passes_the_linter_of_ros_with_lines_of_this_length() -> None:
-    flake8 = pytest.importorskip("ament_flake8.main", reason="one of ROS' linters: runs where ROS is installed")
+    flake8 = pytest.importorskip("ament_flake8.main", reason="one of ROS' linters: comes with ROS, and with 'make dev'")
     assert flake8.main(argv=["--config", str(PACKAGE / "setup.cfg"), str(PACKAGE)]) == 0
+
+
+def test_docstrings_pass_the_linter_of_ros_in_the_form_that_is_used_here() -> None:
+    pep257 = pytest.importorskip("ament_pep257.main", reason="one of ROS' linters: comes with ROS, and with 'make dev'")
+    left_out = ["D105", "D107", "D417"]  # magic methods; arguments that their names explain
+    given = ["--convention", "google", "--add-ignore", *left_out, "--"]
+    assert pep257.main(argv=[*given, str(PACKAGE / "quadid_node"), str(PACKAGE / "launch")]) == 0
