@@ -1,4 +1,4 @@
-"""Files of users: opened without waiting for what is none, a pipe that nobody writes or reads."""
+"""Files of users: opened without waiting for a pipe that nobody writes or reads, and written whole or not at all."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import contextlib
 import errno
 import os
 import stat
+from collections.abc import Iterator
 from pathlib import Path
 
 
@@ -18,6 +19,31 @@ def unwaited(name: str, flags: int) -> int:
     descriptor = os.open(name, flags | os.O_NONBLOCK, 0o666)
     os.set_blocking(descriptor, True)
     return descriptor
+
+
+@contextlib.contextmanager
+def written_whole(target: Path) -> Iterator[Path]:
+    """A name under which to write a file whole or not at all; a pipe or device is written to where one stands there.
+
+    Where a link stands, it is the link that is replaced.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    # /dev/stdout is a link that the system keeps, to a file where one was redirected.
+    ways = os.path.realpath(target.parent) + "/", os.readlink(target) if target.is_symlink() else ""
+    if target.exists() and (not target.is_file() or any(way.startswith("/proc/") for way in ways)):
+        with open(target, "wb", opener=unwaited):  # held open: whatever writes it next need not wait for a reader
+            yield target
+        return
+    part = target.with_name(f".{os.getpid()}.{target.name[-24:]}")
+    try:
+        part.unlink(missing_ok=True)  # a link that somebody laid there would be followed
+        yield part
+        os.replace(part, target)
+    finally:
+        with contextlib.suppress(OSError):
+            part.unlink(missing_ok=True)
 
 
 def read_regular(path: str | Path, most: int = 1 << 20) -> bytes:

@@ -95,9 +95,10 @@ def unreliable(parameters: Iterable[Parameter], names: Collection[str]) -> tuple
 def _scaled(p: Parameter, factor: float, sigma: float) -> Parameter:
     """A parameter times a factor whose logarithm has this standard deviation."""
     value = p.value * factor
-    down, up = (math.hypot(math.log(end) - math.log(p.value), Z95 * sigma) for end in p.ci95)
-    interval = value * math.exp(-down), value * math.exp(up)
-    return replace(p, value=value, sigma=factor * math.hypot(p.sigma, sigma * p.value), ci95=interval)
+    with np.errstate(divide="ignore", over="ignore", invalid="ignore"):  # ends of an interval may be 0 and infinite
+        away = np.hypot(np.log(p.ci95) - np.log(p.value), Z95 * sigma)
+        low, high = (value * np.exp(away * [-1.0, 1.0])).tolist()
+    return replace(p, value=value, sigma=factor * math.hypot(p.sigma, sigma * p.value), ci95=(low, high))
 
 
 @dataclass(frozen=True)

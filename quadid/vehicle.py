@@ -23,7 +23,7 @@ from pydantic import (
 
 from quadid.effects import EFFECTS, Scale, known_keys, rotor_drag_losses
 from quadid.errors import ParameterError, VehicleError, nearest
-from quadid.files import read_regular, unwaited
+from quadid.files import read_regular, written_whole
 from quadid.parameters import INERTIAS, MAY_VANISH, NOMINAL_NAMES, VANISHED, impossible_inertia
 from quadid.sanitise import LONGEST_LINE, LONGEST_NAME, plain
 from quadid.types import FloatArray
@@ -763,8 +763,8 @@ class Vehicle(Strict):
     def save(self, path: str | Path) -> Path:
         """Writes the vehicle file; returns its absolute path."""
         target = Path(path).absolute()
-        with open(target, "w", encoding="utf-8", opener=unwaited) as file:
-            file.write(self.to_yaml())
+        with written_whole(target) as part:
+            part.write_text(self.to_yaml(), encoding="utf-8")
         return target
 
 

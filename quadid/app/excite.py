@@ -56,6 +56,7 @@ class Proposed(Reported):
         forms: what flies it is written in these as well (`quadid.report.manoeuvres.FORMS`).
     """
 
+    endings = (".manoeuvre*", ".sticks.txt", ".sid_*.param")
     result: dict[str, Any]
     proposal: Proposal
     manoeuvre: str

@@ -72,6 +72,7 @@ class Gains(Reported):
         before: those with the gains flown so far, where they are known.
     """
 
+    endings = (".gains.*",)
     result: dict[str, Any]
     loops: Mapping[str, Loops]
     before: Mapping[str, Loops]

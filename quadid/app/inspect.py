@@ -15,6 +15,7 @@ from quadid.app.logs import (
     Flight,
     Log,
     LogPart,
+    file_name,
     flown_parts,
     gridded,
     left_on_ground,
@@ -41,6 +42,7 @@ if TYPE_CHECKING:
 class Inspected(Outcome):
     """Contents of a log; `result` has the form ``quadid.inspect/1``."""
 
+    endings = (".inspect.json",)
     result: dict[str, Any]
     found: Inspection
 
@@ -82,7 +84,7 @@ class Inspected(Outcome):
 
     def write(self, folder: Path, kept: str | None = None) -> list[tuple[str, Path]]:
         """Writes the inspection as JSON."""
-        path = folder / f"{Path(self.result['log']).name}.inspect.json"
+        path = folder / f"{file_name(self.result['log'])}.inspect.json"
         self.result["files"] = [str(path)]
         return [("Written", write_text(path, json_text(self.result)))]
 

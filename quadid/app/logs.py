@@ -6,7 +6,7 @@ import math
 import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
@@ -22,6 +22,7 @@ from quadid.data.grid import linear
 from quadid.data.window import Recording, Window
 from quadid.errors import LogError, QuadidError, VehicleError
 from quadid.files import unwaited
+from quadid.files import written_whole as whole
 from quadid.sanitise import LONGEST_NAME
 from quadid.types import FloatArray, IntArray
 from quadid.vehicle import MOST_FLIGHTS, FittedFlight, Vehicle
@@ -44,33 +45,14 @@ class OutputError(QuadidError):
 
 @contextmanager
 def written_whole(target: Path) -> Iterator[Path]:
-    """A name under which to write a file whole or not at all; a pipe or device is written to where one stands there.
-
-    Where a link stands, it is the link that is replaced.
-
-    Raises:
-        OutputError: it cannot be written.
-    """
-    # /dev/stdout is a link that the system keeps, to a file where one was redirected.
-    ways = os.path.realpath(target.parent) + "/", os.readlink(target) if target.is_symlink() else ""
-    there = target.exists() and (not target.is_file() or any(way.startswith("/proc/") for way in ways))
-    part = target if there else target.with_name(f".{os.getpid()}.{file_name(target.name[-24:])}")
+    """`quadid.files.written_whole`; raises OutputError where that cannot be done."""
     try:
-        if there:
-            with open(part, "wb", opener=unwaited):  # held open: whatever writes it next need not wait for a reader
-                yield part
-        else:
-            part.unlink(missing_ok=True)  # a link that somebody laid there would be followed
+        with whole(target) as part:
             yield part
-            os.replace(part, target)
     except OSError as error:
         raise OutputError(
             f"{target} cannot be written ({error.strerror})", fix="check permissions and free space"
         ) from error
-    finally:
-        if not there:
-            with suppress(OSError):
-                part.unlink(missing_ok=True)
 
 
 def write_text(path: str | Path, text: str) -> Path:
@@ -93,10 +75,15 @@ _pipes: list[int] = []
 """Pipes to be written later: the reader of one ends when its last writer does."""
 
 
-def check_place(file: Path, option: str) -> None:
-    """Raises OutputError when a file to be written later cannot be; `option` is what the user named it by."""
+def check_place(file: Path, option: str, inside: bool = False) -> None:
+    """Raises OutputError when a file to be written later cannot be.
+
+    Args:
+        option: what the user named it by; `inside`: or the folder that it will be in.
+    """
     if file.is_dir():
-        raise OutputError(f"{option} {file} is a directory", "a file name", f"name a file in it: {file / 'result'}")
+        fix = "remove it, or choose another folder" if inside else f"name a file in it: {file / 'result'}"
+        raise OutputError(f"{option} {file} is a directory", "a file name", fix)
     folder = file.absolute().parent
     if not folder.is_dir():
         raise OutputError(f"{option}: no folder {folder}", "an existing folder", f"mkdir -p {folder}")
@@ -125,14 +112,14 @@ def check_folder(folder: Path, option: str, *names: str) -> Path:
     if not os.access(folder, os.W_OK | os.X_OK):
         raise OutputError(f"{folder} is not writable", "a folder you may write to", f"choose another {option}")
     for file in (found for name in names for found in folder.glob(name) if not found.is_file()):
-        check_place(file, option)
+        check_place(file, option, inside=True)
     return folder.resolve()
 
 
 def write_texts(place: str | Path, texts: Mapping[str, str]) -> list[Path]:
     """Writes texts by file name into a folder, or the only one under the name that `place` is; returns absolute paths.
 
-    A place is a file name where it has a suffix and is no folder.
+    A place is a file name where it has a suffix and is no folder.  All are looked at before the first is written.
 
     Raises:
         OutputError: several texts for one file, or a place that cannot be written to.
@@ -140,6 +127,8 @@ def write_texts(place: str | Path, texts: Mapping[str, str]) -> list[Path]:
     where = Path(place)
     if where.is_dir() or not where.suffix:
         make_folder(where)
+        for name in texts:
+            check_place(where / name, "file", inside=True)
         return [write_text(where / name, text) for name, text in texts.items()]
     if len(texts) != 1:
         raise OutputError(f"{where} is one file, this holds {len(texts)} files", "a folder", f"{where.parent}")

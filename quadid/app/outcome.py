@@ -59,10 +59,12 @@ class Outcome(ABC):
 
     Attributes:
         title: what was asked for, for the page of a failure; empty where there is none.
+        endings: of files that it writes under the names of its vehicle and logs, `*` for what is not known before.
         result: plain data of the command's JSON, without the files that only the command writes.
     """
 
     title: ClassVar[str] = ""
+    endings: ClassVar[tuple[str, ...]] = ()
     result: dict[str, Any]
 
     def tables(self) -> list[TextTable]:
@@ -248,12 +250,15 @@ class Fitted(Reported):
     """A result from logs that were fitted and scored.
 
     Attributes:
+        over_time: endings of what `save_series` writes.
         sets: scored logs, for pictures.
         logs: the same ones as loaded, training logs first.
         forces: what the models miss on them; None where no gyro or accelerometer shows it.
         beside: what acts beside the values of the vehicle file.
     """
 
+    endings = ("*.yaml",)
+    over_time: ClassVar[tuple[str, ...]] = (".*simulated.*", ".*missing.csv")
     sets: list[ScoredSet]
     logs: list[Log]
     forces: MissingForces | None = None

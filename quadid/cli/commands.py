@@ -277,21 +277,20 @@ def _run(
     typed: Mapping[str, Any], given: Mapping[str, Any],
 ) -> None:  # fmt: skip
     from quadid.app.logs import check_folder, file_name, parse_part, write_text
-    from quadid.app.outcome import UnansweredError
+    from quadid.app.outcome import Fitted, UnansweredError
     from quadid.cli import terminal
     from quadid.errors import QuadidError
     from quadid.vehicle import Vehicle
 
     # Places to write to are looked at before any work.
-    texts = [t for n in typed if typed[n].option.metavar == "LOG" for t in given[n] or ()]
+    logged = [given[n] for n in typed if typed[n].option.metavar == "LOG" and given[n]]
+    texts = [text for one in logged for text in ([one] if isinstance(one, str) else one)]
     json, report, series, out = (given.get(name) for name in ("json", "report", "series", "out"))
     terminal.check_file(json, "--json")
     folder = None if out is None else check_folder(out, "--out")
-    if series is not None:
-        names = (file_name(parse_part(text).path.name) for text in texts)
-        check_folder(
-            series, "--series", *(f"{name}.*{kind}" for name in names for kind in ("simulated.*", "missing.csv"))
-        )
+    names = [file_name(parse_part(text).path.name) for text in texts]
+    if series is not None and issubclass(outcome, Fitted):
+        check_folder(series, "--series", *(name + end for name in names for end in outcome.over_time))
     terminal.check_file(report, "--report")
 
     # What was not typed is as the function has it.
@@ -301,8 +300,9 @@ def _run(
         asked = inspect.signature(check).parameters
         check(**{name: told.get(name, p.default) for name, p in signature.parameters.items() if name in asked})
     vehicle = next((value for value in told.values() if isinstance(value, Vehicle)), None)
-    if folder is not None and vehicle is not None:
-        check_folder(folder, "--out", f"{file_name(vehicle.name)}*.yaml")
+    names += [file_name(vehicle.name)] if vehicle is not None else []
+    if folder is not None:
+        check_folder(folder, "--out", *(name + end for name in names for end in outcome.endings))
     logs = [name for name in typed if typed[name].opened and name in told]
     how = {name: given[name] for name in ("rate", *command.reading) if name in given}
 

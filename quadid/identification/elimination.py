@@ -19,6 +19,8 @@ ANGLES_AND_RATES = 6
 """Directions of an initial state before those of its velocity."""
 ROUNDING = 1e-15
 """Share by which squares are raised before a factor is made of them."""
+LEFT = 1e-12
+"""A cost of which the elimination leaves a smaller share is made of rounding, where that is more than a unit of it."""
 
 
 class StatePrior(NamedTuple):
@@ -139,6 +141,7 @@ def reduce_segments(white: FloatArray, prior: StatePrior, into: Reduced) -> None
     into.cost[:] = cost - taken[:, -1, -1]
     into.gram[:] = products[:, 1 + own :, 1 + own :] - taken[:, :-1, :-1]
     into.grad[:] = products[:, 0, 1 + own :] - taken[:, -1, :-1]
+    into.largest[into.cost < LEFT * cost - 1.0] = np.inf
 
 
 # --- Normal equations of some parameters once others are fitted along: the Schur complement

@@ -37,7 +37,7 @@ from quadid.identification.search import SWARM_SECONDS, swarm_search
 from quadid.model.layout import IMU_PERIOD, Layout
 from quadid.online.records import Job, JobReply
 from quadid.parameters import NOMINAL_NAMES
-from quadid.types import BoolArray, FloatArray
+from quadid.types import BoolArray, FloatArray, check_shapes
 from quadid.vehicle import Vehicle
 
 SIX = len(NOMINAL_NAMES)
@@ -297,8 +297,8 @@ def fit(request: FitRequest) -> FitReply:
     # 2. Gyro and accelerometer in time.
     late, period = _late(request), request.theta[IMU_PERIOD]
     request = _in_time(request, late)
-    # 3. Where nothing is known yet: global search, then the maximum over the longest stretch; steps to it over much
-    # more than before; now and then the noise numbers of this window.
+    # 3. Where nothing is known yet, or a delay shows first: global search, then the maximum over the longest stretch;
+    # steps to it over much more than before; now and then the noise numbers of this window.
     z, noise, found = request.z, request.noise, None
     if noise is None:
         z, noise = _maximum(request, late)
@@ -306,7 +306,9 @@ def fit(request: FitRequest) -> FitReply:
         if not np.isfinite(z).all():
             return FitReply(request.number, problem="the simulation diverges at every point tried", excitation=bounds)
     elif request.learned:
-        z, noise = _renewed(request, replace(noise, late=late))
+        if (late > 0.0) != (noise.late > 0.0):  # what is known was found with a gyro out of time
+            z, noise = _maximum(request, late)
+        z, noise = _renewed(replace(request, z=z), replace(noise, late=late))
         found = noise
     elif request.measure:
         found = _followed(request, noise)
@@ -374,6 +376,8 @@ def _places(problem: Problem, vehicle: Vehicle) -> list[int]:
 
 def _like(problem: Problem, vehicle: Vehicle, z: FloatArray, noise: Noise) -> tuple[Problem, FloatArray]:
     """The problem in the units of the noise at hand, and its own part of z."""
+    shapes = ("psi", noise.psi, (k.N_NOISE,)), ("tail", noise.tail, (4,)), ("control", noise.control, (3,))
+    check_shapes("filter", ("z", z, (len(names_of(vehicle)),)), *shapes)
     own = z[_places(problem, vehicle)]
     problem = replace(problem, control=noise.control, tail=noise.tail)
     return replace(problem.based_on(own)[0], control=noise.control), own

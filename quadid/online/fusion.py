@@ -304,12 +304,14 @@ class Fusion:
         """Estimate from a sum by the first `own` parameters, the rest taken to be none."""
         part, mean, sigma = slice(own), self._mean[:own], (self._sigma if self._met else self._without)[:own]
         precision, net, loose = 1.0 / sigma**2, total.information[part, part], total.loose[:, part]
-        # What noise of the rotors explains is no information, but there is never less than the prior's.
+        # What noise of the rotors explains is no information, but there is never less than the prior's; where noise
+        # explains more than there is, nothing was told.
         size, turned = np.linalg.eigh(sigma[:, None] * net * sigma)
-        turned = turned / sigma[:, None]
+        lost, turned = turned[:, size < 0.0], turned / sigma[:, None]
+        vector = total.vector[part] - lost @ (lost.T @ (sigma * total.vector[part])) / sigma
         inverse = np.linalg.inv(np.diag(precision) + (turned * np.maximum(size, 0.0)) @ turned.T)
         # A loop faster than the log answers a random moment within a step: by half of what it may, give or take that.
-        z = inverse @ (total.vector[part] + precision * mean + loose[:-1].sum(axis=0))
+        z = inverse @ (vector + precision * mean + loose[:-1].sum(axis=0))
         for i in self._positive:
             z = z - inverse[:, i] / inverse[i, i] * min(z[i], 0.0)
         spread = net + total.noise[part, part] + np.diag(precision) + loose.T @ loose

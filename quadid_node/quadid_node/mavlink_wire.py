@@ -21,7 +21,7 @@ from pymavlink.dialects.v20 import ardupilotmega
 from quadid_replay.mavlink_messages import extend_dialect, two_rows
 
 from quadid.errors import QuadidError
-from quadid.files import read_regular
+from quadid.files import read_regular, written_whole
 
 # --- Time stamps of signatures over a restart, as the MAVLink specification asks: what was sent before it is a replay
 
@@ -75,14 +75,12 @@ class SigningMemory:
         self._saved_at = now
         last = sorted(streams.items(), key=lambda entry: -entry[1])[:_MOST_STREAMS]
         kept = {"newest": last[0][1], "streams": {".".join(map(str, stream)): stamp for stream, stamp in last}}
-        aside = self._path.with_suffix(".new")
         try:
             self._path.parent.mkdir(parents=True, exist_ok=True)
-            with aside.open("w", encoding="ascii") as file:
+            with written_whole(self._path) as part, part.open("w", encoding="ascii") as file:
                 json.dump(kept, file)
                 file.flush()
                 os.fsync(file.fileno())
-            aside.replace(self._path)
         except OSError as error:
             self.problem = f"time stamps of signatures cannot be kept in {self._path} ({error.strerror})"
             return

@@ -10,6 +10,7 @@ python -m quadid_node.wire_format FILE  # does a job that failed and was kept ag
 from __future__ import annotations
 
 import contextlib
+import errno
 import math
 import sys
 import time
@@ -122,12 +123,16 @@ def folder_of(history: Path) -> Path:
 
 def keep(history: Path, job: Job) -> str:
     """Keeps the input of a job, and the newest `MOST` of all; returns where, or why not, for people."""
-    path = folder_of(history) / f"{time.time_ns():020d}-{type(job).__name__}{SUFFIX}"
+    folder = folder_of(history)
+    path = folder / f"{time.time_ns():020d}-{type(job).__name__}{SUFFIX}"
     try:
-        path.parent.mkdir(exist_ok=True)
+        folder.mkdir(exist_ok=True)
+        if folder.is_symlink():  # whose oldest files would be removed
+            raise OSError(errno.ELOOP, "a link stands there", str(folder))
+        others = sorted(folder.glob(f"*{SUFFIX}"))
         path.write_bytes(pack(job))
-        for old in sorted(path.parent.glob(f"*{SUFFIX}"))[:-MOST]:
-            with contextlib.suppress(FileNotFoundError):
+        for old in others[: 1 - MOST]:
+            with contextlib.suppress(OSError):
                 old.unlink()
     except (OSError, ParcelError) as error:
         return f"its input could not be kept ({error})"

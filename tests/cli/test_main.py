@@ -27,7 +27,7 @@ from quadid_replay.writers import open_for_writing
 from quadid.app.excite import Proposed
 from quadid.app.fleet_page import Fleet
 from quadid.app.identify import identify
-from quadid.app.logs import load, write_recording, write_text
+from quadid.app.logs import OutputError, load, write_recording, write_text, write_texts
 from quadid.app.simulate import read_manoeuvre
 from quadid.cli.commands import COMMANDS
 from quadid.cli.history import Stored
@@ -233,6 +233,9 @@ INSIDE = {
     "flights/set1.mcap": ("reproduce", "--quick"),
     "pelican+ground.yaml": ("diagnose", "no.csv", "--vehicle", "pelican"),
     "no.csv.missing.csv": ("identify", "no.csv", "--vehicle", "pelican"),
+    "pelican.gains.params": ("gains", "--vehicle", "pelican", "--format", "px4"),
+    "pelican.sid_1_roll.param": ("excite", "no.csv", "--vehicle", "pelican", "--format", "ardupilot-sid"),
+    "no.csv.inspect.json": ("inspect", "no.csv"),
 }
 
 
@@ -255,6 +258,16 @@ def test_a_file_in_a_folder_that_cannot_be_written_is_said_before_any_work(
     happened(35, f"{name} in the folder of results is a {what}: '{done.err.strip()[:90]}'")
 
 
+def test_of_several_files_none_is_written_where_one_cannot_be(tmp_path: Path, happened: Happened) -> None:
+    """Those before it were written, beside older ones of its name."""
+    texts = {"a.yaml": "new", "b.lua": "new", "c.param": "new"}
+    (tmp_path / "b.lua").mkdir()
+    with pytest.raises(OutputError, match=r"b\.lua is a directory.*another folder"):
+        write_texts(tmp_path, texts)
+    assert [p.name for p in tmp_path.iterdir()] == ["b.lua"]
+    happened(35, "one of three files of an export is a folder: told, none of the others written")
+
+
 def test_links_under_the_names_of_what_is_written_over_time_are_replaced(
     flights: Flights, tmp_path: Path, happened: Happened
 ) -> None:
@@ -269,6 +282,12 @@ def test_links_under_the_names_of_what_is_written_over_time_are_replaced(
         path.symlink_to(mine)
     for path in logs:
         write_recording(path, log.recording)
+    stamps = tmp_path / "stamps.json"
+    for path in (saved := tmp_path / "saved.yaml", stamps):
+        path.symlink_to(mine)
+        logs.append(path)
+    done.vehicle.save(saved)
+    SigningMemory(stamps, SimpleNamespace(stream_timestamps={(1, 1, 1): 5}, timestamp=0)).keep(at_once=True)
     assert done.save_series(tmp_path) == series
     assert mine.read_text() == "precious"
     assert not [path for path in (*logs, *series) if path.is_symlink()]

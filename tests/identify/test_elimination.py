@@ -5,7 +5,24 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from quadid.identification.elimination import eliminated, freed
+from quadid.identification.elimination import Reduced, StatePrior, eliminated, freed, reduce_segments
+
+
+@pytest.mark.parametrize("grown", [1.0, 1e3, 1e6, 1e9, 1e10, 1e12, 1e14])
+def test_a_cost_of_which_rounding_is_left_is_one_that_ran_away(grown: float) -> None:
+    """Where all columns grow alike, the costs were 0 or less than nothing: better than that of every right model."""
+    rng, own, free, rows = np.random.default_rng(0), 9, 6, 700
+    mode = grown ** np.linspace(0.0, 1.0, rows)[:, None] * rng.normal(size=rows)[:, None]
+    white = rng.normal(size=(4, rows, 1 + own + free)) + mode * rng.normal(size=(4, 1, 1 + own + free))
+    prior, into = StatePrior(np.ones(own), 0.0, np.zeros((4, 3))), Reduced.room(4, own, free, rows, 1)
+    reduce_segments(white, prior, into)
+    for columns, cost, largest in zip(white, into.cost, into.largest, strict=True):
+        basis = np.linalg.qr(np.vstack([columns[:, 1 : 1 + own], np.eye(own)]))[0]
+        left = np.append(columns[:, 0], np.zeros(own))
+        for _ in range(2):
+            left -= basis @ (basis.T @ left)
+        assert np.isinf(largest) or cost == pytest.approx(left @ left, rel=0.01)
+        assert np.isinf(largest) == (grown > 1e6)
 
 
 @pytest.mark.parametrize(("stay", "go"), [(1, 4), (3, 2), (3, 0), (0, 2)])

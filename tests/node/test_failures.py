@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 from quadid_node.history import Store
 from quadid_node.service import Service
@@ -50,6 +51,29 @@ def test_the_input_of_an_unexpected_error_is_kept_for_replay(tmp_path: Path, hap
     assert len(list(folder_of(store.path).iterdir())) <= MOST
     store.close()
     happened(11, f"a fit with an error of the program: told, its input kept ({size} bytes), done again")
+
+
+def test_a_link_beside_the_history_has_no_file_of_another_folder_removed(tmp_path: Path, happened: Happened) -> None:
+    """The oldest of what is kept is removed: in the folder of the user that a link of that name leads to, too."""
+    history, mine = tmp_path / "h.sqlite", tmp_path / "mine"
+    mine.mkdir()
+    names = [f"{i}.job" for i in range(MOST + 2)]
+    for name in names:
+        (mine / name).touch()
+    folder_of(history).symlink_to(mine)
+    request = FitRequest(1, PELICAN, (), 0.0, 1.0, np.ones(3), np.ones(3), None, 0, ())
+    assert "could not be kept" in keep(history, request)
+    assert sorted(path.name for path in mine.iterdir()) == sorted(names)
+    happened(11, "a link where inputs of failed jobs are kept: refused, the files it leads to are there")
+
+
+def test_files_that_claim_to_be_newer_do_not_have_an_input_removed(tmp_path: Path) -> None:
+    history = tmp_path / "h.sqlite"
+    folder_of(history).mkdir()
+    for i in range(MOST):
+        (folder_of(history) / f"~{i}.job").mkdir()
+    request = FitRequest(1, PELICAN, (), 0.0, 1.0, np.ones(3), np.ones(3), None, 0, ())
+    assert isinstance(repeat(Path(keep(history, request).removeprefix("its input is in "))), FitReply)
 
 
 def test_a_file_that_holds_no_job_is_refused(tmp_path: Path) -> None:

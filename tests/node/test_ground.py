@@ -29,9 +29,11 @@ from quadid_node.wire_format import KINDS, LARGEST, LARGEST_RECORD, ParcelError,
 from quadid_node.worker import InlineWorker, ProcessWorker, Trouble
 from quadid_node.zenoh import FleetView, ZenohLink
 
+from quadid.estimate.kalman import N_NOISE
 from quadid.online import FitReply, FitRequest, Session, SessionSettings
 from quadid.online.background_diagnosis import DiagnosisReply
 from quadid.online.change_job import ChangeReply
+from quadid.online.fit_job import Noise
 from quadid.online.records import OnlineFinding
 from quadid.vehicle import Vehicle
 from quadid_node import ground
@@ -403,12 +405,18 @@ def served(monkeypatch: pytest.MonkeyPatch, payloads: list[bytes]) -> list[_Quer
     return queries
 
 
+NOISE = Noise(np.ones(N_NOISE), np.zeros(4), np.ones(3), 0.0)
+WRONG = [(NOISE.psi, np.zeros(0), NOISE.control), (NOISE.control,) * 3, (NOISE.psi, NOISE.tail, np.zeros(0))]
+"""Noise of other sizes than the filter reads."""
+
+
 def test_requests_that_make_no_sense_do_not_end_the_ground_machine(
     request_: FitRequest, monkeypatch: pytest.MonkeyPatch, happened: Happened
 ) -> None:
     broken = [
         replace(request_, theta=np.ones(3)), replace(request_, theta=np.full_like(request_.theta, np.nan)),
         replace(request_, windows=()), replace(request_, theta=np.zeros((3, 3))),
+        *(replace(request_, noise=Noise(*sizes, 0.0)) for sizes in WRONG), replace(request_, noise=NOISE, z=np.ones(5)),
     ]  # fmt: skip
     answers = [unpack(q.answers[0]) for q in served(monkeypatch, [pack(item) for item in [*broken, request_]])]
     assert all(reply.problem for reply in answers[:-1])

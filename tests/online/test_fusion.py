@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from quadid.estimate.kalman import N_NOISE
 from quadid.flight import Flight, Segment, fly
 from quadid.model.layout import B
 from quadid.online import FitReply, FitRequest, Session, SessionSettings
@@ -72,6 +75,19 @@ def test_a_score_that_is_not_zero_is_a_step_still_to_be_made() -> None:
     fused = learner.estimate()
     assert fused is not None
     assert np.allclose(fused.z, best, atol=1e-8)
+
+
+def test_where_noise_explains_more_than_there_is_nothing_is_told() -> None:
+    """Rotor speeds rounded to 20 rad/s drove J_xx to e^600 times the guess and b to a tenth: it was "on the ground"."""
+    point, information, axis = np.full(P, 0.1), 1e4 * np.eye(P), np.full(P, 1.0 / np.sqrt(P))
+    learner = fusion()
+    learner.add(replace(window(0.0, point, information), noise=3e4 * np.outer(axis, axis)))
+    fused = learner.estimate()
+    assert fused is not None
+    assert fused.z == pytest.approx(0.0, abs=1e-6)
+    assert axis @ fused.covariance @ axis > PRIOR[0] ** 2
+    aside = np.append([1.0, -1.0], np.zeros(P - 2)) / np.sqrt(2.0)
+    assert aside @ fused.covariance @ aside == pytest.approx(1e-4, rel=1e-3)
 
 
 def test_stretches_are_what_was_told_between_two_moments() -> None:
@@ -199,6 +215,25 @@ def test_a_low_pass_of_the_gyro_does_not_pass_for_a_smaller_inertia(
     sigma, off = estimated(fly(PELICAN, None, 24.0, 1, effects=effects, noise_scale=0.1), 1150, vehicle)
     assert np.all(np.abs(off) < 3.0 * sigma)
     assert np.all(np.abs(off)[[B, *ROLL_PITCH]] < 0.01)
+
+
+def test_a_delay_that_shows_late_is_not_searched_from_what_was_found_with_it() -> None:
+    """An attitude that began after 25 s left inertias a thousandth, and noise that explained all of the flight."""
+    flown = fly(PELICAN, None, 24.0, 1, effects={"imu_lag": {"cutoff": 8.0}})
+    cut, learner = flown.window.slice(50, 1150), Estimator(PELICAN, 1e9, 10.0, 0)
+    first = replace(cut.slice(0, 500), attitude=None)
+    asked = learner.request(1, WindowCut((first,), 10.0, 0), first.t0, first.t0 + 10.0)
+    learner.take(asked, asked.answer())
+    asked = learner.request(2, WindowCut((cut.slice(600, 1100),), 10.0, 0), cut.t0 + 12.0, cut.t0 + 22.0)
+    assert asked.noise is not None
+    psi = asked.noise.psi * np.where(np.arange(N_NOISE) < 3, 1e-4, np.where(np.arange(N_NOISE) < 18, 30.0, 1.0))
+    spans = (cut.t0, cut.t0 + 10.0), (cut.t0 + 10.0, cut.t0 + 22.0)
+    asked = replace(asked, noise=replace(asked.noise, psi=psi), z=asked.z + 0.3, learned=(cut,), spans=spans)
+    learner.take(asked, asked.answer())
+    assert learner.noise is not None
+    assert learner.noise.late > 0.015
+    for name in ("b", "J_xx", "J_yy"):
+        assert learner.value(name) == pytest.approx(flown.truth.parameters.as_dict()[name], rel=0.02)
 
 
 def estimated(flown: Flight, last: int, vehicle: Vehicle = PELICAN) -> tuple[FloatArray, FloatArray]:

@@ -164,6 +164,14 @@ def test_what_the_reference_left_open_buys_no_room(
     assert decision.check == ("approval" if passes else "reference")
 
 
+def test_an_interval_from_nothing_to_infinity_stays_one() -> None:
+    """Of an estimate known to a thousand times its value: an unexpected error, after which learning restarted."""
+    narrow = parameter_set(TRUE, sigma=0.001)
+    vague = [replace(p, ci95=(0.0, math.inf)) for p in narrow.parameters]
+    wide = ParameterSet(tuple(vague), np.array(narrow.covariance)).scaled_together(0.09)
+    assert {p.ci95 for p in wide.parameters} == {(0.0, math.inf)}
+
+
 def test_a_file_whose_values_have_a_factor_in_common_tells_torque_over_inertia() -> None:
     """As a set without a reference is exported: each value to 8 %, b over J to 0.1 %."""
     stated = parameter_set(TRUE, sigma=0.001).scaled_together(0.08)
