@@ -18,7 +18,7 @@ NUMBA_SETTINGS = Path(".numba_config.yaml")
 def refuse() -> None:
     """Raises ImportError in a folder whose settings of numba would change what is computed."""
     if NUMBA_SETTINGS.exists():
-        what = f"{NUMBA_SETTINGS} in this folder would change what is computed, and run code from where it says"
+        what = f"{NUMBA_SETTINGS} in this folder would change what is computed, and run code from elsewhere"
         raise ImportError(f"{what}; fix: change to another folder, or remove it", name="quadid")
 
 

@@ -136,12 +136,12 @@ def compare_vehicles(
 ) -> Compared:  # fmt: skip
     """Predicts the same flights with two vehicle files, from the same starts.
 
-    The ratio of their mean errors comes with an interval from whole blocks of starts, drawn anew with their errors by
-    both (paired block bootstrap): runs that overlap err alike, and a hard stretch is hard for both.
+    The ratio of their mean errors gets an interval by a paired block bootstrap: whole blocks of starts are drawn anew,
+    because runs that overlap have similar errors, and each block with the errors of both files.
 
     Args:
         a: a shipped vehicle or a vehicle file; its values are taken as they are.
-        b: the other one, likewise.
+        b: the other vehicle or vehicle file.
         on: a flight to predict, or several.
         horizons: samples of the grid after the start of each run, or times, as ``0.1s``.
         rate: of the grid [Hz]; None for each log's own.

@@ -171,7 +171,7 @@ def diagnose(
     removed = None if forces is None else _removed(forces, found, selection, fit.vehicle)
     if found.verdict is Explanation.PARTLY_EXPLAINED and removed is not None and removed < LEAST_REMOVED:
         told = (
-            f"the causes take only {100.0 * removed:.0f} % off the squared missing force and moment: none is confident"
+            f"the causes remove only {100.0 * removed:.0f} % of the squared missing force and moment: none is confident"
         )
         doubted = tuple(replace(f, confident=False) for f in found.findings)
         found = replace(found, verdict=Explanation.UNKNOWN, findings=doubted, warnings=(*found.warnings, told))

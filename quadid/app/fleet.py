@@ -64,7 +64,7 @@ def fleet(
     columns: NamedColumns = None,
     advance: Advance = silent,
 ) -> Fleet:
-    """Identifies every log of a folder in parallel on Dask; run again, it goes on where it was.
+    """Identifies every log of a folder in parallel on Dask; a second run continues where the first stopped.
 
     Rows of all logs and vehicles are written as SQLite and Parquet.
 

@@ -330,8 +330,8 @@ def every_log(logs: Sequence[Json]) -> JsonDict:
         ]  # fmt: skip
         tables.append(rows_of(head, rows, f"{unit}: {len(rows)} log{'s' * (len(rows) != 1)}", "compact"))
     intro = (
-        "Squared errors over what the model expects, before and after: 1 is right about its own errors. The worst "
-        "come first. Dates are those of the clock in the log or of its file."
+        "Squared errors before and after the fit, relative to what the model expects (1: as large as expected). The "
+        "worst come first. Dates are those of the clock in the log or of its file."
     )
     return section("logs", "Every log", intro + _left_out(logs), tables=tables)
 

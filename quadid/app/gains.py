@@ -219,14 +219,14 @@ def gains(
 
     Args:
         vehicle: a fitted file, a shipped name or a `Vehicle`; with `command.max_speed`.
-        format: whose parameters: px4, ardupilot or betaflight.
-        bandwidth: wanted of roll and pitch rate [Hz], at -3 dB; default the largest that keeps the margin.
-        phase_margin: least one of the rate loops [deg], 20 to 80.
-        derivative: use the D term, which takes motor lag back.
+        format: the autopilot whose parameters are proposed: px4, ardupilot or betaflight.
+        bandwidth: of the roll and pitch rate loops [Hz], at -3 dB; default the largest that keeps the margin.
+        phase_margin: smallest phase margin of the rate loops [deg], 20 to 80.
+        derivative: use the D term, which compensates motor lag.
         motor_lag: time constant [s] where the file has none, because the log showed no commands.
         delay: time from command to rotor [s] where the file has none.
-        current: log, parameter file or parameters of the autopilot: its filters and rates, and its gains to compare.
-        anyway: take guesses of the file as if they were identified.
+        current: log, parameter file or parameters of the autopilot, for its filters, rates and present gains.
+        anyway: use guesses of the file as if they had been identified.
 
     Raises:
         ParameterError: a format, margin, bandwidth or lag that cannot be, or a vehicle that the autopilot cannot fly.

@@ -155,7 +155,7 @@ class Identified(Fitted):
                     *("-" if v is None or not math.isfinite(v) else f"{max(v, -999.0):.0f} %" for v in fits),
                 )
             )
-        title = "Squared errors over what the model expects (1 = right about its own errors)"
+        title = "Squared errors, relative to what the model expects (1: as large as expected)"
         followed = TextTable(title, columns, tuple(rows))
         return [parameter_table(self.result["parameters"], truth), followed]
 

@@ -100,7 +100,7 @@ def inspect(
 ) -> Inspected:  # fmt: skip
     """Says what a log holds: channels, rates, gaps, faults, units and frames, excitation, what is missing.
 
-    No log that can be read is refused.
+    Every log that can be read is shown, usable or not.
 
     Args:
         log: a flight log: ROS 2 MCAP, .tlog, DataFlash, ULog or CSV, format auto-detected; or a span of one, as

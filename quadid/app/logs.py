@@ -92,7 +92,7 @@ def check_place(file: Path, option: str, inside: bool = False) -> None:
             _pipes.append(os.open(file, os.O_WRONLY | os.O_NONBLOCK))
         except OSError as error:
             raise OutputError(
-                f"{option}: {file} is a pipe that nobody reads, or a socket ({error.strerror})", "a file",
+                f"{option}: {file} is a pipe without a reader, or a socket ({error.strerror})", "a file",
                 "choose another place, or start what reads the pipe",
             ) from error  # fmt: skip
     elif not os.access(file if file.exists() else folder, os.W_OK):

@@ -102,7 +102,7 @@ Preset = Annotated[
 ]
 Unchecked = Annotated[bool, typer.Option("--unchecked", help="Use logs even when their units or frames look wrong.")]
 _COLUMNS = typer.Option(
-    "--columns", metavar="NAME=C", help="What a CSV calls a column, as gyro_x=p,gyro_y=q; repeatable."
+    "--columns", metavar="NAME=C", help="Names of the columns of a CSV, as gyro_x=p,gyro_y=q; repeatable."
 )
 Columns = Annotated[list[str] | None, _COLUMNS]
 NamedColumns = Annotated[Mapping[str, str] | None, Typed(list[str] | None, _COLUMNS, read=parse_columns)]
@@ -155,11 +155,11 @@ def _several(name: str, form: str, about: str, read: Callable[[Any], Any]) -> Ty
 
 Free = Annotated[
     Sequence[str],
-    _several("--free", "NAME", "Fit this number of a known effect, too, as motor_lag.tau.", lambda typed: typed),
+    _several("--free", "NAME", "Also fit this number of a known effect, as motor_lag.tau.", lambda typed: typed),
 ]
 Fix = Annotated[
     Sequence[str],
-    _several("--fix", "NAME", "Keep this one of the six as the vehicle file has it.", lambda typed: typed),
+    _several("--fix", "NAME", "Keep this one of the six at the value of the vehicle file.", lambda typed: typed),
 ]
 Bounds = Annotated[
     Mapping[str, tuple[float, float]] | None,
@@ -168,20 +168,25 @@ Bounds = Annotated[
 Priors = Annotated[
     Mapping[str, tuple[float, float]] | None,
     _several(
-        "--prior", "NAME=VALUE:SIGMA", "What is known of one of the six before, instead of the file's.",
+        "--prior", "NAME=VALUE:SIGMA", "Prior knowledge of one of the six, instead of the file's.",
         _pairs("NAME=VALUE:SIGMA"),
     ),
 ]  # fmt: skip
 KnownEffects = Annotated[
     Mapping[str, Mapping[str, float]] | None,
-    _several("--effect", "NAME:KEY=VALUE,...", "Known effect, beside or instead of the file's.", _effects),
+    _several(
+        "--effect",
+        "NAME:KEY=VALUE,...",
+        "A known effect, in addition to the file's or in place of one of them.",
+        _effects,
+    ),
 ]
 
 # --- The work, and where its results go
 
 
 Seed = Annotated[int, typer.Option("--seed", metavar="N", min=0, help="Seed of all random numbers.")]
-WindowSeconds = Annotated[float, typer.Option("--window", metavar="S", help="Flight that one fit looks at.")]
+WindowSeconds = Annotated[float, typer.Option("--window", metavar="S", help="Length of flight that one fit uses.")]
 Refit = Annotated[float, typer.Option("--refit", metavar="S", help="Time between fits.")]
 Diagnose = Annotated[
     float, typer.Option("--diagnose", metavar="S", help="Time between two diagnoses of the last minute; 0: never.")
@@ -221,6 +226,6 @@ SeriesFolder = Annotated[
     typer.Option(
         "--series",
         metavar="DIR",
-        help="Write measured, simulated, innovations and what is missing over time into this folder, as CSV and MCAP.",
+        help="Write what is measured, simulated and missing over time into this folder, as CSV and MCAP.",
     ),
 ]

@@ -107,7 +107,7 @@ class Scored(Reported):
         ]  # fmt: skip
         caption = (
             f"mean error from the measured state on, and the band in which {100 * SHARE:.0f} % of the runs lie; at "
-            "the noise floor an error cannot be told from the sensors'"
+            "the noise floor an error is no larger than the sensors' own"
         )
         drawn = figure("horizons", "Error over the horizon", data, layout, 130 * len(known) + 70, caption=caption)
         sections = [
@@ -129,7 +129,7 @@ def score(
         vehicle: whose values are scored as they are; default that of the first loaded log.
         horizons: samples of the grid after the start of each run, or times, as ``0.1s``.
         rate: of the grid [Hz]; None for each log's own, whatever it was loaded with.
-        closed_loop: predict bands with the autopilot in the loop, as the vehicle file or the logs know it.
+        closed_loop: predict bands with the autopilot in the loop, as the vehicle file or the logs describe it.
 
     Raises:
         LogError: a log that does not fit the vehicle.
@@ -248,7 +248,7 @@ def coverage(
     elif closed_loop:
         told.append("no autopilot is known: neither gains in the vehicle file nor references that show them in the log")
     if any(h not in total for h in wanted):
-        told.append(f"none beyond {OPEN:g} s from logged rotor speeds, which already answer the future")
+        told.append(f"none beyond {OPEN:g} s from logged rotor speeds, which already contain the controller's answer")
     return out, f"{'; '.join([*told, *reasons])}."
 
 

@@ -200,7 +200,7 @@ def believed(vehicle: Vehicle) -> ParameterSet:
 def check_suffix(path: str | Path) -> None:
     """Raises SimulateError for a suffix of no format that is written."""
     if Path(path).suffix.lower() not in SUFFIXES:
-        raise SimulateError(f"cannot tell the format of '{path}'", ", ".join(SUFFIXES) + " or udpout:HOST:PORT")
+        raise SimulateError(f"'{path}' has the suffix of no format", ", ".join(SUFFIXES) + " or udpout:HOST:PORT")
 
 
 def parse_effects(

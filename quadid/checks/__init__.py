@@ -142,7 +142,7 @@ class Log:
                 return {"motor_order": order} | ({"rotor_timing": late} if early else {})
         if self.readings is not None and time.verdict is CheckResult.ERROR:  # coarse steps have lags of their own
             time = Check(
-                time.name, CheckResult.UNKNOWN, f"{time.message}; its steps are too coarse to tell", "", time.numbers
+                time.name, CheckResult.UNKNOWN, f"{time.message}; its steps are too coarse to be sure", "", time.numbers
             )
         wrong = [check for check in (time, balance) if check.verdict is CheckResult.ERROR]
         if wrong:

@@ -147,9 +147,9 @@ def gravity_check(recording: Recording, spans: Spans) -> Check:
     # A vehicle that lies on its back does not turn.
     flown = z > 0.5 * length and bool(spans) and is_turning(recording.channels.get("gyro"), spans, _MOTION)
     if z > -0.5 * length and not flown and _attitude_explains(accel, recording.channels.get("attitude"), inside):
-        return check(CheckResult.UNKNOWN, f"{message}; its attitude says that the vehicle lies or turns so")
+        return check(CheckResult.UNKNOWN, f"{message}; its attitude agrees: the vehicle lies or turns this way")
     if not spans and z > -0.8 * length:
-        return check(CheckResult.UNKNOWN, f"{message}; the vehicle does not fly in this log: it may lie so")
+        return check(CheckResult.UNKNOWN, f"{message}; the vehicle does not fly in this log and may lie this way")
     if z > 0.5 * length:
         turned = f"{message}: z points up (FLU, as ROS has it) or the sign is reversed"
         return check(CheckResult.ERROR, turned, _downwards(recording, accel, inside))
@@ -226,7 +226,7 @@ def attitude_check(recording: Recording, found: Response | None) -> Check:
         return Check(
             "gravity", CheckResult.ERROR if size > 3.0 * most else CheckResult.WARNING,
             f"specific force is {aside[0]:+.2g} m/s^2 along x and {aside[1]:+.2g} along y on the average of "
-            f"{seconds:.3g} s, beyond what gravity and attitude leave: the accelerometer's zero is wrong, or the "
+            f"{seconds:.3g} s, more than gravity and attitude explain: the accelerometer's zero is wrong, or the "
             "attitude", "calibrate it level, or subtract this", {"aside": size},
         )  # fmt: skip
     return Check(
@@ -410,7 +410,7 @@ def _angle_rates(gyro: Channel, attitude: Channel) -> Check | None:
         return None
     return Check(
         "gyro_attitude", CheckResult.ERROR,
-        "gyro holds the rates of roll, pitch and yaw angle (Euler rates), not those about the body's axes",
+        "gyro is the rates of roll, pitch and yaw angle (Euler rates), not those about the body's axes",
         "log the gyro; or p = phi' - psi' sin(theta), q = theta' cos(phi) + psi' sin(phi) cos(theta), "
         "r = psi' cos(phi) cos(theta) - theta' sin(phi)", {"share": like / size},
     )  # fmt: skip

@@ -86,7 +86,7 @@ def rotor_timing_check(recording: Recording, vehicle: Vehicle, spans: Spans) -> 
     )
     fix = "stamp the rotor signal by the clock that stamps the IMU, or log both on board"
     if high - low > 0.02 and correlation < 0.5:
-        weak = f"{message}: too weak to tell a clock from other motion"
+        weak = f"{message}: too weak to be sure that it is the clock"
         return Check(name, CheckResult.UNKNOWN, weak, numbers=numbers)
     if high - low > 0.02:  # [s]; a centre of gravity a tenth of the arm off makes 16 ms
         return Check(name, CheckResult.ERROR, f"{message}: the rotor signal is not in time with the gyro", fix, numbers)
@@ -539,7 +539,7 @@ def balance_check(recording: Recording, vehicle: Vehicle, spans: Spans) -> Check
     if placed := [odd for odd in _misplaced(share, lever) if odd < read]:
         farther = " or ".join(f"{odd.rotor + 1} stood {1.0 / odd.ratio:.2f}" for odd in placed)
         return check(
-            f"{here} {farther} times as far from it as the vehicle file says: then inertias are wrong, else the centre "
+            f"{here} {farther} times as far from it as in the vehicle file: then inertias are wrong, else the centre "
             "of gravity is there",
             "measure where that rotor is, and where the vehicle balances",
             {"off": off, "rotor": placed[0].rotor + 1.0, "arm_ratio": placed[0].ratio},

@@ -65,18 +65,18 @@ COMMANDS = {
         "quadid.cli.simulate:simulate",
     ),
     "init": Command(
-        "A vehicle file to fill in, or filled in from a log.",
+        "Write a vehicle file to fill in, or fill it in from a log.",
         ("quadid init mine", "quadid init mine --from flight.bin --mass 1.9"),
         "quadid.app.init:init",
     ),
     "vehicles": Command(
-        "The vehicles that ship.",
+        "List the vehicles that come with quadid.",
         ("quadid vehicles",),
         "quadid.app.init:vehicles",
         out="",
     ),
     "inspect": Command(
-        "What a log holds, whether it can be true, and what is missing.",
+        "Check a log against physics, and list what it lacks.",
         ("quadid inspect flight.bin", "quadid inspect flight.ulg@76:216 --vehicle mine.yaml --json -"),
         "quadid.app.inspect:inspect",
         out="Also write the inspection as JSON into this folder.",
@@ -93,46 +93,48 @@ COMMANDS = {
         "quadid.app.identify:check_optimizer",
     ),
     "score": Command(
-        "Open-loop prediction error of a vehicle file on logs.",
+        "Measure how well a vehicle file predicts logs.",
         ("quadid score other.mcap --vehicle pelican.fitted.yaml --horizons 1,10,50",),
         "quadid.app.score:score",
         READING[1:],
     ),
     "compare": Command(
-        "All optimisers and subspace methods on the same data.",
+        "Run all optimisers and subspace methods on the same data.",
         ("quadid compare flight.mcap --validate other.mcap --vehicle pelican",),
         "quadid_evaluation.paper.compare:compare",
         READING,
         "quadid_evaluation.paper.compare:check_names",
     ),
     "diagnose": Command(
-        "What the simulation gets wrong, why, and the gain of correcting it.",
+        "Find what the simulation gets wrong, why, and the gain of correcting it.",
         ("quadid diagnose flight.mcap --validate other.mcap --vehicle pelican --report diagnosis.html",),
         "quadid.app.diagnose:diagnose",
         READING,
     ),
     "health": Command(
-        "What changed in the vehicle since the baseline flights.",
+        "Find what changed in the vehicle since the baseline flights.",
         ("quadid health today.usd --baseline a.usd --baseline b.usd --vehicle crazyflie --report health.html",),
         "quadid.app.health:health",
     ),
     "excite": Command(
-        "Which manoeuvre to fly next, and what it would gain.",
+        "Propose the manoeuvre to fly next, and predict its gain.",
         ("quadid excite flight.mcap --vehicle pelican",),
         "quadid.app.excite:propose",
         ("rate", "preset", "columns", "unchecked"),
         "quadid.app.excite:check_limits",
     ),
     "reproduce": Command(
-        "The paper's tables and figures.", ("quadid reproduce --out reproduce-out",), "quadid.cli.reproduce:reproduce"
+        "Reproduce the paper's tables and figures.",
+        ("quadid reproduce --out reproduce-out",),
+        "quadid.cli.reproduce:reproduce",
     ),
     "replay": Command(
-        "Drive the online session from a log.",
+        "Show what the online service would have published for a log.",
         ("quadid replay flight.mcap --vehicle pelican --speed max --out result.mcap",),
         "quadid.cli.replay:replay",
     ),
     "serve": Command(
-        "The online service on a MAVLink link, no ROS needed.",
+        "Run the online service on a MAVLink link; no ROS needed.",
         ("quadid serve --vehicle mine.yaml --mavlink udpin:0.0.0.0:14540",),
         "quadid.cli.serve:serve",
     ),
@@ -142,17 +144,17 @@ COMMANDS = {
         "quadid.cli.worker:worker",
     ),
     "watch": Command(
-        "Live terminal view of one or many vehicles.",
+        "Watch one or many vehicles live in the terminal.",
         ("quadid watch", "quadid watch --zenoh tcp/192.168.1.5:7447"),
         "quadid.cli.watch:watch",
     ),
     "history": Command(
-        "Stored parameter sets: what, when, from which data, by whom.",
+        "List stored parameter sets: what, when, from which data, by whom.",
         ("quadid history --vehicle mine.yaml --events 20",),
         "quadid.cli.history:history",
     ),
     "export": Command(
-        "The parameters for another program.",
+        "Write the parameters for another program.",
         (
             "quadid export --vehicle pelican.fitted.yaml --format px4 --out params",
             "quadid export --vehicle pelican --history h.sqlite --format ardupilot",
@@ -161,13 +163,13 @@ COMMANDS = {
         "quadid.cli.export:export",
     ),
     "compare-vehicles": Command(
-        "Two vehicle files on the same flights.",
+        "Compare two vehicle files on the same flights.",
         ("quadid compare-vehicles old.yaml new.yaml --on flight.mcap --report compared.html",),
         "quadid.app.compare_vehicles:compare_vehicles",
         ("preset", "unchecked"),
     ),
     "gains": Command(
-        "Rate and attitude gains from the identified vehicle.",
+        "Propose rate and attitude gains from the identified vehicle.",
         (
             "quadid gains --vehicle mine.yaml --format px4 --report gains.html",
             "quadid gains --vehicle mine.yaml --format ardupilot --from flight.bin --bandwidth 5",
@@ -184,7 +186,9 @@ COMMANDS = {
         "quadid.app.fleet:fleet",
         out="",
     ),
-    "warmup": Command("Compile now what the first fit would compile.", ("quadid warmup",), "quadid.cli.warmup:warmup"),
+    "warmup": Command(
+        "Compile everything now, so that the first fit need not.", ("quadid warmup",), "quadid.cli.warmup:warmup"
+    ),
 }
 """Every command, in the order of `quadid --help`."""
 

@@ -34,9 +34,12 @@ def export(
         ),
     ] = None,
     name: Annotated[
-        str | None, typer.Option("--id", metavar="NAME", help="Whose sets of the history; default the vehicle's.")
+        str | None,
+        typer.Option("--id", metavar="NAME", help="Name in the history whose set is exported; default the vehicle's."),
     ] = None,
-    anyway: Annotated[bool, typer.Option("--anyway", help="Export values unproven or out of date, too.")] = False,
+    anyway: Annotated[
+        bool, typer.Option("--anyway", help="Also export values that are unproven or out of date.")
+    ] = False,
     json: JsonTarget = None,
     out: OutFolder = Path(),
 ) -> None:

@@ -55,7 +55,7 @@ def replay(
         ),
     ] = False,
     candidates: Annotated[
-        bool, typer.Option("--candidates", help="Every estimate in the JSON, not only sets.")
+        bool, typer.Option("--candidates", help="Put every estimate into the JSON, not only the published sets.")
     ] = False,
     seed: options.Seed = 0,
     preset: options.Preset = "auto",

@@ -57,7 +57,7 @@ def simulate(
         typer.Option(
             "--draws",
             metavar="N",
-            help="Fly N vehicles within the file's uncertainty, each under its random forces; logs get numbers.",
+            help="Fly N vehicles within the file's uncertainty, each under its random forces; the logs are numbered.",
         ),
     ] = None,
     json: JsonTarget = None,

@@ -38,7 +38,12 @@ def watch(
     approve: Annotated[
         str, typer.Option("--approve", metavar="VEHICLE[=N]", help="Approve set N, or the newest that waits, and end.")
     ] = "",
-    rollback: Annotated[str, typer.Option("--rollback", metavar="VEHICLE", help="Take its set back, and end.")] = "",
+    rollback: Annotated[
+        str,
+        typer.Option(
+            "--rollback", metavar="VEHICLE", help="Take the vehicle's set in force back to the previous one, and end."
+        ),
+    ] = "",
     json: JsonTarget = None,
 ) -> None:
     """Show parameters with intervals, gate state and reason, findings and data rates of all vehicles, live."""

@@ -287,7 +287,8 @@ def late_unknown(model: Model, parameters: Sequence[Parameter]) -> dict[str, str
     turning = [p for p in parameters if p.name in ("J_xx", "J_yy")]
     if not all(p.status is Status.UNRELIABLE for p in turning):
         return {}
-    reason = f"{' and '.join(p.name for p in turning)}, beside which rotation shows it, are not to be used"
+    names = " and ".join(p.name for p in turning)
+    reason = f"rotation shows it only together with {names}, which are not to be used"
     return {c.label: reason for c in model.causes if c.family == "late" and EFFECTS[c.effect].turns}
 
 
@@ -297,15 +298,15 @@ def slight_causes(model: Model) -> dict[str, str]:
     Air gets thinner in a climb, rotors carry otherwise in it, and motors warm up: from one part of a flight to the next
     thrust differs, and a step at the border takes that up.  A tilted vertical of the attitude pushes as a wind does.
     """
-    step = f"parts of a flight differ by as much on any vehicle, {UNTIDY:g} of what it typically is"
-    push = "in still air, a vertical of the attitude that is off by a degree does the same"
+    step = f"on any vehicle, parts of a flight differ by as much, {UNTIDY:g} of its typical size"
+    push = "in still air, an attitude tilted by a degree looks the same"
     small = [c for c in model.causes if untidy_sized(model, c)]
     return {c.label: push if c.timed is None else step for c in small if c.timed is not None or c.effect == "wind"}
 
 
 def unproven_causes(model: Model, tests: int) -> dict[str, str]:
     """Causes of `model` whose numbers may as well be none, of as many `tests`, by label, and why."""
-    reason = "its numbers may be none beside random forces"
+    reason = "it may be zero: random forces explain as much"
     chance = {c.label: survival(model.wald(c), len(c.names)) * tests for c in model.causes if not c.refines}
     return {label: reason for label, p in chance.items() if p > FALSE_ALARM}
 

@@ -194,8 +194,8 @@ FIT_SECONDS = 1.0
 MOST_SEGMENTS = 1000
 """Most segments of the first polish; a start needs no more."""
 _RANDOM = (
-    "something that the model lacks moves the vehicle: its parameters were estimated beside random forces and moments, "
-    "with drag, damping, centre of gravity and what is late fitted along; `quadid diagnose` looks for the cause"
+    "something that the model lacks moves the vehicle: the fit therefore allows for random forces and moments, and "
+    "fits drag, damping, centre of gravity, lag and delay along; `quadid diagnose` looks for the cause"
 )
 NO_FILTER = "a filter with this model has no finite answer on this flight: its numbers are not to be used"
 

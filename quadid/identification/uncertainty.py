@@ -189,7 +189,9 @@ def doubted(parameters: Sequence[Parameter], off: Mapping[str, float]) -> tuple[
     out = tuple(_off_by(p, off[p.name]) if off.get(p.name) else p for p in parameters)
     moved = {p.name: round(100.0 * math.expm1(off[p.name])) for p in parameters if p.name in off}
     listed = ", ".join(f"{name} {percent:+d} %" for name, percent in moved.items() if percent)
-    told = f"if the log is wrong as said, these estimates are off, which their intervals hold: {listed}"
+    told = (
+        f"if the warnings about the log are right, these estimates are off, and their intervals allow for it: {listed}"
+    )
     return out, (told,) if listed else ()
 
 

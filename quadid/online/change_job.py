@@ -147,8 +147,8 @@ def carried(request: ChangeRequest) -> OnlineFinding | None:
         "mass_change", {"time": request.time, "fraction": fraction},
         {"time": 0.5, "fraction": abs(fraction / change.errors)}, {"time": "s", "fraction": ""}, np.nan, np.nan, np.nan,
         tuple(OnlineAlternative(effect, np.nan) for effect in (PULL, "thrust_drop")),
-        f"thrust per weight stepped by {change.size:+.1%}: {newtons:+.2f} N to hold the vehicle up, of a payload, of a "
-        "steady pull, or of thrust that was lost: not told apart", False,
+        f"thrust per weight stepped by {change.size:+.1%}: {newtons:+.2f} N to hold the vehicle up; a payload, a "
+        "steady pull and lost thrust cannot be told apart yet", False,
     )  # fmt: skip
 
 

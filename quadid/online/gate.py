@@ -241,7 +241,7 @@ def _unproven(case: Case, settings: GateSettings) -> str | None:
 def _doubtful(case: Case, settings: GateSettings) -> str | None:
     for f in case.doubts:
         if _too_far(*_together(f, case), settings)[0]:
-            also = f" and thrust {math.expm1(_hidden(case)[0]):+.1%} off what the set says"
+            also = f" and thrust {math.expm1(_hidden(case)[0]):+.1%} off the set's thrust"
             return f"{f}{also}: b, J_xx and J_yy may be off by it, allowed {settings.width:.0%}"
     return None
 

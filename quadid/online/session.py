@@ -495,7 +495,7 @@ class Session:
             return
         scale, mass, loaded = self._diagnosis.wrong_scale, estimator.vehicle.mass, ""
         if abs(math.log(sets.load)) > LEAST:
-            changed = f"the mass changed by about {sets.load - 1.0:+.0%} in flight, as far as the thrust tells"
+            changed = f"the mass changed by about {sets.load - 1.0:+.0%} in flight, judged by its thrust"
             loaded = f"{changed}; b and the inertias of this set rest on {mass:g} kg"
         case = replace(
             estimator.case(parameters, request, reply, sets, self.settings.gate.windows),

@@ -145,7 +145,11 @@ class Facts:
     @property
     def lag_remark(self) -> str:
         """Remark for a reader of `lag`; empty where the vehicle file has one."""
-        return "" if "motor_lag" in self.vehicle.effects else ", not measured: stands for rotors that follow at once"
+        return (
+            ""
+            if "motor_lag" in self.vehicle.effects
+            else ", not measured: a small value, for rotors that follow at once"
+        )
 
     @property
     def lag_down(self) -> float:
@@ -330,7 +334,7 @@ def ardupilot(facts: Facts) -> dict[str, Any]:
     """
     expo = facts.thrust_expo
     frame, motors = sitl_frame(facts)
-    refused = f"no .sitl.json: the rotors stand in none of the frames {', '.join(SITL_FRAMES)} of ArduPilot's simulator"
+    refused = f"no .sitl.json: ArduPilot's simulator has no such frame, only {', '.join(SITL_FRAMES)}"
     return {
         "expo": expo, "sitl_expo": 1.0 if expo is None and facts.vehicle.command.kind != "thrust" else expo,
         "lost": () if expo is not None else ("thrust_curve",), "frame": frame, "motors": motors,

@@ -137,8 +137,8 @@ def identify_verdict(result: Json) -> Verdict:
     if not ratio <= ROUGH:
         headline = f"Not to be used yet: {match}."
         found = (
-            "It differs from the flights that were fitted in what the model lacks; values can be wrong even where the "
-            "interval is narrow."
+            "Something that the model lacks differs between this flight and the fitted ones; values can be wrong even "
+            "where the interval is narrow."
         )
         details = (found, *([missing] if missing else []), *_details((), judged))
     steps = _next_steps(result, open_ones, stuck, ratio, adequate)
@@ -209,11 +209,11 @@ def _match(ratio: float, shares: tuple[float, float] | None, where: str) -> tupl
     if not math.isfinite(ratio):
         return "poor", f"the simulation diverges on {where}"
     if ratio > ROUGH:
-        return "poor", f"on {where} errors are {math.sqrt(ratio):.2g} times what this model expects of itself"
+        return "poor", f"on {where} errors are {math.sqrt(ratio):.2g} times what the model expects"
     if shares is None:
         return "fair", f"without gyro and accelerometer it is unknown what the simulation misses on {where}"
     if ratio <= NOISE_LEVEL and shares[0] <= SMALL_FORCE and shares[1] <= SMALL_MOMENT:
-        return "good", f"nothing that counts is missing in the simulation of {where}"
+        return "good", f"the simulation of {where} misses nothing of importance"
     missing = f"{percent(shares[0])} of the weight and up to {percent(shares[1])} of the rotors' moment"
     return "fair", f"on {where} the simulation misses {missing}"
 
@@ -287,7 +287,7 @@ def reason(parameter: Json, stuck: Sequence[str] = ()) -> str:
             f" It needs {needs}." if needs else ""
         )
     if status == "unreliable":
-        return "Not to be used: the model misses this flight, or parts of it yield different values."
+        return "Not to be used: the model does not follow this flight, or parts of the flight yield different values."
     if status == "ratio_only":
         return f"Only its ratio to {parameter.get('relative_to', 'another parameter')} is known, not both."
     change = _number(parameter["value"]) / _number(parameter["initial"]) - 1.0 if parameter["initial"] else math.nan

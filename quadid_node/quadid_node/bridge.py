@@ -46,7 +46,7 @@ _ENTRY = re.compile(rf"(\S+) = (?:({_NUMBER}) \* )?(\w+) in ({_NUMBER}) \.\. ({_
 OPTIONS = {
     "controller": ("", "Name of the node whose parameters are set, as ros2 node list shows it."),
     "map": ([""], "Entries 'gains.roll.p = 11.0 * J_xx in 0.01 .. 1.0': parameter, factor, name in the set, limits."),
-    "dry_run": (True, "Only say what would be set; false applies the newest set. A rollback makes it true."),
+    "dry_run": (True, "Only log what would be set; false applies the newest set. A rollback sets it to true."),
     "step": (0.5, "Largest relative change of a parameter of the controller by one set."),
     "mass": (0.0, "[kg] of the controller's vehicle; 0: sets of any mass."),
     "vehicle_id": ("", "Only sets of this vehicle; '': any on the topic."),
@@ -90,7 +90,7 @@ def entry(text: str) -> MapEntry:
 def objection(message: Any, vehicle: str, mass: float, newest: int) -> str:
     """Reason why a set is not for this controller, or not in force; empty when it may be applied."""
     if message.schema_version != SCHEMA_VERSION:
-        return f"schema {message.schema_version}, this bridge knows {SCHEMA_VERSION}"
+        return f"schema {message.schema_version}, this bridge supports {SCHEMA_VERSION}"
     if not len(message.names) == len(message.values) == len(message.status):
         return f"{len(message.names)} names, {len(message.values)} values and {len(message.status)} status"
     if vehicle and message.vehicle_id != vehicle:

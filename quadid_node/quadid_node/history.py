@@ -887,7 +887,7 @@ class Store:
                 for table, kept in self._kept.items():
                     db.execute(f"DELETE FROM {table} WHERE id <= (SELECT max(id) FROM {table}) - ?", (kept,))
             if self._lock is not lock or lock.moved():
-                raise sqlite3.OperationalError("another file stands there now")
+                raise sqlite3.OperationalError("it was replaced by another file")
         return refused
 
     def _begin_anew(self) -> None:

@@ -321,7 +321,7 @@ class Decoder:
             channel = SIGNALS[name][0]
             if channel in self._ranks and not self._chooser.has(channel):
                 field = self._deniable[name]
-                return f"says that it has no {field} ({field}_covariance[0] is -1; 0 if unknown); nothing else tells it"
+                return f"declares no {field} ({field}_covariance[0] is -1; 0 if unknown), and no other topic has any"
         if "gyro" in self._ranks and not self._mounted and not _BODY_FRAME.search(self._frame):
             frame = plain(self._frame, 40)
             return f"is measured in {frame}, not base_link: say mounting: {{rotation, position}} in the vehicle file"

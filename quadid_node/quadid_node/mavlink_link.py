@@ -107,7 +107,9 @@ class MotorOrder:
         self.problem = found.problem
         if silent and not found.problem:
             outputs = ", ".join(str(k + 1) for k in found.columns)
-            self.problem = f"the autopilot has not told which outputs are motors (SERVOn_FUNCTION): {outputs} are used"
+            self.problem = (
+                f"the autopilot has not sent SERVOn_FUNCTION, which names the motor outputs: {outputs} are used"
+            )
         if found.columns and (message not in _ESC_MESSAGES or any(self._turning)):
             self._used[message, len(values)] = found.columns
         return found.columns

@@ -185,7 +185,7 @@ _REASONS = {
     "bad_stamp": "with a wild stamp",
     "impossible": "far from those before and after",
     "not_attitude": "that are no attitude (quaternion far from unit length)",
-    "held": "that stay the same for seconds while the gyro turns: nobody measured them",
+    "held": "that stay the same for seconds while the gyro turns: they are not measurements",
 }
 
 

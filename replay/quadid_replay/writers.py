@@ -625,7 +625,7 @@ def write_compared(
             write_recordings(writer, recordings, epoch_ns, wrenches)
         return
     if kind != ".csv":
-        raise LogError(f"cannot tell the format of '{path}'", ".mcap, .csv")
+        raise LogError(f"'{path}' has the suffix of no format", ".mcap, .csv")
     channels = [(name, layout) for name, r in recordings.items() for layout in column_names(r).items()]
     t, columns = union_rows([recordings[name].channels[channel] for name, (channel, _) in channels])
     header, table = ["t"], [t[:, None]]

@@ -333,7 +333,7 @@ def test_what_sitl_and_sih_cannot_be_is_left_out_with_its_reason() -> None:
     long = cross.model_copy(update={"rotors": tuple(stretched)})
     done = exported(long, "ardupilot")
     assert [name for name in done.texts if name.endswith(".json")] == []
-    assert any("none of the frames" in text for text in done.result["warnings"])
+    assert any("has no such frame" in text for text in done.result["warnings"])
     reversed_spins = [r.model_copy(update={"spin": -r.spin}) for r in cross.rotors]
     done = exported(cross.model_copy(update={"rotors": tuple(reversed_spins)}), "px4")
     assert any("yaw of this vehicle would come out wrong" in text for text in done.result["warnings"])
@@ -354,4 +354,4 @@ def test_a_motor_lag_that_nobody_measured_is_written_as_such() -> None:
         for lag in ({}, {"motor_lag": {"tau": 0.03}}):
             vehicle = Vehicle.shipped("pelican_x").model_copy(update={"effects": lag})
             (text,) = export(vehicle, form, "x").values()
-            assert ("not measured: stands for rotors that follow at once" in text) == (not lag), form
+            assert ("not measured: a small value, for rotors that follow at once" in text) == (not lag), form

@@ -105,7 +105,7 @@ def test_bands_are_predicted_up_to_a_tenth_of_a_second_and_the_reason_stands_bel
     inside: Cli, flights: Flights, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run = inside("score", flights.unseen, "--vehicle", "pelican", "--horizons", "1,5,10")
-    assert "already answer the future" in run.out
+    assert "already contain the controller's answer" in run.out
     assert "found in the first third of each log" in run.out
     coverage = inside("score", flights.unseen, "--vehicle", "pelican", "--horizons", "1,5,10", "--json", "-").data
     coverage = coverage["coverage"]

@@ -25,7 +25,7 @@ def test_symbols_and_effects_have_every_parameter_with_its_unit(repository: Path
         row = next(line for line in plain.splitlines() if line.startswith(f"| {name} | `{name}` |"))
         assert unit in row
     page = (repository / "docs" / "effects.md").read_text(encoding="utf-8")
-    parts = dict(re.findall(r"^### (\w+)[^\n]*\n(.*?)\. \*\*What:", page, flags=re.MULTILINE | re.DOTALL))
+    parts = dict(re.findall(r"^### (\w+)[^\n]*\n(.*?\])\. ", page, flags=re.MULTILINE | re.DOTALL))
     for effect in EFFECTS.values():
         groups = [group.strip(" ]").split(" [") for group in parts[effect.name].replace("²", "^2").split(";")]
         stated = [(name.strip(" `"), unit) for names, unit in groups for name in names.split(",")]
@@ -33,7 +33,7 @@ def test_symbols_and_effects_have_every_parameter_with_its_unit(repository: Path
 
 
 def test_the_map_of_the_house_names_what_is_there(repository: Path) -> None:
-    text = (repository / "docs" / "architecture.md").read_text(encoding="utf-8")
+    text = (repository / "ARCHITECTURE.md").read_text(encoding="utf-8")
     rooms = re.findall(r"^\| `(quadid/\w+)` \|", text, flags=re.MULTILINE)
     there = {f"quadid/{p.parent.name}" for p in (repository / "quadid").glob("*/__init__.py")}
     assert set(rooms) == there

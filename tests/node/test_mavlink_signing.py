@@ -370,7 +370,7 @@ def test_nothing_is_taken_for_a_motor_before_an_ardupilot_has_told_which_are(ord
 def test_an_ardupilot_that_never_tells_has_its_motors_on_the_first_outputs_and_that_is_said(order: MotorOrder) -> None:
     assert take(order, 100.0) == ()
     assert take(order, 100.0 + PATIENCE) == PULSES[:4]
-    assert "has not told which outputs are motors" in order.problem
+    assert "has not sent SERVOn_FUNCTION, which names the motor outputs" in order.problem
     tell(order, 33, 34, 35, 36)
     assert take(order, 110.0) == PULSES[:4]
 

@@ -182,7 +182,7 @@ def test_an_answer_is_checked_at_the_door() -> None:
     assert len(told.warnings[0]) <= 2000
 
 
-# A format of somebody else, added as docs/logs.md says, and one that does what its file says.
+# A format of somebody else, added as CONTRIBUTING.md describes, and one that does what its file says.
 
 HARMFUL = """
 import os, signal, socket, tempfile, time
@@ -222,7 +222,7 @@ def extended(tmp_path_factory: pytest.TempPathFactory, repository: Path) -> Path
     """A folder with the package in it, to which the formats were added."""
     folder = tmp_path_factory.mktemp("extended")
     shutil.copytree(repository / "replay" / "quadid_replay", folder / "quadid_replay")
-    page = (repository / "docs" / "logs.md").read_text(encoding="utf-8").partition("## Add a log format")[2]
+    page = (repository / "CONTRIBUTING.md").read_text(encoding="utf-8").partition("## Adding a log format")[2]
     reader, line = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
     (folder / "quadid_replay" / "xyz_reader.py").write_text(reader)
     (folder / "quadid_replay" / "harm_reader.py").write_text(HARMFUL)
