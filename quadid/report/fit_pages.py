@@ -268,8 +268,8 @@ def identify_page(
 _APPLIED = "Nothing has been applied to any vehicle. The interval is where the value lies in 95 of 100 such flights."
 _PREDICTION = (
     "The simulation runs for one second at a time from an estimated start, then is compared with the measurement. "
-    "Error: mean squared prediction error, relative to what the model expects (1: as large as expected). Fit: 100 % is a "
-    "perfect curve, 0 % no better than the mean; a channel that is mostly noise stays far below 100 %."
+    "Error: mean squared prediction error, relative to what the model expects (1: as large as expected). Fit: 100 % is "
+    "a perfect curve, 0 % no better than the mean; a channel that is mostly noise stays far below 100 %."
 )
 _KEYS = (
     "Drag to zoom, double-click to come back, click a name to hide it. With the keyboard: + and − zoom, ← and → move, "
