@@ -7,7 +7,7 @@ BIN := $(VENV)/bin
 try_python = for p in python3 python3.13 python3.12 python3.11; do \
 	$$p -c 'import sys, venv; sys.exit(not (3, 11) <= sys.version_info[:2] <= $(1))' 2>/dev/null && echo $$p && break; done
 PYTHON ?= $(or $(shell $(call try_python,(3, 13))),$(shell $(call try_python,(3, 99))))
-PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
+INSTALL := @tools/waiting.sh "Installing into $(VENV)" $(BIN)/python -m pip --disable-pip-version-check --quiet install
 
 # What is installed, one stamp a step; a step runs again only when what it reads has changed.
 RUNTIME := $(VENV)/.stamp-runtime
@@ -28,22 +28,21 @@ help: ## list the targets
 
 $(BIN)/python:
 	@test -n "$(PYTHON)" || { echo "No Python >= 3.11 with its venv module found: install one (Debian: python3-venv), or say make PYTHON=..." >&2; exit 1; }
-	$(PYTHON) -m venv $(VENV)
+	@tools/waiting.sh "Making $(VENV)" $(PYTHON) -m venv $(VENV)
 
 $(RUNTIME): pyproject.toml | $(BIN)/python
-	@echo "Installing quadid and what it needs into $(VENV): a minute or so ..."
-	$(PIP) install --no-compile --editable .
+	$(INSTALL) --no-compile --editable .
 	@echo "Compiling the simulation for this processor: under a minute ..."
 	$(BIN)/quadid warmup
 	@touch $@
 
 $(DEV): pyproject.toml $(RUNTIME)
-	$(PIP) install --editable ".[dev]"
+	$(INSTALL) --editable ".[dev]"
 	@touch $@
 
 # These wheels make every start of this Python re-execute itself; beside `dev`, they come after it.
 $(ROS): pyproject.toml $(RUNTIME) | $(if $(filter messages,$(MAKECMDGOALS)),,$(DEV))
-	$(PIP) install --editable ".[ros]"
+	$(INSTALL) --editable ".[ros]"
 	@$(BIN)/python -m pip freeze | grep -i '^ros-' >$@.new; cmp -s $@.new $(ROS_VERSIONS) || cp $@.new $(ROS_VERSIONS); rm $@.new
 	@touch $@
 
@@ -211,7 +210,7 @@ coverage: $(MESSAGES) ## lines and branches of quadid/ that the tests run, into 
 
 QUALITY := $(VENV)/.stamp-quality
 $(QUALITY): pyproject.toml $(DEV)
-	$(PIP) install --editable ".[quality]"
+	$(INSTALL) --editable ".[quality]"
 	@touch $@
 
 mutation: $(MESSAGES) $(QUALITY) ## gate, ledger and session spoilt line by line: which tests notice? into docs/results/mutation.md (40 min)
@@ -258,7 +257,7 @@ format: $(DEV) ## let ruff put files into the common form
 
 DOCS := $(VENV)/.stamp-docs
 $(DOCS): pyproject.toml $(RUNTIME)
-	$(PIP) install --editable ".[docs]"
+	$(INSTALL) --editable ".[docs]"
 	@touch $@
 
 .PHONY: docs

@@ -22,7 +22,7 @@ from typer.models import OptionInfo, ParameterInfo
 
 if TYPE_CHECKING:
     from quadid.app.logs import Log
-    from quadid.app.outcome import Outcome
+    from quadid.app.outcome import Advance, Outcome
     from quadid.vehicle import Vehicle
 
 READING = ("rate", "start", "stop", "preset", "unchecked", "columns")
@@ -38,6 +38,7 @@ class Command:
         function: ``module:name`` of a function of the library, or of the command line itself.
         reading: options of how its logs are read.
         check: ``module:name`` of what refuses wrong arguments before any log is read.
+        simulates: whether it needs the kernels of a fit once it has a vehicle.
         out: help of ``--out``; files that are not written without it have one of their own; none has no such option.
     """
 
@@ -47,6 +48,7 @@ class Command:
     reading: tuple[str, ...] = ()
     check: str = ""
     out: str = FOLDER
+    simulates: bool = False
 
 
 COMMANDS = {
@@ -80,6 +82,7 @@ COMMANDS = {
         ("quadid inspect flight.bin", "quadid inspect flight.ulg@76:216 --vehicle mine.yaml --json -"),
         "quadid.app.inspect:inspect",
         out="Also write the inspection as JSON into this folder.",
+        simulates=True,
     ),
     "identify": Command(
         "Identify the parameters of a vehicle from its flight logs.",
@@ -91,12 +94,14 @@ COMMANDS = {
         "quadid.app.identify:identify",
         READING,
         "quadid.app.identify:check_optimizer",
+        simulates=True,
     ),
     "score": Command(
         "Measure how well a vehicle file predicts logs.",
         ("quadid score other.mcap --vehicle pelican.fitted.yaml --horizons 1,10,50",),
         "quadid.app.score:score",
         READING[1:],
+        simulates=True,
     ),
     "compare": Command(
         "Run all optimisers and subspace methods on the same data.",
@@ -104,12 +109,14 @@ COMMANDS = {
         "quadid_evaluation.paper.compare:compare",
         READING,
         "quadid_evaluation.paper.compare:check_names",
+        simulates=True,
     ),
     "diagnose": Command(
         "Find what the simulation gets wrong, why, and the gain of correcting it.",
         ("quadid diagnose flight.mcap --validate other.mcap --vehicle pelican --report diagnosis.html",),
         "quadid.app.diagnose:diagnose",
         READING,
+        simulates=True,
     ),
     "health": Command(
         "Find what changed in the vehicle since the baseline flights.",
@@ -122,6 +129,7 @@ COMMANDS = {
         "quadid.app.excite:propose",
         ("rate", "preset", "columns", "unchecked"),
         "quadid.app.excite:check_limits",
+        simulates=True,
     ),
     "reproduce": Command(
         "Reproduce the paper's tables and figures.",
@@ -167,6 +175,7 @@ COMMANDS = {
         ("quadid compare-vehicles old.yaml new.yaml --on flight.mcap --report compared.html",),
         "quadid.app.compare_vehicles:compare_vehicles",
         ("preset", "unchecked"),
+        simulates=True,
     ),
     "gains": Command(
         "Propose rate and attitude gains from the identified vehicle.",
@@ -185,6 +194,7 @@ COMMANDS = {
         ),
         "quadid.app.fleet:fleet",
         out="",
+        simulates=True,
     ),
     "warmup": Command(
         "Compile everything now, so that the first fit need not.", ("quadid warmup",), "quadid.cli.warmup:warmup"
@@ -280,6 +290,7 @@ def _run(
     command: Command, function: Callable[..., Outcome], outcome: type[Outcome], signature: inspect.Signature,
     typed: Mapping[str, Any], given: Mapping[str, Any],
 ) -> None:  # fmt: skip
+    from quadid.app.kernels import FIT, prepare
     from quadid.app.logs import check_folder, file_name, parse_part, write_text
     from quadid.app.outcome import Fitted, UnansweredError
     from quadid.cli import terminal
@@ -310,40 +321,43 @@ def _run(
     logs = [name for name in typed if typed[name].opened and name in told]
     how = {name: given[name] for name in ("rate", *command.reading) if name in given}
 
-    def conclude(done: Outcome) -> None:
-        terminal.conclude(done, json, report, folder, series, given.get("vehicle"))
-
+    done: Outcome | None = None
+    unanswered: UnansweredError | None = None
     try:
-        if vehicle is not None:
-            told |= {name: opened(told[name], vehicle, **how) for name in logs}
-        if "advance" in signature.parameters:
-            with terminal.progress() as advance:
-                done = function(**told, advance=advance)
-        else:
-            done = function(**told)
-    except UnansweredError as error:
-        conclude(error.outcome)
-        raise
+        with terminal.progress() as advance:
+            if vehicle is not None:
+                told |= {name: opened(told[name], vehicle, advance, **how) for name in logs}
+            if command.simulates and (vehicle is not None or "advance" in signature.parameters):
+                prepare(FIT, advance)
+            advance(function.__name__.replace("_", " "), 0.0)
+            try:
+                done = function(**told, **({"advance": advance} if "advance" in signature.parameters else {}))
+            except UnansweredError as error:
+                done, unanswered = error.outcome, error
+            advance("writing", 1.0)
+            files = terminal.write(done, report, folder, series, given.get("vehicle"))
     except QuadidError as error:
         # The report of an attempt that failed says why, and shows the data.
-        if report is not None and vehicle is not None and outcome.title:
+        if done is None and report is not None and vehicle is not None and outcome.title:
             from quadid.app.failure import failure_html
 
             what, preset = f"{outcome.title} of {vehicle.name}", given.get("preset", "auto")
             text = failure_html(error, what, texts, vehicle, preset, terminal.command_line())
             terminal.warn([f"no answer; why, and the data as they are: {write_text(report, text)}"])
         raise
-    conclude(done)
+    terminal.show(done, json, files)
+    if unanswered is not None:
+        raise unanswered
 
 
-def opened(texts: Sequence[str], vehicle: Vehicle, columns: Sequence[str] | None = None, **how: Any) -> list[Log]:
+def opened(
+    texts: Sequence[str], vehicle: Vehicle, advance: Advance, columns: Sequence[str] | None = None, **how: Any
+) -> list[Log]:
     """Logs read, checked and on the grid; `how` as `quadid.load` takes it."""
     from quadid.app import logs
-    from quadid.cli import terminal
 
     out, named = [], logs.parse_columns(columns or [])
-    with terminal.progress(compiled=()) as advance:
-        for k, text in enumerate(texts):
-            advance(f"reading {Path(text).name}", k / len(texts))
-            out.append(logs.load(text, vehicle, columns=named, **how))
+    for k, text in enumerate(texts):
+        advance(f"reading {Path(text).name}", k / len(texts))
+        out.append(logs.load(text, vehicle, columns=named, **how))
     return out

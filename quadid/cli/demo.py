@@ -44,9 +44,9 @@ def demo(
         check_folder(folder / name, "--out", *WRITTEN)
     with terminal.progress(("simulation", "closed loop", "estimate", "flight")) as advance:
         shown = run(QUICK_SECONDS if quick else SECONDS, seed, folder, advance)
-    page = folder / "report.html"
+        advance("writing the report", 1.0)
+        page = write_text(folder / "report.html", html(shown, seed, terminal.command_line()))
     result = summary(shown, str(page))
-    write_text(page, html(shown, seed, terminal.command_line()))
     terminal.write_json(result, str(folder / "result.json"))
     terminal.write_json(result, json)
     show(shown, page, quiet=json == "-")

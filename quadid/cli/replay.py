@@ -68,6 +68,7 @@ def replay(
     from quadid_node.settings import session_settings
     from quadid_node.worker import InlineWorker
 
+    from quadid.app.kernels import FIT
     from quadid.app.logs import parse_columns, parse_part
     from quadid.cli import terminal
     from quadid.vehicle import Vehicle
@@ -82,22 +83,24 @@ def replay(
     cut = parse_part(log)
     if as_recorded and cut.path != Path(log):
         raise ReplayError(f"--as-recorded of {log}, a part", "whole recordings", f"--as-recorded {cut.path}")
-    recording = cut.of(open_log(cut.path, preset, described.columns | parse_columns(columns or [])))
-    if as_recorded:
-        beginning = _beginning(Path(log), described.name)
-        described = beginning.vehicle
-        service = Service(described, beginning.settings, InlineWorker(), restored=beginning.restored, live=False)
-        blocks = arrivals(Path(log), beginning.source, len(described.rotors))
-    else:
-        service = Service(described, settings, InlineWorker(), live=False)
-        blocks = stream(recording)
-    rows = sum(len(c.t) for c in recording.channels.values())
-    with terminal.progress() as advance:
+    with terminal.progress(FIT) as advance:
+        advance(f"reading {cut.path.name}", 0.0)
+        recording = cut.of(open_log(cut.path, preset, described.columns | parse_columns(columns or [])))
+        if as_recorded:
+            beginning = _beginning(Path(log), described.name)
+            described = beginning.vehicle
+            service = Service(described, beginning.settings, InlineWorker(), restored=beginning.restored, live=False)
+            blocks = arrivals(Path(log), beginning.source, len(described.rotors))
+        else:
+            service = Service(described, settings, InlineWorker(), live=False)
+            blocks = stream(recording)
+        rows = sum(len(c.t) for c in recording.channels.values())
         outputs = play(service, blocks, pace, lambda count: advance("replay", min(count / max(rows, 1), 1.0)))
-    result = summary(recording, service, outputs, candidates)
-    if out is not None:
-        write_outputs(out, outputs, described.name)
-        result["out"] = str(out.absolute())
+        result = summary(recording, service, outputs, candidates)
+        if out is not None:
+            advance(f"writing {out.name}", 1.0)
+            write_outputs(out, outputs, described.name)
+            result["out"] = str(out.absolute())
     terminal.conclude(Replayed(result), json)
     if not result["published"]:
         raise typer.Exit(NOTHING)

@@ -12,6 +12,7 @@ from quadid_evaluation.paper import protocol
 from quadid_evaluation.paper.figures import FIGURES, draw, interactive
 from quadid_evaluation.paper.page import all_tables, paper_markdown, paper_sections
 
+from quadid.app.kernels import FIT
 from quadid.app.logs import check_folder, write_text, written_whole
 from quadid.app.options import JsonTarget, OutFolder, Seed
 from quadid.cli import terminal
@@ -35,7 +36,7 @@ def reproduce(
     check_folder(folder / _FIGURES, "--out", "figure-*")
     flights = check_folder(folder / "flights", "--out", "set?.mcap", "pelican.yaml")
     plan = protocol.QUICK if quick else protocol.Plan()
-    with terminal.progress() as advance:
+    with terminal.progress(FIT) as advance:
         command = f"quadid reproduce{' --quick' if quick else ''} --seed {seed}"
         result, scores = protocol.reproduce(flights, plan, seed, advance, command)
         advance("draw", 0.0)

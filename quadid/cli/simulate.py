@@ -10,6 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from quadid.app.options import JsonTarget, Seed, VehicleName
+from quadid.app.outcome import Advance, silent
 from quadid.app.simulate import Draw, Drawn, SimulateError, check_suffix, simulate_draws
 from quadid.app.simulate import simulate as fly
 from quadid.cli import terminal
@@ -69,22 +70,31 @@ def simulate(
         "seconds": seconds, "effects": effect or (), "profile": profile, "manoeuvre": manoeuvre, "noise": noise,
         "rate": rate, "extras": extra or (), "spread": spread,
     }  # fmt: skip
-    if draws is not None:
-        if out.startswith(LIVE):
-            raise SimulateError(f"--draws {draws} to {out}", "a file", "leave one of them out")
-        several(Path(out), simulate_draws(vehicle, draws, seed, **how), json)
+    live = out.startswith(LIVE)
+    if draws is not None and live:
+        raise SimulateError(f"--draws {draws} to {out}", "a file", "leave one of them out")
+    with terminal.progress(("flight",)) as advance:
+        advance("flying", 0.0)
+        if draws is not None:
+            drawn = simulate_draws(vehicle, draws, seed, **how)
+            result = saved(Path(out), drawn)
+        else:
+            done = fly(vehicle, seed=seed, **how)
+            if live:
+                stream(out, done.flight.recording, advance)
+            done.result["log"] = out if live else str(done.save(out))
+    if draws is None:
+        terminal.conclude(done, json)
         return
-    done = fly(vehicle, seed=seed, **how)
-    if out.startswith(LIVE):
-        stream(out, done.flight.recording)
-        done.result["log"] = out
-    else:
-        done.result["log"] = str(done.save(out))
-    terminal.conclude(done, json)
+    terminal.conclude(result, json)
+    if result.result["diverged"] == draws:
+        from quadid.flight import FlightError
+
+        raise FlightError(f"all {draws} vehicles diverged", fix="another manoeuvre, or gains that fit the vehicle")
 
 
-def several(target: Path, draws: Sequence[Draw], json: str | None) -> None:
-    """Writes the logs of several draws as ``OUT-1``, ``OUT-2`` and so on, and says which did not last."""
+def saved(target: Path, draws: Sequence[Draw]) -> Drawn:
+    """Writes the logs of several draws as ``OUT-1``, ``OUT-2`` and so on; returns which did not last."""
     paths = [target.with_name(f"{target.stem}-{i}{target.suffix}") for i in range(1, len(draws) + 1)]
     entries = [draw.entry for draw in draws]
     for entry, draw, path in zip(entries, draws, paths, strict=True):
@@ -92,11 +102,7 @@ def several(target: Path, draws: Sequence[Draw], json: str | None) -> None:
             entry["log"] = str(draw.flown.save(path))
     lost = sum(bool(draw.failed) for draw in draws)
     result = {"schema": "quadid.simulate/1", "vehicle": draws[0].vehicle.name, "diverged": lost, "draws": entries}
-    terminal.conclude(Drawn(result, tuple(path.name for path in paths)), json)
-    if lost == len(draws):
-        from quadid.flight import FlightError
-
-        raise FlightError(f"all {lost} vehicles diverged", fix="another manoeuvre, or gains that fit the vehicle")
+    return Drawn(result, tuple(path.name for path in paths))
 
 
 def check_target(out: str) -> None:
@@ -110,7 +116,7 @@ def check_target(out: str) -> None:
     terminal.check_file(out, "OUT")
 
 
-def stream(address: str, recording: Recording) -> None:
+def stream(address: str, recording: Recording, advance: Advance = silent) -> None:
     """Sends a recording as MAVLink 2 over UDP, each message when its time has come.
 
     Raises:
@@ -126,15 +132,17 @@ def stream(address: str, recording: Recording) -> None:
         raise SimulateError(f"cannot send to {address} ({error.strerror})", fix="check host and port") from error
     mav = dialect.MAVLink(None, srcSystem=SYSTEM, srcComponent=COMPONENT)
     try:
-        for message in in_real_time(mavlink_messages(recording)):
+        begin, end = recording.channels["gyro"].t[[0, -1]]
+        for t, message in in_real_time(mavlink_messages(recording)):
+            advance("sending", (t - begin) / (end - begin))
             link.write(message.pack(mav))
             mav.seq = (mav.seq + 1) % 256
     finally:
         link.close()
 
 
-def in_real_time(messages: Iterator[tuple[float, Any]]) -> Iterator[Any]:
-    """Yields messages when their time [s] has come, counted from the first."""
+def in_real_time(messages: Iterator[tuple[float, Any]]) -> Iterator[tuple[float, Any]]:
+    """Yields times [s] and messages when their time has come, counted from the first."""
     begin: float | None = None
     for t, message in messages:
         now = time.monotonic()
@@ -142,4 +150,4 @@ def in_real_time(messages: Iterator[tuple[float, Any]]) -> Iterator[Any]:
             begin = now - t
         if begin + t > now:
             time.sleep(begin + t - now)
-        yield message
+        yield t, message

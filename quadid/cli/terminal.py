@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from quadid.app.kernels import FIT, prepare
+from quadid.app.kernels import prepare
 from quadid.app.logs import OutputError, check_place, write_text
 from quadid.app.outcome import Advance, Outcome, json_text, silent
 from quadid.errors import QuadidError
@@ -55,7 +55,7 @@ def warn(messages: tuple[str, ...] | list[str]) -> None:
 
 
 @contextmanager
-def progress(compiled: Sequence[str] = FIT) -> Iterator[Advance]:
+def progress(compiled: Sequence[str] = ()) -> Iterator[Advance]:
     """Shows a progress bar on stderr while the block runs, if stderr is a terminal; yields how to advance it.
 
     Args:
@@ -150,11 +150,11 @@ def print_verdict(console: Console, verdict: Verdict) -> None:
         print_cell(console, Cell(line))
 
 
-def conclude(
-    done: Outcome, json: str | None, report: Path | None = None, folder: Path | None = None,
-    series: Path | None = None, kept: str | None = None,
-) -> None:  # fmt: skip
-    """Writes what a command gives beside what it prints, names that in its JSON, and prints the result.
+def write(
+    done: Outcome, report: Path | None = None, folder: Path | None = None, series: Path | None = None,
+    kept: str | None = None,
+) -> list[tuple[str, Path]]:  # fmt: skip
+    """Writes the files of a result but its JSON, which names them; returns them with labels.
 
     Args:
         series: folder for measured, simulated and missing over time.
@@ -169,6 +169,11 @@ def conclude(
         written = whole.save_series(series)
         done.result["series"] = [str(path) for path in written]
         files += [("Over time", path) for path in written]
+    return files
+
+
+def show(done: Outcome, json: str | None, files: Sequence[tuple[str, Path]] = ()) -> None:
+    """Prints a result, also as JSON, and names the files that were written."""
     write_json(done.result, json)
     out = console(quiet=json == "-")
     for cell in done.opening:
@@ -181,6 +186,11 @@ def conclude(
     for label, path in files:
         out.print(f"{label}: {path}", soft_wrap=True)
     warn(done.warnings)
+
+
+def conclude(done: Outcome, json: str | None, folder: Path | None = None, kept: str | None = None) -> None:
+    """Writes and prints a result; arguments as of `write`."""
+    show(done, json, write(done, folder=folder, kept=kept))
 
 
 # --- Errors as one line for people: what was found, what is allowed, what to do

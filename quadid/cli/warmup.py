@@ -13,7 +13,7 @@ def warmup(json: JsonTarget = None) -> None:
     """Compile all kernels for this machine's processor, in processes side by side; nothing to do where that is done."""
     terminal.check_file(json, "--json")
     begin = time.perf_counter()
-    with terminal.progress(compiled=()) as advance:
+    with terminal.progress() as advance:
         made = prepare(tuple(PARTS), advance)
     seconds = time.perf_counter() - begin
     terminal.write_json({"schema": "quadid.warmup/1", "compiled": made, "seconds": seconds}, json)

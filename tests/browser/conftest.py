@@ -52,12 +52,11 @@ def hostile_page(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def demo_page(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The report that `quadid demo --quick` writes."""
-    from quadid.app.logs import write_text
-    from quadid.cli import demo
+    from quadid.cli.demo import demo
 
     folder = tmp_path_factory.mktemp("demo")
-    shown = demo.run(demo.QUICK_SECONDS, 1, folder, lambda stage, share: None)
-    return write_text(folder / "report.html", demo.html(shown, 1, "quadid demo"))
+    demo(quick=True, out=folder)
+    return folder / "report.html"
 
 
 @pytest.fixture(scope="session")
