@@ -6,9 +6,6 @@ import sys
 import threading
 import time
 
-PATIENCE = 0.5
-"""Nothing is said before [s]; afterwards as often."""
-
 
 class Loading:
     """Seconds of loading in one line of stderr, on a terminal only; `end` takes the line away."""
@@ -21,7 +18,7 @@ class Loading:
 
     def _count(self) -> None:
         begin = time.monotonic()
-        while not self._ended.wait(PATIENCE):
+        while not self._ended.wait(0.5):
             print(f"\rquadid: loading, {time.monotonic() - begin:.0f} s", end="", file=sys.stderr, flush=True)
 
     def end(self) -> None:

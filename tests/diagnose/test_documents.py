@@ -20,7 +20,7 @@ def test_every_effect_has_its_part_and_no_other_is_explained(repository: Path) -
     assert set(explained) == set(EFFECTS)
     assert len(parts) == len(EFFECTS)
     for name, part in explained.items():
-        for word in ("**Equation:**", "**Size:**", "**In the data:**", "**Similar:**", "**To separate them:**"):
+        for word in ("**Equation:**", "**Size:**", "**Signs:**", "**Similar:**", "**Separated by:**"):
             assert word in part, (name, word)
         assert EFFECTS[name].advice.endswith("."), f"{name}: what to do is said with the finding"
         assert ("(of the flight)" in part.splitlines()[0]) == EFFECTS[name].per_log, name
