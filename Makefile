@@ -58,6 +58,14 @@ node: ## the node alone: NumPy 1.26 as beside ROS 2 Jazzy, no plots, Dask or pya
 	rm -rf build/node
 	tools/node_alone.sh build/node $(PYTHON)
 
+.PHONY: wheel
+wheel: $(DEV) ## a wheel in dist/, installed alone into build/wheel, where it must identify a simulated flight
+	rm -rf build/wheel dist/quadid-*.whl
+	$(BIN)/python -m hatchling build --target wheel --directory dist
+	$(PYTHON) -m venv build/wheel
+	@tools/waiting.sh "Installing into build/wheel" build/wheel/bin/pip --quiet install dist/quadid-*.whl
+	cd build/wheel && bin/quadid simulate flight.mcap --seconds 20 && bin/quadid identify flight.mcap --vehicle pelican
+
 venv: $(RUNTIME) ## .venv with the quadid command
 dev: $(DEV) ## ... and what developers use: linters, types, tests
 messages: $(MESSAGES) ## .venv with the quadid command, ROS 2 Jazzy and quadid_msgs, without what developers use
