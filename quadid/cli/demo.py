@@ -146,6 +146,7 @@ def html(shown: Shown, seed: int, command: str) -> str:
         shown.diagnosed.result, shown.diagnosed.sets, "same", TRUE_SECTION,
         "Nothing was hidden in this vehicle, so nothing should be found.",
     )  # fmt: skip
+    same["kind"] = "folded"
     apart = diagnosis_part(
         hidden.result, hidden.sets[-1:], "hidden", HIDDEN_SECTION,
         f"This vehicle flew with {effects_words(HIDDEN)}, which the model lacks.", hidden.maps(),

@@ -40,8 +40,8 @@ class Explanation(StrEnum):
         """The verdict in plain words."""
         return {
             Explanation.NOTHING_FOUND: "The simulation agrees with the flight: nothing was found that it gets wrong.",
-            Explanation.EXPLAINED: "Together they explain more than 99.9 % of the model error.",
-            Explanation.PARTLY_EXPLAINED: "Together they explain most of the model error; some remains.",
+            Explanation.EXPLAINED: "This explains more than 99.9 % of the model error.",
+            Explanation.PARTLY_EXPLAINED: "This explains most of the model error; some remains.",
             Explanation.UNKNOWN: "The simulation gets something wrong that no known cause explains.",
         }[self]
 

@@ -607,7 +607,7 @@ def missing_section(missing: Json, log: str, parts: Mapping[str, Sequence[Missin
     )
     return section(
         "missing",
-        "What acts on the vehicle and the simulation lacks",
+        "Force and moment that the simulation misses",
         intro,
         missing_figures(parts, "missing"),
         [table],

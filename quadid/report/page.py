@@ -84,8 +84,12 @@ def packed(value: Any) -> Any:
 
 def unit(text: str) -> str:
     """A unit with raised powers: ``N s^2/rad^2`` -> ``N s²/rad²``; a dash for none."""
-    raised = re.sub(r"\^(-?\d+)", lambda m: m[1].translate(_RAISED), text)
-    return raised.replace(" ", "\u00a0") or "–"
+    return raised(text).replace(" ", "\u00a0") or "–"
+
+
+def raised(text: str) -> str:
+    """A text with raised powers in its units."""
+    return re.sub(r"\^(-?\d+)", lambda m: m[1].translate(_RAISED), text)
 
 
 def number(value: float | None, digits: int = 4) -> str:

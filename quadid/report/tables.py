@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from html import escape
 from typing import Literal, NamedTuple
 
-from quadid.report.page import rows_of
+from quadid.report.page import raised, rows_of
 from quadid.report.verdict import digits, parameter_name, percent, relative_halfwidth, status_words
 from quadid.types import Json, JsonDict
 
@@ -80,7 +80,8 @@ class TextTable:
 
     def part(self) -> JsonDict:
         """The table as part of a page, without its title."""
-        return rows_of([c.heading for c in self.columns], [[_cell(value).text for value in row] for row in self.rows])
+        rows = [[raised(_cell(value).text) for value in row] for row in self.rows]
+        return rows_of([raised(c.heading) for c in self.columns], rows)
 
     def _blocks(self, width: int) -> list[list[int]]:
         """Columns that stand beside each other: those kept, below each other where the width does not hold them.

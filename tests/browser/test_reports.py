@@ -239,6 +239,15 @@ def test_the_other_reports_too(
         assert one.complaints == []
 
 
+def test_a_report_is_read_on_a_phone(chromium: Browser, demo_page: Path, shots: Path) -> None:
+    """As it opens, details folded, seven screens; the words of the verdict come first."""
+    with opened(chromium, demo_page, 390) as one:
+        one.page.screenshot(path=shots / "demo-390-folded.png", full_page=True)
+        assert one.page.evaluate("document.documentElement.scrollHeight") <= 6000
+        assert one.page.evaluate("document.documentElement.scrollWidth") <= 390
+        assert one.page.locator("main .verdict").first.is_visible()
+
+
 @pytest.mark.parametrize("width", [390, 700])
 def test_a_fleet_is_read_on_a_phone(chromium: Browser, fleet_page: Path, shots: Path, width: int) -> None:
     """A few screens as it opens; unfolded, two lines a log or three; what is folded opens where it is touched."""

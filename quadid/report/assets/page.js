@@ -72,9 +72,10 @@
   const boxes = () => document.querySelectorAll(".plot");
   const redraw = () => boxes().forEach((box) => { if (box.dataset.drawn) draw(box); });
 
-  // A phone shows the verdict, what is missing and the parameters; the rest unfolds where it is touched.
+  // A phone shows the verdict, the first part and the parameters; the rest unfolds where it is touched.
   if (window.matchMedia("(max-width: 640px)").matches) {
-    document.querySelectorAll("main details").forEach((part) => { part.open = Boolean(part.closest("#missing")) && part.parentElement.id === "missing"; });
+    const first = document.querySelector("main section:not(#verdict)");
+    document.querySelectorAll("main details").forEach((part) => { part.open = part.open && part.parentElement === first; });
   }
 
   const seen = new IntersectionObserver((entries) => {
