@@ -87,7 +87,7 @@ class Filtered:
     def doubts(self, free: Free) -> tuple[str, ...]:
         """Sentences on parameters whose estimates differ too much."""
         late = [n for n, step in zip(free.names, self.prompt, strict=True) if abs(step) > SPREAD_LIMIT]
-        otherwise = f"{', '.join(late)}: more than {SPREAD_LIMIT:.0%} different where nothing is late"
+        otherwise = f"{', '.join(late)}: more than {SPREAD_LIMIT:.0%} different without lag and delay"
         return (*((otherwise,) if late else ()), *self.trust.reasons(free))
 
 

@@ -140,12 +140,12 @@ class Reliability:
     def reasons(self, free: Free) -> tuple[str, ...]:
         """Sentences on the nominal parameters whose estimates differ too much."""
         if self.missed:
-            return ("the model misses this flight by so much that its numbers are not to be used",)
+            return ("the model is so far from this flight that its numbers are not to be used",)
         why: dict[str, list[str]] = {}
         for j in np.flatnonzero((self.spread > SPREAD_LIMIT) & free.is_log):
             k = int(np.argmax(np.abs(self.steps[:, j]))) if len(self.steps) else -1
             close = k < 0 or abs(self.steps[k, j]) < self.spread[j]
-            how = f"changes by more than {SPREAD_LIMIT:.0%} {'between parts of the flight' if close else self.names[k]}"
+            how = f"more than {SPREAD_LIMIT:.0%} different {'between parts of the flight' if close else self.names[k]}"
             why.setdefault(how, []).append(free.names[j])
         return tuple(f"{', '.join(n)}: {how}" for how, n in why.items())
 

@@ -214,8 +214,11 @@ def _match(ratio: float, shares: tuple[float, float] | None, where: str) -> tupl
         return "fair", f"without gyro and accelerometer it is unknown what the simulation misses on {where}"
     if ratio <= NOISE_LEVEL and shares[0] <= SMALL_FORCE and shares[1] <= SMALL_MOMENT:
         return "good", f"the simulation of {where} misses nothing of importance"
-    missing = f"{percent(shares[0])} of the weight and up to {percent(shares[1])} of the rotors' moment"
-    return "fair", f"on {where} the simulation misses {missing}"
+    moment = f"up to {percent(shares[1])}".replace("up to over", "over")
+    return (
+        "fair",
+        f"on {where} the simulation misses {percent(shares[0])} of the weight and {moment} of the rotors' moment",
+    )
 
 
 def _count(known: int, total: int) -> str:
@@ -231,8 +234,8 @@ def _details(known: Sequence[Json], judged: Sequence[Json]) -> tuple[str, ...]:
         out.append(f"The least certain is {widest['name']}, to {percent(relative_halfwidth(widest))} (95 % interval).")
     fits: list[str] = []
     for name, axis in (("p", "roll"), ("q", "pitch"), ("r", "yaw")):
-        values = [max(v, -999.0) for s in judged if (v := s["fit_percent"].get(name)) is not None]
-        fits += [f"{axis} {min(values):.0f} %"] if values else []
+        values = [v for s in judged if (v := s["fit_percent"].get(name)) is not None]
+        fits += [f"{axis} {min(values):.0f} %" if min(values) >= -100.0 else f"{axis} below -100 %"] if values else []
     if fits:
         out.append(f"Fit over one second: {', '.join(fits)} (100 % is perfect, 0 % is no better than the mean).")
     return tuple(out)
@@ -242,6 +245,12 @@ def at_bounds(result: Json) -> list[str]:
     """Names of the parameters that a fit left on a bound, as its warnings tell."""
     names = [p["name"] for p in result["parameters"]]
     return [n for n in names if any(w.startswith(f"{n} = ") and "rests on its bound" in w for w in result["warnings"])]
+
+
+def out_of_reach(result: Json) -> dict[str, str]:
+    """Parameters that the channels of the logs cannot show, and why, as its warnings state it."""
+    told = (w.partition(": the vehicle file's values are kept, because ") for w in result["warnings"])
+    return {name: why for names, _, why in told if why for name in names.split(", ")}
 
 
 def _next_steps(
@@ -259,7 +268,11 @@ def _next_steps(
             f"rest{'s' * (len(stuck) == 1)} on a bound."
         )
     # With the wrong model a parameter seems hidden that the flight shows well: more flying is no cure.
-    hidden = [] if rough else [p for p in open_ones if p["name"] not in stuck]
+    beyond = out_of_reach(result)
+    for why in dict.fromkeys(beyond.values()):
+        names = ", ".join(name for name, other in beyond.items() if other == why)
+        out.append(f"Log it better: {why}. Then {names} can be identified.")
+    hidden = [] if rough else [p for p in open_ones if p["name"] not in stuck and p["name"] not in beyond]
     for p in hidden:
         if p["status"] == "prior_dominated":
             out.append(f"Fly {MOTION.get(p['name'], 'with more motion')}: {p['name']} is not observable in these data.")

@@ -146,4 +146,4 @@ def test_a_filter_that_passes_for_inertia_makes_it_unreliable(data_dir: Path) ->
     for name, truth in (("J_xx", 0.018), ("J_yy", 0.024)):
         found = fit.parameters[name]
         assert found.ci95[0] < truth < found.ci95[1] or found.status not in SURE
-    assert any("where nothing is late" in w for w in fit.result["warnings"])
+    assert any("without lag and delay" in w for w in fit.result["warnings"])

@@ -73,6 +73,25 @@ def test_what_the_data_do_not_show_is_said_with_the_motion_it_needs() -> None:
     assert any("yaw turns" in step for step in verdict.next_steps)
 
 
+def test_what_the_channels_cannot_show_needs_another_log_and_no_motion() -> None:
+    why = "rotor signal at 12 Hz is too slow, 30 Hz needed"
+    result = _result(status="prior_dominated")
+    result["warnings"] = [f"d, J_xx, J_yy, J_zz, J_r: the vehicle file's values are kept, because {why}"]
+    steps = identify_verdict(result).next_steps
+    assert f"Log it better: {why}. Then d, J_xx, J_yy, J_zz, J_r can be identified." in steps
+    assert [step for step in steps if step.startswith("Fly ")] == [
+        "Fly climbs and descents: b is not observable in these data."
+    ]
+
+
+def test_a_useless_fit_and_a_huge_lack_are_said_in_words() -> None:
+    result = _result(moment=0.9)
+    result["sets"][-1]["fit_percent"] = {"p": -864.0, "q": -53.0}
+    verdict = identify_verdict(result)
+    assert "and over 200 % of the rotors' moment" in verdict.headline
+    assert any("roll below -100 %, pitch -53 %" in line for line in verdict.details)
+
+
 def test_with_the_wrong_model_more_flying_is_no_cure() -> None:
     result = _result(fitted=320.0)
     result["parameters"][5]["status"] = "prior_dominated"
