@@ -13,7 +13,7 @@ from quadid.checks import Inspection, inspect
 from quadid.data.window import CHANNELS, Recording
 from quadid.errors import QuadidError
 from quadid.report.figures import WHOLE_POINTS, thinned
-from quadid.report.page import axis, figure, render, rows_of, section, trace
+from quadid.report.page import axis, figure, raised, render, rows_of, section, trace
 from quadid.report.verdict import Verdict
 from quadid.types import JsonDict
 from quadid.vehicle import Vehicle
@@ -71,7 +71,7 @@ def _data(recording: Recording, place: int) -> JsonDict:
             t, columns = channel.t[rows] - channel.t[0], channel.values[rows].T
             data = [trace(f"unit{k}", f"{name} {k + 1}", t, column) for k, column in enumerate(columns)]
             layout, title = {"xaxis": axis("time [s]")}, name.replace("_", " ")
-            figures.append(figure(f"raw{place}-{i}", title, data, layout, 220, caption=CHANNELS[name][1]))
+            figures.append(figure(f"raw{place}-{i}", title, data, layout, 220, caption=raised(CHANNELS[name][1])))
     intro = f"{recording.format}, {len(recording.channels)} channels."
     if recording.warnings:
         intro += " Notes: " + "; ".join(recording.warnings) + "."
