@@ -28,7 +28,7 @@ P = 7
 PRIOR = np.full(P, 0.7)
 MOVES = {"roll": 0.15, "pitch": 0.15, "yaw": 0.2}
 """Sticks, rms [rad]."""
-SMOOTHED = {"imu_lag": {"cutoff": 20.0}}
+SMOOTHED, SLOW = {"imu_lag": {"cutoff": 20.0}}, {"imu_lag": {"cutoff": 6.5}}
 AWAY = np.array([0.15, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
 
 
@@ -207,7 +207,7 @@ def test_a_simulator_without_gyroscopic_coupling_is_seen(share: float) -> None:
     assert bool(sigma[NOMINAL_NAMES.index("J_zz")] < 0.05) is (share == 0.0)
 
 
-@pytest.mark.parametrize(("effects", "stated"), [(SMOOTHED, True), (SMOOTHED, False), ({}, False)])
+@pytest.mark.parametrize(("effects", "stated"), [(SMOOTHED, True), (SMOOTHED, False), (SLOW, False), ({}, False)])
 def test_a_low_pass_of_the_gyro_does_not_pass_for_a_smaller_inertia(
     effects: dict[str, dict[str, float]], stated: bool
 ) -> None:
