@@ -80,7 +80,7 @@ def export(
     written = written_as(described, format, origin, doubt)
     texts = {f"{file_name(described.name)}{end}": text for end, text in written.items()}
     guessed = [n for n, p in described.parameters.items() if p.sigma is None]
-    warnings = [f"{', '.join(guessed)}: guesses from the vehicle file; no flight was fitted"] if guessed else []
+    warnings = [f"{', '.join(guessed)}: guesses from the vehicle file; no flight has shown better"] if guessed else []
     if format in ("px4", "ardupilot") and described.command.max_speed is None:
         warnings.append("no hover thrust: add command.max_speed, the rotor speed at full command, to the vehicle file")
     warnings += [why for why in (refused(described, format), doubt and f"{origin} is {doubt}") if why]
