@@ -706,8 +706,8 @@ def open_store(path: Path) -> Iterator[Store]:
     """Opens or makes the SQLite file; raises OutputError for one that `fleet` has not made, or that fails."""
     check_beside(path)
     try:
-        if path.is_symlink() or (path.exists() and not path.is_file()):
-            raise sqlite3.DatabaseError("it is no regular file")
+        if path.is_symlink() or (path.exists() and (not path.is_file() or path.stat().st_nlink > 1)):
+            raise sqlite3.DatabaseError("it is no regular file, or has a second name")
         with contextlib.closing(sqlite3.connect(path)) as connection:
             yield Store(connection)
     except sqlite3.Error as error:

@@ -211,7 +211,7 @@ def test_results_that_a_stranger_packed_beside_the_logs_are_forgotten(
     happened(35, "fleet.sqlite packed beside the logs: its rows forgotten, the logs done")
 
 
-@pytest.mark.parametrize("what", ["a view", "a trigger", "a pipe", "a link", "a folder", "text"])
+@pytest.mark.parametrize("what", ["a view", "a trigger", "a pipe", "a link", "other results", "a folder", "text"])
 def test_a_store_that_fleet_has_not_made_is_refused(tmp_path: Path, what: str, happened: Happened) -> None:
     path, other = tmp_path / "fleet.sqlite", tmp_path / "other"
     with contextlib.closing(sqlite3.connect(other)) as db, db:
@@ -228,6 +228,13 @@ def test_a_store_that_fleet_has_not_made_is_refused(tmp_path: Path, what: str, h
         os.mkfifo(path)
     elif what == "a link":
         path.symlink_to(other)
+    elif what == "other results":  # by a second name
+        other.unlink()
+        with open_store(other) as store:
+            store._connection.execute("INSERT INTO trims (log) VALUES ('x')")
+            store._connection.commit()
+        kept = other.read_bytes()
+        os.link(other, path)
     elif what == "a folder":
         path.mkdir()
     else:
