@@ -122,7 +122,7 @@ def said(records: Sequence[Record]) -> str:
     return (
         "The motor lag is missing from all models. Only `quadid identify` reports it, by statuses: "
         f"{counts}; {missed} identified values lie outside their interval. Its intervals (half-widths {widths} %) "
-        "reach from fast motion fitted with a lag of its own to the answer without. `quadid diagnose` names the lag."
+        "allow for what a missing lag may do. `quadid diagnose` names the lag."
     )
 
 
