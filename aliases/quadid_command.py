@@ -20,4 +20,7 @@ def main() -> int:
             raise
         print(f"quadid: {error}", file=sys.stderr)  # noqa: T201 - a command's last word
         return 2
-    return app_main(loading)
+    try:
+        return app_main()
+    finally:
+        loading.end()

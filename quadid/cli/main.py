@@ -15,7 +15,6 @@ from typer.core import TyperCommand, TyperGroup
 from typer.main import get_command
 
 from quadid.cli.commands import COMMANDS, load
-from quadid.cli.loading import Loading
 
 
 class LazyGroup(TyperGroup):
@@ -31,10 +30,7 @@ class LazyGroup(TyperGroup):
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         """Finds the command asked for, imported and complete."""
         name, command, rest = super().resolve_command(ctx, args)
-        whole = None if command is None else load(str(command.name))
-        if ctx.obj is not None:
-            ctx.obj.end()
-        return name, whole, rest
+        return name, None if command is None else load(str(command.name)), rest
 
 
 def _version(wanted: bool) -> None:
@@ -64,12 +60,8 @@ BLAS_THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 core itself: more threads than one only wait for each other, on a busy machine for most of the time."""
 
 
-def app_main(loading: Loading | None = None) -> int:
-    """Runs the command line; returns the exit code: 0 done, 2 bad input, 3 the data cannot support an answer.
-
-    Args:
-        loading: what is shown until the command is imported.
-    """
+def app_main() -> int:
+    """Runs the command line; returns the exit code: 0 done, 2 bad input, 3 the data cannot support an answer."""
     if sys.stderr is None:  # closed by the shell: what is written to it goes nowhere
         sys.stderr = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115 - it stays open to the end
     if sys.stdout is None:
@@ -83,8 +75,7 @@ def app_main(loading: Loading | None = None) -> int:
     for name in BLAS_THREADS:
         os.environ.setdefault(name, "1")
     try:
-        words = sys.argv[1:] or ["--help"]
-        result = get_command(app).main(words, prog_name="quadid", standalone_mode=False, obj=loading)
+        result = get_command(app).main(sys.argv[1:] or ["--help"], prog_name="quadid", standalone_mode=False)
         sys.stdout.flush()
     except BrokenPipeError:
         # The reader of our pipe left; nothing more can be said there, not even at exit.

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import io
 import os
 import pty
 import re
 import socket
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -31,6 +33,7 @@ from quadid.app.logs import OutputError, load, write_recording, write_text, writ
 from quadid.app.simulate import read_manoeuvre
 from quadid.cli.commands import COMMANDS
 from quadid.cli.history import Stored
+from quadid.cli.loading import Loading
 from quadid.cli.main import BLAS_THREADS
 from quadid.cli.replay import Replayed
 from quadid.cli.terminal import check_file, conclude
@@ -57,6 +60,38 @@ def test_help_lists_every_installed_command(quadid: Cli) -> None:
 def test_the_list_of_commands_is_whole_on_a_narrow_terminal(quadid: Cli) -> None:
     text = " ".join(quadid("--help", COLUMNS="60").out.split())
     assert all(command.short in text for command in COMMANDS.values())
+
+
+class Terminal(io.StringIO):
+    """A stream that is a terminal, or not."""
+
+    def __init__(self, is_one: bool) -> None:
+        super().__init__()
+        self.is_one = is_one
+
+    def isatty(self) -> bool:
+        return self.is_one
+
+
+@pytest.mark.parametrize("terminal", [True, False])
+def test_a_terminal_sees_that_a_command_is_loaded_until_it_prints(
+    monkeypatch: pytest.MonkeyPatch, terminal: bool
+) -> None:
+    out, err = Terminal(True), Terminal(terminal)
+    monkeypatch.setattr(sys, "stdout", out)
+    monkeypatch.setattr(sys, "stderr", err)
+    loading = Loading()
+    for _ in range(100):
+        time.sleep(0.02 if terminal else 0.0)
+        if err.getvalue():
+            break
+    print("answer")
+    said = err.getvalue()
+    loading.end()
+    assert (said.startswith("\rquadid: loading, ") and said.endswith("\r\x1b[2K")) == terminal
+    assert (said == "") != terminal
+    assert err.getvalue() == said, "erased once"
+    assert out.getvalue() == "answer\n"
 
 
 def test_start_imports_nothing_heavy() -> None:
