@@ -17,7 +17,7 @@ class Loading:
         self._line = threading.Thread(target=self._count, daemon=True)
         self._streams = [_First(stream, self.end) for stream in (sys.stdout, sys.stderr) if stream is not None]
         if len(self._streams) == 2 and self._terminal.isatty():
-            sys.stdout, sys.stderr = self._streams  # type: ignore[assignment]  # they do all that a stream does
+            sys.stdout, sys.stderr = self._streams
             self._line.start()
 
     def _count(self) -> None:
