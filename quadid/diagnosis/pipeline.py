@@ -19,7 +19,7 @@ from quadid.effects import EFFECTS
 from quadid.identification.fit import NO_FILTER, Fit, FitOptions, check_windows, possible_moments, tied
 from quadid.identification.gauss_newton import polish
 from quadid.identification.noise import NoiseModel
-from quadid.identification.noise_fit import FAR_ITERATIONS, flexible_fit, residual_noise, with_memory
+from quadid.identification.noise_fit import FAR_ITERATIONS, flexible_fit, residual_noise
 from quadid.identification.problem import Shooting
 from quadid.identification.result import with_values
 from quadid.identification.search import SWARM_SECONDS, Progress, swarm_search
@@ -196,9 +196,7 @@ def _selected(
             break
         again = select(schedule, nominal, listed, report, search.model)
         search = replace(again, rounds=(*search.rounds, *again.rounds))
-    # 6. The memory of the noise; under other noise a cause may be nothing any more.
-    noise = with_memory(windows, search.shooting, search.model.theta, search.model.free.names)
-    schedule, search = _with_noise(noise, schedule, search)
+    # 6. Under other noise a cause may be nothing any more.
     return schedule, replace(search, model=pruned(search.shooting, search.model))
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.optimize import lsq_linear
 
 from quadid.estimate import kalman as k
-from quadid.estimate.kalman import Gains
+from quadid.estimate.kalman import Gains, Track
 from quadid.estimate.problem import Problem
 from quadid.types import BoolArray, FloatArray
 
@@ -101,7 +101,7 @@ def estimate(problem: Problem, start: FloatArray | None = None) -> Estimate:
         if (z - before) @ information @ (z - before) < FINE:
             break
     # 4. Where innovations have outliers, their density has tails.
-    tail = tails([whitened(g) for g in gains])
+    tail = tails([whitened(*each) for each in zip(problem.tracks, gains, strict=True)])
     if np.any(tail > 0.0):
         heavy = replace(problem, tail=tail)
         tried = scoring(heavy, z, psi, MOST, ALL_NOISE)
@@ -133,7 +133,8 @@ def estimate(problem: Problem, start: FloatArray | None = None) -> Estimate:
     by_square = taken * of_square(problem, z, psi, gains)
     score = information + noise + 0.25 * within.T @ within + np.outer(by_square, by_square)
     covariance = inverse @ score @ inverse
-    return Estimate(problem, z, psi, np.asarray(covariance), value, tuple(whitened(g) for g in gains))
+    white = tuple(whitened(*each) for each in zip(problem.tracks, gains, strict=True))
+    return Estimate(problem, z, psi, np.asarray(covariance), value, white)
 
 
 def settle_noise(problem: Problem, z: FloatArray, psi: FloatArray) -> tuple[FloatArray, FloatArray, list[Gains]]:
@@ -165,10 +166,17 @@ def of_square(problem: Problem, z: FloatArray, psi: FloatArray, gains: Sequence[
     return float(min(2.0 * np.sqrt(known[k.ROTOR, k.ROTOR]), (high / psi[k.ROTOR]) ** 2 / np.sqrt(12.0)))
 
 
-def whitened(gains: Gains) -> FloatArray:
+def measured(track: Track, g: Gains) -> BoolArray:
+    """Mask of innovations that are of measurements, shape (n, M): a velocity that nobody measured has only a prior."""
+    out = g.S > 0.0
+    out[:, k.VELOCITY :] &= track.seen[:, 3:]
+    return np.asarray(out)
+
+
+def whitened(track: Track, g: Gains) -> FloatArray:
     """Innovations of a pass over their standard deviations, shape (n, M); 0 where not measured."""
-    seen = gains.S > 0.0
-    return np.where(seen, gains.nu * np.sqrt(gains.w / np.where(seen, gains.S, 1.0)), 0.0)
+    seen = measured(track, g)
+    return np.where(seen, g.nu * np.sqrt(g.w / np.where(seen, g.S, 1.0)), 0.0)
 
 
 def tails(whitened: Sequence[FloatArray]) -> FloatArray:

@@ -756,14 +756,13 @@ def kalman(track: Track, p: FloatArray, psi: FloatArray, tail: FloatArray, store
             for j in range(count):
                 S += what[j] * PH[where[j]]
             square, light = v * v / S, 1.0
-            if m < VELOCITY or track.seen[k, 3]:
-                k_inv = tail[m // 3]
-                if k_inv > 0.0:
-                    light = min((1.0 + k_inv) / (1.0 + k_inv * square), 1.0)
-                    total += (1.0 + 1.0 / k_inv) * math.log1p(k_inv * square) + _normaliser(1.0 / k_inv)
-                else:
-                    total += square
-                total += math.log(S)
+            k_inv = tail[m // 3] if track.seen[k, m // 3] else 0.0
+            if k_inv > 0.0:
+                light = min((1.0 + k_inv) / (1.0 + k_inv * square), 1.0)
+                total += (1.0 + 1.0 / k_inv) * math.log1p(k_inv * square) + _normaliser(1.0 / k_inv)
+            else:
+                total += square
+            total += math.log(S)
             gain = light / S
             for i in range(N):
                 dx[i] += gain * PH[i] * v

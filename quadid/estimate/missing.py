@@ -22,6 +22,7 @@ from quadid.estimate.fit import (
     NEAR_SECONDS,
     NO_NOISE,
     Estimate,
+    measured,
     scoring,
     settle_noise,
     tails,
@@ -31,7 +32,7 @@ from quadid.estimate.problem import Problem
 from quadid.estimate.track import from_window
 from quadid.model.layout import Layout
 from quadid.rotation import conjugate, rotated
-from quadid.types import BoolArray, FloatArray
+from quadid.types import FloatArray
 from quadid.vehicle import GRAVITY, RandomForces, RandomInput, Vehicle
 
 RESIZING = 10
@@ -118,18 +119,11 @@ def _smoothed(problem: Problem, z: FloatArray, psi: FloatArray) -> list[Missing]
                 track.mass * GRAVITY,
                 psi[k.SIGMA + np.array([0, 0, 1, 2, 2, 3])],
                 psi[k.TIME + np.array([0, 0, 1, 2, 2, 3])],
-                np.where(_measured(track, g), g.nu, np.nan),
+                np.where(measured(track, g), g.nu, np.nan),
                 np.sqrt(g.S),
             )  # fmt: skip
         )
     return out
-
-
-def _measured(track: k.Track, g: k.Gains) -> BoolArray:
-    """Mask of innovations that are of measurements, shape (n, M): a velocity that nobody measured has only a prior."""
-    out = g.S > 0.0
-    out[:, k.VELOCITY :] &= track.seen[:, 3:]
-    return np.asarray(out)
 
 
 class Vehicles:
@@ -146,7 +140,7 @@ class Vehicles:
         problem, z = settled(windows, vehicle, theta, None)
         part = problem.liveliest(NEAR_SECONDS)
         z, self.psi, gains = settle_noise(part, z, problem.first_noise())
-        self.tail = tails([whitened(g) for g in gains])
+        self.tail = tails([whitened(*each) for each in zip(problem.tracks, gains, strict=True)])
         if self.tail.any():
             _, self.psi, *_ = scoring(replace(part, tail=self.tail), z, self.psi, MOST, ALL_NOISE)
 
@@ -179,7 +173,7 @@ class Vehicles:
     def _mean_square(self, problem: Problem, z: FloatArray) -> float:
         value, gains = problem.passes(z, self.psi)
         each = zip(problem.tracks, gains, strict=True)
-        squares = np.concatenate([whitened(g)[_measured(track, g)] for track, g in each]) ** 2
+        squares = np.concatenate([whitened(track, g)[measured(track, g)] for track, g in each]) ** 2
         return float(np.mean(squares)) if np.isfinite(value) and len(squares) else np.inf
 
 

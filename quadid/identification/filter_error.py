@@ -22,9 +22,10 @@ from quadid.chi_square import exceeded
 from quadid.data.window import Window
 from quadid.effects import EFFECTS
 from quadid.estimate import kalman as k
-from quadid.estimate.fit import NEAR_SECONDS, Estimate, estimate, newton_step
+from quadid.estimate.fit import ACTS, NEAR_SECONDS, Estimate, estimate, newton_step
 from quadid.estimate.problem import LATE, Problem, Sensitivities
 from quadid.estimate.track import from_window
+from quadid.identification.noise import NoiseModel
 from quadid.identification.problem import Free
 from quadid.identification.reliability import (
     BLOCKS,
@@ -72,6 +73,7 @@ class Filtered:
         prompt: step of what is free to where nothing is late, scaled parameters, shape (P,).
         trust: what other estimates differ by.
         tilting: random moments act about roll or pitch.
+        noise: of the sensors, white and, of the attitude, slow.
     """
 
     theta: FloatArray
@@ -79,6 +81,7 @@ class Filtered:
     prompt: FloatArray
     trust: Reliability
     tilting: bool
+    noise: NoiseModel
 
     def held(self, uncertainty: Uncertainty) -> Uncertainty:
         """An uncertainty of these parameters with what other estimates differ by."""
@@ -158,7 +161,16 @@ def _filtered(
     wide, half = wide.settled(unsettled), half.settled(unsettled)
     trust = _compared(found, wide, half, places, unit)
     share = found.psi[k.SIGMA : k.TIME] / problem.noise_scale
-    return Filtered(out, own, prompt, trust, bool(share[2] > LARGE))
+    return Filtered(out, own, prompt, trust, bool(share[2] > LARGE), sensor_noise(found))
+
+
+def sensor_noise(found: Estimate) -> NoiseModel:
+    """Noise of the measured channels, the attitude estimator's error as the slow part of the attitude's."""
+    measured = 12 if any(track.seen[:, 3].any() for track in found.problem.tracks) else 9
+    slow, error = np.zeros(measured), found.psi[[k.SIGMA + 4, k.SIGMA + 4, k.SIGMA + 5]]
+    acts = error > ACTS * found.problem.noise_bounds[[k.SIGMA + 4, k.SIGMA + 4, k.SIGMA + 5], 0]
+    slow[k.ATTITUDE : k.ACCEL] = np.where(acts, error, 0.0)
+    return NoiseModel(found.psi[:measured].copy(), slow, float(found.psi[k.TIME + 4]))
 
 
 def fitted_along(stated: Collection[str]) -> tuple[str, ...]:

@@ -14,7 +14,7 @@ from quadid.errors import NotIdentifiableError, WindowError
 from quadid.identification.filter_error import Filtered, filtered
 from quadid.identification.gauss_newton import Convergence
 from quadid.identification.noise import NoiseModel
-from quadid.identification.noise_fit import FAR_ITERATIONS, flexible_fit, reweighted_fit, with_memory
+from quadid.identification.noise_fit import reweighted_fit
 from quadid.identification.particle_swarm import SwarmOptions
 from quadid.identification.problem import Free, Shooting, default_prior
 from quadid.identification.search import SWARM_SECONDS, Progress, swarm_search
@@ -190,7 +190,6 @@ def spread(windows: Sequence[Window]) -> tuple[list[Window], tuple[str, ...]]:
 # --- The fit
 
 
-FIT_SECONDS = 1.0
 MOST_SEGMENTS = 1000
 """Most segments of the first polish; a start needs no more."""
 _RANDOM = (
@@ -268,10 +267,9 @@ def fit(
     # 2. Polish there, and the noise that it leaves.
     report("polish", 0.0)
     short = short.at_most(MOST_SEGMENTS)
-    typical = short.noise
     short, first = reweighted_fit(short, theta, free, iterations=10, robust=True)
     report("polish", 0.2)
-    # 3. The likelihood of innovations from there, and how far its parameters hold.
+    # 3. The likelihood of innovations from there, how far its parameters hold, and the noise that belongs to it.
     beside = filtered(windows, short.vehicle, first.theta, free)
     if beside is None:
         unc = uncertainty(first.lin, default_prior(short, free))
@@ -279,14 +277,8 @@ def fit(
         found = Fit(vehicle, first.theta, rows, short.noise, unc, first.outcome, 0, (NO_FILTER, *on_bounds(rows)))
     else:
         found = beside_random_forces(short, beside, free)
-    # 4. Sensor noise, in which errors are stated: what the whole catalogue leaves.
-    report("noise", 0.8)
-    noise = flexible_fit(windows, short, [found.theta, first.theta], free, typical, FAR_ITERATIONS).noise
-    noise = with_memory(
-        windows, Shooting.cut(windows, vehicle, FIT_SECONDS, noise, short.layout), found.theta, free.names
-    )
     report("polish", 1.0)
-    found = replace(found, noise=noise, evaluations=evaluations + first.simulated, warnings=(*thinned, *found.warnings))
+    found = replace(found, evaluations=evaluations + first.simulated, warnings=(*thinned, *found.warnings))
     return final_answer(found, out_of_reach or {}, off)
 
 
@@ -297,4 +289,5 @@ def beside_random_forces(short: Shooting, found: Filtered, free: Free) -> Fit:
     remarks = (*((_RANDOM,) if found.tilting else ()), *found.doubts(free))
     unc = found.held(unc)
     rows = parameter_set(free, theta, short.layout.initial(short.vehicle), unc)
-    return Fit(short.vehicle, theta, rows, short.noise, unc, Convergence.CONVERGED, 0, (*remarks, *on_bounds(rows)))
+    noise = found.noise.extended(short.noise)
+    return Fit(short.vehicle, theta, rows, noise, unc, Convergence.CONVERGED, 0, (*remarks, *on_bounds(rows)))

@@ -25,7 +25,7 @@ from quadid.vehicle import Noise
 
 
 SLOW_TIME = 0.66
-"""Correlation time of the slow attitude error [s] until it is estimated (`quadid.identification.noise_fit`)."""
+"""Correlation time of the slow attitude error [s] until a filter has estimated it."""
 ATTITUDE = (3, 4, 5)
 """Channels that may have a slow part; elsewhere slow structure is left for the diagnosis to see."""
 SHAPE_POINTS = 51
@@ -69,6 +69,15 @@ class NoiseModel:
             return self
         shape = None if self.shape is None else self.shape[:channels]
         return replace(self, white=self.white[:channels], slow=self.slow[:channels], shape=shape)
+
+    def extended(self, other: NoiseModel) -> NoiseModel:
+        """Noise with the channels of `other` where it has none."""
+        own = len(self.white)
+        shape = None
+        if self.shape is not None:
+            shape = np.concatenate([self.shape, np.ones((len(other.white) - own, SHAPE_POINTS))])
+        white, slow = np.append(self.white, other.white[own:]), np.append(self.slow, other.slow[own:])
+        return replace(self, white=white, slow=slow, shape=shape)
 
     @property
     def variance(self) -> FloatArray:
@@ -149,9 +158,7 @@ def correlation(length: int, step: float) -> FloatArray:
     return np.asarray(np.exp(-step * lag))
 
 
-def estimate_noise(
-    residuals: FloatArray, weights: FloatArray, dt: float, freedom: float, slow_time: float = SLOW_TIME
-) -> NoiseModel:
+def estimate_noise(residuals: FloatArray, weights: FloatArray, dt: float, freedom: float) -> NoiseModel:
     """Estimates the noise from residuals of a fit flexible enough to leave only noise.
 
     Args:
@@ -159,7 +166,6 @@ def estimate_noise(
         weights: 0 for samples to leave out, shape as residuals.
         dt: grid step [s].
         freedom: fraction of the residual's degrees of freedom left after the parameters were fitted, 0..1.
-        slow_time: correlation time of the slow part [s].
 
     Returns:
         The noise; a channel without enough data keeps the typical value.
@@ -169,7 +175,7 @@ def estimate_noise(
     white, lasting = guess.white.copy(), np.zeros(channels)
     for c in range(channels):
         complete = np.all(weights[:, :, c] > 0.0, axis=1)
-        basis, forms = _forms(length, round(float(dt) / slow_time, 9), min(TREND[c // 3], length - 2))
+        basis, forms = _forms(length, round(float(dt) / SLOW_TIME, 9), min(TREND[c // 3], length - 2))
         if np.count_nonzero(complete) < 5:
             used = weights[:, :, c] > 0.0
             if np.count_nonzero(used) > 20:
@@ -193,7 +199,7 @@ def estimate_noise(
             if solution[1] > 0.0 and solution[0] > 0.0:
                 var_white, var_slow = float(solution[0]), float(solution[1])
         white[c], lasting[c] = np.sqrt(max(var_white, 1e-18)), np.sqrt(var_slow)
-    return NoiseModel(white, lasting, slow_time)
+    return NoiseModel(white, lasting)
 
 
 @lru_cache(maxsize=64)
@@ -206,17 +212,3 @@ def _forms(length: int, step: float, order: int) -> tuple[FloatArray, tuple[Floa
     forms = [np.eye(length), slow]
     expectation = np.array([[np.trace(project @ f), np.trace(project @ f @ project @ slow)] for f in forms])
     return basis, (forms[0], forms[1], expectation)
-
-
-def modes_beside_trend(covariance: FloatArray, order: int) -> tuple[FloatArray, FloatArray]:
-    """Independent modes of noise less its fitted trend, as columns (length, modes), and their variances.
-
-    Args:
-        covariance: of the noise, shape (length, length).
-        order: coefficients of the trend, a polynomial in time.
-    """
-    length = len(covariance)
-    trend = np.vander(np.linspace(-1.0, 1.0, length), order)
-    rest = np.linalg.qr(np.column_stack([trend, np.eye(length)]))[0][:, order:]
-    levels, turn = np.linalg.eigh(rest.T @ covariance @ rest)
-    return rest @ turn, levels

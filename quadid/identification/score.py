@@ -7,7 +7,7 @@ states were fitted, so a perfect model scores 1.0 whatever the segment length, n
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -179,16 +179,7 @@ def scored_problem(windows: Sequence[Window], vehicle: Vehicle, noise: NoiseMode
 def covering(noise: NoiseModel | None, channels: int, vehicle: Vehicle) -> NoiseModel:
     """The noise model for `channels` channels: `noise` as far as it goes, then the typical."""
     typical = NoiseModel.guess(channels, vehicle.noise)
-    if noise is None:
-        return typical
-    known = min(channels, len(noise.white))
-    white, slow = typical.white.copy(), typical.slow.copy()
-    white[:known], slow[:known] = noise.white[:known], noise.slow[:known]
-    shape = None
-    if noise.shape is not None:
-        shape = np.ones((channels, noise.shape.shape[1]))
-        shape[:known] = noise.shape[:known]
-    return replace(noise, white=white, slow=slow, shape=shape)
+    return typical if noise is None else noise.first(min(channels, len(noise.white))).extended(typical)
 
 
 @INFINITE

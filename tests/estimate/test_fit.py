@@ -55,6 +55,13 @@ def test_truth_lies_inside_the_intervals_and_no_random_force_is_found() -> None:
     assert not tails(found.whitened).any()
 
 
+def test_a_velocity_that_nobody_measures_has_no_innovations_and_no_outliers() -> None:
+    flight = fly(PELICAN, draw_truth(PELICAN, 1), SECONDS, 1)
+    found = estimate(Problem.of([from_window(flight.window, PELICAN, air=True)], PELICAN, ("rotor_drag.k_x",)))
+    assert not found.whitened[0][:, k.VELOCITY :].any()
+    assert not found.problem.tail.any()
+
+
 def test_guesses_off_by_up_to_four_end_at_the_same_optimum() -> None:
     ends = [estimated(2, 4.0, guess)[0] for guess in range(3)]
     for other in ends[1:]:

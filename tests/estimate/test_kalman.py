@@ -81,8 +81,12 @@ def flown(seed: int = 1, seconds: float = 12.0) -> tuple[k.Track, FloatArray]:
     return from_window(flight.window, PELICAN), p
 
 
-def test_score_is_the_slope_of_the_likelihood() -> None:
+@pytest.mark.parametrize("still", [0.0, 3.0])
+def test_score_is_the_slope_of_the_likelihood(still: float) -> None:
     track, p = flown()
+    if still > 0.0:  # nobody measures the velocity
+        track.seen[:, 3] = False
+        track = track._replace(still=still)
     p[k.DRAG] = p[k.DRAG + 1] = 0.3
     _, gains = k.kalman(track, p, NOISE, GAUSS, True)
     score = k.backward(track, p, NOISE, gains, False)[0] * NOISE

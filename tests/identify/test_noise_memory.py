@@ -6,52 +6,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.signal import lfilter
 
 import quadid
 from quadid.flight import fly
 from quadid.flight.sensors import SensorNoise
 from quadid.identification.fit import FitOptions, fit
-from quadid.identification.noise import ATTITUDE, SLOW_TIME
-from quadid.identification.noise_fit import MEMORY_SECONDS, attitude_memory
+from quadid.identification.noise import ATTITUDE
 from quadid.parameters import NOMINAL_NAMES
-from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 from tests.conftest import absent
 
 PELICAN = Vehicle.shipped("pelican")
 SCALES = tuple(f"gyro_scale.{axis}" for axis in "xyz")
-
-
-def drawn(memory: float, dt: float, white: float = 0.003, slow: float = 0.004) -> FloatArray:
-    """Noise of 150 segments, white and slow, beside lines that initial states leave, in the attitude's channels."""
-    rng, length = np.random.default_rng(1), round(MEMORY_SECONDS / dt)
-    pole = np.exp(-dt / memory)
-    drive = rng.standard_normal((150, length, 3))
-    drive[:, 1:] *= np.sqrt(1.0 - pole**2)
-    noise = white * rng.standard_normal(drive.shape) + slow * lfilter([1.0], [1.0, -pole], drive, axis=1)
-    lines = rng.standard_normal((2, 150, 1, 3))
-    out = np.zeros((150, length, 9))
-    out[..., ATTITUDE] = noise + lines[0] + lines[1] * np.linspace(-1.0, 1.0, length)[:, None]
-    return out
-
-
-@pytest.mark.parametrize("dt", [0.02, 0.005])
-@pytest.mark.parametrize("memory", [0.3, 0.66, 1.5, 3.0])
-def test_the_memory_that_was_drawn_is_found(memory: float, dt: float) -> None:
-    residuals = drawn(memory, dt)
-    found = attitude_memory(residuals, np.ones_like(residuals), dt)
-    assert found is not None
-    # The longer the memory, the fewer of its turns a segment holds.
-    assert abs(np.log(found / memory)) < (0.3 if memory < 1.0 else 0.7)
-
-
-def test_segments_with_gaps_tell_no_memory() -> None:
-    residuals = drawn(1.0, 0.02)
-    gaps = np.ones_like(residuals)
-    assert attitude_memory(np.zeros_like(residuals), gaps, 0.02) is None
-    gaps[5:, 7] = 0.0
-    assert attitude_memory(residuals, gaps, 0.02) is None
 
 
 @pytest.mark.parametrize("memory", [0.3, 3.0])
@@ -68,8 +34,12 @@ def test_a_fit_takes_the_memory_from_its_data(memory: float) -> None:
 
 
 def test_what_a_model_misses_is_no_memory_of_the_noise() -> None:
-    flown = fly(PELICAN, seconds=60.0, seed=3, effects={"cg_offset": {"x": 0.002, "y": 0.0}})
-    assert fit([flown.window], PELICAN, FitOptions(iterations=0)).noise.slow_time == SLOW_TIME
+    exact, missing = (
+        fit([fly(PELICAN, seconds=60.0, seed=3, effects=effects).window], PELICAN, FitOptions(iterations=0)).noise
+        for effects in ({}, {"cg_offset": {"x": 0.002, "y": 0.0}})
+    )
+    np.testing.assert_allclose(missing.slow_time, exact.slow_time, rtol=0.2)
+    np.testing.assert_allclose(missing.slow, exact.slow, rtol=0.05)
 
 
 @pytest.mark.parametrize(

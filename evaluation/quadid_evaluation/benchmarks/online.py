@@ -22,7 +22,7 @@ from quadid_node.worker import InlineWorker, ProcessWorker
 
 from quadid.data.window import Block
 from quadid.flight import Flight, fly
-from quadid.identification.fit import FIT_SECONDS, FitOptions, fit
+from quadid.identification.fit import FitOptions, fit
 from quadid.online import Job, JobReply, OnlineDiagnosis, Publish, Session, SessionSettings
 from quadid.online.records import Action
 from quadid.online.stream import SETTLE
@@ -59,7 +59,7 @@ def flown(seconds: float, seed: int, profile: str = "excited", **effects: dict[s
 def against_batch(seeds: range) -> dict[str, Any]:
     """The last estimate of 60 s against `quadid.identify` on the same 60 s, and both against the truth.
 
-    How far the batch moves when its flight begins a quarter of a segment later tells what it leaves open itself.
+    How far the batch moves when its flight begins a quarter of a second later tells what it leaves open itself.
     """
     rows = []
     for seed in seeds:
@@ -69,7 +69,7 @@ def against_batch(seeds: range) -> dict[str, Any]:
         every = [a.item for a in actions if isinstance(a, Publish) and a.topic == "candidate"]
         batch, later = (
             fit([flight.window.slice(first, round(SECONDS * 50))], PELICAN, FitOptions()).parameters
-            for first in (0, round(0.24 * FIT_SECONDS * 50))
+            for first in (0, 12)
         )
         truth = flight.truth.parameters.as_dict()
         last, told = every[-1].parameters, every[-1].told_by_flight

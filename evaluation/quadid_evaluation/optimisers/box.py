@@ -12,7 +12,7 @@ import numpy as np
 from quadid.data.window import Window
 from quadid.errors import NotIdentifiableError
 from quadid.identification.controller_gains import Autopilot
-from quadid.identification.fit import FIT_SECONDS, Fit
+from quadid.identification.fit import Fit
 from quadid.identification.gauss_newton import Convergence
 from quadid.identification.noise import NoiseModel
 from quadid.identification.paper_objective import PaperProblem
@@ -25,6 +25,8 @@ from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 
+FIT_SECONDS = 1.0
+"""Length of the segments on which the answer of a search is judged [s]."""
 SEGMENTS = 400
 """Most segments, spread evenly."""
 

@@ -131,10 +131,6 @@ def _same_noise(windows: object, short: Any, model: object) -> Any:
     return short.noise
 
 
-def _own_noise(windows: object, shooting: Shooting, *_: object) -> Any:
-    return shooting.noise
-
-
 def _nominal(shooting: Shooting, *_: object) -> Model:
     return fit_model(shooting, shooting.layout.initial(shooting.vehicle), ())
 
@@ -181,7 +177,6 @@ RULES: dict[str, dict[str, Any]] = {
     "use without the best block": {"relevant": _gains},
     "a last pruning": {"pruned": _unpruned},
     "noise around the causes": {"_noise_around": _same_noise},
-    "memory of the noise": {"with_memory": _own_noise},
     "a start from everything": {"from_everything": _nominal},
     "two starts of the flexible fit when far": {"flexible_fit": _first_guess},
     "what the fit left undone, in scores": {"Everything._unspent": _given(0.0)},
@@ -330,7 +325,7 @@ def _windows(names: Sequence[str], vehicle: Vehicle) -> list[Window]:
 
 
 FITS = (
-    "polish", "settle_states", "flexible_fit", "residual_noise", "with_memory", "mode_power",
+    "polish", "settle_states", "flexible_fit", "residual_noise", "mode_power",
     "filtered", "mse_score", "reliability", "follows",
 )  # fmt: skip
 """Functions that the diagnosis calls, of `quadid.identify`, which no variant changes, but for the last one …"""
