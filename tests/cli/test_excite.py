@@ -40,17 +40,23 @@ def test_a_manoeuvre_from_a_log_keeps_limits_and_promises(inside: Cli, flights: 
     assert "<html" in (tmp_path / "excite.html").read_text(encoding="utf-8")
     file = Path(result["manoeuvre_file"])
     seconds = str(yaml.safe_load(file.read_text(encoding="utf-8"))["seconds"])
-    flown = tmp_path / "flown.mcap"
-    made = inside("simulate", flown, "--vehicle", "pelican", "--manoeuvre", file, "--seconds", seconds, "--seed", "9")
-    assert made.code == 0, made.err
-    both = inside("identify", flights.train, flown, "--vehicle", "pelican", "--out", tmp_path, "--json", "-")
-    for promised, got in zip(result["parameters"], both.data["parameters"], strict=True):
-        ratio = (math.sqrt(got["ci95"][1] / got["ci95"][0]) - 1.0) / promised["manoeuvre"]
-        # Where half as fast a grid gives another J_r beyond chance, `identify` adds a third of the difference, about
-        # 0.5 %, and parts of the flight that differ do the same; by chance on one flight of the manoeuvre and not on
-        # the next, be it the one that promises or the one that is flown.
-        low, high = (0.25, 4.0) if got["name"] == "J_r" else (0.75, 1.25)
-        assert low < ratio < high, (got["name"], ratio)
+    # Where half as fast a grid gives another estimate beyond chance, `identify` adds a third of the difference: of J_r
+    # always, about 0.5 %; of d and J_zz on one flight of the manoeuvre and not on the next.
+    ratios: dict[str, list[float]] = {name: [] for name in NOMINAL_NAMES}
+    for seed in ("9", "10", "11"):
+        flown = tmp_path / f"flown{seed}.mcap"
+        made = inside(
+            "simulate", flown, "--vehicle", "pelican", "--manoeuvre", file, "--seconds", seconds, "--seed", seed
+        )
+        assert made.code == 0, made.err
+        both = inside("identify", flights.train, flown, "--vehicle", "pelican", "--out", tmp_path, "--json", "-")
+        for promised, got in zip(result["parameters"], both.data["parameters"], strict=True):
+            width = math.sqrt(got["ci95"][1] / got["ci95"][0]) - 1.0
+            ratios[got["name"]].append(width / promised["manoeuvre"])
+    for name, found in ratios.items():
+        assert min(found) > (0.25 if name == "J_r" else 0.75), (name, found)
+        assert min(found) < (4.0 if name == "J_r" else 1.25), (name, found)
+        assert max(found) < (4.0 if name in ("d", "J_zz", "J_r") else 1.25), (name, found)
 
 
 def test_without_a_log_the_vehicle_file_says_what_is_known(inside: Cli, tmp_path: Path) -> None:
