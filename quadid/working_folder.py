@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 NUMBA_SETTINGS = Path(".numba_config.yaml")
-"""numba reads this file of the folder we stand in, and takes machine code from where it says."""
+"""numba reads this file in the working folder, and loads machine code from the folder that it names."""
 
 
 def refuse() -> None:

@@ -142,7 +142,7 @@ def diagnose(
         validate: flights to measure the gain on; without any, held-out blocks of `logs` serve.
         vehicle: nominal vehicle; default that of the first loaded log.
         seed: of all random numbers.
-        advance: told how far it is.
+        advance: called with the stage and the share done.
 
     Raises:
         NotIdentifiableError: too little data.

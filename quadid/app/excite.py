@@ -253,7 +253,7 @@ def propose(
         battery: what must remain of the battery [%].
         forms: also write what flies it: ardupilot-lua, ardupilot-sid, px4, sticks.
         seed: of all random numbers.
-        advance: told how far it is.
+        advance: called with the stage and the share done.
 
     Raises:
         ParameterError: limits that cannot be flown.

@@ -104,7 +104,7 @@ def _centre(rows: Sequence[Json]) -> dict[str, float]:
 
 
 def _drifts(series: Mapping[tuple[str, str], list[Json]]) -> list[dict[str, Any]]:
-    """Parameters that rise or fall with time: Kendall's tau decides, Theil and Sen's slope says how fast."""
+    """Parameters that rise or fall with time, by Kendall's tau; how fast, by Theil and Sen's slope."""
     from scipy import stats
 
     fit_for = {

@@ -334,7 +334,7 @@ def _measured(facts: Facts) -> list[Used]:
 
 
 def _on_board(autopilot: Autopilot, known: Mapping[str, float], vehicle: Vehicle) -> dict[str, Used]:
-    """Filters and period of the autopilot's loop: as told, as the vehicle file has it, or its defaults."""
+    """Filters and period of the autopilot's loop: as given, as the vehicle file has it, or its defaults."""
     out = {}
     parts = {
         "gyro filter": autopilot.gyro, "derivative filter": autopilot.derivative, "loop rate": autopilot.rate,

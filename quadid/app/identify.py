@@ -138,7 +138,7 @@ class Identified(Fitted):
         return [Cell(f"{self.fit.vehicle.name}: {known(self.fit.vehicle)}, from its file. All values depend on these.")]
 
     def tables(self, truth: Mapping[str, float] | None = None) -> list[TextTable]:
-        """Parameters, beside the truth where a simulation knows it, and how well each log is followed."""
+        """Parameters, beside the truth of a simulation, and how well each log is followed."""
         columns = (
             Column("log"), Column("role"), Column("current", right=True), Column("fitted", right=True),
             *(Column(f"fit {n}", right=True, rank=1) for n in FITS),
@@ -248,7 +248,7 @@ def identify(
         bounds: of parameters of the six, instead of the file's.
         priors: value and standard deviation of parameters of the six, instead of the file's.
         effects: known effects, beside or instead of the file's.
-        advance: told how far the fit is.
+        advance: called with the stage and the share done.
 
     Raises:
         UnansweredError: the data reveal no parameter.

@@ -260,7 +260,7 @@ class Log:
 
     Attributes:
         recording: as read, each channel at its own rate.
-        vehicle: whose log it is; says what the rotor columns mean.
+        vehicle: whose log it is; decides what the rotor columns mean.
         windows: on one grid, without gaps.
         grid: how the windows were made.
         cut: the part that is used.
@@ -341,7 +341,7 @@ def load(
 
     Args:
         log: path, or path with a span as in ``flight.bin@76:216`` [s].
-        vehicle: a shipped name, a YAML file or a `Vehicle`; says what the rotor columns mean.
+        vehicle: a shipped name, a YAML file or a `Vehicle`; decides what the rotor columns mean.
         rate: of the grid [Hz]; None for the log's own.
         start: first time to use [s], after the log's first IMU sample.
         stop: last time to use [s], likewise.
@@ -508,7 +508,7 @@ def check_unseen(train: Sequence[Log], held: Sequence[Log], vehicle: Vehicle | N
 
 
 def without_own_priors(vehicle: Vehicle, train: Sequence[Log]) -> tuple[Vehicle, list[str]]:
-    """The vehicle without standard deviations that come from the flights to be fitted, and a sentence that says so.
+    """The vehicle without standard deviations that come from the flights to be fitted, and a remark on it.
 
     A flight would count twice otherwise: as data, and as what was known before.
     """

@@ -112,7 +112,7 @@ READING: dict[str, tuple[Any, Any]] = {
 }  # fmt: skip
 """Options of a command whose logs are opened for it, with defaults; arguments of `quadid.load`."""
 
-# --- What is fitted, beside or instead of what the vehicle file says
+# --- Fitted parameters, beside or instead of those of the vehicle file
 
 
 def key_numbers(pairs: str, text: str, form: str = "NAME:KEY=NUMBER,KEY=NUMBER") -> dict[str, float]:

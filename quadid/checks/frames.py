@@ -48,7 +48,7 @@ _SURE = 0.8
 _SMOOTHED = 0.8
 """Share that a smoothed gyro reads at most, somewhere, of what it reads of slow turning."""
 _TILT, _PARTS = np.radians(4.0), 5
-"""Least angle [rad] between gyro and attitude that is told; it must be as many times its error as there are parts."""
+"""Least angle [rad] between gyro and attitude that is reported; also as many times its error as there are parts."""
 _AXES = ("x", "y", "z")
 
 

@@ -30,7 +30,7 @@ from quadid.vehicle import GRAVITY, Vehicle
 Spans = tuple[tuple[float, float], ...]
 
 HOPELESS = 16.0
-"""A thrust coefficient that is wrong by more tells nothing of the weight."""
+"""A thrust coefficient that is wrong by more does not show the weight."""
 _NOTHING = 0.1
 """A rotor below this share of the median speed of all is ignored."""
 _SHORTEST = 1.0

@@ -928,7 +928,7 @@ def _spins(lagged: Lagged, vehicle: Vehicle) -> tuple[list[tuple[int, ...]], flo
     own, chance = _gain(found[:1]), exceeded(_CHANCE, 1) / _independent(lagged.slow, _spun(vehicle, turned[best]))
     if gain[best] <= own or _gain(found[best : best + 1]) <= own + chance:
         return [], float(found[0])
-    # Which of them is told by roll and pitch, but for partners on one arm: they have one command.
+    # Roll and pitch show which of them it is, but for partners on one arm: they have one command.
     near = 1 + np.flatnonzero(gain[1:] > gain[best] - max(_CHANGE, chance))
     whole = _gain(np.array([[_drag_explains(lagged.slow, _spun(vehicle, turned[k]), alone=False)] for k in near]))
     return [turned[k] for k in near[whole > whole.max() - _CHANGE]], float(found[best])
@@ -1168,5 +1168,5 @@ def _unlikely(vehicle: Vehicle, scale: float, hover: float, numbers: dict[str, f
 
 
 def _farther(factor: float) -> Off:
-    """Errors of the estimates if the rotors are so many times as far from the centre as the vehicle file says."""
+    """Errors of the estimates if the rotors are so many times as far from the centre as in the vehicle file."""
     return estimates_off(torque=(factor, factor, 1.0))

@@ -81,7 +81,7 @@ def _in_force(vehicle: Vehicle, history: Path, name: str) -> tuple[Vehicle, str,
             "a set that a service has written", "fly on until the service publishes another",
         ) from error  # fmt: skip
     if TANGENT in found.item.parameters.names:
-        # The file says by a dead speed how steep thrust is at hover.
+        # A dead speed in the file gives the slope of thrust at hover.
         b, steep = (found.item.parameters[n].value for n in ("b", TANGENT))
         law = ThrustModel.stated(fitted).with_tangent(steep / b, fitted.mass * GRAVITY)
         prior = fitted.parameters["b"].model_copy(update={"initial": law.curve[0], "bounds": None, "sigma": None})

@@ -197,7 +197,7 @@ def conclude(done: Outcome, json: str | None, folder: Path | None = None, kept: 
 
 
 _MISSING = "MissingParameter"
-"""An error of usage for what was not given; its help says what that may be."""
+"""An error of usage for what was not given, with what it may be as its help."""
 
 
 class Failure(NamedTuple):

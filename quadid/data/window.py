@@ -150,7 +150,7 @@ class Recording:
         autopilot: the autopilot's own parameters as the log holds them, by their names there (`INS_GYRO_FILTER`).
         epoch: UNIX time of its time 0 [s]; None where its clock has no date.
         modes: when the autopilot entered a flight mode [s], and its name; empty where the log lacks them.
-        other: what says that it is no multirotor, whose outputs are left out; empty where nothing does.
+        other: the evidence that it is no multirotor, whose outputs are left out; empty where there is none.
     """
 
     name: str

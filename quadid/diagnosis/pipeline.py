@@ -33,7 +33,7 @@ DECIDE_SECONDS = (4.0, 2.0, 1.0, 0.5)
 """Lengths of segments that may decide (the longest as `segment_schedule.USUAL_SECONDS` allows), longest first;
 below them only the short ones of the first fit."""
 NOISE_FELL = 0.7
-"""When a channel's noise variance falls below this share once causes are known, the selection is repeated with it."""
+"""Share below which a channel's noise variance must fall, once causes are known, for a selection with the new one."""
 SHARE_TO_NAME = 0.8
 """Named causes must account for this share of all structure, else the answer is `unknown` …"""
 SHARE_ALONE = 0.9

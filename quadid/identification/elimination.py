@@ -105,7 +105,7 @@ def columns_of(out: FloatArray, lane: IndexArray, steps: FloatArray, channels: i
 
 
 def reduce_segments(white: FloatArray, prior: StatePrior, into: Reduced) -> None:
-    """Squares the columns of every segment and eliminates its initial state; where they ran away, only says so.
+    """Squares the columns of every segment and eliminates its initial state; where they ran away, only marks that.
 
     Args:
         white: columns of `columns_of`, weighted and whitened: the directions that are eliminated first, then the

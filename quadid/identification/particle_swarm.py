@@ -100,7 +100,7 @@ class Swarm:
         best_cost: its cost; infinite while there is none.
         stop: `Stop.RUNNING`, or why to stop.  The swarm obeys `ask` after that too; whether to go on is the caller's.
         iteration: number of completed iterations; the initial evaluation is number 0.
-        evaluations: number of costs told.
+        evaluations: number of costs reported to it.
     """
 
     def __init__(

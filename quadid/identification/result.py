@@ -20,7 +20,7 @@ from quadid.vehicle import ParameterPrior, Vehicle
 NOTHING_NEW = 0.9
 """Share of the information that the prior brings, above which the data add nothing."""
 CORRELATED = 0.01
-"""Least correlation that a file tells."""
+"""Least correlation that is written into a file."""
 _DIGITS = 7
 """Significant digits of a fitted vehicle file; far below any interval."""
 

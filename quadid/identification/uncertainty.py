@@ -180,7 +180,7 @@ def _status(
 
 
 def doubted(parameters: Sequence[Parameter], off: Mapping[str, float]) -> tuple[tuple[Parameter, ...], tuple[str, ...]]:
-    """Parameters whose intervals hold the truth if a doubt about the log is right, too, and a sentence that says so.
+    """Parameters whose intervals hold the truth if a doubt about the log is right, too, and remarks on them.
 
     Args:
         parameters: as the log shows them.

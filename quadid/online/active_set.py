@@ -76,7 +76,7 @@ class ActiveSet:
         return self._earlier[-1] if self._earlier else None
 
     def reference(self, stated: ParameterSet) -> tuple[Reference, float]:
-        """Reference of a set, and the standard deviation (log scale) of what it says of force.
+        """Reference of a set, and the standard deviation (log scale) of the force by it.
 
         Args:
             stated: parameters that the vehicle file claims to know.

@@ -78,7 +78,7 @@ class Velocity:
         self._at, self.sigma = np.zeros(3), ASTRAY
 
     def body(self, rows: Rows) -> FloatArray:
-        """Velocity in body axes [m/s] of the next rows, shape (n, 3); zero where no attitude says what is up."""
+        """Velocity in body axes [m/s] of the next rows, shape (n, 3); zero where no attitude shows what is up."""
         q, force = rows.columns.get("attitude"), rows.columns["accel"]
         if q is None or len(rows.t) < 2:
             return np.zeros_like(force)
@@ -245,7 +245,7 @@ def step_beside(
     share = found.spread**2 * scatter * np.sum(gain**2, axis=0) / power**2 / variance
     freedom = (first - 1) / share**2
     errors = np.sqrt(freedom * np.log1p(size**2 / variance / freedom))
-    # What is left tells the size best: the test leans on the first moments, in which rotors lag and drag swings.
+    # The size comes best from what is left: the test leans on the first moments, in which rotors lag and drag swings.
     lasting = np.array([left[first + j + 1 :].mean() for j in range(splits)])
     errors *= (np.abs(lasting) >= least) & (lasting * size > 0.0)
     best = int(np.argmax(errors))

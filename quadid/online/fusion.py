@@ -462,7 +462,7 @@ class Estimator:
         )  # fmt: skip
 
     def agrees(self, request: FitRequest, reply: FitReply) -> bool:
-        """True if what a reply says of its newest rows fits what is known from before them."""
+        """True if a reply's estimate by its newest rows agrees with that from before them."""
         return self._before(request, reply).agrees(reply.estimates[-1])
 
     def _before(self, request: FitRequest, reply: FitReply) -> Fusion:

@@ -90,7 +90,7 @@ class Case:
             deviation, by the inertia's name.
         between_rows: relative standard deviation by what the rotors do between readings, newest window, by name.
         left_out: of thrust by b w^2 and standard deviations, shape (2, R + 1) (`Estimator.left_out`).
-        loaded: why the vehicle may have another mass than the vehicle file says, or empty.
+        loaded: why the vehicle may have another mass than in the vehicle file, or empty.
     """
 
     parameters: ParameterSet
@@ -295,7 +295,7 @@ def _step(case: Case, settings: GateSettings, times: float = 1.0) -> str | None:
             old = reference.parameters[p.name]
             known = not UNKNOWN & {p.status, old.status}
             change = p.value / old.value - 1.0 if p.name in LIMITED and old.value > 0.0 else 0.0
-            # What was only guessed before may be learned: its own interval says how far it may move.
+            # A value that was only guessed before may be learned: it may move as far as its own interval.
             own = reference.told_by_flight(p.name)
             room = limit + (2.0 * own / old.value if known and old.value > 0.0 else math.inf)
             if abs(math.log1p(change)) > math.log1p(room):

@@ -385,7 +385,7 @@ class Session:
             self._outbox.act(request)
 
     def _fit(self, tick: float) -> Iterator[None]:
-        """Cuts the window before `tick` [s], judges it, and asks for its fit; or says why there is none."""
+        """Cuts the window before `tick` [s], judges it, and asks for its fit; or reports why there is none."""
         wanted = self.settings.window
         if self._asked_now:
             self._asked_now, wanted = False, min(4.0, wanted)  # what a person asked for needs less

@@ -32,7 +32,7 @@ from quadid.vehicle import GRAVITY
 
 AXES = ("roll", "pitch", "yaw")
 Known = Mapping[str, float]
-"""Parameters of an autopilot by name, as far as they are told."""
+"""Parameters of an autopilot by name, as far as they are given."""
 
 
 class Hover(NamedTuple):

@@ -248,7 +248,7 @@ def error_over_time(score: SetScore, fitted: SetScore) -> tuple[FloatArray, Floa
 
 
 def parameter_figure(parameters: Sequence[Mapping[str, Any]], truth: Mapping[str, float] | None = None) -> JsonDict:
-    """Proposed over current value with its interval, one row a parameter; the truth where a simulation knows it."""
+    """Proposed over current value with its interval, one row a parameter; and the truth of a simulation."""
     shown = [p for p in parameters if p["initial"] and np.isfinite(p["initial"])][::-1]
     names = [p["name"] for p in shown]
     scale = np.array([p["initial"] for p in shown])

@@ -242,7 +242,7 @@ def identify_page(
         result: of the form ``quadid.identify/1``.
         sets: the scored logs in the order of ``result["sets"]``.
         quality: a part of the page for each log.
-        truth: true parameters, where a simulation knows them.
+        truth: true parameters of a simulation, where there is one.
         missing: of `missing_section`.
         more: sections below the parameters.
         excitation: of `excitation_part`.

@@ -170,7 +170,7 @@ class Facts:
 
     @property
     def max_speed(self) -> float | None:
-        """Rotor speed at full command [rad/s], where the vehicle file knows it."""
+        """Rotor speed at full command [rad/s], where the vehicle file has it."""
         return self.vehicle.command.max_speed
 
     @cached_property
@@ -282,7 +282,7 @@ def px4(facts: Facts) -> dict[str, Any]:
 
 
 def _no_cross(facts: Facts, what: str) -> str:
-    """Reason why a program that knows only PX4's X and motor order cannot fly it, after `what`; empty where it can."""
+    """Reason why a program with only PX4's X and motor order cannot fly it, after `what`; empty where it can."""
     shape = f"{what} four alike rotors in an X, front right and back left counterclockwise, front left and back right"
     if len(facts.rotors) != _SIH.shape[1]:
         return f"{shape}; this vehicle has {len(facts.rotors)} rotors"

@@ -110,7 +110,7 @@ def residual_map(
         for mode, channel, quantity in PAIRS[effect]
         if quantity in signals
     ]
-    # Against time everything shows; what the equation depends on says more.
+    # Against time everything shows; what the equation depends on shows more.
     found = [(late, m) for late, m in drawn if m is not None]
     return max(found, key=lambda f: (not f[0], f[1].seen), default=(True, None))[1]
 

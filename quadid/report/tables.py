@@ -131,7 +131,7 @@ def number(value: float | None, digits: int = 4) -> str:
 
 
 def parameter_table(parameters: Sequence[Json], truth: Mapping[str, float] | None = None) -> TextTable:
-    """Current and fitted values with intervals and status; the truth where a simulation knows it.
+    """Current and fitted values with intervals and status, and the truth of a simulation.
 
     Args:
         parameters: entries of ``quadid.identify/1``.

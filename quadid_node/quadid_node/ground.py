@@ -40,7 +40,7 @@ class Done:
 
 
 def work(where: str, stop: Callable[[], bool], told: Callable[[str], None]) -> Done:
-    """Answers requests until `stop` says so; waits for a router that is not there yet."""
+    """Answers requests until `stop` is true; waits for a router that is not there yet."""
     config_of(where)
     said = set[str]()
 
@@ -125,7 +125,7 @@ FAR_LIMIT = 5.0
 """A ground machine that does not answer a fit within this time [s] is given up for `REST`."""
 REST = 30.0
 MOST_ANSWERS, MOST_GROUNDS = 8, 256
-"""Answers that wait to be looked at, and ground machines that are told apart; larger numbers are rejected."""
+"""Most answers that wait to be looked at, and most ground machines that are kept apart; more are rejected."""
 
 
 class Ground:

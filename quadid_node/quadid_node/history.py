@@ -486,7 +486,7 @@ def why_none(found: OnlineSet, number: int, gate: GateSettings, vehicle: Vehicle
     covariance, sigma = found.parameters.covariance, np.array([p.sigma for p in found.parameters])
     if not np.isfinite(covariance).all():
         return "its covariance is not a number"
-    # What it says of differences and ratios is believed by the gate.
+    # The gate believes its differences and ratios.
     most = np.outer(sigma, sigma)
     if (np.abs(covariance) > 1.01 * most).any() or (np.abs(covariance - covariance.T) > 0.01 * most).any():
         return "its covariance is not that of its standard deviations"

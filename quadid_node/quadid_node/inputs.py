@@ -287,7 +287,7 @@ class Decoder:
 
         Args:
             rotors: number of rotors; surplus motor outputs are left out.
-            mounted: the vehicle file says how the IMU stands in the body.
+            mounted: the vehicle file has how the IMU stands in the body.
         """
         kind = TYPES[entry.type]
         self._frame, self._mounted = "", mounted

@@ -34,7 +34,7 @@ from quadid.parameters import NOMINAL_NAMES
 from quadid_node.inputs import stamp
 
 Output = Publish | OnlineDiagnosis | HealthReport | HealthyFlight | Event
-"""Output of a service; its `topic` says which it is, and is what the tables of the links are keyed by."""
+"""Output of a service; the tables of the links are keyed by its `topic`."""
 SILENT_WARNING, SILENT_ERROR = 1.0, 5.0
 """A channel that was there and is silent for this long [s] is worth a warning, an error."""
 BEHIND = 2.0

@@ -23,7 +23,7 @@ from quadid_node.service import Service
 
 ROOT = "quadid"
 LARGEST_MESSAGE = 1 << 25
-"""Zenoh itself takes no larger messages [bytes], whatever the configuration says; its own default is 1 GiB."""
+"""Zenoh itself takes no larger messages [bytes], whatever its configuration allows; its own default is 1 GiB."""
 
 
 class ZenohError(QuadidError):

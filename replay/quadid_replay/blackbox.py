@@ -36,7 +36,7 @@ _LOG_END = b"End of log\x00"
 _TURN = 1 << 32
 """All numbers have 32 bits, and predictions wrap in them as in the firmware."""
 LONGEST_STEP = 10_000_000
-"""Time [us] between main frames without an event that says why: more is damage."""
+"""Longest time [us] between main frames without an event that explains it: more is damage."""
 _PACE = 2.0
 """Time for each iteration of the loop may differ by this factor from what it was."""
 _EVENT_NUMBERS = {0: 1, 14: 2, 15: 1, 30: 2, 40: 1}

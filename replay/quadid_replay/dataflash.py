@@ -84,7 +84,7 @@ class DataflashIndex:
         return np.array(self.offsets.get(name, ()), dtype=np.int64)
 
     def column(self, name: str, column: str) -> FloatArray:
-        """Returns one numeric column, scaled as its format says, shape (n,)."""
+        """Returns one numeric column, scaled as its format defines, shape (n,)."""
         description = self.formats[name]
         place, kind = _place(description, description.columns.index(column))
         scale = FORMAT_TO_STRUCT[description.format[description.columns.index(column)]][1]
@@ -208,7 +208,7 @@ _EKF = ("XKF1", "NKF1", "EKF1")
 
 
 def _volts(volts: FloatArray) -> FloatArray:
-    """Battery voltage [V]; old CURR counts centivolts, and a monitor that is not there says zero."""
+    """Battery voltage [V]; old CURR counts centivolts, and a monitor that is not there reports zero."""
     if not len(volts) or np.max(volts) <= 0.0:
         return np.full_like(volts, np.nan)
     return volts * 0.01 if np.median(volts) > 100.0 else volts
@@ -282,7 +282,7 @@ def read_dataflash(path: Path) -> Recording:
         raw += [*_outputs(index, times, parameters, notes), *_esc(index, times, parameters, notes)]
     changed = changed_within(names, values)
     notes += [changed] if changed else []
-    # ArduPilot numbers its logs from 1 on every vehicle: such a name tells something only with its folder's.
+    # ArduPilot numbers its logs from 1 on every vehicle: such a name identifies a log only with its folder's.
     name = f"{path.absolute().parent.name}/{path.name}" if path.stem.isdigit() else path.name
     recording = assemble(name, "dataflash", raw, clock, notes, parameters, other)
     mode = next((c for c in ("ModeNum", "Mode") if index.has("MODE", c)), None)

@@ -43,7 +43,7 @@ class LogFormat(NamedTuple):
 
     Attributes:
         name: as `Recording.format` has it.
-        begins: its first bytes, or what tells it from the first `HEAD_BYTES` and the name of a CSV's column of time.
+        begins: its first bytes, or what recognises it from its first `HEAD_BYTES` and the column of time of a CSV.
         reader: module of this package and function in it, which takes the path and returns a `Recording`.
         takes: arguments of `quadid_replay.open_log` that the function takes beside the path.
     """

@@ -116,7 +116,7 @@ def _log_time(message: Message) -> int:
 #
 # The library `mcap` reads the summary, chunks and definitions.  Walking from record to record is ours, because its
 # readers stop at the first damage; so is the check of the summary's CRC, which it leaves out.  Every place of the file
-# is read once and never backwards, whatever an index says.
+# is read once and never backwards, whatever stands in an index.
 
 
 _MESSAGE = struct.Struct("<HIQQ")

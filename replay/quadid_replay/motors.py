@@ -235,7 +235,7 @@ def changed_functions(names: Sequence[str], values: Sequence[float]) -> str:
     """Names the parameters of outputs whose motor changes; empty where none does.
 
     Args:
-        names: of all parameters in the order in which they are told.
+        names: of all parameters in the order in which they came.
         values: theirs.
     """
     given: dict[str, list[int]] = {}
@@ -283,13 +283,13 @@ def motor_columns(functions: Sequence[int]) -> list[int]:
 
 
 def px4_rotor_count(parameters: Mapping[str, float]) -> int:
-    """Returns the number of rotors that CA_ROTOR_COUNT, else MAV_TYPE, tells; 0 when neither does."""
+    """Returns the number of rotors by CA_ROTOR_COUNT, else by MAV_TYPE; 0 when neither has it."""
     count = _whole(parameters, "CA_ROTOR_COUNT")
     return count if 0 < count <= MOST_ROTORS else MULTIROTORS.get(_whole(parameters, "MAV_TYPE"), 0)
 
 
 def _driven(name: str, value: float) -> tuple[int, int | None]:
-    """Output (0 is the first) that a parameter is about, and the motor (0 is the first) that it says to be on it."""
+    """Output (0 is the first) that a parameter is about, and the motor (0 is the first) that it puts on it."""
     match = MOTOR_FUNCTION.fullmatch(name)
     assert match is not None
     motors = _ARDUPILOT_MOTORS if match[1] else _PX4_MOTORS

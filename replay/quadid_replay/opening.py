@@ -61,7 +61,7 @@ def open_log(path: str | Path, preset: str = AUTO, columns: Mapping[str, str] | 
     """Reads a flight log of any known format into core units and frames (SI, world NED, body FRD).
 
     Args:
-        path: the file, whose format is told by its content and never by its suffix, or the folder of a rosbag2
+        path: the file, whose format is recognised by its content and never by its suffix, or the folder of a rosbag2
             recording.
         preset: for ROS logs, whose topic names to expect (see `quadid_replay.presets`); auto finds them by type.
         columns: for CSV, names in the file for those of the contract, as in the vehicle file.

@@ -183,7 +183,7 @@ def _imu_block(m: Any) -> Runs:
 
 
 def _imu_signals(runs: list[FloatArray], extra: Any) -> Signals:
-    """REP-145: a covariance that begins with -1 says that the quantity is absent."""
+    """REP-145: a covariance that begins with -1 marks the quantity as absent."""
     (v,) = runs
     return [
         ("body_rate", v[:, 13:16], v[:, 16] != -1.0), ("body_force", v[:, 25:28], v[:, 28] != -1.0),

@@ -96,7 +96,7 @@ class Database:
             raise self._damaged(error) from error
 
     def damage(self) -> list[str]:
-        """SQLite tells damage when it is met; it is an error then."""
+        """SQLite reports damage when it meets it; it is an error then."""
         return []
 
     def _read_topics(self) -> dict[int, Topic]:

@@ -251,7 +251,7 @@ def _whole(kind: str) -> str:
 
 _INVALID, _ARDUPILOT = 8, 3
 _EPOCH_US = 1e14
-"""SYSTEM_TIME tells the date where it counts more than this [us]."""
+"""SYSTEM_TIME holds a date where it counts more than this [us]."""
 _WIDTH = {"esc": ESCS, "servo": ESCS, "actuator": 32, "attitude": 4, "attitude_reference": 4, "battery": 1}
 Told: TypeAlias = Mapping[str, tuple[IntArray, Messages]]
 """Messages by name, and which frames of the log they are, rising, shape (n,)."""
@@ -268,7 +268,7 @@ class VehicleLog:
         changed: which of them that name a motor change within the log; empty for none.
         ardupilot: whether it calls itself one.
         kind: its MAV_TYPE; 0 for unknown.
-        rotors: as ESC_INFO says; 0 for unknown, and for more than a vehicle has.
+        rotors: by ESC_INFO; 0 for unknown, and for more than a vehicle has.
         heard: whether a measurement has its time before the log ends.
         backwards: how often the boot time fell.
     """
@@ -308,7 +308,7 @@ def vehicle_log(told: Told, received: FloatArray) -> VehicleLog:
 def _signals(
     told: Told, received: FloatArray, clock: LogClock
 ) -> tuple[dict[tuple[str, str], tuple[FloatArray, FloatArray]], Placing]:
-    """Signals in the order in which they are first told, and the times of all messages that tell one."""
+    """Signals in the order in which they first appear, and the times of all messages with one."""
     frames: list[IntArray] = []
     stamps: list[Stamps] = []
     parts: dict[tuple[str, str], list[tuple[IntArray, IntArray, FloatArray]]] = {}  # frames, first columns, values
@@ -360,7 +360,7 @@ def _signals(
 
 
 def _unix_offset(told: Told, which: IntArray) -> FloatArray:
-    """UNIX time of boot [s] as the last SYSTEM_TIME before each frame says; NaN before the first."""
+    """UNIX time of boot [s] by the last SYSTEM_TIME before each frame; NaN before the first."""
     if "SYSTEM_TIME" not in told:
         return np.full(len(which), np.nan)
     at, m = told["SYSTEM_TIME"]

@@ -42,7 +42,7 @@ from quadid_replay.motors import (
 
 # --- Walks through the records of a PX4 ULog and hands pyulog only whole ones, of the topics that are wanted
 #
-# pyulog says a file is not corrupt when it simply ends inside a record (26 of 30 random cuts), and loops for ever on
+# To pyulog a file is not corrupt when it simply ends inside a record (26 of 30 random cuts), and loops for ever on
 # some damaged definitions.
 
 

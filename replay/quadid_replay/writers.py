@@ -314,7 +314,7 @@ def _all_series(recording: Recording, epoch_ns: int) -> Iterator[_Series]:
     first = min((float(c.t[0]) for c in channels.values()), default=0.0)
     if epoch_ns + round(first * 1e9) < 0:
         raise LogError(f"times begin at {first:.3f} s", "times from 0 s on", "give an epoch that makes stamps positive")
-    # One IMU message a stamp; what was not measured there says so in its covariance (REP-145).
+    # One IMU message a stamp; a covariance marks what was not measured there (REP-145).
     t, measured = union_rows([channels.get("gyro"), channels.get("accel")])
     if len(t):
         rows = np.zeros((len(t), 37))
