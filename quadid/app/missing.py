@@ -93,7 +93,7 @@ class MissingForces:
             shares = ", ".join(percent(share).removesuffix(" %") for share in moment / control_size(parts))
             each.append((f"{total:.2g} N ({percent(total / weight)} of the weight)", f"{shares} %"))
         (force_then, moment_then), (force_now, moment_now) = each[0], each[-1]
-        unseen = "unseen flights" if "validate" in self.roles else "these flights"
+        unseen = "validation flights" if "validate" in self.roles else "these flights"
         start = (
             f"On {unseen} the simulation misses {force_then} and {moment_then} of the rms roll, pitch and yaw moment"
         )

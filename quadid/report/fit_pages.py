@@ -391,7 +391,7 @@ def diagnose_verdict(result: Json) -> Verdict:
         headline = f"Found: {'; '.join(found)}. {headline}"
     v = result["validation"]
     held_out = v.get("on") == HELD_OUT
-    where = "held-out blocks of the same flight" if held_out else "unseen flights"
+    where = "held-out blocks of the same flight" if held_out else "validation flights"
     change = _change(v, bool(result["findings"]))
     missing = (result.get("missing") or {}).get("statement")
     details: tuple[str, ...] = (
