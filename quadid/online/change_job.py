@@ -20,7 +20,7 @@ numbers, or larger ones, has to spread its probability over more outcomes.
 from __future__ import annotations
 
 import math
-from collections.abc import Generator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -426,15 +426,13 @@ class ChangeWatch:
         self._detector.restart()
         self.seen = None
 
-    def look(self, tick: float, length: float, estimator: Estimator) -> Generator[None, None, ChangePoint | None]:
-        """Takes in the last `length` [s] of rows before `tick` [s], piece by piece; returns a change seen just now."""
+    def look(self, tick: float, length: float, estimator: Estimator) -> ChangePoint | None:
+        """Takes in the last `length` [s] of rows before `tick` [s]; returns a change seen just now."""
         for i in reversed(range(round(length / CHUNK))):
             self._detector.add(self._rows.span(tick - (i + 1) * CHUNK - _EPS, tick - i * CHUNK - _EPS))
         if self.seen is not None:
             return None
-        yield
         recent = self._rows.cut(tick - ASK_FLYING, tick - _EPS)
-        yield
         quality = judge(recent, self._vehicle, estimator.thrust, estimator.learned)
         # A load taken up or dropped in hover looks like a floor while the step is in what is judged, and no longer.
         self._carried = self._carried + length if quality.carried else 0.0
@@ -443,7 +441,6 @@ class ChangeWatch:
             return None
         if quality.carried:
             return None
-        yield
         inertia = np.array([estimator.value(n) for n in ("J_xx", "J_yy", "J_zz")])
         # One window may have moved too little for its own interval to be right: another has to say the same.
         known = estimator.learned and estimator.fusion.agreement(CONFIRMED)[0] == CONFIRMED

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Generator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -13,7 +12,7 @@ from quadid.data.grid import GAP, OPTIONAL, REQUIRED, ChannelTrack, GridPlan, on
 from quadid.data.window import Sampling, Window, true_runs
 from quadid.types import BoolArray, FloatArray
 
-# --- Rows of the grid, and channels of a live stream read on them, piece by piece
+# --- Rows of the grid, and channels of a live stream read on them
 
 
 @dataclass(frozen=True)
@@ -40,8 +39,8 @@ class Rows:
     new_clock: bool = False
 
 
-def columns_on_grid(plan: GridPlan, at: FloatArray) -> Generator[None, None, dict[str, FloatArray]]:
-    """Reads the channels of a plan, one a piece; returns values by channel, NaN where nothing was measured.
+def columns_on_grid(plan: GridPlan, at: FloatArray) -> dict[str, FloatArray]:
+    """Values of the channels of a plan by name, NaN where nothing was measured.
 
     Optional channels that say nothing in these rows are left out.
 
@@ -53,7 +52,6 @@ def columns_on_grid(plan: GridPlan, at: FloatArray) -> Generator[None, None, dic
     for name in (*REQUIRED, *OPTIONAL):
         if name not in plan.tracks:
             continue
-        yield
         values = on_grid(name, _mended(plan.tracks[name], plan.step), at, plan)
         if name in REQUIRED or not np.isnan(values).all():
             columns[name] = values

@@ -7,18 +7,18 @@
         compare with healthy flights            -> HealthReport, HealthyFlight
         diagnose the last minute, now and then  -> DiagnosisRequest, OnlineDiagnosis; nothing waits for it
         cut a window, judge its quality         -> what is missing, not flying, broken
-        FitRequest                              -> stops here until `deliver` brings the reply
+        FitRequest                              -> the next tick waits until `deliver` brings the reply
         fuse, ask the gate                      -> Publish(candidate), Publish(parameters)
 
-A session stands still while a fit runs and catches up afterwards, so that nothing depends on how long a fit takes.
-Where the machine is too slow for that, whoever drives the session calls `hurry` and `go_on`: then it goes on without
-the reply, which is taken when it comes, no further fit begins until it has caught up, and changes are looked for.
+Data are read on while a fit runs, but the next tick waits for its reply: nothing depends on how long it takes.  A live
+session has limited `patience`: where the machine is too slow, whoever drives it calls `go_on`, and ticks go on without
+the reply and look for changes; it counts when it comes, and no further fit begins until then.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 from pydantic import BaseModel, ConfigDict, Field
@@ -51,7 +51,7 @@ from quadid.online.records import (
     SetState,
     unexpected,
 )
-from quadid.online.stream import LEADER, Resampler
+from quadid.online.stream import BLOCK, LEADER, SETTLE, Resampler
 from quadid.parameters import NOMINAL_NAMES
 from quadid.vehicle import Vehicle
 
@@ -62,7 +62,6 @@ STARTING = 3.0
 FOUND_AFTER = 3.0
 """An answer that takes long is used so long after it was asked for [s], so that a replay does what was done live."""
 _EPS = 1e-6
-_DONE = object()
 
 
 class SessionSettings(BaseModel):
@@ -96,13 +95,13 @@ class Session:
         resampler: the samples; its `counts`, `last` and `faults` tell what arrives.
         active_set: which set is in force.
         settings: as given.
-        skipped: fits that were due and left out in a hurry.
+        skipped: fits that were due and left out, as the machine was too slow.
     """
 
     def __init__(
         self, vehicle: Vehicle, settings: SessionSettings | None = None, restored: OnlineSet | None = None,
         next_sequence: int = 1, baseline: OnlineSet | None = None, healthy: Sequence[FlightTrim] = (),
-        load: float = 1.0,
+        load: float = 1.0, patience: float = math.inf,
     ) -> None:  # fmt: skip
         """Starts a session.
 
@@ -114,6 +113,7 @@ class Session:
             baseline: set from which creeping is measured; default `restored`.
             healthy: trims of the vehicle's healthy flights, the oldest first.
             load: mass over that of the vehicle file, as changes in earlier flights left it.
+            patience: a fit that is due so much behind the newest data [s] is left out; the next one takes its rows.
         """
         self.settings = settings or SessionSettings()
         self.resampler = Resampler(vehicle, self.settings.rate)
@@ -128,18 +128,17 @@ class Session:
             vehicle, self._rows, self.settings.diagnose, self.settings.seed, self._outbox.stamp
         )
         self._estimator = Estimator(vehicle, self.settings.memory, self.settings.window, self.settings.seed)
-        # The walk: data read up to `_now` [s], the next tick [s], and the pieces of work that have begun.
+        # The walk: data read up to `_now` [s], the next tick [s], rows of a new stretch that wait as a tick does.
         self._now, self._tick_at = -math.inf, math.nan
-        self._work: Iterator[None] | None = None
-        # Jobs: the one that is waited for, its reply, one that is too late; a long fit, whose reply is waited for when
-        # it is due, and that reply; replies up to `_outdated` are ignored.
+        self._next: Rows | None = None
+        # Jobs: the one whose reply is waited for, that reply, whether ticks go on without; a long fit, whose reply is
+        # waited for when it is due, and that reply; replies up to `_outdated` are ignored.
         self._waiting: Job | None = None
         self._reply: JobReply | None = None
-        self._late: Job | None = None
+        self._overdue, self._patience = False, patience
         self._search: FitRequest | None = None
         self._found: JobReply | None = None
-        self._number = self._outdated = 0
-        self._hurried, self.skipped = False, 0
+        self._number = self._outdated = self.skipped = 0
         # Learning: nothing before `_learn_from` [s] counts; since when [s] windows have disagreed with the estimate.
         self._learn_from, self._disagrees_since = -math.inf, math.inf
         self._cut, self._quality = WindowCut((), 0.0, 0), Quality()
@@ -167,20 +166,14 @@ class Session:
             self._reply = reply
         elif self._search is not None and reply.number == self._search.number:
             self._found = reply
-        elif self._late is not None and reply.number == self._late.number and self._waiting is None:
-            self._waiting, self._reply, self._late = self._late, reply, None
         else:
             self._diagnosis.deliver(reply)
 
-    def hurry(self, needed: bool) -> None:
-        """Notes whether the machine is too slow at the moment: then changes come first, and no fit begins."""
-        self._hurried = needed
-
     def go_on(self) -> None:
-        """Waits no longer for the running job: the reply to a fit is taken when it comes, a change keeps no cause."""
-        if isinstance(self._waiting, FitRequest) and self._reply is None:
-            self._waiting, self._late = None, self._waiting
-        elif self._waiting is not None and self._reply is None:
+        """Waits no longer for a fit, whose reply is taken when it comes; a change keeps no cause once this lags."""
+        if isinstance(self._waiting, FitRequest):
+            self._overdue = True
+        elif self._waiting is not None and self._reply is None and self.backlog > self._patience:
             self._reply = self._waiting.failed("the machine is too slow for a fit in time")
 
     def approve(self, by: str, sequence: int | None = None) -> Answer:
@@ -193,7 +186,7 @@ class Session:
         """A person takes the set in force back; from then on sets wait for approval."""
         answer = self.active_set.roll_back(self._outbox.stamp(self._now), by)
         if answer.done:
-            self._outdated, self._work = self._number, None
+            self._outdated = self._number
             self._changes.restart()
             self._relearn(self._now, f"rolled back by {by}")
             self._outbox.act(*answer.actions)
@@ -212,32 +205,23 @@ class Session:
         return self._waiting or (self._search if self._found is None else None)
 
     @property
+    def waits(self) -> bool:
+        """True while the next tick has to wait for the reply to a job."""
+        return self._waiting is not None and not self._overdue
+
+    @property
     def backlog(self) -> float:
         """Data that have arrived and were not worked through yet [s]."""
         return max(self.resampler.time.newest - self._now, 0.0) if math.isfinite(self._now) else 0.0
 
-    @property
-    def busy(self) -> bool:
-        """True if there is a piece of work that waits for nothing."""
-        if self._work is None and self._waiting is not None:
-            return self._reply is not None
-        return self._work is not None or self._tick_due or self.resampler.busy
-
-    def poll(self, most: int | None = None) -> list[Action]:
-        """Works through what has arrived and returns what to do, in order.
-
-        Args:
-            most: pieces of work at most, of a millisecond or two each, so that a caller with other duties gets control
-                back.
-        """
-        done = 0
-        while self.busy and (most is None or done < most):
+    def poll(self) -> list[Action]:
+        """Works through what has arrived and returns what to do, in order."""
+        going_on = True
+        while going_on:
             try:
-                self._piece()
+                going_on = self._work()
             except Exception as error:  # noqa: BLE001 - whatever it is, the flight goes on, and it is told
-                self._work = None
                 self._fail(self._now, unexpected(error))
-            done += 1
         return self._outbox.take()
 
     def status(self) -> SessionStatus:
@@ -271,24 +255,28 @@ class Session:
     def _tick(self) -> float:
         return min(self.settings.refit, 1.0)
 
-    @property
-    def _tick_due(self) -> bool:
-        return not math.isnan(self._tick_at) and self._now >= self._tick_at - _EPS
-
-    def _piece(self) -> None:
-        """The next piece of work: of an answer, a tick, or a block of rows."""
-        if self._work is None:
-            if self._waiting is not None:
-                self._work = self._apply()
-            elif self._tick_due:
-                tick, self._tick_at = self._tick_at, self._tick_at + self._tick
-                self._work = self._at(tick)
-        if self._work is None:
-            rows = self.resampler.work()
-            if rows is not None:
-                self._take(rows)
-        elif next(self._work, _DONE) is _DONE:
-            self._work = None
+    def _work(self) -> bool:
+        """Works on the next reply, tick or block of rows; returns False where there is none, or it has to wait."""
+        # 1. A reply, as soon as it is there.
+        if self._reply is not None:
+            self._apply()
+            return True
+        # 2. Rows, until a tick is due.
+        tick_due = self._now >= self._tick_at - _EPS
+        if not tick_due and self._next is None:
+            self._next = self.resampler.next_rows()
+            if self._next is None:
+                return False
+        # 3. A tick, or the begin of a stretch, once no reply has to come before.
+        if self.waits and (tick_due or (self._next is not None and self._next.fresh)):
+            return False
+        if tick_due:
+            tick, self._tick_at = self._tick_at, self._tick_at + self._tick
+            self._at(tick)
+        elif self._next is not None:
+            rows, self._next = self._next, None
+            self._take(rows)
+        return True
 
     def _take(self, rows: Rows) -> None:
         if rows.fresh:
@@ -302,15 +290,13 @@ class Session:
         self._rows.add(rows)
         self._now = float(rows.t[-1]) + 1.0 / self.settings.rate
 
-    def _at(self, tick: float) -> Iterator[None]:
-        """One tick, piece by piece: first look for sudden changes; then a fit."""
+    def _at(self, tick: float) -> None:
+        """One tick: first look for sudden changes; then a fit."""
         self._consistency.add(self._rows.span(tick - self._tick - LEAD - _EPS, tick - _EPS), self._tick)
         if self._consistency.fault:
-            yield
             self._distrust(tick)
             return
-        yield
-        seen = yield from self._changes.look(tick, self._tick, self._estimator)
+        seen = self._changes.look(tick, self._tick, self._estimator)
         if seen is not None:
             self._outbox.state(Phase.CANDIDATE, f"a change of {seen.channel} is being looked into")
             what = f"{seen.channel} stepped by {seen.size:+.1%} at {self._outbox.stamp(seen.time):.2f} s"
@@ -319,17 +305,18 @@ class Session:
             self._health_until = tick
             self._compare_with_healthy_flights(tick)
         self._diagnose(tick)
-        yield
         if self._changes.seen is not None:
             self._explain_change(tick)
-        elif self._search is not None:
-            if tick >= self._search.stop + FOUND_AFTER - _EPS:
-                self._waiting, self._reply, self._search, self._found = self._search, self._found, None, None
+        elif (search := self._search) is not None:
+            if tick >= search.stop + FOUND_AFTER - _EPS:
+                found, self._search, self._found = self._found, None, None
+                self._wait_for(search, found)
         elif self._asked_now or (self._errors < MOST_ERRORS and tick - self._last_fit >= self.settings.refit - _EPS):
-            if self._hurried or self._late is not None or self._waiting is not None:
+            behind = self.resampler.time.newest - tick - SETTLE - BLOCK / self.settings.rate
+            if self._waiting is not None or behind > self._patience:
                 self.skipped += 1
             else:
-                yield from self._fit(tick)
+                self._fit(tick)
 
     def _distrust(self, tick: float) -> None:
         """The sensors disagree: nothing is learned until they do not, and what was learned is forgotten."""
@@ -362,7 +349,7 @@ class Session:
         told = self._diagnosis.answer(tick, self._learn_from)
         if told is not None:
             self._outbox.act(told)
-        moving = estimator.learned and is_excited(estimator.excitation) and not self._hurried
+        moving = estimator.learned and is_excited(estimator.excitation) and self._waiting is None
         if moving and self._changes.seen is None and self._quality == Quality():
             request = self._diagnosis.ask(self._number + 1, tick, max(self._learn_from, estimator.start))
             if request is not None:
@@ -376,7 +363,8 @@ class Session:
         request = self._changes.ask(self._number + 1, tick, self._estimator, stamp)
         if request is None:
             return
-        self._number, self._waiting, self._late, self._search = request.number, request, None, None
+        self._number, self._search = request.number, None
+        self._wait_for(request)
         if not request.windows:
             self._reply = request.failed("too little data after the change")
         elif not self._estimator.learned:
@@ -384,7 +372,10 @@ class Session:
         else:
             self._outbox.act(request)
 
-    def _fit(self, tick: float) -> Iterator[None]:
+    def _wait_for(self, request: Job, reply: JobReply | None = None) -> None:
+        self._waiting, self._reply, self._overdue = request, reply, False
+
+    def _fit(self, tick: float) -> None:
         """Cuts the window before `tick` [s], judges it, and asks for its fit; or reports why there is none."""
         wanted = self.settings.window
         if self._asked_now:
@@ -401,13 +392,11 @@ class Session:
             have = f"{max(tick - start, 0.0):.0f} of {self.settings.window:g} s of flight"
             self._outbox.state(Phase.COLLECTING, f"{have}; {cut.reason or 'no gaps'}")
             return
-        yield
         self._quality = judge(cut, self._vehicle, self._estimator.thrust, self._estimator.learned)
         if self._quality != Quality():
             phase = Phase.BLOCKED if self._quality.fault else Phase.NOT_FLYING
             self._outbox.note(tick, phase, self._quality.fault or self._quality.grounded)
             return
-        yield
         self._last_fit = tick
         start = max(start, tick - self.settings.window)
         request = self._estimator.request(self._number + 1, cut, start, tick, self._rows)
@@ -415,12 +404,12 @@ class Session:
         if request.is_long:
             self._search, self._found = request, None
         else:
-            self._waiting = request
+            self._wait_for(request)
         self._outbox.act(request)
 
     # --- what replies bring
 
-    def _apply(self) -> Iterator[None]:
+    def _apply(self) -> None:
         request, reply = self._waiting, self._reply
         self._waiting = self._reply = None
         if request is None or request.number <= self._outdated or not request.is_answered_by(reply):
@@ -434,7 +423,7 @@ class Session:
             return
         self._errors = 0
         if isinstance(request, FitRequest) and isinstance(reply, FitReply):
-            yield from self._fitted(request, reply)
+            self._fitted(request, reply)
         elif isinstance(request, ChangeRequest) and isinstance(reply, ChangeReply):
             self._changes.restart()
             # Where it may be the mass, the sets after it wait for a person.
@@ -443,8 +432,8 @@ class Session:
             span = request.start, request.stop
             self._has_changed(span, "finding", text, "unknown_cause", request.start + 0.1, reply.finding)
 
-    def _fitted(self, request: FitRequest, reply: FitReply) -> Iterator[None]:
-        """Takes in the fit of a window, piece by piece: fuse it, watch the set in force, ask the gate."""
+    def _fitted(self, request: FitRequest, reply: FitReply) -> None:
+        """Takes in the fit of a window: fuse it, watch the set in force, ask the gate."""
         outbox, estimator = self._outbox, self._estimator
         if reply.problem:
             outbox.note(request.stop, Phase.FAILED, reply.problem)
@@ -474,7 +463,6 @@ class Session:
         if request.noise is None and reply.noise is not None and reply.noise.late > 0.0:
             late = f"gyro and accelerometer come {1e3 * reply.noise.late:.0f} ms after the attitude"
             outbox.say(request.stop, "info", "sensors", f"{late}, as behind a low-pass: fits undo that")
-        yield
         # The set in force is taken back when its predecessor predicts new windows better.
         sets, told = self.active_set, estimator.fusion.disjoint(1)
         if sets.predecessor is not None and told:

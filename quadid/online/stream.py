@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter, deque
-from collections.abc import Generator, Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from itertools import pairwise
 from typing import NamedTuple
@@ -379,8 +379,8 @@ def _turned(buffer: ChannelBuffer, at: FloatArray) -> FloatArray:
 LEADER = "gyro"
 SETTLE = 0.5
 """Rows leave this long [s] after their time, so that slower and delayed channels are there."""
-BLOCK = 20
-"""Rows that leave at once: many of them are read from the channels for little more than one."""
+BLOCK = 5
+"""Rows that leave at once: many of them are read for little more than one, but the first wait for the last."""
 HISTORY = 2.0
 """Past samples kept [s]: rates and gaps are judged from them.  Over a longer pause of the gyro no rows are made: work
 is in proportion to what came, not to the time that its stamps claim."""
@@ -446,7 +446,6 @@ class Resampler:
         self._told: set[str] = set()
         self._stretches: deque[_Stretch] = deque()
         self._stretch: _Stretch | None = None
-        self._making: Iterator[Rows | None] | None = None
         self._row = 0
         # The low-pass makes its table when first used: now, not in flight.
         lowpass(np.arange(20.0), np.zeros((20, 1)), np.full(1, 10.0), 1.0, held=False)
@@ -578,25 +577,26 @@ class Resampler:
 
     # --- rows out
 
-    @property
-    def busy(self) -> bool:
-        """True if there is a piece of `work`."""
-        return self._making is not None or self._is_due()
-
-    def work(self) -> Rows | None:
-        """Does one piece of the work on the next block of rows, a millisecond or two; the last one gives the block.
-
-        What arrives between two pieces changes nothing in the block.
-        """
-        making, self._making = self._making, None  # a block that cannot be made is left out
-        if making is None:
-            if not self._is_due():
-                return None
-            making = self._make()
-        rows = next(making)
-        if rows is None:
-            self._making = making
-        return rows
+    def next_rows(self) -> Rows | None:
+        """The next block of rows; None until enough has arrived.  One that cannot be made raises, and is left out."""
+        if not self._is_due():
+            return None
+        assert self._stretch is not None
+        at, stretch, fresh = self._times(), self._stretch, self._row == 0
+        self._row += BLOCK
+        for name, buffer in self._buffers.items():
+            late, doubles = buffer.settle(
+                float(at[0]) - (HISTORY if fresh else SETTLE), float(at[-1]) + SETTLE,
+                stretch.end if fresh else -math.inf,
+            )  # fmt: skip
+            if late:
+                self.faults[f"{name}: late"] += late
+            if doubles:
+                self.faults[f"{name}: duplicate"] += doubles
+        rows = self._grid(at)
+        for buffer in self._buffers.values():
+            buffer.forget(float(at[0]) - HISTORY)
+        return replace(rows, fresh=fresh, new_clock=fresh and stretch.new_clock)
 
     def _is_due(self) -> bool:
         """True if the stream has come past the next block of rows; goes on to the next stretch where one has ended."""
@@ -617,27 +617,7 @@ class Resampler:
         rows = np.arange(self._row, self._row + BLOCK, dtype=np.float64)
         return np.asarray(self._stretch.first + self._step * rows)
 
-    def _make(self) -> Iterator[Rows | None]:
-        """Makes a block of rows piece by piece: None after each piece but the last."""
-        assert self._stretch is not None
-        at, stretch, fresh = self._times(), self._stretch, self._row == 0
-        self._row += BLOCK
-        for name, buffer in self._buffers.items():
-            late, doubles = buffer.settle(
-                float(at[0]) - (HISTORY if fresh else SETTLE), float(at[-1]) + SETTLE,
-                stretch.end if fresh else -math.inf,
-            )  # fmt: skip
-            if late:
-                self.faults[f"{name}: late"] += late
-            if doubles:
-                self.faults[f"{name}: duplicate"] += doubles
-        yield None
-        rows = yield from self._grid(at)
-        for buffer in self._buffers.values():
-            buffer.forget(float(at[0]) - HISTORY)
-        yield replace(rows, fresh=fresh, new_clock=fresh and stretch.new_clock)
-
-    def _grid(self, at: FloatArray) -> Generator[None, None, Rows]:
+    def _grid(self, at: FloatArray) -> Rows:
         channels = {}
         for name, buffer in self._buffers.items():
             channel = buffer.between(name, float(at[0]) - HISTORY, float(at[-1]) + SETTLE)
@@ -650,7 +630,7 @@ class Resampler:
             empty = np.full((len(at), len(self._vehicle.rotors)), np.nan)
             return Rows(at, {"rotor_speed": empty}, "held", "", problem=str(error))
         plan = make_plan(recording, rotor.t, rotor.values, rotor.sampling, 1.0 / self._step)
-        columns = yield from columns_on_grid(plan, at)
+        columns = columns_on_grid(plan, at)
         spacing = plan.tracks["rotor_speed"].period / self._step
         return Rows(at, columns, plan.sampling, rotor.source, spacing=spacing)
 

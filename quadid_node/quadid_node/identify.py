@@ -6,11 +6,12 @@ import contextlib
 import importlib
 import sys
 
-from quadid_node.process import SPIN_SECONDS, StopSignal, end_middleware, without_shared_memory
+from quadid_node.process import SPIN_SECONDS, StopSignal, end_middleware, one_thread, without_shared_memory
 
 
 def main(args: list[str] | None = None) -> int:
     """Runs the node; returns the exit code: 0 done, 2 bad parameters, or a folder to run nothing in."""
+    one_thread()
     try:
         importlib.import_module("quadid")  # refuses a folder that would run foreign code
     except ImportError as error:

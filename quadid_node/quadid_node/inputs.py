@@ -470,7 +470,7 @@ class Intake:
             topic.decoder.pace.look(self._looked, before, len(taken))
         return Waiting(max(1, math.ceil((self._looked - before) / SLICE)), messages)
 
-    def read(self, waiting: Waiting, record: Record | None = None) -> Iterator[list[Block]]:
+    def read(self, waiting: Waiting, record: Record | None = None) -> Iterator[Block]:
         """Reads what was taken, one topic after the other.
 
         Args:
@@ -483,7 +483,7 @@ class Intake:
                     for data in piece:
                         record(entry.topic, entry.type.replace("/", "/msg/"), data)
                 if piece:
-                    yield list(decoder.take(piece))
+                    yield from decoder.take(piece)
 
     def troubles(self) -> dict[str, str]:
         """Problems of the messages of topics, by topic name as resolved."""

@@ -592,8 +592,6 @@ class MavlinkLink:
 
 IDLE = 0.005
 """Pause when nothing arrives [s]."""
-WORK_SECONDS = 0.02
-"""No piece of the session's work begins later than this in a step [s]."""
 
 
 class Outlet(Protocol):
@@ -620,7 +618,7 @@ def run(
         for block in link.receive():
             busy = True
             service.push(block)
-        for output in service.step(WORK_SECONDS):
+        for output in service.step():
             link.publish(output)
             for outlet in outlets:
                 outlet.publish(output)

@@ -44,13 +44,13 @@ from quadid_node.inputs import (
     to_message,
 )
 from quadid_node.publish import NO_SUBSCRIPTION_EVENTS, Bond, GraphMonitor, Offer, Publishers, bond_of
-from quadid_node.recording import WRITTEN, Beginning, Recorder
-from quadid_node.service import PATIENCE, ROUND_SECONDS, STEP_SECONDS, WORK_SECONDS, Scheduler, Service
+from quadid_node.recording import Beginning, Recorder
+from quadid_node.service import Service
 from quadid_node.settings import PARAMETERS, READ_BACK, as_declared, check_change, descriptor, read_settings, vehicle_id
 from quadid_node.zenoh import ZenohLink
 
-CATCHING_UP = 10.0
-"""A step lasts longer, up to so many times, in proportion to a backlog beyond the service's patience."""
+ROUND_SECONDS = 0.1
+"""A round is done this often [s]: rows of the grid wait five times as long for late channels."""
 REPORT_SECONDS = 1.0
 """Status and health are published this often [s]."""
 TOLD_SECONDS = 5.0
@@ -142,9 +142,8 @@ class IdentifyNode(PollingNode, LifecycleNode):
         self._outputs = Publishers(self)
         self._change_state = self._service_change_state.callback
         self._service_change_state.callback = self._on_change_state
-        self._scheduler, self._report_at = Scheduler(self._round), 0.0
-        self._active = False
-        self.create_timer(STEP_SECONDS, self._step, clock=RosClock(clock_type=ClockType.STEADY_TIME))
+        self._report_at, self._active = 0.0, False
+        self.create_timer(ROUND_SECONDS, self._round, clock=RosClock(clock_type=ClockType.STEADY_TIME))
 
     def start(self) -> bool:
         """Configures and activates a node that has no lifecycle manager (`autostart`); False: it cannot be."""
@@ -178,7 +177,7 @@ class IdentifyNode(PollingNode, LifecycleNode):
             self._tear_down()
             return Return.FAILURE
         gc.collect()
-        gc.freeze()  # what there is now need not be looked through in flight, which takes as long as three steps
+        gc.freeze()  # what there is now need not be looked through in flight
         return Return.SUCCESS
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -305,7 +304,6 @@ class IdentifyNode(PollingNode, LifecycleNode):
         self._active = False
         gc.unfreeze()
         self._break_bond()
-        self._scheduler.drop()
         self._intake.clear()
         while self._polled:
             self.destroy_subscription(self._polled.pop())
@@ -326,12 +324,7 @@ class IdentifyNode(PollingNode, LifecycleNode):
 
     # --- callbacks
 
-    def _step(self) -> None:
-        """Goes on with the round, for longer when the session is far behind its data."""
-        behind = self._service.session.backlog / PATIENCE if self._service is not None else 1.0
-        self._scheduler.step(WORK_SECONDS * min(max(behind, 1.0), CATCHING_UP))
-
-    def _round(self) -> Iterator[None]:
+    def _round(self) -> None:
         """All there is to do again and again: take in what has arrived, write it down, report, work on it."""
         service, graph, recorder = self._service, self._graph, self._recorder
         # What has arrived since the last round, topic by topic; while two publish an input it is forgotten.
@@ -339,24 +332,14 @@ class IdentifyNode(PollingNode, LifecycleNode):
         if graph is not None:
             for polled in self._polled:  # a publisher is counted before its first message can be taken
                 graph.count(polled.topic_name, polled.get_publisher_count())
-        yield
         if service is not None and graph is not None and self._active and not graph.paused:
-            for items in self._intake.read(waiting, recorder.take if recorder is not None else None):
-                for item in items:
-                    service.push(item)
-                yield
-                if not self._active:
-                    break
-        while recorder is not None and recorder.write(WRITTEN):
-            yield
+            for block in self._intake.read(waiting, recorder.take if recorder is not None else None):
+                service.push(block)
+        if recorder is not None:
+            recorder.write()
+        if service is not None:
+            self._put(service.step() if self._active else service.idle())
         self._report_if_due()
-        yield
-        # Work on it, until that is done or the round lasts too long.
-        for outputs in () if service is None else service.pieces() if self._active else [service.idle()]:
-            self._put(outputs)
-            yield
-            if self._scheduler.overdue or not self._active:
-                return
 
     def _put(self, outputs: list[messages.Output]) -> None:
         """Publishes what the service hands out, and logs its events."""
@@ -441,7 +424,7 @@ class IdentifyNode(PollingNode, LifecycleNode):
                 return response
             answer = do(service, request)
             response.success, response.message = answer.done, answer.text
-            self._put(service.step(WORK_SECONDS))
+            self._put(service.step())
             if hasattr(response, "in_force"):
                 response.in_force = service.session.status().in_force
             return response

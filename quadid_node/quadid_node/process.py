@@ -12,8 +12,16 @@ from types import FrameType
 
 SPIN_SECONDS = 0.2
 """Longest wait before signals are looked at [s]; the executor of these wheels needs a limit to deliver anything."""
+THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
+"""Variables of NumPy's number of threads: on a busy machine more than one wait for each other, of small matrices."""
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _CHOSEN_BY_USER = ("FASTDDS_BUILTIN_TRANSPORTS", "FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PROFILES_FILE")
+
+
+def one_thread() -> None:
+    """Has linear algebra take one thread, where the user does not say otherwise; before NumPy is imported."""
+    for name in THREADS:
+        os.environ.setdefault(name, "1")
 
 
 class StopSignal:

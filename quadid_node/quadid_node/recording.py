@@ -34,8 +34,6 @@ from quadid_node.messages import Output, set_from_dict, set_to_dict
 from quadid_node.service import Service
 
 RECORD = "quadid.session"
-WRITTEN = 32
-"""Messages that are written in about a millisecond."""
 CHUNK_BYTES = 1 << 16
 """A small chunk is compressed in half a millisecond; a usual one would hold up the node for ten."""
 
@@ -79,13 +77,11 @@ class Recorder:
         self._last = max(time.time_ns(), self._last + 1)
         self._waiting.append((topic, kind, data, self._last))
 
-    def write(self, most: int | None = None) -> bool:
-        """Writes what waits, `most` messages at most; returns whether some are left."""
-        most = len(self._waiting) if most is None else most
-        now, self._waiting = self._waiting[:most], self._waiting[most:]
-        for message in now:
+    def write(self) -> None:
+        """Writes what waits."""
+        for message in self._waiting:
             self._writer.write_cdr(*message)
-        return bool(self._waiting)
+        self._waiting.clear()
 
     def close(self) -> None:
         """Writes what waits and the end of the file."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import time
 import uuid
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 
 from quadid.data.window import Block
@@ -78,7 +78,7 @@ class Publication:
 DECISION_SECONDS = 2.0
 """Time that a person's decision waits to be on the disk before it is answered [s]."""
 PATIENCE = 1.0
-"""A session this far behind its data [s] waits no longer for a fit that takes as long, and begins no other."""
+"""A fit that is waited for longer [s] is late; a session this far behind its data [s] begins none."""
 RATE_MEMORY = 2.0
 """Time over which data rates are measured [s]."""
 
@@ -108,7 +108,7 @@ class Service:
         self.boot_id = store.boot_id if store is not None else uuid.uuid4().hex
         self.session = Session(
             vehicle, settings, restored.item, restored.next_sequence, restored.baseline, restored.healthy,
-            restored.mass / vehicle.mass if restored.mass else 1.0,
+            restored.mass / vehicle.mass if restored.mass else 1.0, PATIENCE if live else math.inf,
         )  # fmt: skip
         self._load = self.session.active_set.load
         self._configured: str = settings.gate.approval
@@ -124,7 +124,8 @@ class Service:
         self._noted = 0
         self._problem = ""
         self._fit_began, self._fit_seconds = 0.0, math.nan
-        self._looked, self._unfinished, self._tell_at = clock(), False, BEHIND
+        self._looked = self._waits_since = clock()
+        self._behind, self._tell_at = 0.0, BEHIND
 
         if restored.approval not in ("", self._configured):
             self.session.active_set.approval = self._approval = restored.approval
@@ -151,32 +152,22 @@ class Service:
         self._arrived |= dict.fromkeys((name for name, _ in messages.columns), self._clock())
         self.session.push(messages)
 
-    def step(self, seconds: float = math.inf) -> list[Output]:
-        """Moves everything on by what there is to do; never waits.
-
-        Args:
-            seconds: no piece of the session's work begins later than this [s]; one always does.
+    def step(self) -> list[Output]:
+        """Does all there is to do, and waits for nothing.
 
         Returns:
             What to publish and log; numbered sets are on the disk by then, or come with a later step.
         """
-        outputs, begin = list[Output](), self._clock()
-        for piece in self.pieces():
-            outputs += piece
-            if self._clock() - begin >= seconds:
-                break
-        return outputs
-
-    def pieces(self) -> Iterator[list[Output]]:
-        """As `step`, and gives control back, with what is to be published and logged, after each piece of the work."""
-        outputs, self._looked = [*self._tidy(), *self._keep_up()], self._clock()
-        while True:
-            outputs += self._carried_out(self.session.poll(1))
-            self._unfinished = self.session.busy
-            yield self._journalled(outputs)
-            if not self.session.busy:
-                return
-            outputs = []
+        before, self._looked = self._looked, self._clock()
+        outputs = self._tidy()
+        if not self.session.waits:
+            self._waits_since = self._looked
+        elif self._live and self._looked - self._waits_since > PATIENCE:
+            self.session.go_on()
+        outputs += self._carried_out(self.session.poll())
+        # How old the data were that results rested on: what waits, and all the time since the step before.
+        self._behind = self.session.backlog + (self._clock() - before) * self._live
+        return self._journalled([*outputs, *self._lag()])
 
     def _carried_out(self, actions: list[Action]) -> list[Output]:
         """Gives requests to the workers; returns the rest."""
@@ -223,16 +214,9 @@ class Service:
             outputs.append(self._event(level, "history", self._problem or "the history is written again"))
         return outputs
 
-    def _keep_up(self) -> list[Event]:
-        """Lets a live session that is behind its data shed work, and reports it; a replay waits for every fit."""
-        if not self._live:
-            return []
-        session, behind = self.session, self.session.backlog
-        waits = session.running is not None and self._clock() - self._fit_began > PATIENCE
-        hurried = behind > PATIENCE and (waits or self._unfinished)
-        session.hurry(hurried)
-        if hurried and waits:
-            session.go_on()
+    def _lag(self) -> list[Event]:
+        """Reports a live session that falls behind its data, and that it has caught up."""
+        behind = self._behind if self._live else 0.0
         if behind >= self._tell_at:
             self._tell_at = 2.0 * behind
             return [self._event("warning", "behind", lag(behind))]
@@ -272,7 +256,7 @@ class Service:
         """The answer to a person's decision, once that is on the disk."""
         if not answer.done:
             return answer
-        self._decided = self._journalled(self._carried_out(self.session.poll(0)))
+        self._decided = self._journalled(self._carried_out(self.session.poll()))
         if self._store is None or self._store.flush(DECISION_SECONDS):
             return answer
         text = f"{answer.text}; NOT on the disk, and published only when it is: {self._store.problem or 'slow disk'}"
@@ -295,7 +279,8 @@ class Service:
         feeds = {name: Feed(self._rate(name, now), max(self._looked - at, 0.0)) for name, at in self._arrived.items()}
         restarts = getattr(self._worker, "restarts", 0)
         history = self._store.problem if self._store is not None else "none kept"
-        return ServiceHealth(self.session.status(), feeds, self._worker.state, restarts, history, self._fit_seconds)
+        status = replace(self.session.status(), backlog=self._behind)
+        return ServiceHealth(status, feeds, self._worker.state, restarts, history, self._fit_seconds)
 
     def close(self) -> None:
         """Ends workers and history; what was journalled is on the disk afterwards."""
@@ -315,62 +300,3 @@ class Service:
 
     def _event(self, level: str, kind: str, text: str) -> Event:
         return Event(self.session.status().t, level, kind, text)
-
-
-# --- What a node does again and again, cut into pieces and done in short steps
-
-
-STEP_SECONDS = 0.0125
-"""A step is taken this often [s]."""
-STEPS = 8
-"""Steps from the beginning of a round to that of the next."""
-ROUND_SECONDS = STEPS * STEP_SECONDS
-"""Messages are taken from the middleware this often [s]: rows of the grid wait five times as long for late channels."""
-WORK_SECONDS = 0.0015
-"""No piece of a round begins later than this in a step [s]."""
-
-
-class Scheduler:
-    """Does one round after the other."""
-
-    def __init__(self, begin: Callable[[], Iterator[None]], clock: Callable[[], float] = time.monotonic) -> None:
-        """Starts with a round that is due.
-
-        Args:
-            begin: begins a round; it is done to the end piece by piece.
-            clock: seconds, monotonic.
-        """
-        self._begin, self._clock = begin, clock
-        self._round: Iterator[None] | None = None
-        self._steps = STEPS
-
-    @property
-    def overdue(self) -> bool:
-        """True if the round lasts twice as long as it should, and work that can wait should be left to the next."""
-        return self._steps >= 2 * STEPS
-
-    @property
-    def resting(self) -> bool:
-        """Checks whether there is nothing to do until the next round."""
-        return self._round is None and self._steps + 1 < STEPS
-
-    def step(self, seconds: float = WORK_SECONDS) -> None:
-        """Goes on with the round, or begins the next one when its time has come.
-
-        Args:
-            seconds: no piece begins later than this [s]; one always does.
-        """
-        end = self._clock() + seconds
-        self._steps += 1
-        if self._round is None:
-            if self._steps < STEPS:
-                return
-            self._round, self._steps = self._begin(), 0
-        for _ in self._round:
-            if self._clock() >= end:
-                return
-        self._round = None
-
-    def drop(self) -> None:
-        """Forgets the round that is being done."""
-        self._round = None

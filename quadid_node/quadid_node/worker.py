@@ -25,6 +25,7 @@ from typing import Any, Protocol
 
 from quadid.online.records import UNEXPECTED, Job, JobReply
 from quadid.vehicle import Vehicle
+from quadid_node.process import THREADS
 
 # --- Whether a child that starts gets anywhere: compiling may take long on a slow machine, standing still may not
 
@@ -82,7 +83,6 @@ CALM = 60.0
 """Failures this long ago [s] are forgiven."""
 MEMORY_MB = 1000
 NICE = 15
-THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 READY = "ready"
 _PR_SET_PDEATHSIG = 1
 

@@ -53,7 +53,7 @@ class MessageReader:
         self._noted: Any = None
 
     def read(self, messages: Sequence[bytes]) -> Read | None:
-        """Reads messages; None for several that have not the layout last learnt: their halves are to be read then.
+        """Reads messages; None for several that are not alike, or not as the layout last learnt: then halves are to be.
 
         Raises:
             Exception: a single message that cannot be decoded: what the library raises, of `UNDECODABLE`.
@@ -66,17 +66,21 @@ class MessageReader:
                 ns = read["seconds"].astype(np.int64) * 10**9 + read["nanoseconds"]
                 blocks = [read[f"block {k}"].astype(np.float64) for k in range(len(self._same) - 1)]
                 return Read(ns, blocks, self._noted)
-        if len(messages) > 1:
+        if len(messages) > 1 and self._layout is not None:
             return None
-        message = self._decode(messages[0])
-        runs, extra = self._kind.blocks(message), self._kind.extra(message)
+        try:
+            decoded = [self._decode(data) for data in messages]
+            each, extras = [self._kind.blocks(m) for m in decoded], [self._kind.extra(m) for m in decoded]
+            ns = np.array([(self._kind.stamp or _header_stamp)(m) for m in decoded], dtype=np.int64)
+        except Exception:
+            if len(messages) > 1:
+                return None
+            raise
+        if any(e != extras[0] for e in extras) or len({tuple(map(len, runs)) for runs in each}) > 1:
+            return None
         if self._kind.stamp is None:
-            self._learn(messages[0], runs, extra)
-            stamp = message.header.stamp
-            ns = stamp.sec * 10**9 + stamp.nanosec
-        else:
-            ns = self._kind.stamp(message)
-        return Read(np.array([ns], dtype=np.int64), [np.array([run], dtype=np.float64) for run in runs], extra)
+            self._learn(messages[-1], each[-1], extras[0])
+        return Read(ns, [np.array(run, dtype=np.float64) for run in zip(*each, strict=True)], extras[0])
 
     def _learn(self, data: bytes, runs: Runs, extra: Any) -> None:
         self._layout = None
@@ -97,6 +101,10 @@ class MessageReader:
         fields = [("seconds", "<i4", _STAMP_AT), ("nanoseconds", "<u4", _STAMP_AT + 4), *places]
         names, formats, offsets = zip(*fields, strict=True)
         self._layout = np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": len(data)})
+
+
+def _header_stamp(message: Any) -> int:
+    return int(message.header.stamp.sec) * 10**9 + int(message.header.stamp.nanosec)
 
 
 class BlockWriter:

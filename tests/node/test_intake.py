@@ -70,8 +70,7 @@ def by_intake(messages: list[Message], batch: int) -> tuple[list[Sample], list[M
             arrived[topic].append(data)
         now[0] = min(k + batch, len(messages)) * SECONDS / len(messages)
         read = intake.read(intake.take(), lambda topic, kind, data: recorded.append((topic, data)))
-        items = [item for topic in read for item in topic]
-        out += flat(iter(items))
+        out += flat(read)
     return out, recorded
 
 
@@ -168,8 +167,7 @@ def sent(messages: list[Message], burst: int) -> tuple[Intake, Decoder]:
             held.clear()
         while (k + 1) / 200.0 >= 0.1 * (step + 1):
             now[0], step = 0.1 * (step + 1), step + 1
-            for items in intake.read(intake.take()):
-                flat(iter(items))
+            flat(intake.read(intake.take()))
     return intake, reader
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import math
+import os
 import re
 import subprocess
 import sys
@@ -19,6 +20,7 @@ import yaml
 from quadid_node.inputs import DECIDE, SILENT, SourceSelector, source, stamp
 from quadid_node.launching import ARGUMENTS, NODE_ARGUMENTS, fleet, parameters, truth
 from quadid_node.messages import WARN, diagnostics
+from quadid_node.process import THREADS
 from quadid_node.recording import stream
 from quadid_node.service import Service
 from quadid_node.settings import PARAMETERS, check_change, read_settings, vehicle_id
@@ -55,6 +57,20 @@ def test_everything_but_the_nodes_imports_without_ros() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize(("given", "used"), [({}, "1"), ({"OPENBLAS_NUM_THREADS": "2"}, "2")])
+def test_linear_algebra_of_the_node_takes_one_thread_unless_told_otherwise(given: dict[str, str], used: str) -> None:
+    """Two threads took eight times as long for a fit's reply on a machine at load 13: each waits for the other."""
+    code = (
+        "import os, sys; from quadid_node import identify\n"
+        "assert 'numpy' not in sys.modules, 'too late to choose'\n"
+        "identify._run = lambda *_: print(os.environ['OPENBLAS_NUM_THREADS'])\n"
+        "identify.main()\n"
+    )
+    unset = {n: v for n, v in os.environ.items() if n not in THREADS}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=unset | given)
+    assert done.stdout.split()[-1] == used
 
 
 def test_the_shipped_configuration_names_only_declared_parameters(repository: Path) -> None:

@@ -41,15 +41,29 @@ class Slow(InlineWorker):
 
 
 def served(stream: Sequence[Sample], worker: InlineWorker, late: float = math.inf) -> tuple[Service, list[Output]]:
-    """A service in step with its data, by the test's own clock; from `late` on [s] one piece of work in 0.6 s."""
+    """A service in step with its data, by the test's own clock; from `late` on [s] rounds take twice as long each."""
     NOW[0] = 0.0
-    service, out = Service(PELICAN, QUICK, worker, clock=lambda: NOW[0]), list[Output]()
-    for k, sample in enumerate(stream):
+    service, out, due, rounds = Service(PELICAN, QUICK, worker, clock=lambda: NOW[0]), list[Output](), 0.0, 0
+    for sample in stream:
         NOW[0] = sample.t
         service.push(sample.block)
-        if k % (4 if sample.t < late else 120) == 3:
-            out += service.step(math.inf if sample.t < late else 0.0)
+        if sample.t >= due:
+            out += service.step()
+            rounds += sample.t >= late
+            due = sample.t + 0.02 * 2**rounds
     return service, out
+
+
+def test_data_that_come_late_and_all_at_once_are_no_backlog() -> None:
+    NOW[0] = 0.0
+    service = Service(PELICAN, QUICK, Slow(0.1), clock=lambda: NOW[0])
+    for k, sample in enumerate(light_flight(20.0)):
+        service.push(sample.block)
+        if k % 600 == 599:  # three seconds of the publisher's, while the service looked all the time
+            for _ in range(30):
+                NOW[0] += 0.1
+                assert not said(service.step(), "behind")
+            assert service.health().status.backlog < 1.0
 
 
 def said(outputs: list[Output], kind: str) -> list[Event]:
@@ -139,8 +153,8 @@ def test_an_estimate_of_before_a_change_that_comes_late_is_not_taken() -> None:
         service.push(sample.block)
         if k % 4 == 3:
             service.step()
-            if late is None and service.session._late is not None:
-                late = service.session._late
+            if late is None and service.session._overdue:
+                late = service.session.running
             if service.session._changes.seen is not None:
                 break
     assert isinstance(late, FitRequest)

@@ -62,8 +62,6 @@ def flown_attitude(first: FloatArray, rate: FloatArray) -> FloatArray:
     return np.asarray(Rotation.concatenate(path).as_quat(scalar_first=True))
 
 
-PIECES = 5000
-"""Far more pieces than there ever are between two polls: a session that would never end is stopped."""
 GATE = GateSettings(windows=2, pause=0.0, width=0.15)
 QUICK = SessionSettings(window=4.0, diagnose=0.0, gate=GATE)
 """A first set after 8 s, when sensors have been compared to some 5 %, and no pause before the next."""
@@ -134,13 +132,12 @@ def works(session: Session, stream: Sequence[Sample], worker: Worker) -> list[Ac
 
 def answered(session: Session, worker: Worker) -> list[Action]:
     """Polls and hands the worker's answers in until nothing is left to do, or the worker gives none."""
-    out, last = session.poll(PIECES), 0
+    out, last = session.poll(), 0
     while session.running is not None and (reply := worker(session.running)) is not None:
         assert session.running.number > last, "a request that was answered must not be asked again"
         last = session.running.number
         session.deliver(reply)
-        out += session.poll(PIECES)
-    assert not session.busy, "the work there is comes to an end"
+        out += session.poll()
     return out
 
 

@@ -15,7 +15,6 @@ from quadid.online.records import Phase, SetState
 from quadid.online.stream import SOURCE, Resampler
 from quadid.vehicle import Stabiliser, Vehicle
 from tests.online.driving import drive, samples
-from tests.online.test_resampler import next_rows
 
 PELICAN = Vehicle.shipped("pelican")
 HOVER = PELICAN.hover_speed(PELICAN.parameters["b"].initial)
@@ -36,7 +35,7 @@ def test_the_commands_are_those_of_the_vehicle(rate: float) -> None:
     for sample in samples(without_rotors(flight.recording)):
         steered.push(sample.block)
     differences, count = [], 0
-    while (a := next_rows(told)) is not None and (b := next_rows(steered)) is not None:
+    while (a := told.next_rows()) is not None and (b := steered.next_rows()) is not None:
         both = np.isfinite(a.columns["rotor_speed"]).all(axis=1) & np.isfinite(b.columns["rotor_speed"]).all(axis=1)
         differences.append((a.columns["rotor_speed"][both] ** 2 - b.columns["rotor_speed"][both] ** 2) / HOVER**2)
         if both.all():

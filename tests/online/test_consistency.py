@@ -25,7 +25,6 @@ from tests.faults.evidence import Happened
 from tests.online.driving import flight, published, samples
 from tests.online.made_up import GATE, PELICAN, QUICK, between, light_flight, tells, works
 from tests.online.test_gate import TRUE, good
-from tests.online.test_resampler import next_rows
 
 FLIGHT = light_flight(60.0)
 
@@ -41,7 +40,7 @@ def consistency_of(recording: Recording, vehicle: Vehicle = PELICAN) -> Consiste
     tick = 1.0
     for sample in samples(recording):
         resampler.push(sample.block)
-        while (rows := next_rows(resampler)) is not None:
+        while (rows := resampler.next_rows()) is not None:
             store.add(rows)
             while rows.t[-1] >= tick:
                 found.add(store.span(tick - 1.0 - LEAD, tick), 1.0)

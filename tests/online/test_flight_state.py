@@ -15,7 +15,7 @@ from quadid_replay import open_log
 
 from quadid.flight import Segment, draw_truth, fly
 from quadid.online.change_job import ChangeWatch
-from quadid.online.changes import CHUNK, ChangeDetector, ChangePoint, FlightState, Velocity, learned, step_beside
+from quadid.online.changes import CHUNK, ChangeDetector, FlightState, Velocity, learned, step_beside
 from quadid.online.fusion import Estimator
 from quadid.online.grid_buffer import GridBuffer, Rows
 from quadid.online.stream import Resampler
@@ -43,9 +43,8 @@ def resampled(log: Path, vehicle: Vehicle) -> Iterator[Rows]:
     resampler = Resampler(vehicle, RATE)
     for count, block in enumerate(stream(open_log(str(log), "auto", vehicle.columns))):
         resampler.push(block)
-        while count % 200 == 0 and resampler.busy:
-            if (rows := resampler.work()) is not None:
-                yield rows
+        while count % 200 == 0 and (rows := resampler.next_rows()) is not None:
+            yield rows
 
 
 def steps(
@@ -63,20 +62,12 @@ def steps(
             rows.columns.pop("velocity", None)
         store.add(rows)
         while rows.t[-1] >= tick:
-            found = _last(supervisor.look(tick, 1.0, estimator))
+            found = supervisor.look(tick, 1.0, estimator)
             if found is not None:
                 seen.append((tick - first, found.channel, found.size))
                 supervisor.restart()
             tick += 1.0
     return seen
-
-
-def _last(work: Iterator[None]) -> ChangePoint | None:
-    try:
-        while True:
-            next(work)
-    except StopIteration as done:
-        return done.value  # type: ignore[no-any-return]
 
 
 FLIGHTS = [

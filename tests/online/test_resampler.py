@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import partial
 
 import numpy as np
 import pytest
@@ -23,21 +22,12 @@ from tests.samples import Sample
 PELICAN = Vehicle.shipped("pelican")
 
 
-def next_rows(buffer: Resampler) -> Rows | None:
-    """The next block of rows, or None until enough has arrived."""
-    while buffer.busy:
-        rows = buffer.work()
-        if rows is not None:
-            return rows
-    return None
-
-
 def run(stream: Sequence[Sample], buffer: Resampler | None = None) -> tuple[list[Rows], Resampler]:
     buffer = buffer or Resampler(PELICAN)
     rows = []
     for sample in stream:
         buffer.push(sample.block)
-        while (block := next_rows(buffer)) is not None:
+        while (block := buffer.next_rows()) is not None:
             rows.append(block)
     return rows, buffer
 
@@ -112,24 +102,8 @@ def test_when_rows_are_asked_for_changes_nothing_not_even_for_late_samples_and_a
     assert any(r.fresh for r in rows[1:])
 
 
-def test_what_arrives_between_two_pieces_of_work_changes_nothing() -> None:
-    stream = sorted(
-        samples(flight(4.0).recording), key=lambda s: s.t + {"gyro": 0.1, "rotor_speed": 0.3}.get(s.channel, 0.0)
-    )
-    rows, buffer, pieces = [], Resampler(PELICAN), 0
-    for sample in stream:
-        buffer.push(sample.block)
-        if buffer.busy:
-            pieces += 1
-            rows += [block for block in [buffer.work()] if block is not None]
-    while buffer.busy:
-        rows += [block for block in [buffer.work()] if block is not None]
-    assert pieces > 2 * len(rows)
-    assert same(rows, run(stream)[0])
-
-
 def taken(buffer: Resampler) -> list[Rows]:
-    return list(iter(partial(next_rows, buffer), None))
+    return list(iter(buffer.next_rows, None))
 
 
 def test_duplicates_are_dropped_and_counted(happened: Happened) -> None:

@@ -59,7 +59,7 @@ def test_how_samples_are_pushed_and_polled_changes_nothing() -> None:
         for sample in shuffled[place : place + size]:
             other.push(sample.block)
         place += size
-        jumpy += other.poll(most=int(rng.integers(0, 3)))
+        jumpy += other.poll() if rng.random() < 0.7 else []
         if other.running is not None and rng.random() < 0.5:  # some replies come late
             assert isinstance(other.running, FitRequest)
             other.deliver(other.running.run())

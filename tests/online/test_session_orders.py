@@ -153,19 +153,6 @@ def test_the_answer_to_a_fit_from_before_a_rollback_is_ignored_and_the_next_one_
     happened(19, "rollback while a fit runs: the earlier set is in force again, the fit's answer is ignored")
 
 
-def test_a_rollback_in_the_middle_of_an_answer_drops_the_rest_of_it() -> None:
-    session = with_two_sets()
-    works(session, between(FLIGHT, 13.7, 14.7), never)
-    assert session.running is not None
-    reply = tells(sigma=0.0005)(session.running)
-    assert reply is not None
-    session.deliver(reply)
-    session.poll(1)  # fused, the gate is not asked yet
-    assert session.roll_back("bob").done
-    assert not published(session.poll(), "candidate")
-    assert session.status().phase is Phase.COLLECTING
-
-
 def test_a_rollback_ends_the_search_for_what_a_change_was() -> None:
     session = Session(PELICAN, QUICK)
     works(session, between(DROPPED, 0.0, 8.7), tells(sigma=0.02))

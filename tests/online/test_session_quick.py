@@ -1,4 +1,4 @@
-"""The session without simulator and fit: when it asks, what it publishes, how its work is cut into pieces.
+"""The session without simulator and fit: when it asks, what it publishes, what waits for a fit.
 
 The session and all it consists of are real; recording and fits are arithmetic (`tests.online.made_up`).
 """
@@ -16,7 +16,7 @@ from quadid.online import FitReply, FitRequest, GateSettings, Phase, Session, Se
 from quadid.online.records import Action, Publish
 from quadid.parameters import NOMINAL_NAMES
 from tests.online.driving import EPOCH, events, published
-from tests.online.made_up import PELICAN, PIECES, answered, between, light_flight, tells, works
+from tests.online.made_up import PELICAN, answered, between, light_flight, tells, works
 from tests.online.test_gate import TRUE, online_set, scaled
 
 QUICK = SessionSettings(window=4.0, diagnose=0.0, gate=GateSettings(windows=2, width=0.15))
@@ -44,7 +44,6 @@ def told(actions: list[Action]) -> list[object]:
 def test_before_the_first_sample_it_waits_and_says_so() -> None:
     session = Session(PELICAN)
     assert session.poll() == []
-    assert not session.busy
     status = session.status()
     assert (status.phase, status.backlog, status.samples, status.in_force, status.pending) == (
         Phase.WAITING,
@@ -159,49 +158,21 @@ def test_blocks_of_messages_give_what_samples_give() -> None:
     assert told(answered(session, tells())) == told(plain)
 
 
-def test_pieces_are_counted() -> None:
-    counts = []
-    for most in (1, 3):
-        session, polls = Session(PELICAN, QUICK), 0
-        for sample in between(FLIGHT, 0.0, 4.0):  # ends before the first fit
-            session.push(sample.block)
-        while session.busy and polls < 1000:
-            session.poll(most)
-            polls += 1
-        counts.append(polls)
-    assert 20 < counts[0] < 1000
-    assert counts[1] == math.ceil(counts[0] / 3)
-
-
-def test_where_no_piece_is_allowed_none_is_done() -> None:
-    session = Session(PELICAN, QUICK)
-    for sample in between(FLIGHT, 0.0, 0.9):  # one block of rows
-        session.push(sample.block)
-    assert session.poll(0) == []
-    assert session.busy
-    before = session.status()
-    assert before.phase is Phase.WAITING
-    session.poll(PIECES)
-    assert session.backlog > 0.0, "the block was taken in"
-    assert session.status().phase is Phase.WAITING, "no tick has come yet"
-
-
-def test_while_a_fit_runs_the_data_wait_and_then_are_caught_up_with() -> None:
+def test_while_a_fit_runs_data_are_read_on_until_the_next_tick_which_waits() -> None:
     session = Session(PELICAN, QUICK)
     works(session, between(FLIGHT, 0.0, 7.9), tells())
     works(session, between(FLIGHT, 7.9, 8.7), lambda request: None)
     request = session.running
     assert isinstance(request, FitRequest)
-    assert not session.busy
-    before = session.backlog
-    assert works(session, between(FLIGHT, 8.7, 11.7), lambda request: None) == []
+    assert works(session, between(FLIGHT, 8.7, 9.3), lambda request: None) == []
+    assert session.backlog < 0.9, "what rows of the grid wait for"
+    assert works(session, between(FLIGHT, 9.3, 11.7), lambda request: None) == []
     assert session.running is request
     assert session.status().phase is Phase.FITTING
-    assert session.status().backlog == pytest.approx(before + 3.0, abs=0.05)
+    assert 2.3 < session.status().backlog < 2.7
     reply = tells()(request)
     assert reply is not None
     session.deliver(reply)
-    assert session.busy
     asked = fits(answered(session, tells()))
     assert [a.stop for a in asked] == [9.0]
     assert session.backlog < 0.7
@@ -225,7 +196,67 @@ def test_while_a_long_fit_runs_the_data_go_on_and_its_answer_counts_three_second
     assert after.spans == ((4.0, 8.0),), "no row is left out"
     late = Session(PELICAN, QUICK)
     works(late, between(FLIGHT, 0.0, 9.7), lambda request: None)
-    assert late.backlog == pytest.approx(2.7, abs=0.7), "then they wait"
+    assert late.backlog == pytest.approx(1.7, abs=0.4), "then they wait"
+
+
+def in_portions(session: Session, rng: np.random.Generator, longest: float, patience: float = math.inf) -> list[Action]:
+    """The flight in portions of any size, each of its replies after up to `longest` [s] of data more.
+
+    Nothing is waited for longer than `patience` [s].
+    """
+    out, left, due, asked = list[Action](), list(FLIGHT), math.nan, math.nan
+    while left or session.running is not None:
+        size = int(rng.integers(1, 60))
+        for sample in left[:size]:
+            session.push(sample.block)
+        del left[:size]
+        out += session.poll()
+        if session.running is None:
+            due = math.nan
+            continue
+        now = session.status().t
+        if math.isnan(due):
+            asked, due = now, now + rng.uniform(0.0, longest)
+        if now - asked > patience:
+            session.go_on()
+        if now >= due or not left:
+            session.deliver(tells()(session.running) or session.running.failed("made up"))
+            due = math.nan
+    return out + session.poll()
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_neither_portions_nor_the_time_that_fits_take_change_what_a_session_says(seed: int) -> None:
+    plain = works(Session(PELICAN, QUICK), FLIGHT, tells())
+    assert published(plain)
+    assert told(in_portions(Session(PELICAN, QUICK), np.random.default_rng(seed), 5.0)) == told(plain)
+
+
+@pytest.mark.parametrize(("seed", "longest"), [(0, 0.4), (1, 3.0), (2, 9.0)])
+def test_a_slow_machine_gives_the_same_answers_or_fewer(seed: int, longest: float) -> None:
+    plain = works(Session(PELICAN, QUICK), FLIGHT, tells())
+    session = Session(PELICAN, QUICK, patience=1.0)
+    actions = in_portions(session, np.random.default_rng(seed), longest, 1.0)
+    assert not events(actions, "change")
+    if longest < 0.5:
+        assert (told(actions), session.skipped) == (told(plain), 0)
+        return
+    assert session.skipped > 3
+    assert 0 < len(published(actions)) <= len(published(plain))
+    assert len(fits(actions)) < len(fits(plain))
+    for item in published(actions):
+        for name in NOMINAL_NAMES:
+            assert item.parameters[name].value == pytest.approx(TRUE[name], rel=0.005)
+
+
+def test_of_data_that_come_all_at_once_only_the_newest_are_fitted_but_all_are_used() -> None:
+    session = Session(PELICAN, QUICK, patience=1.0)
+    known = works(session, between(FLIGHT, 0.0, 16.0), tells())
+    for sample in between(FLIGHT, 16.0, 19.7):
+        session.push(sample.block)
+    (only,) = fits(answered(session, tells()))
+    assert (only.stop, session.skipped) == (19.0, 3)
+    assert only.spans[0][0] == fits(known)[-1].stop == 15.0, "no row is left out"
 
 
 def test_answers_to_nothing_and_to_something_else_are_ignored() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
@@ -15,7 +16,7 @@ from mcap_ros2.decoder import DecoderFactory
 from mcap_ros2.writer import Writer as RosWriter
 from quadid_replay import TopicWriter, open_log, write_mcap
 from quadid_replay.motors import RPM
-from quadid_replay.ros_messages import TYPES
+from quadid_replay.ros_messages import TYPES, MessageReader
 from quadid_replay.schemas import schema_text
 from quadid_replay.writers import offered_qos
 from rosbags.highlevel import AnyReader
@@ -224,6 +225,25 @@ def test_fast_reading_is_what_the_library_decodes(data_dir: Path) -> None:
         theirs = [m.decoded_message for m in reader.iter_decoded_messages(topics=["/imu/data_raw"])]
     rates = np.array([[m.angular_velocity.x, -m.angular_velocity.y, -m.angular_velocity.z] for m in theirs])
     np.testing.assert_array_equal(ours["gyro"].values, rates)
+
+
+def test_messages_without_a_layout_are_read_together_as_one_by_one() -> None:
+    """PX4's have no header: each was a block of its own, which took half of the time in which the node took them in."""
+
+    def decode(data: bytes) -> SimpleNamespace:
+        t, *q = struct.unpack("<Q4f", data)
+        return SimpleNamespace(timestamp=t, timestamp_sample=t, q=q)
+
+    kind, rng = TYPES["px4_msgs/VehicleAttitude"], np.random.default_rng(0)
+    data = [struct.pack("<Q4f", 1000 + k, *rng.normal(size=4)) for k in range(20)]
+    together = MessageReader(kind, decode).read(data)
+    each = [MessageReader(kind, decode).read([one]) for one in data]
+    assert together is not None
+    assert together.ns.tolist() == [one.ns[0] for one in each if one is not None]
+    assert together.blocks[0].tobytes() == b"".join(one.blocks[0].tobytes() for one in each if one is not None)
+    assert MessageReader(kind, decode).read([*data, b"short"]) is None, "its halves tell which one it is"
+    with pytest.raises(struct.error):
+        MessageReader(kind, decode).read([b"short"])
 
 
 def test_other_readers_open_our_files(tmp_path: Path) -> None:

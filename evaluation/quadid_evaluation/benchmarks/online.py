@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 from quadid_node.recording import stream
-from quadid_node.service import ROUND_SECONDS, STEP_SECONDS, WORK_SECONDS, Service
+from quadid_node.service import Service
 from quadid_node.worker import InlineWorker, ProcessWorker
 
 from quadid.data.window import Block
@@ -284,16 +284,15 @@ def _repeat(r: Result) -> list[str]:
 
 def _load(r: Result) -> list[str]:
     return [
-        "IMU 1 kHz, attitude and rotor speeds 250 Hz, references and odometry 50 Hz, from another process. Every "
-        f"{1e3 * ROUND_SECONDS:g} ms waiting messages are processed in steps {1e3 * STEP_SECONDS:g} ms apart, which "
-        f"block services and timers; no piece of work begins after {1e3 * WORK_SECONDS:.1f} ms. The grid waits "
-        f"{1e3 * SETTLE:.0f} ms for the slowest channel. Goals: under 15 % of a core, steps below 5 ms (p99).", "",
+        "IMU 1 kHz, attitude and rotor speeds 250 Hz, references and odometry 50 Hz, from another process. Ten "
+        "times a second what waits is processed in one round, which blocks services and timers. The grid waits "
+        f"{1e3 * SETTLE:.0f} ms for the slowest channel. Goals: under 15 % of a core, rounds below 100 ms (p99).", "",
         *table(
             ("run", "% of a core: node, fits", "IMU received %", "wait of a message p50, p99 [ms]",
-             "a step p50, p99 [ms]", "memory MiB"),
+             "a round p50, p99 [ms]", "memory MiB"),
             [
                 (name, f"{100 * x['cpu_node']:.1f}, {100 * x['cpu_worker']:.1f}", f"{100 * x['imu_received']:.2f}",
-                 _pair(x["fitting"]), _pair(x["step"]), f"{x['memory_begin']:.0f} → {x['memory_end']:.0f}")
+                 _pair(x["fitting"]), _pair(x["round"]), f"{x['memory_begin']:.0f} → {x['memory_end']:.0f}")
                 for name, x in r.items()
             ],
         ),

@@ -20,7 +20,7 @@ import threading
 import time
 from array import array
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -104,16 +104,14 @@ def feed(seconds: float, rate: float, profile: str) -> None:
 
 
 def watched_node() -> int:
-    """The node itself, with notes of messages by topic, of the latency of IMU messages, and of its steps."""
+    """The node itself, with notes of messages by topic, of the latency of IMU messages, and of its rounds."""
     import quadid_node.node
     from quadid_node.identify import main
-    from quadid_node.publish import Publishers
-    from quadid_node.service import Service
 
     class Watched(quadid_node.node.IdentifyNode):
         def __init__(self, *arguments: Any) -> None:
             super().__init__(*arguments)
-            self.late: dict[str, array[float]] = {name: array("d") for name in ("idle", "fitting", "step")}
+            self.late: dict[str, array[float]] = {name: array("d") for name in ("idle", "fitting", "round")}
             self.counted, self.noted = Counter[str](), time.monotonic()
 
         def poll(self, kind: Any, topic: str, qos: Any) -> Callable[[], bytes | None]:
@@ -131,14 +129,11 @@ def watched_node() -> int:
 
             return counted
 
-        def _step(self) -> None:
-            resting, begin = self._scheduler.resting, time.monotonic()
-            super()._step()
-            if self.counted and not resting:
-                self.late["step"].append(time.monotonic() - begin)
-
-        def _report(self, service: Service, speaker: Publishers) -> Iterator[None]:
-            yield from super()._report(service, speaker)
+        def _round(self) -> None:
+            begin = time.monotonic()
+            super()._round()
+            if self.counted:
+                self.late["round"].append(time.monotonic() - begin)
             if time.monotonic() - self.noted >= float(os.environ[EVERY]):
                 self.note()
 
@@ -229,7 +224,7 @@ def under_load(seconds: float, profile: str, record: bool = False) -> dict[str, 
     """The node's share of a core, its latencies and memory with an IMU of `FAST`."""
     found = flown(seconds, FAST, profile, record, seconds - 2.0 * SETTLE, lambda line: None)
     (first, last), note = found["points"], found["minutes"][-1]
-    longest = max(found["minutes"], key=lambda m: m["step"]["count"])
+    longest = max(found["minutes"], key=lambda m: m["round"]["count"])
     span = 3600.0 * (last["hours"] - first["hours"])
     return {
         "seconds": seconds, "profile": profile, "record": record, "exit_code": found["exit_code"],
@@ -237,7 +232,7 @@ def under_load(seconds: float, profile: str, record: bool = False) -> dict[str, 
         "cpu_worker": (last["worker_processor"] - first["worker_processor"]) / span,
         "memory_begin": first["memory_mib"], "memory_end": last["memory_mib"], "memory_worker": last["worker_mib"],
         "load_average": last["load"], "messages": sum(found["sent"].values()),
-        **{name: longest[name] for name in ("idle", "fitting", "step")},
+        **{name: longest[name] for name in ("idle", "fitting", "round")},
         "imu_received": note["messages"].get("imu", 0) / found["sent"]["imu"],
     }  # fmt: skip
 

@@ -153,9 +153,8 @@ def _fly_through(log: Path, vehicle: Vehicle, folder: Path, follow: Callable[[],
                 if n % BATCH:
                     continue
                 stamps[0] = nanoseconds * 1e-9 - EPOCH
-                for items in intake.read(intake.take()):
-                    for item in items:
-                        service.push(item)
+                for block in intake.read(intake.take()):
+                    service.push(block)
                 for output in [o for _ in range(5) for o in service.step()]:
                     if output.topic == "parameters":
                         messages.RESULTS[output.topic].message(output, vehicle.name, service.boot_id)
