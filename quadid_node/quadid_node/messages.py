@@ -318,6 +318,9 @@ def set_from_dict(data: Mapping[str, Any]) -> OnlineSet:
     covariance = data.get("covariance") or np.diag([p["sigma"] ** 2 for p in parameters])
     found["parameters"] = {"parameters": parameters, "covariance": covariance}
     made: OnlineSet = msgspec.convert(found, OnlineSet, dec_hook=lambda _, rows: np.array(rows, dtype=np.float64))
+    for p in made.parameters:
+        if p.ci95[1] < p.value or p.value < p.ci95[0]:
+            raise ValueError(f"a set with {p.name} = {p.value:g} outside its interval")
     if "reference_sd" not in data:  # of a version that did not ask
         made = replace(made, parameters=made.parameters.scaled_together(FORCE), reference_sd=FORCE)
     if not 0.0 <= made.reference_sd <= 1.0:

@@ -522,10 +522,9 @@ def test_a_disk_that_is_full_is_said_and_what_came_meanwhile_is_written_later(
         while True:
             file.write(b"x" * 4096)
     service = Service(PELICAN, SessionSettings(window=5.0, diagnose=0.0), InlineWorker(), store)
+    said: list[Output] = []
     for sample in samples(flight(10.0, 6).recording):
         service.push(sample.block)
-    said: list[Output] = []
-    while service.session.running is not None or not service.session.status().fits:
         said += service.step()
     for k in range(20):
         store.event(Event(float(k), "info", "test", "x" * 2000))
@@ -748,6 +747,7 @@ HOSTILE_SETS = {
     "a covariance beyond the deviations": with_all(covariance=np.full((6, 6), 1e9).tolist()),
     "a covariance of two minds": with_all(covariance=[[0.0] * 6] * 3 + [[2e-12, *[0.0] * 5]] + [[0.0] * 6] * 2),
     "an old one without a value": with_first(value=0.0, ci95=[1.0, 2.0]).replace("reference_sd", "no"),
+    "an interval beside its value": with_first(ci95=[0.0, 0.0]),
     "an old one without an interval": with_first(ci95=[0.0, 0.0]).replace("reference_sd", "no"),
     "a parameter twice": with_all(parameters=2 * set_to_dict(online_set(TRUE))["parameters"], covariance=None),
 }  # fmt: skip
