@@ -26,7 +26,7 @@ PELICAN = Vehicle.shipped("pelican")
 WITHOUT, WITH = "#c4520a", "#1565c0"
 """Colours of the reports."""
 FROM = 20
-"""Where the pictures of the fit begin [s]."""
+"""Begin of the pictures of the fit [s]."""
 DRAG = {"k_x": 0.3, "k_y": 0.3}
 SHOWN: dict[str, dict[str, float]] = {
     "rotor_drag": DRAG, "axial_inflow": {"k_z": 0.3}, "weak_rotor": {"rotor": 2, "loss": 0.06},

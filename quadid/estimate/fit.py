@@ -101,7 +101,7 @@ def estimate(problem: Problem, start: FloatArray | None = None) -> Estimate:
         if (z - before) @ information @ (z - before) < FINE:
             break
     # 4. Where innovations have outliers, their density has tails.
-    tail = tails([whitened(*each) for each in zip(problem.tracks, gains, strict=True)])
+    tail = tails(whitened(problem.tracks, gains))
     if np.any(tail > 0.0):
         heavy = replace(problem, tail=tail)
         tried = scoring(heavy, z, psi, MOST, ALL_NOISE)
@@ -133,8 +133,7 @@ def estimate(problem: Problem, start: FloatArray | None = None) -> Estimate:
     by_square = taken * of_square(problem, z, psi, gains)
     score = information + noise + 0.25 * within.T @ within + np.outer(by_square, by_square)
     covariance = inverse @ score @ inverse
-    white = tuple(whitened(*each) for each in zip(problem.tracks, gains, strict=True))
-    return Estimate(problem, z, psi, np.asarray(covariance), value, white)
+    return Estimate(problem, z, psi, np.asarray(covariance), value, whitened(problem.tracks, gains))
 
 
 def settle_noise(problem: Problem, z: FloatArray, psi: FloatArray) -> tuple[FloatArray, FloatArray, list[Gains]]:
@@ -173,10 +172,13 @@ def measured(track: Track, g: Gains) -> BoolArray:
     return np.asarray(out)
 
 
-def whitened(track: Track, g: Gains) -> FloatArray:
-    """Innovations of a pass over their standard deviations, shape (n, M); 0 where not measured."""
-    seen = measured(track, g)
-    return np.where(seen, g.nu * np.sqrt(g.w / np.where(seen, g.S, 1.0)), 0.0)
+def whitened(tracks: Sequence[Track], gains: Sequence[Gains]) -> tuple[FloatArray, ...]:
+    """Innovations of a pass over their standard deviations, shape (n, M) for each flight; 0 where not measured."""
+    seen = [measured(track, g) for track, g in zip(tracks, gains, strict=True)]
+    return tuple(
+        np.where(there, g.nu * np.sqrt(g.w / np.where(there, g.S, 1.0)), 0.0)
+        for there, g in zip(seen, gains, strict=True)
+    )
 
 
 def tails(whitened: Sequence[FloatArray]) -> FloatArray:

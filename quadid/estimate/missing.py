@@ -140,7 +140,7 @@ class Vehicles:
         problem, z = settled(windows, vehicle, theta, None)
         part = problem.liveliest(NEAR_SECONDS)
         z, self.psi, gains = settle_noise(part, z, problem.first_noise())
-        self.tail = tails([whitened(*each) for each in zip(problem.tracks, gains, strict=True)])
+        self.tail = tails(whitened(problem.tracks, gains))
         if self.tail.any():
             _, self.psi, *_ = scoring(replace(part, tail=self.tail), z, self.psi, MOST, ALL_NOISE)
 
@@ -172,8 +172,8 @@ class Vehicles:
 
     def _mean_square(self, problem: Problem, z: FloatArray) -> float:
         value, gains = problem.passes(z, self.psi)
-        each = zip(problem.tracks, gains, strict=True)
-        squares = np.concatenate([whitened(track, g)[measured(track, g)] for track, g in each]) ** 2
+        each = zip(whitened(problem.tracks, gains), problem.tracks, gains, strict=True)
+        squares = np.concatenate([white[measured(track, g)] for white, track, g in each]) ** 2
         return float(np.mean(squares)) if np.isfinite(value) and len(squares) else np.inf
 
 

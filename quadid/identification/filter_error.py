@@ -167,9 +167,9 @@ def _filtered(
 def sensor_noise(found: Estimate) -> NoiseModel:
     """Noise of the measured channels, the attitude estimator's error as the slow part of the attitude's."""
     measured = 12 if any(track.seen[:, 3].any() for track in found.problem.tracks) else 9
-    slow, error = np.zeros(measured), found.psi[[k.SIGMA + 4, k.SIGMA + 4, k.SIGMA + 5]]
-    acts = error > ACTS * found.problem.noise_bounds[[k.SIGMA + 4, k.SIGMA + 4, k.SIGMA + 5], 0]
-    slow[k.ATTITUDE : k.ACCEL] = np.where(acts, error, 0.0)
+    slow, tilt_and_heading = np.zeros(measured), [k.SIGMA + 4, k.SIGMA + 4, k.SIGMA + 5]
+    error, least = found.psi[tilt_and_heading], found.problem.noise_bounds[tilt_and_heading, 0]
+    slow[k.ATTITUDE : k.ACCEL] = np.where(error > ACTS * least, error, 0.0)
     return NoiseModel(found.psi[:measured].copy(), slow, float(found.psi[k.TIME + 4]))
 
 

@@ -387,7 +387,7 @@ def _renewed(request: FitRequest, noise: Noise) -> tuple[FloatArray, Noise]:
     """Point and noise by steps over all that was learned from, tails too: outliers show in much data only."""
     problem, own = _like(problem_of(max(request.learned, key=len), request.vehicle), request.vehicle, request.z, noise)
     own, psi, _, gains, _ = scoring(problem, own, noise.psi, NEAR, ALL_NOISE)
-    problem = replace(problem, tail=tails([whitened(*each) for each in zip(problem.tracks, gains, strict=True)]))
+    problem = replace(problem, tail=tails(whitened(problem.tracks, gains)))
     own, psi, value, gains, _ = scoring(problem, own, psi, NEAR, ALL_NOISE)
     if not math.isfinite(value):
         return request.z, noise

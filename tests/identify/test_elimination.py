@@ -10,7 +10,7 @@ from quadid.identification.elimination import Reduced, StatePrior, eliminated, f
 
 @pytest.mark.parametrize("grown", [1.0, 1e3, 1e6, 1e9, 1e10, 1e12, 1e14])
 def test_a_cost_of_which_rounding_is_left_is_one_that_ran_away(grown: float) -> None:
-    """Where all columns grow alike, the costs were 0 or less than nothing: better than that of every right model."""
+    """Columns that all grow alike: the costs were 0 or less than nothing: better than that of every right model."""
     rng, own, free, rows = np.random.default_rng(0), 9, 6, 700
     mode = grown ** np.linspace(0.0, 1.0, rows)[:, None] * rng.normal(size=rows)[:, None]
     white = rng.normal(size=(4, rows, 1 + own + free)) + mode * rng.normal(size=(4, 1, 1 + own + free))
