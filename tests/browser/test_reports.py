@@ -56,11 +56,17 @@ class Opened:
         self.page.evaluate("scrollTo(0, 0)")
 
     def until(self, condition: str) -> None:
-        """Waits; Playwright's own waiting evaluates in the page, which the page's policy forbids."""
-        for _ in range(1200):
+        """Waits; Playwright's own waiting evaluates in the page, which the page's policy forbids.
+
+        Figures wait for a frame, and a headless browser on a busy machine may draw none for minutes: a picture asks
+        for one.
+        """
+        for i in range(1200):
             if self.page.evaluate(condition):
                 return
             self.page.wait_for_timeout(100)
+            if i % 20 == 19:
+                self.page.screenshot()
         pytest.fail(f"never true: {condition}; {self.page.evaluate('document.visibilityState')}; {self.complaints}")
 
 
