@@ -7,7 +7,7 @@
     found.vehicle.save("mine.yaml")
 
 Every check, status, refusal and warning of the commands is made here too: the commands call these functions.
-Nothing heavy is imported before it is used; nothing is imported or run from the folder the program stands in.
+Nothing heavy is imported before it is used; no process that it starts imports from the folder we stand in.
 """
 
 from __future__ import annotations

@@ -3,15 +3,23 @@
 from __future__ import annotations
 
 import hashlib
+import os
 from collections.abc import Callable
 from functools import cache
 from importlib import resources
 from typing import Any, TypeVar, cast
 
 import numba
+from numba.core import config
 from numba.core.caching import IndexDataCacheFile
 
+from quadid.working_folder import refuse
+
 F = TypeVar("F", bound=Callable[..., object])
+
+refuse()
+config._config_fname = ""  # looked for before every compilation, in the folder that the program has changed to by then
+config.reload_config()  # type: ignore[no-untyped-call]
 
 
 class Files(IndexDataCacheFile):
@@ -61,9 +69,11 @@ def kept(stamp: str = "", **options: Any) -> Callable[[F], F]:
     def compiled(function: F) -> F:
         try:
             dispatcher: Any = numba.njit(cache=True, nogil=True, error_model="numpy", **options)(function)
+            old = dispatcher._cache._cache_file
+            if not os.path.isabs(old._cache_path):  # of a user without a home: in the working folder
+                raise RuntimeError(old._cache_path)
         except RuntimeError:  # every start compiles anew
             return cast(F, numba.njit(nogil=True, error_model="numpy", **options)(function))
-        old = dispatcher._cache._cache_file
         stamps = f"{old._source_stamp} {stamp}"
         files: Any = Files
         dispatcher._cache._cache_file = files(old._cache_path, old._index_name.removesuffix(".nbi"), stamps)

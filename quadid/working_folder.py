@@ -6,10 +6,7 @@ Looked at before anything else is imported, and with nothing but the standard li
 from __future__ import annotations
 
 import os
-import sys
-from importlib.abc import MetaPathFinder
 from pathlib import Path
-from typing import Any
 
 NUMBA_SETTINGS = Path(".numba_config.yaml")
 """numba reads this file in the working folder, and loads machine code from the folder that it names."""
@@ -23,7 +20,7 @@ def refuse() -> None:
 
 
 def guard() -> None:
-    """Refuses such a folder, now and when numba is imported; no Python that this process starts imports from its own.
+    """Refuses such a folder; no Python that this process starts imports from the one it stands in.
 
     Libraries start Python too (the fork servers and resource trackers of `multiprocessing`, of which Dask makes use):
     ``python -c`` and ``python -m`` look into the working folder first, unless PYTHONSAFEPATH is set.
@@ -33,13 +30,3 @@ def guard() -> None:
     searched = os.environ.get("PYTHONPATH", "")
     if "" in searched.split(os.pathsep) and searched:  # an empty entry is the working folder
         os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, searched.split(os.pathsep)))
-    if not any(isinstance(finder, _BeforeNumba) for finder in sys.meta_path):
-        sys.meta_path.insert(0, _BeforeNumba())
-
-
-class _BeforeNumba(MetaPathFinder):
-    """Looks at the folder once more: the program may have changed to another one since."""
-
-    def find_spec(self, name: str, path: Any = None, target: Any = None) -> None:
-        if name == "numba":
-            refuse()

@@ -20,6 +20,7 @@ from functools import lru_cache
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 from queue import Empty, SimpleQueue
+from tempfile import TemporaryDirectory
 from typing import Annotated, Any
 
 import typer
@@ -292,7 +293,8 @@ def cluster(address: str | None, workers: int | None, memory: str) -> Iterator[A
         "distributed.scheduler.worker-ttl": None,  # a worker that compiles kernels is silent for minutes
         "distributed.worker.multiprocessing-method": "forkserver",
     }  # fmt: skip
-    with dask.config.set({**settings, **_QUIET}), _program_unseen():
+    private = TemporaryDirectory(dir=dask.config.get("temporary-directory"), ignore_cleanup_errors=True)
+    with private, dask.config.set({**settings, **_QUIET, "temporary-directory": private.name}), _program_unseen():
         if address is not None:
             try:
                 client = Client(address, timeout=ANSWER, set_as_default=False)
@@ -322,13 +324,19 @@ def cluster(address: str | None, workers: int | None, memory: str) -> Iterator[A
 
 @contextmanager
 def _program_unseen() -> Iterator[None]:
-    """Keeps processes that start from running the caller's script first, which would start more of them."""
-    main = vars(sys.modules["__main__"])
+    """Keeps processes that start from running the caller's script first, which would start more of them.
+
+    They import from the folders that this process does, but not from the one it stands in (notebooks, ``python -c``).
+    """
+    main, path = vars(sys.modules["__main__"]), sys.path[:]
+    named = [*filter(None, path)]
     kept: dict[str, Any] = {name: main[name] for name in ("__file__", "__spec__") if name in main}
     main.update({"__file__": None, "__spec__": None})
+    sys.path[:] = named[1:] if named[0] == os.getcwd() else named
     try:
         yield
     finally:
+        sys.path[:] = path
         del main["__file__"], main["__spec__"]
         main.update(kept)
 

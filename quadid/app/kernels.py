@@ -6,7 +6,6 @@ The parts are made so that two processes side by side take about the same time.
 from __future__ import annotations
 
 import gc
-import os
 import subprocess
 import sys
 import time
@@ -177,7 +176,6 @@ def prepare(parts: Sequence[str], advance: Advance) -> list[str]:
         with subprocess.Popen(
             [sys.executable, "-P", "-c", _CHILD.format(name)],
             stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True,
-            env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
         ) as child:  # fmt: skip
             assert child.stdout is not None
             for line in child.stdout:

@@ -9,6 +9,7 @@ import os
 import pickle
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 import pytest
@@ -181,6 +182,59 @@ def test_a_library_refuses_them_too_also_in_a_folder_that_it_changes_to(tmp_path
     where, code = (text.format(here=tmp_path) for text in (start, lines))
     done = subprocess.run([sys.executable, "-c", code], cwd=where, capture_output=True, text=True, check=False)
     assert "ImportError: .numba_config.yaml in this folder" in done.stderr
+
+
+NUMBA = """
+import os, sys, numba, quadid.model.kernel
+from numba.core import config
+os.chdir(sys.argv[1])
+numba.njit(lambda x: x)(1.0)
+print(repr(config.CACHE_DIR))
+"""
+
+
+def test_numba_reads_no_settings_in_a_folder_that_a_library_changes_to(tmp_path: Path, happened: Happened) -> None:
+    """It looks for them before every compilation, and loads kernels from the folder that they name."""
+    (tmp_path / ".numba_config.yaml").write_text("cache_dir: /tmp/somebody\n")
+    assert python(NUMBA, str(tmp_path)).split() == ["''"]
+    happened(34, "a program compiles in a folder with .numba_config.yaml that it changed to: its settings are not read")
+
+
+def test_machine_code_is_not_kept_in_the_folder_we_stand_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As numba does for users without a home."""
+    (tmp_path / "kernel_on_disk.py").write_text(KERNEL.format(name="Of"))
+    monkeypatch.chdir(tmp_path)
+    text = "import sys; sys.path.insert(0, sys.argv[1]); import kernel_on_disk"
+    assert python(text, str(tmp_path), NUMBA_CACHE_DIR="here").strip() == "3.0 0"
+    assert not [*tmp_path.rglob("*.nbi")]
+
+
+NOTEBOOK = """
+import os, sys
+import quadid.app.fleet as fleet
+if __name__ == "__main__":
+    os.chdir(sys.argv[1])
+    sys.path[:0] = ["", os.getcwd()]  # as Python does it in notebooks, and for -m
+    with fleet.cluster(None, 1, "2GiB") as client:
+        found = client.run(lambda: sys.path)
+    print(*(path for paths in found.values() for path in paths), sep="\\n")
+    assert sys.path[:2] == ["", os.getcwd()]
+"""
+
+
+def test_workers_of_a_notebook_in_the_folder_do_not_import_from_it(tmp_path: Path, happened: Happened) -> None:
+    """Nor from a folder of Dask that anyone may have made before."""
+    script = tmp_path / "elsewhere" / "notebook.py"
+    script.parent.mkdir()
+    (planted := tmp_path / "planted").mkdir()
+    script.write_text(NOTEBOOK)
+    done = subprocess.run([sys.executable, script, planted], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    searched = done.stdout.splitlines()
+    assert str(planted) not in searched
+    assert "" not in searched
+    assert not [path for path in searched if Path(path).parent == Path(tempfile.gettempdir(), "dask-scratch-space")]
+    happened(34, "`quadid.fleet` from a notebook in the folder: its workers do not look into it, nor into /tmp")
 
 
 # --- Import paths of release 0.1.0: each works and warns; public names stay functions
