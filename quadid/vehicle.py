@@ -392,16 +392,20 @@ class Proof(Strict):
         unseen: flights that were predicted and not fitted.
         error: largest of their errors: `identify` in what the model expects, `diagnose` in noise variances; 1 is none.
         fitted: flights that the values rest on; their standard deviations are no knowledge beside the same flights.
+        doubt: what else speaks against the values, as of a set that a service has withdrawn.
     """
 
     verdict: Literal["good", "fair", "poor"]
     unseen: tuple[str, ...] = ()
     error: Annotated[float, Field(gt=0.0, allow_inf_nan=False)] | None = None
     fitted: Annotated[tuple[FittedFlight, ...], Field(max_length=MOST_FLIGHTS)] = ()
+    doubt: str = ""
 
     @property
     def lacking(self) -> str:
         """Reason why the values are not proven; empty when they are."""
+        if self.doubt:
+            return self.doubt
         if self.verdict == "poor":
             error = f": error {self.error:.3g} times what is expected on an unseen flight" if self.error else ""
             return f"its fit was judged poor{error}"

@@ -53,17 +53,15 @@ class UnprovenError(QuadidError):
 
 
 def export(
-    vehicle: str | Path | Vehicle, format: str = "yaml", *, source: str | None = None, doubt: str = "",
-    anyway: bool = False,
-) -> Exported:  # fmt: skip
+    vehicle: str | Path | Vehicle, format: str = "yaml", *, source: str | None = None, anyway: bool = False
+) -> Exported:
     """Parameters for another program, with units and where each came from; nothing is sent to a vehicle.
 
     Args:
         vehicle: a shipped name, a YAML file or a `Vehicle`.
         format: one of `quadid.report.programs.FORMATS`.
         source: where the values come from, for the file; default the vehicle's file or name.
-        doubt: what speaks against the values, beside the proof in the vehicle file.
-        anyway: write the values of a fit that is not proven, or in doubt; the file says so at its top.
+        anyway: write values that are not proven, or in doubt; the file says so at its top.
 
     Raises:
         ParameterError: an unknown format.
@@ -72,18 +70,19 @@ def export(
     """
     described, format = Vehicle.named(vehicle), form_of(format)
     origin = source or (Path(vehicle).name if isinstance(vehicle, str | Path) else described.name)
-    lacking = doubt or (f"not proven: {described.proof.lacking}" if described.proof and described.proof.lacking else "")
+    lacking, doubt = (described.proof.lacking, described.proof.doubt) if described.proof else ("", "")
+    told = f"{origin} is {'' if doubt else 'not proven: '}{lacking}" if lacking else ""
     if lacking and not anyway:
         proven = "values that predict an unseen flight", "`quadid identify LOG --validate OTHER`, or `quadid diagnose`"
         wanted, fix = ("a set that is in force", "fly on until the service publishes another") if doubt else proven
-        raise UnprovenError(f"{origin} is {lacking}", wanted, f"{fix}; insist with --anyway")
-    written = written_as(described, format, origin, doubt)
+        raise UnprovenError(told, wanted, f"{fix}; insist with --anyway")
+    written = written_as(described, format, origin)
     texts = {f"{file_name(described.name)}{end}": text for end, text in written.items()}
     guessed = [n for n, p in described.parameters.items() if p.sigma is None]
     warnings = [f"{', '.join(guessed)}: guesses from the vehicle file; no flight has shown better"] if guessed else []
     if format in ("px4", "ardupilot") and described.command.max_speed is None:
         warnings.append("no hover thrust: add command.max_speed, the rotor speed at full command, to the vehicle file")
-    warnings += [why for why in (refused(described, format), doubt and f"{origin} is {doubt}") if why]
+    warnings += [why for why in (refused(described, format), told) if why]
     result = {
         "schema": "quadid.export/1", "vehicle": described.name, "format": format, "files": [], "warnings": warnings,
     }  # fmt: skip

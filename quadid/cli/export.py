@@ -50,23 +50,24 @@ def export(
         return
     if vehicle is None:
         raise typer.BadParameter("no vehicle: use --vehicle, or --list", param_hint="--vehicle")
-    described, source, doubt = Vehicle.named(vehicle), Path(vehicle).name, ""
+    described, source = Vehicle.named(vehicle), Path(vehicle).name
     if history is not None:
-        described, source, doubt = _in_force(described, history, name or described.name)
+        described, source = _in_force(described, history, name or described.name)
     elif name is not None:
         raise typer.BadParameter("it names sets of a history: give --history FILE too", param_hint="--id")
-    done = exported(described, form, source=source, doubt=doubt, anyway=anyway)
+    done = exported(described, form, source=source, anyway=anyway)
     terminal.conclude(done, json, folder=check_folder(out, "--out"), kept=vehicle)
 
 
-def _in_force(vehicle: Vehicle, history: Path, name: str) -> tuple[Vehicle, str, str]:
-    """The vehicle with the values that a service put in force last, where they come from, and what speaks against."""
+def _in_force(vehicle: Vehicle, history: Path, name: str) -> tuple[Vehicle, str]:
+    """The vehicle with the values that a service put in force last and what speaks against, and where they are from."""
     from quadid_node.history import StoreError, read_history, read_in_force
 
     from quadid.identification.result import with_correlation, with_values
     from quadid.model.layout import ThrustModel
     from quadid.parameters import TANGENT
-    from quadid.vehicle import GRAVITY
+    from quadid.sanitise import one_line
+    from quadid.vehicle import GRAVITY, Proof
 
     found = read_in_force(history, name, vehicle)
     if found.item is None:
@@ -74,7 +75,8 @@ def _in_force(vehicle: Vehicle, history: Path, name: str) -> tuple[Vehicle, str,
         unread = f": {found.why_none}" if found.why_none else ""
         raise StoreError(f"no set of '{name}' was ever in force in {history}{unread}", f"one of: {names}", "give --id")
     try:
-        fitted = with_values(vehicle, found.item.parameters).model_copy(update={"proof": None})
+        proof = Proof(verdict="poor", doubt=one_line(found.doubt)) if found.doubt else None
+        fitted = with_values(vehicle, found.item.parameters).model_copy(update={"proof": proof})
     except ValueError as error:
         raise StoreError(
             f"set {found.item.sequence} of '{name}' in {history} is no set that a fit makes: {found.why_none}",
@@ -92,4 +94,4 @@ def _in_force(vehicle: Vehicle, history: Path, name: str) -> tuple[Vehicle, str,
             }
         )  # fmt: skip
     fitted = with_correlation(fitted, found.item.parameters)
-    return fitted, f"{history.name}, set {found.item.sequence} of {name}", found.doubt
+    return fitted, f"{history.name}, set {found.item.sequence} of {name}"

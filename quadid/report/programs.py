@@ -50,15 +50,10 @@ class RotorFacts(NamedTuple):
 
 @dataclass(frozen=True)
 class Facts:
-    """A vehicle as other programs describe it.
-
-    Attributes:
-        doubt: what speaks against its values beside their proof, for headers.
-    """
+    """A vehicle as other programs describe it."""
 
     vehicle: Vehicle
     source: str
-    doubt: str = ""
     tensor = (("ixx", 0, 0), ("ixy", 0, 1), ("ixz", 0, 2), ("iyy", 1, 1), ("iyz", 1, 2), ("izz", 2, 2))
     """Entries of an inertia tensor as SDF and URDF call them."""
 
@@ -208,8 +203,6 @@ class Facts:
     def unproven(self) -> str:
         """Reason why nothing shows that the values predict; empty where something does."""
         proof = self.vehicle.proof
-        if self.doubt:
-            return self.doubt
         if proof is not None:
             return proof.lacking
         guessed = any(p.sigma is None for p in self.vehicle.parameters.values())
@@ -589,14 +582,13 @@ def refused(vehicle: Vehicle, form: str) -> str:
     return str(FORMS[form_of(form)].particulars(Facts(vehicle, "")).get("refused", ""))
 
 
-def export(vehicle: Vehicle, form: str, source: str, doubt: str = "") -> dict[str, str]:
+def export(vehicle: Vehicle, form: str, source: str) -> dict[str, str]:
     """Writes a vehicle in the form of another program.
 
     Args:
         vehicle: with its fitted values as initial values.
         form: one of `FORMATS`, or what `form_of` takes for one.
         source: what the vehicle was read from, for the header.
-        doubt: what speaks against the values, for the header.
 
     Returns:
         Text by the ending of the file name it belongs in.
@@ -604,7 +596,7 @@ def export(vehicle: Vehicle, form: str, source: str, doubt: str = "") -> dict[st
     Raises:
         ParameterError: unknown form, or a vehicle that it cannot hold.
     """
-    facts, asked = Facts(vehicle, source, doubt), FORMS[form_of(form)]
+    facts, asked = Facts(vehicle, source), FORMS[form_of(form)]
     own = asked.particulars(facts)
     header = facts.header(tuple(name for name in asked.carried if name not in own.get("lost", ())))
     values = {**own, "f": facts, "v": vehicle, "rotors": facts.rotors, "header": header}

@@ -405,14 +405,14 @@ class StoredSet(NamedTuple):
         why_none: why it cannot be taken up; empty where it can, or where there is none.
         confirmed: whether a flight of the last run confirmed it; after a restart a set is stale until one does.
         boot_id: of the run that numbered it; empty where the history does not say.
-        rotors: `rotors_of` the vehicle that it was estimated for; None where the history does not say.
+        rests: `rests_on` of the vehicle that it was estimated for, as far as the history says.
     """
 
     item: OnlineSet | None
     why_none: str = ""
     confirmed: bool = True
     boot_id: str = ""
-    rotors: Any = None
+    rests: Mapping[str, Any] = MappingProxyType({})
 
     @property
     def doubt(self) -> str:
@@ -424,24 +424,28 @@ class StoredSet(NamedTuple):
         return "" if self.confirmed else "stale: no flight has confirmed it since the service started again"
 
 
-def rotors_of(vehicle: Vehicle) -> list[list[float]]:
-    """Place and spin of each rotor, as they stand beside a set: b and the inertias rest on them."""
-    return [[*rotor.position, rotor.spin] for rotor in vehicle.rotors]
+def rests_on(vehicle: Vehicle) -> dict[str, Any]:
+    """What of the vehicle file b and the inertias rest on beside the mass, as it is noted with each set."""
+    file = vehicle.model_dump(mode="json", include={"command", "effects", "mounting"})
+    if vehicle.command.kind == "rotor_speed":
+        del file["command"]["max_speed"]  # nothing is scaled by it
+    return {**file, "rotors": [[*r.position, r.spin] for r in vehicle.rotors]}
 
 
 def in_force(db: sqlite3.Connection, name: str, gate: GateSettings, vehicle: Vehicle | None) -> StoredSet:
-    """The set last in force, with why it is out of date: withdrawn, or of other rotors or mass than the vehicle file's.
+    """The set last in force, with why it is out of date: withdrawn, or it rests on what is not in the vehicle file now.
 
     Args:
-        vehicle: of this run; None: its mass is not compared.
+        vehicle: of this run; None: nothing of it is compared.
     """
     last = stored(db, name, f"{_FORCE} ORDER BY rowid DESC", gate, vehicle)
     if last.item is None or last.why_none:
         return last
     told = stored(db, name, f"({_FORCE} OR state = 'stale') ORDER BY rowid DESC", gate, vehicle).item or last.item
     item = replace(last.item, outdated=told.outdated, outdated_code=told.outdated_code)
-    if vehicle is not None and not item.outdated and last.rotors not in (None, rotors_of(vehicle)):
-        item = replace(item, outdated="it rests on rotors in other places than those of the vehicle file")
+    other = [] if vehicle is None else [n for n, now in rests_on(vehicle).items() if last.rests.get(n, now) != now]
+    if other and not item.outdated:
+        item = replace(item, outdated=f"it rests on other {' and '.join(other)} than the vehicle file has now")
     if vehicle is not None and not item.outdated and not abs(item.mass / vehicle.mass - 1.0) <= _SAME_MASS:
         rests = "a mass that it does not state" if math.isnan(item.mass) else f"a mass of {item.mass:g} kg"
         why = f"it rests on {rests}, the vehicle file has {vehicle.mass:g} kg"
@@ -465,7 +469,7 @@ def stored(db: sqlite3.Connection, name: str, which: str, gate: GateSettings, ve
         data = json.loads(row[0])
         found = set_from_dict(data)
         why, boot = why_none(found, row[1], gate, vehicle), str(data.get("boot_id", ""))
-        return StoredSet(found, why, boot_id=boot, rotors=data.get("rotors"))
+        return StoredSet(found, why, boot_id=boot, rests={n: v for n, v in data.items() if v is not None})
     except UNREADABLE as error:
         return StoredSet(found, f"{type(error).__name__}: {str(error)[:120]}")
 
@@ -621,7 +625,7 @@ class Store:
             raise StoreError(f"{str(path)!r} names no file ({error})", "a path", "give another --history") from error
         self.vehicle, self.boot_id, self._kept = vehicle, uuid.uuid4().hex, kept
         self._boots: dict[int, str] = {}
-        self._rotors: list[list[float]] | None = None
+        self._rests: dict[str, Any] = {}
         self.notes: list[str] = []
         self.problem = ""
         self._unread = False
@@ -662,10 +666,10 @@ class Store:
     def restore(self, gate: GateSettings | None = None, vehicle: Vehicle | None = None) -> Restored:
         """State left by the last run; a set is taken up again when this `gate` and `vehicle` could have let it pass.
 
-        From now on each set is noted with the vehicle's rotors.
+        From now on each set is noted with what it rests on.
         """
         gate = gate or GateSettings()
-        self._rotors = rotors_of(vehicle) if vehicle is not None else None
+        self._rests = rests_on(vehicle) if vehicle is not None else {}
         if self._lock is None or not self.path.is_file() or not self.path.stat().st_size:
             return Restored(None, first_number())
         try:
@@ -814,7 +818,7 @@ class Store:
     def _stands(self, item: OnlineSet) -> Row:
         """The row of a set, kept where a new file would have to begin with it; what `_restored` looks for."""
         state = item.state.value
-        data = {**set_to_dict(item), "boot_id": self._boots.get(item.sequence, self.boot_id), "rotors": self._rotors}
+        data = {**set_to_dict(item), "boot_id": self._boots.get(item.sequence, self.boot_id), **self._rests}
         row = self._row(
             "sets", item.sequence, sequence=item.sequence, state=state, reason=item.reason,
             approved_by=item.approved_by, stop=item.stop, data=json.dumps(data),

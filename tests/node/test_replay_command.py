@@ -6,6 +6,7 @@ import json
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 from quadid_node.history import Store
@@ -15,7 +16,7 @@ from quadid_replay.mcap_file import McapFile
 from quadid.model.layout import ThrustModel
 from quadid.online.fusion import with_tangent
 from quadid.online.records import OnlineSet, SetState
-from quadid.vehicle import GRAVITY, Vehicle
+from quadid.vehicle import GRAVITY, Command, Mounting, Vehicle
 from tests.commands import Cli
 from tests.faults.evidence import Happened
 from tests.online.driving import flight
@@ -186,6 +187,13 @@ def test_a_set_that_is_not_in_force_is_exported_only_when_insisted(
     first = Path(told["files"][0]).read_text(encoding="utf-8").splitlines()[0]
     assert first.startswith("# NOT PROVEN: ")
     assert why in first
+    for command in (
+        ("export", "--format", "px4"),
+        ("gains", "--format", "px4"),
+    ):  # what was written is no less in doubt
+        again = inside(*command, "--vehicle", told["files"][0], "--out", out)
+        assert again.code == 2
+        assert why in again.err
     shown = inside("history", "--vehicle", "pelican", "--history", str(path), "--json", "-")
     assert why in json.loads(shown.out)["in_force"]["doubt"]
     # The service takes up none of these as it is: one rule for all who read a history.
@@ -208,29 +216,41 @@ def test_a_value_that_no_vehicle_file_holds_is_refused_in_one_line(
     happened(36, f"export of b = {b:g}: refused")
 
 
-def test_a_set_of_a_vehicle_with_other_rotors_is_exported_only_when_insisted(
-    tmp_path: Path, inside: Cli, happened: Happened
+PWM = Command(kind="pwm", max_speed=900.0)
+OTHERS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
+    "rotors": ({}, {"rotors": Vehicle.shipped("pelican_x").rotors}),
+    "command": ({"command": PWM}, {"command": PWM.model_copy(update={"max_speed": 1000.0})}),
+    "effects": ({"effects": {"motor_lag": {"tau": 0.03}}}, {"effects": {"thrust_curve": {"dead_speed": 60.0}}}),
+    "mounting": ({}, {"mounting": Mounting(rotation=(0.0, 0.0, 0.1))}),
+    "": ({}, {"command": Command(max_speed=900.0)}),  # scales no reading
+}
+"""What the vehicle file had when a set was made, and has now: b and the inertias rest on it."""
+
+
+@pytest.mark.parametrize("other", list(OTHERS))
+def test_a_set_that_rests_on_another_vehicle_file_is_exported_only_when_insisted(
+    other: str, tmp_path: Path, inside: Cli, happened: Happened
 ) -> None:
     """Of the same name and mass; the service that finds such a set publishes it as out of date."""
-    pelican, cross, path = Vehicle.shipped("pelican"), Vehicle.shipped("pelican_x"), tmp_path / "h.sqlite"
-    assert cross.mass == pelican.mass
-    wider = [r.model_copy(update={"position": tuple(1.1 * x for x in r.position)}) for r in pelican.rotors]
+    path, file = tmp_path / "h.sqlite", tmp_path / "mine.yaml"
+    before, now = (Vehicle.shipped("pelican").model_copy(update=update) for update in OTHERS[other])
     store = Store(path, "pelican")
-    store.restore(vehicle=pelican)
+    store.restore(vehicle=before)
     store.numbered(replace(GOOD, sequence=1, approved_by="auto"))
     store.close()
-    for rotors, code in ((pelican.rotors, 0), (tuple(wider), 2), (cross.rotors, 2)):
-        other = tmp_path / "other.yaml"
-        pelican.model_copy(update={"rotors": rotors}).save(other)
-        run = inside("export", "--vehicle", other, "--history", path, "--out", tmp_path / "out")
-        assert run.code == code, run.err
-        assert ("rotors in other places" in run.err) == bool(code)
-    store = Store(path, "pelican")
-    item = store.restore(vehicle=Vehicle.named(other)).item
-    store.close()
-    assert item is not None
-    assert "rotors in other places" in item.outdated
-    happened(36, f"export of a set for rotors in other places: '{run.err.strip()[:100]}'")
+    for vehicle in (before, now):
+        vehicle.save(file)
+        why = f"{other} than the vehicle file has now" if vehicle is now and other else ""
+        run = inside("export", "--vehicle", file, "--history", path, "--out", tmp_path / "out")
+        assert run.code == (2 if why else 0), run.err
+        assert why in run.err
+        store = Store(path, "pelican")
+        item = store.restore(vehicle=Vehicle.named(file)).item
+        store.close()
+        assert item is not None
+        assert bool(item.outdated) == bool(why)
+        assert why in item.outdated
+    happened(36, f"export of a set, the vehicle file has other {other or 'max_speed'}: code {run.code}")
 
 
 def test_a_set_in_force_is_exported_without_a_word(tmp_path: Path, inside: Cli) -> None:
