@@ -194,8 +194,8 @@ def attitude_check(recording: Recording, found: Response | None) -> Check:
         recording: the log.
         found: of `response`.
     """
-    rates, coarse = gyro_check(recording, found), attitude_steps_check(recording)
-    if coarse is not None and rates.numbers.get("r2", 1.0) < _CLEAR:
+    rates = gyro_check(recording, found)
+    if rates.numbers.get("r2", 1.0) < _CLEAR and (coarse := attitude_steps_check(recording)) is not None:
         rates = Check(rates.name, CheckResult.UNKNOWN, f"{coarse.message}: too coarse to compare with the gyro")
     accel, attitude = recording.channels.get("accel"), recording.channels.get("attitude")
     if rates.verdict is CheckResult.ERROR or accel is None or attitude is None or len(attitude.t) < 2:
@@ -252,6 +252,8 @@ def gyro_check(recording: Recording, found: Response | None = None) -> Check:
     own = _moving_rates(gyro, attitude.t, given)
     readings = {"as given": given, "world to body": conjugate(given), "x y z w (scalar last)": given[:, [3, 0, 1, 2]]}
     for name, q in readings.items():
+        if best is not None and _likely(*best) >= _likely("", AxisMap((0, 1, 2), (1, 1, 1), 1.0, 1.0)):
+            break  # no other can be likelier
         measured, derived = own if q is given else _moving_rates(gyro, attitude.t, q)
         if len(measured) < 20:
             if name == "as given":  # as much noise moves every reading of it: no other is more likely for it

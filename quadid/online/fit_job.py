@@ -214,14 +214,12 @@ def _are_estimates(estimates: tuple[WindowEstimate, ...], request: FitRequest) -
     """None, or one a span, all linearised at one point."""
     if estimates and tuple((e.start, e.stop) for e in estimates) != request.spans:
         return False
-    return all(
-        _is_estimate(e, request.vehicle) and np.array_equal(e.z, estimates[0].z, equal_nan=True) for e in estimates
-    )
+    return all(_is_estimate(e, request) and np.array_equal(e.z, estimates[0].z, equal_nan=True) for e in estimates)
 
 
-def _is_estimate(estimate: WindowEstimate, vehicle: Vehicle) -> bool:
+def _is_estimate(estimate: WindowEstimate, request: FitRequest) -> bool:
     """An estimate of this vehicle; one without finite numbers is refused later, with that reason."""
-    P = len(names_of(vehicle))
+    P = len(request.z)
     vectors = estimate.z, estimate.score, estimate.half_score
     squares = estimate.information, estimate.noise, estimate.half_information
     if any(a.shape != (P,) for a in vectors) or any(a.shape != (P, P) for a in squares):
@@ -230,7 +228,7 @@ def _is_estimate(estimate: WindowEstimate, vehicle: Vehicle) -> bool:
         return False
     if not estimate.finite:
         return True
-    low, high = np.log([vehicle.limits(name) for name in NOMINAL_NAMES]).T
+    low, high = np.log([request.vehicle.limits(name) for name in NOMINAL_NAMES]).T
     if np.any(estimate.z[:SIX] < low - BEYOND) or np.any(estimate.z[:SIX] > high + BEYOND):
         return False
     values = np.linalg.eigvalsh(0.5 * (estimate.information + estimate.information.T))

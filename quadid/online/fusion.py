@@ -38,7 +38,6 @@ from quadid.online.fit_job import (
     FitRequest,
     Noise,
     WindowEstimate,
-    names_of,
     own_names,
     prior_of,
     thrust_names,
@@ -337,6 +336,7 @@ class Estimator:
         fusion: what windows said.
         theta: full parameter vector, the best at hand.
         noise: noise numbers; None: the next fit searches for everything.
+        left_out: of thrust by b w^2 and standard deviations, shape (2, R + 1); None before.
         excitation: of the newest window, shape (6,); NaN before.
         start: first time of the data learned from [s]; NaN before.
         rows: grid rows learned from.
@@ -350,14 +350,15 @@ class Estimator:
         self._hash = hashlib.sha256(f"quadid {vehicle.to_yaml()} {seed}".encode()).digest()
         self._layout = Layout(vehicle)
         self._initial = self._layout.initial(vehicle)
+        self._stated = ThrustModel(self._layout, self._initial)
         self._free = Free(tuple(self._layout.entry(n) for n in NOMINAL_NAMES))
-        prior, count, own = prior_of(vehicle), len(names_of(vehicle)), len(own_names(vehicle))
+        self._thrust = [self._layout.entry(name) for name in thrust_names(vehicle)]
+        names = own_names(vehicle)
+        prior, count, own = prior_of(vehicle), len(names) + len(self._thrust), len(names)
         self._prior_sigma = prior.sigma
         mean, sigma = np.zeros(count), np.ones(count)
         mean[:SIX], sigma[:SIX], sigma[own:] = np.log(prior.mean), prior.sigma, WIDTH
-        lags, unusual = (
-            [i for i, name in enumerate(own_names(vehicle)) if name == one] for one in ("motor_lag.tau", UNCOUPLED)
-        )
+        lags, unusual = ([i for i, name in enumerate(names) if name == one] for one in ("motor_lag.tau", UNCOUPLED))
         self._nothing = partial(Fusion, mean, sigma, own, memory, length, lags, unusual)
         self._z = mean
         self.reset()
@@ -371,6 +372,7 @@ class Estimator:
         """The vehicle has changed: what was learned no longer holds; the next fit searches globally."""
         self.fusion = self._nothing()
         self.noise: Noise | None = None
+        self.left_out: FloatArray | None = None
         self.start, self.rows, self._measured, self._enough = math.nan, 0, 0, 0.0
 
     @property
@@ -387,10 +389,9 @@ class Estimator:
     def published(self) -> ThrustModel:
         """Thrust by what is published and the vehicle file's own effects: what who uses a set has."""
         fused, beyond = self.fusion.estimate(), self._slope_beyond_b
-        model = ThrustModel.stated(self.vehicle)
         if fused is None:
-            return model
-        model = model.with_b(math.exp(fused.z[B]))
+            return self._stated
+        model = self._stated.with_b(math.exp(fused.z[B]))
         return model if beyond is None else model.with_tangent(math.exp(beyond[0]), self.vehicle.mass * GRAVITY)
 
     @property
@@ -399,10 +400,9 @@ class Estimator:
 
         None where that is nothing as far as is known.
         """
-        left_out = self.left_out()
-        if left_out is None:
+        if self.left_out is None:
             return None
-        value, sigma = left_out[:, :-1].mean(axis=1).tolist()
+        value, sigma = self.left_out[:, :-1].mean(axis=1).tolist()
         return (value, sigma) if value**2 > exceeded(CHANCE, 1) * sigma**2 else None
 
     @property
@@ -493,6 +493,7 @@ class Estimator:
         assert fused is not None
         self._z = reply.estimates[-1].z
         self.theta = self._free.placed(reply.theta, fused.z[:SIX])
+        self.left_out = self._beyond_b()
 
     def _pool(self, found: Noise | None, of_all: bool) -> None:
         """Takes in noise that a fit found: that of all that was flown, or of one more window."""
@@ -526,7 +527,7 @@ class Estimator:
         six = parameter_set(self._free, theta, self._initial, unc)
         return six if beyond is None else with_tangent(six, *beyond)
 
-    def left_out(self) -> FloatArray | None:
+    def _beyond_b(self) -> FloatArray:
         """Thrust beyond b w^2: a row of values and one of their standard deviations, shape (2, R + 1).
 
         The value of a rotor is the logarithm of its thrust's change with speed at hover, with what thrust may have
@@ -535,26 +536,22 @@ class Estimator:
         there is where no rotor turns, over the weight.  A rotor's own curve has none there; what a support carries, or
         the bias that hides a wrong scale, is there.
         """
-        fused = self.fusion.estimate(wide=True)
-        if fused is None:
-            return None
-        weight, stated = self.vehicle.mass * GRAVITY, ThrustModel.stated(self.vehicle)
-        places = [*range(SIX), *range(len(own_names(self.vehicle)), len(fused.z))]
-        entries = [self._layout.entry(name) for name in thrust_names(self.vehicle)]
-
+        fused, weight = self.fusion.estimate(wide=True), self.vehicle.mass * GRAVITY
+        assert fused is not None
+        places = [*range(SIX), *range(len(fused.z) - len(self._thrust), len(fused.z))]
         at = math.exp(self._z[B])
         dead, rest = (self._layout.entry(f"thrust_curve.{n}").index for n in ("dead_speed", "offset"))
 
         def value(z: FloatArray) -> FloatArray:
             theta = self._initial.copy()
-            for entry, effect in zip(entries, z[SIX:], strict=True):
+            for entry, effect in zip(self._thrust, z[SIX:], strict=True):
                 theta[entry.index] += effect * entry.typical
             # What was linearised is b w^2, its slope and what is at rest: that is a parabola, whose root is this.
             b, was = max(at * (1.0 + z[B] - self._z[B]), 0.1 * at), self._initial[dead]
             theta[B], theta[dead] = b, was + (theta[dead] - was) * at / b
             theta[rest] += b * (was**2 - theta[dead] ** 2)
             full = ThrustModel(self._layout, theta)
-            six = stated.with_b(full.like(stated, weight))
+            six = self._stated.with_b(full.like(self._stated, weight))
             own = np.log(np.maximum(full.slope(weight), 1e-12) / six.slope(weight))
             return np.append(own, (full.at_rest - six.at_rest) / weight)
 
@@ -594,15 +591,15 @@ class Estimator:
         most = max(windows, 3)
         agreeing, odd = self.fusion.agreement(most)
         disagreement = f"{NOMINAL_NAMES[odd[0]]} differs by {np.expm1(odd[1]):+.1%} in one of them" if odd else ""
-        fused, left_out = self.fusion.estimate(), self.left_out()
+        fused = self.fusion.estimate()
         assert fused is not None
-        assert left_out is not None
+        assert self.left_out is not None
         missed = zip(NOMINAL_NAMES, fused.between_rows[:SIX].tolist(), strict=True)
         return Case(
             parameters, reply.excited, self._thrust_ratio(request.windows), agreeing, disagreement,
             self._held_out(sets.in_force, sets.seen), sets.in_force, sets.baseline, sets.approval,
             self.fusion.counted - sets.seen, stated=self.stated, walked=self._walked(most), between_rows=dict(missed),
-            left_out=left_out,
+            left_out=self.left_out,
         )  # fmt: skip
 
     def scores(self) -> tuple[float, float]:

@@ -107,6 +107,7 @@ class GridBuffer:
         self._step = 1.0 / rate
         self._most = round(seconds * rate)
         self._blocks: list[Rows] = []
+        self._kept = 0
 
     @property
     def start(self) -> float:
@@ -116,9 +117,9 @@ class GridBuffer:
     def add(self, rows: Rows) -> None:
         """Appends a block of rows and forgets the oldest."""
         self._blocks.append(rows)
-        total = sum(len(b.t) for b in self._blocks)
-        while total - len(self._blocks[0].t) >= self._most:
-            total -= len(self._blocks.pop(0).t)
+        self._kept += len(rows.t)
+        while self._kept - len(self._blocks[0].t) >= self._most:
+            self._kept -= len(self._blocks.pop(0).t)
 
     def _reaching(self, start: float, stop: float) -> list[Rows]:
         """Blocks with a row between the two, or on either side of them."""
