@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.special import chdtrc, chdtri, fdtrc, log_ndtr, ndtri, stdtr, stdtrit
-from scipy.stats import qmc
 
 from quadid.chi_square import Z95
 from quadid.condition.trim import AXES, FlightTrim, Healthy, healthy_spread, trim_directions
@@ -268,6 +267,8 @@ def _evidence_of_draws(question: _Question) -> FloatArray:
 @cache
 def _healthy_points(*freedom: float) -> FloatArray:
     """Draws of independent Student t of these degrees of freedom, shape (draws, axes); always the same."""
+    from scipy.stats import qmc  # two seconds to import, and few flights are compared with healthy ones
+
     points = qmc.Sobol(len(freedom), scramble=True, seed=0).random(_DRAWS)
     return np.column_stack([stdtrit(v, column) for v, column in zip(freedom, points.T, strict=True)])
 

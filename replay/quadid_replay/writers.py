@@ -6,6 +6,7 @@ import math
 import struct
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
+from functools import cache
 from pathlib import Path
 from types import SimpleNamespace, TracebackType
 from typing import Any, BinaryIO, NamedTuple, TypeAlias
@@ -14,7 +15,6 @@ import numpy as np
 import yaml
 from mcap.writer import CompressionType, Writer
 from mcap_ros2._dynamic import serialize_dynamic
-from pymavlink.dialects.v20 import ardupilotmega
 
 from quadid.data.grid import linear
 from quadid.data.window import Channel, Recording, Window, as_recording
@@ -446,7 +446,6 @@ def write_table(file: str | Path | BinaryIO, header: Sequence[str], table: Float
 # ATTITUDE_TARGET milliseconds, ESC_STATUS whole rpm, SERVO_OUTPUT_RAW whole microseconds: the format's resolution.
 
 
-dialect = extend_dialect(ardupilotmega)
 SYSTEM, COMPONENT = 1, 1
 _UNIX_START_US = 1_600_000_000_000_000  # receive time at recording time 0
 _TYPES = {rotors: kind for kind, rotors in MULTIROTORS.items()}
@@ -457,6 +456,13 @@ _Messages = tuple[FloatArray, Callable[[int], list[Any]]]
 """Times [s], and the messages of a row."""
 
 
+@cache
+def _dialect() -> Any:
+    from pymavlink.dialects.v20 import ardupilotmega  # a second to import and 80 MB, and many write other formats only
+
+    return extend_dialect(ardupilotmega)
+
+
 def write_tlog(file: str | Path | BinaryIO, source: Source) -> None:
     """Writes a recording or windows to a telemetry log.
 
@@ -464,7 +470,7 @@ def write_tlog(file: str | Path | BinaryIO, source: Source) -> None:
         LogError: nothing to write, times that boot clocks cannot tell, or a file that cannot be written.
     """
     recording = recording_of(source)
-    mav = dialect.MAVLink(None, srcSystem=SYSTEM, srcComponent=COMPONENT)
+    mav = _dialect().MAVLink(None, srcSystem=SYSTEM, srcComponent=COMPONENT)
     with _stream(file) as stream:
         for t, message in mavlink_messages(recording):
             frame = message.pack(mav)
@@ -507,8 +513,9 @@ def _mavlink_series(channels: Mapping[str, Channel], first: float, last: float) 
     def heartbeat(row: int) -> list[Any]:
         zeros = [0, 0, 0, 0]
         escs = range(0, rotors, 4) if "rotor_speed" in channels else ()
-        return [dialect.MAVLink_heartbeat_message(_TYPES.get(rotors, 2), _GENERIC_AUTOPILOT, 0, 0, _ACTIVE, 3)] + [
-            dialect.MAVLink_esc_info_message(i, _us(seconds[row]), 0, rotors, 0, 0, zeros, zeros, zeros) for i in escs
+        return [_dialect().MAVLink_heartbeat_message(_TYPES.get(rotors, 2), _GENERIC_AUTOPILOT, 0, 0, _ACTIVE, 3)] + [
+            _dialect().MAVLink_esc_info_message(i, _us(seconds[row]), 0, rotors, 0, 0, zeros, zeros, zeros)
+            for i in escs
         ]
 
     yield seconds, heartbeat
@@ -521,7 +528,7 @@ def _mavlink_series(channels: Mapping[str, Channel], first: float, last: float) 
             if values is not None and np.isfinite(values[row]).all():
                 updated |= bits
                 fields[place : place + 3] = values[row].tolist()
-        return [dialect.MAVLink_highres_imu_message(_us(imu[row]), *fields, *[0.0] * 7, updated)]
+        return [_dialect().MAVLink_highres_imu_message(_us(imu[row]), *fields, *[0.0] * 7, updated)]
 
     if len(imu):
         yield imu, highres_imu
@@ -535,7 +542,7 @@ def _mavlink_series(channels: Mapping[str, Channel], first: float, last: float) 
 
     def local_position(row: int) -> list[Any]:
         numbers = [v for part in states for v in ([math.nan] * 3 if part is None else part[row].tolist())]
-        return [dialect.MAVLink_local_position_ned_message(_ms(local[row]), *numbers)]
+        return [_dialect().MAVLink_local_position_ned_message(_ms(local[row]), *numbers)]
 
     if len(local):
         yield local, local_position
@@ -543,7 +550,7 @@ def _mavlink_series(channels: Mapping[str, Channel], first: float, last: float) 
 
 def _attitude(c: Channel) -> Callable[[int], list[Any]]:
     return lambda row: [
-        dialect.MAVLink_attitude_quaternion_message(_ms(c.t[row]), *c.values[row].tolist(), 0.0, 0.0, 0.0)
+        _dialect().MAVLink_attitude_quaternion_message(_ms(c.t[row]), *c.values[row].tolist(), 0.0, 0.0, 0.0)
     ]
 
 
@@ -553,7 +560,7 @@ def _escs(c: Channel) -> Callable[[int], list[Any]]:
     def messages(row: int) -> list[Any]:
         rpm = [round(w / RPM) for w in c.values[row].tolist()] + [0] * (-width % 4)
         return [
-            dialect.MAVLink_esc_status_message(i, _us(c.t[row]), rpm[i : i + 4], zeros, zeros)
+            _dialect().MAVLink_esc_status_message(i, _us(c.t[row]), rpm[i : i + 4], zeros, zeros)
             for i in range(0, width, 4)
         ]
 
@@ -565,12 +572,12 @@ def _outputs(c: Channel) -> Callable[[int], list[Any]]:
     width = c.values.shape[1]
     if np.nanmedian(np.abs(c.values)) > 100.0:
         return lambda row: [
-            dialect.MAVLink_servo_output_raw_message(
+            _dialect().MAVLink_servo_output_raw_message(
                 _us(c.t[row]) % 2**32, 0, *(round(v) for v in c.values[row].tolist()), *[0] * (16 - width)
             )
         ]
     return lambda row: [
-        dialect.MAVLink_actuator_output_status_message(
+        _dialect().MAVLink_actuator_output_status_message(
             _us(c.t[row]), width, [*c.values[row].tolist(), *[0.0] * (32 - width)]
         )
     ]
@@ -579,7 +586,7 @@ def _outputs(c: Channel) -> Callable[[int], list[Any]]:
 def _reference(c: Channel) -> Callable[[int], list[Any]]:
     q = from_euler(c.values[:, :3])
     return lambda row: [
-        dialect.MAVLink_attitude_target_message(
+        _dialect().MAVLink_attitude_target_message(
             _ms(c.t[row]), 0, q[row].tolist(), 0.0, 0.0, 0.0, float(c.values[row, 3])
         )
     ]
@@ -588,7 +595,7 @@ def _reference(c: Channel) -> Callable[[int], list[Any]]:
 def _voltage(c: Channel) -> Callable[[int], list[Any]]:
     """The whole pack's voltage as if of one cell [mV]."""
     return lambda row: [
-        dialect.MAVLink_battery_status_message(
+        _dialect().MAVLink_battery_status_message(
             0, 0, 0, 32767, [min(round(float(c.values[row, 0]) * 1e3), 65534)] + [65535] * 9, -1, -1, -1, -1
         )
     ]
