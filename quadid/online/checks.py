@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -162,12 +163,13 @@ class Quality:
     carried: bool = False
 
 
-def judge(cut: WindowCut, vehicle: Vehicle, thrust: ThrustModel, known: bool) -> Quality:
+def judge(cut: WindowCut, vehicle: Vehicle, thrust: ThrustModel, known: bool, units: bool = True) -> Quality:
     """Judges the windows of one fit.
 
     Args:
         thrust: of the rotors, by the best estimate at hand.
         known: whether it was identified or is a guess.
+        units: False: units and frames of a good window are left to its fit.
     """
     # First whether the rotors lift: at rest sensors and rotors may well repeat themselves.
     for window in cut.windows:
@@ -176,12 +178,11 @@ def judge(cut: WindowCut, vehicle: Vehicle, thrust: ThrustModel, known: bool) ->
             return lift
         if fault := _broken(window):
             return Quality(fault=fault)
-    if fault := mistake(cut, vehicle, known):
-        return Quality(fault=fault)
-    if why := next((why for w in cut.windows if (why := _not_flying(w))), ""):
-        return Quality(grounded=why)
+    still = next((why for w in cut.windows if (why := _not_flying(w))), "")
     carried = next((why for w in cut.windows if (why := _floor(w, _weight_share(w, vehicle, thrust)))), "")
-    return Quality(grounded=carried, carried=bool(carried))
+    if (units or still or carried) and (fault := mistake(cut, vehicle, known)):
+        return Quality(fault=fault)
+    return Quality(grounded=still or carried, carried=not still and bool(carried))
 
 
 def _broken(window: Window) -> str:
@@ -230,16 +231,17 @@ def mistake(cut: WindowCut, vehicle: Vehicle, known: bool) -> str:
     Returns:
         What is wrong and how to mend it; empty for nothing.
     """
-    units = next((why for window in cut.windows if (why := _wrong_unit(window))), "")
-    return units or ("" if known else _wrong_order(cut, vehicle))
+    return wrong_unit(cut.windows) or ("" if known else _wrong_order(cut, vehicle))
 
 
-def _wrong_unit(window: Window) -> str:
-    recording = as_recording([window])
-    log = Log(recording, None, ((window.t0, window.t0 + window.dt * len(window)),), recording)
-    for check in (question.test(log) for stage in STAGES for question in stage if question.live):
-        if check is not None and check.verdict is CheckResult.ERROR:
-            return f"{check.message}; {check.fix}; on ROS topics FLU and ENU: PX4 has FRD and NED"
+def wrong_unit(windows: Sequence[Window]) -> str:
+    """Names the wrong unit or frame of windows, and how to mend it; empty for nothing."""
+    for window in windows:
+        recording = as_recording([window])
+        log = Log(recording, None, ((window.t0, window.t0 + window.dt * len(window)),), recording)
+        for check in (question.test(log) for stage in STAGES for question in stage if question.live):
+            if check is not None and check.verdict is CheckResult.ERROR:
+                return f"{check.message}; {check.fix}; on ROS topics FLU and ENU: PX4 has FRD and NED"
     return ""
 
 

@@ -35,6 +35,7 @@ from quadid.identification.problem import Prior, Shooting
 from quadid.identification.reliability import coarse
 from quadid.identification.search import SWARM_SECONDS, swarm_search
 from quadid.model.layout import IMU_PERIOD, Layout
+from quadid.online.checks import wrong_unit
 from quadid.online.records import Job, JobReply
 from quadid.parameters import NOMINAL_NAMES
 from quadid.types import BoolArray, FloatArray, check_shapes
@@ -134,6 +135,7 @@ class FitReply(JobReply):
         estimates: quadratic models, one a span.
         theta: full parameter vector where it was linearised.
         noise: found by this fit; None: the request's still holds.
+        fault: a wrong unit or frame of the windows, for which they were not fitted; or empty.
     """
 
     excitation: FloatArray | None = None
@@ -141,6 +143,7 @@ class FitReply(JobReply):
     estimates: tuple[WindowEstimate, ...] = ()
     theta: FloatArray | None = None
     noise: Noise | None = None
+    fault: str = ""
 
     @property
     def finite(self) -> bool:
@@ -286,6 +289,9 @@ def problem_of(window: Window, vehicle: Vehicle, more: tuple[str, ...] = ()) -> 
 
 def fit(request: FitRequest) -> FitReply:
     """Fits a window: the maximum where nothing is known yet, else one step of the recursion."""
+    # 0. Units and frames, beside the session; it has asked for those of a vehicle that is not known yet.
+    if request.noise is not None and (fault := wrong_unit(request.windows)):
+        return FitReply(request.number, fault=fault)
     # 1. What the motion reveals.
     bounds = _excitation(request)
     if bounds is None:

@@ -392,7 +392,8 @@ class Session:
             have = f"{max(tick - start, 0.0):.0f} of {self.settings.window:g} s of flight"
             self._outbox.state(Phase.COLLECTING, f"{have}; {cut.reason or 'no gaps'}")
             return
-        self._quality = judge(cut, self._vehicle, self._estimator.thrust, self._estimator.learned)
+        known = self._estimator.learned
+        self._quality = judge(cut, self._vehicle, self._estimator.thrust, known, units=not known)
         if self._quality != Quality():
             phase = Phase.BLOCKED if self._quality.fault else Phase.NOT_FLYING
             self._outbox.note(tick, phase, self._quality.fault or self._quality.grounded)
@@ -437,6 +438,10 @@ class Session:
         outbox, estimator = self._outbox, self._estimator
         if reply.problem:
             outbox.note(request.stop, Phase.FAILED, reply.problem)
+            return
+        if reply.fault:
+            self._quality, self._last_fit = Quality(reply.fault), -math.inf
+            outbox.note(request.stop, Phase.BLOCKED, reply.fault)
             return
         if not reply.estimates:
             estimator.take(request, reply)

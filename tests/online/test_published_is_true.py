@@ -113,7 +113,7 @@ def test_what_a_support_carries_shows_at_rest_and_a_curve_of_the_rotors_own_does
         learner = Estimator(PELICAN, 120.0, 10.0, 0)
         asked = learner.request(1, WindowCut((window,), 24.0, 0), 0.0, 24.0)
         learner.take(asked, asked.answer())
-        left_out = learner.left_out()
+        left_out = learner.left_out
         assert left_out is not None
         (*rotors, at_rest), (*_, sigma) = left_out
         assert at_rest == pytest.approx(carried, abs=3.0 * sigma)
