@@ -15,10 +15,12 @@ from quadid.data.window import Window
 from quadid.flight import draw_truth, fly
 from quadid.model.layout import Layout, ThrustModel
 from quadid.online.checks import Quality, judge, mistake
+from quadid.online.fusion import Estimator
 from quadid.online.grid_buffer import WindowCut
 from quadid.vehicle import GRAVITY, Vehicle
 from tests.faults.evidence import Happened
 from tests.online.driving import flight
+from tests.online.made_up import NOISE
 
 PELICAN = Vehicle.shipped("pelican")
 B = 2.33e-5
@@ -150,7 +152,14 @@ def test_rotor_speeds_in_rpm_are_named() -> None:
 )
 def test_wrong_units_and_frames_are_named(name: str, factor: np.ndarray, word: str) -> None:
     window = flight(30.0, 3).window.slice(0, 500)
-    assert word in verdict(changed(window, name, getattr(window, name) * factor)).fault
+    wrong = changed(window, name, getattr(window, name) * factor)
+    assert word in verdict(wrong).fault
+    # Of a known vehicle by the fit, beside the session; by the session where it would call it no flight.
+    cut, learner = WindowCut((wrong,), 10.0, 0), Estimator(PELICAN, 120.0, 10.0, 0)
+    left = judge(cut, PELICAN, thrust_of(B), known=True, units=False)
+    assert left == Quality() or word in left.fault
+    learner.noise = NOISE
+    assert word in learner.request(1, cut, 0.0, 10.0).answer().fault
 
 
 def test_an_attitude_in_a_world_with_z_up_is_named() -> None:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -287,6 +288,21 @@ def test_a_failed_fit_is_told_once_and_the_next_windows_are_learned_from() -> No
     assert session.status().fits == 0
     assert published(works(session, between(FLIGHT, 15.7, 28.0), tells()))
     assert session.status().phase is Phase.ACCEPTED
+
+
+def test_units_that_a_fit_finds_wrong_block_until_a_window_is_right_again() -> None:
+    """Units of a known vehicle are asked beside the session: every second they took it as long as all the rest."""
+    session = Session(PELICAN, QUICK.model_copy(update={"refit": 3.0}))
+    works(session, between(FLIGHT, 0.0, 15.7), tells())
+    before = session.status().fits
+    actions = works(session, between(FLIGHT, 15.7, 19.7), lambda r: FitReply(r.number, fault="gyro is in deg/s"))
+    (event,) = events(actions, "blocked")
+    assert (event.t, event.text) == (fits(actions)[0].stop, "gyro is in deg/s")
+    assert [b.stop - a.stop for a, b in pairwise(fits(actions))] == [1.0] * (len(fits(actions)) - 1)
+    assert len(fits(actions)) > 1
+    assert (session.status().phase, session.status().fits) == (Phase.BLOCKED, before)
+    works(session, between(FLIGHT, 19.7, 24.0), tells())
+    assert session.status().fits > before
 
 
 def test_a_window_that_reveals_nothing_is_named_and_nothing_is_published() -> None:
