@@ -188,7 +188,8 @@ class Replayed(Outcome):
             told.append(f"{count} estimate{'s' * (count != 1)} not published: {check.replace('_', ' ')}")
         if result["published"]:
             last = result["published"][-1]
-            told.append(f"set {last['sequence']} of {result['vehicle']}, from {last['stop'] - last['start']:.0f} s")
+            about = f"from {last['stop'] - last['start']:.0f} s, reference: {last['reference']}"
+            told.append(f"set {last['sequence']} of {result['vehicle']}, {about}")
         else:
             told.append(f"nothing published: {result['status']['phase']}: {result['status']['reason']}")
         return [Cell(text) for text in told]

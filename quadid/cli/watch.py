@@ -121,7 +121,7 @@ def table(found: Mapping[str, Any]) -> Table:
         status = _mapping(health.get("status"))
         color = "green" if kinds["alive"] else "red"
         state = f"{_plain(status.get('phase', 'unknown'))}: {_plain(status.get('reason', ''))}"
-        notes = f"\nrests on {_plain(force['reference'])}" if force.get("reference") else ""
+        notes = f"\nreference: {_plain(force['reference'])}" if force.get("reference") else ""
         notes += f"\nout of date: {_plain(force['outdated'])}" if force.get("outdated") else ""
         diagnosis = kinds.get("diagnosis", {})
         lines = []

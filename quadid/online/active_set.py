@@ -106,10 +106,8 @@ class ActiveSet:
         if by != "auto":
             self._trusted, self.load = True, 1.0
         self.watched, self._watch_from, self.seen = 0.0, stop, stop
-        return [
-            Publish("parameters", accepted),
-            Event(t, "info", "accepted", f"set {accepted.sequence} in force: {accepted.reason}"),
-        ]
+        told = f"set {accepted.sequence} in force (reference: {accepted.reference}): {accepted.reason}"
+        return [Publish("parameters", accepted), Event(t, "info", "accepted", told)]
 
     def withdraw(self, why: str, code: str) -> list[Action]:
         """Marks the set in force as out of date; it stays what there is until the next one.

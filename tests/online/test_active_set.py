@@ -87,7 +87,7 @@ def test_every_answer_says_what_was_done_and_every_change_is_an_event() -> None:
     assert (first.reason, first.approved_by, ledger.seen) == ("approved by ann: 3 windows agree", "ann", 30.0)
     assert told.done is True
     assert told.text == f"set {waits.sequence} approved, in force as set 2"
-    event = Event(31.0, "info", "accepted", f"set 2 in force: {first.reason}")
+    event = Event(31.0, "info", "accepted", f"set 2 in force (reference: none): {first.reason}")
     assert told.actions == (Publish("parameters", first), event)
     ledger.accept(online_set({**TRUE, "b": 2.4e-5}), "auto", 60.0, 60.0)
     back = ledger.roll_back(61.0, "bob")
