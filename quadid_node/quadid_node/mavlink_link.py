@@ -24,6 +24,7 @@ from quadid_replay.motors import (
 from quadid.condition.watch import HealthReport
 from quadid.data.window import Block
 from quadid.online.records import OnlineSet
+from quadid.online.stream import CONFIRMATIONS
 from quadid_node.inputs import SourceSelector
 from quadid_node.mavlink_wire import LinkError, VehicleSender, Wire, dialect, is_autopilot, message_id, sender
 from quadid_node.messages import Output, ServiceHealth
@@ -131,7 +132,7 @@ class MotorOrder:
 
 
 REBOOT = 1.0
-"""The vehicle's clock this far back [s] is one that began anew."""
+"""The vehicle's clock this far back [s] is one that began anew, once further stamps of the gyro agree."""
 MOTOR_PREFERENCE = {
     "rotor_speed": ("ESC_STATUS", "ESC_TELEMETRY"),
     "motor_command": ("ACTUATOR_OUTPUT_STATUS", "SERVO_OUTPUT_RAW"),
@@ -167,7 +168,7 @@ class MavlinkDecoder:
         self.order = MotorOrder(rotors)
         self._chooser = SourceSelector({channel: 0 for channel, _ in RANKS})
         self._boot_clock: BootClock[list[Reading]] = BootClock()
-        self._wall, self._epoch, self._newest = wall, 0.0, math.inf
+        self._wall, self._epoch, self._newest, self._back = wall, math.nan, -math.inf, 0
         self._rounds: dict[str, _Round] = {}
 
     def blocks(self, message: Any, received: float, earliest: float | None = None) -> Iterator[Block]:
@@ -193,12 +194,20 @@ class MavlinkDecoder:
         placed = clock.unstamped(readings, came) if boot is None else clock.stamped(readings, boot, received)
         for waited, t in placed:
             if t is not None:
+                self._set_clock(t, any(reading.signal == "gyro" for reading in waited))
                 for reading in waited:
-                    # UNIX time: the vehicle's clock is set by ours when it is first heard and when it reboots.
-                    if t < self._newest - REBOOT:
-                        self._epoch, self._newest = self._wall() - t, t
-                    self._newest = max(self._newest, t)
                     yield from self._channel(t + self._epoch, reading, received)
+
+    def _set_clock(self, t: float, leads: bool) -> None:
+        """UNIX time: the vehicle's clock is set by ours when it is first heard and when the gyro shows a reboot."""
+        if leads:
+            self._back = self._back + 1 if t < self._newest - REBOOT else 0
+            self._newest = max(self._newest, t)
+        anew = self._back > CONFIRMATIONS
+        if anew:
+            self._newest, self._back = t, 0
+        if math.isnan(self._epoch) or (anew and abs(t + self._epoch - self._wall()) > REBOOT):
+            self._epoch = self._wall() - t
 
     def _channel(self, t: float, reading: Reading, received: float) -> Iterator[Block]:
         source = reading.source.split(" ")[0]

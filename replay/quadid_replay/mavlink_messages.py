@@ -335,6 +335,8 @@ class BootClock(Generic[T]):
         """Time of the newest stamped message [s]."""
         self._newest_received = 0.0
         """When the last message of that moment came [s]."""
+        self._strange = math.nan
+        """Time of the last stamped message, where its clock seems to be another."""
         self._waiting: list[tuple[T, float]] = []
 
     def stamped(self, item: T, time: float, received: float) -> list[Placed[T]]:
@@ -345,10 +347,17 @@ class BootClock(Generic[T]):
             time: its stamp [s], unwrapped.
             received: when it came at the latest [s], on any clock.
         """
-        if self.newest is not None and self.newest - FARTHEST <= time <= self.newest:
-            if time >= self.newest - MOMENT:
-                self._newest_received = received
-            return [(item, time)]
+        if self.newest is not None:
+            step, passed, before = time - self.newest, received - self._newest_received, self._strange
+            self._strange = math.nan
+            if -FARTHEST <= step <= 0.0:
+                if step >= -MOMENT:
+                    self._newest_received = received
+                return [(item, time)]
+            # A clock of one message is no clock of others; two messages in a row may be a reboot.
+            if not (0.0 < step <= FARTHEST or abs(step - passed) <= FARTHEST or abs(time - before) <= FARTHEST):
+                self._strange = time
+                return [(item, time)]
         placed = self._release(time) if self._waiting else []
         self.newest, self._newest_received = time, received
         return [*placed, (item, time)]

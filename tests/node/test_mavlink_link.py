@@ -5,7 +5,8 @@ from __future__ import annotations
 import os
 import random
 import time
-from collections.abc import Iterator
+from collections import defaultdict
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -550,6 +551,56 @@ def test_servo_outputs_follow_the_autopilots_motor_functions_and_unwrap() -> Non
     motors = [s for s in out if s.channel == "motor_command"]
     assert motors[0].values == (1400.0, 1300.0, 1200.0, 1100.0)
     assert motors[0].t == pytest.approx(boot + 0.005)
+
+
+ROUND_OF: tuple[Callable[[int], Any], ...] = (
+    lambda us: dialect.MAVLink_highres_imu_message(us, 0, 0, -9.8, 0, 0, 0, *[0.0] * 7, 0x3F),
+    lambda us: dialect.MAVLink_attitude_quaternion_message(us // 1000, 1, 0, 0, 0, 0, 0, 0),
+    lambda us: dialect.MAVLink_attitude_target_message(us // 1000, 0, [1, 0, 0, 0], 0, 0, 0, 0.5),
+)
+"""Stamped messages of a moment, the gyro first; rotor speeds without stamp follow."""
+
+
+@pytest.mark.parametrize("place", range(len(ROUND_OF)))
+@pytest.mark.parametrize(("ahead", "every"), [(2.0, 1), (20.0, 1), (-20.0, 1), (29.0, 100), (-29.0, 100), (1e6, 100)])
+def test_stamps_of_one_message_cost_those_of_others_nothing(
+    place: int, ahead: float, every: int, happened: Happened
+) -> None:
+    """All others' had come as late as they were read, and rotor speeds were lost, each with its round."""
+    if place == 0 and every == 1:
+        return  # the gyro leads the clock: the others are apart from it
+    now, rng, off = 0.0, np.random.default_rng(1), defaultdict(list)
+    decoder = MavlinkDecoder(4, wall=lambda: 1e9 + now)
+    escs = dialect.MAVLink_esc_telemetry_1_to_4_message([30] * 4, [1000] * 4, [0] * 4, [100] * 4, [5000] * 4, [1] * 4)
+    for k in range(1000):
+        t = 100.0 + 0.02 * k
+        now = t + rng.uniform(0.0, 0.03)
+        stamps = np.full(len(ROUND_OF), t)
+        stamps[place] += ahead if k % every == every // 2 else 0.0
+        messages = [*(made(int(max(s, 0.0) * 1e6)) for made, s in zip(ROUND_OF, stamps, strict=True)), escs]
+        for sample in flat(block for m in messages for block in decoder.blocks(decoded(m), now)):
+            if k >= 150:  # which source is best is known by then
+                off[sample.channel].append(sample.t - t - 1e9)
+    usual = np.median(off["gyro"])
+    apart = {name: sum(abs(x - usual) > 0.04 for x in values) for name, values in off.items()}
+    lost = {0: {"gyro", "accel"}, 1: {"attitude"}, 2: {"attitude_reference"}}[place]
+    assert len(off["rotor_speed"]) == 850
+    assert {name for name, count in apart.items() if count} == lost
+    assert max(apart.values()) <= 1000 // every
+    assert np.ptp([x for x in off["gyro"] if abs(x - usual) < 1.0]) < 1e-5
+    happened(
+        42, f"MAVLink, message {place + 1} of a round {ahead:+g} s: {max(apart.values())} of its own lost, no other"
+    )
+
+
+def test_a_reboot_sets_the_clock_anew() -> None:
+    wall, off = 1e9, []
+    decoder = MavlinkDecoder(4, wall=lambda: wall)
+    for k in range(200):
+        wall = 1e9 + 0.02 * k + (10.0 if k >= 100 else 0.0)
+        imu = ROUND_OF[0](int(1e6 * (100.0 + 0.02 * k if k < 100 else 1.0 + 0.02 * (k - 100))))
+        off += [s.t - wall for s in flat(decoder.blocks(imu, wall)) if s.channel == "gyro"]
+    np.testing.assert_allclose(np.delete(off, slice(100, 103)), 0.0, atol=1e-5)
 
 
 def test_a_motor_beyond_the_outputs_that_come_is_said_and_ends_nothing(
