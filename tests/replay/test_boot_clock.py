@@ -54,15 +54,29 @@ def test_without_a_stamp_near_there_is_no_time() -> None:
     assert clock.finish() == [("near", 5.5), ("far", None)]
 
 
-def test_a_reboot_starts_anew() -> None:
+def test_a_reboot_starts_anew_once_two_stamps_agree() -> None:
     clock: BootClock[str] = BootClock()
     clock.stamped("old", 100.0, 0.0)
     clock.unstamped("last", 0.01)
-    assert clock.stamped("new", 2.0, 20.0) == [("last", 100.01), ("new", 2.0)]
-    clock.unstamped("next", 20.01)
-    item, time = clock.stamped("after", 2.02, 20.02)[0]
+    assert clock.stamped("new", 2.0, 20.0) == [("new", 2.0)]
+    clock.unstamped("between", 20.01)
+    assert clock.stamped("newer", 2.02, 20.02) == [("last", 100.01), ("between", None), ("newer", 2.02)]
+    clock.unstamped("next", 20.03)
+    item, time = clock.stamped("after", 2.04, 20.04)[0]
     assert item == "next"
-    assert time == pytest.approx(2.01)
+    assert time == pytest.approx(2.03)
+
+
+def test_a_pause_is_believed_at_once_and_one_stamp_of_another_clock_never() -> None:
+    clock: BootClock[str] = BootClock()
+    clock.stamped("before", 100.0, 0.0)
+    clock.stamped("behind a pause", 107.0, 7.1)
+    for k in range(5):
+        clock.stamped("of another clock", 127.0 + 0.1 * k, 7.2 + 0.1 * k)
+        clock.unstamped("esc", 7.21 + 0.1 * k)
+        item, time = clock.stamped("of the clock", 107.15 + 0.1 * k, 7.25 + 0.1 * k)[0]
+        assert item == "esc"
+        assert time == pytest.approx(107.11 + 0.1 * k, abs=0.041)
 
 
 def test_an_older_stamp_between_is_disorder() -> None:
