@@ -11,16 +11,10 @@ import sys
 def main() -> int:
     """Runs the command; returns its exit code, 2 in such a folder."""
     try:
-        from quadid.cli.loading import Loading
-
-        loading = Loading()
         from quadid.cli.main import app_main
     except ImportError as error:
         if error.name != "quadid":
             raise
         print(f"quadid: {error}", file=sys.stderr)  # noqa: T201 - a command's last word
         return 2
-    try:
-        return app_main()
-    finally:
-        loading.end()
+    return app_main()

@@ -19,7 +19,6 @@ import numpy as np
 from quadid.errors import ParameterError, nearest
 from quadid.on_disk import kept
 from quadid.types import FloatArray
-from quadid.vehicle import Vehicle
 
 
 @kept(inline="always")
@@ -67,13 +66,6 @@ def pack_gains(gains: Mapping[str, float]) -> FloatArray:
     return np.array([float(gains[name]) for name in GAIN_NAMES])
 
 
-def mixer_matrix(vehicle: Vehicle, gains: Mapping[str, float]) -> FloatArray:
-    """Pseudo-inverse of the geometry: (thrust [N], roll, pitch, yaw torque [N m]) to omega^2, shape (rotors, 4)."""
-    b, d = gains["thrust_coefficient"], gains["drag_coefficient"]
-    effect = np.vstack([np.ones(len(vehicle.rotors)), vehicle.torque_arms.T]) * [[b], [b], [b], [d]]
-    return np.ascontiguousarray(np.linalg.pinv(effect))
-
-
 @kept()
 def rotation_of(roll: float, pitch: float, yaw: float, out: FloatArray) -> None:
     """Writes the rotation matrix (body to world, 3-2-1 Euler angles [rad]) into `out`, shape (3, 3)."""
@@ -102,7 +94,7 @@ def steer(
 
     Args:
         gains: `pack_gains`.
-        mixer: `mixer_matrix`.
+        mixer: `quadid.vehicle.mixer_matrix`.
         wanted: rotation matrix, body to world, shape (3, 3).
         throttle: 0..1 (fraction of the thrust at `max_speed`).
         attitude: measured rotation matrix, body to world, shape (3, 3).
@@ -150,7 +142,7 @@ def stabilise(
 
     Args:
         gains: `pack_gains`.
-        mixer: `mixer_matrix`.
+        mixer: `quadid.vehicle.mixer_matrix`.
         reference: roll, pitch, yaw [rad], throttle 0..1 (fraction of the thrust at `max_speed`).
         attitude: measured rotation matrix, body to world, shape (3, 3).
         rate: measured body rates [rad/s].
@@ -178,7 +170,7 @@ def stabilise_rows(
 
     Args:
         gains: `pack_gains`.
-        mixer: `mixer_matrix`.
+        mixer: `quadid.vehicle.mixer_matrix`.
         reference: roll, pitch, yaw [rad], throttle 0..1, shape (n, 4).
         attitude: measured unit quaternions, body to world, scalar first, shape (n, 4).
         rate: measured body rates [rad/s], shape (n, 3).

@@ -6,9 +6,9 @@ Every error states what was found, what is allowed and what to do about it.  The
 
 from __future__ import annotations
 
-import difflib
 import re
 from collections.abc import Iterable
+from os.path import commonprefix
 
 from quadid.sanitise import one_line
 
@@ -64,18 +64,56 @@ FOREIGN_UNIT = re.compile(
 """Units in names of others that no name of ours has."""
 
 
-def nearest(name: str, valid: Iterable[str]) -> str:
-    """Returns ``did you mean 'x'?`` for the valid name closest to `name`, or the list of valid names.
+IN_MICROSECONDS = "range"
+"""The one name of ours whose numbers are in no SI unit: pulse widths."""
 
-    A name that carries a unit of its own, as ``max_rpm``, is told that ours are in SI units.
+
+def nearest(name: str, valid: Iterable[str]) -> str:
+    """Returns ``did you mean 'x'?`` for the valid names that can have been meant, or the list of all.
+
+    A name can mean another that is misspelt by a letter in a word, or has words more or fewer: nothing else is guessed.
+    One that carries a unit of its own, as ``max_rpm``, is told that ours are in SI units.
     """
     options = list(valid)
-    close = difflib.get_close_matches(name, options, n=1, cutoff=0.5)
-    if not close:
-        return _one_of(", ".join(options))
     unit = FOREIGN_UNIT.search(name)
-    in_si = f", in SI units, not {unit[0]}" if unit and not FOREIGN_UNIT.search(close[0]) else ""
-    return f"did you mean '{close[0]}'{in_si}?"
+    given = _words(name.replace(unit[0], "") if unit else name) or _words(name)
+    alike = [o for o in options if _misspelt(given, _words(o))] or [o for o in options if _part(given, _words(o))]
+    if not 1 <= len(alike) <= 3:
+        return _one_of(", ".join(options))
+    foreign = unit and alike != [IN_MICROSECONDS] and not any(map(FOREIGN_UNIT.search, alike))
+    in_si = f", in SI units, not {unit[0]}" if unit and foreign else ""
+    return f"did you mean {' or '.join(map(repr, alike))}{in_si}?"
+
+
+def _words(name: str) -> list[str]:
+    return re.findall(r"[^\W_]+", name.lower())
+
+
+def _misspelt(given: list[str], meant: list[str]) -> bool:
+    if len(given) != len(meant):
+        given, meant = ["".join(given)], ["".join(meant)]
+    return all(map(_slip, given, meant))
+
+
+def _part(given: list[str], meant: list[str]) -> bool:
+    if "sigma" in {*meant} - {*given}:  # no quantity is its uncertainty
+        return False
+    return any(all(any(_stem(w, o) for o in b) for w in a) for a, b in ((given, meant), (meant, given)) if a)
+
+
+def _stem(a: str, b: str) -> bool:
+    """Checks whether two words are one, or one is short for the other."""
+    return a == b or len(commonprefix((a, b))) >= max(4, min(len(a), len(b), 6))
+
+
+def _slip(a: str, b: str) -> bool:
+    """Checks whether two words differ by at most one letter, two that are exchanged, or letters that are doubled."""
+    if len({re.sub(r"(.)\1+", r"\1", word) for word in (a, b)}) == 1:
+        return True
+    start = len(commonprefix((a, b)))
+    end = len(commonprefix((a[start:][::-1], b[start:][::-1])))
+    c, d = a[start : len(a) - end], b[start : len(b) - end]
+    return max(len(a), len(b)) >= 3 and (max(len(c), len(d)) <= 1 or (len(c) == 2 and c == d[::-1]))
 
 
 def _one_of(options: str) -> str:

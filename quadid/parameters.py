@@ -25,6 +25,8 @@ class Status(StrEnum):
 
 UNKNOWN = frozenset({Status.PRIOR_DOMINATED, Status.UNRELIABLE})
 """Statuses of numbers that are not to be used as measured."""
+PRIOR_SHARE = 0.5
+"""A parameter whose posterior is wider than this share of its prior is prior-dominated."""
 AT_BOUND = 1e-3
 """Distance from a bound, relative to it, within which a value rests on it: what stands there is the bound, not data."""
 

@@ -777,6 +777,13 @@ def to_fill_in(text: str) -> list[str]:
     return [line.split(":")[0].strip(" -#") for line in text.splitlines() if _FILL_IN in line]
 
 
+def mixer_matrix(vehicle: Vehicle, gains: Mapping[str, float]) -> FloatArray:
+    """Pseudo-inverse of the geometry: (thrust [N], roll, pitch, yaw torque [N m]) to omega^2, shape (rotors, 4)."""
+    b, d = gains["thrust_coefficient"], gains["drag_coefficient"]
+    effect = np.vstack([np.ones(len(vehicle.rotors)), vehicle.torque_arms.T]) * [[b], [b], [b], [d]]
+    return np.ascontiguousarray(np.linalg.pinv(effect))
+
+
 def _first_problem(error: ValidationError) -> tuple[str, str]:
     """First problem of a file, and what to do about it."""
     details = error.errors()

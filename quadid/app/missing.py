@@ -11,10 +11,9 @@ import numpy as np
 
 from quadid.app.logs import Log, free_name, written_whole
 from quadid.app.over_time import OverTime
-from quadid.data.window import Channel, Recording, Window, beginning
+from quadid.data.window import CHANNEL_NAMES, Channel, Recording, Window, beginning
 from quadid.errors import ParameterError
 from quadid.model.layout import Layout
-from quadid.model.rollout import CHANNEL_NAMES
 from quadid.report.verdict import percent
 from quadid.types import FloatArray, JsonDict
 from quadid.vehicle import RandomForces, ResidualTerm, Vehicle

@@ -23,10 +23,9 @@ from quadid.app.logs import LONGEST, Log, free_name, write_text, written_whole
 from quadid.app.missing import Beside, MissingForces
 from quadid.app.over_time import OverTime, imported
 from quadid.chi_square import Z95
-from quadid.data.window import Channel, Recording, beginning, sample_period
+from quadid.data.window import CHANNEL_NAMES, Channel, Recording, beginning, sample_period
 from quadid.errors import LogError, NotIdentifiableError
 from quadid.jsonable import jsonable
-from quadid.model.rollout import CHANNEL_NAMES
 from quadid.report.page import measures, number, part, quiet, render
 from quadid.report.tables import Cell, TextTable
 from quadid.report.verdict import Verdict

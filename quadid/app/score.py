@@ -16,7 +16,6 @@ from quadid.app.options import Horizons, Logs, OfVehicle, OwnRate
 from quadid.app.outcome import LIBRARY, Reported, provenance
 from quadid.data.window import Window, beginning, sample_period
 from quadid.errors import NotIdentifiableError, ParameterError
-from quadid.identification.predict import SHARE
 from quadid.model.layout import Layout
 from quadid.report.page import band, figure, section, stacked, trace
 from quadid.report.tables import Cell, Column, TextTable, number
@@ -80,6 +79,8 @@ class Scored(Reported):
 
     def page(self, command: str = LIBRARY) -> str:
         """One page: errors over the horizon beside sensor noise and beside predicting no change, and the bands."""
+        from quadid.identification.predict import SHARE
+
         result, (errors, inside) = self.result, self.tables()
         steps = [int(h) for h in result["horizons"]]
         units = result["units"]

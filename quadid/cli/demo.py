@@ -15,7 +15,6 @@ from quadid.app.logs import Log, check_folder, load, write_recording, write_text
 from quadid.app.options import JsonTarget, OutFolder, Seed
 from quadid.app.outcome import Advance, provenance, quality, told
 from quadid.cli import terminal
-from quadid.flight import TruthParameters, fly
 from quadid.report.fit_pages import diagnosis_part, findings_section, identify_page
 from quadid.report.page import render
 from quadid.report.verdict import effects_words
@@ -88,6 +87,8 @@ def run(seconds: float, seed: int, folder: Path, advance: Advance) -> Shown:
     Args:
         seconds: length of each of the three flights.
     """
+    from quadid.flight import TruthParameters
+
     vehicle = Vehicle.named(VEHICLE)
     truth = TruthParameters.of(vehicle).as_dict()
     flights = [
@@ -116,6 +117,8 @@ def fly_and_load(
     advance: Advance,
 ) -> Log:  # fmt: skip
     """Flies once, writes the log as MCAP, and reads it back as any other log."""
+    from quadid.flight import fly
+
     advance(f"fly {path.stem}", 0.0)
     flight = fly(vehicle, seconds=seconds, seed=seed, effects=effects)
     write_recording(path, flight.recording)

@@ -22,7 +22,7 @@ class Loading:
 
     def _count(self) -> None:
         begin = time.monotonic()
-        while not self._ended.wait(0.5):  # nothing is said where half a second is enough
+        while not self._ended.wait(0.25):  # nothing is said where that is enough
             print(f"\rquadid: loading, {time.monotonic() - begin:.0f} s", end="", file=self._terminal, flush=True)
 
     def end(self) -> None:

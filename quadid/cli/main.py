@@ -5,6 +5,8 @@ What the commands are: `quadid.cli.commands`.
 
 from __future__ import annotations
 
+import atexit
+import gc
 import importlib
 import os
 import sys
@@ -15,6 +17,12 @@ from typer.core import TyperCommand, TyperGroup
 from typer.main import get_command
 
 from quadid.cli.commands import COMMANDS, load
+from quadid.cli.loading import Loading
+from quadid.errors import QuadidError, nearest
+
+
+class UnknownCommandError(QuadidError):
+    """A command that is not in the table."""
 
 
 class LazyGroup(TyperGroup):
@@ -29,6 +37,8 @@ class LazyGroup(TyperGroup):
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         """Finds the command asked for, imported and complete."""
+        if args[0] not in self.commands and not args[0].startswith("-"):
+            raise UnknownCommandError(f"No such command '{args[0]}'", fix=nearest(args[0], self.commands))
         name, command, rest = super().resolve_command(ctx, args)
         return name, None if command is None else load(str(command.name)), rest
 
@@ -74,6 +84,8 @@ def app_main() -> int:
         return 2
     for name in BLAS_THREADS:
         os.environ.setdefault(name, "1")
+    atexit.register(gc.freeze)  # the end would look through all that numba and its compiler made, for seconds
+    loading = Loading()
     try:
         result = get_command(app).main(sys.argv[1:] or ["--help"], prog_name="quadid", standalone_mode=False)
         sys.stdout.flush()
@@ -92,4 +104,6 @@ def app_main() -> int:
             raise
         print(f"quadid: {reason.line}", file=sys.stderr)
         return reason.exit_code
+    finally:
+        loading.end()
     return result if isinstance(result, int) else 0

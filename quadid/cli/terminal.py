@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from quadid.app.kernels import prepare
 from quadid.app.logs import OutputError, check_place, write_text
 from quadid.app.outcome import Advance, Outcome, json_text, silent
-from quadid.errors import QuadidError
+from quadid.errors import QuadidError, nearest
 from quadid.report.tables import SPACE, Cell, TextTable
 from quadid.report.verdict import Verdict
 from quadid.sanitise import one_line, plain
@@ -196,7 +196,7 @@ def conclude(done: Outcome, json: str | None, folder: Path | None = None, kept: 
 # --- Errors as one line for people: what was found, what is allowed, what to do
 
 
-_MISSING = "MissingParameter"
+_NO_OPTION, _MISSING = "NoSuchOption", "MissingParameter"
 """An error of usage for what was not given, with what it may be as its help."""
 
 
@@ -228,5 +228,9 @@ def explain(error: Exception) -> Failure | None:
         path = context.command_path if context is not None else "quadid"
         wanted = getattr(getattr(error, "param", None), "help", None) if type(error).__name__ == _MISSING else None
         allowed = f"; allowed: {wanted[0].lower()}{wanted[1:].rstrip('.')}" if wanted else ""
-        return Failure(one_line(f"{str(told()).rstrip('.')}{allowed}; see `{path} --help`"), 2)
+        text = str(told()).rstrip(".")
+        if type(error).__name__ == _NO_OPTION and context is not None:  # what it is like, is decided in one place
+            options = [n for p in context.command.params for n in p.opts if n.startswith("--")]
+            text, allowed = error.message, f"; fix: {nearest(error.option_name, options)}"
+        return Failure(one_line(f"{text}{allowed}; see `{path} --help`"), 2)
     return None

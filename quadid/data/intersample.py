@@ -25,12 +25,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from quadid.attitude_controller import mixer_matrix
 from quadid.chi_square import exceeded
 from quadid.data.window import Window
 from quadid.rotation import euler
 from quadid.types import ComplexArray, FloatArray
-from quadid.vehicle import Vehicle
+from quadid.vehicle import Vehicle, mixer_matrix
 
 STRETCH_SECONDS = 10.0
 """Stretches compared by themselves [s], each half over the one before."""

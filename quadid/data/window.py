@@ -40,6 +40,9 @@ CHANNELS: dict[str, tuple[int | None, str]] = {
 ``accel`` is specific force (-g on z at rest); ``accel_z`` its z alone, ``accel_world`` the same in world axes, from
 logs that hold no more.
 """
+CHANNEL_NAMES = ("p", "q", "r", "phi", "theta", "psi", "a_x", "a_y", "a_z", "v_n", "v_e", "v_d", "x", "y", "z")
+"""Residual channels: rates, attitude error as a body rotation vector, specific force, velocity, position."""
+CHANNEL_UNITS = ("rad/s",) * 3 + ("rad",) * 3 + ("m/s^2",) * 3 + ("m/s",) * 3 + ("m",) * 3
 COINCIDENT = 5e-3
 """Samples this close to a uniform grid, in steps, lie on it."""
 _MEASURED = ("gyro", "attitude", "accel", "velocity", "position", "battery", "attitude_reference")

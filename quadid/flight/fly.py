@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from quadid.attitude_controller import mixer_matrix, pack_gains
+from quadid.attitude_controller import pack_gains
 from quadid.data.window import Channel, Recording, Window
 from quadid.errors import ParameterError, QuadidError
 from quadid.flight import sensors
@@ -20,7 +20,7 @@ from quadid.flight.sensors import SensorNoise, coloured
 from quadid.flight.setup import Effects, Setup, TruthParameters, prepare
 from quadid.rotation import continuous_sign, exponential, product
 from quadid.types import FloatArray
-from quadid.vehicle import RandomForces, Vehicle
+from quadid.vehicle import RandomForces, Vehicle, mixer_matrix
 
 FULL_BATTERY = 12.4
 """Voltage at the first sample [V]; thrust goes with its square."""

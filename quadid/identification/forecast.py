@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from quadid.attitude_controller import mixer_matrix, pack_gains, stabilise_rows
+from quadid.attitude_controller import pack_gains, stabilise_rows
 from quadid.chi_square import Z95
 from quadid.data.window import Window
 from quadid.errors import NotIdentifiableError
@@ -27,7 +27,7 @@ from quadid.model.layout import Layout
 from quadid.model.step import Simulator
 from quadid.rotation import exponential, product, turn
 from quadid.types import FloatArray, IndexArray
-from quadid.vehicle import RandomForces, RandomInput, ResidualTerm, Vehicle
+from quadid.vehicle import RandomForces, RandomInput, ResidualTerm, Vehicle, mixer_matrix
 
 BANDS: Mapping[str, float] = {"50": 0.67449, "80": 1.28155, "95": Z95}
 """Half-widths of the bands in standard deviations, by per cent."""

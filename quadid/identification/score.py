@@ -11,12 +11,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from quadid.data.window import Window
+from quadid.data.window import CHANNEL_NAMES, CHANNEL_UNITS, Window
 from quadid.errors import NotIdentifiableError
 from quadid.identification.initial_states import InitialStates
 from quadid.identification.noise import NoiseModel
 from quadid.identification.problem import Linearised, Shooting
-from quadid.model.rollout import CHANNEL_NAMES, CHANNEL_UNITS
 from quadid.rotation import euler, product
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle

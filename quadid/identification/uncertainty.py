@@ -11,7 +11,16 @@ import numpy as np
 from quadid.chi_square import Z95
 from quadid.identification.elimination import eliminated
 from quadid.identification.problem import Free, Linearised, Prior, posterior_covariance
-from quadid.parameters import MAY_VANISH, NOMINAL_NAMES, Parameter, ParameterSet, Status, at_bound, unreliable
+from quadid.parameters import (
+    MAY_VANISH,
+    NOMINAL_NAMES,
+    PRIOR_SHARE,
+    Parameter,
+    ParameterSet,
+    Status,
+    at_bound,
+    unreliable,
+)
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 
@@ -27,8 +36,6 @@ KNOWN = 0.03
 RATIO_SIGMA = 0.05
 RATIO_GAIN = 0.25
 """A ratio is known when its standard deviation is below RATIO_SIGMA and below RATIO_GAIN of the parameter's own."""
-PRIOR_SHARE = 0.5
-"""A parameter whose posterior is wider than this share of its prior is prior-dominated."""
 SPREAD_LIMIT = 0.1
 """Spread of estimates of one parameter (log scale) beyond which none of them is to be used."""
 

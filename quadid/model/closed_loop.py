@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numba as nb
 import numpy as np
 
-from quadid.attitude_controller import mixer_matrix, pack_gains, rotation_of, steer, write_rotation
+from quadid.attitude_controller import pack_gains, rotation_of, steer, write_rotation
 from quadid.data.window import Window
 from quadid.errors import ParameterError, WindowError
 from quadid.model import layout as ix
@@ -25,7 +25,7 @@ from quadid.model.sensor_kernel import distort_imu, sensor_constants, step_tilt_
 from quadid.model.simd import LANES, aligned, cache_aligned, cached, jit
 from quadid.rotation import down
 from quadid.types import FloatArray, IntArray, check_shapes
-from quadid.vehicle import GRAVITY, Vehicle
+from quadid.vehicle import GRAVITY, Vehicle, mixer_matrix
 
 # isort: off
 from quadid.model.work_array import (

@@ -39,12 +39,7 @@ from quadid.model.work_array import ALL_MOMENTS, MAX_TANGENTS, N_STATE
 from quadid.types import BoolArray, FloatArray, IndexArray, IntArray, check_shapes
 from quadid.vehicle import Vehicle
 
-# --- Residual channels: their order, and what a window measured of each
-
-
-CHANNEL_NAMES = ("p", "q", "r", "phi", "theta", "psi", "a_x", "a_y", "a_z", "v_n", "v_e", "v_d", "x", "y", "z")
-"""Residual channels: rates, attitude error as a body rotation vector, specific force, velocity, position."""
-CHANNEL_UNITS = ("rad/s",) * 3 + ("rad",) * 3 + ("m/s^2",) * 3 + ("m/s",) * 3 + ("m",) * 3
+# --- Residual channels: what a window measured of each
 
 
 def channels_of(window: Window) -> int:

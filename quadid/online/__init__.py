@@ -21,16 +21,45 @@ What stands between samples and the parameter topic, in this order; each says wh
 `session` calls them in turn; `changes` looks for sudden changes beside them, and `change_job` names their cause.
 """
 
-from quadid.online.fit_job import FitReply as FitReply
-from quadid.online.fit_job import FitRequest as FitRequest
-from quadid.online.gate import GateSettings as GateSettings
-from quadid.online.records import Event as Event
-from quadid.online.records import Job as Job
-from quadid.online.records import JobReply as JobReply
-from quadid.online.records import OnlineDiagnosis as OnlineDiagnosis
-from quadid.online.records import OnlineSet as OnlineSet
-from quadid.online.records import Phase as Phase
-from quadid.online.records import Publish as Publish
-from quadid.online.records import SetState as SetState
-from quadid.online.session import Session as Session
-from quadid.online.session import SessionSettings as SessionSettings
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from quadid.online.fit_job import FitReply as FitReply
+    from quadid.online.fit_job import FitRequest as FitRequest
+    from quadid.online.gate import GateSettings as GateSettings
+    from quadid.online.records import Event as Event
+    from quadid.online.records import Job as Job
+    from quadid.online.records import JobReply as JobReply
+    from quadid.online.records import OnlineDiagnosis as OnlineDiagnosis
+    from quadid.online.records import OnlineSet as OnlineSet
+    from quadid.online.records import Phase as Phase
+    from quadid.online.records import Publish as Publish
+    from quadid.online.records import SetState as SetState
+    from quadid.online.session import Session as Session
+    from quadid.online.session import SessionSettings as SessionSettings
+
+_PUBLIC = {
+    "FitReply": "fit_job",
+    "FitRequest": "fit_job",
+    "GateSettings": "gate",
+    "Event": "records",
+    "Job": "records",
+    "JobReply": "records",
+    "OnlineDiagnosis": "records",
+    "OnlineSet": "records",
+    "Phase": "records",
+    "Publish": "records",
+    "SetState": "records",
+    "Session": "session",
+    "SessionSettings": "session",
+}
+"""Public names and their modules: whoever reads a history or a message needs no fit."""
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _PUBLIC:
+        raise AttributeError(f"module 'quadid.online' has no attribute '{name}'")
+    return getattr(import_module(f"quadid.online.{_PUBLIC[name]}"), name)

@@ -51,8 +51,6 @@ EXCITED_SECONDS = 1.66
 """Length of the runs from which that is computed [s]."""
 TURNS = 1
 """Steps in which the noise numbers follow those of a window: what is pooled settles."""
-ROOM = 16.0
-"""A number that somebody stored may be off a bare guess by this factor each way."""
 BEYOND = 2.0
 """An estimate may lie so far outside the bounds, log scale: the step from where it was linearised."""
 NUDGE = 1e-3
@@ -259,16 +257,6 @@ def thrust_names(vehicle: Vehicle) -> tuple[str, ...]:
 def names_of(vehicle: Vehicle) -> tuple[str, ...]:
     """Names of all scaled parameters, shape (P,)."""
     return (*own_names(vehicle), *thrust_names(vehicle))
-
-
-def with_room(vehicle: Vehicle) -> Vehicle:
-    """The vehicle with wide bounds about its bare guesses, as sure of these as before; bounds that it gives stay."""
-    parameters = {}
-    for name, given in vehicle.parameters.items():
-        bounds = given.bounds or (given.initial / ROOM, given.initial * ROOM)
-        sigma = given.sigma or (None if given.bounds else given.log_sigma * given.initial)
-        parameters[name] = given.model_copy(update={"bounds": bounds, "sigma": sigma})
-    return vehicle.model_copy(update={"parameters": parameters})
 
 
 def prior_of(vehicle: Vehicle) -> Prior:

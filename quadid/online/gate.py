@@ -12,11 +12,11 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from quadid.checks.turns import Factor
 from quadid.chi_square import Z95
-from quadid.identification.uncertainty import PRIOR_SHARE
 from quadid.online.records import WAITS, OnlineSet, SetState
 from quadid.parameters import (
     MAY_VANISH,
     NOMINAL_NAMES,
+    PRIOR_SHARE,
     TANGENT,
     UNKNOWN,
     ParameterSet,
@@ -25,11 +25,24 @@ from quadid.parameters import (
     impossible_inertia,
 )
 from quadid.types import FloatArray
+from quadid.vehicle import Vehicle
 
+ROOM = 16.0
+"""A number that somebody stored may be off a bare guess by this factor each way."""
 LIMITED = (*NOMINAL_NAMES, TANGENT)
 """Parameters that may not jump from one set to the next; effects may."""
 MUST_BE_KNOWN = ("b", "J_xx", "J_yy")
 """Without these no set is published; yaw parameters may stay at the vehicle file's values, and say so."""
+
+
+def with_room(vehicle: Vehicle) -> Vehicle:
+    """The vehicle with wide bounds about its bare guesses, as sure of these as before; bounds that it gives stay."""
+    parameters = {}
+    for name, given in vehicle.parameters.items():
+        bounds = given.bounds or (given.initial / ROOM, given.initial * ROOM)
+        sigma = given.sigma or (None if given.bounds else given.log_sigma * given.initial)
+        parameters[name] = given.model_copy(update={"bounds": bounds, "sigma": sigma})
+    return vehicle.model_copy(update={"parameters": parameters})
 
 
 class GateSettings(BaseModel):

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from quadid.attitude_controller import mixer_matrix, pack_gains, stabilise_rows
+from quadid.attitude_controller import pack_gains, stabilise_rows
 from quadid.data.grid import GAP, HALF_WIDTH, linear, lowpass, make_plan
 from quadid.data.rotor_signal import RotorSignal, rotor_channel, rotor_signal
 from quadid.data.window import CHANNELS, Block, Channel, Recording, in_body_axes
@@ -19,7 +19,7 @@ from quadid.errors import LogError, QuadidError
 from quadid.online.grid_buffer import Rows, columns_on_grid
 from quadid.rotation import continuous_sign
 from quadid.types import BoolArray, FloatArray
-from quadid.vehicle import GRAVITY, Vehicle
+from quadid.vehicle import GRAVITY, Vehicle, mixer_matrix
 
 # --- Time of a live stream: one rising session time, led by the stamps of the gyro, which every row of the grid needs
 #

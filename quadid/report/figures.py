@@ -10,11 +10,11 @@ import numpy as np
 from scipy.signal import welch
 
 from quadid.chi_square import Z95, exceeded
+from quadid.data.window import CHANNEL_NAMES, CHANNEL_UNITS
 from quadid.errors import ParameterError
 from quadid.estimate.missing import Missing
 from quadid.identification.result import ScoredSet
 from quadid.identification.score import SCORE_SECONDS, SetScore
-from quadid.model.rollout import CHANNEL_NAMES, CHANNEL_UNITS
 from quadid.report.page import axis, band, figure, listed, stacked, trace, upright
 from quadid.types import FloatArray, IndexArray, JsonDict
 

@@ -13,14 +13,13 @@ from scipy.signal import welch
 
 from quadid.checks.motion import Spans, flying_spans, within
 from quadid.data.rotor_signal import rotor_channel
-from quadid.data.window import CHANNELS, Channel, Recording, sample_period
+from quadid.data.window import CHANNEL_NAMES, CHANNEL_UNITS, CHANNELS, Channel, Recording, sample_period
 from quadid.effects import EFFECTS
 from quadid.estimate.missing import Missing
 from quadid.identification.excitation import Excitation
 from quadid.identification.noise import NoiseModel
 from quadid.identification.result import ScoredSet
 from quadid.identification.score import SCORE_SECONDS
-from quadid.model.rollout import CHANNEL_NAMES, CHANNEL_UNITS
 from quadid.parameters import ParameterSet
 from quadid.report.figures import (
     MODELS,

@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from markupsafe import Markup
-from scipy.spatial.transform import Rotation
 
 from quadid.chi_square import Z95
 from quadid.effects import EFFECTS, rotor_losses
@@ -444,6 +443,8 @@ def pegasus(facts: Facts) -> dict[str, Any]:
     Raises:
         ParameterError: not four rotors, which the program takes for granted.
     """
+    from scipy.spatial.transform import Rotation  # slow to load
+
     _four(facts, "Pegasus")
     links = gazebo(facts)
     moments, axes = np.linalg.eigh(links["body_inertia"])

@@ -14,13 +14,12 @@ from typing import Any, Literal
 import numpy as np
 
 from quadid.chi_square import Z95
-from quadid.data.window import Window, beginning
+from quadid.data.window import CHANNEL_NAMES, CHANNEL_UNITS, Window, beginning
 from quadid.effects import EFFECTS, NEVER
 from quadid.identification.noise import NoiseModel
 from quadid.identification.problem import Linearised, Shooting
 from quadid.identification.score import SCORE_SECONDS, covering, settle_states
 from quadid.model.layout import Layout
-from quadid.model.rollout import CHANNEL_NAMES, CHANNEL_UNITS
 from quadid.report.page import axis, figure, level, trace
 from quadid.rotation import conjugate, rotated
 from quadid.types import BoolArray, FloatArray, IndexArray

@@ -33,8 +33,7 @@ from quadid.condition.trim import FlightTrim, flight_from_dict, flight_to_dict
 from quadid.condition.watch import MOST_FLIGHTS
 from quadid.errors import QuadidError
 from quadid.files import check_beside
-from quadid.online.fit_job import ROOM, with_room
-from quadid.online.gate import LIMITED, GateSettings, implausible
+from quadid.online.gate import LIMITED, ROOM, GateSettings, implausible, with_room
 from quadid.online.records import Event, OnlineDiagnosis, OnlineSet, SetState
 from quadid.parameters import NOMINAL_NAMES, TANGENT, ParameterSet
 from quadid.sanitise import plain

@@ -138,7 +138,8 @@ def test_what_is_freed_fixed_and_stated_is_fitted_so_by_library_and_command(insi
 @pytest.mark.parametrize(
     ("stated", "found"),
     [
-        ({"fix": ["J_q"]}, "did you mean 'J_r'"),
+        ({"fix": ["J_z"]}, "did you mean 'J_zz'"),
+        ({"fix": ["J_q"]}, "allowed: b, d, J_xx"),
         ({"free": ["motor_lag.tau"]}, "the vehicle has no motor_lag"),
         ({"free": ["motor_lg.tau"]}, "did you mean 'motor_lag.tau'"),
         ({"bounds": {"b": (3e-5, 4e-5)}}, "outside bounds"),

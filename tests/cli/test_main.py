@@ -10,7 +10,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -37,10 +37,11 @@ from quadid.cli.loading import Loading
 from quadid.cli.main import BLAS_THREADS
 from quadid.cli.replay import Replayed
 from quadid.cli.terminal import check_file, conclude
-from quadid.errors import QuadidError
+from quadid.effects import EFFECTS
+from quadid.errors import QuadidError, nearest
 from quadid.parameters import NOMINAL_UNITS
 from quadid.report.tables import Column, TextTable
-from quadid.vehicle import Vehicle
+from quadid.vehicle import Command, Noise, Vehicle
 from quadid.version import __version__
 from tests.cli.conftest import Flights, table, write_table
 from tests.commands import QUADID, Cli, one_line
@@ -94,14 +95,29 @@ def test_a_terminal_sees_that_a_command_is_loaded_until_it_prints(
     assert out.getvalue() == "answer\n"
 
 
-def test_start_imports_nothing_heavy() -> None:
+@pytest.mark.parametrize(("command", "heavy"), [
+    ("--help", "numpy numba scipy pydantic rich plotly yaml"), ("--version", "numpy numba scipy pydantic rich"),
+    ("vehicles", "numba scipy plotly"), ("init mine", "numba scipy plotly"),
+    ("history --vehicle pelican", "numba plotly"), ("identify --help", "numba scipy plotly"),
+    ("score --help", "numba scipy plotly"), ("export --help", "numba scipy plotly"),
+])  # fmt: skip
+def test_what_works_without_a_fit_imports_nothing_heavy(tmp_path: Path, command: str, heavy: str) -> None:
     check = (
-        "import sys; sys.argv = ['quadid', '--help']; from quadid.cli.main import app_main; app_main(); "
-        "heavy = {'numpy', 'numba', 'scipy', 'pydantic', 'rich', 'plotly', 'yaml'} & set(sys.modules); "
-        "sys.exit(f'imported {heavy}' if heavy else 0)"
+        f"import sys; sys.argv = ['quadid', *{command.split()}]; from quadid.cli.main import app_main; app_main(); "
+        f"sys.exit(' '.join(set({heavy.split()}) & set(sys.modules)) or 0)"
     )
-    done = subprocess.run([sys.executable, "-c", check], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
+    done = subprocess.run([sys.executable, "-c", check], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, f"imported: {done.stderr}"
+
+
+def test_the_end_of_a_command_does_not_look_through_everything_once_more() -> None:
+    check = (
+        "import atexit, gc, sys; atexit.register(lambda: print(gc.get_freeze_count(), len(gc.get_objects()))); "
+        "sys.argv = ['quadid', '--version']; from quadid.cli.main import app_main; app_main()"
+    )
+    done = subprocess.run([sys.executable, "-c", check], capture_output=True, text=True, check=True)
+    frozen, left = map(int, done.stdout.split()[-2:])
+    assert frozen > 100 * left
 
 
 @pytest.mark.parametrize(("given", "used"), [({}, "1"), ({"OPENBLAS_NUM_THREADS": "2"}, "2")])
@@ -119,6 +135,38 @@ def test_linear_algebra_takes_one_thread_unless_told_otherwise(given: dict[str, 
 
 def test_version(inside: Cli) -> None:
     assert inside("--version").out == f"quadid {__version__}\n"
+
+
+@pytest.mark.parametrize(("slip", "names", "meant"), [
+    ("motor_lga", EFFECTS, "'motor_lag'?"), ("RotorDrag", EFFECTS, "'rotor_drag'?"),
+    ("weak_motor", EFFECTS, "'weak_rotor'?"),
+    ("bias", EFFECTS, "'gyro_bias' or 'accel_bias'?"), ("spin_up", EFFECTS, "'rotor_spin_up'?"),
+    ("J_z", NOMINAL_UNITS, "'J_zz'?"), ("thruststand", Vehicle.model_fields, "'thrust_stand'?"),
+    ("maxspeed", Command.model_fields, "'max_speed'?"),
+    ("max_rpm", Command.model_fields, "'max_speed', in SI units, not rpm?"),
+    ("range_us", Command.model_fields, "'range'?"), ("gyro_dps", Noise.model_fields, "'gyro', in SI units, not dps?"),
+    ("compare_vehicles", COMMANDS, "'compare-vehicles'?"),
+])  # fmt: skip
+def test_a_slip_is_told_what_was_meant(slip: str, names: Iterable[str], meant: str) -> None:
+    assert nearest(slip, names) == f"did you mean {meant}"
+
+
+@pytest.mark.parametrize(("other", "names"), [
+    ("min_speed", Command.model_fields), ("rate", Command.model_fields), ("accel_scale", EFFECTS),
+    ("mag_bias", EFFECTS), ("gyro_noise", EFFECTS), ("rotor_decay", EFFECTS), ("com", EFFECTS), ("arm", Vehicle.model_fields),
+    ("report", COMMANDS), ("plot", COMMANDS), ("estimate", COMMANDS), ("J_q", NOMINAL_UNITS),
+    ("roll_d", ("roll_p", "roll_i")),
+])  # fmt: skip
+def test_nothing_is_offered_that_means_something_else(other: str, names: Iterable[str]) -> None:
+    assert nearest(other, names) == f"use one of {', '.join(names)}"
+
+
+def test_an_option_that_a_command_lacks_is_not_taken_for_another(inside: Cli) -> None:
+    slip = one_line(inside("identify", "f.mcap", "--optimiser", "pso"), 2)
+    assert "No such option: --optimiser; fix: did you mean '--optimizer'?" in slip
+    assert "No such option: --report; fix: use one of --vehicle, --" in one_line(
+        inside("inspect", "f", "--report", "r.pdf"), 2
+    )
 
 
 def test_usage_errors_are_one_line(inside: Cli) -> None:

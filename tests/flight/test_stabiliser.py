@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from quadid.attitude_controller import GAIN_NAMES, mixer_matrix, pack_gains, stabilise_rows
+from quadid.attitude_controller import GAIN_NAMES, pack_gains, stabilise_rows
 from quadid.errors import ParameterError
 from quadid.flight import PROFILES, Flight, Segment, TruthParameters, default_gains, draw_truth, fly
 from quadid.flight.pilot import scripted, stick_profile
 from quadid.types import FloatArray
-from quadid.vehicle import Stabiliser, Vehicle
+from quadid.vehicle import Stabiliser, Vehicle, mixer_matrix
 
 # --- The stabiliser: its pure step replays the log, gains travel through the vehicle file, the mixer inverts geometry
 

@@ -19,7 +19,7 @@ from quadid_replay.columns import mode_changes
 from quadid_replay.dataflash import ARDUCOPTER
 
 from quadid.data.grid import to_windows
-from quadid.data.window import Channel
+from quadid.data.window import CHANNEL_NAMES, CHANNEL_UNITS, Channel
 from quadid.effects import EFFECTS, NEVER
 from quadid.estimate.missing import Missing
 from quadid.flight import fly
@@ -28,7 +28,6 @@ from quadid.identification.result import ScoredSet
 from quadid.identification.score import ChannelScore, Series, SetScore
 from quadid.jsonable import jsonable
 from quadid.model.layout import Layout
-from quadid.model.rollout import CHANNEL_NAMES, CHANNEL_UNITS
 from quadid.report.figures import (
     BUDGET,
     VISIBLE,
