@@ -229,8 +229,9 @@ def explain(error: Exception) -> Failure | None:
         wanted = getattr(getattr(error, "param", None), "help", None) if type(error).__name__ == _MISSING else None
         allowed = f"; allowed: {wanted[0].lower()}{wanted[1:].rstrip('.')}" if wanted else ""
         text = str(told()).rstrip(".")
-        if type(error).__name__ == _NO_OPTION and context is not None:  # what it is like, is decided in one place
+        slip = getattr(error, "option_name", "")
+        if type(error).__name__ == _NO_OPTION and context is not None:  # not what typer takes it for
             options = [n for p in context.command.params for n in p.opts if n.startswith("--")]
-            text, allowed = error.message, f"; fix: {nearest(error.option_name, options)}"
+            text, allowed = f"No such option: {slip}", f"; fix: {nearest(slip, options)}"
         return Failure(one_line(f"{text}{allowed}; see `{path} --help`"), 2)
     return None

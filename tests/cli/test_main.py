@@ -153,7 +153,8 @@ def test_a_slip_is_told_what_was_meant(slip: str, names: Iterable[str], meant: s
 
 @pytest.mark.parametrize(("other", "names"), [
     ("min_speed", Command.model_fields), ("rate", Command.model_fields), ("accel_scale", EFFECTS),
-    ("mag_bias", EFFECTS), ("gyro_noise", EFFECTS), ("rotor_decay", EFFECTS), ("com", EFFECTS), ("arm", Vehicle.model_fields),
+    ("mag_bias", EFFECTS), ("gyro_noise", EFFECTS), ("rotor_decay", EFFECTS), ("com", EFFECTS),
+    ("arm", Vehicle.model_fields),
     ("report", COMMANDS), ("plot", COMMANDS), ("estimate", COMMANDS), ("J_q", NOMINAL_UNITS),
     ("roll_d", ("roll_p", "roll_i")),
 ])  # fmt: skip
