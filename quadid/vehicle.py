@@ -469,6 +469,7 @@ class Vehicle(Strict):
     correlation: dict[str, dict[str, Correlation]] = Field(default_factory=dict)
     proof: Proof | None = None
     _remark: str = PrivateAttr("")
+    _file: str = PrivateAttr("")
 
     @field_validator("parameters", mode="before")
     @classmethod
@@ -745,7 +746,14 @@ class Vehicle(Strict):
                 f"`quadid init`, marked {_FILL_IN}", "measured values",
                 f"write your vehicle's and delete the words {_FILL_IN}",
             )  # fmt: skip
-        return cls.from_yaml(text, path.name)
+        out = cls.from_yaml(text, path.name)
+        out._file = name
+        return out
+
+    @property
+    def label(self) -> str:
+        """The file that it was read from, as it was named; without one, its own name."""
+        return self._file or self.name
 
     def to_yaml(self) -> str:
         """Writes the vehicle as YAML that `from_yaml` reads back."""

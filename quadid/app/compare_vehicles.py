@@ -189,8 +189,9 @@ def compare_vehicles(
         f"{label}: {log.name}: the vehicle file was fitted to this flight, so its errors are no proof"
         for label, (vehicle, logs) in zip("AB", both, strict=True) for log in logs if fitted_before(vehicle, log)
     ]  # fmt: skip
+    labels = [v.name for v in pair] if pair[0].name != pair[1].name else [v.label for v in pair]
     result = {
-        "schema": "quadid.compare_vehicles/1", "a": pair[0].name, "b": pair[1].name,
+        "schema": "quadid.compare_vehicles/1", **dict(zip("ab", labels, strict=True)),
         "logs": [log.recording.name for log in opened[0]], "samples": sum(block.shape[1] for block in blocks),
         "blocks": len(blocks), "horizons": entries, "units": dict(QUANTITIES),
         "ratio": overall, "ci95": [float(low), float(high)], "after": wanted[-1],

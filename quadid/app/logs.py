@@ -82,7 +82,8 @@ def check_place(file: Path, option: str, inside: bool = False) -> None:
         option: what the user named it by; `inside`: or the folder that it will be in.
     """
     if file.is_dir():
-        fix = "remove it, or choose another folder" if inside else f"name a file in it: {file / 'result'}"
+        name = "report.html" if option == "--report" else "result.json"
+        fix = "remove it, or choose another folder" if inside else f"name a file in it: {file / name}"
         raise OutputError(f"{option} {file} is a directory", "a file name", fix)
     folder = file.absolute().parent
     if not folder.is_dir():
@@ -153,6 +154,7 @@ def free_name(folder: str | Path, name: str, ending: str, taken: Sequence[Path])
 # --- Parts of a log: those asked for as LOG@from:to, and those in the air
 
 
+SPAN = "LOG@START:STOP in seconds, for example LOG@76:216"
 _CUT = re.compile(r"(?P<path>.+)@(?P<start>[0-9.]*):(?P<stop>[0-9.]*)")
 
 
@@ -199,16 +201,16 @@ class LogPart:
 
 def parse_part(text: str, start: float | None = None, stop: float | None = None) -> LogPart:
     """Splits ``LOG@76:216`` into its parts, unless a file of that name exists; own limits go before the common ones."""
-    found = _CUT.fullmatch(text)
+    found, (before, sign, _) = _CUT.fullmatch(text), text.rpartition("@")
+    if found is None and sign and not Path(text).exists() and Path(before).exists():
+        raise LogError(f"cannot read the span of '{text}'", SPAN)
     if found is None or Path(text).exists():
         cut = LogPart(Path(text), start, stop)
     else:
         try:
             own = [float(found[key]) if found[key] else None for key in ("start", "stop")]
         except ValueError as error:
-            raise LogError(
-                f"cannot read the span of '{text}'", "LOG@START:STOP in seconds, for example LOG@76:216"
-            ) from error
+            raise LogError(f"cannot read the span of '{text}'", SPAN) from error
         cut = LogPart(Path(found["path"]), start if own[0] is None else own[0], stop if own[1] is None else own[1])
     for limit in (cut.start, cut.stop):
         if limit is not None and not math.isfinite(limit):

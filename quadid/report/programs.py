@@ -496,8 +496,8 @@ class Form(NamedTuple):
 
     @property
     def names(self) -> set[str]:
-        """Other names of a format: its programs, and the kinds of its files."""
-        kinds = {part for end in self.templates for part in end.split(".")[1:]}
+        """Other names of a format: its programs, and the kinds of its files that are theirs alone."""
+        kinds = {part for end in self.templates for part in end.split(".")[1:]} - {"json", "xml", "toml", "py", "hpp"}
         return {*kinds, *self.program.lower().split(", "), *self.program.lower().replace(",", "").split()}
 
 

@@ -149,6 +149,17 @@ def test_the_interval_covers_what_other_flights_show(flights: Flights) -> None:
     assert abs(np.log(two["ratio"]) - middle) < 3.0 * width
 
 
+def test_two_files_of_one_name_are_told_apart(flights: Flights, tmp_path: Path) -> None:
+    for folder, factor in (("old", 1.2), ("new", 1.0)):
+        (tmp_path / folder).mkdir()
+        near(factor).save(tmp_path / folder / "mine.yaml")
+    old, new = (str(tmp_path / folder / "mine.yaml") for folder in ("old", "new"))
+    made = quadid.compare_vehicles(old, new, flights.unseen)
+    assert (made.result["a"], made.result["b"]) == (old, new)
+    assert all(f"A ({old})" in text and f"B ({new})" in text for text in (made.text(), made.page()))
+    assert quadid.compare_vehicles("pelican", new, flights.unseen).result["a"] == "pelican"
+
+
 def test_effects_stand_side_by_side(flights: Flights) -> None:
     lagged = near(effects={"motor_lag": {"tau": 0.001}})
     made = quadid.compare_vehicles(near(1.2), lagged, str(flights.unseen))

@@ -345,8 +345,9 @@ def test_what_sitl_and_sih_cannot_be_is_left_out_with_its_reason() -> None:
 def test_programs_and_kinds_of_files_name_a_form(asked: str, form: str) -> None:
     cross = Vehicle.shipped("pelican_x")
     assert exported(cross, asked).texts == exported(cross, form).texts
-    with pytest.raises(ParameterError):
-        exported(cross, "yaml2")
+    for nobody in ("yaml2", "json"):  # a kind of file of many programs names none of them
+        with pytest.raises(ParameterError, match="unknown format"):
+            exported(cross, nobody)
 
 
 def test_a_motor_lag_that_nobody_measured_is_written_as_such() -> None:

@@ -170,6 +170,10 @@ def test_an_option_that_a_command_lacks_is_not_taken_for_another(inside: Cli) ->
     )
 
 
+def test_a_span_that_is_written_another_way_is_told_how(inside: Cli, flights: Flights) -> None:
+    assert "LOG@START:STOP" in one_line(inside("identify", f"{flights.train}@10-20", "--vehicle", "pelican"), 2)
+
+
 def test_usage_errors_are_one_line(inside: Cli) -> None:
     assert "identify" in one_line(inside("identfy"), 2)
     assert "--vehicle" in one_line(inside("identify", "x.csv"), 2)
