@@ -267,6 +267,13 @@ def put_debians_packages(folder: Path) -> None:
             (folder / file).write_text(lines, encoding="utf-8")
 
 
+def test_the_page_runs_programs_by_the_environment_that_it_makes(repository: Path) -> None:
+    """Debian's own Python finds pydantic 1.10, with which the examples do not even start."""
+    text = (repository / "docs" / "using-with-ros.md").read_text(encoding="utf-8")
+    assert re.findall(r"^python\S* (?!-m venv).*", text, re.M) == []
+    assert all((repository / path).is_file() for path in re.findall(r"src/quadid/(\S+\.(?:py|yaml|txt))", text))
+
+
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
 def test_the_environment_beside_debians_packages(tmp_path: Path, repository: Path) -> None:
