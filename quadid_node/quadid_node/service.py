@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import time
 import uuid
+from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -79,6 +80,8 @@ DECISION_SECONDS = 2.0
 """Time that a person's decision waits to be on the disk before it is answered [s]."""
 PATIENCE = 1.0
 """A fit that is waited for longer [s] is late; a session this far behind its data [s] begins none."""
+STATUS_SECONDS = 1.0
+"""The backlog of a status is the largest of this time [s]: a status comes once a second, after any round of it."""
 RATE_MEMORY = 2.0
 """Time over which data rates are measured [s]."""
 
@@ -125,7 +128,7 @@ class Service:
         self._problem = ""
         self._fit_began, self._fit_seconds = 0.0, math.nan
         self._looked = self._waits_since = clock()
-        self._behind, self._tell_at = 0.0, BEHIND
+        self._behind, self._tell_at = deque[tuple[float, float]](), BEHIND
 
         if restored.approval not in ("", self._configured):
             self.session.active_set.approval = self._approval = restored.approval
@@ -166,7 +169,10 @@ class Service:
             self.session.go_on()
         outputs += self._carried_out(self.session.poll())
         # How old the data were that results rested on: what waits, and all the time since the step before.
-        self._behind = self.session.backlog + (self._clock() - before) * self._live
+        now = self._clock()
+        self._behind.append((now, self.session.backlog + (now - before) * self._live))
+        while now - self._behind[0][0] > STATUS_SECONDS:
+            self._behind.popleft()
         return self._journalled([*outputs, *self._lag()])
 
     def _carried_out(self, actions: list[Action]) -> list[Output]:
@@ -216,7 +222,7 @@ class Service:
 
     def _lag(self) -> list[Event]:
         """Reports a live session that falls behind its data, and that it has caught up."""
-        behind = self._behind if self._live else 0.0
+        behind = self._behind[-1][1] if self._live else 0.0
         if behind >= self._tell_at:
             self._tell_at = 2.0 * behind
             return [self._event("warning", "behind", lag(behind))]
@@ -279,7 +285,7 @@ class Service:
         feeds = {name: Feed(self._rate(name, now), max(self._looked - at, 0.0)) for name, at in self._arrived.items()}
         restarts = getattr(self._worker, "restarts", 0)
         history = self._store.problem if self._store is not None else "none kept"
-        status = replace(self.session.status(), backlog=self._behind)
+        status = replace(self.session.status(), backlog=max((s for _, s in self._behind), default=0.0))
         return ServiceHealth(status, feeds, self._worker.state, restarts, history, self._fit_seconds)
 
     def close(self) -> None:

@@ -66,6 +66,18 @@ def test_data_that_come_late_and_all_at_once_are_no_backlog() -> None:
             assert service.health().status.backlog < 1.0
 
 
+def test_a_status_holds_the_longest_round_of_its_second() -> None:
+    """A status is made after a round of every second, the same one each time: others went by unseen."""
+    NOW[0] = 0.0
+    service, seen = Service(PELICAN, QUICK, InlineTells(), clock=lambda: NOW[0]), list[float]()
+    for wait in (0.1, 0.1, 0.7, *[0.1] * 11):
+        NOW[0] += wait
+        service.step()
+        seen.append(round(service.health().status.backlog, 9))
+    assert seen[2:12] == [0.7] * 10
+    assert seen[-1] == 0.1, "and no longer"
+
+
 def said(outputs: list[Output], kind: str) -> list[Event]:
     return [o for o in outputs if isinstance(o, Event) and o.kind == kind]
 
