@@ -25,7 +25,7 @@ from quadid.effects import butterworth_delay
 from quadid.estimate import kalman as k
 from quadid.estimate.fit import ALL_NOISE, NEAR, estimate, of_square, scoring, tails, whitened
 from quadid.estimate.kalman import Gains
-from quadid.estimate.late_imu import delay_of, in_time
+from quadid.estimate.late_imu import MOST, delay_of, in_time
 from quadid.estimate.problem import TRIMMED, UPRIGHT, Problem
 from quadid.estimate.track import from_window
 from quadid.identification.excitation import bounds_of
@@ -192,16 +192,16 @@ class FitRequest(Job):
             return False
         return (
             (reply.excitation is None or reply.excitation.shape == (SIX,))
-            and (reply.noise is None or _is_noise(reply.noise))
+            and (reply.noise is None or _is_noise(reply.noise, _known_delay(self) or MOST))
             and _are_estimates(reply.estimates, self)
             and (not reply.estimates or reply.noise is not None or self.noise is not None)
             and (reply.theta is None or _is_vector(reply.theta, self.theta) or not reply.finite)
         )
 
 
-def _is_noise(noise: Noise) -> bool:
+def _is_noise(noise: Noise, latest: float) -> bool:
     shapes = noise.psi.shape, noise.tail.shape, noise.control.shape
-    if shapes != ((k.N_NOISE,), (4,), (3,)) or not all(0.0 <= x < math.inf for x in (noise.doubt, noise.late)):
+    if shapes != ((k.N_NOISE,), (4,), (3,)) or not (0.0 <= noise.doubt < math.inf and 0.0 <= noise.late <= latest):
         return False
     return all(bool(np.isfinite(a).all() and np.all(a >= 0.0)) for a in (noise.psi, noise.tail, noise.control))
 
@@ -310,11 +310,16 @@ def fit(request: FitRequest) -> FitReply:
     return FitReply(request.number, "", bounds, True, estimates, theta, found)
 
 
+def _known_delay(request: FitRequest) -> float | None:
+    cutoff = request.vehicle.effects.get("imu_lag", {}).get("cutoff")
+    return None if cutoff is None else butterworth_delay(cutoff)
+
+
 def _late(request: FitRequest) -> float:
     """Delay of gyro and accelerometer [s]: by the vehicle file's low-pass, or as the flight shows it."""
-    cutoff = request.vehicle.effects.get("imu_lag", {}).get("cutoff")
-    if cutoff is not None:
-        return butterworth_delay(cutoff)
+    known = _known_delay(request)
+    if known is not None:
+        return known
     if request.noise is not None and not request.learned:
         return request.noise.late
     return delay_of(request.learned or request.windows)

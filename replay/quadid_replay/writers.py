@@ -19,7 +19,7 @@ from mcap_ros2._dynamic import serialize_dynamic
 from quadid.data.grid import linear
 from quadid.data.window import Channel, Recording, Window, as_recording
 from quadid.errors import LogError
-from quadid.files import unwaited
+from quadid.files import unwaited, written_whole
 from quadid.rotation import conjugate, rotated
 from quadid.types import FloatArray
 from quadid_replay.csv_reader import EULER, GROUPS
@@ -73,8 +73,11 @@ def union_rows(channels: Sequence[Channel | None]) -> tuple[FloatArray, list[Flo
 
 
 def open_for_writing(path: str | Path) -> BinaryIO:
-    """Opens a file for writing; raises LogError with the reason when it cannot be."""
+    """Opens a file for writing, in place of a link that stands there; raises LogError where it cannot be."""
     try:
+        if Path(path).is_symlink():
+            with written_whole(Path(path)) as fresh:
+                fresh.touch()
         return open(path, "wb", opener=unwaited)
     except OSError as error:
         raise LogError(

@@ -288,6 +288,16 @@ def test_what_a_session_began_with_comes_back_exactly(tmp_path: Path) -> None:
     assert flight_to_dict(healthy) == flight_to_dict(written.restored.healthy[0]), "health is judged as it was"
 
 
+def test_a_recording_replaces_a_link_and_leaves_what_it_led_to(tmp_path: Path, happened: Happened) -> None:
+    path, other = tmp_path / "r.mcap", tmp_path / "of_the_user"
+    other.write_text("kept")
+    path.symlink_to(other)
+    Recorder(path, beginning(), INPUTS).close()
+    assert read_beginning(path) is not None
+    assert other.read_text() == "kept"
+    happened(35, "a link under the name of the node's recording: replaced, the file it led to is as it was")
+
+
 def test_messages_come_back_in_the_order_of_arrival(tmp_path: Path) -> None:
     log, path = tmp_path / "log.mcap", tmp_path / "r.mcap"
     write_mcap(log, flight(4.0).recording, EPOCH_NS)

@@ -53,6 +53,7 @@ SPOILT: dict[str, Spoil] = {
     "loose of one": estimate(loose=np.zeros(1)), "rows of none": estimate(rows=0.0),
     "noise of three": noise(psi=np.ones(3)), "noise below zero": noise(psi=np.full(N_NOISE, -1.0)),
     "tails of two": noise(tail=np.zeros(2)), "a doubt without end": noise(doubt=math.inf),
+    "a gyro too late": noise(late=0.2),
 }  # fmt: skip
 
 
