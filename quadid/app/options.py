@@ -81,10 +81,10 @@ def vehicle_if(about: str) -> Typed:
 
 
 Rate = Annotated[
-    float, typer.Option("--rate", metavar="HZ", help="Rate of the uniform grid; default 50 Hz.", show_default=False)
+    float, typer.Option("--rate", metavar="HZ", help="Resample logs to this rate; default 50 Hz.", show_default=False)
 ]
 OwnRate = Annotated[
-    float | None, typer.Option("--rate", metavar="HZ", help="Rate of the uniform grid; default the log's own.")
+    float | None, typer.Option("--rate", metavar="HZ", help="Resample logs to this rate; default the log's own.")
 ]
 Start = Annotated[
     float | None,

@@ -51,7 +51,9 @@ def history(
     except VehicleError as error:
         if vehicle not in names:
             there = ", ".join(names) or "none"
-            raise StoreError(f"{error.found}, and no vehicle of {path}", f"there: {there}") from error
+            raise StoreError(
+                f"{error.found}, and no vehicle in {path}", f"a vehicle file, or a name in that history: {there}"
+            ) from error
     if described is not None and vehicle not in names:
         name = described.name
         found = read_history(path, name, candidates, events)
