@@ -12,6 +12,8 @@ from os.path import commonprefix
 
 from quadid.sanitise import one_line
 
+_ONE_OF = "use one of "
+
 
 class QuadidError(Exception):
     """Base of all errors raised on purpose; each is one line of printable text, whatever it quotes.
@@ -26,7 +28,8 @@ class QuadidError(Exception):
 
     def __init__(self, found: str, allowed: str = "", fix: str = "") -> None:
         found, allowed, fix = map(one_line, (found, allowed, fix))
-        fix = "" if allowed and fix == _one_of(allowed) else fix  # what is allowed is stated once
+        if fix.startswith(_ONE_OF) and allowed.startswith(fix.removeprefix(_ONE_OF)):  # what is allowed is stated once
+            fix = ""
         self.found, self.allowed, self.fix = found, allowed, fix
         parts = [found]
         if allowed:
@@ -79,7 +82,7 @@ def nearest(name: str, valid: Iterable[str]) -> str:
     given = _words(name.replace(unit[0], "") if unit else name) or _words(name)
     alike = [o for o in options if _misspelt(given, _words(o))] or [o for o in options if _part(given, _words(o))]
     if not 1 <= len(alike) <= 3:
-        return _one_of(", ".join(options))
+        return _ONE_OF + ", ".join(options)
     foreign = unit and alike != [IN_MICROSECONDS] and not any(map(FOREIGN_UNIT.search, alike))
     in_si = f", in SI units, not {unit[0]}" if unit and foreign else ""
     return f"did you mean {' or '.join(map(repr, alike))}{in_si}?"
@@ -114,7 +117,3 @@ def _slip(a: str, b: str) -> bool:
     end = len(commonprefix((a[start:][::-1], b[start:][::-1])))
     c, d = a[start : len(a) - end], b[start : len(b) - end]
     return max(len(a), len(b)) >= 3 and (max(len(c), len(d)) <= 1 or (len(c) == 2 and c == d[::-1]))
-
-
-def _one_of(options: str) -> str:
-    return f"use one of {options}"

@@ -728,7 +728,7 @@ class Vehicle(Strict):
             return given
         name, path = str(given), Path(given)
         looks_like_file = path.suffix.lower() in (".yaml", ".yml") or "/" in name
-        if not looks_like_file and not path.is_file():
+        if not looks_like_file and not path.is_file() and (name in cls.shipped_texts() or not path.is_dir()):
             return cls.shipped(name)
         if path.is_dir():
             raise VehicleError(f"{name} is a directory", "a shipped name or a YAML file", "name the file in it")

@@ -170,6 +170,17 @@ def test_an_option_that_a_command_lacks_is_not_taken_for_another(inside: Cli) ->
     )
 
 
+def test_a_folder_is_no_vehicle_and_what_is_allowed_is_told_once(
+    inside: Cli, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("logs", "pelican"):
+        (tmp_path / name).mkdir()
+    monkeypatch.chdir(tmp_path)
+    assert "logs is a directory" in one_line(inside("export", "--vehicle", "logs"), 2)
+    assert Vehicle.named("pelican").name == "pelican"
+    assert one_line(inside("export", "--vehicle", "x500"), 2).count("hexacopter") == 1
+
+
 def test_a_span_that_is_written_another_way_is_told_how(inside: Cli, flights: Flights) -> None:
     assert "LOG@START:STOP" in one_line(inside("identify", f"{flights.train}@10-20", "--vehicle", "pelican"), 2)
 
