@@ -481,7 +481,8 @@ def find_jobs(
         VehicleError: a log without a vehicle.
     """
     if not root.is_dir():
-        raise LogError(f"no folder {root}", "a folder with flight logs", "check the path")
+        fix = "name the folder that it is in" if root.exists() else "check the path"
+        raise LogError(f"no folder {root}", "a folder with flight logs", fix)
     jobs, others, texts, secret = list[Job](), list[str](), dict[Path, str](), _secret()
     for path in _files(root, leave_out):
         name, folder = (_text(p.relative_to(root)) for p in (path, path.parent))
