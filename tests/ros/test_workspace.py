@@ -237,6 +237,18 @@ def test_the_study_of_load_builds_every_message_of_its_stacks() -> None:
     assert {kind for kind in heard if kind.split("/")[0] in MESSAGES} <= built
 
 
+def test_what_the_study_of_load_builds_is_no_package_of_the_checkout(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """`colcon build` refused the checkout once the study had run in it: each of its packages is there twice."""
+    from quadid_evaluation.studies.ros_load import built
+
+    monkeypatch.setattr(shutil, "which", lambda *names, **options: None)
+    with pytest.raises(SystemExit, match="cmake is not installed"):
+        built(tmp_path / "build" / "ros_load")
+    assert (tmp_path / "build" / "ros_load" / "COLCON_IGNORE").is_file()
+
+
 # --- The environment that docs/using-with-ros.md makes beside the Python packages of Debian, line by line
 
 

@@ -87,6 +87,8 @@ def built(folder: Path) -> dict[str, str]:
     environment = {k: v for k, v in os.environ.items() if k not in ("CMAKE_PREFIX_PATH", "PYTHONPATH", "ROS_DISTRO")}
     environment |= {"AMENT_PREFIX_PATH": sys.prefix, "PATH": f"{sys.prefix}/bin:{os.environ['PATH']}"}
     cmake, prefix = shutil.which("cmake", path=environment["PATH"]), folder / "prefix"
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "COLCON_IGNORE").touch()  # source and installed, each is there twice
     if cmake is None:
         raise SystemExit("cmake is not installed")
     for name, messages in MESSAGES.items():
