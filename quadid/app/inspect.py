@@ -218,7 +218,9 @@ def parameter_outlook_table(found: Inspection) -> TextTable:
             excited = f"{100.0 * sigma:.2g} %" if sigma < 10.0 else "not excited"
             cells.append(excited if outlook.possible else "")
         rows.append((*cells, _clean(outlook.reason)))
-    return TextTable("What can be identified", tuple(columns), tuple(rows))
+    wrong = any(c.verdict.value == "error" for c in found.checks)
+    title = "What these channels show once the error is mended" if wrong else "What can be identified"
+    return TextTable(title, tuple(columns), tuple(rows))
 
 
 def _from_to(first: float, last: float, found: Inspection) -> str:
