@@ -6,12 +6,13 @@ import contextlib
 import queue
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import zenoh
 
 from quadid.online.records import Job, JobReply, unexpected
+from quadid.sanitise import one_line
 from quadid.vehicle import Vehicle
 from quadid_node.wire_format import LARGEST, ParcelError, pack, unpack
 from quadid_node.worker import MEMORY_MB, STUDY_LIMIT, ProcessWorker, Trouble, Worker
@@ -261,7 +262,8 @@ class RemoteWorker:
             return
         self._asked = None
         self.far += 1
-        out.append(reply)
+        sentences: dict[str, Any] = {n: one_line(text) for n, text in vars(reply).items() if isinstance(text, str)}
+        out.append(replace(reply, **sentences))
 
     def _fall_back(self, why: str) -> None:
         request, self._asked = self._asked, None

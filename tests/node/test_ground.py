@@ -16,7 +16,8 @@ import tracemalloc
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -35,6 +36,7 @@ from quadid.online.background_diagnosis import DiagnosisReply
 from quadid.online.change_job import ChangeReply
 from quadid.online.fit_job import Noise
 from quadid.online.records import OnlineFinding
+from quadid.sanitise import one_line
 from quadid.vehicle import Vehicle
 from quadid_node import ground
 from tests.commands import QUADID
@@ -155,6 +157,21 @@ def test_a_ground_machine_fits_and_what_it_leaves_is_fitted_on_board(
     assert worker.far == 1
     assert same(here, after)
     assert any("vanished" in text and "on board" in text for text in told)
+
+
+def test_sentences_of_a_ground_machine_are_short_and_printable(request_: FitRequest, happened: Happened) -> None:
+    """They are shown and kept: 256 KiB of control characters a second were, too."""
+    long, local = "\x1b[2J\n" * 30_000, cast(ProcessWorker, InlineWorker())
+    for hostile in (FitReply(request_.number, problem=long), FitReply(request_.number, fault=long)):
+
+        def ask(job: FitRequest, answers: queue.Queue[Any], _: float, item: FitReply = hostile) -> None:
+            answers.put((job.number, pack(item)))
+
+        worker = RemoteWorker(local, cast(Ground, SimpleNamespace(there=True, alive={"it"}, ask=ask)))
+        worker.submit(request_)
+        (told,) = [reply for reply in worker.poll() if isinstance(reply, FitReply)]
+        assert told.problem + told.fault == one_line(long)
+    happened(20, f"{len(long)} characters that a terminal acts on, answered by the ground: cut, shown as ?")
 
 
 def test_a_ground_machine_ends_in_peace_and_refuses_what_is_no_request(router: str, ground_machine: Start) -> None:
