@@ -118,7 +118,8 @@ def test_the_model_with_the_cause_misses_less_on_another_flight() -> None:
 def test_the_right_model_misses_nothing_and_is_right_about_its_errors(measured: tuple[str, ...]) -> None:
     """Drag tells the velocity that nobody measures; what was only added along the filter's states ran away there."""
     hidden = {"rotor_drag": {"k_x": 0.3, "k_y": 0.3}, "weak_rotor": {"rotor": 2, "loss": 0.04}}
-    windows = [fly(PELICAN, None, 40.0, seed, effects=hidden, extras=measured).window for seed in (1, 2)]
+    # Longer than the liveliest minute, on which the noise is settled.
+    windows = [fly(PELICAN, None, 65.0, seed, effects=hidden, extras=measured).window for seed in (1, 2)]
     layout = Layout(PELICAN)
     theta = layout.initial(PELICAN)
     theta[:6] = list(TruthParameters.of(PELICAN).as_dict().values())
