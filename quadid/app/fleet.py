@@ -253,8 +253,8 @@ _QUIET = {
 }  # fmt: skip
 """Dask otherwise looks at every worker's stack each 10 ms, at itself each 20 ms and at memory each 100 ms."""
 _WARM = (
-    "distributed", "distributed.nanny", "quadid.app.fleet", "quadid.app.identify", "quadid.condition.trim",
-    "quadid_replay.rosbag",
+    "distributed", "distributed.nanny", "quadid.app.fleet", "quadid.app.identify", "quadid.identification.fit",
+    "quadid.condition.trim", "quadid_replay.rosbag",
 )  # fmt: skip
 """Modules imported by the process from which all workers are forked, those that replace dead ones too."""
 

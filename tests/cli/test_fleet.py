@@ -341,7 +341,7 @@ def test_workers_begin_warm_and_with_one_thread_each() -> None:
         import os
         import sys
 
-        warm = "quadid.app.identify" in sys.modules
+        warm = "quadid.identification.fit" in sys.modules
         return warm, sys.modules["numba"].config.NUMBA_NUM_THREADS, os.environ.get("OPENBLAS_NUM_THREADS")
 
     with cluster(None, 1, "1GiB") as client:
