@@ -147,7 +147,7 @@ PARTS = {
     "closed loop": Part(_closed_loop, ("model.closed_loop:fly_closed_loop",), 80),
     "estimate": Part(
         _estimate,
-        tuple(f"estimate.kalman:{name}" for name in ("moments", "kalman", "replay", "backward")),
+        tuple(f"estimate.kalman:{name}" for name in ("moments", "filter_pass", "replay", "backward")),
         30,
     ),
     "flight": Part(_flight, ("flight.march:march",), 30),

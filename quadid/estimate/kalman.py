@@ -700,7 +700,6 @@ def _normaliser(degrees: float) -> float:
     return 2.0 * (math.lgamma(0.5 * degrees) - math.lgamma(0.5 * (degrees + 1.0))) + math.log(0.5 * degrees)
 
 
-@_fast
 def kalman(track: Track, p: FloatArray, psi: FloatArray, tail: FloatArray, store: bool) -> tuple[float, Gains]:
     """Filter pass over a flight.
 
@@ -715,14 +714,21 @@ def kalman(track: Track, p: FloatArray, psi: FloatArray, tail: FloatArray, store
     Returns:
         -2 ln L, and the gains.
     """
-    n = len(track.t)
-    air = track.still > 0.0 or track.seen[:, 3].any()
-    rows = n if store else 1
+    rows = len(track.t) if store else 1
+    # Made here: numba crashes where Ctrl-C arrives while it makes a tuple of ours for what it returns.
     g = Gains(
         np.zeros((rows, M, N)), np.zeros((rows, M)), np.zeros((rows, M)), np.zeros((rows, M)),
         np.zeros((rows, 3, 9)), np.zeros((rows, N_MEAN)), np.zeros((rows, N, 9)),
         moments(track, p[DELAY], p[LAG]), (p[DELAY], p[LAG]), track.beyond,
     )  # fmt: skip
+    return filter_pass(track, p, psi, tail, store, g), g
+
+
+@_fast
+def filter_pass(track: Track, p: FloatArray, psi: FloatArray, tail: FloatArray, store: bool, g: Gains) -> float:
+    """Writes the gains of `kalman`; returns -2 ln L."""
+    n = len(track.t)
+    air = track.still > 0.0 or track.seen[:, 3].any()
     c, keep = _constants(p, track), np.empty(9)
     x, after = _start(track, p), np.empty(N_MEAN)
     P, FP, F, turn = np.zeros((N, N)), np.zeros((N, N)), np.zeros((N, N)), np.zeros((3, 3))
@@ -810,7 +816,7 @@ def kalman(track: Track, p: FloatArray, psi: FloatArray, tail: FloatArray, store
                 if G[a] != 0.0:
                     for b in range(FO):
                         P[a, b] += q * G[a] * G[b]
-    return total, g
+    return total
 
 
 @_fast

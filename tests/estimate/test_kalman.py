@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -238,3 +240,30 @@ def test_any_other_model_moves_the_means_as_it_says() -> None:
     np.testing.assert_allclose(mean[:, k.VE + 1 : k.VE + 4], wanted.velocity[:40], atol=3e-3)
     sensed = mean[:, 4:7] + track.beyond.added[1:41, 9:12]
     np.testing.assert_allclose(sensed, wanted.rate[:40], atol=3e-3)
+
+
+INTERRUPTED = """
+import signal
+from quadid.estimate.problem import Problem
+from quadid.estimate.track import from_window
+from quadid.flight import fly
+from quadid.vehicle import Vehicle
+
+vehicle = Vehicle.shipped("pelican")
+problem = Problem.of([from_window(fly(vehicle, seconds=60.0, seed=1).window, vehicle)], vehicle)
+z, psi = problem.start(), problem.first_noise()
+problem.passes(z, psi)
+signal.signal(signal.SIGALRM, signal.default_int_handler)
+for i in range(8):
+    try:
+        signal.setitimer(signal.ITIMER_REAL, 0.03 + 0.004 * i)
+        while True:
+            problem.passes(z, psi)
+    except KeyboardInterrupt:
+        print("stopped")
+"""
+
+
+def test_an_interrupt_during_a_pass_is_an_exception_and_no_crash() -> None:
+    ended = subprocess.run([sys.executable, "-c", INTERRUPTED], capture_output=True, text=True)
+    assert (ended.returncode, ended.stdout.split()) == (0, 8 * ["stopped"]), ended.stderr[-2000:]
