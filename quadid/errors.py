@@ -75,7 +75,7 @@ def nearest(name: str, valid: Iterable[str]) -> str:
     """Returns ``did you mean 'x'?`` for the valid names that can have been meant, or the list of all.
 
     A name can mean another that is misspelt by a letter in a word, or has words more or fewer: nothing else is guessed.
-    One that carries a unit of its own, as ``max_rpm``, is told that ours are in SI units.
+    For one that carries a unit of its own, as ``max_rpm``, the answer adds that ours are in SI units.
     """
     options = list(valid)
     unit = FOREIGN_UNIT.search(name)

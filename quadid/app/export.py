@@ -61,7 +61,7 @@ def export(
         vehicle: a shipped name, a YAML file or a `Vehicle`.
         format: one of `quadid.report.programs.FORMATS`.
         source: where the values come from, for the file; default the vehicle's file or name.
-        anyway: write values that are not proven, or in doubt; the file says so at its top.
+        anyway: write values that are not proven, or in doubt; the top of the file warns of it.
 
     Raises:
         ParameterError: an unknown format.

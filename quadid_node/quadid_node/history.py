@@ -424,7 +424,7 @@ class StoredSet(NamedTuple):
 
 
 def rests_on(vehicle: Vehicle) -> dict[str, Any]:
-    """What of the vehicle file b and the inertias rest on beside the mass, as it is noted with each set."""
+    """Parts of the vehicle file, beside the mass, that b and the inertias rest on, as each set notes them."""
     file = vehicle.model_dump(mode="json", include={"command", "effects", "mounting"})
     if vehicle.command.kind == "rotor_speed":
         del file["command"]["max_speed"]  # nothing is scaled by it

@@ -224,7 +224,7 @@ OTHERS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
     "mounting": ({}, {"mounting": Mounting(rotation=(0.0, 0.0, 0.1))}),
     "": ({}, {"command": Command(max_speed=900.0)}),  # scales no reading
 }
-"""What the vehicle file had when a set was made, and has now: b and the inertias rest on it."""
+"""Part of the vehicle file that b and the inertias rest on: when a set was made, and now."""
 
 
 @pytest.mark.parametrize("other", list(OTHERS))
