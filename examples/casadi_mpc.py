@@ -52,8 +52,15 @@ class Controller:
             cost += 5.0 * heading**2 + sum(w * term for w, term in zip(weights, terms, strict=True))
             gaps.append(now - step(x=X[:, k], u=U[:, k], p=ca.DM(0, 1))["next"])
         problem = {"x": ca.veccat(X, U), "f": cost, "g": ca.veccat(*gaps), "p": ca.veccat(x0, goal)}
-        options = {"ipopt.print_level": 0, "print_time": False, "expand": True, "ipopt.sb": "yes",
-                   "ipopt.max_iter": 30, "ipopt.tol": 1e-4, "ipopt.warm_start_init_point": "yes"}  # fmt: skip
+        options = {
+            "ipopt.print_level": 0,
+            "print_time": False,
+            "expand": True,
+            "ipopt.sb": "yes",
+            "ipopt.max_iter": 30,
+            "ipopt.tol": 1e-4,
+            "ipopt.warm_start_init_point": "yes",
+        }
         self.solver, self.guess = ca.nlpsol("mpc", "ipopt", problem, options), None
         free = np.full(X.numel(), np.inf)
         self.low = np.concatenate([-free, np.full(U.numel(), 0.3 * self.hover)])
@@ -67,8 +74,9 @@ class Controller:
             start = np.tile(state, AHEAD + 1)
             self.guess = np.concatenate([start, np.full(AHEAD * len(flight.rotor_speed), self.hover)])
         goal = wanted(flight.time + STEP * (1 + np.arange(AHEAD)))
-        found = self.solver(x0=self.guess, p=np.concatenate([state, goal.T.ravel()]), lbx=self.low, ubx=self.high,
-                            lbg=0.0, ubg=0.0)  # fmt: skip
+        found = self.solver(
+            x0=self.guess, p=np.concatenate([state, goal.T.ravel()]), lbx=self.low, ubx=self.high, lbg=0.0, ubg=0.0
+        )
         self.guess = np.array(found["x"]).ravel()
         at = self.size * (AHEAD + 1)
         return self.guess[at : at + len(flight.rotor_speed)]

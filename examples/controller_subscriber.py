@@ -29,8 +29,13 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 SCHEMA = 3
 UNITS = {
-    "b": "N s^2/rad^2", "d": "N m s^2/rad^2", "J_xx": "kg m^2", "J_yy": "kg m^2", "J_zz": "kg m^2", "J_r": "kg m^2",
-}  # fmt: skip
+    "b": "N s^2/rad^2",
+    "d": "N m s^2/rad^2",
+    "J_xx": "kg m^2",
+    "J_yy": "kg m^2",
+    "J_zz": "kg m^2",
+    "J_r": "kg m^2",
+}
 NEEDED = ("b", "J_xx", "J_yy")
 """Without these the set is of no use; the others may stay as they are."""
 SLOPE = "b_tangent"
@@ -106,8 +111,10 @@ def gains(values: dict[str, float], start: dict[str, float]) -> dict[str, float]
     """
     out = dict(start)
     for axis, inertia, bandwidth, integral in (
-        ("roll", "J_xx", 11.0, 14.0), ("pitch", "J_yy", 11.0, 14.0), ("yaw", "J_zz", 3.0, 1.5),
-    ):  # fmt: skip
+        ("roll", "J_xx", 11.0, 14.0),
+        ("pitch", "J_yy", 11.0, 14.0),
+        ("yaw", "J_zz", 3.0, 1.5),
+    ):
         out[f"{axis}_rate_p"] = bandwidth * values[inertia]
         out[f"{axis}_rate_i"] = integral * values[inertia]
     out["thrust_coefficient"], out["drag_coefficient"] = values.get(SLOPE, values["b"]), values["d"]

@@ -63,9 +63,7 @@ def wait_for_viewer(channels: dict[str, foxglove.Channel], seconds: float) -> No
 
 
 def play(
-    streams: list[Iterator[tuple[Schema | None, Channel, Message]]],
-    channels: dict[str, foxglove.Channel],
-    speed: float,
+    streams: list[Iterator[tuple[Schema | None, Channel, Message]]], channels: dict[str, foxglove.Channel], speed: float
 ) -> int:
     """Sends all messages in the order of their stamps, paced; returns how many."""
     count, begin, first = 0, time.monotonic(), None

@@ -35,9 +35,16 @@ PAUSE = 0.5
 BANDS = ((0.3, 1.0), (0.8, 2.0), (1.5, 3.5))
 """Frequencies of the stick movements [Hz], lowest and highest."""
 MIXES = (
-    ("roll",), ("pitch",), ("yaw",), ("throttle",), ("roll", "pitch"), ("roll", "yaw"), ("pitch", "yaw"),
-    ("roll", "pitch", "yaw"), ("roll", "pitch", "yaw", "throttle"),
-)  # fmt: skip
+    ("roll",),
+    ("pitch",),
+    ("yaw",),
+    ("throttle",),
+    ("roll", "pitch"),
+    ("roll", "yaw"),
+    ("pitch", "yaw"),
+    ("roll", "pitch", "yaw"),
+    ("roll", "pitch", "yaw", "throttle"),
+)
 AMPLITUDES = {"roll": (0.1, 0.35), "pitch": (0.1, 0.35), "yaw": (0.3, 1.5), "throttle": (0.07, 0.15)}
 """Start and latest end of the search for the largest amplitude within limits: rad rms, fraction of hover
 thrust."""
@@ -108,9 +115,14 @@ class TrialFlights:
     def fly(self, segments: Sequence[Segment], seconds: float, profile: str = "scripted") -> Flight:
         """One flight; raises FlightError when it ends on the ground."""
         return fly(
-            self.vehicle, self.truth, seconds, self.seed, profile, effects=self.vehicle.effects,
+            self.vehicle,
+            self.truth,
+            seconds,
+            self.seed,
+            profile,
+            effects=self.vehicle.effects,
             segments=segments if profile == "scripted" else None,
-        )  # fmt: skip
+        )
 
     def information(self, flight: Flight) -> FloatArray:
         """Fisher information of the log parameters in the log of a flight, shape (P, P)."""
@@ -168,10 +180,17 @@ class AsLogged:
         """One flight, logged; raises FlightError when it ends on the ground."""
         simulator = self._simulator
         flown = fly(
-            simulator.vehicle, simulator.truth, seconds, simulator.seed, profile, effects=simulator.vehicle.effects,
-            outside={"gusts": self.gusts}, segments=segments if profile == "scripted" else None, noise=self._noise,
+            simulator.vehicle,
+            simulator.truth,
+            seconds,
+            simulator.seed,
+            profile,
+            effects=simulator.vehicle.effects,
+            outside={"gusts": self.gusts},
+            segments=segments if profile == "scripted" else None,
+            noise=self._noise,
             log_rate=self._rate,
-        ).recording  # fmt: skip
+        ).recording
         channels = {}
         for name, channel in flown.channels.items():
             there = self._recording.channels.get(name, channel)
@@ -224,9 +243,10 @@ def design_manoeuvre(
     candidates = movements(simulator, limits, advance)
     if not candidates:
         raise NotIdentifiableError(
-            "no movement stays within the limits", "a tilt of 5 degrees or more, a rate of 30 deg/s or more",
+            "no movement stays within the limits",
+            "a tilt of 5 degrees or more, a rate of 30 deg/s or more",
             "use wider --tilt and --rate-limit",
-        )  # fmt: skip
+        )
     blocks = max(round(seconds / (BLOCK + PAUSE)), 1)
     chosen = d_optimal(np.array([m.information for m in candidates]), known, blocks)
     picked = tuple(candidates[i] for i in sorted(chosen, key=lambda i: (-chosen.count(i), i)))
@@ -246,9 +266,17 @@ def design_manoeuvre(
     sweeps = one_axis_at_a_time(simulator, limits, length)
     swept = simulator.information(simulator.fly(sweeps, length)) if sweeps else 0.0 * known
     return Proposal(
-        picked, row, length, peak, halfwidths(known), halfwidths(known + gentle), halfwidths(known + gained), flight,
-        sweeps, halfwidths(known + swept),
-    )  # fmt: skip
+        picked,
+        row,
+        length,
+        peak,
+        halfwidths(known),
+        halfwidths(known + gentle),
+        halfwidths(known + gained),
+        flight,
+        sweeps,
+        halfwidths(known + swept),
+    )
 
 
 def one_axis_at_a_time(simulator: TrialFlights, limits: Limits, seconds: float) -> tuple[Segment, ...]:

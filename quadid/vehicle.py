@@ -53,7 +53,7 @@ Correlation = Annotated[float, Field(ge=-1.0, le=1.0, allow_inf_nan=False)]
 Angle = Annotated[float, Field(ge=-6.3, le=6.3, allow_inf_nan=False)]
 
 MIXERS: dict[str, tuple[tuple[float, ...], ...]] = {
-    "crazyflie": ((1.0, -0.5, 0.5, 1.0), (1.0, -0.5, -0.5, -1.0), (1.0, 0.5, -0.5, 1.0), (1.0, 0.5, 0.5, -1.0)),
+    "crazyflie": ((1.0, -0.5, 0.5, 1.0), (1.0, -0.5, -0.5, -1.0), (1.0, 0.5, -0.5, 1.0), (1.0, 0.5, 0.5, -1.0))
 }
 """Mixers by name: rows are rotors, columns the inputs.  Crazyflie takes thrust, roll, pitch, yaw."""
 
@@ -307,14 +307,29 @@ def impossible_hover(low: float, high: float) -> str:
 
 
 SIGNALS: dict[str, str] = {
-    "v_x": "m/s", "v_y": "m/s", "v_z": "m/s", "p": "rad/s", "q": "rad/s", "r": "rad/s", "g_x": "", "g_y": "",
-    "g_z": "", "T": "N", "W": "rad/s", "V": "m/s",
-}  # fmt: skip
+    "v_x": "m/s",
+    "v_y": "m/s",
+    "v_z": "m/s",
+    "p": "rad/s",
+    "q": "rad/s",
+    "r": "rad/s",
+    "g_x": "",
+    "g_y": "",
+    "g_z": "",
+    "T": "N",
+    "W": "rad/s",
+    "V": "m/s",
+}
 """Factors of a term, with units, all in body axes (FRD): velocity through the air, rates, direction of gravity,
 thrust and speeds of all rotors together, airspeed.  In the order of `quadid.model.body_kernel`, after the one."""
 TARGETS: dict[str, str] = {
-    "force_x": "N", "force_y": "N", "force_z": "N", "moment_x": "N m", "moment_y": "N m", "moment_z": "N m",
-}  # fmt: skip
+    "force_x": "N",
+    "force_y": "N",
+    "force_z": "N",
+    "moment_x": "N m",
+    "moment_y": "N m",
+    "moment_z": "N m",
+}
 """Targets of a term, with units: force and moment in body axes at the centre of gravity."""
 MOST_FACTORS = 3
 """Signals in one product, at most."""
@@ -743,9 +758,10 @@ class Vehicle(Strict):
         if blanks := to_fill_in(text):
             raise VehicleError(
                 f"{name}: {' and '.join(blanks)} {'is a guess' if len(blanks) == 1 else 'are guesses'} of "
-                f"`quadid init`, marked {_FILL_IN}", "measured values",
+                f"`quadid init`, marked {_FILL_IN}",
+                "measured values",
                 f"write your vehicle's and delete the words {_FILL_IN}",
-            )  # fmt: skip
+            )
         out = cls.from_yaml(text, path.name)
         out._file = name
         return out
@@ -809,10 +825,16 @@ def _first_problem(error: ValidationError) -> tuple[str, str]:
 
 def _valid_keys(path: tuple[int | str, ...]) -> list[str]:
     models: dict[str, type[BaseModel]] = {
-        "rotors": Rotor, "thrust_stand": ThrustPoint, "mounting": Mounting,
-        "command": Command, "parameters": ParameterPrior, "noise": Noise, "stabiliser": Stabiliser, "proof": Proof,
+        "rotors": Rotor,
+        "thrust_stand": ThrustPoint,
+        "mounting": Mounting,
+        "command": Command,
+        "parameters": ParameterPrior,
+        "noise": Noise,
+        "stabiliser": Stabiliser,
+        "proof": Proof,
         "random": RandomForces,
-    }  # fmt: skip
+    }
     model = models.get(str(path[0]), Vehicle) if path else Vehicle
     model = RandomInput if model is RandomForces and len(path) > 1 else model
     return list(model.model_fields)

@@ -65,9 +65,10 @@ def read_value(text: str, origin: str) -> Any:
         mark = getattr(error, "problem_mark", None)
         where = "" if mark is None else f" in line {mark.line + 1}"
         raise VehicleError(
-            f"{origin}: not YAML{where} ({plain(getattr(error, 'problem', None) or first, 160)})", "YAML",
+            f"{origin}: not YAML{where} ({plain(getattr(error, 'problem', None) or first, 160)})",
+            "YAML",
             "indent with spaces, and write `name: value`",
-        ) from error  # fmt: skip
+        ) from error
 
 
 def _check_depth(text: str) -> None:

@@ -29,9 +29,13 @@ FROM = 20
 """Begin of the pictures of the fit [s]."""
 DRAG = {"k_x": 0.3, "k_y": 0.3}
 SHOWN: dict[str, dict[str, float]] = {
-    "rotor_drag": DRAG, "axial_inflow": {"k_z": 0.3}, "weak_rotor": {"rotor": 2, "loss": 0.06},
-    "motor_lag": {"tau": 0.04}, "imu_lever_arm": {"x": 0.04, "y": 0.0, "z": 0.0}, "battery_sag": {"fraction": 0.1},
-}  # fmt: skip
+    "rotor_drag": DRAG,
+    "axial_inflow": {"k_z": 0.3},
+    "weak_rotor": {"rotor": 2, "loss": 0.06},
+    "motor_lag": {"tau": 0.04},
+    "imu_lever_arm": {"x": 0.04, "y": 0.0, "z": 0.0},
+    "battery_sag": {"fraction": 0.1},
+}
 
 
 def main() -> None:

@@ -64,16 +64,22 @@ def main() -> None:
     (folder / "NOTICE").write_text("\n".join(lines) + "\n", encoding="utf-8")
     components = [
         {
-            "type": "library", "name": p.name, "version": p.version, "purl": f"pkg:pypi/{p.name.lower()}@{p.version}",
+            "type": "library",
+            "name": p.name,
+            "version": p.version,
+            "purl": f"pkg:pypi/{p.name.lower()}@{p.version}",
             "licenses": [{"license": {"name": licence(p)}}],
         }
         for p in packages
-    ]  # fmt: skip
+    ]
     root = {"type": "application", "name": "quadid", "version": distribution("quadid").version}
     bom = {
-        "bomFormat": "CycloneDX", "specVersion": "1.5", "version": 1, "metadata": {"component": root},
+        "bomFormat": "CycloneDX",
+        "specVersion": "1.5",
+        "version": 1,
+        "metadata": {"component": root},
         "components": components,
-    }  # fmt: skip
+    }
     (folder / "sbom.json").write_text(json.dumps(bom, indent=1) + "\n", encoding="utf-8")
     print(f"{len(packages)} packages: {folder / 'NOTICE'}, {folder / 'sbom.json'}")
 

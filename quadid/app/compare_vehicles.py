@@ -60,26 +60,39 @@ class Compared(Reported):
         """Errors after every horizon, parameters and effects side by side."""
         result = self.result
         columns = (
-            Column("after", right=True), Column("quantity"), Column("A", right=True), Column("B", right=True),
-            Column("B / A", right=True), Column("95 % interval", right=True, rank=1),
-        )  # fmt: skip
+            Column("after", right=True),
+            Column("quantity"),
+            Column("A", right=True),
+            Column("B", right=True),
+            Column("B / A", right=True),
+            Column("95 % interval", right=True, rank=1),
+        )
         rows = tuple(
             (
-                after, f"{name} [{result['units'][name]}]", number(e["a"]), number(e["b"]), number(e["ratio"], 3),
+                after,
+                f"{name} [{result['units'][name]}]",
+                number(e["a"]),
+                number(e["b"]),
+                number(e["ratio"], 3),
                 " .. ".join(number(v, 3) for v in e["ci95"]),
             )
-            for after, errors in result["horizons"].items() for name, e in errors.items()
-        )  # fmt: skip
+            for after, errors in result["horizons"].items()
+            for name, e in errors.items()
+        )
         title = (
             f"Mean open-loop error of A ({result['a']}) and B ({result['b']}) after n samples, {result['samples']} "
             f"runs in {result['blocks']} blocks"
         )
         out = [TextTable(title, columns, rows)]
         sides = (
-            Column("parameter"), Column("A", right=True), Column("A, 95 %", right=True, rank=2),
-            Column("B", right=True), Column("B, 95 %", right=True, rank=2), Column("apart [sigma]", right=True),
+            Column("parameter"),
+            Column("A", right=True),
+            Column("A, 95 %", right=True, rank=2),
+            Column("B", right=True),
+            Column("B, 95 %", right=True, rank=2),
+            Column("apart [sigma]", right=True),
             Column("unit", rank=1),
-        )  # fmt: skip
+        )
         ends = [
             [" .. ".join(number(v) for v in p[k]) if p[k] else "a guess" for k in ("a_ci95", "b_ci95")]
             for p in result["parameters"]
@@ -96,10 +109,17 @@ class Compared(Reported):
     def records(self) -> list[dict[str, Any]]:
         """One row a horizon and quantity."""
         return [
-            {"name": f"{name}.{h}", "after": int(h), "quantity": name, **{k: v for k, v in e.items() if k != "ci95"},
-             "low": e["ci95"][0], "high": e["ci95"][1]}
-            for h, errors in self.result["horizons"].items() for name, e in errors.items()
-        ]  # fmt: skip
+            {
+                "name": f"{name}.{h}",
+                "after": int(h),
+                "quantity": name,
+                **{k: v for k, v in e.items() if k != "ci95"},
+                "low": e["ci95"][0],
+                "high": e["ci95"][1],
+            }
+            for h, errors in self.result["horizons"].items()
+            for name, e in errors.items()
+        ]
 
     def page(self, command: str = LIBRARY) -> str:
         """One page: errors, ratios with intervals, parameters."""
@@ -116,8 +136,10 @@ class Compared(Reported):
                     more = {"line": {"dash": "dot"}, "showlegend": False} if edge else {"mode": "lines+markers"}
                     data.append(trace(role, name + edge, after, y, **more))
         layout = {
-            "xaxis": axis("samples after the start"), "yaxis": axis("error of B over that of A"), "shapes": [level(1.0)]
-        }  # fmt: skip
+            "xaxis": axis("samples after the start"),
+            "yaxis": axis("error of B over that of A"),
+            "shapes": [level(1.0)],
+        }
         caption = "below 1: B predicts better; dotted: 95 % interval"
         ratios = figure("ratios", "Errors of B over those of A", data, layout, 320, caption=caption)
         sections = [
@@ -132,8 +154,11 @@ def compare_vehicles(
     a: Annotated[Described, Typed(str, typer.Argument(metavar="A"), ..., Vehicle.named)],
     b: Annotated[Described, Typed(str, typer.Argument(metavar="B"), ..., Vehicle.named)],
     on: Annotated[Given, Typed(list[str], typer.Option(metavar="LOG"), ..., opened=True)],
-    *, horizons: Horizons = HORIZONS, rate: OwnRate = None, seed: Seed = 0,
-) -> Compared:  # fmt: skip
+    *,
+    horizons: Horizons = HORIZONS,
+    rate: OwnRate = None,
+    seed: Seed = 0,
+) -> Compared:
     """Predicts the same flights with two vehicle files, from the same starts.
 
     The ratio of their mean errors gets an interval by a paired block bootstrap: whole blocks of starts are drawn anew,
@@ -163,9 +188,10 @@ def compare_vehicles(
     found = [[start_errors(log.windows, vehicle, steps) for log in logs] for vehicle, logs in both]
     if [[len(w) for w in log] for log in found[0]] != [[len(w) for w in log] for log in found[1]]:
         raise LogError(
-            "the two vehicles read these logs on different grids", "the same meaning of the rotor columns",
+            "the two vehicles read these logs on different grids",
+            "the same meaning of the rotor columns",
             "use one `command` in both files, or a common --rate",
-        )  # fmt: skip
+        )
     blocks = []
     for k, log in enumerate(opened[0]):
         size = max(max(steps), round(BLOCK / log.windows[0].dt))
@@ -174,9 +200,10 @@ def compare_vehicles(
             blocks += [errors[:, i : i + size] for i in range(0, errors.shape[1], size)]
     if len(blocks) < FEWEST_BLOCKS:
         raise LogError(
-            f"{len(blocks)} stretches of {max(steps)} samples", f"at least {FEWEST_BLOCKS} for an interval",
+            f"{len(blocks)} stretches of {max(steps)} samples",
+            f"at least {FEWEST_BLOCKS} for an interval",
             "use longer flights, or shorter horizons",
-        )  # fmt: skip
+        )
     total, drawn = _means(blocks, seed)
     wanted = tuple(dict.fromkeys(steps))
     entries = {
@@ -187,18 +214,27 @@ def compare_vehicles(
     low, high = np.quantile(spread, [0.025, 0.975]) if np.isfinite(spread).all() else (0.0, math.inf)
     warnings = [
         f"{label}: {log.name}: the vehicle file was fitted to this flight, so its errors are no proof"
-        for label, (vehicle, logs) in zip("AB", both, strict=True) for log in logs if fitted_before(vehicle, log)
-    ]  # fmt: skip
+        for label, (vehicle, logs) in zip("AB", both, strict=True)
+        for log in logs
+        if fitted_before(vehicle, log)
+    ]
     labels = [v.name for v in pair] if pair[0].name != pair[1].name else [v.label for v in pair]
     result = {
-        "schema": "quadid.compare_vehicles/1", **dict(zip("ab", labels, strict=True)),
-        "logs": [log.recording.name for log in opened[0]], "samples": sum(block.shape[1] for block in blocks),
-        "blocks": len(blocks), "horizons": entries, "units": dict(QUANTITIES),
-        "ratio": overall, "ci95": [float(low), float(high)], "after": wanted[-1],
+        "schema": "quadid.compare_vehicles/1",
+        **dict(zip("ab", labels, strict=True)),
+        "logs": [log.recording.name for log in opened[0]],
+        "samples": sum(block.shape[1] for block in blocks),
+        "blocks": len(blocks),
+        "horizons": entries,
+        "units": dict(QUANTITIES),
+        "ratio": overall,
+        "ci95": [float(low), float(high)],
+        "after": wanted[-1],
         "better": "b" if high < 1.0 else "a" if low > 1.0 else "neither",
-        "parameters": _parameters(*pair), "effects": _effects(*pair),
+        "parameters": _parameters(*pair),
+        "effects": _effects(*pair),
         "warnings": [*dict.fromkeys([*warnings, *(text for log in opened[0] for text in log.warnings)])],
-    }  # fmt: skip
+    }
     return Compared(result, tuple(opened[0]))
 
 
@@ -245,10 +281,17 @@ def _parameters(a: Vehicle, b: Vehicle) -> list[Json]:
         if one.sigma and two.sigma:
             apart = (two.initial - one.initial) / math.hypot(one.sigma, two.sigma)
         ends = [None if p.sigma is None else [p.initial - Z95 * p.sigma, p.initial + Z95 * p.sigma] for p in (one, two)]
-        out.append({
-            "name": name, "unit": unit, "a": one.initial, "a_ci95": ends[0], "b": two.initial, "b_ci95": ends[1],
-            "apart": apart,
-        })  # fmt: skip
+        out.append(
+            {
+                "name": name,
+                "unit": unit,
+                "a": one.initial,
+                "a_ci95": ends[0],
+                "b": two.initial,
+                "b_ci95": ends[1],
+                "apart": apart,
+            }
+        )
     return out
 
 

@@ -133,8 +133,8 @@ class Diagnosed(Fitted):
 
 
 def diagnose(
-    logs: Logs, validate: Validate = (), *, vehicle: OfVehicle = None, seed: Seed = 1, advance: Advance = silent,
-) -> Diagnosed:  # fmt: skip
+    logs: Logs, validate: Validate = (), *, vehicle: OfVehicle = None, seed: Seed = 1, advance: Advance = silent
+) -> Diagnosed:
     """Names what the simulation gets wrong, extends the model by it, and measures the gain on unseen data.
 
     Args:
@@ -160,9 +160,13 @@ def diagnose(
     unreachable = out_of_reach(train)
     # One flight has one error: what `quadid identify` states for it, and what the findings make of that.
     fit = search(
-        OPTIMIZERS[0], windows, with_reference_voltage(described, windows), seed,
-        lambda _, share: advance("nominal fit", share), unreachable,
-    )  # fmt: skip
+        OPTIMIZERS[0],
+        windows,
+        with_reference_voltage(described, windows),
+        seed,
+        lambda _, share: advance("nominal fit", share),
+        unreachable,
+    )
     found, selection = diagnose_windows(windows, described, unseen, seed, advance, nominal=fit)
     found, model = _within_reach(found, unreachable, farthest([log.off for log in train])), selection.model
     models = {"nominal": fit.theta, "extended": model.theta}
@@ -179,8 +183,10 @@ def diagnose(
     found = replace(found, vehicle=physical)
     result, (before, after) = found.to_dict(), found.validation.deciding
     result["validation"]["deciding"] = {
-        "seconds": selection.shooting.seconds, "mse_nominal": before, "mse_extended": after
-    }  # fmt: skip
+        "seconds": selection.shooting.seconds,
+        "mse_nominal": before,
+        "mse_extended": after,
+    }
     result["warnings"] = [*result.get("warnings", []), *given.warnings]
     result["seed"] = seed
     advance("scores", 0.0)
@@ -241,9 +247,13 @@ def _within_reach(found: Diagnosis, unreachable: Mapping[str, str], off: Mapping
 def finding_table(findings: Sequence[Json]) -> TextTable:
     """Every named cause with its numbers, what it gains on unseen data, and the closest rejected alternative."""
     columns = (
-        Column("cause"), Column("value"), Column("without", right=True), Column("with", right=True),
-        Column("95 % interval", rank=2), Column("rejected alternative", rank=1),
-    )  # fmt: skip
+        Column("cause"),
+        Column("value"),
+        Column("without", right=True),
+        Column("with", right=True),
+        Column("95 % interval", rank=2),
+        Column("rejected alternative", rank=1),
+    )
     rows = [row for finding in findings for row in _finding_rows(finding)]
     runs = ", ".join(dict.fromkeys(f"{f['gain']['seconds']:g} s" for f in findings))
     title = f"What the simulation gets wrong (error of {runs} runs in noise variances, 1 = noise floor)"

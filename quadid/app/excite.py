@@ -125,13 +125,19 @@ class Proposed(Reported):
         assert window.attitude is not None
         names = [p["name"] for p in result["parameters"]]
         bars = [
-            {"role": role, "name": label, "type": "bar", "x": names,
-             "y": [100.0 * min(p[key], 2.0) for p in result["parameters"]]}
+            {
+                "role": role,
+                "name": label,
+                "type": "bar",
+                "x": names,
+                "y": [100.0 * min(p[key], 2.0) for p in result["parameters"]],
+            }
             for role, label, key in (
-                ("measured", "now", "now"), ("before", "after a gentle flight", "gentle_flight"),
+                ("measured", "now", "now"),
+                ("before", "after a gentle flight", "gentle_flight"),
                 ("after", "after the manoeuvre", "manoeuvre"),
             )
-        ]  # fmt: skip
+        ]
         widths = {"yaxis": axis("half-width (%)", type="log"), "xaxis": {"type": "category"}}
         angles = np.degrees(np.unwrap(euler(window.attitude), axis=0))
         lines = [
@@ -149,22 +155,26 @@ class Proposed(Reported):
         ]
         sections = [
             section(
-                "gain", "What it would gain",
+                "gain",
+                "What it would gain",
                 "Relative half-width of the 95 % interval, from the Fisher information of simulated flights.",
-                [figure("gain-bars", "Half-widths", bars, widths, 320)], [self.tables()[0].part()],
+                [figure("gain-bars", "Half-widths", bars, widths, 320)],
+                [self.tables()[0].part()],
             ),
             section(
-                "manoeuvre", "The manoeuvre",
+                "manoeuvre",
+                "The manoeuvre",
                 "Stick movements one after the other, and the attitude that the simulation flies.",
                 [figure("attitude", "Attitude", lines, tilted, 320)],
                 [rows_of(("movement", "times", "amplitude, rms"), grouped(result["movements"]))],
             ),
             section(
-                "envelope", "Where it may be flown",
+                "envelope",
+                "Where it may be flown",
                 "Scripts start only inside the envelope and stop outside it.",
                 tables=[rows_of(("", "needed in simulation", "envelope"), limits)],
             ),
-        ]  # fmt: skip
+        ]
         flown = f"{result['seconds']:g} s, at most {peak['tilt_deg']:.0f}° of tilt and {peak['rate_deg_s']:.0f}°/s"
         return self.rendered(f"What to fly next: {result['vehicle']}", flown, sections, provenance(self.logs, command))
 
@@ -191,9 +201,8 @@ def parse_height(text: str) -> tuple[float, float]:
 
 
 def check_limits(
-    seconds: float, tilt: float, rate_limit: float, height: tuple[float, float], battery: float,
-    forms: Sequence[str],
-) -> None:  # fmt: skip
+    seconds: float, tilt: float, rate_limit: float, height: tuple[float, float], battery: float, forms: Sequence[str]
+) -> None:
     """Raises ParameterError for a manoeuvre that cannot be flown, or a form that is not written."""
     for form in forms:
         check_form(form)
@@ -282,9 +291,11 @@ def propose(
             return np.minimum(proposal.now, halfwidths(np.asarray(np.linalg.inv(covariance), dtype=np.float64)))
 
         proposal = replace(
-            proposal, pilot=promised((), "gentle"), after=promised(proposal.segments),
+            proposal,
+            pilot=promised((), "gentle"),
+            after=promised(proposal.segments),
             swept=promised(proposal.sweeps) if proposal.sweeps else proposal.swept,
-        )  # fmt: skip
+        )
     plan = made_into_plan(believed.name, proposal, tilt, height, battery)
     result = {
         **_result(believed.name, proposal, tilt, rate_limit),
@@ -304,14 +315,18 @@ def made_into_plan(
     sideways, up, down = proposal.room.tolist()
     if up + down > height[1] - height[0]:
         raise ParameterError(
-            f"--height {height[0]:g}:{height[1]:g}", f"at least {up + down:.2g} m, which the manoeuvre needs",
+            f"--height {height[0]:g}:{height[1]:g}",
+            f"at least {up + down:.2g} m, which the manoeuvre needs",
             "a wider --height, or a smaller --tilt",
-        )  # fmt: skip
+        )
     envelope = {
-        "lowest_m": height[0], "highest_m": height[1], "radius_m": float(math.ceil(max(ROOM * sideways, LEAST_ROOM))),
-        "tilt_deg": tilt, "abort_tilt_deg": round(ABORT * math.degrees(proposal.peak.tilt), 1),
+        "lowest_m": height[0],
+        "highest_m": height[1],
+        "radius_m": float(math.ceil(max(ROOM * sideways, LEAST_ROOM))),
+        "tilt_deg": tilt,
+        "abort_tilt_deg": round(ABORT * math.degrees(proposal.peak.tilt), 1),
         "battery_percent": battery,
-    }  # fmt: skip
+    }
     promises = (dict(zip(NOMINAL_NAMES, half.tolist(), strict=True)) for half in (proposal.after, proposal.swept))
     segments, sweeps = ([asdict(s) for s in part] for part in (proposal.segments, proposal.sweeps))
     return ManoeuvrePlan(vehicle, proposal.seconds, segments, sweeps, envelope, *promises)

@@ -84,8 +84,12 @@ def export(
         warnings.append("no hover thrust: add command.max_speed, the rotor speed at full command, to the vehicle file")
     warnings += [why for why in (refused(described, format), told) if why]
     result = {
-        "schema": "quadid.export/1", "vehicle": described.name, "format": format, "files": [], "warnings": warnings,
-    }  # fmt: skip
+        "schema": "quadid.export/1",
+        "vehicle": described.name,
+        "format": format,
+        "files": [],
+        "warnings": warnings,
+    }
     return Exported(result, texts)
 
 

@@ -55,11 +55,15 @@ def failure_html(
     verdict = Verdict(
         "poor", f"No answer: {error.found}.", details, tuple(steps or ["`quadid inspect LOG` shows more."])
     )
-    return render({
-        "title": f"{what}: no answer",
-        "subtitle": "Nothing was identified. What the logs hold is shown as it was read.",
-        "verdict": asdict(verdict), "sections": sections, "provenance": rows,
-    })  # fmt: skip
+    return render(
+        {
+            "title": f"{what}: no answer",
+            "subtitle": "Nothing was identified. What the logs hold is shown as it was read.",
+            "verdict": asdict(verdict),
+            "sections": sections,
+            "provenance": rows,
+        }
+    )
 
 
 def _data(recording: Recording, place: int) -> JsonDict:

@@ -39,7 +39,7 @@ from quadid.app.logs import (
     parse_part,
     require_gyro,
     written_whole,
-)  # fmt: skip
+)
 from quadid.app.options import OUT, Described, NamedColumns, Rate, Seed, Typed, vehicle_if
 from quadid.app.outcome import Advance, silent
 from quadid.data.window import Recording
@@ -118,11 +118,15 @@ def fleet(
         logs, parameters, findings, trims = (store.rows(table) for table in ("logs", "parameters", "findings", "trims"))
         files = [target / "fleet.sqlite", *store.write_parquet(target)]
     result = {
-        "schema": "quadid.fleet/1", "logs": len(logs), "worked": len(waiting), "seconds": time.perf_counter() - begin,
+        "schema": "quadid.fleet/1",
+        "logs": len(logs),
+        "worked": len(waiting),
+        "seconds": time.perf_counter() - begin,
         **summarise(logs, parameters, findings, found.copies),
         "health": health_trend(logs, trims, {job.unit: job.vehicle for job in found.jobs}),
-        "other_files": list(found.others), "files": [str(file) for file in files],
-    }  # fmt: skip
+        "other_files": list(found.others),
+        "files": [str(file) for file in files],
+    }
     return Fleet(result, logs, parameters)
 
 
@@ -224,11 +228,17 @@ def _identified(job: Job, log: Log) -> Row:
         "mse_initial": error["initial"],
         "mse_fitted": error["fitted"],
         "parameters": [
-            {"parameter": p["name"], "unit": p["unit"], "value": p["value"], "low": p["ci95"][0], "high": p["ci95"][1],
-             "status": p["status"]}
+            {
+                "parameter": p["name"],
+                "unit": p["unit"],
+                "value": p["value"],
+                "low": p["ci95"][0],
+                "high": p["ci95"][1],
+                "status": p["status"],
+            }
             for p in result["parameters"]
         ],
-    }  # fmt: skip
+    }
     if job.diagnose:
         from quadid.app.diagnose import diagnose
 
@@ -248,14 +258,21 @@ ATTEMPTS = 4
 _ONE_THREAD = {f"{library}_NUM_THREADS": "1" for library in ("OMP", "OPENBLAS", "MKL", "NUMBA")}
 
 _QUIET = {
-    "distributed.worker.profile.enabled": False, "distributed.admin.tick.interval": "500ms",
-    "distributed.admin.system-monitor.interval": "5s", "distributed.worker.memory.monitor-interval": "500ms",
-}  # fmt: skip
+    "distributed.worker.profile.enabled": False,
+    "distributed.admin.tick.interval": "500ms",
+    "distributed.admin.system-monitor.interval": "5s",
+    "distributed.worker.memory.monitor-interval": "500ms",
+}
 """Dask otherwise looks at every worker's stack each 10 ms, at itself each 20 ms and at memory each 100 ms."""
 _WARM = (
-    "distributed", "distributed.nanny", "quadid.app.fleet", "quadid.app.identify", "quadid.identification.fit",
-    "quadid.condition.trim", "quadid_replay.rosbag",
-)  # fmt: skip
+    "distributed",
+    "distributed.nanny",
+    "quadid.app.fleet",
+    "quadid.app.identify",
+    "quadid.identification.fit",
+    "quadid.condition.trim",
+    "quadid_replay.rosbag",
+)
 """Modules imported by the process from which all workers are forked, those that replace dead ones too."""
 
 STARTING = 180.0
@@ -289,10 +306,11 @@ def cluster(address: str | None, workers: int | None, memory: str) -> Iterator[A
 
     logging.getLogger("distributed").setLevel(logging.CRITICAL)
     settings = {
-        "distributed.scheduler.allowed-failures": 0, "distributed.nanny.pre-spawn-environ": _ONE_THREAD,
+        "distributed.scheduler.allowed-failures": 0,
+        "distributed.nanny.pre-spawn-environ": _ONE_THREAD,
         "distributed.scheduler.worker-ttl": None,  # a worker that compiles kernels is silent for minutes
         "distributed.worker.multiprocessing-method": "forkserver",
-    }  # fmt: skip
+    }
     private = TemporaryDirectory(dir=dask.config.get("temporary-directory"), ignore_cleanup_errors=True)
     with private, dask.config.set({**settings, **_QUIET, "temporary-directory": private.name}), _program_unseen():
         if address is not None:
@@ -300,9 +318,10 @@ def cluster(address: str | None, workers: int | None, memory: str) -> Iterator[A
                 client = Client(address, timeout=ANSWER, set_as_default=False)
             except (OSError, TimeoutError, ValueError) as error:
                 raise ClusterError(
-                    f"no Dask scheduler answers at {address}", "an address such as tcp://10.0.0.1:8786",
+                    f"no Dask scheduler answers at {address}",
+                    "an address such as tcp://10.0.0.1:8786",
                     "start one with `dask scheduler`, or leave --scheduler out",
-                ) from error  # fmt: skip
+                ) from error
             with client:
                 yield client
             return
@@ -310,9 +329,15 @@ def cluster(address: str | None, workers: int | None, memory: str) -> Iterator[A
         count, others = workers or os.cpu_count() or 1, set(multiprocessing.active_children())
         try:
             own = LocalCluster(
-                n_workers=count, threads_per_worker=1, processes=True, memory_limit=memory, dashboard_address=None,
-                host="127.0.0.1", silence_logs=logging.CRITICAL, death_timeout=STARTING,
-            )  # fmt: skip
+                n_workers=count,
+                threads_per_worker=1,
+                processes=True,
+                memory_limit=memory,
+                dashboard_address=None,
+                host="127.0.0.1",
+                silence_logs=logging.CRITICAL,
+                death_timeout=STARTING,
+            )
         except (RuntimeError, OSError, TimeoutError) as error:
             raise _no_worker(f"their processes end at once or not within {STARTING:g} s") from error
         try:
@@ -432,9 +457,10 @@ def _next_of(ended: SimpleQueue[Any], client: Any) -> Any:
 
 def _no_worker(how: str) -> ClusterError:
     return ClusterError(
-        f"no worker can start: {how}", "at least one worker with memory for one log",
+        f"no worker can start: {how}",
+        "at least one worker with memory for one log",
         "use more --memory, or fewer --workers; finished logs are kept",
-    )  # fmt: skip
+    )
 
 
 def _lost(job: Job) -> Row:
@@ -497,10 +523,20 @@ def find_jobs(
         text = _vehicle_text(path.parent, root, default, texts)
         made_from = f"{status.st_size} {status.st_mtime_ns} {rate!r} {seed} {diagnose} {__version__}"
         key = hmac.new(secret, "\0".join((name, made_from, text)).encode(errors="replace"), "sha256").hexdigest()[:32]
-        jobs.append(Job(
-            str(path), name, _vehicle_name(text, folder), text, status.st_size, status.st_mtime_ns,
-            key, rate, seed, diagnose,
-        ))  # fmt: skip
+        jobs.append(
+            Job(
+                str(path),
+                name,
+                _vehicle_name(text, folder),
+                text,
+                status.st_size,
+                status.st_mtime_ns,
+                key,
+                rate,
+                seed,
+                diagnose,
+            )
+        )
     if not jobs:
         raise LogError(f"no flight log below {root} ({len(others)} other files)", "MCAP, tlog, DataFlash, ULog or CSV")
     copies = _copies(jobs)
@@ -612,13 +648,26 @@ LOGS: dict[str, str] = {
 }  # fmt: skip
 """Columns of the table of logs: times in [s], started since 1970, size in bytes, modified in ns."""
 PARAMETERS: dict[str, str] = {
-    "log": "TEXT", "parameter": "TEXT", "unit": "TEXT", "value": "REAL", "low": "REAL", "high": "REAL",
+    "log": "TEXT",
+    "parameter": "TEXT",
+    "unit": "TEXT",
+    "value": "REAL",
+    "low": "REAL",
+    "high": "REAL",
     "status": "TEXT",
-}  # fmt: skip
+}
 FINDINGS: dict[str, str] = {
-    "log": "TEXT", "effect": "TEXT", "confident": "INTEGER", "parameter": "TEXT", "unit": "TEXT", "value": "REAL",
-    "low": "REAL", "high": "REAL", "mse_before": "REAL", "mse_after": "REAL",
-}  # fmt: skip
+    "log": "TEXT",
+    "effect": "TEXT",
+    "confident": "INTEGER",
+    "parameter": "TEXT",
+    "unit": "TEXT",
+    "value": "REAL",
+    "low": "REAL",
+    "high": "REAL",
+    "mse_before": "REAL",
+    "mse_after": "REAL",
+}
 TRIMS: dict[str, str] = {"log": "TEXT", "trim": "TEXT"}
 """Trim of a flight as JSON, for the comparison with other flights of its vehicle."""
 
@@ -630,10 +679,12 @@ def _columns(kinds: Mapping[str, str]) -> str:
 TABLES = {"logs": LOGS, "parameters": PARAMETERS, "findings": FINDINGS, "trims": TRIMS}
 PARTS = ("parameters", "findings", "trims")
 """Tables with rows of a log."""
-SCHEMA = "".join([
-    *(f"CREATE TABLE IF NOT EXISTS {table} ({_columns(kinds)});" for table, kinds in TABLES.items()),
-    *(f"CREATE INDEX IF NOT EXISTS {table}_log ON {table} (log);" for table in PARTS),
-])  # fmt: skip
+SCHEMA = "".join(
+    [
+        *(f"CREATE TABLE IF NOT EXISTS {table} ({_columns(kinds)});" for table, kinds in TABLES.items()),
+        *(f"CREATE INDEX IF NOT EXISTS {table}_log ON {table} (log);" for table in PARTS),
+    ]
+)
 ENDED = ("done", "refused", "unreadable")
 """Outcomes that the same file would have again."""
 

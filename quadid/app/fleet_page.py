@@ -108,9 +108,10 @@ def _drifts(series: Mapping[tuple[str, str], list[Json]]) -> list[dict[str, Any]
     from scipy import stats
 
     fit_for = {
-        key: rows for key, rows in series.items()
+        key: rows
+        for key, rows in series.items()
         if len(rows) >= FEWEST_FOR_DRIFT and len({r["started"] for r in rows}) >= FEWEST_FOR_DRIFT
-    }  # fmt: skip
+    }
     out = []
     for (unit, name), rows in fit_for.items():
         t = np.array([r["started"] for r in rows]) / DAY
@@ -119,11 +120,18 @@ def _drifts(series: Mapping[tuple[str, str], list[Json]]) -> list[dict[str, Any]
         if p_value < FALSE_ALARM:
             slope = stats.theilslopes(relative, t)
             change = float(slope.slope) * float(np.ptp(t))
-            out.append({
-                "unit": unit, "parameter": name, "change": change, "days": float(np.ptp(t)),
-                "per_day": float(slope.slope), "ci95": [float(slope.low_slope), float(slope.high_slope)],
-                "p_value": p_value, "flights": len(rows),
-            })  # fmt: skip
+            out.append(
+                {
+                    "unit": unit,
+                    "parameter": name,
+                    "change": change,
+                    "days": float(np.ptp(t)),
+                    "per_day": float(slope.slope),
+                    "ci95": [float(slope.low_slope), float(slope.high_slope)],
+                    "p_value": p_value,
+                    "flights": len(rows),
+                }
+            )
     return sorted(out, key=lambda d: -abs(d["change"]))
 
 
@@ -139,10 +147,17 @@ def _outliers(series: Mapping[tuple[str, str], list[Json]]) -> list[dict[str, An
             scale = math.hypot(centre["spread"] * abs(centre["median"]), own)
             distance = (row["value"] - centre["median"]) / scale if scale > 0.0 else 0.0
             if abs(distance) > FAR:
-                out.append({
-                    "log": row["log"], "unit": unit, "parameter": name, "value": row["value"],
-                    "median": centre["median"], "unit_of_value": row["unit"], "deviations": distance,
-                })  # fmt: skip
+                out.append(
+                    {
+                        "log": row["log"],
+                        "unit": unit,
+                        "parameter": name,
+                        "value": row["value"],
+                        "median": centre["median"],
+                        "unit_of_value": row["unit"],
+                        "deviations": distance,
+                    }
+                )
     return sorted(out, key=lambda o: -abs(o["deviations"]))
 
 
@@ -155,13 +170,18 @@ def _common(by_name: Mapping[str, Json], findings: Sequence[Json]) -> list[dict[
             seen[log["unit"], row["effect"]].setdefault(row["log"], row)
     out = [
         {
-            "unit": unit, "effect": effect, "flights": len(rows), "of": diagnosed[unit],
-            "parameter": (first := next(iter(rows.values())))["parameter"], "unit_of_value": first["unit"],
+            "unit": unit,
+            "effect": effect,
+            "flights": len(rows),
+            "of": diagnosed[unit],
+            "parameter": (first := next(iter(rows.values())))["parameter"],
+            "unit_of_value": first["unit"],
             "median": float(np.median([r["value"] for r in rows.values()])),
-            "lowest": min(r["value"] for r in rows.values()), "highest": max(r["value"] for r in rows.values()),
+            "lowest": min(r["value"] for r in rows.values()),
+            "highest": max(r["value"] for r in rows.values()),
         }
         for (unit, effect), rows in seen.items()
-    ]  # fmt: skip
+    ]
     return sorted(out, key=lambda c: (-c["flights"], c["unit"], c["effect"]))
 
 
@@ -264,10 +284,12 @@ def summary_sections(summary: Json) -> list[JsonDict]:
             ("Vehicle", "Parameter", "Change", "Rate, 95 % interval", "Chance without drift", "Flights"),
             [
                 (
-                    d["unit"], d["parameter"],
+                    d["unit"],
+                    d["parameter"],
                     f"{100 * d['change']:+.2g} % in {d['days']:.3g} days".replace("-", "−"),
                     f"{number(100 * d['ci95'][0], 2)} … {number(100 * d['ci95'][1], 2)} % a day",
-                    number(d["p_value"], 2), str(d["flights"]),
+                    number(d["p_value"], 2),
+                    str(d["flights"]),
                 )
                 for d in summary["drifts"]
             ],
@@ -276,8 +298,11 @@ def summary_sections(summary: Json) -> list[JsonDict]:
             ("Log", "Parameter", "Value", "Median of the vehicle", "Deviations"),
             [
                 (
-                    o["log"], o["parameter"], f"{number(o['value'])} {unit_text(o['unit_of_value'])}",
-                    number(o["median"]), number(o["deviations"], 2),
+                    o["log"],
+                    o["parameter"],
+                    f"{number(o['value'])} {unit_text(o['unit_of_value'])}",
+                    number(o["median"]),
+                    number(o["deviations"], 2),
                 )
                 for o in summary["outliers"]
             ],
@@ -286,7 +311,9 @@ def summary_sections(summary: Json) -> list[JsonDict]:
             ("Vehicle", "Finding", "Flights", "Median", "Range"),
             [
                 (
-                    c["unit"], c["effect"].replace("_", " "), f"{c['flights']} of {c['of']}",
+                    c["unit"],
+                    c["effect"].replace("_", " "),
+                    f"{c['flights']} of {c['of']}",
                     f"{c['parameter']} = {number(c['median'])} {c['unit_of_value']}".rstrip(),
                     f"{number(c['lowest'])} … {number(c['highest'])}",
                 )
@@ -300,7 +327,7 @@ def summary_sections(summary: Json) -> list[JsonDict]:
                 for r in summary["reasons"]
             ],
         ),
-    }  # fmt: skip
+    }
     out = [section("vehicles", "Vehicles", spread, tables=tables)] if tables else []
     for (identifier, name, intro), (columns, found) in parts.items():
         if found:
@@ -322,12 +349,13 @@ def every_log(logs: Sequence[Json]) -> JsonDict:
     for unit, some in groupby(sorted(worst[:MOST_ROWS], key=lambda log: str(log["unit"])), key=lambda log: log["unit"]):
         rows = [
             (
-                log["name"], log["status"],
+                log["name"],
+                log["status"],
                 " → ".join(number(log[key], 3) for key in errors) if log[errors[-1]] is not None else "–",
                 f"{date(log['started'])[:-3]} ({log['dated_by']})",
             )
             for log in some
-        ]  # fmt: skip
+        ]
         tables.append(rows_of(head, rows, f"{unit}: {len(rows)} log{'s' * (len(rows) != 1)}", "compact"))
     intro = (
         "Squared errors before and after the fit, relative to what the model expects (1: as large as expected). The "
@@ -417,14 +445,21 @@ class Fleet(Reported):
         for unit in self.result["units"]:
             for i, p in enumerate(unit["parameters"] or [None]):
                 head = (unit["unit"], str(unit["logs"]), str(unit["done"])) if i == 0 else ("", "", "")
-                tail = ("", "", "", "") if p is None else (
-                    p["parameter"], plain_number(p["median"]), p["unit"], f"{100 * p['spread']:.2g} %"
-                )  # fmt: skip
+                tail = (
+                    ("", "", "", "")
+                    if p is None
+                    else (p["parameter"], plain_number(p["median"]), p["unit"], f"{100 * p['spread']:.2g} %")
+                )
                 rows.append((*head, *tail))
         columns = (
-            Column("vehicle"), Column("logs", right=True, rank=1), Column("answers", right=True, rank=2),
-            Column("parameter"), Column("median", right=True), Column("unit"), Column("spread", right=True),
-        )  # fmt: skip
+            Column("vehicle"),
+            Column("logs", right=True, rank=1),
+            Column("answers", right=True, rank=2),
+            Column("parameter"),
+            Column("median", right=True),
+            Column("unit"),
+            Column("spread", right=True),
+        )
         return [TextTable("Vehicles", columns, tuple(rows))]
 
     @property
@@ -495,9 +530,12 @@ def _health(rows: Sequence[Json], logs: Sequence[Json]) -> dict[str, Any] | None
         line = trace(f"unit{i}", unit, None, score, mode="lines+markers", text=text)
         data.append({**line, "x": [places[row["log"]] for row in own]})
     layout = {
-        "xaxis": time, "yaxis": axis("healthy spreads", rangemode="tozero"), "hovermode": "closest",
-        "showlegend": True, "shapes": [level(HEALTHY_SCORE)],
-    }  # fmt: skip
+        "xaxis": time,
+        "yaxis": axis("healthy spreads", rangemode="tozero"),
+        "hovermode": "closest",
+        "showlegend": True,
+        "shapes": [level(HEALTHY_SCORE)],
+    }
     drawn = figure("fleet-health", "Distance from healthy", data, layout, 280)
     changed = [cells for _, own in sorted(by_unit.items()) if (cells := _changes_of(own))]
     table = rows_of(("Vehicle", "Flights changed", "First", "Last", "Changed"), changed[:MOST_ROWS], kind="compact")
@@ -553,10 +591,7 @@ def _view(
         bars = {"type": "data", "symmetric": False, "array": upper.tolist(), "arrayminus": lower.tolist()}
         line = trace(f"unit{i}", unit, None, value, mode="markers", error_y=bars, text=[p["log"] for p in own])
         data.append({**line, "x": [places[p["log"]] for p in own]})
-    layout = {
-        "xaxis": time, "yaxis": axis(f"{name} [{mine[0]['unit']}]"), "hovermode": "closest",
-        "showlegend": True,
-    }  # fmt: skip
+    layout = {"xaxis": time, "yaxis": axis(f"{name} [{mine[0]['unit']}]"), "hovermode": "closest", "showlegend": True}
     return {"label": name, "data": data, "layout": layout}
 
 

@@ -45,9 +45,10 @@ _LINE = re.compile(
 
 
 _FILES = {
-    "px4": (".params", "1\t1\t{name}\t{value}\t9\n"), "ardupilot": (".param", "{name},{value}\n"),
+    "px4": (".params", "1\t1\t{name}\t{value}\t9\n"),
+    "ardupilot": (".param", "{name},{value}\n"),
     "betaflight": (".txt", "set {name} = {value:.0f}\n"),
-}  # fmt: skip
+}
 """Ending and line of a file of parameters."""
 
 
@@ -100,8 +101,11 @@ class Gains(Reported):
     def tables(self) -> list[TextTable]:
         """Gains, loops before and after, and what they rest on."""
         columns = (
-            Column("parameter"), Column("proposed", right=True), Column("now", right=True), Column("what", rank=1)
-        )  # fmt: skip
+            Column("parameter"),
+            Column("proposed", right=True),
+            Column("now", right=True),
+            Column("what", rank=1),
+        )
         rows = tuple(
             (g["name"], number(g["value"], 4), number(g["current"], 4), f"{g['axis']} {g['term']}")
             for g in self.result["gains"]
@@ -151,10 +155,13 @@ class Gains(Reported):
 def loop_table(result: Json) -> TextTable:
     """Promises of every loop."""
     columns = (
-        Column("loop"), Column("bandwidth [Hz]", right=True), Column("over the intervals", right=True, rank=1),
-        Column("phase margin [deg]", right=True), Column("gain margin [dB]", right=True, rank=2),
+        Column("loop"),
+        Column("bandwidth [Hz]", right=True),
+        Column("over the intervals", right=True, rank=1),
+        Column("phase margin [deg]", right=True),
+        Column("gain margin [dB]", right=True, rank=2),
         Column("overshoot", right=True),
-    )  # fmt: skip
+    )
     rows = []
     for a in result["axes"]:
         for when, part in (("", a), (", now", a["before"])):
@@ -162,12 +169,16 @@ def loop_table(result: Json) -> TextTable:
                 r = part and part[loop]
                 if r:
                     top = f"{100.0 * r['overshoot']:.0f} %" if math.isfinite(r["overshoot"]) else "unstable"
-                    rows.append((
-                        f"{a['axis']} {loop}{when}", number(r["bandwidth"], 3),
-                        " .. ".join(number(v, 3) for v in r["bandwidth_range"]),
-                        f"{r['phase_margin']:.0f}, least {r['phase_margin_least']:.0f}",
-                        f"{r['gain_margin']:.0f}, least {r['gain_margin_least']:.0f}", top,
-                    ))  # fmt: skip
+                    rows.append(
+                        (
+                            f"{a['axis']} {loop}{when}",
+                            number(r["bandwidth"], 3),
+                            " .. ".join(number(v, 3) for v in r["bandwidth_range"]),
+                            f"{r['phase_margin']:.0f}, least {r['phase_margin_least']:.0f}",
+                            f"{r['gain_margin']:.0f}, least {r['gain_margin_least']:.0f}",
+                            top,
+                        )
+                    )
     return TextTable("Loops, and the least margins over the 95 % intervals", columns, tuple(rows))
 
 
@@ -208,8 +219,7 @@ def gains(
     motor_lag: Annotated[float | None, typer.Option("--motor-lag", metavar="S")] = None,
     delay: Annotated[float | None, typer.Option("--delay", metavar="S")] = None,
     current: Annotated[
-        str | Path | Mapping[str, float] | None,
-        Typed(Path | None, typer.Option("--from", metavar="LOG|PARAMS")),
+        str | Path | Mapping[str, float] | None, Typed(Path | None, typer.Option("--from", metavar="LOG|PARAMS"))
     ] = None,
     anyway: Annotated[bool, typer.Option("--anyway")] = False,
 ) -> Gains:
@@ -276,13 +286,21 @@ def gains(
             if n:
                 chosen.setdefault(n, {"name": n, "axis": axis, "term": term, "value": gain[n], "current": old})
     result = {
-        "schema": "quadid.gains/1", "vehicle": described.name, "format": format, "program": autopilot.program,
-        "phase_margin": phase_margin, "bandwidth": bandwidth, "axes": axes, "file": None,
+        "schema": "quadid.gains/1",
+        "vehicle": described.name,
+        "format": format,
+        "program": autopilot.program,
+        "phase_margin": phase_margin,
+        "bandwidth": bandwidth,
+        "axes": axes,
+        "file": None,
         "gains": list(chosen.values()),
-        "used": [{"name": u.name, "unit": u.unit, "value": u.value, "ci95": [u.low, u.high], "source": u.source}
-                 for u in used],
+        "used": [
+            {"name": u.name, "unit": u.unit, "value": u.value, "ci95": [u.low, u.high], "source": u.source}
+            for u in used
+        ],
         "warnings": warnings + [f"{a}: the present gains are unstable" for a, b in before.items() if not b.stable],
-    }  # fmt: skip
+    }
     return Gains(result, loops, before)
 
 
@@ -294,9 +312,10 @@ def _check_identified(vehicle: Vehicle, anyway: bool) -> list[str]:
         lacking = "; ".join(filter(None, (lacking, f"not proven: {vehicle.proof.lacking}")))
     if lacking and not anyway:
         raise UnprovenError(
-            f"{vehicle.name}: {lacking}", "a fitted vehicle file that predicts an unseen flight",
+            f"{vehicle.name}: {lacking}",
+            "a fitted vehicle file that predicts an unseen flight",
             "`quadid diagnose LOG --validate OTHER`; insist with --anyway",
-        )  # fmt: skip
+        )
     return [lacking] if lacking else []
 
 
@@ -313,8 +332,9 @@ def _lateness(vehicle: Vehicle, motor_lag: float | None, delay: float | None) ->
     tau = max(lag.get("tau", 0.0), lag.get("tau_down", 0.0))
     out = []
     for name, given, held, stated in (
-        ("motor lag", motor_lag, tau, bool(lag)), ("command delay", delay, wait.get("delay", 0.0), bool(wait)),
-    ):  # fmt: skip
+        ("motor lag", motor_lag, tau, bool(lag)),
+        ("command delay", delay, wait.get("delay", 0.0), bool(wait)),
+    ):
         value = held if given is None else given
         if not 0.0 <= value <= 1.0:
             raise ParameterError(f"{name} {value:g} s", "0 to 1 s")
@@ -337,9 +357,11 @@ def _on_board(autopilot: Autopilot, known: Mapping[str, float], vehicle: Vehicle
     """Filters and period of the autopilot's loop: as given, as the vehicle file has it, or its defaults."""
     out = {}
     parts = {
-        "gyro filter": autopilot.gyro, "derivative filter": autopilot.derivative, "loop rate": autopilot.rate,
+        "gyro filter": autopilot.gyro,
+        "derivative filter": autopilot.derivative,
+        "loop rate": autopilot.rate,
         "yaw error filter": autopilot.yaw_error,
-    }  # fmt: skip
+    }
     for name, (parameter, default) in parts.items():
         value, source = known.get(parameter, default), parameter if parameter in known else f"default of {parameter}"
         held = vehicle.effects.get("imu_lag", {}).get("cutoff")
@@ -394,10 +416,14 @@ def _axis(axis: str, now: Loops, before: Loops | None, best: Loops, held: bool) 
     phases = best.plant.phases(crossover, best.rate)
     largest = max(phases, key=lambda name: phases[name])
     return {
-        "axis": axis, **_promises(now), "before": None if before is None else _promises(before),
-        "largest_bandwidth": float(best.bandwidth()[0]), "limited_by": "moment of the rotors" if held else largest,
-        "phase_taken": phases, "at": crossover,
-    }  # fmt: skip
+        "axis": axis,
+        **_promises(now),
+        "before": None if before is None else _promises(before),
+        "largest_bandwidth": float(best.bandwidth()[0]),
+        "limited_by": "moment of the rotors" if held else largest,
+        "phase_taken": phases,
+        "at": crossover,
+    }
 
 
 def _promises(loops: Loops) -> Json:
@@ -410,11 +436,15 @@ def _promises(loops: Loops) -> Json:
         m, band = loops.margins(angle), loops.bandwidth(angle)
         top = loops.step(angle)[1].max(axis=1) - 1.0 if loops.stable else np.full(len(band), np.inf)
         out[name] = {
-            "bandwidth": float(band[0]), "bandwidth_range": [float(band.min()), float(band.max())],
-            "phase_margin": float(m.phase[0]), "phase_margin_least": float(m.phase.min()),
-            "gain_margin": float(m.gain[0]), "gain_margin_least": float(m.gain.min()),
-            "overshoot": max(float(top[0]), 0.0), "overshoot_most": max(float(top.max()), 0.0),
-        }  # fmt: skip
+            "bandwidth": float(band[0]),
+            "bandwidth_range": [float(band.min()), float(band.max())],
+            "phase_margin": float(m.phase[0]),
+            "phase_margin_least": float(m.phase.min()),
+            "gain_margin": float(m.gain[0]),
+            "gain_margin_least": float(m.gain.min()),
+            "overshoot": max(float(top[0]), 0.0),
+            "overshoot_most": max(float(top.max()), 0.0),
+        }
     return out
 
 
@@ -443,7 +473,8 @@ def _told(current: str | Path | Mapping[str, float] | None, autopilot: Autopilot
         found = dict(open_log(path).autopilot)
     if not wanted & set(found):
         raise LogError(
-            f"{path.name}: no rate gains of {autopilot.program}", f"parameters such as {autopilot.names[0][0]}",
+            f"{path.name}: no rate gains of {autopilot.program}",
+            f"parameters such as {autopilot.names[0][0]}",
             "a log or parameter file of this autopilot, or leave --from out",
-        )  # fmt: skip
+        )
     return found

@@ -82,11 +82,12 @@ class HealthOutcome(Reported):
         )
         rows = [
             (
-                change_words(c), c["evidence"] + ("" if c["confident"] else " Not certain."),
+                change_words(c),
+                c["evidence"] + ("" if c["confident"] else " Not certain."),
                 ", ".join(map(rival_words, c["alternatives"])) or "none",
             )
             for c in result["changes"]
-        ]  # fmt: skip
+        ]
         changes = [rows_of(("Change", "Found", "Rejected alternatives (probability)"), rows)] if rows else []
         intro = _INTROS["lacking" if result["baseline_lacking"] or result["unfamiliar"] else result["verdict"]]
         flown = [
@@ -112,8 +113,11 @@ class HealthOutcome(Reported):
 def health(
     logs: LogNames,
     baseline: Annotated[Given, Typed(list[str], typer.Option(metavar="LOG"), ...)],
-    *, vehicle: OfVehicle = None, preset: Preset = "auto", unchecked: Unchecked = False,
-) -> HealthOutcome:  # fmt: skip
+    *,
+    vehicle: OfVehicle = None,
+    preset: Preset = "auto",
+    unchecked: Unchecked = False,
+) -> HealthOutcome:
     """Compares flights with healthy flights of the same vehicle: which rotor, mass, centre of gravity, thrust.
 
     Works on gentle flights: hover for 5 s or more between take-off and landing.  All baseline flights share one healthy
@@ -164,8 +168,9 @@ def _check_flown(trim: FlightTrim, healthy: Sequence[FlightTrim]) -> None:
     if share < LEAST_THRUST:
         raise NotIdentifiableError(
             f"{trim.name}: the rotors give {100.0 * share:.0f} % of the thrust of the baseline flights: not a flight",
-            "flights", "use a flight; a hover is enough",
-        )  # fmt: skip
+            "flights",
+            "use a flight; a hover is enough",
+        )
 
 
 def _open(given: Flight, vehicle: Vehicle, preset: str, unchecked: bool, warnings: list[str]) -> Recording:
@@ -199,16 +204,20 @@ def _distinct(tested: Sequence[Recording], healthy: Sequence[Recording]) -> None
 
 _LEVELS: dict[str, Level] = {"unchanged": "good", "changed": "poor", "unknown": "poor"}
 _WORDS = {
-    "mass_change": "mass", "cg_offset": "centre of gravity", "thrust_drop": "thrust of all rotors",
+    "mass_change": "mass",
+    "cg_offset": "centre of gravity",
+    "thrust_drop": "thrust of all rotors",
     "weak_rotor": "rotor",
-}  # fmt: skip
+}
 _LARGE = 0.2
 """Change of effort (log of command per force) from which the flights may be of two vehicles."""
 _ONE_VEHICLE = "Check that all flights are of one vehicle, and their motors logged in one way."
 _INTROS = {
-    "changed": "", "unknown": "Nothing that has a name.", "lacking": "Not known. If anything:",
+    "changed": "",
+    "unknown": "Nothing that has a name.",
+    "lacking": "Not known. If anything:",
     "unchanged": "Nothing beyond what healthy flights differ by. If anything:",
-}  # fmt: skip
+}
 _STEPS = {
     "weak_rotor": "Look at the propeller (cuts, tape, loose on its shaft) and the motor of rotor {rotor}; "
     "exchange the propeller and fly again.",
@@ -272,10 +281,7 @@ def health_verdict(result: Json) -> Verdict:
         details += [f"If anything, {suspects}; that is within the spread of healthy flights."] if suspects else []
         return Verdict("good", "The vehicle flies as it did in the baseline flights.", tuple(details), ())
     if verdict == "unknown":
-        checks = (
-            _ONE_VEHICLE,
-            "Look the vehicle over; compare with `quadid diagnose`, which fits the motion.",
-        )
+        checks = (_ONE_VEHICLE, "Look the vehicle over; compare with `quadid diagnose`, which fits the motion.")
         return Verdict("poor", "The vehicle has changed, by nothing that has a name here.", tuple(details), checks)
     sure = [c for c in changes if c["confident"]] or changes[:1]
     rest = [c for c in changes if c not in sure]
@@ -310,9 +316,13 @@ def _step(change: Json) -> str:
 def change_table(changes: Sequence[Json]) -> TextTable:
     """Changes with intervals, and the explanations that lost."""
     columns = (
-        Column("change"), Column("value"), Column("95 % interval"), Column("p", right=True, rank=1),
-        Column("probability", right=True, rank=2), Column("rejected alternative", rank=3),
-    )  # fmt: skip
+        Column("change"),
+        Column("value"),
+        Column("95 % interval"),
+        Column("p", right=True, rank=1),
+        Column("probability", right=True, rank=2),
+        Column("rejected alternative", rank=3),
+    )
     rows: list[tuple[str | Cell, ...]] = []
     for c in changes:
         first = True
@@ -334,16 +344,22 @@ def change_table(changes: Sequence[Json]) -> TextTable:
 def trim_table(result: Json) -> TextTable:
     """Each trim of the flights in question against the baseline."""
     columns = (
-        Column("trim"), Column("now", right=True), Column("baseline", right=True), Column("spread", right=True, rank=1),
+        Column("trim"),
+        Column("now", right=True),
+        Column("baseline", right=True),
+        Column("spread", right=True, rank=1),
         Column("distance", right=True),
-    )  # fmt: skip
+    )
     rows = tuple(
         (
-            t["name"], f"{t['value']:.4f}", f"{t['baseline']:.4f}", f"{t['spread']:.4f}",
+            t["name"],
+            f"{t['value']:.4f}",
+            f"{t['baseline']:.4f}",
+            f"{t['spread']:.4f}",
             Cell(f"{t['distance']:+.1f}", "poor" if abs(t["distance"]) > 3.0 else ""),
         )
         for t in result["trim"]
-    )  # fmt: skip
+    )
     title = (
         "Trim, how the rotors share the work in steady flight: roll (left more than right), pitch (front more than "
         "back) and yaw (one direction of spin more than the other) as parts of all command; effort, the logarithm of "
@@ -361,17 +377,18 @@ def trim_figure(rows: Sequence[tuple[str, str, Sequence[float]]], names: Sequenc
     """
     data = [
         {
-            "role": role, "name": label, "type": "scatter", "mode": "markers", "text": [n for _, n, _ in part],
+            "role": role,
+            "name": label,
+            "type": "scatter",
+            "mode": "markers",
+            "text": [n for _, n, _ in part],
             "x": [k + 0.06 * (i - 0.5 * (len(part) - 1)) for k in range(len(names)) for i in range(len(part))],
             "y": [float(d[k]) for k in range(len(names)) for _, _, d in part],
         }
         for role, label in (("measured", "baseline"), ("after", "now"))
         for part in [[r for r in rows if r[0] == role]]
-    ]  # fmt: skip
-    layout = {
-        "xaxis": {"tickvals": list(range(len(names))), "ticktext": list(names)},
-        "yaxis": axis("healthy spreads"),
-    }
+    ]
+    layout = {"xaxis": {"tickvals": list(range(len(names))), "ticktext": list(names)}, "yaxis": axis("healthy spreads")}
     return figure("trims", "Every flight", data, layout, 300, caption="distance from the baseline's mean")
 
 

@@ -39,9 +39,16 @@ if TYPE_CHECKING:
 
 
 OPTIMIZERS = (
-    "pso_polish", "pso", "initial", "quasi_newton", "least_squares", "cma_es", "l_shade", "differential_evolution",
+    "pso_polish",
+    "pso",
+    "initial",
+    "quasi_newton",
+    "least_squares",
+    "cma_es",
+    "l_shade",
+    "differential_evolution",
     "pso_algorithm_1",
-)  # fmt: skip
+)
 FITS = ("p", "q", "r", "a_z")
 """Channels whose fit is printed."""
 BUDGET = 4000
@@ -61,10 +68,15 @@ def check_seed(seed: int) -> None:
 
 
 def search(
-    name: str, windows: Sequence[Window], vehicle: Vehicle, seed: int, advance: Advance,
-    out_of_reach: Mapping[str, str] | None = None, names: Sequence[str] | None = None,
+    name: str,
+    windows: Sequence[Window],
+    vehicle: Vehicle,
+    seed: int,
+    advance: Advance,
+    out_of_reach: Mapping[str, str] | None = None,
+    names: Sequence[str] | None = None,
     off: Mapping[str, float] | None = None,
-) -> Fit:  # fmt: skip
+) -> Fit:
     """Identifies the parameters with the search called `name`.
 
     The sensor noise, which decides intervals and scores, always comes from the standard fit; with the other searches
@@ -140,9 +152,12 @@ class Identified(Fitted):
     def tables(self, truth: Mapping[str, float] | None = None) -> list[TextTable]:
         """Parameters, beside the truth of a simulation, and how well each log is followed."""
         columns = (
-            Column("log"), Column("role"), Column("current", right=True), Column("fitted", right=True),
+            Column("log"),
+            Column("role"),
+            Column("current", right=True),
+            Column("fitted", right=True),
             *(Column(f"fit {n}", right=True, rank=1) for n in FITS),
-        )  # fmt: skip
+        )
         rows = []
         for s in self.result["sets"]:
             fits = [s["fit_percent"].get(n) for n in FITS]
@@ -219,22 +234,34 @@ class Identified(Fitted):
         ]
         flights = [flight_section(log.recording, fit.vehicle, i) for i, log in enumerate(self.logs[:MOST_LOGS])]
         page = identify_page(
-            result, self.sets, fit.noise, [quality(log) for log in self.logs], rows,
+            result,
+            self.sets,
+            fit.noise,
+            [quality(log) for log in self.logs],
+            rows,
             missing=None if self.forces is None else self.forces.section(),
             more=[correlation_section(fit.parameters), *(f for f in flights if f is not None)],
             excitation=told(fit, self.train),
-        )  # fmt: skip
+        )
         return render(page)
 
 
 def identify(
-    logs: Logs, validate: Validate = (), *, vehicle: OfVehicle = None,
+    logs: Logs,
+    validate: Validate = (),
+    *,
+    vehicle: OfVehicle = None,
     optimizer: Annotated[
         str, typer.Option("--optimizer", metavar="NAME", help=f"How to search: {', '.join(OPTIMIZERS)}.")
     ] = OPTIMIZERS[0],
-    seed: Seed = 1, free: Free = (), fix: Fix = (), bounds: Bounds = None, priors: Priors = None,
-    effects: KnownEffects = None, advance: Advance = silent,
-) -> Identified:  # fmt: skip
+    seed: Seed = 1,
+    free: Free = (),
+    fix: Fix = (),
+    bounds: Bounds = None,
+    priors: Priors = None,
+    effects: KnownEffects = None,
+    advance: Advance = silent,
+) -> Identified:
     """Fits b, d, J_xx, J_yy, J_zz and J_r to flight logs; states how well each is known, and how well they predict.
 
     Args:
@@ -300,9 +327,11 @@ def identify(
 
 
 def stated(
-    vehicle: Vehicle, bounds: Mapping[str, tuple[float, float]], priors: Mapping[str, tuple[float, float]],
+    vehicle: Vehicle,
+    bounds: Mapping[str, tuple[float, float]],
+    priors: Mapping[str, tuple[float, float]],
     effects: Mapping[str, Mapping[str, float]],
-) -> Vehicle:  # fmt: skip
+) -> Vehicle:
     """The vehicle with bounds, priors and effects that a caller states; checked as a file is.
 
     Raises:
@@ -341,9 +370,10 @@ def freed(vehicle: Vehicle, free: Sequence[str], fix: Sequence[str]) -> list[str
         effect = name.split(".")[0]
         if effect not in vehicle.effects:
             raise ParameterError(
-                f"free '{name}': the vehicle has no {effect}", "numbers of its effects",
+                f"free '{name}': the vehicle has no {effect}",
+                "numbers of its effects",
                 f"begin somewhere: effects={{'{effect}': {{...}}}}",
-            )  # fmt: skip
+            )
     names = [*(name for name in NOMINAL_NAMES if name not in fix), *added]
     if not names:
         raise ParameterError("every parameter is fixed", "at least one to fit", "fix fewer")
@@ -381,9 +411,8 @@ def origin_remark(logs: Sequence[Log]) -> str:
 
 
 def proven(
-    vehicle: Vehicle, verdict: Verdict, sets: Sequence[Mapping[str, Any]], train: Sequence[Log],
-    beside: Beside | None,
-) -> Vehicle:  # fmt: skip
+    vehicle: Vehicle, verdict: Verdict, sets: Sequence[Mapping[str, Any]], train: Sequence[Log], beside: Beside | None
+) -> Vehicle:
     """The vehicle with what was found beside its values, their proof, and where it all comes from.
 
     Values of a red fit become guesses without `sigma`.
@@ -396,10 +425,11 @@ def proven(
     unseen = [s for s in sets if s["role"] == "validate"]
     errors = [s["mse"]["fitted"] for s in unseen]
     proof = Proof(
-        verdict=verdict.level, unseen=tuple(s["log"] for s in unseen),
+        verdict=verdict.level,
+        unseen=tuple(s["log"] for s in unseen),
         error=max(errors) if errors and all(math.isfinite(e) for e in errors) else None,
         fitted=remembered(train, vehicle),
-    )  # fmt: skip
+    )
     whole = vehicle if beside is None else beside.in_vehicle(vehicle)
     update: dict[str, Any] = {"proof": proof}
     if verdict.level == "poor":

@@ -100,9 +100,13 @@ class Shipped(Outcome):
     def tables(self) -> list[TextTable]:
         """One row a vehicle."""
         columns = (
-            Column("vehicle"), Column("rotors", right=True), Column("mass [kg]", right=True),
-            Column("arm [m]", right=True), Column("command", rank=1), Column("description", rank=2),
-        )  # fmt: skip
+            Column("vehicle"),
+            Column("rotors", right=True),
+            Column("mass [kg]", right=True),
+            Column("arm [m]", right=True),
+            Column("command", rank=1),
+            Column("description", rank=2),
+        )
         rows = tuple(
             (r["name"], str(r["rotors"]), f"{r['mass']:.4g}", f"{r['arm']:.3g}", r["command"], r["description"])
             for r in self.records()
@@ -124,11 +128,16 @@ def shipped() -> list[dict[str, Any]]:
     out = []
     for name, text in Vehicle.shipped_texts().items():
         vehicle = Vehicle.from_yaml(text, name)
-        out.append({
-            "name": vehicle.name, "rotors": len(vehicle.rotors), "mass": vehicle.mass, "arm": vehicle.arm,
-            "command": f"{vehicle.command.kind}, {vehicle.command.sampling}",
-            "description": text.splitlines()[0].removeprefix("# ").split(".")[0],
-        })  # fmt: skip
+        out.append(
+            {
+                "name": vehicle.name,
+                "rotors": len(vehicle.rotors),
+                "mass": vehicle.mass,
+                "arm": vehicle.arm,
+                "command": f"{vehicle.command.kind}, {vehicle.command.sampling}",
+                "description": text.splitlines()[0].removeprefix("# ").split(".")[0],
+            }
+        )
     return out
 
 
@@ -181,23 +190,30 @@ def vehicle_text(recording: Recording, name: str, mass: float | None = None, arm
     if channel is not None and channel.values.shape[1] != len(frame.rotors):
         raise LogError(
             f"{recording.name}: {channel.values.shape[1]} motor columns ({channel.source}), {frame.name} has "
-            f"{len(frame.rotors)}", "as many columns as rotors", "write the file by hand: docs/new-vehicle.md",
-        )  # fmt: skip
+            f"{len(frame.rotors)}",
+            "as many columns as rotors",
+            "write the file by hand: docs/new-vehicle.md",
+        )
     weight = mass if mass is not None else _MASS
     command = _command(recording, channel)
     b = _hover_thrust(recording, channel, command, weight, len(frame.rotors))
     known_size = arm is not None or not frame.scaled
     judged = known_size and channel is not None and channel.name == "rotor_speed"
-    text = "\n".join([
-        f"name: {json.dumps(name)}",
-        f"mass: {weight:g}             {'# kg' if mass is not None else '# kg  FILL IN: weigh it as it flies'}",
-        *_rotor_lines(frame, arm),
-        f"command: {command.line}",
-        *_guesses(frame, weight, b, _possible_thrust(frame) if judged else None),
-        *_effects(recording),
-        *(f"# {note}" for note in notes),
-        *_remarks(recording),
-    ]) + "\n"  # fmt: skip
+    text = (
+        "\n".join(
+            [
+                f"name: {json.dumps(name)}",
+                f"mass: {weight:g}             {'# kg' if mass is not None else '# kg  FILL IN: weigh it as it flies'}",
+                *_rotor_lines(frame, arm),
+                f"command: {command.line}",
+                *_guesses(frame, weight, b, _possible_thrust(frame) if judged else None),
+                *_effects(recording),
+                *(f"# {note}" for note in notes),
+                *_remarks(recording),
+            ]
+        )
+        + "\n"
+    )
     Vehicle.from_yaml(text, name)  # what is handed out is valid
     return text
 

@@ -96,8 +96,12 @@ class Inspected(Outcome):
 def inspect(
     log: Annotated[Flight, Typed(str, typer.Argument(metavar="LOG"), ...)],
     vehicle: Annotated[Described | None, vehicle_if(": checks motors and excitation too.")] = None,
-    *, start: Start = None, stop: Stop = None, preset: Preset = "auto", columns: NamedColumns = None,
-) -> Inspected:  # fmt: skip
+    *,
+    start: Start = None,
+    stop: Stop = None,
+    preset: Preset = "auto",
+    columns: NamedColumns = None,
+) -> Inspected:
     """Says what a log holds: channels, rates, gaps, faults, units and frames, excitation, what is missing.
 
     Every log that can be read is shown, usable or not.
@@ -176,10 +180,15 @@ _TONES: dict[str, Tone] = {"ok": "good", "warning": "fair", "error": "poor", "un
 def channel_table(found: Inspection) -> TextTable:
     """One row a channel."""
     columns = (
-        Column("channel"), Column("rate (Hz)", right=True), Column("samples", right=True, rank=4),
-        Column("from-to (s)", right=True, rank=3), Column("gaps", right=True),
-        Column("longest (s)", right=True, rank=5), Column("dropped", right=True, rank=2), Column("source", rank=1),
-    )  # fmt: skip
+        Column("channel"),
+        Column("rate (Hz)", right=True),
+        Column("samples", right=True, rank=4),
+        Column("from-to (s)", right=True, rank=3),
+        Column("gaps", right=True),
+        Column("longest (s)", right=True, rank=5),
+        Column("dropped", right=True, rank=2),
+        Column("source", rank=1),
+    )
     rows = tuple(
         (
             f.name,

@@ -146,9 +146,7 @@ PARTS = {
     ),
     "closed loop": Part(_closed_loop, ("model.closed_loop:fly_closed_loop",), 80),
     "estimate": Part(
-        _estimate,
-        tuple(f"estimate.kalman:{name}" for name in ("moments", "filter_pass", "replay", "backward")),
-        30,
+        _estimate, tuple(f"estimate.kalman:{name}" for name in ("moments", "filter_pass", "replay", "backward")), 30
     ),
     "flight": Part(_flight, ("flight.march:march",), 30),
 }
@@ -175,8 +173,10 @@ def prepare(parts: Sequence[str], advance: Advance) -> list[str]:
     def follow(name: str) -> None:
         with subprocess.Popen(
             [sys.executable, "-P", "-c", _CHILD.format(name)],
-            stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True,
-        ) as child:  # fmt: skip
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            text=True,
+        ) as child:
             assert child.stdout is not None
             for line in child.stdout:
                 done[name] = int(line)

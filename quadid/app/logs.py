@@ -93,9 +93,10 @@ def check_place(file: Path, option: str, inside: bool = False) -> None:
             _pipes.append(os.open(file, os.O_WRONLY | os.O_NONBLOCK))
         except OSError as error:
             raise OutputError(
-                f"{option}: {file} is a pipe without a reader, or a socket ({error.strerror})", "a file",
+                f"{option}: {file} is a pipe without a reader, or a socket ({error.strerror})",
+                "a file",
                 "choose another place, or start what reads the pipe",
-            ) from error  # fmt: skip
+            ) from error
     elif not os.access(file if file.exists() else folder, os.W_OK):
         raise OutputError(f"{option}: {file} is not writable", "a file you may write", "choose another place")
 
@@ -336,9 +337,16 @@ def _places(channel: str, width: int) -> tuple[str, Sequence[str | int]]:
 
 
 def load(
-    log: str | Path, vehicle: str | Path | Vehicle, *, rate: float | None = GRID, start: float | None = None,
-    stop: float | None = None, preset: str = "auto", unchecked: bool = False, columns: Mapping[str, str] | None = None,
-) -> Log:  # fmt: skip
+    log: str | Path,
+    vehicle: str | Path | Vehicle,
+    *,
+    rate: float | None = GRID,
+    start: float | None = None,
+    stop: float | None = None,
+    preset: str = "auto",
+    unchecked: bool = False,
+    columns: Mapping[str, str] | None = None,
+) -> Log:
     """Opens a log of any kind, checks it, and brings it onto the grid.
 
     Args:
@@ -371,9 +379,10 @@ def require_gyro(recording: Recording) -> None:
     if "gyro" not in recording.channels:
         unused = next((f"; {note}" for note in recording.warnings if note.startswith("columns not used")), "")
         raise LogError(
-            f"{recording.name}: no gyro in the data{unused}", "p q r [rad/s]",
+            f"{recording.name}: no gyro in the data{unused}",
+            "p q r [rad/s]",
             "log the IMU at 50 Hz or faster, or name the columns of a CSV: --columns gyro_x=p,gyro_y=q,gyro_z=r",
-        )  # fmt: skip
+        )
 
 
 def write_recording(path: str | Path, recording: Recording) -> Path:
@@ -550,10 +559,11 @@ def remembered(train: Sequence[Log], vehicle: Vehicle) -> tuple[FittedFlight, ..
         t, rates = gyro(log)
         epoch = log.recording.epoch
         out[log.name] = FittedFlight(
-            log=log.name[:LONGEST_NAME], seconds=round(float(np.ptp(t)), 2) if len(t) else 0.0,
+            log=log.name[:LONGEST_NAME],
+            seconds=round(float(np.ptp(t)), 2) if len(t) else 0.0,
             begin=None if epoch is None or not len(t) else round(epoch + float(t[0]), 2),
             marks=" ".join(f"{mark:016x}" for mark in np.unique(_runs(rates))[:KEPT].tolist()),
-        )  # fmt: skip
+        )
     before = () if vehicle.proof is None else vehicle.proof.fitted
     return (*out.values(), *(flight for flight in before if flight.log not in out))[:MOST_FLIGHTS]
 
@@ -641,9 +651,10 @@ def vehicle_of(logs: Sequence[Flight], vehicle: str | Path | Vehicle | None) -> 
         if isinstance(log, Log):
             return log.vehicle
     raise VehicleError(
-        f"no vehicle for {logs[0]}", "a shipped name, a YAML file or a Vehicle",
+        f"no vehicle for {logs[0]}",
+        "a shipped name, a YAML file or a Vehicle",
         'give vehicle="...", or a log from quadid.load(path, vehicle="...")',
-    )  # fmt: skip
+    )
 
 
 def read(logs: Given, vehicle: Vehicle) -> list[Log]:

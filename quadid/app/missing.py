@@ -194,10 +194,12 @@ class MissingForces:
         t = self._joined(i, self.models[0], "t")
         return {
             f"missing/{model}{'/sigma' * bool(end)}": (
-                t, np.hstack([self._joined(i, model, f"force{end}"), self._joined(i, model, f"moment{end}")])
+                t,
+                np.hstack([self._joined(i, model, f"force{end}"), self._joined(i, model, f"moment{end}")]),
             )
-            for model in self.models for end in ("", "_sigma")
-        }  # fmt: skip
+            for model in self.models
+            for end in ("", "_sigma")
+        }
 
     def innovations(self, i: int) -> dict[str, Recording]:
         """Innovations of gyro and accelerometer of log `i` by model."""
@@ -256,9 +258,13 @@ def _by_axis(values: FloatArray) -> dict[str, float]:
 
 
 def compared(
-    train: Sequence[Log], held: Sequence[Log], vehicle: Vehicle, models: Mapping[str, FloatArray],
-    guesses: Mapping[str, FloatArray], advance: Callable[[str, float], None],
-) -> tuple[MissingForces | None, list[dict[str, float]]]:  # fmt: skip
+    train: Sequence[Log],
+    held: Sequence[Log],
+    vehicle: Vehicle,
+    models: Mapping[str, FloatArray],
+    guesses: Mapping[str, FloatArray],
+    advance: Callable[[str, float], None],
+) -> tuple[MissingForces | None, list[dict[str, float]]]:
     """Missing force and moment of parameter vectors, and how right each is about its own errors on every log.
 
     All are judged at the noise of the first on the training logs.  No force and moment is seen where a log lacks the

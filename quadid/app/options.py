@@ -107,9 +107,13 @@ _COLUMNS = typer.Option(
 Columns = Annotated[list[str] | None, _COLUMNS]
 NamedColumns = Annotated[Mapping[str, str] | None, Typed(list[str] | None, _COLUMNS, read=parse_columns)]
 READING: dict[str, tuple[Any, Any]] = {
-    "rate": (Rate, GRID), "start": (Start, None), "stop": (Stop, None), "preset": (Preset, "auto"),
-    "unchecked": (Unchecked, False), "columns": (Columns, None),
-}  # fmt: skip
+    "rate": (Rate, GRID),
+    "start": (Start, None),
+    "stop": (Stop, None),
+    "preset": (Preset, "auto"),
+    "unchecked": (Unchecked, False),
+    "columns": (Columns, None),
+}
 """Options of a command whose logs are opened for it, with defaults; arguments of `quadid.load`."""
 
 # --- Fitted parameters, beside or instead of those of the vehicle file
@@ -168,10 +172,12 @@ Bounds = Annotated[
 Priors = Annotated[
     Mapping[str, tuple[float, float]] | None,
     _several(
-        "--prior", "NAME=VALUE:SIGMA", "Prior knowledge of one of the six, instead of the file's.",
+        "--prior",
+        "NAME=VALUE:SIGMA",
+        "Prior knowledge of one of the six, instead of the file's.",
         _pairs("NAME=VALUE:SIGMA"),
     ),
-]  # fmt: skip
+]
 KnownEffects = Annotated[
     Mapping[str, Mapping[str, float]] | None,
     _several(

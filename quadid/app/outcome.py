@@ -239,10 +239,16 @@ class Reported(Outcome):
 
     def rendered(self, title: str, subtitle: str, sections: Sequence[Json], origin: Sequence[Json]) -> str:
         """A page of sections below the verdict; `origin` as of `provenance`."""
-        return render({
-            "title": title, "subtitle": subtitle, "verdict": None if self.verdict is None else asdict(self.verdict),
-            "sections": sections, "warnings": self.warnings, "provenance": origin,
-        })  # fmt: skip
+        return render(
+            {
+                "title": title,
+                "subtitle": subtitle,
+                "verdict": None if self.verdict is None else asdict(self.verdict),
+                "sections": sections,
+                "warnings": self.warnings,
+                "provenance": origin,
+            }
+        )
 
 
 class Fitted(Reported):
@@ -329,9 +335,10 @@ class Fitted(Reported):
         for i, (scored, log) in enumerate(zip(self.sets, self.logs, strict=True)):
             t, measured = scored.fitted.series.t, scored.fitted.series.measured
             columns = (
-                ("measured", measured), ("simulated", scored.fitted.series.simulated),
+                ("measured", measured),
+                ("simulated", scored.fitted.series.simulated),
                 ("before", scored.initial.series.simulated),
-            )  # fmt: skip
+            )
             parts = {name: _recording(log.name, t, values) for name, values in columns}
             epoch = round(1e9 * (log.recording.epoch or 0.0))
             table, bag = (free_name(folder, log.name, f"simulated.{kind}", out) for kind in ("csv", "mcap"))
@@ -369,11 +376,14 @@ def quality(log: Log) -> JsonDict:
     ]
     rows = [
         (
-            c.name, f"{number(1.0 / sample_period(c.t) if len(c.t) > 1 else None, 3)} Hz", str(len(c.t)), c.source,
+            c.name,
+            f"{number(1.0 / sample_period(c.t) if len(c.t) > 1 else None, 3)} Hz",
+            str(len(c.t)),
+            c.source,
             ", ".join(f"{n} {why.replace('_', ' ')}" for why, n in c.faults.items()) or "none",
         )
         for c in log.recording.channels.values()
-    ]  # fmt: skip
+    ]
     channels = measures(("Channel", "Rate", "Samples", "Source", "Dropped"), rows, (1, 2))
     title = Markup("{} {}").format(log.recording.name, quiet(f"({log.recording.format})"))
     return part(title, tables=[channels], lines=[f"{'; '.join(summary)}."])

@@ -66,10 +66,15 @@ class Scored(Reported):
                 for quantity, error in errors.items():
                     low, high = entry["spread"][h][quantity]
                     row = {
-                        "name": ".".join(filter(None, (entry["log"], quantity, h))), "log": entry["log"],
-                        "quantity": quantity, "after": int(h), "unit": result["units"][quantity], "error": error,
-                        "low": low, "high": high,
-                    }  # fmt: skip
+                        "name": ".".join(filter(None, (entry["log"], quantity, h))),
+                        "log": entry["log"],
+                        "quantity": quantity,
+                        "after": int(h),
+                        "unit": result["units"][quantity],
+                        "error": error,
+                        "low": low,
+                        "high": high,
+                    }
                     if entry["log"] is None:
                         row |= {key: result[key][h][quantity] for key in ("noise_floor", "no_change")}
                         inside = (result["coverage"][h] or {}).get(quantity) or dict.fromkeys(BANDS)
@@ -87,25 +92,35 @@ class Scored(Reported):
         known = [n for n in units if not all(math.isnan(errors[n]) for errors in result["horizons"].values())]
         places, layout = stacked([(f"{n} [{units[n]}]", {"type": "log"}) for n in known], "samples ahead")
         lines = (
-            ("before", "no change predicted", result["no_change"]), ("floor", "noise floor", result["noise_floor"]),
+            ("before", "no change predicted", result["no_change"]),
+            ("floor", "noise floor", result["noise_floor"]),
             ("after", "error", result["horizons"]),
-        )  # fmt: skip
+        )
         drawn_bands = [
             part
             for i, (name, where) in enumerate(zip(known, places, strict=True))
             for part in band(
-                "after", "of the runs", np.array(steps, dtype=np.float64),
-                *np.array([result["spread"][str(h)][name] for h in steps], dtype=np.float64).T, **where,
+                "after",
+                "of the runs",
+                np.array(steps, dtype=np.float64),
+                *np.array([result["spread"][str(h)][name] for h in steps], dtype=np.float64).T,
+                **where,
             )
-        ]  # fmt: skip
+        ]
         data = drawn_bands + [
             trace(
-                role, label, np.array(steps, dtype=np.float64),
+                role,
+                label,
+                np.array(steps, dtype=np.float64),
                 np.array([math.nan if (v := of[str(h)][name]) is None else v for h in steps], dtype=np.float64),
-                mode="lines+markers", showlegend=i == 0, legendgroup=role, **where,
+                mode="lines+markers",
+                showlegend=i == 0,
+                legendgroup=role,
+                **where,
             )
-            for i, (name, where) in enumerate(zip(known, places, strict=True)) for role, label, of in lines
-        ]  # fmt: skip
+            for i, (name, where) in enumerate(zip(known, places, strict=True))
+            for role, label, of in lines
+        ]
         caption = (
             f"mean error from the measured state on, and the band in which {100 * SHARE:.0f} % of the runs lie; at "
             "the noise floor an error is no larger than the sensors' own"
@@ -120,9 +135,13 @@ class Scored(Reported):
 
 
 def score(
-    logs: Logs, *, vehicle: OfVehicle = None, horizons: Horizons = HORIZONS, rate: OwnRate = None,
+    logs: Logs,
+    *,
+    vehicle: OfVehicle = None,
+    horizons: Horizons = HORIZONS,
+    rate: OwnRate = None,
     closed_loop: Annotated[bool, typer.Option("--closed-loop")] = False,
-) -> Scored:  # fmt: skip
+) -> Scored:
     """Open-loop prediction error after h samples: every sample starts one run from the measured state.
 
     Args:
@@ -238,10 +257,14 @@ def coverage(
                 sums[name] = sums.get(name, 0.0) + counts
     out: dict[str, dict[str, dict[str, float] | None] | None] = {}
     for h in wanted:
-        out[str(h)] = None if h not in total else {
-            name: dict(zip(BANDS, (c[:-1] / c[-1]).tolist(), strict=True)) if c[-1] else None
-            for name, c in total[h].items()
-        }  # fmt: skip
+        out[str(h)] = (
+            None
+            if h not in total
+            else {
+                name: dict(zip(BANDS, (c[:-1] / c[-1]).tolist(), strict=True)) if c[-1] else None
+                for name, c in total[h].items()
+            }
+        )
     source = "of the vehicle file" if vehicle.random is not None else "found in the first third of each log"
     told = [f"Bands: random forces {source}; sensor noise, trim and biases from the first third of each log"]
     if autopilot is not None:
@@ -261,12 +284,13 @@ def horizon_table(result: Json) -> TextTable:
     """
     many = len(result["files"]) > 1
     columns = (
-        Column("log"), Column("after", right=True),
+        Column("log"),
+        Column("after", right=True),
         *(
             Column(f"{name} [{unit}]", right=True, rank=max(2 - i, 0))
             for i, (name, unit) in enumerate(result["units"].items())
         ),
-    )  # fmt: skip
+    )
     rows = []
     for entry in [*(result["files"] if many else []), result]:
         label = entry.get("log", "all" if many else result["files"][0]["log"])

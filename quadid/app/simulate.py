@@ -81,10 +81,19 @@ class Drawn(Outcome):
 
 
 def simulate(
-    vehicle: str | Path | Vehicle = "pelican", *, seconds: float = 500.0, seed: int = 1, effects: Sequence[str] = (),
-    profile: str = "excited", manoeuvre: str | Path | None = None, noise: float = 1.0, rate: float = 50.0,
-    extras: Sequence[str] = (), spread: float = 0.0, random: bool = False,
-) -> Simulated:  # fmt: skip
+    vehicle: str | Path | Vehicle = "pelican",
+    *,
+    seconds: float = 500.0,
+    seed: int = 1,
+    effects: Sequence[str] = (),
+    profile: str = "excited",
+    manoeuvre: str | Path | None = None,
+    noise: float = 1.0,
+    rate: float = 50.0,
+    extras: Sequence[str] = (),
+    spread: float = 0.0,
+    random: bool = False,
+) -> Simulated:
     """Flies the closed-loop vehicle, controlled at 1 kHz, and logs it.
 
     Args:
@@ -120,9 +129,19 @@ def simulate(
     segments = read_manoeuvre(Path(manoeuvre)) if manoeuvre is not None else None
     flown = profile if segments is None else "scripted"
     flight = fly(
-        described, truth, seconds, seed, flown, effects={**described.effects, **named}, outside=outside,
-        noise_scale=noise, log_rate=rate, segments=segments, extras=extras, random=described.random if random else None,
-    )  # fmt: skip
+        described,
+        truth,
+        seconds,
+        seed,
+        flown,
+        effects={**described.effects, **named},
+        outside=outside,
+        noise_scale=noise,
+        log_rate=rate,
+        segments=segments,
+        extras=extras,
+        random=described.random if random else None,
+    )
     result = summary(flight, seed, flown)
     if described.residual:
         terms = "; ".join(term.formula for term in described.residual)
@@ -189,11 +208,16 @@ def believed(vehicle: Vehicle) -> ParameterSet:
     priors = {name: vehicle.parameters[name] for name in NOMINAL_UNITS}
     listed = [
         Parameter(
-            name, NOMINAL_UNITS[name], prior.initial, prior.sigma or 0.0, prior.initial, prior.limits,
+            name,
+            NOMINAL_UNITS[name],
+            prior.initial,
+            prior.sigma or 0.0,
+            prior.initial,
+            prior.limits,
             Status.IDENTIFIED if prior.sigma else Status.PRIOR_DOMINATED,
         )
         for name, prior in priors.items()
-    ]  # fmt: skip
+    ]
     return ParameterSet(tuple(listed), vehicle.covariance)
 
 

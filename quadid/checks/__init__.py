@@ -127,9 +127,11 @@ class Log:
         first = better_description(lagged, vehicle)
         for early in (0.0, 0.05, 0.1) if first is not None else ():
             moved = rotors_earlier(recording, early)
-            other = first if not early else better_description(
-                lagged_motion(rotors_earlier(self.read, early), vehicle, spans), vehicle
-            )  # fmt: skip
+            other = (
+                first
+                if not early
+                else better_description(lagged_motion(rotors_earlier(self.read, early), vehicle, spans), vehicle)
+            )
             if other is None:
                 break
             again = rotor_timing_check(moved, other.vehicle, spans)

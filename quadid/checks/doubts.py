@@ -20,9 +20,12 @@ Off = dict[str, float]
 
 
 def estimates_off(
-    mass: float = 1.0, thrust: float = 1.0, torque: Sequence[float] = (1.0, 1.0, 1.0), spinning: float = 1.0,
+    mass: float = 1.0,
+    thrust: float = 1.0,
+    torque: Sequence[float] = (1.0, 1.0, 1.0),
+    spinning: float = 1.0,
     turning: Sequence[float] = (1.0, 1.0, 1.0),
-) -> Off:  # fmt: skip
+) -> Off:
     """Natural logarithm of estimate over truth of the six parameters of a flat vehicle, J_zz = 2 J_xx = 2 J_yy.
 
     Args:

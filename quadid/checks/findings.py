@@ -168,9 +168,7 @@ _HOW: dict[str, dict[str, str]] = {
         "mcap": "record imu/data_raw (sensor_msgs/Imu) at 50 Hz or more; sensor_combined for PX4",
         "csv": "add columns p, q, r [rad/s]",
     },
-    "accel": {
-        "csv": "add columns ax, ay, az [m/s^2], specific force",
-    },
+    "accel": {"csv": "add columns ax, ay, az [m/s^2], specific force"},
     "attitude": {
         "ulog": "log vehicle_attitude (in every SDLOG_PROFILE)",
         "dataflash": "add ATTITUDE_FAST to LOG_BITMASK",
@@ -178,7 +176,7 @@ _HOW: dict[str, dict[str, str]] = {
         "mcap": "record attitude (geometry_msgs/QuaternionStamped) or an imu with orientation",
         "csv": "add columns qw, qx, qy, qz or phi, theta, psi [rad]",
     },
-}  # fmt: skip
+}
 
 
 def missing_signals(log_format: str, facts: tuple[ChannelFacts, ...]) -> tuple[Missing, ...]:

@@ -209,12 +209,14 @@ def attitude_check(recording: Recording, found: Response | None) -> Check:
     most = 0.7 + 5.0 / max(seconds, 1e-3)
     if down < 0.5 * GRAVITY and most < abs(up - GRAVITY) < 0.5 * GRAVITY:
         return Check(
-            "gravity", CheckResult.ERROR if abs(up - GRAVITY) > 2.0 * most else CheckResult.WARNING,
+            "gravity",
+            CheckResult.ERROR if abs(up - GRAVITY) > 2.0 * most else CheckResult.WARNING,
             f"specific force is {up:.3g} m/s^2 upwards on the average of {seconds:.3g} s, which must be "
             f"{GRAVITY:.2f}: scale or zero of the accelerometer is wrong, and b with it",
-            f"calibrate it; if it is the scale, multiply acceleration by {GRAVITY / up:.3g}", {"up": up},
+            f"calibrate it; if it is the scale, multiply acceleration by {GRAVITY / up:.3g}",
+            {"up": up},
             estimates_off(mass=up / GRAVITY) if up > 0.0 else {},
-        )  # fmt: skip
+        )
     if down < 0.5 * GRAVITY:
         q = linear(attitude.t, attitude.values, accel.t)
         upwards = np.broadcast_to([0.0, 0.0, -GRAVITY], accel.values.shape)  # makes up for gravity alone
@@ -224,16 +226,21 @@ def attitude_check(recording: Recording, found: Response | None) -> Check:
         if rates.verdict is CheckResult.WARNING or size < most:
             return rates
         return Check(
-            "gravity", CheckResult.ERROR if size > 3.0 * most else CheckResult.WARNING,
+            "gravity",
+            CheckResult.ERROR if size > 3.0 * most else CheckResult.WARNING,
             f"specific force is {aside[0]:+.2g} m/s^2 along x and {aside[1]:+.2g} along y on the average of "
             f"{seconds:.3g} s, more than gravity and attitude explain: the accelerometer's zero is wrong, or the "
-            "attitude", "calibrate it level, or subtract this", {"aside": size},
-        )  # fmt: skip
+            "attitude",
+            "calibrate it level, or subtract this",
+            {"aside": size},
+        )
     return Check(
-        rates.name, CheckResult.ERROR,
+        rates.name,
+        CheckResult.ERROR,
         f"the attitude turns what the accelerometer reads to point down ({down:.3g} m/s^2): its world has z up",
-        "convert attitude, velocity and position to NED; ROS uses east, north, up (ENU)", {"down": down},
-    )  # fmt: skip
+        "convert attitude, velocity and position to NED; ROS uses east, north, up (ENU)",
+        {"down": down},
+    )
 
 
 def gyro_check(recording: Recording, found: Response | None = None) -> Check:
@@ -267,10 +274,13 @@ def gyro_check(recording: Recording, found: Response | None = None) -> Check:
     found = found if best[0] == "as given" else None
     rows = _without_jumps(*own)
     return (
-        _apart(found) or _angle_rates(gyro, attitude) or _one_axis(rows) or _bias_step(*own)
+        _apart(found)
+        or _angle_rates(gyro, attitude)
+        or _one_axis(rows)
+        or _bias_step(*own)
         or (best[0] == "as given" and best[1].straight and _turned(rows))
         or _judge_rates(gyro, attitude, *best, smoothed=found is not None and (found.left < _SMOOTHED or found.named))
-    )  # fmt: skip
+    )
 
 
 def _one_axis(rows: tuple[FloatArray, ...]) -> Check | None:
@@ -361,11 +371,13 @@ def _turned(rows: tuple[FloatArray, ...]) -> Check | None:
     roll, pitch, yaw = np.degrees(angles)
     rotation = ", ".join(f"{angle:.3f}" for angle in angles)
     return Check(
-        "gyro_attitude", CheckResult.ERROR if size > 2.0 * _TILT else CheckResult.WARNING,
+        "gyro_attitude",
+        CheckResult.ERROR if size > 2.0 * _TILT else CheckResult.WARNING,
         f"gyro is turned against the attitude: roll {roll:.2g}, pitch {pitch:.2g}, yaw {yaw:.2g} deg",
-        f"mounting: {{rotation: [{rotation}]}} in the vehicle file, or correct the attitude", {"angle_rad": size},
+        f"mounting: {{rotation: [{rotation}]}} in the vehicle file, or correct the attitude",
+        {"angle_rad": size},
         estimates_off(turning=sizes.tolist()) if sizes.min() > 0.0 else {},
-    )  # fmt: skip
+    )
 
 
 def _bias_step(measured: FloatArray, derived: FloatArray) -> Check | None:
@@ -386,10 +398,12 @@ def _bias_step(measured: FloatArray, derived: FloatArray) -> Check | None:
     if share[k, axis] < 8.0**2 * noise or not (still or (fit.straight and fit.r2 >= _CLEAR)):
         return None
     return Check(
-        "gyro_attitude", CheckResult.ERROR,
+        "gyro_attitude",
+        CheckResult.ERROR,
         f"the gyro's bias about {_AXES[axis]} stepped by {size[k, axis]:+.2g} rad/s; without that the attitude agrees",
-        "use the flight before it, and calibrate the gyro at rest", {"step": float(size[k, axis])},
-    )  # fmt: skip
+        "use the flight before it, and calibrate the gyro at rest",
+        {"step": float(size[k, axis])},
+    )
 
 
 def _angle_rates(gyro: Channel, attitude: Channel) -> Check | None:
@@ -411,11 +425,13 @@ def _angle_rates(gyro: Channel, attitude: Channel) -> Check | None:
     if like < 0.5 * size or like**2 < _CLEAR * size * float(np.sum(missed**2)):
         return None
     return Check(
-        "gyro_attitude", CheckResult.ERROR,
+        "gyro_attitude",
+        CheckResult.ERROR,
         "gyro is the rates of roll, pitch and yaw angle (Euler rates), not those about the body's axes",
         "log the gyro; or p = phi' - psi' sin(theta), q = theta' cos(phi) + psi' sin(phi) cos(theta), "
-        "r = psi' cos(phi) cos(theta) - theta' sin(phi)", {"share": like / size},
-    )  # fmt: skip
+        "r = psi' cos(phi) cos(theta) - theta' sin(phi)",
+        {"share": like / size},
+    )
 
 
 class Response(NamedTuple):
@@ -489,10 +505,11 @@ def response(gyro: Channel, attitude: Channel) -> Response | None:
     known = (error < 0.1) & (hz < 0.1 / slowest)
     quick = np.where(known, abs(both) * hz**2, 0.0)
     return Response(
-        late + lag_mean, sigma,
+        late + lag_mean,
+        sigma,
         float(np.min((share * (1.0 + 2.0 * error))[known], initial=1.0)),
         float(quick.sum() / np.sum(quick / np.minimum(share, 1.0))) if known.any() else 1.0,
-    )  # fmt: skip
+    )
 
 
 def _filtered(found: Response | None, known: Mapping[str, Mapping[str, float]]) -> Check | None:
@@ -511,15 +528,20 @@ def _filtered(found: Response | None, known: Mapping[str, Mapping[str, float]]) 
         delay = f"{later} comes {1e3 * abs(late):.0f} ms after the {sooner}"
         notes.append(f"{delay}, as low-passed at {butterworth_delay(abs(late)):.2g} Hz or stamped late")
     if smoothed:
-        notes.append(f"gyro has {found.left:.0%} of the attitude's quick turning: it was " + (
-            "low-passed" if sure and late > 0.0 else "smoothed without a delay"
-        ))  # fmt: skip
+        notes.append(
+            f"gyro has {found.left:.0%} of the attitude's quick turning: it was "
+            + ("low-passed" if sure and late > 0.0 else "smoothed without a delay")
+        )
     models = "`attitude_delay` models a delay" if sure and late < 0.0 else "`imu_lag` models a filter"
     fix = f"log the raw {later if sure else 'gyro'}" + f"; {models}" * sure
     return Check(
-        "gyro_source", CheckResult.WARNING, "; ".join(notes), fix, {"late_s": late, "left": found.left},
+        "gyro_source",
+        CheckResult.WARNING,
+        "; ".join(notes),
+        fix,
+        {"late_s": late, "left": found.left},
         estimates_off(turning=(found.read,) * 3) if later == "gyro" or smoothed else {},
-    )  # fmt: skip
+    )
 
 
 def gyro_source_check(recording: Recording, vehicle: Vehicle | None, found: Response | None) -> Check | None:
@@ -546,10 +568,12 @@ def gyro_source_check(recording: Recording, vehicle: Vehicle | None, found: Resp
         return _filtered(found, {} if vehicle is None else vehicle.effects)
     noisy = bends > 0.5 * float(np.median(np.linalg.norm(rates, axis=1)))
     return Check(
-        "gyro_source", CheckResult.ERROR if noisy else CheckResult.WARNING,
+        "gyro_source",
+        CheckResult.ERROR if noisy else CheckResult.WARNING,
         "gyro is the attitude, differentiated: it measures nothing by itself" + ", and is mostly noise" * noisy,
-        "log the gyro; noise and delay of the attitude are in both", {"missed_rad_s": least, "bends_rad_s": bends},
-    )  # fmt: skip
+        "log the gyro; noise and delay of the attitude are in both",
+        {"missed_rad_s": least, "bends_rad_s": bends},
+    )
 
 
 def _moving_rates(gyro: Channel, t: FloatArray, q: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -596,10 +620,12 @@ def _apart(found: Response | None) -> Check | None:
         return None
     which = ("gyro", "attitude") if found.late > 0.0 else ("attitude", "gyro")
     return Check(
-        "gyro_attitude", CheckResult.ERROR,
+        "gyro_attitude",
+        CheckResult.ERROR,
         f"{which[0]} comes {1e3 * abs(found.late):.0f} ms after the {which[1]}",
-        f"stamp the {which[0]} when it is measured, on the clock of the {which[1]}", {"lag_s": found.late},
-    )  # fmt: skip
+        f"stamp the {which[0]} when it is measured, on the clock of the {which[1]}",
+        {"lag_s": found.late},
+    )
 
 
 def _likely(reading: str, fit: AxisMap) -> float:
@@ -664,11 +690,12 @@ def velocity_check(recording: Recording) -> Check:
     if not (min(np.std(up), np.std(down)) > 0.05 and np.corrcoef(up, down)[0, 1] < -0.8):
         return level
     return Check(
-        "velocity_attitude", CheckResult.ERROR,
+        "velocity_attitude",
+        CheckResult.ERROR,
         f"vertical {velocity.name} rises where the force pushes down: it points up",
         f"negate {'vz, and z if it points up too' if velocity.name == 'velocity' else 'z'}: the world is NED",
         {"vertical": -1.0},
-    )  # fmt: skip
+    )
 
 
 def _flown(position: Channel | None) -> Channel | None:
@@ -768,10 +795,12 @@ def position_check(recording: Recording) -> Check | None:
     turned = fit.axes != (0, 1, 2) or min(fit.signs[:2]) < 0
     if np.max(np.std(moved[:, :2], axis=0)) > LEAST_MOTION and fit.r2 > CLEAR**2 and turned:
         return Check(
-            "position_velocity", CheckResult.WARNING,
+            "position_velocity",
+            CheckResult.WARNING,
             f"world axes of velocity differ from those of position: {fit} (R^2 {fit.r2:.2f})",
-            "use NED for both; ROS' ENU swaps x and y", {"r2": fit.r2},
-        )  # fmt: skip
+            "use NED for both; ROS' ENU swaps x and y",
+            {"r2": fit.r2},
+        )
     numbers: dict[str, float] = {}
     scales: list[str] = []
     off: list[str] = []
@@ -781,10 +810,12 @@ def position_check(recording: Recording) -> Check | None:
         correlation = float(np.sum(p * v) / np.sqrt(max(np.sum(p * p) * np.sum(v * v), 1e-300)))
         if where == "vertically" and np.max(np.std(p, axis=0)) > 0.2 * LEAST_MOTION and correlation < -0.8:
             return Check(
-                "position_velocity", CheckResult.ERROR,
+                "position_velocity",
+                CheckResult.ERROR,
                 f"position rises where velocity falls (correlation {correlation:.2f}): one of them points up",
-                "negate z or vz: the world is NED, its z down", {"correlation": correlation},
-            )  # fmt: skip
+                "negate z or vz: the world is NED, its z down",
+                {"correlation": correlation},
+            )
         if np.max(np.std(p, axis=0)) < LEAST_MOTION or correlation < CLEAR:
             continue
         # Both have errors: the ratio of their sizes, not a regression of one on the other.
@@ -806,13 +837,14 @@ def position_check(recording: Recording) -> Check | None:
     if not off:
         return Check("position_velocity", CheckResult.OK, measured, numbers=numbers)
     return Check(
-        "position_velocity", CheckResult.WARNING,
+        "position_velocity",
+        CheckResult.WARNING,
         f"the logged velocity is {' and '.join(off)} than the logged change of position ({measured}): the scale of one "
         "of them is wrong; a simulation fitted to such a log misses positions by as much, unless it has "
         "`velocity_scale`",
         "check the scale of the positioning system and of the estimator's velocity (flow sensor, marker distances)",
         numbers,
-    )  # fmt: skip
+    )
 
 
 def _changes(position: Channel, velocity: Channel) -> tuple[FloatArray, FloatArray, float]:

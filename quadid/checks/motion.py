@@ -9,16 +9,7 @@ import numpy as np
 from quadid.checks.findings import ChannelFacts, Check, CheckResult
 from quadid.data.grid import holes, longest_step, moving_mean
 from quadid.data.rotor_signal import rotor_channel
-from quadid.data.window import (
-    CHANNELS,
-    Channel,
-    Recording,
-    at_limit,
-    copied,
-    measured_period,
-    sample_period,
-    true_runs,
-)
+from quadid.data.window import CHANNELS, Channel, Recording, at_limit, copied, measured_period, sample_period, true_runs
 from quadid.model.layout import ThrustModel
 from quadid.rotation import euler
 from quadid.types import BoolArray, FloatArray
@@ -286,12 +277,13 @@ def timing_checks(recording: Recording, facts: tuple[ChannelFacts, ...]) -> list
         text = ", ".join(f"{f.name} {f.gaps}" for f in gaps.values())
         checks.append(
             Check(
-                "timing", CheckResult.WARNING,
+                "timing",
+                CheckResult.WARNING,
                 f"gaps: {text}; the longest lasts {worst.longest_gap:.3g} s ({worst.name})",
                 "windows are cut there; log to a faster card or at a lower rate",
                 {"gaps": float(sum(f.gaps for f in facts)), "longest_s": worst.longest_gap},
             )
-        )  # fmt: skip
+        )
     unsteady = [f for f in facts if f.name in ("gyro", "accel", "rotor_speed", "motor_command") and f.jitter > 0.25]
     for f in unsteady:
         message = f"{f.name}: steps vary by {f.jitter:.0%} of their median: stamps are unsteady or samples are lost"
@@ -364,7 +356,9 @@ def attitude_steps_check(recording: Recording) -> Check | None:
     if step < 0.005:
         return None
     return Check(
-        "attitude_steps", CheckResult.WARNING,
+        "attitude_steps",
+        CheckResult.WARNING,
         f"attitude comes in steps of {np.degrees(step):.2g} deg ({attitude.source})",
-        "log it with more digits", {"step_rad": step},
-    )  # fmt: skip
+        "log it with more digits",
+        {"step_rad": step},
+    )

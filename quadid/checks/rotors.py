@@ -325,11 +325,13 @@ def readings_check(recording: Recording, vehicle: Vehicle, spans: Spans) -> Chec
     step, noise = _coarse(signal.t[inside], values)
     if step and not problem:  # such a signal rests between its steps
         return Check(
-            _NAME, CheckResult.WARNING,
+            _NAME,
+            CheckResult.WARNING,
             f"rotor speeds come in steps of {step:.3g} rad/s: too coarse for the motion ({signal.source})",
-            "log them finer, or motor commands", {"step_rad_s": step},
+            "log them finer, or motor commands",
+            {"step_rad_s": step},
             estimates_off(torque=[1.0 / (1.0 + noise)] * 3, spinning=1.0 / (1.0 + noise)),
-        )  # fmt: skip
+        )
     problem = problem or _stuck(signal, recording, inside)
     fix = "check which outputs drive the motors, and that all of them were logged" if commands else _FIX
     return problem and Check(_NAME, CheckResult.ERROR, f"{problem[0]} ({signal.source})", fix, problem[1])
@@ -358,9 +360,11 @@ def _other_unit(speeds: FloatArray) -> Problem | None:
         ratio = own / max(others, 1e-9)
         if np.ptp(speeds[:, rotor]) > 0.0 < own and others > 0.0 and not 0.2 < ratio < 5.0:
             likely = (
-                ("in rpm", 30.0 / np.pi), ("a square", others), ("a command from 0 to 1", 0.5 / others),
+                ("in rpm", 30.0 / np.pi),
+                ("a square", others),
+                ("a command from 0 to 1", 0.5 / others),
                 ("in rev/s", 0.5 / np.pi),
-            )  # fmt: skip
+            )
             unit = next((f": is it {name}?" for name, r in likely if 0.5 < ratio / r < 2.0), "")
             return f"rotor {rotor + 1} reads {ratio:.3g} times what the others read{unit}", {"rotor": rotor + 1.0}
     return None
@@ -436,7 +440,7 @@ def _stuck(signal: RotorSignal, recording: Recording, inside: BoolArray) -> Prob
         return (
             "no rotor ever changes its speed, though the vehicle moves: the speed signal is stuck",
             {"stuck_s": float(t[-1] - t[0])},
-        )  # fmt: skip
+        )
     for rotor, column in enumerate(values.T):
         others = np.delete(values, rotor, axis=1)
         same = np.append(column[1:] == column[:-1], False) & (column != others.min()) & (column != others.max())
@@ -477,8 +481,9 @@ def _unbalanced(squares: FloatArray, vehicle: Vehicle) -> Problem | None:
         return "the rotor speeds are far from balance", {"share": float(odd.mean())}
     return (
         f"rotor {found.rotor + 1} reads {found.ratio:.2f} times the speed that balance needs for {odd.mean():.0%} of "
-        "the flight", {"rotor": found.rotor + 1.0, "speed_ratio": found.ratio, "share": float(odd.mean())},
-    )  # fmt: skip
+        "the flight",
+        {"rotor": found.rotor + 1.0, "speed_ratio": found.ratio, "share": float(odd.mean())},
+    )
 
 
 class _Odd(NamedTuple):
@@ -550,8 +555,9 @@ def balance_check(recording: Recording, vehicle: Vehicle, spans: Spans) -> Check
         f"{here} {read.rotor + 1} read {read.ratio:.2f} times its speed: then b and inertias are wrong, else the "
         "centre of gravity is there",
         "check that rotor's reading, propeller and place in the vehicle file, and where the vehicle balances",
-        {"off": off, "rotor": read.rotor + 1.0, "speed_ratio": read.ratio}, rotors_off(vehicle, speeds, true),
-    )  # fmt: skip
+        {"off": off, "rotor": read.rotor + 1.0, "speed_ratio": read.ratio},
+        rotors_off(vehicle, speeds, true),
+    )
 
 
 def _moved_rotor(vehicle: Vehicle, odd: _Odd) -> Vehicle:
@@ -592,9 +598,12 @@ def _against_thrust(
 
 
 _UNITS = (
-    ("in rpm", 2.0 * np.pi / 60.0), ("in rev/s", 2.0 * np.pi), ("of the electrical field (if 14 poles)", 1.0 / 7.0),
-    ("ten times too low, or b to be per rpm^2", 10.0), ("in thousands of rpm", 1e3 * 2.0 * np.pi / 60.0),
-)  # fmt: skip
+    ("in rpm", 2.0 * np.pi / 60.0),
+    ("in rev/s", 2.0 * np.pi),
+    ("of the electrical field (if 14 poles)", 1.0 / 7.0),
+    ("ten times too low, or b to be per rpm^2", 10.0),
+    ("in thousands of rpm", 1e3 * 2.0 * np.pi / 60.0),
+)
 """Units that speeds may be in instead of rad/s, and the factor that mends each."""
 _SLOW_MOTION = 0.4
 """Motion slower than about 1/0.4 s is left out: there aerodynamics and the controller rule [s]."""
@@ -783,8 +792,9 @@ def better_description(lagged: Lagged | str, vehicle: Vehicle) -> Other | None:
     rotors = tuple(range(len(vehicle.rotors)))
     named = [
         (float(_gain(axes)) - _CHANGE * (_moved(order) + (sign < 0.0)), 0.0, order, axes)
-        for sign in (1.0, -1.0) for order, axes in _best(grams, vehicle, _orders(len(rotors)), sign)
-    ]  # fmt: skip
+        for sign in (1.0, -1.0)
+        for order, axes in _best(grams, vehicle, _orders(len(rotors)), sign)
+    ]
     own = max((one for one in named if one[2] == rotors), key=lambda one: one[0])
     # The most likely orders, and the own one, with the frame turned as roll and pitch then answer.
     for order in {rotors, *(one[2] for one in sorted(named, key=lambda one: -one[0])[:_TURNED])}:
@@ -1017,8 +1027,9 @@ def _rotated(vehicle: Vehicle, angle: float) -> Vehicle:
     cos, sin = math.cos(angle), math.sin(angle)
     rotors = tuple(
         r.model_copy(update={"position": (cos * x - sin * y, sin * x + cos * y, z)})
-        for r in vehicle.rotors for x, y, z in (r.position,)
-    )  # fmt: skip
+        for r in vehicle.rotors
+        for x, y, z in (r.position,)
+    )
     return vehicle.model_copy(update={"rotors": rotors})
 
 
@@ -1108,9 +1119,10 @@ def geometry_check(lagged: Lagged | str, vehicle: Vehicle, b_from_hover: float |
     if float(np.min(explained)) < 0.1:
         axis = ("roll", "pitch")[int(np.argmin(explained))]
         return Check(
-            name, CheckResult.UNKNOWN,
+            name,
+            CheckResult.UNKNOWN,
             f"rotor torques explain only {np.min(explained):.0%} of the {axis} motion: too little to judge positions",
-        )  # fmt: skip
+        )
     numbers = {"turned_rad": angle, "explained": float(np.min(explained))}
     return _judge_scale(vehicle, scale, b_from_hover or 0.0, numbers)
 
@@ -1158,13 +1170,15 @@ def _unlikely(vehicle: Vehicle, scale: float, hover: float, numbers: dict[str, f
     low, high = stated * np.exp(-found[which] + np.array([-2.0, 2.0]) / np.sqrt(power[which]))
     doubt = _heavier(math.exp(found[which])) if which else _farther(math.exp(-found[which]))
     return Check(
-        "geometry", CheckResult.WARNING,
+        "geometry",
+        CheckResult.WARNING,
         f"is the {what} {stated:.3g} {unit}? Weight and motion make the inertia about x and y {size:.2g} times mass "
         f"times arm squared ({_SHARE:g} on most vehicles) and {hover / scale:.2g} times its guess, and b "
         f"{hover / guessed:.2g} times its guess",
-        f"measure the {what}: {low:.2g} to {high:.2g} {unit} would fit", {**numbers, "size": size},
+        f"measure the {what}: {low:.2g} to {high:.2g} {unit} would fit",
+        {**numbers, "size": size},
         doubt if surprise[which] > _DOUBTED else {},
-    )  # fmt: skip
+    )
 
 
 def _farther(factor: float) -> Off:

@@ -119,5 +119,6 @@ def factors(axis: int, turns: float, moments: FloatArray) -> list[Factor]:
     found = [Factor(f"{AXES[axis]} {TURN_FACTOR}", math.copysign(size, slope[axis]), float(sigma[axis]))]
     return found + [
         Factor(f"part of the gyro's {AXES[k]} in the attitude's {AXES[axis]}", float(slope[k]), float(sigma[k]), 0.0)
-        for k in range(3) if k != axis
-    ]  # fmt: skip
+        for k in range(3)
+        if k != axis
+    ]

@@ -72,10 +72,7 @@ COMMANDS = {
         "quadid.app.init:init",
     ),
     "vehicles": Command(
-        "List the vehicles that come with quadid.",
-        ("quadid vehicles",),
-        "quadid.app.init:vehicles",
-        out="",
+        "List the vehicles that come with quadid.", ("quadid vehicles",), "quadid.app.init:vehicles", out=""
     ),
     "inspect": Command(
         "Check a log against physics, and list what it lacks.",
@@ -275,11 +272,13 @@ def of_library(command: Command, function: Callable[..., Outcome]) -> Callable[.
 
     parameters = [
         inspect.Parameter(
-            n, inspect.Parameter.KEYWORD_ONLY, annotation=told,
+            n,
+            inspect.Parameter.KEYWORD_ONLY,
+            annotation=told,
             default=inspect.Parameter.empty if default is ... else default,
         )
         for n, (told, default) in shown.items()
-    ]  # fmt: skip
+    ]
     run.__doc__ = about
     run.__dict__["__signature__"] = inspect.Signature(parameters)
     run.__annotations__ = {name: told for name, (told, _) in shown.items()}
@@ -287,9 +286,13 @@ def of_library(command: Command, function: Callable[..., Outcome]) -> Callable[.
 
 
 def _run(
-    command: Command, function: Callable[..., Outcome], outcome: type[Outcome], signature: inspect.Signature,
-    typed: Mapping[str, Any], given: Mapping[str, Any],
-) -> None:  # fmt: skip
+    command: Command,
+    function: Callable[..., Outcome],
+    outcome: type[Outcome],
+    signature: inspect.Signature,
+    typed: Mapping[str, Any],
+    given: Mapping[str, Any],
+) -> None:
     from quadid.app.kernels import FIT, prepare
     from quadid.app.logs import check_folder, file_name, parse_part, write_text
     from quadid.app.outcome import Fitted, UnansweredError

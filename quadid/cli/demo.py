@@ -113,9 +113,13 @@ def run(seconds: float, seed: int, folder: Path, advance: Advance) -> Shown:
 
 
 def fly_and_load(
-    vehicle: Vehicle, path: Path, seconds: float, seed: int, effects: Mapping[str, Mapping[str, float]],
+    vehicle: Vehicle,
+    path: Path,
+    seconds: float,
+    seed: int,
+    effects: Mapping[str, Mapping[str, float]],
     advance: Advance,
-) -> Log:  # fmt: skip
+) -> Log:
     """Flies once, writes the log as MCAP, and reads it back as any other log."""
     from quadid.flight import fly
 
@@ -146,18 +150,31 @@ def html(shown: Shown, seed: int, command: str) -> str:
     rows = [*provenance(logs, command), {"name": "seed", "value": str(seed)}]
     hidden = shown.hidden
     same = diagnosis_part(
-        shown.diagnosed.result, shown.diagnosed.sets, "same", TRUE_SECTION,
+        shown.diagnosed.result,
+        shown.diagnosed.sets,
+        "same",
+        TRUE_SECTION,
         "Nothing was hidden in this vehicle, so nothing should be found.",
-    )  # fmt: skip
+    )
     same["kind"] = "folded"
     apart = diagnosis_part(
-        hidden.result, hidden.sets[-1:], "hidden", HIDDEN_SECTION,
-        f"This vehicle flew with {effects_words(HIDDEN)}, which the model lacks.", hidden.maps(),
+        hidden.result,
+        hidden.sets[-1:],
+        "hidden",
+        HIDDEN_SECTION,
+        f"This vehicle flew with {effects_words(HIDDEN)}, which the model lacks.",
+        hidden.maps(),
         None if hidden.forces is None else hidden.forces.section(),
-    )  # fmt: skip
+    )
     page = identify_page(
-        done.result, done.sets, done.fit.noise, [quality(log) for log in logs], rows, shown.truth,
-        more=[findings_section([same, apart])], excitation=told(done.fit, done.logs[:1]),
-    )  # fmt: skip
+        done.result,
+        done.sets,
+        done.fit.noise,
+        [quality(log) for log in logs],
+        rows,
+        shown.truth,
+        more=[findings_section([same, apart])],
+        excitation=told(done.fit, done.logs[:1]),
+    )
     page["title"] = "Demonstration: a simulated Pelican"
     return render(page)

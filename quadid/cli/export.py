@@ -80,8 +80,9 @@ def _in_force(vehicle: Vehicle, history: Path, name: str) -> tuple[Vehicle, str]
     except ValueError as error:
         raise StoreError(
             f"set {found.item.sequence} of '{name}' in {history} is no set that a fit makes: {found.why_none}",
-            "a set that a service has written", "fly on until the service publishes another",
-        ) from error  # fmt: skip
+            "a set that a service has written",
+            "fly on until the service publishes another",
+        ) from error
     if TANGENT in found.item.parameters.names:
         # A dead speed in the file gives the slope of thrust at hover.
         b, steep = (found.item.parameters[n].value for n in ("b", TANGENT))
@@ -90,8 +91,9 @@ def _in_force(vehicle: Vehicle, history: Path, name: str) -> tuple[Vehicle, str]
         curve = {**fitted.effects.get("thrust_curve", {}), "dead_speed": law.curve[1]}
         fitted = fitted.model_copy(
             update={
-                "parameters": {**fitted.parameters, "b": prior}, "effects": {**fitted.effects, "thrust_curve": curve},
+                "parameters": {**fitted.parameters, "b": prior},
+                "effects": {**fitted.effects, "thrust_curve": curve},
             }
-        )  # fmt: skip
+        )
     fitted = with_correlation(fitted, found.item.parameters)
     return fitted, f"{history.name}, set {found.item.sequence} of {name}"

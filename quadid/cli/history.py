@@ -60,8 +60,12 @@ def history(
     last = read_in_force(path, name, described)
     force = None if last.item is None else {"sequence": last.item.sequence, "doubt": last.doubt}
     result = {
-        "schema": "quadid.history/1", "vehicle": name, "history": str(path.absolute()), "in_force": force, **found,
-    }  # fmt: skip
+        "schema": "quadid.history/1",
+        "vehicle": name,
+        "history": str(path.absolute()),
+        "in_force": force,
+        **found,
+    }
     terminal.conclude(Stored(result), json)
 
 
@@ -97,15 +101,26 @@ class Stored(Outcome):
 def _story(sets: Sequence[dict[str, Any]], title: str) -> TextTable:
     """Time, author and data of a set."""
     columns = (
-        Column("set", right=True), Column("when"), Column("state"), Column("by"), Column("data [s]", right=True),
-        Column("error", right=True), Column("rests on"),
-    )  # fmt: skip
+        Column("set", right=True),
+        Column("when"),
+        Column("state"),
+        Column("by"),
+        Column("data [s]", right=True),
+        Column("error", right=True),
+        Column("rests on"),
+    )
     rows = tuple(
-        (str(item["sequence"]), _when(item["wall"]), item["state"], item["approved_by"],
-         f"{(item['stop'] or 0.0) - (item['start'] or 0.0):.0f}", number(item["mse"], 3),
-         f"{item['reference']}, +-{Z95 * item['reference_sd']:.0%}")
+        (
+            str(item["sequence"]),
+            _when(item["wall"]),
+            item["state"],
+            item["approved_by"],
+            f"{(item['stop'] or 0.0) - (item['start'] or 0.0):.0f}",
+            number(item["mse"], 3),
+            f"{item['reference']}, +-{Z95 * item['reference_sd']:.0%}",
+        )
         for item in sets
-    )  # fmt: skip
+    )
     return TextTable(title, columns, rows)
 
 

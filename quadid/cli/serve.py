@@ -129,8 +129,7 @@ class _Console:
         status = health.status
         rates += f" | {status.backlog:.1f} s behind the data, {status.skipped} fits left out" * (status.backlog > 1.0)
         self._console.print(
-            f"{status.phase.value}: {status.reason} | Hz: {rates} | fit process {health.worker}",
-            soft_wrap=True,
+            f"{status.phase.value}: {status.reason} | Hz: {rates} | fit process {health.worker}", soft_wrap=True
         )
 
     def attend(self) -> None:

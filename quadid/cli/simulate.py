@@ -44,8 +44,7 @@ def simulate(
     noise: Annotated[float, typer.Option("--noise", metavar="FACTOR", min=0.0, help="Scales all sensor noise.")] = 1.0,
     rate: Annotated[float, typer.Option("--rate", metavar="HZ", help="Log rate.")] = 50.0,
     extra: Annotated[
-        list[str] | None,
-        typer.Option("--extra", metavar="CHANNEL", help="Log velocity, position or battery as well."),
+        list[str] | None, typer.Option("--extra", metavar="CHANNEL", help="Log velocity, position or battery as well.")
     ] = None,
     spread: Annotated[
         float,
@@ -67,9 +66,15 @@ def simulate(
     check_target(out)
     terminal.check_file(json, "--json")
     how: dict[str, Any] = {
-        "seconds": seconds, "effects": effect or (), "profile": profile, "manoeuvre": manoeuvre, "noise": noise,
-        "rate": rate, "extras": extra or (), "spread": spread,
-    }  # fmt: skip
+        "seconds": seconds,
+        "effects": effect or (),
+        "profile": profile,
+        "manoeuvre": manoeuvre,
+        "noise": noise,
+        "rate": rate,
+        "extras": extra or (),
+        "spread": spread,
+    }
     live = out.startswith(LIVE)
     if draws is not None and live:
         raise SimulateError(f"--draws {draws} to {out}", "a file", "leave one of them out")

@@ -93,9 +93,10 @@ def check_file(path: Path | str | None, option: str) -> None:
     file = Path(path)
     if option == "--report" and file.suffix.lower() not in (".html", ".htm") and not file.is_dir():
         raise OutputError(
-            f"{option} {file}: a report is an HTML page", "a name that ends in .html",
+            f"{option} {file}: a report is an HTML page",
+            "a name that ends in .html",
             f"{file.stem}.html; a browser prints it to PDF, in eight pages at most",
-        )  # fmt: skip
+        )
     check_place(file, option)
 
 
@@ -151,9 +152,12 @@ def print_verdict(console: Console, verdict: Verdict) -> None:
 
 
 def write(
-    done: Outcome, report: Path | None = None, folder: Path | None = None, series: Path | None = None,
+    done: Outcome,
+    report: Path | None = None,
+    folder: Path | None = None,
+    series: Path | None = None,
     kept: str | None = None,
-) -> list[tuple[str, Path]]:  # fmt: skip
+) -> list[tuple[str, Path]]:
     """Writes the files of a result but its JSON, which names them; returns them with labels.
 
     Args:

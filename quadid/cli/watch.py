@@ -129,10 +129,13 @@ def table(found: Mapping[str, Any]) -> Table:
             sure = "" if finding.get("confident") else " (?)"
             lines.append(f"{_plain(finding.get('effect'))}{sure}: {_plain(finding.get('evidence'))}")
         out.add_row(
-            Text(_plain(name), style=color), Text(state if kinds["alive"] else "gone"),
-            Text(_plain(f"{force.get('sequence', '-')} {force.get('state', '')}") + notes), Text(_parameters(force)),
-            Text("\n".join(lines)), Text(_feeds(health)),
-        )  # fmt: skip
+            Text(_plain(name), style=color),
+            Text(state if kinds["alive"] else "gone"),
+            Text(_plain(f"{force.get('sequence', '-')} {force.get('state', '')}") + notes),
+            Text(_parameters(force)),
+            Text("\n".join(lines)),
+            Text(_feeds(health)),
+        )
     return out
 
 

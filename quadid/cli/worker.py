@@ -13,8 +13,7 @@ from quadid.sanitise import plain
 
 def worker(
     connect: Annotated[
-        str,
-        typer.Option("--connect", metavar="WHERE", help="A locator (tcp/host:7447), a config file, or 'local'."),
+        str, typer.Option("--connect", metavar="WHERE", help="A locator (tcp/host:7447), a config file, or 'local'.")
     ],
     seconds: Annotated[float, typer.Option("--seconds", metavar="S", help="End after this long; 0: never.")] = 0.0,
     json: JsonTarget = None,
@@ -34,9 +33,7 @@ def worker(
     end = time.monotonic() + seconds if seconds > 0.0 else float("inf")
     warm_up(Vehicle.shipped("pelican"))
     done = work(
-        connect,
-        lambda: stop() or time.monotonic() > end,
-        lambda text: console.print(plain(text), soft_wrap=True),
+        connect, lambda: stop() or time.monotonic() > end, lambda text: console.print(plain(text), soft_wrap=True)
     )
     stop.ignore_more()
     result = {"schema": "quadid.worker/1", "answered": done.answered, "refused": done.refused, "seconds": done.seconds}

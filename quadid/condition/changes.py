@@ -414,10 +414,8 @@ class Health:
             "changes": [change.to_dict() for change in self.changes],
             "score": self.score,
             "p_value": self.p_value,
-            "trim": [
-                {"name": n, "value": v, "baseline": m, "spread": s, "distance": d} for n, v, m, s, d in each
-            ],
-        }  # fmt: skip
+            "trim": [{"name": n, "value": v, "baseline": m, "spread": s, "distance": d} for n, v, m, s, d in each],
+        }
 
 
 def assess(flights: Sequence[FlightTrim], baseline: Sequence[FlightTrim], vehicle: Vehicle) -> Health:
@@ -445,9 +443,18 @@ def assess(flights: Sequence[FlightTrim], baseline: Sequence[FlightTrim], vehicl
     changes = () if unexplained else _changes(found, vehicle, verdict == "changed", not unfamiliar)
     score = float(np.sqrt((far**2).sum()))
     return Health(
-        verdict, lacking, changes, score, p_rest if unexplained else p_value, trim, far, healthy, tuple(flights),
-        tuple(baseline), unfamiliar,
-    )  # fmt: skip
+        verdict,
+        lacking,
+        changes,
+        score,
+        p_rest if unexplained else p_value,
+        trim,
+        far,
+        healthy,
+        tuple(flights),
+        tuple(baseline),
+        unfamiliar,
+    )
 
 
 def _unfamiliar(flights: Sequence[FlightTrim], baseline: Sequence[FlightTrim]) -> str:
@@ -549,9 +556,11 @@ def _weak_rotor(
         "baseline."
     )
     parameters = (
-        ("rotor", "", float(rotor), None), ("loss", "", loss, loss_ci), ("drag_loss", "", drag, drag_ci),
+        ("rotor", "", float(rotor), None),
+        ("loss", "", loss, loss_ci),
+        ("drag_loss", "", drag, drag_ci),
         *(() if partner is None else (("or_rotor", "", float(partner + 1), None),)),
-    )  # fmt: skip
+    )
     return Change("weak_rotor", parameters, one.p_value, share, changed and share > _SURE, lost, sentence)
 
 

@@ -99,8 +99,9 @@ def flight_trim(recording: Recording, vehicle: Vehicle) -> FlightTrim:
     if kept.sum() < _FEWEST:
         raise NotIdentifiableError(
             f"{recording.name}: {kept.sum() * BLOCK:.0f} s of steady flight",
-            f"{_FEWEST * BLOCK:.0f} s or more between take-off and landing", "fly longer, a hover will do",
-        )  # fmt: skip
+            f"{_FEWEST * BLOCK:.0f} s or more between take-off and landing",
+            "fly longer, a hover will do",
+        )
     edges, load = edges[kept], load[kept]
     force, from_what = _specific_force(recording, edges)
     total = load.sum(axis=1)
@@ -109,9 +110,15 @@ def flight_trim(recording: Recording, vehicle: Vehicle) -> FlightTrim:
     mean, rest = _at_rest(trims, motion)
     parts = [mean + rest[places].mean(axis=0) for places in _parts(edges)]
     return FlightTrim(
-        recording.name, mean, np.array(parts), (load / total[:, None]).mean(axis=0), wander(rest),
-        len(edges) * BLOCK, f"{rotors.source}; {from_what}; {moved}", _turning(recording, edges),
-    )  # fmt: skip
+        recording.name,
+        mean,
+        np.array(parts),
+        (load / total[:, None]).mean(axis=0),
+        wander(rest),
+        len(edges) * BLOCK,
+        f"{rotors.source}; {from_what}; {moved}",
+        _turning(recording, edges),
+    )
 
 
 def _turning(recording: Recording, edges: FloatArray) -> float:

@@ -404,9 +404,12 @@ class Gridded(NamedTuple):
 
 
 def to_windows(
-    recording: Recording, vehicle: Vehicle, rate: float | None = 50.0, start: float | None = None,
+    recording: Recording,
+    vehicle: Vehicle,
+    rate: float | None = 50.0,
+    start: float | None = None,
     stop: float | None = None,
-) -> list[Window]:  # fmt: skip
+) -> list[Window]:
     """Merges what lies between `start` and `stop` [s] onto uniform grids; see `grid_recording` for the rest."""
     part = -math.inf if start is None else start, math.inf if stop is None else stop
     return grid_recording(recording, vehicle, rate, [part]).windows
@@ -462,10 +465,14 @@ def _report(
     plan: GridPlan, rotor: RotorSignal, windows: list[Window], gaps: int, dropped: list[float], log_span: Span
 ) -> GridReport:
     period = measured_period(rotor.t, rotor.values)
-    slow = [
-        f"rotor signal at {1 / period:.3g} Hz is slower than the grid at {1 / plan.step:.3g} Hz: "
-        "fast motion cannot be attributed to the rotors"
-    ] if period > 1.5 * plan.step else []  # fmt: skip
+    slow = (
+        [
+            f"rotor signal at {1 / period:.3g} Hz is slower than the grid at {1 / plan.step:.3g} Hz: "
+            "fast motion cannot be attributed to the rotors"
+        ]
+        if period > 1.5 * plan.step
+        else []
+    )
     return GridReport(
         rate=1.0 / plan.step,
         windows=len(windows),
@@ -545,9 +552,11 @@ def _nothing_left(
         asked = " nor ".join(f"{a - zero:g} and {b - zero:g} s" for a, b in parts)
         return LogError(
             f"{recording.name}: nothing to use between {asked}",
-            f"{first:z.1f} to {last:z.1f} s after its first IMU sample", "see `quadid inspect` for the flying spans",
-        )  # fmt: skip
+            f"{first:z.1f} to {last:z.1f} s after its first IMU sample",
+            "see `quadid inspect` for the flying spans",
+        )
     return NotIdentifiableError(
         f"{recording.name}: the longest stretch with rotor signal and IMU and without gaps is {longest:.3g} s",
-        f"at least {needed:.3g} s", "log at a steady rate, or ask for a lower --rate",
-    )  # fmt: skip
+        f"at least {needed:.3g} s",
+        "log at a steady rate, or ask for a lower --rate",
+    )

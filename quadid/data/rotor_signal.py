@@ -52,8 +52,9 @@ def rotor_signal(recording: Recording, vehicle: Vehicle) -> RotorSignal:
     if channel is None:
         raise LogError(
             "; ".join((f"{recording.name}: no rotor speeds and no motor commands", *notes, *recording.warnings)),
-            "either of them", _HOW_TO_GET_MOTORS,
-        )  # fmt: skip
+            "either of them",
+            _HOW_TO_GET_MOTORS,
+        )
     source = channel.source or channel.name
     if channel.name == "rotor_speed":
         _check_speeds(recording, channel)
@@ -68,15 +69,17 @@ def rotor_signal(recording: Recording, vehicle: Vehicle) -> RotorSignal:
     found, wanted = signal.values.shape[1], len(vehicle.rotors)
     if found != wanted:
         raise LogError(
-            f"{recording.name}: {found} rotor columns ({signal.source})", f"{wanted}, the rotors of '{vehicle.name}'",
+            f"{recording.name}: {found} rotor columns ({signal.source})",
+            f"{wanted}, the rotors of '{vehicle.name}'",
             "choose the vehicle file that belongs to this log",
-        )  # fmt: skip
+        )
     rate = 1.0 / measured_period(signal.t, signal.values)
     if rate < SLOWEST_RATE:
         raise NotIdentifiableError(
             f"{recording.name}: rotor signal ({signal.source}) at {rate:.2g} Hz is too slow",
-            f"{SLOWEST_RATE:g} Hz or more, 50 Hz for inertias", _HOW_TO_GET_MOTORS,
-        )  # fmt: skip
+            f"{SLOWEST_RATE:g} Hz or more, 50 Hz for inertias",
+            _HOW_TO_GET_MOTORS,
+        )
     return signal
 
 
@@ -94,14 +97,16 @@ def rotor_channel(recording: Recording, vehicle: Vehicle | None) -> tuple[Channe
         if vehicle.mixer is None:
             raise LogError(
                 f"{recording.name}: holds mixer inputs ({mixed.source}), but '{vehicle.name}' has no mixer",
-                "a vehicle file with `mixer:`", "add it, for example mixer: crazyflie",
-            )  # fmt: skip
+                "a vehicle file with `mixer:`",
+                "add it, for example mixer: crazyflie",
+            )
         matrix = vehicle.mixing
         if mixed.values.shape[1] != matrix.shape[1]:
             raise LogError(
                 f"{recording.name}: {mixed.values.shape[1]} mixer inputs ({mixed.source})",
-                f"{matrix.shape[1]}, the columns of the mixer of '{vehicle.name}'", "correct `mixer:`",
-            )  # fmt: skip
+                f"{matrix.shape[1]}, the columns of the mixer of '{vehicle.name}'",
+                "correct `mixer:`",
+            )
         command = Channel("motor_command", mixed.t, mixed.values @ matrix.T, f"{mixed.source}, mixed")
     why = "" if speed is None else _passed_over(speed, command, vehicle)
     if speed is not None and why:
@@ -135,8 +140,9 @@ def _check_speeds(recording: Recording, speed: Channel) -> None:
     if backwards:
         raise LogError(
             f"{recording.name}: rotor speeds below zero ({speed.source}, rotor {', '.join(backwards)})",
-            "speeds without a sign", "write their sizes; which way a rotor turns is its `spin` in the vehicle file",
-        )  # fmt: skip
+            "speeds without a sign",
+            "write their sizes; which way a rotor turns is its `spin` in the vehicle file",
+        )
     if 0.0 < top <= 1.5:
         raise LogError(
             f"{recording.name}: rotor speeds up to {top:.3g} ({speed.source}) are commands from 0 to 1, no rad/s",
@@ -152,10 +158,11 @@ def _needs_command_kind(
     kind = "pwm" if _looks_like_pwm(command) else "normalized"
     if passed_over:
         return LogError(
-            f"{recording.name}: {'; '.join(passed_over)}", f"rotor speeds above zero, as '{vehicle.name}' expects them",
+            f"{recording.name}: {'; '.join(passed_over)}",
+            f"rotor speeds above zero, as '{vehicle.name}' expects them",
             "fly; if the ESCs never report, "
             f"write command: {{kind: {kind}, max_speed: <rad/s at full command>}} in the vehicle file",
-        )  # fmt: skip
+        )
     return LogError(
         f"{recording.name}: holds motor commands ({command.source}) but '{vehicle.name}' expects rotor speeds",
         "a vehicle file whose `command` fits the log",

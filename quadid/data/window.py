@@ -184,11 +184,13 @@ class Recording:
 def mounting_matrix(rotation: tuple[float, float, float]) -> FloatArray:
     """Matrix (3, 3) from IMU to body axes, for roll, pitch, yaw [rad] of the IMU in the body (z-y-x)."""
     (cr, cp, cy), (sr, sp, sy) = np.cos(rotation), np.sin(rotation)
-    return np.array([
-        [cp * cy, sr * sp * cy - cr * sy, cr * sp * cy + sr * sy],
-        [cp * sy, sr * sp * sy + cr * cy, cr * sp * sy - sr * cy],
-        [-sp, sr * cp, cr * cp],
-    ])  # fmt: skip
+    return np.array(
+        [
+            [cp * cy, sr * sp * cy - cr * sy, cr * sp * cy + sr * sy],
+            [cp * sy, sr * sp * sy + cr * cy, cr * sp * sy - sr * cy],
+            [-sp, sr * cp, cr * cp],
+        ]
+    )
 
 
 def in_body_axes(recording: Recording, vehicle: Vehicle) -> Recording:

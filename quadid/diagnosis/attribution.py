@@ -154,9 +154,12 @@ class NominalFit(NamedTuple):
 
 
 def stated_errors(
-    nominal: NominalFit | Fit, model: Model, windows: Sequence[Window], validation: Sequence[Window],
+    nominal: NominalFit | Fit,
+    model: Model,
+    windows: Sequence[Window],
+    validation: Sequence[Window],
     deciding: tuple[float, float],
-) -> Validation:  # fmt: skip
+) -> Validation:
     """Errors without and with the findings, as `mse_score` has them; without validation logs, of blocks left out.
 
     Args:

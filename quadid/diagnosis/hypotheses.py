@@ -319,9 +319,14 @@ def free_names(causes: tuple[Candidate, ...]) -> list[str]:
 
 
 def fit_model(
-    shooting: Shooting, theta: FloatArray, causes: tuple[Candidate, ...], states: InitialStates | None = None,
-    iterations: int = 6, tolerance: float = 0.05, tried: Mapping[str, float] | None = None,
-) -> Model:  # fmt: skip
+    shooting: Shooting,
+    theta: FloatArray,
+    causes: tuple[Candidate, ...],
+    states: InitialStates | None = None,
+    iterations: int = 6,
+    tolerance: float = 0.05,
+    tried: Mapping[str, float] | None = None,
+) -> Model:
     """Fits the model with `causes` from `theta` and `states`; `iterations` and `tolerance` as in `polish`."""
     free = shooting.free(free_names(causes))
     prior = default_prior(shooting, free)
@@ -372,9 +377,13 @@ def sketch(shooting: Shooting, model: Model, candidate: Candidate) -> Start:
 
 
 def extend(
-    shooting: Shooting, model: Model, candidate: Candidate, start: Start | None = None, iterations: int = 6,
+    shooting: Shooting,
+    model: Model,
+    candidate: Candidate,
+    start: Start | None = None,
+    iterations: int = 6,
     tried: float = 1.0,
-) -> Model:  # fmt: skip
+) -> Model:
     """Refits `model` with `candidate` added.
 
     Args:

@@ -45,9 +45,14 @@ LEAST_OF_EXPLAINED = 1e-3
 
 
 def diagnose(
-    windows: Sequence[Window], vehicle: Vehicle, validation: Sequence[Window] = (), seed: int = 0,
-    progress: Progress | None = None, swarm: bool = False, nominal: Fit | None = None,
-) -> tuple[Diagnosis, Search]:  # fmt: skip
+    windows: Sequence[Window],
+    vehicle: Vehicle,
+    validation: Sequence[Window] = (),
+    seed: int = 0,
+    progress: Progress | None = None,
+    swarm: bool = False,
+    nominal: Fit | None = None,
+) -> tuple[Diagnosis, Search]:
     """Says what the simulation of `vehicle` gets wrong on `windows`, why, and what a better one gains.
 
     Args:
@@ -106,13 +111,20 @@ def diagnose(
         *(f.text for f in faults),
         *(f"{reason}: it replaces another cause and is not confident" for reason in doubts.values()),
         *(f"{label} is not named with confidence: {reason}" for label, reason in weak.items()),
-        *reasons, *([] if moved is None else [moved]),
-    ]  # fmt: skip
+        *reasons,
+        *([] if moved is None else [moved]),
+    ]
     physical = with_values(vehicle, parameters, [c.effect for c in model.causes], model.theta)
     result = Diagnosis(
-        verdict, findings, outcome, left, parameters, physical,
-        "+".join([vehicle.name, *dict.fromkeys(f.effect for f in findings)]), tuple(warnings),
-    )  # fmt: skip
+        verdict,
+        findings,
+        outcome,
+        left,
+        parameters,
+        physical,
+        "+".join([vehicle.name, *dict.fromkeys(f.effect for f in findings)]),
+        tuple(warnings),
+    )
     report("done", 1.0)
     return result, search
 

@@ -148,9 +148,12 @@ def _followed(site: Site, names: tuple[str, ...], prepared: list[_Prepared], mod
     none = replace(model.lin, gram=gram[:, :own, :own], grad=grad[:, :own])
     gain = paired_gain(held_out(none, precision[:own]).block, held_out(both, precision).block)
     each = freed(
-        (sizes + precision[own:])[:, None, None], total[own:, None, :own],
-        total[:own, :own] + np.diag(precision[:own]), slope[own:, None], slope[:own],
-    )  # fmt: skip
+        (sizes + precision[own:])[:, None, None],
+        total[own:, None, :own],
+        total[:own, :own] + np.diag(precision[:own]),
+        slope[own:, None],
+        slope[:own],
+    )
     return Follows(site, gain, dict(zip(names, each.tolist(), strict=True)))
 
 

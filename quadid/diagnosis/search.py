@@ -132,9 +132,12 @@ class Search:
 
 
 def select(
-    schedule: Sequence[Shooting], theta: FloatArray, listed: Sequence[Candidate], report: Callable[[str, float], None],
+    schedule: Sequence[Shooting],
+    theta: FloatArray,
+    listed: Sequence[Candidate],
+    report: Callable[[str, float], None],
     known: Model | None = None,
-) -> Search:  # fmt: skip
+) -> Search:
     """Selects the causes that the data support.
 
     Args:

@@ -288,10 +288,16 @@ def _dragged(c, x2, y2, s1, u, v):  # type: ignore[no-untyped-def]
 def _rotation(w, x, y, z):  # type: ignore[no-untyped-def]
     """Body to world, row by row."""
     return (
-        w * w + x * x - y * y - z * z, 2.0 * (x * y - w * z), 2.0 * (x * z + w * y),
-        2.0 * (x * y + w * z), w * w - x * x + y * y - z * z, 2.0 * (y * z - w * x),
-        2.0 * (x * z - w * y), 2.0 * (y * z + w * x), w * w - x * x - y * y + z * z,
-    )  # fmt: skip
+        w * w + x * x - y * y - z * z,
+        2.0 * (x * y - w * z),
+        2.0 * (x * z + w * y),
+        2.0 * (x * y + w * z),
+        w * w - x * x + y * y - z * z,
+        2.0 * (y * z - w * x),
+        2.0 * (x * z - w * y),
+        2.0 * (y * z + w * x),
+        w * w - x * x - y * y + z * z,
+    )
 
 
 @_fast
@@ -309,18 +315,21 @@ def _falling(c, s2, s1, w, x, y, z, vn, ve, vd, fx, fy, fz):  # type: ignore[no-
     ax, ay, az, _, _, _ = _force(c, s2, s1, w, x, y, z, vn, ve, vd)
     ax, ay, az = ax + fx, ay + fy, az + fz
     return (
-        r[0] * ax + r[1] * ay + r[2] * az, r[3] * ax + r[4] * ay + r[5] * az,
+        r[0] * ax + r[1] * ay + r[2] * az,
+        r[3] * ax + r[4] * ay + r[5] * az,
         r[6] * ax + r[7] * ay + r[8] * az + GRAVITY,
-    )  # fmt: skip
+    )
 
 
 @_fast
 def _spin(w, x, y, z, p, q, r):  # type: ignore[no-untyped-def]
     """Eq. 2: rate of the quaternion."""
     return (
-        0.5 * (-x * p - y * q - z * r), 0.5 * (w * p + y * r - z * q), 0.5 * (w * q + z * p - x * r),
+        0.5 * (-x * p - y * q - z * r),
+        0.5 * (w * p + y * r - z * q),
+        0.5 * (w * q + z * p - x * r),
         0.5 * (w * r + x * q - y * p),
-    )  # fmt: skip
+    )
 
 
 @_fast
@@ -548,9 +557,10 @@ def _transition(c, row, h, keep, air, x, after, F, turn):  # type: ignore[no-unt
     p, q, r = 0.5 * (x[4] + after[4]), 0.5 * (x[5] + after[5]), 0.5 * (x[6] + after[6])
     o1, s1 = 0.5 * (row[4] + row[MOMENTS + 4]), 0.5 * (row[5] + row[MOMENTS + 5])
     A = (
-        (-c[14], c[6] * r + c[4] * o1, c[6] * q), (c[7] * r - c[5] * o1, -c[15], c[7] * p),
+        (-c[14], c[6] * r + c[4] * o1, c[6] * q),
+        (c[7] * r - c[5] * o1, -c[15], c[7] * p),
         (c[8] * q, c[8] * p, -c[16] - c[21] * s1),
-    )  # fmt: skip
+    )
     turned = (h * p, h * q, h * r)
     square = turned[0] ** 2 + turned[1] ** 2 + turned[2] ** 2
     for i in range(3):
@@ -579,9 +589,17 @@ def _transition(c, row, h, keep, air, x, after, F, turn):  # type: ignore[no-unt
         R = _rotation(scale * w, scale * a, scale * b, scale * e)
         s2, s1 = 0.5 * (row[0] + row[MOMENTS]), 0.5 * (row[5] + row[MOMENTS + 5])
         fx, fy, fz, u, v, down = _force(
-            c, s2, s1, scale * w, scale * a, scale * b, scale * e, 0.5 * (x[VE + 1] + after[VE + 1]),
-            0.5 * (x[VE + 2] + after[VE + 2]), 0.5 * (x[VE + 3] + after[VE + 3]),
-        )  # fmt: skip
+            c,
+            s2,
+            s1,
+            scale * w,
+            scale * a,
+            scale * b,
+            scale * e,
+            0.5 * (x[VE + 1] + after[VE + 1]),
+            0.5 * (x[VE + 2] + after[VE + 2]),
+            0.5 * (x[VE + 3] + after[VE + 3]),
+        )
         fx, fy, fz = fx + x[FO + 1], fy + x[FO + 2], fz + x[FO + 3]
         kx, ky = c[12] * s1, c[13] * s1
         # d force / d rotation vector = -[force]x - k [velocity]x, in body axes.
@@ -717,10 +735,17 @@ def kalman(track: Track, p: FloatArray, psi: FloatArray, tail: FloatArray, store
     rows = len(track.t) if store else 1
     # Made here: numba crashes where Ctrl-C arrives while it makes a tuple of ours for what it returns.
     g = Gains(
-        np.zeros((rows, M, N)), np.zeros((rows, M)), np.zeros((rows, M)), np.zeros((rows, M)),
-        np.zeros((rows, 3, 9)), np.zeros((rows, N_MEAN)), np.zeros((rows, N, 9)),
-        moments(track, p[DELAY], p[LAG]), (p[DELAY], p[LAG]), track.beyond,
-    )  # fmt: skip
+        np.zeros((rows, M, N)),
+        np.zeros((rows, M)),
+        np.zeros((rows, M)),
+        np.zeros((rows, M)),
+        np.zeros((rows, 3, 9)),
+        np.zeros((rows, N_MEAN)),
+        np.zeros((rows, N, 9)),
+        moments(track, p[DELAY], p[LAG]),
+        (p[DELAY], p[LAG]),
+        track.beyond,
+    )
     return filter_pass(track, p, psi, tail, store, g), g
 
 

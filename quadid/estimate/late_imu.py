@@ -86,8 +86,12 @@ def in_time(window: Window, delay: float) -> Window:
 def _undone(values: FloatArray, dt: float, delay: float) -> FloatArray:
     """Right side of Eq. 1, shape (n, 3), by the spectrum; rows that were not measured stay so."""
     rows, missing = np.arange(len(values)), np.isnan(values)
-    whole = np.column_stack([np.interp(rows, rows[~m], c[~m]) if m.any() and not m.all() else c
-                             for c, m in zip(values.T, missing.T, strict=True)])  # fmt: skip
+    whole = np.column_stack(
+        [
+            np.interp(rows, rows[~m], c[~m]) if m.any() and not m.all() else c
+            for c, m in zip(values.T, missing.T, strict=True)
+        ]
+    )
     more = min(MARGIN, len(whole) - 1)
     longer = np.pad(whole, ((more, more), (0, 0)), mode="reflect", reflect_type="odd")
     s = 2j * np.pi * np.fft.rfftfreq(len(longer), dt)[:, None]

@@ -81,9 +81,16 @@ class Missing:
     def rows(self, first: int, last: int) -> Missing:
         """Rows `first` to before `last`."""
         names = (
-            "t", "force", "force_sigma", "moment", "moment_sigma", "control", "factors", "innovation",
+            "t",
+            "force",
+            "force_sigma",
+            "moment",
+            "moment_sigma",
+            "control",
+            "factors",
+            "innovation",
             "innovation_sigma",
-        )  # fmt: skip
+        )
         return replace(self, **{name: getattr(self, name)[first:last] for name in names})
 
 
@@ -121,7 +128,7 @@ def _smoothed(problem: Problem, z: FloatArray, psi: FloatArray) -> list[Missing]
                 psi[k.TIME + np.array([0, 0, 1, 2, 2, 3])],
                 np.where(measured(track, g), g.nu, np.nan),
                 np.sqrt(g.S),
-            )  # fmt: skip
+            )
         )
     return out
 
@@ -178,9 +185,12 @@ class Vehicles:
 
 
 def settled(
-    windows: Sequence[Window], vehicle: Vehicle, theta: FloatArray, psi: FloatArray | None,
+    windows: Sequence[Window],
+    vehicle: Vehicle,
+    theta: FloatArray,
+    psi: FloatArray | None,
     tail: FloatArray | None = None,
-) -> tuple[Problem, FloatArray]:  # fmt: skip
+) -> tuple[Problem, FloatArray]:
     """The problem of a model with fixed physics, and trim and biases of each flight, fitted.
 
     Args:

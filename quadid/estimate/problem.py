@@ -48,9 +48,14 @@ UPRIGHT = "accel_bias.z"
 TRIMMED = tuple(name for name in PLACES if name.split(".")[0] in PER_FLIGHT and name != UPRIGHT)
 """Parameters free in every model beside its own: a constant moment and the sensors' biases."""
 _SIZE = {
-    "gyro_bias": 0.05, "accel_bias": 0.5, "rotor_drag.k_x": 0.5, "rotor_drag.k_y": 0.5, "rate_damping": 2.0,
-    "command_delay": 0.01, "motor_lag": 0.02,
-}  # fmt: skip
+    "gyro_bias": 0.05,
+    "accel_bias": 0.5,
+    "rotor_drag.k_x": 0.5,
+    "rotor_drag.k_y": 0.5,
+    "rate_damping": 2.0,
+    "command_delay": 0.01,
+    "motor_lag": 0.02,
+}
 """Standard deviation of the prior, in the parameter's unit; about what is met on real vehicles."""
 OFF_CENTRE = 0.05
 """The same of the centre of gravity, as a share of the arm; that of a trim moment is the control moment."""
@@ -72,10 +77,14 @@ PAST = 3
 """Samples from which rotor moments are foreseen."""
 WAVER = 0.005
 """Prior of the noise of logged rotor speeds, as a share of hover speed."""
-ACTS = np.array([
-    [1.0, 0.0, 0.0, 0.0, 0.0, 0.0], [1.0, 0.0, -1.0, 0.0, 0.0, 0.0], [1.0, 0.0, 0.0, -1.0, 0.0, 0.0],
-    [0.0, 1.0, 0.0, 0.0, -1.0, 0.0],
-])  # fmt: skip
+ACTS = np.array(
+    [
+        [1.0, 0.0, 0.0, 0.0, 0.0, 0.0],
+        [1.0, 0.0, -1.0, 0.0, 0.0, 0.0],
+        [1.0, 0.0, 0.0, -1.0, 0.0, 0.0],
+        [0.0, 1.0, 0.0, 0.0, -1.0, 0.0],
+    ]
+)
 """Powers of the six in what rotors make of specific thrust and of the angular accelerations."""
 AT_ONCE = 16
 """Points whose effects are simulated together: more would only take more memory."""
@@ -107,9 +116,13 @@ def cut(track: Track, first: int, last: int) -> Track:
     early, late = np.searchsorted(track.piece_t, [2.0 * t[0] - t[-1], 2.0 * t[-1] - t[0]], side="right")
     pieces = slice(max(early - 1, 0), late)
     return track._replace(
-        t=t, y=track.y[rows], seen=track.seen[rows], beyond=beyond, piece_t=track.piece_t[pieces],
+        t=t,
+        y=track.y[rows],
+        seen=track.seen[rows],
+        beyond=beyond,
+        piece_t=track.piece_t[pieces],
         speed=track.speed[pieces],
-    )  # fmt: skip
+    )
 
 
 def _rows(track: Track, share: float) -> tuple[int, int]:
@@ -180,9 +193,14 @@ class Problem:
 
     @classmethod
     def of(
-        cls, tracks: Sequence[Track], vehicle: Vehicle, names: Sequence[str] = (), windows: Sequence[Window] = (),
-        theta: FloatArray | None = None, nominal: Sequence[str] = NOMINAL_NAMES,
-    ) -> Problem:  # fmt: skip
+        cls,
+        tracks: Sequence[Track],
+        vehicle: Vehicle,
+        names: Sequence[str] = (),
+        windows: Sequence[Window] = (),
+        theta: FloatArray | None = None,
+        nominal: Sequence[str] = NOMINAL_NAMES,
+    ) -> Problem:
         """The six, trim moment, biases and `names` free, from the vehicle file's guess.
 
         Args:
@@ -212,9 +230,13 @@ class Problem:
 
     @classmethod
     def _beside(
-        cls, tracks: Sequence[Track], vehicle: Vehicle, theta: FloatArray, names: tuple[str, ...],
+        cls,
+        tracks: Sequence[Track],
+        vehicle: Vehicle,
+        theta: FloatArray,
+        names: tuple[str, ...],
         windows: Sequence[Window],
-    ) -> Problem:  # fmt: skip
+    ) -> Problem:
         base, layout = np.zeros(k.N_PHYSICS), Layout(vehicle)
         # What the filter has in its own equations it also differentiates: drag tells it the velocity through the
         # accelerometer, which what is only added along its states cannot.
@@ -398,10 +420,17 @@ class Problem:
     def noise_scale(self) -> FloatArray:
         """Prior size of f, alpha, e and of the noise of rotor speeds, shape (7,)."""
         tilt = float(np.sqrt(np.mean(self.control[:2] ** 2)))
-        return np.array([
-            FORCE[0] * GRAVITY, FORCE[1] * GRAVITY, MOMENT * tilt, MOMENT * self.control[2], TILT, TILT,
-            WAVER * self.vehicle.hover_speed(float(self.base[k.B])),
-        ])  # fmt: skip
+        return np.array(
+            [
+                FORCE[0] * GRAVITY,
+                FORCE[1] * GRAVITY,
+                MOMENT * tilt,
+                MOMENT * self.control[2],
+                TILT,
+                TILT,
+                WAVER * self.vehicle.hover_speed(float(self.base[k.B])),
+            ]
+        )
 
     @cached_property
     def noise_bounds(self) -> FloatArray:
@@ -552,9 +581,14 @@ class Problem:
         return np.repeat(np.sqrt((1.0 + self.tail) / (1.0 + 3.0 * self.tail)), 3)
 
     def sensitivities(
-        self, j: int, z: FloatArray, psi: FloatArray, g: Gains, nudge: float | FloatArray = 1e-5,
+        self,
+        j: int,
+        z: FloatArray,
+        psi: FloatArray,
+        g: Gains,
+        nudge: float | FloatArray = 1e-5,
         only: Collection[int] | None = None,
-    ) -> Sensitivities:  # fmt: skip
+    ) -> Sensitivities:
         """Whitened innovations of flight j and their derivatives, by `only` these of its entries; default all."""
         steps = np.diag(np.broadcast_to(nudge, len(z)))
         mine = [i for i, (_, _, where) in enumerate(self.entries) if where in (-1, j) and (only is None or i in only)]

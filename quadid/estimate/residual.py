@@ -77,10 +77,12 @@ def learn(
         if target.startswith("force") and not flown:
             continue
         # 1. How many: the fewest terms within a standard error of the best.
-        left = np.array([
-            [_left(fold, _fitted(chosen, others, axis), axis) for chosen in _pursued(others, axis, size)]
-            for fold, others in ((f, _total([g for g in folds if g is not f])) for f in folds)
-        ])  # fmt: skip
+        left = np.array(
+            [
+                [_left(fold, _fitted(chosen, others, axis), axis) for chosen in _pursued(others, axis, size)]
+                for fold, others in ((f, _total([g for g in folds if g is not f])) for f in folds)
+            ]
+        )
         best = int(np.argmin(left.mean(axis=0)))
         worse = left - left[:, best : best + 1]
         within = worse.mean(axis=0) <= worse.std(axis=0, ddof=1) / np.sqrt(len(folds))
@@ -90,9 +92,7 @@ def learn(
         value = _fitted(chosen, every, axis)
         shares = [float(left[:, count].mean()), *(_left(judge, value, axis) for judge in judges)]
         if count and max(shares[1:] or shares) <= 1.0 - LEAST:
-            out += [
-                ResidualTerm(acts_on=target, product=products[i], value=float(f"{value[i]:.5g}")) for i in chosen
-            ]  # fmt: skip
+            out += [ResidualTerm(acts_on=target, product=products[i], value=float(f"{value[i]:.5g}")) for i in chosen]
     return tuple(out)
 
 

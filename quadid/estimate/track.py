@@ -79,9 +79,16 @@ def _new(values: FloatArray) -> BoolArray:
 
 
 def _track(
-    channels: dict[str, tuple[FloatArray, FloatArray]], rows: FloatArray, rotor_t: FloatArray, speed: FloatArray,
-    slope: FloatArray | None, held: bool, period: float, vehicle: Vehicle, air: bool,
-) -> Track:  # fmt: skip
+    channels: dict[str, tuple[FloatArray, FloatArray]],
+    rows: FloatArray,
+    rotor_t: FloatArray,
+    speed: FloatArray,
+    slope: FloatArray | None,
+    held: bool,
+    period: float,
+    vehicle: Vehicle,
+    air: bool,
+) -> Track:
     """Merges channels onto one rising axis of times, with `rows` whether or not something was measured then."""
     every = np.unique(np.concatenate([rows, *(t for t, _ in channels.values())]))
     t = every[np.concatenate([[True], np.diff(every) > TOGETHER])]

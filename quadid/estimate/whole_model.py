@@ -26,9 +26,16 @@ from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 
 IN_SENSORS = (
-    "imu_lag", "attitude_delay", "imu_lever_arm", "imu_misalignment", "gyro_scale", "gyro_bias", "accel_bias",
-    "ahrs_acceleration_error", "velocity_scale",
-)  # fmt: skip
+    "imu_lag",
+    "attitude_delay",
+    "imu_lever_arm",
+    "imu_misalignment",
+    "gyro_scale",
+    "gyro_bias",
+    "accel_bias",
+    "ahrs_acceleration_error",
+    "velocity_scale",
+)
 """Effects that leave the motion alone."""
 NUDGE = 1e-3
 """Step of derivatives by rates [rad/s] and velocity [m/s]."""
@@ -45,9 +52,19 @@ class WholeModel:
         level = np.tile([1.0, 0.0, 0.0, 0.0], (len(window), 1))
         # Against measurements of zero, residuals are the measurements that the model predicts.
         blank = Window(
-            window.t0, window.dt, window.rotor_speed, zero, level, zero, zero, zero, window.battery,
-            sampling=window.sampling, rotor_slope=window.rotor_slope, log_span=window.log_span,
-        )  # fmt: skip
+            window.t0,
+            window.dt,
+            window.rotor_speed,
+            zero,
+            level,
+            zero,
+            zero,
+            zero,
+            window.battery,
+            sampling=window.sampling,
+            rotor_slope=window.rotor_slope,
+            log_span=window.log_span,
+        )
         self._window, self._vehicle, self._own, self._rollout = window, vehicle, own, Rollout(blank, vehicle)
         entries = Layout(vehicle).entries.values()
         self._sensors = [(e.index, e.neutral) for e in entries if e.name.split(".")[0] in IN_SENSORS]

@@ -167,9 +167,13 @@ def rotor_wrench(omega: FloatArray, efficiency: FloatArray, changed: int, body: 
 
 @kernel
 def hub_forces(
-    omega: FloatArray, velocity: tuple[float, float, float], rates: tuple[float, float, float], changed: int,
-    body: Body, air: Air,
-) -> tuple[float, float, float, float, float, float]:  # fmt: skip
+    omega: FloatArray,
+    velocity: tuple[float, float, float],
+    rates: tuple[float, float, float],
+    changed: int,
+    body: Body,
+    air: Air,
+) -> tuple[float, float, float, float, float, float]:
     """Drag in the rotor planes and thrust lost to inflow, summed rotor by rotor: force [N], torque about the CG [N m].
 
     Args:

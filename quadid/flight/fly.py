@@ -139,9 +139,15 @@ def write_window(flown: Flown, extras: Sequence[str]) -> Window:
     accel = sensors.read_accel(track, plan, setup.on_board, setup.imu_cutoff, steps)
     attitude = product(lagged, exponential(flown.tilt_noise[at]))
     rows = LogRows(
-        gyro + flown.gyro_noise[at], accel + flown.noise("accel", flown.sensor.accel, 3), continuous_sign(attitude),
-        steps, track, plan, setup.on_board, np.mean((rotor / hover) ** 2, axis=1),
-    )  # fmt: skip
+        gyro + flown.gyro_noise[at],
+        accel + flown.noise("accel", flown.sensor.accel, 3),
+        continuous_sign(attitude),
+        steps,
+        track,
+        plan,
+        setup.on_board,
+        np.mean((rotor / hover) ** 2, axis=1),
+    )
     distort_log(rows, flown.outside, flown.seed)
     # Velocity, position, and the battery, which falls over the flight and dips with the rotors' power.
     events, t = setup.events, plan.dt * plan.log_every * np.arange(plan.rows)
@@ -156,10 +162,19 @@ def write_window(flown: Flown, extras: Sequence[str]) -> Window:
         name: clean[name] + flown.noise(name, getattr(flown.sensor, name), clean[name].shape[1]) for name in extras
     }
     return Window(
-        0.0, plan.log_every * plan.dt, rotor, rows.gyro, rows.attitude, rows.accel, optional.get("velocity"),
-        optional.get("position"), optional.get("battery"), track.reference, setup.vehicle.command.sampling,
+        0.0,
+        plan.log_every * plan.dt,
+        rotor,
+        rows.gyro,
+        rows.attitude,
+        rows.accel,
+        optional.get("velocity"),
+        optional.get("position"),
+        optional.get("battery"),
+        track.reference,
+        setup.vehicle.command.sampling,
         name=flown.name,
-    )  # fmt: skip
+    )
 
 
 def true_states(flown: Flown) -> Truth:

@@ -314,12 +314,16 @@ def _fixed(low: float, high: float, by: str = "") -> Size:
 Sizes = dict[str, Size]
 ARRANGE: dict[Arrange, Sizes] = {
     suspended_load: {  # length, depth [m]
-        "share": Size(0.05, 0.12), "length": _fixed(0.5, 1.5), "damping": _fixed(0.04, 0.08),
+        "share": Size(0.05, 0.12),
+        "length": _fixed(0.5, 1.5),
+        "damping": _fixed(0.04, 0.08),
         "depth": _fixed(0.02, 0.05, "lever"),
     },
     flexible_arm: {"share": Size(0.25, 0.5), "frequency": _fixed(6.0, 11.0), "damping": _fixed(0.05, 0.12)},  # [Hz]
     slosh: {  # [Hz], [m]
-        "share": Size(0.05, 0.12), "frequency": _fixed(1.2, 2.2), "damping": _fixed(0.08, 0.15),
+        "share": Size(0.05, 0.12),
+        "frequency": _fixed(1.2, 2.2),
+        "damping": _fixed(0.08, 0.15),
         "depth": _fixed(0.04, 0.08, "lever"),
     },
     gimbal_torque: {"roll": Size(0.5, 1.5), "pitch": Size(0.5, 1.5), "frequency": _fixed(0.6, 2.0)},  # [rad/s^2]
@@ -332,7 +336,7 @@ ARRANGE: dict[Arrange, Sizes] = {
     transverse_flow: {"roll": Size(0.3, 0.8)},  # [rad/m^2]
     dead_time_jitter: {"jitter": Size(0.02, 0.045)},  # [s]
     lost_commands: {"probability": Size(0.15, 0.4)},
-}  # fmt: skip
+}
 """Changes of a flight: the function, which names and describes the effect, and its numbers."""
 DISTORT: dict[Distort, Sizes] = {
     vibration_rectification: {"shift": Size(0.3, 0.8)},  # [m/s^2]

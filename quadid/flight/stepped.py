@@ -26,9 +26,14 @@ class SteppedFlight:
     """
 
     def __init__(
-        self, vehicle: Vehicle, truth: TruthParameters | None = None, *, effects: Effects | None = None,
-        height: float = 30.0, span: float = 60.0,
-    ) -> None:  # fmt: skip
+        self,
+        vehicle: Vehicle,
+        truth: TruthParameters | None = None,
+        *,
+        effects: Effects | None = None,
+        height: float = 30.0,
+        span: float = 60.0,
+    ) -> None:
         """Begins level, at rest, in hover.
 
         Args:

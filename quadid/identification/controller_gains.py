@@ -139,9 +139,7 @@ def _explained(values: FloatArray, predicted: FloatArray) -> float:
     return 1.0 - float(np.sum((values - predicted) ** 2)) / spread if spread > 0.0 else 0.0
 
 
-def _fit_axis(
-    rows: Sequence[_Rows], axis: int, arm: FloatArray, late: bool, known: _Axis | None = None
-) -> _Axis:  # fmt: skip
+def _fit_axis(rows: Sequence[_Rows], axis: int, arm: FloatArray, late: bool, known: _Axis | None = None) -> _Axis:
     """Fits one axis, from what is known if anything.
 
     With `late`, a row's command, the mean of faster ones, follows what is measured half a row later.

@@ -52,8 +52,8 @@ def bounds_of(information: FloatArray) -> FloatArray:
 
 
 def excitation(
-    windows: Sequence[Window], vehicle: Vehicle, theta: FloatArray | None = None, noise: NoiseModel | None = None,
-) -> Excitation:  # fmt: skip
+    windows: Sequence[Window], vehicle: Vehicle, theta: FloatArray | None = None, noise: NoiseModel | None = None
+) -> Excitation:
     """Computes the bounds for `windows` at `theta` (default: the vehicle's initial guess).
 
     Args:

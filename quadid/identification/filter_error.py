@@ -45,9 +45,17 @@ from quadid.types import FloatArray, IndexArray
 from quadid.vehicle import Vehicle
 
 ALONG = (
-    "rotor_drag.k_x", "rotor_drag.k_y", "rotor_drag.central", "rotor_drag_moment.h_x", "rotor_drag_moment.h_y",
-    "rate_damping.l_p", "rate_damping.m_q", "rate_damping.n_r", "cg_offset.x", "cg_offset.y",
-)  # fmt: skip
+    "rotor_drag.k_x",
+    "rotor_drag.k_y",
+    "rotor_drag.central",
+    "rotor_drag_moment.h_x",
+    "rotor_drag_moment.h_y",
+    "rate_damping.l_p",
+    "rate_damping.m_q",
+    "rate_damping.n_r",
+    "cg_offset.x",
+    "cg_offset.y",
+)
 """Fitted along, with what is late, unless the model has numbers of that effect."""
 MOST_SECONDS = 600.0
 """Of longer flights the liveliest so many seconds are fitted: then a minute's interval is a third."""

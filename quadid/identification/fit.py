@@ -18,13 +18,7 @@ from quadid.identification.noise_fit import reweighted_fit
 from quadid.identification.particle_swarm import SwarmOptions
 from quadid.identification.problem import Free, Shooting, default_prior
 from quadid.identification.search import SWARM_SECONDS, Progress, swarm_search
-from quadid.identification.uncertainty import (
-    Uncertainty,
-    doubted,
-    parameter_set,
-    uncertainty,
-    with_scale_uncertainty,
-)
+from quadid.identification.uncertainty import Uncertainty, doubted, parameter_set, uncertainty, with_scale_uncertainty
 from quadid.model.layout import Layout
 from quadid.parameters import (
     INERTIAS,
@@ -92,8 +86,15 @@ def final_answer(fit: Fit, out_of_reach: Mapping[str, str], off: Mapping[str, fl
             covariance[j, :], covariance[:, j] = 0.0, 0.0
             covariance[j, j] = (spread * p.initial) ** 2
             ci = (p.initial * math.exp(-Z95 * spread), p.initial * math.exp(Z95 * spread))
-            rows[j] = replace(p, value=p.initial, sigma=spread * p.initial, ci95=ci, relative_to=None, prior_share=1.0,
-                              status=Status.PRIOR_DOMINATED)  # fmt: skip
+            rows[j] = replace(
+                p,
+                value=p.initial,
+                sigma=spread * p.initial,
+                ci95=ci,
+                relative_to=None,
+                prior_share=1.0,
+                status=Status.PRIOR_DOMINATED,
+            )
     if lost:
         reasons = dict.fromkeys(out_of_reach.values())
         why = {reason: ", ".join(n for n in lost if out_of_reach[n] == reason) for reason in reasons}
@@ -184,7 +185,7 @@ def spread(windows: Sequence[Window]) -> tuple[list[Window], tuple[str, ...]]:
     return kept, (
         f"{total / 3600.0:.1f} h of flight are more than the parameters need: they come from {len(kept)} of {count} "
         f"stretches of {STRETCH:.3g} s, spread evenly",
-    )  # fmt: skip
+    )
 
 
 # --- The fit
@@ -224,9 +225,10 @@ def check_windows(windows: Sequence[Window]) -> None:
     longest = max(((len(w) - 1) * w.dt for w in windows), default=0.0)
     if longest < LEAST_SECONDS:
         raise NotIdentifiableError(
-            f"the longest stretch of usable data is {longest:.3g} s", f"at least {LEAST_SECONDS:g} s without gaps",
+            f"the longest stretch of usable data is {longest:.3g} s",
+            f"at least {LEAST_SECONDS:g} s without gaps",
             "use a longer flight, or a wider span of it",
-        )  # fmt: skip
+        )
     if all(w.gyro is None or not np.isfinite(w.gyro).any() for w in windows):
         raise WindowError("no gyro in the data", "p q r [rad/s]", "log the IMU at 50 Hz or faster")
     if len({round(w.dt, 9) for w in windows}) > 1:
@@ -234,10 +236,14 @@ def check_windows(windows: Sequence[Window]) -> None:
 
 
 def fit(
-    windows: Sequence[Window], vehicle: Vehicle, options: FitOptions | None = None, names: Sequence[str] | None = None,
-    progress: Progress | None = None, out_of_reach: Mapping[str, str] | None = None,
+    windows: Sequence[Window],
+    vehicle: Vehicle,
+    options: FitOptions | None = None,
+    names: Sequence[str] | None = None,
+    progress: Progress | None = None,
+    out_of_reach: Mapping[str, str] | None = None,
     off: Mapping[str, float] | None = None,
-) -> Fit:  # fmt: skip
+) -> Fit:
     """Identifies parameters from flight data.
 
     Args:

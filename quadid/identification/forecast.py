@@ -136,9 +136,17 @@ def _none(samples: Sequence[int]) -> Shares:
 
 
 def _flown_in_loop(
-    vehicle: Vehicle, theta: FloatArray, window: Window, p: FloatArray, psi: FloatArray, g: Gains, rows: IndexArray,
-    samples: Sequence[int], autopilot: Autopilot, seed: int,
-) -> dict[int, FloatArray]:  # fmt: skip
+    vehicle: Vehicle,
+    theta: FloatArray,
+    window: Window,
+    p: FloatArray,
+    psi: FloatArray,
+    g: Gains,
+    rows: IndexArray,
+    samples: Sequence[int],
+    autopilot: Autopilot,
+    seed: int,
+) -> dict[int, FloatArray]:
     """States (starts, draws, 13) of simulated draws from some rows on, by horizon.
 
     States are attitude, rate, velocity and position; `g` has a row for each of `rows`.
@@ -169,9 +177,12 @@ def _flown_in_loop(
     step = window.dt / turns
     state = simulator.start(
         attitude=product(start[:, :4], exponential(motion[:, k.ATTITUDE : k.ATTITUDE + 3])),
-        rate=start[:, 4:7] + motion[:, k.GYRO : k.GYRO + 3], velocity=start[:, 7:10] + motion[:, k.VELOCITY :],
-        rotor_speed=np.repeat(window.rotor_speed[rows], DRAWS, axis=0), inputs=inputs, dt=step,
-    )  # fmt: skip
+        rate=start[:, 4:7] + motion[:, k.GYRO : k.GYRO + 3],
+        velocity=start[:, 7:10] + motion[:, k.VELOCITY :],
+        rotor_speed=np.repeat(window.rotor_speed[rows], DRAWS, axis=0),
+        inputs=inputs,
+        dt=step,
+    )
     gains, mixer = pack_gains(autopilot.gains), mixer_matrix(vehicle, autopilot.gains)
     integral = np.repeat(_integrals_at(vehicle, window, autopilot, rows), DRAWS, axis=0)
     command, lasting = np.empty((many, len(vehicle.rotors))), np.full(many, step)
@@ -232,9 +243,15 @@ def _inside(error: FloatArray) -> FloatArray:
 
 
 def _add(
-    out: dict[str, FloatArray], problem: Problem, track: Track, p: FloatArray, psi: FloatArray, begin: int,
-    h: int, phase: int,
-) -> None:  # fmt: skip
+    out: dict[str, FloatArray],
+    problem: Problem,
+    track: Track,
+    p: FloatArray,
+    psi: FloatArray,
+    begin: int,
+    h: int,
+    phase: int,
+) -> None:
     """Adds the predictions of one pass, `h` rows from every start on; starts take turns between the quantities."""
     period = h + max(RECOVERY * h, 5)
     starts = np.arange(begin + phase * period // PHASES, len(track.t) - h, period)

@@ -149,9 +149,16 @@ def robust_weights(shooting: Shooting, lin: Linearised) -> FloatArray:
 
 
 def polish(
-    shooting: Shooting, theta: FloatArray, free: Free, prior: Prior | None = None, states: InitialStates | None = None,
-    iterations: int = 12, robust: bool = False, tolerance: float = 0.02, settled: bool = False,
-) -> Polished:  # fmt: skip
+    shooting: Shooting,
+    theta: FloatArray,
+    free: Free,
+    prior: Prior | None = None,
+    states: InitialStates | None = None,
+    iterations: int = 12,
+    robust: bool = False,
+    tolerance: float = 0.02,
+    settled: bool = False,
+) -> Polished:
     """Refines `theta` to the local optimum, once more from measured initial states where those at hand went astray.
 
     Args:
@@ -184,9 +191,16 @@ def polish(
 
 
 def _descend(
-    shooting: Shooting, theta: FloatArray, free: Free, prior: Prior, states: InitialStates, iterations: int,
-    robust: bool, tolerance: float, settled: bool,
-) -> Polished:  # fmt: skip
+    shooting: Shooting,
+    theta: FloatArray,
+    free: Free,
+    prior: Prior,
+    states: InitialStates,
+    iterations: int,
+    robust: bool,
+    tolerance: float,
+    settled: bool,
+) -> Polished:
     """`polish` from the states as they are; gives up where these have gone astray."""
     lin = shooting.linearise(theta, free, states)
     if robust:

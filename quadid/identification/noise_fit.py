@@ -17,11 +17,7 @@ from quadid.data.window import Window
 from quadid.effects import EFFECTS
 from quadid.identification.gauss_newton import Polished, polish
 from quadid.identification.initial_states import InitialStates
-from quadid.identification.noise import (
-    SHAPE_POINTS,
-    NoiseModel,
-    estimate_noise,
-)
+from quadid.identification.noise import SHAPE_POINTS, NoiseModel, estimate_noise
 from quadid.identification.problem import Free, Shooting
 from quadid.model.layout import Layout
 from quadid.parameters import NOMINAL_NAMES
@@ -209,9 +205,13 @@ class Flexible(NamedTuple):
 
 
 def flexible_fit(
-    windows: Sequence[Window], short: Shooting, starts: Sequence[FloatArray], free: Free,
-    noise: NoiseModel | None = None, iterations: int = 4,
-) -> Flexible:  # fmt: skip
+    windows: Sequence[Window],
+    short: Shooting,
+    starts: Sequence[FloatArray],
+    free: Free,
+    noise: NoiseModel | None = None,
+    iterations: int = 4,
+) -> Flexible:
     """Fits everything the catalogue can free at once.
 
     The flexible model is fitted on short segments, where it is nearly linear (of a long flight on some of them, spread

@@ -56,9 +56,10 @@ class PaperProblem:
         usable = [w for w in windows if has_references(w)]
         if not usable:
             raise NotIdentifiableError(
-                "no stretch with complete attitude and throttle references", "roll, pitch, yaw, throttle in the log",
+                "no stretch with complete attitude and throttle references",
+                "roll, pitch, yaw, throttle in the log",
                 "log them, or use the multiple-shooting objective",
-            )  # fmt: skip
+            )
         self._loops = [ClosedLoop(w, vehicle, autopilot.gains, autopilot.rate) for w in usable]
         self._measured = [measured_outputs(w) for w in usable]
         rows = np.concatenate(self._measured)

@@ -285,8 +285,9 @@ def horizon_scores(
     if len(runs) == 0:
         raise NotIdentifiableError(
             f"no run of {longest} samples fits: measured rate, and no gap for {longest} samples after it",
-            f"stretches longer than {longest} samples with gyro", "log without gaps, or ask for a lower --rate",
-        )  # fmt: skip
+            f"stretches longer than {longest} samples with gyro",
+            "log without gaps, or ask for a lower --rate",
+        )
     return _score(pooled, runs, wanted), [_score(*tally, wanted) for tally in tallies]
 
 
@@ -397,8 +398,11 @@ def white_noise(series: Sequence[FloatArray]) -> float:
 def _vectors(window: Window, quantity: str) -> FloatArray:
     """Measured rows of a quantity, (n, 3); an attitude as the turns from its first row on, summed up."""
     values = {
-        "position": window.position, "velocity": window.velocity, "rotation": window.attitude, "rate": window.gyro,
-    }[quantity]  # fmt: skip
+        "position": window.position,
+        "velocity": window.velocity,
+        "rotation": window.attitude,
+        "rate": window.gyro,
+    }[quantity]
     if values is None:
         return np.zeros((0, 3))
     known = values[np.isfinite(values).all(axis=1)]

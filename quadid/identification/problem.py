@@ -261,9 +261,13 @@ class Shooting:
 
     @classmethod
     def cut(
-        cls, windows: Sequence[Window], vehicle: Vehicle, seconds: float, noise: NoiseModel | None = None,
+        cls,
+        windows: Sequence[Window],
+        vehicle: Vehicle,
+        seconds: float,
+        noise: NoiseModel | None = None,
         layout: Layout | None = None,
-    ) -> Shooting:  # fmt: skip
+    ) -> Shooting:
         """Cuts `windows` into segments of about `seconds` with room for filters and delays before each.
 
         Channels count that every window has and whose noise is known; without `noise`, typical noise.
@@ -375,10 +379,19 @@ class Shooting:
             place = which.stop
         times = [r.window.t[s.starts] for r, s in zip(self.rollouts, self.segments, strict=True)]
         return Linearised(
-            into.gram, into.grad, into.cost, into.occam, np.count_nonzero(weights, axis=(1, 2)) - into.fitted,
-            into.base, weights, (into.offset, into.slope),
-            np.repeat(np.arange(len(counts), dtype=np.intp), counts), np.concatenate(times), states, n_pre,
-        )  # fmt: skip
+            into.gram,
+            into.grad,
+            into.cost,
+            into.occam,
+            np.count_nonzero(weights, axis=(1, 2)) - into.fitted,
+            into.base,
+            weights,
+            (into.offset, into.slope),
+            np.repeat(np.arange(len(counts), dtype=np.intp), counts),
+            np.concatenate(times),
+            states,
+            n_pre,
+        )
 
     def measured_weights(self, i: int) -> FloatArray:
         """1 where a window's segments were measured, 0 elsewhere, shape (segments, length, channels)."""
@@ -406,9 +419,17 @@ class Shooting:
         return self.rollouts[i].roll(self.segments[i], thetas, x0, dx, n_pre)[0], steps
 
     def _reduce(
-        self, i: int, theta: FloatArray, free: Free, x0: FloatArray, prior: StatePrior, n_pre: int, k: int,
-        weights: FloatArray, into: Reduced,
-    ) -> None:  # fmt: skip
+        self,
+        i: int,
+        theta: FloatArray,
+        free: Free,
+        x0: FloatArray,
+        prior: StatePrior,
+        n_pre: int,
+        k: int,
+        weights: FloatArray,
+        into: Reduced,
+    ) -> None:
         """Linearises the segments of one window and eliminates the initial state of each."""
         segments = self.segments[i]
         thetas, dx, steps = self._directions(theta, free, k)
@@ -450,9 +471,16 @@ class Shooting:
             ridge = np.repeat(np.diag(1.0 / RIDGE[:k])[None], len(flat), axis=0)
             basis = np.linalg.qr(np.concatenate([flat[..., 1 : 1 + k], ridge], axis=1))[0][:, :-k]
             yield Columns(
-                self.rollouts[i].window, self.segments[i].rows, basis, white[..., 0], np.all(weights > 0.0, axis=1),
-                flat[..., 1 + k :], base, weights, self.noise,
-            )  # fmt: skip
+                self.rollouts[i].window,
+                self.segments[i].rows,
+                basis,
+                white[..., 0],
+                np.all(weights > 0.0, axis=1),
+                flat[..., 1 + k :],
+                base,
+                weights,
+                self.noise,
+            )
 
 
 # --- Priors on the free parameters, and normal equations of data and prior

@@ -47,9 +47,14 @@ class ScoredSet:
 
 
 def identify_result(
-    fit: Fit, optimizer: str, seed: int, seconds: float, sets: Sequence[ScoredSet], vehicle_file: str | None,
+    fit: Fit,
+    optimizer: str,
+    seed: int,
+    seconds: float,
+    sets: Sequence[ScoredSet],
+    vehicle_file: str | None,
     warnings: Sequence[str] = (),
-) -> JsonDict:  # fmt: skip
+) -> JsonDict:
     """The result of an identification.
 
     Args:
@@ -141,7 +146,7 @@ def with_correlation(vehicle: Vehicle, parameters: ParameterSet) -> Vehicle:
     together = {
         names[i]: {names[j]: round(float(found[i, j]), 3) for j in known if j < i and abs(found[i, j]) >= CORRELATED}
         for i in known
-    }  # fmt: skip
+    }
     return vehicle.model_copy(update={"correlation": {one: others for one, others in together.items() if others}})
 
 

@@ -127,9 +127,11 @@ class Tally:
 
     def __add__(self, other: Tally) -> Tally:
         return Tally(
-            self.squares + other.squares, self.expected + other.expected, self.samples + other.samples,
+            self.squares + other.squares,
+            self.expected + other.expected,
+            self.samples + other.samples,
             self.ran_away or other.ran_away,
-        )  # fmt: skip
+        )
 
     @property
     def ratio(self) -> FloatArray:
@@ -159,9 +161,11 @@ def tallied(shooting: Shooting, theta: FloatArray, lin: Linearised | None = None
     if known is not None:
         expected[known:] = 0.0
     return Tally(
-        np.sum(np.where(used, lin.residuals, 0.0) ** 2, axis=(0, 1)), expected,
-        np.count_nonzero(used, axis=(0, 1)).astype(np.float64), not np.isfinite(lin.cost).all(),
-    )  # fmt: skip
+        np.sum(np.where(used, lin.residuals, 0.0) ** 2, axis=(0, 1)),
+        expected,
+        np.count_nonzero(used, axis=(0, 1)).astype(np.float64),
+        not np.isfinite(lin.cost).all(),
+    )
 
 
 def scored_problem(windows: Sequence[Window], vehicle: Vehicle, noise: NoiseModel | None) -> Shooting:
@@ -170,8 +174,9 @@ def scored_problem(windows: Sequence[Window], vehicle: Vehicle, noise: NoiseMode
     if not shooting.rollouts:
         raise NotIdentifiableError(
             f"{windows[0].name or 'window'}: no stretch is long enough to be scored",
-            f"{SCORE_SECONDS + 0.4:g} s without gaps", "record longer stretches at a steady rate",
-        )  # fmt: skip
+            f"{SCORE_SECONDS + 0.4:g} s without gaps",
+            "record longer stretches at a steady rate",
+        )
     return shooting.with_noise(covering(noise, shooting.channels, vehicle))
 
 

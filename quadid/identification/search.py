@@ -24,9 +24,14 @@ SWARM_SEGMENTS = 100
 
 
 def swarm_search(
-    shooting: Shooting, theta: FloatArray, free: Free, options: SwarmOptions, particles: int, seed: int,
+    shooting: Shooting,
+    theta: FloatArray,
+    free: Free,
+    options: SwarmOptions,
+    particles: int,
+    seed: int,
     report: Progress,
-) -> tuple[FloatArray, int]:  # fmt: skip
+) -> tuple[FloatArray, int]:
     """Global search by the particle swarm on a thinned set of segments.
 
     Args:

@@ -145,16 +145,23 @@ def parameter_set(free: Free, theta: FloatArray, initial: FloatArray, unc: Uncer
         loose = 0.98 * min(math.log(e.upper / guess), math.log(guess / e.lower)) if free.is_log[j] else 0.0
         out.append(
             Parameter(
-                e.name, e.unit, value, float(sigma[j]), guess, (e.lower, e.upper), status, partner, ci,
-                float(unc.prior_share[j]), float(unc.prior_sigma[j]) < loose,
+                e.name,
+                e.unit,
+                value,
+                float(sigma[j]),
+                guess,
+                (e.lower, e.upper),
+                status,
+                partner,
+                ci,
+                float(unc.prior_share[j]),
+                float(unc.prior_sigma[j]) < loose,
             )
-        )  # fmt: skip
+        )
     return ParameterSet(tuple(out), unc.covariance * np.outer(scale, scale))
 
 
-def _status(
-    j: int, free: Free, unc: Uncertainty, value: float, ci: tuple[float, float]
-) -> tuple[Status, str | None]:  # fmt: skip
+def _status(j: int, free: Free, unc: Uncertainty, value: float, ci: tuple[float, float]) -> tuple[Status, str | None]:
     sigma, entry = unc.sigma, free.entries[j]
     if at_bound(value, entry.lower, entry.upper):
         return Status.UNRELIABLE, None

@@ -301,10 +301,15 @@ def _step(air, hub, solid, rare, dt, s):  # type: ignore[no-untyped-def]
         # Means over the halves from a parabola through the stages.
         fx, fy, fz = 4.0 * (f2x + f3x), 4.0 * (f2y + f3y), 4.0 * (f2z + f3z)
         put_force(
-            TWELFTH * (5.0 * f1x + fx - f4x), TWELFTH * (5.0 * f1y + fy - f4y), TWELFTH * (5.0 * f1z + fz - f4z),
-            TWELFTH * (fx - f1x + 5.0 * f4x), TWELFTH * (fy - f1y + 5.0 * f4y), TWELFTH * (fz - f1z + 5.0 * f4z),
-            lane, s,
-        )  # fmt: skip
+            TWELFTH * (5.0 * f1x + fx - f4x),
+            TWELFTH * (5.0 * f1y + fy - f4y),
+            TWELFTH * (5.0 * f1z + fz - f4z),
+            TWELFTH * (fx - f1x + 5.0 * f4x),
+            TWELFTH * (fy - f1y + 5.0 * f4y),
+            TWELFTH * (fz - f1z + 5.0 * f4z),
+            lane,
+            s,
+        )
 
 
 def _step_of(air: bool, hub: bool, solid: bool, rare: bool) -> Any:

@@ -53,9 +53,11 @@ def _see(lane: int, tilted: bool, s: FloatArray, attitude: FloatArray, rate: Flo
     if tilted:
         a, b, c, d = s[E_QW + lane], s[E_QW + LANES + lane], s[E_QW + 2 * LANES + lane], s[E_QW + 3 * LANES + lane]
         w, x, y, z = (
-            a * w - b * x - c * y - d * z, a * x + b * w + c * z - d * y,
-            a * y - b * z + c * w + d * x, a * z + b * y - c * x + d * w,
-        )  # fmt: skip
+            a * w - b * x - c * y - d * z,
+            a * x + b * w + c * z - d * y,
+            a * y - b * z + c * w + d * x,
+            a * z + b * y - c * x + d * w,
+        )
     write_rotation(w, x, y, z, attitude)
     p, q, r = s[X_P + lane], s[X_P + LANES + lane], s[X_P + 2 * LANES + lane]
     for i in range(3):
@@ -89,9 +91,19 @@ def _keep_half(half: int, halves: int, place: int, force: FloatArray, s: FloatAr
 
 @cached
 def fly_closed_loop(
-    references: FloatArray, gains: FloatArray, mixer: FloatArray, substeps: int, lanes: int, geometry: FloatArray,
-    terms: IntArray, flight: Flight, theta: FloatArray, need: Needs, x0: FloatArray, out: FloatArray,
-) -> None:  # fmt: skip
+    references: FloatArray,
+    gains: FloatArray,
+    mixer: FloatArray,
+    substeps: int,
+    lanes: int,
+    geometry: FloatArray,
+    terms: IntArray,
+    flight: Flight,
+    theta: FloatArray,
+    need: Needs,
+    x0: FloatArray,
+    out: FloatArray,
+) -> None:
     """Flies one block of lanes through a window.
 
     Args:
@@ -223,8 +235,9 @@ class ClosedLoop:
         if window.attitude_reference is None or not np.isfinite(window.attitude_reference).all():
             raise WindowError(
                 f"{window.name or 'window'}: no complete attitude and throttle references",
-                "roll, pitch, yaw [rad] and throttle 0..1 in every row", "log the references",
-            )  # fmt: skip
+                "roll, pitch, yaw [rad] and throttle 0..1 in every row",
+                "log the references",
+            )
         self.substeps = 1 if rate is None else round(rate * window.dt)
         if self.substeps < 1 or (rate is not None and abs(rate * window.dt - self.substeps) > 1e-6):
             raise ParameterError(f"stabiliser rate {rate} Hz", f"a whole multiple of {1.0 / window.dt:g} Hz")
@@ -253,13 +266,25 @@ class ClosedLoop:
         out = aligned((len(self.window), OUTPUTS, LANES))
         rotors = len(self._geometry)
         check_shapes(
-            "fly_closed_loop", ("theta", full, (LANES, ix.LOSS + 2 * rotors + len(self._terms))),
-            ("references", self._references, (len(self.window), 4)), ("mixer", self._mixer, (rotors, 4)),
-        )  # fmt: skip
+            "fly_closed_loop",
+            ("theta", full, (LANES, ix.LOSS + 2 * rotors + len(self._terms))),
+            ("references", self._references, (len(self.window), 4)),
+            ("mixer", self._mixer, (rotors, 4)),
+        )
         fly_closed_loop(
-            self._references, self._gains, self._mixer, self.substeps, lanes, self._geometry, self._terms, self._flight,
-            full, needs_of(full, rotors, 9), self._x0, out,
-        )  # fmt: skip
+            self._references,
+            self._gains,
+            self._mixer,
+            self.substeps,
+            lanes,
+            self._geometry,
+            self._terms,
+            self._flight,
+            full,
+            needs_of(full, rotors, 9),
+            self._x0,
+            out,
+        )
         return np.ascontiguousarray(np.moveaxis(out[..., :lanes], 2, 0))
 
 

@@ -69,9 +69,16 @@ RARE_ENTRIES = places("parasitic_drag", "ground_effect", "translational_lift", "
 PAYLOAD_ENTRIES = places(*(f"mass_change.{key}" for key in ("J_xx", "J_yy", "J_zz", "x", "y")))
 FACTOR_ENTRIES = (*places("battery_sag", "thrust_drop.fraction", "mass_change.fraction"), *PAYLOAD_ENTRIES)
 SOLID_ENTRIES = places(
-    "rotor_drag_moment", "rate_damping", "cg_offset", "product_of_inertia", "rotor_spin_up", "imu_lever_arm",
-    "no_gyroscopic_coupling", "rotor_drag.central", "axial_inflow.central",
-)  # fmt: skip
+    "rotor_drag_moment",
+    "rate_damping",
+    "cg_offset",
+    "product_of_inertia",
+    "rotor_spin_up",
+    "imu_lever_arm",
+    "no_gyroscopic_coupling",
+    "rotor_drag.central",
+    "axial_inflow.central",
+)
 IMU_ENTRIES = places("gyro_bias", "accel_bias", "gyro_scale", "imu_misalignment")
 DELAY_ENTRIES = places("command_delay", "rotor_telemetry_delay")
 ROTOR_ENTRIES = places(
@@ -252,9 +259,15 @@ def load_payload(t: float, dt: float, theta: FloatArray, s: FloatArray) -> None:
         th = theta[lane]
         part = min(max((t + dt - s[C_LOAD_TIME + lane]) / dt, 0.0), 1.0)
         _inertia(
-            th[ix.JXX] * (1.0 + part * th[LOAD_XX]), th[ix.JYY] * (1.0 + part * th[LOAD_YY]),
-            th[ix.JZZ] * (1.0 + part * th[LOAD_ZZ]), -th[ix.JXY], -th[ix.JXZ], -th[ix.JYZ], lane, s,
-        )  # fmt: skip
+            th[ix.JXX] * (1.0 + part * th[LOAD_XX]),
+            th[ix.JYY] * (1.0 + part * th[LOAD_YY]),
+            th[ix.JZZ] * (1.0 + part * th[LOAD_ZZ]),
+            -th[ix.JXY],
+            -th[ix.JXZ],
+            -th[ix.JYZ],
+            lane,
+            s,
+        )
         x, y = th[ix.CGX] + part * th[LOAD_X], th[ix.CGY] + part * th[LOAD_Y]
         s[C_CGX + lane], s[C_CGY + lane], s[C_RX + lane], s[C_RY + lane] = x, y, th[ix.LAX] - x, th[ix.LAY] - y
 
@@ -343,10 +356,20 @@ def step_core(dt: float, s: FloatArray) -> None:
     lane_kernel()
     for lane in range(LANES):
         _core(
-            s[A_S2 + lane], s[A_S2 + HALF + lane], s[A_X2 + lane], s[A_X2 + HALF + lane], s[A_Y2 + lane],
-            s[A_Y2 + HALF + lane], s[A_Z2 + lane], s[A_Z2 + HALF + lane], s[A_O1 + lane], s[A_O1 + HALF + lane],
-            dt, lane, s,
-        )  # fmt: skip
+            s[A_S2 + lane],
+            s[A_S2 + HALF + lane],
+            s[A_X2 + lane],
+            s[A_X2 + HALF + lane],
+            s[A_Y2 + lane],
+            s[A_Y2 + HALF + lane],
+            s[A_Z2 + lane],
+            s[A_Z2 + HALF + lane],
+            s[A_O1 + lane],
+            s[A_O1 + HALF + lane],
+            dt,
+            lane,
+            s,
+        )
 
 
 @nb.njit(**jit)

@@ -103,9 +103,18 @@ class Layout:
         for k, key in enumerate(("loss", "drag_loss")):
             p = EFFECTS["weak_rotor"].parameter(key)
             entries.extend(
-                Entry(f"weak_rotor.{p.entry or key}_{i + 1}", LOSS + k * self.rotors + i, "", 0.0, p.lower, p.upper,
-                      p.typical, p.sign) for i in range(self.rotors)
-            )  # fmt: skip
+                Entry(
+                    f"weak_rotor.{p.entry or key}_{i + 1}",
+                    LOSS + k * self.rotors + i,
+                    "",
+                    0.0,
+                    p.lower,
+                    p.upper,
+                    p.typical,
+                    p.sign,
+                )
+                for i in range(self.rotors)
+            )
         entries.extend(
             Entry(f"residual.{i + 1}", LOSS + 2 * self.rotors + i, term.unit, 0.0, -math.inf, math.inf, 1.0)
             for i, term in enumerate(vehicle.residual)

@@ -64,8 +64,13 @@ def measurements(window: Window, channels: int) -> tuple[FloatArray, BoolArray]:
     measured = np.zeros((n, channels + 1))
     measured[:, 3] = 1.0
     valid = np.zeros((n, channels), dtype=bool)
-    places = ((window.gyro, 0, 0), (window.attitude, 3, 3), (window.accel, 7, 6), (window.velocity, 10, 9),
-              (window.position, 13, 12))  # fmt: skip
+    places = (
+        (window.gyro, 0, 0),
+        (window.attitude, 3, 3),
+        (window.accel, 7, 6),
+        (window.velocity, 10, 9),
+        (window.position, 13, 12),
+    )
     for values, column, channel in places:
         if values is None or channel >= channels:
             continue
@@ -159,9 +164,13 @@ def packing(thetas: FloatArray, rotors: int) -> IndexArray:
         return np.arange(len(thetas))
     others = thetas[1:]
     entries = (
-        (ix.IMU_PERIOD,), (ix.ATT_DELAY,), (ix.AHRS_K,), HUB_ENTRIES + RARE_ENTRIES, SOLID_ENTRIES + FACTOR_ENTRIES,
+        (ix.IMU_PERIOD,),
+        (ix.ATT_DELAY,),
+        (ix.AHRS_K,),
+        HUB_ENTRIES + RARE_ENTRIES,
+        SOLID_ENTRIES + FACTOR_ENTRIES,
         RARE_ENTRIES,
-    )  # fmt: skip
+    )
     needs = [np.any(others[:, list(group)] != 0.0, axis=1) for group in entries]
     driving = [*ROTOR_ENTRIES, *range(ix.LOSS, ix.LOSS + 2 * rotors)]
     own = np.any(others[:, driving] != thetas[0, driving], axis=1)
@@ -261,9 +270,8 @@ class Rollout:
         slope = speed[:0] if window.rotor_slope is None else window.rotor_slope.view()
         speed.flags.writeable = slope.flags.writeable = False  # those of a window that was pickled can be written to
         self.drive = Drive(
-            speed, slope, relative_voltage(window, vehicle), window.sampling == "held", self.geometry,
-            window.dt,
-        )  # fmt: skip
+            speed, slope, relative_voltage(window, vehicle), window.sampling == "held", self.geometry, window.dt
+        )
         self.flight = Flight(self.mass, self.reach, hub, plan, window.t0, window.dt, *window.log_span)
         self._number = next(NUMBERS)
 
@@ -271,9 +279,14 @@ class Rollout:
         return len(self.window)
 
     def roll(
-        self, segments: Segments, theta: FloatArray, x0: FloatArray, dx: FloatArray | None = None, n_pre: int = 1,
+        self,
+        segments: Segments,
+        theta: FloatArray,
+        x0: FloatArray,
+        dx: FloatArray | None = None,
+        n_pre: int = 1,
         out: tuple[FloatArray, FloatArray] | None = None,
-    ) -> tuple[FloatArray, FloatArray]:  # fmt: skip
+    ) -> tuple[FloatArray, FloatArray]:
         """Simulates every segment for every parameter vector.
 
         Args:
@@ -305,9 +318,14 @@ class Rollout:
         return residuals, ends
 
     def roll_parts(
-        self, segments: Segments, theta: FloatArray, x0: FloatArray, dx: FloatArray, n_pre: int,
+        self,
+        segments: Segments,
+        theta: FloatArray,
+        x0: FloatArray,
+        dx: FloatArray,
+        n_pre: int,
         use: Callable[[slice, FloatArray], None],
-    ) -> None:  # fmt: skip
+    ) -> None:
         """Simulates as `roll` does, a few segments at a time, so that residuals are used while they are in cache.
 
         Args:
@@ -341,9 +359,14 @@ class Rollout:
             list(_threads().map(part, starts))
 
     def costs(
-        self, segments: Segments, theta: FloatArray, x0: FloatArray, weights: FloatArray, basis: FloatArray,
+        self,
+        segments: Segments,
+        theta: FloatArray,
+        x0: FloatArray,
+        weights: FloatArray,
+        basis: FloatArray,
         n_pre: int = 1,
-    ) -> FloatArray:  # fmt: skip
+    ) -> FloatArray:
         """Weighted sum of squares of many parameter vectors, initial states eliminated by variable projection.
 
         For residuals r of a segment, weights W and orthonormal columns Q that span the directions which the initial
@@ -374,9 +397,14 @@ class Rollout:
         return cost.reshape(-1)[: len(theta)]
 
     def _each_block(
-        self, segments: Segments, n_pre: int, theta: FloatArray, dx: FloatArray | None, channels: int,
+        self,
+        segments: Segments,
+        n_pre: int,
+        theta: FloatArray,
+        dx: FloatArray | None,
+        channels: int,
         run: Callable[[int, _Lanes], None],
-    ) -> None:  # fmt: skip
+    ) -> None:
         """Cuts parameter vectors into blocks of lanes and runs the blocks, several at a time."""
         lanes = self._prepared(segments, n_pre, theta, dx, channels)
         if len(lanes) == 1:
@@ -427,9 +455,17 @@ class Rollout:
         return table
 
     def _run(
-        self, segments: Segments, n_pre: int, x0: FloatArray, lanes: _Lanes, scale: FloatArray,
-        basis: FloatArray | None, out: FloatArray, ends: FloatArray, cost: FloatArray,
-    ) -> None:  # fmt: skip
+        self,
+        segments: Segments,
+        n_pre: int,
+        x0: FloatArray,
+        lanes: _Lanes,
+        scale: FloatArray,
+        basis: FloatArray | None,
+        out: FloatArray,
+        ends: FloatArray,
+        cost: FloatArray,
+    ) -> None:
         rows, length, count, channels = len(self), segments.length, len(segments.starts), scale.shape[1]
         first, last = segments.starts[0] - n_pre, segments.starts[-1] + length
         if first < 0 or last >= rows:
@@ -438,10 +474,12 @@ class Rollout:
             raise ValueError(f"{channels} residual channels; allowed: 9, 12 or 15, at most {self.channels}")
         sums = basis is not None
         given = [
-            ("scale", scale, (rows, channels)), ("x0", x0, (count, N_STATE)), ("theta", lanes.theta, self._size),
+            ("scale", scale, (rows, channels)),
+            ("x0", x0, (count, N_STATE)),
+            ("theta", lanes.theta, self._size),
             ("dx", lanes.dx, (MAX_TANGENTS, LANES)),
             ("out", out, (1, 1, channels * LANES) if sums else (count, length, channels * LANES)),
-        ]  # fmt: skip
+        ]
         if basis is None:
             given.append(("ends", ends, (count, N_STATE, LANES)))
         else:

@@ -38,9 +38,16 @@ from quadid.types import FloatArray, IntArray
 
 # isort: off
 from quadid.model.sensor_kernel import (
-    delay_attitude, distort_imu, remember_attitude, sensor_constants, start_filter, step_filter, step_tilt_error,
-    tilt_attitude, use_filter,
-)  # fmt: skip
+    delay_attitude,
+    distort_imu,
+    remember_attitude,
+    sensor_constants,
+    start_filter,
+    step_filter,
+    step_tilt_error,
+    tilt_attitude,
+    use_filter,
+)
 
 # isort: on
 # isort: off

@@ -162,9 +162,19 @@ def turn(x: float, y: float, spin: float, inv: float, keep: float, s: FloatArray
         n1, n2, w1 = _piece(w, a1 + s1 * s[P_H + B + lane], s1, D + lane, lane, s)
         s[T_SPEED + lane] = w1
         _add_rotor(
-            inv * (k1 + m1), inv * (k2 + m2), inv * (l1 + n1), inv * (l2 + n2), inv * (wm - w0), inv * (w1 - wm),
-            x, y, spin, keep, lane, s,
-        )  # fmt: skip
+            inv * (k1 + m1),
+            inv * (k2 + m2),
+            inv * (l1 + n1),
+            inv * (l2 + n2),
+            inv * (wm - w0),
+            inv * (w1 - wm),
+            x,
+            y,
+            spin,
+            keep,
+            lane,
+            s,
+        )
 
 
 @nb.njit(**jit)
@@ -288,9 +298,16 @@ def _scale_inputs(drive: Drive, rot: FloatArray, s: FloatArray) -> None:
 
 @nb.njit(**jit)
 def turn_rotor(
-    plain: bool, r: int, held: bool, sloped: bool, geometry: FloatArray, dt: float, need: Needs,
-    rot: FloatArray, s: FloatArray,
-) -> None:  # fmt: skip
+    plain: bool,
+    r: int,
+    held: bool,
+    sloped: bool,
+    geometry: FloatArray,
+    dt: float,
+    need: Needs,
+    rot: FloatArray,
+    s: FloatArray,
+) -> None:
     """Advances rotor r over one step and adds it to the moments of both half steps.
 
     Args:

@@ -104,9 +104,17 @@ def step_filter(dt: float, s: FloatArray) -> None:
             kappa, sigma = s[C_KAPPA + lane], s[C_SIGMA + lane]
             c, e = s[C_EC2 + lane], s[C_ES2 + lane]
             y, dy = _follow(
-                s[G_W0 + i + lane], s[S_P + i + lane], s[G_BEND + i + lane], s[G_W + i + lane], s[G_DW + i + lane], inv,
-                kappa, sigma, s[C_EC + lane], s[C_ES + lane],
-            )  # fmt: skip
+                s[G_W0 + i + lane],
+                s[S_P + i + lane],
+                s[G_BEND + i + lane],
+                s[G_W + i + lane],
+                s[G_DW + i + lane],
+                inv,
+                kappa,
+                sigma,
+                s[C_EC + lane],
+                s[C_ES + lane],
+            )
             middle = s[G_FM + i + lane]
             f, df = _follow(
                 s[G_F0 + i + lane], middle, 0.0, s[G_F + i + lane], s[G_DF + i + lane], 2.0 * inv, kappa, sigma, c, e
@@ -129,9 +137,11 @@ def use_filter(s: FloatArray) -> None:
 def _product(a0, a1, a2, a3, b0, b1, b2, b3):  # type: ignore[no-untyped-def]
     """Hamilton product of two quaternions."""
     return (
-        a0 * b0 - a1 * b1 - a2 * b2 - a3 * b3, a0 * b1 + a1 * b0 + a2 * b3 - a3 * b2,
-        a0 * b2 - a1 * b3 + a2 * b0 + a3 * b1, a0 * b3 + a1 * b2 - a2 * b1 + a3 * b0,
-    )  # fmt: skip
+        a0 * b0 - a1 * b1 - a2 * b2 - a3 * b3,
+        a0 * b1 + a1 * b0 + a2 * b3 - a3 * b2,
+        a0 * b2 - a1 * b3 + a2 * b0 + a3 * b1,
+        a0 * b3 + a1 * b2 - a2 * b1 + a3 * b0,
+    )
 
 
 @nb.njit(**inlined)
@@ -206,9 +216,15 @@ def tilt_attitude(s: FloatArray) -> None:
     lane_kernel()
     for lane in range(LANES):
         q0, q1, q2, q3 = _product(
-            s[E_QW + lane], s[E_QX + lane], s[E_QY + lane], s[E_QZ + lane],
-            s[S_QW + lane], s[S_QX + lane], s[S_QY + lane], s[S_QZ + lane],
-        )  # fmt: skip
+            s[E_QW + lane],
+            s[E_QX + lane],
+            s[E_QY + lane],
+            s[E_QZ + lane],
+            s[S_QW + lane],
+            s[S_QX + lane],
+            s[S_QY + lane],
+            s[S_QZ + lane],
+        )
         s[S_QW + lane], s[S_QX + lane], s[S_QY + lane], s[S_QZ + lane] = q0, q1, q2, q3
         s[E_QW + lane], s[E_QX + lane] = s[N_QW + lane], s[N_QX + lane]
         s[E_QY + lane], s[E_QZ + lane] = s[N_QY + lane], s[N_QZ + lane]

@@ -434,9 +434,14 @@ class Simulator:
     """
 
     def __init__(
-        self, vehicle: Vehicle, theta: FloatArray | None = None, *, random: RandomInputs | RandomForces | None = None,
-        seed: int = 0, span: float = math.inf,
-    ) -> None:  # fmt: skip
+        self,
+        vehicle: Vehicle,
+        theta: FloatArray | None = None,
+        *,
+        random: RandomInputs | RandomForces | None = None,
+        seed: int = 0,
+        span: float = math.inf,
+    ) -> None:
         """Prepares the simulation.
 
         Args:
@@ -474,10 +479,17 @@ class Simulator:
         self._each = (self.vehicles, len(self._geometry))
 
     def start(
-        self, *, attitude: ArrayLike = LEVEL, rate: ArrayLike = STILL, velocity: ArrayLike = STILL,
-        position: ArrayLike = STILL, rotor_speed: ArrayLike | None = None, time: float = 0.0,
-        inputs: ArrayLike = 0.0, dt: float = 0.005,
-    ) -> State:  # fmt: skip
+        self,
+        *,
+        attitude: ArrayLike = LEVEL,
+        rate: ArrayLike = STILL,
+        velocity: ArrayLike = STILL,
+        position: ArrayLike = STILL,
+        rotor_speed: ArrayLike | None = None,
+        time: float = 0.0,
+        inputs: ArrayLike = 0.0,
+        dt: float = 0.005,
+    ) -> State:
         """Returns a state to start from; each argument for one vehicle, or with a row a vehicle.
 
         Args:
@@ -513,9 +525,12 @@ class Simulator:
         moving[:, E_QW : E_QW + LANES] = 1.0
         rot[:, :, R_SPEED : R_SPEED + LANES] = speeds
         memory = (
-            moving[:, STATE:], rot, np.repeat(speeds[:, None], self._delayed, axis=1),
-            _in_lanes(given[5], blocks), np.repeat(rows[:, None, :7], late, axis=1),
-        )  # fmt: skip
+            moving[:, STATE:],
+            rot,
+            np.repeat(speeds[:, None], self._delayed, axis=1),
+            _in_lanes(given[5], blocks),
+            np.repeat(rows[:, None, :7], late, axis=1),
+        )
         kept, none = np.concatenate([m.reshape(blocks, -1) for m in memory], axis=1), _NO_CONSTANTS
         return State(time, 0, n, kept, rotors, dt, none, none)
 
@@ -572,9 +587,10 @@ class Simulator:
         if dt != state._dt:
             if self._need.delayed or self._need.att_delay:
                 raise WindowError(
-                    f"dt {dt} s after {state._dt} s", "one step size where commands or attitude are delayed",
+                    f"dt {dt} s after {state._dt} s",
+                    "one step size where commands or attitude are delayed",
                     "begin with start(dt=...)",
-                )  # fmt: skip
+                )
             state._dt = dt
         if dt != self._dt:
             self._settle(dt)
@@ -642,9 +658,16 @@ class Trajectory:
 
 
 def simulate(
-    vehicle: Vehicle, rotor_speed: FloatArray, dt: float, *, attitude: FloatArray = LEVEL, rate: FloatArray = STILL,
-    velocity: FloatArray = STILL, position: FloatArray = STILL, theta: FloatArray | None = None,
-) -> Trajectory:  # fmt: skip
+    vehicle: Vehicle,
+    rotor_speed: FloatArray,
+    dt: float,
+    *,
+    attitude: FloatArray = LEVEL,
+    rate: FloatArray = STILL,
+    velocity: FloatArray = STILL,
+    position: FloatArray = STILL,
+    theta: FloatArray | None = None,
+) -> Trajectory:
     """Simulates a vehicle file, effects included, from given rotor speeds.
 
     Args:

@@ -28,9 +28,18 @@ Three = tuple[Scalar, Scalar, Scalar]
 MOTION = ("qw", "qx", "qy", "qz", "p", "q", "r", "v_north", "v_east", "v_down", "north", "east", "down")
 """States of the motion; rotor speeds follow where the rotors lag."""
 LEFT_OUT = (
-    "command_delay", "rotor_telemetry_delay", "attitude_delay", "imu_lag", "gyro_bias", "accel_bias", "gyro_scale",
-    "imu_misalignment", "imu_lever_arm", "ahrs_acceleration_error", "velocity_scale",
-)  # fmt: skip
+    "command_delay",
+    "rotor_telemetry_delay",
+    "attitude_delay",
+    "imu_lag",
+    "gyro_bias",
+    "accel_bias",
+    "gyro_scale",
+    "imu_misalignment",
+    "imu_lever_arm",
+    "ahrs_acceleration_error",
+    "velocity_scale",
+)
 """Effects that act before the rotors or in sensors, and leave the rates of these states as they are."""
 
 
@@ -160,8 +169,9 @@ def _rotor_drag(s: Scene) -> None:
         flow = s.each * w / s.hover
         force = (
             -flow * th[ix.KX] * (u + share * (q * z - r * y)),
-            -flow * th[ix.KY] * (v + share * (r * x - p * z)), 0.0,
-        )  # fmt: skip
+            -flow * th[ix.KY] * (v + share * (r * x - p * z)),
+            0.0,
+        )
         s.push(force, (x, y, z), share)
         s.drag[0] += force[0]
         s.drag[1] += force[1]
@@ -258,8 +268,9 @@ class Frame:
         if self.theta[ix.JSPIN] and not self.lagging:
             raise ParameterError(
                 "rotor_spin_up without motor_lag: an impulse at every change of the command",
-                "rotors that lag", "give motor_lag a tau, or leave rotor_spin_up out",
-            )  # fmt: skip
+                "rotors that lag",
+                "give motor_lag a tau, or leave rotor_spin_up out",
+            )
         if self.theta[ix.SAG] and not math.isfinite(span):
             raise ParameterError("battery_sag without a length of the flight", "span in seconds", "pass span=")
         rotors = tuple(f"rotor_{i + 1}" for i in range(len(vehicle.rotors)))
@@ -271,9 +282,14 @@ class Frame:
         self._residual = [(targets.index(t.acts_on), [names.index(n) for n in t.product]) for t in vehicle.residual]
 
     def derivative(
-        self, f: Functions, x: Sequence[Scalar], u: Sequence[Scalar], th: Sequence[Scalar], t: Scalar = 0.0,
+        self,
+        f: Functions,
+        x: Sequence[Scalar],
+        u: Sequence[Scalar],
+        th: Sequence[Scalar],
+        t: Scalar = 0.0,
         voltage: Scalar = 1.0,
-    ) -> list[Scalar]:  # fmt: skip
+    ) -> list[Scalar]:
         """Rate of every state.
 
         Args:
@@ -318,10 +334,19 @@ class Frame:
         a = [force * scene.unloaded / self.vehicle.mass for force in scene.force]
         moved = [row[0] * a[0] + row[1] * a[1] + row[2] * a[2] for row in rows]
         return [
-            0.5 * (-qx * p - qy * q - qz * r), 0.5 * (qw * p + qy * r - qz * q), 0.5 * (qw * q + qz * p - qx * r),
-            0.5 * (qw * r + qx * q - qy * p), *_turned(scene), moved[0], moved[1], moved[2] + GRAVITY, vn, ve, vd,
+            0.5 * (-qx * p - qy * q - qz * r),
+            0.5 * (qw * p + qy * r - qz * q),
+            0.5 * (qw * q + qz * p - qx * r),
+            0.5 * (qw * r + qx * q - qy * p),
+            *_turned(scene),
+            moved[0],
+            moved[1],
+            moved[2] + GRAVITY,
+            vn,
+            ve,
+            vd,
             *(turning if self.lagging else ()),
-        ]  # fmt: skip
+        ]
 
     @property
     def left_out(self) -> tuple[str, ...]:

@@ -41,13 +41,11 @@ DOWN = 4 * PIECE
 """From the constants of speeding up to those of slowing down."""
 # The rotor at work: value and slope of each piece of its input, speed, gains of thrust and drag torque; means
 # of speed and its square over each half step; factor of the voltage.
-(
-    T_A0, T_S0, T_A1, T_S1, T_SPEED, T_GAIN, T_DRAG, T_M1, T_M2, T_N1, T_N2, T_VOLT,
-) = _rows(P_E + 2 * DOWN, 12)  # fmt: skip
+(T_A0, T_S0, T_A1, T_S1, T_SPEED, T_GAIN, T_DRAG, T_M1, T_M2, T_N1, T_N2, T_VOLT) = _rows(P_E + 2 * DOWN, 12)
 # Rotor moments, means over the first half step; those over the second follow at + HALF.
-(
-    A_S2, A_X2, A_Y2, A_Z2, A_O1, A_S1, A_DO, A_X1, A_Y1, A_Z1, A_XX, A_YY, A_ZZ, A_XY, A_XZ, A_YZ, A_G, A_M,
-) = _rows(T_VOLT + LANES, 18)  # fmt: skip
+(A_S2, A_X2, A_Y2, A_Z2, A_O1, A_S1, A_DO, A_X1, A_Y1, A_Z1, A_XX, A_YY, A_ZZ, A_XY, A_XZ, A_YZ, A_G, A_M) = _rows(
+    T_VOLT + LANES, 18
+)
 ALL_MOMENTS = 16
 HALF = 18 * LANES
 # State: quaternion, rate, velocity, position.
@@ -71,7 +69,5 @@ N_ROWS = L_PAST // LANES + 6
 
 # Rows of each rotor, in an array of their own (rotors, ROTOR): speed; gains of thrust and drag torque; input one sample
 # back, now, one ahead; its slope one sample back, now, one ahead.
-(
-    R_SPEED, R_GAIN, R_DRAG, R_PAST, R_NOW, R_NEXT, R_PAST_SLOPE, R_NOW_SLOPE, R_NEXT_SLOPE,
-) = _rows(0, 9)  # fmt: skip
+(R_SPEED, R_GAIN, R_DRAG, R_PAST, R_NOW, R_NEXT, R_PAST_SLOPE, R_NOW_SLOPE, R_NEXT_SLOPE) = _rows(0, 9)
 ROTOR = 9 * LANES

@@ -39,9 +39,13 @@ class ActiveSet:
     """
 
     def __init__(
-        self, approval: str, restored: OnlineSet | None = None, next_sequence: int = 1,
-        baseline: OnlineSet | None = None, load: float = 1.0,
-    ) -> None:  # fmt: skip
+        self,
+        approval: str,
+        restored: OnlineSet | None = None,
+        next_sequence: int = 1,
+        baseline: OnlineSet | None = None,
+        load: float = 1.0,
+    ) -> None:
         """Starts empty, or from the last accepted set of an earlier run, which is stale until revalidated.
 
         Args:
@@ -159,10 +163,14 @@ class ActiveSet:
         bad, good = self.in_force, self._earlier.pop()
         reason = f"set {good.sequence} again, in place of set {bad.sequence}: {why or 'asked for by ' + by}"
         self.in_force = replace(
-            good, sequence=self._number(), state=SetState.ROLLED_BACK, reason=reason, approved_by=by,
+            good,
+            sequence=self._number(),
+            state=SetState.ROLLED_BACK,
+            reason=reason,
+            approved_by=by,
             outdated=good.outdated or bad.outdated,
             outdated_code=good.outdated_code if good.outdated else bad.outdated_code,
-        )  # fmt: skip
+        )
         self._held.clear()
         self._watch_from = math.inf
         if by != "auto":

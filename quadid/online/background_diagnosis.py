@@ -68,11 +68,17 @@ class DiagnosisRequest(Job):
 def _online(f: Finding, slow: bool) -> OnlineFinding:
     sure = f.confident and not (slow and EFFECTS[f.effect].needs_fast_rotors)
     return OnlineFinding(
-        f.effect, {p.name: p.value for p in f.parameters},
+        f.effect,
+        {p.name: p.value for p in f.parameters},
         {p.name: (p.ci95[1] - p.ci95[0]) / (2.0 * Z95) for p in f.parameters},
-        {p.name: p.unit for p in f.parameters}, f.gain.mse_before, f.gain.mse_after, f.p_value,
-        tuple(OnlineAlternative(a.effect, a.mse_after) for a in f.alternatives), f.evidence, sure,
-    )  # fmt: skip
+        {p.name: p.unit for p in f.parameters},
+        f.gain.mse_before,
+        f.gain.mse_after,
+        f.p_value,
+        tuple(OnlineAlternative(a.effect, a.mse_after) for a in f.alternatives),
+        f.evidence,
+        sure,
+    )
 
 
 class BackgroundDiagnosis:

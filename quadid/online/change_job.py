@@ -60,9 +60,7 @@ SURE = 0.95
 PULL = "steady_pull"
 """Not an effect of a vehicle: what holds or draws it, such as a line; in the finding as a force downwards [N]."""
 NOTHING = "nothing"
-_ODDS = {
-    "weak_rotor": 0.35, "mass_change": 0.4, PULL: 0.1, "cg_offset": 0.06, "thrust_drop": 0.06, NOTHING: 0.3,
-}  # fmt: skip
+_ODDS = {"weak_rotor": 0.35, "mass_change": 0.4, PULL: 0.1, "cg_offset": 0.06, "thrust_drop": 0.06, NOTHING: 0.3}
 """Prior odds of what changes suddenly in flight, and of a step that was none."""
 _SIZE = 0.2
 """Prior standard deviation of what a mass, a pull or lost thrust changes, as a share of the weight."""
@@ -144,12 +142,18 @@ def carried(request: ChangeRequest) -> OnlineFinding | None:
     fraction = float(np.expm1(-change.size))
     newtons = fraction * request.vehicle.mass * GRAVITY
     return OnlineFinding(
-        "mass_change", {"time": request.time, "fraction": fraction},
-        {"time": 0.5, "fraction": abs(fraction / change.errors)}, {"time": "s", "fraction": ""}, np.nan, np.nan, np.nan,
+        "mass_change",
+        {"time": request.time, "fraction": fraction},
+        {"time": 0.5, "fraction": abs(fraction / change.errors)},
+        {"time": "s", "fraction": ""},
+        np.nan,
+        np.nan,
+        np.nan,
         tuple(OnlineAlternative(effect, np.nan) for effect in (PULL, "thrust_drop")),
         f"thrust per weight stepped by {change.size:+.1%}: {newtons:+.2f} N to hold the vehicle up; a payload, a "
-        "steady pull and lost thrust cannot be told apart yet", False,
-    )  # fmt: skip
+        "steady pull and lost thrust cannot be told apart yet",
+        False,
+    )
 
 
 # --- Series before and after a change
@@ -197,10 +201,13 @@ def _series(request: ChangeRequest, chunks: Sequence[Chunk], b: float) -> list[_
     lagging = growth.sum(axis=1) / square.sum(axis=1)
     out = [
         _Series(
-            np.array([c.thrust for c in chunks]), np.column_stack([[c.state for c in chunks], lagging]),
-            np.append(state.typical, LAG), LEAST / 5.0, np.array([np.pad(c.astray, ((0, 0), (0, 1))) for c in chunks]),
+            np.array([c.thrust for c in chunks]),
+            np.column_stack([[c.state for c in chunks], lagging]),
+            np.append(state.typical, LAG),
+            LEAST / 5.0,
+            np.array([np.pad(c.astray, ((0, 0), (0, 1))) for c in chunks]),
         )
-    ]  # fmt: skip
+    ]
     j, scale = request.theta[2:5], _per_square(request, b)
     couple = np.clip([(j[2] - j[1]) / j[0], (j[0] - j[2]) / j[1], (j[1] - j[0]) / j[2]], -1.0, 1.0)
     sigma = request.z_sigma
@@ -380,9 +387,17 @@ def _finding(request: ChangeRequest, ranked: Sequence[tuple[float, _Explained]],
     if seen.channel == "thrust":
         text += f" ({np.expm1(-seen.size) * request.vehicle.mass * GRAVITY:+.2f} N to hold the vehicle up)"
     return OnlineFinding(
-        best.cause.effect, values, sigma, units, nothing.left, best.left, p_value, tuple(rivals.values()), text,
+        best.cause.effect,
+        values,
+        sigma,
+        units,
+        nothing.left,
+        best.left,
+        p_value,
+        tuple(rivals.values()),
+        text,
         share >= SURE,
-    )  # fmt: skip
+    )
 
 
 def _numbers(request: ChangeRequest, best: _Explained) -> tuple[dict[str, float], dict[str, float], dict[str, str]]:
@@ -466,6 +481,13 @@ class ChangeWatch:
             return None
         cut = self._rows.cut(max(self.seen.time - BASELINE, self._since) - _EPS, tick - _EPS)
         return ChangeRequest(
-            number, estimator.vehicle, cut.windows, self.seen.time, tick, estimator.theta, estimator.z_sigma, self.seen,
+            number,
+            estimator.vehicle,
+            cut.windows,
+            self.seen.time,
+            tick,
+            estimator.theta,
+            estimator.z_sigma,
+            self.seen,
             stamp,
-        )  # fmt: skip
+        )

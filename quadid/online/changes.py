@@ -108,9 +108,16 @@ class FlightState:
         layout, self._hover = Layout(vehicle), vehicle.hover_speed()
         dead, inflow, lift, drag, damping, along, high = (
             layout.entry(n).typical
-            for n in ("thrust_curve.dead_speed", "axial_inflow.k_z", "translational_lift.k",
-                      "parasitic_drag.beside_z", "rate_damping.l_p", "rotor_drag.k_x", "rotor_drag_moment.h_x")
-        )  # fmt: skip
+            for n in (
+                "thrust_curve.dead_speed",
+                "axial_inflow.k_z",
+                "translational_lift.k",
+                "parasitic_drag.beside_z",
+                "rate_damping.l_p",
+                "rotor_drag.k_x",
+                "rotor_drag_moment.h_x",
+            )
+        )
         self.typical = np.array([2.0 * dead, inflow, lift, drag])
         self.typical_moment = np.array([damping, along * high * vehicle.mass])
 
@@ -202,7 +209,7 @@ def learned(y: FloatArray, x: FloatArray, typical: FloatArray, least: float) -> 
 
 def step_beside(
     y: FloatArray, x: FloatArray, typical: FloatArray, first: int, least: float, astray: FloatArray | None = None
-) -> tuple[float, float, int]:  # fmt: skip
+) -> tuple[float, float, int]:
     """Clearest step of `y` from `first` on, beside what its regressors and random forces explain.
 
     Coefficients and random forces are those of the values before `first`.  A step is a change of the mean of the
@@ -371,11 +378,21 @@ class ChangeDetector:
         logs = np.log([np.maximum(force[good], 0.1 * lift), square[good].sum(axis=1)])
         spread = np.cov(logs, bias=True)
         return Chunk(
-            float(rows.t.mean()), lift, float(np.log(lift / total)), state, np.array(astray), sigma,
-            float(spread[0, 1]), float(spread[1, 1]), slope, gyro[rate].mean(axis=0),
-            np.array([np.mean(q * r), np.mean(p * r), np.mean(p * q)]), velocity[:, 1::-1].mean(axis=0),
-            np.asarray(weighed), _slope(t[good], square[good]),
-        )  # fmt: skip
+            float(rows.t.mean()),
+            lift,
+            float(np.log(lift / total)),
+            state,
+            np.array(astray),
+            sigma,
+            float(spread[0, 1]),
+            float(spread[1, 1]),
+            slope,
+            gyro[rate].mean(axis=0),
+            np.array([np.mean(q * r), np.mean(p * r), np.mean(p * q)]),
+            velocity[:, 1::-1].mean(axis=0),
+            np.asarray(weighed),
+            _slope(t[good], square[good]),
+        )
 
     def look(self, b: float, inertia: FloatArray, doubt: FloatArray | None) -> ChangePoint | None:
         """The strongest significant step of the last seconds, or None.

@@ -117,9 +117,7 @@ class WindowEstimate:
     @property
     def finite(self) -> bool:
         """True if it contains finite numbers only."""
-        arrays = (
-            self.z, self.information, self.score, self.noise, self.loose, self.half_information, self.half_score,
-        )  # fmt: skip
+        arrays = (self.z, self.information, self.score, self.noise, self.loose, self.half_information, self.half_score)
         return math.isfinite(self.cost) and all(bool(np.isfinite(a).all()) for a in arrays)
 
 
@@ -429,12 +427,16 @@ def _estimates(request: FitRequest, z: FloatArray, noise: Noise) -> tuple[tuple[
             share, (information, score) = float(np.mean(new)), _quadratic(J, plain, new, problem.expected)
             of_half = _quadratic(half_J, half, half_new, problem.expected)
             out[i] = replace(
-                e, information=e.information + information, score=e.score + score - share * slope,
+                e,
+                information=e.information + information,
+                score=e.score + score - share * slope,
                 cost=e.cost + float(np.sum(plain[new] ** 2)),
-                rows=e.rows + 3.0 * np.count_nonzero(problem.tracks[0].seen[new]), noise=e.noise + share * curvature,
-                loose=e.loose + share * unsure, half_information=e.half_information + E.T @ of_half[0] @ E,
+                rows=e.rows + 3.0 * np.count_nonzero(problem.tracks[0].seen[new]),
+                noise=e.noise + share * curvature,
+                loose=e.loose + share * unsure,
+                half_information=e.half_information + E.T @ of_half[0] @ E,
                 half_score=e.half_score + of_half[1] @ E,
-            )  # fmt: skip
+            )
         theta = problem.vector(own, 0)
     return tuple(out), theta
 

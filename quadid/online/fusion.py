@@ -153,9 +153,15 @@ class Fusion:
     """
 
     def __init__(
-        self, mean: FloatArray, sigma: FloatArray, own: int, memory: float, length: float,
-        positive: Sequence[int] = (), unusual: Sequence[int] = (),
-    ) -> None:  # fmt: skip
+        self,
+        mean: FloatArray,
+        sigma: FloatArray,
+        own: int,
+        memory: float,
+        length: float,
+        positive: Sequence[int] = (),
+        unusual: Sequence[int] = (),
+    ) -> None:
         """Starts from the prior.
 
         Args:
@@ -457,9 +463,19 @@ class Estimator:
         if learned and best is not None:
             z = np.append(best.z, np.zeros(len(z) - len(best.z)))
         return FitRequest(
-            number, self.vehicle, cut.windows, start, stop, self.theta, z, self.noise, self._seed, spans, learned,
+            number,
+            self.vehicle,
+            cut.windows,
+            start,
+            stop,
+            self.theta,
+            z,
+            self.noise,
+            self._seed,
+            spans,
+            learned,
             self.fusion.taken % 5 == 0,
-        )  # fmt: skip
+        )
 
     def agrees(self, request: FitRequest, reply: FitReply) -> bool:
         """True if a reply's estimate by its newest rows agrees with that from before them."""
@@ -596,11 +612,21 @@ class Estimator:
         assert self.left_out is not None
         missed = zip(NOMINAL_NAMES, fused.between_rows[:SIX].tolist(), strict=True)
         return Case(
-            parameters, reply.excited, self._thrust_ratio(request.windows), agreeing, disagreement,
-            self._held_out(sets.in_force, sets.seen), sets.in_force, sets.baseline, sets.approval,
-            self.fusion.counted - sets.seen, stated=self.stated, walked=self._walked(most), between_rows=dict(missed),
+            parameters,
+            reply.excited,
+            self._thrust_ratio(request.windows),
+            agreeing,
+            disagreement,
+            self._held_out(sets.in_force, sets.seen),
+            sets.in_force,
+            sets.baseline,
+            sets.approval,
+            self.fusion.counted - sets.seen,
+            stated=self.stated,
+            walked=self._walked(most),
+            between_rows=dict(missed),
             left_out=self.left_out,
-        )  # fmt: skip
+        )
 
     def scores(self) -> tuple[float, float]:
         """Mean squared innovation of the newest rows: as fitted, and by the six of data before the window, or NaN."""

@@ -99,10 +99,16 @@ class Session:
     """
 
     def __init__(
-        self, vehicle: Vehicle, settings: SessionSettings | None = None, restored: OnlineSet | None = None,
-        next_sequence: int = 1, baseline: OnlineSet | None = None, healthy: Sequence[FlightTrim] = (),
-        load: float = 1.0, patience: float = math.inf,
-    ) -> None:  # fmt: skip
+        self,
+        vehicle: Vehicle,
+        settings: SessionSettings | None = None,
+        restored: OnlineSet | None = None,
+        next_sequence: int = 1,
+        baseline: OnlineSet | None = None,
+        healthy: Sequence[FlightTrim] = (),
+        load: float = 1.0,
+        patience: float = math.inf,
+    ) -> None:
         """Starts a session.
 
         Args:
@@ -492,9 +498,10 @@ class Session:
             loaded = f"{changed}; b and the inertias of this set rest on {mass:g} kg"
         case = replace(
             estimator.case(parameters, request, reply, sets, self.settings.gate.windows),
-            unexplained=f"the diagnosis is in force: {scale}" if scale else "", doubts=self._consistency.doubts(),
+            unexplained=f"the diagnosis is in force: {scale}" if scale else "",
+            doubts=self._consistency.doubts(),
             loaded=loaded,
-        )  # fmt: skip
+        )
         decision = decide(case, self.settings.gate)
         mse, unseen = estimator.scores()
         stop, (reference, spread) = outbox.stamp(request.stop), sets.reference(estimator.stated)
@@ -535,9 +542,14 @@ class Session:
         self._outbox.state(Phase.COLLECTING, f"{why}: learning restarts")
 
     def _has_changed(
-        self, span: tuple[float, float], kind: str, text: str, unexplained: str, learn_from: float,
+        self,
+        span: tuple[float, float],
+        kind: str,
+        text: str,
+        unexplained: str,
+        learn_from: float,
         finding: OnlineFinding | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         """Publishes what happened within `span` [s]; the set in force is out of date, learning begins anew."""
         since, until = map(self._outbox.stamp, span)
         explained = finding is not None and finding.confident

@@ -250,9 +250,15 @@ class CommandReconstruction:
         if self._gains is not None:  # compiled before the first flight, not in it
             still, level = np.zeros((1, 4)), np.array([[1.0, 0.0, 0.0, 0.0]])
             stabilise_rows(
-                self._gains, self._mixer, still, level, np.zeros((1, 3)), np.full(1, 0.02), np.zeros((1, 3)),
+                self._gains,
+                self._mixer,
+                still,
+                level,
+                np.zeros((1, 3)),
+                np.full(1, 0.02),
+                np.zeros((1, 3)),
                 np.empty((1, len(self._mixer))),
-            )  # fmt: skip
+            )
 
     @property
     def known(self) -> bool:
@@ -319,9 +325,15 @@ class CommandReconstruction:
                 return None
         commands = np.empty((len(at), len(self._mixer)))
         stabilise_rows(
-            self._gains, self._mixer, np.ascontiguousarray(reference.values[held]), _turned(attitude, at),
-            linear(gyro.t, gyro.values, at), np.repeat(np.diff(t) / runs, runs), self._integral[None], commands,
-        )  # fmt: skip
+            self._gains,
+            self._mixer,
+            np.ascontiguousarray(reference.values[held]),
+            _turned(attitude, at),
+            linear(gyro.t, gyro.values, at),
+            np.repeat(np.diff(t) / runs, runs),
+            self._integral[None],
+            commands,
+        )
         return np.asarray(commands.reshape(len(t) - 1, runs, -1).mean(axis=1))
 
     def _settle(self, dt: FloatArray, commands: FloatArray, rate: FloatArray) -> None:
@@ -586,9 +598,10 @@ class Resampler:
         self._row += BLOCK
         for name, buffer in self._buffers.items():
             late, doubles = buffer.settle(
-                float(at[0]) - (HISTORY if fresh else SETTLE), float(at[-1]) + SETTLE,
+                float(at[0]) - (HISTORY if fresh else SETTLE),
+                float(at[-1]) + SETTLE,
                 stretch.end if fresh else -math.inf,
-            )  # fmt: skip
+            )
             if late:
                 self.faults[f"{name}: late"] += late
             if doubles:

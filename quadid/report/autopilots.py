@@ -79,9 +79,10 @@ def hover(facts: Facts) -> Hover:
     full, command = facts.max_speed, facts.hover_command
     if full is None or command is None or facts.full_thrust is None:
         raise ParameterError(
-            f"{facts.vehicle.name}: no command.max_speed", "the rotor speed at full command [rad/s]",
+            f"{facts.vehicle.name}: no command.max_speed",
+            "the rotor speed at full command [rad/s]",
             "add it to the vehicle file: gains of an autopilot act on its motor command",
-        )  # fmt: skip
+        )
     if not command < 1.0:
         raise ParameterError(f"{facts.vehicle.name} hovers at {command:.0%} of full command", "below 100 %")
     model, weight = ThrustModel.stated(facts.vehicle), facts.vehicle.mass * GRAVITY
@@ -128,9 +129,10 @@ def _ardupilot(facts: Facts, known: Known, at: Hover) -> FloatArray:
     frame, motors = sitl_frame(facts)
     if not frame:
         raise ParameterError(
-            f"{facts.vehicle.name}: rotors in no known frame", f"as ArduPilot's {', '.join(SITL_FRAMES)}",
+            f"{facts.vehicle.name}: rotors in no known frame",
+            f"as ArduPilot's {', '.join(SITL_FRAMES)}",
             "use another format",
-        )  # fmt: skip
+        )
     angle = np.radians([a for a, _ in SITL_FRAMES[frame]])
     spin = np.array([float(s) for _, s in SITL_FRAMES[frame]])
     factors = np.column_stack([-np.sin(angle), np.cos(angle), spin])

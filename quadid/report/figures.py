@@ -218,10 +218,7 @@ def error_figure(scored: ScoredSet, identifier: str, labels: tuple[str, str] = P
     """Error over time: mean squared residual of each second over that of a perfect model, before and after."""
     zero = float(scored.fitted.series.t[0])
     data = []
-    for role, name, score in (
-        ("before", labels[0], scored.initial),
-        ("after", labels[1], scored.fitted),
-    ):
+    for role, name, score in (("before", labels[0], scored.initial), ("after", labels[1], scored.fitted)):
         t, ratio = error_over_time(score, scored.fitted)
         data.append(trace(role, name, t - zero, ratio))
     ends = scored.fitted.series.t[[0, -1]] - zero

@@ -32,20 +32,7 @@ from quadid.report.figures import (
     parameter_figure,
     thinned,
 )
-from quadid.report.page import (
-    axis,
-    figure,
-    fit,
-    measures,
-    number,
-    part,
-    quiet,
-    rows_of,
-    section,
-    trace,
-    unit,
-    upright,
-)
+from quadid.report.page import axis, figure, fit, measures, number, part, quiet, rows_of, section, trace, unit, upright
 from quadid.report.residual_maps import ResidualMap, map_figure
 from quadid.report.verdict import (
     MOTION,
@@ -231,10 +218,17 @@ FIT_NAMES = ("p", "q", "r", "phi", "theta", "psi", "a_z")
 
 
 def identify_page(
-    result: Json, sets: Sequence[ScoredSet], noise: NoiseModel, quality: Sequence[Json],
-    provenance: Sequence[Json], truth: Mapping[str, float] | None = None, *, missing: Json | None = None,
-    more: Sequence[Json] = (), excitation: Json | None = None,
-) -> dict[str, Any]:  # fmt: skip
+    result: Json,
+    sets: Sequence[ScoredSet],
+    noise: NoiseModel,
+    quality: Sequence[Json],
+    provenance: Sequence[Json],
+    truth: Mapping[str, float] | None = None,
+    *,
+    missing: Json | None = None,
+    more: Sequence[Json] = (),
+    excitation: Json | None = None,
+) -> dict[str, Any]:
     """Builds the page of an identification.
 
     Args:
@@ -250,9 +244,14 @@ def identify_page(
     fitted, held = ([s["role"] for s in result["sets"]].count(role) for role in ("train", "validate"))
     search = f"search {result['optimizer']}, {result['seconds']:.1f} s"
     fit = section(
-        "fit", "How well the simulation predicts", _PREDICTION, (), [fit_table(result["sets"])],
-        parts=set_parts(result["sets"], sets), menu="Prediction",
-    )  # fmt: skip
+        "fit",
+        "How well the simulation predicts",
+        _PREDICTION,
+        (),
+        [fit_table(result["sets"])],
+        parts=set_parts(result["sets"], sets),
+        menu="Prediction",
+    )
     shown = parameter_section(parameters, truth, stuck, [parameter_figure(parameters, truth)])
     return {
         "title": f"Identification of {result['vehicle']}",
@@ -277,9 +276,11 @@ _KEYS = (
 
 
 def parameter_section(
-    parameters: Sequence[Json], truth: Mapping[str, float] | None = None, stuck: Sequence[str] = (),
+    parameters: Sequence[Json],
+    truth: Mapping[str, float] | None = None,
+    stuck: Sequence[str] = (),
     figures: Sequence[Json] = (),
-) -> JsonDict:  # fmt: skip
+) -> JsonDict:
     """Every parameter with its interval, status and reason, and the truth where it is known; then pictures."""
     head = ["Parameter", "Current", "Proposed", "95 % interval", "Unit", "Status", "Reason"]
     classes = ["", "number", "number strong", "number", "", "", "reason"]
@@ -288,11 +289,17 @@ def parameter_section(
         n, margin = digits(p), percent(relative_halfwidth(p)).replace(" ", "\u00a0")
         low, high = (number(v, n) for v in p["ci95"])
         chip = Markup('<span class="chip {}">{}</span>').format(p["status"], status_words(p))
-        rows.append([
-            parameter_name(p["name"]), number(p["initial"]), number(p["value"], n),
-            Markup("{} … {} {}").format(low, high, quiet(f"(±{margin})", "quiet nobreak")), unit(p["unit"]), chip,
-            reason(p, stuck).replace(" %", "\u00a0%"),
-        ])  # fmt: skip
+        rows.append(
+            [
+                parameter_name(p["name"]),
+                number(p["initial"]),
+                number(p["value"], n),
+                Markup("{} … {} {}").format(low, high, quiet(f"(±{margin})", "quiet nobreak")),
+                unit(p["unit"]),
+                chip,
+                reason(p, stuck).replace(" %", "\u00a0%"),
+            ]
+        )
     if truth:
         head.insert(4, "Truth")
         classes.insert(4, "number")
@@ -337,11 +344,14 @@ def fit_table(entries: Sequence[Json]) -> JsonDict:
     head = ("Log", "Used for", "Error before", "Error after", *(f"Fit {n}" for n in names))
     rows = [
         (
-            s["log"], "fitting" if s["role"] == "train" else "validation", number(s["mse"]["initial"], 3),
-            number(s["mse"]["fitted"], 3), *(fit(s["fit_percent"].get(n)) for n in names),
+            s["log"],
+            "fitting" if s["role"] == "train" else "validation",
+            number(s["mse"]["initial"], 3),
+            number(s["mse"]["fitted"], 3),
+            *(fit(s["fit_percent"].get(n)) for n in names),
         )
         for s in entries
-    ]  # fmt: skip
+    ]
     return rows_of(head, rows, classes=("", "", "number", "number strong", *["number"] * len(names)))
 
 
@@ -458,9 +468,15 @@ def _next_steps(result: Json) -> tuple[str, ...]:
 
 
 def diagnosis_part(
-    result: Json, sets: Sequence[ScoredSet] = (), prefix: str = "d", title: str = "", intro: str = "",
-    maps: Mapping[str, ResidualMap] | None = None, missing: Json | None = None, judged: bool = True,
-) -> dict[str, Any]:  # fmt: skip
+    result: Json,
+    sets: Sequence[ScoredSet] = (),
+    prefix: str = "d",
+    title: str = "",
+    intro: str = "",
+    maps: Mapping[str, ResidualMap] | None = None,
+    missing: Json | None = None,
+    judged: bool = True,
+) -> dict[str, Any]:
     """A diagnosis as part of a page: verdict, findings, pictures.
 
     Args:
@@ -533,8 +549,9 @@ def finding_part(finding: Json, floor: float, identifier: str, seen: ResidualMap
     rivals = [f"{a['effect'].replace('_', ' ')} ({_short(a['mse_after'])})" for a in finding["alternatives"]]
     rejected = (
         f"Rejected alternatives, with the error they leave: {', '.join(rivals)}."
-        if rivals else "No other cause of the catalogue came near it."
-    )  # fmt: skip
+        if rivals
+        else "No other cause of the catalogue came near it."
+    )
     unsure = Markup("") if finding["confident"] else Markup(' <span class="chip prior_dominated">not certain</span>')
     return part(
         Markup("{}{}").format(name, unsure),
@@ -635,10 +652,16 @@ def remaining(result: Json, sets: Sequence[ScoredSet]) -> list[JsonDict]:
 
 
 def diagnose_page(
-    result: Json, vehicle: str, sets: Sequence[ScoredSet], noise: NoiseModel, quality: Sequence[Json],
-    provenance: Sequence[Json], warnings: Sequence[str] = (), maps: Mapping[str, ResidualMap] | None = None,
+    result: Json,
+    vehicle: str,
+    sets: Sequence[ScoredSet],
+    noise: NoiseModel,
+    quality: Sequence[Json],
+    provenance: Sequence[Json],
+    warnings: Sequence[str] = (),
+    maps: Mapping[str, ResidualMap] | None = None,
     missing: Json | None = None,
-) -> dict[str, Any]:  # fmt: skip
+) -> dict[str, Any]:
     """Builds the page of a diagnosis; arguments as in `diagnosis_part` and `identify_page`."""
     fitted, held = (sum(s.role == role for s in sets) for role in ("train", "validate"))
     parameters = parameter_section(result["parameters"]) if result.get("parameters") else None

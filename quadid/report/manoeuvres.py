@@ -105,9 +105,7 @@ def written_as(plan: ManoeuvrePlan, form: str, hover_throttle: float) -> dict[st
         return {".sticks.txt": render("manoeuvres/sticks.txt", {**facts, "blocks": _blocks(plan)})}
     if not plan.sweeps:
         raise ParameterError(
-            f"too short for sweeps of one axis after the other: {plan.seconds:g} s",
-            "36 s or more",
-            "use --seconds 60",
+            f"too short for sweeps of one axis after the other: {plan.seconds:g} s", "36 s or more", "use --seconds 60"
         )
     return {
         f".sid_{i}_{sweep['axis']}.param": render(

@@ -138,10 +138,18 @@ def _asset(name: str) -> str:
 
 
 def part(
-    title: str = "", intro: str = "", figures: Sequence[Json] = (), tables: Sequence[Json] = (), *,
-    lines: Sequence[str] = (), after: Sequence[str] = (), parts: Sequence[Json] = (), verdict: Json | None = None,
-    picture: str = "", kind: str = "",
-) -> JsonDict:  # fmt: skip
+    title: str = "",
+    intro: str = "",
+    figures: Sequence[Json] = (),
+    tables: Sequence[Json] = (),
+    *,
+    lines: Sequence[str] = (),
+    after: Sequence[str] = (),
+    parts: Sequence[Json] = (),
+    verdict: Json | None = None,
+    picture: str = "",
+    kind: str = "",
+) -> JsonDict:
     """A part of a section, in the order in which it is shown.
 
     Args:
@@ -157,16 +165,29 @@ def part(
         kind: ``finding`` for a card, ``open`` or ``folded`` for what can be folded, ``chapter`` for one of several.
     """
     return {
-        "title": title, "intro": intro, "lines": list(filter(None, lines)), "verdict": verdict, "picture": picture,
-        "figures": list(figures), "tables": list(tables), "parts": list(parts), "after": list(filter(None, after)),
+        "title": title,
+        "intro": intro,
+        "lines": list(filter(None, lines)),
+        "verdict": verdict,
+        "picture": picture,
+        "figures": list(figures),
+        "tables": list(tables),
+        "parts": list(parts),
+        "after": list(filter(None, after)),
         "kind": kind,
-    }  # fmt: skip
+    }
 
 
 def section(
-    identifier: str, title: str, intro: str = "", figures: Sequence[Json] = (), tables: Sequence[Json] = (), *,
-    menu: str = "", **more: Any,
-) -> JsonDict:  # fmt: skip
+    identifier: str,
+    title: str,
+    intro: str = "",
+    figures: Sequence[Json] = (),
+    tables: Sequence[Json] = (),
+    *,
+    menu: str = "",
+    **more: Any,
+) -> JsonDict:
     """A section of the page: a `part` with its identifier and its name in the menu.
 
     It can be folded, and is where `kind` is ``folded``; of kind ``plain`` it cannot.
@@ -180,9 +201,12 @@ def quiet(text: str, kind: str = "quiet") -> Markup:
 
 
 def rows_of(
-    head: Sequence[str], rows: Sequence[Sequence[Any]], fold: str = "", kind: str = "cards",
+    head: Sequence[str],
+    rows: Sequence[Sequence[Any]],
+    fold: str = "",
+    kind: str = "cards",
     classes: Sequence[str] | None = None,
-) -> JsonDict:  # fmt: skip
+) -> JsonDict:
     """A table; folded under a line where one is given; `classes` are of the cells of each column.
 
     On a phone each row is a card (`kind` ``cards``, ``cards narrow``), or a line or two (``compact``).

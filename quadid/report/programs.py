@@ -218,10 +218,7 @@ class Facts:
         left += [f"residual ({t.formula})" for t in self.vehicle.residual if "residual" not in used]
         left += ["random"] if self.vehicle.random is not None and "random" not in used else []
         lines = [f"NOT PROVEN: {self.unproven}."] if self.unproven else []
-        lines += [
-            f"Written by quadid from {self.source} ({self.vehicle.name}); SI units.",
-            "Sources of the values:",
-        ]
+        lines += [f"Written by quadid from {self.source} ({self.vehicle.name}); SI units.", "Sources of the values:"]
         lines += [f"  {n} = {self.value(n):.6g} {unit}: {self.origin(n)}" for n, unit in NOMINAL_UNITS.items()]
         lines.append(f"  mass = {self.vehicle.mass:g} kg and geometry: from the vehicle file, taken as known")
         if left:
@@ -328,10 +325,14 @@ def ardupilot(facts: Facts) -> dict[str, Any]:
     frame, motors = sitl_frame(facts)
     refused = f"no .sitl.json: ArduPilot's simulator has no such frame, only {', '.join(SITL_FRAMES)}"
     return {
-        "expo": expo, "sitl_expo": 1.0 if expo is None and facts.vehicle.command.kind != "thrust" else expo,
-        "lost": () if expo is not None else ("thrust_curve",), "frame": frame, "motors": motors,
-        "refused": "" if frame else refused, "without": () if frame else (".sitl.json",),
-    }  # fmt: skip
+        "expo": expo,
+        "sitl_expo": 1.0 if expo is None and facts.vehicle.command.kind != "thrust" else expo,
+        "lost": () if expo is not None else ("thrust_curve",),
+        "frame": frame,
+        "motors": motors,
+        "refused": "" if frame else refused,
+        "without": () if frame else (".sitl.json",),
+    }
 
 
 def sitl_frame(facts: Facts) -> tuple[str, list[int]]:
@@ -389,8 +390,9 @@ def _in_quadrant(facts: Facts, x: int, y: int) -> RotorFacts:
     if len(facts.rotors) != len(_AGILICIOUS) or len(here) != 1:
         raise ParameterError(
             f"{facts.vehicle.name}: {len(facts.rotors)} rotors, not one in each quadrant",
-            "four rotors in a cross, as Agilicious has them", "export to another form",
-        )  # fmt: skip
+            "four rotors in a cross, as Agilicious has them",
+            "export to another form",
+        )
     return here[0]
 
 
@@ -409,9 +411,12 @@ def drone_models(facts: Facts) -> dict[str, Any]:
     mixing = np.array([arms[:, 1], -arms[:, 0], [r.turn_flu * arm for r in facts.rotors]]) / arm
     name = "".join(c if c.isascii() and (c.isalnum() or c in "-_") else "_" for c in facts.vehicle.name)
     return {
-        "section": Markup(name or "vehicle"), "gravity": GRAVITY, "per_rpm": 2.0 * math.pi / 60.0, "mixing": mixing,
+        "section": Markup(name or "vehicle"),
+        "gravity": GRAVITY,
+        "per_rpm": 2.0 * math.pi / 60.0,
+        "mixing": mixing,
         "drag": -facts.vehicle.mass * np.diag(drag),
-    }  # fmt: skip
+    }
 
 
 def _four(facts: Facts, program: str) -> None:
@@ -429,12 +434,16 @@ def airsim(facts: Facts) -> dict[str, Any]:
     arm, turn, height = facts.vehicle.arm, 2.0 * math.pi, 0.01
     front = 0.2 * arm**2 + len(facts.rotors) * math.pi * arm * height
     return {
-        "density": AIR_DENSITY, "turn": turn, "diameter": arm, "height": height, "box": (arm, arm, 0.2 * arm),
+        "density": AIR_DENSITY,
+        "turn": turn,
+        "diameter": arm,
+        "height": height,
+        "box": (arm, arm, 0.2 * arm),
         "c_t": facts.value("b") * turn**2 / (AIR_DENSITY * arm**4),
         "c_p": facts.value("d") * turn**3 / (AIR_DENSITY * arm**5),
         "drag": 2.0 * facts.vehicle.mass * facts.effect("parasitic_drag", "c") / (AIR_DENSITY * front),
         "refused": _no_cross(facts, "not for SimpleFlight, but behind PX4 or ArduPilot: SimpleFlight mixes for"),
-    }  # fmt: skip
+    }
 
 
 def pegasus(facts: Facts) -> dict[str, Any]:
@@ -451,9 +460,11 @@ def pegasus(facts: Facts) -> dict[str, Any]:
     x, y, z, w = Rotation.from_matrix(np.linalg.det(axes) * axes).as_quat()
     drag = (facts.effect("rotor_drag", "k_x"), facts.effect("rotor_drag", "k_y"), facts.effect("axial_inflow", "k_z"))
     return links | {
-        "moments": moments, "axes": (w, x, y, z), "torques": facts.torque_per_thrust * facts.thrust,
+        "moments": moments,
+        "axes": (w, x, y, z),
+        "torques": facts.torque_per_thrust * facts.thrust,
         "drag": facts.vehicle.mass * np.array(drag),
-    }  # fmt: skip
+    }
 
 
 def isaac_lab(facts: Facts) -> dict[str, Any]:
@@ -466,9 +477,10 @@ def isaac_lab(facts: Facts) -> dict[str, Any]:
         return told
     size, time = facts.vehicle.random.each_axis
     return told | {
-        "random_force": facts.vehicle.mass * size[:3], "random_times": time,
+        "random_force": facts.vehicle.mass * size[:3],
+        "random_times": time,
         "random_torque": np.diag(facts.inertia) * size[3:],
-    }  # fmt: skip
+    }
 
 
 # --- Every form by name: whose it is, which effects it carries, its templates, and what only it wants to know
@@ -527,10 +539,7 @@ FORMS: dict[str, Form] = {
         {"_params.py": "rotorpy.py"},
     ),
     "agilicious": Form(
-        "Agilicious",
-        ("cg_offset", "motor_lag", "rotor_drag"),
-        {".agilicious.yaml": "agilicious.yaml"},
-        agilicious,
+        "Agilicious", ("cg_offset", "motor_lag", "rotor_drag"), {".agilicious.yaml": "agilicious.yaml"}, agilicious
     ),
     "mujoco": Form("MuJoCo", (*_BODY, "weak_rotor"), {".mjcf.xml": "mujoco.mjcf.xml"}),
     "urdf": Form("URDF", _BODY, {".urdf": "vehicle.urdf"}),

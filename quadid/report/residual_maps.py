@@ -81,9 +81,13 @@ class ResidualMap:
 
 
 def residual_map(
-    windows: Sequence[Window], vehicle: Vehicle, theta: FloatArray, effect: str, names: Sequence[str],
+    windows: Sequence[Window],
+    vehicle: Vehicle,
+    theta: FloatArray,
+    effect: str,
+    names: Sequence[str],
     noise: NoiseModel | None = None,
-) -> ResidualMap | None:  # fmt: skip
+) -> ResidualMap | None:
     """Residual with a cause and with it switched off, all else unchanged, where it shows most.
 
     Args:
@@ -189,9 +193,14 @@ def _in_the_air(window: Window, rows: IndexArray, start: FloatArray, n_pre: int)
 
 
 def _binned(
-    shooting: Shooting, before: FloatArray, after: FloatArray, mode: str, channel: int, quantity: str,
+    shooting: Shooting,
+    before: FloatArray,
+    after: FloatArray,
+    mode: str,
+    channel: int,
+    quantity: str,
     signal: FloatArray,
-) -> ResidualMap | None:  # fmt: skip
+) -> ResidualMap | None:
     if channel >= before.shape[2]:
         return None
     both = [before[..., channel], after[..., channel]]

@@ -138,9 +138,14 @@ def parameter_table(parameters: Sequence[Json], truth: Mapping[str, float] | Non
         truth: true values by name.
     """
     columns = [
-        Column("parameter"), Column("fitted", right=True), Column("±", right=True, rank=2), Column("unit"),
-        Column("status"), Column("current", right=True, rank=3), Column("95 % interval", right=True, rank=4),
-    ]  # fmt: skip
+        Column("parameter"),
+        Column("fitted", right=True),
+        Column("±", right=True, rank=2),
+        Column("unit"),
+        Column("status"),
+        Column("current", right=True, rank=3),
+        Column("95 % interval", right=True, rank=4),
+    ]
     if truth:
         columns.insert(2, Column("truth", right=True, rank=1))
     rows = []
@@ -148,9 +153,14 @@ def parameter_table(parameters: Sequence[Json], truth: Mapping[str, float] | Non
         n = digits(p)
         low, high = p["ci95"]
         row: list[str | Cell] = [
-            parameter_name(p["name"]), number(p["value"], n), percent(relative_halfwidth(p)), p["unit"] or "1",
-            Cell(status_words(p), _TONES[p["status"]]), number(p["initial"]), f"{number(low, n)} .. {number(high, n)}",
-        ]  # fmt: skip
+            parameter_name(p["name"]),
+            number(p["value"], n),
+            percent(relative_halfwidth(p)),
+            p["unit"] or "1",
+            Cell(status_words(p), _TONES[p["status"]]),
+            number(p["initial"]),
+            f"{number(low, n)} .. {number(high, n)}",
+        ]
         if truth:
             row.insert(2, number(truth.get(p["name"])))
         rows.append(tuple(row))

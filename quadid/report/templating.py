@@ -109,9 +109,14 @@ def environment(ending: str) -> Environment:
         return Markup(separator).join(map(written, values))
 
     out = Environment(
-        autoescape=True, finalize=written, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True,
-        keep_trailing_newline=True, loader=PackageLoader("quadid.report"),
-    )  # fmt: skip
+        autoescape=True,
+        finalize=written,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+        loader=PackageLoader("quadid.report"),
+    )
     out.filters |= {
         "comment": lambda text: Markup(re.sub(*language.comment, plain(str(text), LONGEST_LINE))),
         "literal": lambda text: Markup(language.literal(str(text))),

@@ -180,9 +180,13 @@ class BridgeNode(Node):
             self._asked.cancel()
         stamp = self.get_clock().now().to_msg()
         status = messages.entry(
-            self.get_fully_qualified_name(), "controller", self._option("vehicle_id"), self._level, self._said,
+            self.get_fully_qualified_name(),
+            "controller",
+            self._option("vehicle_id"),
+            self._level,
+            self._said,
             {"applied set": self._applied},
-        )  # fmt: skip
+        )
         fields = {"header": {"stamp": {"sec": stamp.sec, "nanosec": stamp.nanosec}}, "status": [status]}
         self._health.publish(to_message(TOPICS["diagnostics"][1], fields))
         await self._work()

@@ -89,8 +89,9 @@ def connect(path: Path, read_only: bool = False) -> sqlite3.Connection:
     except OSError as error:
         raise StoreError(
             f"{error.filename}: {error.strerror}: another file would be changed",
-            "a history with files of its own", "remove it, or use another history",
-        ) from error  # fmt: skip
+            "a history with files of its own",
+            "remove it, or use another history",
+        ) from error
     name = f"{path.absolute().as_uri()}?mode=ro" if read_only else path
     db = sqlite3.connect(name, uri=read_only, timeout=BUSY_SECONDS)
     try:
@@ -98,9 +99,10 @@ def connect(path: Path, read_only: bool = False) -> sqlite3.Connection:
         (version,) = db.execute("PRAGMA user_version").fetchone()
         if not 0 <= version <= VERSION:
             raise StoreError(
-                f"the history {path} has version {version}", f"up to {VERSION}",
+                f"the history {path} has version {version}",
+                f"up to {VERSION}",
                 "use the version of quadid that wrote it, or another history",
-            )  # fmt: skip
+            )
         if not read_only:
             _into_wal(db)
             db.execute("PRAGMA synchronous = FULL")
@@ -345,8 +347,9 @@ class HistoryLock:
                     raise StoreError(
                         f"the history {self._path} has {found.st_nlink} names (hard links): by each it would be "
                         "another database",
-                        "one name", "remove the other names, or copy the file instead of linking it",
-                    )  # fmt: skip
+                        "one name",
+                        "remove the other names, or copy the file instead of linking it",
+                    )
                 if self._vehicle in vehicles:
                     raise BlockingIOError
                 fcntl.fcntl(descriptor, _LOCK, _flock(fcntl.F_RDLCK, _NAMES + known))
@@ -357,16 +360,18 @@ class HistoryLock:
                     raise StoreError(
                         f"another service has the history {self._path} open by another name (as by a bind mount of the "
                         "file): by each it would be another database",
-                        "one name in one folder", "mount the folder, not the file",
-                    )  # fmt: skip
+                        "one name in one folder",
+                        "mount the folder, not the file",
+                    )
                 fcntl.fcntl(descriptor, _LOCK, self._byte(fcntl.F_WRLCK))
                 vehicles.add(self._vehicle)
                 self._file = file
             except BlockingIOError as error:
                 raise StoreError(
                     f"another service writes the history of '{self._vehicle[:80]}' in {self._path}",
-                    "one service a vehicle", "stop the other one, give another history, or start as observer",
-                ) from error  # fmt: skip
+                    "one service a vehicle",
+                    "stop the other one, give another history, or start as observer",
+                ) from error
             finally:
                 _close_unused(file)
 
@@ -759,10 +764,17 @@ class Store:
 
     def candidate(self, item: OnlineSet) -> None:
         """Journals an estimate and what the gate said of it."""
-        self._put(self._row(
-            "candidates", passes=True, state=item.state.value, gate=item.check, reason=item.reason, stop=item.stop,
-            data=json.dumps(set_to_dict(item, covariance=False)),
-        ))  # fmt: skip
+        self._put(
+            self._row(
+                "candidates",
+                passes=True,
+                state=item.state.value,
+                gate=item.check,
+                reason=item.reason,
+                stop=item.stop,
+                data=json.dumps(set_to_dict(item, covariance=False)),
+            )
+        )
 
     def event(self, item: Event, data: str | None = None) -> None:
         """Journals an event, with JSON that belongs to it."""
@@ -819,9 +831,15 @@ class Store:
         state = item.state.value
         data = {**set_to_dict(item), "boot_id": self._boots.get(item.sequence, self.boot_id), **self._rests}
         row = self._row(
-            "sets", item.sequence, sequence=item.sequence, state=state, reason=item.reason,
-            approved_by=item.approved_by, stop=item.stop, data=json.dumps(data),
-        )  # fmt: skip
+            "sets",
+            item.sequence,
+            sequence=item.sequence,
+            state=state,
+            reason=item.reason,
+            approved_by=item.approved_by,
+            stop=item.stop,
+            data=json.dumps(data),
+        )
         if state == "accepted":
             self._standing.setdefault("first", row)
         if state != "stale" and item.approved_by not in ("auto", ""):

@@ -380,10 +380,8 @@ class Decoder:
 _BODY_FRAME = re.compile(r"^$|(^|/)(base_|body|fcu)[^/]*$")
 """Names of frames that are the body's, or say nothing."""
 _DENIABLE = {
-    "sensor_msgs/Imu": {
-        "body_rate": "angular_velocity", "body_force": "linear_acceleration", "attitude": "orientation",
-    }
-}  # fmt: skip
+    "sensor_msgs/Imu": {"body_rate": "angular_velocity", "body_force": "linear_acceleration", "attitude": "orientation"}
+}
 """Signals that a message may say to have none of, by a covariance of -1 (REP-145), and its field."""
 
 

@@ -239,9 +239,14 @@ class MavlinkDecoder:
 
 
 PARAMETERS = {
-    "b": "QI_B", "d": "QI_D", "J_xx": "QI_J_XX", "J_yy": "QI_J_YY", "J_zz": "QI_J_ZZ", "J_r": "QI_J_R",
+    "b": "QI_B",
+    "d": "QI_D",
+    "J_xx": "QI_J_XX",
+    "J_yy": "QI_J_YY",
+    "J_zz": "QI_J_ZZ",
+    "J_r": "QI_J_R",
     "b_tangent": "QI_B_TAN",
-}  # fmt: skip
+}
 
 REFERENCES = {"none": 0.0, "vehicle_file": 1.0, "history": 2.0}
 """Reference of a set, as a number."""
@@ -317,10 +322,16 @@ MOTORS = 80.0
 err alike: slow torque by 6 % where at this rate [Hz] it is 0.4 % (`python -m
 quadid_evaluation.studies.readings`)."""
 REQUESTED = {
-    "HIGHRES_IMU": 100.0, "RAW_IMU": 100.0, "ATTITUDE_QUATERNION": 50.0, "SERVO_OUTPUT_RAW": MOTORS,
-    "ACTUATOR_OUTPUT_STATUS": MOTORS, "ESC_STATUS": MOTORS, "ATTITUDE_TARGET": 50.0,
-    "LOCAL_POSITION_NED": 20.0, "BATTERY_STATUS": 1.0,
-}  # fmt: skip
+    "HIGHRES_IMU": 100.0,
+    "RAW_IMU": 100.0,
+    "ATTITUDE_QUATERNION": 50.0,
+    "SERVO_OUTPUT_RAW": MOTORS,
+    "ACTUATOR_OUTPUT_STATUS": MOTORS,
+    "ESC_STATUS": MOTORS,
+    "ATTITUDE_TARGET": 50.0,
+    "LOCAL_POSITION_NED": 20.0,
+    "BATTERY_STATUS": 1.0,
+}
 """Messages asked for, with their rates [Hz]."""
 FRAMES_A_SECOND, OTHERS_A_SECOND = 4000, 1000
 """More frames of the vehicle, or of all others together, are a flood: the rest is dropped unread."""
@@ -363,9 +374,14 @@ class MavlinkLink:
     """
 
     def __init__(
-        self, url: str, rotors: int, system: int = 0, key: bytes | None = None,
-        clock: Callable[[], float] = time.monotonic, memory: Path | None = None,
-    ) -> None:  # fmt: skip
+        self,
+        url: str,
+        rotors: int,
+        system: int = 0,
+        key: bytes | None = None,
+        clock: Callable[[], float] = time.monotonic,
+        memory: Path | None = None,
+    ) -> None:
         """Opens the link.
 
         Args:
@@ -496,9 +512,16 @@ class MavlinkLink:
         now = self._clock()
         if now - self._beat >= 1.0:
             self._beat = now
-            self._send(dialect.MAVLink_heartbeat_message(
-                dialect.MAV_TYPE_ONBOARD_CONTROLLER, dialect.MAV_AUTOPILOT_INVALID, 0, 0, dialect.MAV_STATE_ACTIVE, 3
-            ))  # fmt: skip
+            self._send(
+                dialect.MAVLink_heartbeat_message(
+                    dialect.MAV_TYPE_ONBOARD_CONTROLLER,
+                    dialect.MAV_AUTOPILOT_INVALID,
+                    0,
+                    0,
+                    dialect.MAV_STATE_ACTIVE,
+                    3,
+                )
+            )
         if now - self._measured >= 2.0:
             counts = self._decoder.counts
             span = now - self._measured
@@ -617,9 +640,12 @@ class Outlet(Protocol):
 
 
 def run(
-    service: Service, link: MavlinkLink, outlets: list[Outlet], stop: Callable[[], bool],
+    service: Service,
+    link: MavlinkLink,
+    outlets: list[Outlet],
+    stop: Callable[[], bool],
     clock: Callable[[], float] = time.monotonic,
-) -> None:  # fmt: skip
+) -> None:
     """Serves until `stop` returns True."""
     reported = clock()
     while not stop():

@@ -369,8 +369,8 @@ class Wire:
     """
 
     def __init__(
-        self, url: str, system: int, component: int, key: bytes | None = None, memory: Path | None = None,
-    ) -> None:  # fmt: skip
+        self, url: str, system: int, component: int, key: bytes | None = None, memory: Path | None = None
+    ) -> None:
         """Opens the link.
 
         Args:
@@ -416,9 +416,12 @@ class Wire:
         self.drained = True
 
     def receive(
-        self, wanted: Container[int], admits: Callable[[bytes], bool], now: float,
+        self,
+        wanted: Container[int],
+        admits: Callable[[bytes], bool],
+        now: float,
         count: Callable[[bytes], None] | None = None,
-    ) -> Iterator[Any]:  # fmt: skip
+    ) -> Iterator[Any]:
         """Yields the wanted messages that have arrived; never waits, and ends however fast more of them come.
 
         Args:

@@ -79,26 +79,39 @@ Message = dict[str, Any]
 
 PARAMETER_SET = "quadid_msgs/msg/ParameterSet"
 TOPICS = {
-    "parameters": ("quadid/parameters", PARAMETER_SET), "candidate": ("quadid/candidate", PARAMETER_SET),
+    "parameters": ("quadid/parameters", PARAMETER_SET),
+    "candidate": ("quadid/candidate", PARAMETER_SET),
     "diagnosis": ("quadid/diagnosis", "quadid_msgs/msg/Diagnosis"),
     "vehicle_health": ("quadid/health", "quadid_msgs/msg/Health"),
     "status": ("quadid/status", "quadid_msgs/msg/FitStatus"),
     "diagnostics": ("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray"),
-}  # fmt: skip
+}
 """Name and type of each topic."""
 PUBLISHED = ("parameters", "candidate", "status")
 """Topics whose messages say when they were sent."""
 SCHEMA_VERSION = 3
 BODY_FRAME = "base_link_frd"
 SET_STATES = {
-    SetState.REJECTED: 1, SetState.PENDING: 2, SetState.ACCEPTED: 3, SetState.ROLLED_BACK: 4, SetState.STALE: 5,
-}  # fmt: skip
+    SetState.REJECTED: 1,
+    SetState.PENDING: 2,
+    SetState.ACCEPTED: 3,
+    SetState.ROLLED_BACK: 4,
+    SetState.STALE: 5,
+}
 NO_SET = 6
 STATUSES = {"identified": 0, "ratio_only": 1, "prior_dominated": 2, "unreliable": 4}
 PHASES = {
-    Phase.WAITING: 0, Phase.COLLECTING: 1, Phase.NOT_EXCITED: 2, Phase.FITTING: 3, Phase.CANDIDATE: 4,
-    Phase.PENDING: 4, Phase.ACCEPTED: 4, Phase.FAILED: 5, Phase.BLOCKED: 6, Phase.NOT_FLYING: 6,
-}  # fmt: skip
+    Phase.WAITING: 0,
+    Phase.COLLECTING: 1,
+    Phase.NOT_EXCITED: 2,
+    Phase.FITTING: 3,
+    Phase.CANDIDATE: 4,
+    Phase.PENDING: 4,
+    Phase.ACCEPTED: 4,
+    Phase.FAILED: 5,
+    Phase.BLOCKED: 6,
+    Phase.NOT_FLYING: 6,
+}
 HEALTH_VERDICTS = {"unchanged": 0, "changed": 1, "unknown": 2}
 VERDICTS = {"nothing_found": 0, "explained": 1, "partly_explained": 2, "unknown": 3}
 OK, WARN, ERROR = b"\x00", b"\x01", b"\x02"
@@ -140,10 +153,16 @@ def no_set(vehicle: str, boot_id: str) -> Message:
     """quadid_msgs/ParameterSet of a vehicle without a set in force."""
     nan = math.nan
     return {
-        "header": {"frame_id": BODY_FRAME}, "schema_version": SCHEMA_VERSION, "vehicle_id": vehicle,
-        "boot_id": boot_id, "state": NO_SET, "reason": "no set of this vehicle was accepted yet",
-        "mass": nan, "mse": nan, "mse_held_out": nan,
-    }  # fmt: skip
+        "header": {"frame_id": BODY_FRAME},
+        "schema_version": SCHEMA_VERSION,
+        "vehicle_id": vehicle,
+        "boot_id": boot_id,
+        "state": NO_SET,
+        "reason": "no set of this vehicle was accepted yet",
+        "mass": nan,
+        "mse": nan,
+        "mse_held_out": nan,
+    }
 
 
 def diagnosis(item: OnlineDiagnosis, vehicle: str) -> Message:
@@ -208,10 +227,12 @@ def health_message(report: HealthReport, vehicle: str) -> Message:
         "rotor_loss": list(report.rotor_loss),
         "rotor_loss_lower": [low for low, _ in report.rotor_interval],
         "rotor_loss_upper": [high for _, high in report.rotor_interval],
-        "mass": mass, "mass_lower": low, "mass_upper": high,
+        "mass": mass,
+        "mass_lower": low,
+        "mass_upper": high,
         "changes": [_finding(change) for change in report.changes],
         "text": report.text,
-    }  # fmt: skip
+    }
 
 
 def fit_status(status: SessionStatus, vehicle: str, seconds: float = math.nan) -> Message:
@@ -236,9 +257,15 @@ def fit_status(status: SessionStatus, vehicle: str, seconds: float = math.nan) -
 
 
 def diagnostics(
-    health: ServiceHealth | None, name: str, hardware: str, now: Message, notes: dict[str, str], hints: dict[str, str],
-    idle: str = "", problem: str = "",
-) -> Message:  # fmt: skip
+    health: ServiceHealth | None,
+    name: str,
+    hardware: str,
+    now: Message,
+    notes: dict[str, str],
+    hints: dict[str, str],
+    idle: str = "",
+    problem: str = "",
+) -> Message:
     """diagnostic_msgs/DiagnosticArray: session, inputs, worker and history, each a status of its own (REP-107).
 
     Args:
@@ -271,10 +298,17 @@ def diagnostics(
     if troubles := [f"{topic}: {why}" for topic, why in [*notes.items(), *hints.items()]]:
         arrive = "; ".join(troubles if level == OK else [arrive, *troubles])
         level = ERROR if notes else max(level, WARN)
-    inputs = entry(name, "inputs", hardware, level, arrive, {
-        **{f"{k} [Hz]": f"{feed.rate:.1f}" for k, feed in health.feeds.items()},
-        **{f"dropped: {reason}": count for reason, count in status.faults.items()},
-    })  # fmt: skip
+    inputs = entry(
+        name,
+        "inputs",
+        hardware,
+        level,
+        arrive,
+        {
+            **{f"{k} [Hz]": f"{feed.rate:.1f}" for k, feed in health.feeds.items()},
+            **{f"dropped: {reason}": count for reason, count in status.faults.items()},
+        },
+    )
     return {"header": {"stamp": now, "frame_id": ""}, "status": [session, inputs, worker, history]}
 
 
@@ -282,9 +316,12 @@ def entry(name: str, part: str, hardware: str, level: bytes, message: str, value
     """diagnostic_msgs/DiagnosticStatus of one part of the node with this full name."""
     pairs = [{"key": str(k), "value": str(v)} for k, v in values.items()]
     return {
-        "level": level, "name": f"{name.lstrip('/')}: {part}", "message": message, "hardware_id": hardware,
+        "level": level,
+        "name": f"{name.lstrip('/')}: {part}",
+        "message": message,
+        "hardware_id": hardware,
         "values": pairs,
-    }  # fmt: skip
+    }
 
 
 # --- JSON
@@ -294,14 +331,21 @@ def set_to_dict(item: OnlineSet, covariance: bool = True) -> dict[str, Any]:
     """A set; times are stamps [s], parameters as in `quadid identify`'s JSON, with standard deviation and bounds."""
     parameters = [
         {
-            "name": p.name, "unit": p.unit, "value": p.value, "sigma": p.sigma, "ci95": p.ci95, "initial": p.initial,
-            "bounds": p.bounds, "status": p.status, **({"relative_to": p.relative_to} if p.relative_to else {}),
+            "name": p.name,
+            "unit": p.unit,
+            "value": p.value,
+            "sigma": p.sigma,
+            "ci95": p.ci95,
+            "initial": p.initial,
+            "bounds": p.bounds,
+            "status": p.status,
+            **({"relative_to": p.relative_to} if p.relative_to else {}),
         }
         for p in item.parameters
-    ]  # fmt: skip
-    data: dict[str, Any] = jsonable({
-        **vars(item), "parameters": parameters, **({"covariance": item.parameters.covariance} if covariance else {}),
-    })  # fmt: skip
+    ]
+    data: dict[str, Any] = jsonable(
+        {**vars(item), "parameters": parameters, **({"covariance": item.parameters.covariance} if covariance else {})}
+    )
     return data
 
 
@@ -335,28 +379,39 @@ def diagnosis_to_dict(item: OnlineDiagnosis) -> dict[str, Any]:
     nan = math.nan
     findings = [
         {
-            "effect": found.effect, "confident": found.confident,
+            "effect": found.effect,
+            "confident": found.confident,
             "parameters": [
                 {"name": n, "unit": found.units.get(n, ""), "value": v, "ci95": interval(v, found.sigma.get(n, nan))}
                 for n, v in found.values.items()
             ],
             "gain": {"mse_before": found.mse_before, "mse_after": found.mse_after},
-            "p_value": found.p_value, "evidence": found.evidence, "alternatives": [vars(a) for a in found.alternatives],
+            "p_value": found.p_value,
+            "evidence": found.evidence,
+            "alternatives": [vars(a) for a in found.alternatives],
         }
         for found in item.findings
-    ]  # fmt: skip
+    ]
     data: dict[str, Any] = jsonable({**vars(item), "findings": findings})
     return data
 
 
 def health_to_dict(report: HealthReport) -> dict[str, Any]:
     """A report as JSON: ``quadid.health/1`` as far as a flight in progress has it, with the loss of every rotor."""
-    data: dict[str, Any] = jsonable({
-        "schema": "quadid.health/1", "t": report.t, "verdict": report.verdict, "has_baseline": report.has_baseline,
-        "changes": [change.to_dict() for change in report.changes],
-        "score": report.score, "rotor_loss": report.rotor_loss, "rotor_interval": report.rotor_interval,
-        "mass": report.mass, "text": report.text,
-    })  # fmt: skip
+    data: dict[str, Any] = jsonable(
+        {
+            "schema": "quadid.health/1",
+            "t": report.t,
+            "verdict": report.verdict,
+            "has_baseline": report.has_baseline,
+            "changes": [change.to_dict() for change in report.changes],
+            "score": report.score,
+            "rotor_loss": report.rotor_loss,
+            "rotor_interval": report.rotor_interval,
+            "mass": report.mass,
+            "text": report.text,
+        }
+    )
     return data
 
 

@@ -244,10 +244,13 @@ class IdentifyNode(PollingNode, LifecycleNode):
         for name, kind, answer in (
             ("fit_now", trigger, self._command(lambda service, _: service.session.fit_now())),
             ("rollback", trigger, self._command(lambda service, _: service.roll_back(by))),
-            ("approve", service_class("quadid_msgs/Approve"),
-             self._command(lambda service, request: service.approve(by, request.sequence))),
+            (
+                "approve",
+                service_class("quadid_msgs/Approve"),
+                self._command(lambda service, request: service.approve(by, request.sequence)),
+            ),
             ("get_history", service_class("quadid_msgs/GetHistory"), self._on_get_history),
-        ):  # fmt: skip
+        ):
             self._offered.append(self.create_service(kind, f"quadid/{name}", answer))
         self._warm_up(self._service, values["warm_up"])
         history = str(store.path) if store is not None else "none"

@@ -57,9 +57,13 @@ class TopicOwnership:
     """
 
     def __init__(
-        self, count: Callable[[], int], kin: Callable[[], int], create: Callable[[], Any],
-        destroy: Callable[[Any], Any], clock: Callable[[], float] = time.monotonic,
-    ) -> None:  # fmt: skip
+        self,
+        count: Callable[[], int],
+        kin: Callable[[], int],
+        create: Callable[[], Any],
+        destroy: Callable[[Any], Any],
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
         """Claims nothing yet.
 
         Args:
@@ -130,9 +134,13 @@ LATCHED_QOS = QoSProfile(
 LEASE = 5.0
 """A service that asserts its liveliness on the parameter topic for longer than this [s] no more is dead or hangs."""
 PARAMETERS_QOS = QoSProfile(
-    depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL, reliability=ReliabilityPolicy.RELIABLE, deadline=Infinite,
-    liveliness=LivelinessPolicy.MANUAL_BY_TOPIC, liveliness_lease_duration=Duration(seconds=LEASE),
-)  # fmt: skip
+    depth=1,
+    durability=DurabilityPolicy.TRANSIENT_LOCAL,
+    reliability=ReliabilityPolicy.RELIABLE,
+    deadline=Infinite,
+    liveliness=LivelinessPolicy.MANUAL_BY_TOPIC,
+    liveliness_lease_duration=Duration(seconds=LEASE),
+)
 ALWAYS = ("status", "diagnostics")
 """Topics that speak in every state of the life cycle."""
 LATCHED = ("diagnosis", "vehicle_health")
@@ -160,9 +168,11 @@ class Publishers:
             self._publishers[topic] = self._create(topic, LATCHED_QOS if topic in LATCHED else USUAL_QOS, managed)
         if not observer:
             self._ownership = TopicOwnership(
-                lambda: self._node.count_publishers(self.ours), self._kin, self._claimed,
+                lambda: self._node.count_publishers(self.ours),
+                self._kin,
+                self._claimed,
                 self._node.destroy_lifecycle_publisher,
-            )  # fmt: skip
+            )
 
     @property
     def silent(self) -> bool:
@@ -248,9 +258,12 @@ class GraphMonitor:
     """
 
     def __init__(
-        self, inputs: Mapping[str, str], offered: Callable[[str], Sequence[Offer]],
-        unbroken: Callable[[str], float], tell: Callable[[str], None],
-    ) -> None:  # fmt: skip
+        self,
+        inputs: Mapping[str, str],
+        offered: Callable[[str], Sequence[Offer]],
+        unbroken: Callable[[str], float],
+        tell: Callable[[str], None],
+    ) -> None:
         """Watches the topics `inputs`.
 
         Args:

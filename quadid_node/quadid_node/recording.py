@@ -58,12 +58,15 @@ class Recorder:
             "vehicle": beginning.vehicle.to_yaml(),
             "settings": beginning.settings.model_dump_json(),
             "source": beginning.source,
-            "restored": json.dumps({
-                **vars(left), "item": left.item and set_to_dict(left.item),
-                "baseline": left.baseline and set_to_dict(left.baseline),
-                "healthy": list(map(flight_to_dict, left.healthy)),
-            }),
-        }  # fmt: skip
+            "restored": json.dumps(
+                {
+                    **vars(left),
+                    "item": left.item and set_to_dict(left.item),
+                    "baseline": left.baseline and set_to_dict(left.baseline),
+                    "healthy": list(map(flight_to_dict, left.healthy)),
+                }
+            ),
+        }
         self._writer = TopicWriter(path, {RECORD: record}, CHUNK_BYTES)
         self._last = 0
         self._waiting: list[tuple[str, str, bytes, int]] = []
@@ -116,10 +119,14 @@ def read_beginning(path: Path) -> Beginning | None:
         settings = SessionSettings.model_validate_json(found["settings"])
         item, baseline = (_set(left[name], settings.gate, vehicle) for name in ("item", "baseline"))
         restored = Restored(
-            item, msgspec.convert(left["next_sequence"], NUMBER), baseline, str(left.get("approval", "")),
-            tuple(map(flight_from_dict, left.get("healthy", ()))), str(left.get("decided", Restored.decided)),
+            item,
+            msgspec.convert(left["next_sequence"], NUMBER),
+            baseline,
+            str(left.get("approval", "")),
+            tuple(map(flight_from_dict, left.get("healthy", ()))),
+            str(left.get("decided", Restored.decided)),
             msgspec.convert(left.get("mass", 0.0), MASS),
-        )  # fmt: skip
+        )
         return Beginning(vehicle, settings, found["source"], restored)
     except UNREADABLE as error:
         raise LogError(f"{path.name}: what its session began with cannot be read ({error})") from error

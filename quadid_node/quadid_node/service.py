@@ -95,9 +95,15 @@ class Service:
     """
 
     def __init__(
-        self, vehicle: Vehicle, settings: SessionSettings, worker: Worker, store: Store | None = None,
-        clock: Callable[[], float] = time.monotonic, restored: Restored | None = None, live: bool = True,
-    ) -> None:  # fmt: skip
+        self,
+        vehicle: Vehicle,
+        settings: SessionSettings,
+        worker: Worker,
+        store: Store | None = None,
+        clock: Callable[[], float] = time.monotonic,
+        restored: Restored | None = None,
+        live: bool = True,
+    ) -> None:
         """Starts where the last run of this vehicle ended.
 
         Args:
@@ -110,9 +116,15 @@ class Service:
         self.vehicle, self.restored = vehicle, restored
         self.boot_id = store.boot_id if store is not None else uuid.uuid4().hex
         self.session = Session(
-            vehicle, settings, restored.item, restored.next_sequence, restored.baseline, restored.healthy,
-            restored.mass / vehicle.mass if restored.mass else 1.0, PATIENCE if live else math.inf,
-        )  # fmt: skip
+            vehicle,
+            settings,
+            restored.item,
+            restored.next_sequence,
+            restored.baseline,
+            restored.healthy,
+            restored.mass / vehicle.mass if restored.mass else 1.0,
+            PATIENCE if live else math.inf,
+        )
         self._load = self.session.active_set.load
         self._configured: str = settings.gate.approval
         self._approval: str = self._configured

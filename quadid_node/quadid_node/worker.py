@@ -154,9 +154,13 @@ class ProcessWorker:
     """
 
     def __init__(
-        self, vehicle: Vehicle, memory_mb: int = MEMORY_MB, clock: Callable[[], float] = time.monotonic,
-        name: str = "fit", limit: float = FIT_LIMIT,
-    ) -> None:  # fmt: skip
+        self,
+        vehicle: Vehicle,
+        memory_mb: int = MEMORY_MB,
+        clock: Callable[[], float] = time.monotonic,
+        name: str = "fit",
+        limit: float = FIT_LIMIT,
+    ) -> None:
         """Starts the child; `ready` is True once its kernels are warm.
 
         Args:
@@ -217,8 +221,11 @@ class ProcessWorker:
         environment = {**os.environ, **dict.fromkeys(THREADS, "1")}
         self._child = subprocess.Popen(
             [sys.executable, "-P", "-m", "quadid_node.worker", str(self._memory)],
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment, start_new_session=True,
-        )  # fmt: skip
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            env=environment,
+            start_new_session=True,
+        )
         self._asked, self._heard = SimpleQueue(), SimpleQueue()
         self._asked.put(self._vehicle)
         talk = (self._child, self._asked, self._heard)

@@ -49,9 +49,10 @@ def open_session(where: str) -> Any:
         return zenoh.open(config)
     except zenoh.ZError as error:
         raise ZenohError(
-            f"Zenoh at {where}: {str(error).splitlines()[0]:.120}", "a router that lets us in",
+            f"Zenoh at {where}: {str(error).splitlines()[0]:.120}",
+            "a router that lets us in",
             "check locator and certificates",
-        ) from error  # fmt: skip
+        ) from error
 
 
 def wait_for_session(
@@ -71,9 +72,12 @@ class LateSession:
     """A session that is opened in the background, as soon as somebody listens there; routers that go come back."""
 
     def __init__(
-        self, where: str, opened: Callable[[Any], None], told: Callable[[str], None] = lambda problem: None,
+        self,
+        where: str,
+        opened: Callable[[Any], None],
+        told: Callable[[str], None] = lambda problem: None,
         retry: float = RETRY,
-    ) -> None:  # fmt: skip
+    ) -> None:
         """Begins to connect.
 
         Args:
@@ -213,10 +217,16 @@ class ZenohLink:
     def report(self, health: ServiceHealth) -> None:
         """Publishes health."""
         feeds = {name: {"rate": feed.rate, "silence": feed.silence} for name, feed in health.feeds.items()}
-        self._put("health", {
-            "status": status_to_dict(health.status), "feeds": feeds, "worker": health.worker,
-            "restarts": health.restarts, "history": health.history,
-        })  # fmt: skip
+        self._put(
+            "health",
+            {
+                "status": status_to_dict(health.status),
+                "feeds": feeds,
+                "worker": health.worker,
+                "restarts": health.restarts,
+                "history": health.history,
+            },
+        )
         self._reports += 1
         if self._reports % REPEAT == 0:
             self._repeat()

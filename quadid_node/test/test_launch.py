@@ -19,9 +19,11 @@ SECONDS = 600.0
 
 @pytest.mark.parametrize(
     ("name", "given", "nodes"),
-    [("identify", {"namespace": "quad1"}, {"/quad1/quadid"}),
-     ("fleet", {"namespaces": "quad1,quad2"}, {"/quad1/quadid", "/quad2/quadid"})],
-)  # fmt: skip
+    [
+        ("identify", {"namespace": "quad1"}, {"/quad1/quadid"}),
+        ("fleet", {"namespaces": "quad1,quad2"}, {"/quad1/quadid", "/quad2/quadid"}),
+    ],
+)
 def test_nodes_get_ready_and_end(
     name: str, given: dict[str, str], nodes: set[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -48,14 +50,18 @@ def test_nodes_get_ready_and_end(
     file = Path(__file__).resolve().parents[1] / "launch" / f"{name}.launch.py"
     arguments = {**given, "vehicle": "pelican", "history": "none"}
     service = launch.LaunchService(argv=[], noninteractive=True)
-    service.include_launch_description(launch.LaunchDescription([
-        actions.IncludeLaunchDescription(
-            PythonLaunchDescriptionSource(str(file)), launch_arguments=arguments.items()
-        ),
-        actions.RegisterEventHandler(event_handlers.OnProcessIO(on_stdout=heard, on_stderr=heard)),
-        actions.RegisterEventHandler(event_handlers.OnProcessExit(on_exit=exited)),
-        actions.TimerAction(period=SECONDS, actions=[actions.EmitEvent(event=launch.events.Shutdown())]),
-    ]))  # fmt: skip
+    service.include_launch_description(
+        launch.LaunchDescription(
+            [
+                actions.IncludeLaunchDescription(
+                    PythonLaunchDescriptionSource(str(file)), launch_arguments=arguments.items()
+                ),
+                actions.RegisterEventHandler(event_handlers.OnProcessIO(on_stdout=heard, on_stderr=heard)),
+                actions.RegisterEventHandler(event_handlers.OnProcessExit(on_exit=exited)),
+                actions.TimerAction(period=SECONDS, actions=[actions.EmitEvent(event=launch.events.Shutdown())]),
+            ]
+        )
+    )
     assert service.run() == 0
     text = "".join(said)
     assert ended == [0] * len(nodes), text

@@ -137,9 +137,11 @@ def _tag8_8svb(r: Reader, count: int) -> list[int]:
 
 
 _GROUPS: Mapping[int, tuple[int, Callable[[Reader, int], list[int]]]] = {
-    6: (8, _tag8_8svb), 7: (3, _three(((2, 2, 2), (4, 4, 4), (8, 8, 8)), 6)), 8: (4, _tag8_4s16),
+    6: (8, _tag8_8svb),
+    7: (3, _three(((2, 2, 2), (4, 4, 4), (8, 8, 8)), 6)),
+    8: (4, _tag8_4s16),
     10: (3, _three(((2, 2, 2), (5, 5, 4), (8, 7, 7)), 8)),
-}  # fmt: skip
+}
 """Encodings of several fields at once: most fields in a group, and decoder."""
 _SINGLE: Mapping[int, Callable[[Reader], int]] = {
     0: Reader.signed,
@@ -294,9 +296,13 @@ def _event(r: Reader) -> tuple[int, list[int]]:
 
 
 def _predicted(
-    raw: Sequence[int], frame: FrameDefinition, signed: Sequence[bool], previous: Sequence[int] | None,
-    before: Sequence[int], constants: Mapping[int, int],
-) -> list[int]:  # fmt: skip
+    raw: Sequence[int],
+    frame: FrameDefinition,
+    signed: Sequence[bool],
+    previous: Sequence[int] | None,
+    before: Sequence[int],
+    constants: Mapping[int, int],
+) -> list[int]:
     """Adds, in 32 bits, to each number what its predictor expects of the header and the two main frames before."""
     out: list[int] = []
     names = frame.names
@@ -334,9 +340,16 @@ def number(text: str) -> float:
 MAGIC = b"H Product:Blackbox"
 _DEGREE = np.pi / 180.0
 _KEPT = (
-    "gyro_scale", "acc_1G", "minthrottle", "vbatref", "motorOutput", "motor_poles", "maxthrottle",
-    "blackbox_high_resolution", "yaw_motors_reversed",
-)  # fmt: skip
+    "gyro_scale",
+    "acc_1G",
+    "minthrottle",
+    "vbatref",
+    "motorOutput",
+    "motor_poles",
+    "maxthrottle",
+    "blackbox_high_resolution",
+    "yaw_motors_reversed",
+)
 
 
 class _Header(NamedTuple):
@@ -359,9 +372,11 @@ def read_blackbox(path: Path) -> Recording:
     for start, stop in zip(starts, [*starts[1:], len(data)], strict=True):
         header = _header(data, start, stop, path.name)
         constants = {
-            4: int(_value(header.values, "minthrottle", 1150.0)), 8: 1500,
-            9: int(_value(header.values, "vbatref", 0.0)), 11: int(_value(header.values, "motorOutput", 0.0)),
-        }  # fmt: skip
+            4: int(_value(header.values, "minthrottle", 1150.0)),
+            8: 1500,
+            9: int(_value(header.values, "vbatref", 0.0)),
+            11: int(_value(header.values, "motorOutput", 0.0)),
+        }
         decoded = decode_frames(data, header.end, stop, header.definitions, constants)
         if best is None or len(decoded.rows) * best[1].width > len(best[1].rows) * decoded.width:
             best = header, decoded
@@ -414,8 +429,9 @@ def _header(data: bytes, start: int, stop: int, origin: str) -> _Header:
 def _bad_header(origin: str, why: str) -> LogError:
     return LogError(
         f"{origin}: its blackbox header is damaged or of another dialect ({plain(why, 60)})",
-        "a log of Betaflight, Cleanflight or INAV", "copy the log from the flight controller again",
-    )  # fmt: skip
+        "a log of Betaflight, Cleanflight or INAV",
+        "copy the log from the flight controller again",
+    )
 
 
 def _value(values: dict[str, str], name: str, otherwise: float) -> float:

@@ -374,9 +374,10 @@ def assemble(
     if not any(len(channel.t) for channel in channels.values()):
         why = f" ({notes[0]})" if notes else ""
         raise LogError(
-            f"{name}: no usable flight data in it{why}", "gyro, attitude, accelerometer or rotor signals",
+            f"{name}: no usable flight data in it{why}",
+            "gyro, attitude, accelerometer or rotor signals",
             "see docs/logs.md for the messages that are read",
-        )  # fmt: skip
+        )
     channels = {n: _without_held(c, channels.get("gyro")) for n, c in channels.items()}
     warnings = [*notes, *filter(None, [other]), *clock.warnings()]
     for channel in channels.values():

@@ -104,9 +104,10 @@ def _check_radians(angles: FloatArray, origin: str) -> None:
     if pitch <= 0.5 * np.pi + 0.01 and roll <= 4.0 * np.pi:
         return
     raise LogError(
-        f"{origin}: columns phi and theta reach {roll:.3g} and {pitch:.3g}: degrees?", "radians",
+        f"{origin}: columns phi and theta reach {roll:.3g} and {pitch:.3g}: degrees?",
+        "radians",
         "multiply phi, theta and psi by 0.0174533",
-    )  # fmt: skip
+    )
 
 
 def _check_seconds(t: FloatArray, origin: str) -> None:
@@ -118,8 +119,9 @@ def _check_seconds(t: FloatArray, origin: str) -> None:
         falls = np.mean(steps < 0.0) > 0.1 or known[-1] < known[0]
         raise LogError(
             f"{origin}: column t {'falls' if falls else 'stays the same'} from row to row",
-            "the time [s] of each row, rising", "sort the rows by time" if falls else "check the export of t",
-        )  # fmt: skip
+            "the time [s] of each row, rising",
+            "sort the rows by time" if falls else "check the export of t",
+        )
     if len(t) < _FEW_ROWS or not step >= _SLOWEST_ROW:
         return
     units = (("milliseconds", 1e-3), ("microseconds", 1e-6), ("nanoseconds", 1e-9))
@@ -160,8 +162,9 @@ def _renamed(names: list[str], columns: Mapping[str, str], origin: str) -> list[
         if given not in names:
             raise LogError(
                 f"{origin}: no column {plain(given, 40)}, which `columns` names for {plain(own, 40)}",
-                plain(", ".join(names), 200), nearest(given, names),
-            )  # fmt: skip
+                plain(", ".join(names), 200),
+                nearest(given, names),
+            )
         theirs[given] = own
     return [theirs.get(name, f"({name})" if name in columns else name) for name in names]
 

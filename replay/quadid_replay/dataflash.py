@@ -30,9 +30,18 @@ from quadid_replay.frames import from_euler
 
 # isort: off
 from quadid_replay.motors import (
-    ESCS, Outputs, RPM, active_outputs, changed_within, esc_columns, frame_rotors, in_pulses, merge_instances,
-    motor_outputs, no_multirotor,
-)  # fmt: skip
+    ESCS,
+    Outputs,
+    RPM,
+    active_outputs,
+    changed_within,
+    esc_columns,
+    frame_rotors,
+    in_pulses,
+    merge_instances,
+    motor_outputs,
+    no_multirotor,
+)
 # isort: on
 
 # --- Finds the records of an ArduPilot DataFlash log and reads their columns
@@ -226,12 +235,13 @@ SOURCES = (
     *(Source("attitude", name, ("Q1", "Q2", "Q3", "Q4")) for name in ("XKQ", "XKQ1", "NKQ1")),
     *(
         Source("attitude_reference", name, ("DesRoll", "DesPitch", "DesYaw", column), note=f"Des*, CTUN {column}")
-        for name in ("ANG", "ATT") for column in ("ThO", "ThrOut")
+        for name in ("ANG", "ATT")
+        for column in ("ThO", "ThrOut")
     ),
     *(Source("velocity", name, ("VN", "VE", "VD"), note="VN VE VD") for name in _EKF),
     *(Source("position", name, ("PN", "PE", "PD"), note="PN PE PD") for name in _EKF),
     *(Source("battery", name, ("Volt",), _volts, "Volt") for name in ("BAT", "CURR")),
-)  # fmt: skip
+)
 """In order of preference."""
 
 ARDUCOPTER = {
@@ -255,17 +265,21 @@ def read_dataflash(path: Path) -> Recording:
     clock = LogClock()
     stamps = {
         name: index.column(name, column) * unit
-        for name in _STAMPED for column, unit in (("TimeUS", 1e-6), ("TimeMS", 1e-3)) if index.has(name, column)
-    }  # fmt: skip
+        for name in _STAMPED
+        for column, unit in (("TimeUS", 1e-6), ("TimeMS", 1e-3))
+        if index.has(name, column)
+    }
     times = clock.times_of(stamps, {name: index.rows(name) for name in stamps})
     names, values = _parameters(index)
     parameters = dict(zip(names, values, strict=True))
     damaged, redefined = (", ".join(sorted(set(names))[:8]) for names in (index.damaged, index.redefined))
     notes = damage(
-        len(index.data), index.skipped, index.cut,
+        len(index.data),
+        index.skipped,
+        index.cut,
         damaged and f"damaged message descriptions: {damaged}",
         redefined and f"{redefined} redefined within the log: data after the change are not used",
-    )  # fmt: skip
+    )
     sources = SOURCES
     if parameters.get("AHRS_EKF_TYPE") == 2.0:
         sources = tuple(sorted(SOURCES, key=lambda source: source.records != "NKF1"))

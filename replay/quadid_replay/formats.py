@@ -81,8 +81,9 @@ def recognise(head: bytes, name: str, time: str = "t") -> LogFormat:
     if len(cells) > _FEW_COLUMNS and all(cell.isprintable() for cell in cells):
         raise LogError(
             f"{name}: a CSV without the column '{time}' (its first are {plain(', '.join(cells[:3]))})",
-            "the time [s] in a column t", f"name it: --columns {plain(cells[0])}=t",
-        )  # fmt: skip
+            "the time [s] in a column t",
+            f"name it: --columns {plain(cells[0])}=t",
+        )
     if head.count(b",", 0, 1000) > _FEW_COLUMNS and b"\n" in head and b"\0" not in head:
         found = "a table whose header is no plain text (UTF-8, characters that print)"
         raise LogError(f"{name}: {found}", ALLOWED, "write plain names of columns, and save it as UTF-8")

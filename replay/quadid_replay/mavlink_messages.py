@@ -32,15 +32,26 @@ class _Field(NamedTuple):
 
 
 _CODES = {
-    "uint8_t": "B", "uint16_t": "H", "int16_t": "h", "uint32_t": "I", "int32_t": "i", "uint64_t": "Q", "float": "f",
-}  # fmt: skip
+    "uint8_t": "B",
+    "uint16_t": "H",
+    "int16_t": "h",
+    "uint32_t": "I",
+    "int32_t": "i",
+    "uint64_t": "Q",
+    "float": "f",
+}
 """Codes of `struct` by C type."""
 _ONE = "index:uint8_t time_usec:uint64_t"
 _MESSAGES = (
-    (ESC_INFO, "ESC_INFO", 251, f"{_ONE} counter:uint16_t count:uint8_t connection_type:uint8_t info:uint8_t "
-     "failure_flags:uint16_t[4] error_count:uint32_t[4] temperature:int16_t[4]"),
+    (
+        ESC_INFO,
+        "ESC_INFO",
+        251,
+        f"{_ONE} counter:uint16_t count:uint8_t connection_type:uint8_t info:uint8_t "
+        "failure_flags:uint16_t[4] error_count:uint32_t[4] temperature:int16_t[4]",
+    ),
     (ESC_STATUS, "ESC_STATUS", 10, f"{_ONE} rpm:int32_t[4] voltage:float[4] current:float[4]"),
-)  # fmt: skip
+)
 """Number, name, seed of the checksum and fields in the order of the XML."""
 
 

@@ -39,22 +39,31 @@ CCW, CW = 1, -1
 _CLASSES = {1: "QUAD", 2: "HEXA", 3: "OCTA", 4: "OCTAQUAD", 5: "Y6", 7: "TRI"}
 _TYPES = {0: "PLUS", 1: "X", 2: "V", 3: "H", 12: "BF_X", 13: "DJI_X", 14: "CW_X", 18: "BF_X_REV"}
 
-ARDUPILOT: Mapping[str, tuple[tuple[float, int], ...]] = MappingProxyType({
-    "QUAD/PLUS": ((90, CCW), (-90, CCW), (0, CW), (180, CW)),
-    "QUAD/X": ((45, CCW), (-135, CCW), (-45, CW), (135, CW)),
-    "QUAD/H": ((45, CW), (-135, CW), (-45, CCW), (135, CCW)),
-    "QUAD/BF_X": ((135, CW), (45, CCW), (-135, CCW), (-45, CW)),
-    "QUAD/BF_X_REV": ((135, CCW), (45, CW), (-135, CW), (-45, CCW)),
-    "QUAD/DJI_X": ((45, CCW), (-45, CW), (-135, CCW), (135, CW)),
-    "QUAD/CW_X": ((45, CCW), (135, CW), (-135, CCW), (-45, CW)),
-    "HEXA/PLUS": ((0, CW), (180, CCW), (-120, CW), (60, CCW), (-60, CCW), (120, CW)),
-    "HEXA/X": ((90, CW), (-90, CCW), (-30, CW), (150, CCW), (30, CCW), (-150, CW)),
-    "OCTA/PLUS": ((0, CW), (180, CW), (45, CCW), (135, CCW), (-45, CCW), (-135, CCW), (-90, CW), (90, CW)),
-    "OCTA/X": (
-        (22.5, CW), (-157.5, CW), (67.5, CCW), (157.5, CCW), (-22.5, CCW), (-112.5, CCW), (-67.5, CW), (112.5, CW)
-    ),
-    "OCTAQUAD/X": ((45, CCW), (-45, CW), (-135, CCW), (135, CW), (-45, CCW), (45, CW), (135, CCW), (-135, CW)),
-})  # fmt: skip
+ARDUPILOT: Mapping[str, tuple[tuple[float, int], ...]] = MappingProxyType(
+    {
+        "QUAD/PLUS": ((90, CCW), (-90, CCW), (0, CW), (180, CW)),
+        "QUAD/X": ((45, CCW), (-135, CCW), (-45, CW), (135, CW)),
+        "QUAD/H": ((45, CW), (-135, CW), (-45, CCW), (135, CCW)),
+        "QUAD/BF_X": ((135, CW), (45, CCW), (-135, CCW), (-45, CW)),
+        "QUAD/BF_X_REV": ((135, CCW), (45, CW), (-135, CW), (-45, CCW)),
+        "QUAD/DJI_X": ((45, CCW), (-45, CW), (-135, CCW), (135, CW)),
+        "QUAD/CW_X": ((45, CCW), (135, CW), (-135, CCW), (-45, CW)),
+        "HEXA/PLUS": ((0, CW), (180, CCW), (-120, CW), (60, CCW), (-60, CCW), (120, CW)),
+        "HEXA/X": ((90, CW), (-90, CCW), (-30, CW), (150, CCW), (30, CCW), (-150, CW)),
+        "OCTA/PLUS": ((0, CW), (180, CW), (45, CCW), (135, CCW), (-45, CCW), (-135, CCW), (-90, CW), (90, CW)),
+        "OCTA/X": (
+            (22.5, CW),
+            (-157.5, CW),
+            (67.5, CCW),
+            (157.5, CCW),
+            (-22.5, CCW),
+            (-112.5, CCW),
+            (-67.5, CW),
+            (112.5, CW),
+        ),
+        "OCTAQUAD/X": ((45, CCW), (-45, CW), (-135, CCW), (135, CW), (-45, CCW), (45, CW), (135, CCW), (-135, CW)),
+    }
+)
 """Angle [deg] and spin of motors 1, 2, 3 … (AP_MotorsMatrix.cpp of ArduPilot 4.x)."""
 
 
@@ -160,9 +169,10 @@ def motor_outputs(
     """
     ardupilot |= any(name.startswith("SERVO") and MOTOR_FUNCTION.fullmatch(name) for name in parameters)
     said = [
-        (name, *_driven(name, value)) for name, value in parameters.items()
+        (name, *_driven(name, value))
+        for name, value in parameters.items()
         if MOTOR_FUNCTION.fullmatch(name) and (name.startswith("SERVO") or not ardupilot)
-    ]  # fmt: skip
+    ]
     said.sort(key=lambda entry: entry[1])  # of several outputs that drive one motor the first counts
     motors = {motor: output for _, output, motor in reversed(said) if motor is not None} if ardupilot else {}
     tricopter = ardupilot and (rotors == 3 or (not rotors and set(motors) == {*_TRICOPTER, _TAIL}))
@@ -171,29 +181,44 @@ def motor_outputs(
         motors.pop(_TAIL, None)
     order = list(_TRICOPTER) if tricopter else list(range(rotors or len(motors)))
     told = bool(motors) and set(motors) == set(order)
-    against = [] if told else [
-        f"{name} {_whole(parameters, name)}" for name, output, motor in said
-        if motor != (output if output in order else None) and (ardupilot or motor in order)
-    ]  # fmt: skip
+    against = (
+        []
+        if told
+        else [
+            f"{name} {_whole(parameters, name)}"
+            for name, output, motor in said
+            if motor != (output if output in order else None) and (ardupilot or motor in order)
+        ]
+    )
     if against:
-        return Outputs([], (
-            f"{', '.join(against[:_NAMED])}: no order of {rotors or 'the'} motors, {message} is not used; "
-            "let all of the autopilot's parameters be heard, or record rotor speeds"
-        ))  # fmt: skip
+        return Outputs(
+            [],
+            (
+                f"{', '.join(against[:_NAMED])}: no order of {rotors or 'the'} motors, {message} is not used; "
+                "let all of the autopilot's parameters be heard, or record rotor speeds"
+            ),
+        )
     columns = [motors[m] if told else m for m in order]
     far = [f"motor {m + 1} on output {k + 1}" for m, k in zip(order, columns, strict=True) if k >= width]
     if far:
-        return Outputs([], (
-            f"{', '.join(far)} (SERVOn_FUNCTION, else the frame), but {message} holds outputs 1 to {width}: "
-            f"it is not used; put the motors on the first {width} outputs, or record rotor speeds"
-        ))  # fmt: skip
+        return Outputs(
+            [],
+            (
+                f"{', '.join(far)} (SERVOn_FUNCTION, else the frame), but {message} holds outputs 1 to {width}: "
+                f"it is not used; put the motors on the first {width} outputs, or record rotor speeds"
+            ),
+        )
     return Outputs(columns, told=told)
 
 
 def esc_columns(
-    parameters: Mapping[str, float], rotors: int, reporting: Sequence[bool] | BoolArray, message: str,
-    ardupilot: bool = False, version: tuple[int, int] | None = None,
-) -> Outputs:  # fmt: skip
+    parameters: Mapping[str, float],
+    rotors: int,
+    reporting: Sequence[bool] | BoolArray,
+    message: str,
+    ardupilot: bool = False,
+    version: tuple[int, int] | None = None,
+) -> Outputs:
     """Finds the motors among the ESCs that report speeds: they go with the outputs, as `motor_outputs` has them.
 
     ESC k is the one on output k, or, up to ArduPilot 4.4, the k-th in the order of their outputs.  The one is used of
@@ -313,13 +338,18 @@ def no_multirotor(parameters: Mapping[str, float], mav_type: int = 0, firmware: 
     airframe = _OTHER_AIRFRAMES.get(_whole(parameters, "CA_AIRFRAME"))
     frame = _OTHER_FRAMES.get(_whole(parameters, "FRAME_CLASS"))
     which = (
-        f"MAV_TYPE {kind}" if kind and kind not in MULTIROTORS
-        else f"Ardu{firmware}" if firmware not in ("", "Copter")
-        else f"CA_AIRFRAME {airframe}" if airframe
-        else f"FRAME_CLASS {frame}" if frame
-        else "Q_ENABLE 1" if parameters.get("Q_ENABLE") == 1.0
+        f"MAV_TYPE {kind}"
+        if kind and kind not in MULTIROTORS
+        else f"Ardu{firmware}"
+        if firmware not in ("", "Copter")
+        else f"CA_AIRFRAME {airframe}"
+        if airframe
+        else f"FRAME_CLASS {frame}"
+        if frame
+        else "Q_ENABLE 1"
+        if parameters.get("Q_ENABLE") == 1.0
         else ""
-    )  # fmt: skip
+    )
     return which and f"the vehicle calls itself {which}, no multirotor: its outputs are not used"
 
 

@@ -75,9 +75,13 @@ def open_log(path: str | Path, preset: str = AUTO, columns: Mapping[str, str] | 
     kind = kind_of(file, columns)
     allowed = limits(stored_size(file))
     request = {
-        "format": kind.name, "path": str(file.absolute()), "preset": preset, "columns": dict(columns or {}),
-        "memory": allowed.memory, "seconds": allowed.seconds,
-    }  # fmt: skip
+        "format": kind.name,
+        "path": str(file.absolute()),
+        "preset": preset,
+        "columns": dict(columns or {}),
+        "memory": allowed.memory,
+        "seconds": allowed.seconds,
+    }
     ours, theirs = socket.socketpair()
     with ours:
         with theirs:
@@ -100,9 +104,10 @@ def open_log(path: str | Path, preset: str = AUTO, columns: Mapping[str, str] | 
         result = unpack(answer[:-_STATUS_BYTES])
     except ValueError as error:
         raise LogError(
-            f"{file.name}: what its reader returned is no recording ({plain(str(error))})", "a log",
+            f"{file.name}: what its reader returned is no recording ({plain(str(error))})",
+            "a log",
             "try again, or report it with the file",
-        ) from error  # fmt: skip
+        ) from error
     if isinstance(result, str):
         raise _limited(file, result, allowed)
     return result
@@ -115,9 +120,10 @@ def stored_size(file: Path) -> int:
     stored = 512 * sum(part.st_blocks for part in sizes)
     if size >= LARGE and stored < _STORED * size:
         raise LogError(
-            f"{file.name}: {size >> 20} MiB of which {stored >> 20} MiB are stored", "a whole file",
+            f"{file.name}: {size >> 20} MiB of which {stored >> 20} MiB are stored",
+            "a whole file",
             "copy it again: the copy or the logger stopped before the end",
-        )  # fmt: skip
+        )
     return size
 
 
@@ -157,9 +163,11 @@ def _given(name: str, otherwise: float) -> float:
 
 
 _BY_SIGNAL = {
-    signal.SIGXCPU: "seconds", signal.SIGALRM: "standing", signal.SIGXFSZ: "written",
+    signal.SIGXCPU: "seconds",
+    signal.SIGALRM: "standing",
+    signal.SIGXFSZ: "written",
     signal.SIGABRT: "memory",  # how Python ends where there is not even enough for an error
-}  # fmt: skip
+}
 _BY_ERROR: dict[int, Literal["written", "open files"]] = {errno.EFBIG: "written", errno.EMFILE: "open files"}
 
 
@@ -169,9 +177,10 @@ def _stopped(path: Path, ended: int, allowed: ReadLimits) -> LogError:
         return _limited(path, _BY_SIGNAL[signal.Signals(-ended)], allowed)
     how = signal.Signals(-ended).name if ended < 0 else f"exit code {ended}"
     return LogError(
-        f"{path.name}: its reader ended with {how}", f"logs that are read within {allowed.memory} MiB of memory",
+        f"{path.name}: its reader ended with {how}",
+        f"logs that are read within {allowed.memory} MiB of memory",
         f"copy the file again, allow more with {MEMORY}, or report it with the file",
-    )  # fmt: skip
+    )
 
 
 def _limited(path: Path, name: str, allowed: ReadLimits) -> LogError:
@@ -182,12 +191,13 @@ def _limited(path: Path, name: str, allowed: ReadLimits) -> LogError:
         "seconds": (f"takes longer than {math.ceil(allowed.seconds)} s of processor time", *slow),
         "standing": (f"takes longer than {math.ceil(STANDING * allowed.seconds)} s by the clock", *slow),
         "memory": (
-            f"takes more than {allowed.memory} MiB of memory", "logs that fit",
+            f"takes more than {allowed.memory} MiB of memory",
+            "logs that fit",
             f"cut it into parts or drop topics that are not needed, or allow more with {MEMORY}",
         ),
         "written": ("writes files", *only_read),
         "open files": ("opens too many files", *only_read),
-    }[name]  # fmt: skip
+    }[name]
     return LogError(f"{path.name}: reading it {found}", fits, fix)
 
 
@@ -314,9 +324,12 @@ class _Process:
         with theirs:
             self._process = subprocess.Popen(
                 [sys.executable, "-P", "-m", "quadid_replay.opening", str(theirs.fileno())],
-                stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, pass_fds=[theirs.fileno()], start_new_session=True,
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                pass_fds=[theirs.fileno()],
+                start_new_session=True,
                 env={**os.environ, "PYTHONPATH": os.pathsep.join(path), "OPENBLAS_NUM_THREADS": "1"},
-            )  # fmt: skip
+            )
         return self._control
 
     def _stop(self) -> None:
@@ -398,19 +411,26 @@ def _begin(answer: socket.socket) -> _Child:
 
 
 def _read(
-    answer: socket.socket, format: str, path: str = "", preset: str = "", columns: dict[str, str] | None = None,
-    memory: int = 0, seconds: float = 0.0,
-) -> None:  # fmt: skip
+    answer: socket.socket,
+    format: str,
+    path: str = "",
+    preset: str = "",
+    columns: dict[str, str] | None = None,
+    memory: int = 0,
+    seconds: float = 0.0,
+) -> None:
     """Runs the child.  It never returns."""
     nothing = os.open(os.devnull, os.O_RDWR)
     for stream in range(3):  # whatever a library prints
         os.dup2(nothing, stream)
     processor = math.ceil(seconds)
     for limit, soft, hard in (
-        (resource.RLIMIT_DATA, memory * _MIB, memory * _MIB), (resource.RLIMIT_FSIZE, 0, 0),
-        (resource.RLIMIT_CORE, 0, 0), (resource.RLIMIT_NOFILE, OPEN_FILES, OPEN_FILES),
+        (resource.RLIMIT_DATA, memory * _MIB, memory * _MIB),
+        (resource.RLIMIT_FSIZE, 0, 0),
+        (resource.RLIMIT_CORE, 0, 0),
+        (resource.RLIMIT_NOFILE, OPEN_FILES, OPEN_FILES),
         (resource.RLIMIT_CPU, processor, processor + 5),
-    ):  # fmt: skip
+    ):
         resource.setrlimit(limit, (soft, hard))
     signal.setitimer(signal.ITIMER_REAL, STANDING * seconds)
     file = Path(path)

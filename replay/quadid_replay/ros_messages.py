@@ -141,8 +141,15 @@ Signals = list[tuple[str, FloatArray, Any]]
 """Names, values (n, size), and whether the messages hold the signal: of each a mask (n,), or of all one truth."""
 _LAST_NUMBER = re.compile(r"(\d{1,9})\D*$", re.ASCII)
 UNDECODABLE = (
-    McapError, struct.error, ValueError, LookupError, TypeError, AttributeError, RecursionError, OverflowError,
-)  # fmt: skip
+    McapError,
+    struct.error,
+    ValueError,
+    LookupError,
+    TypeError,
+    AttributeError,
+    RecursionError,
+    OverflowError,
+)
 """Errors that the library and the types' functions raise on damaged data."""
 
 
@@ -183,20 +190,24 @@ def _wxyz(q: FloatArray) -> FloatArray:
 def _imu_block(m: Any) -> Runs:
     return [
         [
-            *_quaternion(m.orientation), *m.orientation_covariance,
-            *_vector(m.angular_velocity), *m.angular_velocity_covariance,
-            *_vector(m.linear_acceleration), *m.linear_acceleration_covariance,
+            *_quaternion(m.orientation),
+            *m.orientation_covariance,
+            *_vector(m.angular_velocity),
+            *m.angular_velocity_covariance,
+            *_vector(m.linear_acceleration),
+            *m.linear_acceleration_covariance,
         ]
-    ]  # fmt: skip
+    ]
 
 
 def _imu_signals(runs: list[FloatArray], extra: Any) -> Signals:
     """REP-145: a covariance that begins with -1 marks the quantity as absent."""
     (v,) = runs
     return [
-        ("body_rate", v[:, 13:16], v[:, 16] != -1.0), ("body_force", v[:, 25:28], v[:, 28] != -1.0),
+        ("body_rate", v[:, 13:16], v[:, 16] != -1.0),
+        ("body_force", v[:, 25:28], v[:, 28] != -1.0),
         ("attitude", _wxyz(v[:, :4]), v[:, 4] != -1.0),
-    ]  # fmt: skip
+    ]
 
 
 def _pose(p: Any) -> list[float]:
@@ -217,9 +228,10 @@ def _odometry_signals(runs: list[FloatArray], in_world: Any) -> Signals:
     if not in_world:
         velocity = np.hstack([q, velocity])
     return [
-        ("pose_attitude", q, True), ("position", v[:, :3], ~np.isnan(v[:, 0])),  # NaN: it tells no position; likewise
+        ("pose_attitude", q, True),
+        ("position", v[:, :3], ~np.isnan(v[:, 0])),  # NaN: it tells no position; likewise
         ("velocity" if in_world else "body_velocity", velocity, ~np.isnan(v[:, 43])),
-    ]  # fmt: skip
+    ]
 
 
 def _joint_order(m: Any) -> tuple[int, ...] | None:
@@ -305,21 +317,23 @@ TYPES: dict[str, MessageType] = {
     "mav_msgs/Actuators": _actuators("angular_velocities"),
     "actuator_msgs/Actuators": _actuators("velocity"),
     "px4_msgs/SensorCombined": MessageType(
-        lambda m: [list(m.gyro_rad), list(m.accelerometer_m_s2)], _runs("gyro", "accel"),
+        lambda m: [list(m.gyro_rad), list(m.accelerometer_m_s2)],
+        _runs("gyro", "accel"),
         stamp=lambda m: int(m.timestamp - 0.5 * m.gyro_integral_dt) * 1000,  # a mean counts at its middle
     ),
     "px4_msgs/VehicleAttitude": _px4("frd_attitude", lambda m: list(m.q)),
     "px4_msgs/VehicleAttitudeSetpoint": _px4("frd_reference", lambda m: [*m.q_d, -m.thrust_body[2]], True),
     "px4_msgs/VehicleLocalPosition": MessageType(
         lambda m: [_set_if(m.xy_valid, [m.x, m.y, m.z]), _set_if(m.v_xy_valid, [m.vx, m.vy, m.vz])],
-        _runs("ned_position", "ned_velocity"), stamp=_px4_stamp,
+        _runs("ned_position", "ned_velocity"),
+        stamp=_px4_stamp,
     ),
     "px4_msgs/BatteryStatus": _px4("battery", lambda m: [m.voltage_v], True),
     "px4_msgs/ActuatorMotors": _px4("actuator_motors", lambda m: list(m.control), True),
     "px4_msgs/ActuatorOutputs": _px4("outputs", lambda m: list(m.output), True),
     "px4_msgs/EscStatus": _px4("rotor_speed", _px4_speeds, True),
     "px4_msgs/VehicleStatus": _px4("vehicle_kind", lambda m: [float(m.system_type)], True),
-}  # fmt: skip
+}
 """Message types that are read, without the ``msg`` in the middle of their name."""
 
 

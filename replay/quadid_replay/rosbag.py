@@ -120,9 +120,10 @@ class Database:
     def _damaged(self, error: Exception) -> LogError:
         why = plain(str(error), 80) or "sizes that cannot be"
         return LogError(
-            f"{self._path.name}: a damaged SQLite database ({why})", "a whole rosbag2 database",
+            f"{self._path.name}: a damaged SQLite database ({why})",
+            "a whole rosbag2 database",
             "sqlite3 FILE .recover, or copy it again after the recorder has stopped",
-        )  # fmt: skip
+        )
 
 
 class Folder:

@@ -116,10 +116,19 @@ def read_frames(path: Path) -> Frames:
     long = head == 10
     message[long] |= data[kind[long] + 1].astype(np.int64) << 8 | data[kind[long] + 2].astype(np.int64) << 16
     return Frames(
-        data, start, end, head, stop[kept], received[kept].astype(np.float64) * 1e-6,
-        data[start + 2 + short].astype(np.int64), message, data[start + 3 + short], data[start + 4 + short],
-        skipped, cut,
-    )  # fmt: skip
+        data,
+        start,
+        end,
+        head,
+        stop[kept],
+        received[kept].astype(np.float64) * 1e-6,
+        data[start + 2 + short].astype(np.int64),
+        message,
+        data[start + 3 + short],
+        data[start + 4 + short],
+        skipped,
+        cut,
+    )
 
 
 def _marks(data: Bytes) -> IntArray:
@@ -235,10 +244,12 @@ def intact(frames: Frames, which: IntArray, seeds: IntArray) -> BoolArray:
 def _layout(kind: Any) -> np.dtype[np.void]:
     """The fields of a payload in the order of the wire."""
     types = dict(zip(kind.fieldnames, kind.fieldtypes, strict=True))
-    return np.dtype([
-        (name, _TYPES.get(types[name]) or _whole(types[name]), (length,) if length else ())
-        for name, length in zip(kind.ordered_fieldnames, kind.array_lengths, strict=True)
-    ])  # fmt: skip
+    return np.dtype(
+        [
+            (name, _TYPES.get(types[name]) or _whole(types[name]), (length,) if length else ())
+            for name, length in zip(kind.ordered_fieldnames, kind.array_lengths, strict=True)
+        ]
+    )
 
 
 def _whole(kind: str) -> str:
@@ -299,10 +310,16 @@ def vehicle_log(told: Told, received: FloatArray) -> VehicleLog:
     clock = LogClock()
     signals, placing = _signals(told, received, clock)
     return VehicleLog(
-        clock, signals, dict(zip(names, values, strict=True)), changed_within(names, values),
-        beats is not None and int(beats.autopilot[-1]) == _ARDUPILOT, 0 if beats is None else int(beats.type[-1]),
-        rotors if rotors <= MOST_ROTORS else 0, placing.waited < len(placing.time), placing.backwards,
-    )  # fmt: skip
+        clock,
+        signals,
+        dict(zip(names, values, strict=True)),
+        changed_within(names, values),
+        beats is not None and int(beats.autopilot[-1]) == _ARDUPILOT,
+        0 if beats is None else int(beats.type[-1]),
+        rotors if rotors <= MOST_ROTORS else 0,
+        placing.waited < len(placing.time),
+        placing.backwards,
+    )
 
 
 def _signals(
@@ -413,8 +430,9 @@ def read_tlog(path: Path) -> Recording:
     if not any(v.heard for v in vehicles.values()):
         raise LogError(
             f"{path.name}: {len(frames.start)} MAVLink frames but no measurements of a vehicle",
-            "IMU, attitude, servo or ESC messages", "ask the autopilot for them (SR*_RAW_SENS, SR*_EXTRA1, MAV_*_MODE)",
-        )  # fmt: skip
+            "IMU, attitude, servo or ESC messages",
+            "ask the autopilot for them (SR*_RAW_SENS, SR*_EXTRA1, MAV_*_MODE)",
+        )
     who = max(vehicles, key=lambda key: sum(len(t) for t, _ in vehicles[key].signals.values()))
     bad = len(which) - int(np.count_nonzero(whole))
     refused = f"{bad} frames with a wrong checksum were refused" if bad else ""
@@ -422,9 +440,10 @@ def read_tlog(path: Path) -> Recording:
     if vehicles[who].backwards > _MOST_BACKWARDS:
         raise LogError(
             f"{path.name}: boot time under system {who[0]} component {who[1]} falls back {vehicles[who].backwards} "
-            "times: two vehicles under one system id", "one vehicle an id",
+            "times: two vehicles under one system id",
+            "one vehicle an id",
             "give each vehicle its own SYSID_THISMAV (MAV_SYS_ID) and record again, or record each link by itself",
-        )  # fmt: skip
+        )
     if two_rows(frames.number[(frames.system == who[0]) & (frames.component == who[1])]):
         notes.append(
             f"frame numbers of system {who[0]} component {who[1]} come in two rows: two links of one vehicle, or two "

@@ -35,9 +35,19 @@ from quadid_replay.frames import to_euler
 
 # isort: off
 from quadid_replay.motors import (
-    DSHOT, MOST_ROTORS, PX4_BANKS, RPM, UAVCAN, active_outputs, esc_columns, in_pulses, motor_columns, no_multirotor,
-    px4_motor_outputs, px4_rotor_count,
-)  # fmt: skip
+    DSHOT,
+    MOST_ROTORS,
+    PX4_BANKS,
+    RPM,
+    UAVCAN,
+    active_outputs,
+    esc_columns,
+    in_pulses,
+    motor_columns,
+    no_multirotor,
+    px4_motor_outputs,
+    px4_rotor_count,
+)
 # isort: on
 
 # --- Walks through the records of a PX4 ULog and hands pyulog only whole ones, of the topics that are wanted
@@ -261,7 +271,9 @@ SOURCES = (
     Source("gyro", "vehicle_imu", (*_numbered("delta_angle", 3), "delta_angle_dt"), _increments),
     Source("gyro", "vehicle_angular_velocity", _XYZ, note="(filtered on board)"),
     Source(
-        "accel", "sensor_combined", (*_numbered("accelerometer_m_s2", 3), "accelerometer_integral_dt"),
+        "accel",
+        "sensor_combined",
+        (*_numbered("accelerometer_m_s2", 3), "accelerometer_integral_dt"),
         lambda rows: rows[:, :3],
     ),
     Source("accel", "vehicle_imu", (*_numbered("delta_velocity", 3), "delta_velocity_dt"), _increments),
@@ -271,7 +283,7 @@ SOURCES = (
     Source("velocity", "vehicle_local_position", ("vx", "vy", "vz")),
     Source("position", "vehicle_local_position", ("x", "y", "z")),
     Source("battery", "battery_status", ("voltage_v",), _volts),
-)  # fmt: skip
+)
 """In order of preference."""
 _MODES = {
     0: "Manual", 1: "Altitude", 2: "Position", 3: "Mission", 4: "Hold", 5: "Return", 10: "Acro", 12: "Descend",
@@ -306,9 +318,11 @@ def read_ulog(path: Path) -> Recording:
     log = _load(path, records)
     again = records.described_anew
     notes = damage(
-        path.stat().st_size, records.skipped, records.cut,
+        path.stat().st_size,
+        records.skipped,
+        records.cut,
         again and f"{again} redefined within the log: data after the change are not used",
-    )  # fmt: skip
+    )
     raw = channels_of(SOURCES, lambda source: _rows(log, source), 2.0)
     other = no_multirotor(log.parameters)
     if not other:
@@ -328,8 +342,9 @@ def _load(path: Path, records: UlogRecords) -> _Log:
     except (ULogException, ValueError, LookupError, TypeError, ArithmeticError, struct.error, RecursionError) as error:
         raise LogError(
             f"{path.name}: its definitions are damaged ({type(error).__name__}: {plain(str(error), 80)})",
-            "a PX4 ULog", "copy the file again from the vehicle",
-        ) from error  # fmt: skip
+            "a PX4 ULog",
+            "copy the file again from the vehicle",
+        ) from error
     topics = {(unversioned(d.name), d.multi_id): d.data for d in reversed(ulog.data_list)}
     parameters = {str(k): float(v) for k, v in ulog.initial_parameters.items() if isinstance(v, int | float)}
     return _Log(topics, parameters)

@@ -217,9 +217,10 @@ def read_usd(path: Path) -> Recording:
     records = collect_usd_records(path.read_bytes(), path.name)
     clock = LogClock()
     tables = {  # the others are events, such as a change of mode
-        title: table for title, table in records.tables.items()
+        title: table
+        for title, table in records.tables.items()
         if title == "fixedFrequency" or any(_holds(table, s) for s in SOURCES)
-    }  # fmt: skip
+    }
     times = clock.times_of({title: table["t"] * 1e-6 for title, table in tables.items()}, records.places)
 
     def rows(source: Source) -> tuple[FloatArray, FloatArray] | None:

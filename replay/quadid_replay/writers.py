@@ -127,9 +127,11 @@ class TopicWriter:
     """
 
     def __init__(
-        self, file: str | Path | BinaryIO, metadata: Mapping[str, Mapping[str, str]] | None = None,
+        self,
+        file: str | Path | BinaryIO,
+        metadata: Mapping[str, Mapping[str, str]] | None = None,
         chunk_bytes: int | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self._owned = open_for_writing(file) if isinstance(file, str | Path) else None
         self._writer = Writer(
             self._owned or file,  # type: ignore[arg-type]
@@ -278,9 +280,11 @@ def write_recording(writer: TopicWriter, recording: Recording, epoch_ns: int = 0
 
 
 def write_recordings(
-    writer: TopicWriter, recordings: Mapping[str, Recording], epoch_ns: int = 0,
+    writer: TopicWriter,
+    recordings: Mapping[str, Recording],
+    epoch_ns: int = 0,
     wrenches: Mapping[str, tuple[FloatArray, FloatArray]] | None = None,
-) -> None:  # fmt: skip
+) -> None:
     """Writes recordings to an open writer, in time order, each with its name before its topics; see `write_mcap`.
 
     Args:
@@ -290,8 +294,9 @@ def write_recordings(
     """
     each = [
         s._replace(topic=f"{name}/{s.topic}" if name else s.topic)
-        for name, recording in recordings.items() for s in _all_series(recording, epoch_ns)
-    ]  # fmt: skip
+        for name, recording in recordings.items()
+        for s in _all_series(recording, epoch_ns)
+    ]
     for topic, (times, rows) in (wrenches or {}).items():
         both = np.hstack([flip_body(rows[:, :3]), flip_body(rows[:, 3:])])
         each.append(_Series(topic, "geometry_msgs/msg/WrenchStamped", times, both, _wrench))
@@ -332,27 +337,39 @@ def _all_series(recording: Recording, epoch_ns: int) -> Iterator[_Series]:
     if (c := channels.get("attitude")) is not None:
         rows = flip_attitude(c.values)[:, [1, 2, 3, 0]]
         yield _Series(
-            "attitude", "geometry_msgs/msg/QuaternionStamped", c.t, rows,
+            "attitude",
+            "geometry_msgs/msg/QuaternionStamped",
+            c.t,
+            rows,
             lambda v: {"header": _MAP, "quaternion": _named("xyzw", v)},
-        )  # fmt: skip
+        )
     if (c := channels.get("rotor_speed")) is not None:
         names = [f"rotor_{i + 1}" for i in range(c.values.shape[1])]
         yield _Series(
-            "rotor_speeds", "sensor_msgs/msg/JointState", c.t, c.values,
+            "rotor_speeds",
+            "sensor_msgs/msg/JointState",
+            c.t,
+            c.values,
             lambda v: {"header": _BODY, "name": names, "position": [], "velocity": v, "effort": []},
-        )  # fmt: skip
+        )
     if (c := channels.get("motor_command")) is not None:
         kind = 1 if np.nanmedian(np.abs(c.values)) > 100.0 else 0  # KIND_PWM, KIND_NORMALIZED
         yield _Series(
-            "motor_command", "quadid_msgs/msg/MotorCommand", c.t, c.values,
+            "motor_command",
+            "quadid_msgs/msg/MotorCommand",
+            c.t,
+            c.values,
             lambda v: {"header": _BODY, "kind": kind, "values": v},
-        )  # fmt: skip
+        )
     if (c := channels.get("attitude_reference")) is not None:
         rows = np.column_stack([to_euler(flip_attitude(from_euler(c.values[:, :3]))), c.values[:, 3]])
         yield _Series(
-            "command", "quadid_msgs/msg/AttitudeCommand", c.t, rows,
+            "command",
+            "quadid_msgs/msg/AttitudeCommand",
+            c.t,
+            rows,
             lambda v: {"header": _MAP, **_named(("roll", "pitch", "yaw", "throttle"), v)},
-        )  # fmt: skip
+        )
     # Pose in the world; twist in the body where there is an attitude, else in the world (child frame = frame).
     t, (position, velocity) = union_rows([channels.get("position"), channels.get("velocity")])
     if len(t):
@@ -371,10 +388,13 @@ def _all_series(recording: Recording, epoch_ns: int) -> Iterator[_Series]:
     if (c := channels.get("battery")) is not None:
         unknown = ("temperature", "current", "charge", "capacity", "design_capacity", "percentage")
         yield _Series(
-            "battery", "sensor_msgs/msg/BatteryState", c.t, c.values,
+            "battery",
+            "sensor_msgs/msg/BatteryState",
+            c.t,
+            c.values,
             lambda v: {"header": _BODY, "voltage": v[0], **dict.fromkeys(unknown, math.nan), "present": True},
             plain=True,
-        )  # fmt: skip
+        )
 
 
 def _named(names: Iterable[str], values: list[float]) -> dict[str, float]:
@@ -384,10 +404,13 @@ def _named(names: Iterable[str], values: list[float]) -> dict[str, float]:
 def _imu(v: list[float]) -> dict[str, Any]:
     return {
         "header": _BODY,
-        "orientation": _named("xyzw", v[:4]), "orientation_covariance": v[4:13],
-        "angular_velocity": _named("xyz", v[13:16]), "angular_velocity_covariance": v[16:25],
-        "linear_acceleration": _named("xyz", v[25:28]), "linear_acceleration_covariance": v[28:37],
-    }  # fmt: skip
+        "orientation": _named("xyzw", v[:4]),
+        "orientation_covariance": v[4:13],
+        "angular_velocity": _named("xyz", v[13:16]),
+        "angular_velocity_covariance": v[16:25],
+        "linear_acceleration": _named("xyz", v[25:28]),
+        "linear_acceleration_covariance": v[28:37],
+    }
 
 
 def _wrench(v: list[float]) -> dict[str, Any]:
@@ -398,9 +421,11 @@ def _odometry(v: list[float], child: str) -> dict[str, Any]:
     pose = {"position": _named("xyz", v[:3]), "orientation": _named("xyzw", v[3:7])}
     twist = {"linear": _named("xyz", v[43:46]), "angular": _named("xyz", v[46:49])}
     return {
-        "header": _MAP, "child_frame_id": child,
-        "pose": {"pose": pose, "covariance": v[7:43]}, "twist": {"twist": twist, "covariance": v[49:85]},
-    }  # fmt: skip
+        "header": _MAP,
+        "child_frame_id": child,
+        "pose": {"pose": pose, "covariance": v[7:43]},
+        "twist": {"twist": twist, "covariance": v[49:85]},
+    }
 
 
 # --- Writes a recording as CSV of the contract; every number is written so that it reads back to the same bits
@@ -605,9 +630,12 @@ def _voltage(c: Channel) -> Callable[[int], list[Any]]:
 
 
 _CHANNELS: dict[str, Callable[[Channel], Callable[[int], list[Any]]]] = {
-    "attitude": _attitude, "rotor_speed": _escs, "motor_command": _outputs, "attitude_reference": _reference,
+    "attitude": _attitude,
+    "rotor_speed": _escs,
+    "motor_command": _outputs,
+    "attitude_reference": _reference,
     "battery": _voltage,
-}  # fmt: skip
+}
 """Makers of the messages of a channel's rows."""
 
 
@@ -615,9 +643,11 @@ _CHANNELS: dict[str, Callable[[Channel], Callable[[int], list[Any]]]] = {
 
 
 def write_compared(
-    path: str | Path, recordings: Mapping[str, Recording], epoch_ns: int = 0,
+    path: str | Path,
+    recordings: Mapping[str, Recording],
+    epoch_ns: int = 0,
     wrenches: Mapping[str, tuple[FloatArray, FloatArray]] | None = None,
-) -> None:  # fmt: skip
+) -> None:
     """Writes recordings under their names: topics ``simulated/imu`` in MCAP, columns ``simulated/p`` in CSV.
 
     Args:

@@ -138,9 +138,10 @@ class Place:
         names, rows = self.table()
         w, x, y, z = (rows[:, names.index(n)] for n in ("qw", "qx", "qy", "qz"))
         angles = [
-            np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)), np.arcsin(np.clip(2 * (w * y - z * x), -1, 1)),
+            np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)),
+            np.arcsin(np.clip(2 * (w * y - z * x), -1, 1)),
             np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)),
-        ]  # fmt: skip
+        ]
         keep = [i for i, n in enumerate(names) if n not in ("qw", "qx", "qy", "qz")]
         columns = np.column_stack([rows[:, keep], *np.degrees(angles)])
         return self.write([*(names[i] for i in keep), "phi", "theta", "psi"], columns)
@@ -277,11 +278,7 @@ MISTAKES = (
     Mistake("one rotor column four times", fit(lambda p: p.moved("w2 w3 w4", "w1 w1 w1")), "the same"),
     Mistake("squared rotor speeds", fit(lambda p: p.of_rotors(np.square)), "squared"),
     Mistake("rotor speeds in steps", fit(lambda p: p.of_rotors(lambda w: 50.0 * np.round(w / 50.0))), "steps of 50", 0),
-    Mistake(
-        "motor columns called pwm1",
-        fit(lambda p: p.named(w1="pwm1", w2="pwm2", w3="pwm3", w4="pwm4")),
-        "pwm1=u1",
-    ),
+    Mistake("motor columns called pwm1", fit(lambda p: p.named(w1="pwm1", w2="pwm2", w3="pwm3", w4="pwm4")), "pwm1=u1"),
     Mistake("a template that was not filled in", of(lambda p: p.template()), "FILL IN"),
     Mistake("no mass", of(lambda p: p.vehicle(mass=None)), "no 'mass'"),
     Mistake("tabs in a vehicle file", of(lambda p: p.bytes("vehicle.yaml", b"name: x\n\tmass: 1\n")), "line 2"),
@@ -382,12 +379,15 @@ def _around(text: str, names: str) -> str:
 def page() -> str:
     """The table of docs/results/mistakes.md."""
     head = [
-        "# Mistakes and their first line", "",
+        "# Mistakes and their first line",
+        "",
         "Written by `python -m tests.cli.mistakes`; a test makes each mistake. Lines begin with `quadid:` and the log "
         "and end with the fix, both left out here. `--unchecked` overrules checks of units, frames and motors. *: does "
-        "not name the cause yet.", "",
-        "| mistake | first line |", "|---|---|",
-    ]  # fmt: skip
+        "not name the cause yet.",
+        "",
+        "| mistake | first line |",
+        "|---|---|",
+    ]
     with tempfile.TemporaryDirectory() as folder:
         place = prepare(Path(folder, "flights"))
         rows = [f"| {m.what}{' *' * m.vague} | `{shown(first_line(m, place)[1], m.names)}` |" for m in MISTAKES]

@@ -69,12 +69,16 @@ RESULTS: dict[str, tuple[str, tuple[str, ...], tuple[str, ...]]] = {
     "excite --seconds 6.5": ("quadid.excite/1", ("Worth flying: ", "Envelope: "), ("Worth flying: ", "Half-widths")),
     "gains --vehicle {full} " + LATE: ("quadid.gains/1", ("Rate loops of roll", "MC_ROLLRATE_P"), ("What they rest",)),
     "compare-vehicles pelican pelican --on {train}": (
-        "quadid.compare_vehicles/1", ("Neither file predicts better",), ("Errors of B over those of A",)
+        "quadid.compare_vehicles/1",
+        ("Neither file predicts better",),
+        ("Errors of B over those of A",),
     ),
     "health {hover}@33: --baseline {hover}@:31 --vehicle pelican_x": (
-        "quadid.health/1", ("baseline flight",), ("Airframe", "sha256")
+        "quadid.health/1",
+        ("baseline flight",),
+        ("Airframe", "sha256"),
     ),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("line", RESULTS)

@@ -22,9 +22,19 @@ from tests.commands import Cli, one_line
 @pytest.fixture(scope="module")
 def compared(quadid: Cli, flights: Flights) -> dict[str, Any]:
     done = quadid(
-        "compare", flights.train, "--validate", flights.unseen, "--vehicle", "pelican", "--seeds", "2",
-        "--budget", "600", "--json", "-",
-    )  # fmt: skip
+        "compare",
+        flights.train,
+        "--validate",
+        flights.unseen,
+        "--vehicle",
+        "pelican",
+        "--seeds",
+        "2",
+        "--budget",
+        "600",
+        "--json",
+        "-",
+    )
     assert done.code == 0, done.err
     return done.data
 

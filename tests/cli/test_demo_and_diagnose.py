@@ -40,9 +40,19 @@ def test_diagnose_names_the_cause_and_writes_the_extended_vehicle(quadid: Cli, t
         logs.append(tmp_path / f"late{seed}.csv")
         write_csv(logs[-1], flight.recording)
     run = quadid(
-        "diagnose", logs[0], "--validate", logs[1], "--vehicle", "pelican", "--out", tmp_path, "--json", "-",
-        "--report", tmp_path / "report.html",
-    )  # fmt: skip
+        "diagnose",
+        logs[0],
+        "--validate",
+        logs[1],
+        "--vehicle",
+        "pelican",
+        "--out",
+        tmp_path,
+        "--json",
+        "-",
+        "--report",
+        tmp_path / "report.html",
+    )
     assert run.code == 0, run.err
     result = run.data
     for key in ("schema", "verdict", "findings", "validation", "unexplained", "vehicle_file"):

@@ -128,9 +128,15 @@ def errors(parameters: list[dict[str, Any]], truth: dict[str, float]) -> dict[st
 @pytest.mark.timeout(1800)
 @pytest.mark.parametrize(("flight", "truth", "arm"), [("quad_sq", SQUARE, 0.25), ("x", X, 0.35)])
 def test_first_flight_with_ardupilot(
-    flight: str, truth: dict[str, float], arm: float, inside: Cli, tmp_path: Path, repository: Path, data_dir: Path,
+    flight: str,
+    truth: dict[str, float],
+    arm: float,
+    inside: Cli,
+    tmp_path: Path,
+    repository: Path,
+    data_dir: Path,
     monkeypatch: pytest.MonkeyPatch,
-) -> None:  # fmt: skip
+) -> None:
     monkeypatch.chdir(tmp_path)
     shutil.copy(data_dir / "ardupilot_sitl" / f"{flight}.bin", "flight.bin")
 

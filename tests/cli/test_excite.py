@@ -73,10 +73,17 @@ def test_without_a_log_the_vehicle_file_says_what_is_known(inside: Cli, tmp_path
 @pytest.mark.parametrize(
     "arguments",
     [
-        ("--seconds", "1"), ("--seconds", "nan"), ("--tilt", "0"), ("--tilt", "90"), ("--rate-limit", "5"),
-        ("--height", "40:10"), ("--height", "low"), ("--battery", "120"), ("--format", "lua"),
+        ("--seconds", "1"),
+        ("--seconds", "nan"),
+        ("--tilt", "0"),
+        ("--tilt", "90"),
+        ("--rate-limit", "5"),
+        ("--height", "40:10"),
+        ("--height", "low"),
+        ("--battery", "120"),
+        ("--format", "lua"),
     ],
-)  # fmt: skip
+)
 def test_limits_that_nobody_can_fly(inside: Cli, tmp_path: Path, arguments: tuple[str, str]) -> None:
     line = one_line(inside("excite", "--vehicle", "pelican", "--out", tmp_path, *arguments), 2)
     assert arguments[0] in line

@@ -195,9 +195,11 @@ def test_every_form_from_the_command_line(inside: Cli, tmp_path: Path, form: str
 
 def test_random_forces_survive_the_own_form_and_their_keys_are_named(inside: Cli, tmp_path: Path) -> None:
     random = {
-        "horizontal": {"sigma": 0.31, "time": 0.5}, "vertical": {"sigma": 0.1, "time": 0.4},
-        "roll_pitch": {"sigma": 2.0, "time": 0.2}, "yaw": {"sigma": 0.3, "time": 1.5},
-    }  # fmt: skip
+        "horizontal": {"sigma": 0.31, "time": 0.5},
+        "vertical": {"sigma": 0.1, "time": 0.4},
+        "roll_pitch": {"sigma": 2.0, "time": 0.2},
+        "yaw": {"sigma": 0.3, "time": 1.5},
+    }
     file = tmp_path / "mine.yaml"
     text = Vehicle.shipped("pelican").to_yaml()
     file.write_text(text + f"random: {json.dumps(random)}\n", encoding="utf-8")
@@ -309,9 +311,11 @@ def test_isaac_lab_ranges_are_the_intervals(vehicle: Vehicle) -> None:
 
 def test_isaac_lab_randomises_over_what_acts_at_random(vehicle: Vehicle) -> None:
     random = RandomForces(
-        horizontal=RandomInput(sigma=0.3, time=0.5), vertical=RandomInput(sigma=0.1, time=0.4),
-        roll_pitch=RandomInput(sigma=2.0, time=0.2), yaw=RandomInput(sigma=0.5, time=1.5),
-    )  # fmt: skip
+        horizontal=RandomInput(sigma=0.3, time=0.5),
+        vertical=RandomInput(sigma=0.1, time=0.4),
+        roll_pitch=RandomInput(sigma=2.0, time=0.2),
+        yaw=RandomInput(sigma=0.5, time=1.5),
+    )
     gusty = vehicle.model_copy(update={"random": random})
     facts: dict[str, Any] = {}
     text = next(iter(export(gusty, "isaac-lab", "x").values()))

@@ -61,9 +61,13 @@ def theirs(vehicle: Vehicle, rows: FloatArray) -> Flown:
     space: dict[str, Any] = {}
     exec(export(vehicle, "rotorpy", "test")["_params.py"], space)
     at = {
-        "x": np.zeros(3), "v": np.zeros(3), "q": np.array([0.0, 0.0, 0.0, 1.0]), "w": np.zeros(3),
-        "wind": np.zeros(3), "rotor_speeds": rows[0].copy(),
-    }  # fmt: skip
+        "x": np.zeros(3),
+        "v": np.zeros(3),
+        "q": np.array([0.0, 0.0, 0.0, 1.0]),
+        "w": np.zeros(3),
+        "wind": np.zeros(3),
+        "rotor_speeds": rows[0].copy(),
+    }
     flier = multirotor.Multirotor(
         space["quad_params"], at, integrator_kwargs={"method": "RK45", "rtol": 1e-9, "atol": 1e-10}
     )
@@ -85,11 +89,12 @@ def with_effects(effects: dict[str, Any]) -> Vehicle:
 CASES: dict[str, dict[str, Any]] = {
     "nominal": {},
     "centre of gravity and products of inertia": {
-        "cg_offset": {"x": 0.006, "y": -0.004}, "product_of_inertia": {"J_xy": 5e-4, "J_xz": 2e-4, "J_yz": -3e-4},
+        "cg_offset": {"x": 0.006, "y": -0.004},
+        "product_of_inertia": {"J_xy": 5e-4, "J_xz": 2e-4, "J_yz": -3e-4},
     },
     "motor lag": {"motor_lag": {"tau": 0.04}},
     "rotor drag": {"rotor_drag": {"k_x": 0.3, "k_y": 0.3}},
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("case", list(CASES))
@@ -203,10 +208,15 @@ def without_rotor_inertia(vehicle: Vehicle) -> Vehicle:
 def test_mujoco_flies_the_exported_vehicle_as_our_simulation_does() -> None:
     mujoco = pytest.importorskip("mujoco", reason="pip install mujoco (extra dev)")
     vehicle = Vehicle.shipped("pelican")
-    tilted = vehicle.model_copy(update={"effects": {
-        "weak_rotor": {"loss_2": 0.01}, "cg_offset": {"x": 0.0004, "y": -0.0003},
-        "product_of_inertia": {"J_xy": 4e-4},
-    }})  # fmt: skip
+    tilted = vehicle.model_copy(
+        update={
+            "effects": {
+                "weak_rotor": {"loss_2": 0.01},
+                "cg_offset": {"x": 0.0004, "y": -0.0003},
+                "product_of_inertia": {"J_xy": 4e-4},
+            }
+        }
+    )
     rows = speeds(vehicle)[:50]
     expected = fly_file(without_rotor_inertia(tilted), rows, DT)
     model = mujoco.MjModel.from_xml_string(export(tilted, "mujoco", "test")[".mjcf.xml"])
@@ -242,8 +252,18 @@ def test_px4_simulation_in_hardware_and_drag_fusion_get_only_what_was_fitted() -
     pelican = as_px4_has_it(Vehicle.shipped("pelican_x"))
     bare = export(pelican, "px4", "x")[".params"]
     rich = export(
-        pelican.model_copy(update={"effects": {"rotor_drag": {"k_x": 0.3, "k_y": 0.2}, "parasitic_drag": {"c": 0.03},
-                                               "motor_lag": {"tau": 0.04}}}), "px4", "x")[".params"]  # fmt: skip
+        pelican.model_copy(
+            update={
+                "effects": {
+                    "rotor_drag": {"k_x": 0.3, "k_y": 0.2},
+                    "parasitic_drag": {"c": 0.03},
+                    "motor_lag": {"tau": 0.04},
+                }
+            }
+        ),
+        "px4",
+        "x",
+    )[".params"]
     values = {row.split("\t")[2]: float(row.split("\t")[3]) for row in rich.splitlines() if not row.startswith("#")}
     assert values["SIH_MASS"] == pelican.mass
     assert values["SIH_IXX"] == pytest.approx(pelican.parameters["J_xx"].initial)
@@ -256,10 +276,11 @@ def test_px4_simulation_in_hardware_and_drag_fusion_get_only_what_was_fitted() -
 
 
 ARDUPILOT = {
-    "+": "90 ccw, -90 ccw, 0 cw, 180 cw", "X": "45 ccw, -135 ccw, -45 cw, 135 cw",
+    "+": "90 ccw, -90 ccw, 0 cw, 180 cw",
+    "X": "45 ccw, -135 ccw, -45 cw, 135 cw",
     "hexa": "0 cw, 180 ccw, -120 cw, 60 ccw, -60 ccw, 120 cw",
     "hexax": "90 cw, -90 ccw, -30 cw, 150 ccw, 30 ccw, -150 cw",
-}  # fmt: skip
+}
 """AP_MotorsMatrix.cpp: motors 1, 2, ... of a frame: angle from forward, clockwise [deg], and how each turns."""
 CROSSES = ("crazyflie", "crazyflie_brushless", "pelican_x")
 
@@ -340,8 +361,16 @@ def test_what_sitl_and_sih_cannot_be_is_left_out_with_its_reason() -> None:
     assert "SIH_" not in "".join(line for line in done.texts["pelican_x.params"].splitlines() if line[0] != "#")
 
 
-@pytest.mark.parametrize(("asked", "form"), [("sdf", "gazebo"), ("mjcf", "mujoco"), ("crazyflow", "drone-models"),
-                                             ("SITL", "ardupilot"), ("isaac", "isaac-lab")])  # fmt: skip
+@pytest.mark.parametrize(
+    ("asked", "form"),
+    [
+        ("sdf", "gazebo"),
+        ("mjcf", "mujoco"),
+        ("crazyflow", "drone-models"),
+        ("SITL", "ardupilot"),
+        ("isaac", "isaac-lab"),
+    ],
+)
 def test_programs_and_kinds_of_files_name_a_form(asked: str, form: str) -> None:
     cross = Vehicle.shipped("pelican_x")
     assert exported(cross, asked).texts == exported(cross, form).texts

@@ -127,9 +127,15 @@ def test_report_is_one_file_that_asks_for_nothing(done: tuple[Run, dict[str, Any
     assert not re.search(r"""(src|href|action)\s*=\s*["']?(https?:)?//""", body)
     assert "default-src 'none'" in body
     for expected in (
-        "All 6 parameters identified", "sha256", "quadid identify", "seed", "train.mcap", "unseen.csv",
-        "What to fly next", "Cramér–Rao",
-    ):  # fmt: skip
+        "All 6 parameters identified",
+        "sha256",
+        "quadid identify",
+        "seed",
+        "train.mcap",
+        "unseen.csv",
+        "What to fly next",
+        "Cramér–Rao",
+    ):
         assert expected in body
 
 
@@ -219,9 +225,7 @@ def test_what_rests_on_a_bound_is_not_identified(inside: Cli, flights: Flights, 
 # --- `--columns` names the columns of a CSV wherever a log is read
 
 
-COMMANDS = {
-    "score": (), "replay": ("--diagnose", "0"), "excite": ("--seconds", "6.5"), "fleet": ("--workers", "1"),
-}  # fmt: skip
+COMMANDS = {"score": (), "replay": ("--diagnose", "0"), "excite": ("--seconds", "6.5"), "fleet": ("--workers", "1")}
 
 
 @pytest.fixture(scope="module")
@@ -526,8 +530,9 @@ def test_wrong_units_are_refused_and_shown(inside: Cli, flights: Flights, tmp_pa
 def test_logs_that_cannot_be_read_are_named(inside: Cli, flights: Flights, tmp_path: Path) -> None:
     (tmp_path / "empty.bin").write_bytes(b"")
     report = tmp_path / "why.html"
-    run = inside("identify", flights.train, tmp_path / "empty.bin", "--vehicle", "pelican", "--report", report,
-                 "--out", tmp_path)  # fmt: skip
+    run = inside(
+        "identify", flights.train, tmp_path / "empty.bin", "--vehicle", "pelican", "--report", report, "--out", tmp_path
+    )
     one_line(run, 2)
     page = report.read_text(encoding="utf-8")
     assert "empty.bin" in page

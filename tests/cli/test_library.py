@@ -108,9 +108,14 @@ def test_drawn_vehicles_have_the_covariance_and_fly(logs: dict[str, str]) -> Non
 def test_what_is_freed_fixed_and_stated_is_fitted_so_by_library_and_command(inside: Cli, tmp_path: Path) -> None:
     late = quadid.simulate(seconds=20.0, effects=["motor_lag:tau=0.04"]).save(tmp_path / "late.csv")
     fit = quadid.identify(
-        late, vehicle="pelican", free=["motor_lag.tau"], effects={"motor_lag": {"tau": 0.02}}, fix=["J_r"],
-        bounds={"J_xx": (5e-3, 3e-2)}, priors={"d": (5e-7, 1e-8)},
-    )  # fmt: skip
+        late,
+        vehicle="pelican",
+        free=["motor_lag.tau"],
+        effects={"motor_lag": {"tau": 0.02}},
+        fix=["J_r"],
+        bounds={"J_xx": (5e-3, 3e-2)},
+        priors={"d": (5e-7, 1e-8)},
+    )
     run = inside(
         "identify", late, "--vehicle", "pelican", "--effect", "motor_lag:tau=0.02", "--free", "motor_lag.tau",
         "--fix", "J_r", "--bounds", "J_xx=5e-3:3e-2", "--prior", "d=5e-7:1e-8", "--out", tmp_path, "--json", "-",
@@ -215,8 +220,12 @@ def test_a_healthy_flight_has_a_table_of_changes_without_rows() -> None:
     trims = [flight_trim(hover(Vehicle.shipped("pelican_x"), seed=k), Vehicle.shipped("pelican_x")) for k in range(7)]
     found = assess(trims[:1], trims[1:], Vehicle.shipped("pelican_x"))
     none = HealthOutcome({"changes": []}, found, Vehicle.shipped("pelican_x"), ())
-    some = {"effect": "thrust_drop", "confident": True, "p_value": 0.1, "parameters": [
-        {"name": "fraction", "unit": "", "value": 0.1, "ci95": None}]}  # fmt: skip
+    some = {
+        "effect": "thrust_drop",
+        "confident": True,
+        "p_value": 0.1,
+        "parameters": [{"name": "fraction", "unit": "", "value": 0.1, "ci95": None}],
+    }
     one = HealthOutcome({"changes": [some]}, found, Vehicle.shipped("pelican_x"), ())
     assert len(none.to_frame()) == 0
     assert list(none.to_frame()) == list(one.to_frame())
@@ -236,10 +245,7 @@ def test_a_healthy_flight_has_a_table_of_changes_without_rows() -> None:
         (lambda log: quadid.identify(log, vehicle="pelican", seed=-1), "seed -1"),
         (lambda log: quadid.diagnose(log, vehicle="pelican", seed=cast(int, 1.5)), "seed 1.5"),
         (lambda log: quadid.score(log, vehicle="pelican", horizons=cast(list[int], [1.5])), "horizons [1.5]"),
-        (
-            lambda log: quadid.score(log, vehicle="pelican", horizons="1;10"),
-            "--horizons 1;10",
-        ),
+        (lambda log: quadid.score(log, vehicle="pelican", horizons="1;10"), "--horizons 1;10"),
         (lambda log: compare(log, vehicle="pelican", seeds=0), "no seed"),
         (lambda log: compare(log, vehicle="pelican", budget=3), "budget 3"),
         (lambda _: init("mine", mass=-1.0), "mass -1"),
@@ -264,9 +270,12 @@ def test_a_printed_fit_says_what_its_values_rest_on(logs: dict[str, str]) -> Non
 def test_vehicles_are_drawn_by_the_names_that_were_fitted(tmp_path: Path) -> None:
     late = quadid.simulate(seconds=20.0, effects=["motor_lag:tau=0.04"]).save(tmp_path / "late.csv")
     fit = quadid.identify(
-        late, vehicle="pelican", free=["motor_lag.tau"], fix=["J_r"],
+        late,
+        vehicle="pelican",
+        free=["motor_lag.tau"],
+        fix=["J_r"],
         effects={"motor_lag": {"tau": 0.02}, "rotor_drag": {"k_x": 0.1, "k_y": 0.1}},
-    )  # fmt: skip
+    )
     thetas, floors = fit.sample(2000)
     layout = Layout(fit.vehicle)
     drawn = {name: thetas[:, layout.entry(name).index] for name in (*fit.parameters.names, "J_r", "rotor_drag.k_x")}

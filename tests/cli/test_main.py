@@ -95,12 +95,19 @@ def test_a_terminal_sees_that_a_command_is_loaded_until_it_prints(
     assert out.getvalue() == "answer\n"
 
 
-@pytest.mark.parametrize(("command", "heavy"), [
-    ("--help", "numpy numba scipy pydantic rich plotly yaml"), ("--version", "numpy numba scipy pydantic rich"),
-    ("vehicles", "numba scipy plotly"), ("init mine", "numba scipy plotly"),
-    ("history --vehicle pelican", "numba plotly"), ("identify --help", "numba scipy plotly"),
-    ("score --help", "numba scipy plotly"), ("export --help", "numba scipy plotly"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("command", "heavy"),
+    [
+        ("--help", "numpy numba scipy pydantic rich plotly yaml"),
+        ("--version", "numpy numba scipy pydantic rich"),
+        ("vehicles", "numba scipy plotly"),
+        ("init mine", "numba scipy plotly"),
+        ("history --vehicle pelican", "numba plotly"),
+        ("identify --help", "numba scipy plotly"),
+        ("score --help", "numba scipy plotly"),
+        ("export --help", "numba scipy plotly"),
+    ],
+)
 def test_what_works_without_a_fit_imports_nothing_heavy(tmp_path: Path, command: str, heavy: str) -> None:
     check = (
         f"import sys; sys.argv = ['quadid', *{command.split()}]; from quadid.cli.main import app_main; app_main(); "
@@ -137,16 +144,23 @@ def test_version(inside: Cli) -> None:
     assert inside("--version").out == f"quadid {__version__}\n"
 
 
-@pytest.mark.parametrize(("slip", "names", "meant"), [
-    ("motor_lga", EFFECTS, "'motor_lag'?"), ("RotorDrag", EFFECTS, "'rotor_drag'?"),
-    ("weak_motor", EFFECTS, "'weak_rotor'?"),
-    ("bias", EFFECTS, "'gyro_bias' or 'accel_bias'?"), ("spin_up", EFFECTS, "'rotor_spin_up'?"),
-    ("J_z", NOMINAL_UNITS, "'J_zz'?"), ("thruststand", Vehicle.model_fields, "'thrust_stand'?"),
-    ("maxspeed", Command.model_fields, "'max_speed'?"),
-    ("max_rpm", Command.model_fields, "'max_speed', in SI units, not rpm?"),
-    ("range_us", Command.model_fields, "'range'?"), ("gyro_dps", Noise.model_fields, "'gyro', in SI units, not dps?"),
-    ("compare_vehicles", COMMANDS, "'compare-vehicles'?"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("slip", "names", "meant"),
+    [
+        ("motor_lga", EFFECTS, "'motor_lag'?"),
+        ("RotorDrag", EFFECTS, "'rotor_drag'?"),
+        ("weak_motor", EFFECTS, "'weak_rotor'?"),
+        ("bias", EFFECTS, "'gyro_bias' or 'accel_bias'?"),
+        ("spin_up", EFFECTS, "'rotor_spin_up'?"),
+        ("J_z", NOMINAL_UNITS, "'J_zz'?"),
+        ("thruststand", Vehicle.model_fields, "'thrust_stand'?"),
+        ("maxspeed", Command.model_fields, "'max_speed'?"),
+        ("max_rpm", Command.model_fields, "'max_speed', in SI units, not rpm?"),
+        ("range_us", Command.model_fields, "'range'?"),
+        ("gyro_dps", Noise.model_fields, "'gyro', in SI units, not dps?"),
+        ("compare_vehicles", COMMANDS, "'compare-vehicles'?"),
+    ],
+)
 def test_a_slip_is_told_what_was_meant(slip: str, names: Iterable[str], meant: str) -> None:
     assert nearest(slip, names) == f"did you mean {meant}"
 
@@ -203,9 +217,13 @@ def on_a_terminal(arguments: list[str], cwd: Path, **environment: str) -> str:
     leader, follower = pty.openpty()
     plain = {k: v for k, v in os.environ.items() if k not in ("NO_COLOR", "FORCE_COLOR", "CI", "COLUMNS")}
     process = subprocess.Popen(
-        [*QUADID, *arguments], stdin=follower, stdout=follower, stderr=follower, cwd=cwd,
+        [*QUADID, *arguments],
+        stdin=follower,
+        stdout=follower,
+        stderr=follower,
+        cwd=cwd,
         env={**plain, "TERM": "xterm-256color", "COLUMNS": "120", **environment},
-    )  # fmt: skip
+    )
     os.close(follower)
     parts = []
     while True:
@@ -240,11 +258,7 @@ def test_a_pipe_gets_plain_text_and_no_progress(quadid: Cli, flights: Flights, t
 
 @pytest.mark.parametrize(
     ("words", "expected"),
-    [
-        ("quadid i", "inspect"),
-        ("quadid identify --vehicle pel", "pelican_x"),
-        ("quadid diagnose --val", "--validate"),
-    ],
+    [("quadid i", "inspect"), ("quadid identify --vehicle pel", "pelican_x"), ("quadid diagnose --val", "--validate")],
 )
 def test_the_shell_completes_commands_options_and_vehicles(quadid: Cli, words: str, expected: str) -> None:
     count = str(len(words.split()) - 1)
@@ -437,33 +451,56 @@ def test_a_pipe_where_time_stamps_of_signatures_were_kept_is_said(tmp_path: Path
 
 
 PARAMETERS = [
-    {"name": name, "unit": unit, "value": 1.23456e-5 * (i + 1), "ci95": [1.23356e-5 * (i + 1), 1.23556e-5 * (i + 1)],
-     "initial": 2e-5, "status": "identified"}
+    {
+        "name": name,
+        "unit": unit,
+        "value": 1.23456e-5 * (i + 1),
+        "ci95": [1.23356e-5 * (i + 1), 1.23556e-5 * (i + 1)],
+        "initial": 2e-5,
+        "status": "identified",
+    }
     for i, (name, unit) in enumerate(NOMINAL_UNITS.items())
-]  # fmt: skip
+]
 SET = {
-    "sequence": 3, "wall": 1.7e9, "state": "rolled_back", "approved_by": "operator", "start": 1.0, "stop": 59.0,
-    "mse": 1.234, "parameters": PARAMETERS, "reason": "it predicts new windows worse than its predecessor",
-    "reference": "none", "reference_sd": 0.09,
-}  # fmt: skip
+    "sequence": 3,
+    "wall": 1.7e9,
+    "state": "rolled_back",
+    "approved_by": "operator",
+    "start": 1.0,
+    "stop": 59.0,
+    "mse": 1.234,
+    "parameters": PARAMETERS,
+    "reason": "it predicts new windows worse than its predecessor",
+    "reference": "none",
+    "reference_sd": 0.09,
+}
 METHOD = {
-    "name": "differential_evolution", "mse": {"train": 1.2345, "validate": [2.3456, 3.4567]},
-    "mse_paper": {"train": 4.5678}, "evaluations": 4000, "seconds": 12.3, "failures": 1, "runs": 3, "note": "stopped",
-}  # fmt: skip
+    "name": "differential_evolution",
+    "mse": {"train": 1.2345, "validate": [2.3456, 3.4567]},
+    "mse_paper": {"train": 4.5678},
+    "evaluations": 4000,
+    "seconds": 12.3,
+    "failures": 1,
+    "runs": 3,
+    "note": "stopped",
+}
 EXCITED = {
-    "seconds": 58.5, "worst": "J_r", "gain": 7.3, "manoeuvre_file": "m.yaml", "files": [],
+    "seconds": 58.5,
+    "worst": "J_r",
+    "gain": 7.3,
+    "manoeuvre_file": "m.yaml",
+    "files": [],
     "parameters": [
         {"name": name, "now": 0.00569, "gentle_flight": 0.00567, "manoeuvre": 0.00409, "one_axis_at_a_time": 0.00543}
         for name in NOMINAL_UNITS
     ],
     "movements": [{"name": "roll + pitch + yaw + throttle, 0.8 to 2 Hz", "amplitudes": {"roll": 0.2, "yaw": 0.15}}],
-    "peak": {"tilt_deg": 23.0, "rate_deg_s": 120.0}, "room": {"sideways_m": 5.0, "up_m": 0.1, "down_m": 0.1},
+    "peak": {"tilt_deg": 23.0, "rate_deg_s": 120.0},
+    "room": {"sideways_m": 5.0, "up_m": 0.1, "down_m": 0.1},
     "envelope": {"lowest_m": 10, "highest_m": 40, "radius_m": 10, "abort_tilt_deg": 32, "battery_percent": 40},
-}  # fmt: skip
+}
 COMPARED = {"validate": ["other.mcap", "third.mcap"], "methods": [METHOD], "budget": 4000}
-REPLAYED = {
-    "vehicle": "pelican", "events": [], "refused": {"held_out_gain": 27}, "published": [SET], "status": {},
-}  # fmt: skip
+REPLAYED = {"vehicle": "pelican", "events": [], "refused": {"held_out_gain": 27}, "published": [SET], "status": {}}
 STORED = {"vehicle": "pelican", "sets": [SET], "vehicles": [], "candidates": [], "events": [], "in_force": None}
 FLEET = {
     "units": [{"unit": "airframe-07", "logs": 2, "done": 2, "parameters": [
@@ -473,16 +510,24 @@ FLEET = {
     "logs": 2, "copies": [], "seconds": 1.0, "files": [], "report": "fleet.html",
 }  # fmt: skip
 SHOWN: dict[str, tuple[Callable[..., Any], tuple[str, ...]]] = {
-    "excite": (lambda: conclude(Proposed(EXCITED, *[cast(Any, None)] * 4), None),
-               ("0.569 %", "0.567 %", "0.409 %", "0.543 %")),
-    "compare": (lambda: conclude(Methods(COMPARED), None),
-                ("differential_evolution", "1.234", "2.346", "3.457", "4000", "12.3", "1/3")),
-    "fleet": (lambda: conclude(Fleet(FLEET, [], []), None),
-              ("airframe-07", "J_xx", "1.235e-05", "N s^2/rad^2", "1.2 %")),
+    "excite": (
+        lambda: conclude(Proposed(EXCITED, *[cast(Any, None)] * 4), None),
+        ("0.569 %", "0.567 %", "0.409 %", "0.543 %"),
+    ),
+    "compare": (
+        lambda: conclude(Methods(COMPARED), None),
+        ("differential_evolution", "1.234", "2.346", "3.457", "4000", "12.3", "1/3"),
+    ),
+    "fleet": (
+        lambda: conclude(Fleet(FLEET, [], []), None),
+        ("airframe-07", "J_xx", "1.235e-05", "N s^2/rad^2", "1.2 %"),
+    ),
     "replay": (lambda: conclude(Replayed(REPLAYED), None), ("1.2346e-05", "7.4074e-05", "identified", "held out gain")),
-    "history": (lambda: conclude(Stored(STORED), None),
-                ("operator", "rolled_back", "1.23", "1.235e-05", "7.407e-05", "predecessor")),
-}  # fmt: skip
+    "history": (
+        lambda: conclude(Stored(STORED), None),
+        ("operator", "rolled_back", "1.23", "1.235e-05", "7.407e-05", "predecessor"),
+    ),
+}
 
 
 @pytest.mark.parametrize("width", [60, 80])
@@ -689,13 +734,7 @@ def test_the_vehicle_file_read_is_never_overwritten(inside: Cli, flights: Flight
         assert file.read_text(encoding="utf-8") == text
 
 
-@pytest.mark.parametrize(
-    ("arguments", "expected"),
-    [
-        (("--rate", "0"), "grid rate"),
-        (("--rate", "nan"), "grid rate"),
-    ],
-)
+@pytest.mark.parametrize(("arguments", "expected"), [(("--rate", "0"), "grid rate"), (("--rate", "nan"), "grid rate")])
 def test_impossible_options(
     inside: Cli, flights: Flights, tmp_path: Path, arguments: tuple[str, ...], expected: str
 ) -> None:

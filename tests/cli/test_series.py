@@ -40,9 +40,19 @@ RATES = "pqr"
 def result(quadid: Cli, flights: Flights, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     folder = tmp_path_factory.mktemp("series")
     run = quadid(
-        "identify", flights.train, "--validate", flights.unseen, "--vehicle", "pelican", "--out", folder,
-        "--series", folder / "over" / "time", "--json", "-",
-    )  # fmt: skip
+        "identify",
+        flights.train,
+        "--validate",
+        flights.unseen,
+        "--vehicle",
+        "pelican",
+        "--out",
+        folder,
+        "--series",
+        folder / "over" / "time",
+        "--json",
+        "-",
+    )
     assert run.code == 0, run.err
     return dict(run.data)
 
@@ -121,9 +131,11 @@ def test_a_file_where_the_folder_should_be_is_refused_before_anything_is_read(in
 
 
 RANDOM = RandomForces(
-    horizontal=RandomInput(sigma=0.8, time=0.5), vertical=RandomInput(sigma=0.3, time=0.3),
-    roll_pitch=RandomInput(sigma=2.0, time=0.2), yaw=RandomInput(sigma=0.5, time=0.5),
-)  # fmt: skip
+    horizontal=RandomInput(sigma=0.8, time=0.5),
+    vertical=RandomInput(sigma=0.3, time=0.3),
+    roll_pitch=RandomInput(sigma=2.0, time=0.2),
+    yaw=RandomInput(sigma=0.5, time=0.5),
+)
 
 
 def uncertain(share: float = 0.02, random: RandomForces | None = RANDOM) -> Vehicle:

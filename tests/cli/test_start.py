@@ -38,9 +38,12 @@ print(json.dumps({k.__name__: len(k.signatures) for name in FIT for k in PARTS[n
 def python(text: str, *arguments: str, **environment: str) -> str:
     """Output of a Python of its own."""
     run = subprocess.run(
-        [sys.executable, "-c", text, *arguments], env={**os.environ, **environment}, capture_output=True, text=True,
+        [sys.executable, "-c", text, *arguments],
+        env={**os.environ, **environment},
+        capture_output=True,
+        text=True,
         check=True,
-    )  # fmt: skip
+    )
     return run.stdout
 
 
@@ -97,10 +100,14 @@ def test_machine_code_on_disk_that_cannot_be_read_is_compiled_again(tmp_path: Pa
 QUADID = Path(sys.executable).with_name("quadid")
 
 
-@pytest.mark.parametrize("command", [
-    (str(QUADID), "vehicles"), (sys.executable, "-P", "-m", "quadid_node.identify", "flight.mcap"),
-    (sys.executable, "-P", "-m", "quadid_node.replay_node", "flight.mcap"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "command",
+    [
+        (str(QUADID), "vehicles"),
+        (sys.executable, "-P", "-m", "quadid_node.identify", "flight.mcap"),
+        (sys.executable, "-P", "-m", "quadid_node.replay_node", "flight.mcap"),
+    ],
+)
 def test_settings_of_numba_that_lie_in_the_folder_are_refused(
     tmp_path: Path, command: tuple[str, ...], happened: Happened
 ) -> None:
@@ -173,10 +180,15 @@ def test_processes_of_libraries_do_not_import_from_it_either(planted: Path, path
     assert not (planted / "ran").exists()
 
 
-@pytest.mark.parametrize(("start", "lines"), [
-    ("{here}", "import quadid"), ("{here}", "import quadid.vehicle"), ("{here}", "import os, quadid.app.logs"),
-    ("/", "import os, quadid\nos.chdir('{here}')\nimport quadid.model.kernel"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("start", "lines"),
+    [
+        ("{here}", "import quadid"),
+        ("{here}", "import quadid.vehicle"),
+        ("{here}", "import os, quadid.app.logs"),
+        ("/", "import os, quadid\nos.chdir('{here}')\nimport quadid.model.kernel"),
+    ],
+)
 def test_a_library_refuses_them_too_also_in_a_folder_that_it_changes_to(tmp_path: Path, start: str, lines: str) -> None:
     (tmp_path / ".numba_config.yaml").write_text("cache_dir: /tmp/somebody\n")
     where, code = (text.format(here=tmp_path) for text in (start, lines))
@@ -265,10 +277,15 @@ def test_names_of_rooms_are_functions_also_after_an_old_import(name: str) -> Non
     assert pickle.loads(pickle.dumps(function)) is function
 
 
-@pytest.mark.parametrize("statement", [
-    "import quadid_cli.main", "import quadid.baselines.order", "from quadid.identify.fit import fit",
-    "from quadid.diagnose import Diagnosis",
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "statement",
+    [
+        "import quadid_cli.main",
+        "import quadid.baselines.order",
+        "from quadid.identify.fit import fit",
+        "from quadid.diagnose import Diagnosis",
+    ],
+)
 def test_old_statements_work_alone(statement: str) -> None:
     done = subprocess.run([sys.executable, "-W", "always", "-c", statement], check=True, capture_output=True, text=True)
     assert "DeprecationWarning" in done.stderr

@@ -25,11 +25,19 @@ def linear(rng: np.random.Generator, segments: int) -> tuple[Linearised, FloatAr
     b, r = rng.standard_normal((segments, ROWS, WIDTH)), rng.standard_normal((segments, ROWS))
     nothing = np.zeros((segments, 1))
     lin = Linearised(
-        gram=np.einsum("srp,srq->spq", b, b), grad=np.einsum("srp,sr->sp", b, r), cost=np.sum(r * r, axis=1),
-        occam=np.zeros(segments), rows=np.full(segments, float(ROWS)), residuals=nothing, weights=nothing,
-        back=(nothing, nothing), window=np.zeros(segments, dtype=np.intp),
-        time=3.0 + np.arange(segments, dtype=np.float64), states=MEASURED, n_pre=1,
-    )  # fmt: skip
+        gram=np.einsum("srp,srq->spq", b, b),
+        grad=np.einsum("srp,sr->sp", b, r),
+        cost=np.sum(r * r, axis=1),
+        occam=np.zeros(segments),
+        rows=np.full(segments, float(ROWS)),
+        residuals=nothing,
+        weights=nothing,
+        back=(nothing, nothing),
+        window=np.zeros(segments, dtype=np.intp),
+        time=3.0 + np.arange(segments, dtype=np.float64),
+        states=MEASURED,
+        n_pre=1,
+    )
     return lin, b, r
 
 

@@ -180,10 +180,13 @@ def test_what_is_late_is_not_known_beside_inertias_that_are_not_to_be_used() -> 
 @pytest.mark.parametrize(
     ("name", "value", "believed"),
     [
-        ("thrust_drop.fraction", 0.015, False), ("thrust_drop.fraction", -0.015, False),
-        ("thrust_drop.fraction", 0.05, True), ("wind.north", 0.4, False), ("wind.east", -2.0, True),
+        ("thrust_drop.fraction", 0.015, False),
+        ("thrust_drop.fraction", -0.015, False),
+        ("thrust_drop.fraction", 0.05, True),
+        ("wind.north", 0.4, False),
+        ("wind.east", -2.0, True),
     ],
-)  # fmt: skip
+)
 def test_what_any_flight_may_have_is_no_event_and_no_wind(name: str, value: float, believed: bool) -> None:
     problem = clean()
     layout = problem.shooting.layout

@@ -34,9 +34,16 @@ HIDDEN: dict[str, dict[str, dict[str, float]]] = {
 
 def climbing(hidden: dict[str, dict[str, float]], seed: int) -> Window:
     return fly(
-        PELICAN, draw_truth(PELICAN, SEED), SECONDS, seed, "scripted", effects=hidden, extras=("velocity",),
-        segments=SWELL, altitude=40.0,
-    ).window  # fmt: skip
+        PELICAN,
+        draw_truth(PELICAN, SEED),
+        SECONDS,
+        seed,
+        "scripted",
+        effects=hidden,
+        extras=("velocity",),
+        segments=SWELL,
+        altitude=40.0,
+    ).window
 
 
 @pytest.mark.parametrize("case", HIDDEN)

@@ -93,8 +93,11 @@ def test_every_call_of_a_recipe_has_types(recipes: list[str], repository: Path, 
     file.write_text("\n".join(recipes), encoding="utf-8")
     checked = subprocess.run(
         [sys.executable, "-m", "mypy", "--config-file", str(repository / "pyproject.toml"), str(file)],
-        cwd=repository, capture_output=True, text=True, check=False,
-    )  # fmt: skip
+        cwd=repository,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     assert checked.returncode == 0, checked.stdout
 
 

@@ -54,8 +54,14 @@ def matrices() -> tuple[FloatArray, FloatArray, FloatArray]:
     G[range(k.FO, k.N), range(9)] = 1.0
     # Noise of every rotor speed, constant over the step: thrust and moments of 2 b omega n.
     (x, y), b = PELICAN.rotor_positions[:, :2].T, PELICAN.initial[0]
-    up = np.stack([-b / PELICAN.mass * np.ones(4), -b / PELICAN.initial[2] * y, b / PELICAN.initial[3] * x,
-                   PELICAN.initial[1] / PELICAN.initial[4] * PELICAN.spins])  # fmt: skip
+    up = np.stack(
+        [
+            -b / PELICAN.mass * np.ones(4),
+            -b / PELICAN.initial[2] * y,
+            b / PELICAN.initial[3] * x,
+            PELICAN.initial[1] / PELICAN.initial[4] * PELICAN.spins,
+        ]
+    )
     act = np.zeros((k.N, 4))
     act[k.VE + 2, 0] = h
     for i in range(3):
@@ -70,8 +76,9 @@ def matrices() -> tuple[FloatArray, FloatArray, FloatArray]:
 
 def measured(track: Track) -> tuple[FloatArray, FloatArray]:
     """Measurements as deviations from hover, shape (n, 12), and whether there are any."""
-    y = np.column_stack([track.y[:, :3], 2.0 * track.y[:, 4:7], track.y[:, 7:10] + [0.0, 0.0, 9.80665],
-                         track.y[:, 10:13]])  # fmt: skip
+    y = np.column_stack(
+        [track.y[:, :3], 2.0 * track.y[:, 4:7], track.y[:, 7:10] + [0.0, 0.0, 9.80665], track.y[:, 10:13]]
+    )
     return y, np.repeat(track.seen, 3, axis=1)
 
 

@@ -150,13 +150,23 @@ def test_rows_without_a_measurement_are_rows_of_the_whole_model_too() -> None:
 
 
 STRONG = {
-    "motor_lag": {"tau": 0.03}, "rotor_drag": {"k_x": 0.3, "k_y": 0.3}, "axial_inflow": {"k_z": 0.3},
-    "gyro_scale": {"x": 0.05}, "imu_lag": {"cutoff": 12.0},
-}  # fmt: skip
+    "motor_lag": {"tau": 0.03},
+    "rotor_drag": {"k_x": 0.3, "k_y": 0.3},
+    "axial_inflow": {"k_z": 0.3},
+    "gyro_scale": {"x": 0.05},
+    "imu_lag": {"cutoff": 12.0},
+}
 FREED = {
-    "rotor_drag.k_x": 0.2, "motor_lag.tau": 0.02, "axial_inflow.k_z": 0.2, "gyro_scale.x": 0.04, "imu_lag.period": 0.06,
-    "attitude_delay.delay": 0.01, "weak_rotor.loss_1": 0.02, "product_of_inertia.J_xy": 0.0, "parasitic_drag.c": 0.0,
-}  # fmt: skip
+    "rotor_drag.k_x": 0.2,
+    "motor_lag.tau": 0.02,
+    "axial_inflow.k_z": 0.2,
+    "gyro_scale.x": 0.04,
+    "imu_lag.period": 0.06,
+    "attitude_delay.delay": 0.01,
+    "weak_rotor.loss_1": 0.02,
+    "product_of_inertia.J_xy": 0.0,
+    "parasitic_drag.c": 0.0,
+}
 
 
 def test_gradient_by_any_entry_is_the_slope_of_the_squares() -> None:

@@ -17,9 +17,11 @@ from quadid.vehicle import ParameterPrior, RandomForces, RandomInput, Vehicle
 
 PELICAN = Vehicle.shipped("pelican")
 RANDOM = RandomForces(
-    horizontal=RandomInput(sigma=0.5, time=0.5), vertical=RandomInput(sigma=0.2, time=0.3),
-    roll_pitch=RandomInput(sigma=1.5, time=0.2), yaw=RandomInput(sigma=0.3, time=0.5),
-)  # fmt: skip
+    horizontal=RandomInput(sigma=0.5, time=0.5),
+    vertical=RandomInput(sigma=0.2, time=0.3),
+    roll_pitch=RandomInput(sigma=1.5, time=0.2),
+    yaw=RandomInput(sigma=0.3, time=0.5),
+)
 SEEDS = (1, 2, 3)
 QUANTITIES = ("velocity", "rotation", "rate")
 

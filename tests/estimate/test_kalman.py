@@ -153,14 +153,19 @@ def test_rotors_that_stand_still_have_no_drag() -> None:
 
 
 EFFECTS = {
-    "rotor_drag": {"k_x": 0.3, "k_y": 0.4}, "cg_offset": {"x": 0.004, "y": -0.003},
+    "rotor_drag": {"k_x": 0.3, "k_y": 0.4},
+    "cg_offset": {"x": 0.004, "y": -0.003},
     "rate_damping": {"l_p": 0.5, "m_q": 0.8, "n_r": 0.2},
-}  # fmt: skip
+}
 MORE = {
-    **EFFECTS, "rotor_drag": {"k_x": 0.3, "k_y": 0.4, "central": 1.0}, "motor_lag": {"tau": 0.03},
+    **EFFECTS,
+    "rotor_drag": {"k_x": 0.3, "k_y": 0.4, "central": 1.0},
+    "motor_lag": {"tau": 0.03},
     "weak_rotor": {"rotor": 2.0, "loss": 0.02},
-    "parasitic_drag": {"c": 0.05}, "gyro_scale": {"x": 0.02, "y": 0.0, "z": -0.03}, "imu_lever_arm": {"x": 0.05},
-}  # fmt: skip
+    "parasitic_drag": {"c": 0.05},
+    "gyro_scale": {"x": 0.02, "y": 0.0, "z": -0.03},
+    "imu_lever_arm": {"x": 0.05},
+}
 
 
 def blind(flight: Flight, vehicle: Vehicle) -> k.Track:

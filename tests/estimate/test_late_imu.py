@@ -25,9 +25,14 @@ def flown(noise: float = 0.1, **effects: dict[str, float]) -> Window:
 @pytest.mark.parametrize("noise", [0.1, 1.0, 3.0])
 @pytest.mark.parametrize(
     "effects",
-    [{}, {"gyro_scale": {"x": 0.05, "y": 0.05, "z": 0.05}}, {"attitude_delay": {"delay": 0.03}},
-     {"gyro_bias": {"x": 0.03}}, {"motor_lag": {"tau": 0.04}}],
-)  # fmt: skip
+    [
+        {},
+        {"gyro_scale": {"x": 0.05, "y": 0.05, "z": 0.05}},
+        {"attitude_delay": {"delay": 0.03}},
+        {"gyro_bias": {"x": 0.03}},
+        {"motor_lag": {"tau": 0.04}},
+    ],
+)
 def test_a_gyro_in_time_has_no_delay(noise: float, effects: dict[str, dict[str, float]]) -> None:
     assert delay_of([flown(noise, **effects)]) == 0.0
 

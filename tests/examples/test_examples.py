@@ -35,10 +35,14 @@ def run(
 ) -> subprocess.CompletedProcess[str]:
     """An example in a process of its own."""
     done = subprocess.run(
-        [sys.executable, str(repository / "examples" / name), *map(str, arguments)], cwd=cwd,
-        capture_output=True, text=True, timeout=900, check=False,
+        [sys.executable, str(repository / "examples" / name), *map(str, arguments)],
+        cwd=cwd,
+        capture_output=True,
+        text=True,
+        timeout=900,
+        check=False,
         env={**os.environ, "PYTHONPATH": os.pathsep.join([str(repository), os.environ.get("PYTHONPATH", "")])},
-    )  # fmt: skip
+    )
     assert done.returncode == code, done.stderr
     return done
 
@@ -63,10 +67,7 @@ def test_identify_in_ten_lines(repository: Path, tmp_path: Path) -> None:
     assert len(code) <= 10
 
 
-@pytest.mark.parametrize(
-    ("wrong", "reason"),
-    [("degrees", "deg/s"), ("rpm", "rpm"), ("swapped", "order")],
-)
+@pytest.mark.parametrize(("wrong", "reason"), [("degrees", "deg/s"), ("rpm", "rpm"), ("swapped", "order")])
 def test_the_example_refuses_what_the_command_refuses(
     wrong: str, reason: str, repository: Path, tmp_path: Path
 ) -> None:
@@ -187,8 +188,10 @@ def test_a_viewer_gets_every_topic_and_message(repository: Path, tmp_path: Path)
     command = [sys.executable, "-u", str(repository / "examples" / "foxglove_live.py"), str(log)]
     done = subprocess.Popen(
         [*command, "--port", "0", "--speed", "5"],
-        stdout=subprocess.PIPE, text=True, env={**os.environ, "PYTHONPATH": str(repository)},
-    )  # fmt: skip
+        stdout=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "PYTHONPATH": str(repository)},
+    )
     assert done.stdout is not None
     port = re.search(r":(\d+)$", done.stdout.readline().strip())
     assert port is not None

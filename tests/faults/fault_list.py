@@ -40,8 +40,7 @@ FAULTS: dict[int, Fault] = {
         "service continues and reports; data stay readable; a corrupted database is set aside",
     ),
     13: Fault(
-        "SIGINT or SIGTERM at any moment, power cut during a commit",
-        "exit < 2 s; last accepted set returns as stale",
+        "SIGINT or SIGTERM at any moment, power cut during a commit", "exit < 2 s; last accepted set returns as stale"
     ),
     14: Fault(
         "MAVLink unsigned, forged, replayed, far-future time stamp, flood",

@@ -80,9 +80,12 @@ def dataflash_log() -> bytes:
 
 
 LOGS: dict[str, Callable[[], bytes]] = {
-    "csv column": csv_log, "mcap topic": mcap_log, "mcap definition": mcap_type, "ulog message": ulog_log,
+    "csv column": csv_log,
+    "mcap topic": mcap_log,
+    "mcap definition": mcap_type,
+    "ulog message": ulog_log,
     "dataflash parameter": dataflash_log,
-}  # fmt: skip
+}
 
 
 @pytest.fixture(params=sorted(LOGS))
@@ -115,9 +118,10 @@ def test_a_reader_and_the_terminal_show_a_bounded_part_without_control_character
     assert "\u202e" not in told
     assert len(told) < 20 * LONGEST_LINE
     happened(
-        20, f"{what} of {path.stat().st_size >> 10} KiB with HTML, ANSI, NUL, SQL: nothing longer than "
-        f"{max(map(len, said))} characters from the reader, {len(told)} on the terminal, no control character"
-    )  # fmt: skip
+        20,
+        f"{what} of {path.stat().st_size >> 10} KiB with HTML, ANSI, NUL, SQL: nothing longer than "
+        f"{max(map(len, said))} characters from the reader, {len(told)} on the terminal, no control character",
+    )
 
 
 def test_a_megabyte_of_hostile_text_in_a_report_stays_text_and_data(happened: Happened) -> None:
@@ -201,13 +205,17 @@ EVIL_TEXT = "\x1b[31mred\u202eevil\u2028x\x85y\x9bz\x00 [bold red]m[/] <script>"
 FIELDS = ("reason", "approved_by", "outdated", "check", "input_hash")
 ROWS: dict[str, tuple[str, object]] = {
     "texts": ("data", json.dumps({**set_to_dict(online_set(TRUE)), **dict.fromkeys(FIELDS, EVIL_TEXT)})),
-    "a time of 1e300": ("wall", 1e300), "a time of words": ("wall", "abc"), "a time of bytes": ("wall", b"\xff"),
-    "an endless time": ("wall", float("inf")), "a list": ("data", "[]"), "a number": ("data", "3"),
+    "a time of 1e300": ("wall", 1e300),
+    "a time of words": ("wall", "abc"),
+    "a time of bytes": ("wall", b"\xff"),
+    "an endless time": ("wall", float("inf")),
+    "a list": ("data", "[]"),
+    "a number": ("data", "3"),
     "bytes": ("data", b"\xff\xfe"),
     "words for a stamp": ("data", json.dumps({**set_to_dict(online_set(TRUE)), "stop": "x"})),
     "no state": ("data", json.dumps({**set_to_dict(online_set(TRUE)), "state": None})),
     "parameters that are none": ("data", json.dumps({**set_to_dict(online_set(TRUE)), "parameters": [1]})),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("what", ROWS)

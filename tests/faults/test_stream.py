@@ -130,7 +130,4 @@ def test_a_killed_writer_loses_at_most_one_chunk(tmp_path: Path, after: int, hap
     a_chunk = CHUNK // (31 + len(next(file.messages(file.topics.keys()))[2])) + 1
     assert lost <= a_chunk
     assert any("recording was not closed" in w or "cut" in w for w in recording.warnings)
-    happened(
-        2,
-        f"killed with -9 after {written} messages: {max(lost, 0)} of them lost, a chunk holds {a_chunk}",
-    )
+    happened(2, f"killed with -9 after {written} messages: {max(lost, 0)} of them lost, a chunk holds {a_chunk}")

@@ -68,8 +68,9 @@ class SecondOpinion:
         row = int(np.floor((t - self.delay) / self.flight.window.dt + 1e-9))
         return np.asarray(self.flight.window.rotor_speed[row])
 
-    def wrench(self, t: float, omega: FloatArray, omega_dot: FloatArray, v_body: FloatArray, nu: FloatArray,
-               height: float) -> tuple[FloatArray, FloatArray]:  # fmt: skip
+    def wrench(
+        self, t: float, omega: FloatArray, omega_dot: FloatArray, v_body: FloatArray, nu: FloatArray, height: float
+    ) -> tuple[FloatArray, FloatArray]:
         """Force and torque about the CG, body axes."""
         p = self.truth
         power = 1.0

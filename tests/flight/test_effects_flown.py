@@ -128,9 +128,10 @@ def test_battery_sags_from_first_to_last_sample() -> None:
 
 
 def test_command_delay_may_be_any_fraction_of_a_sample() -> None:
-    delay, flight = 0.0263, fly(
-        PELICAN, seconds=10.0, seed=5, noise_scale=0.0, effects={"command_delay": {"delay": 0.0263}}
-    )  # fmt: skip
+    delay, flight = (
+        0.0263,
+        fly(PELICAN, seconds=10.0, seed=5, noise_scale=0.0, effects={"command_delay": {"delay": 0.0263}}),
+    )
     w, p = flight.window, flight.truth.parameters
     assert w.accel is not None
     pull = -p.b * (w.rotor_speed**2).sum(axis=1) / p.mass

@@ -96,8 +96,13 @@ def test_impossible_orders_are_refused() -> None:
 
 def test_individuals_are_like_their_type() -> None:
     assert TruthParameters.of(PELICAN).as_dict() == {
-        "b": 2.33e-5, "d": 4.96e-7, "J_xx": 1.00e-2, "J_yy": 1.36e-2, "J_zz": 2.92e-2, "J_r": 5.00e-5,
-    }  # fmt: skip
+        "b": 2.33e-5,
+        "d": 4.96e-7,
+        "J_xx": 1.00e-2,
+        "J_yy": 1.36e-2,
+        "J_zz": 2.92e-2,
+        "J_r": 5.00e-5,
+    }
     for name in VEHICLES:
         vehicle = Vehicle.shipped(name)
         base = TruthParameters.of(vehicle).as_dict()

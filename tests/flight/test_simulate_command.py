@@ -23,9 +23,17 @@ PELICAN = Vehicle.shipped("pelican")
 @pytest.mark.parametrize("suffix", ["csv", "mcap", "tlog"])
 def test_files(suffix: str, tmp_path: Path, inside: Cli) -> None:
     result = inside(
-        "simulate", tmp_path / f"a.{suffix}", "--seconds", "5", "--seed", "7", "--effect", "rotor_drag:k_x=0.3,k_y=0.2",
-        "--json", "-",
-    ).data  # fmt: skip
+        "simulate",
+        tmp_path / f"a.{suffix}",
+        "--seconds",
+        "5",
+        "--seed",
+        "7",
+        "--effect",
+        "rotor_drag:k_x=0.3,k_y=0.2",
+        "--json",
+        "-",
+    ).data
     assert result["schema"] == "quadid.simulate/1"
     assert result["effects"] == {"rotor_drag": {"k_x": 0.3, "k_y": 0.2}}
     assert result["log"] == str(tmp_path / f"a.{suffix}")

@@ -23,9 +23,14 @@ NAMES = ["pelican", "pelican_x", "hexacopter", "hummingbird", "crazyflie_brushle
 
 
 def steps(
-    gains: Mapping[str, float], mixer: FloatArray, reference: FloatArray, attitude: FloatArray, rate: FloatArray,
-    integral: FloatArray, dt: float,
-) -> FloatArray:  # fmt: skip
+    gains: Mapping[str, float],
+    mixer: FloatArray,
+    reference: FloatArray,
+    attitude: FloatArray,
+    rate: FloatArray,
+    integral: FloatArray,
+    dt: float,
+) -> FloatArray:
     """Rotor speeds (n, rotors) of n steps in a row from integral torques (3,)."""
     command = np.empty((len(reference), len(mixer)))
     after = np.array(integral[None], dtype=np.float64)

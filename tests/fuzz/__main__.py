@@ -62,8 +62,13 @@ def main() -> None:
         outcome = run(kind, first, count)
         _keep(kind, outcome, given.findings)
         counts = (outcome.read, outcome.refused, outcome.stopped, len(outcome.findings), round(outcome.seconds, 1))
-        entry = {"start": first, "stop": first + count, **dict(zip(COUNTED, counts, strict=True)),
-                 "date": f"{datetime.now(UTC):%Y-%m-%d}", "revision": revision}  # fmt: skip
+        entry = {
+            "start": first,
+            "stop": first + count,
+            **dict(zip(COUNTED, counts, strict=True)),
+            "date": f"{datetime.now(UTC):%Y-%m-%d}",
+            "revision": revision,
+        }
         runs = account.setdefault(kind, [])
         last = runs[-1] if runs else {}
         if all(

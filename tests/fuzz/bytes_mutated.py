@@ -67,8 +67,18 @@ def move(rng: Random, data: bytearray) -> None:
 
 
 MUTATIONS: Sequence[Callable[[Random, bytearray], None]] = (
-    flip_bit, flip_bit, set_byte, set_byte, set_integer, set_integer, set_number, delete, insert, repeat, move,
-)  # fmt: skip
+    flip_bit,
+    flip_bit,
+    set_byte,
+    set_byte,
+    set_integer,
+    set_integer,
+    set_number,
+    delete,
+    insert,
+    repeat,
+    move,
+)
 
 
 def mutate_bytes(rng: Random, data: bytes, times: int = 1) -> bytes:

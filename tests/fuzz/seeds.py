@@ -178,8 +178,9 @@ def _rosbag2_seeds() -> list[bytes]:
     """The rows of `rosbag2_format`: an IMU and rotors with their definitions, and an IMU whose type is known."""
     kinds = ("sensor_msgs/msg/Imu", "sensor_msgs/msg/JointState")
     messages: list[Callable[[int], Any]] = [
-        imu, lambda ns: {"header": header(ns), "name": ["a", "b", "c", "d"], "velocity": [400.0] * 4}
-    ]  # fmt: skip
+        imu,
+        lambda ns: {"header": header(ns), "name": ["a", "b", "c", "d"], "velocity": [400.0] * 4},
+    ]
     seeds = []
     for described in (True, False):
         rows = []

@@ -42,9 +42,11 @@ def check(path: Path, data: bytes) -> None:
 
 @FEW
 @given(
-    names=st.lists(NAMES, min_size=1, max_size=8), rows=st.lists(st.lists(CELLS, max_size=9), max_size=6),
-    separator=st.sampled_from(",;\t |"), end=st.sampled_from(("\n", "\r\n", "\r", "\n\n")),
-)  # fmt: skip
+    names=st.lists(NAMES, min_size=1, max_size=8),
+    rows=st.lists(st.lists(CELLS, max_size=9), max_size=6),
+    separator=st.sampled_from(",;\t |"),
+    end=st.sampled_from(("\n", "\r\n", "\r", "\n\n")),
+)
 def test_any_table_is_a_recording_or_one_error(
     tmp_path: Path, names: list[str], rows: list[list[str]], separator: str, end: str
 ) -> None:
@@ -55,8 +57,9 @@ def test_any_table_is_a_recording_or_one_error(
 @FEW
 @given(
     rows=st.lists(st.tuples(*[NUMBERS] * 8), min_size=1, max_size=8),
-    place=st.integers(0, 300), noise=st.binary(max_size=8),
-)  # fmt: skip
+    place=st.integers(0, 300),
+    noise=st.binary(max_size=8),
+)
 def test_a_flight_with_any_numbers_and_any_bytes_inside(
     tmp_path: Path, rows: list[tuple[str, ...]], place: int, noise: bytes
 ) -> None:

@@ -76,11 +76,13 @@ def test_any_text_is_a_vehicle_or_one_error(text: str) -> None:
 
 WITH_EFFECTS = PELICAN | {
     "effects": {
-        "motor_lag": {"tau": 0.03}, "rotor_drag": {"k_x": 0.2, "k_y": 0.2}, "weak_rotor": {"rotor": 3.0, "loss": 0.1},
+        "motor_lag": {"tau": 0.03},
+        "rotor_drag": {"k_x": 0.2, "k_y": 0.2},
+        "weak_rotor": {"rotor": 3.0, "loss": 0.1},
         "cg_offset": {"x": 0.001, "y": 0.0},
     },
     "reference_voltage": 12.0,
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("extreme", [1e308, -1e308, 5e-324, 1e-300, float("inf"), 10**400, 1e154, 1e30, 1e29, 1e-29])
@@ -146,9 +148,10 @@ SLIPS = {
     "a mass that may be none": (TEXT + "mass_sigma: 1.4\n", "mass_sigma 1.4 is no less than the mass"),
     "a correlation with itself": (TEXT + "correlation: {b: {b: 0.5}}\n", "b beside itself"),
     "b of another unit": (
-        TEXT.replace("2.0e-05", "2.0e-19").replace("1.0e-05, 5.0e-05", "1.0e-19, 5.0e-19"), "b within its bounds"
+        TEXT.replace("2.0e-05", "2.0e-19").replace("1.0e-05, 5.0e-05", "1.0e-19, 5.0e-19"),
+        "b within its bounds",
     ),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", [*TRAPS, *SLIPS])

@@ -15,9 +15,15 @@ STEP, EVERY = 1e-3, 20
 
 
 def fly_fast(
-    vehicle: Vehicle, seconds: float, seed: int, kp: float, kd: float, act_every: int = 1, lag: float = 0.0,
+    vehicle: Vehicle,
+    seconds: float,
+    seed: int,
+    kp: float,
+    kd: float,
+    act_every: int = 1,
+    lag: float = 0.0,
     noise: float = 1.0,
-) -> Window:  # fmt: skip
+) -> Window:
     """Flies random attitude steps and logs at 50 Hz: gyro and attitude at instants, means of force and speeds.
 
     Args:

@@ -73,9 +73,9 @@ HIDDEN = {"rotor_drag": {"k_x": 0.3, "k_y": 0.3}, "weak_rotor": {"rotor": 2.0, "
 
 
 def test_where_nothing_moves_intervals_are_wide_but_end(tmp_path: Path) -> None:
-    quadid.simulate(
-        "pelican", seconds=30.0, seed=5, profile="hover", effects=["weak_rotor:rotor=2,loss=0.1"]
-    ).save(tmp_path / "hover.csv")  # fmt: skip
+    quadid.simulate("pelican", seconds=30.0, seed=5, profile="hover", effects=["weak_rotor:rotor=2,loss=0.1"]).save(
+        tmp_path / "hover.csv"
+    )
     for p in quadid.identify(tmp_path / "hover.csv", vehicle="pelican").parameters:
         least, most = p.bounds
         assert least / 20.0 < p.ci95[0] < p.ci95[1] < 20.0 * most, p

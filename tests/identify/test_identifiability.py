@@ -49,9 +49,11 @@ def test_only_identified_values_are_written_with_a_sigma(found: Fit) -> None:
 def test_a_guess_beside_identified_moments_stays_a_rigid_body(found: Fit) -> None:
     J_zz = found.vehicle.parameters["J_zz"].initial
     small = changed(
-        found, J_xx=(0.1 * J_zz, Status.IDENTIFIED), J_yy=(0.1 * J_zz, Status.IDENTIFIED),
+        found,
+        J_xx=(0.1 * J_zz, Status.IDENTIFIED),
+        J_yy=(0.1 * J_zz, Status.IDENTIFIED),
         J_zz=(J_zz, Status.UNRELIABLE),
-    )  # fmt: skip
+    )
     written = Vehicle.from_yaml(fitted_vehicle(small).to_yaml()).parameters
     assert written["J_zz"].initial == pytest.approx(0.2 * J_zz)
     assert written["J_zz"].sigma is None
@@ -100,9 +102,15 @@ def test_a_prior_that_decides_is_named() -> None:
 
 @pytest.mark.parametrize(
     ("value", "low", "high", "rests"),
-    [(1.0005, 1.0, 2.0, True), (1.002, 1.0, 2.0, False), (1.999, 1.0, 2.0, True), (0.0, 0.0, 0.2, True),
-     (0.001, 0.0, 0.2, False), (1.0, -np.inf, np.inf, False)],
-)  # fmt: skip
+    [
+        (1.0005, 1.0, 2.0, True),
+        (1.002, 1.0, 2.0, False),
+        (1.999, 1.0, 2.0, True),
+        (0.0, 0.0, 0.2, True),
+        (0.001, 0.0, 0.2, False),
+        (1.0, -np.inf, np.inf, False),
+    ],
+)
 def test_one_tolerance_says_what_rests_on_a_bound(value: float, low: float, high: float, rests: bool) -> None:
     assert at_bound(value, low, high) is rests
 

@@ -90,9 +90,17 @@ def test_constriction_coefficient_is_the_published_one() -> None:
 
 
 def algorithm_1(
-    cost: Callable[[list[float]], float], lower: list[float], upper: list[float], n: int, iterations: int,
-    w: tuple[float, float], c1: float, c2: float, seed: int, batch: bool,
-) -> list[float]:  # fmt: skip
+    cost: Callable[[list[float]], float],
+    lower: list[float],
+    upper: list[float],
+    n: int,
+    iterations: int,
+    w: tuple[float, float],
+    c1: float,
+    c2: float,
+    seed: int,
+    batch: bool,
+) -> list[float]:
     """The paper's Algorithm 1 in plain scalars, line by line; returns the cost of g_best after every iteration.
 
     `batch` postpones line 7 until all particles have moved, which is how a vectorised swarm runs.

@@ -62,9 +62,16 @@ def case(window: Window, names: Sequence[str], **values: float) -> Case:
         fresh = Shooting.cut([window], PELICAN, 0.4, NOISE).starts(n_pre).x0[0]
         away[:, 6:] = x0[:, 7:10] - fresh[:, 7:10]
     return Case(
-        shooting, free, theta, lin, dense.state_columns(theta, x0, k), dense.parameter_columns(theta, x0, free),
-        dense.residual(theta, x0), precision, away,
-    )  # fmt: skip
+        shooting,
+        free,
+        theta,
+        lin,
+        dense.state_columns(theta, x0, k),
+        dense.parameter_columns(theta, x0, free),
+        dense.residual(theta, x0),
+        precision,
+        away,
+    )
 
 
 def explicit_cost(c: Case, s: int, z: FloatArray) -> float:
@@ -118,8 +125,9 @@ def test_gram_and_gradient_are_those_of_the_projected_columns(which: str, reques
         stacked = np.vstack([c.a[s], np.diag(np.sqrt(c.precision))])
         q = np.linalg.qr(stacked)[0]
         b = np.vstack([c.b[s], np.zeros((len(c.precision), c.b.shape[2]))])
-        r = np.concatenate([c.r[s], c.away[s] * (c.precision - RIDGE[: len(c.precision)] ** -2.0)
-                            / np.sqrt(c.precision)])  # fmt: skip
+        r = np.concatenate(
+            [c.r[s], c.away[s] * (c.precision - RIDGE[: len(c.precision)] ** -2.0) / np.sqrt(c.precision)]
+        )
         b = b - q @ (q.T @ b)
         scale = np.linalg.norm(c.b[s], axis=0) + 1e-12
         np.testing.assert_allclose(c.lin.gram[s] / np.outer(scale, scale), b.T @ b / np.outer(scale, scale), atol=2e-4)

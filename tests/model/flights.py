@@ -46,6 +46,9 @@ def vector(vehicle: Vehicle, values: Mapping[str, float]) -> FloatArray:
 def fly(vehicle: Vehicle, values: Mapping[str, float], given: Input) -> Flown:
     """Flies an input from a moving start: tilted, turning, drifting, 1.5 m above the ground."""
     return Independent(vehicle, values).fly(
-        given, np.array([0.1, -0.15, 0.4]), np.array([0.3, -0.2, 0.25]), np.array([2.0, -1.0, 0.4]),
+        given,
+        np.array([0.1, -0.15, 0.4]),
+        np.array([0.3, -0.2, 0.25]),
+        np.array([2.0, -1.0, 0.4]),
         np.array([1.0, -2.0, -1.5]),
-    )  # fmt: skip
+    )

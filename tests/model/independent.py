@@ -92,9 +92,12 @@ class Flown:
         accel = np.full((len(t), 3), np.nan)
         accel[1:-1] = self.mean_force(t[1:-1], self.given.dt)
         logged: dict[str, Any] = {
-            "gyro": y[:, RATE], "attitude": quaternion(y[:, EULER]), "accel": accel, "velocity": y[:, VELOCITY],
+            "gyro": y[:, RATE],
+            "attitude": quaternion(y[:, EULER]),
+            "accel": accel,
+            "velocity": y[:, VELOCITY],
             "position": y[:, POSITION],
-        }  # fmt: skip
+        }
         logged.update(channels)
         return Window(self.given.t0, self.given.dt, self.given.rows, sampling=self.given.sampling, **logged)
 
@@ -126,8 +129,16 @@ class Independent:
     def __getitem__(self, name: str) -> float:
         return self.values.get(name, 0.0)
 
-    def wrench(self, t: float, omega: FloatArray, turning: FloatArray, v_air: FloatArray, nu: FloatArray, height: float,
-               span: tuple[float, float]) -> tuple[FloatArray, FloatArray]:  # fmt: skip
+    def wrench(
+        self,
+        t: float,
+        omega: FloatArray,
+        turning: FloatArray,
+        v_air: FloatArray,
+        nu: FloatArray,
+        height: float,
+        span: tuple[float, float],
+    ) -> tuple[FloatArray, FloatArray]:
         """Force and torque about the CG, body axes; v_air: velocity relative to the air, body axes."""
         power = 1.0 - self["battery_sag.fraction"] * (t - span[0]) / (span[1] - span[0])
         if t > self.values.get("thrust_drop.time", np.inf):
@@ -190,11 +201,13 @@ class Independent:
         turned = (1.0 - self["no_gyroscopic_coupling.share"]) * cross(nu, J @ nu)
         nu_dot = np.linalg.solve(J, torque - turned)
         nu_dot -= np.array([self[f"rate_damping.{a}"] for a in ("l_p", "m_q", "n_r")]) * nu
-        euler_dot = np.array([
-            nu[0] + np.tan(theta) * (np.sin(phi) * nu[1] + np.cos(phi) * nu[2]),
-            np.cos(phi) * nu[1] - np.sin(phi) * nu[2],
-            (np.sin(phi) * nu[1] + np.cos(phi) * nu[2]) / np.cos(theta),
-        ])  # fmt: skip
+        euler_dot = np.array(
+            [
+                nu[0] + np.tan(theta) * (np.sin(phi) * nu[1] + np.cos(phi) * nu[2]),
+                np.cos(phi) * nu[1] - np.sin(phi) * nu[2],
+                (np.sin(phi) * nu[1] + np.cos(phi) * nu[2]) / np.cos(theta),
+            ]
+        )
         felt = force / mass
         imu = self.imu - self.loaded(t) * np.array([self["mass_change.x"], self["mass_change.y"], 0.0])
         at_imu = felt + cross(np.asarray(nu_dot), imu) + cross(nu, cross(nu, imu))
@@ -202,9 +215,15 @@ class Independent:
         return np.concatenate([euler_dot, nu_dot, R @ felt + G * DOWN, y[VELOCITY], at_imu, rotors])
 
     def fly(
-        self, given: Input, euler: FloatArray, nu: FloatArray, velocity: FloatArray, position: FloatArray,
-        span: tuple[float, float] | None = None, tolerance: float = 1e-10,
-    ) -> Flown:  # fmt: skip
+        self,
+        given: Input,
+        euler: FloatArray,
+        nu: FloatArray,
+        velocity: FloatArray,
+        position: FloatArray,
+        span: tuple[float, float] | None = None,
+        tolerance: float = 1e-10,
+    ) -> Flown:
         """Integrates from the first row to the last; rotors start at the first row's input."""
         t, dt = given.t, given.dt
         span = span or (float(t[0]), float(t[-1]))
@@ -218,9 +237,15 @@ class Independent:
             u, later = given.at(start - self.delay), given.at(end - self.delay, just_before=True)
             slope = (later - u) / (end - start)
             solved = solve_ivp(
-                self.rhs, (start, end), y, "DOP853", dense_output=True, rtol=tolerance, atol=tolerance,
+                self.rhs,
+                (start, end),
+                y,
+                "DOP853",
+                dense_output=True,
+                rtol=tolerance,
+                atol=tolerance,
                 args=(u, slope, start, span),
-            )  # fmt: skip
+            )
             pieces.append(solved.sol)
             y = solved.y[:, -1]
         return Flown(given, list(times), pieces)

@@ -28,9 +28,11 @@ class Trajectory:
 
 
 def state(
-    quaternion: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0), rate: tuple[float, ...] = (0.0, 0.0, 0.0),
-    velocity: tuple[float, ...] = (0.0, 0.0, 0.0), position: tuple[float, ...] = (0.0, 0.0, 0.0),
-) -> FloatArray:  # fmt: skip
+    quaternion: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0),
+    rate: tuple[float, ...] = (0.0, 0.0, 0.0),
+    velocity: tuple[float, ...] = (0.0, 0.0, 0.0),
+    position: tuple[float, ...] = (0.0, 0.0, 0.0),
+) -> FloatArray:
     """Initial state, shape (13,)."""
     q = np.array(quaternion) / np.linalg.norm(quaternion)
     return np.concatenate([q, rate, velocity, position])

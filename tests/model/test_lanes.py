@@ -28,9 +28,17 @@ def noisy_window(seconds: float = 1.4, sampling: Sampling = "held", motion: bool
     attitude /= np.linalg.norm(attitude, axis=1, keepdims=True)
     gyro, accel, velocity, position = 0.2 * rng.standard_normal((4, n, 3))
     return Window(
-        0.0, DT, given.rows, gyro, attitude, accel - [0.0, 0.0, 9.8], velocity if motion else None,
-        position - [0.0, 0.0, 1.5] if motion else None, np.linspace(12.4, 10.4, n), sampling=sampling,
-    )  # fmt: skip
+        0.0,
+        DT,
+        given.rows,
+        gyro,
+        attitude,
+        accel - [0.0, 0.0, 9.8],
+        velocity if motion else None,
+        position - [0.0, 0.0, 1.5] if motion else None,
+        np.linspace(12.4, 10.4, n),
+        sampling=sampling,
+    )
 
 
 def rolled(window: Window, thetas: FloatArray) -> FloatArray:

@@ -143,8 +143,14 @@ def test_drag_takes_energy_from_motion_through_the_air(name: str) -> None:
 
 
 def test_no_drag_when_moving_with_the_wind() -> None:
-    values = with_effects(rotor_drag__k_x=0.5, rotor_drag__k_y=0.5, parasitic_drag__c=0.1, axial_inflow__k_z=0.5,
-                          wind__north=4.0, wind__east=-3.0)  # fmt: skip
+    values = with_effects(
+        rotor_drag__k_x=0.5,
+        rotor_drag__k_y=0.5,
+        parasitic_drag__c=0.1,
+        axial_inflow__k_z=0.5,
+        wind__north=4.0,
+        wind__east=-3.0,
+    )
     run = simulate(PELICAN, values, held(np.full((50, 4), HOVER)), state(velocity=(4.0, -3.0, 0.0)))
     assert np.abs(run.force - [0.0, 0.0, -GRAVITY]).max() < 1e-10
 
@@ -159,10 +165,18 @@ def test_terminal_velocity() -> None:
 # --- symmetries
 
 SYMMETRIC = {
-    "rotor_drag.k_x": 0.3, "rotor_drag.k_y": 0.2, "rotor_drag_moment.h_x": 0.03, "rotor_drag_moment.h_y": 0.02,
-    "parasitic_drag.c": 0.04, "rate_damping.l_p": 1.0, "rate_damping.m_q": 0.5, "axial_inflow.k_z": 0.2,
-    "motor_lag.tau": 0.03, "rotor_spin_up.J": 5e-5, "imu_lever_arm.z": 0.05,
-}  # fmt: skip
+    "rotor_drag.k_x": 0.3,
+    "rotor_drag.k_y": 0.2,
+    "rotor_drag_moment.h_x": 0.03,
+    "rotor_drag_moment.h_y": 0.02,
+    "parasitic_drag.c": 0.04,
+    "rate_damping.l_p": 1.0,
+    "rate_damping.m_q": 0.5,
+    "axial_inflow.k_z": 0.2,
+    "motor_lag.tau": 0.03,
+    "rotor_spin_up.J": 5e-5,
+    "imu_lever_arm.z": 0.05,
+}
 
 
 def test_heading_of_the_world_axes_does_not_matter() -> None:
@@ -188,9 +202,11 @@ def test_names_of_the_rotors_do_not_matter() -> None:
     start = state((0.95, 0.1, -0.2, 0.1), (0.3, -0.2, 0.4), (2.0, 1.0, -0.5))
     one = simulate(PELICAN, values_of(PELICAN, {**SYMMETRIC, "weak_rotor.loss_1": 0.02}), given, start)
     two = simulate(
-        shuffled, values_of(PELICAN, {**SYMMETRIC, "weak_rotor.loss_2": 0.02}),
-        Input(given.rows[:, order], given.dt), start,
-    )  # fmt: skip
+        shuffled,
+        values_of(PELICAN, {**SYMMETRIC, "weak_rotor.loss_2": 0.02}),
+        Input(given.rows[:, order], given.dt),
+        start,
+    )
     assert np.abs(one.end - two.end).max() < 1e-12
 
 
@@ -198,9 +214,13 @@ def test_names_of_the_rotors_do_not_matter() -> None:
 def test_mirror_image_flies_the_mirrored_flight(extra: dict[str, float]) -> None:
     """Left and right exchanged: y, v, q_x, q_z, p, r and spins change sign; nothing else does."""
     given = lively_input(PELICAN, 0.6, 0.02)
-    other = PELICAN.model_copy(update={"rotors": tuple(
-        Rotor(position=(r.position[0], -r.position[1], r.position[2]), spin=-r.spin) for r in PELICAN.rotors
-    )})  # fmt: skip
+    other = PELICAN.model_copy(
+        update={
+            "rotors": tuple(
+                Rotor(position=(r.position[0], -r.position[1], r.position[2]), spin=-r.spin) for r in PELICAN.rotors
+            )
+        }
+    )
     start = state((0.95, 0.1, -0.2, 0.1), (0.3, -0.2, 0.4), (2.0, 1.0, -0.5))
     sign = np.array([1, -1, 1, -1, -1, 1, -1, 1, -1, 1, 1, -1, 1.0])
     one = simulate(PELICAN, values_of(PELICAN, extra), given, start)

@@ -36,12 +36,22 @@ def test_zero_terms_change_nothing() -> None:
 @pytest.mark.parametrize(
     ("terms", "effects", "channels"),
     [
-        ([("moment_x", ("p",), -8e-3 * 0.5), ("moment_y", ("q",), -8e-3 * 0.4)],
-         {"rate_damping": {"l_p": 0.5, "m_q": 0.4}}, slice(0, 3)),
-        ([("force_x", ("V", "v_x"), -1.3 * 0.03), ("force_y", ("V", "v_y"), -1.3 * 0.03),
-          ("force_z", ("V", "v_z"), -1.3 * 0.03)], {"parasitic_drag": {"c": 0.03}}, slice(6, 9)),
+        (
+            [("moment_x", ("p",), -8e-3 * 0.5), ("moment_y", ("q",), -8e-3 * 0.4)],
+            {"rate_damping": {"l_p": 0.5, "m_q": 0.4}},
+            slice(0, 3),
+        ),
+        (
+            [
+                ("force_x", ("V", "v_x"), -1.3 * 0.03),
+                ("force_y", ("V", "v_y"), -1.3 * 0.03),
+                ("force_z", ("V", "v_z"), -1.3 * 0.03),
+            ],
+            {"parasitic_drag": {"c": 0.03}},
+            slice(6, 9),
+        ),
     ],
-)  # fmt: skip
+)
 def test_a_term_is_the_effect_that_has_its_form(
     terms: list[tuple[str, tuple[str, ...], float]], effects: dict[str, dict[str, float]], channels: slice
 ) -> None:

@@ -128,9 +128,11 @@ def test_impossible_calls_are_refused() -> None:
 def test_layout_reads_and_writes_vehicle_files() -> None:
     layout = Layout(VEHICLE)
     effects = {
-        "imu_lag": {"cutoff": 8.0}, "weak_rotor": {"rotor": 3.0, "loss": 0.1}, "wind": {"north": 2.0, "east": -1.0},
+        "imu_lag": {"cutoff": 8.0},
+        "weak_rotor": {"rotor": 3.0, "loss": 0.1},
+        "wind": {"north": 2.0, "east": -1.0},
         "mass_change": {"time": 12.0, "fraction": 0.2},
-    }  # fmt: skip
+    }
     theta = layout.neutral()
     layout.write_effects(theta, effects)
     assert theta[ix.IMU_PERIOD] == pytest.approx(0.125)

@@ -97,10 +97,13 @@ def test_imu_statics() -> None:
     effects = {
         f"{name}.{axis}": float(value)
         for name, values in (
-            ("imu_misalignment", turn), ("gyro_scale", scale), ("gyro_bias", gyro_bias), ("accel_bias", accel_bias),
+            ("imu_misalignment", turn),
+            ("gyro_scale", scale),
+            ("gyro_bias", gyro_bias),
+            ("accel_bias", accel_bias),
         )
         for axis, value in zip("xyz", values, strict=True)
-    }  # fmt: skip
+    }
     found = residuals(window, effects)
     assert np.abs(found[:, GYRO]).max() < 1e-6
     assert np.abs(found[:, ACCEL]).max() < 1e-6

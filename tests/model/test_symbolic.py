@@ -114,9 +114,17 @@ def test_other_airframes_and_terms_beyond_the_catalogue(name: str) -> None:
 
 def test_every_effect_is_in_the_table_or_said_to_be_left_out() -> None:
     around = {  # what the terms act on: the derivative itself has these
-        "motor_lag", "supply_voltage", "wind", "cg_offset", "product_of_inertia", "no_gyroscopic_coupling",
-        "rate_damping", "mass_change", "thrust_drop", "battery_sag",
-    }  # fmt: skip
+        "motor_lag",
+        "supply_voltage",
+        "wind",
+        "cg_offset",
+        "product_of_inertia",
+        "no_gyroscopic_coupling",
+        "rate_damping",
+        "mass_change",
+        "thrust_drop",
+        "battery_sag",
+    }
     there = {name for term in TERMS for name in term.effects} | around
     assert there - {"residual"} | set(LEFT_OUT) == set(EFFECTS)
     assert set(EFFECT) == there - {"residual"}
@@ -149,8 +157,9 @@ def test_a_step_is_one_of_fourth_order() -> None:
     model, errors = symbolic.model(vehicle), []
     for dt in (0.01, 0.005):
         simulator = Simulator(vehicle)
-        state = simulator.start(attitude=x[:4], rate=x[4:7], velocity=x[7:10], position=x[10:13], rotor_speed=x[13:],
-                                dt=dt / 8)  # fmt: skip
+        state = simulator.start(
+            attitude=x[:4], rate=x[4:7], velocity=x[7:10], position=x[10:13], rotor_speed=x[13:], dt=dt / 8
+        )
         for _ in range(8):
             simulator.advance(state, u, dt / 8)
         there = np.array(model.step(dt)(x=x, u=u)["next"]).ravel()

@@ -7,9 +7,19 @@ import yaml
 from tests.node.peers import ROOT
 
 KNOWN = {
-    "type", "path", "find_and_remove_prefix", "remove_prefix", "startswith", "contains", "name", "expected", "regex",
-    "timeout", "num_items", "discard_stale",
-}  # fmt: skip
+    "type",
+    "path",
+    "find_and_remove_prefix",
+    "remove_prefix",
+    "startswith",
+    "contains",
+    "name",
+    "expected",
+    "regex",
+    "timeout",
+    "num_items",
+    "discard_stale",
+}
 """Parameters of diagnostic_aggregator/GenericAnalyzer in Jazzy; another one ends its initialisation."""
 
 

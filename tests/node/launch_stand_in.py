@@ -77,9 +77,11 @@ MODULES: dict[str, tuple[type, ...]] = {
     "launch_ros.actions": (Node,),
 }
 KEPT = {
-    "launch.substitutions": "PathJoinSubstitution", "launch_ros.substitutions": "FindPackageShare",
-    "launch.launch_description_sources": "PythonLaunchDescriptionSource", "launch_ros": "launch_ros",
-}  # fmt: skip
+    "launch.substitutions": "PathJoinSubstitution",
+    "launch_ros.substitutions": "FindPackageShare",
+    "launch.launch_description_sources": "PythonLaunchDescriptionSource",
+    "launch_ros": "launch_ros",
+}
 
 
 def launched(file: Path, given: dict[str, str], monkeypatch: pytest.MonkeyPatch) -> list[Kept]:

@@ -431,10 +431,13 @@ def test_requests_that_make_no_sense_do_not_end_the_ground_machine(
     request_: FitRequest, monkeypatch: pytest.MonkeyPatch, happened: Happened
 ) -> None:
     broken = [
-        replace(request_, theta=np.ones(3)), replace(request_, theta=np.full_like(request_.theta, np.nan)),
-        replace(request_, windows=()), replace(request_, theta=np.zeros((3, 3))),
-        *(replace(request_, noise=Noise(*sizes, 0.0)) for sizes in WRONG), replace(request_, noise=NOISE, z=np.ones(5)),
-    ]  # fmt: skip
+        replace(request_, theta=np.ones(3)),
+        replace(request_, theta=np.full_like(request_.theta, np.nan)),
+        replace(request_, windows=()),
+        replace(request_, theta=np.zeros((3, 3))),
+        *(replace(request_, noise=Noise(*sizes, 0.0)) for sizes in WRONG),
+        replace(request_, noise=NOISE, z=np.ones(5)),
+    ]
     answers = [unpack(q.answers[0]) for q in served(monkeypatch, [pack(item) for item in [*broken, request_]])]
     assert all(reply.problem for reply in answers[:-1])
     assert answers[-1].theta is not None

@@ -730,16 +730,24 @@ def with_first(**fields: object) -> str:
 
 
 HOSTILE_SETS = {
-    "100,000 brackets": "[" * 100_000, "a list": "[]", "nothing": "null", "a number": "7",
+    "100,000 brackets": "[" * 100_000,
+    "a list": "[]",
+    "nothing": "null",
+    "a number": "7",
     "a value of 400 digits": with_first(value=10**400),
     "an infinite number": with_first().replace('"samples": ', '"samples": 1e999, "old": '),
-    "one bound": with_first(bounds=[1.0]), "no interval": with_first(ci95=[]), "no b": with_first(name="c"),
+    "one bound": with_first(bounds=[1.0]),
+    "no interval": with_first(ci95=[]),
+    "no b": with_first(name="c"),
     "a mass of 400 digits": with_all(mass=10**400),
-    "a number beyond 64 bits": with_all(sequence=2**64), "another set's number": with_all(sequence=8),
+    "a number beyond 64 bits": with_all(sequence=2**64),
+    "another set's number": with_all(sequence=8),
     "a negative deviation": with_first(sigma=-2e-4),
     "a covariance of no numbers": with_all(covariance=[[math.nan] * 6] * 6),
-    "a time that no message holds": with_all(stop=1e300), "more samples than a message holds": with_all(samples=2**40),
-    "fewer samples than none": with_all(samples=-4), "half a character": with_all(reason="\ud800"),
+    "a time that no message holds": with_all(stop=1e300),
+    "more samples than a message holds": with_all(samples=2**40),
+    "fewer samples than none": with_all(samples=-4),
+    "half a character": with_all(reason="\ud800"),
     "half a character in a unit": with_first(unit="\udcff"),
     "a reference known to 1e308": with_all(reference_sd=1e308),
     "one known to less than nothing": with_all(reference_sd=-1.0),
@@ -750,14 +758,15 @@ HOSTILE_SETS = {
     "an interval beside its value": with_first(ci95=[0.0, 0.0]),
     "an old one without an interval": with_first(ci95=[0.0, 0.0]).replace("reference_sd", "no"),
     "a parameter twice": with_all(parameters=2 * set_to_dict(online_set(TRUE))["parameters"], covariance=None),
-}  # fmt: skip
+}
 
 
 HOSTILE_TO_A_VEHICLE = {
-    "a negative mass": with_all(mass=-3.0), "a mass that no float of 32 bits holds": with_all(mass=1e300),
+    "a negative mass": with_all(mass=-3.0),
+    "a mass that no float of 32 bits holds": with_all(mass=1e300),
     "b far outside the vehicle's bounds": with_first(value=1.0, bounds=[0.5, 2.0]),
     "a deviation that no float of 32 bits holds": with_first(sigma=1e300),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("what", [*HOSTILE_SETS, *HOSTILE_TO_A_VEHICLE])

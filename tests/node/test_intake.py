@@ -106,10 +106,15 @@ def test_no_topic_runs_far_ahead_when_much_has_piled_up(messages: list[Message])
 @pytest.mark.parametrize(
     ("frame", "told"),
     [
-        ("base_link", False), ("quad1/base_link_frd", False), ("", False), ("fcu", False),
-        ("imu_link", True), ("base_link/imu", True), ("rebase_link", True),
+        ("base_link", False),
+        ("quad1/base_link_frd", False),
+        ("", False),
+        ("fcu", False),
+        ("imu_link", True),
+        ("base_link/imu", True),
+        ("rebase_link", True),
     ],
-)  # fmt: skip
+)
 def test_an_imu_in_a_frame_of_its_own_is_told_unless_its_mounting_is_given(
     messages: list[Message], frame: str, told: bool
 ) -> None:
@@ -133,8 +138,9 @@ def test_an_imu_in_a_frame_of_its_own_is_told_unless_its_mounting_is_given(
         assert len(flat(reader.take(framed))) == 40
         assert reader.trouble == (
             f"is measured in {frame}, not base_link: say mounting: {{rotation, position}} in the vehicle file"
-            if told and not mounted else ""
-        )  # fmt: skip
+            if told and not mounted
+            else ""
+        )
 
 
 def test_a_damaged_message_spoils_only_itself(messages: list[Message]) -> None:

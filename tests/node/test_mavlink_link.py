@@ -159,8 +159,11 @@ def test_a_flood_is_bounded_and_the_peer_list_does_not_grow(port: int, happened:
     assert len(link._wire._conn.clients) <= 2
     link.close()
     each = spent / seconds
-    happened(14, f"{sent // seconds} frames a second: {decoded // seconds} a second decoded, the rest dropped, "
-                 f"{each:.2f} s of processor time for each second; {len(crowd)} strangers forgotten")  # fmt: skip
+    happened(
+        14,
+        f"{sent // seconds} frames a second: {decoded // seconds} a second decoded, the rest dropped, "
+        f"{each:.2f} s of processor time for each second; {len(crowd)} strangers forgotten",
+    )
 
 
 @given(st.lists(st.binary(max_size=400), max_size=8), st.booleans())
@@ -314,8 +317,11 @@ def test_a_flood_before_the_vehicle_comes_or_comes_back_keeps_nobody_out(
     again = Sender(port)
     assert looks(again, 60) == 60
     link.close()
-    happened(43, "a flood of 10,000 frames a second before the vehicle is heard, and as it comes back from another "
-                 "address: its first frame is taken, and it is asked")  # fmt: skip
+    happened(
+        43,
+        "a flood of 10,000 frames a second before the vehicle is heard, and as it comes back from another "
+        "address: its first frame is taken, and it is asked",
+    )
 
 
 def test_what_is_sent_has_a_budget(port: int, happened: Happened) -> None:

@@ -286,9 +286,15 @@ def test_mavproxy_sees_the_parameters(crowd: tuple[MavlinkLink, Sender, int], tm
     link, vehicle, port = crowd
     log = tmp_path / "heard.tlog"
     command = [
-        sys.executable, str(Path(sys.executable).with_name("mavproxy.py")), f"--master=udpin:127.0.0.1:{port}",
-        "--daemon", "--non-interactive", "--default-modules=", f"--logfile={log}", f"--state-basedir={tmp_path}",
-    ]  # fmt: skip
+        sys.executable,
+        str(Path(sys.executable).with_name("mavproxy.py")),
+        f"--master=udpin:127.0.0.1:{port}",
+        "--daemon",
+        "--non-interactive",
+        "--default-modules=",
+        f"--logfile={log}",
+        f"--state-basedir={tmp_path}",
+    ]
     with Process(*command) as proxy:
         keep_talking(link, vehicle, lambda: b"QI_J_XX" not in (log.read_bytes() if log.exists() else b""), 3.0, 120.0)
         keep_talking(link, vehicle, lambda: True, 0.0, 1.0)

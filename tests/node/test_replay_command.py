@@ -43,9 +43,11 @@ def test_a_log_gives_sets_findings_and_an_mcap(log: Path, tmp_path: Path, quadid
     file = McapFile(out)
     names = {topic.name: topic.type for topic in file.topics.values()}
     assert names == {
-        "quadid/parameters": "quadid_msgs/msg/ParameterSet", "quadid/candidate": "quadid_msgs/msg/ParameterSet",
-        "quadid/diagnosis": "quadid_msgs/msg/Diagnosis", "quadid/health": "quadid_msgs/msg/Health",
-    }  # fmt: skip
+        "quadid/parameters": "quadid_msgs/msg/ParameterSet",
+        "quadid/candidate": "quadid_msgs/msg/ParameterSet",
+        "quadid/diagnosis": "quadid_msgs/msg/Diagnosis",
+        "quadid/health": "quadid_msgs/msg/Health",
+    }
     # health says at once that it has no baseline; everything else rests on a whole window
     rest = {number for number, topic in file.topics.items() if topic.name != "quadid/health"}
     stamps = [ns for _, ns, _ in file.messages(rest)]
@@ -153,18 +155,23 @@ MAD = replace(online_set({**TRUE, "b": 1e3}), mass=1.3)
 DOUBTFUL = {
     "withdrawn": ((GOOD, replace(GOOD, outdated="thrust stepped by -17.9 %")), "out of date: thrust stepped"),
     "withdrawn by a stale row": (
-        (GOOD, replace(GOOD, state=SetState.STALE, outdated="thrust stepped")), "out of date: thrust stepped"),
+        (GOOD, replace(GOOD, state=SetState.STALE, outdated="thrust stepped")),
+        "out of date: thrust stepped",
+    ),
     "not confirmed since a restart": ((GOOD, replace(GOOD, state=SetState.STALE)), "stale: no flight has confirmed it"),
     "of another mass": ((replace(GOOD, mass=1.35),), "a mass of 1.35 kg, the vehicle file has 1.3 kg"),
     "of a mass not stated": ((replace(GOOD, mass=math.nan),), "a mass that it does not state"),
     "rolled back to and withdrawn": (
         (GOOD, *(replace(GOOD, state=SetState.ROLLED_BACK, outdated=why) for why in ("", "stepped"))),
-        "out of date: stepped"),
+        "out of date: stepped",
+    ),
     "withdrawn, and another waits": (
-        (GOOD, replace(GOOD, outdated="stepped"), replace(GOOD, state=SetState.PENDING)), "out of date: stepped"),
+        (GOOD, replace(GOOD, outdated="stepped"), replace(GOOD, state=SetState.PENDING)),
+        "out of date: stepped",
+    ),
     "of a mass that is none": ((replace(GOOD, mass=130.0),), "a mass of 130 kg, the vehicle has 1.3 kg"),
     "no plausible one": ((GOOD, MAD), "no set that a fit makes"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("case", list(DOUBTFUL))

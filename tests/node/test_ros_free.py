@@ -169,8 +169,12 @@ def test_a_source_that_falls_silent_gives_way() -> None:
 def test_how_samples_are_cut_into_blocks_changes_nothing(seed: int) -> None:
     """Two or three sources that come, fall silent and come back, in any order of arrival."""
     rng = np.random.default_rng(seed)
-    runs = [(int(rank), np.sort(start + rng.uniform(0.0, 3.0, 12))) for start in np.arange(0.0, 40.0, 2.5)
-            for rank in rng.permutation(3) if rng.random() < 0.5]  # fmt: skip
+    runs = [
+        (int(rank), np.sort(start + rng.uniform(0.0, 3.0, 12)))
+        for start in np.arange(0.0, 40.0, 2.5)
+        for rank in rng.permutation(3)
+        if rng.random() < 0.5
+    ]
     best = {"attitude": int(rng.integers(2))}
     whole, single = SourceSelector(best), SourceSelector(best)
     for rank, t in runs:

@@ -28,9 +28,12 @@ UNCONFIGURED, INACTIVE, ACTIVE, FINALIZED = 1, 2, 3, 4
 CONFIGURE, CLEANUP, ACTIVATE, DEACTIVATE = 1, 2, 3, 4
 SHUTDOWN = {UNCONFIGURED: 5, INACTIVE: 6, ACTIVE: 7}
 VALID = {
-    (UNCONFIGURED, CONFIGURE): INACTIVE, (INACTIVE, CLEANUP): UNCONFIGURED, (INACTIVE, ACTIVATE): ACTIVE,
-    (ACTIVE, DEACTIVATE): INACTIVE, **dict.fromkeys(SHUTDOWN.items(), FINALIZED),
-}  # fmt: skip
+    (UNCONFIGURED, CONFIGURE): INACTIVE,
+    (INACTIVE, CLEANUP): UNCONFIGURED,
+    (INACTIVE, ACTIVATE): ACTIVE,
+    (ACTIVE, DEACTIVATE): INACTIVE,
+    **dict.fromkeys(SHUTDOWN.items(), FINALIZED),
+}
 """The transitions that a client may ask for, and where they lead (design.ros2.org, managed nodes)."""
 ASKED = (*range(0, 9), *range(10, 12), 62, 200)
 """Numbers of transitions: those of clients, create, destroy, results of callbacks, and one that means nothing."""
@@ -80,9 +83,10 @@ def test_every_transition_in_every_state_is_answered_and_the_node_lives(last: in
     """The longest walk asks for all others in every state; `configure` comes back with warm kernels."""
     client, state, seen = Client(ear), UNCONFIGURED, set[int]()
     walk = {
-        UNCONFIGURED: [], INACTIVE: [CONFIGURE],
+        UNCONFIGURED: [],
+        INACTIVE: [CONFIGURE],
         ACTIVE: [CONFIGURE, CLEANUP, CONFIGURE, ACTIVATE, DEACTIVATE, ACTIVATE],
-    }  # fmt: skip
+    }
     for number in [*walk[last], SHUTDOWN[last]]:
         if last == ACTIVE and state not in seen:
             refuse_all_others(client, state, managed)
@@ -256,9 +260,12 @@ def test_status_and_diagnostics_speak_in_every_state_of_the_life_cycle(ear: Ear)
         client = Client(ear)
         assert said("unconfigured"), managed.text
         for number, state in (
-            (CONFIGURE, "inactive"), (ACTIVATE, "active"), (DEACTIVATE, "inactive"), (CLEANUP, "unconfigured"),
+            (CONFIGURE, "inactive"),
+            (ACTIVATE, "active"),
+            (DEACTIVATE, "inactive"),
+            (CLEANUP, "unconfigured"),
             (SHUTDOWN[UNCONFIGURED], "finalized"),
-        ):  # fmt: skip
+        ):
             assert client.change(number), managed.text
             assert said(state), f"{state}: {status} {health}"
             assert abs(status[-1].published.sec - time.time()) < 60.0, "by the node's clock"
@@ -278,9 +285,12 @@ def alive(ear: Ear, sets: list[Any]) -> Callable[[], int]:
         counts.append(event.alive_count)
 
     asked = QoSProfile(
-        depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL, reliability=ReliabilityPolicy.RELIABLE,
-        liveliness=LivelinessPolicy.MANUAL_BY_TOPIC, liveliness_lease_duration=Duration(seconds=8.0),
-    )  # fmt: skip
+        depth=1,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL,
+        reliability=ReliabilityPolicy.RELIABLE,
+        liveliness=LivelinessPolicy.MANUAL_BY_TOPIC,
+        liveliness_lease_duration=Duration(seconds=8.0),
+    )
     callbacks = SubscriptionEventCallbacks(liveliness=changed)
     ear.node.create_subscription(ParameterSet, "quadid/parameters", sets.append, asked, event_callbacks=callbacks)
     return lambda: counts[-1]
@@ -513,6 +523,7 @@ def test_two_that_lost_sight_of_each_other_end_with_one_speaker(tmp_path: Path, 
             assert second.child.poll() is None
     seen = "both spoke for a moment" if both else "it gave way before anyone saw both"
     happened(
-        21, f"speaker stopped until DDS forgets it: the observer speaks after {took_over:.0f} s; the first one back "
-        f"({seen}): one speaker again after {settled:.1f} s"
-    )  # fmt: skip
+        21,
+        f"speaker stopped until DDS forgets it: the observer speaks after {took_over:.0f} s; the first one back "
+        f"({seen}): one speaker again after {settled:.1f} s",
+    )

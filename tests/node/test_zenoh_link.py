@@ -99,10 +99,7 @@ def test_forged_values_and_spying_are_refused_by_the_router(net: Net, happened: 
         assert stolen == []
         told = [r for r in mallory.get("quadid/quad1/command/rollback", timeout=1.0) if r.ok is not None]
         assert told == []
-        happened(
-            16,
-            "put, get, subscription, command under another vehicle's name: refused by certificate name",
-        )
+        happened(16, "put, get, subscription, command under another vehicle's name: refused by certificate name")
         spy.undeclare()  # type: ignore[no-untyped-call]
     finally:
         for session in (watcher, victim):

@@ -48,8 +48,10 @@ class Net:
         router = self._write("router.json5", (EXAMPLES / "router.json5").read_text())
         self.process = subprocess.Popen(
             [sys.executable, str(Path(__file__).with_name("zenoh_router.py")), str(router)],
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
-        )  # fmt: skip
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
         assert self.process.stdout is not None
         assert self.process.stdout.readline() == "routing\n"
 

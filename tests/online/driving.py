@@ -18,9 +18,12 @@ EPOCH = 1_700_000_000.0
 
 @lru_cache(maxsize=16)
 def flight(
-    seconds: float, seed: int = 1, profile: str = "excited", effects: tuple[tuple[str, str, float], ...] = (),
+    seconds: float,
+    seed: int = 1,
+    profile: str = "excited",
+    effects: tuple[tuple[str, str, float], ...] = (),
     gusts: float = 0.0,
-) -> Flight:  # fmt: skip
+) -> Flight:
     """A Pelican flight; effects as (effect, parameter, value), gusts in m/s^2 (rms)."""
     named: dict[str, dict[str, float]] = {}
     for effect, parameter, value in effects:

@@ -33,9 +33,16 @@ def within(recording: Recording, name: str, start: float, stop: float) -> Record
 
 @pytest.mark.parametrize(
     ("name", "start", "stop"),
-    [("velocity", 11.0, 99.0), ("velocity", 0.0, 11.0), ("velocity", 11.0, 14.0), ("position", 11.0, 99.0),
-     ("attitude", 0.0, 11.0), ("attitude", 11.0, 99.0), ("accel", 11.0, 99.0)],
-)  # fmt: skip
+    [
+        ("velocity", 11.0, 99.0),
+        ("velocity", 0.0, 11.0),
+        ("velocity", 11.0, 14.0),
+        ("position", 11.0, 99.0),
+        ("attitude", 0.0, 11.0),
+        ("attitude", 11.0, 99.0),
+        ("accel", 11.0, 99.0),
+    ],
+)
 def test_a_channel_that_begins_or_ends_in_flight_ends_no_fit(
     name: str, start: float, stop: float, happened: Happened
 ) -> None:

@@ -51,10 +51,14 @@ def consistency_of(recording: Recording, vehicle: Vehicle = PELICAN) -> Consiste
 @pytest.mark.parametrize(
     "effect",
     [
-        (), (("attitude_delay", "delay", 0.05),), (("imu_lag", "cutoff", 8.0),),
-        (("ahrs_acceleration_error", "k", 0.5),), (("accel_bias", "z", 0.2),), (("gyro_bias", "x", 0.05),),
+        (),
+        (("attitude_delay", "delay", 0.05),),
+        (("imu_lag", "cutoff", 8.0),),
+        (("ahrs_acceleration_error", "k", 0.5),),
+        (("accel_bias", "z", 0.2),),
+        (("gyro_bias", "x", 0.05),),
     ],
-)  # fmt: skip
+)
 def test_what_healthy_sensors_do_is_no_contradiction(effect: tuple[tuple[str, str, float], ...]) -> None:
     """Delays, the pull of an attitude filter, and biases leave the factors at 1."""
     found = factors_of(flight(40.0, 5, effects=effect).recording)

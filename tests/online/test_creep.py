@@ -82,5 +82,8 @@ def test_creeping_there_in_small_steps_ends_at_the_baseline_even_across_restarts
     limit = math.exp(math.log1p(machine.settings.gate.reference) + 2.0 * sigma) - 1.0
     assert reached <= limit + 1e-9, "the limit, and two standard deviations of the first set"
     assert told
-    happened(17, f"{name} creeping to × 2 by 6 % a step with restarts between: published up to {reached:+.0%} of the "
-                 f"baseline, then '{told[-1][0]}: {told[-1][1][:80]}'")  # fmt: skip
+    happened(
+        17,
+        f"{name} creeping to × 2 by 6 % a step with restarts between: published up to {reached:+.0%} of the "
+        f"baseline, then '{told[-1][0]}: {told[-1][1][:80]}'",
+    )

@@ -247,9 +247,7 @@ def test_first_sticks_after_a_hover_are_no_step_of_a_moment(name: str) -> None:
     """Rotors follow commands 35 ms late, which forty seconds of calm hover did not show."""
     vehicle = Vehicle.shipped(name)
     sticks = [Segment("roll", "doublet", 41.0, 1.5, 0.35), Segment("pitch", "doublet", 43.0, 1.5, 0.35)]
-    effects = {
-        "motor_lag": {"tau": 0.035}, "rotor_drag": {"k_x": 0.3, "k_y": 0.2}, "axial_inflow": {"k_z": 0.3},
-    }  # fmt: skip
+    effects = {"motor_lag": {"tau": 0.035}, "rotor_drag": {"k_x": 0.3, "k_y": 0.2}, "axial_inflow": {"k_z": 0.3}}
     flight = fly(vehicle, draw_truth(vehicle, 7001), 48.0, 7001, "scripted", segments=sticks, effects=effects)
     assert list(watched(vehicle, flight, 7001)) == []
 

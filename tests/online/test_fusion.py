@@ -33,14 +33,27 @@ AWAY = np.array([0.15, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
 
 
 def window(
-    start: float, z: FloatArray, information: FloatArray, seconds: float = 10.0, score: FloatArray | None = None,
+    start: float,
+    z: FloatArray,
+    information: FloatArray,
+    seconds: float = 10.0,
+    score: FloatArray | None = None,
     mse: float = 1.0,
-) -> WindowEstimate:  # fmt: skip
+) -> WindowEstimate:
     none = np.zeros((P, P))
     return WindowEstimate(
-        start, start + seconds, z, information, np.zeros(P) if score is None else score, 100.0 * mse, 100.0, none,
-        np.zeros((LOOSE, P)), information, np.zeros(P) if score is None else score,
-    )  # fmt: skip
+        start,
+        start + seconds,
+        z,
+        information,
+        np.zeros(P) if score is None else score,
+        100.0 * mse,
+        100.0,
+        none,
+        np.zeros((LOOSE, P)),
+        information,
+        np.zeros(P) if score is None else score,
+    )
 
 
 def fusion(memory: float = 1e12, sigma: FloatArray = PRIOR) -> Fusion:

@@ -30,11 +30,15 @@ TRUE = dict(zip(NOMINAL_NAMES, (2.33e-5, 4.96e-7, 0.010, 0.0136, 0.0226, 5e-5), 
 def parameter_set(values: dict[str, float], sigma: float = 0.005, **status: Status) -> ParameterSet:
     parameters = tuple(
         Parameter(
-            name, NOMINAL_UNITS[name], values[name], abs(values[name]) * sigma,
-            bounds=PELICAN.parameters[name].limits, status=status.get(name, Status.IDENTIFIED),
+            name,
+            NOMINAL_UNITS[name],
+            values[name],
+            abs(values[name]) * sigma,
+            bounds=PELICAN.parameters[name].limits,
+            status=status.get(name, Status.IDENTIFIED),
         )
         for name in NOMINAL_NAMES
-    )  # fmt: skip
+    )
     return ParameterSet(parameters, np.diag(np.square([p.sigma for p in parameters])))
 
 
@@ -148,12 +152,15 @@ def test_a_guess_of_the_vehicle_file_and_a_wide_deviation_are_no_reference() -> 
     assert decide(good(stated=known_b(0.2 * TRUE["b"])), GateSettings()).state is SetState.ACCEPTED
 
 
-@pytest.mark.parametrize(("factors", "known_together", "passes"), [
-    ({"b": 1.06}, True, False),
-    ({"b": 1.06, "J_xx": 1.06, "J_yy": 1.06}, True, False),
-    ({"b": 1.01, "J_xx": 1.01, "J_yy": 1.01}, True, True),
-    ({"b": 1.06, "J_xx": 1.06, "J_yy": 1.06}, False, True),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("factors", "known_together", "passes"),
+    [
+        ({"b": 1.06}, True, False),
+        ({"b": 1.06, "J_xx": 1.06, "J_yy": 1.06}, True, False),
+        ({"b": 1.01, "J_xx": 1.01, "J_yy": 1.01}, True, True),
+        ({"b": 1.06, "J_xx": 1.06, "J_yy": 1.06}, False, True),
+    ],
+)
 def test_what_the_reference_left_open_buys_no_room(
     factors: dict[str, float], known_together: bool, passes: bool
 ) -> None:
@@ -251,17 +258,23 @@ def test_a_curve_of_all_rotors_is_published_where_nothing_is_carried_at_rest(
 
 def test_torque_over_inertia_goes_with_the_slope_of_thrust() -> None:
     """A curve that a later set states and its reference did not know: torque and inertia are as they were."""
-    curved = with_tangent(parameter_set({**TRUE, "b": TRUE["b"] * 1.04, "J_xx": TRUE["J_xx"] * 1.04,
-                                         "J_yy": TRUE["J_yy"] * 1.04}), -math.log(1.04), 0.005)  # fmt: skip
+    curved = with_tangent(
+        parameter_set({**TRUE, "b": TRUE["b"] * 1.04, "J_xx": TRUE["J_xx"] * 1.04, "J_yy": TRUE["J_yy"] * 1.04}),
+        -math.log(1.04),
+        0.005,
+    )
     assert [curved[n].value for n in ("b_tangent", "J_xx")] == pytest.approx([TRUE["b"], TRUE["J_xx"]])
     left_out = off_by([-math.log(1.04)] * 4, at_rest=(0.0, 0.005))
     before = online_set(TRUE, sigma=0.001)
     case = good(parameters=curved, left_out=left_out, in_force=before, baseline=before, held_out=(50.0,))
     assert decide(case, GateSettings()).state is ACCEPTED, decide(case, GateSettings()).reason
     faster = good(
-        parameters=with_tangent(parameter_set(TRUE), -math.log(1.04), 0.005), left_out=left_out, baseline=before,
-        in_force=before, held_out=(50.0,),
-    )  # fmt: skip
+        parameters=with_tangent(parameter_set(TRUE), -math.log(1.04), 0.005),
+        left_out=left_out,
+        baseline=before,
+        in_force=before,
+        held_out=(50.0,),
+    )
     assert decide(faster, GateSettings()).state is ACCEPTED, "b, and torque over inertia, are as they were"
 
 
@@ -306,17 +319,33 @@ numbers = st.floats(-1e6, 1e6) | st.sampled_from([math.nan, math.inf, -math.inf]
     approval=st.sampled_from(["auto", "manual"]),
 )
 def test_nothing_is_accepted_that_breaks_a_promise(
-    factors: list[float], sigma: float, statuses: list[Status], excited: bool, ratio: float, agreeing: int,
-    held_out: list[float], force: list[float] | None, unproven: bool, approval: str,
-) -> None:  # fmt: skip
+    factors: list[float],
+    sigma: float,
+    statuses: list[Status],
+    excited: bool,
+    ratio: float,
+    agreeing: int,
+    held_out: list[float],
+    force: list[float] | None,
+    unproven: bool,
+    approval: str,
+) -> None:
     values = {n: TRUE[n] * f for n, f in zip(NOMINAL_NAMES, factors, strict=True)}
     named = dict(zip(NOMINAL_NAMES, statuses, strict=True))
     before = None if force is None else online_set({n: TRUE[n] * f for n, f in zip(NOMINAL_NAMES, force, strict=True)})
     settings = GateSettings()
     case = Case(
-        parameter_set(values, sigma, **named), excited, ratio, agreeing, "", tuple(held_out), before, before, approval,
+        parameter_set(values, sigma, **named),
+        excited,
+        ratio,
+        agreeing,
+        "",
+        tuple(held_out),
+        before,
+        before,
+        approval,
         doubts=(Factor("roll turn", 1.0, 0.2),) if unproven else (),
-    )  # fmt: skip
+    )
     decision = decide(case, settings)
     assert decision.reason
     assert decision.check in {name for name, _ in CHECKS + JUDGED} | {"approval"}

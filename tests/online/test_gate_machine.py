@@ -131,10 +131,7 @@ class Machine(RuleBasedStateMachine):
             if self.service.session.running is not None:
                 self.fit("as it is", 0.005)
 
-    @rule(
-        channel=st.sampled_from(NEEDED),
-        value=st.sampled_from([math.nan, math.inf, 0.0, -1.0, 57.3, 1e9]),
-    )
+    @rule(channel=st.sampled_from(NEEDED), value=st.sampled_from([math.nan, math.inf, 0.0, -1.0, 57.3, 1e9]))
     def fly_with_a_broken_sensor(self, channel: str, value: float) -> None:
         def spoil(sample: Sample) -> Sample:
             if sample.channel != channel:

@@ -87,9 +87,11 @@ def test_a_crash_is_named(happened: Happened) -> None:
 
 @pytest.mark.parametrize(
     ("name", "profile", "until"),
-    [*((n, "excited", 280) for n in ("gyro", "accel", "attitude", "rotor_speed")),
-     *((n, "gentle", 600) for n in ("gyro", "accel", "attitude"))],
-)  # fmt: skip
+    [
+        *((n, "excited", 280) for n in ("gyro", "accel", "attitude", "rotor_speed")),
+        *((n, "gentle", 600) for n in ("gyro", "accel", "attitude")),
+    ],
+)
 def test_a_stuck_sensor_is_named(name: str, profile: str, until: int, happened: Happened) -> None:
     window = flight(30.0, 3, profile).window.slice(0, 611)
     values = getattr(window, name).copy()

@@ -40,21 +40,30 @@ def noise(**changed: Any) -> Spoil:
 
 
 SPOILT: dict[str, Spoil] = {
-    "z of three": estimate(z=np.zeros(3)), "z of none": estimate(z=np.zeros(0)),
-    "z of two axes": estimate(z=np.zeros((6, 6))), "z beyond every bound": estimate(z=np.full(6, -1e5)),
+    "z of three": estimate(z=np.zeros(3)),
+    "z of none": estimate(z=np.zeros(0)),
+    "z of two axes": estimate(z=np.zeros((6, 6))),
+    "z beyond every bound": estimate(z=np.full(6, -1e5)),
     "information of three": estimate(information=np.eye(3)),
     "information of one axis": estimate(information=np.ones(6)),
-    "information below zero": estimate(information=-1e6 * np.eye(6)), "score of two": estimate(score=np.zeros(2)),
-    "no time": estimate(start=4.0, stop=4.0), "time without end": estimate(stop=1e300),
+    "information below zero": estimate(information=-1e6 * np.eye(6)),
+    "score of two": estimate(score=np.zeros(2)),
+    "no time": estimate(start=4.0, stop=4.0),
+    "time without end": estimate(stop=1e300),
     "an estimate too many": lambda reply: replace(reply, estimates=2 * reply.estimates),
-    "theta of three": fields(theta=np.ones(3)), "theta of two axes": fields(theta=np.ones((4, 4))),
+    "theta of three": fields(theta=np.ones(3)),
+    "theta of two axes": fields(theta=np.ones((4, 4))),
     "theta that is no number": fields(theta=np.full(200, math.nan)),
-    "excitation of two": fields(excitation=np.zeros(2)), "half of three": estimate(half_information=np.eye(3)),
-    "loose of one": estimate(loose=np.zeros(1)), "rows of none": estimate(rows=0.0),
-    "noise of three": noise(psi=np.ones(3)), "noise below zero": noise(psi=np.full(N_NOISE, -1.0)),
-    "tails of two": noise(tail=np.zeros(2)), "a doubt without end": noise(doubt=math.inf),
+    "excitation of two": fields(excitation=np.zeros(2)),
+    "half of three": estimate(half_information=np.eye(3)),
+    "loose of one": estimate(loose=np.zeros(1)),
+    "rows of none": estimate(rows=0.0),
+    "noise of three": noise(psi=np.ones(3)),
+    "noise below zero": noise(psi=np.full(N_NOISE, -1.0)),
+    "tails of two": noise(tail=np.zeros(2)),
+    "a doubt without end": noise(doubt=math.inf),
     "a gyro too late": noise(late=0.2),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("what", SPOILT)

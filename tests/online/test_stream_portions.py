@@ -111,8 +111,11 @@ def test_one_odd_stamp_costs_no_more_than_itself(channel: str, ahead: float, hap
     for name in {c for r in plain for c in r.columns} - {channel}:
         for a, b in zip(plain, rows, strict=True):
             assert a.columns[name].tobytes() == b.columns[name].tobytes()
-    happened(42, f"{len(places)} stamps of {channel} {ahead:g} s ahead: {sum(buffer.faults.values())} samples lost, "
-                "all other channels bit for bit")  # fmt: skip
+    happened(
+        42,
+        f"{len(places)} stamps of {channel} {ahead:g} s ahead: {sum(buffer.faults.values())} samples lost, "
+        "all other channels bit for bit",
+    )
 
 
 @pytest.mark.parametrize("channel", OTHERS)

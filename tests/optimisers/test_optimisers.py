@@ -129,9 +129,15 @@ def test_a_simulation_that_diverges_in_part_of_the_box_is_survived(name: str, ba
 @pytest.mark.parametrize("name", NAMES)
 def test_where_nothing_is_finite_the_start_comes_back_with_an_infinite_cost(name: str) -> None:
     result = minimise(
-        name, lambda x: np.full(len(x), math.nan), START, LOWER, UPPER, 200, 0,
+        name,
+        lambda x: np.full(len(x), math.nan),
+        START,
+        LOWER,
+        UPPER,
+        200,
+        0,
         residual=lambda x: np.full((len(x), 5), math.nan),
-    )  # fmt: skip
+    )
     np.testing.assert_array_equal(result.x, START)
     assert math.isinf(result.cost)
 
@@ -188,8 +194,14 @@ def random_state() -> bytes:
 )
 def test_what_cannot_be_minimised_is_refused(change: dict[str, Any], message: str) -> None:
     arguments: dict[str, Any] = {
-        "name": "pso", "cost_batch": cost, "x0": START, "lower": LOWER, "upper": UPPER, "budget": 100, "seed": 0,
-    } | change  # fmt: skip
+        "name": "pso",
+        "cost_batch": cost,
+        "x0": START,
+        "lower": LOWER,
+        "upper": UPPER,
+        "budget": 100,
+        "seed": 0,
+    } | change
     with pytest.raises(ParameterError, match=message):
         minimise(**arguments)
 
@@ -261,9 +273,13 @@ def test_follows_the_published_trajectory_on_cec_2021_function_2() -> None:
 
 @pytest.mark.parametrize(
     ("cost", "half_width", "n", "budget", "optimum"),
-    [(sphere, 100.0, 6, 8_000, 0.0), (rosenbrock, 30.0, 4, 20_000, 1.0), (rastrigin, 5.12, 5, 12_000, 0.0),
-     (ackley, 32.0, 6, 15_000, 0.0)],
-)  # fmt: skip
+    [
+        (sphere, 100.0, 6, 8_000, 0.0),
+        (rosenbrock, 30.0, 4, 20_000, 1.0),
+        (rastrigin, 5.12, 5, 12_000, 0.0),
+        (ackley, 32.0, 6, 15_000, 0.0),
+    ],
+)
 def test_finds_known_optima_from_every_seed(cost: Cost, half_width: float, n: int, budget: int, optimum: float) -> None:
     for seed in range(3):
         solver = evolved(cost, n, half_width, budget, seed, LShadeOptions(tolerance=0.0))

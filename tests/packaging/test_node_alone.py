@@ -62,9 +62,10 @@ def test_all_that_the_node_imports_comes_with_its_list(repository: Path) -> None
     lines = (repository / "quadid_node" / "requirements.txt").read_text(encoding="utf-8").splitlines()
     listed = brought(Requirement(line).name for line in lines if not line.startswith("#")) | {"quadid"}
     absent = sorted(
-        module for module, of in metadata.packages_distributions().items()
+        module
+        for module, of in metadata.packages_distributions().items()
         if not {canonicalize_name(name) for name in of} & listed and not any(name.startswith("ros-") for name in of)
-    )  # fmt: skip
+    )
     assert {"dask", "jinja2", "plotly"} < set(absent)
     code = f"""
 import importlib, pkgutil, sys

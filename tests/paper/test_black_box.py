@@ -39,8 +39,14 @@ def turning(rows: int = 5) -> Window:
     for psi in np.linspace(3.0, 3.4, rows):
         roll, pitch, yaw = (np.array([np.cos(a / 2), np.sin(a / 2)]) for a in (0.2, -0.1, psi))
         (cr, sr), (cp, sp), (cy, sy) = roll, pitch, yaw
-        out.append([cy * cp * cr + sy * sp * sr, cy * cp * sr - sy * sp * cr,
-                    cy * sp * cr + sy * cp * sr, sy * cp * cr - cy * sp * sr])  # fmt: skip
+        out.append(
+            [
+                cy * cp * cr + sy * sp * sr,
+                cy * cp * sr - sy * sp * cr,
+                cy * sp * cr + sy * cp * sr,
+                sy * cp * cr - cy * sp * sr,
+            ]
+        )
     speeds = np.full((rows, 4), 400.0)
     return Window(0.0, 0.02, speeds, gyro=np.ones((rows, 3)), attitude=np.array(out), accel=np.full((rows, 3), 2.0))
 

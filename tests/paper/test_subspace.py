@@ -68,9 +68,12 @@ def resonance() -> System:
         [[0.9 * np.cos(0.4), 0.9 * np.sin(0.4), 0.0], [-0.9 * np.sin(0.4), 0.9 * np.cos(0.4), 0.0], [0, 0, 0.7]]
     )
     return System(
-        A, np.array([[1.0, 0.2], [-0.5, 0.8], [0.3, 1.0]]), np.array([[1.0, 0.3, -0.5], [0.2, -1.0, 0.8]]),
-        np.array([[0.5, 0.0], [0.0, -0.2]]), 0.1 * np.array([[1.0, 0.5], [-0.3, 0.4], [0.2, 0.6]]),
-    )  # fmt: skip
+        A,
+        np.array([[1.0, 0.2], [-0.5, 0.8], [0.3, 1.0]]),
+        np.array([[1.0, 0.3, -0.5], [0.2, -1.0, 0.8]]),
+        np.array([[0.5, 0.0], [0.0, -0.2]]),
+        0.1 * np.array([[1.0, 0.5], [-0.3, 0.4], [0.2, 0.6]]),
+    )
 
 
 def unstable() -> System:
@@ -225,9 +228,12 @@ def test_records_are_never_joined_and_a_missing_row_is_a_gap() -> None:
 
 @settings(max_examples=15)
 @given(
-    u_scale=st.floats(1e-4, 1e6), y_scale=st.floats(1e-4, 1e6),
-    u_offset=st.floats(-100.0, 100.0), y_offset=st.floats(-100.0, 100.0), variant=st.sampled_from(VARIANTS),
-)  # fmt: skip
+    u_scale=st.floats(1e-4, 1e6),
+    y_scale=st.floats(1e-4, 1e6),
+    u_offset=st.floats(-100.0, 100.0),
+    y_offset=st.floats(-100.0, 100.0),
+    variant=st.sampled_from(VARIANTS),
+)
 def test_units_and_offsets_change_the_numbers_but_not_the_model(
     u_scale: float, y_scale: float, u_offset: float, y_offset: float, variant: tuple[str, Any]
 ) -> None:

@@ -94,8 +94,11 @@ FIELDS: tuple[tuple[str, int, int, int, int], ...] = (
 NAMES = [f[0] for f in FIELDS]
 MINTHROTTLE, VBATREF, LOW, HIGH = 1070, 1600, 48, 2047
 _GROUPS: dict[int, tuple[int, Callable[[Sequence[int]], bytes]]] = {
-    7: (3, tag2_3s32), 8: (4, tag8_4s16), 10: (3, tag2_3svariable), 6: (8, tag8_8svb),
-}  # fmt: skip
+    7: (3, tag2_3s32),
+    8: (4, tag8_4s16),
+    10: (3, tag2_3svariable),
+    6: (8, tag8_8svb),
+}
 _SINGLE: dict[int, Callable[[int], bytes]] = {0: signed, 1: unsigned, 3: neg_14bit, 9: lambda value: b""}
 
 
@@ -105,14 +108,24 @@ def _listed(place: int) -> str:
 
 def header() -> bytes:
     lines = [
-        "Product:Blackbox flight data recorder by Nicholas Sherlock", "Data version:2", "I interval:8",
+        "Product:Blackbox flight data recorder by Nicholas Sherlock",
+        "Data version:2",
+        "I interval:8",
         f"Field I name:{','.join(NAMES)}",
-        f"Field I predictor:{_listed(1)}", f"Field I encoding:{_listed(2)}",
-        f"Field P predictor:{_listed(3)}", f"Field P encoding:{_listed(4)}",
-        "Field S name:flightModeFlags,stateFlags", "Field S predictor:0,0", "Field S encoding:1,1",
-        f"minthrottle:{MINTHROTTLE}", f"vbatref:{VBATREF}", f"motorOutput:{LOW},{HIGH}", "motor_poles:14",
-        "gyro_scale:0x3f800000", "acc_1G:2048",
-    ]  # fmt: skip
+        f"Field I predictor:{_listed(1)}",
+        f"Field I encoding:{_listed(2)}",
+        f"Field P predictor:{_listed(3)}",
+        f"Field P encoding:{_listed(4)}",
+        "Field S name:flightModeFlags,stateFlags",
+        "Field S predictor:0,0",
+        "Field S encoding:1,1",
+        f"minthrottle:{MINTHROTTLE}",
+        f"vbatref:{VBATREF}",
+        f"motorOutput:{LOW},{HIGH}",
+        "motor_poles:14",
+        "gyro_scale:0x3f800000",
+        "acc_1G:2048",
+    ]
     return "".join(f"H {line}\n" for line in lines).encode()
 
 
@@ -127,9 +140,16 @@ def frames(rows: Sequence[Sequence[int]], interval: int = 8) -> list[bytes]:
         for i, (_, i_predictor, i_encoding, p_predictor, p_encoding) in enumerate(FIELDS):
             predictor, encoding = (i_predictor, i_encoding) if whole else (p_predictor, p_encoding)
             guess = {
-                0: 0, 1: previous[i], 2: 2 * previous[i] - before[i], 3: int((previous[i] + before[i]) / 2),
-                4: MINTHROTTLE, 5: row[NAMES.index("motor[0]")], 6: previous[i] + 1, 9: VBATREF, 11: LOW,
-            }[predictor]  # fmt: skip
+                0: 0,
+                1: previous[i],
+                2: 2 * previous[i] - before[i],
+                3: int((previous[i] + before[i]) / 2),
+                4: MINTHROTTLE,
+                5: row[NAMES.index("motor[0]")],
+                6: previous[i] + 1,
+                9: VBATREF,
+                11: LOW,
+            }[predictor]
             wanted.append((row[i] - guess, encoding))
         history = [row, row] if whole else [history[-1], row]
         out.append((b"I" if whole else b"P") + _encoded(wanted) + (b"S" + unsigned(3) + unsigned(0) if whole else b""))

@@ -74,7 +74,10 @@ def _interior(children: list[tuple[int, int]], page: int) -> bytes:
         out[at : at + len(cell)] = cell
         places.append(at)
     out[0], out[3:5], out[5:7], out[8:12] = (
-        5, struct.pack(">H", len(places)), struct.pack(">H", at), struct.pack(">I", children[-1][0]),
-    )  # fmt: skip
+        5,
+        struct.pack(">H", len(places)),
+        struct.pack(">H", at),
+        struct.pack(">I", children[-1][0]),
+    )
     out[12 : 12 + 2 * len(places)] = struct.pack(f">{len(places)}H", *places)
     return bytes(out)

@@ -100,8 +100,13 @@ def chunks_of_zeros() -> bytes:
 
 
 def channels_without_end() -> bytes:
-    return mcap(b"".join(record(4, struct.pack("<HH", k % 65536, 1) + text(b"a" * 9) + text(b"cdr") + bytes(4))
-                         for k in range(100_000)), b"")  # fmt: skip
+    return mcap(
+        b"".join(
+            record(4, struct.pack("<HH", k % 65536, 1) + text(b"a" * 9) + text(b"cdr") + bytes(4))
+            for k in range(100_000)
+        ),
+        b"",
+    )
 
 
 def definition(line: str) -> Callable[[], bytes]:

@@ -55,9 +55,16 @@ def log(tmp_path: Path, data: bytes) -> Path:
 
 @pytest.mark.parametrize(
     ("encoding", "encode", "size"),
-    [(0, lambda v: writer.signed(v[0]), 1), (3, lambda v: writer.neg_14bit(v[0]), 1), (6, writer.tag8_8svb, 8),
-     (6, writer.tag8_8svb, 3), (7, writer.tag2_3s32, 3), (8, writer.tag8_4s16, 4), (10, writer.tag2_3svariable, 3)],
-)  # fmt: skip
+    [
+        (0, lambda v: writer.signed(v[0]), 1),
+        (3, lambda v: writer.neg_14bit(v[0]), 1),
+        (6, writer.tag8_8svb, 8),
+        (6, writer.tag8_8svb, 3),
+        (7, writer.tag2_3s32, 3),
+        (8, writer.tag8_4s16, 4),
+        (10, writer.tag2_3svariable, 3),
+    ],
+)
 def test_every_encoding_gives_back_its_numbers(encoding: int, encode: Callable[[list[int]], bytes], size: int) -> None:
     rng = Random(1)
     definition = FrameDefinition(("x",) * size, (0,) * size, (encoding,) * size)

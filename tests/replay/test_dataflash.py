@@ -252,8 +252,10 @@ def test_what_is_no_order_of_the_motors_is_said_and_no_output_guessed(
         st.sampled_from([*functions(*range(16)), *functions(*range(16), bank="MAIN"), *functions(1, 2, bank="AUX")]),
         st.sampled_from([0, 33, 34, 35, 36, 37, 39, 82, 101, 102, 103, 104, -1, 1e30, math.nan, -math.inf]),
     ),
-    rotors=st.sampled_from([0, 3, 4, 6, 12]), width=st.sampled_from([4, 8, 16, 32]), ardupilot=st.booleans(),
-)  # fmt: skip
+    rotors=st.sampled_from([0, 3, 4, 6, 12]),
+    width=st.sampled_from([4, 8, 16, 32]),
+    ardupilot=st.booleans(),
+)
 def test_whatever_parameters_say_each_rotor_has_an_output_of_its_own_or_none_is_used(
     parameters: dict[str, float], rotors: int, width: int, ardupilot: bool
 ) -> None:

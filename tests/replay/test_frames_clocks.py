@@ -7,14 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from quadid_replay.columns import LogClock, RawChannel, clean_channel, fastest_first
-from quadid_replay.frames import (
-    flip_attitude,
-    flip_body,
-    flip_world,
-    from_euler,
-    to_euler,
-    unit_quaternions,
-)
+from quadid_replay.frames import flip_attitude, flip_body, flip_world, from_euler, to_euler, unit_quaternions
 from quadid_replay.mavlink_messages import SERVO_TURN, boot_stamp
 from scipy.spatial.transform import Rotation
 
@@ -111,9 +104,17 @@ def test_a_jump_ahead_is_a_break_and_a_single_wild_stamp_is_dropped() -> None:
 
 @pytest.mark.parametrize(
     ("places", "late"),
-    [([500], 20.0), ([500], 0.5), ([500], -20.0), ([0], 20.0), ([500, 501, 502], 20.0),
-     ([500, 502, 504, 506], 20.0), ([*range(50, 2000, 100)], 20.0), ([*range(50, 2000, 100)], -29.0)],
-)  # fmt: skip
+    [
+        ([500], 20.0),
+        ([500], 0.5),
+        ([500], -20.0),
+        ([0], 20.0),
+        ([500, 501, 502], 20.0),
+        ([500, 502, 504, 506], 20.0),
+        ([*range(50, 2000, 100)], 20.0),
+        ([*range(50, 2000, 100)], -29.0),
+    ],
+)
 def test_single_wild_stamps_cost_themselves_and_no_other(places: list[int], late: float) -> None:
     t = 0.02 * np.arange(2000)
     wild: FloatArray = np.array(t, dtype=np.float64)

@@ -22,9 +22,12 @@ from quadid.vehicle import Vehicle
 
 Flight = tuple[Recording, Vehicle]
 FLIGHTS = {
-    "pelican": None, "cases": "cases/case_001/train.csv", "hexacopter": "findings/vehicles/2_hexa_wrong_logs/clean.csv",
-    "figure8": "crazyflie_rpm/figure8_27.csv", "brushed": "brushed/jana00.csv",
-}  # fmt: skip
+    "pelican": None,
+    "cases": "cases/case_001/train.csv",
+    "hexacopter": "findings/vehicles/2_hexa_wrong_logs/clean.csv",
+    "figure8": "crazyflie_rpm/figure8_27.csv",
+    "brushed": "brushed/jana00.csv",
+}
 
 
 @pytest.fixture(scope="module", params=FLIGHTS)

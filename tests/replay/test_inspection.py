@@ -48,9 +48,19 @@ def check(inspection: Inspection, name: str) -> Check:
 def test_a_clean_flight_passes_every_check(clean: Recording) -> None:
     found = inspect(clean, PELICAN)
     assert {c.name: c.verdict for c in found.checks} == dict.fromkeys(
-        ("clock", "gravity", "gyro_attitude", "velocity_attitude", "rotor_speed", "hover", "motor_order",
-         "rotor_timing", "geometry"), CheckResult.OK,
-    )  # fmt: skip
+        (
+            "clock",
+            "gravity",
+            "gyro_attitude",
+            "velocity_attitude",
+            "rotor_speed",
+            "hover",
+            "motor_order",
+            "rotor_timing",
+            "geometry",
+        ),
+        CheckResult.OK,
+    )
     assert found.usable
     np.testing.assert_allclose(found.flying, [(0.0, 19.98)])
     assert found.missing == ()
@@ -176,9 +186,11 @@ def test_thrust_that_pulls_down_is_no_flight_by_the_vehicle_file(clean: Recordin
 
 @pytest.mark.parametrize(
     ("what", "name", "factor", "within", "fix"),
-    [*(("mass", "mass", f, 0.03, "kg would fit") for f in (0.8, 1.2)),
-     *(("arm", "geometry", f, 0.1, "measure the arm") for f in (0.7, 1.4))],
-)  # fmt: skip
+    [
+        *(("mass", "mass", f, 0.03, "kg would fit") for f in (0.8, 1.2)),
+        *(("arm", "geometry", f, 0.1, "measure the arm") for f in (0.7, 1.4)),
+    ],
+)
 def test_a_wrong_mass_and_arm_are_named_with_the_factor_where_thrust_and_inertia_are_known(
     clean: Recording, what: str, name: str, factor: float, within: float, fix: str, happened: Happened
 ) -> None:

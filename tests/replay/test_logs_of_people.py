@@ -87,10 +87,13 @@ def test_single_impossible_readings_are_dropped_and_counted(flight: Recording, w
 @pytest.mark.parametrize(
     ("name", "wrong", "rows"),
     [
-        ("rotor_speed", 65535.0 * 2.0 * np.pi / 60.0, 12), ("rotor_speed", 0.0, 12), ("rotor_speed", 2500.0, 3),
-        ("motor_command", 65535.0, 12), ("motor_command", 65535.0, 1),
+        ("rotor_speed", 65535.0 * 2.0 * np.pi / 60.0, 12),
+        ("rotor_speed", 0.0, 12),
+        ("rotor_speed", 2500.0, 3),
+        ("motor_command", 65535.0, 12),
+        ("motor_command", 65535.0, 1),
     ],
-)  # fmt: skip
+)
 def test_impossible_readings_of_a_while_are_dropped_and_counted(
     flight: Recording, name: str, wrong: float, rows: int
 ) -> None:
@@ -163,10 +166,12 @@ def test_an_accelerometer_off_zero_is_named(flight: Recording) -> None:
 @pytest.mark.parametrize(
     ("unit", "made"),
     [
-        ("in rpm", lambda w: w * 30.0 / np.pi), ("a square", lambda w: w**2), ("in rev/s", lambda w: w * 0.5 / np.pi),
+        ("in rpm", lambda w: w * 30.0 / np.pi),
+        ("a square", lambda w: w**2),
+        ("in rev/s", lambda w: w * 0.5 / np.pi),
         ("a command from 0 to 1", lambda w: w / 900.0),
     ],
-)  # fmt: skip
+)
 def test_one_rotor_in_another_unit_is_named(vehicle: str, unit: str, made: Callable[[FloatArray], FloatArray]) -> None:
     """On a hexacopter all rotors were to be multiplied by 1/7, or the rotor was dead."""
     recording = quadid.simulate(vehicle, seconds=20.0, seed=5).flight.recording
@@ -209,9 +214,10 @@ def test_a_signal_that_moves_keeps_every_reading(flight: Recording) -> None:
     for name in ("crash", "noise", "start"):
         rng, n = np.random.default_rng(0), 400
         speeds = {
-            "crash": np.where(np.arange(n) < 200, 400.0, 0.0), "noise": 400.0 + 200.0 * rng.standard_normal(n),
+            "crash": np.where(np.arange(n) < 200, 400.0, 0.0),
+            "noise": 400.0 + 200.0 * rng.standard_normal(n),
             "start": np.clip(np.arange(n) - 100.0, 0.0, 200.0),
-        }[name][:, None] * np.ones(4)  # fmt: skip
+        }[name][:, None] * np.ones(4)
         cleaned = clean_channel(RawChannel("rotor_speed", np.linspace(0.0, 0.02 * (n - 1), n), speeds, "made"))
         assert cleaned is not None
         assert len(cleaned.t) == n, name
@@ -297,10 +303,12 @@ def test_inertia_in_grams_and_thrust_per_rpm_are_named(flight: Recording) -> Non
     [
         ("gyro", 1e3, "gyro_attitude", "scale of one is wrong"),
         ("gyro", 10.0, "gyro_attitude", "multiply gyro by 0."),
-        ("position", 1e3, "position_velocity", "different units"), ("velocity", 3.6, "velocity_attitude", "by 3."),
-        ("rotor_speed", 60.0, "hover", "check mass, the unit"), ("rotor_speed", 0.004, "hover", "check mass, the unit"),
+        ("position", 1e3, "position_velocity", "different units"),
+        ("velocity", 3.6, "velocity_attitude", "by 3."),
+        ("rotor_speed", 60.0, "hover", "check mass, the unit"),
+        ("rotor_speed", 0.004, "hover", "check mass, the unit"),
     ],
-)  # fmt: skip
+)
 def test_a_unit_that_nobody_named_is_an_error_all_the_same(
     flight: Recording, channel: str, factor: float, check: str, said: str
 ) -> None:
@@ -376,9 +384,14 @@ def test_another_frame_numbered_otherwise_is_answered_with_turn_and_order(flew: 
 
 @pytest.mark.parametrize(
     ("full", "zero", "said"),
-    [(100.0, 0.0, "divide by 100"), (255.0, 0.0, "divide by 255"), (1000.0, 0.0, "divide by 1000"),
-     (65535.0, 0.0, "divide by 65535"), (2.0, -1.0, "write 0 for standing still")],
-)  # fmt: skip
+    [
+        (100.0, 0.0, "divide by 100"),
+        (255.0, 0.0, "divide by 255"),
+        (1000.0, 0.0, "divide by 1000"),
+        (65535.0, 0.0, "divide by 65535"),
+        (2.0, -1.0, "write 0 for standing still"),
+    ],
+)
 def test_commands_that_count_to_another_number_are_no_pulses_nor_speeds(full: float, zero: float, said: str) -> None:
     vehicle = Vehicle.shipped("crazyflie")
     recording = quadid.simulate(vehicle, seconds=10.0, seed=14).flight.recording
@@ -400,8 +413,9 @@ def test_what_lies_on_its_back_and_never_flies_is_no_wrong_frame() -> None:
     t = np.arange(0.0, 10.0, 0.02, dtype=np.float64)
     noise = np.random.default_rng(1).normal(0.0, 0.02, (500, 6))
     made = {
-        "gyro": Channel("gyro", t, 0.1 * noise[:, :3]), "accel": Channel("accel", t, noise[:, 3:] + [0.0, 0.0, 9.81]),
-    }  # fmt: skip
+        "gyro": Channel("gyro", t, 0.1 * noise[:, :3]),
+        "accel": Channel("accel", t, noise[:, 3:] + [0.0, 0.0, 9.81]),
+    }
     found = inspect(Recording("made", "csv", made))
     assert [c.verdict for c in found.checks if c.name == "gravity"] == [CheckResult.UNKNOWN]
 
@@ -460,21 +474,27 @@ def test_init_bounds_the_thrust_coefficient_by_the_size_of_the_frame(data_dir: P
 
 def test_betaflight_says_which_way_its_propellers_turn() -> None:
     spins = [
-        [r.spin for r in frame.rotors] for told in (0.0, 1.0)
+        [r.spin for r in frame.rotors]
+        for told in (0.0, 1.0)
         if (frame := frame_of({"yaw_motors_reversed": told}, 0.1)) is not None
-    ]  # fmt: skip
+    ]
     assert spins == [[-1, 1, 1, -1], [1, -1, -1, 1]]
 
 
 @pytest.mark.parametrize(
     ("parameters", "kind", "firmware", "word"),
     [
-        ({}, 1, "", "MAV_TYPE 1"), ({"MAV_TYPE": 22.0}, 0, "", "MAV_TYPE 22"), ({}, 0, "Plane", "ArduPlane"),
-        ({"CA_AIRFRAME": 2.0}, 0, "", "VTOL"), ({"FRAME_CLASS": 6.0}, 2, "Copter", "helicopter"),
-        ({"Q_ENABLE": 1.0}, 0, "", "Q_ENABLE"), ({"MAV_TYPE": 2.0, "CA_AIRFRAME": 0.0}, 0, "", ""),
-        ({"FRAME_CLASS": 1.0}, 13, "Copter", ""), ({}, 0, "", ""),
+        ({}, 1, "", "MAV_TYPE 1"),
+        ({"MAV_TYPE": 22.0}, 0, "", "MAV_TYPE 22"),
+        ({}, 0, "Plane", "ArduPlane"),
+        ({"CA_AIRFRAME": 2.0}, 0, "", "VTOL"),
+        ({"FRAME_CLASS": 6.0}, 2, "Copter", "helicopter"),
+        ({"Q_ENABLE": 1.0}, 0, "", "Q_ENABLE"),
+        ({"MAV_TYPE": 2.0, "CA_AIRFRAME": 0.0}, 0, "", ""),
+        ({"FRAME_CLASS": 1.0}, 13, "Copter", ""),
+        ({}, 0, "", ""),
     ],
-)  # fmt: skip
+)
 def test_what_is_no_multirotor(parameters: dict[str, float], kind: int, firmware: str, word: str) -> None:
     said = no_multirotor(parameters, kind, firmware)
     assert (word in said) if word else said == ""

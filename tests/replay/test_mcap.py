@@ -178,8 +178,9 @@ def test_joints_are_rotors_in_the_order_of_their_numbers(tmp_path: Path, names: 
 def test_actuators_of_rotors_and_gazebo(tmp_path: Path) -> None:
     text = with_parts(
         "std_msgs/Header header\nfloat64[] position\nfloat64[] velocity\nfloat64[] normalized\n",
-        "std_msgs/Header", "builtin_interfaces/Time",
-    )  # fmt: skip
+        "std_msgs/Header",
+        "builtin_interfaces/Time",
+    )
     with (tmp_path / "log").open("wb") as stream, RosWriter(stream) as writer:
         schema = writer.register_msgdef("actuator_msgs/msg/Actuators", text)
         for k in range(50):
@@ -279,10 +280,19 @@ def test_other_readers_open_our_files(tmp_path: Path) -> None:
 
 def test_any_message_of_ours_can_be_written(tmp_path: Path) -> None:
     parameters = {
-        "header": header(5), "schema_version": 1, "vehicle_id": "pelican", "sequence": 7, "state": 3,
-        "names": ["b"], "units": ["N s^2/rad^2"], "values": [2e-5], "covariance": [1e-12], "status": [0],
-        "relative_to": [""], "mse_held_out": float("nan"),
-    }  # fmt: skip
+        "header": header(5),
+        "schema_version": 1,
+        "vehicle_id": "pelican",
+        "sequence": 7,
+        "state": 3,
+        "names": ["b"],
+        "units": ["N s^2/rad^2"],
+        "values": [2e-5],
+        "covariance": [1e-12],
+        "status": [0],
+        "relative_to": [""],
+        "mse_held_out": float("nan"),
+    }
     with TopicWriter(tmp_path / "log") as writer:
         writer.write("quadid/parameters", "quadid_msgs/msg/ParameterSet", parameters, 5)
         finding = {"effect": "motor_lag", "parameter_names": ["tau"], "parameter_values": [0.05]}

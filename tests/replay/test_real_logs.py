@@ -18,9 +18,16 @@ from tests.replay.synthetic import PELICAN, with_command
 
 EXPECTED: dict[str, Any] = json.loads(GOLDEN.read_text(encoding="utf-8"))
 PLAUSIBLE = {
-    "gyro": 45.0, "accel": 160.0, "attitude": 1.0, "rotor_speed": 6000.0, "motor_command": 2200.0, "velocity": 40.0,
-    "position": 500.0, "battery": 60.0, "attitude_reference": 3.2,
-}  # fmt: skip
+    "gyro": 45.0,
+    "accel": 160.0,
+    "attitude": 1.0,
+    "rotor_speed": 6000.0,
+    "motor_command": 2200.0,
+    "velocity": 40.0,
+    "position": 500.0,
+    "battery": 60.0,
+    "attitude_reference": 3.2,
+}
 
 
 def test_the_golden_file_covers_every_log(data_dir: Path) -> None:

@@ -254,7 +254,7 @@ def test_an_arm_that_no_inertia_fits_is_asked_for(data_dir: Path) -> None:
         *(("findings/vehicles/6_bob_gyro_scale", "train.csv", *x) for x in ((1.0, 1.0, ""), (1.35, 1.0, "arm"))),
         *(("cases_hub/case_001", "train.csv", *x) for x in ((1.0, 1.0, ""), (1.0, 1.3, "mass"), (0.7, 1.0, "arm"))),
     ],
-)  # fmt: skip
+)
 def test_an_arm_or_a_mass_that_guesses_and_motion_make_unlikely_is_asked_for(
     data_dir: Path, folder: str, log: str, arm: float, mass: float, asked: str
 ) -> None:
@@ -283,9 +283,10 @@ def test_a_pair_of_reversed_spins_on_six_rotors_is_asked_for() -> None:
     recording = simulate(vehicle, seconds=30.0, seed=3).flight.recording
     rotors = tuple(r.model_copy(update={"spin": -r.spin}) if k in (0, 3) else r for k, r in enumerate(vehicle.rotors))
     (check,) = (
-        check for check in inspect(recording, vehicle.model_copy(update={"rotors": rotors})).checks
+        check
+        for check in inspect(recording, vehicle.model_copy(update={"rotors": rotors})).checks
         if check.name == "motor_order"
-    )  # fmt: skip
+    )
     assert check.verdict is CheckResult.WARNING
     assert "rotor 1 and 4, and how the IMU is mounted" in check.fix
 

@@ -54,8 +54,7 @@ def test_round_trip_of_every_channel(tmp_path: Path, kind: str) -> None:
 
 @pytest.mark.parametrize("kind", WRITERS)
 @pytest.mark.parametrize(
-    "source",
-    ["nanodrone/square_run1.csv", "ardupilot/log171.bin", "px4/ascend_cubeorange_test.ulg"],
+    "source", ["nanodrone/square_run1.csv", "ardupilot/log171.bin", "px4/ascend_cubeorange_test.ulg"]
 )
 def test_round_trip_of_real_flights(tmp_path: Path, data_dir: Path, source: str, kind: str) -> None:
     recording = open_log(data_dir / source)

@@ -18,15 +18,31 @@ def rows(values: dict[str, np.ndarray], sigma: float = 0.01) -> tuple[list[dict[
     for unit, series in values.items():
         for i, value in enumerate(2e-5 * series):
             name = f"{unit}/{i}.csv"
-            logs.append({
-                "name": name, "unit": unit, "status": "done", "reason": "", "started": 1.6e9 + i * DAY, "verdict": None,
-                "dated_by": "log", "mse_initial": 20.0, "mse_fitted": 1.0 + 0.01 * i,
-            })  # fmt: skip
+            logs.append(
+                {
+                    "name": name,
+                    "unit": unit,
+                    "status": "done",
+                    "reason": "",
+                    "started": 1.6e9 + i * DAY,
+                    "verdict": None,
+                    "dated_by": "log",
+                    "mse_initial": 20.0,
+                    "mse_fitted": 1.0 + 0.01 * i,
+                }
+            )
             half = 1.96 * sigma * 2e-5
-            parameters.append({
-                "log": name, "parameter": "b", "unit": "N s^2/rad^2", "value": value, "low": value - half,
-                "high": value + half, "status": "identified",
-            })  # fmt: skip
+            parameters.append(
+                {
+                    "log": name,
+                    "parameter": "b",
+                    "unit": "N s^2/rad^2",
+                    "value": value,
+                    "low": value - half,
+                    "high": value + half,
+                    "status": "identified",
+                }
+            )
     return logs, parameters
 
 

@@ -34,9 +34,7 @@ def test_an_fmu_flies_as_the_simulator(tmp_path: Path, monkeypatch: pytest.Monke
     for i in range(6):
         given[f"command.{i + 1}"] = command[:, i]
     names = [f"position.{axis}" for axis in "ned"] + [f"rate.{axis}" for axis in "pqr"] + ["rotor_speed.6"]
-    found = fmpy.simulate_fmu(
-        file, stop_time=float(t[-1]), step_size=DT, output_interval=DT, input=given, output=names,
-    )  # fmt: skip
+    found = fmpy.simulate_fmu(file, stop_time=float(t[-1]), step_size=DT, output_interval=DT, input=given, output=names)
     simulator = quadid.Simulator(vehicle)
     state = simulator.start()
     for row in range(ROWS - 1):

@@ -76,14 +76,20 @@ def hostile_vehicle(text: str, full_speed: float | None) -> Vehicle:
     flight = FittedFlight.model_construct(log=text, seconds=1.0, begin=None, marks=text)
     proof = Proof.model_construct(verdict=text, unseen=(text,), error=2.0, fitted=(flight,))
     sigma = ParameterPrior(initial=2e-5, sigma=1e-7)
-    vehicle = Vehicle.model_construct(**{
-        **{name: getattr(cross, name) for name in Vehicle.model_fields},
-        "name": text, "mixer": text, "columns": {text: text}, "residual": (term,), "proof": proof,
-        "correlation": {text: {text: 0.5}},
-        "effects": {"motor_lag": {"tau": 0.03}} | ({} if full_speed else {text: {text: 1.0}}),
-        "command": Command.model_construct(kind=text, sampling=text, max_speed=full_speed, range=(1000.0, 2000.0)),
-        "parameters": {**cross.parameters, "b": sigma},
-    })  # fmt: skip
+    vehicle = Vehicle.model_construct(
+        **{
+            **{name: getattr(cross, name) for name in Vehicle.model_fields},
+            "name": text,
+            "mixer": text,
+            "columns": {text: text},
+            "residual": (term,),
+            "proof": proof,
+            "correlation": {text: {text: 0.5}},
+            "effects": {"motor_lag": {"tau": 0.03}} | ({} if full_speed else {text: {text: 1.0}}),
+            "command": Command.model_construct(kind=text, sampling=text, max_speed=full_speed, range=(1000.0, 2000.0)),
+            "parameters": {**cross.parameters, "b": sigma},
+        }
+    )
     return vehicle.with_remark(f"{text}\n{text}")
 
 
@@ -156,19 +162,29 @@ def check_yaml(text: str) -> None:
     known = {"mass", "inertia", "tbm_fr", "tbm_bl", "tbm_br", "tbm_fl", "motor_omega_min", "motor_omega_max",
              "motor_tau", "thrust_map", "kappa", "thrust_min", "thrust_max", "rotors_config", "aero_coeff_1",
              "aero_coeff_3", "aero_coeff_h"}  # fmt: skip
-    assert set(data) in (known, {*Vehicle.model_fields} - {"reference_voltage", "stabiliser", "mounting", "random",
-                                                            "mass_sigma", "arm_sigma", "thrust_stand"})  # fmt: skip
+    assert set(data) in (
+        known,
+        {*Vehicle.model_fields}
+        - {"reference_voltage", "stabiliser", "mounting", "random", "mass_sigma", "arm_sigma", "thrust_stand"},
+    )
     assert all(line[:1] != "#" or line.isprintable() for line in re.split("[\n\r\x85\u2028\u2029]", text))
 
 
 CHECKS: dict[str, Callable[[str], None]] = {
-    ".lua": check_lua, ".py": check_python, ".sdf": check_xml, ".xml": check_xml, ".urdf": check_xml,
+    ".lua": check_lua,
+    ".py": check_python,
+    ".sdf": check_xml,
+    ".xml": check_xml,
+    ".urdf": check_xml,
     ".params": lambda t: check_lines(t, r"1\t1\t[A-Z0-9_]+\t[-+.e\d]+\t[69]", "\t"),
     ".param": lambda t: check_lines(t, r"[A-Z0-9_]+,[-+.e\d]+", ","),
-    ".hpp": lambda t: check_code(t, "//"), ".usda": lambda t: check_code(t, "#"),
-    ".json": check_json, ".toml": check_toml, ".yaml": check_yaml,
+    ".hpp": lambda t: check_code(t, "//"),
+    ".usda": lambda t: check_code(t, "#"),
+    ".json": check_json,
+    ".toml": check_toml,
+    ".yaml": check_yaml,
     ".txt": lambda t: check_lines("".join(f"# {line}\n" for line in t.split("\n")), "", ""),
-}  # fmt: skip
+}
 
 
 def check(ending: str, text: str) -> None:
@@ -240,12 +256,27 @@ def test_a_page_holds_strangers_text_as_text(kind: str) -> None:
     def shown(text: str) -> _Tags:
         verdict = {"level": "good", "headline": text, "details": [text], "next_steps": [text]}
         table: dict[str, Any] = {"kind": "", "head": [text], "rows": [[text]], "classes": [""], "fold": text}
-        figure = {"id": "f", "title": text, "caption": text, "height": 100, "views": [{"label": text, "data": [
-            {"type": "scatter", "name": text, "x": [1.0], "y": [1.0]}]}]}  # fmt: skip
+        figure = {
+            "id": "f",
+            "title": text,
+            "caption": text,
+            "height": 100,
+            "views": [{"label": text, "data": [{"type": "scatter", "name": text, "x": [1.0], "y": [1.0]}]}],
+        }
         inner = part(text, text, lines=[text], after=[text], verdict=verdict, kind="finding")
         whole = section("s", text, text, [figure], [table], lines=[quiet(text)], parts=[inner], menu=text)
-        return tags(page({"title": text, "subtitle": text, "verdict": verdict, "sections": [whole],
-                          "warnings": [text], "provenance": [{"name": text, "value": text}]}))  # fmt: skip
+        return tags(
+            page(
+                {
+                    "title": text,
+                    "subtitle": text,
+                    "verdict": verdict,
+                    "sections": [whole],
+                    "warnings": [text],
+                    "provenance": [{"name": text, "value": text}],
+                }
+            )
+        )
 
     plain, evil = shown("text"), shown(HOSTILE[kind])
     quotes = "code" if "`" in HOSTILE[kind] else ""
@@ -257,9 +288,12 @@ def test_a_page_holds_strangers_text_as_text(kind: str) -> None:
 @pytest.mark.parametrize("field", ["name", "columns", "keys of columns", "mixer", "proof", "flight"])
 def test_a_vehicle_is_not_made_with_text_that_does_not_print(field: str, text: str) -> None:
     fields: dict[str, dict[str, Any]] = {
-        "name": {"name": text}, "columns": {"columns": {"p": text}}, "keys of columns": {"columns": {text: "p"}},
-        "mixer": {"mixer": text}, "proof": {"proof": {"verdict": "good", "unseen": [text]}},
+        "name": {"name": text},
+        "columns": {"columns": {"p": text}},
+        "keys of columns": {"columns": {text: "p"}},
+        "mixer": {"mixer": text},
+        "proof": {"proof": {"verdict": "good", "unseen": [text]}},
         "flight": {"proof": {"verdict": "good", "fitted": [{"log": text, "seconds": 1.0}]}},
-    }  # fmt: skip
+    }
     with pytest.raises(ValueError, match=r"does not print|unicode"):
         Vehicle.model_validate({**Vehicle.shipped("pelican").model_dump(), **fields[field]})

@@ -136,8 +136,10 @@ class Autopilot:
         down += 3.0 * (-climb - down) * step
         self.velocity = (north, east, down)
         self.north, self.east, self.height = (
-            self.north + north * step, self.east + east * step, self.height - down * step
-        )  # fmt: skip
+            self.north + north * step,
+            self.east + east * step,
+            self.height - down * step,
+        )
 
     def run(self, seconds: float, each: Callable[[Autopilot], None] = lambda a: None) -> None:
         """Calls the script as the scheduler does, for some seconds."""
@@ -158,7 +160,8 @@ class Autopilot:
             "ahrs": {
                 "get_relative_position_NED_home": lambda _: vector(self.north, self.east, -self.height),
                 "get_velocity_NED": lambda _: vector(*self.velocity),
-                f"get_roll{rad}": lambda _: self.roll, f"get_pitch{rad}": lambda _: self.pitch,
+                f"get_roll{rad}": lambda _: self.roll,
+                f"get_pitch{rad}": lambda _: self.pitch,
                 f"get_yaw{rad}": lambda _: self.yaw,
             },
             "battery": {"capacity_remaining_pct": lambda _, which: self.battery},
@@ -166,11 +169,12 @@ class Autopilot:
             "rc": {"get_aux_cached": lambda _, which: self.switch},
             "gcs": {"send_text": lambda _, severity, text: self.said.append(text)},
             "vehicle": {
-                "get_mode": lambda _: self.mode, "set_mode": lambda _, mode: self.set_mode(mode),
+                "get_mode": lambda _: self.mode,
+                "set_mode": lambda _, mode: self.set_mode(mode),
                 "get_likely_flying": lambda _: self.height > 1.0,
                 "set_target_angle_and_climbrate": lambda _, *values: self.ask(values),
             },
-        }  # fmt: skip
+        }
         for name, functions in names.items():
             lua.globals()[name] = lua.table_from(functions)
         lua.globals()["millis"] = lambda: lua.table_from({"tofloat": lambda _: 1e3 * self.now})
@@ -217,10 +221,14 @@ def test_it_asks_for_the_manoeuvre_and_ends_in_loiter(autopilot: Autopilot) -> N
 @pytest.mark.parametrize(
     ("name", "value", "why"),
     [
-        ("height", 9.0, "height 9.0 m"), ("height", 41.0, "height 41.0 m"), ("roll", 0.7, "tilt 40 deg"),
-        ("battery", 39.0, "battery 39 %"), ("battery", None, "no battery level"), ("north", 60.0, "too far away"),
+        ("height", 9.0, "height 9.0 m"),
+        ("height", 41.0, "height 41.0 m"),
+        ("roll", 0.7, "tilt 40 deg"),
+        ("battery", 39.0, "battery 39 %"),
+        ("battery", None, "no battery level"),
+        ("north", 60.0, "too far away"),
     ],
-)  # fmt: skip
+)
 def test_leaving_the_envelope_ends_it_at_once(autopilot: Autopilot, name: str, value: float | None, why: str) -> None:
     autopilot.run(0.5)
     autopilot.switch = 2

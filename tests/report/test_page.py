@@ -103,9 +103,16 @@ def result(sets: list[ScoredSet]) -> dict[str, Any]:
         for s in sets
     ]
     return {
-        "schema": "quadid.identify/1", "vehicle": EVIL, "optimizer": "pso_polish", "seed": 1, "seconds": 1.0,
-        "parameters": parameters, "sets": entries, "vehicle_file": "/x.yaml", "warnings": [EVIL],
-    }  # fmt: skip
+        "schema": "quadid.identify/1",
+        "vehicle": EVIL,
+        "optimizer": "pso_polish",
+        "seed": 1,
+        "seconds": 1.0,
+        "parameters": parameters,
+        "sets": entries,
+        "vehicle_file": "/x.yaml",
+        "warnings": [EVIL],
+    }
 
 
 def page(sets: list[ScoredSet]) -> str:
@@ -230,17 +237,23 @@ def test_long_flights_and_many_logs_stay_below_six_megabytes(logs: int, rows: in
 
 def test_diagnosis_part_shows_findings_and_what_remains() -> None:
     finding = {
-        "effect": "motor_lag", "confident": True, "p_value": 1e-9, "evidence": EVIL,
+        "effect": "motor_lag",
+        "confident": True,
+        "p_value": 1e-9,
+        "evidence": EVIL,
         "parameters": [{"name": "tau", "unit": "s", "value": 0.05, "ci95": [0.04, None]}],
         "gain": {"mse_before": 3.1, "mse_after": 1.0, "ci95": [1.9, 2.2], "seconds": 4.0},
         "alternatives": [{"effect": "command_delay", "mse_after": 1.3}],
-    }  # fmt: skip
+    }
     data = {
-        "schema": "quadid.diagnose/1", "verdict": "partly_explained", "statement": "Some remains.",
+        "schema": "quadid.diagnose/1",
+        "verdict": "partly_explained",
+        "statement": "Some remains.",
         "findings": [finding],
-        "validation": {"mse_nominal": 3.1, "mse_extended": 1.0, "noise_floor": 1.0}, "unexplained": {"p": 0.02},
+        "validation": {"mse_nominal": 3.1, "mse_extended": 1.0, "noise_floor": 1.0},
+        "unexplained": {"p": 0.02},
         "vehicle_file": "/x.yaml",
-    }  # fmt: skip
+    }
     reader = Reader()
     reader.feed(
         render({"title": "t", "sections": [findings_section([diagnosis_part(data, [scored("a")], "d", EVIL, EVIL)])]})
@@ -333,15 +346,26 @@ def missing(size: float, rows: int = 100) -> Missing:
     """A stretch on which a model misses a force of this size [N] and as large a moment [N m]."""
     t, acted = 0.02 * np.arange(rows, dtype=np.float64), np.full((rows, 3), size)
     control = np.outer(np.sin(0.3 * np.arange(rows)), np.ones(3))
-    return Missing(t, acted, 0.1 * acted, acted, 0.1 * acted, control, np.zeros((rows, 8)), 10.0, *np.full((2, 6), 0.1),
-                   *np.ones((2, rows, 12)))  # fmt: skip
+    return Missing(
+        t,
+        acted,
+        0.1 * acted,
+        acted,
+        0.1 * acted,
+        control,
+        np.zeros((rows, 8)),
+        10.0,
+        *np.full((2, 6), 0.1),
+        *np.ones((2, rows, 12)),
+    )
 
 
 def test_what_is_missing_is_drawn_with_its_band_for_every_model_and_axis() -> None:
     force, moment = missing_figures({"nominal": [missing(0.5)], "extended": [missing(0.001)]}, "m")
     lines = force["views"][0]["data"]
     assert [line["role"] for line in lines] == ["before"] * 3 + ["after"] * 3 + ["before"] * 3 + ["after"] * 3 + [
-        "before"] * 3 + ["after"] * 3  # fmt: skip
+        "before"
+    ] * 3 + ["after"] * 3
     upper, lower, value = (np.asarray(line["y"], dtype=float) for line in lines[:3])
     assert value == pytest.approx(0.5)
     assert (upper - lower) / 2.0 == pytest.approx(1.96 * 0.05, rel=0.01)
@@ -434,9 +458,12 @@ def pelican() -> Vehicle:
 
 
 def drawn(
-    vehicle: Vehicle, effect: str, values: dict[str, float], names: tuple[str, ...],
+    vehicle: Vehicle,
+    effect: str,
+    values: dict[str, float],
+    names: tuple[str, ...],
     extras: tuple[str, ...] = ("velocity", "position"),
-) -> ResidualMap:  # fmt: skip
+) -> ResidualMap:
     """The map of an effect that a vehicle flew with, at its true values."""
     flight = fly(vehicle, seconds=40.0, seed=8, effects={effect: values}, extras=extras)
     layout = Layout(vehicle)
@@ -572,10 +599,11 @@ def test_modes_are_told_from_the_first_imu_sample_on() -> None:
 @pytest.mark.parametrize(
     ("log", "names"),
     [
-        ("ardupilot/log171.bin", {"Loiter", "Acro"}), ("px4/ascend_cubeorange_test.ulg", {"Takeoff", "Hold", "Land"}),
+        ("ardupilot/log171.bin", {"Loiter", "Acro"}),
+        ("px4/ascend_cubeorange_test.ulg", {"Takeoff", "Hold", "Land"}),
         ("nanodrone/square_run1.csv", set()),
     ],
-)  # fmt: skip
+)
 def test_recorded_flights(data_dir: Path, log: str, names: set[str]) -> None:
     assert {name for _, name in open_log(data_dir / log).modes} == names
 
@@ -626,8 +654,14 @@ def test_everything_that_results_hold_becomes_plain() -> None:
         3: None,
     }
     expected = {
-        "good": "good", "path": "/a/b", "row": [1.0, None, None], "number": 2.5, "whole": 7, "flag": True,
-        "pair": [1, {"inner": None}], "3": None,
-    }  # fmt: skip
+        "good": "good",
+        "path": "/a/b",
+        "row": [1.0, None, None],
+        "number": 2.5,
+        "whole": 7,
+        "flag": True,
+        "pair": [1, {"inner": None}],
+        "3": None,
+    }
     assert jsonable(value) == expected
     assert json.loads(json.dumps(jsonable(value), allow_nan=False)) == expected

@@ -12,9 +12,12 @@ from quadid.report.verdict import MOTION, digits, identify_verdict, percent, rea
 
 
 def _result(
-    fitted: float | None = 1.0, status: str = "identified", role: str = "validate", force: float = 0.05,
+    fitted: float | None = 1.0,
+    status: str = "identified",
+    role: str = "validate",
+    force: float = 0.05,
     moment: float = 0.001,
-) -> dict[str, Any]:  # fmt: skip
+) -> dict[str, Any]:
     """A result of ``quadid identify`` of a vehicle of 10 N whose rotors make 0.1 N m."""
     parameters = [
         {"name": n, "unit": "", "value": 1.1, "ci95": [1.09, 1.11], "initial": 1.0, "status": status} for n in MOTION
@@ -193,9 +196,12 @@ def test_what_is_no_larger_than_on_most_vehicles_is_told_apart_and_needs_no_mend
     ]
     validation = {"mse_nominal": 9.0, "mse_extended": 1.0}
     result = {
-        "verdict": "explained", "statement": "These causes explain the model error.", "findings": findings,
-        "validation": validation, "unexplained": {},
-    }  # fmt: skip
+        "verdict": "explained",
+        "statement": "These causes explain the model error.",
+        "findings": findings,
+        "validation": validation,
+        "unexplained": {},
+    }
     verdict = diagnose_verdict(result)
     assert verdict.headline.startswith("Found: parasitic drag; no larger than on most vehicles: cg offset. ")
     assert [step.split(":")[0] for step in verdict.next_steps if ":" in step] == ["Parasitic drag"]
@@ -206,15 +212,21 @@ def test_what_is_no_larger_than_on_most_vehicles_is_told_apart_and_needs_no_mend
 @pytest.mark.parametrize(
     ("validation", "level"),
     [
-        ({"mse_extended": 1.1}, "good"), ({"mse_extended": 2.9}, "fair"), ({"mse_extended": None}, "fair"),
-        ({"mse_extended": 2.9, "mse_extended_refitted": 1.1}, "good"), ({"mse_extended": 1.1, "on": HELD_OUT}, "fair"),
+        ({"mse_extended": 1.1}, "good"),
+        ({"mse_extended": 2.9}, "fair"),
+        ({"mse_extended": None}, "fair"),
+        ({"mse_extended": 2.9, "mse_extended_refitted": 1.1}, "good"),
+        ({"mse_extended": 1.1, "on": HELD_OUT}, "fair"),
     ],
-)  # fmt: skip
+)
 def test_a_diagnosis_is_green_where_an_unseen_flight_is_predicted_down_to_the_noise(
     validation: dict[str, Any], level: str
 ) -> None:
     result = {
-        "verdict": "explained", "statement": "These causes explain the model error.", "findings": [],
-        "validation": {"mse_nominal": 400.0, **validation}, "unexplained": {},
-    }  # fmt: skip
+        "verdict": "explained",
+        "statement": "These causes explain the model error.",
+        "findings": [],
+        "validation": {"mse_nominal": 400.0, **validation},
+        "unexplained": {},
+    }
     assert diagnose_verdict(result).level == level

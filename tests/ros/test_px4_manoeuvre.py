@@ -64,12 +64,21 @@ def px4_messages(repository: Path, tmp_path_factory: pytest.TempPathFactory) -> 
     assert cmake is not None
     prefix, build = source / "prefix", source / "build"
     for arguments in (
-        ["-S", source, "-B", build, "-Wno-dev", "-DBUILD_TESTING=OFF", f"-DCMAKE_PREFIX_PATH={sys.prefix}",
-         f"-DCMAKE_INSTALL_PREFIX={prefix}", f"-DPython3_EXECUTABLE={sys.executable}",
-         f"-DCMAKE_PROJECT_INCLUDE={repository / 'tools' / 'wheel_targets.cmake'}"],
+        [
+            "-S",
+            source,
+            "-B",
+            build,
+            "-Wno-dev",
+            "-DBUILD_TESTING=OFF",
+            f"-DCMAKE_PREFIX_PATH={sys.prefix}",
+            f"-DCMAKE_INSTALL_PREFIX={prefix}",
+            f"-DPython3_EXECUTABLE={sys.executable}",
+            f"-DCMAKE_PROJECT_INCLUDE={repository / 'tools' / 'wheel_targets.cmake'}",
+        ],
         ["--build", build, "--parallel", "2"],
         ["--install", build],
-    ):  # fmt: skip
+    ):
         subprocess.run([cmake, *map(str, arguments)], env=environment, check=True, capture_output=True, timeout=500)
     (package,) = prefix.glob("lib/python*/site-packages")
     return package
@@ -139,15 +148,21 @@ def fly(script: tuple[Path, dict[str, str]], low_at: float, hover: float = 0.4) 
     stand_in = path.with_name("stand_in.py")
     stand_in.write_text(STAND_IN, encoding="utf-8")
     autopilot = subprocess.Popen(
-        [sys.executable, str(stand_in), str(low_at)], env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+        [sys.executable, str(stand_in), str(low_at)],
+        env=environment,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
         text=True,
-    )  # fmt: skip
+    )
     try:
         done = subprocess.run(
             [sys.executable, str(path), "--ros-args", "-p", f"hover_thrust:={hover}"],
-            env=environment, capture_output=True,
-            text=True, timeout=900, check=False,
-        )  # fmt: skip
+            env=environment,
+            capture_output=True,
+            text=True,
+            timeout=900,
+            check=False,
+        )
         out, _ = autopilot.communicate("", timeout=900)
     finally:
         autopilot.kill()
@@ -169,9 +184,10 @@ def test_it_flies_the_manoeuvre_once_in_offboard_and_asks_for_hold(script: tuple
     assert t[-1] == pytest.approx(SECONDS, abs=1.5)
     w, x, y, z = flown[:, 2:6].T
     angles = {
-        "roll": np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)), "pitch": np.arcsin(2 * (w * y - z * x)),
+        "roll": np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)),
+        "pitch": np.arcsin(2 * (w * y - z * x)),
         "yaw": np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)),
-    }  # fmt: skip
+    }
     wanted = scripted(SEGMENTS, 1, round(SECONDS / PILOT_STEP))
     grid = PILOT_STEP * np.arange(len(wanted))
     angles["throttle"] = -flown[:, 6] / 0.4 * np.cos(angles["roll"]) * np.cos(angles["pitch"]) - 1.0

@@ -212,9 +212,10 @@ def test_the_recorded_hour_lost_nothing_and_stayed_flat(repository: Path, happen
     p99 = np.median([m["p99"] for m in r["minutes"] if m["p99"] is not None])
     load, count = r["points"][-1]["load"], sum(sent.values())
     happened(
-        22, f"{hours:.1f} h of the node in real time, recorded {found['measured']}: {count:,} messages, none "
-        f"lost; memory {grown:+.1f} MiB/h, handles constant; IMU latency p99 {p99:.0f} ms at a load of {load:.0f}"
-    )  # fmt: skip
+        22,
+        f"{hours:.1f} h of the node in real time, recorded {found['measured']}: {count:,} messages, none "
+        f"lost; memory {grown:+.1f} MiB/h, handles constant; IMU latency p99 {p99:.0f} ms at a load of {load:.0f}",
+    )
 
 
 def test_the_recorded_accelerated_flight_lost_nothing_and_stayed_flat(repository: Path, happened: Happened) -> None:
@@ -225,9 +226,10 @@ def test_the_recorded_accelerated_flight_lost_nothing_and_stayed_flat(repository
     grown = slope(points, "memory_mib")
     assert grown < 4.0
     happened(
-        22, f"{last['hours']:.1f} h of flight at accelerated time of the {asked:.0f} wanted, recorded "
-        f"{found['measured']}: {last['sent']:,} samples, none lost; memory {grown:+.1f} MiB/h"
-    )  # fmt: skip
+        22,
+        f"{last['hours']:.1f} h of flight at accelerated time of the {asked:.0f} wanted, recorded "
+        f"{found['measured']}: {last['sent']:,} samples, none lost; memory {grown:+.1f} MiB/h",
+    )
 
 
 # --- Every input on which the product failed once is answered rightly

@@ -52,9 +52,19 @@ def missed(path: str, scale: float) -> float:
     known = Known(CRAFT.mass, scale * b, d, np.array(j), j_r, 0.0, np.zeros(2))
     noise = np.zeros((len(way.yaw), 12))
     went, _ = track(
-        way, known, gains(POSITION_WEIGHTS), gains(ATTITUDE_WEIGHTS), unmixer(known), noise, 0.0, 900.0,
-        setup.efficiency, setup.body, setup.air, Oddity(),
-    )  # fmt: skip
+        way,
+        known,
+        gains(POSITION_WEIGHTS),
+        gains(ATTITUDE_WEIGHTS),
+        unmixer(known),
+        noise,
+        0.0,
+        900.0,
+        setup.efficiency,
+        setup.body,
+        setup.air,
+        Oddity(),
+    )
     return float(np.linalg.norm(went[500:] - way.position[500:], axis=1).max())
 
 

@@ -122,11 +122,17 @@ def numpy_step(x: FloatArray, theta: FloatArray, moments: FloatArray, mass: floa
 
     def slope(y: FloatArray) -> FloatArray:
         w, i, j, k, p, q, r = y
-        return np.stack([
-            -0.5 * (i * p + j * q + k * r), 0.5 * (w * p + j * r - k * q), 0.5 * (w * q + k * p - i * r),
-            0.5 * (w * r + i * q - j * p), ((jy - jz) * q * r + roll + spin * q) / jx,
-            ((jz - jx) * p * r + pitch - spin * p) / jy, ((jx - jy) * p * q + yaw) / jz,
-        ])  # fmt: skip
+        return np.stack(
+            [
+                -0.5 * (i * p + j * q + k * r),
+                0.5 * (w * p + j * r - k * q),
+                0.5 * (w * q + k * p - i * r),
+                0.5 * (w * r + i * q - j * p),
+                ((jy - jz) * q * r + roll + spin * q) / jx,
+                ((jz - jx) * p * r + pitch - spin * p) / jy,
+                ((jx - jy) * p * q + yaw) / jz,
+            ]
+        )
 
     k1 = slope(x)
     k2 = slope(x + 0.5 * dt * k1)
@@ -267,9 +273,11 @@ def effect_table(rounds: int) -> dict[str, Any]:
             least[name] = min(least[name], 1e9 * _best(case, time.thread_time) / case.steps)
     ratios = {name: ns / least["nominal"] for name, ns in least.items() if name != "nominal"}
     return {
-        "ns": least, "ratios": ratios, "median": float(np.median(list(ratios.values()))),
+        "ns": least,
+        "ratios": ratios,
+        "median": float(np.median(list(ratios.values()))),
         "largest": max(ratios, key=lambda name: ratios[name]),
-    }  # fmt: skip
+    }
 
 
 def _best(case: Case, clock: Callable[[], float]) -> float:

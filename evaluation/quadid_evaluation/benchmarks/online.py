@@ -73,16 +73,18 @@ def against_batch(seeds: range) -> dict[str, Any]:
         )
         truth = flight.truth.parameters.as_dict()
         last, told = every[-1].parameters, every[-1].told_by_flight
-        rows.append({
-            "seed": seed,
-            "first_set_at": sets[0].stop if sets else None,
-            "sets": len(sets),
-            "to_batch": {n: last[n].value / batch[n].value - 1.0 for n in NOMINAL_NAMES},
-            "to_truth": {n: last[n].value / truth[n] - 1.0 for n in NOMINAL_NAMES},
-            "batch_cut_later": {n: later[n].value / batch[n].value - 1.0 for n in NOMINAL_NAMES},
-            "batch_to_truth": {n: batch[n].value / truth[n] - 1.0 for n in NOMINAL_NAMES},
-            "sigma": {n: told(n) / last[n].value for n in NOMINAL_NAMES},
-        })  # fmt: skip
+        rows.append(
+            {
+                "seed": seed,
+                "first_set_at": sets[0].stop if sets else None,
+                "sets": len(sets),
+                "to_batch": {n: last[n].value / batch[n].value - 1.0 for n in NOMINAL_NAMES},
+                "to_truth": {n: last[n].value / truth[n] - 1.0 for n in NOMINAL_NAMES},
+                "batch_cut_later": {n: later[n].value / batch[n].value - 1.0 for n in NOMINAL_NAMES},
+                "batch_to_truth": {n: batch[n].value / truth[n] - 1.0 for n in NOMINAL_NAMES},
+                "sigma": {n: told(n) / last[n].value for n in NOMINAL_NAMES},
+            }
+        )
     return {"seconds": SECONDS, "flights": rows}
 
 
@@ -95,14 +97,16 @@ def mass_changes(seeds: range) -> dict[str, Any]:
         actions = list(drive(Session(PELICAN), stream(flight.recording)))
         found = [a for a in actions if isinstance(a, OnlineDiagnosis)]
         finding = found[0].findings[0] if found and found[0].findings else None
-        rows.append({
-            "seed": seed,
-            "fraction": fraction,
-            "said": [f.effect for d in found for f in d.findings],
-            "after": found[0].t - CHANGE_AT if found else None,
-            "size": finding.values.get("fraction") if finding is not None else None,
-            "confident": finding.confident if finding is not None else None,
-        })  # fmt: skip
+        rows.append(
+            {
+                "seed": seed,
+                "fraction": fraction,
+                "said": [f.effect for d in found for f in d.findings],
+                "after": found[0].t - CHANGE_AT if found else None,
+                "size": finding.values.get("fraction") if finding is not None else None,
+                "confident": finding.confident if finding is not None else None,
+            }
+        )
     good = [r for r in rows if _hit(r)]
     return {"at": CHANGE_AT, "flights": rows, "hits": len(good)}
 
@@ -122,14 +126,16 @@ def hover(seconds: float, seeds: range) -> dict[str, Any]:
         session = Session(PELICAN)
         actions = list(drive(session, stream(flight.recording)))
         sets = [a for a in actions if isinstance(a, Publish)]
-        rows.append({
-            "seed": seed,
-            "seconds": seconds,
-            "published": sum(a.topic == "parameters" for a in sets),
-            "candidates": sum(a.topic == "candidate" for a in sets),
-            "diagnoses": sum(isinstance(a, OnlineDiagnosis) for a in actions),
-            "phase": session.status().phase.value,
-        })  # fmt: skip
+        rows.append(
+            {
+                "seed": seed,
+                "seconds": seconds,
+                "published": sum(a.topic == "parameters" for a in sets),
+                "candidates": sum(a.topic == "candidate" for a in sets),
+                "diagnoses": sum(isinstance(a, OnlineDiagnosis) for a in actions),
+                "phase": session.status().phase.value,
+            }
+        )
     return {"flights": rows}
 
 
@@ -208,10 +214,12 @@ Result = Mapping[str, Any]
 def page(results: Mapping[str, Any]) -> str:
     """Markdown of all parts that were measured."""
     out = [
-        "# The online service", "",
+        "# The online service",
+        "",
         "`python -m quadid_evaluation.benchmarks.online --out docs/results`; every value is in `online.json`. Window "
-        "10 s, a refit every second, grid 50 Hz, Pelican.", "",
-    ]  # fmt: skip
+        "10 s, a refit every second, grid 50 Hz, Pelican.",
+        "",
+    ]
     for name, (title, _, write) in PARTS.items():
         out += [f"## {title}", ""]
         if (found := results.get(name)) is None:
@@ -227,19 +235,22 @@ def _estimate(r: Result) -> list[str]:
     rows = []
     for n in NOMINAL_NAMES:
         batch = _column(flights, "to_batch", n)
-        rows.append((
-            n, f"{_rms(batch):.3f}, {np.abs(batch).max():.3f}", f"{np.sum(np.abs(batch) <= 1.0)} of {len(batch)}",
-            f"{_rms(_column(flights, 'to_truth', n)):.3f}, {_rms(_column(flights, 'batch_to_truth', n)):.3f}",
-            f"{np.median(_column(flights, 'sigma', n)):.3f}",
-        ))  # fmt: skip
-    heads = (
-        "parameter", "online to batch: RMS, worst [%]", "within 1 %", "RMS error [%]: online, batch", "sigma [%]",
-    )  # fmt: skip
+        rows.append(
+            (
+                n,
+                f"{_rms(batch):.3f}, {np.abs(batch).max():.3f}",
+                f"{np.sum(np.abs(batch) <= 1.0)} of {len(batch)}",
+                f"{_rms(_column(flights, 'to_truth', n)):.3f}, {_rms(_column(flights, 'batch_to_truth', n)):.3f}",
+                f"{np.median(_column(flights, 'sigma', n)):.3f}",
+            )
+        )
+    heads = ("parameter", "online to batch: RMS, worst [%]", "within 1 %", "RMS error [%]: online, batch", "sigma [%]")
     return [
         f"{len(flights)} excited flights of {r['seconds']:.0f} s. First set published after {_median(first):.0f} s "
-        f"(median; {len(first)} of {len(flights)} flights published). Goal: within 1 % of the offline batch.", "",
+        f"(median; {len(first)} of {len(flights)} flights published). Goal: within 1 % of the offline batch.",
+        "",
         *table(heads, rows),
-    ]  # fmt: skip
+    ]
 
 
 def _column(flights: list[Result], what: str, name: str) -> np.ndarray[Any, np.dtype[np.float64]]:
@@ -256,7 +267,7 @@ def _change(r: Result) -> list[str]:
         f"Mass +15 % or −15 % at {r['at']} s of {len(flights)} excited flights. Named `mass_change` within 5 s with "
         f"its size within 10 %: **{r['hits']} of {len(flights)}**. Named at all: {named}. Reported after "
         f"{_median(after):.2f} s (median), {max(after, default=float('nan')):.2f} s (latest); size off by "
-        f"{np.median(error):.2f} % (median), {error.max():.2f} % (worst).",
+        f"{np.median(error):.2f} % (median), {error.max():.2f} % (worst)."
     ]
 
 
@@ -269,8 +280,10 @@ def _hover(r: Result) -> list[str]:
     ]
     after = r["after_flight"]
     same = "the same to the bit" if after["same_bits"] else "**changed**"
-    lines += [f"60 s excited, then {after['seconds']:.0f} s of hover: {after['published']} sets published in the "
-              f"hover, the set in force is {same}."]  # fmt: skip
+    lines += [
+        f"60 s excited, then {after['seconds']:.0f} s of hover: {after['published']} sets published in the "
+        f"hover, the set in force is {same}."
+    ]
     return lines
 
 
@@ -278,7 +291,7 @@ def _repeat(r: Result) -> list[str]:
     same = "all the same to the bit" if r["same_bits"] else "**they differ**"
     return [
         f"{r['seconds']:.0f} s, samples out of order and up to 0.3 s late; fits in a process, then inline: "
-        f"{r['estimates']} estimates, {same}. Over DDS: `tests/node/test_ros_node.py`.",
+        f"{r['estimates']} estimates, {same}. Over DDS: `tests/node/test_ros_node.py`."
     ]
 
 
@@ -312,18 +325,28 @@ def _median(x: list[float]) -> float:
 
 
 PARTS: dict[str, tuple[str, Callable[[Given], Any], Callable[[Result], list[str]]]] = {
-    "estimate": ("Sixty seconds of excited flight against the offline batch",
-                 lambda g: against_batch(range(g.flights)), _estimate),
+    "estimate": (
+        "Sixty seconds of excited flight against the offline batch",
+        lambda g: against_batch(range(g.flights)),
+        _estimate,
+    ),
     "change": ("Mass changed by 15 % in flight", lambda g: mass_changes(range(g.flights)), _change),
-    "hover": ("Ten minutes of hover",
-              lambda g: {**hover(600.0, range(3)), "after_flight": hover_after_flight(600.0, 3)}, _hover),
+    "hover": (
+        "Ten minutes of hover",
+        lambda g: {**hover(600.0, range(3)), "after_flight": hover_after_flight(600.0, 3)},
+        _hover,
+    ),
     "repeat": ("Live and replayed", lambda g: repeatability(60.0, 1), _repeat),
-    "load": ("Load", lambda g: {
-        "excited": ros_flight.under_load(g.load_seconds, "excited"),
-        "hover": ros_flight.under_load(g.load_seconds, "hover"),
-        "recording": ros_flight.under_load(g.load_seconds, "excited", record=True),
-    }, _load),
-}  # fmt: skip
+    "load": (
+        "Load",
+        lambda g: {
+            "excited": ros_flight.under_load(g.load_seconds, "excited"),
+            "hover": ros_flight.under_load(g.load_seconds, "hover"),
+            "recording": ros_flight.under_load(g.load_seconds, "excited", record=True),
+        },
+        _load,
+    ),
+}
 """Title, measurement and lines of each part; memory over many hours is what the soak shows."""
 
 

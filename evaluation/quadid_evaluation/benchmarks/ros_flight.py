@@ -143,13 +143,16 @@ def watched_node() -> int:
             status = session.status() if session else None
             both = latency([*self.late["idle"], *self.late["fitting"]])
             line = {
-                "t": time.time(), "messages": dict(self.counted), **{n: both.get(n) for n in ("p50", "p99", "max")},
+                "t": time.time(),
+                "messages": dict(self.counted),
+                **{n: both.get(n) for n in ("p50", "p99", "max")},
                 **{name: latency(values) for name, values in self.late.items()},
                 "taken": dict(session.resampler.counts) if session else {},
                 "dropped": dict(session.resampler.faults) if session else {},
-                "fits": status.fits if status else 0, "in_force": status.in_force if status else 0,
+                "fits": status.fits if status else 0,
+                "in_force": status.in_force if status else 0,
                 "backlog": status.backlog if status else 0.0,
-            }  # fmt: skip
+            }
             self.late, self.noted = {name: array("d") for name in self.late}, time.monotonic()
             with Path(os.environ[OUT]).open("a") as file:
                 file.write(json.dumps(line) + "\n")
@@ -195,10 +198,15 @@ def flown(
         kept = Path(folder) / "kept"
         kept.mkdir()
         environment = {
-            **os.environ, OUT: f"{folder}/notes.jsonl", EVERY: str(between), "PYTHONUNBUFFERED": "1",
-            "AMENT_PREFIX_PATH": sys.prefix, "ROS_DOMAIN_ID": str(1 + os.getpid() % 100), **THIS_MACHINE,
+            **os.environ,
+            OUT: f"{folder}/notes.jsonl",
+            EVERY: str(between),
+            "PYTHONUNBUFFERED": "1",
+            "AMENT_PREFIX_PATH": sys.prefix,
+            "ROS_DOMAIN_ID": str(1 + os.getpid() % 100),
+            **THIS_MACHINE,
             "ROS_LOG_DIR": f"{kept}/log",
-        }  # fmt: skip
+        }
         given = [f"history:={kept}/h.sqlite", *([f"record:={kept}/r.mcap"] if record else [])]
         said = (Path(folder) / "said.txt").open("w+")
         node = _start(environment, "node", "--ros-args", *(a for g in given for a in ("-p", g)))
@@ -216,8 +224,14 @@ def flown(
         noted = [json.loads(line) for line in Path(f"{folder}/notes.jsonl").read_text().splitlines()]
         said.seek(0)
         problems = [line.strip() for line in said if "[ERROR]" in line or "[WARN]" in line or "Traceback" in line]
-    return {"asked_seconds": seconds, "sent": sent, "points": points, "minutes": noted, "exit_code": node.returncode,
-            "problems": problems}  # fmt: skip
+    return {
+        "asked_seconds": seconds,
+        "sent": sent,
+        "points": points,
+        "minutes": noted,
+        "exit_code": node.returncode,
+        "problems": problems,
+    }
 
 
 def under_load(seconds: float, profile: str, record: bool = False) -> dict[str, Any]:
@@ -227,14 +241,20 @@ def under_load(seconds: float, profile: str, record: bool = False) -> dict[str, 
     longest = max(found["minutes"], key=lambda m: m["round"]["count"])
     span = 3600.0 * (last["hours"] - first["hours"])
     return {
-        "seconds": seconds, "profile": profile, "record": record, "exit_code": found["exit_code"],
+        "seconds": seconds,
+        "profile": profile,
+        "record": record,
+        "exit_code": found["exit_code"],
         "cpu_node": (last["processor"] - first["processor"]) / span,
         "cpu_worker": (last["worker_processor"] - first["worker_processor"]) / span,
-        "memory_begin": first["memory_mib"], "memory_end": last["memory_mib"], "memory_worker": last["worker_mib"],
-        "load_average": last["load"], "messages": sum(found["sent"].values()),
+        "memory_begin": first["memory_mib"],
+        "memory_end": last["memory_mib"],
+        "memory_worker": last["worker_mib"],
+        "load_average": last["load"],
+        "messages": sum(found["sent"].values()),
         **{name: longest[name] for name in ("idle", "fitting", "round")},
         "imu_received": note["messages"].get("imu", 0) / found["sent"]["imu"],
-    }  # fmt: skip
+    }
 
 
 def _start(environment: dict[str, str], *arguments: str) -> subprocess.Popen[str]:
@@ -282,14 +302,19 @@ def _watch(
         children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
         workers = (int(c) for c in children if b"node.worker" in Path(f"/proc/{c}/cmdline").read_bytes())
         worker = next(workers, 0)
-        points.append({
-            "hours": (time.monotonic() - begin) / 3600.0, "memory_mib": resident(pid),
-            "files_mib": sum(f.stat().st_size for f in kept.rglob("*") if f.is_file()) / 2**20,
-            "worker_mib": resident(worker) if worker else float("nan"), "load": os.getloadavg()[0],
-            "processor": _processor(pid), "worker_processor": _processor(worker),
-            "handles": len(list(Path(f"/proc/{pid}/fd").iterdir())),
-            "threads": len(list(Path(f"/proc/{pid}/task").iterdir())),
-        })  # fmt: skip
+        points.append(
+            {
+                "hours": (time.monotonic() - begin) / 3600.0,
+                "memory_mib": resident(pid),
+                "files_mib": sum(f.stat().st_size for f in kept.rglob("*") if f.is_file()) / 2**20,
+                "worker_mib": resident(worker) if worker else float("nan"),
+                "load": os.getloadavg()[0],
+                "processor": _processor(pid),
+                "worker_processor": _processor(worker),
+                "handles": len(list(Path(f"/proc/{pid}/fd").iterdir())),
+                "threads": len(list(Path(f"/proc/{pid}/task").iterdir())),
+            }
+        )
         tell(f"{points[-1]['hours'] * 60:.0f} min, {points[-1]['memory_mib']:.0f} MiB")
 
 

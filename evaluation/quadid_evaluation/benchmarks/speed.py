@@ -129,41 +129,49 @@ def _kernel(r: Result) -> list[str]:
     least = r["operations"] / r["fma_per_ns"]
     rows = [
         (t["name"], *(f"{t[cores]['least']:.1f}" for cores in ("one_core", "all_cores")))
-        for t in r["timings"] if t["name"] in SHOWN
-    ]  # fmt: skip
+        for t in r["timings"]
+        if t["name"] in SHOWN
+    ]
     return [
         "Best runs in float64: processor time on one core, wall time on both. The arithmetic of the nominal step "
         f"({r['operations']} operations) takes {least:.1f} ns at the peak of {r['fma_per_ns']:.1f} fused multiply-adds "
-        f"per ns; NumPy at its best {r['gain_over_numpy']:.0f} times the nominal.", "",
+        f"per ns; NumPy at its best {r['gain_over_numpy']:.0f} times the nominal.",
+        "",
         *table(("nanoseconds per particle and step", "one core", "both cores"), rows),
-    ]  # fmt: skip
+    ]
 
 
 def _scaling(r: Result) -> list[str]:
     rows = [
-        (f"{hours:.1f}", f"{run['fit']:.1f}, {run['fit_processor']:.1f}",
-         f"{run['peak_mb']:.0f}, {1e-6 * run['rows'] * SAMPLE_BYTES:.0f}")
+        (
+            f"{hours:.1f}",
+            f"{run['fit']:.1f}, {run['fit_processor']:.1f}",
+            f"{run['peak_mb']:.0f}, {1e-6 * run['rows'] * SAMPLE_BYTES:.0f}",
+        )
         for hours, run in zip(r["hours"], r["runs"], strict=True)
-    ]  # fmt: skip
+    ]
     heads = ("hours of flight at 50 Hz", "fit: wall, processor [s]", "peak memory, windows alone [MB]")
     e = r["exponents"]
     return [
-        *table(heads, rows), "",
+        *table(heads, rows),
+        "",
         f"Exponents: processor time {e['fit_processor']:.2f}, memory {e['peak_mb']:.2f}. Of more than an hour, a fit "
-        "uses stretches spread evenly (`quadid/identification/fit.py`).", "",
+        "uses stretches spread evenly (`quadid/identification/fit.py`).",
+        "",
         "![](speed-scaling.png)",
-    ]  # fmt: skip
+    ]
 
 
 def _logs(r: Result) -> list[str]:
     return [
         "A simulated log of 500 s, and the largest recorded ones. quadid reads, checks, hashes and puts all channels "
-        "on one clock; large files in a process of their own.", "",
+        "on one clock; large files in a process of their own.",
+        "",
         *table(
             ("what", "wall [s]", "ms of processor per MB"),
             [(n, f"{t['wall']:.3g}", f"{t['ms_per_mb']:.3g}") for n, t in r["times"].items()],
         ),
-    ]  # fmt: skip
+    ]
 
 
 def _step(r: Result) -> list[str]:

@@ -35,9 +35,12 @@ class Times:
         """Medians, quartiles and number of runs."""
         low, middle, high = np.percentile(self.wall, [25, 50, 75])
         return {
-            "wall": middle, "wall_quartiles": [low, high], "processor": float(np.median(self.processor)),
-            "processor_least": min(self.processor), "runs": len(self.wall),
-        }  # fmt: skip
+            "wall": middle,
+            "wall_quartiles": [low, high],
+            "processor": float(np.median(self.processor)),
+            "processor_least": min(self.processor),
+            "runs": len(self.wall),
+        }
 
 
 def interleaved(cases: Mapping[str, Callable[[], object]], rounds: int) -> dict[str, dict[str, Any]]:
@@ -69,9 +72,12 @@ def child(code: str, *arguments: str, environment: Mapping[str, str] | None = No
     )
     wall, processor = time.perf_counter(), processor_seconds()
     done = subprocess.run(
-        [sys.executable, "-c", wrapped, *arguments], capture_output=True, text=True, check=True,
+        [sys.executable, "-c", wrapped, *arguments],
+        capture_output=True,
+        text=True,
+        check=True,
         env={**_surroundings(), **(environment or {})},
-    )  # fmt: skip
+    )
     lines = done.stdout.splitlines()
     told = json.loads(lines[-2]) if len(lines) > 1 else {}
     spent = {"wall": time.perf_counter() - wall, "processor": processor_seconds() - processor}
@@ -99,10 +105,13 @@ def machine() -> dict[str, Any]:
     """Processor, versions, date and load."""
     cpu = next((line.split(":")[1].strip() for line in _cpu_lines() if line.startswith("model name")), "unknown")
     return {
-        "processor": cpu, "cores": os.cpu_count(), "python": platform.python_version(),
+        "processor": cpu,
+        "cores": os.cpu_count(),
+        "python": platform.python_version(),
         "versions": {name: version(name) for name in LIBRARIES},
-        "date": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"), "load": os.getloadavg()[0],
-    }  # fmt: skip
+        "date": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
+        "load": os.getloadavg()[0],
+    }
 
 
 def _cpu_lines() -> list[str]:

@@ -231,10 +231,14 @@ def starts(rounds: int, folder: Path) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as cache:
         first = child(FIRST_FIT, str(path), environment={"NUMBA_CACHE_DIR": cache})
         times = interleaved(
-            {"import of the fit": lambda: child("import quadid.identification.fit\nprint('{}')"),
-             "second start to first fit": lambda: child(FIRST_FIT, str(path), environment={"NUMBA_CACHE_DIR": cache})},
+            {
+                "import of the fit": lambda: child("import quadid.identification.fit\nprint('{}')"),
+                "second start to first fit": lambda: child(
+                    FIRST_FIT, str(path), environment={"NUMBA_CACHE_DIR": cache}
+                ),
+            },
             rounds,
-        )  # fmt: skip
+        )
     return {"first": first, "times": times | interleaved({"first quadid identify, 60 s MCAP": identified}, 1)}
 
 

@@ -156,9 +156,16 @@ def _differential_evolution(ledger: Ledger, start: FloatArray, seed: int) -> Sto
 
     evolve: Any = scipy.optimize.differential_evolution  # its stubs lack a vectorised cost
     found = evolve(
-        cost, [(0.0, 1.0)] * len(start), x0=start, seed=np.random.default_rng(seed), vectorized=True,
-        updating="deferred", polish=False, maxiter=ledger.budget, tol=1e-8,
-    )  # fmt: skip
+        cost,
+        [(0.0, 1.0)] * len(start),
+        x0=start,
+        seed=np.random.default_rng(seed),
+        vectorized=True,
+        updating="deferred",
+        polish=False,
+        maxiter=ledger.budget,
+        tol=1e-8,
+    )
     return Stop.CONVERGED if found.success else Stop.STALLED
 
 
@@ -168,10 +175,13 @@ def _cma_es(ledger: Ledger, start: FloatArray, seed: int) -> Stop:
 
     rng = np.random.default_rng(seed)
     options = {
-        "bounds": [0.0, 1.0], "verbose": -10, "verb_log": 0, "verb_disp": 0,
+        "bounds": [0.0, 1.0],
+        "verbose": -10,
+        "verb_log": 0,
+        "verb_disp": 0,
         "seed": np.nan,  # leave numpy's global generator alone; all numbers come from ours
         "randn": lambda *shape: rng.standard_normal(shape),
-    }  # fmt: skip
+    }
     ledger.cost(start[None])
     evolution = cma.CMAEvolutionStrategy(start, 0.25, options)
     while not evolution.stop():

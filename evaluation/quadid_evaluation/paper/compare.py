@@ -26,9 +26,16 @@ from quadid_evaluation.optimisers.minimise import NAMES, Result, minimise
 from quadid_evaluation.paper.subspace import METHODS as BLACK_BOXES
 
 METHODS = (
-    "initial", "quasi_newton", "least_squares", "pso", "pso_polish", "cma_es", "l_shade", "differential_evolution",
+    "initial",
+    "quasi_newton",
+    "least_squares",
+    "pso",
+    "pso_polish",
+    "cma_es",
+    "l_shade",
+    "differential_evolution",
     *BLACK_BOXES,
-)  # fmt: skip
+)
 """Methods by name, in the order of the table."""
 KNOWN = (*METHODS, *(name for name in NAMES if name not in METHODS))
 """All names that may be asked for."""
@@ -56,19 +63,27 @@ class Methods(Outcome):
         """One row a method."""
         validate = self.result["validate"]
         columns = (
-            Column("method"), *(Column(name, right=True) for name in ("train", *validate)),
-            Column("paper's MSE", right=True, rank=1), Column("evaluations", right=True),
-            Column("seconds", right=True), Column("failed", right=True), Column("remark", rank=2),
-        )  # fmt: skip
+            Column("method"),
+            *(Column(name, right=True) for name in ("train", *validate)),
+            Column("paper's MSE", right=True, rank=1),
+            Column("evaluations", right=True),
+            Column("seconds", right=True),
+            Column("failed", right=True),
+            Column("remark", rank=2),
+        )
         rows = tuple(
             (
-                m["name"], number(m["mse"]["train"]),
+                m["name"],
+                number(m["mse"]["train"]),
                 *(number(v) for v in m["mse"]["validate"] or [None] * len(validate)),
-                number(None if m["mse_paper"] is None else m["mse_paper"]["train"]), str(m["evaluations"]),
-                number(m["seconds"], 3), f"{m['failures']}/{m['runs']}", m.get("note", m.get("stop", "")),
+                number(None if m["mse_paper"] is None else m["mse_paper"]["train"]),
+                str(m["evaluations"]),
+                number(m["seconds"], 3),
+                f"{m['failures']}/{m['runs']}",
+                m.get("note", m.get("stop", "")),
             )
             for m in self.records()
-        )  # fmt: skip
+        )
         title = "Methods on the same data (error over 1 s of simulation, 1 = noise floor)"
         return [TextTable(title, columns, rows)]
 
@@ -94,15 +109,17 @@ def check_names(methods: Sequence[str] | None, objective: str) -> Sequence[str]:
 
 
 def compare(
-    logs: Logs, validate: Validate = (), *, vehicle: OfVehicle = None,
-    methods: Annotated[
-        Sequence[str] | None, Typed(list[str] | None, typer.Option("--method", metavar="NAME"))
-    ] = None,
+    logs: Logs,
+    validate: Validate = (),
+    *,
+    vehicle: OfVehicle = None,
+    methods: Annotated[Sequence[str] | None, Typed(list[str] | None, typer.Option("--method", metavar="NAME"))] = None,
     seeds: Annotated[int, typer.Option(metavar="N", min=1)] = 3,
     budget: Annotated[int, typer.Option(metavar="N", min=100)] = 4000,
     objective: Annotated[str, typer.Option(metavar="NAME")] = OBJECTIVES[0],
-    seed: Seed = 1, advance: Advance = silent,
-) -> Methods:  # fmt: skip
+    seed: Seed = 1,
+    advance: Advance = silent,
+) -> Methods:
     """Sets the initial guess, quasi-Newton, least squares, swarms, evolution, CVA and MOESP side by side.
 
     Args:
@@ -143,9 +160,10 @@ def compare(
         problem = PaperBox(windows, craft, autopilot)
     else:
         raise NotIdentifiableError(
-            "the stabiliser is not known", "references in the log, or gains in the vehicle file",
+            "the stabiliser is not known",
+            "references in the log, or gains in the vehicle file",
             "give `stabiliser: {gains: ...}`, or use --objective shooting",
-        )  # fmt: skip
+        )
 
     # Fits, every optimiser with every seed.
     p, boxes = problem, dict[str, JsonDict]()
@@ -160,13 +178,17 @@ def compare(
                 first, *others = (score_black_box(box, part, craft, noise) for part in sets)
             except QuadidError as error:  # cannot be fitted to these data
                 boxes[name] = _entry(name, math.nan, [], None, 0, math.nan) | {
-                    "runs": 1, "failures": 1, "note": str(error)
-                }  # fmt: skip
+                    "runs": 1,
+                    "failures": 1,
+                    "note": str(error),
+                }
                 continue
             boxes[name] = _entry(name, first, others, None, box.tried + 1, seconds) | {
-                "order": box.model.order, "runs": 1, "failures": 0,
+                "order": box.model.order,
+                "runs": 1,
+                "failures": 0,
                 "note": "a black box: predicts, gives no physical parameters",
-            }  # fmt: skip
+            }
         else:
             runs[name] = [
                 (s, minimise(name, p.cost, p.start, p.lower, p.upper, budget, s, p.residual, time.perf_counter))
@@ -184,19 +206,28 @@ def compare(
             scores = [paper_score(part, craft, theta, autopilot) for part in sets]
             paper = [math.nan if s is None else s.mse for s in scores]
         boxes[name] = _entry(name, first, others, paper, found.evaluations, found.seconds) | {
-            "cost": found.cost, "parameters": dict(zip(NOMINAL_NAMES, theta[:6].tolist(), strict=True)),
-            "seed": chosen, "stop": found.stop.value, "runs": len(tried),
+            "cost": found.cost,
+            "parameters": dict(zip(NOMINAL_NAMES, theta[:6].tolist(), strict=True)),
+            "seed": chosen,
+            "stop": found.stop.value,
+            "runs": len(tried),
             "failures": sum(not run.cost <= SUCCESS * lowest for _, run in tried),
             "trials": [
                 {"seed": s, "cost": run.cost, "evaluations": run.evaluations, "seconds": run.seconds}
                 for s, run in tried
             ],
-        }  # fmt: skip
+        }
     result = {
-        "schema": "quadid.compare/1", "vehicle": craft.name, "objective": objective, "budget": budget,
-        "seeds": list(range(seed, seed + seeds)), "noise_floor": 1.0, "train": [log.recording.name for log in train],
-        "validate": [log.recording.name for log in held], "methods": [boxes[name] for name in names],
-    }  # fmt: skip
+        "schema": "quadid.compare/1",
+        "vehicle": craft.name,
+        "objective": objective,
+        "budget": budget,
+        "seeds": list(range(seed, seed + seeds)),
+        "noise_floor": 1.0,
+        "train": [log.recording.name for log in train],
+        "validate": [log.recording.name for log in held],
+        "methods": [boxes[name] for name in names],
+    }
     return Methods(result, tuple(text for log in (*train, *held) for text in log.warnings))
 
 
@@ -205,7 +236,10 @@ def _entry(
 ) -> JsonDict:
     """Entries of every method in ``quadid.compare/1``; `paper` is its score on each set."""
     return {
-        "name": name, "mse": {"train": train, "validate": validate},
+        "name": name,
+        "mse": {"train": train, "validate": validate},
         "mse_paper": None if paper is None else {"train": paper[0], "validate": paper[1:]},
-        "evaluations": evaluations, "seconds": seconds, "parameters": {},
-    }  # fmt: skip
+        "evaluations": evaluations,
+        "seconds": seconds,
+        "parameters": {},
+    }

@@ -23,8 +23,16 @@ GROUPS: dict[str, tuple[str, slice]] = {
     "rates": ("body rates", slice(3, 6)),
 }
 OUTPUTS = (
-    "φ [deg]", "θ [deg]", "ψ [deg]", "p [deg/s]", "q [deg/s]", "r [deg/s]", "a_x [m/s²]", "a_y [m/s²]", "a_z [m/s²]",
-)  # fmt: skip
+    "φ [deg]",
+    "θ [deg]",
+    "ψ [deg]",
+    "p [deg/s]",
+    "q [deg/s]",
+    "r [deg/s]",
+    "a_x [m/s²]",
+    "a_y [m/s²]",
+    "a_z [m/s²]",
+)
 """The paper's outputs with their units."""
 SECONDS = 20.0
 """Length of the time segments that are shown [s]."""
@@ -59,9 +67,13 @@ class PaperFigure:
 
 
 FIGURES = (
-    PaperFigure(3, "angles", (1,)), PaperFigure(4, "accelerations", (1,)), PaperFigure(5, "rates", (1,)),
-    PaperFigure(6, "angles", (2, 3)), PaperFigure(7, "accelerations", (2, 3)), PaperFigure(8, "rates", (2, 3)),
-)  # fmt: skip
+    PaperFigure(3, "angles", (1,)),
+    PaperFigure(4, "accelerations", (1,)),
+    PaperFigure(5, "rates", (1,)),
+    PaperFigure(6, "angles", (2, 3)),
+    PaperFigure(7, "accelerations", (2, 3)),
+    PaperFigure(8, "rates", (2, 3)),
+)
 """The paper's figures of results."""
 
 

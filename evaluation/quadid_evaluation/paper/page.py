@@ -35,14 +35,26 @@ PAPER_GAIN: dict[str, tuple[float, float, float]] = {
 }
 """Its gains of PSO over the others, as printed."""
 PAPER_PARAMETERS: dict[str, float] = {
-    "b": 2.33e-5, "d": 4.96e-7, "J_xx": 1.00e-2, "J_yy": 1.36e-2, "J_zz": 2.92e-2, "J_r": 5.00e-5,
-}  # fmt: skip
+    "b": 2.33e-5,
+    "d": 4.96e-7,
+    "J_xx": 1.00e-2,
+    "J_yy": 1.36e-2,
+    "J_zz": 2.92e-2,
+    "J_r": 5.00e-5,
+}
 """Table 2 of the paper."""
 COLUMN_NAMES = {
-    "initial": "initial guess", "quasi_newton": "quasi-Newton", "pso": "PSO", "pso_polish": "PSO + polish",
-    "identified": "quadid, nominal", "extended": "quadid, extended", "true_nominal": "true parameters",
-    "perfect": "flown vehicle", "cva": "CVA", "moesp": "MOESP",
-}  # fmt: skip
+    "initial": "initial guess",
+    "quasi_newton": "quasi-Newton",
+    "pso": "PSO",
+    "pso_polish": "PSO + polish",
+    "identified": "quadid, nominal",
+    "extended": "quadid, extended",
+    "true_nominal": "true parameters",
+    "perfect": "flown vehicle",
+    "cva": "CVA",
+    "moesp": "MOESP",
+}
 """Models by name, for people."""
 
 
@@ -140,17 +152,17 @@ def notes(result: Json) -> dict[str, list[str]]:
             f"*True parameters*: the nominal model with the true values; its error on set 1 is {exact:.2f} times that "
             "of quasi-Newton, so the rest is model error. *Flown vehicle*: the model with all flown effects; its error "
             f"is sensor noise and the stabiliser's response. The extended model leaves {extended:.0%} of "
-            "quasi-Newton's error on set 2.",
+            "quasi-Newton's error on set 2."
         ],
         "Prediction": [
             f"Prediction over 1 s on set 2 (1 = noise floor): quasi-Newton {mse['quasi_newton'][1]:.4g}, quadid "
             f"nominal {mse['identified'][1]:.4g}, extended {mse['extended'][1]:.4g}; black boxes of {orders['cva']} "
-            f"states: CVA {mse['cva'][1]:.4g}, MOESP {mse['moesp'][1]:.4g}.",
+            f"states: CVA {mse['cva'][1]:.4g}, MOESP {mse['moesp'][1]:.4g}."
         ],
         "Table 2": [
             f"The 95 % intervals of the extended model contain {inside} of 6 true values, those of the nominal model "
             f"{wrong}, widened by differences between parts of the flight. d and J_zz are correlated by "
-            f"{result['correlations'][1][4]:+.2f} in the nominal model.",
+            f"{result['correlations'][1][4]:+.2f} in the nominal model."
         ],
     }
 
@@ -164,14 +176,18 @@ def paper_markdown(result: Json, figures: str) -> str:
     """
     flight = result["flight"]
     lines = [
-        f"# {TITLE}", "", f"{SOURCE}.", "",
+        f"# {TITLE}",
+        "",
+        f"{SOURCE}.",
+        "",
         f"`{result['command']}`, {result['date']}, seed {result['seed']}, {result['seconds']:.0f} s; quadid "
-        f"{result['version']}. `make reproduce` renews this page.", "",
+        f"{result['version']}. `make reproduce` renews this page.",
+        "",
         f"Three sets of {flight['seconds']:g} s of a simulated Pelican, stabiliser at {flight['stabiliser_rate']:g} "
         "Hz, logged at 50 Hz; set 1 trains, sets 2 and 3 validate. The vehicle flies with effects that the paper's "
         f"model lacks: {effects_words(flight['effects'])}. The stabiliser's gains are given.",
         "",
-    ]  # fmt: skip
+    ]
     for table in all_tables(result):
         if table.title.startswith(SHOWN):
             lines += [f"## {table.title}", "", *markdown([c.heading for c in table.columns], table.rows), ""]

@@ -113,9 +113,16 @@ def reproduce(
     for i, name in enumerate(("quasi_newton", "pso_polish")):
         advance(f"{name} on the paper's objective", i / 2)
         found = minimise(
-            name, problem.cost, problem.start, problem.lower, problem.upper, BUDGET, seed, problem.residual,
+            name,
+            problem.cost,
+            problem.start,
+            problem.lower,
+            problem.upper,
+            BUDGET,
+            seed,
+            problem.residual,
             time.perf_counter,
-        )  # fmt: skip
+        )
         columns[name] = Column(problem.theta(found.x), found.evaluations, found.seconds)
     runs = []
     for i in range(plan.seeds):

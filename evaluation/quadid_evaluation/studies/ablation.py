@@ -209,9 +209,16 @@ OUT: dict[str, Any] = {
 
 
 SCALED = (
-    "single 7000", "single 7006", "single 7008", "single 7009", "null 7000", "pair 7001", "look_alike 7000",
-    "look_alike 7003", "outside 7000",
-)  # fmt: skip
+    "single 7000",
+    "single 7006",
+    "single 7008",
+    "single 7009",
+    "null 7000",
+    "pair 7001",
+    "look_alike 7000",
+    "look_alike 7003",
+    "outside 7000",
+)
 """Flights on which numbers are halved and doubled too: one of each kind, which compute fast."""
 FLIGHTS = (
     *SCALED, "outside 7002", "outside 7003", "outside 7007", "outside 7012", "outside 7021", "single 1055",
@@ -287,12 +294,16 @@ def _independent(folder: str) -> list[Flight]:
     answers = json.loads((DATA / folder / "answers.json").read_text(encoding="utf-8"))
     return [
         Flight(
-            f"{folder} {a['case']}", None, (f"{folder}/{a['case']}/train.csv",),
-            (f"{folder}/{a['case']}/validate.csv",), f"{folder}/{a['case']}/vehicle.yaml", tuple(a["effects"]),
+            f"{folder} {a['case']}",
+            None,
+            (f"{folder}/{a['case']}/train.csv",),
+            (f"{folder}/{a['case']}/validate.csv",),
+            f"{folder}/{a['case']}/vehicle.yaml",
+            tuple(a["effects"]),
             tuple(a["truth"]) if a["kind"] == "clutter" else (),
         )
         for a in answers
-    ]  # fmt: skip
+    ]
 
 
 def load(flight: Flight, cache: Path | None = None) -> Windows:
@@ -325,9 +336,16 @@ def _windows(names: Sequence[str], vehicle: Vehicle) -> list[Window]:
 
 
 FITS = (
-    "polish", "settle_states", "flexible_fit", "residual_noise", "mode_power",
-    "filtered", "mse_score", "reliability", "follows",
-)  # fmt: skip
+    "polish",
+    "settle_states",
+    "flexible_fit",
+    "residual_noise",
+    "mode_power",
+    "filtered",
+    "mse_score",
+    "reliability",
+    "follows",
+)
 """Functions that the diagnosis calls, of `quadid.identify`, which no variant changes, but for the last one …"""
 NUMBERS = ("quadid.diagnosis.residual_tests", "quadid.diagnosis.hypotheses")
 """… whose answer depends on numbers of these modules, and on nothing else that a variant changes."""
@@ -493,9 +511,18 @@ def ask(flight: Flight, given: Windows, variant: str, memory: Memory) -> Answer:
     if flight.known is not None:
         right = all(n.inside for n in of_set("", flight.known, {"": found.to_dict()}) if n.identified)
     return Answer(
-        flight.name, variant, found.verdict.value, listed, named, right,
-        found.validation.nominal, found.validation.extended, memory.asked, intervals, follows,
-    )  # fmt: skip
+        flight.name,
+        variant,
+        found.verdict.value,
+        listed,
+        named,
+        right,
+        found.validation.nominal,
+        found.validation.extended,
+        memory.asked,
+        intervals,
+        follows,
+    )
 
 
 def _right(flight: Flight, verdict: str, listed: Sequence[str], named: Sequence[str]) -> bool | None:

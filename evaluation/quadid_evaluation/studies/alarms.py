@@ -31,9 +31,7 @@ from quadid_evaluation.harness import study, table
 SECONDS, AT = 300.0, 40.3
 """Length of a healthy flight [s]; moment of a change [s]."""
 VEHICLES, PROFILES = ("pelican", "hexacopter", "crazyflie"), ("hover", "gentle", "excited")
-AIR = {
-    "calm": 0.0, "light": 0.3, "gusty": 0.6, "rough": 0.9,
-}  # fmt: skip
+AIR = {"calm": 0.0, "light": 0.3, "gusty": 0.6, "rough": 0.9}
 """Turbulence of Dryden's form: specific force, rms [m/s^2]; moments come with it, and 3 m/s of wind for each 0.3."""
 KNOWN = 0.02
 """Prior knowledge of the vehicle: error and standard deviation of log parameters."""
@@ -57,9 +55,12 @@ class Seen:
 def flown(vehicle: Vehicle, seed: int, profile: str, air: float, seconds: float, **changes: dict[str, float]) -> Flight:
     """One flight of an individual vehicle with motor lag, rotor drag and inflow, in wind of strength `air`."""
     effects = {
-        "motor_lag": {"tau": 0.03}, "rotor_drag": {"k_x": 0.25, "k_y": 0.25}, "axial_inflow": {"k_z": 0.2},
-        "wind": {"north": 10.0 * air, "east": 0.0}, **changes,
-    }  # fmt: skip
+        "motor_lag": {"tau": 0.03},
+        "rotor_drag": {"k_x": 0.25, "k_y": 0.25},
+        "axial_inflow": {"k_z": 0.2},
+        "wind": {"north": 10.0 * air, "east": 0.0},
+        **changes,
+    }
     gusts = {"gusts": {"push": air, "turn": 1.3 * air, "time": 0.6}} if air else {}
     truth = draw_truth(vehicle, seed)
     return fly(vehicle, truth, seconds, seed, profile, effects=effects, outside=gusts)
@@ -129,12 +130,14 @@ def healthy(hours: float, seed: int) -> str:
         print(*rows[-1], flush=True)
     flew, refused = flights * SECONDS / 3600.0, total.pop("windows refused", 0)
     heads = ("air", "flight", "hours", "changes", "windows refused", "what")
-    return "\n".join([
-        f"## Healthy flights\n`make alarms`, seed {seed}. {', '.join(VEHICLES)}; individuals "
-        f"known to {KNOWN:.0%}, with motor lag, rotor drag and inflow. **{total.total()} false changes in {flew:.1f} "
-        f"h, at most {upper(total.total(), flew):.2f} an hour (95 %); {refused} windows refused.**\n",
-        *table(heads, rows),
-    ])  # fmt: skip
+    return "\n".join(
+        [
+            f"## Healthy flights\n`make alarms`, seed {seed}. {', '.join(VEHICLES)}; individuals "
+            f"known to {KNOWN:.0%}, with motor lag, rotor drag and inflow. **{total.total()} false changes in "
+            f"{flew:.1f} h, at most {upper(total.total(), flew):.2f} an hour (95 %); {refused} windows refused.**\n",
+            *table(heads, rows),
+        ]
+    )
 
 
 def detections(each: int, seed: int) -> str:
@@ -163,12 +166,14 @@ def detections(each: int, seed: int) -> str:
         rows.append((what, profile, air, f"{within} of {each}", len(soon) - within, times, right, false, size))
         print(*rows[-1], flush=True)
     heads = ("change", "flight", "air", "within 5 s", "later", "delay [s]", "right", "wrong and sure", "size")
-    return "\n".join([
-        f"## Changes\n`make alarms`, seed {seed}. Seen and named within 5 s, and within 8 s; "
-        "median delay; right: named, a rotor by its number, or among the alternatives of a finding that is not sure; "
-        "wrong and sure: another cause, with confidence; median size.\n",
-        *table(heads, rows),
-    ])  # fmt: skip
+    return "\n".join(
+        [
+            f"## Changes\n`make alarms`, seed {seed}. Seen and named within 5 s, and within 8 s; "
+            "median delay; right: named, a rotor by its number, or among the alternatives of a finding that is not "
+            "sure; wrong and sure: another cause, with confidence; median size.\n",
+            *table(heads, rows),
+        ]
+    )
 
 
 def _changed(vehicle: Vehicle, seed: int, profile: str, air: float, what: str, rotor: int) -> Flight:
@@ -186,6 +191,12 @@ def _changed(vehicle: Vehicle, seed: int, profile: str, air: float, what: str, r
 
 
 if __name__ == "__main__":
-    study(__doc__, "alarms.md", "False alarms, and changes that are seen", {
-        "healthy": lambda g: healthy(g.hours, g.seed), "changes": lambda g: detections(g.each, g.seed),
-    }, hours=6.0, each=4, seed=500)  # fmt: skip
+    study(
+        __doc__,
+        "alarms.md",
+        "False alarms, and changes that are seen",
+        {"healthy": lambda g: healthy(g.hours, g.seed), "changes": lambda g: detections(g.each, g.seed)},
+        hours=6.0,
+        each=4,
+        seed=500,
+    )

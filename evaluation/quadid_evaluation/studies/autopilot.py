@@ -170,10 +170,20 @@ def serve(log: Path, vehicle: Path, seconds: float) -> Outcome:
         wire.bind(("127.0.0.1", 0))
         port, history = free_port(), Path(folder) / "history.sqlite"
         served = subprocess.Popen(
-            [QUADID, "serve", "--vehicle", str(vehicle), "--mavlink", f"udpin:127.0.0.1:{port}",
-             "--history", str(history)],
-            stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
-        )  # fmt: skip
+            [
+                QUADID,
+                "serve",
+                "--vehicle",
+                str(vehicle),
+                "--mavlink",
+                f"udpin:127.0.0.1:{port}",
+                "--history",
+                str(history),
+            ],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+        )
         said, ready = list[str](), threading.Event()
         listener = threading.Thread(target=listen, args=(served, said, ready), daemon=True)
         listener.start()

@@ -76,8 +76,9 @@ def rows(name: str, one: FlightSet, data: Path) -> list[Sequence[str]]:
     told = "–" if removed is None else f"{100.0 * removed:.0f} %"
     return [
         (name, quantity, *(_cell(c, i) for i in range(len(BANDS))), f"{c[-1]:.0f}", told)
-        for quantity, c in total.items() if c[-1]
-    ]  # fmt: skip
+        for quantity, c in total.items()
+        if c[-1]
+    ]
 
 
 def _cell(counts: Sequence[float] | FloatArray, i: int) -> str:

@@ -43,20 +43,35 @@ from quadid_evaluation.studies.truth import with_values
 GUESS = 0.2
 """Standard deviation of the logarithm of the initial guess against the truth."""
 LATER = (
-    "translational_lift", "supply_voltage", "rotor_telemetry_delay", "drag_torque_curve", "no_gyroscopic_coupling",
+    "translational_lift",
+    "supply_voltage",
+    "rotor_telemetry_delay",
+    "drag_torque_curve",
+    "no_gyroscopic_coupling",
     "velocity_scale",
-)  # fmt: skip
+)
 """Effects that joined the catalogue when the numbers of the cases below were in use; a class of their own."""
 SINGLES = tuple(name for name in EFFECTS if name not in LATER)
 PAIRS = (
-    ("motor_lag", "rotor_drag"), ("cg_offset", "gyro_bias"), ("weak_rotor", "battery_sag"), ("motor_lag", "cg_offset"),
-    ("command_delay", "imu_lever_arm"), ("mass_change", "rotor_drag"), ("accel_bias", "thrust_curve"),
-    ("imu_misalignment", "motor_lag"), ("rate_damping", "cg_offset"), ("product_of_inertia", "attitude_delay"),
-)  # fmt: skip
+    ("motor_lag", "rotor_drag"),
+    ("cg_offset", "gyro_bias"),
+    ("weak_rotor", "battery_sag"),
+    ("motor_lag", "cg_offset"),
+    ("command_delay", "imu_lever_arm"),
+    ("mass_change", "rotor_drag"),
+    ("accel_bias", "thrust_curve"),
+    ("imu_misalignment", "motor_lag"),
+    ("rate_damping", "cg_offset"),
+    ("product_of_inertia", "attitude_delay"),
+)
 LOOK_ALIKES = (
-    ("motor_lag", "command_delay"), ("weak_rotor", "cg_offset"), ("rotor_drag", "accel_bias"),
-    ("mass_change", "battery_sag"), ("imu_lag", "motor_lag"), ("attitude_delay", "gyro_scale"),
-)  # fmt: skip
+    ("motor_lag", "command_delay"),
+    ("weak_rotor", "cg_offset"),
+    ("rotor_drag", "accel_bias"),
+    ("mass_change", "battery_sag"),
+    ("imu_lag", "motor_lag"),
+    ("attitude_delay", "gyro_scale"),
+)
 
 
 @dataclass(frozen=True)
@@ -133,9 +148,19 @@ def _case(group: str, n: int) -> Case:
 
 
 GROUPS = {
-    "single": 100, "null": 100, "pair": 30, "look_alike": 24, "outside": 48, "clutter": 50, "noisy": 25, "short": 25,
-    "weak": 25, "size_0.3": 25, "size_0.1": 25, "size_0.03": 25,
-}  # fmt: skip
+    "single": 100,
+    "null": 100,
+    "pair": 30,
+    "look_alike": 24,
+    "outside": 48,
+    "clutter": 50,
+    "noisy": 25,
+    "short": 25,
+    "weak": 25,
+    "size_0.3": 25,
+    "size_0.1": 25,
+    "size_0.03": 25,
+}
 
 
 def guessed_vehicle(case: Case, truth: dict[str, float]) -> Vehicle:
@@ -165,9 +190,16 @@ def flown(case: Case) -> tuple[Window, Window, Vehicle]:
     windows = []
     for k in range(2):
         flight = fly(
-            craft, truth, case.seconds, case.seed + 7919 * k, case.profile, effects=case.hidden, outside=case.outside,
-            noise_scale=case.noise_scale, extras=extras,
-        )  # fmt: skip
+            craft,
+            truth,
+            case.seconds,
+            case.seed + 7919 * k,
+            case.profile,
+            effects=case.hidden,
+            outside=case.outside,
+            noise_scale=case.noise_scale,
+            extras=extras,
+        )
         windows.append(flight.window)
     return windows[0], windows[1], guessed_vehicle(case, truth.as_dict())
 
@@ -326,29 +358,43 @@ def write(graded: Sequence[Graded], folder: Path, command: str) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     groups = {g.case.group: [x for x in graded if x.case.group == g.case.group] for g in graded}
     lines = [
-        "# Diagnosis: blinded campaign", "",
+        "# Diagnosis: blinded campaign",
+        "",
         f"{len(graded)} cases, `{command}`, {datetime.date.today().isoformat()}. Class and number of a case are its "
-        "seed. Flights of 120 s unless said otherwise; intervals in brackets are exact 95 % binomial ones.", "",
-        "## By class", "",
+        "seed. Flights of 120 s unless said otherwise; intervals in brackets are exact 95 % binomial ones.",
+        "",
+        "## By class",
+        "",
         *table(
             ("class", "all found", "nothing else named", "correct", "verdicts", "median [s]"),
             [_class(name, part) for name, part in groups.items()],
-        ), "",
+        ),
+        "",
         "Correct: exactly the hidden effects are named; nothing on a null; no confident name for an effect outside "
-        "the catalogue; in clutter (every effect at a twentieth of its size, one large) the large one first.", "",
-    ]  # fmt: skip
+        "the catalogue; in clutter (every effect at a twentieth of its size, one large) the large one first.",
+        "",
+    ]
     singles = groups.get("single", [])
     if singles:
         ratios = {name: found for name, part in groups.items() if (found := oracle_ratios(part))}
         told = "; ".join(f"{n} {np.median(r):.3f} ({min(r):.3f}), {len(r)} cases" for n, r in ratios.items())
         confusion(singles, folder / "diagnosis-confusion.png")
         lines += [
-            "## Parameters of the effects", "",
-            f"Effects always found within {NEAR:.0%}, at most one number outside its interval, are left out.", "",
-            *_parameters(singles), "",
-            "## Gain on an unseen flight, relative to the true structure", "", f"Median (worst): {told}.", "",
-            "## First finding", "", "![Hidden effect against first finding](diagnosis-confusion.png)", "",
-        ]  # fmt: skip
+            "## Parameters of the effects",
+            "",
+            f"Effects always found within {NEAR:.0%}, at most one number outside its interval, are left out.",
+            "",
+            *_parameters(singles),
+            "",
+            "## Gain on an unseen flight, relative to the true structure",
+            "",
+            f"Median (worst): {told}.",
+            "",
+            "## First finding",
+            "",
+            "![Hidden effect against first finding](diagnosis-confusion.png)",
+            "",
+        ]
     sizes = {float(k.split("_")[1]): v for k, v in groups.items() if k.startswith("size_")}
     if sizes:
         detection({**sizes, 1.0: singles}, folder / "diagnosis-detection.png")
@@ -364,11 +410,13 @@ def _class(name: str, graded: Sequence[Graded]) -> tuple[str, ...]:
     found = sum(set(g.case.expected) <= set(g.named) for g in graded)
     alone = sum(all(n in g.case.hidden for n in g.named) for g in graded)
     return (
-        name, "–" if name in ("null", "outside") else f"{found} of {len(graded)}", f"{alone} of {len(graded)}",
+        name,
+        "–" if name in ("null", "outside") else f"{found} of {len(graded)}",
+        f"{alone} of {len(graded)}",
         share(sum(map(right, graded)), len(graded)),
         ", ".join(f"{verdict} {count}" for verdict, count in Counter(g.verdict for g in graded).most_common()),
         f"{np.median([g.seconds for g in graded]):.1f}",
-    )  # fmt: skip
+    )
 
 
 def _parameters(singles: Sequence[Graded]) -> list[str]:

@@ -462,17 +462,26 @@ def history_removed(scene: Scene) -> str:
 FAULTS: dict[str, tuple[int, Fault]] = {
     "fit process killed": (11, lambda scene: _signal_worker(scene, signal.SIGKILL)),
     "fit process stopped": (11, lambda scene: _signal_worker(scene, signal.SIGSTOP)),
-    "fit process out of memory": (11, worker_out_of_memory), "SIGTERM or SIGINT": (13, terminated),
-    "power cut": (13, power_cut), "kill between commit and publication": (23, killed_at_commit),
-    "history locked": (12, history_locked), "history damaged": (12, history_damaged),
-    "history deleted": (12, history_removed), "disk full": (12, disk_full), "link silent": (9, link_silent),
-    "vehicle reboots": (7, vehicle_reboots), "sensor not a number": (6, sensor_not_a_number),
+    "fit process out of memory": (11, worker_out_of_memory),
+    "SIGTERM or SIGINT": (13, terminated),
+    "power cut": (13, power_cut),
+    "kill between commit and publication": (23, killed_at_commit),
+    "history locked": (12, history_locked),
+    "history damaged": (12, history_damaged),
+    "history deleted": (12, history_removed),
+    "disk full": (12, disk_full),
+    "link silent": (9, link_silent),
+    "vehicle reboots": (7, vehicle_reboots),
+    "sensor not a number": (6, sensor_not_a_number),
     "sensor stuck": (6, sensor_stuck),
     "wrong units": (10, lambda s: _spoilt(s, lambda m: _scaled(m, 180.0 / math.pi), "gyro in deg/s for 5 s")),
     "wrong sign": (17, lambda s: _spoilt(s, lambda m: _scaled(m, -1.0), "gyro with the sign flipped for 5 s")),
-    "half of the messages lost": (8, half_lost), "forged frames": (14, forged), "replayed frames": (14, replayed),
-    "flood": (14, flood), "second service": (21, second_service),
-}  # fmt: skip
+    "half of the messages lost": (8, half_lost),
+    "forged frames": (14, forged),
+    "replayed frames": (14, replayed),
+    "flood": (14, flood),
+    "second service": (21, second_service),
+}
 """Row of the list and what does it, by name."""
 
 
@@ -541,10 +550,16 @@ def _throw(scene: Scene, names: Sequence[str], entries: list[Entry], until: floa
         did = harm(scene)
         over = time.time()
         recovered = _recovered(scene.service, over)
-        entries.append({
-            "row": row, "name": name, "did": did, "lasted": over - at, "recovered": recovered,
-            "load": os.getloadavg()[0],
-        })  # fmt: skip
+        entries.append(
+            {
+                "row": row,
+                "name": name,
+                "did": did,
+                "lasted": over - at,
+                "recovered": recovered,
+                "load": os.getloadavg()[0],
+            }
+        )
         _say(f"{name} ({did}): {'not recovered' if recovered is None else f'{recovered:.1f} s'}")
         if recovered is None:
             said = "; ".join(scene.service.lines[-2:])
@@ -608,15 +623,19 @@ def page(
 ) -> str:
     """Markdown: totals, then recovery by fault."""
     lines = [
-        "# Chaos: random faults at the running service", "",
+        "# Chaos: random faults at the running service",
+        "",
         f"`{command}` (`make chaos`), {time.strftime('%Y-%m-%d')}: `quadid serve` with history and signing, a signed "
         f"vehicle flying over MAVLink in real time; {len(entries)} faults in {minutes:.0f} min on {os.cpu_count()} "
-        f"cores, load average {np.mean([e['load'] for e in entries] or [0]):.0f}.", "",
+        f"cores, load average {np.mean([e['load'] for e in entries] or [0]):.0f}.",
+        "",
         f"* Crashes, unexpected ends, tracebacks, no recovery: **{len(crashes)}**",
         "* Wrong publications (b, J_xx or J_yy more than 5 % off, not in the history, or under another set's number): "
-        f"**{len(wrong)}** of {sets} sets", "",
-        "Recovery: from the end of the fault to the next estimate; a window takes 5 s.", "",
-    ]  # fmt: skip
+        f"**{len(wrong)}** of {sets} sets",
+        "",
+        "Recovery: from the end of the fault to the next estimate; a window takes 5 s.",
+        "",
+    ]
     rows = []
     for name in FAULTS:
         found = [e for e in entries if e["name"] == name]

@@ -110,9 +110,19 @@ def desired_frame(force: FloatArray, yaw: float) -> FloatArray:
 
 @kernel
 def track(
-    ref: Reference, known: Known, k_p: FloatArray, k_a: FloatArray, unmix: FloatArray, noise: FloatArray, tau: float,
-    limit: float, efficiency: FloatArray, body: Body, air: Air, odd: Oddity,
-) -> tuple[FloatArray, FloatArray]:  # fmt: skip
+    ref: Reference,
+    known: Known,
+    k_p: FloatArray,
+    k_a: FloatArray,
+    unmix: FloatArray,
+    noise: FloatArray,
+    tau: float,
+    limit: float,
+    efficiency: FloatArray,
+    body: Body,
+    air: Air,
+    odd: Oddity,
+) -> tuple[FloatArray, FloatArray]:
     """Flies the reference; kept whole, since it reads like the block diagram.
 
     Args:
@@ -155,11 +165,13 @@ def track(
         alpha = ref.rate_dot[k] - k_a[0] * miss - k_a[1] * (nu - ref.rate[k])
         momentum = known.J * nu
         spin = np.sum(body.spins * wanted)
-        torque = known.J * alpha + np.array([
-            nu[1] * momentum[2] - nu[2] * momentum[1] - known.J_r * spin * nu[1],
-            nu[2] * momentum[0] - nu[0] * momentum[2] + known.J_r * spin * nu[0],
-            nu[0] * momentum[1] - nu[1] * momentum[0],
-        ])  # fmt: skip
+        torque = known.J * alpha + np.array(
+            [
+                nu[1] * momentum[2] - nu[2] * momentum[1] - known.J_r * spin * nu[1],
+                nu[2] * momentum[0] - nu[0] * momentum[2] + known.J_r * spin * nu[0],
+                nu[0] * momentum[1] - nu[1] * momentum[0],
+            ]
+        )
         thrust = -np.sum(force * frame[:, 2])
         for i in range(rotors):
             square = unmix[i, 0] * thrust + unmix[i, 1] * torque[0] + unmix[i, 2] * torque[1] + unmix[i, 3] * torque[2]
@@ -222,8 +234,10 @@ def _step(t: FloatArray, at: float) -> FloatArray:
 
 
 PATHS: dict[str, Callable[[FloatArray], tuple[FloatArray, FloatArray]]] = {
-    "figure eight": figure_eight, "circle": circle, "steps": steps,
-}  # fmt: skip
+    "figure eight": figure_eight,
+    "circle": circle,
+    "steps": steps,
+}
 
 
 def beliefs(truth: TruthParameters, effects: dict[str, dict[str, float]], seed: int) -> list[Known]:
@@ -264,9 +278,19 @@ def flown(path: Reference, known: Known, setup: Setup, seed: int) -> tuple[float
     noise = np.random.default_rng([seed, 3]).standard_normal((len(path.yaw), 12)) * NOISE
     limit = 2.0 * CRAFT.hover_speed(setup.body.b)
     went, commands = track(
-        path, known, gains(POSITION_WEIGHTS), gains(ATTITUDE_WEIGHTS), unmixer(known), noise, setup.drive.tau, limit,
-        setup.efficiency, setup.body, setup.air, Oddity(),
-    )  # fmt: skip
+        path,
+        known,
+        gains(POSITION_WEIGHTS),
+        gains(ATTITUDE_WEIGHTS),
+        unmixer(known),
+        noise,
+        setup.drive.tau,
+        limit,
+        setup.efficiency,
+        setup.body,
+        setup.air,
+        Oddity(),
+    )
     late = round(SETTLE / CONTROL)
     error = np.linalg.norm(went[late:] - path.position[late:], axis=1)
     beyond = float(np.max(went[:, :2] - path.position[-1, :2]))
@@ -327,9 +351,11 @@ REMARK = """\
 * Attitude and position come from the simulation with noise, not from an estimator."""
 
 PAIRS = (
-    ("initial guess", "identified"), ("initial guess", "identified + lag and drag"),
-    ("truth", "identified"), ("truth", "identified + lag and drag"),
-)  # fmt: skip
+    ("initial guess", "identified"),
+    ("initial guess", "identified + lag and drag"),
+    ("truth", "identified"),
+    ("truth", "identified + lag and drag"),
+)
 
 
 def page(seeds: int) -> str:

@@ -49,10 +49,14 @@ def counted() -> dict[str, Counts]:
 
 
 def _counts(summary: Mapping[str, int]) -> Counts:
-    return Counter({
-        "statements": summary["num_statements"], "run": summary["covered_lines"],
-        "branches": summary["num_branches"], "taken": summary["covered_branches"],
-    })  # fmt: skip
+    return Counter(
+        {
+            "statements": summary["num_statements"],
+            "run": summary["covered_lines"],
+            "branches": summary["num_branches"],
+            "taken": summary["covered_branches"],
+        }
+    )
 
 
 def percent(c: Counts) -> float:
@@ -85,15 +89,19 @@ def page(files: Mapping[str, Counts], machine_code: int) -> str:
     every = sum(files.values(), Counter())
     least = sorted(files, key=lambda n: percent(files[n]))[:5]
     lines = [
-        "# Test coverage of `quadid/`", "",
+        "# Test coverage of `quadid/`",
+        "",
         f"`make coverage`, {time.strftime('%Y-%m-%d')}, coverage {coverage.__version__}, tests of core, readers and "
-        "command line with their processes.", "",
+        "command line with their processes.",
+        "",
         f"**{percent(every):.1f} % of statements and branches** (goal {GOAL:.0f} %): {every['run']:,} of "
         f"{every['statements']:,} statements, {every['taken']:,} of {every['branches']:,} branches, without "
-        f"{machine_code:,} statements in compiled functions.", "",
-        *table(("package", "statements", "branches", "both"), rows), "",
+        f"{machine_code:,} statements in compiled functions.",
+        "",
+        *table(("package", "statements", "branches", "both"), rows),
+        "",
         "Least covered: " + ", ".join(f"`{n}` {percent(files[n]):.0f} %" for n in least) + ".",
-    ]  # fmt: skip
+    ]
     return "\n".join(lines) + "\n"
 
 

@@ -112,18 +112,32 @@ def page(seeds: int, seconds: float) -> str:
     inside = np.mean(np.abs([r[1] for r in results]) < 1.96)
     middle = np.median(widths, axis=0)
     heads = (
-        "parameter", "one gentle minute", "two", "gentle, then lively", "manoeuvre, forecast", "obtained",
+        "parameter",
+        "one gentle minute",
+        "two",
+        "gentle, then lively",
+        "manoeuvre, forecast",
+        "obtained",
         "times narrower than two gentle",
-    )  # fmt: skip
+    )
     rows = [
         (name, *(f"{middle[k, j]:.3g}" for k in (0, 1, 2, 3, 5)), f"{np.median(widths[:, 1, j] / widths[:, 5, j]):.1f}")
         for j, name in enumerate(NOMINAL_NAMES)
     ]
-    return "\n".join([
-        "`make excite`", "", (__doc__ or "").split("\n\n")[2].replace("  ", " "), "",
-        f"Relative 95 % half-width in per cent, median of {seeds} vehicles:", "", *table(heads, rows), "",
-        *sentences(widths, float(inside), sum(r[2] for r in results)), REMARK,
-    ])  # fmt: skip
+    return "\n".join(
+        [
+            "`make excite`",
+            "",
+            (__doc__ or "").split("\n\n")[2].replace("  ", " "),
+            "",
+            f"Relative 95 % half-width in per cent, median of {seeds} vehicles:",
+            "",
+            *table(heads, rows),
+            "",
+            *sentences(widths, float(inside), sum(r[2] for r in results)),
+            REMARK,
+        ]
+    )
 
 
 if __name__ == "__main__":

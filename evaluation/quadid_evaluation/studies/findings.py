@@ -32,9 +32,12 @@ def answer_of(arguments: Sequence[str | Path]) -> Answer:
         program = [] if arguments[0] == "bash" else [QUADID]
         wants = [] if arguments[0] in ("init", "bash") else ["--json", result]
         run = subprocess.run(
-            [*map(str, [*program, *arguments, *wants])], capture_output=True, text=True, check=False,
+            [*map(str, [*program, *arguments, *wants])],
+            capture_output=True,
+            text=True,
+            check=False,
             env={**os.environ, "Q": QUADID, "P": sys.executable, "PYTHONWARNINGS": "ignore"},
-        )  # fmt: skip
+        )
         data = json.loads(result.read_text(encoding="utf-8")) if result.exists() else {}
     return run.returncode, f"{run.stderr}{run.stdout}", data
 
@@ -205,9 +208,12 @@ _X8 = "vehicles/5_x8_feedback_and_health"
 def compared(log: str) -> Callable[[Path, Path], Sequence[str | Path]]:
     """Compares a flight of the folder with its five healthy ones."""
     return lambda folder, out: [
-        "health", folder / log, *(part for k in range(5) for part in ("--baseline", folder / f"healthy{k}.csv")),
-        "--vehicle", folder / "vehicle.yaml",
-    ]  # fmt: skip
+        "health",
+        folder / log,
+        *(part for k in range(5) for part in ("--baseline", folder / f"healthy{k}.csv")),
+        "--vehicle",
+        folder / "vehicle.yaml",
+    ]
 
 
 VEHICLES: tuple[Finding, ...] = (
@@ -239,14 +245,16 @@ VEHICLES: tuple[Finding, ...] = (
 )  # fmt: skip
 ARDUPILOT: tuple[Finding, ...] = tuple(
     Finding(
-        "ardupilot", what, inspect(log, "mine_pwm.yaml"),
+        "ardupilot",
+        what,
+        inspect(log, "mine_pwm.yaml"),
         lambda a: usable(a) and verdicts(a)["motor_order"] == "ok" and verdicts(a)["rotor_timing"] == "ok",
     )
     for what, log in (
         ("first sticks after a hover", "first_sticks_57s_false_pitch_step.tlog"),
         ("weak motors and a payload in hover", "payload_hover_378s_no_alarm.tlog"),
     )
-)  # fmt: skip
+)
 FINDINGS = (*LOGS, *VEHICLES, *ARDUPILOT)
 MOVED = {"push_block": "push", "resampler._due": "resampler._stretches"}
 """Names that the attacks' scripts call by an old one; old paths of modules are known once quadid is imported."""
@@ -281,8 +289,13 @@ def worst(answer: Answer) -> float:
 
 def gate(folder: str, what: str, lines: str) -> Finding:
     """A faulty flight: no set that is more than 5 % off is accepted."""
-    return Finding(f"attacks/{folder}", what, attack(lines), lambda a: a[0] == 0 and worst(a) <= 5.0,
-                   lambda a: f"{worst(a)} % off" if "accepted" in a[1] else "none accepted")  # fmt: skip
+    return Finding(
+        f"attacks/{folder}",
+        what,
+        attack(lines),
+        lambda a: a[0] == 0 and worst(a) <= 5.0,
+        lambda a: f"{worst(a)} % off" if "accepted" in a[1] else "none accepted",
+    )
 
 
 def spoilt(folder: str, what: str, change: str, simulate: str = "") -> Finding:

@@ -215,8 +215,9 @@ def _ahead(rows: Mapping[str, Row]) -> str:
         "bold: better than ridge and random features. Iris: the other half of the same flight. A benchmark, no goal: "
         "rotor speeds were logged in closed loop, so they already answer the disturbances to come, and a model that "
         "takes torque for less than it is predicts better. The file is physics "
-        "that may fly; bands of its predictions: `quadid score`.", "",
-    ]  # fmt: skip
+        "that may fly; bands of its predictions: `quadid score`.",
+        "",
+    ]
     shown = []
     for name, row in rows.items():
         if "ridge" not in row.prediction or row.diagnosed is None:
@@ -238,9 +239,10 @@ def _share(value: float) -> str:
 def _numbers(rows: Mapping[str, Row], others: Sequence[Number]) -> str:
     """Every number whose truth is known, beside it."""
     own = [
-        n for name, row in rows.items()
+        n
+        for name, row in rows.items()
         for n in of_set(name, SETS[name], {"identify": row.identified, "diagnose": row.diagnosed})
-    ]  # fmt: skip
+    ]
     return outside_table([*own, *others])
 
 

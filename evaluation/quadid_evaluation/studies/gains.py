@@ -93,9 +93,14 @@ class Flown(NamedTuple):
 
 
 def flown(
-    found: Gains, vehicle: Vehicle, truth: TruthParameters, effects: Effects, rate: FloatArray | None = None,
-    angle: FloatArray | None = None, output: FloatArray | None = None,
-) -> Flown:  # fmt: skip
+    found: Gains,
+    vehicle: Vehicle,
+    truth: TruthParameters,
+    effects: Effects,
+    rate: FloatArray | None = None,
+    angle: FloatArray | None = None,
+    output: FloatArray | None = None,
+) -> Flown:
     """Flies an autopilot's law around the truth.
 
     Args:
@@ -157,9 +162,14 @@ PERIOD = 8.0
 
 
 def step(
-    found: Gains, vehicle: Vehicle, truth: TruthParameters, effects: Effects, axis: int, angle: bool = False,
+    found: Gains,
+    vehicle: Vehicle,
+    truth: TruthParameters,
+    effects: Effects,
+    axis: int,
+    angle: bool = False,
     seconds: float = 2.5,
-) -> tuple[float, FloatArray]:  # fmt: skip
+) -> tuple[float, FloatArray]:
     """Rate, or angle, of one axis after a step of what is asked for, over it; the period of the loop first [s]."""
     size = TILT if angle else STEP
     asked = np.tile(size * np.eye(3)[axis], (round(seconds * RATE[found.result["format"]][1]), 1))
@@ -267,12 +277,15 @@ def rows_of(name: str, form: str, seed: int) -> Iterator[tuple[object, ...]]:
             response = step(found, vehicle, truth, effects, k, angle)
             phase, gain = flew[k]
             yield (
-                name, AUTOPILOTS[form].program, f"{axis} {loop}",
+                name,
+                AUTOPILOTS[form].program,
+                f"{axis} {loop}",
                 f"{promised['bandwidth']:.2f}, {bandwidth(*response):.2f}",
-                f"{promised['phase_margin']:.0f}, {phase:.0f}", f"{promised['gain_margin']:.1f}, {gain:.1f}",
+                f"{promised['phase_margin']:.0f}, {phase:.0f}",
+                f"{promised['gain_margin']:.1f}, {gain:.1f}",
                 f"{100 * promised['overshoot']:.0f}, {100 * max(response[1].max() - 1.0, 0.0):.0f}",
                 f"{outside(response, found.loops[axis], angle):.3f}",
-            )  # fmt: skip
+            )
 
 
 def promises(seed: int) -> str:
@@ -284,15 +297,24 @@ def promises(seed: int) -> str:
                 rows.append(row)
                 print(*row, sep=" | ", flush=True)
     heads = (
-        "vehicle", "autopilot", "loop", "bandwidth [Hz]", "phase margin [deg]", "gain margin [dB]", "overshoot [%]",
+        "vehicle",
+        "autopilot",
+        "loop",
+        "bandwidth [Hz]",
+        "phase margin [deg]",
+        "gain margin [dB]",
+        "overshoot [%]",
         "outside of the band",
-    )  # fmt: skip
-    return "\n".join([
-        f"`make gains`, seed {seed}. Each individual is identified from a minute of flight, from guesses off by up to "
-        "35 %; its gains are flown by the autopilot's own law around the truth. Promised, then obtained; last the "
-        "largest distance of the response to a unit step from its band over the 95 % intervals.", "",
-        *table(heads, rows),
-    ])  # fmt: skip
+    )
+    return "\n".join(
+        [
+            f"`make gains`, seed {seed}. Each individual is identified from a minute of flight, from guesses off by up "
+            "to 35 %; its gains are flown by the autopilot's own law around the truth. Promised, then obtained; last "
+            "the largest distance of the response to a unit step from its band over the 95 % intervals.",
+            "",
+            *table(heads, rows),
+        ]
+    )
 
 
 if __name__ == "__main__":

@@ -51,11 +51,15 @@ RECORDED = {
     "nanodrone": ("nanodrone/random_run1.csv", "nanodrone/vehicle.yaml"),
     "ardupilot": ("ardupilot_sitl/quad_sq.bin", "ardupilot_sitl/quad_sq.yaml"),
     "iris": ("iris/sideways.csv", "iris/vehicle.yaml"),
-    "mujoco hexa": ("findings/vehicles/2_hexa_wrong_logs/clean.csv",
-                    "findings/vehicles/2_hexa_wrong_logs/vehicle.yaml"),
-    "mujoco x8": ("findings/vehicles/5_x8_feedback_and_health/train.csv",
-                  "findings/vehicles/5_x8_feedback_and_health/vehicle.yaml"),
-}  # fmt: skip
+    "mujoco hexa": (
+        "findings/vehicles/2_hexa_wrong_logs/clean.csv",
+        "findings/vehicles/2_hexa_wrong_logs/vehicle.yaml",
+    ),
+    "mujoco x8": (
+        "findings/vehicles/5_x8_feedback_and_health/train.csv",
+        "findings/vehicles/5_x8_feedback_and_health/vehicle.yaml",
+    ),
+}
 
 
 def described(name: str) -> Vehicle:
@@ -318,10 +322,16 @@ MISTAKES: tuple[Mistake, ...] = (
     Mistake("attitude 100 ms late", late("attitude", 0.1), "attitude comes"),
     Mistake("attitude 200 ms late", late("attitude", 0.2), "attitude comes"),
     Mistake("accelerometer 50 ms late", late("accel", 0.05), "accelerometer answers the rotors"),
-    Mistake("attitude in steps of 1 deg", attitude(
-        lambda q: from_euler(np.radians(np.round(np.degrees(euler(q)))))), "in steps"),
-    Mistake("attitude in steps of 5 deg", attitude(
-        lambda q: from_euler(np.radians(5.0 * np.round(np.degrees(euler(q)) / 5.0)))), "in steps"),
+    Mistake(
+        "attitude in steps of 1 deg",
+        attitude(lambda q: from_euler(np.radians(np.round(np.degrees(euler(q)))))),
+        "in steps",
+    ),
+    Mistake(
+        "attitude in steps of 5 deg",
+        attitude(lambda q: from_euler(np.radians(5.0 * np.round(np.degrees(euler(q)) / 5.0)))),
+        "in steps",
+    ),
     Mistake("attitude held at 10 Hz", held("attitude", 10.0), "^$|attitude.*Hz"),
     Mistake("IMU turned by 10 deg", imu_turned, "turned against the attitude"),
     Mistake("gyro clipped", clipped, "limit of its range"),
@@ -349,12 +359,15 @@ MISTAKES: tuple[Mistake, ...] = (
     Mistake("spin of rotor 1 reversed", spun(0), r"spin of rotor 1\b"),
     Mistake("spins of rotors 1, 2 reversed", spun(0, 1), r"\b1 and 2\b"),
     Mistake("spins of rotors 1, 3 reversed", spun(0, 2), r"\b1 and 3\b"),
-    Mistake("frame turned by 45 deg", placed(
-        lambda x, y: ((x - y) * 0.70710678, (x + y) * 0.70710678)), "turn the rotor positions"),
+    Mistake(
+        "frame turned by 45 deg",
+        placed(lambda x, y: ((x - y) * 0.70710678, (x + y) * 0.70710678)),
+        "turn the rotor positions",
+    ),
     Mistake("positions mirrored", placed(lambda x, y: (x, -y)), f"{ORDER}|mirror"),
     Mistake("arms 1.35 times", placed(lambda x, y: (1.35 * x, 1.35 * y)), "arm"),
     Mistake("mass 1.3 times", heavier, "mass|weigh"),
-)  # fmt: skip
+)
 
 
 def orders(rotors: int) -> Iterator[Mistake]:
@@ -426,17 +439,24 @@ def _text(found: dict[str, dict[str, tuple[str, str]]], vehicles: Sequence[str])
     rows = [(mistake, *(row.get(v, ("–", ""))[0] for v in vehicles)) for mistake, row in found.items()]
     wrong = [
         f"* {mistake}, {vehicle}: {line.replace('|', '/')[:200]}"
-        for mistake, row in found.items() for vehicle, (verdict, line) in row.items() if verdict == "WRONG"
-    ]  # fmt: skip
+        for mistake, row in found.items()
+        for vehicle, (verdict, line) in row.items()
+        if verdict == "WRONG"
+    ]
     count = {
         v: sum(cell[0] == v for row in found.values() for cell in row.values()) for v in ("right", "silent", "WRONG")
     }
     return "\n".join(
-        ["`make judging`: one mistake at a time on logs that are right; the first line that a user reads. *right*: it "
-         "names the mistake; *silent*: nothing is said; –: the log has no such channel or rotor. "
-         f"{count['right']} right, {count['silent']} silent, {count['WRONG']} wrong.", "",
-         *table(("mistake", *vehicles), rows), "", *wrong]
-    )  # fmt: skip
+        [
+            "`make judging`: one mistake at a time on logs that are right; the first line that a user reads. *right*: "
+            "it names the mistake; *silent*: nothing is said; –: the log has no such channel or rotor. "
+            f"{count['right']} right, {count['silent']} silent, {count['WRONG']} wrong.",
+            "",
+            *table(("mistake", *vehicles), rows),
+            "",
+            *wrong,
+        ]
+    )
 
 
 if __name__ == "__main__":

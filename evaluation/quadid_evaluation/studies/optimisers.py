@@ -164,9 +164,13 @@ def problem(kind: str, bounds: str, seed: int) -> Problem:
     if kind == "smooth":
         return Problem(fly(base, truth, SECONDS[kind], seed).window, vehicle, values, BOUNDS[bounds], seed)
     flight = fly(
-        base, truth, SECONDS[kind], seed, effects={"command_delay": {"delay": DELAY}},
+        base,
+        truth,
+        SECONDS[kind],
+        seed,
+        effects={"command_delay": {"delay": DELAY}},
         outside={"weak_supply": {"knee": KNEE, "share": 0.0}},
-    )  # fmt: skip
+    )
     return LateAndSaturated(flight.window, vehicle, values, BOUNDS[bounds], seed)
 
 
@@ -233,31 +237,39 @@ def answer(results: dict[tuple[str, str], list[dict[str, Outcome]]]) -> list[str
             alone.append(f"{kind}, {bounds} bounds")
     return [
         f"A swarm before least squares gains at least {GAIN:.0%} of the runs on: "
-        + (f"{'; '.join(worth)}." if worth else "none of these problems."), "",
+        + (f"{'; '.join(worth)}." if worth else "none of these problems."),
+        "",
         f"A swarm without polish is best on: {'; '.join(alone) if alone else 'none of them'}.",
-    ]  # fmt: skip
+    ]
 
 
 def page(results: dict[tuple[str, str], list[dict[str, Outcome]]], seeds: int) -> str:
     """The result as Markdown."""
     lines = [
-        "# When is a particle swarm worth it?", "",
-        f"`python -m quadid_evaluation.studies.optimisers --seeds {seeds} --out docs/results`", "",
+        "# When is a particle swarm worth it?",
+        "",
+        f"`python -m quadid_evaluation.studies.optimisers --seeds {seeds} --out docs/results`",
+        "",
         "Each seed is a new Pelican, flight and random start, the same for all methods. Success: cost within "
-        f"{SUCCESS - 1.0:.0%} of the lowest of any method, or of least squares from the truth.", "",
+        f"{SUCCESS - 1.0:.0%} of the lowest of any method, or of least squares from the truth.",
+        "",
         f"* Smooth: the six parameters, flights of {SECONDS['smooth']:g} s, segments of {SEGMENT:g} s, "
         f"{BUDGET['smooth']} evaluations.",
         f"* Non-smooth: flights of {SECONDS['non-smooth']:g} s with a command delay of {1e3 * DELAY:g} ms and rotors "
         f"that saturate at {KNEE:g} hover speeds. Delay (whole samples, no gradient) and saturation speed are fitted "
         f"too; {BUDGET['non-smooth']} evaluations.",
-        "* Bounds: " + ", ".join(f"{name} a factor of {factor:g} each way" for name, factor in BOUNDS.items())
-        + f", off centre by up to a factor of {np.exp(OFF_CENTRE):.2f}.", "",
-        *answer(results), "",
-    ]  # fmt: skip
+        "* Bounds: "
+        + ", ".join(f"{name} a factor of {factor:g} each way" for name, factor in BOUNDS.items())
+        + f", off centre by up to a factor of {np.exp(OFF_CENTRE):.2f}.",
+        "",
+        *answer(results),
+        "",
+    ]
     lines += [
-        "Successes, median evaluations to success, median and largest cost over the optimum:", "",
+        "Successes, median evaluations to success, median and largest cost over the optimum:",
+        "",
         *successes_table(results),
-    ]  # fmt: skip
+    ]
     return "\n".join(lines) + "\n"
 
 

@@ -170,10 +170,15 @@ def _answer(session: Session, sets: list[OnlineSet]) -> None:
 
 
 CHANNELS: dict[str, tuple[str, int | None]] = {
-    "gyro p": ("gyro", 0), "gyro q": ("gyro", 1), "gyro r": ("gyro", 2), "accelerometer": ("accel", None),
-    "attitude": ("attitude", None), "all rotor speeds": ("rotor_speed", None),
-    "rotor 1": ("rotor_speed", 0), "rotor 2": ("rotor_speed", 1),
-}  # fmt: skip
+    "gyro p": ("gyro", 0),
+    "gyro q": ("gyro", 1),
+    "gyro r": ("gyro", 2),
+    "accelerometer": ("accel", None),
+    "attitude": ("attitude", None),
+    "all rotor speeds": ("rotor_speed", None),
+    "rotor 1": ("rotor_speed", 0),
+    "rotor 2": ("rotor_speed", 1),
+}
 """Rotors 3 and 4 are the mirror images of 1 and 2."""
 FACTORS, STEPS = (0.8, 0.9, 1.1, 1.25), (0.5, 1.5)
 RAMPS = (0.0, 120.0, 30.0, 300.0)
@@ -187,21 +192,28 @@ SINGLE: dict[str, Spoil] = {
     **{f"support {f:+.0%} of weight": supported(f * WEIGHT, B) for f in (0.04, 0.08, 0.15, -0.08, -0.15)},
     **{f"accelerometer scale {f:g} under a bias": about_the_mean(f) for f in (0.9, 1.06, 1.12, 1.17, 1.3)},
     **{f"changes of rotor speed x {f:g}": about_the_mean(f, "rotor_speed") for f in (0.9, 1.05, 1.1, 1.2)},
-    "leak p to q 15 %": leaking(0, 1, 0.15), "leak q to p 5 %": leaking(1, 0, 0.05),
+    "leak p to q 15 %": leaking(0, 1, 0.15),
+    "leak q to p 5 %": leaking(1, 0, 0.05),
     "leak r to p 15 %": leaking(2, 0, 0.15),
     **{f"gyro smoothed {f:g} Hz": smoothed(f) for f in (3.0, 4.0, 4.5, 5.0)},
-    "attitude 100 ms late": late("attitude", 0.1), "attitude 50 ms late": late("attitude", 0.05),
-    "rotor 1 x 0.95": scaled("rotor_speed", 0.95, 0), "rotor 1 x 0.9": scaled("rotor_speed", 0.9, 0),
+    "attitude 100 ms late": late("attitude", 0.1),
+    "attitude 50 ms late": late("attitude", 0.05),
+    "rotor 1 x 0.95": scaled("rotor_speed", 0.95, 0),
+    "rotor 1 x 0.9": scaled("rotor_speed", 0.9, 0),
     "rotor 3 x 1.1": scaled("rotor_speed", 1.1, 2),
-}  # fmt: skip
+}
 """Faults from take-off of a first flight, one at a time."""
 PARTS: dict[str, Spoil] = {
-    "accel 1.03": scaled("accel", 1.03), "accel 0.97": scaled("accel", 0.97),
-    "gyro 0.975": scaled("gyro", 0.975), "gyro 1.025": scaled("gyro", 1.025),
-    "support 4 %": supported(0.04 * WEIGHT, B), "leak 3 %": leaking(0, 1, 0.03),
-    "accel scale 1.04": about_the_mean(1.04), "rotor 1 x 0.97": scaled("rotor_speed", 0.97, 0),
+    "accel 1.03": scaled("accel", 1.03),
+    "accel 0.97": scaled("accel", 0.97),
+    "gyro 0.975": scaled("gyro", 0.975),
+    "gyro 1.025": scaled("gyro", 1.025),
+    "support 4 %": supported(0.04 * WEIGHT, B),
+    "leak 3 %": leaking(0, 1, 0.03),
+    "accel scale 1.04": about_the_mean(1.04),
+    "rotor 1 x 0.97": scaled("rotor_speed", 0.97, 0),
     "attitude 40 ms late": late("attitude", 0.04),
-}  # fmt: skip
+}
 """Faults that are small enough to pass alone: in pairs and triples."""
 TOGETHER = [c for n in (2, 3) for c in combinations(PARTS, n) if len({p.split()[0] for p in c}) == n]
 HIDING = [
@@ -312,20 +324,24 @@ def page(cells: list[Cell], done: list[Cell], healthy: list[tuple[float, dict[st
     held = sum(w <= GOAL for w in worst)
     first = healthy[0] if healthy else (float("nan"), {})
     lines = [
-        "# Poisoned sensors", "",
+        "# Poisoned sensors",
+        "",
         f"`make poisoning` (`python -m quadid_evaluation.studies.poisoning`), {time.strftime('%Y-%m-%d')}, "
         f"flight of seed {seed}, "
         f"{os.cpu_count()} cores: a simulated Pelican with one channel multiplied by a factor, at once or over a ramp, "
-        "or with other faults from take-off, and an online session with default settings but a fit every 2 s.", "",
+        "or with other faults from take-off, and an online session with default settings but a fit every 2 s.",
+        "",
         f"* Cases with no published error of b, J_xx or J_yy above {GOAL:.0%}: **{held} of {len(done)}** flown "
         f"({len(cells)} in all); largest error: **{max(worst, default=0.0):.1%}**. In {sum(w > 0.0 for w in worst)} "
         "something was accepted.",
         f"* Beyond {GOAL:.0%}: **{sum(d.get('held', False) for d, w in zip(done, worst, strict=True) if w > GOAL)} of "
         f"{len(done) - held}** have the truth in the 95 % intervals that were published.",
-        f"* Without poison: {len(healthy)} sets in the first 60 s, the first after {first[0]:.0f} s of flight.", "",
+        f"* Without poison: {len(healthy)} sets in the first 60 s, the first after {first[0]:.0f} s of flight.",
+        "",
         "Largest error [%] of b, J_xx and J_yy among sets accepted after the poison began, over all factors; `–`: none "
-        "was accepted. Channels without an accepted set are left out; `poisoning.json` has every case.", "",
-    ]  # fmt: skip
+        "was accepted. Channels without an accepted set are left out; `poisoning.json` has every case.",
+        "",
+    ]
     titles = {
         "in flight": "Poison after 60 s, with a set in force; the vehicle file has bare guesses",
         "from take-off": "Poison from take-off; the history has a set of a healthy flight",

@@ -102,12 +102,21 @@ def built(folder: Path) -> dict[str, str]:
         (source / "package.xml").write_text(PACKAGE.format(name=name, depends=depends), encoding="utf-8")
         (source / "CMakeLists.txt").write_text(CMAKE.format(name=name), encoding="utf-8")
         for arguments in (
-            ["-S", source, "-B", build, "-Wno-dev", "-DBUILD_TESTING=OFF", f"-DCMAKE_PREFIX_PATH={sys.prefix}",
-             f"-DCMAKE_INSTALL_PREFIX={prefix}", f"-DPython3_EXECUTABLE={sys.executable}",
-             f"-DCMAKE_PROJECT_INCLUDE={ROOT / 'tools' / 'wheel_targets.cmake'}"],
+            [
+                "-S",
+                source,
+                "-B",
+                build,
+                "-Wno-dev",
+                "-DBUILD_TESTING=OFF",
+                f"-DCMAKE_PREFIX_PATH={sys.prefix}",
+                f"-DCMAKE_INSTALL_PREFIX={prefix}",
+                f"-DPython3_EXECUTABLE={sys.executable}",
+                f"-DCMAKE_PROJECT_INCLUDE={ROOT / 'tools' / 'wheel_targets.cmake'}",
+            ],
             ["--build", build, "--parallel", "2"],
             ["--install", build],
-        ):  # fmt: skip
+        ):
             subprocess.run([cmake, *map(str, arguments)], env=environment, check=True, stdout=subprocess.DEVNULL)
     (packages,) = prefix.glob("lib/python*/site-packages")
     libraries = f"{prefix / 'lib'}:{os.environ.get('LD_LIBRARY_PATH', '')}"
@@ -131,19 +140,41 @@ def px4(recording: Recording) -> Iterator[Row]:
     """Messages as the uXRCE-DDS bridge publishes them, with ESCs that report."""
     gyro, accel, attitude, rotors = (recording.channels[c] for c in ("gyro", "accel", "attitude", "rotor_speed"))
     for k, t in enumerate(gyro.t):
-        yield t, "fmu/out/sensor_combined", "px4_msgs/SensorCombined", lambda at, k=k: {
-            "timestamp": round(at * 1e6), "gyro_rad": gyro.values[k], "accelerometer_m_s2": accel.values[k],
-        }  # fmt: skip
+        yield (
+            t,
+            "fmu/out/sensor_combined",
+            "px4_msgs/SensorCombined",
+            lambda at, k=k: {
+                "timestamp": round(at * 1e6),
+                "gyro_rad": gyro.values[k],
+                "accelerometer_m_s2": accel.values[k],
+            },
+        )
     for k, t in enumerate(attitude.t):
-        yield t, "fmu/out/vehicle_attitude", "px4_msgs/VehicleAttitude", lambda at, k=k: {
-            "timestamp": round(at * 1e6), "timestamp_sample": round(at * 1e6), "q": attitude.values[k],
-        }  # fmt: skip
+        yield (
+            t,
+            "fmu/out/vehicle_attitude",
+            "px4_msgs/VehicleAttitude",
+            lambda at, k=k: {
+                "timestamp": round(at * 1e6),
+                "timestamp_sample": round(at * 1e6),
+                "q": attitude.values[k],
+            },
+        )
     for k, t in enumerate(rotors.t):
-        yield t, "fmu/out/esc_status", "px4_msgs/EscStatus", lambda at, k=k: {
-            "timestamp": round(at * 1e6), "esc_count": rotors.values.shape[1],
-            "esc": [{"esc_rpm": round(w / RPM), "actuator_function": 101 + i} for i, w in enumerate(rotors.values[k])]
-            + [{}] * (8 - rotors.values.shape[1]),
-        }  # fmt: skip
+        yield (
+            t,
+            "fmu/out/esc_status",
+            "px4_msgs/EscStatus",
+            lambda at, k=k: {
+                "timestamp": round(at * 1e6),
+                "esc_count": rotors.values.shape[1],
+                "esc": [
+                    {"esc_rpm": round(w / RPM), "actuator_function": 101 + i} for i, w in enumerate(rotors.values[k])
+                ]
+                + [{}] * (8 - rotors.values.shape[1]),
+            },
+        )
 
 
 def mavros(recording: Recording) -> Iterator[Row]:
@@ -152,18 +183,37 @@ def mavros(recording: Recording) -> Iterator[Row]:
     rates, forces, turned = flip_body(gyro.values), flip_body(accel.values), flip_attitude(attitude.values)
     absent = [-1.0] + [0.0] * 8
     for k, t in enumerate(gyro.t):
-        yield t, "mavros/imu/data_raw", "sensor_msgs/Imu", lambda at, k=k: {
-            "header": _header(at), "orientation_covariance": absent,
-            "angular_velocity": _xyz(rates[k]), "linear_acceleration": _xyz(forces[k]),
-        }  # fmt: skip
+        yield (
+            t,
+            "mavros/imu/data_raw",
+            "sensor_msgs/Imu",
+            lambda at, k=k: {
+                "header": _header(at),
+                "orientation_covariance": absent,
+                "angular_velocity": _xyz(rates[k]),
+                "linear_acceleration": _xyz(forces[k]),
+            },
+        )
     for k, t in enumerate(attitude.t):
-        yield t, "mavros/imu/data", "sensor_msgs/Imu", lambda at, k=k: {
-            "header": _header(at), "orientation": dict(zip("wxyz", map(float, turned[k]), strict=True)),
-        }  # fmt: skip
+        yield (
+            t,
+            "mavros/imu/data",
+            "sensor_msgs/Imu",
+            lambda at, k=k: {
+                "header": _header(at),
+                "orientation": dict(zip("wxyz", map(float, turned[k]), strict=True)),
+            },
+        )
     for k, t in enumerate(rotors.t):
-        yield t, "mavros/esc_telemetry/telemetry", "mavros_msgs/ESCTelemetry", lambda at, k=k: {
-            "header": _header(at), "esc_telemetry": [{"rpm": round(w / RPM)} for w in rotors.values[k]],
-        }  # fmt: skip
+        yield (
+            t,
+            "mavros/esc_telemetry/telemetry",
+            "mavros_msgs/ESCTelemetry",
+            lambda at, k=k: {
+                "header": _header(at),
+                "esc_telemetry": [{"rpm": round(w / RPM)} for w in rotors.values[k]],
+            },
+        )
 
 
 def publish(stack: str, recording: Recording) -> None:
@@ -218,9 +268,11 @@ def run(source: str, log: Path, seconds: float, environment: dict[str, str]) -> 
     executor.add_node(ear)
     sets, statuses, loads = list[tuple[float, Any]](), list[Any](), list[float]()
     ear.create_subscription(
-        ParameterSet, "quadid/parameters",
-        lambda m: sets.append((time.monotonic(), m)) if m.state == ParameterSet.STATE_ACCEPTED else None, LATCHED_QOS,
-    )  # fmt: skip
+        ParameterSet,
+        "quadid/parameters",
+        lambda m: sets.append((time.monotonic(), m)) if m.state == ParameterSet.STATE_ACCEPTED else None,
+        LATCHED_QOS,
+    )
     ear.create_subscription(FitStatus, "quadid/status", statuses.append, 10)
     given = (f"source:={source}", "vehicle:=pelican", f"history:={folder / 'history.sqlite'}", "diagnose:=0.0")
     node = [sys.executable, "-m", "quadid_node.identify", "--ros-args", *(a for g in given for a in ("-p", g))]
@@ -253,10 +305,13 @@ def run(source: str, log: Path, seconds: float, environment: dict[str, str]) -> 
     told = [dict(zip(m.names, m.values, strict=True)) for _, m in sets]
     errors = [[abs(values[n] / TABLE_2[n] - 1.0) for n in NOMINAL_NAMES] for values in told]
     return Seen(
-        sets[0][0] - begin if sets else math.nan, len(sets),
+        sets[0][0] - begin if sets else math.nan,
+        len(sets),
         np.max(errors, axis=0) if errors else np.full(len(NOMINAL_NAMES), np.nan),
-        max(s.backlog for s in statuses), statuses[-1].fits, float(np.mean(loads)),
-    )  # fmt: skip
+        max(s.backlog for s in statuses),
+        statuses[-1].fits,
+        float(np.mean(loads)),
+    )
 
 
 def flight(seconds: float) -> Recording:
@@ -282,15 +337,27 @@ def main() -> None:
         for source in SOURCES:
             seen = run(source, log, seconds, environment)
             errors = ", ".join(f"{100 * e:.2g}" for e in seen.errors)
-            rows.append((
-                source, f"{seen.load:.1f}", f"{seen.backlog:.2f} s", seen.fits, seen.sets, f"{seen.first:.0f} s",
-                f"{errors} %",
-            ))  # fmt: skip
+            rows.append(
+                (
+                    source,
+                    f"{seen.load:.1f}",
+                    f"{seen.backlog:.2f} s",
+                    seen.fits,
+                    seen.sets,
+                    f"{seen.first:.0f} s",
+                    f"{errors} %",
+                )
+            )
             print(*rows[-1], sep=" | ", flush=True)
     heads = (
-        "preset", "load", "largest backlog", "fits", "sets", "first set",
+        "preset",
+        "load",
+        "largest backlog",
+        "fits",
+        "sets",
+        "first set",
         "largest error of b, d, J_xx, J_yy, J_zz, J_r",
-    )  # fmt: skip
+    )
     told = f"{given.minutes:g} min of flight a preset, {RATE:g} Hz a channel, {os.cpu_count()} processors."
     title, name = "The ROS node on a loaded machine", f"load {given.load:g}, {given.minutes:g} minutes"
     put(given, "ros-load.md", title, name, [told, "", *table(heads, rows)])

@@ -44,9 +44,13 @@ def vehicle_of(truth: dict[str, Any]) -> Vehicle:
         for place, spin in zip(truth["rotor_pos"].values(), truth["rotor_directions"], strict=True)
     ]
     parameters = {
-        "b": 0.8 * truth["k_eta"], "d": 1.3 * truth["k_m"], "J_xx": 1.3 * truth["Ixx"], "J_yy": 0.75 * truth["Iyy"],
-        "J_zz": 1.2 * truth["Izz"], "J_r": 1e-6,
-    }  # fmt: skip
+        "b": 0.8 * truth["k_eta"],
+        "d": 1.3 * truth["k_m"],
+        "J_xx": 1.3 * truth["Ixx"],
+        "J_yy": 0.75 * truth["Iyy"],
+        "J_zz": 1.2 * truth["Izz"],
+        "J_r": 1e-6,
+    }
     data = {"name": "hummingbird", "mass": truth["mass"], "rotors": rotors, "parameters": parameters}
     return Vehicle.model_validate(data)
 
@@ -59,9 +63,13 @@ def fly(truth: dict[str, Any], seconds: float, seed: int, aero: bool = True, rea
     rng = np.random.default_rng(seed)
     hover = np.sqrt(truth["mass"] * GRAVITY / (4.0 * truth["k_eta"]))
     at: dict[str, Any] = {
-        "x": np.zeros(3), "v": np.zeros(3), "q": np.array([0.0, 0.0, 0.0, 1.0]), "w": np.zeros(3),
-        "wind": np.zeros(3), "rotor_speeds": np.full(4, hover),
-    }  # fmt: skip
+        "x": np.zeros(3),
+        "v": np.zeros(3),
+        "q": np.array([0.0, 0.0, 0.0, 1.0]),
+        "w": np.zeros(3),
+        "wind": np.zeros(3),
+        "rotor_speeds": np.full(4, hover),
+    }
     flier = Multirotor(truth, at, aero=aero, integrator_kwargs={"method": "RK45", "rtol": 1e-8, "atol": 1e-9})
     flier.g = GRAVITY
     flier.weight = np.array([0.0, 0.0, -truth["mass"] * GRAVITY])
@@ -74,9 +82,15 @@ def fly(truth: dict[str, Any], seconds: float, seed: int, aero: bool = True, rea
         place, speed = np.sum(sizes * np.sin(wave), axis=0), np.sum(sizes * turns * np.cos(wave), axis=0)
         acceleration = -np.sum(sizes * turns**2 * np.sin(wave), axis=0)
         flat = {
-            "x": place[:3], "x_dot": speed[:3], "x_ddot": acceleration[:3], "x_dddot": np.zeros(3),
-            "x_ddddot": np.zeros(3), "yaw": place[3], "yaw_dot": speed[3], "yaw_ddot": 0.0,
-        }  # fmt: skip
+            "x": place[:3],
+            "x_dot": speed[:3],
+            "x_ddot": acceleration[:3],
+            "x_dddot": np.zeros(3),
+            "x_ddddot": np.zeros(3),
+            "yaw": place[3],
+            "yaw_dot": speed[3],
+            "yaw_ddot": 0.0,
+        }
         command[k] = np.clip(pilot.update(k * DT, at, flat)["cmd_motor_speeds"], 0.4 * hover, 1.8 * hover)
         command[k] *= 1.0 + 0.02 * rng.standard_normal(4)
         state.append(at)
@@ -92,11 +106,13 @@ def _logged(command: FloatArray, state: list[dict[str, Any]], between: FloatArra
     q = np.array([s["q"] for s in state])
     attitude = np.column_stack([q[:, 3], q[:, 0], -q[:, 1], -q[:, 2]])
     w, x, y, z = attitude.T
-    rotation = np.array([
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ])  # fmt: skip
+    rotation = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
     world = np.diff(between, axis=0) / DT * FLIP - np.array([0.0, 0.0, GRAVITY])
     force = np.einsum("jik,kj->ki", rotation, world)
     gyro = np.array([s["w"] for s in state]) * FLIP

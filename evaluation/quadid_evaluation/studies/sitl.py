@@ -46,8 +46,9 @@ def sticks(seconds: float, seed: int) -> FloatArray:
     """Stick positions -1 to 1 every `PILOT_STEP`, shape (n, axes of `quadid.flight.pilot.AXES`)."""
     segments = [
         Segment(axis, "multisine", start, 6.0, size, *BANDS[int(start / 6.5) % len(BANDS)])
-        for start in np.arange(0.0, seconds - 6.0, 6.5) for axis, size in STICKS.items()
-    ]  # fmt: skip
+        for start in np.arange(0.0, seconds - 6.0, 6.5)
+        for axis, size in STICKS.items()
+    ]
     return np.clip(scripted(segments, seed, round(seconds / PILOT_STEP)), -1.0, 1.0)
 
 
@@ -118,18 +119,38 @@ def flown(given: Given) -> Outcome:
             model = f"{given.model}:frame.json"
         history = Path(folder) / "history.sqlite"
         autopilot = subprocess.Popen(
-            [str(given.binary.resolve()), "--model", model, "--defaults", str(given.defaults.resolve()), "--wipe",
-             "--speedup", "1"],
-            cwd=folder, stdout=subprocess.DEVNULL, stderr=subprocess.STDOUT,
-        )  # fmt: skip
+            [
+                str(given.binary.resolve()),
+                "--model",
+                model,
+                "--defaults",
+                str(given.defaults.resolve()),
+                "--wipe",
+                "--speedup",
+                "1",
+            ],
+            cwd=folder,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.STDOUT,
+        )
         said, ready = list[str](), threading.Event()
         try:
             link = mavutil.mavlink_connection(f"tcp:127.0.0.1:{PILOT}", retries=60)
             served = subprocess.Popen(
-                [QUADID, "serve", "--vehicle", str(given.vehicle), "--mavlink", f"tcp:127.0.0.1:{SERVICE}",
-                 "--history", str(history)],
-                stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
-            )  # fmt: skip
+                [
+                    QUADID,
+                    "serve",
+                    "--vehicle",
+                    str(given.vehicle),
+                    "--mavlink",
+                    f"tcp:127.0.0.1:{SERVICE}",
+                    "--history",
+                    str(history),
+                ],
+                stdout=subprocess.PIPE,
+                stderr=subprocess.STDOUT,
+                text=True,
+            )
             threading.Thread(target=listen, args=(served, said, ready), daemon=True).start()
             try:
                 ready.wait(READY)
@@ -146,9 +167,16 @@ def flown(given: Given) -> Outcome:
 def main() -> None:
     """Flies what was asked for and prints the table, or says why not."""
     given = options(
-        __doc__, words="NAME=VALUE of parameters that are known", binary=Path(), defaults=Path(), model="+",
-        frame=Path(), vehicle=Path(), seconds=120.0, seed=1,
-    )  # fmt: skip
+        __doc__,
+        words="NAME=VALUE of parameters that are known",
+        binary=Path(),
+        defaults=Path(),
+        model="+",
+        frame=Path(),
+        vehicle=Path(),
+        seconds=120.0,
+        seed=1,
+    )
     if given.binary == Path():
         print("skipped: no ArduCopter binary is named (--binary)")
         return

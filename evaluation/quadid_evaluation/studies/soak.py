@@ -110,10 +110,11 @@ def batches(recording: Recording) -> list[tuple[Block, ...]]:
     made = (
         tuple(
             Block(c.t[p[k] : p[k + 1]], ((name, c.values[p[k] : p[k + 1]]),))
-            for (name, c), p in zip(channels.items(), places.values(), strict=True) if p[k + 1] > p[k]
+            for (name, c), p in zip(channels.items(), places.values(), strict=True)
+            if p[k + 1] > p[k]
         )
         for k in range(len(edges))
-    )  # fmt: skip
+    )
     return [batch for batch in made if batch]
 
 
@@ -148,11 +149,15 @@ class _Tally:
         buffer, worker = self._service.session.resampler, self._worker
         taken, dropped = sum(buffer.counts.values()), sum(buffer.faults.values())
         out = {
-            "memory_mib": ros_flight.resident(), "sent": self._sent, "taken": taken, "dropped": dropped,
+            "memory_mib": ros_flight.resident(),
+            "sent": self._sent,
+            "taken": taken,
+            "dropped": dropped,
             "us_a_sample": 1e6 * self._own / max(self._sent - self._sent_before, 1),
             "ms_a_fit": 1e3 * (worker.spent - self._fits_spent) / max(worker.fits - self._fits_before, 1),
-            "fits": worker.fits, "published": self._published,
-        }  # fmt: skip
+            "fits": worker.fits,
+            "published": self._published,
+        }
         self._sent_before, self._fits_before = self._sent, worker.fits
         self._own, self._fits_spent = 0.0, worker.spent
         return out
@@ -176,13 +181,13 @@ Result = Mapping[str, Any]
 def page(results: Result) -> str:
     """Markdown of the parts that were measured."""
     out = [
-        "# Soak", "",
+        "# Soak",
+        "",
         "`make soak`: session, fits, diagnoses and history in one process at accelerated time; the node over DDS with "
-        "its fit process in real time. Points over time are in `soak.json`.", "",
-    ]  # fmt: skip
-    for name, title, write in (
-        ("accelerated", "At accelerated time", _accelerated), ("live", "In real time", _live),
-    ):  # fmt: skip
+        "its fit process in real time. Points over time are in `soak.json`.",
+        "",
+    ]
+    for name, title, write in (("accelerated", "At accelerated time", _accelerated), ("live", "In real time", _live)):
         found = results.get(name)
         out += [f"## {title}", "", *(write(found["result"]) if found else ["Not measured."]), ""]
         if found:
@@ -205,13 +210,14 @@ def _accelerated(r: Result) -> list[str]:
         f"**{last['hours']:.1f} h of flight**{short} in {r['wall_seconds'] / 60:.0f} min: {FLIGHT:.0f} s flown, "
         f"{GROUND:.0f} s of silence, and again; {last['fits']} fits, a diagnosis every {r['diagnose']:.0f} s, "
         f"{last['published']} sets published. The history keeps the newest {r['kept']} candidates and events here (in "
-        f"service {KEPT['candidates']} and {KEPT['events']}).", "",
+        f"service {KEPT['candidates']} and {KEPT['events']}).",
+        "",
         f"Samples sent {last['sent']:,}, taken {last['taken']:,}, dropped {last['dropped']:,}: "
         f"**{last['sent'] - last['taken'] - last['dropped']} lost**. Memory {last['memory_mib']:.0f} MiB at the end. "
         f"Slopes over the last three quarters: memory {slope(points, 'memory_mib'):+.3f} MiB/h, files "
         f"{slope(points, 'files_mib'):+.3f} MiB/h, processor time {slope(points, 'us_a_sample'):+.3f} us a sample per "
         "hour.",
-    ]  # fmt: skip
+    ]
     return lines
 
 
@@ -224,7 +230,8 @@ def _live(r: Result) -> list[str]:
     lines = [
         f"**{points[-1]['hours'] * 60:.0f} min**; all inputs at 100 Hz, a fit every second, a diagnosis every minute: "
         f"{minutes[-1]['fits']} fits, set {minutes[-1]['in_force']} in force at the end, exit code {r['exit_code']}, "
-        f"{len(r['problems'])} warnings or errors.", "",
+        f"{len(r['problems'])} warnings or errors.",
+        "",
         f"Messages sent {sum(sent.values()):,}, taken {sum(taken.values()):,}; "
         f"**lost: {', '.join(f'{t} {n}' for t, n in lost.items() if n) or 'none'}**; samples dropped by the session: "
         f"{minutes[-1]['dropped'] or 'none'}. Slopes over the last three quarters: memory "
@@ -232,7 +239,7 @@ def _live(r: Result) -> list[str]:
         f"{slope(points, 'files_mib'):+.2f} MiB/h; handles {points[0]['handles']:.0f} → {points[-1]['handles']:.0f}. "
         f"IMU latency p99: first third {np.median(p99[:third]):.0f} ms, last third {np.median(p99[-third:]):.0f} ms "
         f"(load average {points[0]['load']:.0f} → {points[-1]['load']:.0f}).",
-    ]  # fmt: skip
+    ]
     if r["problems"]:
         lines += ["", "Warnings: " + "; ".join(f"`{p[:160]}`" for p in r["problems"][:8])]
     return lines

@@ -64,10 +64,12 @@ def resonance() -> System:
     """A resonance of radius 0.9 and a lag of 0.7."""
     c, s = 0.9 * np.cos(0.4), 0.9 * np.sin(0.4)
     return System(
-        "resonance and lag, 2 × 2", np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 0.7]]),
-        np.array([[1.0, 0.2], [-0.5, 0.8], [0.3, 1.0]]), np.array([[1.0, 0.3, -0.5], [0.2, -1.0, 0.8]]),
+        "resonance and lag, 2 × 2",
+        np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 0.7]]),
+        np.array([[1.0, 0.2], [-0.5, 0.8], [0.3, 1.0]]),
+        np.array([[1.0, 0.3, -0.5], [0.2, -1.0, 0.8]]),
         0.1 * np.array([[1.0, 0.5], [-0.3, 0.4], [0.2, 0.6]]),
-    )  # fmt: skip
+    )
 
 
 def two_masses() -> System:
@@ -90,9 +92,11 @@ def poles(seeds: int) -> list[str]:
     """Markdown rows: pole errors of every system, method and form."""
     rows = []
     cases = (
-        (resonance(), 0.1, ROWS), (two_masses(), 0.1, ROWS),
-        (unstable(3.0), 1.0, 2 * ROWS), (unstable(0.3), 1.0, 2 * ROWS),
-    )  # fmt: skip
+        (resonance(), 0.1, ROWS),
+        (two_masses(), 0.1, ROWS),
+        (unstable(3.0), 1.0, 2 * ROWS),
+        (unstable(0.3), 1.0, 2 * ROWS),
+    )
     for system, noise, count in cases:
         data = [system.run(np.random.default_rng([seed, 3]), count, noise) for seed in range(seeds)]
         for method in METHODS:
@@ -127,19 +131,30 @@ def flights(seconds: float, orders: tuple[int, ...]) -> list[str]:
 
 if __name__ == "__main__":
     given = options(__doc__, seeds=20, seconds=500.0)
-    text = "\n".join([
-        "# CVA and MOESP: poles of known systems, prediction of flights", "",
-        f"`python -m quadid_evaluation.studies.subspace --seeds {given.seeds} --seconds {given.seconds:g} "
-        f"--out docs/results`", "",
-        "## Poles", "",
-        f"{ROWS} rows a record ({2 * ROWS} under feedback); noise: innovations relative to the output without them. "
-        "The order is given. Median and largest pole error [%], records within 1 %. quadid uses the form `closed`.", "",
-        *poles(given.seeds), "",
-        "## Flights", "",
-        f"Three simulated Pelican flights of {given.seconds:g} s under the stabiliser, fitted on the first; mean "
-        "squared error over 1 s relative to a perfect physical model.", "",
-        *flights(given.seconds, (12, 22)), "",
-    ])  # fmt: skip
+    text = "\n".join(
+        [
+            "# CVA and MOESP: poles of known systems, prediction of flights",
+            "",
+            f"`python -m quadid_evaluation.studies.subspace --seeds {given.seeds} --seconds {given.seconds:g} "
+            f"--out docs/results`",
+            "",
+            "## Poles",
+            "",
+            f"{ROWS} rows a record ({2 * ROWS} under feedback); noise: innovations relative to the output without "
+            "them. The order is given. Median and largest pole error [%], records within 1 "
+            "%. quadid uses the form `closed`.",
+            "",
+            *poles(given.seeds),
+            "",
+            "## Flights",
+            "",
+            f"Three simulated Pelican flights of {given.seconds:g} s under the stabiliser, fitted on the first; mean "
+            "squared error over 1 s relative to a perfect physical model.",
+            "",
+            *flights(given.seconds, (12, 22)),
+            "",
+        ]
+    )
     print(text)
     if given.out is not None:
         (given.out / "subspace.md").write_text(text, encoding="utf-8")

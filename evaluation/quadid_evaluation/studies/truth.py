@@ -98,18 +98,29 @@ def efficiency(outcomes: list[Outcome]) -> list[str]:
     n = len(outcomes)
     inside = np.mean(np.abs(error) <= Z95 * sigma, axis=0)
     heads = (
-        "parameter", "RMS error %", "bound of one set of segments %", "ratio", "bias % ± s.e.", "coverage % ± s.e.",
-    )  # fmt: skip
+        "parameter",
+        "RMS error %",
+        "bound of one set of segments %",
+        "ratio",
+        "bias % ± s.e.",
+        "coverage % ± s.e.",
+    )
     rows = []
     for j, name in enumerate(NOMINAL_NAMES):
         rms, crb = np.sqrt(np.mean(error[:, j] ** 2)), np.sqrt(np.mean(limit[:, j] ** 2))
         normal = np.sqrt(np.mean((error[:, j] / limit[:, j]) ** 2))
         mean, spread = np.mean(error[:, j]), np.std(error[:, j]) / np.sqrt(n)
         cover = inside[j]
-        rows.append((
-            name, f"{100 * rms:.4f}", f"{100 * crb:.4f}", f"{normal:.3f}", f"{100 * mean:.4f} ± {100 * spread:.4f}",
-            f"{100 * cover:.1f} ± {100 * np.sqrt(max(cover * (1 - cover), 1e-9) / n):.1f}",
-        ))  # fmt: skip
+        rows.append(
+            (
+                name,
+                f"{100 * rms:.4f}",
+                f"{100 * crb:.4f}",
+                f"{normal:.3f}",
+                f"{100 * mean:.4f} ± {100 * spread:.4f}",
+                f"{100 * cover:.1f} ± {100 * np.sqrt(max(cover * (1 - cover), 1e-9) / n):.1f}",
+            )
+        )
     return table(heads, rows)
 
 
@@ -126,10 +137,14 @@ def noise_levels(seeds: int, processes: int) -> str:
     """
     parts = {x: pooled(run, [(10_000 + s, "excited", 60.0, x) for s in range(seeds)], processes) for x in NOISE_SCALES}
     text = [
-        f"## Bias with noise: {seeds} flights of 60 s at three noise levels", "",
+        f"## Bias with noise: {seeds} flights of 60 s at three noise levels",
+        "",
         f"Mean error in stated standard deviations (standard error {1.0 / np.sqrt(seeds):.2f}) of "
-        f"{', '.join(NOMINAL_NAMES)}; coverage [%].", "", "| noise | mean errors | coverage |", "|---|---|---|",
-    ]  # fmt: skip
+        f"{', '.join(NOMINAL_NAMES)}; coverage [%].",
+        "",
+        "| noise | mean errors | coverage |",
+        "|---|---|---|",
+    ]
     for x, part in parts.items():
         z = np.array([o.error / o.sigma for o in part])
         means = ", ".join(f"{m:+.2f}" for m in np.mean(z, axis=0))
@@ -143,9 +158,11 @@ def status(seeds: int, processes: int) -> str:
     profiles = ("hover", "one_axis", "roll_pitch")
     parts = [pooled(run, [(20_000 + s, profile, 60.0, 1.0) for s in range(seeds)], processes) for profile in profiles]
     text = [
-        f"## Status in {seeds} flights of 60 s, and the bound [%]", "",
-        "| parameter | " + " | ".join(profiles) + " |", "|---" * (len(profiles) + 1) + "|",
-    ]  # fmt: skip
+        f"## Status in {seeds} flights of 60 s, and the bound [%]",
+        "",
+        "| parameter | " + " | ".join(profiles) + " |",
+        "|---" * (len(profiles) + 1) + "|",
+    ]
     for j, name in enumerate(NOMINAL_NAMES):
         cells = []
         for part in parts:
@@ -162,9 +179,13 @@ def remembering(job: tuple[int, float]) -> tuple[FloatArray, float]:
     craft = Vehicle.shipped("pelican")
     scale = dict(zip("xyz", np.random.default_rng([seed, 7]).uniform(-0.05, 0.05, 3).tolist(), strict=True))
     flown = fly(
-        craft, draw_truth(craft, seed), 120.0, seed, effects={"gyro_scale": scale},
+        craft,
+        draw_truth(craft, seed),
+        120.0,
+        seed,
+        effects={"gyro_scale": scale},
         noise=SensorNoise(attitude_time=memory),
-    )  # fmt: skip
+    )
     names = {f"gyro_scale.{axis}": value for axis, value in scale.items()}
     found = fit([flown.window], craft, FitOptions(iterations=0), names=[*NOMINAL_NAMES, *names])
     error = [(found.parameters[n].value - value) / found.parameters[n].sigma for n, value in names.items()]
@@ -174,10 +195,11 @@ def remembering(job: tuple[int, float]) -> tuple[FloatArray, float]:
 def memories(seeds: int, processes: int) -> str:
     """Section on attitude noise that is remembered for another time."""
     text = [
-        f"## Correlation time of attitude noise: {seeds} flights of 120 s, gyro scale of up to 5 % fitted", "",
+        f"## Correlation time of attitude noise: {seeds} flights of 120 s, gyro scale of up to 5 % fitted",
+        "",
         "| time [s] | estimate: median (range) | gyro scale: coverage [%] | RMS error [sigma] |",
         "|---|---|---|---|",
-    ]  # fmt: skip
+    ]
     for memory in MEMORIES:
         part = pooled(remembering, [(30_000 + s, memory) for s in range(seeds)], processes)
         z, found = np.array([error for error, _ in part]), np.array([time for _, time in part])

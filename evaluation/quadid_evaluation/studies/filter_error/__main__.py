@@ -27,41 +27,43 @@ from quadid.parameters import NOMINAL_NAMES
 from quadid.vehicle import ParameterPrior, Vehicle
 from quadid_evaluation.harness import Given, options, pooled, put
 from quadid_evaluation.studies.filter_error.causes import search
-from quadid_evaluation.studies.filter_error.jobs import (
-    BRIEF,
-    GUSTS,
-    LATE,
-    SECONDS,
-    caused,
-    exact,
-    fast_loop,
-    lagging,
-)
+from quadid_evaluation.studies.filter_error.jobs import BRIEF, GUSTS, LATE, SECONDS, caused, exact, fast_loop, lagging
 from quadid_evaluation.studies.truth import poor_guess
 
 EFFECTS = (
-    "rotor_drag.k_x", "rotor_drag.k_y", "rate_damping.l_p", "rate_damping.m_q", "rate_damping.n_r", "cg_offset.x",
-    "cg_offset.y", "command_delay.delay",
-)  # fmt: skip
+    "rotor_drag.k_x",
+    "rotor_drag.k_y",
+    "rate_damping.l_p",
+    "rate_damping.m_q",
+    "rate_damping.n_r",
+    "cg_offset.x",
+    "cg_offset.y",
+    "command_delay.delay",
+)
 RECORDED: tuple[tuple[str, tuple[str, ...], float | None], ...] = (
     *(("brushed", ("jana00.csv", "jana02.csv"), rate) for rate in (50.0, 100.0, 200.0)),
-    ("brushed", ("jana00.csv",), 100.0), ("brushed", ("jana02.csv",), 100.0),
+    ("brushed", ("jana00.csv",), 100.0),
+    ("brushed", ("jana02.csv",), 100.0),
     ("crazyflie_rpm", ("figure8_17.csv", "figure8_22.csv"), 100.0),
     ("crazyflie_rpm", ("figure8_27.csv", "figure8_34.csv"), 100.0),
-    ("nanodrone", ("random_run1.csv",), 100.0), ("iris", ("sideways.csv",), 50.0),
-)  # fmt: skip
+    ("nanodrone", ("random_run1.csv",), 100.0),
+    ("iris", ("sideways.csv",), 50.0),
+)
 """Folder of the recorded data, flights, rate [Hz]; None: every channel at its own rate."""
 APART: tuple[tuple[str, str, str], ...] = (
-    ("brushed", "jana00.csv", "jana02.csv"), ("brushed", "jana02.csv", "jana00.csv"),
-    ("crazyflie_rpm", "figure8_17.csv", "figure8_22.csv"), ("crazyflie_rpm", "figure8_27.csv", "figure8_34.csv"),
+    ("brushed", "jana00.csv", "jana02.csv"),
+    ("brushed", "jana02.csv", "jana00.csv"),
+    ("crazyflie_rpm", "figure8_17.csv", "figure8_22.csv"),
+    ("crazyflie_rpm", "figure8_27.csv", "figure8_34.csv"),
     ("nanobench", "B2_circle_fast_rep1.csv", "B9_trefoil_fast_rep10.csv"),
-)  # fmt: skip
+)
 """Folder of the recorded data, the flight on which causes are searched, and the one on which they are judged."""
 KNOWN = {
     "brushed": "b 2.02e-8 (thrust stand), J 1.5–1.9e-5, speeds act 4–8 ms late",
-    "crazyflie_rpm": "b 3.70e-8", "nanodrone": "b 3.72e-8; its low-passed states yield a wrong J",
+    "crazyflie_rpm": "b 3.70e-8",
+    "nanodrone": "b 3.72e-8; its low-passed states yield a wrong J",
     "iris": "b 5.84e-6, J_xx, J_yy 0.0291; commands at 10 Hz",
-}  # fmt: skip
+}
 
 
 def simulated(gusty: bool, flights: int, processes: int) -> str:
@@ -75,13 +77,18 @@ def simulated(gusty: bool, flights: int, processes: int) -> str:
         "inside 95 % [%]": [f"{100 * share:.0f}" for share in inside.mean(axis=0)],
         "half-width, median [%]": [f"{196 * s:.2f}" for s in np.median(sigma, axis=0)],
     }
-    return "\n".join([
-        f"{flights} flights of {SECONDS:.0f} s at 50 Hz, one drawn Pelican each, seeds from 100; guesses off by up to "
-        f"35 %.  Random forces and moments that acted (horizontal, vertical; roll and pitch, yaw): {truth}.", "",
-        "| | " + " | ".join(NOMINAL_NAMES) + " |", "|---|" + "---|" * len(NOMINAL_NAMES),
-        *(f"| {name} | " + " | ".join(cells) + " |" for name, cells in rows.items()), "",
-        f"All six together: {100 * inside.mean():.1f} % inside 95 %.",
-    ])  # fmt: skip
+    return "\n".join(
+        [
+            f"{flights} flights of {SECONDS:.0f} s at 50 Hz, one drawn Pelican each, seeds from 100; guesses off by up "
+            f"to 35 %.  Random forces and moments that acted (horizontal, vertical; roll and pitch, yaw): {truth}.",
+            "",
+            "| | " + " | ".join(NOMINAL_NAMES) + " |",
+            "|---|" + "---|" * len(NOMINAL_NAMES),
+            *(f"| {name} | " + " | ".join(cells) + " |" for name, cells in rows.items()),
+            "",
+            f"All six together: {100 * inside.mean():.1f} % inside 95 %.",
+        ]
+    )
 
 
 def guesses(count: int) -> str:
@@ -109,10 +116,11 @@ def feedback(flights: int, processes: int) -> str:
     """The loop at 500 Hz logged at 10, 50, 100 Hz."""
     lines = [
         f"{flights} flights of {SECONDS:.0f} s each: a stabiliser at 500 Hz reads a gyro of 0.01 rad/s and an attitude "
-        "estimator fed by it; the log holds mean commands.  Random moments of 0.3 s.", "",
+        "estimator fed by it; the log holds mean commands.  Random moments of 0.3 s.",
+        "",
         "| log | random moments | noise of speeds | J_xx [%] | inside 95 % | half-width, median [%] |",
         "|---|---|---|---|---|---|",
-    ]  # fmt: skip
+    ]
     for every, share, speed in ((10, 0.0, 0.0), (10, 0.2, 0.0), (10, 0.2, 0.005), (5, 0.2, 0.005), (50, 0.2, 0.005)):
         found = np.array(pooled(fast_loop, [(s, every, share, speed) for s in range(flights)], processes))
         error, sigma = found[:, 0, 2], found[:, 1, 2]
@@ -128,9 +136,11 @@ def recorded(data: Path) -> str:
     """Recorded vehicles, with rotor drag, damping, centre of gravity and delay free."""
     lines = [
         "Free: the six, " + ", ".join(EFFECTS) + ", trim moment and biases a flight.  ± 95 %.  Missing: rms of the "
-        "smoothed random force as a share of weight, and moment as a share of the rotors' (roll, pitch).", "",
-        "| data | grid | b | J_xx | J_yy | delay [ms] | missing | known |", "|---|---|---|---|---|---|---|---|",
-    ]  # fmt: skip
+        "smoothed random force as a share of weight, and moment as a share of the rotors' (roll, pitch).",
+        "",
+        "| data | grid | b | J_xx | J_yy | delay [ms] | missing | known |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
     for folder, files, rate in RECORDED:
         vehicle = Vehicle.from_yaml((data / folder / "vehicle.yaml").read_text(encoding="utf-8"))
         tracks = []
@@ -156,10 +166,11 @@ def recorded(data: Path) -> str:
 def late(flights: int, processes: int) -> str:
     """A hidden motor lag, with and without the family of late causes among the free parameters."""
     lines = [
-        f"{flights} flights of {SECONDS:.0f} s a row, drawn Pelicans.  The family: {', '.join(LATE)}.", "",
+        f"{flights} flights of {SECONDS:.0f} s a row, drawn Pelicans.  The family: {', '.join(LATE)}.",
+        "",
         "| motor lag | free | J_xx, J_yy, mean error [%] | inside 95 % | half-width, median [%] |",
         "|---|---|---|---|---|",
-    ]  # fmt: skip
+    ]
     for lag in (0.0, 0.03, 0.04):
         found = np.array(pooled(lagging, [(300 + s, lag) for s in range(flights)], processes))
         for which, free in enumerate(("the six", "and the family")):
@@ -175,33 +186,44 @@ def named(flights: int, processes: int) -> str:
     """Causes by innovations beside today's diagnosis: single causes in still and rough air, nothing hidden."""
     lines = [
         f"Single causes of the campaign (classes `single`, `null`), {BRIEF:.0f} s each; rough air: the gusts above.  "
-        "Right: exactly what was hidden is named.", "",
-        "| hidden | still air: filter | today | rough air: filter | today |", "|---|---|---|---|---|",
-    ]  # fmt: skip
+        "Right: exactly what was hidden is named.",
+        "",
+        "| hidden | still air: filter | today | rough air: filter | today |",
+        "|---|---|---|---|---|",
+    ]
     kinds = [("single", n) for n in range(flights)] + [("null", n) for n in range(max(flights // 6, 2))]
     jobs = [(group, n, gusty) for group, n in kinds for gusty in (False, True)]
     found = pooled(caused, jobs, processes)
     for still, rough in zip(found[::2], found[1::2], strict=True):
-        cells = [f"{'' if good else '**'}{name}{'' if good else '**'}"
-                 for one in (still, rough) for good, name in ((one[1], one[3]), (one[2], one[4]))]  # fmt: skip
+        cells = [
+            f"{'' if good else '**'}{name}{'' if good else '**'}"
+            for one in (still, rough)
+            for good, name in ((one[1], one[3]), (one[2], one[4]))
+        ]
         lines.append(f"| {still[0]} | " + " | ".join(cells) + " |")
     counts = [sum(bool(one[1 + which]) for one in found[rough::2]) for rough in (0, 1) for which in (0, 1)]
     total, seconds = len(found) // 2, np.median([one[5] for one in found])
-    return "\n".join([
-        *lines, "",
-        f"Right of {total}: still air {counts[0]} (today {counts[1]}), rough air {counts[2]} (today {counts[3]}); "
-        f"processor time of the filter's search, median {seconds:.0f} s.",
-    ])  # fmt: skip
+    return "\n".join(
+        [
+            *lines,
+            "",
+            f"Right of {total}: still air {counts[0]} (today {counts[1]}), rough air {counts[2]} (today {counts[3]}); "
+            f"processor time of the filter's search, median {seconds:.0f} s.",
+        ]
+    )
 
 
 def causes(flights: int, processes: int, data: Path) -> str:
     """Causes on simulated flights, and on recorded ones what they take from the missing force and moment."""
     lines = [
-        named(flights, processes), "",
+        named(flights, processes),
+        "",
         "Recorded vehicles at 100 Hz: causes searched on one flight; removed: share of the squared missing force and "
-        "moment on the other one, which was not fitted.", "", "| data | judged on | named | J_xx, J_yy | removed |",
+        "moment on the other one, which was not fitted.",
+        "",
+        "| data | judged on | named | J_xx, J_yy | removed |",
         "|---|---|---|---|---|",
-    ]  # fmt: skip
+    ]
     for folder, train, test in APART:
         vehicle = Vehicle.from_yaml((data / folder / "vehicle.yaml").read_text(encoding="utf-8"))
         fitted, unseen = (grid_recording(open_log(data / folder / n), vehicle, 100.0).windows for n in (train, test))

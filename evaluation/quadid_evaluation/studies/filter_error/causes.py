@@ -86,9 +86,10 @@ def search(windows: Sequence[Window], vehicle: Vehicle, report: bool = False) ->
     rotors = ["readings" if vehicle.command.sampling == "instant" else "commands"]
     rotors += ["battery"] if vehicle.reference_voltage is not None and windows[0].battery is not None else []
     listed = [
-        c for c in candidates(layout, has_velocity, has_position, rotors)
+        c
+        for c in candidates(layout, has_velocity, has_position, rotors)
         if c.timed is None and not c.split and c.effect not in vehicle.effects
-    ]  # fmt: skip
+    ]
     tracks = [from_window(w, vehicle, air=True) for w in windows]
     whole = Problem.of(tracks, vehicle, tuple(n for c in listed for n in c.names), windows)
     nominal = _fitted(whole, (), None, len(listed))

@@ -62,10 +62,14 @@ def _turn(w, torque, total, J):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True)
 def _product(a, b):  # type: ignore[no-untyped-def]
-    return np.array([
-        a[0] * b[0] - a[1] * b[1] - a[2] * b[2] - a[3] * b[3], a[0] * b[1] + a[1] * b[0] + a[2] * b[3] - a[3] * b[2],
-        a[0] * b[2] - a[1] * b[3] + a[2] * b[0] + a[3] * b[1], a[0] * b[3] + a[1] * b[2] - a[2] * b[1] + a[3] * b[0],
-    ])  # fmt: skip
+    return np.array(
+        [
+            a[0] * b[0] - a[1] * b[1] - a[2] * b[2] - a[3] * b[3],
+            a[0] * b[1] + a[1] * b[0] + a[2] * b[3] - a[3] * b[2],
+            a[0] * b[2] - a[1] * b[3] + a[2] * b[0] + a[3] * b[1],
+            a[0] * b[3] + a[1] * b[2] - a[2] * b[1] + a[3] * b[0],
+        ]
+    )
 
 
 @nb.njit(cache=True)
@@ -89,9 +93,15 @@ def _memory(rng: np.random.Generator, n: int, sigma: FloatArray, time: float) ->
 
 
 def fly(
-    vehicle: Vehicle, seconds: float, seed: int, every: int = 10, share: float = 0.2, time: float = 0.3,
-    gyro: float = 0.01, speed: float = 0.005,
-) -> Window:  # fmt: skip
+    vehicle: Vehicle,
+    seconds: float,
+    seed: int,
+    every: int = 10,
+    share: float = 0.2,
+    time: float = 0.3,
+    gyro: float = 0.01,
+    speed: float = 0.005,
+) -> Window:
     """One flight with the guess of the vehicle file as truth.
 
     Args:

@@ -21,9 +21,17 @@ def flights(data: Path) -> list[recorded.Flown]:
 
 
 if __name__ == "__main__":
-    study(__doc__, "health.md", TITLE, {
-        "recorded": lambda g: recorded.recorded(recorded.judge(flights(g.data)), g.out and g.out / "health-score.png"),
-        "command": lambda g: recorded.command(flights(g.data), g.data / "crazypad"),
-        "fleet": lambda g: recorded.fleet(flights(g.data), g.data / "crazypad"),
-        "simulated": lambda g: simulated.text(g.each),
-    }, each=6)  # fmt: skip
+    study(
+        __doc__,
+        "health.md",
+        TITLE,
+        {
+            "recorded": lambda g: recorded.recorded(
+                recorded.judge(flights(g.data)), g.out and g.out / "health-score.png"
+            ),
+            "command": lambda g: recorded.command(flights(g.data), g.data / "crazypad"),
+            "fleet": lambda g: recorded.fleet(flights(g.data), g.data / "crazypad"),
+            "simulated": lambda g: simulated.text(g.each),
+        },
+        each=6,
+    )

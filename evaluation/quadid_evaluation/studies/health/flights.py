@@ -68,9 +68,13 @@ def squared_speeds(
 
 
 def hover_seconds(
-    vehicle: Vehicle, seconds: int, rng: np.random.Generator, variation: Variation | None = None,
-    wrong: Wrong | None = None, onset: int = 0,
-) -> Iterator[tuple[FloatArray, float]]:  # fmt: skip
+    vehicle: Vehicle,
+    seconds: int,
+    rng: np.random.Generator,
+    variation: Variation | None = None,
+    wrong: Wrong | None = None,
+    onset: int = 0,
+) -> Iterator[tuple[FloatArray, float]]:
     """Mean squared rotor speeds and specific force of each second of a hover.
 
     Args:
@@ -92,9 +96,14 @@ def hover_seconds(
 
 
 def hover_blocks(
-    vehicle: Vehicle, begin: float, seconds: int, rng: np.random.Generator, wrong: Wrong | None = None, onset: int = 0,
+    vehicle: Vehicle,
+    begin: float,
+    seconds: int,
+    rng: np.random.Generator,
+    wrong: Wrong | None = None,
+    onset: int = 0,
     rate: int = 50,
-) -> Iterator[Block]:  # fmt: skip
+) -> Iterator[Block]:
     """Messages of a hover from `begin` [s] on, a block a second, with 6 s on the ground before and after."""
     ground = [(np.full(len(vehicle.rotors), 100.0), G)] * 6
     for k, (load, force) in enumerate([*ground, *hover_seconds(vehicle, seconds, rng, None, wrong, onset), *ground]):

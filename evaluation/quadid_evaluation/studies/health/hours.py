@@ -140,6 +140,12 @@ def soon(each: int) -> str:
 
 
 if __name__ == "__main__":
-    study(__doc__, "health.md", "Health: what changed in this vehicle", {
-        "online": lambda g: quiet(g.hours, g.session), "losses": lambda g: soon(g.each),
-    }, hours=100.0, session=10.0, each=25)  # fmt: skip
+    study(
+        __doc__,
+        "health.md",
+        "Health: what changed in this vehicle",
+        {"online": lambda g: quiet(g.hours, g.session), "losses": lambda g: soon(g.each)},
+        hours=100.0,
+        session=10.0,
+        each=25,
+    )

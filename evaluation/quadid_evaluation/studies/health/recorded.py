@@ -144,9 +144,10 @@ def kind_right(one: Judged) -> bool:
 def order(judged: Sequence[Judged], airframe: str, kind: str) -> list[Judged]:
     """Cuts and healthy flights of an airframe in one kind of log."""
     return [
-        j for j in judged
+        j
+        for j in judged
         if (j.flown.airframe, j.flown.kind) == (airframe, kind) and j.flown.condition in ("cut", "healthy")
-    ]  # fmt: skip
+    ]
 
 
 @dataclass(frozen=True)
@@ -175,11 +176,15 @@ QUESTIONS = (
     Question("cuts below 3 mm and tape: found", "", _small, lambda j: j.changed),
     Question("one propeller, 3 mm or more: named first", "≥ 95 %", lambda j: is_single(j, LARGE, 99.0), named_first),
     Question("one propeller, 1 to 2.5 mm: named first", "≥ 75 %", lambda j: is_single(j, 1.0, LARGE), named_first),
-    Question("two propellers, 3 mm or more each: both named", "≥ 85 %", lambda j: min(j.flown.cut[:2]) >= LARGE,
-             lambda j: j.flown.rotors <= set(j.named)),
+    Question(
+        "two propellers, 3 mm or more each: both named",
+        "≥ 85 %",
+        lambda j: min(j.flown.cut[:2]) >= LARGE,
+        lambda j: j.flown.rotors <= set(j.named),
+    ),
     Question("propeller told from glued weight", "≥ 90 %", lambda j: is_large(j.flown), kind_right),
     Question("the same, of those found", "", lambda j: is_large(j.flown) and j.changed, kind_right),
-)  # fmt: skip
+)
 
 
 def balanced(judged: Sequence[Judged]) -> float:
@@ -210,12 +215,17 @@ def recorded(judged: Sequence[Judged], picture: Path | None) -> str:
         *((q.text, q.wanted, q.told(judged)) for q in QUESTIONS),
         ("rank correlation of score and mm cut (with healthy flights / cuts alone)", "≥ 0.9", "; ".join(orders)),
     ]
-    return "\n".join([
-        "## Recorded flights",
-        f"`make health`; {len(judged)} flights of two Crazyflies, each against the other healthy flights of its "
-        f"airframe ({each}). Brackets: exact binomial 95 % intervals.", "",
-        *table(("question", "wanted", "measured"), rows), "", "![Score against millimetres cut](health-score.png)",
-    ])  # fmt: skip
+    return "\n".join(
+        [
+            "## Recorded flights",
+            f"`make health`; {len(judged)} flights of two Crazyflies, each against the other healthy flights of its "
+            f"airframe ({each}). Brackets: exact binomial 95 % intervals.",
+            "",
+            *table(("question", "wanted", "measured"), rows),
+            "",
+            "![Score against millimetres cut](health-score.png)",
+        ]
+    )
 
 
 BASELINES, SEED = 3, 3
@@ -243,9 +253,12 @@ def command(flights: Sequence[Flown], folder: Path) -> str:
     figures: list[tuple[str, Callable[[Judged], bool], Callable[[Sequence[Judged]], float]]] = [
         ("balanced accuracy", lambda j: is_large(j.flown) or j.flown.condition == "healthy", balanced),
         *((q.text, q.of, q.figure) for q in QUESTIONS),
-        ("rank correlation of score and mm cut", lambda j: j.flown.condition == "cut",
-         lambda some: _order([j for j in some if j.flown.condition == "cut"])),
-    ]  # fmt: skip
+        (
+            "rank correlation of score and mm cut",
+            lambda j: j.flown.condition == "cut",
+            lambda some: _order([j for j in some if j.flown.condition == "cut"]),
+        ),
+    ]
     rows = []
     for name, of, figure in figures:
         cells = [name]
@@ -259,18 +272,25 @@ def command(flights: Sequence[Flown], folder: Path) -> str:
             asked = sum(map(of, mine))
             cells.append(f"{figure(mine):.2f} of {asked}{spread}" if asked else "–")
         rows.append(cells)
-    return "\n".join([
-        "## The command, three baseline flights",
-        f"`quadid health` with the shipped vehicle and {BASELINES} healthy flights of the airframe, drawn once; all "
-        "other flights are in question. The comparison's priors were chosen with both airframes at hand: neither row "
-        "is of an airframe that nobody had seen.", "", *table(("question", *airframes), rows), "",
-        f"Refused: {len(refused)} of {len(judged) + len(refused)}" + (f": {refused[0]} …" if refused else "."),
-    ])  # fmt: skip
+    return "\n".join(
+        [
+            "## The command, three baseline flights",
+            f"`quadid health` with the shipped vehicle and {BASELINES} healthy flights of the airframe, drawn once; "
+            "all other flights are in question. The comparison's priors were chosen with both airframes at hand: "
+            "neither row is of an airframe that nobody had seen.",
+            "",
+            *table(("question", *airframes), rows),
+            "",
+            f"Refused: {len(refused)} of {len(judged) + len(refused)}" + (f": {refused[0]} …" if refused else "."),
+        ]
+    )
 
 
 SERIES: tuple[tuple[str, str, frozenset[int]], ...] = (
-    ("E8, M3", "E8", frozenset({3})), ("E9, M3", "E9", frozenset({3})), ("E9, M1 and M2", "E9", frozenset({1, 2})),
-)  # fmt: skip
+    ("E8, M3", "E8", frozenset({3})),
+    ("E9, M3", "E9", frozenset({3})),
+    ("E9, M1 and M2", "E9", frozenset({1, 2})),
+)
 """Vehicles of the fleet: name, airframe and the rotors that are cut ever shorter."""
 _DAY, _FIRST = 86400.0, 1.7e9
 
@@ -304,9 +324,15 @@ def fleet(flights: Sequence[Flown], data: Path) -> str:
         first = next((f"{mm:g}" for mm, c in changed if c), "none")
         after = next((f"{mm:g}" for mm, _ in changed if mm > missed), "none")
         correlation = spearmanr([mm for mm, _ in later], [row["score"] for _, row in later])[0]
-        rows.append((name, f"{len(of_unit)} ({len(of_unit) - len(later)})",
-                     ", ".join(f"{sum(g)} of {len(g)}" for g in groups), f"{first}, {after}",
-                     f"{correlation:.2f}"))  # fmt: skip
+        rows.append(
+            (
+                name,
+                f"{len(of_unit)} ({len(of_unit) - len(later)})",
+                ", ".join(f"{sum(g)} of {len(g)}" for g in groups),
+                f"{first}, {after}",
+                f"{correlation:.2f}",
+            )
+        )
     heads = (
         "vehicle",
         "flights (baseline)",
@@ -314,11 +340,15 @@ def fleet(flights: Sequence[Flown], data: Path) -> str:
         "first, all from [mm]",
         "order",
     )
-    return "\n".join([
-        "## Trend of a fleet",
-        "`quadid fleet`, called by `make health`: the first five flights are the baseline, the others follow by "
-        "millimetres cut; order: Spearman correlation of score and cut.", "", *table(heads, rows),
-    ])  # fmt: skip
+    return "\n".join(
+        [
+            "## Trend of a fleet",
+            "`quadid fleet`, called by `make health`: the first five flights are the baseline, the others follow by "
+            "millimetres cut; order: Spearman correlation of score and cut.",
+            "",
+            *table(heads, rows),
+        ]
+    )
 
 
 def curve(judged: Sequence[Judged], path: Path) -> None:

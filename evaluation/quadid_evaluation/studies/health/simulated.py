@@ -147,9 +147,7 @@ def text(each: int) -> str:
         for name, simulate in SIMULATORS.items():
             done.setdefault(case.group, {}).setdefault(name, []).append(judged(case, k, simulate))
     head = "; ".join(SIMULATORS)
-    heads = (
-        "hidden (flights)", f"changed, right, wrong with confidence: {head}", "error of loss, of drag loss [%]",
-    )  # fmt: skip
+    heads = ("hidden (flights)", f"changed, right, wrong with confidence: {head}", "error of loss, of drag loss [%]")
     rows = []
     for group, by in done.items():
         cells = [", ".join(f"{int(sum(flags))}" for flags in list(np.array(answers).T)[:3]) for answers in by.values()]
@@ -157,11 +155,16 @@ def text(each: int) -> str:
         sizes = [f"{100.0 * np.nanmedian(e):.1f}" for e in errors if np.isfinite(e).any()]
         cells.append(", ".join(sizes) or "–")
         rows.append((f"{group} ({len(errors.T)})", "; ".join(cells[:-1]), cells[-1]))
-    return "\n".join([
-        f"## Simulated flights\n`make health`, seed {SEED}; Pelican (plus and X frame) of {SECONDS:.0f} s, {BASELINES} "
-        "baseline flights each, in closed loop (`quadid.flight`) and by the balance of a hover. Between flights, rotor "
-        "thrust varies by 1 %, the battery by 0.7 mm, the load by 1 % (1 sigma).", "", *table(heads, rows), "",
-        "A rotor that lost only thrust and a weight at its hub have the same trims; the likelier weight is named. Drag "
-        "torque alone moves the yaw trim alone, as much for every rotor: the change is found, the rotor is a guess "
-        "(one right in four).",
-    ])  # fmt: skip
+    return "\n".join(
+        [
+            f"## Simulated flights\n`make health`, seed {SEED}; Pelican (plus and X frame) of {SECONDS:.0f} s, "
+            f"{BASELINES} baseline flights each, in closed loop (`quadid.flight`) and by the balance of a hover. "
+            "Between flights, rotor thrust varies by 1 %, the battery by 0.7 mm, the load by 1 % (1 sigma).",
+            "",
+            *table(heads, rows),
+            "",
+            "A rotor that lost only thrust and a weight at its hub have the same trims; the likelier weight is named. "
+            "Drag torque alone moves the yaw trim alone, as much for every rotor: the change is found, the rotor is a "
+            "guess (one right in four).",
+        ]
+    )

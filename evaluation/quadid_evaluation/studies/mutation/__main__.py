@@ -72,13 +72,15 @@ def survivor(module: str, name: str, judged: Mapping[str, Mapping[str, str]]) ->
 def page(counts: Mapping[str, Counter[str]], left: Mapping[str, Sequence[Survivor]]) -> str:
     """Markdown: counts, then survivors by module."""
     lines = [
-        "# Mutation tests of gate, active set and session", "",
+        "# Mutation tests of gate, active set and session",
+        "",
         f"`make mutation`, {time.strftime('%Y-%m-%d')}, mutmut {version('mutmut')}. A mutant is detected if a test of "
         "`[tool.mutmut]` fails or exceeds its time limit. Undetected ones are judged in "
-        "`evaluation/quadid_evaluation/studies/mutation/judged.yaml`.", "",
+        "`evaluation/quadid_evaluation/studies/mutation/judged.yaml`.",
+        "",
         "| module | mutants | detected | by time limit | undetected | not run | detected of those run |",
         "|---|---|---|---|---|---|---|",
-    ]  # fmt: skip
+    ]
     for module, c in counts.items():
         if not c:
             lines.append(f"| `online/{module}.py` | – | – | – | – | **not run yet** | – |")

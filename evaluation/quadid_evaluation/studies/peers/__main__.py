@@ -28,9 +28,11 @@ def flown(given: Given) -> list[str]:
     records = [r for r in records if r["program"] != given.anew]
     done = {(r["case"], r["seed"], r["program"]) for r in records}
     todo = [
-        key for seed in range(1, max(most.values()) + 1) for key in product(simulated.CASES, (seed,), most)
+        key
+        for seed in range(1, max(most.values()) + 1)
+        for key in product(simulated.CASES, (seed,), most)
         if seed <= most[key[2]] and key not in done
-    ]  # fmt: skip
+    ]
     if todo:
         simulated.warm_up()
     for key in todo:
@@ -40,9 +42,11 @@ def flown(given: Given) -> list[str]:
 
 
 PARTS = {
-    "simulated": flown, "recorded": lambda g: recorded.section(g.data), "recipe": lambda g: recipe.section(g.data),
+    "simulated": flown,
+    "recorded": lambda g: recorded.section(g.data),
+    "recipe": lambda g: recipe.section(g.data),
     "online": lambda g: online.section(),
-}  # fmt: skip
+}
 
 if __name__ == "__main__":
     given = options(__doc__, words=", ".join(PARTS), seeds=200, peer_seeds=48, anew="")

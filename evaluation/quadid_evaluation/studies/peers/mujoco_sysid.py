@@ -73,9 +73,12 @@ def _apply(vehicle: Vehicle) -> Callable[[Any, Any], None]:
 
 
 def identify(
-    windows: Sequence[Window], vehicle: Vehicle, noise: tuple[float, float, float] = NOISE,
-    factor: float = 4.0, chunk: float = CHUNK,
-) -> Answer:  # fmt: skip
+    windows: Sequence[Window],
+    vehicle: Vehicle,
+    noise: tuple[float, float, float] = NOISE,
+    factor: float = 4.0,
+    chunk: float = CHUNK,
+) -> Answer:
     """Estimates the nominal parameters (their logarithms) of flights with gyro, attitude and accelerometer.
 
     Args:

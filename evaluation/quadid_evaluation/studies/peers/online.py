@@ -50,10 +50,13 @@ class _Model:
         spin = self._J_r * float(self._spins @ omega)
 
         def slope(w: FloatArray) -> FloatArray:
-            turning = np.array([
-                (J[1] - J[2]) * w[1] * w[2] + spin * w[1], (J[2] - J[0]) * w[2] * w[0] - spin * w[0],
-                (J[0] - J[1]) * w[0] * w[1],
-            ])  # fmt: skip
+            turning = np.array(
+                [
+                    (J[1] - J[2]) * w[1] * w[2] + spin * w[1],
+                    (J[2] - J[0]) * w[2] * w[0] - spin * w[0],
+                    (J[0] - J[1]) * w[0] * w[1],
+                ]
+            )
             return np.asarray((torque + turning) / J)
 
         for _ in range(2):
@@ -153,8 +156,9 @@ def section() -> list[str]:
     """The part of the page."""
     rows = [
         "| estimator | RMS error after 60 s of " + ", ".join(NAMES) + " [%] | delay to +15 % mass [s] | name | "
-        "processor [s per s] |", "|---|---|---|---|---|",
-    ]  # fmt: skip
+        "processor [s per s] |",
+        "|---|---|---|---|---|",
+    ]
     for who in (*FILTERS, "quadid.online.Session"):
         runs = [_session(seed) if who not in FILTERS else _filtered(who, seed) for seed in SEEDS]
         rms = np.sqrt(np.mean(np.square([error for error, _, _ in runs]), axis=0))
@@ -162,9 +166,12 @@ def section() -> list[str]:
         names = "none" if who in FILTERS else "mass_change"
         rows.append(f"| {who} | {', '.join(f'{100 * v:.2g}' for v in rms)} | {after:.1f} | {names} | {cost:.3f} |")
     return [
-        "## Online: Kalman filters", "",
+        "## Online: Kalman filters",
+        "",
         f"`python -m quadid_evaluation.studies.peers online`: {len(SEEDS)} flights of a Pelican (seeds "
         f"{SEEDS[0]} to {SEEDS[-1]}), the "
         f"guess off by up to 35 %. The filters receive J_r, the true noise and a random walk of {WALK:g} per sample; a "
-        "change counts as seen when b has moved half of it.", "", *rows,
-    ]  # fmt: skip
+        "change counts as seen when b has moved half of it.",
+        "",
+        *rows,
+    ]

@@ -47,9 +47,16 @@ class _Inputs:
         x, y, _ = vehicle.rotor_positions.T
         squares = speed**2
         return cls(
-            window.dt, vehicle.mass, squares.sum(axis=1), -squares @ y, squares @ x, squares @ spins, speed @ spins,
-            window.gyro, window.accel[:, 2],
-        )  # fmt: skip
+            window.dt,
+            vehicle.mass,
+            squares.sum(axis=1),
+            -squares @ y,
+            squares @ x,
+            squares @ spins,
+            speed @ spins,
+            window.gyro,
+            window.accel[:, 2],
+        )
 
     def outputs(self, many: FloatArray) -> FloatArray:
         """Rates and specific force for several parameter vectors at once, shape (vectors, samples, 4)."""
@@ -60,11 +67,13 @@ class _Inputs:
 
         def turning(w: FloatArray, k: int) -> FloatArray:
             p, q, r = w.T
-            return np.column_stack([
-                ((j_yy - j_zz) * q * r + b * self.roll[k] + j_r * self.total[k] * q) / j_xx,
-                ((j_zz - j_xx) * p * r + b * self.pitch[k] - j_r * self.total[k] * p) / j_yy,
-                ((j_xx - j_yy) * p * q + d * self.yaw[k]) / j_zz,
-            ])  # fmt: skip
+            return np.column_stack(
+                [
+                    ((j_yy - j_zz) * q * r + b * self.roll[k] + j_r * self.total[k] * q) / j_xx,
+                    ((j_zz - j_xx) * p * r + b * self.pitch[k] - j_r * self.total[k] * p) / j_yy,
+                    ((j_xx - j_yy) * p * q + d * self.yaw[k]) / j_zz,
+                ]
+            )
 
         for k in range(len(self.gyro)):
             out[:, k, :3] = rate

@@ -126,11 +126,15 @@ def section(data: Path) -> list[str]:
     ours = {p["name"]: p for p in diagnosed.result["parameters"]}
     told = " and ".join(f"{ours[n]['value']:.2e} ({ours[n]['status']})" for n in ("J_xx", "J_yy"))
     return [
-        "## The least squares of sysid.tools on its authors' logs", "",
+        "## The least squares of sysid.tools on its authors' logs",
+        "",
         f"`python -m quadid_evaluation.studies.peers recipe`: fitted to {LOG} up to {CUT:g} s, predicted from "
         f"there; rate errors "
-        "relative to no change.", "", *rows, "",
+        "relative to no change.",
+        "",
+        *rows,
+        "",
         f"Recipe: J_xx {j[0]:.2e}, J_yy {j[1]:.2e} kg m^2 "
         f"without intervals, R² of its accelerations {', '.join(f'{v:.2f}' for v in found.r2)}. "
         f"`quadid diagnose`: {told}; the authors' notebook: 1.03e-5 and 1.11e-5.",
-    ]  # fmt: skip
+    ]

@@ -83,14 +83,16 @@ def section(data: Path) -> list[str]:
     for name in (ROTORPY, *RECORDED):
         rows += _rows(name, rotorpy() if name == ROTORPY else recorded(name, data))
     return [
-        "## mujoco.sysid on vehicles of others", "",
+        "## mujoco.sysid on vehicles of others",
+        "",
         "`python -m quadid_evaluation.studies.peers recorded`: nominal model in `mujoco.sysid`, chunks of "
         f"{' and '.join(f'{c:g}' for c in CHUNKS)} s from the measured state, noise as quadid estimates it. RotorPy's "
         f"Hummingbird has its aerodynamics and motors that lag {1000 * LAG:g} ms. The rate error after 0.5 s is a "
         "benchmark column, which may get worse: the logged inputs of a closed loop already answer the disturbances to "
         "come, and whoever takes torque for less than it is predicts better.",
-        "", *rows,
-    ]  # fmt: skip
+        "",
+        *rows,
+    ]
 
 
 def _rows(name: str, flights: Flights) -> list[str]:

@@ -75,9 +75,15 @@ def record(case: str, seed: int, program: str) -> Record:
     ahead = shares_of_no_change([unseen], with_values(vehicle, np.exp(answer.values)), AHEAD)["rate"]
     error = answer.values - np.log([numbers[n] for n in NOMINAL_NAMES])
     return {
-        "case": case, "seed": seed, "program": program, "error": rounded(error), "half": rounded(answer.half),
-        "seconds": round(answer.seconds, 3), "ahead": round(ahead, 5), "status": statuses,
-    }  # fmt: skip
+        "case": case,
+        "seed": seed,
+        "program": program,
+        "error": rounded(error),
+        "half": rounded(answer.half),
+        "seconds": round(answer.seconds, 3),
+        "ahead": round(ahead, 5),
+        "status": statuses,
+    }
 
 
 def rounded(values: FloatArray) -> list[float]:
@@ -88,10 +94,15 @@ def rounded(values: FloatArray) -> list[float]:
 def errors_table(records: Sequence[Record]) -> list[str]:
     """Markdown: one row a case and program; white noise, which differs little, is in the records only."""
     heads = (
-        "flights", "program", "seeds", "median error b, d, J_xx, J_yy, J_zz, J_r [%]",
+        "flights",
+        "program",
+        "seeds",
+        "median error b, d, J_xx, J_yy, J_zz, J_r [%]",
         "95 % intervals contain the truth (exact binomial interval, parameters as if independent)",
-        "of b, d, J_xx, J_yy, J_zz, J_r [%]", "rate error after 0.5 s", "processor [s]",
-    )  # fmt: skip
+        "of b, d, J_xx, J_yy, J_zz, J_r [%]",
+        "rate error after 0.5 s",
+        "processor [s]",
+    )
     rows = []
     told = ""
     for case, program in product(list(CASES)[1:], PROGRAMS):
@@ -103,10 +114,18 @@ def errors_table(records: Sequence[Record]) -> list[str]:
         hold = np.abs(error) <= half
         each = ", ".join(f"{100.0 * v:.0f}" for v in hold.mean(axis=0))
         ahead, seconds = (float(np.median([r[k] for r in mine])) for k in ("ahead", "seconds"))
-        rows.append((
-            "" if case == told else case, program, len(mine), median, share(int(hold.sum()), hold.size), each,
-            f"{ahead:.3f}", f"{seconds:.2f}",
-        ))  # fmt: skip
+        rows.append(
+            (
+                "" if case == told else case,
+                program,
+                len(mine),
+                median,
+                share(int(hold.sum()), hold.size),
+                each,
+                f"{ahead:.3f}",
+                f"{seconds:.2f}",
+            )
+        )
         told = case
     return table(heads, rows)
 
@@ -129,12 +148,15 @@ def said(records: Sequence[Record]) -> str:
 def section(records: Sequence[Record]) -> list[str]:
     """The part of the page."""
     return [
-        "## mujoco.sysid and output error on simulated flights", "",
+        "## mujoco.sysid and output error on simulated flights",
+        "",
         f"`python -m quadid_evaluation.studies.peers simulated`: {SECONDS:g} s of a simulated Pelican at 50 "
         f"Hz, the guess off "
         "by up to 35 %; rate errors on unseen flights, relative to no change. `mujoco.sysid` (MJCF, chunks of 1 s from "
         "the measured state) and output error (`nlgreyest`'s method on scipy) receive the true sensor noise; quadid "
         "estimates it.",
         "",
-        *errors_table(records), "", said(records),
-    ]  # fmt: skip
+        *errors_table(records),
+        "",
+        said(records),
+    ]
