@@ -21,6 +21,7 @@ from quadid.app.logs import (
     left_on_ground,
     names_of,
     parse_part,
+    standing,
     write_text,
 )
 from quadid.app.options import Described, NamedColumns, Preset, Start, Stop, Typed, vehicle_if
@@ -135,7 +136,7 @@ def inspect(
     if described is not None and found.usable:  # after an error nothing later is asked: it would be as wrong
         refused, rows = _refused(whole, described, cut, flown), _excitation(whole, described, cut, flown)
         found = replace(found, excitation=rows, checks=(*found.checks, *refused))
-    use = names_of(cut, flown)
+    use, found = names_of(cut, flown), replace(found, warnings=(*found.warnings, *standing(whole, found.flying, cut)))
     return Inspected({**found.to_dict(), "use": use, "log": str(cut.path.resolve()), "files": []}, found)
 
 

@@ -229,12 +229,21 @@ def flown_parts(recording: Recording, flying: Spans, cut: LogPart) -> Spans:
     Args:
         flying: when it flies [s, in the time of the recording].
     """
+    return () if cut.start is not None or cut.stop is not None else _in_the_air(recording, flying, cut)
+
+
+def _in_the_air(recording: Recording, flying: Spans, cut: LogPart) -> Spans:
+    """What of a part, or of a whole log, does not stand on the ground, as `flown_parts`; none where it hardly does."""
     from quadid.checks import proposed_cuts
 
     imu = [c.t for n, c in recording.channels.items() if n in ("gyro", "accel") and len(c.t)]
-    if cut.start is not None or cut.stop is not None or not imu:
+    if not imu:
         return ()
-    return proposed_cuts(flying, recording.first_imu_time, max(float(t[-1]) for t in imu))
+    low, high = cut.span(recording)
+    first, last = max(low, recording.first_imu_time), min(high, max(float(t[-1]) for t in imu))
+    inside = tuple((max(a, first), min(b, last)) for a, b in flying if b > first and a < last)
+    begin = round(first - recording.first_imu_time, 1)
+    return tuple((round(begin + a, 1), round(begin + b, 1)) for a, b in proposed_cuts(inside, first, last))
 
 
 def names_of(cut: LogPart, parts: Spans) -> list[str]:
@@ -246,6 +255,17 @@ def left_on_ground(names: Sequence[str]) -> str:
     """Used parts of a log that also stands on the ground, by the names of its parts, and how to use all of it."""
     whole = names[0].rpartition("@")[0]
     return f"time on the ground is left out: fits use {' '.join(names)}; to use all of it: {whole}@0:"
+
+
+def standing(recording: Recording, flying: Spans, cut: LogPart) -> list[str]:
+    """A sentence where a part that was asked for also stands on the ground, with the part that does not; else none.
+
+    Who asks for all of a log, ``flight.bin@0:``, knows.
+    """
+    if not cut.start and cut.stop is None:
+        return []
+    names = names_of(cut, _in_the_air(recording, flying, cut))
+    return [f"this part also stands on the ground, which carries the vehicle: use {' '.join(names)}"] if names else []
 
 
 # --- From names of logs and vehicles to checked windows on a grid
@@ -468,7 +488,8 @@ def check_conventions(recording: Recording, vehicle: Vehicle, cut: LogPart) -> C
             parts = " ".join(names_of(cut, flown))
             fix = f"{fix}; or leave out the ground: use {parts}" if parts else fix
             raise LogError(f"{recording.name}: {'; '.join(filter(None, (of_rotors, check.message)))}", fix=fix)
-    return Checked(tuple(doubts_of(found.checks)), flown, farthest([check.off for check in found.checks]))
+    doubts = (*doubts_of(found.checks), *standing(recording, found.flying, cut))
+    return Checked(doubts, flown, farthest([check.off for check in found.checks]))
 
 
 def doubts_of(checks: Sequence[Check]) -> list[str]:

@@ -68,7 +68,7 @@ SELDOM = 1e-4
 LARGE = 0.5
 """Random moments in units of their prior, a tenth of the control moment, from which they are reported."""
 LOST = 3.0
-"""The same of the vertical force, a twentieth of the weight, beyond which no number is to be used."""
+"""The same of the vertical force that the flight shows, a twentieth of the weight: beyond, no number is to be used."""
 
 
 @dataclass(frozen=True)
@@ -172,6 +172,13 @@ def _filtered(
     return Filtered(out, own, prompt, trust, bool(share[2] > LARGE), sensor_noise(found))
 
 
+def carried(problem: Problem, found: Estimate) -> float:
+    """Root mean square of the vertical random force, specific [m/s^2]: what carries the vehicle beside its rotors."""
+    gains = problem.passes(found.z, found.psi)[1]
+    force = np.concatenate([g.mean[:, k.FO + 1 + 2] for g in gains])
+    return float(np.sqrt(np.mean(force**2)))
+
+
 def sensor_noise(found: Estimate) -> NoiseModel:
     """Noise of the measured channels, the attitude estimator's error as the slow part of the attitude's."""
     measured = 12 if any(track.seen[:, 3].any() for track in found.problem.tracks) else 9
@@ -231,7 +238,7 @@ def _compared(found: Estimate, wide: Problem, half: Problem, places: IndexArray,
     box = problem.limits - found.z
     steps = np.array([newton_step(gram, slope, 0.0, *box) for gram, slope in zip(grams, slopes, strict=True)])
     variances = np.diagonal(np.linalg.inv(grams), axis1=1, axis2=2)
-    _, between = random_effects(steps[:, places] * unit, variances[:, places] * unit**2)
+    between = random_effects(steps[:, places] * unit, variances[:, places] * unit**2)
     # 2. The whole catalogue, linearised at the estimate on the liveliest minute.
     part = problem.liveliest(NEAR_SECONDS)
     near = whole if part is problem else _sensitivities(part, found)
@@ -240,7 +247,7 @@ def _compared(found: Estimate, wide: Problem, half: Problem, places: IndexArray,
         for name, step in _with_causes(found, near, wide.liveliest(NEAR_SECONDS))
     ]
     # 3. Every second row: what inputs do within a row is a third of the step to rows twice as long.
-    lost = bool(found.psi[k.SIGMA + 1] > LOST * problem.noise_scale[1])
+    lost = bool(carried(problem, found) > LOST * problem.noise_scale[1])
     try:
         others.append(("when the flight is fitted on a finer grid", _on_coarse_grid(found, half)[places] * unit))
     except np.linalg.LinAlgError:  # it runs away there

@@ -150,11 +150,14 @@ class Reliability:
         return tuple(f"{', '.join(n)}: {how}" for how, n in why.items())
 
 
-def random_effects(steps: FloatArray, variances: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Standard deviation between blocks beyond chance, and what it adds to that of their mean, shapes (P,).
+def random_effects(steps: FloatArray, variances: FloatArray) -> FloatArray:
+    """Standard deviation that differences between blocks, beyond chance, add to that of the estimate, shape (P,).
+
+    An estimate of all blocks lies amid theirs, unless they differ in another parameter: then that one is a compromise,
+    and what moves with it agrees between blocks on another value.  How far their mean lies off counts as well.
 
     Args:
-        steps: estimate of each block, shape (blocks, P).
+        steps: from the estimate to that of each block, shape (blocks, P).
         variances: of these, shape (blocks, P).
     """
     # Variance between blocks from the excess of Q over its degrees of freedom.
@@ -163,8 +166,11 @@ def random_effects(steps: FloatArray, variances: FloatArray) -> tuple[FloatArray
     q = np.sum(weight * (steps - np.sum(weight * steps, axis=0) / total) ** 2, axis=0)
     excess = np.maximum(q - (count - 1), 0.0) / (total - np.sum(weight**2, axis=0) / total)
     tau = np.where(q > exceeded(CHANCE, count - 1), np.sqrt(excess), 0.0)
-    mean = 1.0 / np.sum(1.0 / (variances + tau**2), axis=0) - 1.0 / total
-    return tau, np.sqrt(np.maximum(mean, 0.0))
+    # Their mean with it, and where it lies off by more than chance.
+    weight = 1.0 / (variances + tau**2)
+    mean, variance = np.sum(weight * steps, axis=0) / weight.sum(axis=0), 1.0 / weight.sum(axis=0)
+    off = np.where(mean**2 > exceeded(CHANCE, 1) * variance, np.abs(mean), 0.0)
+    return np.asarray(np.sqrt(np.maximum(variance - 1.0 / total, 0.0) + off**2))
 
 
 def promised(

@@ -489,6 +489,21 @@ def test_a_part_that_was_asked_for_is_used_as_it_is(standing: Path, part: str) -
     assert log.windows[0].t[0] - first == pytest.approx(float(part[1:].split(":")[0]), abs=0.02)
 
 
+def test_a_part_with_ground_in_it_is_used_and_said(standing: Path) -> None:
+    log = quadid.load(f"{standing}@5:30", vehicle="pelican")
+    said = "standing.csv: this part also stands on the ground, which carries the vehicle: use standing.csv@12:30"
+    assert [w for w in log.warnings if "ground" in w] == [said]
+    assert [w for w in quadid.inspect(f"{standing}@5:30", vehicle="pelican").warnings if "ground" in w] == [said[14:]]
+
+
+def test_no_number_is_identified_where_something_else_carries_the_weight(standing: Path) -> None:
+    """Feet carried the vehicle for a third of this span; b, and J with b / J, are a compromise."""
+    found = quadid.identify(f"{standing}@0:", vehicle="pelican")
+    assert {p.status.value for p in found.parameters} <= {"unreliable", "prior_dominated"}
+    assert found.verdict.level == "poor"
+    assert "so far from this flight" in found.fit.warnings[0]
+
+
 def test_a_refused_log_proposes_it_as_well(standing: Path, tmp_path: Path) -> None:
     names, rows = table(standing)
     rows[:, names.index("az")] *= -1.0
