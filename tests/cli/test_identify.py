@@ -501,7 +501,7 @@ def test_no_number_is_identified_where_something_else_carries_the_weight(standin
     found = quadid.identify(f"{standing}@0:", vehicle="pelican")
     assert {p.status.value for p in found.parameters} <= {"unreliable", "prior_dominated"}
     assert found.verdict.level == "poor"
-    assert "so far from this flight" in found.fit.warnings[0]
+    assert any("so far from this flight" in text for text in found.fit.warnings)
 
 
 def test_a_refused_log_proposes_it_as_well(standing: Path, tmp_path: Path) -> None:
