@@ -21,18 +21,19 @@ from quadid.model.rotor_kernel import input_constants, rotor_constants, turn_rot
 from quadid.model.sensor_kernel import (
     delay_attitude,
     distort_imu,
+    remember_attitude,
     sensor_constants,
     step_filter,
     step_tilt_error,
     tilt_attitude,
 )
-from quadid.model.simd import LANES, cached, jit
+from quadid.model.simd import LANES, cached, inlined, jit, lane_kernel
 from quadid.types import BoolArray, FloatArray, IntArray
 from quadid.vehicle import RandomForces, Vehicle
 
 # isort: off
 from quadid.model.work_array import (
-    A_G, C_SHIFT, E_QW, F1_X, F2_X, G_BEND, G_DF, G_F, G_F0, G_FM, G_W, G_W0, HALF, N_QW, N_ROWS, N_STATE, ROTOR,
+    A_G, C_SHIFT, E_QW, F1_X, F2_X, G_BEND, G_DF, G_F, G_F0, G_FM, G_W, G_W0, HALF, L_NOW, N_QW, N_ROWS, N_STATE, ROTOR,
     R_NEXT, R_NOW, R_PAST, R_SPEED, S_BENDX, S_FX, S_P, S_QW, T_A1, X_D, X_E, X_N, X_P, X_Q, X_QW, X_QX, X_QY, X_QZ,
     X_R, X_VD, X_VE, X_VN,
 )  # fmt: skip
@@ -46,47 +47,76 @@ from quadid.model.work_array import (
 
 STATE = X_QW
 """First row that belongs to the state; those before are constants and sums of one step."""
-SENSED = S_QW
+SENSED, SENSORS = S_QW, 10
+WORK = (N_ROWS + N_SIGNALS) * LANES
+"""Numbers in the work array: rows, then the signals of terms beyond the catalogue."""
 TURNS = 6
 """Random numbers of a lane and step: specific force 3, angular acceleration 3."""
 
 
-@nb.njit(**jit)
-def _scrambled(x: np.uint64) -> np.uint64:
-    """Scrambles 64 bits: splitmix64's finaliser (Steele, Lea & Flood 2014, doi:10.1145/2660193.2660195)."""
+@nb.njit(**inlined)
+def _uniform(x):  # type: ignore[no-untyped-def]
+    """Number between 0 and 1, both left out, of 64 bits: splitmix64's finaliser, doi:10.1145/2660193.2660195."""
     x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-    return x ^ (x >> np.uint64(31))
+    x = x ^ (x >> np.uint64(31))
+    return np.uint64((x >> np.uint64(12)) | np.uint64(0x3FF0000000000000)).view(np.float64) - (1.0 - 2.0**-53)
+
+
+@nb.njit(**inlined)
+def _logarithm(x):  # type: ignore[no-untyped-def]
+    """Natural logarithm without a branch or a call: x = 2^e m, ln m = 2 artanh((m - 1) / (m + 1))."""
+    bits = np.float64(x).view(np.int64)
+    e = (bits - np.int64(0x3FE6A09E667F3BCD)) >> np.int64(52)  # m from the root of 1/2 to that of 2
+    m = np.int64(bits - (e << np.int64(52))).view(np.float64)
+    s = (m - 1.0) / (m + 1.0)
+    z = s * s
+    tail = z * (1 / 11 + z * (1 / 13 + z * (1 / 15 + z * (1 / 17 + z * (1 / 19 + z / 21)))))
+    return float(e) * math.log(2.0) + 2.0 * s * (1.0 + z * (1 / 3 + z * (1 / 5 + z * (1 / 7 + z * (1 / 9 + tail)))))
+
+
+@nb.njit(**inlined)
+def _circle(x):  # type: ignore[no-untyped-def]
+    """Cosine and sine of 2 pi x for x from -1/2 to 1/2: Taylor's series of a quarter of the angle, doubled twice."""
+    a = 0.5 * math.pi * x
+    z = a * a
+    s = z / 20 * (1.0 - z / 42 * (1.0 - z / 72 * (1.0 - z / 110 * (1.0 - z / 156 * (1.0 - z / 210)))))
+    s = a * (1.0 - z / 6 * (1.0 - s))
+    c = z / 30 * (1.0 - z / 56 * (1.0 - z / 90 * (1.0 - z / 132 * (1.0 - z / 182 * (1.0 - z / 240)))))
+    c = 1.0 - z / 2 * (1.0 - z / 12 * (1.0 - c))
+    c, s = 1.0 - 2.0 * s * s, 2.0 * s * c
+    return 1.0 - 2.0 * s * s, 2.0 * s * c
 
 
 @nb.njit(**jit)
-def _random_inputs(seed: int, vehicle: int, step: int, walk: FloatArray, state: FloatArray) -> None:
-    """Advances one vehicle's random inputs, first-order Gauss-Markov processes, by a step.
+def _random_inputs(seed: int, first: int, step: int, walk: FloatArray, inputs: FloatArray) -> None:
+    """Advances the random inputs of all lanes, first-order Gauss-Markov processes, by a step.
 
     The numbers follow from seed, vehicle and step alone (a counter, not a stream), so that a step can be repeated.
 
     Args:
         seed: of all numbers.
-        vehicle: place in the batch.
+        first: place of the first lane's vehicle in the batch.
         step: number of the step.
         walk: exp(-dt / T) of each input, and the standard deviation of what a step adds, (2, TURNS).
-        state: the inputs (TURNS,), advanced.
+        inputs: advanced, (TURNS, LANES).
     """
-    base = _scrambled(np.uint64(seed) + np.uint64(0x9E3779B97F4A7C15) * np.uint64(vehicle + 1))
-    for pair in range(TURNS // 2):
-        at = base + np.uint64(0x9E3779B97F4A7C15) * np.uint64(TURNS * step + 2 * pair + 1)
-        first = (float(_scrambled(at) >> np.uint64(11)) + 0.5) * 2.0**-53
-        second = float(_scrambled(at + np.uint64(0x9E3779B97F4A7C15)) >> np.uint64(11)) * 2.0**-53
-        radius, angle = math.sqrt(-2.0 * math.log(first)), 2.0 * math.pi * second  # Box & Muller 1958
-        for i in range(2):
-            normal = radius * (math.cos(angle) if i == 0 else math.sin(angle))
-            at_i = 2 * pair + i
-            state[at_i] = walk[0, at_i] * state[at_i] + walk[1, at_i] * normal
+    lane_kernel()
+    golden = np.uint64(0x9E3779B97F4A7C15)
+    for i in range(0, TURNS, 2):
+        at = np.uint64(seed) + golden * np.uint64((TURNS * step + i + 1) << 24)
+        for lane in range(LANES):
+            own = at + golden * np.uint64(first + lane + 1)
+            radius = math.sqrt(-2.0 * _logarithm(_uniform(own)))  # Box & Muller 1958
+            cos, sin = _circle(_uniform(own ^ np.uint64(1 << 63)) - 0.5)
+            inputs[i, lane] = walk[0, i] * inputs[i, lane] + walk[1, i] * radius * cos
+            inputs[i + 1, lane] = walk[0, i + 1] * inputs[i + 1, lane] + walk[1, i + 1] * radius * sin
 
 
 @nb.njit(**jit)
 def _push(dt: float, inputs: FloatArray, s: FloatArray) -> None:
     """Lets random specific force and angular acceleration (TURNS, LANES) act over a step that has just been made."""
+    lane_kernel()
     for lane in range(LANES):
         fx, fy, fz = inputs[0, lane], inputs[1, lane], inputs[2, lane]
         qw, qx, qy, qz = s[X_QW + lane], s[X_QX + lane], s[X_QY + lane], s[X_QZ + lane]
@@ -115,15 +145,15 @@ def _push(dt: float, inputs: FloatArray, s: FloatArray) -> None:
 
 
 @nb.njit(**jit)
-def _read_sensors(first: bool, dt: float, need: Needs, s: FloatArray, past: FloatArray) -> None:
+def _read_sensors(steps: int, dt: float, need: Needs, s: FloatArray, past: FloatArray) -> None:
     """Writes what the sensors read at the end of a step: rows S_QW to S_FZ.
 
     Args:
-        first: no step has been made before; filters begin settled.
+        steps: made before; with none, filters begin settled.
         dt: step [s].
         need: which parts of the model any lane needs.
         s: rows.
-        past: attitude and rate at the ends of the last steps, (rows, 7, LANES), the newest last; moved on.
+        past: attitude and rate at the ends of the last steps, a ring that stands there twice, (rows, 7, LANES).
     """
     if need.ahrs:  # needs the attitude at both ends of the step
         step_tilt_error(s)
@@ -135,7 +165,7 @@ def _read_sensors(first: bool, dt: float, need: Needs, s: FloatArray, past: Floa
         s[S_FX + i] = 0.5 * (s[F1_X + i] + s[F2_X + i])
     if need.imu_lag:
         for i in range(3 * LANES):
-            if first:
+            if steps == 0:
                 s[G_F + i], s[G_DF + i], s[G_F0 + i] = s[S_FX + i], 0.0, s[S_FX + i]
             s[G_BEND + i], s[G_FM + i] = s[S_BENDX + i], 0.5 * (s[G_F0 + i] + s[S_FX + i])
         step_filter(dt, s)
@@ -143,19 +173,43 @@ def _read_sensors(first: bool, dt: float, need: Needs, s: FloatArray, past: Floa
             s[G_W0 + i], s[G_F0 + i] = s[S_P + i], s[S_FX + i]
             s[S_P + i], s[S_FX + i] = s[G_W + i], s[G_F + i]
     if need.att_delay:
-        newest = len(past) - 1
-        for i in range(newest):
-            for row in range(7):
-                for lane in range(LANES):
-                    past[i, row, lane] = past[i + 1, row, lane]
-        for row in range(7):
-            for lane in range(LANES):
-                past[newest, row, lane] = s[X_QW + row * LANES + lane]
-        delay_attitude(newest, dt, past, s)
+        late = len(past) // 2
+        at = steps % late
+        remember_attitude(at, s, past)
+        remember_attitude(at + late, s, past)
+        delay_attitude(at + late, dt, past, s)
     if need.ahrs:
         tilt_attitude(s)
     if need.imu_static:
         distort_imu(s)
+
+
+@nb.njit(**jit)
+def _copy(source: FloatArray, target: FloatArray) -> None:
+    """Copies numbers one after another."""
+    lane_kernel()
+    for i in range(len(target)):
+        target[i] = source[i]
+
+
+@nb.njit(**jit)
+def _take(source: FloatArray, stretches: IntArray, target: FloatArray) -> None:
+    """Copies numbers, one after another, to stretches (first, end) of the work array."""
+    at = 0
+    for k in range(len(stretches)):
+        first, end = stretches[k, 0], stretches[k, 1]
+        _copy(source[at : at + end - first], target[first:end])
+        at += end - first
+
+
+@nb.njit(**jit)
+def _keep(source: FloatArray, stretches: IntArray, target: FloatArray) -> None:
+    """Copies stretches (first, end) of the work array, one after another."""
+    at = 0
+    for k in range(len(stretches)):
+        first, end = stretches[k, 0], stretches[k, 1]
+        _copy(source[first:end], target[at : at + end - first])
+        at += end - first
 
 
 @cached
@@ -187,8 +241,8 @@ def write_constants(
 @cached
 def step_blocks(
     commands: FloatArray, geometry: FloatArray, theta: FloatArray, terms: IntArray, coefficients: FloatArray,
-    needs: BoolArray, constants: FloatArray, walk: FloatArray, time: float, span: float, dt: float, seed: int,
-    step: int, delayed: int, s: FloatArray, state: FloatArray, out: FloatArray,
+    needs: BoolArray, own: IntArray, constants: FloatArray, kept: IntArray, walk: FloatArray, time: float, span: float,
+    dt: float, seed: int, step: int, delayed: int, s: FloatArray, state: FloatArray, out: FloatArray,
 ) -> None:  # fmt: skip
     """Makes one step a row of commands with every vehicle of a batch.
 
@@ -199,7 +253,9 @@ def step_blocks(
         terms: beyond the catalogue, (terms, 4).
         coefficients: of those, (blocks, terms, LANES).
         needs: which parts of the model any vehicle needs, in the order of `Needs`.
-        constants: rows of each block, (blocks, STATE); one row for all blocks stands in `s` already.
+        own: stretches (first, end) of the constants that differ between blocks; the others stand in `s` already.
+        constants: those of each block, (blocks, size).
+        kept: stretches of the state, sensors last; what is between them is written before it is read.
         walk: of the random inputs, exp(-dt / T) and the standard deviation of what a step adds, (2, TURNS); no rows
             where there are none.
         time: at the start of the first step [s].
@@ -207,8 +263,8 @@ def step_blocks(
         dt: step [s].
         seed: of the random inputs.
         step: number of steps made before.
-        delayed: commands that are remembered.
-        s: work array (N_ROWS * LANES), overwritten.
+        delayed: commands that are remembered, a ring that stands there twice.
+        s: work array (WORK), all but its common constants overwritten.
         state: motion and filters, rotors, last commands, past attitudes, random inputs (blocks, width), advanced;
             see `quadid.model.step.State`.
         out: after each step (steps, vehicles, N_STATE + 10), written: motion, sensors; no rows: not wanted.
@@ -219,40 +275,30 @@ def step_blocks(
         needs[10], needs[11], needs[12], needs[13], needs[14], needs[15], needs[16],
     )  # fmt: skip
     plain = not (need.delayed or need.uneven)
-    sensing = need.imu_lag or need.ahrs or need.learned
-    moving = N_ROWS * LANES - STATE if sensing else SENSED + 10 * LANES - STATE
-    own, signals = np.empty(TURNS), np.empty((N_SIGNALS, LANES))
-    newest = delayed - 1
-    at_rotors = N_ROWS * LANES - STATE
+    signals = s[N_ROWS * LANES :].reshape(N_SIGNALS, LANES)
+    at_rotors = (kept[:, 1] - kept[:, 0]).sum()
     at_sent = at_rotors + rotors * ROTOR
-    at_inputs = at_sent + delayed * rotors * LANES
+    at_inputs = at_sent + 2 * delayed * rotors * LANES
     at_past = at_inputs + TURNS * LANES
     for block in range(len(state)):
         now = state[block]
         rot = now[at_rotors:at_sent].reshape(rotors, ROTOR)
-        sent = now[at_sent:at_inputs].reshape(delayed, rotors, LANES)
+        sent = now[at_sent:at_inputs].reshape(2 * delayed, rotors, LANES)
         inputs = now[at_inputs:at_past].reshape(TURNS, LANES)
         past = now[at_past:].reshape(-1, 7, LANES)
-        if len(constants) > 1:
-            for i in range(STATE):
-                s[i] = constants[block, i]
-        for i in range(moving):
-            s[STATE + i] = now[i]
+        _take(constants[block], own, s)
+        _take(now, kept[:-1], s)
         first, last = block * LANES, count - 1
         for k in range(len(commands)):
-            if not plain:
-                for i in range(newest):
-                    for r in range(rotors):
-                        for lane in range(LANES):
-                            sent[i, r, lane] = sent[i + 1, r, lane]
-                for r in range(rotors):
-                    for lane in range(LANES):
-                        sent[newest, r, lane] = commands[k, min(first + lane, last), r]
+            newest = (step + k) % delayed + delayed
             for r in range(rotors):
                 if plain:
                     for lane in range(LANES):
                         s[T_A1 + lane] = commands[k, min(first + lane, last), r]
                 else:
+                    for lane in range(LANES):
+                        now_sent = commands[k, min(first + lane, last), r]
+                        sent[newest, r, lane] = sent[newest - delayed, r, lane] = now_sent
                     for lane in range(LANES):
                         at = newest - int(s[C_SHIFT + lane])
                         rot[r, R_PAST + lane], rot[r, R_NOW + lane] = sent[at - 1, r, lane], sent[at, r, lane]
@@ -268,29 +314,23 @@ def step_blocks(
                 residual_forces(terms, coefficients[block], signals, step + k == 0, s)
             step_in_air(need, dt, s)
             if len(walk) > 0:
-                for lane in range(min(LANES, count - first)):
-                    for i in range(TURNS):
-                        own[i] = inputs[i, lane]
-                    _random_inputs(seed, first + lane, step + k, walk, own)
-                    for i in range(TURNS):
-                        inputs[i, lane] = own[i]
+                _random_inputs(seed, first, step + k, walk, inputs)
                 _push(dt, inputs, s)
-            _read_sensors(step + k == 0, dt, need, s, past)
+            _read_sensors(step + k, dt, need, s, past)
             if len(out) > 0:
                 for lane in range(min(LANES, count - first)):
                     for i in range(N_STATE):
                         out[k, first + lane, i] = s[X_QW + i * LANES + lane]
                     for i in range(10):
                         out[k, first + lane, N_STATE + i] = s[SENSED + i * LANES + lane]
-        for i in range(moving):
-            now[i] = s[STATE + i]
+        _keep(s, kept, now)
 
 
 @cache
 def compiled_steps() -> Any:
-    """Machine code of `step_blocks`, contiguous arrays only: numba's look at 17 types takes a fifth of a step."""
+    """Machine code of `step_blocks`, contiguous arrays only: numba's look at 19 types takes a fifth of a step."""
     row, table, rows = "f8[::1],", "f8[:,::1],", "f8[:,:,::1],"
-    arrays = rows + table + rows + "i8[:,::1]," + rows + "b1[::1]," + table + table
+    arrays = rows + table + rows + "i8[:,::1]," + rows + "b1[::1],i8[:,::1]," + table + "i8[:,::1]," + table
     return step_blocks.compile(f"void({arrays}f8,f8,f8,i8,i8,i8,{row}{table}f8[:,:,::1])")
 
 
@@ -307,10 +347,8 @@ def compiled_steps() -> Any:
 
 LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
 STILL = np.zeros(3)
-_NO_OUT, _NO_WALK = np.empty((0, 0, 0)), np.empty((0, TURNS))
-_NO_CONSTANTS = np.empty((0, STATE))
-_ROTORS_AT = N_ROWS * LANES - STATE
-"""First number of the rotors in the memory of a block."""
+_NO_OUT = np.empty((0, 0, 0))
+_NO_CONSTANTS = np.empty((0, 0))
 
 
 @dataclass(frozen=True)
@@ -361,6 +399,7 @@ class State:
     vehicles: int
     _memory: FloatArray
     _rotors: int
+    _kept: int
     _dt: float
     _work: FloatArray
     _constants: FloatArray
@@ -368,31 +407,36 @@ class State:
     def copy(self) -> State:
         """Returns a state that changes no more with this one."""
         kept, none = self._memory.copy(), _NO_CONSTANTS
-        return State(self.time, self.steps, self.vehicles, kept, self._rotors, self._dt, none, none)
+        return State(self.time, self.steps, self.vehicles, kept, self._rotors, self._kept, self._dt, none, none)
 
     def _read(self, row: int, count: int) -> FloatArray:
-        rows = self._memory[:, row - STATE : row - STATE + count * LANES].reshape(-1, count, LANES)
+        rows = self._memory[:, row * LANES : (row + count) * LANES].reshape(-1, count, LANES)
         return rows.transpose(0, 2, 1).reshape(-1, count)[: self.vehicles]
+
+    @property
+    def _sensors(self) -> int:
+        """Row of the first sensor reading."""
+        return self._kept // LANES - SENSORS
 
     @property
     def attitude(self) -> FloatArray:
         """True attitude, unit quaternions wxyz, body to world, shape (vehicles, 4)."""
-        return self._read(X_QW, 4)
+        return self._read(0, 4)
 
     @property
     def rate(self) -> FloatArray:
         """True rate [rad/s], shape (vehicles, 3)."""
-        return self._read(X_P, 3)
+        return self._read(4, 3)
 
     @property
     def velocity(self) -> FloatArray:
         """True velocity [m/s], shape (vehicles, 3)."""
-        return self._read(X_VN, 3)
+        return self._read(7, 3)
 
     @property
     def position(self) -> FloatArray:
         """True position [m], shape (vehicles, 3)."""
-        return self._read(X_N, 3)
+        return self._read(10, 3)
 
     @property
     def motion(self) -> FloatArray:
@@ -400,28 +444,28 @@ class State:
 
         A file without `motor_lag` has no rotor states there: its first 13 columns.
         """
-        return np.hstack([self._read(X_QW, N_STATE), self.rotor_speed])
+        return np.hstack([self._read(0, N_STATE), self.rotor_speed])
 
     @property
     def rotor_speed(self) -> FloatArray:
         """True rotor speeds [rad/s], shape (vehicles, rotors)."""
-        rot = self._memory[:, _ROTORS_AT : _ROTORS_AT + self._rotors * ROTOR].reshape(-1, self._rotors, ROTOR)
+        rot = self._memory[:, self._kept : self._kept + self._rotors * ROTOR].reshape(-1, self._rotors, ROTOR)
         return rot[:, :, R_SPEED : R_SPEED + LANES].transpose(0, 2, 1).reshape(-1, self._rotors)[: self.vehicles]
 
     @property
     def gyro(self) -> FloatArray:
         """Rate as the gyro reads it [rad/s], shape (vehicles, 3)."""
-        return self._read(S_P, 3)
+        return self._read(self._sensors + 4, 3)
 
     @property
     def accel(self) -> FloatArray:
         """Specific force as the accelerometer reads it [m/s^2], the mean over the last step, shape (vehicles, 3)."""
-        return self._read(S_FX, 3)
+        return self._read(self._sensors + 7, 3)
 
     @property
     def reported_attitude(self) -> FloatArray:
         """Attitude as the attitude estimator reports it, quaternions wxyz, shape (vehicles, 4)."""
-        return self._read(S_QW, 4)
+        return self._read(self._sensors, 4)
 
 
 class Simulator:
@@ -471,11 +515,13 @@ class Simulator:
         flat = self._theta.reshape(blocks * LANES, -1)
         self._need: Needs = needs_of(flat, len(vehicle.rotors), 15)
         self._needs = np.array(self._need, dtype=np.bool_)
-        self._alike = bool((flat == flat[0]).all())
+        filters = ((G_W, 18, self._need.imu_lag), (E_QW, 4, self._need.ahrs), (L_NOW, 6, self._need.learned))
+        kept = [(X_QW, N_STATE), *((row, count) for row, count, needed in filters if needed), (SENSED, SENSORS)]
+        self._kept = np.array([(row, row + LANES * count) for row, count in kept])
         self._terms = residual_terms(vehicle)
         self._coefficients = np.empty((blocks, len(self._terms), LANES))
         self._seed, self._span = seed, min(span, 1e9)
-        self._dt, self._constants, self._walk, self._delayed = 0.0, _NO_CONSTANTS, _NO_WALK, 2
+        self._dt, self._constants = 0.0, _NO_CONSTANTS
         self._each = (self.vehicles, len(self._geometry))
 
     def start(
@@ -515,7 +561,6 @@ class Simulator:
             raise WindowError(f"shapes {shapes}", f"4, 3, 3, 3, {rotors}, {TURNS}, or with {n} rows") from error
         motion = np.concatenate([given[0] / np.linalg.norm(given[0], axis=1)[:, None], *given[1:4]], axis=1)
         rot = self._settle(dt)
-        late = math.ceil(max(float(self._theta[..., ix.ATT_DELAY].max()), 0.0) / dt) + 2
         rows, speeds = _in_lanes(motion, blocks), _in_lanes(given[4], blocks)
         moving = np.zeros((blocks, N_ROWS * LANES))
         moving[:, X_QW : X_QW + N_STATE * LANES] = rows.reshape(blocks, -1)
@@ -525,14 +570,14 @@ class Simulator:
         moving[:, E_QW : E_QW + LANES] = 1.0
         rot[:, :, R_SPEED : R_SPEED + LANES] = speeds
         memory = (
-            moving[:, STATE:],
+            *(moving[:, first:end] for first, end in self._kept),
             rot,
-            np.repeat(speeds[:, None], self._delayed, axis=1),
+            np.repeat(speeds[:, None], 2 * self._delayed, axis=1),
             _in_lanes(given[5], blocks),
-            np.repeat(rows[:, None, :7], late, axis=1),
+            np.repeat(rows[:, None, :7], 2 * self._late, axis=1),
         )
         kept, none = np.concatenate([m.reshape(blocks, -1) for m in memory], axis=1), _NO_CONSTANTS
-        return State(time, 0, n, kept, rotors, dt, none, none)
+        return State(time, 0, n, kept, rotors, int(np.diff(self._kept).sum()), dt, none, none)
 
     def step(self, state: State, command: ArrayLike, dt: float, voltage: float | None = None) -> State:
         """Returns the state after one step; `state` stays as it is.
@@ -577,9 +622,6 @@ class Simulator:
         self, state: State, commands: FloatArray, dt: float, voltage: float | None, out: FloatArray = _NO_OUT
     ) -> None:
         """Makes the steps; the one way into the kernel."""
-        if state.vehicles != self.vehicles or state._rotors != self._each[1]:
-            found = f"a state of {state.vehicles} vehicles with {state._rotors} rotors"
-            raise WindowError(found, f"{self.vehicles} with {self._each[1]}, as the simulator has")
         if commands.shape[1:] != self._each:
             if commands.shape[1:] != (1, self._each[1]):
                 raise WindowError(f"commands of shape {commands.shape[1:]}", f"{self._each}")
@@ -594,14 +636,18 @@ class Simulator:
             state._dt = dt
         if dt != self._dt:
             self._settle(dt)
+        if state._constants is not self._constants:  # a new state or a copy, or another step or simulator than before
+            if (state.vehicles, state._rotors) != self._each:
+                found = f"a state of {state.vehicles} vehicles with {state._rotors} rotors"
+                raise WindowError(found, f"{self.vehicles} with {self._each[1]}, as the simulator has")
+            if state._memory.shape[1] != self._width:
+                raise WindowError("a state of other delays or filters", "one of this simulator's `start`")
+            state._work, state._constants = self._prepared.copy(), self._constants
         if voltage is not None:
             exponent = self._theta[..., ix.EXPONENT].reshape(-1)[: state.vehicles]
             commands = commands * voltage ** exponent[None, :, None]
-        if state._constants is not self._constants:  # a new state or a copy, or another step or simulator than before
-            state._work, state._constants = self._prepared.copy(), self._constants
         compiled_steps()(
-            commands, self._geometry, self._theta, self._terms, self._coefficients, self._needs, self._constants,
-            self._walk, state.time, self._span, dt, self._seed, state.steps, self._delayed, state._work,
+            commands, *self._fixed, state.time, self._span, dt, self._seed, state.steps, self._delayed, state._work,
             state._memory, out,
         )  # fmt: skip
         state.time += len(commands) * dt
@@ -615,13 +661,21 @@ class Simulator:
         flight = Flight(self.vehicle.mass, self._reach, self._hub, self._plan, 0.0, dt, 0.0, self._span)
         constants, rot = np.empty((blocks, STATE)), np.zeros((blocks, len(self._geometry), ROTOR))
         write_constants(self._theta, flight, self._coefficients, constants, rot)
-        self._constants = constants[:1] if self._alike else constants
-        self._prepared = np.concatenate([constants[0], np.zeros(N_ROWS * LANES - STATE)])
+        differ = (constants != constants[0]).any(axis=0).reshape(-1, LANES).any(axis=1)
+        own = LANES * np.flatnonzero(np.diff(differ, prepend=False, append=False)).reshape(-1, 2)
+        self._constants = np.ascontiguousarray(constants[:, np.repeat(differ, LANES)])
+        self._prepared = np.concatenate([constants[0], np.zeros(WORK - STATE)])
         self._delayed = math.floor(max(float(self._theta[..., ix.DELAY].max()), 0.0) / dt) + 2
+        self._late = math.ceil(max(float(self._theta[..., ix.ATT_DELAY].max()), 0.0) / dt) + 2
+        rotors = len(self._geometry) * (ROTOR // LANES + 2 * self._delayed)
+        self._width = int(np.diff(self._kept).sum()) + LANES * (rotors + TURNS + 14 * self._late)
+        walk = np.empty((0, TURNS))
         if self.random is not None:
             size, time = self.random.each_axis
             keep = np.exp(-dt / time)
-            self._walk = np.array([keep, size * np.sqrt(1.0 - keep**2)])
+            walk = np.array([keep, size * np.sqrt(1.0 - keep**2)])
+        model = (self._geometry, self._theta, self._terms, self._coefficients, self._needs)
+        self._fixed = (*model, own, self._constants, self._kept, walk)
         self._dt = dt
         return rot
 

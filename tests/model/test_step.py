@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import pickle
 from typing import Any
 
@@ -10,8 +11,9 @@ import pytest
 
 import quadid
 from quadid.errors import ParameterError, WindowError
+from quadid.model import layout as ix
 from quadid.model.layout import Layout
-from quadid.model.step import RandomInputs, Simulator
+from quadid.model.step import RandomInputs, Simulator, State
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 from tests.model.independent import Input
@@ -98,19 +100,53 @@ def test_the_motor_lag_is_not_lost_between_steps() -> None:
     np.testing.assert_allclose(slow.rotor_speed[0], expected, rtol=1e-9)
 
 
-@pytest.mark.parametrize("count", [1, 16, 21])
-def test_a_batch_flies_as_each_vehicle_alone(count: int) -> None:
-    vehicle = craft({"motor_lag": {"tau": 0.03}, "rotor_drag": {"k_x": 0.3, "k_y": 0.2}})
+LAGGING: dict[str, dict[str, float]] = {"motor_lag": {"tau": 0.03}, "rotor_drag": {"k_x": 0.3, "k_y": 0.2}}
+
+
+@pytest.mark.parametrize(("count", "every"), [(1, False), (16, False), (21, False), (21, True)])
+def test_a_batch_flies_as_each_vehicle_alone(count: int, every: bool) -> None:
+    """Each with numbers of its own; with `every`, of all effects: other delays, payloads and filters in each lane."""
+    vehicle = craft({} if every else LAGGING)
     rng = np.random.default_rng(2)
     thetas = np.tile(Layout(vehicle).initial(vehicle), (count, 1))
     thetas[:, :6] *= np.exp(0.1 * rng.standard_normal((count, 6)))
+    for entry in Layout(vehicle).entries.values() if every else ():
+        if entry.index > ix.JR and "battery_sag" not in entry.name:
+            size = 0.15 if entry.name.endswith(".time") else entry.typical
+            thetas[:, entry.index] = size * rng.uniform(0.5, 1.5, count)
     rows = vehicle.hover_speed() * (1.0 + 0.02 * rng.standard_normal((30, count, 4)))
     batch = Simulator(vehicle, thetas)
     together = batch.run(batch.start(rotor_speed=rows[0], dt=0.01), rows, 0.01)
     for i in range(count):
         alone = Simulator(vehicle, thetas[i])
         one = alone.run(alone.start(rotor_speed=rows[0, i], dt=0.01), rows[:, i], 0.01)
-        np.testing.assert_allclose(together[:, i], one[:, 0], rtol=1e-12, atol=1e-14)
+        np.testing.assert_allclose(together[:, i], one[:, 0], rtol=1e-11 if every else 1e-12, atol=1e-13)
+
+
+def normals(seed: int, vehicle: int, step: int) -> list[float]:
+    """The six normal numbers of a vehicle's step, in Python's own numbers."""
+    golden, size, out = 0x9E3779B97F4A7C15, 1 << 64, []
+
+    def uniform(x: int) -> float:
+        x = (x ^ (x >> 30)) * 0xBF58476D1CE4E5B9 % size
+        x = (x ^ (x >> 27)) * 0x94D049BB133111EB % size
+        return ((x ^ (x >> 31)) >> 12) / 2.0**52 + 2.0**-53
+
+    for pair in range(3):
+        counter = ((6 * step + 2 * pair + 1) << 24) + vehicle + 1
+        at = (seed + golden * counter) % size
+        radius, angle = math.sqrt(-2.0 * math.log(uniform(at))), 2.0 * math.pi * (uniform(at ^ (1 << 63)) - 0.5)
+        out += [radius * math.cos(angle), radius * math.sin(angle)]
+    return out
+
+
+def drawn(state: State, vehicle: int) -> FloatArray:
+    """What acts at random on a vehicle, read from the change of its rate and velocity in a step at level."""
+    still = Simulator(PELICAN, np.tile(Layout(PELICAN).initial(PELICAN), (400, 1)))
+    begun = still.start(dt=0.01)
+    still.advance(begun, np.full(4, PELICAN.hover_speed()), 0.01)
+    change = np.concatenate([state.velocity - begun.velocity, state.rate - begun.rate], axis=1)
+    return np.asarray(change[vehicle] / 0.01)
 
 
 def test_random_inputs_repeat_and_have_their_size() -> None:
@@ -127,6 +163,13 @@ def test_random_inputs_repeat_and_have_their_size() -> None:
     t, big = 2.0, 0.1
     grown = 2.0 * big * (t - 1.5 * big)
     np.testing.assert_allclose(runs[0][-1, :, 4:7].std(axis=0), np.array([3.0, 2.0, 1.0]) * np.sqrt(grown), rtol=0.12)
+    # The numbers are those of a counter, through splitmix64 and Box and Muller.
+    many = Simulator(PELICAN, thetas, random=random, seed=7)
+    begun = many.start(dt=0.01)
+    many.advance(begun, rows[0], 0.01)
+    for vehicle in (0, 17, 399):
+        expected = np.array(random.each_axis[0]) * np.sqrt(1.0 - np.exp(-0.02 / random.each_axis[1]))
+        np.testing.assert_allclose(drawn(begun, vehicle), expected * normals(7, vehicle, 0), rtol=1e-12)
     again = Simulator(PELICAN, thetas, random=random, seed=1)
     state = again.start(dt=0.01)
     branch = again.step(state, rows[0], 0.01)
@@ -166,6 +209,10 @@ def test_a_state_of_other_vehicles_is_refused_and_commands_need_not_lie_in_a_row
     """The kernel would read beyond the parameters of the smaller batch."""
     one = Simulator(PELICAN)
     thetas = np.tile(Layout(PELICAN).initial(PELICAN), (40, 1))
+    late = Simulator(craft({"command_delay": {"delay": 0.05}, "attitude_delay": {"delay": 0.03}}))
+    for simulator, other in ((one, late), (late, one)):  # remembers more, or less, than the simulator would
+        with pytest.raises(WindowError, match="a state of other delays"):
+            simulator.step(other.start(dt=0.01), np.full(4, 400.0), 0.01)
     many, hexacopter = Simulator(PELICAN, thetas), Simulator(Vehicle.shipped("hexacopter"))
     for other in (many, hexacopter):
         with pytest.raises(WindowError, match="a state of"):
