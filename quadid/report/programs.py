@@ -396,6 +396,16 @@ def _in_quadrant(facts: Facts, x: int, y: int) -> RotorFacts:
     return here[0]
 
 
+def rotorpy(facts: Facts) -> dict[str, Any]:
+    """Nothing beside `Facts`.
+
+    Raises:
+        ParameterError: not four rotors: RotorPy 3 inverts the allocation, and ends with a LinAlgError.
+    """
+    _four(facts, "RotorPy")
+    return {}
+
+
 def drone_models(facts: Facts) -> dict[str, Any]:
     """Numbers of the model ``first_principles``: drag is that at hover speed.
 
@@ -422,7 +432,7 @@ def drone_models(facts: Facts) -> dict[str, Any]:
 def _four(facts: Facts, program: str) -> None:
     if len(facts.rotors) != 4:
         raise ParameterError(
-            f"{len(facts.rotors)} rotors", f"four, which {program} takes for granted", "use rotorpy or mujoco"
+            f"{len(facts.rotors)} rotors", f"four, which {program} takes for granted", "use mujoco or urdf"
         )
 
 
@@ -537,6 +547,7 @@ FORMS: dict[str, Form] = {
         "RotorPy",
         (*_BODY, "motor_lag", "rotor_drag", "axial_inflow", "parasitic_drag", "imu_lever_arm"),
         {"_params.py": "rotorpy.py"},
+        rotorpy,
     ),
     "agilicious": Form(
         "Agilicious", ("cg_offset", "motor_lag", "rotor_drag"), {".agilicious.yaml": "agilicious.yaml"}, agilicious

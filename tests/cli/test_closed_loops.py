@@ -1,0 +1,211 @@
+"""Exports flown in a closed loop by the programs themselves: hover, a roll step, a yaw step, as our simulation does."""
+
+from __future__ import annotations
+
+import inspect
+import tempfile
+import tomllib
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+
+from quadid.app.init import shipped
+from quadid.errors import ParameterError
+from quadid.model.step import Simulator
+from quadid.report.programs import SHORTEST_LAG, export
+from quadid.types import FloatArray
+from quadid.vehicle import GRAVITY, Vehicle
+
+VEHICLES = [entry["name"] for entry in shipped()]
+DT, STEPS = 0.01, 100
+TO_FLU = np.array([1.0, -1.0, -1.0])
+"""Turns vectors of body FRD into FLU and of NED into NWU, and the vector part of the attitude likewise."""
+
+
+class Motion(NamedTuple):
+    """Attitude wxyz, rate, velocity, position; FRD and NED."""
+
+    attitude: FloatArray
+    rate: FloatArray
+    velocity: FloatArray
+    position: FloatArray
+
+
+REST = Motion(np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(3), np.zeros(3), np.array([0.0, 0.0, -10.0]))
+Program = Callable[[FloatArray], Motion]
+"""Flies on for DT with these rotor speeds [rad/s], held."""
+
+
+def plain(name: str) -> Vehicle:
+    """A shipped vehicle without what no program but ours knows: the gyroscopic torque of its rotors."""
+    vehicle = Vehicle.shipped(name)
+    still = vehicle.parameters["J_r"].model_copy(update={"initial": 1e-12, "bounds": None})
+    return vehicle.model_copy(update={"parameters": {**vehicle.parameters, "J_r": still}, "effects": {}})
+
+
+def ours(vehicle: Vehicle, lag: float) -> Program:
+    effects = {"motor_lag": {"tau": lag}} if lag > 0.0 else {}
+    simulator = Simulator(vehicle.model_copy(update={"effects": effects}))
+    state = simulator.start(position=REST.position, dt=DT)
+
+    def step(speeds: FloatArray) -> Motion:
+        simulator.advance(state, speeds, DT)
+        return Motion(state.attitude[0], state.rate[0], state.velocity[0], state.position[0])
+
+    return step
+
+
+def rotorpy(vehicle: Vehicle) -> Program:
+    module = pytest.importorskip("rotorpy.vehicles.multirotor", reason="pip install rotorpy (extra dev)")
+    space: dict[str, Any] = {}
+    exec(export(vehicle, "rotorpy", "test")["_params.py"], space)
+    at = {"x": REST.position * TO_FLU, "v": np.zeros(3), "q": np.array([0.0, 0.0, 0.0, 1.0]), "w": np.zeros(3)}
+    at |= {"wind": np.zeros(3), "rotor_speeds": np.full(len(vehicle.rotors), vehicle.hover_speed())}
+    precise = {"method": "RK45", "rtol": 1e-8, "atol": 1e-10}
+    flier = module.Multirotor(space["quad_params"], at, integrator_kwargs=precise)
+
+    def step(speeds: FloatArray) -> Motion:
+        at.update(flier.step(at, {"cmd_motor_speeds": speeds}, DT))
+        q = np.append(at["q"][3], at["q"][:3] * TO_FLU)
+        return Motion(q, at["w"] * TO_FLU, at["v"] * TO_FLU, at["x"] * TO_FLU)
+
+    return step
+
+
+def drone_models(vehicle: Vehicle) -> Program:
+    program = pytest.importorskip("drone_models.first_principles", reason="pip install drone-models (extra dev)")
+    read = tomllib.loads(export(vehicle, "drone-models", "test")[".params.toml"])
+    (section,) = read.values()
+    wanted = inspect.signature(program.dynamics).parameters.values()
+    numbers = {p.name: np.array(section[p.name]) for p in wanted if p.kind is p.KEYWORD_ONLY and p.name != "J_inv"}
+    numbers["J_inv"] = np.linalg.inv(numbers["J"])
+    to_rpm, n = 60.0 / (2.0 * np.pi), 10
+    at = np.concatenate([REST.position * TO_FLU, [0.0, 0.0, 0.0, 1.0], np.zeros(6)])
+    at = np.append(at, np.full(4, vehicle.hover_speed() * to_rpm))
+
+    def slope(s: FloatArray, command: FloatArray) -> FloatArray:
+        q = s[3:7] / np.linalg.norm(s[3:7])
+        place, _, *rest = program.dynamics(s[:3], q, s[7:10], s[10:13], command, s[13:], **numbers)
+        # Its own derivative of the quaternion is not to be integrated, as its documentation says.
+        turn = 0.5 * np.append(q[3] * s[10:13] + np.cross(q[:3], s[10:13]), -q[:3] @ s[10:13])
+        return np.concatenate([place, turn, *rest])
+
+    def step(speeds: FloatArray) -> Motion:
+        nonlocal at
+        h = DT / n
+        for _ in range(n):  # classical Runge-Kutta, of which the lag of 1 ms needs small steps
+            k1 = slope(at, speeds * to_rpm)
+            k2 = slope(at + 0.5 * h * k1, speeds * to_rpm)
+            k3 = slope(at + 0.5 * h * k2, speeds * to_rpm)
+            k4 = slope(at + h * k3, speeds * to_rpm)
+            at = at + h / 6.0 * (k1 + 2.0 * (k2 + k3) + k4)
+        q = np.append(at[6], at[3:6] * TO_FLU) / np.linalg.norm(at[3:7])
+        return Motion(q, at[10:13] * TO_FLU, at[7:10] * TO_FLU, at[:3] * TO_FLU)
+
+    return step
+
+
+def mujoco(vehicle: Vehicle) -> Program:
+    program = pytest.importorskip("mujoco", reason="pip install mujoco (extra dev)")
+    model = program.MjModel.from_xml_string(export(vehicle, "mujoco", "test")[".mjcf.xml"])
+    data = program.MjData(model)
+    data.qpos[:3] = REST.position * TO_FLU
+
+    def step(speeds: FloatArray) -> Motion:
+        data.ctrl[:] = vehicle.parameters["b"].initial * speeds**2
+        for _ in range(round(DT / model.opt.timestep)):
+            program.mj_step(model, data)
+        q = np.append(data.qpos[3], data.qpos[4:7] * TO_FLU)
+        return Motion(q, data.qvel[3:] * TO_FLU, data.qvel[:3] * TO_FLU, data.qpos[:3] * TO_FLU)
+
+    return step
+
+
+def bullet(vehicle: Vehicle) -> Program:
+    """The URDF in the engine of gym-pybullet-drones and PyFlyt: a thrust at each rotor's link, as they apply it.
+
+    Bullet gave the rotors' links, which had no inertia, a kilogram each.
+    """
+    program = pytest.importorskip("pybullet", reason="pip install pybullet")
+    client = program.connect(program.DIRECT)
+    with tempfile.NamedTemporaryFile("w", suffix=".urdf", encoding="utf-8") as file:
+        file.write(export(vehicle, "urdf", "test")[".urdf"])
+        file.flush()
+        at = (REST.position * TO_FLU).tolist()
+        flags = program.URDF_USE_INERTIA_FROM_FILE
+        body = program.loadURDF(file.name, at, flags=flags, physicsClientId=client)
+    program.setGravity(0.0, 0.0, -GRAVITY, physicsClientId=client)
+    n = 20
+    program.setTimeStep(DT / n, physicsClientId=client)
+    for link in range(-1, len(vehicle.rotors)):
+        program.changeDynamics(body, link, linearDamping=0.0, angularDamping=0.0, physicsClientId=client)
+    b, d = (vehicle.parameters[key].initial for key in "bd")
+
+    def step(speeds: FloatArray) -> Motion:
+        for _ in range(n):
+            for i, speed in enumerate(speeds):
+                program.applyExternalForce(body, i, [0, 0, b * speed**2], [0, 0, 0], program.LINK_FRAME, client)
+            torque = -float(vehicle.spins @ (d * speeds**2))
+            program.applyExternalTorque(body, -1, [0, 0, torque], program.LINK_FRAME, client)
+            program.stepSimulation(client)
+        position, xyzw = program.getBasePositionAndOrientation(body, client)
+        velocity, rate = program.getBaseVelocity(body, client)
+        turn = np.array(program.getMatrixFromQuaternion(xyzw)).reshape(3, 3)
+        q = np.append(xyzw[3], np.array(xyzw[:3]) * TO_FLU)
+        return Motion(q, turn.T @ rate * TO_FLU, np.array(velocity) * TO_FLU, np.array(position) * TO_FLU)
+
+    return step
+
+
+class Goal(NamedTuple):
+    """References of a flight: roll and yaw [rad], how far to climb [m]."""
+
+    roll: float
+    yaw: float
+    climb: float
+
+
+GOALS = {"hover": Goal(0.0, 0.0, 0.2), "roll": Goal(0.2, 0.0, 0.0), "yaw": Goal(0.0, 0.3, 0.0)}
+
+
+def flown(vehicle: Vehicle, program: Program, goal: Goal) -> FloatArray:
+    """Attitude, velocity and position under a controller that allocates by the vehicle file, (STEPS, 9)."""
+    b, d = (vehicle.parameters[key].initial for key in "bd")
+    x, y, _ = vehicle.rotor_positions.T
+    mixer = np.linalg.pinv(np.array([np.full(len(x), b), -b * y, b * x, d * vehicle.spins]))
+    inertia = np.array([vehicle.parameters[f"J_{axis}{axis}"].initial for axis in "xyz"])
+    half = 0.5 * np.array([goal.roll, goal.yaw])
+    wanted = np.array([np.cos(half).prod(), np.sin(half[0]) * np.cos(half[1]), 0.0, np.sin(half[1]) * np.cos(half[0])])
+    now, rows = REST, []
+    for _ in range(STEPS):
+        w, v = now.attitude[0], now.attitude[1:]
+        miss = 2.0 * (wanted[0] * v - w * wanted[1:] - np.cross(wanted[1:], v))
+        moment = inertia * (-np.array([25.0, 25.0, 9.0]) * miss - np.array([10.0, 10.0, 6.0]) * now.rate)
+        high = REST.position[2] - goal.climb - now.position[2]
+        thrust = vehicle.mass * (GRAVITY - 9.0 * high + 6.0 * now.velocity[2])
+        now = program(np.sqrt(np.maximum(mixer @ np.append(thrust, moment), 0.0)))
+        sign = np.copysign(1.0, now.attitude[0])
+        rows.append(np.concatenate([2.0 * sign * now.attitude[1:], now.velocity, now.position - REST.position]))
+    return np.array(rows)
+
+
+@pytest.mark.parametrize("name", VEHICLES)
+@pytest.mark.parametrize(
+    ("program", "lag"), [(rotorpy, SHORTEST_LAG), (drone_models, SHORTEST_LAG), (mujoco, 0.0), (bullet, 0.0)]
+)
+def test_every_program_flies_the_export_as_we_do(program: Callable[[Vehicle], Program], lag: float, name: str) -> None:
+    vehicle = plain(name)
+    if program in (rotorpy, drone_models) and len(vehicle.rotors) != 4:
+        with pytest.raises(ParameterError, match="6 rotors.*four, which .* takes for granted"):
+            program(vehicle)
+        return
+    for kind, goal in GOALS.items():
+        theirs, own = flown(vehicle, program(vehicle), goal), flown(vehicle, ours(vehicle, lag), goal)
+        reached = (-own[-1, 8], own[-1, 0], own[-1, 2])
+        expected = (goal.climb, goal.roll, goal.yaw)
+        np.testing.assert_allclose(reached, expected, atol=0.35 * max(expected), err_msg=kind)
+        for part in (slice(0, 3), slice(3, 6), slice(6, 9)):
+            size = float(np.abs(own[:, part]).max())
+            assert np.abs(theirs[:, part] - own[:, part]).max() < 0.01 * max(size, 0.1), kind
