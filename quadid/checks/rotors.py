@@ -736,11 +736,28 @@ def lagged_of(windows: Sequence[Window], vehicle: Vehicle, rate: float) -> Lagge
     """As `lagged_motion`, of windows in flight, with rotor readings at `rate` [Hz]."""
     if rate < 30.0:
         return f"rotor signal at {rate:.3g} Hz is too slow to check the motor order"
+    windows = [replace(w, rotor_speed=_turned(w, vehicle)) for w in windows]
     thrust, b = ThrustModel.stated(vehicle), vehicle.parameters["b"].initial
     acted = [thrust.single(w.rotor_speed) / b for w in windows]
     fast = [_in_band(windows, acted, lag, _SLOW_MOTION, 0.0) for lag in range(_LAGS)]
     slow = _in_band(windows, acted, 0, *_TURNING)
     return Lagged(fast, slow) if len(fast[0][0]) >= 100 else "too little flight to check the motor order"
+
+
+def _turned(w: Window, vehicle: Vehicle) -> FloatArray:
+    """Rotor speeds as the motor lag of the file leaves them: means over each step of commands, else at instants."""
+    lag = vehicle.effects.get("motor_lag", {})
+    tau = 0.5 * (lag.get("tau", 0.0) + lag.get("tau_down", lag.get("tau", 0.0)))
+    if not tau > 0.0:
+        return w.rotor_speed
+    from scipy.signal import lfilter  # slow to load
+
+    keep, u = math.exp(-w.dt / tau), w.rotor_speed
+    if w.sampling == "held":  # omega' = (u - omega) / tau from u_0 on, u the same over a step
+        begun = lfilter([0.0, 1.0 - keep], [1.0, -keep], u, axis=0, zi=u[:1])[0]
+        return np.asarray(u + (begun - u) * (tau / w.dt) * (1.0 - keep))
+    each = 0.5 * (1.0 - keep)
+    return np.asarray(lfilter([each, each], [1.0, -keep], u, axis=0, zi=(1.0 - each) * u[:1])[0])
 
 
 def _in_band(windows: Sequence[Window], thrust: list[FloatArray], lag: int, slowest: float, fastest: float) -> Rows:

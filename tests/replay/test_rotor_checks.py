@@ -270,6 +270,25 @@ def test_an_arm_or_a_mass_that_guesses_and_motion_make_unlikely_is_asked_for(
     assert [line.split()[2] for line in said] == [asked] * bool(asked)
 
 
+@pytest.mark.parametrize("tau", [0.02, 0.05, 0.1])
+def test_the_arm_is_judged_behind_the_motor_lag_of_the_file(tau: float) -> None:
+    """A lag of 50 ms, in the file, made its arm 0.79 times as long, and every inertia of a later fit unreliable."""
+    flown = simulate(seconds=60.0, seed=1, effects=[f"motor_lag:tau={tau}"]).flight
+    truth = flown.truth.parameters.as_dict()
+    pelican = Vehicle.shipped("pelican")
+    known = {
+        name: prior.model_copy(update={"initial": truth[name], "sigma": 0.01 * truth[name], "bounds": None})
+        for name, prior in pelican.parameters.items()
+    }
+    right = pelican.model_copy(update={"parameters": known, "effects": {"motor_lag": {"tau": tau}}})
+    for factor in (1.0, 1.5):
+        rotors = tuple(r.model_copy(update={"position": tuple(factor * x for x in r.position)}) for r in right.rotors)
+        checks = inspect(flown.recording, right.model_copy(update={"rotors": rotors})).checks
+        (geometry,) = (check for check in checks if check.name == "geometry")
+        assert geometry.numbers["arm_factor"] == pytest.approx(1.0 / factor, rel=0.1)
+        assert (geometry.verdict is CheckResult.WARNING) == (factor > 1.0)
+
+
 @pytest.mark.parametrize("effects", [(), ("imu_misalignment",)])
 def test_a_tilted_gyro_is_no_pair_of_reversed_spins(effects: tuple[str, ...]) -> None:
     vehicle = Vehicle.shipped("hexacopter")
