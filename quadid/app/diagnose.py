@@ -14,7 +14,7 @@ from quadid.app.outcome import LIBRARY, NUMBER_COLUMNS, Advance, Fitted, number_
 from quadid.checks.doubts import farthest
 from quadid.effects import EFFECTS
 from quadid.model.layout import Layout, with_reference_voltage
-from quadid.parameters import INERTIAS, Status, unreliable
+from quadid.parameters import INERTIAS, NOMINAL_NAMES, Status, unreliable
 from quadid.report.page import render
 from quadid.report.tables import Cell, Column, TextTable, number, parameter_table
 from quadid.report.verdict import Verdict, digits
@@ -67,8 +67,8 @@ class Diagnosed(Fitted):
 
     @property
     def file_name(self) -> str:
-        """``pelican+motor_lag.yaml``, or ``pelican.fitted.yaml`` without findings."""
-        return f"{file_name(self.found.vehicle_name)}{'' if self.found.findings else '.fitted'}.yaml"
+        """``pelican+motor_lag.yaml``, or ``pelican.diagnosed.yaml`` without findings: no file of an identification."""
+        return f"{file_name(self.found.vehicle_name)}{'' if self.found.findings else '.diagnosed'}.yaml"
 
     @property
     def verdict(self) -> Verdict:
@@ -150,7 +150,7 @@ def diagnose(
     """
     from quadid.diagnosis.pipeline import diagnose as diagnose_windows
     from quadid.diagnosis.result import Explanation
-    from quadid.identification.result import ScoredSet, with_values
+    from quadid.identification.result import ScoredSet, parameter_entry, with_values
     from quadid.identification.score import mse_score
 
     check_seed(seed)
@@ -213,7 +213,11 @@ def diagnose(
     if beside is not None and beside.terms:
         result["residual"] = {"terms": [t.formula for t in beside.terms], "missing_removed": beside.removed}
         result["missing"]["statement"] += f" {beside.sentence}"
-    return Diagnosed(result, found, sets, fit.noise, [*train, *held], described, selection, forces, beside)
+    done = Diagnosed(result, found, sets, fit.noise, [*train, *held], described, selection, forces, beside)
+    if done.verdict.level == "poor":  # what is left without a name may have bent the numbers too
+        found = replace(found, parameters=unreliable(found.parameters, NOMINAL_NAMES))
+        result["parameters"] = [parameter_entry(p) for p in found.parameters]
+    return replace(done, found=found)
 
 
 def _removed(forces: MissingForces, found: Diagnosis, selection: Search, vehicle: Vehicle) -> float:

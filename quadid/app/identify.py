@@ -24,7 +24,7 @@ from quadid.model.layout import Layout, with_reference_voltage
 from quadid.parameters import NOMINAL_NAMES, ParameterSet
 from quadid.report.page import render
 from quadid.report.tables import Cell, Column, TextTable, number, parameter_table
-from quadid.report.verdict import ROUGH, Verdict, identify_verdict, worst
+from quadid.report.verdict import Verdict, identify_verdict
 from quadid.sanitise import LONGEST_LINE, plain
 from quadid.types import FloatArray
 from quadid.vehicle import Proof, Vehicle
@@ -312,11 +312,10 @@ def identify(
     result = identify_result(fit, optimizer, seed, seconds, sets, None, given.warnings)
     for entry, log in zip(result["sets"], flown, strict=True):
         entry["seconds"] = log.grid.seconds_used
-    # A model that is wrong about its own errors proves no parameter.
-    if not worst(result["sets"]) <= ROUGH:
+    result["missing"] = None if forces is None else forces.result()
+    if identify_verdict(result).level == "poor":
         fit = replace(fit, parameters=fit.parameters.unreliable(fit.parameters.names))
         result["parameters"] = [parameter_entry(p) for p in fit.parameters]
-    result["missing"] = None if forces is None else forces.result()
     advance("random forces", 0.0)
     beside = None if forces is None else forces.beside(fitted_vehicle(fit), terms=False)
     done = Identified(result, fit, sets, flown, forces, beside)
