@@ -153,8 +153,8 @@ subspace: venv ## CVA and MOESP: poles of known systems, prediction of flights
 control: venv ## tracking with guessed, identified, extended and true parameters
 	$(STUDY) quadid_evaluation.studies.control --out docs/results
 
-kernel-speed: dev ## nanoseconds per particle and step of the kernel, and of a step of `quadid.Simulator`
-	$(STUDY) quadid_evaluation.benchmarks.speed --parts kernel step
+kernel-speed: dev ## nanoseconds per particle and step of the kernel; a step of `quadid.Simulator`, RotorPy, crazyflow, gym-pybullet-drones
+	SCIPY_ARRAY_API=1 $(STUDY) quadid_evaluation.benchmarks.speed --parts kernel step
 
 bench: dev ## every speed beside its peers, in one run: docs/results/speed.md (half an hour on an idle machine)
 	$(STUDY) quadid_evaluation.benchmarks.speed --out docs/results

@@ -8,8 +8,11 @@ The NumPy step does the nominal model's step alone, vectorised over particles, a
 from __future__ import annotations
 
 import functools
+import importlib.util
+import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -311,24 +314,87 @@ def fastest(run: Callable[[], object], calls: int) -> float:
     return float(shortest)
 
 
-def rotorpy_step() -> float | None:
-    """Time of one step of RotorPy's Hummingbird [s]; None where it is not installed."""
-    try:
-        from rotorpy.vehicles.hummingbird_params import quad_params
-        from rotorpy.vehicles.multirotor import Multirotor
-    except ImportError:
-        return None
+def rotorpy_steps() -> dict[str, float]:
+    """Time of one step of RotorPy's Hummingbird [s]."""
+    from rotorpy.vehicles.hummingbird_params import quad_params
+    from rotorpy.vehicles.multirotor import Multirotor
+
     craft = Multirotor(quad_params)
     state, control = craft.initial_state, {"cmd_motor_speeds": np.full(4, 350.0)}
-    return fastest(lambda: craft.step(state, control, DT), 50)
+    return {"RotorPy, one vehicle": fastest(lambda: craft.step(state, control, DT), 50)}
+
+
+def crazyflow_steps() -> dict[str, float]:
+    """Time of a step of crazyflow [s], one vehicle, and each of a batch; float32, Runge-Kutta of fourth order."""
+    from crazyflow.control import Control
+    from crazyflow.dynamics import Dynamics
+    from crazyflow.sim import Sim
+    from crazyflow.sim.integration import Integrator
+
+    times = {}
+    for n in (1, BATCH):
+        sim = Sim(
+            n, 1, dynamics=Dynamics.first_principles, control=Control.rotor_vel, integrator=Integrator.rk4, freq=500
+        )
+        sim.rotor_vel_control(np.full((n, 1, 4), 15000.0))
+
+        def step(sim: Any = sim) -> None:
+            sim.step()
+            sim.data.states.pos.block_until_ready()
+
+        step()
+        times["crazyflow, one vehicle" if n == 1 else f"crazyflow, {n} vehicles, each"] = fastest(step, 20) / n
+    return times
+
+
+def pybullet_steps() -> dict[str, float]:
+    """Time of a step of gym-pybullet-drones [s], by the engine and by its own equations."""
+    from gym_pybullet_drones.envs.CtrlAviary import CtrlAviary
+    from gym_pybullet_drones.utils.enums import Physics
+
+    times = {}
+    for physics in (Physics.PYB, Physics.DYN):
+        flown = CtrlAviary(physics=physics, pyb_freq=500, ctrl_freq=500, gui=False)
+        flown.reset()
+        action = np.full((1, 4), flown.HOVER_RPM)
+        times[f"gym-pybullet-drones, one vehicle, {physics.value}"] = fastest(functools.partial(flown.step, action), 50)
+        flown.close()
+    return times
+
+
+@contextmanager
+def one_core() -> Iterator[None]:
+    """Keeps this process, and the threads that it starts within, on one core."""
+    cores = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {max(cores)})
+    try:
+        yield
+    finally:
+        os.sched_setaffinity(0, cores)
 
 
 def step_table() -> dict[str, Any]:
-    """Seconds of a step of one vehicle and of batches on one core, beside RotorPy's."""
+    """Seconds of a step of one vehicle and of batches on one core, beside those of other simulators that are there."""
+    with one_core():
+        times, absent = own_steps(), []
+        for name, steps in (
+            ("rotorpy", rotorpy_steps),
+            ("crazyflow", crazyflow_steps),
+            ("gym_pybullet_drones", pybullet_steps),
+        ):
+            if importlib.util.find_spec(name) is None:
+                absent.append(name)
+            else:
+                times |= steps()
+    return {"times": times, "absent": absent}
+
+
+def own_steps() -> dict[str, float]:
+    """Seconds of a step of `quadid.Simulator`."""
     pelican = Vehicle.shipped("pelican")
     hover, one = np.full(4, pelican.hover_speed()), Simulator(pelican)
     state, rows = one.start(dt=DT), np.tile(hover, (1000, 1))
-    times: dict[str, float | None] = {
+    times: dict[str, float] = {
         "one vehicle, in place": fastest(lambda: one.advance(state, hover, DT), 5000),
         "one vehicle, a new state": fastest(lambda: one.step(state, hover, DT), 5000),
         "one vehicle, 1000 steps a run": fastest(lambda: one.run(state, rows, DT), 20) / 1000,
@@ -343,4 +409,4 @@ def step_table() -> dict[str, Any]:
         flying = batch.start(dt=DT)
         each = fastest(functools.partial(batch.advance, flying, commands, DT), 5) / BATCH
         times[f"{BATCH} vehicles, {name}, each"] = each
-    return {"times": times | {"RotorPy, one vehicle": rotorpy_step()}}
+    return times

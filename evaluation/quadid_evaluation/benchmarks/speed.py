@@ -175,8 +175,9 @@ def _logs(r: Result) -> list[str]:
 
 
 def _step(r: Result) -> list[str]:
-    rows = [(name, f"{1e6 * t:.3g}") for name, t in r["times"].items() if t is not None]
-    return table(("step of `quadid.Simulator`", "us"), rows)
+    rows = [(name, f"{1e6 * t:.3g}") for name, t in r["times"].items()]
+    absent = [f"Not installed: {', '.join(r['absent'])}.", ""] if r["absent"] else []
+    return [*absent, *table(("one step on one core; without a name, of `quadid.Simulator`", "us"), rows)]
 
 
 PARTS: dict[str, tuple[str, Callable[[Result], list[str]]]] = {
