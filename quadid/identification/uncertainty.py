@@ -133,7 +133,10 @@ def score_products(lin: Linearised) -> tuple[FloatArray, int]:
 
 
 def parameter_set(free: Free, theta: FloatArray, initial: FloatArray, unc: Uncertainty) -> ParameterSet:
-    """Parameters with units, intervals (log scale for nominal ones) and status."""
+    """Parameters with units, intervals (log scale for nominal ones) and status.
+
+    One that the data do not show, and nothing showed before, keeps its guess where its interval holds that.
+    """
     scale, at = free.jacobian(theta), theta[free.index]
     sigma = unc.sigma * scale
     low, high = (free.shifted(at, z) for z in (-Z95 * unc.sigma, Z95 * unc.sigma))
@@ -143,11 +146,13 @@ def parameter_set(free: Free, theta: FloatArray, initial: FloatArray, unc: Uncer
         status, partner = _status(j, free, unc, value, ci)
         guess = float(initial[e.index])
         loose = 0.98 * min(math.log(e.upper / guess), math.log(guess / e.lower)) if free.is_log[j] else 0.0
+        measured = float(unc.prior_sigma[j]) < loose
+        kept = status is Status.PRIOR_DOMINATED and not measured and ci[0] <= guess <= ci[1]
         out.append(
             Parameter(
                 e.name,
                 e.unit,
-                value,
+                guess if kept else value,
                 float(sigma[j]),
                 guess,
                 (e.lower, e.upper),
@@ -155,7 +160,7 @@ def parameter_set(free: Free, theta: FloatArray, initial: FloatArray, unc: Uncer
                 partner,
                 ci,
                 float(unc.prior_share[j]),
-                float(unc.prior_sigma[j]) < loose,
+                measured,
             )
         )
     return ParameterSet(tuple(out), unc.covariance * np.outer(scale, scale))

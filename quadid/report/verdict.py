@@ -296,7 +296,7 @@ def reason(parameter: Json, stuck: Sequence[str] = ()) -> str:
         return f"{percent(_number(parameter['prior_share']))} of the information is from the vehicle file's sigma."
     if status == "prior_dominated":
         needs = MOTION.get(name)
-        return "Not observable with this model and flight; the guess is kept." + (
+        return "Not observable with this model and flight; the file keeps its guess." + (
             f" It needs {needs}." if needs else ""
         )
     if status == "unreliable":

@@ -24,7 +24,9 @@ from quadid.app.logs import Log, check_unseen
 from quadid.checks.motion import Spans, flying_spans
 from quadid.data.window import Recording
 from quadid.errors import LogError, QuadidError
+from quadid.flight import draw_outside, fly
 from quadid.parameters import NOMINAL_NAMES, NOMINAL_UNITS, Status
+from quadid.report.verdict import reason
 from quadid.vehicle import Vehicle
 from tests.cli.conftest import Flights, table, write_table
 from tests.commands import Cli, Run, one_line
@@ -349,6 +351,31 @@ def test_a_red_fit_writes_guesses(tmp_path: Path) -> None:
         quadid.export(file, "px4")
 
 
+def test_a_diagnosis_that_leaves_what_has_no_name_identifies_nothing(tmp_path: Path) -> None:
+    """Its verdict was red, and values stood below it as identified."""
+    flight = fly(Vehicle.shipped("pelican"), seconds=40.0, seed=5, outside={"gusts": draw_outside("gusts", 5)})
+    write_csv(tmp_path / "gusts.csv", flight.recording)
+    found = quadid.diagnose(tmp_path / "gusts.csv", vehicle="pelican")
+    assert (found.verdict.level, found.result["verdict"]) == ("poor", "unknown")
+    told = {p["name"]: p["status"] for p in found.result["parameters"]}
+    assert told == {p.name: p.status for p in found.found.parameters}
+    assert set(told.values()) <= {"unreliable", "prior_dominated"}
+    assert all(prior.sigma is None for prior in found.vehicle.parameters.values())
+
+
+def test_what_a_flight_does_not_show_keeps_its_guess(tmp_path: Path) -> None:
+    """J_r was answered as 6.7e-5 for a guess of 3e-5, beside the words that the guess is kept."""
+    fit = quadid.identify(
+        quadid.simulate(seconds=40, seed=1, profile="gentle").save(tmp_path / "a.csv"), vehicle="pelican"
+    )
+    hidden = [p for p in fit.result["parameters"] if p["status"] == "prior_dominated"]
+    assert "J_r" in [p["name"] for p in hidden]
+    for p in hidden:
+        assert p["value"] == p["initial"] == fit.vehicle.parameters[p["name"]].initial
+        assert p["ci95"][0] < p["value"] < p["ci95"][1]
+        assert "the file keeps its guess" in reason(p)
+
+
 def test_only_an_unseen_flight_makes_it_green(tmp_path: Path) -> None:
     paths = [quadid.simulate(seconds=25, seed=seed).save(tmp_path / f"{seed}.csv") for seed in (5, 6)]
     one, other = (quadid.load(path, vehicle="pelican") for path in paths)
@@ -361,6 +388,8 @@ def test_only_an_unseen_flight_makes_it_green(tmp_path: Path) -> None:
     assert proven.vehicle.proof is not None
     assert not proven.vehicle.proof.lacking
     found = quadid.diagnose(one)
+    assert not found.result["findings"]
+    assert found.file_name != alone.file_name, "one command never writes over the other's file"
     assert found.verdict.level == "fair"
     assert any("no unseen flight" in line for line in found.verdict.details)
 
