@@ -28,7 +28,7 @@ from quadid.model.sensor_kernel import (
     tilt_attitude,
 )
 from quadid.model.simd import LANES, cached, inlined, jit, lane_kernel
-from quadid.types import BoolArray, FloatArray, IntArray
+from quadid.types import FloatArray, IntArray
 from quadid.vehicle import RandomForces, Vehicle
 
 # isort: off
@@ -238,49 +238,63 @@ def write_constants(
         constants[block] = s[:STATE]
 
 
+PLAN = 9
+"""Numbers at the begin of a plan: rotors, size of a parameter vector, terms beyond the catalogue, stretches of own
+constants, of the state, numbers of these, commands that are remembered, 1 with random inputs, their seed.  Then what
+is needed, in the order of `Needs`; stretches (first, end) of the constants that differ between blocks and of the state,
+sensors last; terms, four numbers each."""
+
+
 @cached
 def step_blocks(
-    commands: FloatArray, geometry: FloatArray, theta: FloatArray, terms: IntArray, coefficients: FloatArray,
-    needs: BoolArray, own: IntArray, constants: FloatArray, kept: IntArray, walk: FloatArray, time: float, span: float,
-    dt: float, seed: int, step: int, delayed: int, s: FloatArray, state: FloatArray, out: FloatArray,
+    commands: FloatArray, plan: IntArray, numbers: FloatArray, time: float, span: float, dt: float, step: int,
+    s: FloatArray, state: FloatArray, out: FloatArray,
 ) -> None:  # fmt: skip
     """Makes one step a row of commands with every vehicle of a batch.
 
+    What stays the same comes in two arrays, because each one that is handed over takes a fiftieth of a step.
+
     Args:
         commands: rotor speeds [rad/s], held over each step, (steps, vehicles, rotors).
-        geometry: (rotors, 4), see `rotor_kernel.Drive`.
-        theta: parameter vectors (blocks, LANES, size).
-        terms: beyond the catalogue, (terms, 4).
-        coefficients: of those, (blocks, terms, LANES).
-        needs: which parts of the model any vehicle needs, in the order of `Needs`.
-        own: stretches (first, end) of the constants that differ between blocks; the others stand in `s` already.
-        constants: those of each block, (blocks, size).
-        kept: stretches of the state, sensors last; what is between them is written before it is read.
-        walk: of the random inputs, exp(-dt / T) and the standard deviation of what a step adds, (2, TURNS); no rows
-            where there are none.
+        plan: see `PLAN`.
+        numbers: geometry (rotors, 4), see `rotor_kernel.Drive`; of random inputs exp(-dt / T) and the standard
+            deviation of what a step adds, (2, TURNS); parameter vectors (blocks, LANES, size); coefficients of terms
+            beyond the catalogue (blocks, terms, LANES); constants of each block that the others do not share.
         time: at the start of the first step [s].
         span: time over which a battery sags [s].
         dt: step [s].
-        seed: of the random inputs.
         step: number of steps made before.
-        delayed: commands that are remembered, a ring that stands there twice.
         s: work array (WORK), all but its common constants overwritten.
         state: motion and filters, rotors, last commands, past attitudes, random inputs (blocks, width), advanced;
             see `quadid.model.step.State`.
         out: after each step (steps, vehicles, N_STATE + 10), written: motion, sensors; no rows: not wanted.
     """
-    count, rotors = commands.shape[1], commands.shape[2]
-    need = Needs(
-        needs[0], needs[1], needs[2], needs[3], needs[4], needs[5], needs[6], needs[7], needs[8], needs[9],
-        needs[10], needs[11], needs[12], needs[13], needs[14], needs[15], needs[16],
+    count, blocks = commands.shape[1], len(state)
+    rotors, size, most, owned, keeping, at_rotors, delayed, walks, seed = (
+        plan[0], plan[1], plan[2], plan[3], plan[4], plan[5], plan[6], plan[7], plan[8],
     )  # fmt: skip
+    n = plan[PLAN : PLAN + 17]
+    need = Needs(
+        n[0] != 0, n[1] != 0, n[2] != 0, n[3] != 0, n[4] != 0, n[5] != 0, n[6] != 0, n[7] != 0, n[8] != 0, n[9] != 0,
+        n[10] != 0, n[11] != 0, n[12] != 0, n[13] != 0, n[14] != 0, n[15] != 0, n[16] != 0,
+    )  # fmt: skip
+    at = PLAN + 17
+    own, at = plan[at : at + 2 * owned].reshape(owned, 2), at + 2 * owned
+    kept, at = plan[at : at + 2 * keeping].reshape(keeping, 2), at + 2 * keeping
+    terms, at = plan[at : at + 4 * most].reshape(most, 4), 4 * rotors
+    geometry = numbers[:at].reshape(rotors, 4)
+    walk, at = numbers[at : at + 2 * TURNS * walks].reshape(2 * walks, TURNS), at + 2 * TURNS * walks
+    many = blocks * LANES * size
+    theta, at = numbers[at : at + many].reshape(blocks, LANES, size), at + many
+    many = blocks * most * LANES
+    coefficients, at = numbers[at : at + many].reshape(blocks, most, LANES), at + many
+    constants = numbers[at:].reshape(blocks, (len(numbers) - at) // blocks)
     plain = not (need.delayed or need.uneven)
     signals = s[N_ROWS * LANES :].reshape(N_SIGNALS, LANES)
-    at_rotors = (kept[:, 1] - kept[:, 0]).sum()
     at_sent = at_rotors + rotors * ROTOR
     at_inputs = at_sent + 2 * delayed * rotors * LANES
     at_past = at_inputs + TURNS * LANES
-    for block in range(len(state)):
+    for block in range(blocks):
         now = state[block]
         rot = now[at_rotors:at_sent].reshape(rotors, ROTOR)
         sent = now[at_sent:at_inputs].reshape(2 * delayed, rotors, LANES)
@@ -328,10 +342,8 @@ def step_blocks(
 
 @cache
 def compiled_steps() -> Any:
-    """Machine code of `step_blocks`, contiguous arrays only: numba's look at 19 types takes a fifth of a step."""
-    row, table, rows = "f8[::1],", "f8[:,::1],", "f8[:,:,::1],"
-    arrays = rows + table + rows + "i8[:,::1]," + rows + "b1[::1],i8[:,::1]," + table + "i8[:,::1]," + table
-    return step_blocks.compile(f"void({arrays}f8,f8,f8,i8,i8,i8,{row}{table}f8[:,:,::1])")
+    """Machine code of `step_blocks`, contiguous arrays only: numba's look at the types takes a fifth of a step."""
+    return step_blocks.compile("void(f8[:,:,::1],i8[::1],f8[::1],f8,f8,f8,i8,f8[::1],f8[:,::1],f8[:,:,::1])")
 
 
 # --- Simulator of the identified vehicle: stepped, one vehicle or a batch of them, or flown along rotor speeds
@@ -514,7 +526,6 @@ class Simulator:
         self._geometry, self._hub, self._plan, self._reach = hub_geometry(vehicle)
         flat = self._theta.reshape(blocks * LANES, -1)
         self._need: Needs = needs_of(flat, len(vehicle.rotors), 15)
-        self._needs = np.array(self._need, dtype=np.bool_)
         filters = ((G_W, 18, self._need.imu_lag), (E_QW, 4, self._need.ahrs), (L_NOW, 6, self._need.learned))
         kept = [(X_QW, N_STATE), *((row, count) for row, count, needed in filters if needed), (SENSED, SENSORS)]
         self._kept = np.array([(row, row + LANES * count) for row, count in kept])
@@ -597,8 +608,7 @@ class Simulator:
 
     def advance(self, state: State, command: ArrayLike, dt: float, voltage: float | None = None) -> None:
         """Makes one step in place; arguments as for `step`."""
-        given = np.ascontiguousarray(command, dtype=np.float64)
-        self._march(state, given[None, None] if given.ndim == 1 else given[None], dt, voltage)
+        self._march(state, np.array(command, np.float64, copy=None, order="C", ndmin=3), dt, voltage)
 
     def run(self, state: State, commands: ArrayLike, dt: float) -> FloatArray:
         """Makes a step a row of commands, in place.
@@ -647,8 +657,8 @@ class Simulator:
             exponent = self._theta[..., ix.EXPONENT].reshape(-1)[: state.vehicles]
             commands = commands * voltage ** exponent[None, :, None]
         compiled_steps()(
-            commands, *self._fixed, state.time, self._span, dt, self._seed, state.steps, self._delayed, state._work,
-            state._memory, out,
+            commands, self._ints, self._numbers, state.time, self._span, dt, state.steps, state._work, state._memory,
+            out,
         )  # fmt: skip
         state.time += len(commands) * dt
         state.steps += len(commands)
@@ -663,7 +673,7 @@ class Simulator:
         write_constants(self._theta, flight, self._coefficients, constants, rot)
         differ = (constants != constants[0]).any(axis=0).reshape(-1, LANES).any(axis=1)
         own = LANES * np.flatnonzero(np.diff(differ, prepend=False, append=False)).reshape(-1, 2)
-        self._constants = np.ascontiguousarray(constants[:, np.repeat(differ, LANES)])
+        self._constants = constants[:, np.repeat(differ, LANES)]
         self._prepared = np.concatenate([constants[0], np.zeros(WORK - STATE)])
         self._delayed = math.floor(max(float(self._theta[..., ix.DELAY].max()), 0.0) / dt) + 2
         self._late = math.ceil(max(float(self._theta[..., ix.ATT_DELAY].max()), 0.0) / dt) + 2
@@ -674,8 +684,12 @@ class Simulator:
             size, time = self.random.each_axis
             keep = np.exp(-dt / time)
             walk = np.array([keep, size * np.sqrt(1.0 - keep**2)])
-        model = (self._geometry, self._theta, self._terms, self._coefficients, self._needs)
-        self._fixed = (*model, own, self._constants, self._kept, walk)
+        rotors, seed, kept = len(self._geometry), self._seed, int(np.diff(self._kept).sum())
+        counts = (rotors, self._theta.shape[-1], len(self._terms), len(own), len(self._kept), kept, self._delayed)
+        stretches = (own.ravel(), self._kept.ravel(), self._terms.ravel())
+        self._ints = np.concatenate([[*counts, len(walk) // 2, seed, *self._need], *stretches]).astype(np.int64)
+        parts = (self._geometry, walk, self._theta, self._coefficients, self._constants)
+        self._numbers = np.concatenate([part.ravel() for part in parts])
         self._dt = dt
         return rot
 

@@ -24,6 +24,12 @@ TO_FLU = np.array([1.0, -1.0, -1.0])
 """Turns vectors of body FRD into FLU and of NED into NWU, and the vector part of the attitude likewise."""
 
 
+@pytest.fixture(autouse=True)
+def array_api(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Sets what drone-models asks for before it lets itself be imported."""
+    monkeypatch.setenv("SCIPY_ARRAY_API", "1")
+
+
 class Motion(NamedTuple):
     """Attitude wxyz, rate, velocity, position; FRD and NED."""
 
