@@ -31,6 +31,10 @@ AT_BOUND = 1e-3
 """Distance from a bound, relative to it, within which a value rests on it: what stands there is the bound, not data."""
 
 
+FLOOR = 0.1
+"""Least relative standard deviation with which vehicles are drawn in a parameter that no flight has shown."""
+
+
 def at_bound(value: float, low: float, high: float) -> bool:
     """Checks whether `value` rests on one of its bounds; a bound of zero has the scale of the other one."""
     scale = (abs(low) or abs(high), abs(high) or abs(low))
@@ -151,7 +155,7 @@ class ParameterSet:
         scale = np.where(sigma > 0.0, sigma, np.inf)
         return np.asarray(self.covariance / np.outer(scale, scale))
 
-    def sample(self, n: int, seed: int = 0, floor: float = 0.1) -> tuple[FloatArray, dict[str, str]]:
+    def sample(self, n: int, seed: int = 0, floor: float = FLOOR) -> tuple[FloatArray, dict[str, str]]:
         """Draws parameter values from the joint covariance, as logarithms, so that none changes its sign.
 
         A parameter that this flight did not identify has at least the spread `floor`: what was not measured is never

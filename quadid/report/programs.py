@@ -15,7 +15,7 @@ from quadid.chi_square import Z95
 from quadid.effects import EFFECTS, rotor_losses
 from quadid.errors import ParameterError, nearest
 from quadid.model.layout import ThrustModel
-from quadid.parameters import NOMINAL_UNITS
+from quadid.parameters import FLOOR, NOMINAL_UNITS
 from quadid.report.templating import render
 from quadid.types import FloatArray
 from quadid.vehicle import GRAVITY, Vehicle
@@ -72,10 +72,17 @@ class Facts:
         return f"fitted, or given with its uncertainty: 95 % within {100.0 * Z95 * prior.sigma / prior.initial:.2g} %"
 
     def interval(self, name: str, scale: float = 1.0) -> tuple[float, float]:
-        """95 % interval of a nominal parameter on the log scale, times `scale`; no width for what was not measured."""
+        """95 % interval of a nominal parameter on the log scale, times `scale`; see `around` for what has no sigma."""
         prior = self.vehicle.parameters[name]
-        half = Z95 * (prior.sigma or 0.0) / prior.initial
-        return scale * prior.initial * math.exp(-half), scale * prior.initial * math.exp(half)
+        return self.around(scale * prior.initial, FLOOR if prior.sigma is None else prior.sigma / prior.initial)
+
+    def around(self, value: float, sigma: float = FLOOR) -> tuple[float, float]:
+        """95 % interval of a positive number; as `ParameterSet.sample` draws it, never without width."""
+        return value * math.exp(-Z95 * sigma), value * math.exp(Z95 * sigma)
+
+    def assumed(self, name: str) -> str:
+        """Remark for a reader of `interval`; empty where the vehicle file has a sigma."""
+        return "" if self.vehicle.parameters[name].sigma is not None else f"not measured: {FLOOR:.0%} assumed"
 
     @cached_property
     def rotors(self) -> list[RotorFacts]:
@@ -482,7 +489,7 @@ def isaac_lab(facts: Facts) -> dict[str, Any]:
     arms, none = facts.arms_flu, np.zeros(len(facts.rotors))
     twist = facts.torque_per_thrust * np.array([r.turn_flu for r in facts.rotors])
     allocation = np.array([none, none, none + 1.0, arms[:, 1], -arms[:, 0], twist])
-    told = {"allocation": allocation, "turn": 2.0 * math.pi, "spread": Z95 * facts.vehicle.mass_sigma}
+    told = {"allocation": allocation, "turn": 2.0 * math.pi, "floor": FLOOR, "spread": Z95 * facts.vehicle.mass_sigma}
     if facts.vehicle.random is None:
         return told
     size, time = facts.vehicle.random.each_axis
