@@ -588,7 +588,7 @@ class Simulator:
             np.repeat(rows[:, None, :7], 2 * self._late, axis=1),
         )
         kept, none = np.concatenate([m.reshape(blocks, -1) for m in memory], axis=1), _NO_CONSTANTS
-        return State(time, 0, n, kept, rotors, int(np.diff(self._kept).sum()), dt, none, none)
+        return State(time, 0, n, kept, rotors, self._width[0], dt, none, none)
 
     def step(self, state: State, command: ArrayLike, dt: float, voltage: float | None = None) -> State:
         """Returns the state after one step; `state` stays as it is.
@@ -608,7 +608,10 @@ class Simulator:
 
     def advance(self, state: State, command: ArrayLike, dt: float, voltage: float | None = None) -> None:
         """Makes one step in place; arguments as for `step`."""
-        self._march(state, np.array(command, np.float64, copy=None, order="C", ndmin=3), dt, voltage)
+        given = np.array(command, np.float64, copy=None, order="C", ndmin=3)
+        if len(given) != 1:
+            raise WindowError(f"commands of shape {given.shape}", f"{self._each}", "`run` makes several steps")
+        self._march(state, given, dt, voltage)
 
     def run(self, state: State, commands: ArrayLike, dt: float) -> FloatArray:
         """Makes a step a row of commands, in place.
@@ -650,7 +653,7 @@ class Simulator:
             if (state.vehicles, state._rotors) != self._each:
                 found = f"a state of {state.vehicles} vehicles with {state._rotors} rotors"
                 raise WindowError(found, f"{self.vehicles} with {self._each[1]}, as the simulator has")
-            if state._memory.shape[1] != self._width:
+            if (state._kept, state._memory.shape[1]) != self._width:
                 raise WindowError("a state of other delays or filters", "one of this simulator's `start`")
             state._work, state._constants = self._prepared.copy(), self._constants
         if voltage is not None:
@@ -677,14 +680,15 @@ class Simulator:
         self._prepared = np.concatenate([constants[0], np.zeros(WORK - STATE)])
         self._delayed = math.floor(max(float(self._theta[..., ix.DELAY].max()), 0.0) / dt) + 2
         self._late = math.ceil(max(float(self._theta[..., ix.ATT_DELAY].max()), 0.0) / dt) + 2
-        rotors = len(self._geometry) * (ROTOR // LANES + 2 * self._delayed)
-        self._width = int(np.diff(self._kept).sum()) + LANES * (rotors + TURNS + 14 * self._late)
+        rotors, kept = len(self._geometry), int(np.diff(self._kept).sum())
+        each = rotors * (ROTOR // LANES + 2 * self._delayed) + TURNS + 14 * self._late
+        self._width = (kept, kept + LANES * each)
         walk = np.empty((0, TURNS))
         if self.random is not None:
             size, time = self.random.each_axis
             keep = np.exp(-dt / time)
             walk = np.array([keep, size * np.sqrt(1.0 - keep**2)])
-        rotors, seed, kept = len(self._geometry), self._seed, int(np.diff(self._kept).sum())
+        seed = self._seed
         counts = (rotors, self._theta.shape[-1], len(self._terms), len(own), len(self._kept), kept, self._delayed)
         stretches = (own.ravel(), self._kept.ravel(), self._terms.ravel())
         self._ints = np.concatenate([[*counts, len(walk) // 2, seed, *self._need], *stretches]).astype(np.int64)

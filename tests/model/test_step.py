@@ -181,6 +181,7 @@ def test_random_inputs_repeat_and_have_their_size() -> None:
     [
         (lambda s, x: s.step(x, np.zeros(3), 0.01), "commands of shape"),
         (lambda s, x: s.step(x, np.zeros((2, 4)), 0.01), "commands of shape"),
+        (lambda s, x: s.step(x, np.zeros((3, 1, 4)), 0.01), "commands of shape"),
         (lambda s, x: s.step(x, np.zeros(4), 0.0), "dt 0.0 s"),
         (lambda s, x: s.start(attitude=np.zeros(3)), "shapes"),
         (lambda s, x: s.start(dt=float("nan")), "dt nan s"),
