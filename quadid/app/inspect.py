@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from quadid_replay import open_log
 
 from quadid.app.logs import (
     GRID,
@@ -21,6 +20,7 @@ from quadid.app.logs import (
     left_on_ground,
     names_of,
     parse_part,
+    read_log,
     standing,
     write_text,
 )
@@ -129,8 +129,7 @@ def inspect(
         whole = None
     described = None if vehicle is None else Vehicle.named(vehicle)
     if whole is None:
-        named = {} if described is None else described.columns
-        whole = open_log(cut.path, preset, {**named, **(columns or {})})
+        whole = read_log(cut.path, preset, described, columns)
     found = replace(inspect_recording(cut.of(whole), described), zero=whole.first_imu_time)
     flown = flown_parts(whole, found.flying, cut)
     if described is not None and found.usable:  # after an error nothing later is asked: it would be as wrong

@@ -389,9 +389,28 @@ def load(
     start_reading()
     described = Vehicle.named(vehicle)
     cut = replace(parse_part(str(log), start, stop), checked=not unchecked)
-    recording = open_log(cut.path, preset, {**described.columns, **(columns or {})})
+    recording = read_log(cut.path, preset, described, columns)
     require_gyro(recording)
     return _read(cut.path.resolve(), recording, described, rate, cut)
+
+
+def read_log(
+    path: Path, preset: str = "auto", vehicle: Vehicle | None = None, columns: Mapping[str, str] | None = None
+) -> Recording:
+    """Opens a log with the columns that a vehicle file names, and others; says where these are of no use.
+
+    Args:
+        path: of the log.
+        preset: topic names of ROS logs.
+        vehicle: whose file may name columns.
+        columns: as of `load`.
+    """
+    recording = open_log(path, preset, {**({} if vehicle is None else vehicle.columns), **(columns or {})})
+    if not columns or recording.format == "csv":
+        return recording
+    given = ", ".join(columns.values())
+    note = f"columns are named for CSV ({given}), and this is {recording.format}: its channels are found by themselves"
+    return replace(recording, warnings=(*recording.warnings, note))
 
 
 def require_gyro(recording: Recording) -> None:

@@ -589,13 +589,22 @@ def _moving_rates(gyro: Channel, t: FloatArray, q: FloatArray) -> tuple[FloatArr
     longer = _without_jumps(*_rates(gyro, t[:: 2 * stride], q[:: 2 * stride]))[1]
     if len(longer) < _FEWEST_STEPS:
         return longer[:0], longer[:0]
-    total = np.var(derived, axis=0)
-    motion = np.maximum((4.0 * np.var(longer, axis=0) - total) / 3.0, 0.0)
+    total, twice = _steady_variance(derived), _steady_variance(longer)
+    motion = np.maximum((4.0 * twice - total) / 3.0, 0.0)
     if max(np.max(np.sqrt(motion)), np.max(np.std(measured, axis=0))) < _MOTION:
         return longer[:0], longer[:0]
     if np.sum(motion) > 0.8 * np.sum(total) or len(t) < 20 * 4 * stride:
         return measured, derived
     return _rates(gyro, t[:: 4 * stride], q[:: 4 * stride])
+
+
+def _steady_variance(rates: FloatArray) -> FloatArray:
+    """Variance about each axis without the twentieth of the rows that turn most: resets that noise hides are no motion.
+
+    What a vehicle does for so short a time only is seen by the gyro.
+    """
+    size = np.linalg.norm(rates - np.median(rates, axis=0), axis=1)
+    return np.asarray(np.var(rates[size <= np.quantile(size, 0.95)], axis=0))
 
 
 def _without_jumps(measured: FloatArray, derived: FloatArray, *more: FloatArray) -> tuple[FloatArray, ...]:

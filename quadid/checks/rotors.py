@@ -1180,21 +1180,26 @@ def _unlikely(vehicle: Vehicle, scale: float, hover: float, numbers: dict[str, f
     power = np.einsum("ki,ij,kj->k", ways, weights, ways)
     found = ways @ weights @ off / power
     surprise = np.abs(found) * np.sqrt(power)
-    which = int(np.argmax(surprise))
-    if surprise[which] < _ASKED:
+    asked = np.flatnonzero(surprise >= _ASKED)
+    if not len(asked):
         return None
-    what, stated, unit = (("arm", vehicle.arm, "m"), ("mass", vehicle.mass, "kg"))[which]
-    low, high = stated * np.exp(-found[which] + np.array([-2.0, 2.0]) / np.sqrt(power[which]))
-    doubt = _heavier(math.exp(found[which])) if which else _farther(math.exp(-found[which]))
+    # Where either would do, nothing shows which, or that both are wrong: both are asked for.
+    stated, fits, doubts = [], [], []
+    for k in asked.tolist():
+        kind, now, unit = (("arm", vehicle.arm, "m"), ("mass", vehicle.mass, "kg"))[k]
+        low, high = now * np.exp(-found[k] + np.array([-2.0, 2.0]) / np.sqrt(power[k]))
+        stated.append(f"the {kind} {now:.3g} {unit}")
+        fits.append(f"the {kind}: {low:.2g} to {high:.2g} {unit} would fit")
+        doubts.append(_heavier(math.exp(found[k])) if k else _farther(math.exp(-found[k])))
     return Check(
         "geometry",
         CheckResult.WARNING,
-        f"is the {what} {stated:.3g} {unit}? Weight and motion make the inertia about x and y {size:.2g} times mass "
-        f"times arm squared ({_SHARE:g} on most vehicles) and {hover / scale:.2g} times its guess, and b "
-        f"{hover / guessed:.2g} times its guess",
-        f"measure the {what}: {low:.2g} to {high:.2g} {unit} would fit",
+        f"{'are' if len(stated) > 1 else 'is'} {' and '.join(stated)} right? Weight and motion make the inertia about "
+        f"x and y {size:.2g} times mass times arm squared ({_SHARE:g} on most vehicles) and {hover / scale:.2g} times "
+        f"its guess, and b {hover / guessed:.2g} times its guess",
+        f"measure {', and '.join(fits)}",
         {**numbers, "size": size},
-        doubt if surprise[which] > _DOUBTED else {},
+        farthest(doubts) if surprise.max() > _DOUBTED else {},
     )
 
 

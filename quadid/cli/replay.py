@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from quadid_replay import TopicWriter, open_log
+from quadid_replay import TopicWriter
 
 from quadid.app import options
 from quadid.app.logs import written_whole
@@ -69,7 +69,7 @@ def replay(
     from quadid_node.worker import InlineWorker
 
     from quadid.app.kernels import FIT
-    from quadid.app.logs import parse_columns, parse_part
+    from quadid.app.logs import parse_columns, parse_part, read_log
     from quadid.cli import terminal
     from quadid.vehicle import Vehicle
 
@@ -85,7 +85,7 @@ def replay(
         raise ReplayError(f"--as-recorded of {log}, a part", "whole recordings", f"--as-recorded {cut.path}")
     with terminal.progress(FIT) as advance:
         advance(f"reading {cut.path.name}", 0.0)
-        recording = cut.of(open_log(cut.path, preset, described.columns | parse_columns(columns or [])))
+        recording = cut.of(read_log(cut.path, preset, described, parse_columns(columns or [])))
         if as_recorded:
             beginning = _beginning(Path(log), described.name)
             described = beginning.vehicle

@@ -454,7 +454,8 @@ class Resampler:
         self._reconstruction = CommandReconstruction(vehicle)
         self._early: deque[tuple[FloatArray, dict[str, Measured]]] = deque(maxlen=MOST_EARLY)
         self._apart: dict[str, tuple[int, int]] = {}
-        self._leads = 0
+        self._leads = self._idle = 0
+        self._led = math.nan
         self._told: set[str] = set()
         self._stretches: deque[_Stretch] = deque()
         self._stretch: _Stretch | None = None
@@ -506,15 +507,18 @@ class Resampler:
         room = MOST_SAMPLES - self._buffers[LEADER].waiting
         if len(stamps) > room:
             self.faults[f"{LEADER}: flood"] += len(stamps) - room
-        elif self.time.newest == -math.inf and len(stamps) > 1:
-            self._lead(stamps[:1], _part(columns, slice(1)))
-            self._lead(stamps[1:], _part(columns, slice(1, None)))
-            return
         stamps, columns = stamps[:room], _part(columns, slice(room))
+        times = np.abs(stamps) <= LARGEST
+        begun = int(times.argmax()) + 1 if self.time.newest == -math.inf and times.any() else len(stamps)
+        if begun < len(stamps):
+            self._lead(stamps[:begun], _part(columns, slice(begun)))
+            self._lead(stamps[begun:], _part(columns, slice(begun, None)))
+            return
         self._leads += len(stamps)
         # Session times, and how far the stream had come before each; where it jumps, another stretch begins.
         before = self.time.newest
         t = self.time.lead(stamps)
+        self._watch_leader(stamps, np.isnan(t) | (np.diff(stamps, prepend=self._led) == 0.0))
         reached = np.fmax.accumulate(np.concatenate([[before], t]))[:-1]
         for k in np.flatnonzero(t > reached + HISTORY).tolist():
             new_clock = self.time.began_in(float(reached[k]), float(t[k]))
@@ -531,6 +535,21 @@ class Resampler:
                 self._take(followers[1], self.time.follow(followers[0]), np.full(1, -math.inf))
                 self.counts.subtract(list(followers[1]))
         self._take(columns, t, reached)
+
+    def _watch_leader(self, stamps: FloatArray, idle: BoolArray) -> None:
+        """Notes that the gyro's clock stands: most messages, those `idle`, bring the stamp before or none to believe.
+
+        A message in three that goes on is enough: the same ones may come over several ways.
+        """
+        if self._idle or idle.any():
+            for stamp, stands in zip(stamps.tolist(), idle.tolist(), strict=True):
+                self._idle = self._idle + 1 if stands else max(self._idle - 2, 0)
+                if self._idle == APART:
+                    why = f"time stands still: stamps of the gyro do not go on from {stamp:.12g} s, or are no times"
+                    self._notice(LEADER, f"{why}; fix: stamp each message when it is measured, in seconds")
+            if not self._idle:
+                self._told.discard(LEADER)
+        self._led = float(stamps[-1]) if len(stamps) else self._led
 
     def _follow(self, stamps: FloatArray, columns: Mapping[str, Measured]) -> None:
         """Takes messages of other channels: none moves the clock."""

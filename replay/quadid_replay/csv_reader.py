@@ -157,8 +157,6 @@ def _renamed(names: list[str], columns: Mapping[str, str], origin: str) -> list[
     """Gives columns the contract's names; a column that loses its own to another is not used under it."""
     theirs = {}
     for own, given in columns.items():
-        if own not in ("t", *_known()) and not any(pattern.fullmatch(own) for pattern in _ROTOR.values()):
-            raise LogError(f"`columns`: unknown name '{plain(own, 40)}'", ", ".join(_known()), nearest(own, _known()))
         if given not in names:
             raise LogError(
                 f"{origin}: no column {plain(given, 40)}, which `columns` names for {plain(own, 40)}",
@@ -167,6 +165,13 @@ def _renamed(names: list[str], columns: Mapping[str, str], origin: str) -> list[
             )
         theirs[given] = own
     return [theirs.get(name, f"({name})" if name in columns else name) for name in names]
+
+
+def check_columns(columns: Mapping[str, str]) -> None:
+    """Raises LogError for a name that is none of the contract's, whatever the format of the log."""
+    for own in columns:
+        if own not in ("t", *_known()) and not any(pattern.fullmatch(own) for pattern in _ROTOR.values()):
+            raise LogError(f"`columns`: unknown name '{plain(own, 40)}'", ", ".join(_known()), nearest(own, _known()))
 
 
 def _known() -> list[str]:

@@ -72,6 +72,10 @@ def open_log(path: str | Path, preset: str = AUTO, columns: Mapping[str, str] | 
     """
     file = Path(path)
     preset_rank(preset, "gyro", "")  # an unknown preset is an error whatever the file is
+    if columns:
+        from quadid_replay.csv_reader import check_columns
+
+        check_columns(columns)
     kind = kind_of(file, columns)
     allowed = limits(stored_size(file))
     request = {

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import pytest
@@ -173,6 +173,33 @@ def test_without_a_gyro_nothing_grows() -> None:
     assert len(buffer._early) == MOST_EARLY
     assert [channel for channel, _ in buffer.notices] == ["gyro"]
     assert buffer.next_rows() is None
+
+
+@pytest.mark.parametrize(
+    ("stamp", "stands"),
+    [
+        (lambda t: min(t, EPOCH + 4.0), True),
+        (lambda t: np.floor(t), True),
+        (lambda t: np.floor(10.0 * t) / 10.0, True),
+        (lambda t: 1e9 * t, True),
+        (lambda t: np.nan, True),
+        (lambda t: np.floor(25.0 * t) / 25.0, False),  # each message over two ways
+        (lambda t: t + 100.0 * (round(50.0 * t) % 2), False),
+    ],
+)
+def test_a_clock_that_stands_is_named(stamp: Callable[[float], float], stands: bool) -> None:
+    """Nothing was said of it; the status stayed as it was before."""
+    stream = [type(s)(stamp(s.t), s.channel, s.values) for s in samples(flight(8.0).recording, EPOCH)]
+    _, buffer = run(stream)
+    assert [channel for channel, text in buffer.notices if text.startswith("time stands still")] == ["gyro"] * stands
+
+
+def test_a_message_of_stamps_that_are_no_times_is_refused_as_a_whole() -> None:
+    """It once ended in a RecursionError, from a thousand stamps on."""
+    buffer = Resampler(PELICAN)
+    buffer.push(Block(np.append(np.full(3000, np.nan), EPOCH), (("gyro", np.zeros((3001, 3))),)))
+    assert buffer.faults["gyro: unconfirmed time"] == 3000
+    assert buffer.counts["gyro"] == 1
 
 
 def test_a_few_odd_samples_are_no_notice() -> None:

@@ -7,8 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from quadid_replay import open_log, write_csv
+from quadid_replay import open_log, write_csv, write_mcap
 
+import quadid
 from quadid.checks import CheckResult, inspect
 from quadid.data.grid import to_windows
 from quadid.data.window import mounting_matrix
@@ -39,6 +40,18 @@ def test_columns_are_read_under_the_names_of_the_vehicle_file(tmp_path: Path) ->
         np.testing.assert_array_equal(found.channels[name].values, channel.values)
     with pytest.raises(LogError, match=r"no column gyro_X, which `columns` names for p.*did you mean 'gyro_"):
         open_log(path, columns={**NAMES, "p": "gyro_X"})
+
+
+def test_names_of_columns_are_no_matter_of_the_format(tmp_path: Path) -> None:
+    """A misspelt name was said of CSV alone, and that names are of no use to other formats was not."""
+    path = tmp_path / "flight.mcap"
+    write_mcap(path, full_recording(4.0, 50.0))
+    with pytest.raises(LogError, match="unknown name 'pp'.*did you mean 'p'"):
+        quadid.inspect(path, columns={"pp": "gyro_x"})
+    said = quadid.inspect(path, columns={"p": "gyro_x"}).warnings
+    assert [text for text in said if "gyro_x" in text and "mcap" in text]
+    described = with_keys(columns=NAMES)
+    assert not [text for text in quadid.inspect(path, vehicle=described).warnings if "columns" in text]
 
 
 def test_an_imu_that_sits_turned_is_turned_back() -> None:

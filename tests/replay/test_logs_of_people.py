@@ -23,7 +23,7 @@ from quadid.checks import Check, CheckResult, inspect
 from quadid.checks.motion import attitude_steps_check
 from quadid.data.window import Channel, Recording
 from quadid.errors import LogError, QuadidError
-from quadid.rotation import euler
+from quadid.rotation import euler, product
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 
@@ -518,6 +518,27 @@ def test_motors_by_function() -> None:
     assert motor_columns([103, 0, 101, 102]) == [2, 3, 0]
     assert motor_columns([101, 103]) == []
     assert motor_columns([0, 0]) == []
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_several_heading_resets_in_a_hover_are_no_rotation(data_dir: Path, seed: int) -> None:
+    """Four within 6 s, each too small to stand out of the noise, were "gyro does not follow the attitude"."""
+    hover = open_log(data_dir / "findings" / "logs" / "heading_reset_hover" / "hover.csv")
+    attitude, rng = hover.channels["attitude"], np.random.default_rng(seed)
+    heading = np.zeros(len(attitude.t))
+    for at in rng.uniform(2.0, 8.0, 4):
+        heading[attitude.t > at] += np.radians(rng.choice([-8, -5, -3, -2, 2, 3, 5, 8]))
+    turned = product(from_euler(np.outer(heading, [0.0, 0.0, 1.0])), attitude.values)
+    found = verdict(with_channel(hover, "attitude", turned), "gyro_attitude")
+    assert found.verdict is CheckResult.UNKNOWN
+    assert "too little rotation" in found.message
+
+
+def test_a_gyro_that_reads_nothing_is_named_beside_an_attitude_that_moves(flight: Recording) -> None:
+    still = with_channel(
+        flight, "gyro", 1e-3 * np.random.default_rng(1).normal(size=(len(flight.channels["gyro"].t), 3))
+    )
+    assert verdict(still, "gyro_attitude").verdict is CheckResult.ERROR
 
 
 def test_a_ground_contact_inside_the_flight_is_left_out(flight: Recording) -> None:

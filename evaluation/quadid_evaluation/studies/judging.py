@@ -294,6 +294,12 @@ def heavier(r: Recording, v: Vehicle) -> Log:
     return r, v.model_copy(update={"mass": 1.3 * v.mass})
 
 
+def oversized(r: Recording, v: Vehicle) -> Log:
+    """A vehicle file with 1.5 times the mass and the arms."""
+    r, v = placed(lambda x, y: (1.5 * x, 1.5 * y))(r, v)
+    return r, v.model_copy(update={"mass": 1.5 * v.mass})
+
+
 ORDER = "reorder the rotors|in the order"
 LATE_ROTORS = "lags its effect|rotor speeds are late|not in time with the gyro"
 MISTAKES: tuple[Mistake, ...] = (
@@ -367,6 +373,7 @@ MISTAKES: tuple[Mistake, ...] = (
     Mistake("positions mirrored", placed(lambda x, y: (x, -y)), f"{ORDER}|mirror"),
     Mistake("arms 1.35 times", placed(lambda x, y: (1.35 * x, 1.35 * y)), "arm"),
     Mistake("mass 1.3 times", heavier, "mass|weigh"),
+    Mistake("arms and mass 1.5 times", oversized, "the arm .* and the mass"),
 )
 
 
