@@ -30,7 +30,7 @@ from quadid_replay.schemas import has_definition, schema_text
 class Topic(NamedTuple):
     """One channel of the file; all but the definition is fit to be shown.
 
-    `unread` says of which kind a definition is that cannot be used; the type is empty then.
+    The definition is empty where none can be used; `unread` says of which kind it is then, if there is one.
     """
 
     name: str
@@ -148,13 +148,13 @@ class McapFile:
 
     @property
     def topics(self) -> dict[int, Topic]:
-        """Topics by channel id; those without a readable definition have an empty type."""
+        """Topics by channel id."""
         out = {}
         for number, channel in self._channels.items():
             schema = self._schemas.get(channel.schema_id)
             held = schema.data.decode("utf-8", "replace") if schema else ""
             text = usable_definition(schema.name, schema.encoding, held) if schema else ""
-            kind = schema.name if schema and text else ""
+            kind = schema.name if schema else ""
             idl = f"{plain(schema.name, 60)} is described in IDL" if schema and schema.encoding == "ros2idl" else ""
             out[number] = Topic(plain(channel.topic), plain(kind), text, plain(channel.message_encoding), idl)
         return out

@@ -113,8 +113,7 @@ class Database:
             if not isinstance(number, int):
                 continue
             text = usable_definition(str(kind), *definitions.get(str(kind), ("", "")))
-            shown = plain(str(kind)) if text else ""
-            out[number] = Topic(plain(str(name)), shown, text, plain(str(encoding)))
+            out[number] = Topic(plain(str(name)), plain(str(kind)), text, plain(str(encoding)))
         return out
 
     def _damaged(self, error: Exception) -> LogError:
@@ -209,9 +208,9 @@ def _sources(bag: Bag, preset: str, notes: list[str]) -> dict[int, TopicSource]:
     """Picks the topics whose type is known and whose name the preset lists for one of its channels."""
     sources = {}
     for number, topic in bag.topics.items():
-        if not topic.type and topic.unread:
+        if not topic.definition and topic.unread:
             notes.append(f"{topic.name}: {topic.unread}: not read; record it with a ros2msg definition")
-        kind = TYPES.get(type_name(topic.type))
+        kind = TYPES.get(type_name(topic.type)) if topic.definition else None
         if kind is None or topic.encoding != "cdr":
             continue
         listed = [preset_rank(preset, channel, topic.name) for channel in {c for c, _ in SIGNALS.values()}]
@@ -271,8 +270,10 @@ def _unused(signal: str, topic: Topic, values: FloatArray) -> bool:
 
 
 def _no_topic(path: Path, bag: Bag, preset: str, notes: list[str]) -> LogError:
-    unread = "type without a readable definition"
-    found = ", ".join(f"{t.name} [{type_name(t.type) or t.unread or unread}]" for t in list(bag.topics.values())[:5])
+    found = ", ".join(
+        f"{t.name} [{type_name(t.type) if t.definition else t.unread or f'{type_name(t.type)}, no definition held'}]"
+        for t in list(bag.topics.values())[:5]
+    )
     damage = plain("; ".join([*bag.damage(), *notes[:4]]), 600)
     reason = f" ({damage})" if damage else ""
     if damage and not bag.topics:

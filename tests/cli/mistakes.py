@@ -19,6 +19,7 @@ import numpy as np
 import yaml
 
 import quadid
+from quadid.rotation import conjugate, product
 from quadid.vehicle import Vehicle
 
 Rows = np.ndarray
@@ -109,22 +110,29 @@ class Place:
         told = {n: factor * Vehicle.shipped("pelican").parameters[n].initial for n in ("J_xx", "J_yy", "J_zz")}
         return self.vehicle(parameters=known | told)
 
-    def spins(self) -> Path:
-        """A Pelican file whose rotors all turn the other way."""
+    def spins(self, *turned: int) -> Path:
+        """A Pelican file whose rotors, all or those named (from 0), turn the other way."""
         rotors = yaml.safe_load(Vehicle.shipped("pelican").to_yaml())["rotors"]
-        return self.vehicle(rotors=[{**r, "spin": -r["spin"]} for r in rotors])
+        which = turned or range(len(rotors))
+        return self.vehicle(
+            rotors=[{**r, "spin": -r["spin"] if k in which else r["spin"]} for k, r in enumerate(rotors)]
+        )
 
     def template(self) -> Path:
         """A vehicle file as `quadid init` writes it."""
         text = Vehicle.shipped("pelican").to_yaml()
         return self.bytes("vehicle.yaml", text.replace("mass: 1.3", "mass: 1.3  # FILL IN: weigh it").encode())
 
-    def of_rotors(self, change: Callable[[Rows], Rows]) -> Path:
-        """The flight with rotor speeds changed."""
+    def changed(self, columns: str, change: Callable[[Rows], Rows]) -> Path:
+        """The flight with some columns changed."""
         names, rows = self.table()
-        places = [names.index(f"w{k}") for k in (1, 2, 3, 4)]
+        places = [names.index(n) for n in columns.split()]
         rows[:, places] = change(rows[:, places])
         return self.write(names, rows)
+
+    def of_rotors(self, change: Callable[[Rows], Rows]) -> Path:
+        """The flight with rotor speeds changed."""
+        return self.changed("w1 w2 w3 w4", change)
 
     def late(self, columns: str, count: int) -> Path:
         """The flight with some columns so many rows later."""
@@ -157,6 +165,15 @@ class Place:
         new[:, names.index("p")] = p + heading * np.sin(pitch)
         new[:, names.index("q")] = q * np.cos(roll) - r * np.sin(roll)
         new[:, names.index("r")] = heading
+        return self.write(names, new)
+
+    def differentiated(self) -> Path:
+        """The flight with the turn of the attitude from row to row in place of the gyro."""
+        names, rows = self.table()
+        q = rows[:, [names.index(n) for n in ("qw", "qx", "qy", "qz")]]
+        turned = 2.0 * product(conjugate(q[:-1]), np.diff(q, axis=0))[:, 1:] / np.diff(rows[:, :1], axis=0)
+        new = rows[:-1].copy()
+        new[:, [names.index(n) for n in "pqr"]] = turned
         return self.write(names, new)
 
     def clipped(self) -> Path:
@@ -261,6 +278,11 @@ MISTAKES = (
     Mistake("vertical velocity upwards", fit(lambda p: p.scaled("vz", -1.0)), "points up"),
     Mistake("height in place of z", fit(lambda p: p.scaled("z", -1.0)), "points up"),
     Mistake("spins reversed", of(lambda p: p.spins()), "negate the spins"),
+    Mistake("spin of one rotor reversed", of(lambda p: p.spins(2)), "spin of rotor 3"),
+    Mistake("rotor speeds of the electrical field", fit(lambda p: p.scaled("w1 w2 w3 w4", 7.0)), "electrical"),
+    Mistake(
+        "a rotor sensor that is dead", fit(lambda p: p.of_rotors(lambda w: w * [1, 0, 1, 1])), "rotor 2 reads nothing"
+    ),
     Mistake("rotor speeds 60 ms late", fit(lambda p: p.late("w1 w2 w3 w4", 3)), "lags its effect"),
     Mistake(
         "gyro 160 ms late", fit(lambda p: p.late("p q r", 8)), "gyro comes 1(5[789]|6[0123]) ms after the attitude"
@@ -271,6 +293,10 @@ MISTAKES = (
         "attitude comes 1(5[789]|6[0123]) ms after the gyro",
     ),
     Mistake("rates of Euler angles as gyro", fit(lambda p: p.euler_rates()), "rates of roll, pitch and yaw"),
+    Mistake("turns of the attitude as gyro", fit(lambda p: p.differentiated()), "differentiated"),
+    Mistake(
+        "attitude in steps", fit(lambda p: p.changed("qw qx qy qz", lambda q: 0.02 * np.round(q / 0.02))), "in steps"
+    ),
     Mistake("one axis of the gyro in degrees", fit(lambda p: p.scaled("r", 57.3)), "about z"),
     Mistake("one axis of the gyro not logged", fit(lambda p: p.scaled("q", 0.0)), "does not turn about y"),
     Mistake("an accelerometer that reads 30 % too much", fit(lambda p: p.scaled("ax ay az", 1.3)), "scale or zero"),
@@ -307,6 +333,11 @@ MISTAKES = (
         "a column named that is not there",
         lambda p: (*fit(lambda p: p.log)(p), "--columns", "gyrox=p"),
         "no column gyrox",
+    ),
+    Mistake(
+        "a column named as nothing is",
+        lambda p: (*fit(lambda p: p.mcap)(p), "--columns", "gyro_x=pp"),
+        "unknown name 'pp'",
     ),
     Mistake(
         "health of a flight that did not fly",
