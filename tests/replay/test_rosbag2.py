@@ -107,6 +107,17 @@ def test_what_is_no_recording_is_named(tmp_path: Path) -> None:
         open_log(tmp_path)
 
 
+def test_types_that_a_database_does_not_describe_are_named(tmp_path: Path, mcap: Path) -> None:
+    """Bags of a research group held one topic of its own type; the answer was "type without a readable definition"."""
+    (database,) = folder_of(mcap, tmp_path / "a", StoragePlugin.SQLITE3).glob("*.db3")
+    with sqlite3.connect(database) as connection:
+        connection.execute("DROP TABLE IF EXISTS message_definitions")
+        connection.execute("UPDATE topics SET type = 'foresee_msgs/msg/DynamicsData'")
+    connection.close()
+    with pytest.raises(LogError, match=r"imu \[foresee_msgs/DynamicsData, no definition held\]"):
+        open_log(database)
+
+
 def test_a_definition_in_idl_is_replaced_or_named(tmp_path: Path, mcap: Path) -> None:
     source = McapFile(mcap)
     (imu,) = (n for n, t in source.topics.items() if t.type == "sensor_msgs/msg/Imu")
