@@ -593,7 +593,9 @@ def _moving_rates(gyro: Channel, t: FloatArray, q: FloatArray) -> tuple[FloatArr
     motion = np.maximum((4.0 * twice - total) / 3.0, 0.0)
     if max(np.max(np.sqrt(motion)), np.max(np.std(measured, axis=0))) < _MOTION:
         return longer[:0], longer[:0]
-    if np.sum(motion) > 0.8 * np.sum(total) or len(t) < 20 * 4 * stride:
+    # Over longer steps a flip turns by more than half a turn, and looks like another one.
+    angle = float(np.max(np.linalg.norm(derived, axis=1))) * stride * sample_period(t)
+    if np.sum(motion) > 0.8 * np.sum(total) or 4.0 * angle > np.pi or len(t) < 20 * 4 * stride:
         return measured, derived
     return _rates(gyro, t[:: 4 * stride], q[:: 4 * stride])
 
