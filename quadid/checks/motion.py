@@ -132,10 +132,11 @@ def _stands(t: FloatArray, thrust: FloatArray, felt: FloatArray, gyro: Channel |
     fresh = np.append(~copied(gyro.values), True)  # a gyro that is stuck does not show that nothing turns
     turning = np.interp(t, gyro.t, np.where(fresh, np.linalg.norm(gyro.values, axis=1), 1.0))
     load, still = moving_mean(thrust / np.maximum(felt, 0.1), width), moving_mean(turning, width) < 0.15
+    carried = moving_mean(np.abs(felt - 1.0), width) < 0.15  # where a fall ends it passes 1
     little = load < 0.75
     if np.mean(little) > 0.3:  # then speeds disagree with the thrust, and nothing follows from them
         return np.zeros(len(t), dtype=bool)
-    stands = little & still & (np.abs(felt - 1.0) < 0.15)
+    stands = little & still & carried
     return np.asarray(moving_mean(stands.astype(np.float64), 2 * width) > 0.0)
 
 

@@ -223,11 +223,15 @@ def test_a_signal_that_moves_keeps_every_reading(flight: Recording) -> None:
         assert len(cleaned.t) == n, name
 
 
-def test_punches_and_falls_are_part_of_the_flight() -> None:
-    """Hover at a quarter of full command with climbs at 0.6 and falls at idle, between two rests on the ground."""
+@pytest.mark.parametrize(("climb", "share"), [(0.6, 0.2), (0.33, 0.7)])
+def test_punches_and_falls_are_part_of_the_flight(climb: float, share: float) -> None:
+    """Hover at a quarter of full command with climbs and falls at idle, between two rests on the ground.
+
+    Where climbs took most of the time, the flight began with the first of them.
+    """
     t = np.linspace(0.0, 39.98, 2000)
     command = np.full(len(t), 0.25)
-    command[(t % 8.0 > 6.5)] = 0.6
+    command[t % 8.0 > 8.0 * (1.0 - share)] = climb
     command[(t % 8.0 > 5.0) & (t % 8.0 < 6.0)] = 0.02
     ground = (t < 4.0) | (t > 36.0)
     command[ground] = 0.0
@@ -532,6 +536,27 @@ def test_several_heading_resets_in_a_hover_are_no_rotation(data_dir: Path, seed:
     found = verdict(with_channel(hover, "attitude", turned), "gyro_attitude")
     assert found.verdict is CheckResult.UNKNOWN
     assert "too little rotation" in found.message
+
+
+@pytest.mark.parametrize("every", [2.5, 12.0])
+def test_flips_are_followed_by_the_attitude(every: float) -> None:
+    """Over steps of 0.4 s a flip in half a second is another turn: the log was refused as if nothing agreed."""
+    t, rng = np.arange(0.0, 30.0, 0.01), np.random.default_rng(3)
+    phases = rng.uniform(0.0, 2.0 * np.pi, 3)
+    rates = 0.3 * np.sin(2.0 * np.pi * np.outer(t, [0.7, 1.1, 0.4]) + phases)
+    for k, at in enumerate(np.arange(4.0, 28.0, every)):
+        flip = (t >= at) & (t < at + 0.5)
+        rates[flip] = np.outer(8.0 * np.pi * np.sin(2.0 * np.pi * (t[flip] - at)) ** 2, np.eye(3)[k % 2])
+    turned = [Rotation.identity()]
+    for rate in rates[:-1]:
+        turned.append(turned[-1] * Rotation.from_rotvec(0.01 * rate))
+    noisy = Rotation.concatenate(turned) * Rotation.from_rotvec(0.002 * rng.standard_normal((len(t), 3)))
+    channels = {
+        "gyro": Channel("gyro", t + 0.005, rates + 0.01 * rng.standard_normal(rates.shape), "made"),
+        "attitude": Channel("attitude", t, noisy.as_quat()[:, [3, 0, 1, 2]], "made"),
+    }
+    found = next(c for c in inspect(Recording("made", "csv", channels)).checks if c.name == "gyro_attitude")
+    assert found.verdict is CheckResult.OK, found.message
 
 
 def test_a_gyro_that_reads_nothing_is_named_beside_an_attitude_that_moves(flight: Recording) -> None:
