@@ -38,6 +38,8 @@ _UNIT = 1.5
 """Two channels of one motion whose sizes are farther apart are of no use together."""
 _JUMP = 8.0
 """An attitude step of so many times the usual one, beside half as much of the gyro's, is no motion."""
+_FEW = 0.05
+"""Share of steps in which an estimator may reset its heading."""
 _FARTHEST, _LATE, _TOO_LATE = 0.3, 0.013, 0.08
 """Gyro and attitude are compared at times so far apart at most [s]; more than the second is named, for an autopilot's
 own filter at 20 Hz makes 12 ms, more than the third an error."""
@@ -417,12 +419,14 @@ def _angle_rates(gyro: Channel, attitude: Channel) -> Check | None:
     keep = usable_steps(t, gyro.t)
     angles = np.diff(np.unwrap(euler(q), axis=0), axis=0)[keep] / np.diff(t)[keep, None]
     measured, turned, angles = _without_jumps(measured, turned, angles)
-    apart, missed = angles - turned, measured - turned
-    size = float(np.sum(apart**2))
-    if len(apart) < FEWEST_SAMPLES or float(np.mean(apart**2)) < _MOTION**2:
+    if len(angles) < FEWEST_SAMPLES:
         return None
+    # On the axis about which they differ most; the others add their noise.
+    axis = int(np.argmax(np.sum((angles - turned) ** 2, axis=0)))
+    apart, missed = ((rates - turned)[:, axis] for rates in (angles, measured))
+    size = float(np.sum(apart**2))
     like = float(np.sum(apart * missed))
-    if like < 0.5 * size or like**2 < _CLEAR * size * float(np.sum(missed**2)):
+    if not size > 0.0 or like < 0.5 * size or like**2 < _CLEAR * size * float(np.sum(missed**2)):
         return None
     return Check(
         "gyro_attitude",
@@ -601,12 +605,12 @@ def _moving_rates(gyro: Channel, t: FloatArray, q: FloatArray) -> tuple[FloatArr
 
 
 def _steady_variance(rates: FloatArray) -> FloatArray:
-    """Variance about each axis without the twentieth of the rows that turn most: resets that noise hides are no motion.
+    """Variance about each axis without the few rows that turn most: resets that noise hides are no motion.
 
     What a vehicle does for so short a time only is seen by the gyro.
     """
     size = np.linalg.norm(rates - np.median(rates, axis=0), axis=1)
-    return np.asarray(np.var(rates[size <= np.quantile(size, 0.95)], axis=0))
+    return np.asarray(np.var(rates[size <= np.quantile(size, 1.0 - _FEW)], axis=0))
 
 
 def _without_jumps(measured: FloatArray, derived: FloatArray, *more: FloatArray) -> tuple[FloatArray, ...]:
@@ -615,7 +619,9 @@ def _without_jumps(measured: FloatArray, derived: FloatArray, *more: FloatArray)
         return measured, derived, *more
     # Where both go together, a jump need be no faster than the motion.
     apart, turned = (np.linalg.norm(rows, axis=1) for rows in (derived - measured, derived))
-    jumps = _jumps(measured, derived) | (apart > _JUMP * np.maximum(np.median(apart), 0.1 * np.median(turned)))
+    far = apart > _JUMP * np.maximum(np.median(apart), 0.1 * np.median(turned))
+    # Resets are few: where more rows differ, gyro and attitude do not agree.
+    jumps = _jumps(measured, derived) | (far & (np.mean(far) < _FEW))
     return tuple(rows[~jumps] for rows in (measured, derived, *more))
 
 

@@ -94,7 +94,7 @@ def changed(recording: Recording, **values: FloatArray) -> Recording:
 def values(recording: Recording, name: str) -> FloatArray:
     """Numbers of a channel; one row where it is absent."""
     channel = recording.channels.get(name)
-    return np.zeros((1, 3)) if channel is None else channel.values
+    return np.zeros((1, 4 if name == "attitude" else 3)) if channel is None else channel.values
 
 
 def scaled(name: str, factor: float | Sequence[float]) -> Callable[[Recording, Vehicle], Log]:
