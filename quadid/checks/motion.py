@@ -53,16 +53,18 @@ def flying_spans(recording: Recording, vehicle: Vehicle | None) -> Spans:
             on &= np.interp(t, accel.t, _felt(accel)) > 0.5
         if not on.any():
             return ()
-        # What usually carries the weight: by what is felt, for in dives and climbs rotors give less or more.
-        usual = float(np.median((thrust if felt is None else thrust / np.maximum(felt, 0.1))[on]))
+        # What carries the weight: where mostly more than that is felt, as in climbs, rotors usually give more.
+        carrying = usual = float(np.median(thrust[on]))
         if felt is not None:
+            usual = float(np.median((thrust / np.maximum(felt, 0.1))[on]))
+            carrying = usual * min(1.0, float(np.median(felt[on])))
             inside = (t >= t[on][0]) & (t <= t[on][-1])
             # Who feels less than this share of his weight falls.
             on |= inside & (felt < 0.8)
             inside = (t > t[on][0] + _SHORTEST) & (t < t[on][-1] - _SHORTEST)
             on[inside] &= ~_stands(t[inside], thrust[inside] / usual, felt[inside], channels.get("gyro"))
         # Below, the ground still carries its share.
-        carried = t[on & (thrust > 0.9 * usual)]
+        carried = t[on & (thrust > 0.9 * carrying)]
         return tuple(later for span in _spans(t, on) if (later := _from_carried(span, carried)))
     if "accel" in channels and len(channels["accel"].t) > 10:
         return _spans(channels["accel"].t, _vibrates(channels["accel"]))

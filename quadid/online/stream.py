@@ -543,7 +543,7 @@ class Resampler:
         """
         if self._idle or idle.any():
             for stamp, stands in zip(stamps.tolist(), idle.tolist(), strict=True):
-                self._idle = self._idle + 1 if stands else max(self._idle - 2, 0)
+                self._idle = min(self._idle + 1, APART) if stands else max(self._idle - 2, 0)
                 if self._idle == APART:
                     why = f"time stands still: stamps of the gyro do not go on from {stamp:.12g} s, or are no times"
                     self._notice(LEADER, f"{why}; fix: stamp each message when it is measured, in seconds")

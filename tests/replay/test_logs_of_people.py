@@ -538,6 +538,11 @@ def test_several_heading_resets_in_a_hover_are_no_rotation(data_dir: Path, seed:
     assert "too little rotation" in found.message
 
 
+def test_an_accelerometer_that_reads_too_little_shortens_no_flight(flight: Recording) -> None:
+    found = inspect(with_channel(flight, "accel", 0.75 * flight.channels["accel"].values), None).flying
+    np.testing.assert_allclose(found, inspect(flight, None).flying, atol=0.5)
+
+
 @pytest.mark.parametrize("every", [2.5, 12.0])
 def test_flips_are_followed_by_the_attitude(every: float) -> None:
     """Over steps of 0.4 s a flip in half a second is another turn: the log was refused as if nothing agreed."""
