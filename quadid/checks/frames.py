@@ -277,7 +277,7 @@ def gyro_check(recording: Recording, found: Response | None = None) -> Check:
     rows = _without_jumps(*own)
     return (
         _apart(found)
-        or _angle_rates(gyro, attitude)
+        or (best[0] == "as given" and _angle_rates(gyro, attitude))
         or _one_axis(rows)
         or _bias_step(*own)
         or (best[0] == "as given" and best[1].straight and _turned(rows))
@@ -589,7 +589,10 @@ def _moving_rates(gyro: Channel, t: FloatArray, q: FloatArray) -> tuple[FloatArr
     stride = max(1, round(_STEP / sample_period(t)))
     if stride > _MOST_ROWS:  # times in minutes or hours
         stride = len(t) // (3 * _FEWEST_STEPS) + 1
-    measured, derived = _without_jumps(*_rates(gyro, t[::stride], q[::stride]))
+    rates = _rates(gyro, t[::stride], q[::stride])
+    kept = _without_jumps(*rates)
+    # Resets are few: where more rows differ, gyro and attitude do not agree.
+    measured, derived = kept if len(kept[0]) > (1.0 - _FEW) * len(rates[0]) else rates
     longer = _without_jumps(*_rates(gyro, t[:: 2 * stride], q[:: 2 * stride]))[1]
     if len(longer) < _FEWEST_STEPS:
         return longer[:0], longer[:0]
@@ -619,9 +622,7 @@ def _without_jumps(measured: FloatArray, derived: FloatArray, *more: FloatArray)
         return measured, derived, *more
     # Where both go together, a jump need be no faster than the motion.
     apart, turned = (np.linalg.norm(rows, axis=1) for rows in (derived - measured, derived))
-    far = apart > _JUMP * np.maximum(np.median(apart), 0.1 * np.median(turned))
-    # Resets are few: where more rows differ, gyro and attitude do not agree.
-    jumps = _jumps(measured, derived) | (far & (np.mean(far) < _FEW))
+    jumps = _jumps(measured, derived) | (apart > _JUMP * np.maximum(np.median(apart), 0.1 * np.median(turned)))
     return tuple(rows[~jumps] for rows in (measured, derived, *more))
 
 
