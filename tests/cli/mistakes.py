@@ -295,7 +295,7 @@ MISTAKES = (
     Mistake("rates of Euler angles as gyro", fit(lambda p: p.euler_rates()), "rates of roll, pitch and yaw"),
     Mistake("turns of the attitude as gyro", fit(lambda p: p.differentiated()), "differentiated"),
     Mistake(
-        "attitude in steps", fit(lambda p: p.changed("qw qx qy qz", lambda q: 0.02 * np.round(q / 0.02))), "in steps"
+        "attitude in steps", fit(lambda p: p.changed("qw qx qy qz", lambda q: 0.02 * np.round(q / 0.02))), "in steps", 0
     ),
     Mistake("one axis of the gyro in degrees", fit(lambda p: p.scaled("r", 57.3)), "about z"),
     Mistake("one axis of the gyro not logged", fit(lambda p: p.scaled("q", 0.0)), "does not turn about y"),
