@@ -11,6 +11,7 @@ import numpy as np
 
 from quadid.app.logs import Log, free_name, written_whole
 from quadid.app.over_time import OverTime
+from quadid.blas import one_thread
 from quadid.data.window import CHANNEL_NAMES, Channel, Recording, Window, beginning
 from quadid.errors import ParameterError
 from quadid.model.layout import Layout
@@ -257,6 +258,7 @@ def _by_axis(values: FloatArray) -> dict[str, float]:
     return {axis: float(v) for axis, v in zip(AXES, values, strict=True)}
 
 
+@one_thread()
 def compared(
     train: Sequence[Log],
     held: Sequence[Log],

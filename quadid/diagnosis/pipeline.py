@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from quadid.blas import one_thread
 from quadid.data.window import Window, data_faults, without_copies
 from quadid.diagnosis.attribution import NominalFit, cause_gains, stated_errors
 from quadid.diagnosis.evidence import better, impossible_causes, late_unknown, slight_causes, unproven_causes
@@ -44,6 +45,7 @@ LEAST_OF_EXPLAINED = 1e-3
 """… nor below this share of what is explained: a huge effect is never described to the last digit."""
 
 
+@one_thread()
 def diagnose(
     windows: Sequence[Window],
     vehicle: Vehicle,

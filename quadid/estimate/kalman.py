@@ -33,6 +33,7 @@ from __future__ import annotations
 import math
 from typing import Any, NamedTuple
 
+import numba as nb
 import numpy as np
 
 from quadid.on_disk import kept
@@ -64,7 +65,11 @@ _CLOCK = np.array([0, 0, 1, 2, 2, 3, 4, 4, 4])
 MOMENTS = 6
 STILL_TIME = 1.0
 """Correlation time of a velocity that nobody measures [s]; see `Track.still`."""
-_fast: Any = kept(fastmath={"contract", "nsz"})
+_RULES = {"contract", "nsz"}
+_fast: Any = kept(fastmath=_RULES)
+_options: dict[str, Any] = {"nogil": True, "error_model": "numpy", "fastmath": _RULES, "_nrt": False}
+_piece: Any = nb.njit(**_options)
+"""Of a function for itself, without reference counts: the compiler makes better loops of it than inside a long one."""
 
 
 class Beyond(NamedTuple):
@@ -187,7 +192,7 @@ def _courses(track: Track, lag: float) -> FloatArray:
     return out
 
 
-@_fast
+@_piece
 def _integral(course: FloatArray, lag: float, s: float) -> float:
     """Integral of a moment up to s after the begin of a piece."""
     total = course[0] + s * (course[1] + s * (course[2] + s * course[3]))
@@ -198,7 +203,7 @@ def _integral(course: FloatArray, lag: float, s: float) -> float:
     return float(total)
 
 
-@_fast
+@_piece
 def _integrals(piece_t: FloatArray, courses: FloatArray, lag: float, t: float, at: int, out: FloatArray) -> int:
     """Writes the integral of every moment up to time t; returns its piece, looked for from piece `at` on."""
     while at > 0 and piece_t[at] > t:
@@ -265,7 +270,7 @@ def _constants(p: FloatArray, track: Track) -> FloatArray:
     return c
 
 
-@_fast
+@_piece
 def _turning(c, s2, x2, y2, z2, o1, s1, p, q, r):  # type: ignore[no-untyped-def]
     """Eq. 2 without alpha: angular acceleration for these rotor moments and rates."""
     return (
@@ -275,7 +280,7 @@ def _turning(c, s2, x2, y2, z2, o1, s1, p, q, r):  # type: ignore[no-untyped-def
     )
 
 
-@_fast
+@_piece
 def _dragged(c, x2, y2, s1, u, v):  # type: ignore[no-untyped-def]
     """Angular acceleration by drag at the hubs, at velocity u, v in body axes."""
     # Sums of x and y times speed about the centre of gravity: of squares over twice the mean speed; 0 at rest.
@@ -284,7 +289,7 @@ def _dragged(c, x2, y2, s1, u, v):  # type: ignore[no-untyped-def]
     return -c[20] * s1 * v, c[19] * s1 * u, c[22] * (c[12] * u * y1 - c[13] * v * x1)
 
 
-@_fast
+@_piece
 def _rotation(w, x, y, z):  # type: ignore[no-untyped-def]
     """Body to world, row by row."""
     return (
@@ -300,7 +305,7 @@ def _rotation(w, x, y, z):  # type: ignore[no-untyped-def]
     )
 
 
-@_fast
+@_piece
 def _force(c, s2, s1, w, x, y, z, vn, ve, vd):  # type: ignore[no-untyped-def]
     """Specific force of rotors and drag in body axes, and velocity there."""
     r = _rotation(w, x, y, z)
@@ -308,7 +313,7 @@ def _force(c, s2, s1, w, x, y, z, vn, ve, vd):  # type: ignore[no-untyped-def]
     return -c[12] * s1 * u, -c[13] * s1 * v, -c[0] * s2, u, v, r[2] * vn + r[5] * ve + r[8] * vd
 
 
-@_fast
+@_piece
 def _falling(c, s2, s1, w, x, y, z, vn, ve, vd, fx, fy, fz):  # type: ignore[no-untyped-def]
     """Eq. 3."""
     r = _rotation(w, x, y, z)
@@ -321,7 +326,7 @@ def _falling(c, s2, s1, w, x, y, z, vn, ve, vd, fx, fy, fz):  # type: ignore[no-
     )
 
 
-@_fast
+@_piece
 def _spin(w, x, y, z, p, q, r):  # type: ignore[no-untyped-def]
     """Eq. 2: rate of the quaternion."""
     return (
@@ -332,7 +337,7 @@ def _spin(w, x, y, z, p, q, r):  # type: ignore[no-untyped-def]
     )
 
 
-@_fast
+@_piece
 def _advance(c: FloatArray, row: FloatArray, h: float, keep: FloatArray, air: bool, x: FloatArray) -> None:
     """Eqs. 2 to 4 over one step: classical Runge-Kutta, rotor moments linear through their means over both halves.
 
@@ -404,7 +409,7 @@ def _advance(c: FloatArray, row: FloatArray, h: float, keep: FloatArray, air: bo
         x[FO + 1 + i] *= keep[i]
 
 
-@_fast
+@_piece
 def _step_beyond(beyond: Beyond, k: int, x: FloatArray, out: FloatArray) -> None:
     """Writes what a larger model adds in step k from mean x, shape (12,)."""
     if len(beyond.added) > 0:
@@ -414,7 +419,7 @@ def _step_beyond(beyond: Beyond, k: int, x: FloatArray, out: FloatArray) -> None
                 out[i] += beyond.slope[k, i, j] * (x[4 + j] - beyond.at[k, j])
 
 
-@_fast
+@_piece
 def _go_beyond(beyond: Beyond, step: FloatArray, room: FloatArray, x: FloatArray) -> None:
     """Adds a `step` of a larger model to the mean after it; `room` (N,) is overwritten."""
     if len(beyond.added) > 0:
@@ -424,7 +429,7 @@ def _go_beyond(beyond: Beyond, step: FloatArray, room: FloatArray, x: FloatArray
         _correct(room, x)
 
 
-@_fast
+@_piece
 def _read_beyond(beyond: Beyond, k: int, step: FloatArray, nu: FloatArray) -> None:
     """Takes what a larger model makes of the measurements off the innovations of row k, after a `step` up to there."""
     if len(beyond.added) > 0:
@@ -434,7 +439,7 @@ def _read_beyond(beyond: Beyond, k: int, step: FloatArray, nu: FloatArray) -> No
             nu[ACCEL + i] -= step[9 + i]
 
 
-@_fast
+@_piece
 def _sense_beyond(beyond: Beyond, k: int, slope: FloatArray) -> None:
     """Adds to `_accel_slope` what a larger model makes of the accelerometer at the end of step k, by velocity."""
     if len(beyond.added) > 0 and k >= 0:
@@ -443,7 +448,7 @@ def _sense_beyond(beyond: Beyond, k: int, slope: FloatArray) -> None:
                 slope[i, 3 + j] += beyond.slope[k, 9 + i, 3 + j]
 
 
-@_fast
+@_piece
 def _bend(beyond: Beyond, k: int, F: FloatArray) -> None:
     """Adds the slope of what a larger model makes of step k to F of Eq. 5."""
     if len(beyond.added) > 0:
@@ -454,7 +459,7 @@ def _bend(beyond: Beyond, k: int, F: FloatArray) -> None:
                 F[VE + i, OM + j] += beyond.slope[k, 6 + i, j]
 
 
-@_fast
+@_piece
 def _expected(c, p, y, seen, row, air, x, out):  # type: ignore[no-untyped-def]
     """Writes y - h(x) of what was measured, shape (M,), a rotation vector of the attitude."""
     for i in range(3):
@@ -495,7 +500,7 @@ def _expected(c, p, y, seen, row, air, x, out):  # type: ignore[no-untyped-def]
         out[VELOCITY + i] = (y[10 + i] if seen[3] else 0.0) - x[VE + 1 + i]
 
 
-@_fast
+@_piece
 def _correct(dx: FloatArray, x: FloatArray) -> None:
     """X <- x + dx, the attitude by its rotation vector."""
     a, b, e = 0.5 * dx[0], 0.5 * dx[1], 0.5 * dx[2]
@@ -533,13 +538,13 @@ def _start(track: Track, p: FloatArray) -> FloatArray:
     return x
 
 
-@_fast
+@_piece
 def _keep(psi: FloatArray, h: float, keep: FloatArray) -> None:
     for i in range(9):
         keep[i] = math.exp(-h / psi[TIME + _CLOCK[i]])
 
 
-@_fast
+@_piece
 def _cross(a, b, e, scale, row, col, F):  # type: ignore[no-untyped-def]
     """Adds scale [(a, b, e)]x to a block of F."""
     F[row, col + 1] -= scale * e
@@ -550,7 +555,7 @@ def _cross(a, b, e, scale, row, col, F):  # type: ignore[no-untyped-def]
     F[row + 2, col + 1] += scale * a
 
 
-@_fast
+@_piece
 def _transition(c, row, h, keep, air, x, after, F, turn):  # type: ignore[no-untyped-def]
     """Writes F of Eq. 5, from a step's begin and end, and the rotation in its middle (3, 3)."""
     F[:] = 0.0
@@ -626,7 +631,7 @@ def _transition(c, row, h, keep, air, x, after, F, turn):  # type: ignore[no-unt
             F[VE + i, VE + i] = 1.0
 
 
-@_fast
+@_piece
 def _kick(h, air, i, turn, G):  # type: ignore[no-untyped-def]
     """Writes the column of G in Eq. 5 of Gauss-Markov state i: its noise acts by half within the step."""
     G[:] = 0.0
@@ -640,7 +645,7 @@ def _kick(h, air, i, turn, G):  # type: ignore[no-untyped-def]
         G[OM + i - 3] = 0.5 * h
 
 
-@_fast
+@_piece
 def _wavering(track, row, h, out):  # type: ignore[no-untyped-def]
     """Writes what rotor speeds of noise 1 rad/s make of the specific thrust and the angular accelerations of a step.
 
@@ -650,7 +655,7 @@ def _wavering(track, row, h, out):  # type: ignore[no-untyped-def]
         out[i] = 2.0 * (row[0] + row[MOMENTS]) * track.period / h * track.waver[i]
 
 
-@_fast
+@_piece
 def _push(h, air, i, turn, G):  # type: ignore[no-untyped-def]
     """Writes the column of G of rotor noise `i` of `_wavering`, constant over the step."""
     G[:] = 0.0
@@ -661,7 +666,7 @@ def _push(h, air, i, turn, G):  # type: ignore[no-untyped-def]
             G[VE + j] = h * turn[j, 2]
 
 
-@_fast
+@_piece
 def _places(channel, slope, where, what):  # type: ignore[no-untyped-def]
     """Writes the non-zero places and values of H of one scalar measurement; returns how many there are."""
     axis = channel % 3
@@ -683,7 +688,7 @@ def _places(channel, slope, where, what):  # type: ignore[no-untyped-def]
     return 1
 
 
-@_fast
+@_piece
 def _accel_slope(c, row, air, x, slope):  # type: ignore[no-untyped-def]
     """Writes the derivative of the accelerometer by rotation vector, velocity and random alpha, (3, 9)."""
     slope[:] = 0.0
@@ -697,13 +702,13 @@ def _accel_slope(c, row, air, x, slope):  # type: ignore[no-untyped-def]
             slope[0, 3 + j], slope[1, 3 + j] = -kx * r[3 * j], -ky * r[3 * j + 1]
 
 
-@_fast
+@_piece
 def _is_measured(track: Track, k: int, channel: int) -> bool:
     """Presence of such a measurement; a velocity that nobody measures is about zero (see `Track.still`)."""
     return track.seen[k, channel // 3] or (channel >= VELOCITY and track.still > 0.0)
 
 
-@_fast
+@_piece
 def _white(track: Track, psi: FloatArray, k: int, channel: int) -> float:
     """Variance r of a scalar measurement."""
     if channel >= VELOCITY and not track.seen[k, 3]:
@@ -712,7 +717,7 @@ def _white(track: Track, psi: FloatArray, k: int, channel: int) -> float:
     return float(psi[channel] * psi[channel])
 
 
-@_fast
+@_piece
 def _normaliser(degrees: float) -> float:
     """-2 ln of the Student-t density at 0 against the Gaussian's."""
     return 2.0 * (math.lgamma(0.5 * degrees) - math.lgamma(0.5 * (degrees + 1.0))) + math.log(0.5 * degrees)
@@ -749,6 +754,66 @@ def kalman(track: Track, p: FloatArray, psi: FloatArray, tail: FloatArray, store
     return filter_pass(track, p, psi, tail, store, g), g
 
 
+@_piece
+def _take(P: FloatArray, PH: FloatArray, gain: FloatArray) -> None:
+    """P <- P - sum of gain (P H)(P H)' over three measurements."""
+    for i in range(N):
+        a, b, c = gain[0] * PH[0, i], gain[1] * PH[1, i], gain[2] * PH[2, i]
+        for j in range(N):
+            P[i, j] -= a * PH[0, j] + b * PH[1, j] + c * PH[2, j]
+
+
+@_piece
+def _update(track, psi, tail, k, nu, slope, P, PH, gain, where, what, dx, store, g):  # type: ignore[no-untyped-def]
+    """Eq. 6 for all that is measured in row k, one scalar after the other; returns -2 ln of their density.
+
+    P changes for the three axes of a sensor at once; until then PH of each axis is reduced by those before it.
+    """
+    total = 0.0
+    for i in range(N):
+        dx[i] = 0.0
+    for m in range(M):
+        if not _is_measured(track, k, m):
+            continue
+        axis, count = m % 3, _places(m, slope, where, what)
+        v, S = nu[m], _white(track, psi, k, m)
+        for i in range(N):
+            PH[axis, i] = 0.0
+        for j in range(count):
+            a, f = where[j], what[j]
+            v -= f * dx[a]
+            for i in range(N):
+                PH[axis, i] += f * P[a, i]
+        for b in range(axis):
+            along = 0.0
+            for j in range(count):
+                along += what[j] * PH[b, where[j]]
+            along *= gain[b]
+            for i in range(N):
+                PH[axis, i] -= along * PH[b, i]
+        for j in range(count):
+            S += what[j] * PH[axis, where[j]]
+        square, light = v * v / S, 1.0
+        k_inv = tail[m // 3] if track.seen[k, m // 3] else 0.0
+        if k_inv > 0.0:
+            light = min((1.0 + k_inv) / (1.0 + k_inv * square), 1.0)
+            total += (1.0 + 1.0 / k_inv) * math.log1p(k_inv * square) + _normaliser(1.0 / k_inv)
+        else:
+            total += square
+        total += math.log(S)
+        gain[axis] = light / S
+        f = gain[axis] * v
+        for i in range(N):
+            dx[i] += f * PH[axis, i]
+        if store:
+            g.nu[k, m], g.S[k, m], g.w[k, m] = v, S, light
+            for i in range(N):
+                g.gain[k, m, i] = gain[axis] * PH[axis, i]
+        if axis == 2:
+            _take(P, PH, gain)
+    return total
+
+
 @_fast
 def filter_pass(track: Track, p: FloatArray, psi: FloatArray, tail: FloatArray, store: bool, g: Gains) -> float:
     """Writes the gains of `kalman`; returns -2 ln L."""
@@ -757,7 +822,8 @@ def filter_pass(track: Track, p: FloatArray, psi: FloatArray, tail: FloatArray, 
     c, keep = _constants(p, track), np.empty(9)
     x, after = _start(track, p), np.empty(N_MEAN)
     P, FP, F, turn = np.zeros((N, N)), np.zeros((N, N)), np.zeros((N, N)), np.zeros((3, 3))
-    dx, PH, G, nu = np.empty(N), np.empty(N), np.empty(N), np.zeros(M)
+    dx, PH, G, nu = np.empty(N), np.empty((3, N)), np.empty(N), np.zeros(M)
+    taken = np.empty(3)
     where, what, loose, step = np.zeros(10, dtype=np.int64), np.zeros(10), np.empty(4), np.zeros(12)
     for i in range(3):
         P[TH + i, TH + i], P[OM + i, OM + i] = 0.09, 1.0
@@ -773,38 +839,7 @@ def filter_pass(track: Track, p: FloatArray, psi: FloatArray, tail: FloatArray, 
         _sense_beyond(track.beyond, k - 1, slope)
         _expected(c, p, track.y[k], track.seen[k], g.table[k], air, x, nu)
         _read_beyond(track.beyond, k, step, nu)
-        dx[:] = 0.0
-        for m in range(M):
-            if not _is_measured(track, k, m):
-                continue
-            count = _places(m, slope, where, what)
-            v, S = nu[m], _white(track, psi, k, m)
-            PH[:] = 0.0
-            for j in range(count):
-                v -= what[j] * dx[where[j]]
-                for i in range(N):
-                    PH[i] += what[j] * P[where[j], i]
-            for j in range(count):
-                S += what[j] * PH[where[j]]
-            square, light = v * v / S, 1.0
-            k_inv = tail[m // 3] if track.seen[k, m // 3] else 0.0
-            if k_inv > 0.0:
-                light = min((1.0 + k_inv) / (1.0 + k_inv * square), 1.0)
-                total += (1.0 + 1.0 / k_inv) * math.log1p(k_inv * square) + _normaliser(1.0 / k_inv)
-            else:
-                total += square
-            total += math.log(S)
-            gain = light / S
-            for i in range(N):
-                dx[i] += gain * PH[i] * v
-            for i in range(N):
-                f = gain * PH[i]
-                for j in range(N):
-                    P[i, j] -= f * PH[j]
-            if store:
-                g.nu[k, m], g.S[k, m], g.w[k, m] = v, S, light
-                for i in range(N):
-                    g.gain[k, m, i] = gain * PH[i]
+        total += _update(track, psi, tail, k, nu, slope, P, PH, taken, where, what, dx, store, g)
         _correct(dx, x)
         if store:
             g.mean[k] = x
@@ -844,7 +879,7 @@ def filter_pass(track: Track, p: FloatArray, psi: FloatArray, tail: FloatArray, 
     return total
 
 
-@_fast
+@_piece
 def _product(F: FloatArray, P: FloatArray, turned: bool, out: FloatArray) -> None:
     """Writes F P, or F' P, of the sparse F of `_transition`."""
     for i in range(N):
@@ -859,7 +894,7 @@ def _product(F: FloatArray, P: FloatArray, turned: bool, out: FloatArray) -> Non
                     out[a, j] += f * P[b, j]
 
 
-@_fast
+@_piece
 def _sandwich(F: FloatArray, P: FloatArray, FP: FloatArray, turned: bool) -> None:
     """P <- F P F' of a symmetric P, or F' P F; FP is room, and holds (F P)' afterwards."""
     _product(F, P, turned, FP)
@@ -924,7 +959,7 @@ def replay(
     return total
 
 
-@_fast
+@_piece
 def _quadratic(G, l, L):  # type: ignore[no-untyped-def]
     """G' l and G' L G of a column with few entries."""
     along, spread = 0.0, 0.0

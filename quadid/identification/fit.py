@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from quadid.blas import one_thread
 from quadid.chi_square import Z95
 from quadid.data.window import Window
 from quadid.errors import NotIdentifiableError, WindowError
@@ -235,6 +236,7 @@ def check_windows(windows: Sequence[Window]) -> None:
         raise WindowError("windows on different grids", "one grid step for all", "give --rate")
 
 
+@one_thread()
 def fit(
     windows: Sequence[Window],
     vehicle: Vehicle,

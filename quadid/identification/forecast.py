@@ -13,6 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from quadid.attitude_controller import pack_gains, stabilise_rows
+from quadid.blas import one_thread
 from quadid.chi_square import Z95
 from quadid.data.window import Window
 from quadid.errors import NotIdentifiableError
@@ -50,6 +51,7 @@ Shares = dict[int, dict[str, FloatArray]]
 class Forecast:
     """Predictions of one flight: noise, trim and biases from its first part, bands on what comes after."""
 
+    @one_thread()
     def __init__(
         self, windows: Sequence[Window], vehicle: Vehicle, theta: FloatArray, random: RandomForces | None
     ) -> None:

@@ -16,8 +16,8 @@ from typing import NamedTuple
 from weakref import WeakValueDictionary
 
 import numpy as np
-from threadpoolctl import ThreadpoolController
 
+from quadid.blas import one_thread
 from quadid.data.window import Window
 from quadid.errors import WindowError
 from quadid.model import layout as ix
@@ -205,11 +205,6 @@ def _threads() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(max_workers=os.cpu_count(), thread_name_prefix="rollout")
 
 
-@lru_cache(maxsize=1)
-def _linear_algebra() -> ThreadpoolController:
-    return ThreadpoolController()
-
-
 _NO_TABLE = np.empty((0, 2 * ALL_MOMENTS))
 _NO_BASIS, _NO_ENDS, _NOTHING = np.empty((0, 0, 0)), np.empty((0, 0, 0)), np.empty(0)
 
@@ -355,7 +350,7 @@ class Rollout:
         if len(starts) == 1:
             part(0)
             return
-        with _linear_algebra().limit(limits=1):  # threads of its own in each of ours only wait for each other
+        with one_thread():
             list(_threads().map(part, starts))
 
     def costs(

@@ -13,6 +13,7 @@ from typing import ClassVar, Literal, TypeGuard
 
 import numpy as np
 
+from quadid.blas import one_thread
 from quadid.condition.trim import FlightTrim
 from quadid.condition.watch import HealthReport
 from quadid.data.window import Window
@@ -300,7 +301,8 @@ class Job(ABC):
     def run(self) -> JobReply:
         """Does it; an error is the reply's `problem`, never raised."""
         try:
-            return self.answer()
+            with one_thread():
+                return self.answer()
         except (QuadidError, np.linalg.LinAlgError) as error:
             return self.failed(str(error))
         except MemoryError:
