@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import cached_property
 from typing import NamedTuple, TypeVar
 
 import numpy as np
@@ -592,10 +592,11 @@ class Problem:
         """Whitened innovations of flight j and their derivatives, by `only` these of its entries; default all."""
         steps = np.diag(np.broadcast_to(nudge, len(z)))
         mine = [i for i, (_, _, where) in enumerate(self.entries) if where in (-1, j) and (only is None or i in only)]
-        plain, *moved = self._several(j, [z, *(z + steps[i] for i in mine)], psi, g)
-        return Sensitivities(
-            mine, plain, np.array([(w - plain) / steps[i, i] for w, i in zip(moved, mine, strict=True)])
-        )
+        whitened = self._several(j, [z, *(z + steps[i] for i in mine)], psi, g)
+        plain, J = whitened[0], whitened[1:]
+        J -= plain
+        J /= steps[mine, mine][:, None, None]
+        return Sensitivities(mine, plain, J)
 
     def corner(
         self, z: FloatArray, psi: FloatArray, gains: Sequence[Gains]
@@ -629,10 +630,10 @@ class Problem:
                 least[i], most[i] = (-z[i], most[i]) if z[i] > 0.0 else (least[i], -z[i])
         return least, most, nudge
 
-    def _several(self, j: int, points: Sequence[FloatArray], psi: FloatArray, g: Gains) -> list[FloatArray]:
-        """Whitened innovations of flight j at points near that of the gains, effects along the states there."""
-        out: list[FloatArray] = []
+    def _several(self, j: int, points: Sequence[FloatArray], psi: FloatArray, g: Gains) -> FloatArray:
+        """Whitened innovations of flight j, (points, n, M), near the point of the gains, effects along its states."""
         track = self.tracks[j]
+        out = np.zeros((len(points), len(track.t), k.M))
         mean = reckoned(track, g.mean) if self.models else g.mean
         for first in range(0, len(points), AT_ONCE):
             some = points[first : first + AT_ONCE]
@@ -640,15 +641,12 @@ class Problem:
             if self.models:
                 added = self.models[j].beyond(np.array([self.vector(z, j) for z in some]), mean)
                 tracks = [track._replace(beyond=Beyond(a, g.beyond.slope, mean[:, 4:10].copy())) for a in added]
-            out += _each(partial(self._whitened, j, psi, g, some, tracks), len(some))
-        return out
 
-    def _whitened(
-        self, j: int, psi: FloatArray, g: Gains, points: Sequence[FloatArray], tracks: Sequence[Track], i: int
-    ) -> FloatArray:
-        track, p = tracks[i], self.physics(points[i], j)
-        out = np.zeros((len(track.t), k.M))
-        k.replay(track, p, psi, g, _table(track, g, p), out, _NO_MEANS)
+            def whiten(i: int, first: int = first, tracks: Sequence[Track] = tracks) -> None:
+                p = self.physics(points[first + i], j)
+                k.replay(tracks[i], p, psi, g, _table(tracks[i], g, p), out[first + i], _NO_MEANS)
+
+            _each(whiten, len(some))
         return out
 
 
