@@ -63,7 +63,7 @@ class Diagnosed(Fitted):
             {"log": log.name, "role": s.role, "mse": {"fitted": unseen["mse_extended"]}}
             for log, s in zip(self.logs, self.sets, strict=True)
         ]
-        return proven(self.found.vehicle, self.verdict, sets, self.train, self.beside)
+        return proven(self.found.vehicle, self.nominal, self.verdict, sets, self.train, self.beside)
 
     @property
     def file_name(self) -> str:

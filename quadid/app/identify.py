@@ -132,7 +132,8 @@ class Identified(Fitted):
         """The vehicle with what was found; ``vehicle.save("mine.yaml")`` writes it."""
         from quadid.identification.result import fitted_vehicle
 
-        return proven(fitted_vehicle(self.fit), self.verdict, self.result["sets"], self.train, self.beside)
+        fit, sets = self.fit, self.result["sets"]
+        return proven(fitted_vehicle(fit), fit.vehicle, self.verdict, sets, self.train, self.beside)
 
     @property
     def file_name(self) -> str:
@@ -410,13 +411,19 @@ def origin_remark(logs: Sequence[Log]) -> str:
 
 
 def proven(
-    vehicle: Vehicle, verdict: Verdict, sets: Sequence[Mapping[str, Any]], train: Sequence[Log], beside: Beside | None
+    vehicle: Vehicle,
+    former: Vehicle,
+    verdict: Verdict,
+    sets: Sequence[Mapping[str, Any]],
+    train: Sequence[Log],
+    beside: Beside | None,
 ) -> Vehicle:
     """The vehicle with what was found beside its values, their proof, and where it all comes from.
 
-    Values of a red fit become guesses without `sigma`.
+    A red fit keeps the guesses and bounds of the former file, without `sigma`.
 
     Args:
+        vehicle: with the fitted values; former: as it was given.
         sets: its scored logs, as in ``quadid.identify/1``.
         train: the logs that were fitted.
         beside: what acts beside its values; None keeps what its file has.
@@ -432,6 +439,6 @@ def proven(
     whole = vehicle if beside is None else beside.in_vehicle(vehicle)
     update: dict[str, Any] = {"proof": proof}
     if verdict.level == "poor":
-        guesses = {n: p.model_copy(update={"sigma": None}) for n, p in vehicle.parameters.items()}
+        guesses = {n: p.model_copy(update={"sigma": None}) for n, p in former.parameters.items()}
         update |= {"parameters": guesses, "correlation": {}}
     return whole.model_copy(update=update).with_remark(origin_remark(train))
