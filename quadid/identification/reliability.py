@@ -154,7 +154,8 @@ def random_effects(steps: FloatArray, variances: FloatArray) -> FloatArray:
     """Standard deviation that differences between blocks, beyond chance, add to that of the estimate, shape (P,).
 
     An estimate of all blocks lies amid theirs, unless they differ in another parameter: then that one is a compromise,
-    and what moves with it agrees between blocks on another value.  How far their mean lies off counts as well.
+    and what moves with it agrees between blocks on another value.  Where that lies beyond `SPREAD_LIMIT`, how far it
+    lies off counts as well.
 
     Args:
         steps: from the estimate to that of each block, shape (blocks, P).
@@ -166,10 +167,10 @@ def random_effects(steps: FloatArray, variances: FloatArray) -> FloatArray:
     q = np.sum(weight * (steps - np.sum(weight * steps, axis=0) / total) ** 2, axis=0)
     excess = np.maximum(q - (count - 1), 0.0) / (total - np.sum(weight**2, axis=0) / total)
     tau = np.where(q > exceeded(CHANCE, count - 1), np.sqrt(excess), 0.0)
-    # Their mean with it, and where it lies off by more than chance.
+    # Their mean with it, and where it lies off by more than chance and too far.
     weight = 1.0 / (variances + tau**2)
     mean, variance = np.sum(weight * steps, axis=0) / weight.sum(axis=0), 1.0 / weight.sum(axis=0)
-    off = np.where(mean**2 > exceeded(CHANCE, 1) * variance, np.abs(mean), 0.0)
+    off = np.where(mean**2 > np.maximum(exceeded(CHANCE, 1) * variance, SPREAD_LIMIT**2), np.abs(mean), 0.0)
     return np.asarray(np.sqrt(np.maximum(variance - 1.0 / total, 0.0) + off**2))
 
 

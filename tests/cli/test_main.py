@@ -724,13 +724,13 @@ def test_places_that_cannot_be_written(inside: Cli, flights: Flights, tmp_path: 
 
 
 def test_the_vehicle_file_read_is_never_overwritten(inside: Cli, flights: Flights, tmp_path: Path) -> None:
-    file = tmp_path / "pelican.fitted.yaml"
     text = Vehicle.shipped("pelican").to_yaml()
-    file.write_text(text, encoding="utf-8")
-    for command in ("identify", "diagnose"):
+    for command, ending in (("identify", "fitted"), ("diagnose", "diagnosed")):
+        file = tmp_path / f"pelican.{ending}.yaml"
+        file.write_text(text, encoding="utf-8")
         run = inside(command, flights.train, "--vehicle", file, "--out", tmp_path, "--json", "-")
         assert run.code == 0, run.err
-        assert run.data["vehicle_file"] == str(tmp_path / "pelican.fitted.new.yaml")
+        assert run.data["vehicle_file"] == str(tmp_path / f"pelican.{ending}.new.yaml")
         assert file.read_text(encoding="utf-8") == text
 
 

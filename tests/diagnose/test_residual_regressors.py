@@ -117,7 +117,7 @@ def test_sites_move_what_they_say() -> None:
 
 
 def test_signals_that_double_one_another_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    """In a flight that holds its heading, for one, its cosine is constant: without `_RIDGE` no inverse exists."""
+    """In a flight that holds its heading, for one, its cosine is constant: without `_RIDGE` no inverse is of use."""
     problem = clean()
     once = {f.site.name: f.gain.total for f in follows(problem.shooting, problem.nominal)}
 
@@ -128,5 +128,8 @@ def test_signals_that_double_one_another_change_nothing(monkeypatch: pytest.Monk
     twice = {f.site.name: f.gain.total for f in follows(problem.shooting, problem.nominal)}
     assert twice == pytest.approx(once, rel=0.01)
     monkeypatch.setattr(residual_tests, "_RIDGE", 0.0)
-    with pytest.raises(np.linalg.LinAlgError):
-        follows(problem.shooting, problem.nominal)
+    try:
+        without = {f.site.name: f.gain.total for f in follows(problem.shooting, problem.nominal)}
+    except np.linalg.LinAlgError:  # unless rounding leaves something to divide by
+        return
+    assert without != pytest.approx(once, rel=0.01)
