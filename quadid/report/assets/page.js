@@ -51,6 +51,7 @@
       margin: { l: 60, r: 20, t: 8, b: 40 }, hovermode: "x unified", dragmode: "zoom",
       hoverlabel: { bgcolor: colour("card"), font: { color: colour("ink") } },
       legend: { orientation: "h", x: 0, y: 1.02, yanchor: "bottom" },
+      xaxis: axis, yaxis: axis, // also of figures that say nothing about theirs
     };
     for (const [key, value] of Object.entries(view.layout)) {
       layout[key] = /^[xy]axis/.test(key) ? Object.assign({}, axis, value) : value;
