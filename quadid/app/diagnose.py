@@ -152,6 +152,7 @@ def diagnose(
     from quadid.diagnosis.result import Explanation
     from quadid.identification.result import ScoredSet, parameter_entry, with_values
     from quadid.identification.score import mse_score
+    from quadid.report.fit_pages import diagnose_verdict
 
     check_seed(seed)
     given = settled(logs, validate, vehicle)
@@ -213,11 +214,10 @@ def diagnose(
     if beside is not None and beside.terms:
         result["residual"] = {"terms": [t.formula for t in beside.terms], "missing_removed": beside.removed}
         result["missing"]["statement"] += f" {beside.sentence}"
-    done = Diagnosed(result, found, sets, fit.noise, [*train, *held], described, selection, forces, beside)
-    if done.verdict.level == "poor":  # what is left without a name may have bent the numbers too
+    if diagnose_verdict(result).level == "poor":  # what is left without a name may have bent the numbers too
         found = replace(found, parameters=unreliable(found.parameters, NOMINAL_NAMES))
         result["parameters"] = [parameter_entry(p) for p in found.parameters]
-    return replace(done, found=found)
+    return Diagnosed(result, found, sets, fit.noise, [*train, *held], described, selection, forces, beside)
 
 
 def _removed(forces: MissingForces, found: Diagnosis, selection: Search, vehicle: Vehicle) -> float:

@@ -233,7 +233,7 @@ def flown_parts(recording: Recording, flying: Spans, cut: LogPart) -> Spans:
 
 
 def _in_the_air(recording: Recording, flying: Spans, cut: LogPart) -> Spans:
-    """What of a part, or of a whole log, does not stand on the ground, as `flown_parts`; none where it hardly does."""
+    """Parts in the air of one that was asked for, or of a whole log; as `flown_parts`, none where it hardly stands."""
     from quadid.checks import proposed_cuts
 
     imu = [c.t for n, c in recording.channels.items() if n in ("gyro", "accel") and len(c.t)]

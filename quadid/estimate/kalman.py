@@ -36,6 +36,7 @@ from typing import Any, NamedTuple
 import numba as nb
 import numpy as np
 
+from quadid.model.simd import jit
 from quadid.on_disk import kept
 from quadid.types import BoolArray, FloatArray
 from quadid.vehicle import GRAVITY
@@ -67,8 +68,7 @@ STILL_TIME = 1.0
 """Correlation time of a velocity that nobody measures [s]; see `Track.still`."""
 _RULES = {"contract", "nsz"}
 _fast: Any = kept(fastmath=_RULES)
-_options: dict[str, Any] = {"nogil": True, "error_model": "numpy", "fastmath": _RULES, "_nrt": False}
-_piece: Any = nb.njit(**_options)
+_piece: Any = nb.njit(**(jit | {"fastmath": _RULES}))
 """Of a function for itself, without reference counts: the compiler makes better loops of it than inside a long one."""
 
 

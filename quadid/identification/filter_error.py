@@ -23,6 +23,7 @@ from quadid.data.window import Window
 from quadid.effects import EFFECTS
 from quadid.estimate import kalman as k
 from quadid.estimate.fit import ACTS, NEAR_SECONDS, Estimate, estimate, newton_step
+from quadid.estimate.kalman import Gains
 from quadid.estimate.problem import LATE, Problem, Sensitivities
 from quadid.estimate.track import from_window
 from quadid.identification.noise import NoiseModel
@@ -172,10 +173,9 @@ def _filtered(
     return Filtered(out, own, prompt, trust, bool(share[2] > LARGE), sensor_noise(found))
 
 
-def carried(problem: Problem, found: Estimate) -> float:
+def carried(gains: Sequence[Gains]) -> float:
     """Root mean square of the vertical random force, specific [m/s^2]: what carries the vehicle beside its rotors."""
-    gains = problem.passes(found.z, found.psi)[1]
-    force = np.concatenate([g.mean[:, k.FO + 1 + 2] for g in gains])
+    force = np.concatenate([g.mean[:, k.FO + 3] for g in gains])  # of the mean, all but the attitude lies one further
     return float(np.sqrt(np.mean(force**2)))
 
 
@@ -232,7 +232,8 @@ def _compared(found: Estimate, wide: Problem, half: Problem, places: IndexArray,
         replace(other, base=problem.base, control=problem.control, tail=problem.tail) for other in (wide, half)
     )
     # 1. Parts of the flights: the step of each block of time from the optimum of all, and its variance.
-    whole = _sensitivities(problem, found)
+    gains = problem.passes(found.z, found.psi)[1]
+    whole = _sensitivities(problem, found, gains)
     grams, slopes = _blocks(problem, whole)
     grams, slopes = grams + np.diag(1.0 / (BLOCKS * problem.prior[1] ** 2)), slopes - slopes.mean(axis=0)
     box = problem.limits - found.z
@@ -241,13 +242,13 @@ def _compared(found: Estimate, wide: Problem, half: Problem, places: IndexArray,
     between = random_effects(steps[:, places] * unit, variances[:, places] * unit**2)
     # 2. The whole catalogue, linearised at the estimate on the liveliest minute.
     part = problem.liveliest(NEAR_SECONDS)
-    near = whole if part is problem else _sensitivities(part, found)
+    near = whole if part is problem else _sensitivities(part, found, part.passes(found.z, found.psi)[1])
     others = [
         (f"when {name} is in the model", step[places] * unit)
         for name, step in _with_causes(found, near, wide.liveliest(NEAR_SECONDS))
     ]
     # 3. Every second row: what inputs do within a row is a third of the step to rows twice as long.
-    lost = bool(carried(problem, found) > LOST * problem.noise_scale[1])
+    lost = bool(carried(gains) > LOST * problem.noise_scale[1])
     try:
         others.append(("when the flight is fitted on a finer grid", _on_coarse_grid(found, half)[places] * unit))
     except np.linalg.LinAlgError:  # it runs away there
@@ -316,9 +317,8 @@ def _on_coarse_grid(found: Estimate, half: Problem) -> FloatArray:
     return np.where(step**2 > chance, SHARE * step, 0.0)
 
 
-def _sensitivities(problem: Problem, found: Estimate) -> list[Sensitivities]:
-    """Sensitivities of each flight of a problem at an estimate."""
-    gains = problem.passes(found.z, found.psi)[1]
+def _sensitivities(problem: Problem, found: Estimate, gains: Sequence[Gains]) -> list[Sensitivities]:
+    """Sensitivities of each flight of a problem at an estimate, under the gains of a pass there."""
     return [problem.sensitivities(j, found.z, found.psi, g) for j, g in enumerate(gains)]
 
 

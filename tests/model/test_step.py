@@ -141,7 +141,7 @@ def normals(seed: int, vehicle: int, step: int) -> list[float]:
 
 
 def drawn(state: State, vehicle: int) -> FloatArray:
-    """What acts at random on a vehicle, read from the change of its rate and velocity in a step at level."""
+    """Random inputs of a vehicle, read from the change of its rate and velocity in a step at level."""
     still = Simulator(PELICAN, np.tile(Layout(PELICAN).initial(PELICAN), (400, 1)))
     begun = still.start(dt=0.01)
     still.advance(begun, np.full(4, PELICAN.hover_speed()), 0.01)

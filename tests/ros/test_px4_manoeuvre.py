@@ -6,8 +6,6 @@ A stand-in of PX4 hovers, is switched to Offboard, and listens.
 from __future__ import annotations
 
 import math
-import os
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -50,48 +48,27 @@ ament_package()
 
 
 @pytest.fixture(scope="module")
-def px4_messages(repository: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder from which Python imports px4_msgs, and whose libraries are found."""
+def px4_messages(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    """The environment in which Python imports px4_msgs."""
+    from quadid_evaluation.studies.ros_load import build_package, importing
+
     source = tmp_path_factory.mktemp("px4_msgs")
     (source / "msg").mkdir()
     for name, text in MESSAGES.items():
         (source / "msg" / f"{name}.msg").write_text(text, encoding="utf-8")
     (source / "package.xml").write_text(PACKAGE, encoding="utf-8")
     (source / "CMakeLists.txt").write_text(CMAKE, encoding="utf-8")
-    environment = {k: v for k, v in os.environ.items() if k not in ("CMAKE_PREFIX_PATH", "PYTHONPATH", "ROS_DISTRO")}
-    environment |= {"AMENT_PREFIX_PATH": sys.prefix, "PATH": f"{sys.prefix}/bin:{os.environ['PATH']}"}
-    cmake = shutil.which("cmake", path=environment["PATH"])
-    assert cmake is not None
-    prefix, build = source / "prefix", source / "build"
-    for arguments in (
-        [
-            "-S",
-            source,
-            "-B",
-            build,
-            "-Wno-dev",
-            "-DBUILD_TESTING=OFF",
-            f"-DCMAKE_PREFIX_PATH={sys.prefix}",
-            f"-DCMAKE_INSTALL_PREFIX={prefix}",
-            f"-DPython3_EXECUTABLE={sys.executable}",
-            f"-DCMAKE_PROJECT_INCLUDE={repository / 'tools' / 'wheel_targets.cmake'}",
-        ],
-        ["--build", build, "--parallel", "2"],
-        ["--install", build],
-    ):
-        subprocess.run([cmake, *map(str, arguments)], env=environment, check=True, capture_output=True, timeout=500)
-    (package,) = prefix.glob("lib/python*/site-packages")
-    return package
+    build_package(source, source / "prefix")
+    return importing(source / "prefix")
 
 
 @pytest.fixture
-def script(px4_messages: Path, tmp_path: Path) -> tuple[Path, dict[str, str]]:
+def script(px4_messages: dict[str, str], tmp_path: Path) -> tuple[Path, dict[str, str]]:
     """The script and the environment it runs in."""
     path = tmp_path / "fly.py"
     (text,) = written_as(PLAN, "px4", 0.3).values()
     path.write_text(text, encoding="utf-8")
-    libraries = f"{px4_messages.parents[1]}:{os.environ.get('LD_LIBRARY_PATH', '')}"
-    return path, {**os.environ, "PYTHONPATH": str(px4_messages), "LD_LIBRARY_PATH": libraries}
+    return path, px4_messages
 
 
 STAND_IN = """

@@ -14,6 +14,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from itertools import chain, takewhile
 from pathlib import Path
@@ -169,33 +170,31 @@ def serve(log: Path, vehicle: Path, seconds: float) -> Outcome:
     with tempfile.TemporaryDirectory() as folder, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as wire:
         wire.bind(("127.0.0.1", 0))
         port, history = free_port(), Path(folder) / "history.sqlite"
-        served = subprocess.Popen(
-            [
-                QUADID,
-                "serve",
-                "--vehicle",
-                str(vehicle),
-                "--mavlink",
-                f"udpin:127.0.0.1:{port}",
-                "--history",
-                str(history),
-            ],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-        )
-        said, ready = list[str](), threading.Event()
-        listener = threading.Thread(target=listen, args=(served, said, ready), daemon=True)
-        listener.start()
-        try:
-            ready.wait(WARM)
+        with serving(vehicle, f"udpin:127.0.0.1:{port}", history) as said:
             _send(log, wire, port, seconds)
             time.sleep(LINGER)
-        finally:
-            served.terminate()
-            served.wait(30)
-        listener.join(5)
         return stored(vehicle, history, said, time.monotonic() - begin)
+
+
+@contextmanager
+def serving(vehicle: Path, link: str, history: Path) -> Iterator[list[str]]:
+    """A `quadid serve` on a MAVLink connection, once it is ready or `WARM` is over; yields the lines that it prints."""
+    served = subprocess.Popen(
+        [QUADID, "serve", "--vehicle", str(vehicle), "--mavlink", link, "--history", str(history)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+    said, ready = list[str](), threading.Event()
+    listener = threading.Thread(target=_listen, args=(served, said, ready), daemon=True)
+    listener.start()
+    try:
+        ready.wait(WARM)
+        yield said
+    finally:
+        served.terminate()
+        served.wait(30)
+        listener.join(5)
 
 
 def stored(vehicle: Path, history: Path, said: list[str], seconds: float) -> Outcome:
@@ -211,7 +210,7 @@ def stored(vehicle: Path, history: Path, said: list[str], seconds: float) -> Out
     return Outcome(found["sets"], found["candidates"], found["events"], status, seconds)
 
 
-def listen(served: subprocess.Popen[str], said: list[str], ready: threading.Event) -> None:
+def _listen(served: subprocess.Popen[str], said: list[str], ready: threading.Event) -> None:
     """Keeps the lines of a service, and notes when it is ready."""
     assert served.stdout is not None
     for line in served.stdout:

@@ -84,15 +84,11 @@ ament_package()
 
 def built(folder: Path) -> dict[str, str]:
     """Builds the message packages where they are not; returns the variables with which Python imports them."""
-    environment = {k: v for k, v in os.environ.items() if k not in ("CMAKE_PREFIX_PATH", "PYTHONPATH", "ROS_DISTRO")}
-    environment |= {"AMENT_PREFIX_PATH": sys.prefix, "PATH": f"{sys.prefix}/bin:{os.environ['PATH']}"}
-    cmake, prefix = shutil.which("cmake", path=environment["PATH"]), folder / "prefix"
+    prefix = folder / "prefix"
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "COLCON_IGNORE").touch()  # source and installed, each is there twice
-    if cmake is None:
-        raise SystemExit("cmake is not installed")
     for name, messages in MESSAGES.items():
-        source, build = folder / name, folder / name / "build"
+        source = folder / name
         if (prefix / "share" / name / "package.xml").is_file():
             continue
         (source / "msg").mkdir(parents=True, exist_ok=True)
@@ -101,23 +97,36 @@ def built(folder: Path) -> dict[str, str]:
         depends = "".join(f"<depend>{other}</depend>" for other in NEEDED)
         (source / "package.xml").write_text(PACKAGE.format(name=name, depends=depends), encoding="utf-8")
         (source / "CMakeLists.txt").write_text(CMAKE.format(name=name), encoding="utf-8")
-        for arguments in (
-            [
-                "-S",
-                source,
-                "-B",
-                build,
-                "-Wno-dev",
-                "-DBUILD_TESTING=OFF",
-                f"-DCMAKE_PREFIX_PATH={sys.prefix}",
-                f"-DCMAKE_INSTALL_PREFIX={prefix}",
-                f"-DPython3_EXECUTABLE={sys.executable}",
-                f"-DCMAKE_PROJECT_INCLUDE={ROOT / 'tools' / 'wheel_targets.cmake'}",
-            ],
-            ["--build", build, "--parallel", "2"],
-            ["--install", build],
-        ):
-            subprocess.run([cmake, *map(str, arguments)], env=environment, check=True, stdout=subprocess.DEVNULL)
+        build_package(source, prefix)
+    return importing(prefix)
+
+
+def build_package(source: Path, prefix: Path) -> None:
+    """Builds a message package with the ROS wheels of this Python, and installs it into a folder."""
+    environment = {k: v for k, v in os.environ.items() if k not in ("CMAKE_PREFIX_PATH", "PYTHONPATH", "ROS_DISTRO")}
+    environment |= {"AMENT_PREFIX_PATH": sys.prefix, "PATH": f"{sys.prefix}/bin:{os.environ['PATH']}"}
+    cmake, build = shutil.which("cmake", path=environment["PATH"]), source / "build"
+    if cmake is None:
+        raise SystemExit("cmake is not installed")
+    variables = {
+        "BUILD_TESTING": "OFF",
+        "CMAKE_PREFIX_PATH": sys.prefix,
+        "CMAKE_INSTALL_PREFIX": prefix,
+        "Python3_EXECUTABLE": sys.executable,
+        "CMAKE_PROJECT_INCLUDE": ROOT / "tools" / "wheel_targets.cmake",
+    }
+    for arguments in (
+        ["-S", source, "-B", build, "-Wno-dev", *(f"-D{name}={value}" for name, value in variables.items())],
+        ["--build", build, "--parallel", "2"],
+        ["--install", build],
+    ):
+        subprocess.run(
+            [cmake, *map(str, arguments)], env=environment, check=True, stdout=subprocess.DEVNULL, timeout=500
+        )
+
+
+def importing(prefix: Path) -> dict[str, str]:
+    """Environment in which Python imports the message packages that are installed in a folder."""
     (packages,) = prefix.glob("lib/python*/site-packages")
     libraries = f"{prefix / 'lib'}:{os.environ.get('LD_LIBRARY_PATH', '')}"
     return {**os.environ, "PYTHONPATH": str(packages), "LD_LIBRARY_PATH": libraries}

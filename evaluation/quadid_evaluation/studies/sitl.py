@@ -18,7 +18,6 @@ import shutil
 import subprocess
 import sys
 import tempfile
-import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -29,13 +28,13 @@ from pymavlink import mavutil
 
 from quadid.flight.pilot import AXES, PILOT_STEP, Segment, scripted
 from quadid.types import FloatArray
-from quadid_evaluation.harness import QUADID, Given, options, put
-from quadid_evaluation.studies.autopilot import TITLE, Flown, Outcome, listen, row, section, stored
+from quadid_evaluation.harness import Given, options, put
+from quadid_evaluation.studies.autopilot import TITLE, Flown, Outcome, row, section, serving, stored
 
 PILOT, SERVICE = 5760, 5762
 """TCP ports of ArduPilot's first two serial ports."""
 HEIGHT, HOVER, READY = 20.0, 15.0, 120.0
-"""Height [m]; hover before the sticks move [s]; longest wait for a position, and for the service [s]."""
+"""Height [m]; hover before the sticks move [s]; longest wait for a position [s]."""
 STICKS = {"roll": 0.35, "pitch": 0.35, "yaw": 0.3}
 """Size of each multisine, rms of full stick."""
 BANDS = ((0.3, 1.0), (0.8, 2.0))
@@ -133,31 +132,10 @@ def flown(given: Given) -> Outcome:
             stdout=subprocess.DEVNULL,
             stderr=subprocess.STDOUT,
         )
-        said, ready = list[str](), threading.Event()
         try:
             link = mavutil.mavlink_connection(f"tcp:127.0.0.1:{PILOT}", retries=60)
-            served = subprocess.Popen(
-                [
-                    QUADID,
-                    "serve",
-                    "--vehicle",
-                    str(given.vehicle),
-                    "--mavlink",
-                    f"tcp:127.0.0.1:{SERVICE}",
-                    "--history",
-                    str(history),
-                ],
-                stdout=subprocess.PIPE,
-                stderr=subprocess.STDOUT,
-                text=True,
-            )
-            threading.Thread(target=listen, args=(served, said, ready), daemon=True).start()
-            try:
-                ready.wait(READY)
+            with serving(given.vehicle, f"tcp:127.0.0.1:{SERVICE}", history) as said:
                 fly(link, given.seconds, given.seed)
-            finally:
-                served.terminate()
-                served.wait(30)
         finally:
             autopilot.kill()
             autopilot.wait()
