@@ -436,10 +436,65 @@ def drone_models(facts: Facts) -> dict[str, Any]:
     }
 
 
+def gym_pybullet_drones(facts: Facts) -> dict[str, Any]:
+    """Rotors in the order of its Crazyflie's motors, clockwise from front right.
+
+    Its drag is that of Gazebo's plugin, at the centre of gravity.
+
+    Raises:
+        ParameterError: not two pairs of rotors, which the program takes for granted.
+    """
+    front_right, back_left, front_left, back_right = _two_pairs(facts, "gym-pybullet-drones")
+    order = [front_right, back_right, back_left, front_left]
+    return _ordered(facts, order) | {"per_rpm": 2.0 * math.pi / 60.0}
+
+
+def pyflyt(facts: Facts) -> dict[str, Any]:
+    """Rotors in its order, which is PX4's, and a lag that is not shorter than a step of its physics.
+
+    Raises:
+        ParameterError: not two pairs of rotors, which the program takes for granted.
+    """
+    lag = max(facts.effect("motor_lag", "tau"), 1.0 / 240.0)
+    return _ordered(facts, _two_pairs(facts, "PyFlyt")) | {"lag": lag, "density": AIR_DENSITY}
+
+
+def _two_pairs(facts: Facts, program: str) -> list[int]:
+    """Rotors (from 0) in PX4's order of an X; in any other shape too, the first two push the vehicle clockwise."""
+    _four(facts, program)
+    if facts.vehicle.spins.sum() != 0:
+        raise ParameterError(
+            f"spins {facts.vehicle.spins.tolist()}", f"two of each, which {program} takes for granted", "use jsbsim"
+        )
+    return sorted(range(4), key=lambda i: (-facts.rotors[i].spin, -facts.vehicle.rotor_positions[i, 0]))
+
+
+def _ordered(facts: Facts, order: list[int]) -> dict[str, Any]:
+    """The rotors in another order, which ``order`` states, and the inertia without products.
+
+    Where there are products, Bullet tells the attitude of the principal axes, which these programs take for the body's.
+    """
+    tensor = np.diag(np.diag(facts.inertia))
+    return {"rotors": [facts.rotors[i] for i in order], "order": [i + 1 for i in order], "tensor": tensor}
+
+
+def jsbsim(facts: Facts) -> dict[str, Any]:
+    """Units of its functions, drag along each axis [1/s], places and inertia in its own frame: aft, right, up."""
+    k, structural = facts.effect, np.diag([-1.0, 1.0, -1.0])
+    along = k("rotor_drag", "k_x"), k("rotor_drag", "k_y"), k("axial_inflow", "k_z")
+    return {
+        "pound": 1.0 / 4.4482216152605,
+        "foot": 0.3048,
+        "drags": list(zip("XYZ", "uvw", along, strict=True)),
+        "places": [structural @ r.frd for r in facts.rotors],
+        "tensor": structural @ facts.inertia @ structural,
+    }
+
+
 def _four(facts: Facts, program: str) -> None:
     if len(facts.rotors) != 4:
         raise ParameterError(
-            f"{len(facts.rotors)} rotors", f"four, which {program} takes for granted", "use mujoco or urdf"
+            f"{len(facts.rotors)} rotors", f"four, which {program} takes for granted", "use jsbsim, mujoco or urdf"
         )
 
 
@@ -560,7 +615,28 @@ FORMS: dict[str, Form] = {
         "Agilicious", ("cg_offset", "motor_lag", "rotor_drag"), {".agilicious.yaml": "agilicious.yaml"}, agilicious
     ),
     "mujoco": Form("MuJoCo", (*_BODY, "weak_rotor"), {".mjcf.xml": "mujoco.mjcf.xml"}),
-    "urdf": Form("URDF", _BODY, {".urdf": "vehicle.urdf"}),
+    "urdf": Form("URDF", _BODY, {".urdf": "vehicle.urdf"}, lambda facts: {"tensor": facts.inertia_flu}),
+    "gym-pybullet-drones": Form(
+        "gym-pybullet-drones",
+        ("cg_offset", "rotor_drag", "rotor_drag.central", "axial_inflow", "axial_inflow.central"),
+        {".cf2x.urdf": "gym_pybullet_drones.urdf"},
+        gym_pybullet_drones,
+    ),
+    "pyflyt": Form(
+        "PyFlyt",
+        ("cg_offset", "motor_lag", "parasitic_drag"),
+        {".pyflyt.urdf": "pyflyt.urdf", ".pyflyt.yaml": "pyflyt.yaml"},
+        pyflyt,
+    ),
+    "jsbsim": Form(
+        "JSBSim",
+        (
+            *(*_BODY, "weak_rotor", "motor_lag", "parasitic_drag"),
+            *("rotor_drag", "rotor_drag.central", "axial_inflow", "axial_inflow.central"),
+        ),
+        {".jsbsim.xml": "jsbsim.xml"},
+        jsbsim,
+    ),
     "drone-models": Form(
         "drone-models, crazyflow",
         (*_BODY, *_LAGS, "rotor_drag", "rotor_drag.central", "axial_inflow", "axial_inflow.central"),
@@ -596,9 +672,9 @@ def form_of(name: str) -> str:
     Raises:
         ParameterError: no form, or several.
     """
-    if name in FORMS:
-        return name
     asked = name.lower().lstrip(".")
+    if asked in FORMS:
+        return asked
     found = [form for form, about in FORMS.items() if asked in about.names]
     if len(found) != 1:
         raise ParameterError(f"unknown format '{name}'", ", ".join(FORMATS), nearest(name, FORMATS))
@@ -627,6 +703,6 @@ def export(vehicle: Vehicle, form: str, source: str) -> dict[str, str]:
     facts, asked = Facts(vehicle, source), FORMS[form_of(form)]
     own = asked.particulars(facts)
     header = facts.header(tuple(name for name in asked.carried if name not in own.get("lost", ())))
-    values = {**own, "f": facts, "v": vehicle, "rotors": facts.rotors, "header": header}
+    values = {"f": facts, "v": vehicle, "rotors": facts.rotors, "header": header, **own}
     without = own.get("without", ())
     return {end: render(f"programs/{name}", values) for end, name in asked.templates.items() if end not in without}

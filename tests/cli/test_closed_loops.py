@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import inspect
+import re
 import tempfile
 import tomllib
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, NamedTuple
+from unittest import mock
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from quadid.app.init import shipped
 from quadid.errors import ParameterError
@@ -53,7 +57,7 @@ def plain(name: str) -> Vehicle:
 
 def ours(vehicle: Vehicle, lag: float) -> Program:
     effects = {"motor_lag": {"tau": lag}} if lag > 0.0 else {}
-    simulator = Simulator(vehicle.model_copy(update={"effects": effects}))
+    simulator = Simulator(vehicle.model_copy(update={"effects": {**effects, **vehicle.effects}}))
     state = simulator.start(position=REST.position, dt=DT)
 
     def step(speeds: FloatArray) -> Motion:
@@ -154,13 +158,111 @@ def bullet(vehicle: Vehicle) -> Program:
             for i, speed in enumerate(speeds):
                 program.applyExternalForce(body, i, [0, 0, b * speed**2], [0, 0, 0], program.LINK_FRAME, client)
             torque = -float(vehicle.spins @ (d * speeds**2))
-            program.applyExternalTorque(body, -1, [0, 0, torque], program.LINK_FRAME, client)
+            program.applyExternalTorque(body, 0, [0, 0, torque], program.LINK_FRAME, client)
             program.stepSimulation(client)
-        position, xyzw = program.getBasePositionAndOrientation(body, client)
-        velocity, rate = program.getBaseVelocity(body, client)
-        turn = np.array(program.getMatrixFromQuaternion(xyzw)).reshape(3, 3)
-        q = np.append(xyzw[3], np.array(xyzw[:3]) * TO_FLU)
-        return Motion(q, turn.T @ rate * TO_FLU, np.array(velocity) * TO_FLU, np.array(position) * TO_FLU)
+        return of_bullet(program, client, body)
+
+    return step
+
+
+def of_bullet(program: Any, client: int, body: int) -> Motion:
+    """Where Bullet has a body; it tells the attitude of the principal axes."""
+    axes = program.invertTransform([0.0, 0.0, 0.0], program.getDynamicsInfo(body, -1, client)[4])
+    position, xyzw = program.multiplyTransforms(*program.getBasePositionAndOrientation(body, client), *axes)
+    velocity, rate = program.getBaseVelocity(body, client)
+    turn = np.array(program.getMatrixFromQuaternion(xyzw)).reshape(3, 3)
+    q = np.append(xyzw[3], np.array(xyzw[:3]) * TO_FLU)
+    return Motion(q, turn.T @ rate * TO_FLU, np.array(velocity) * TO_FLU, np.array(position) * TO_FLU)
+
+
+def order_in(text: str) -> list[int]:
+    """The rotors (from 0) that an exported file says the motors of its program are."""
+    found = re.search(r"rotors\s+(\d(?:, \d)*)\s+of the vehicle file", text)
+    assert found
+    return [int(n) - 1 for n in found[1].split(", ")]
+
+
+def gym_pybullet_drones(vehicle: Vehicle) -> Program:
+    text = export(vehicle, "gym-pybullet-drones", "test")[".cf2x.urdf"]
+    program = pytest.importorskip("gym_pybullet_drones.envs.BaseAviary", reason="no package: install from its source")
+    envs, order = pytest.importorskip("gym_pybullet_drones.envs.CtrlAviary"), order_in(text)
+    n = 20
+    with tempfile.NamedTemporaryFile("w", suffix=".urdf", encoding="utf-8") as file:
+        file.write(text)
+        file.flush()
+        with mock.patch.object(program.pkg_resources, "resource_filename", return_value=file.name):
+            high = (REST.position * TO_FLU)[None]
+            rates = {"pyb_freq": round(n / DT), "ctrl_freq": round(1.0 / DT)}
+            flier = envs.CtrlAviary(initial_xyzs=high, physics=envs.Physics.PYB_DRAG, **rates)
+    body = int(flier.DRONE_IDS[0])
+    program.p.changeDynamics(body, -1, linearDamping=0.0, angularDamping=0.0, physicsClientId=flier.CLIENT)
+
+    def step(speeds: FloatArray) -> Motion:
+        flier.step(speeds[None, order] * 60.0 / (2.0 * np.pi))
+        return of_bullet(program.p, flier.CLIENT, body)
+
+    return step
+
+
+def pyflyt(vehicle: Vehicle) -> Program:
+    texts = export(vehicle, "pyflyt", "test")
+    core, n = pytest.importorskip("PyFlyt.core", reason="pip install pyflyt, which wants NumPy below 2"), 20
+    with tempfile.TemporaryDirectory() as folder:
+        place = Path(folder) / "v.pyflyt"
+        place.mkdir()
+        for ending, text in texts.items():
+            (place / f"v{ending}").write_text(text, encoding="utf-8")
+        options = {"drone_model": place.name, "model_dir": folder, "control_hz": round(1.0 / DT)}
+        high = (REST.position * TO_FLU)[None]
+        with pytest.warns(UserWarning, match="Physics_hz"):
+            flier = core.Aviary(high, np.zeros((1, 3)), "quadx", drone_options=options, physics_hz=round(n / DT))
+    flier.setTimeStep(DT / n)  # it leaves Bullet at 240 Hz, whatever its own rate
+    drone, order = flier.drones[0], order_in(texts[".pyflyt.yaml"])
+    flier.set_mode(-1)
+    full = drone.motors.max_rpm
+    drone.motors.throttle = vehicle.hover_speed() / full
+
+    def step(speeds: FloatArray) -> Motion:
+        flier.set_setpoint(0, speeds[order] / full)
+        flier.step()
+        return of_bullet(pytest.importorskip("pybullet"), flier._client, drone.Id)
+
+    return step
+
+
+def jsbsim(vehicle: Vehicle) -> Program:
+    program = pytest.importorskip("jsbsim", reason="pip install jsbsim (extra dev)")
+    n, foot = 20, 0.3048
+    with tempfile.TemporaryDirectory() as folder:
+        flier = program.FGFDMExec(folder)
+        flier.set_debug_level(0)
+        flier.set_dt(DT / n)
+        Path(folder, "v.jsbsim.xml").write_text(export(vehicle, "jsbsim", "test")[".jsbsim.xml"], encoding="utf-8")
+        flier.set_aircraft_path("")
+        assert flier.load_model("v.jsbsim", False)
+    flier["ic/lat-geod-deg"] = 45.5  # where the Earth's gravity is `GRAVITY`
+    flier["ic/h-sl-ft"] = -REST.position[2] / foot
+    for motion in ("translational", "rotational"):
+        flier[f"simulation/integrator/rate/{motion}"] = 1  # Euler: others remember the fall before the rotors turned
+    for i in range(len(vehicle.rotors)):
+        flier[f"fcs/rotor-{i + 1}-cmd-rad_sec"] = vehicle.hover_speed()
+    flier.run_ic()
+    flier.suspend_integration()
+    for _ in range(40 * n):  # rotors begin at rest: they reach hover before the vehicle moves
+        flier.run()
+    flier.resume_integration()
+
+    def step(speeds: FloatArray) -> Motion:
+        for i, speed in enumerate(speeds):
+            flier[f"fcs/rotor-{i + 1}-cmd-rad_sec"] = speed
+        for _ in range(n):
+            flier.run()
+        rpy = [flier[f"attitude/{axis}-rad"] for axis in ("psi", "theta", "phi")]
+        x, y, z, w = Rotation.from_euler("ZYX", rpy).as_quat(canonical=True)
+        rate = np.array([flier[f"velocities/{axis}-rad_sec"] for axis in "pqr"])
+        velocity = foot * np.array([flier[f"velocities/v-{axis}-fps"] for axis in ("north", "east", "down")])
+        at = [flier["position/from-start-neu-n-ft"], flier["position/from-start-neu-e-ft"], -flier["position/h-sl-ft"]]
+        return Motion(np.array([w, x, y, z]), rate, velocity, foot * np.array(at))
 
     return step
 
@@ -197,16 +299,7 @@ def flown(vehicle: Vehicle, program: Program, goal: Goal) -> FloatArray:
     return np.array(rows)
 
 
-@pytest.mark.parametrize("name", VEHICLES)
-@pytest.mark.parametrize(
-    ("program", "lag"), [(rotorpy, SHORTEST_LAG), (drone_models, SHORTEST_LAG), (mujoco, 0.0), (bullet, 0.0)]
-)
-def test_every_program_flies_the_export_as_we_do(program: Callable[[Vehicle], Program], lag: float, name: str) -> None:
-    vehicle = plain(name)
-    if program in (rotorpy, drone_models) and len(vehicle.rotors) != 4:
-        with pytest.raises(ParameterError, match="6 rotors.*four, which .* takes for granted"):
-            program(vehicle)
-        return
+def assert_alike(vehicle: Vehicle, program: Callable[[Vehicle], Program], lag: float) -> None:
     for kind, goal in GOALS.items():
         theirs, own = flown(vehicle, program(vehicle), goal), flown(vehicle, ours(vehicle, lag), goal)
         reached = (-own[-1, 8], own[-1, 0], own[-1, 2])
@@ -215,3 +308,47 @@ def test_every_program_flies_the_export_as_we_do(program: Callable[[Vehicle], Pr
         for part in (slice(0, 3), slice(3, 6), slice(6, 9)):
             size = float(np.abs(own[:, part]).max())
             assert np.abs(theirs[:, part] - own[:, part]).max() < 0.01 * max(size, 0.1), kind
+
+
+@pytest.mark.parametrize("name", VEHICLES)
+@pytest.mark.parametrize(
+    ("program", "lag"),
+    [
+        (rotorpy, SHORTEST_LAG),
+        (drone_models, SHORTEST_LAG),
+        (mujoco, 0.0),
+        (bullet, 0.0),
+        (gym_pybullet_drones, 0.0),
+        (pyflyt, 1.0 / 240.0),
+        (jsbsim, 0.0),
+    ],
+)
+def test_every_program_flies_the_export_as_we_do(program: Callable[[Vehicle], Program], lag: float, name: str) -> None:
+    vehicle = plain(name)
+    if program not in (mujoco, bullet, jsbsim) and len(vehicle.rotors) != 4:
+        with pytest.raises(ParameterError, match="6 rotors.*four, which .* takes for granted"):
+            program(vehicle)
+        return
+    assert_alike(vehicle, program, lag)
+
+
+ASIDE, WEAK = {"cg_offset": {"x": 8e-4, "y": -6e-4}}, {"weak_rotor": {"loss_2": 0.01}}
+OFF_CENTRE = {**ASIDE, "product_of_inertia": {"J_xy": 4e-4, "J_xz": 3e-4, "J_yz": -2e-4}}
+LAG, DRAG = {"motor_lag": {"tau": 0.03}}, {"parasitic_drag": {"c": 0.05}}
+ROTOR_DRAG = {"rotor_drag": {"k_x": 0.3, "k_y": 0.3, "central": 1.0}, "axial_inflow": {"k_z": 0.2, "central": 1.0}}
+
+
+@pytest.mark.parametrize(
+    ("program", "effects"),
+    [
+        (mujoco, {**OFF_CENTRE, **WEAK}),
+        (bullet, OFF_CENTRE),
+        (gym_pybullet_drones, {**ASIDE, **ROTOR_DRAG}),
+        (pyflyt, {**ASIDE, **LAG, **DRAG}),
+        (jsbsim, {**OFF_CENTRE, **LAG, **DRAG, **ROTOR_DRAG, **WEAK}),
+    ],
+)
+def test_the_effects_that_a_form_carries_are_flown(
+    program: Callable[[Vehicle], Program], effects: dict[str, dict[str, float]]
+) -> None:
+    assert_alike(plain("pelican").model_copy(update={"effects": effects}), program, 0.0)

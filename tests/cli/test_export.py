@@ -282,8 +282,8 @@ def test_optional_numbers_that_have_no_place_are_named_too(vehicle: Vehicle, for
     rotors, effects = Vehicle.shipped("pelican_x").rotors, {"motor_lag": lag, "axial_inflow": inflow}
     for text in export(vehicle.model_copy(update={"rotors": rotors, "effects": effects}), form, "x").values():
         told = "".join(line for line in text.splitlines() if "have no place here" in line)
-        assert ("k_climb" in told) == (form in {"rotorpy", "drone-models", "pegasus"})
-        assert ("tau_down" in told) == (form in {"px4", "rotorpy", "agilicious", "airsim"})
+        assert ("k_climb" in told) == (form in {"rotorpy", "drone-models", "pegasus", "gym-pybullet-drones", "jsbsim"})
+        assert ("tau_down" in told) == (form in {"px4", "rotorpy", "agilicious", "airsim", "pyflyt", "jsbsim"})
         assert "central" not in told, "neutral: nothing is left out"
 
 

@@ -369,6 +369,8 @@ def test_what_sitl_and_sih_cannot_be_is_left_out_with_its_reason() -> None:
         ("crazyflow", "drone-models"),
         ("SITL", "ardupilot"),
         ("isaac", "isaac-lab"),
+        ("URDF", "urdf"),
+        ("PyFlyt", "pyflyt"),
     ],
 )
 def test_programs_and_kinds_of_files_name_a_form(asked: str, form: str) -> None:
@@ -385,3 +387,12 @@ def test_a_motor_lag_that_nobody_measured_is_written_as_such() -> None:
             vehicle = Vehicle.shipped("pelican_x").model_copy(update={"effects": lag})
             (text,) = export(vehicle, form, "x").values()
             assert ("not measured: a small value, for rotors that follow at once" in text) == (not lag), form
+
+
+@pytest.mark.parametrize("form", ["gym-pybullet-drones", "pyflyt"])
+def test_three_rotors_that_turn_alike_are_refused_where_pairs_are_taken_for_granted(form: str) -> None:
+    cross = Vehicle.shipped("pelican_x")
+    first, *others = cross.rotors
+    odd = (first.model_copy(update={"spin": -first.spin}), *others)
+    with pytest.raises(ParameterError, match="two of each, which .* takes for granted"):
+        export(cross.model_copy(update={"rotors": odd}), form, "x")
