@@ -9,6 +9,7 @@ from typing import Any
 
 import numba as nb
 import numpy as np
+from numba.np.unsafe.ndarray import to_fixed_tuple
 from numpy.typing import ArrayLike
 
 from quadid.errors import ParameterError, WindowError
@@ -145,7 +146,7 @@ def _push(dt: float, inputs: FloatArray, s: FloatArray) -> None:
 
 
 @nb.njit(**jit)
-def _read_sensors(steps: int, dt: float, need: Needs, s: FloatArray, past: FloatArray) -> None:
+def _read_sensors(steps: int, dt: float, need: Needs, s: FloatArray, ring: FloatArray) -> None:
     """Writes what the sensors read at the end of a step: rows S_QW to S_FZ.
 
     Args:
@@ -153,7 +154,7 @@ def _read_sensors(steps: int, dt: float, need: Needs, s: FloatArray, past: Float
         dt: step [s].
         need: which parts of the model any lane needs.
         s: rows.
-        past: attitude and rate at the ends of the last steps, a ring that stands there twice, (rows, 7, LANES).
+        ring: attitude and rate at the ends of the last steps, rows (7, LANES) one after another, all there twice.
     """
     if need.ahrs:  # needs the attitude at both ends of the step
         step_tilt_error(s)
@@ -173,6 +174,7 @@ def _read_sensors(steps: int, dt: float, need: Needs, s: FloatArray, past: Float
             s[G_W0 + i], s[G_F0 + i] = s[S_P + i], s[S_FX + i]
             s[S_P + i], s[S_FX + i] = s[G_W + i], s[G_F + i]
     if need.att_delay:
+        past = ring.reshape(-1, 7, LANES)
         late = len(past) // 2
         at = steps % late
         remember_attitude(at, s, past)
@@ -194,20 +196,20 @@ def _copy(source: FloatArray, target: FloatArray) -> None:
 
 @nb.njit(**jit)
 def _take(source: FloatArray, stretches: IntArray, target: FloatArray) -> None:
-    """Copies numbers, one after another, to stretches (first, end) of the work array."""
+    """Copies numbers, one after another, to stretches of the work array: first, end, first, end ..."""
     at = 0
-    for k in range(len(stretches)):
-        first, end = stretches[k, 0], stretches[k, 1]
+    for k in range(0, len(stretches), 2):
+        first, end = stretches[k], stretches[k + 1]
         _copy(source[at : at + end - first], target[first:end])
         at += end - first
 
 
 @nb.njit(**jit)
 def _keep(source: FloatArray, stretches: IntArray, target: FloatArray) -> None:
-    """Copies stretches (first, end) of the work array, one after another."""
+    """Copies stretches of the work array, as in `_take`, one after another."""
     at = 0
-    for k in range(len(stretches)):
-        first, end = stretches[k, 0], stretches[k, 1]
+    for k in range(0, len(stretches), 2):
+        first, end = stretches[k], stretches[k + 1]
         _copy(source[first:end], target[at : at + end - first])
         at += end - first
 
@@ -238,11 +240,36 @@ def write_constants(
         constants[block] = s[:STATE]
 
 
-PLAN = 9
+COUNTS, NEEDS = 9, len(Needs._fields)
+PLAN = COUNTS + -(-NEEDS // 8)
 """Numbers at the begin of a plan: rotors, size of a parameter vector, terms beyond the catalogue, stretches of own
-constants, of the state, numbers of these, commands that are remembered, 1 with random inputs, their seed.  Then what
-is needed, in the order of `Needs`; stretches (first, end) of the constants that differ between blocks and of the state,
+constants, of the state, numbers of these, commands that are remembered, 1 with random inputs, their seed; then, a byte
+each, what is needed.  Behind them stretches (first, end) of the constants that differ between blocks and of the state,
 sensors last; terms, four numbers each."""
+
+
+@nb.njit(**jit)
+def _send(
+    commands: FloatArray, first: int, newest: int, r: int, sent: FloatArray, rot: FloatArray, s: FloatArray
+) -> None:
+    """Remembers the commands to a rotor, and writes those that reach it now and next.
+
+    Args:
+        commands: (vehicles, rotors).
+        first: place of the first lane's vehicle.
+        newest: place of these commands in `sent`.
+        r: the rotor.
+        sent: last commands, a ring that stands there twice, (2 delayed, rotors, LANES).
+        rot: rows of the rotors.
+        s: rows.
+    """
+    for lane in range(LANES):
+        now = commands[min(first + lane, len(commands) - 1), r]
+        sent[newest, r, lane] = sent[newest - len(sent) // 2, r, lane] = now
+    for lane in range(LANES):
+        at = newest - int(s[C_SHIFT + lane])
+        rot[r, R_PAST + lane], rot[r, R_NOW + lane] = sent[at - 1, r, lane], sent[at, r, lane]
+        rot[r, R_NEXT + lane] = sent[at, r, lane]
 
 
 @cached
@@ -270,74 +297,61 @@ def step_blocks(
         out: after each step (steps, vehicles, N_STATE + 10), written: motion, sensors; no rows: not wanted.
     """
     count, blocks = commands.shape[1], len(state)
-    rotors, size, most, owned, keeping, at_rotors, delayed, walks, seed = (
-        plan[0], plan[1], plan[2], plan[3], plan[4], plan[5], plan[6], plan[7], plan[8],
-    )  # fmt: skip
-    n = plan[PLAN : PLAN + 17]
-    need = Needs(
-        n[0] != 0, n[1] != 0, n[2] != 0, n[3] != 0, n[4] != 0, n[5] != 0, n[6] != 0, n[7] != 0, n[8] != 0, n[9] != 0,
-        n[10] != 0, n[11] != 0, n[12] != 0, n[13] != 0, n[14] != 0, n[15] != 0, n[16] != 0,
-    )  # fmt: skip
-    at = PLAN + 17
-    own, at = plan[at : at + 2 * owned].reshape(owned, 2), at + 2 * owned
-    kept, at = plan[at : at + 2 * keeping].reshape(keeping, 2), at + 2 * keeping
-    terms, at = plan[at : at + 4 * most].reshape(most, 4), 4 * rotors
-    geometry = numbers[:at].reshape(rotors, 4)
-    walk, at = numbers[at : at + 2 * TURNS * walks].reshape(2 * walks, TURNS), at + 2 * TURNS * walks
-    many = blocks * LANES * size
-    theta, at = numbers[at : at + many].reshape(blocks, LANES, size), at + many
-    many = blocks * most * LANES
-    coefficients, at = numbers[at : at + many].reshape(blocks, most, LANES), at + many
-    constants = numbers[at:].reshape(blocks, (len(numbers) - at) // blocks)
+    rotors, size, most, owned, keeping, at_rotors, delayed, walks, seed = to_fixed_tuple(plan[:COUNTS], COUNTS)
+    need = Needs(*to_fixed_tuple(plan[COUNTS:PLAN].view(np.bool_)[:NEEDS], NEEDS))
     plain = not (need.delayed or need.uneven)
-    signals = s[N_ROWS * LANES :].reshape(N_SIGNALS, LANES)
+    # Where each part begins: views of it are made where they are used, since making one takes a fiftieth of a step.
+    at_kept = PLAN + 2 * owned
+    at_terms = at_kept + 2 * keeping
+    at_walk = 4 * rotors
+    at_theta = at_walk + 2 * TURNS * walks
+    at_coefficients = at_theta + blocks * LANES * size
+    at_constants = at_coefficients + blocks * most * LANES
+    own_size = (len(numbers) - at_constants) // blocks
     at_sent = at_rotors + rotors * ROTOR
     at_inputs = at_sent + 2 * delayed * rotors * LANES
     at_past = at_inputs + TURNS * LANES
+    geometry = numbers[:at_walk].reshape(rotors, 4)
     for block in range(blocks):
-        now = state[block]
+        now, at = state[block], at_constants + block * own_size
         rot = now[at_rotors:at_sent].reshape(rotors, ROTOR)
-        sent = now[at_sent:at_inputs].reshape(2 * delayed, rotors, LANES)
-        inputs = now[at_inputs:at_past].reshape(TURNS, LANES)
-        past = now[at_past:].reshape(-1, 7, LANES)
-        _take(constants[block], own, s)
-        _take(now, kept[:-1], s)
+        _take(numbers[at : at + own_size], plan[PLAN:at_kept], s)
+        _take(now, plan[at_kept : at_terms - 2], s)
         first, last = block * LANES, count - 1
         for k in range(len(commands)):
-            newest = (step + k) % delayed + delayed
             for r in range(rotors):
                 if plain:
                     for lane in range(LANES):
                         s[T_A1 + lane] = commands[k, min(first + lane, last), r]
                 else:
-                    for lane in range(LANES):
-                        now_sent = commands[k, min(first + lane, last), r]
-                        sent[newest, r, lane] = sent[newest - delayed, r, lane] = now_sent
-                    for lane in range(LANES):
-                        at = newest - int(s[C_SHIFT + lane])
-                        rot[r, R_PAST + lane], rot[r, R_NOW + lane] = sent[at - 1, r, lane], sent[at, r, lane]
-                        rot[r, R_NEXT + lane] = sent[at, r, lane]
+                    sent = now[at_sent:at_inputs].reshape(2 * delayed, rotors, LANES)
+                    _send(commands[k], first, (step + k) % delayed + delayed, r, sent, rot, s)
                 turn_rotor(plain, r, True, False, geometry, dt, need, rot, s)
             begin = time + k * dt
             if need.factors:
                 flight_factors(begin, 0.0, span, dt, s)
             if need.payload:
-                load_payload(begin, dt, theta[block], s)
+                at = at_theta + block * LANES * size
+                load_payload(begin, dt, numbers[at : at + LANES * size].reshape(LANES, size), s)
             if need.learned:
+                at, signals = at_coefficients + block * most * LANES, s[N_ROWS * LANES :].reshape(N_SIGNALS, LANES)
+                terms = plan[at_terms : at_terms + 4 * most].reshape(most, 4)
                 residual_signals(s, signals)
-                residual_forces(terms, coefficients[block], signals, step + k == 0, s)
+                coefficients = numbers[at : at + most * LANES].reshape(most, LANES)
+                residual_forces(terms, coefficients, signals, step + k == 0, s)
             step_in_air(need, dt, s)
-            if len(walk) > 0:
-                _random_inputs(seed, first, step + k, walk, inputs)
+            if walks > 0:
+                inputs = now[at_inputs:at_past].reshape(TURNS, LANES)
+                _random_inputs(seed, first, step + k, numbers[at_walk:at_theta].reshape(2, TURNS), inputs)
                 _push(dt, inputs, s)
-            _read_sensors(step + k, dt, need, s, past)
+            _read_sensors(step + k, dt, need, s, now[at_past:])
             if len(out) > 0:
                 for lane in range(min(LANES, count - first)):
                     for i in range(N_STATE):
                         out[k, first + lane, i] = s[X_QW + i * LANES + lane]
                     for i in range(10):
                         out[k, first + lane, N_STATE + i] = s[SENSED + i * LANES + lane]
-        _keep(s, kept, now)
+        _keep(s, plan[at_kept:at_terms], now)
 
 
 @cache
@@ -534,6 +548,7 @@ class Simulator:
         self._seed, self._span = seed, min(span, 1e9)
         self._dt, self._constants = 0.0, _NO_CONSTANTS
         self._each = (self.vehicles, len(self._geometry))
+        self._one = (1, *self._each)
 
     def start(
         self,
@@ -608,10 +623,7 @@ class Simulator:
 
     def advance(self, state: State, command: ArrayLike, dt: float, voltage: float | None = None) -> None:
         """Makes one step in place; arguments as for `step`."""
-        given = np.array(command, np.float64, copy=None, order="C", ndmin=3)
-        if len(given) != 1:
-            raise WindowError(f"commands of shape {given.shape}", f"{self._each}", "`run` makes several steps")
-        self._march(state, given, dt, voltage)
+        self._march(state, np.array(command, np.float64, copy=None, order="C", ndmin=3), dt, voltage)
 
     def run(self, state: State, commands: ArrayLike, dt: float) -> FloatArray:
         """Makes a step a row of commands, in place.
@@ -634,28 +646,11 @@ class Simulator:
     def _march(
         self, state: State, commands: FloatArray, dt: float, voltage: float | None, out: FloatArray = _NO_OUT
     ) -> None:
-        """Makes the steps; the one way into the kernel."""
-        if commands.shape[1:] != self._each:
-            if commands.shape[1:] != (1, self._each[1]):
-                raise WindowError(f"commands of shape {commands.shape[1:]}", f"{self._each}")
-            commands = np.repeat(commands, self.vehicles, axis=1)
-        if dt != state._dt:
-            if self._need.delayed or self._need.att_delay:
-                raise WindowError(
-                    f"dt {dt} s after {state._dt} s",
-                    "one step size where commands or attitude are delayed",
-                    "begin with start(dt=...)",
-                )
-            state._dt = dt
-        if dt != self._dt:
-            self._settle(dt)
-        if state._constants is not self._constants:  # a new state or a copy, or another step or simulator than before
-            if (state.vehicles, state._rotors) != self._each:
-                found = f"a state of {state.vehicles} vehicles with {state._rotors} rotors"
-                raise WindowError(found, f"{self.vehicles} with {self._each[1]}, as the simulator has")
-            if (state._kept, state._memory.shape[1]) != self._width:
-                raise WindowError("a state of other delays or filters", "one of this simulator's `start`")
-            state._work, state._constants = self._prepared.copy(), self._constants
+        """Makes the steps; the one way into the kernel.  What need not be asked at every step is asked elsewhere."""
+        if commands.shape != self._one:
+            commands = self._spread(commands, out)
+        if state._constants is not self._constants or dt != self._dt:
+            self._prepare(state, dt)
         if voltage is not None:
             exponent = self._theta[..., ix.EXPONENT].reshape(-1)[: state.vehicles]
             commands = commands * voltage ** exponent[None, :, None]
@@ -665,6 +660,31 @@ class Simulator:
         )  # fmt: skip
         state.time += len(commands) * dt
         state.steps += len(commands)
+
+    def _spread(self, commands: FloatArray, out: FloatArray) -> FloatArray:
+        """Commands to every vehicle, shape (steps, vehicles, rotors); several steps only where they are written."""
+        if out is _NO_OUT and len(commands) != 1:
+            raise WindowError(f"commands of shape {commands.shape}", f"{self._each}", "`run` makes several steps")
+        if commands.shape[1:] not in (self._each, (1, self._each[1])):
+            raise WindowError(f"commands of shape {commands.shape[1:]}", f"{self._each}")
+        return np.ascontiguousarray(np.broadcast_to(commands, (len(commands), *self._each)))
+
+    def _prepare(self, state: State, dt: float) -> None:
+        """Makes the constants of a step ready: for a new state or a copy, or after another step or simulator."""
+        if dt != state._dt and (self._need.delayed or self._need.att_delay):
+            raise WindowError(
+                f"dt {dt} s after {state._dt} s",
+                "one step size where commands or attitude are delayed",
+                "begin with start(dt=...)",
+            )
+        if dt != self._dt:
+            self._settle(dt)
+        if (state.vehicles, state._rotors) != self._each:
+            found = f"a state of {state.vehicles} vehicles with {state._rotors} rotors"
+            raise WindowError(found, f"{self.vehicles} with {self._each[1]}, as the simulator has")
+        if (state._kept, state._memory.shape[1]) != self._width:
+            raise WindowError("a state of other delays or filters", "one of this simulator's `start`")
+        state._dt, state._work, state._constants = dt, self._prepared.copy(), self._constants
 
     def _settle(self, dt: float) -> FloatArray:
         """Prepares all that depends on the step; returns rows of the rotors with their gains."""
@@ -689,9 +709,13 @@ class Simulator:
             keep = np.exp(-dt / time)
             walk = np.array([keep, size * np.sqrt(1.0 - keep**2)])
         seed = self._seed
+        needs = np.zeros(8 * (PLAN - COUNTS), np.bool_)
+        needs[:NEEDS] = self._need
         counts = (rotors, self._theta.shape[-1], len(self._terms), len(own), len(self._kept), kept, self._delayed)
         stretches = (own.ravel(), self._kept.ravel(), self._terms.ravel())
-        self._ints = np.concatenate([[*counts, len(walk) // 2, seed, *self._need], *stretches]).astype(np.int64)
+        self._ints = np.concatenate([[*counts, len(walk) // 2, seed], needs.view(np.int64), *stretches]).astype(
+            np.int64
+        )
         parts = (self._geometry, walk, self._theta, self._coefficients, self._constants)
         self._numbers = np.concatenate([part.ravel() for part in parts])
         self._dt = dt
