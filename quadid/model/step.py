@@ -240,6 +240,8 @@ def write_constants(
         constants[block] = s[:STATE]
 
 
+as_tuple: Any = to_fixed_tuple
+"""Numbers of an array as a tuple of so many; its annotations are those of the compiler's side."""
 COUNTS, NEEDS = 9, len(Needs._fields)
 PLAN = COUNTS + -(-NEEDS // 8)
 """Numbers at the begin of a plan: rotors, size of a parameter vector, terms beyond the catalogue, stretches of own
@@ -297,8 +299,8 @@ def step_blocks(
         out: after each step (steps, vehicles, N_STATE + 10), written: motion, sensors; no rows: not wanted.
     """
     count, blocks = commands.shape[1], len(state)
-    rotors, size, most, owned, keeping, at_rotors, delayed, walks, seed = to_fixed_tuple(plan[:COUNTS], COUNTS)
-    need = Needs(*to_fixed_tuple(plan[COUNTS:PLAN].view(np.bool_)[:NEEDS], NEEDS))
+    rotors, size, most, owned, keeping, at_rotors, delayed, walks, seed = as_tuple(plan[:COUNTS], COUNTS)
+    need = Needs(*as_tuple(plan[COUNTS:PLAN].view(np.bool_)[:NEEDS], NEEDS))
     plain = not (need.delayed or need.uneven)
     # Where each part begins: views of it are made where they are used, since making one takes a fiftieth of a step.
     at_kept = PLAN + 2 * owned
