@@ -548,7 +548,7 @@ class Simulator:
         self._terms = residual_terms(vehicle)
         self._coefficients = np.empty((blocks, len(self._terms), LANES))
         self._seed, self._span = seed, min(span, 1e9)
-        self._dt, self._constants = 0.0, _NO_CONSTANTS
+        self._dt, self._constants = math.nan, _NO_CONSTANTS
         self._each = (self.vehicles, len(self._geometry))
         self._one = (1, *self._each)
 

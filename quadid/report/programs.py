@@ -446,7 +446,7 @@ def gym_pybullet_drones(facts: Facts) -> dict[str, Any]:
     """
     front_right, back_left, front_left, back_right = _two_pairs(facts, "gym-pybullet-drones")
     order = [front_right, back_right, back_left, front_left]
-    return _ordered(facts, order) | {"per_rpm": 2.0 * math.pi / 60.0}
+    return _ordered(facts, order) | {"per_rpm": 2.0 * math.pi / 60.0, "gravity": GRAVITY}
 
 
 def pyflyt(facts: Facts) -> dict[str, Any]:
