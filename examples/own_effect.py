@@ -20,7 +20,7 @@ from quadid.data.grid import to_windows
 from quadid.data.window import Window
 from quadid.flight import TruthParameters, fly
 from quadid.identification.fit import FitOptions, fit
-from quadid.identification.score import mse_score
+from quadid.identification.result import mse_score
 from quadid.vehicle import GRAVITY, Vehicle
 
 TRUE = {"knee": 1.02, "share": 0.5}

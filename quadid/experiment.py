@@ -20,9 +20,9 @@ from quadid.errors import NotIdentifiableError
 from quadid.estimate import missing
 from quadid.flight import Flight, FlightError, Segment, TruthParameters, fly
 from quadid.flight.sensors import SensorNoise
-from quadid.identification.excitation import d_optimal, excitation, halfwidths
+from quadid.identification.fit import Progress as Advance
 from quadid.identification.noise import NoiseModel
-from quadid.identification.search import Progress as Advance
+from quadid.identification.uncertainty import d_optimal, excitation, halfwidths
 from quadid.parameters import NOMINAL_NAMES
 from quadid.rotation import down
 from quadid.types import FloatArray

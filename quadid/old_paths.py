@@ -33,8 +33,8 @@ MOVED = {
     "quadid.condition.trim": "quadid.health.spread",
     "quadid.checks.frames": "quadid.inspection.conventions",
     "quadid.checks.motion": "quadid.inspection.airborne quadid.inspection.timing",
-    "quadid.checks.rotors": "quadid.inspection.geometry quadid.inspection.motor_checks quadid.inspection.rotor_checks "
-    "quadid.inspection.rotor_timing",
+    "quadid.checks.rotors": "quadid.inspection.geometry quadid.inspection.motor_checks "
+    "quadid.inspection.rotor_checks quadid.inspection.rotor_timing",
     "quadid.checks.findings": "quadid.inspection.outlook",
     "quadid.data.intersample": "quadid.intersample",
     "quadid.model.rollout": "quadid.model.packing",
@@ -58,15 +58,13 @@ MOVED = {
     "quadid.app.fleet": "quadid_cli.fleet_cluster quadid_cli.fleet_folder quadid_cli.fleet_store",
     "quadid.identification.problem": "quadid.identify.parameterization quadid.identify.segment_cost "
     "quadid.identify.segment_jacobian quadid.identify.shooting",
-    "quadid.identification.elimination": "quadid.identify.elimination_kernel",
+    "quadid.identification.elimination": "quadid.identify.elimination_kernel quadid.identification.initial_states",
     "quadid.identification.gauss_newton": "quadid.identify.box_qp",
-    "quadid.identification.search": "quadid.identify.global_search",
     "quadid.identification.noise": "quadid.identify.noise_model",
-    "quadid.identification.noise_fit": "quadid.identify.noise_spectrum quadid.identify.noise_estimation",
-    "quadid.identification.uncertainty": "quadid.identify.covariance quadid.identify.composite_likelihood",
-    "quadid.identification.excitation": "quadid.identify.optimal_input",
+    "quadid.identification.uncertainty": "quadid.identify.covariance quadid.identify.composite_likelihood "
+    "quadid.identification.reliability quadid.identify.optimal_input quadid.identification.excitation",
     "quadid.identification.predict": "quadid.identify.open_loop quadid.identify.prediction "
-    "quadid.identify.prediction_floor",
+    "quadid.identify.prediction_floor quadid.identification.forecast",
     "quadid_evaluation.optimisers.box": "quadid.identify.shooting_objective",
     "quadid_evaluation.paper.subspace": "quadid_evaluation.paper.hankel quadid_evaluation.paper.order "
     "quadid_evaluation.paper.state_space",
@@ -112,6 +110,10 @@ MOVED = {
     "quadid.app.excite": "quadid_cli.excite",
     "quadid.app.init": "quadid_replay.vehicle_from_log",
     "quadid.cli.demo": "quadid.app.demo",
+    "quadid.identification.fit": "quadid.identify.global_search quadid.identification.search "
+    "quadid.identify.noise_spectrum quadid.identify.noise_estimation quadid.identification.noise_fit",
+    "quadid.identification.controller_gains": "quadid.identification.paper_objective",
+    "quadid.identification.result": "quadid.identification.score",
 }
 """Old modules of each new one."""
 _NEW = {old: new for new, olds in MOVED.items() for old in olds.split()}

@@ -150,8 +150,7 @@ def diagnose(
     """
     from quadid.diagnosis.pipeline import diagnose as diagnose_windows
     from quadid.diagnosis.result import Explanation
-    from quadid.identification.result import ScoredSet, parameter_entry, with_values
-    from quadid.identification.score import mse_score
+    from quadid.identification.result import ScoredSet, mse_score, parameter_entry, with_values
     from quadid.report.fit_pages import diagnose_verdict
 
     check_seed(seed)

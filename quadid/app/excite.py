@@ -269,7 +269,7 @@ def propose(
         NotIdentifiableError: no movement stays within the limits, or too little data.
     """
     from quadid.experiment import AsLogged, Limits, TrialFlights, design_manoeuvre, manoeuvre_file
-    from quadid.identification.excitation import halfwidths
+    from quadid.identification.uncertainty import halfwidths
     from quadid.report.programs import Facts
 
     check_limits(seconds, tilt, rate_limit, height, battery, forms)

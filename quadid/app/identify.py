@@ -392,9 +392,8 @@ def out_of_reach(logs: Sequence[Log]) -> dict[str, str]:
 
 def scored(log: Log, role: str, fit: Fit, autopilot: Autopilot | None, mse: tuple[float, float]) -> ScoredSet:
     """Scores the initial guess and the fit on one log; as the paper does, too, where the stabiliser is known."""
-    from quadid.identification.paper_objective import paper_score
-    from quadid.identification.result import ScoredSet
-    from quadid.identification.score import mse_score
+    from quadid.identification.controller_gains import paper_score
+    from quadid.identification.result import ScoredSet, mse_score
 
     initial = Layout(fit.vehicle).initial(fit.vehicle)
     before, after = (mse_score(log.windows, fit.vehicle, theta, fit.noise) for theta in (initial, fit.theta))

@@ -153,7 +153,7 @@ def _refused(recording: Recording, vehicle: Vehicle, cut: LogPart, flown: Spans)
 
 def _excitation(recording: Recording, vehicle: Vehicle, cut: LogPart, flown: Spans) -> tuple[dict[str, Any], ...]:
     """Expected relative standard deviation per parameter, from up to `LONGEST` s of flight; none when refused."""
-    from quadid.identification.excitation import excitation
+    from quadid.identification.uncertainty import excitation
 
     try:
         windows, _ = beginning(gridded(recording, vehicle, GRID, cut, flown)[0], LONGEST)

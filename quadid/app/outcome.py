@@ -193,7 +193,7 @@ def data_frame(records: list[dict[str, Any]], columns: Sequence[str] = ()) -> pd
 
 
 _CHANNELS = {"gyro": 0, "attitude": 3, "accel": 6, "velocity": 9, "position": 12}
-"""First of the three columns of each channel in a `quadid.identification.score.Series`."""
+"""First of the three columns of each channel in a `quadid.identification.result.Series`."""
 YAW = 5
 """Its column of the yaw, which is unwrapped."""
 
@@ -358,7 +358,7 @@ def known(vehicle: Vehicle) -> str:
 
 def told(fit: Fit, logs: Sequence[Log]) -> dict[str, Any]:
     """Information of the fitted logs about each parameter, from `LONGEST` s of them at most."""
-    from quadid.identification.excitation import excitation
+    from quadid.identification.uncertainty import excitation
     from quadid.report.fit_pages import excitation_part
 
     windows, seconds = beginning((w for log in logs for w in log.windows), LONGEST)

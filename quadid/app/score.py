@@ -58,7 +58,7 @@ class Scored(Reported):
 
     def records(self) -> list[dict[str, Any]]:
         """One row a quantity and horizon; those of single logs, which follow, have the name of the log in theirs."""
-        from quadid.identification.forecast import BANDS
+        from quadid.identification.predict import BANDS
 
         result, out = self.result, []
         for entry in [{"log": None, **result}, *(result["files"] if len(result["files"]) > 1 else ())]:
@@ -235,7 +235,7 @@ def coverage(
         closed_loop: simulate with the autopilot in the loop instead of taking the logged rotor speeds.
     """
     from quadid.identification.controller_gains import find_autopilot
-    from quadid.identification.forecast import BANDS, Forecast
+    from quadid.identification.predict import BANDS, Forecast
 
     total: dict[int, dict[str, FloatArray]] = {}
     reasons = []

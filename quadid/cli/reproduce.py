@@ -16,7 +16,7 @@ from quadid.app.kernels import FIT
 from quadid.app.logs import check_folder, write_text, written_whole
 from quadid.app.options import JsonTarget, OutFolder, Seed
 from quadid.cli import terminal
-from quadid.identification.paper_objective import PaperScore
+from quadid.identification.controller_gains import PaperScore
 from quadid.report.page import render
 from quadid.types import JsonDict
 

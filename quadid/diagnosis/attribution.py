@@ -6,7 +6,7 @@ tenths of the training log are left out in turn.  Causes no larger than on any v
 
 What all of them gain is stated as an identification of the same flights states errors, and the verdict goes by that:
 runs of one second, in the noise that the identification estimated, from the parameters that the identification found
-(`quadid.identification.score`).
+(`quadid.identification.result`).
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from quadid.identification.fit import Fit
 from quadid.identification.gauss_newton import polish
 from quadid.identification.noise import NoiseModel
 from quadid.identification.problem import Shooting, default_prior, posterior_covariance
-from quadid.identification.score import Tally, mse_score, scored_problem, settle_states, tallied
+from quadid.identification.result import Tally, mse_score, scored_problem, settle_states, tallied
 from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle

@@ -11,8 +11,8 @@ import numpy as np
 from scipy.special import stdtrit
 
 from quadid.effects import EFFECTS, NEVER, Effect
+from quadid.identification.elimination import InitialStates
 from quadid.identification.gauss_newton import Polished, bounded_step, polish
-from quadid.identification.initial_states import InitialStates
 from quadid.identification.problem import (
     Free,
     Linearised,
@@ -23,7 +23,7 @@ from quadid.identification.problem import (
     posterior_covariance,
     prior_terms,
 )
-from quadid.identification.score import INFINITE
+from quadid.identification.result import INFINITE
 from quadid.identification.uncertainty import Uncertainty, uncertainty, variance_ratio
 from quadid.model.layout import Layout, places
 from quadid.parameters import NOMINAL_NAMES

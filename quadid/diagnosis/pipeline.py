@@ -17,13 +17,24 @@ from quadid.diagnosis.residual_tests import Remainder, inconstant_causes, remain
 from quadid.diagnosis.result import Diagnosis, Explanation, describe
 from quadid.diagnosis.search import LINEAR_MISFIT, Search, from_everything, pruned, select
 from quadid.effects import EFFECTS
-from quadid.identification.fit import NO_FILTER, Fit, FitOptions, check_windows, possible_moments, tied
+from quadid.identification.fit import (
+    FAR_ITERATIONS,
+    NO_FILTER,
+    SWARM_SECONDS,
+    Fit,
+    FitOptions,
+    Progress,
+    check_windows,
+    flexible_fit,
+    possible_moments,
+    residual_noise,
+    swarm_search,
+    tied,
+)
 from quadid.identification.gauss_newton import polish
 from quadid.identification.noise import NoiseModel
-from quadid.identification.noise_fit import FAR_ITERATIONS, flexible_fit, residual_noise
 from quadid.identification.problem import Shooting
 from quadid.identification.result import with_values
-from quadid.identification.search import SWARM_SECONDS, Progress, swarm_search
 from quadid.identification.uncertainty import SPREAD_LIMIT, parameter_set
 from quadid.model.layout import with_reference_voltage
 from quadid.parameters import NOMINAL_NAMES, Parameter

@@ -11,7 +11,7 @@ from quadid.data.window import CHANNEL_NAMES
 from quadid.diagnosis.hypotheses import Candidate, Gain, Model, held_out, paired_gain
 from quadid.effects import EFFECTS
 from quadid.identification.elimination import freed
-from quadid.identification.noise_fit import LEAST_LEFT, SMOOTH, SPECTRUM_SECONDS, band_power, mode_power
+from quadid.identification.fit import LEAST_LEFT, SMOOTH, SPECTRUM_SECONDS, band_power, mode_power
 from quadid.identification.problem import Columns, Shooting
 from quadid.rotation import product
 from quadid.types import FloatArray

@@ -9,7 +9,7 @@ import numpy as np
 
 from quadid.diagnosis.evidence import Everything, Score, better, impossible_causes, missed, worth_a_refit
 from quadid.diagnosis.hypotheses import Candidate, Model, Start, extend, fit_model, refit, sketch, taken_out, without
-from quadid.identification.noise_fit import flexible_names
+from quadid.identification.fit import flexible_names
 from quadid.identification.problem import Shooting
 from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray

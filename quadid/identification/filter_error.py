@@ -28,18 +28,19 @@ from quadid.estimate.problem import LATE, Problem, Sensitivities
 from quadid.estimate.track import from_window
 from quadid.identification.noise import NoiseModel
 from quadid.identification.problem import Free
-from quadid.identification.reliability import (
+from quadid.identification.uncertainty import (
     BLOCKS,
     CHANCE,
     NEAR_BEST,
     SHARE,
+    SPREAD_LIMIT,
     WIDE,
     Reliability,
+    Uncertainty,
     coarse,
     promised,
     random_effects,
 )
-from quadid.identification.uncertainty import SPREAD_LIMIT, Uncertainty
 from quadid.model.layout import Layout
 from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray, IndexArray

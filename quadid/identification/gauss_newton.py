@@ -8,7 +8,7 @@ from enum import StrEnum
 import numpy as np
 
 from quadid.errors import NotIdentifiableError
-from quadid.identification.initial_states import InitialStates
+from quadid.identification.elimination import InitialStates
 from quadid.identification.problem import (
     MEASURED,
     Free,

@@ -19,8 +19,15 @@ import numpy as np
 
 from quadid.data.window import Window
 from quadid.effects import EFFECTS
-from quadid.identification.elimination import Reduced, StatePrior, columns_of, reduce_segments
-from quadid.identification.initial_states import InitialStates, Starts, frozen
+from quadid.identification.elimination import (
+    InitialStates,
+    Reduced,
+    Starts,
+    StatePrior,
+    columns_of,
+    frozen,
+    reduce_segments,
+)
 from quadid.identification.noise import NoiseModel
 from quadid.model.layout import Entry, Layout, places
 from quadid.model.rollout import Rollout, Segments, packed, packing, shared_rollout

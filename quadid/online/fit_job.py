@@ -28,12 +28,11 @@ from quadid.estimate.kalman import Gains
 from quadid.estimate.late_imu import MOST, delay_of, in_time
 from quadid.estimate.problem import TRIMMED, UPRIGHT, Problem
 from quadid.estimate.track import from_window
-from quadid.identification.excitation import bounds_of
 from quadid.identification.filter_error import fitted_along, start_of
+from quadid.identification.fit import SWARM_SECONDS, swarm_search
 from quadid.identification.particle_swarm import SwarmOptions
 from quadid.identification.problem import Prior, Shooting
-from quadid.identification.reliability import coarse
-from quadid.identification.search import SWARM_SECONDS, swarm_search
+from quadid.identification.uncertainty import bounds_of, coarse
 from quadid.model.layout import IMU_PERIOD, Layout
 from quadid.online.checks import wrong_unit
 from quadid.online.records import Job, JobReply

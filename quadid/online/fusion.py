@@ -26,8 +26,7 @@ import numpy as np
 from quadid.chi_square import Z95, exceeded
 from quadid.data.window import Window
 from quadid.identification.problem import Free
-from quadid.identification.reliability import CHANCE, SHARE
-from quadid.identification.uncertainty import Uncertainty, parameter_set
+from quadid.identification.uncertainty import CHANCE, SHARE, Uncertainty, parameter_set
 from quadid.model.layout import B, Layout, ThrustModel
 from quadid.online.active_set import ActiveSet
 from quadid.online.fit_job import (

@@ -13,8 +13,7 @@ from quadid.chi_square import Z95, exceeded
 from quadid.data.window import CHANNEL_NAMES, CHANNEL_UNITS
 from quadid.errors import ParameterError
 from quadid.estimate.missing import Missing
-from quadid.identification.result import ScoredSet
-from quadid.identification.score import SCORE_SECONDS, SetScore
+from quadid.identification.result import SCORE_SECONDS, ScoredSet, SetScore
 from quadid.report.page import axis, band, figure, listed, stacked, trace, upright
 from quadid.types import FloatArray, IndexArray, JsonDict
 

@@ -16,10 +16,9 @@ from quadid.data.rotor_signal import rotor_channel
 from quadid.data.window import CHANNEL_NAMES, CHANNEL_UNITS, CHANNELS, Channel, Recording, sample_period
 from quadid.effects import EFFECTS
 from quadid.estimate.missing import Missing
-from quadid.identification.excitation import Excitation
 from quadid.identification.noise import NoiseModel
-from quadid.identification.result import ScoredSet
-from quadid.identification.score import SCORE_SECONDS
+from quadid.identification.result import SCORE_SECONDS, ScoredSet
+from quadid.identification.uncertainty import Excitation
 from quadid.parameters import ParameterSet
 from quadid.report.figures import (
     MODELS,

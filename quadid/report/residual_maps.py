@@ -18,7 +18,7 @@ from quadid.data.window import CHANNEL_NAMES, CHANNEL_UNITS, Window, beginning
 from quadid.effects import EFFECTS, NEVER
 from quadid.identification.noise import NoiseModel
 from quadid.identification.problem import Linearised, Shooting
-from quadid.identification.score import SCORE_SECONDS, covering, settle_states
+from quadid.identification.result import SCORE_SECONDS, covering, settle_states
 from quadid.model.layout import Layout
 from quadid.report.page import axis, figure, level, trace
 from quadid.rotation import conjugate, rotated

@@ -12,7 +12,7 @@ import yaml
 from quadid_replay import write_csv
 
 import quadid
-from quadid.identification import forecast
+from quadid.identification import predict
 from quadid.vehicle import Stabiliser, Vehicle
 from tests.cli.conftest import Flights, table, write_table
 from tests.commands import Cli, one_line
@@ -115,7 +115,7 @@ def test_bands_are_predicted_up_to_a_tenth_of_a_second_and_the_reason_stands_bel
             shares = coverage[h][quantity]
             assert list(shares) == ["50", "80", "95"]
             assert 0.0 <= shares["50"] <= shares["80"] <= shares["95"] <= 1.0
-    monkeypatch.setattr(forecast, "SHORTEST", 60.0)
+    monkeypatch.setattr(predict, "SHORTEST", 60.0)
     short = inside("score", flights.unseen, "--vehicle", "pelican", "--horizons", "1", "--json", "-").data
     assert short["coverage"] == {"1": None}
     assert "60 s with gyro" in short["bands"]

@@ -11,11 +11,10 @@ import numpy as np
 from quadid.data.window import Window
 from quadid.diagnosis.hypotheses import Candidate, Model, candidates, fit_model
 from quadid.flight import draw_truth, fly
+from quadid.identification.fit import SWARM_SECONDS, flexible_fit, reweighted_fit
 from quadid.identification.gauss_newton import polish
 from quadid.identification.noise import NoiseModel
-from quadid.identification.noise_fit import flexible_fit, reweighted_fit
 from quadid.identification.problem import Shooting
-from quadid.identification.search import SWARM_SECONDS
 from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray
 from tests.identify.flights import PELICAN, guessed

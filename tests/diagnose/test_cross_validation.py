@@ -12,7 +12,7 @@ from scipy.stats import multivariate_normal
 from quadid.diagnosis.hypotheses import block_labels, extend, held_out, paired_gain, steps_without, sum_by_block
 from quadid.identification.gauss_newton import polish
 from quadid.identification.problem import MEASURED, Linearised, Shooting
-from quadid.identification.score import settle_states
+from quadid.identification.result import settle_states
 from quadid.model.rollout import Segments
 from quadid.types import BoolArray, FloatArray
 from tests.diagnose.problems import cause, fitted, window_with

@@ -8,8 +8,8 @@ import pytest
 from quadid.diagnosis import Diagnosis, diagnose, pipeline
 from quadid.flight import draw_truth, fly
 from quadid.identification.filter_error import filtered
+from quadid.identification.fit import SWARM_SECONDS
 from quadid.identification.problem import Shooting
-from quadid.identification.search import SWARM_SECONDS
 from quadid.identification.uncertainty import uncertainty
 from quadid.parameters import NOMINAL_NAMES, UNKNOWN, Status
 from quadid.vehicle import Vehicle

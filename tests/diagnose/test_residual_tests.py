@@ -12,7 +12,7 @@ from quadid.diagnosis.hypotheses import Gain, Model
 from quadid.diagnosis.pipeline import judge
 from quadid.diagnosis.residual_tests import ALARM, SITES, Follows, Remainder, Structure, remainder
 from quadid.diagnosis.result import Explanation
-from quadid.identification.noise_fit import mode_power
+from quadid.identification.fit import mode_power
 from quadid.types import FloatArray
 from tests.diagnose.problems import Problem, clean, fitted, window_with
 

@@ -10,7 +10,7 @@ import pytest
 from quadid.errors import NotIdentifiableError
 from quadid.flight import Flight, fly
 from quadid.identification.controller_gains import Autopilot
-from quadid.identification.forecast import BANDS, PHASES, Forecast, Shares
+from quadid.identification.predict import BANDS, PHASES, Forecast, Shares
 from quadid.model.layout import Layout
 from quadid.parameters import NOMINAL_NAMES
 from quadid.vehicle import ParameterPrior, RandomForces, RandomInput, Vehicle

@@ -10,7 +10,7 @@ import pytest
 from quadid.data.window import Window
 from quadid.flight import draw_truth, fly
 from quadid.identification.fit import Fit, FitOptions, fit
-from quadid.identification.reliability import coarse
+from quadid.identification.uncertainty import coarse
 from quadid.parameters import NOMINAL_NAMES, Status
 from quadid.types import FloatArray
 from tests.identify.flights import PELICAN, guessed, values_of

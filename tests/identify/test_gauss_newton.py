@@ -12,9 +12,9 @@ from scipy.optimize import lsq_linear
 
 from quadid.errors import NotIdentifiableError, QuadidError
 from quadid.identification import gauss_newton as polishing
+from quadid.identification.elimination import InitialStates
 from quadid.identification.fit import FitOptions, fit
 from quadid.identification.gauss_newton import LONGEST_STEP, Convergence, Polished, bounded_step, polish, robust_weights
-from quadid.identification.initial_states import InitialStates
 from quadid.identification.problem import (
     MEASURED,
     PRIOR_SIGMA_LINEAR,

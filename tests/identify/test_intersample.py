@@ -14,7 +14,7 @@ from quadid.errors import WindowError
 from quadid.flight import fly
 from quadid.flight.pilot import default_gains
 from quadid.identification.fit import Fit, FitOptions, fit
-from quadid.identification.score import mse_score
+from quadid.identification.result import mse_score
 from quadid.model.layout import Layout
 from quadid.model.rollout import Rollout, Segments
 from quadid.parameters import NOMINAL_NAMES

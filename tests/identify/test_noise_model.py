@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from scipy.signal import freqz, lfilter
 
+from quadid.identification.fit import LOWEST, shaped_noise
 from quadid.identification.noise import SHAPE_POINTS, SLOW_TIME, NoiseModel, estimate_noise
-from quadid.identification.noise_fit import LOWEST, shaped_noise
 from quadid.identification.problem import Shooting
-from quadid.identification.score import settle_states
+from quadid.identification.result import settle_states
 from quadid.types import FloatArray
 from quadid.vehicle import Noise
 from tests.identify.flights import PELICAN, at_truth, flown, turned

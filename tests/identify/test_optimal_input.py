@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from quadid.errors import ParameterError
-from quadid.identification.excitation import d_optimal, halfwidths
+from quadid.identification.uncertainty import d_optimal, halfwidths
 
 
 def information(seed: int, count: int) -> np.ndarray:

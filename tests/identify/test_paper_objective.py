@@ -9,8 +9,13 @@ import pytest
 from quadid_evaluation.optimisers.box import PaperBox
 
 from quadid.errors import NotIdentifiableError
-from quadid.identification.controller_gains import Autopilot, find_autopilot
-from quadid.identification.paper_objective import PaperProblem, measured_outputs, paper_score
+from quadid.identification.controller_gains import (
+    Autopilot,
+    PaperProblem,
+    find_autopilot,
+    measured_outputs,
+    paper_score,
+)
 from quadid.model.layout import Layout
 from quadid.parameters import NOMINAL_NAMES
 from quadid.vehicle import Stabiliser

@@ -12,10 +12,10 @@ from scipy.optimize import least_squares
 from quadid.data.window import Window
 from quadid.errors import WindowError
 from quadid.flight import draw_truth, fly
+from quadid.identification.fit import Projected
 from quadid.identification.noise import NoiseModel
 from quadid.identification.problem import MEASURED, VELOCITY_PRIOR, Free, Linearised, Shooting
-from quadid.identification.score import settle_states
-from quadid.identification.search import Projected
+from quadid.identification.result import settle_states
 from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray
 from tests.identify.dense import DenseProblem, perturbed

@@ -9,7 +9,7 @@ from quadid.errors import NotIdentifiableError, ParameterError
 from quadid.flight import Flight, SensorNoise, fly
 from quadid.identification.noise import NoiseModel
 from quadid.identification.predict import OpenLoop, horizon_scores, true_rate
-from quadid.identification.score import mse_score
+from quadid.identification.result import mse_score
 from quadid.model import layout as ix
 from quadid.model.layout import Layout
 from quadid.rotation import euler

@@ -11,7 +11,7 @@ from quadid.data.window import Window
 from quadid.errors import NotIdentifiableError, WindowError
 from quadid.flight import fly
 from quadid.identification.noise import NoiseModel
-from quadid.identification.score import mse_score
+from quadid.identification.result import mse_score
 from quadid.model.layout import Layout
 from quadid.parameters import NOMINAL_NAMES
 from quadid.vehicle import Vehicle

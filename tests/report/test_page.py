@@ -23,9 +23,8 @@ from quadid.data.window import CHANNEL_NAMES, CHANNEL_UNITS, Channel
 from quadid.effects import EFFECTS, NEVER
 from quadid.estimate.missing import Missing
 from quadid.flight import fly
-from quadid.identification.excitation import Excitation
-from quadid.identification.result import ScoredSet
-from quadid.identification.score import ChannelScore, Series, SetScore
+from quadid.identification.result import ChannelScore, ScoredSet, Series, SetScore
+from quadid.identification.uncertainty import Excitation
 from quadid.jsonable import jsonable
 from quadid.model.layout import Layout
 from quadid.report.figures import (

@@ -18,7 +18,7 @@ from quadid.diagnosis import diagnose
 from quadid.flight import draw_truth, fly
 from quadid.identification.fit import Fit, FitOptions, fit
 from quadid.identification.particle_swarm import SwarmOptions
-from quadid.identification.score import mse_score
+from quadid.identification.result import mse_score
 from quadid.model.layout import Layout
 from quadid.online.fusion import Estimator
 from quadid.online.grid_buffer import WindowCut

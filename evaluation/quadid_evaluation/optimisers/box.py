@@ -11,14 +11,12 @@ import numpy as np
 
 from quadid.data.window import Window
 from quadid.errors import NotIdentifiableError
-from quadid.identification.controller_gains import Autopilot
-from quadid.identification.fit import Fit
+from quadid.identification.controller_gains import Autopilot, PaperProblem
+from quadid.identification.fit import SWARM_SECONDS, Fit, Projected
 from quadid.identification.gauss_newton import Convergence
 from quadid.identification.noise import NoiseModel
-from quadid.identification.paper_objective import PaperProblem
 from quadid.identification.problem import Free, Shooting, default_prior, posterior_covariance
-from quadid.identification.score import settle_states
-from quadid.identification.search import SWARM_SECONDS, Projected
+from quadid.identification.result import settle_states
 from quadid.identification.uncertainty import parameter_set, uncertainty
 from quadid.model.layout import Layout
 from quadid.parameters import NOMINAL_NAMES

@@ -16,7 +16,7 @@ from quadid_replay.frames import from_euler
 from quadid.data.window import Window
 from quadid.errors import NotIdentifiableError, WindowError
 from quadid.identification.noise import NoiseModel
-from quadid.identification.score import SCORE_SECONDS, expected_squares, scored_problem
+from quadid.identification.result import SCORE_SECONDS, expected_squares, scored_problem
 from quadid.model.layout import Layout
 from quadid.rotation import conjugate, euler, product
 from quadid.types import FloatArray

@@ -137,10 +137,9 @@ def compare(
         ParameterError: an unknown method or objective.
         NotIdentifiableError: too little data, or no stabiliser for the closed loop.
     """
-    from quadid.identification.controller_gains import find_autopilot
+    from quadid.identification.controller_gains import find_autopilot, paper_score
     from quadid.identification.fit import FitOptions, fit
-    from quadid.identification.paper_objective import paper_score
-    from quadid.identification.score import mse_score
+    from quadid.identification.result import mse_score
     from quadid_evaluation.optimisers.box import BoxProblem, PaperBox
     from quadid_evaluation.paper.black_box import fit_black_box, score_black_box
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from quadid.identification.paper_objective import PaperScore
+from quadid.identification.controller_gains import PaperScore
 from quadid.report.figures import liveliest
 from quadid.report.page import axis, trace
 from quadid.types import FloatArray, JsonDict

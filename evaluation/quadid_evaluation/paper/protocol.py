@@ -15,11 +15,10 @@ from quadid.app.outcome import Advance
 from quadid.chi_square import Z95
 from quadid.diagnosis import diagnose
 from quadid.flight import fly
-from quadid.identification.controller_gains import find_autopilot
+from quadid.identification.controller_gains import PaperScore, find_autopilot
 from quadid.identification.fit import FitOptions, fit
-from quadid.identification.paper_objective import PaperScore
 from quadid.identification.particle_swarm import Stop, Swarm
-from quadid.identification.score import mse_score
+from quadid.identification.result import mse_score
 from quadid.model.layout import Layout
 from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray, JsonDict

@@ -38,7 +38,7 @@ from quadid.diagnosis.hypotheses import Model, candidates, fit_model, paired_gai
 from quadid.diagnosis.pipeline import SHARE_TO_NAME
 from quadid.diagnosis.search import LINEAR_MISFIT
 from quadid.errors import QuadidError
-from quadid.identification.noise_fit import flexible_fit
+from quadid.identification.fit import flexible_fit
 from quadid.identification.problem import Shooting
 from quadid.model.rollout import Rollout
 from quadid.vehicle import Vehicle

@@ -19,7 +19,7 @@ import numpy as np
 import quadid
 from quadid.chi_square import Z95
 from quadid.errors import QuadidError
-from quadid.identification.forecast import BANDS, PHASES, Forecast
+from quadid.identification.predict import BANDS, PHASES, Forecast
 from quadid.model.layout import Layout
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle

@@ -18,9 +18,9 @@ from quadid.app.excite import knowledge
 from quadid.data.window import Window
 from quadid.experiment import Limits, Proposal, TrialFlights, design_manoeuvre, peaks
 from quadid.flight import Flight, draw_truth, fly
-from quadid.identification.excitation import halfwidths
 from quadid.identification.fit import FitOptions, fit
 from quadid.identification.result import fitted_vehicle
+from quadid.identification.uncertainty import halfwidths
 from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle

@@ -18,12 +18,11 @@ from quadid.chi_square import Z95
 from quadid.data.window import Window
 from quadid.flight import draw_truth, fly
 from quadid.flight.sensors import SensorNoise
-from quadid.identification.excitation import bounds_of
-from quadid.identification.fit import FitOptions, fit
+from quadid.identification.fit import FitOptions, fit, shaped_noise
 from quadid.identification.noise import estimate_noise
-from quadid.identification.noise_fit import shaped_noise
 from quadid.identification.problem import Shooting
-from quadid.identification.score import settle_states
+from quadid.identification.result import settle_states
+from quadid.identification.uncertainty import bounds_of
 from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray
 from quadid.vehicle import ParameterPrior, Vehicle
