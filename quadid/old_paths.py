@@ -32,11 +32,10 @@ MOVED = {
     "quadid.condition.changes": "quadid.health.hypotheses",
     "quadid.condition.trim": "quadid.health.spread",
     "quadid.checks.frames": "quadid.inspection.conventions",
-    "quadid.checks.motion": "quadid.inspection.airborne quadid.inspection.timing",
+    "quadid.checks.motion": "quadid.inspection.airborne quadid.inspection.timing quadid.checks.turns",
     "quadid.checks.rotors": "quadid.inspection.geometry quadid.inspection.motor_checks "
     "quadid.inspection.rotor_checks quadid.inspection.rotor_timing",
-    "quadid.checks.findings": "quadid.inspection.outlook",
-    "quadid.data.intersample": "quadid.intersample",
+    "quadid.checks.findings": "quadid.inspection.outlook quadid.checks.doubts",
     "quadid.model.rollout": "quadid.model.packing",
     "quadid.model.rotor_kernel": "quadid.model.lag_kernel",
     "quadid.model.kernel": "quadid.model.needs_kernel",
@@ -52,7 +51,7 @@ MOVED = {
     "quadid.online.checks": "quadid.online.quality",
     "quadid.online.records": "quadid.online.jobs quadid.online.outbox",
     "quadid.vehicle": "quadid.residual quadid.vehicle_size",
-    "quadid.data.rotor_signal": "quadid.rotor_signal",
+    "quadid.data.rotor_signal": "quadid.rotor_signal quadid.intersample quadid.data.intersample",
     "quadid.data.window": "quadid.window quadid.data_faults quadid.saturation",
     "quadid.cli.terminal": "quadid_cli.failure quadid_cli.output quadid_cli.tables",
     "quadid.app.fleet": "quadid_cli.fleet_cluster quadid_cli.fleet_folder quadid_cli.fleet_store",
@@ -71,7 +70,8 @@ MOVED = {
     "quadid_evaluation.paper.black_box": "quadid_evaluation.paper.quadrotor_io",
     "quadid_evaluation.paper.compare": "quadid_evaluation.paper.comparison",
     "quadid.diagnosis.hypotheses": "quadid.diagnose.cross_validation quadid.diagnose.model",
-    "quadid.diagnosis.evidence": "quadid.diagnose.log_evidence quadid.diagnose.score_test quadid.diagnose.plausibility",
+    "quadid.diagnosis.evidence": "quadid.diagnose.log_evidence quadid.diagnose.score_test "
+    "quadid.diagnose.plausibility quadid.diagnosis.attribution",
     "quadid.diagnosis.search": "quadid.diagnose.segment_schedule quadid.diagnose.selection",
     "quadid.diagnosis.residual_tests": "quadid.diagnose.residual_regressors",
     "quadid.model.closed_loop": "quadid.model.closed_loop_kernel",
@@ -114,6 +114,8 @@ MOVED = {
     "quadid.identify.noise_spectrum quadid.identify.noise_estimation quadid.identification.noise_fit",
     "quadid.identification.controller_gains": "quadid.identification.paper_objective",
     "quadid.identification.result": "quadid.identification.score",
+    "quadid.diagnosis.pipeline": "quadid.diagnosis.innovations",
+    "quadid.report.figures": "quadid.report.residual_maps",
 }
 """Old modules of each new one."""
 _NEW = {old: new for new, olds in MOVED.items() for old in olds.split()}

@@ -16,7 +16,7 @@ import quadid
 from quadid.chi_square import Z95
 from quadid.flight import Flight, fly
 from quadid.model.layout import Layout
-from quadid.report.residual_maps import residual_map
+from quadid.report.figures import residual_map
 from quadid.rotation import conjugate, rotated
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle

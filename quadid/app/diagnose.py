@@ -11,7 +11,7 @@ from quadid.app.logs import Log, file_name, settled
 from quadid.app.missing import Beside, MissingForces, compared
 from quadid.app.options import Logs, OfVehicle, Seed, Validate
 from quadid.app.outcome import LIBRARY, NUMBER_COLUMNS, Advance, Fitted, number_rows, provenance, quality, silent
-from quadid.checks.doubts import farthest
+from quadid.checks.findings import farthest
 from quadid.effects import EFFECTS
 from quadid.model.layout import Layout, with_reference_voltage
 from quadid.parameters import INERTIAS, NOMINAL_NAMES, Status, unreliable
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from quadid.diagnosis.search import Search
     from quadid.identification.noise import NoiseModel
     from quadid.identification.result import ScoredSet
-    from quadid.report.residual_maps import ResidualMap
+    from quadid.report.figures import ResidualMap
 
 
 LEAST_REMOVED = 0.3
@@ -121,7 +121,7 @@ class Diagnosed(Fitted):
 
     def maps(self) -> dict[str, ResidualMap]:
         """Picture of every cause in the residual of the diagnosed logs, by name of the effect."""
-        from quadid.report.residual_maps import residual_map
+        from quadid.report.figures import residual_map
 
         windows = [w for log in self.train for w in log.windows]
         model = self.search.model

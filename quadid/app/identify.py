@@ -17,7 +17,7 @@ from quadid.app.logs import Log, file_name, remembered, settled
 from quadid.app.missing import Beside, MissingForces, compared
 from quadid.app.options import Bounds, Fix, Free, KnownEffects, Logs, OfVehicle, Priors, Seed, Validate
 from quadid.app.outcome import LIBRARY, Advance, Fitted, UnansweredError, known, provenance, quality, silent, told
-from quadid.checks.doubts import farthest
+from quadid.checks.findings import farthest
 from quadid.data.window import Window
 from quadid.errors import ParameterError, nearest
 from quadid.model.layout import Layout, with_reference_voltage

@@ -492,7 +492,7 @@ def check_conventions(recording: Recording, vehicle: Vehicle, cut: LogPart) -> C
         LogError: units, frames or a motor order that cannot be right; names the fix.
     """
     from quadid.checks import FATAL, CheckResult, inspect
-    from quadid.checks.doubts import farthest
+    from quadid.checks.findings import farthest
 
     found = inspect(recording, vehicle)
     flown = flown_parts(recording, found.flying, cut)

@@ -11,10 +11,19 @@ from typing import NamedTuple
 
 import numpy as np
 
-from quadid.checks.doubts import estimates_off
-from quadid.checks.findings import Check, CheckResult
-from quadid.checks.motion import FEWEST_SAMPLES, Spans, attitude_steps_check, is_turning, within
-from quadid.checks.turns import FEWEST, TURN, Factor, Turns, factors
+from quadid.checks.findings import Check, CheckResult, estimates_off
+from quadid.checks.motion import (
+    FEWEST,
+    FEWEST_SAMPLES,
+    TURN,
+    Factor,
+    Spans,
+    Turns,
+    attitude_steps_check,
+    factors,
+    is_turning,
+    within,
+)
 from quadid.data.grid import GAP, linear
 from quadid.data.window import Channel, Recording, fresh_rows, measured_period, sample_period
 from quadid.effects import butterworth_delay

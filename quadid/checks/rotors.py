@@ -11,8 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from quadid.checks.doubts import Off, estimates_off, farthest, rotors_off
-from quadid.checks.findings import Check, CheckResult
+from quadid.checks.findings import Check, CheckResult, Off, estimates_off, farthest, rotors_off
 from quadid.checks.motion import HOPELESS, Spans, is_turning, within
 from quadid.chi_square import exceeded
 from quadid.data.grid import bridged, linear, moving_mean, to_windows

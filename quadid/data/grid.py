@@ -10,8 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from quadid.data.intersample import follow_feedback
-from quadid.data.rotor_signal import RotorSignal, rotor_signal
+from quadid.data.rotor_signal import RotorSignal, follow_feedback, rotor_signal
 from quadid.data.window import (
     COINCIDENT,
     Recording,
@@ -422,7 +421,7 @@ def grid_recording(
 
     A log whose rows already lie on the grid passes bit for bit.  Down-sampled commands come out as ``instant``, for the
     filtered staircase has a value at an instant; commands at the grid's own rate stay ``held``, with the slope within
-    each sample that the flight controller's feedback makes (`quadid.data.intersample`).
+    each sample that the flight controller's feedback makes (`quadid.data.rotor_signal`).
 
     Args:
         recording: a log in core units and frames.

@@ -226,7 +226,7 @@ class Window:
         attitude_reference: shape (n, 4): roll, pitch, yaw [rad], throttle 0..1; or None.
         sampling: ``held``: row k of `rotor_speed` acts from t_k to t_k+1; ``instant``: a reading, linear in between.
         rotor_slope: shape (n, rotors) [rad/s^2]: a held row is the mean of a speed that runs on at this slope within
-            its sample (`quadid.data.intersample`); None: it stays the same.
+            its sample (`quadid.data.rotor_signal`); None: it stays the same.
         log_span: first and last time [s] of the whole log, for effects that run over a flight.
     """
 

@@ -9,14 +9,22 @@ import numpy as np
 
 from quadid.blas import one_thread
 from quadid.data.window import Window, data_faults, without_copies
-from quadid.diagnosis.attribution import NominalFit, cause_gains, stated_errors
-from quadid.diagnosis.evidence import better, impossible_causes, late_unknown, slight_causes, unproven_causes
+from quadid.diagnosis.evidence import (
+    NominalFit,
+    better,
+    cause_gains,
+    impossible_causes,
+    late_unknown,
+    slight_causes,
+    stated_errors,
+    unproven_causes,
+)
 from quadid.diagnosis.hypotheses import BLOCKS, Model, candidates, free_names, refit, without
-from quadid.diagnosis.innovations import fit_numbers, with_numbers
 from quadid.diagnosis.residual_tests import Remainder, inconstant_causes, remainder
 from quadid.diagnosis.result import Diagnosis, Explanation, describe
 from quadid.diagnosis.search import LINEAR_MISFIT, Search, from_everything, pruned, select
 from quadid.effects import EFFECTS
+from quadid.identification.filter_error import filtered
 from quadid.identification.fit import (
     FAR_ITERATIONS,
     NO_FILTER,
@@ -24,6 +32,7 @@ from quadid.identification.fit import (
     Fit,
     FitOptions,
     Progress,
+    beside_random_forces,
     check_windows,
     flexible_fit,
     possible_moments,
@@ -40,6 +49,46 @@ from quadid.model.layout import with_reference_voltage
 from quadid.parameters import NOMINAL_NAMES, Parameter
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
+
+# --- Numbers of a diagnosis: the selected model by the likelihood of innovations
+#
+# The selection follows simulated runs of short segments, each of which finds a state of its own: that takes a second
+# for twenty models, but leaves much of what a flight shows unused, and moments that no model has, which the controller
+# answers, pass for inertia there.  The selected model is then fitted as an identification fits
+# (`quadid.identification.filter_error`), the numbers of its causes with it.
+
+
+def fit_numbers(windows: Sequence[Window], short: Shooting, model: Model) -> Fit | None:
+    """The fit of `model` by the likelihood of innovations: the six and what belongs to the vehicle of its causes.
+
+    Args:
+        windows: the data.
+        short: segments of them, for the vehicle and its names.
+        model: the selected one.
+
+    Returns:
+        None where the filter has no finite answer.
+    """
+    flight = [n for c in model.causes if EFFECTS[c.effect].per_log for n in c.names]
+    free = short.free([n for n in model.free.names if n not in flight])
+    found = filtered(windows, short.vehicle, model.theta, free, flight)
+    return None if found is None else beside_random_forces(short, found, free)
+
+
+def with_numbers(model: Model, found: Fit) -> Model:
+    """`model` with the numbers of `found` and their covariance in place of its own; its residuals stay."""
+    names = found.parameters.names
+    places = np.array([model.free.names.index(n) for n in names])
+    theta, covariance = model.theta.copy(), model.uncertainty.covariance.copy()
+    index = model.free.index[places]
+    theta[index] = found.theta[index]
+    covariance[places], covariance[:, places] = 0.0, 0.0
+    covariance[np.ix_(places, places)] = found.uncertainty.covariance
+    return replace(model, theta=theta, known=replace(model.uncertainty, covariance=covariance))
+
+
+# --- The diagnosis from windows to verdict: fit, noise floor, selection, remainder, validation
+
 
 DECIDE_SECONDS = (4.0, 2.0, 1.0, 0.5)
 """Lengths of segments that may decide (the longest as `segment_schedule.USUAL_SECONDS` allows), longest first;

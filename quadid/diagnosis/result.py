@@ -9,7 +9,7 @@ from enum import StrEnum
 from typing import Any
 
 from quadid.chi_square import Z95, survival
-from quadid.diagnosis.attribution import Benefit, Validation, Worth
+from quadid.diagnosis.evidence import Benefit, Validation, Worth
 from quadid.diagnosis.hypotheses import Candidate, Model
 from quadid.diagnosis.residual_tests import Remainder
 from quadid.diagnosis.search import Search

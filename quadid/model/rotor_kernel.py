@@ -27,7 +27,7 @@ from quadid.model.work_array import (
 # omega' = (u - omega) / tau.  Over each half step the means of omega and omega^2 are exact for first-order lag and
 # pure delay.  The input u, delayed by (j + f) dt, switches (held) or bends (linear) once within a step, f dt after its
 # start; each half step is therefore two pieces, one of which may have no length.  A held input may run on at a slope
-# within its samples, whose mean it is (`quadid.data.intersample`).
+# within its samples, whose mean it is (`quadid.data.rotor_signal`).
 #
 # What one rotor needs is copied into the rows T_*, so that each loop works on one array: distances between rows are
 # then constants, and the compiler sees that rows do not overlap.

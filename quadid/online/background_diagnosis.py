@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, ClassVar
 
-from quadid.checks.turns import ALLOWED
+from quadid.checks.motion import ALLOWED
 from quadid.chi_square import Z95
 from quadid.data.rotor_signal import INERTIA_RATE
 from quadid.effects import EFFECTS

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from quadid.checks import STAGES, CheckResult, Log
+from quadid.checks.motion import ALLOWED, AXES, FEWEST, MOVING, TURN, TURN_FACTOR, Factor, Turns, factors
 from quadid.checks.rotors import better_description, lagged_of, motor_order_check
-from quadid.checks.turns import ALLOWED, AXES, FEWEST, MOVING, TURN, TURN_FACTOR, Factor, Turns, factors
 from quadid.data.grid import moving_mean
 from quadid.data.window import Window, as_recording, at_limit, copied, true_runs
 from quadid.model.layout import ThrustModel
@@ -22,7 +22,7 @@ from quadid.vehicle import GRAVITY, Vehicle
 
 # --- Do the sensors agree?  Factors of channels against each other, from physics that needs no model of the vehicle
 #
-# * Gyro against attitude: `quadid.checks.turns`.
+# * Gyro against attitude: `quadid.checks.motion`.
 # * Accelerometer against gravity: the vertical specific force of a flight is g on average, because velocity stays
 #   small.
 #

@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from quadid.checks.turns import Factor
+from quadid.checks.motion import Factor
 from quadid.chi_square import Z95
 from quadid.online.records import WAITS, OnlineSet, SetState
 from quadid.parameters import (

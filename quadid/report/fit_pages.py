@@ -24,15 +24,16 @@ from quadid.report.figures import (
     MODELS,
     MOST_LOGS,
     WHOLE_POINTS,
+    ResidualMap,
     channel_figures,
     error_figure,
     gain_figure,
+    map_figure,
     missing_figures,
     parameter_figure,
     thinned,
 )
 from quadid.report.page import axis, figure, fit, measures, number, part, quiet, rows_of, section, trace, unit, upright
-from quadid.report.residual_maps import ResidualMap, map_figure
 from quadid.report.verdict import (
     MOTION,
     NOISE_LEVEL,

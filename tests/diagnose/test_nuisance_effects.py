@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from quadid.diagnosis.attribution import ordinary
+from quadid.diagnosis.evidence import ordinary
 from quadid.diagnosis.hypotheses import candidates
 from tests.diagnose.problems import clean
 

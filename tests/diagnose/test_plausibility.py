@@ -10,8 +10,7 @@ import pytest
 
 from quadid.diagnosis.evidence import impossible_causes, late_unknown, slight_causes
 from quadid.diagnosis.hypotheses import Model, Start, candidates, extend, free_names, without
-from quadid.diagnosis.innovations import fit_numbers
-from quadid.diagnosis.pipeline import _nominal_parameters
+from quadid.diagnosis.pipeline import _nominal_parameters, fit_numbers
 from quadid.diagnosis.residual_tests import inconstant_causes, remainder
 from quadid.identification.fit import NO_FILTER, possible_moments
 from quadid.identification.result import with_values

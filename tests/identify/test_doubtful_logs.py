@@ -13,7 +13,7 @@ from quadid_replay import open_log
 
 import quadid
 from quadid.checks import inspect
-from quadid.checks.doubts import estimates_off, rotors_off
+from quadid.checks.findings import estimates_off, rotors_off
 from quadid.errors import LogError
 from quadid.flight.setup import TABLE_2
 from quadid.vehicle import Vehicle

@@ -12,7 +12,7 @@ from quadid_evaluation.studies.poisoning import Poison
 from quadid_replay import open_log
 from scipy.signal import butter, sosfiltfilt
 
-from quadid.checks.turns import ALLOWED, AXES, Factor
+from quadid.checks.motion import ALLOWED, AXES, Factor
 from quadid.data.window import Recording
 from quadid.online import Phase, Session
 from quadid.online.checks import LEAD, Consistency

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from quadid.checks.turns import Factor
+from quadid.checks.motion import Factor
 from quadid.chi_square import Z95
 from quadid.online.fusion import with_tangent
 from quadid.online.gate import CHECKS, JUDGED, Case, GateSettings, decide

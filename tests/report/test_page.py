@@ -29,14 +29,19 @@ from quadid.jsonable import jsonable
 from quadid.model.layout import Layout
 from quadid.report.figures import (
     BUDGET,
+    PAIRS,
     VISIBLE,
     WHOLE_POINTS,
+    ResidualMap,
     channel_figures,
     error_over_time,
     gain_figure,
     liveliest,
+    map_figure,
     missing_figures,
     parameter_figure,
+    residual_map,
+    switched_off,
 )
 from quadid.report.fit_pages import (
     SHARP,
@@ -50,7 +55,6 @@ from quadid.report.fit_pages import (
     spectrum,
 )
 from quadid.report.page import code, fit, listed, measures, number, packed, part, render
-from quadid.report.residual_maps import PAIRS, ResidualMap, map_figure, residual_map, switched_off
 from quadid.vehicle import Vehicle
 from tests.faults.evidence import Happened
 

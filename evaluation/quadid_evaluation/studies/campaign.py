@@ -27,7 +27,7 @@ import numpy as np
 
 from quadid.data.window import Window
 from quadid.diagnosis import Search, diagnose
-from quadid.diagnosis.attribution import block_deviance
+from quadid.diagnosis.evidence import block_deviance
 from quadid.diagnosis.hypotheses import Model, Start, candidates, extend, fit_model
 from quadid.effects import EFFECTS
 from quadid.errors import QuadidError
