@@ -19,7 +19,7 @@ from quadid.data.window import Recording, Window
 from quadid.errors import NotIdentifiableError
 from quadid.estimate import missing
 from quadid.flight import Flight, FlightError, Segment, TruthParameters, fly
-from quadid.flight.sensors import SensorNoise
+from quadid.flight.loop import SensorNoise
 from quadid.identification.fit import Progress as Advance
 from quadid.identification.noise import NoiseModel
 from quadid.identification.uncertainty import d_optimal, excitation, halfwidths

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from markupsafe import Markup
 from quadid_replay import write_compared
-from quadid_replay.frames import from_euler
+from quadid_replay.columns import from_euler
 
 from quadid.app.logs import LONGEST, Log, free_name, write_text, written_whole
 from quadid.app.missing import Beside, MissingForces

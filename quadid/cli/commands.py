@@ -146,12 +146,12 @@ COMMANDS = {
     "worker": Command(
         "Fit on this machine for services elsewhere, over Zenoh.",
         ("quadid worker --connect tcp/192.168.1.5:7447",),
-        "quadid.cli.worker:worker",
+        "quadid.cli.serve:worker",
     ),
     "watch": Command(
         "Watch one or many vehicles live in the terminal.",
         ("quadid watch", "quadid watch --zenoh tcp/192.168.1.5:7447"),
-        "quadid.cli.watch:watch",
+        "quadid.cli.serve:watch",
     ),
     "history": Command(
         "List stored parameter sets: what, when, from which data, by whom.",

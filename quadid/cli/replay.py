@@ -64,8 +64,7 @@ def replay(
 ) -> None:
     """Drive the online session from a log: the sets, findings and reasons that a live service would have published."""
     from quadid_node.recording import arrivals, play, stream
-    from quadid_node.service import Service
-    from quadid_node.settings import session_settings
+    from quadid_node.service import Service, session_settings
     from quadid_node.worker import InlineWorker
 
     from quadid.app.kernels import FIT

@@ -1,8 +1,11 @@
-"""`quadid serve`: the online service on a MAVLink link, no ROS needed."""
+"""`quadid serve`, `worker` and `watch`: the online service on a MAVLink link, its fits elsewhere, and a view of all."""
 
 from __future__ import annotations
 
+import contextlib
+import re
 import time
+from collections.abc import Mapping
 from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -10,12 +13,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from quadid.app import options
+from quadid.app.options import JsonTarget
+from quadid.errors import QuadidError
+from quadid.sanitise import plain
 
 if TYPE_CHECKING:
     from quadid_node.mavlink_link import MavlinkLink
     from quadid_node.messages import Output, ServiceHealth
     from quadid_node.service import Service
+    from quadid_node.zenoh import FleetView
     from rich.console import Console
+    from rich.table import Table
 
 SAY_EVERY = 10.0
 """Time between two lines about how things are [s]."""
@@ -61,13 +69,11 @@ def serve(
     from quadid_node.process import StopSignal
 
     stop = StopSignal()
-    from quadid_node.ground import fit_worker
     from quadid_node.history import Store, default_path
     from quadid_node.mavlink_link import MavlinkLink, Outlet, run
     from quadid_node.mavlink_wire import memory_path, read_key
-    from quadid_node.service import Service
-    from quadid_node.settings import session_settings
-    from quadid_node.zenoh import ZenohLink
+    from quadid_node.service import Service, session_settings
+    from quadid_node.zenoh import ZenohLink, fit_worker
 
     from quadid.cli import terminal
     from quadid.vehicle import Vehicle
@@ -157,3 +163,191 @@ def summary(service: Service, link: MavlinkLink, name: str) -> dict[str, Any]:
         "worker_restarts": health.restarts,
         "history": health.history,
     }
+
+
+# --- `quadid worker`: fits on this machine for services elsewhere, over Zenoh
+
+
+def worker(
+    connect: Annotated[
+        str, typer.Option("--connect", metavar="WHERE", help="A locator (tcp/host:7447), a config file, or 'local'.")
+    ],
+    seconds: Annotated[float, typer.Option("--seconds", metavar="S", help="End after this long; 0: never.")] = 0.0,
+    json: JsonTarget = None,
+) -> None:
+    """Fit windows on this machine for vehicles' services; they fit on board whenever this one is gone."""
+    from quadid_node.process import StopSignal
+
+    stop = StopSignal()
+    from quadid_node.zenoh import work
+
+    from quadid.cli import terminal
+    from quadid.online.fit_job import warm_up
+    from quadid.vehicle import Vehicle
+
+    terminal.check_file(json, "--json")
+    console = terminal.console(quiet=json == "-")
+    end = time.monotonic() + seconds if seconds > 0.0 else float("inf")
+    warm_up(Vehicle.shipped("pelican"))
+    done = work(
+        connect, lambda: stop() or time.monotonic() > end, lambda text: console.print(plain(text), soft_wrap=True)
+    )
+    stop.ignore_more()
+    result = {"schema": "quadid.worker/1", "answered": done.answered, "refused": done.refused, "seconds": done.seconds}
+    console.print(f"{done.answered} requests answered, {done.refused} refused")
+    terminal.write_json(result, json)
+
+
+# --- `quadid watch`: a live terminal view of one or many vehicles over Zenoh
+
+
+REFRESH = 0.5
+SETTLE = 1.0
+"""Time that a snapshot waits for answers [s]."""
+_LONGEST = 160
+
+
+class WatchError(QuadidError):
+    """A command that a vehicle did not carry out."""
+
+    exit_code = 3
+
+
+def watch(
+    zenoh: Annotated[
+        str, typer.Option("--zenoh", metavar="WHERE", help="A locator (tcp/host:7447), a config file, or 'local'.")
+    ] = "local",
+    seconds: Annotated[float, typer.Option("--seconds", metavar="S", help="End after this long; 0: never.")] = 0.0,
+    approve: Annotated[
+        str, typer.Option("--approve", metavar="VEHICLE[=N]", help="Approve set N, or the newest that waits, and end.")
+    ] = "",
+    rollback: Annotated[
+        str,
+        typer.Option(
+            "--rollback", metavar="VEHICLE", help="Take the vehicle's set in force back to the previous one, and end."
+        ),
+    ] = "",
+    json: JsonTarget = None,
+) -> None:
+    """Show parameters with intervals, gate state and reason, findings and data rates of all vehicles, live."""
+    from quadid_node.zenoh import FleetView
+
+    from quadid.cli import terminal
+
+    terminal.check_file(json, "--json")
+    fleet = FleetView(zenoh)
+    try:
+        for vehicle, name in ((approve, "approve"), (rollback, "rollback")):
+            if vehicle:
+                done = _command(fleet, vehicle, name)
+                if json != "-":
+                    typer.echo(f"{vehicle}: {done['text']}")
+                terminal.write_json(done, json)
+        if approve or rollback:
+            return
+        if json is not None:
+            time.sleep(max(seconds, SETTLE))
+            terminal.write_json(snapshot(fleet), json)
+            return
+        with contextlib.suppress(KeyboardInterrupt):
+            _live(fleet, seconds, terminal.console())
+    finally:
+        fleet.close()
+
+
+def _command(fleet: FleetView, vehicle: str, name: str) -> dict[str, Any]:
+    """Answer of the vehicle to a command that it carried out, of the form ``quadid.command/1``."""
+    sequence = None
+    if name == "approve" and (numbered := re.fullmatch(r"(.+)=([0-9]{1,18})", vehicle)):
+        vehicle, sequence = numbered[1], int(numbered[2])
+    if name == "approve" and sequence is None:
+        end = time.monotonic() + SETTLE
+        while not (sequence := fleet.waiting(vehicle)) and time.monotonic() < end:
+            time.sleep(0.05)
+    done, text = fleet.command(vehicle, name, sequence)
+    if not done:
+        raise WatchError(f"{vehicle}: {name} was not done: {text}")
+    return {"schema": "quadid.command/1", "vehicle": vehicle, "command": name, "text": plain(text)}
+
+
+def _live(fleet: FleetView, seconds: float, console: Any) -> None:
+    from rich.live import Live
+
+    end = time.monotonic() + seconds if seconds > 0.0 else float("inf")
+    with Live(table(snapshot(fleet)), console=console, auto_refresh=False) as live:
+        while time.monotonic() < end:
+            time.sleep(REFRESH)
+            live.update(table(snapshot(fleet)), refresh=True)
+
+
+def snapshot(fleet: FleetView) -> dict[str, Any]:
+    """State of all vehicles now, of the form ``quadid.watch/1``."""
+    names = sorted({*fleet.latest, *fleet.alive})
+    return {
+        "schema": "quadid.watch/1",
+        "vehicles": {n: {"alive": fleet.alive.get(n, False), **fleet.latest.get(n, {})} for n in names},
+        "refused": fleet.refused,
+    }
+
+
+def table(found: Mapping[str, Any]) -> Table:
+    """One row a vehicle."""
+    from rich.table import Table
+    from rich.text import Text
+
+    count = len(found["vehicles"])
+    out = Table(title=f"{count} vehicle{'s' * (count != 1)}", show_lines=True)
+    for heading in ("vehicle", "state", "set", "parameters", "finding", "data"):
+        out.add_column(heading, overflow="fold")
+    for name, kinds in found["vehicles"].items():
+        health, force = kinds.get("health", {}), kinds.get("parameters", {})
+        status = _mapping(health.get("status"))
+        color = "green" if kinds["alive"] else "red"
+        state = f"{_plain(status.get('phase', 'unknown'))}: {_plain(status.get('reason', ''))}"
+        notes = f"\nreference: {_plain(force['reference'])}" if force.get("reference") else ""
+        notes += f"\nout of date: {_plain(force['outdated'])}" if force.get("outdated") else ""
+        diagnosis = kinds.get("diagnosis", {})
+        lines = []
+        for finding in _listing(diagnosis.get("findings"))[:5]:
+            sure = "" if finding.get("confident") else " (?)"
+            lines.append(f"{_plain(finding.get('effect'))}{sure}: {_plain(finding.get('evidence'))}")
+        out.add_row(
+            Text(_plain(name), style=color),
+            Text(state if kinds["alive"] else "gone"),
+            Text(_plain(f"{force.get('sequence', '-')} {force.get('state', '')}") + notes),
+            Text(_parameters(force)),
+            Text("\n".join(lines)),
+            Text(_feeds(health)),
+        )
+    return out
+
+
+def _parameters(force: Mapping[str, Any]) -> str:
+    lines = []
+    for p in _listing(force.get("parameters"))[:12]:
+        value, sigma = p.get("value"), p.get("sigma")
+        if isinstance(value, int | float) and isinstance(sigma, int | float) and value:
+            lines.append(f"{_plain(p.get('name'))} {value:.4g} +-{196.0 * sigma / abs(value):.1f} %")
+    return "\n".join(lines)
+
+
+def _feeds(health: Mapping[str, Any]) -> str:
+    lines = []
+    for name, feed in list(_mapping(health.get("feeds")).items())[:12]:
+        rate = _mapping(feed).get("rate")
+        if isinstance(rate, int | float):
+            lines.append(f"{_plain(name)} {rate:.0f} Hz")
+    return "\n".join(lines)
+
+
+def _mapping(value: Any) -> Mapping[str, Any]:
+    return value if isinstance(value, Mapping) else {}
+
+
+def _listing(value: Any) -> list[Mapping[str, Any]]:
+    return [item for item in value if isinstance(item, Mapping)] if isinstance(value, list) else []
+
+
+def _plain(value: Any) -> str:
+    """Text from elsewhere, without anything a terminal would act on."""
+    return plain(str(value), _LONGEST)

@@ -7,16 +7,16 @@ flight.truth                         what really happened, for tests only
 
 from quadid.flight.fly import Flight as Flight
 from quadid.flight.fly import FlightError as FlightError
+from quadid.flight.fly import SteppedFlight as SteppedFlight
 from quadid.flight.fly import fly as fly
+from quadid.flight.loop import SensorNoise as SensorNoise
 from quadid.flight.outside import OUTSIDE as OUTSIDE
 from quadid.flight.outside import draw_outside as draw_outside
 from quadid.flight.pilot import PROFILES as PROFILES
 from quadid.flight.pilot import Segment as Segment
 from quadid.flight.pilot import default_gains as default_gains
-from quadid.flight.sensors import SensorNoise as SensorNoise
 from quadid.flight.setup import TruthParameters as TruthParameters
 from quadid.flight.setup import check_effects as check_effects
 from quadid.flight.setup import draw_effect as draw_effect
 from quadid.flight.setup import draw_truth as draw_truth
 from quadid.flight.setup import propeller_radius as propeller_radius
-from quadid.flight.stepped import SteppedFlight as SteppedFlight

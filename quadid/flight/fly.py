@@ -1,4 +1,4 @@
-"""Flight of the vehicle, and the log of it with the truth beside."""
+"""Flight of the vehicle, as a whole or step by step, and the log of it with the truth beside."""
 
 from __future__ import annotations
 
@@ -7,20 +7,162 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from quadid.attitude_controller import pack_gains
+from quadid.attitude_controller import pack_gains, stabilise
 from quadid.data.window import Channel, Recording, Window
 from quadid.errors import ParameterError, QuadidError
-from quadid.flight import sensors
-from quadid.flight.airframe import PUSHES, STATES
-from quadid.flight.loop import Plan, Track, quaternion_of, supply, turning_at
-from quadid.flight.march import CRASHED, march
+from quadid.flight.airframe import PUSHES, STATES, Air, Body, Drive, Oddity, kernel
+from quadid.flight.loop import (
+    BEGUN,
+    EPSILON,
+    NO_TIME,
+    Events,
+    OnBoard,
+    Plan,
+    Progress,
+    SensorNoise,
+    Track,
+    Turning,
+    attitude_at,
+    coloured,
+    fly_on,
+    log_steps,
+    pull_attitude,
+    quaternion_of,
+    read_accel,
+    read_gyro,
+    shake,
+    supply,
+    turned,
+    turning_at,
+)
 from quadid.flight.outside import LogRows, Scene, apply_outside, check_outside, distort_log, random_forces
-from quadid.flight.pilot import PILOT_STEP, Pilot, Segment, band_noise, default_gains, scripted, stick_profile
-from quadid.flight.sensors import SensorNoise, coloured
+from quadid.flight.pilot import (
+    PILOT_STEP,
+    Pilot,
+    Segment,
+    band_noise,
+    default_gains,
+    fly_by_hand,
+    scripted,
+    stick_profile,
+)
 from quadid.flight.setup import Effects, Setup, TruthParameters, prepare
 from quadid.rotation import continuous_sign, exponential, product
 from quadid.types import FloatArray
 from quadid.vehicle import RandomForces, Vehicle, mixer_matrix
+
+# --- The march through a flight: one numerical kernel, kept whole because it is the order of events
+
+
+FLEW, CRASHED = 0, 1
+
+
+@kernel
+def copy_into(values: FloatArray, out: FloatArray) -> None:
+    """Copies numbers one by one: assigning a slice would compile a message about shapes for seconds."""
+    for i in range(values.shape[0]):
+        out[i] = values[i]
+
+
+@kernel
+def march(
+    plan: Plan, body: Body, air: Air, odd: Oddity, drive: Drive, events: Events, on_board: OnBoard, pilot: Pilot,
+    gains: FloatArray, mixer: FloatArray, sticks: FloatArray, gyro_noise: FloatArray, tilt_noise: FloatArray,
+    arrival: FloatArray, pushes: FloatArray, efficiency: FloatArray, y: FloatArray, rotors: Turning, track: Track,
+) -> tuple[int, float]:  # fmt: skip
+    """Flies the closed loop.
+
+    Args:
+        gains: of the stabiliser, see `pack_gains`.
+        mixer: of the stabiliser, see `mixer_matrix`.
+        sticks: shape (pilot instants, 4).
+        gyro_noise: shape (control instants, 3) [rad/s].
+        tilt_noise: AHRS error as body rotation vector, shape (control instants, 3) [rad].
+        arrival: when each command reaches the rotors [s], non-decreasing, shape (control instants,).
+        pushes: disturbance, see `airframe.derivative`: shape (1, 9) for a constant one, or one row a step.
+        efficiency: factors on thrust and drag torque, shape (rotors, 2).
+        y: state at the start, shape (33,); in place.
+        rotors: at the start; in place.
+        track: written.
+
+    Returns:
+        `FLEW` or `CRASHED` (hit the ground, overturned or diverged), and the time of the end [s].
+    """
+    dt, hover = plan.dt, air.hover_sum / rotors.speed.shape[0]
+    integral, trim = np.zeros(3), np.zeros(3)
+    reference, measured = np.zeros(4), np.zeros(3)
+    error = np.zeros(9)
+    error[0] = error[4] = error[8] = 1.0
+    truth, ahrs, seen = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3))
+    force, shaken, trembling = np.zeros(3), np.zeros(3), np.zeros(6)
+    shaking = on_board.gyro_shake > 0.0 or on_board.accel_shake > 0.0
+    progress, issued, row = Progress(0, NO_TIME, 0, False), 0, 0
+
+    for n in range(plan.steps):
+        now = plan.start + n * dt
+        # --- sensors, just before the command of this instant acts
+        for i in range(3):
+            for j in range(3):
+                truth[i, j] = y[6 + 3 * i + j]
+        for axis in range(3):
+            track.gyro[n, axis] = y[15 + axis] + on_board.gyro_shake * trembling[axis]
+            track.accel[n, axis] = y[18 + axis] + shaken[axis]
+        if on_board.pull != 0.0:
+            for i in range(3):
+                for j in range(3):
+                    ahrs[i, j] = (
+                        error[3 * i] * truth[0, j] + error[3 * i + 1] * truth[1, j] + error[3 * i + 2] * truth[2, j]
+                    )
+            if n > 0:
+                for i in range(3):
+                    force[i] = on_board.accel_bias[i]
+                    for j in range(3):
+                        raw = (track.accel[n, j] - track.accel[n - 1, j]) / dt
+                        force[i] += on_board.accel_matrix[i, j] * raw
+                pull_attitude(error, ahrs, force, on_board.pull * dt)
+        else:
+            for i in range(3):
+                for j in range(3):
+                    ahrs[i, j] = truth[i, j]
+        quaternion_of(ahrs, track.attitude[n])
+
+        # --- pilot and stabiliser
+        if n % plan.pilot_every == 0:
+            stick = sticks[min(n // plan.pilot_every, sticks.shape[0] - 1)]
+            fly_by_hand(pilot, y[0:3], y[3:6], truth, stick, trim, reference)
+            tilted = truth[2, 2] < 0.1 or y[2] > 0.0 or not np.isfinite(y[15] + y[2] + y[3])
+            if tilted:
+                return CRASHED, now
+        if row < plan.rows and n == plan.first_log + row * plan.log_every:
+            copy_into(y, track.state[row])
+            copy_into(reference, track.reference[row])
+            copy_into(rotors.speed, track.rotor[row])
+            row += 1
+        if n % plan.control_every == 0:
+            c = n // plan.control_every
+            turned(ahrs, tilt_noise[c], seen)
+            for i in range(3):
+                measured[i] = on_board.gyro_bias[i] + gyro_noise[c, i]
+                for j in range(3):
+                    measured[i] += on_board.gyro_matrix[i, j] * track.gyro[n, j]
+            stabilise(gains, mixer, reference, seen, measured, plan.control_every * dt, integral, track.command[c])
+            issued = c + 1
+
+        # --- the step
+        push = pushes[min(n, pushes.shape[0] - 1)]
+        progress = fly_on(
+            now, now + dt, issued, progress, track.command, arrival, efficiency, push, body, air, odd, drive, events,
+            y, rotors,
+        )  # fmt: skip
+        if shaking:
+            shake(rotors.phase, rotors.speed, on_board.shake_mode, hover, trembling)
+            for axis in range(3):
+                shaken[axis] += dt * on_board.accel_shake * trembling[3 + axis]
+    return FLEW, plan.start + plan.steps * dt
+
+
+# --- Flight of the vehicle, and the log of it with the truth beside
+
 
 FULL_BATTERY = 12.4
 """Voltage at the first sample [V]; thrust goes with its square."""
@@ -131,12 +273,12 @@ def write_window(flown: Flown, extras: Sequence[str]) -> Window:
     plan, setup, track = flown.plan, flown.setup, flown.track
     rotor = logged_rotors(track, plan, setup.vehicle.command.sampling, setup.reading_delay)
     # Gyro, accelerometer and attitude at the rows, then what the logging distorts.
-    steps = sensors.log_steps(plan)
+    steps = log_steps(plan)
     at = steps.astype(np.int64) // plan.control_every
-    lagged = sensors.attitude_at(track, steps - setup.attitude_delay / plan.dt)
+    lagged = attitude_at(track, steps - setup.attitude_delay / plan.dt)
     hover = setup.air.hover_sum / rotor.shape[1]
-    gyro = sensors.read_gyro(track, plan, setup.on_board, setup.imu_cutoff, steps)
-    accel = sensors.read_accel(track, plan, setup.on_board, setup.imu_cutoff, steps)
+    gyro = read_gyro(track, plan, setup.on_board, setup.imu_cutoff, steps)
+    accel = read_accel(track, plan, setup.on_board, setup.imu_cutoff, steps)
     attitude = product(lagged, exponential(flown.tilt_noise[at]))
     rows = LogRows(
         gyro + flown.gyro_noise[at],
@@ -372,3 +514,103 @@ def fly(
     assert window.attitude_reference is not None
     recording, references = as_recording(window, vehicle), window.attitude_reference
     return Flight(window, recording, true_states(flown), references, dict(gains), vehicle)
+
+
+# --- The flown vehicle stepped from outside: any controller closes the loop around the truth
+
+
+LONGEST_STEP = 1e-3
+"""As `fly` integrates [s]."""
+
+
+class SteppedFlight:
+    """One vehicle in the air, with the equations of `fly` and a command from whoever calls.
+
+    Sensors are the caller's: effects that act in sensors alone change nothing here.
+
+    Attributes:
+        time: [s].
+        rotor_speed: [rad/s], shape (rotors,).
+    """
+
+    def __init__(
+        self,
+        vehicle: Vehicle,
+        truth: TruthParameters | None = None,
+        *,
+        effects: Effects | None = None,
+        height: float = 30.0,
+        span: float = 60.0,
+    ) -> None:
+        """Begins level, at rest, in hover.
+
+        Args:
+            truth: true parameters; default `TruthParameters.of(vehicle)`.
+            effects: hidden effects of the catalogue, name -> parameter -> value.
+            height: above the ground [m].
+            span: over which a battery sags [s].
+        """
+        base = TruthParameters.of(vehicle) if truth is None else truth
+        still = np.zeros((6, len(vehicle.rotors), 2))
+        self._setup = prepare(vehicle, base, effects or {}, span, 0.0, (0.0, 0.0), still)
+        self._y = np.zeros(STATES)
+        self._y[2], self._y[6], self._y[10], self._y[14] = -height, 1.0, 1.0, 1.0
+        speed = base.hover_speed(len(vehicle.rotors)) + self._setup.body.dead_speed
+        self.rotor_speed: FloatArray = np.full(len(vehicle.rotors), speed)
+        self.time = 0.0
+        self._rotors, self._progress = turning_at(self.rotor_speed, self._setup.efficiency), BEGUN
+        self._arrival, self._commands = np.zeros(0), np.zeros((0, len(vehicle.rotors)))
+
+    @property
+    def position(self) -> FloatArray:
+        """Of the CG, NED [m], shape (3,)."""
+        return self._y[0:3].copy()
+
+    @property
+    def velocity(self) -> FloatArray:
+        """Of the CG, NED [m/s], shape (3,)."""
+        return self._y[3:6].copy()
+
+    @property
+    def rotation(self) -> FloatArray:
+        """Body to world, shape (3, 3)."""
+        return self._y[6:15].reshape(3, 3).copy()
+
+    @property
+    def quaternion(self) -> FloatArray:
+        """Body to world, wxyz, shape (4,)."""
+        out = np.empty(4)
+        quaternion_of(self.rotation, out)
+        return out
+
+    @property
+    def rate(self) -> FloatArray:
+        """In body axes [rad/s], shape (3,)."""
+        return self._y[15:18].copy()
+
+    def step(self, command: FloatArray, dt: float) -> None:
+        """Gives a command, which reaches the rotors after their delay, and flies on for `dt` [s].
+
+        Args:
+            command: rotor speeds [rad/s], shape (rotors,), held until the next.
+
+        Raises:
+            ParameterError: a command of another shape or not finite, or a step that is not positive.
+        """
+        given = np.asarray(command, dtype=np.float64)
+        if given.shape != self.rotor_speed.shape or not np.isfinite(given).all() or not dt > 0.0:
+            raise ParameterError(
+                f"command {given} for {dt} s", f"{len(self.rotor_speed)} finite rotor speeds, a positive time"
+            )
+        self._arrival = np.append(self._arrival, self.time + self._setup.delay)
+        self._commands = np.concatenate([self._commands, given[None]])
+        end, s = self.time + dt, self._setup
+        while end - self.time > EPSILON:
+            stop = min(end, self.time + LONGEST_STEP)
+            progress = fly_on(
+                self.time, stop, len(self._arrival), self._progress, self._commands, self._arrival, s.efficiency,
+                np.zeros(PUSHES), s.body, s.air, Oddity(), s.drive, s.events, self._y, self._rotors,
+            )  # fmt: skip
+            # Commands that act already are forgotten.
+            self._arrival, self._commands = self._arrival[progress.head :], self._commands[progress.head :]
+            self._progress, self.time = progress._replace(head=0), stop

@@ -11,9 +11,8 @@ import numpy as np
 from scipy.signal import cont2discrete, lfilter
 
 from quadid.errors import ParameterError, nearest
-from quadid.flight import sensors
 from quadid.flight.airframe import PUSHES
-from quadid.flight.loop import OnBoard, Plan, Track
+from quadid.flight.loop import OnBoard, Plan, Track, attitude_at, read_accel, read_gyro
 from quadid.flight.setup import Setup, vehicle_scales
 from quadid.rotation import conjugate, continuous_sign, euler, exponential, product
 from quadid.types import FloatArray
@@ -226,7 +225,7 @@ def accel_clipping(rows: LogRows, v: Values, rng: np.random.Generator) -> None:
 
 def _reread(rows: LogRows, track: Track, steps: FloatArray) -> None:
     """Replaces what the IMU measured by what it would have measured on `track` at `steps`; the noise stays."""
-    for name, read in (("gyro", sensors.read_gyro), ("accel", sensors.read_accel)):
+    for name, read in (("gyro", read_gyro), ("accel", read_accel)):
         was = read(rows.track, rows.plan, rows.on_board, np.inf, rows.steps)
         setattr(rows, name, getattr(rows, name) + read(track, rows.plan, rows.on_board, np.inf, steps) - was)
 
@@ -265,7 +264,7 @@ def attitude_steps(rows: LogRows, v: Values, rng: np.random.Generator) -> None:
 def clock_jitter(rows: LogRows, v: Values, rng: np.random.Generator) -> None:
     """Measures gyro, accelerometer and attitude at instants scattered about the stamped ones."""
     steps = rows.steps + np.clip(rng.normal(0.0, v["sigma"], len(rows.steps)), -0.01, 0.01) / rows.plan.dt
-    before, after = sensors.attitude_at(rows.track, rows.steps), sensors.attitude_at(rows.track, steps)
+    before, after = attitude_at(rows.track, rows.steps), attitude_at(rows.track, steps)
     rows.attitude = continuous_sign(product(rows.attitude, product(conjugate(before), after)))
     _reread(rows, rows.track, steps)
 

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.signal import butter, sosfilt
 
 from quadid.errors import ParameterError, nearest
-from quadid.flight.jit import kernel
+from quadid.flight.airframe import kernel
 from quadid.flight.setup import TruthParameters
 from quadid.types import FloatArray
 from quadid.vehicle import GRAVITY, Vehicle

@@ -10,9 +10,8 @@ import numpy as np
 
 from quadid.effects import EFFECTS, known_keys, rotor_drag_losses, rotor_losses
 from quadid.errors import ParameterError, nearest
-from quadid.flight.airframe import Air, Body, Oddity
+from quadid.flight.airframe import Air, Body, Drive, Oddity
 from quadid.flight.loop import NO_TIME, Events, OnBoard
-from quadid.flight.rotors import Drive
 from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray
 from quadid.vehicle import GRAVITY, Vehicle

@@ -11,12 +11,12 @@ What stands between samples and the parameter topic, in this order; each says wh
 
     stream              a sample belongs to a channel, is finite, and in time
     checks              gyro, attitude and accelerometer agree; while they do not, nothing is learned
-    grid_buffer         a window has gyro, rotors and four fifths of its rows
-    checks              no sensor is stuck or saturated, units fit, the vehicle flies
+    checks              a window has gyro, rotors and four fifths of its rows
+                        no sensor is stuck or saturated, units fit, the vehicle flies
     fit_job             the motion reveals roll and pitch, or there is no estimate; a reply can be one to its request
     fusion              the window agrees with those before it, or is left out
     gate                the fused estimate is possible, narrow, agreed upon, better than the set in force, and near it
-    active_set          a person approves where that is wanted; what predicts worse than its predecessor is taken back
+                        a person approves where that is wanted; what predicts worse than its predecessor is taken back
 
 `session` calls them in turn; `changes` looks for sudden changes beside them, and `change_job` names their cause.
 """

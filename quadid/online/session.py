@@ -26,15 +26,20 @@ from pydantic import BaseModel, ConfigDict, Field
 from quadid.condition.trim import FlightTrim
 from quadid.condition.watch import HealthWatch
 from quadid.data.window import Block
-from quadid.online.active_set import ActiveSet, Answer
-from quadid.online.background_diagnosis import DIAGNOSED_SECONDS, BackgroundDiagnosis
-from quadid.online.change_job import PULL, ChangeReply, ChangeRequest, ChangeWatch, carried
+from quadid.online.change_job import (
+    DIAGNOSED_SECONDS,
+    PULL,
+    BackgroundDiagnosis,
+    ChangeReply,
+    ChangeRequest,
+    ChangeWatch,
+    carried,
+)
 from quadid.online.changes import BASELINE, LEAST, ChangePoint
-from quadid.online.checks import LEAD, Consistency, Quality, judge, mistake
+from quadid.online.checks import LEAD, Consistency, GridBuffer, Quality, Rows, WindowCut, judge, mistake
 from quadid.online.fit_job import FitReply, FitRequest, is_excited
 from quadid.online.fusion import Estimator
-from quadid.online.gate import GateSettings, decide
-from quadid.online.grid_buffer import GridBuffer, Rows, WindowCut
+from quadid.online.gate import ActiveSet, Answer, GateSettings, decide
 from quadid.online.records import (
     MOST_ERRORS,
     Action,

@@ -14,8 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from quadid_replay.motors import no_multirotor
-from quadid_replay.presets import TOPICS, sources
-from quadid_replay.ros_messages import SIGNALS, TYPES, MessageReader
+from quadid_replay.ros_messages import SIGNALS, TOPICS, TYPES, MessageReader, sources
 
 from quadid.data.window import Block
 from quadid.errors import QuadidError, nearest

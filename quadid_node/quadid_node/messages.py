@@ -18,7 +18,7 @@ from quadid.chi_square import Z95
 from quadid.condition.changes import Change
 from quadid.condition.watch import HealthReport
 from quadid.jsonable import jsonable
-from quadid.online.active_set import FORCE
+from quadid.online.gate import FORCE
 from quadid.online.records import (
     Event,
     HealthyFlight,

@@ -24,11 +24,10 @@ from rclpy.subscription import Subscription
 
 from quadid.errors import QuadidError
 from quadid.online import Publish
-from quadid.online.active_set import Answer
+from quadid.online.gate import Answer
 from quadid.sanitise import one_line
 from quadid.vehicle import Vehicle
 from quadid_node import messages
-from quadid_node.ground import fit_worker
 from quadid_node.history import Store, default_path
 from quadid_node.inputs import (
     DEPTH,
@@ -45,9 +44,17 @@ from quadid_node.inputs import (
 )
 from quadid_node.publish import NO_SUBSCRIPTION_EVENTS, Bond, GraphMonitor, Offer, Publishers, bond_of
 from quadid_node.recording import Beginning, Recorder
-from quadid_node.service import Service
-from quadid_node.settings import PARAMETERS, READ_BACK, as_declared, check_change, descriptor, read_settings, vehicle_id
-from quadid_node.zenoh import ZenohLink
+from quadid_node.service import (
+    PARAMETERS,
+    READ_BACK,
+    Service,
+    as_declared,
+    check_change,
+    descriptor,
+    read_settings,
+    vehicle_id,
+)
+from quadid_node.zenoh import ZenohLink, fit_worker
 
 ROUND_SECONDS = 0.1
 """A round is done this often [s]: rows of the grid wait five times as long for late channels."""

@@ -24,8 +24,7 @@ import numpy as np
 
 from quadid.errors import QuadidError
 from quadid.files import read_regular
-from quadid.online.background_diagnosis import DiagnosisReply, DiagnosisRequest
-from quadid.online.change_job import ChangeReply, ChangeRequest
+from quadid.online.change_job import ChangeReply, ChangeRequest, DiagnosisReply, DiagnosisRequest
 from quadid.online.fit_job import FitReply, FitRequest
 from quadid.online.records import Job, JobReply
 from quadid.vehicle import Vehicle

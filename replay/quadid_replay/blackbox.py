@@ -18,8 +18,7 @@ from quadid.data.window import Recording
 from quadid.errors import LogError
 from quadid.sanitise import plain
 from quadid.types import FloatArray
-from quadid_replay.columns import LogClock, RawChannel, assemble, damage
-from quadid_replay.frames import GRAVITY, flip_body
+from quadid_replay.columns import GRAVITY, LogClock, RawChannel, assemble, damage, flip_body
 from quadid_replay.motors import RPM
 
 # --- Frames of a Betaflight blackbox log: variable-length numbers, predicted from the frames before

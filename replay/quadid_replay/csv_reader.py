@@ -15,9 +15,8 @@ from quadid.data.window import COINCIDENT, Channel, Recording, sample_period
 from quadid.errors import LogError, nearest
 from quadid.sanitise import plain
 from quadid.types import FloatArray
-from quadid_replay.columns import LogClock, RawChannel, assemble
+from quadid_replay.columns import LogClock, RawChannel, assemble, from_euler
 from quadid_replay.formats import HEAD_BYTES, header_line
-from quadid_replay.frames import from_euler
 
 GROUPS: dict[str, tuple[str, ...]] = {
     "gyro": ("p", "q", "r"),

@@ -22,11 +22,11 @@ from quadid_replay.columns import (
     assemble,
     channels_of,
     damage,
+    from_euler,
     mode_changes,
     rising,
     spikes,
 )
-from quadid_replay.frames import from_euler
 
 # isort: off
 from quadid_replay.motors import (

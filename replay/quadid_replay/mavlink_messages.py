@@ -12,7 +12,7 @@ from typing import Any, Generic, NamedTuple, TypeAlias, TypeVar
 import numpy as np
 
 from quadid.types import BoolArray, FloatArray, IntArray
-from quadid_replay.frames import GRAVITY, from_euler, to_euler
+from quadid_replay.columns import GRAVITY, from_euler, to_euler
 from quadid_replay.motors import ESCS, RPM
 
 # --- ESC_INFO (290) and ESC_STATUS (291) of MAVLink's common dialect, which pymavlink lacks, added at run time

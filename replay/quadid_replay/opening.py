@@ -38,7 +38,7 @@ from quadid.errors import LogError, QuadidError
 from quadid.sanitise import LONGEST_LINE, plain
 from quadid.types import FloatArray
 from quadid_replay.formats import kind_of, parts_of, read_here, reader_of
-from quadid_replay.presets import AUTO, preset_rank
+from quadid_replay.ros_messages import AUTO, preset_rank
 
 LARGE = 4 << 20
 """Files of this size [bytes] are looked at for missing parts; of small ones a file system may store nothing apart."""
@@ -63,7 +63,7 @@ def open_log(path: str | Path, preset: str = AUTO, columns: Mapping[str, str] | 
     Args:
         path: the file, whose format is recognised by its content and never by its suffix, or the folder of a rosbag2
             recording.
-        preset: for ROS logs, whose topic names to expect (see `quadid_replay.presets`); auto finds them by type.
+        preset: for ROS logs, whose topic names to expect (see `quadid_replay.ros_messages`); auto finds them by type.
         columns: for CSV, names in the file for those of the contract, as in the vehicle file.
 
     Raises:

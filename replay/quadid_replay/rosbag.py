@@ -21,8 +21,16 @@ from quadid.types import FloatArray
 from quadid_replay.columns import RawChannel, assemble, fastest_first
 from quadid_replay.mcap_file import McapFile, Message, Topic, usable_definition
 from quadid_replay.motors import active_outputs, no_multirotor
-from quadid_replay.presets import AUTO, preset_rank
-from quadid_replay.ros_messages import SIGNALS, TYPES, MessageReader, TopicSource, decode_messages, type_name
+from quadid_replay.ros_messages import (
+    AUTO,
+    SIGNALS,
+    TYPES,
+    MessageReader,
+    TopicSource,
+    decode_messages,
+    preset_rank,
+    type_name,
+)
 
 # --- Folders that `ros2 bag record` makes: which files of them are read, in which order
 
@@ -180,7 +188,7 @@ def read_mcap(path: Path, preset: str = AUTO) -> Recording:
     """Reads a ROS 2 log, whole or damaged: an MCAP file, a rosbag2 database or a rosbag2 folder.
 
     Args:
-        preset: key of `quadid_replay.presets.TOPICS`, or ``auto``.
+        preset: key of `quadid_replay.ros_messages.TOPICS`, or ``auto``.
 
     Raises:
         LogError: no topic of a known type, or unknown preset.

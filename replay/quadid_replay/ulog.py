@@ -30,8 +30,8 @@ from quadid_replay.columns import (
     damage,
     fastest_first,
     mode_changes,
+    to_euler,
 )
-from quadid_replay.frames import to_euler
 
 # isort: off
 from quadid_replay.motors import (

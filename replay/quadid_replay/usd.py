@@ -16,8 +16,7 @@ from quadid.data.window import Recording
 from quadid.errors import LogError
 from quadid.sanitise import plain
 from quadid.types import FloatArray, IntArray
-from quadid_replay.columns import LogClock, Source, assemble, channels_of
-from quadid_replay.frames import GRAVITY, flip_body, from_euler
+from quadid_replay.columns import GRAVITY, LogClock, Source, assemble, channels_of, flip_body, from_euler
 from quadid_replay.motors import RPM
 
 # --- Walks through a Crazyflie µSD log: declared event types, then records of them, then a CRC-32 of all that

@@ -22,8 +22,8 @@ from quadid.errors import LogError
 from quadid.files import unwaited, written_whole
 from quadid.rotation import conjugate, rotated
 from quadid.types import FloatArray
+from quadid_replay.columns import flip_attitude, flip_body, flip_world, from_euler, to_euler
 from quadid_replay.csv_reader import EULER, GROUPS
-from quadid_replay.frames import flip_attitude, flip_body, flip_world, from_euler, to_euler
 from quadid_replay.mavlink_messages import extend_dialect
 from quadid_replay.motors import MULTIROTORS, RPM
 from quadid_replay.ros_messages import BlockWriter

@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from quadid.flight import Flight, TruthParameters, draw_truth, fly
-from quadid.flight.airframe import STATES, Oddity, derivative, orthonormalise, rotor_wrench
-from quadid.flight.rotors import advance
+from quadid.flight.airframe import STATES, Oddity, advance, derivative, orthonormalise, rotor_wrench
 from quadid.flight.setup import Effects, Setup, prepare
 from quadid.types import FloatArray
 from quadid.vehicle import GRAVITY, Vehicle

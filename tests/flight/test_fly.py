@@ -29,7 +29,7 @@ from quadid.flight import (
     fly,
 )
 from quadid.flight.airframe import derivative
-from quadid.flight.march import march
+from quadid.flight.fly import march
 from quadid.flight.outside import ARRANGE, DISTORT
 from quadid.flight.setup import SIZES
 from quadid.parameters import NOMINAL_NAMES

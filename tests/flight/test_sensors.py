@@ -9,7 +9,7 @@ from scipy.stats import kstest
 
 from quadid.errors import ParameterError
 from quadid.flight import Flight, SensorNoise, fly
-from quadid.flight.sensors import butterworth, coloured
+from quadid.flight.loop import butterworth, coloured
 from quadid.rotation import exponential, product
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import zstandard
 from quadid_replay import open_log
-from quadid_replay.frames import from_euler, to_euler
+from quadid_replay.columns import from_euler, to_euler
 from quadid_replay.motors import motor_outputs, px4_motor_outputs, px4_rotor_count
 from quadid_replay.schemas import schema_text
 

@@ -9,7 +9,7 @@ import pytest
 
 import quadid
 from quadid.flight import fly
-from quadid.flight.sensors import SensorNoise
+from quadid.flight.loop import SensorNoise
 from quadid.identification.fit import FitOptions, fit
 from quadid.identification.noise import ATTITUDE
 from quadid.parameters import NOMINAL_NAMES

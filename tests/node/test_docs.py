@@ -10,7 +10,7 @@ import pytest
 from quadid_node.inputs import source
 from quadid_node.mavlink_link import PARAMETERS as MAVLINK_NAMES
 from quadid_node.mavlink_link import REQUESTED
-from quadid_node.settings import PARAMETERS
+from quadid_node.service import PARAMETERS
 
 from quadid.cli.commands import load
 from quadid.online.gate import CHECKS, GateSettings

@@ -25,20 +25,18 @@ import zenoh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from msgspec.msgpack import decode, encode
-from quadid_node.ground import Ground, RemoteWorker, work
 from quadid_node.wire_format import KINDS, LARGEST, LARGEST_RECORD, ParcelError, pack, unpack
 from quadid_node.worker import InlineWorker, ProcessWorker, Trouble
-from quadid_node.zenoh import FleetView, ZenohLink
+from quadid_node.zenoh import FleetView, Ground, RemoteWorker, ZenohLink, work
 
 from quadid.estimate.kalman import N_NOISE
 from quadid.online import FitReply, FitRequest, Session, SessionSettings
-from quadid.online.background_diagnosis import DiagnosisReply
-from quadid.online.change_job import ChangeReply
+from quadid.online.change_job import ChangeReply, DiagnosisReply
 from quadid.online.fit_job import Noise
 from quadid.online.records import OnlineFinding
 from quadid.sanitise import one_line
 from quadid.vehicle import Vehicle
-from quadid_node import ground
+from quadid_node import zenoh as ground
 from tests.commands import QUADID
 from tests.faults.evidence import Happened
 from tests.node.zenoh_net import Net, accepted, free_port, service, until

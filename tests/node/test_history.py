@@ -28,7 +28,7 @@ from quadid_node.worker import InlineWorker
 from quadid.app.fleet import open_store
 from quadid.condition.trim import FlightTrim
 from quadid.online import SessionSettings, SetState
-from quadid.online.active_set import FORCE, ActiveSet
+from quadid.online.gate import FORCE, ActiveSet
 from quadid.online.records import Event, OnlineDiagnosis, OnlineFinding, OnlineSet, Publish
 from quadid.vehicle import Vehicle
 from quadid_node import history as storing

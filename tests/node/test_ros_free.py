@@ -22,8 +22,7 @@ from quadid_node.launching import ARGUMENTS, NODE_ARGUMENTS, fleet, parameters, 
 from quadid_node.messages import WARN, diagnostics
 from quadid_node.process import THREADS
 from quadid_node.recording import stream
-from quadid_node.service import Service
-from quadid_node.settings import PARAMETERS, check_change, read_settings, vehicle_id
+from quadid_node.service import PARAMETERS, Service, check_change, read_settings, vehicle_id
 from quadid_node.worker import InlineWorker
 from quadid_replay import open_log, write_mcap
 from quadid_replay.ros_messages import TYPES
@@ -52,8 +51,8 @@ def test_everything_but_the_nodes_imports_without_ros() -> None:
         "            raise ModuleNotFoundError(name)\n"
         "sys.meta_path.insert(0, Block())\n"
         "import quadid_node.service, quadid_node.history, quadid_node.worker, quadid_node.inputs, quadid_node.zenoh\n"
-        "import quadid_node.settings, quadid_node.recording, quadid_node.mavlink_link, quadid_node.process\n"
-        "import quadid.cli.replay, quadid.cli.serve, quadid.cli.watch, quadid.cli.history\n"
+        "import quadid_node.service, quadid_node.recording, quadid_node.mavlink_link, quadid_node.process\n"
+        "import quadid.cli.replay, quadid.cli.serve, quadid.cli.serve, quadid.cli.history\n"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr

@@ -15,7 +15,7 @@ import pytest
 import zenoh
 from quadid_node.zenoh import KINDS, FleetView, ZenohError, ZenohLink, key_of
 
-from quadid.cli.watch import snapshot, table, watch
+from quadid.cli.serve import snapshot, table, watch
 from quadid.online.records import OnlineDiagnosis, OnlineFinding
 from quadid_node import zenoh as zenoh_fleet
 from tests.faults.evidence import Happened
@@ -242,7 +242,7 @@ def test_a_watcher_is_not_filled_up_nor_upset_by_strangers(monkeypatch: pytest.M
     huge = b'{"parameters": [{"name": "b", "value": ' + b"9" * 4000 + b', "sigma": 1}], "feeds": 1, "sequence": -1}'
     session.take(_Heard("quadid/odd/parameters", _Bytes(huge)))
     table(snapshot(fleet))
-    large = _Bytes(b'{"a": "' + b"x" * (zenoh_fleet.LARGEST - 20) + b'"}')
+    large = _Bytes(b'{"a": "' + b"x" * (zenoh_fleet.LARGEST_PAYLOAD - 20) + b'"}')
     for k in range(300):
         session.take(_Heard(f"quadid/v{k}/{KINDS[k % 5]}", large))
     held = sum(len(str(value)) for kinds in fleet.latest.values() for value in kinds.values())

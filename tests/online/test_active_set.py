@@ -10,7 +10,7 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
 
-from quadid.online.active_set import MOST_HELD, ActiveSet, Answer
+from quadid.online.gate import MOST_HELD, ActiveSet, Answer
 from quadid.online.records import WAITS, Event, Publish, SetState
 from tests.online.test_gate import TRUE, online_set
 

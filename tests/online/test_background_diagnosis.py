@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 
 from quadid.online import Job, JobReply, Session, SessionSettings
-from quadid.online.background_diagnosis import DiagnosisReply, DiagnosisRequest
+from quadid.online.change_job import DiagnosisReply, DiagnosisRequest
 from quadid.online.records import Action, OnlineFinding
 from quadid.vehicle import Vehicle
 from tests.online.driving import EPOCH, diagnosed, drive, flight, samples, unanswered

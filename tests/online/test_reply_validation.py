@@ -12,7 +12,7 @@ import pytest
 
 from quadid.estimate.kalman import N_NOISE
 from quadid.online import FitReply, FitRequest, Session
-from quadid.online.background_diagnosis import _is_wrong_scale
+from quadid.online.change_job import _is_wrong_scale
 from quadid.online.records import Job, JobReply, OnlineFinding
 from tests.faults.evidence import Happened
 from tests.online.driving import published

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from quadid.online import FitReply, FitRequest, Phase, Session
-from quadid.online.background_diagnosis import DiagnosisReply, DiagnosisRequest
-from quadid.online.change_job import ChangeReply, ChangeRequest
+from quadid.online.change_job import ChangeReply, ChangeRequest, DiagnosisReply, DiagnosisRequest
 from quadid.online.records import Action, Job, JobReply, OnlineFinding
 from tests.faults.evidence import Happened
 from tests.online.driving import EPOCH, diagnosed, events, published

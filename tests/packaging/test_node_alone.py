@@ -82,7 +82,7 @@ for top in (quadid, quadid_node, quadid_replay):
                 importlib.import_module(module.name)
             except quadid.errors.QuadidError as error:
                 assert "pip install 'quadid[" in str(error), error
-import quadid.cli.serve, quadid.cli.replay, quadid.cli.history, quadid.cli.watch, quadid.cli.worker
+import quadid.cli.serve, quadid.cli.replay, quadid.cli.history, quadid.cli.serve, quadid.cli.serve
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr

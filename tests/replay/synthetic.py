@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from quadid_replay.frames import from_euler
+from quadid_replay.columns import from_euler
 
 from quadid.data.window import Channel, Recording
 from quadid.rotation import continuous_sign

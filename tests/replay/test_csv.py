@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from quadid_replay import open_log
-from quadid_replay.frames import from_euler
+from quadid_replay.columns import from_euler
 
 from quadid.data.grid import grid_recording
 from quadid.errors import LogError

@@ -12,8 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pymavlink import DFReader
 from quadid_replay import open_log
+from quadid_replay.columns import from_euler
 from quadid_replay.dataflash import index_dataflash
-from quadid_replay.frames import from_euler
 from quadid_replay.motors import RPM, Outputs, active_outputs, frame_rotors, merge_instances, motor_outputs
 
 from tests.faults.evidence import Happened

@@ -6,8 +6,18 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from quadid_replay.columns import LogClock, RawChannel, clean_channel, fastest_first
-from quadid_replay.frames import flip_attitude, flip_body, flip_world, from_euler, to_euler, unit_quaternions
+from quadid_replay.columns import (
+    LogClock,
+    RawChannel,
+    clean_channel,
+    fastest_first,
+    flip_attitude,
+    flip_body,
+    flip_world,
+    from_euler,
+    to_euler,
+    unit_quaternions,
+)
 from quadid_replay.mavlink_messages import SERVO_TURN, boot_stamp
 from scipy.spatial.transform import Rotation
 

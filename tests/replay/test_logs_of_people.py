@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 import yaml
 from quadid_replay import open_log, write_csv
-from quadid_replay.columns import RawChannel, clean_channel
-from quadid_replay.frames import from_euler
+from quadid_replay.columns import RawChannel, clean_channel, from_euler
 from quadid_replay.motors import active_outputs, frame_of, in_pulses, motor_columns, no_multirotor
 from scipy.spatial.transform import Rotation
 

@@ -14,7 +14,7 @@ import quadid_replay
 from pymavlink.dialects.v20 import ardupilotmega
 from pymavlink.generator import mavgen
 from quadid_replay import open_log
-from quadid_replay.frames import GRAVITY
+from quadid_replay.columns import GRAVITY
 from quadid_replay.mavlink_messages import ESC_INFO, ESC_STATUS, extend_dialect
 from quadid_replay.motors import RPM
 from quadid_replay.tlog import _rounds

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
-from quadid_replay.frames import from_euler
+from quadid_replay.columns import from_euler
 
 from quadid.data.window import Window
 from quadid.errors import NotIdentifiableError, WindowError

@@ -22,8 +22,7 @@ from typing import Any
 
 from quadid_node.messages import set_to_dict
 from quadid_node.recording import play, stream
-from quadid_node.service import Service
-from quadid_node.settings import session_settings
+from quadid_node.service import Service, session_settings
 from quadid_node.worker import InlineWorker
 from quadid_replay import open_log
 from quadid_replay.tlog import read_frames

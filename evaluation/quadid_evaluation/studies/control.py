@@ -25,8 +25,7 @@ import numpy as np
 from scipy.linalg import solve_continuous_are
 
 from quadid.flight import TruthParameters, draw_truth, fly
-from quadid.flight.airframe import PUSHES, STATES, Air, Body, Oddity, derivative, orthonormalise, rotor_wrench
-from quadid.flight.jit import kernel
+from quadid.flight.airframe import PUSHES, STATES, Air, Body, Oddity, derivative, kernel, orthonormalise, rotor_wrench
 from quadid.flight.setup import Setup, prepare
 from quadid.identification.fit import Fit, FitOptions, fit
 from quadid.parameters import NOMINAL_NAMES

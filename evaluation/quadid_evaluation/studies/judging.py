@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 from quadid_replay import open_log
-from quadid_replay.frames import from_euler
+from quadid_replay.columns import from_euler
 from scipy.signal import butter, filtfilt
 
 import quadid

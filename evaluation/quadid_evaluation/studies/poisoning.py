@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from quadid_replay.frames import from_euler
+from quadid_replay.columns import from_euler
 from scipy.signal import butter, sosfiltfilt
 
 from quadid.data.window import Block, Recording

@@ -24,7 +24,7 @@ import rclpy
 from quadid_node.inputs import message_class, to_message
 from quadid_node.publish import LATCHED_QOS
 from quadid_replay import write_mcap
-from quadid_replay.frames import flip_attitude, flip_body
+from quadid_replay.columns import flip_attitude, flip_body
 from quadid_replay.motors import RPM
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy

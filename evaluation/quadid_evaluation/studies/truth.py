@@ -17,7 +17,7 @@ import numpy as np
 from quadid.chi_square import Z95
 from quadid.data.window import Window
 from quadid.flight import draw_truth, fly
-from quadid.flight.sensors import SensorNoise
+from quadid.flight.loop import SensorNoise
 from quadid.identification.fit import FitOptions, fit, shaped_noise
 from quadid.identification.noise import estimate_noise
 from quadid.identification.problem import Shooting
