@@ -196,15 +196,26 @@ def vehicle_text(recording: Recording, name: str, mass: float | None = None, arm
         )
     weight = mass if mass is not None else _MASS
     command = _command(recording, channel)
-    b = _hover_thrust(recording, channel, command, weight, len(frame.rotors))
+    # Thrust coefficient [N s^2/rad^2] that carries the weight at the speeds of the flight; else at 0.55 of full
+    squares = len(frame.rotors) * (0.55 * _MAX_SPEED) ** 2
+    spans = flying_spans(recording, None)
+    if channel is not None and spans:
+        inside = within(channel.t, spans)
+        speed = np.maximum(channel.values[inside] - command.low, 0.0) * command.scale
+        squares = float(np.mean(np.sum(speed**2, axis=1))) if inside.any() and speed.any() else squares
+    b = weight * GRAVITY / squares
     known_size = arm is not None or not frame.scaled
     judged = known_size and channel is not None and channel.name == "rotor_speed"
+    mark = "  FILL IN: the arm is a guess; the autopilot stores none" if frame.scaled and arm is None else ""
+    rotor_lines = [f"rotors:                 # forward, right, down [m]; {frame.name}{mark}"]
+    for r in frame.rotors:
+        rotor_lines.append(f"  - {{position: [{r.x:.4f}, {r.y:.4f}, {r.z:.4f}], spin: {r.spin:+d}}}")
     text = (
         "\n".join(
             [
                 f"name: {json.dumps(name)}",
                 f"mass: {weight:g}             {'# kg' if mass is not None else '# kg  FILL IN: weigh it as it flies'}",
-                *_rotor_lines(frame, arm),
+                *rotor_lines,
                 f"command: {command.line}",
                 *_guesses(frame, weight, b, _possible_thrust(frame) if judged else None),
                 *_effects(recording),
@@ -216,14 +227,6 @@ def vehicle_text(recording: Recording, name: str, mass: float | None = None, arm
     )
     Vehicle.from_yaml(text, name)  # what is handed out is valid
     return text
-
-
-def _rotor_lines(frame: Frame, arm: float | None) -> list[str]:
-    mark = "  FILL IN: the arm is a guess; the autopilot stores none" if frame.scaled and arm is None else ""
-    lines = [f"rotors:                 # forward, right, down [m]; {frame.name}{mark}"]
-    for r in frame.rotors:
-        lines.append(f"  - {{position: [{r.x:.4f}, {r.y:.4f}, {r.z:.4f}], spin: {r.spin:+d}}}")
-    return lines
 
 
 def _command(recording: Recording, channel: Channel | None) -> _Command:
@@ -241,17 +244,6 @@ def _command(recording: Recording, channel: Channel | None) -> _Command:
     if 0.0 <= spin_min < spin_max <= 1.0:  # thrust begins at the one and ends at the other
         low, high = low + spin_min * (high - low), low + spin_max * (high - low)
     return _Command(f"{{kind: pwm, range: [{low:g}, {high:g}], {speed}", low, _MAX_SPEED / (high - low))
-
-
-def _hover_thrust(recording: Recording, channel: Channel | None, command: _Command, mass: float, rotors: int) -> float:
-    """Thrust coefficient [N s^2/rad^2] that carries the weight at the speeds of the flight; else at 0.55 of full."""
-    squares = rotors * (0.55 * _MAX_SPEED) ** 2
-    spans = flying_spans(recording, None)
-    if channel is not None and spans:
-        inside = within(channel.t, spans)
-        speed = np.maximum(channel.values[inside] - command.low, 0.0) * command.scale
-        squares = float(np.mean(np.sum(speed**2, axis=1))) if inside.any() and speed.any() else squares
-    return mass * GRAVITY / squares
 
 
 def _possible_thrust(frame: Frame) -> tuple[float, float] | None:

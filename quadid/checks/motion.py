@@ -70,7 +70,10 @@ def flying_spans(recording: Recording, vehicle: Vehicle | None) -> Spans:
         carried = t[on & (thrust > 0.9 * carrying)]
         return tuple(later for span in _spans(t, on) if (later := _from_carried(span, carried)))
     if "accel" in channels and len(channels["accel"].t) > 10:
-        return _spans(channels["accel"].t, _vibrates(channels["accel"]))
+        # True where the accelerometer's length varies by more than at rest (0.3 m/s^2 over 25 samples)
+        length = np.linalg.norm(channels["accel"].values, axis=1)
+        mean, square = moving_mean(length, 25), moving_mean(length**2, 25)
+        return _spans(channels["accel"].t, np.asarray(np.sqrt(np.maximum(square - mean**2, 0.0)) > 0.3))
     return ()
 
 
@@ -186,13 +189,6 @@ def _felt(accel: Channel) -> FloatArray:
     share = accel.values @ usual / float(usual @ usual or 1.0)
     width = max(1, round(0.5 / sample_period(accel.t)))
     return np.asarray(moving_mean(share, width) > 0.3, dtype=np.float64)
-
-
-def _vibrates(accel: Channel) -> BoolArray:
-    """True where the accelerometer's length varies by more than at rest (0.3 m/s^2 over 25 samples)."""
-    length = np.linalg.norm(accel.values, axis=1)
-    mean, square = moving_mean(length, 25), moving_mean(length**2, 25)
-    return np.asarray(np.sqrt(np.maximum(square - mean**2, 0.0)) > 0.3)
 
 
 def _from_carried(span: tuple[float, float], carried: FloatArray) -> tuple[float, float] | None:

@@ -508,20 +508,16 @@ def _changes(found: Sequence[Explained], vehicle: Vehicle, changed: bool, steady
     if best.hypothesis.kind == "weak_rotor":
         out = []
         for k, rotor in enumerate(best.hypothesis.rotors):
-            partner, sure = _coaxial(vehicle, rotor), held(rotor)
+            # The rotor above or below another one; None for none
+            away = np.linalg.norm(vehicle.rotor_positions[:, :2] - vehicle.rotor_positions[rotor, :2], axis=1)
+            near = [k for k in np.flatnonzero(away < 0.1 * vehicle.arm).tolist() if k != rotor]
+            partner, sure = (int(near[0]) if near else None), held(rotor)
             if partner is not None and partner not in best.hypothesis.rotors and not (steady and sure > _SURE):
                 out.append(_weak_rotor(best, k, held(rotor, partner), changed, lost, partner))
             else:
                 out.append(_weak_rotor(best, k, sure, changed, lost))
         return tuple(sorted(out, key=lambda c: -abs(c.parameters[1][2])))
     return _changes_of_mass(best, vehicle, float(shares[0]), changed, lost)
-
-
-def _coaxial(vehicle: Vehicle, rotor: int) -> int | None:
-    """The rotor above or below another one; None for none."""
-    away = np.linalg.norm(vehicle.rotor_positions[:, :2] - vehicle.rotor_positions[rotor, :2], axis=1)
-    near = [k for k in np.flatnonzero(away < 0.1 * vehicle.arm).tolist() if k != rotor]
-    return int(near[0]) if near else None
 
 
 def _names(one: Explained) -> tuple[tuple[str, ...], tuple[int, ...]]:

@@ -224,7 +224,12 @@ def _motions(part: Columns) -> dict[str, FloatArray]:
     lift = f_z - np.mean(f_z)
     out |= {"a_x": f_x, "a_y": f_y, "a_z": lift, "a_z squared": lift**2, "a_x a_z": f_x * lift, "a_y a_z": f_y * lift}
     if window.attitude is not None:
-        w, x, y, z = _predicted_attitude(part, window.attitude)
+        # Predicted quaternion, shape (4, segments, length): the measured one turned by its residual, a body rotation
+        error = 0.5 * part.base[:, :, 3:6].reshape(-1, 3)
+        turned = product(
+            np.nan_to_num(window.attitude[part.rows.ravel()]), np.column_stack([np.ones(len(error)), error])
+        )
+        w, x, y, z = turned.T.reshape(4, *part.rows.shape)
         out |= {"pitched": 2.0 * (x * z - w * y), "rolled": 2.0 * (y * z + w * x)}
         out |= {"heading north": w * w + x * x - y * y - z * z, "heading east": 2.0 * (x * y + w * z)}
     return out
@@ -239,13 +244,6 @@ def _predicted(part: Columns, measured: FloatArray | None, axis: int, channel: i
     """Predicted value of a channel; where nothing was measured, 0, as its residual."""
     value = part.base[:, :, channel]
     return value if measured is None else value + np.nan_to_num(measured[part.rows][..., axis])
-
-
-def _predicted_attitude(part: Columns, measured: FloatArray) -> FloatArray:
-    """Predicted quaternion, shape (4, segments, length): the measured one turned by its residual, a body rotation."""
-    error = 0.5 * part.base[:, :, 3:6].reshape(-1, 3)
-    turned = product(np.nan_to_num(measured[part.rows.ravel()]), np.column_stack([np.ones(len(error)), error]))
-    return turned.T.reshape(4, *part.rows.shape)
 
 
 # --- What remains after the named causes: is it noise, and does it contradict them?

@@ -132,23 +132,17 @@ def _whitener(noise: NoiseModel, length: int, dt: float) -> FloatArray:
             continue
         covariance = white**2 * np.eye(length)
         if noise.shape is not None and not slow > 0.0:
-            covariance = white**2 * _stationary(noise.shape[c], length)
+            # Covariance (length, length) of noise whose spectrum is `shape` from 0 to the Nyquist frequency (Wiener-
+            # Khinchin). The spectrum is linear between its points, on a grid fine enough for the longest lag.
+            points = max(4 * length, SHAPE_POINTS)
+            frequency = (np.arange(points) + 0.5) / points
+            level = np.interp(frequency, np.linspace(0.0, 1.0, SHAPE_POINTS), noise.shape[c])
+            lag = np.cos(np.pi * np.outer(np.arange(length), frequency)) @ level / points
+            covariance = white**2 * np.asarray(lag[np.abs(np.subtract.outer(np.arange(length), np.arange(length)))])
         covariance += slow**2 * correlation(length, dt / noise.slow_time)
         out[c] = np.tril(np.linalg.inv(np.linalg.cholesky(covariance)))
     out.setflags(write=False)
     return out
-
-
-def _stationary(shape: FloatArray, length: int) -> FloatArray:
-    """Covariance (length, length) of noise whose spectrum is `shape` from 0 to the Nyquist frequency (Wiener-Khinchin).
-
-    The spectrum is linear between its points, on a grid fine enough for the longest lag.
-    """
-    points = max(4 * length, SHAPE_POINTS)
-    frequency = (np.arange(points) + 0.5) / points
-    level = np.interp(frequency, np.linspace(0.0, 1.0, SHAPE_POINTS), shape)
-    lag = np.cos(np.pi * np.outer(np.arange(length), frequency)) @ level / points
-    return np.asarray(lag[np.abs(np.subtract.outer(np.arange(length), np.arange(length)))])
 
 
 @lru_cache(maxsize=32)

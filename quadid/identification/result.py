@@ -277,26 +277,21 @@ def _series(shooting: Shooting, lin: Linearised) -> Series:
         known = rollout.measured[rows]
         y = np.concatenate([known[:, :3], np.zeros((len(rows), 3)), known[:, 7:]], axis=1)[:, : shooting.channels]
         y_sim = y + residual
-        y[:, _ATTITUDE], y_sim[:, _ATTITUDE] = _angles(known[:, 3:7], residual[:, _ATTITUDE])
+        # Measured and simulated roll, pitch, yaw [rad] from attitudes (n, 4) and the simulation's error (n, 3). The
+        # error is twice the vector part of the rotation from measured to simulated body.
+        q = known[:, 3:7]
+        v = np.clip(0.5 * residual[:, _ATTITUDE], -1.0, 1.0)
+        w = np.sqrt(np.maximum(1.0 - np.sum(v * v, axis=1), 0.0))
+        simulated = product(q, np.column_stack([w, v]))
+        angles, other = euler(q), euler(simulated)
+        angles[:, 2] = np.unwrap(angles[:, 2])
+        difference = np.remainder(other - angles + np.pi, 2.0 * np.pi) - np.pi
+        y[:, _ATTITUDE], y_sim[:, _ATTITUDE] = angles, angles + difference
         absent = ~rollout.valid[rows][:, : shooting.channels]
         y[absent] = y_sim[absent] = np.nan
         parts.append((rollout.window.t[rows], y, y_sim))
     t, y, y_sim = (np.concatenate(part) for part in zip(*parts, strict=True))
     return Series(t, y, y_sim, np.hypot(shooting.noise.white, shooting.noise.slow))
-
-
-def _angles(q: FloatArray, error: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Measured and simulated roll, pitch, yaw [rad] from attitudes (n, 4) and the simulation's error (n, 3).
-
-    The error is twice the vector part of the rotation from measured to simulated body.
-    """
-    v = np.clip(0.5 * error, -1.0, 1.0)
-    w = np.sqrt(np.maximum(1.0 - np.sum(v * v, axis=1), 0.0))
-    simulated = product(q, np.column_stack([w, v]))
-    angles, other = euler(q), euler(simulated)
-    angles[:, 2] = np.unwrap(angles[:, 2])
-    difference = np.remainder(other - angles + np.pi, 2.0 * np.pi) - np.pi
-    return angles, angles + difference
 
 
 # --- Results as plain dictionaries, ready for JSON: the forms of ``quadid.identify/1`` and ``quadid.score/1``

@@ -282,19 +282,17 @@ class Consistency:
             return
         step, q, self._compared = float(rows.t[1] - rows.t[0]), rows.columns["attitude"], True
         if "gyro" in rows.columns:
-            self._add_turns(rows.columns["gyro"], q, step)
+            gyro = rows.columns["gyro"]
+            turns = Turns.of(gyro, q, step)
+            moving = np.sqrt(np.mean(gyro[np.isfinite(gyro).all(axis=1)] ** 2, axis=0)) > MOVING
+            for axis in np.flatnonzero(moving).tolist() if len(turns.gyro) else ():
+                self._turns[axis].add(len(turns.gyro) * step, turns.moments(axis, step))
         if "accel" in rows.columns:
             new = round(seconds / step)
             force = -np.sum(down(q[-new:]) * rows.columns["accel"][-new:], axis=1)
             force = force[np.isfinite(force)]
             if len(force):
                 self._force.add(len(force) * step, np.asarray(force.sum() * step))
-
-    def _add_turns(self, gyro: FloatArray, q: FloatArray, step: float) -> None:
-        turns = Turns.of(gyro, q, step)
-        moving = np.sqrt(np.mean(gyro[np.isfinite(gyro).all(axis=1)] ** 2, axis=0)) > MOVING
-        for axis in np.flatnonzero(moving).tolist() if len(turns.gyro) else ():
-            self._turns[axis].add(len(turns.gyro) * step, turns.moments(axis, step))
 
     def factors(self) -> tuple[Factor, ...]:
         """Every factor of which there are data: of the gyro by axis, what leaks into it, of the accelerometer."""

@@ -520,13 +520,6 @@ _REMARKS = {
 }
 
 
-def _finding_advice(finding: Json) -> str:
-    """Advice about a cause, and what sets it apart."""
-    known = EFFECTS.get(finding["effect"])
-    parts = [] if known is None or finding.get("ordinary") else [known.advice]
-    return " ".join([*parts, *(text for key, text in _REMARKS.items() if finding.get(key))]).strip()
-
-
 def finding_part(finding: Json, floor: float, identifier: str, seen: ResidualMap | None) -> dict[str, Any]:
     """One cause: its picture, its gain with interval, the rejected alternatives.
 
@@ -553,13 +546,20 @@ def finding_part(finding: Json, floor: float, identifier: str, seen: ResidualMap
         else "No other cause of the catalogue came near it."
     )
     unsure = Markup("") if finding["confident"] else Markup(' <span class="chip prior_dominated">not certain</span>')
+    # Advice about a cause, and what sets it apart
+    known = EFFECTS.get(finding["effect"])
+    parts = [] if known is None or finding.get("ordinary") else [known.advice]
     return part(
         Markup("{}{}").format(name, unsure),
         figures=[
             *([map_figure(seen, f"{identifier}-map", name)] if seen is not None else []),
             gain_figure(finding, floor, f"{identifier}-gain"),
         ],
-        lines=[finding["evidence"], Markup("").join(map(_value, finding["parameters"])), _finding_advice(finding)],
+        lines=[
+            finding["evidence"],
+            Markup("").join(map(_value, finding["parameters"])),
+            " ".join([*parts, *(text for key, text in _REMARKS.items() if finding.get(key))]).strip(),
+        ],
         after=[f"{''.join(gained)}. {_noise_sentence(gain, floor, name)}".rstrip(), quiet(rejected)],
         kind="finding",
     )

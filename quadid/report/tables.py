@@ -88,21 +88,17 @@ class TextTable:
 
         The first column, which names the rows, begins every block.
         """
-        kept = self._fitting(width)
+        # Indices of the columns that fit `width`, those of rank 0 in any case
+        kept = list(range(len(self.columns)))
+        going = sorted((i for i in kept if self.columns[i].rank > 0), key=lambda i: (-self.columns[i].rank, -i))
+        while going and self._wide(kept) > width:
+            kept.remove(going.pop(0))
         blocks = [kept[:1]]
         for i in kept[1:]:
             if len(blocks[-1]) > 1 and self._wide([*blocks[-1], i]) > width:
                 blocks.append(kept[:1])
             blocks[-1] = [*blocks[-1], i]
         return blocks
-
-    def _fitting(self, width: int) -> list[int]:
-        """Indices of the columns that fit `width`, those of rank 0 in any case."""
-        kept = list(range(len(self.columns)))
-        going = sorted((i for i in kept if self.columns[i].rank > 0), key=lambda i: (-self.columns[i].rank, -i))
-        while going and self._wide(kept) > width:
-            kept.remove(going.pop(0))
-        return kept
 
     def _wide(self, columns: Sequence[int]) -> int:
         return sum(self._width(i) for i in columns) + len(SPACE) * (len(columns) - 1)

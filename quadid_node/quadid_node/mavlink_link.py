@@ -21,7 +21,6 @@ from quadid_replay.motors import (
     no_multirotor,
 )
 
-from quadid.condition.watch import HealthReport
 from quadid.data.window import Block
 from quadid.online.records import OnlineSet
 from quadid.online.stream import CONFIRMATIONS
@@ -194,20 +193,17 @@ class MavlinkDecoder:
         placed = clock.unstamped(readings, came) if boot is None else clock.stamped(readings, boot, received)
         for waited, t in placed:
             if t is not None:
-                self._set_clock(t, any(reading.signal == "gyro" for reading in waited))
+                # UNIX time: the vehicle's clock is set by ours when it is first heard and when the gyro shows a reboot
+                if any(reading.signal == "gyro" for reading in waited):
+                    self._back = self._back + 1 if t < self._newest - REBOOT else 0
+                    self._newest = max(self._newest, t)
+                anew = self._back > CONFIRMATIONS
+                if anew:
+                    self._newest, self._back = t, 0
+                if math.isnan(self._epoch) or (anew and abs(t + self._epoch - self._wall()) > REBOOT):
+                    self._epoch = self._wall() - t
                 for reading in waited:
                     yield from self._channel(t + self._epoch, reading, received)
-
-    def _set_clock(self, t: float, leads: bool) -> None:
-        """UNIX time: the vehicle's clock is set by ours when it is first heard and when the gyro shows a reboot."""
-        if leads:
-            self._back = self._back + 1 if t < self._newest - REBOOT else 0
-            self._newest = max(self._newest, t)
-        anew = self._back > CONFIRMATIONS
-        if anew:
-            self._newest, self._back = t, 0
-        if math.isnan(self._epoch) or (anew and abs(t + self._epoch - self._wall()) > REBOOT):
-            self._epoch = self._wall() - t
 
     def _channel(self, t: float, reading: Reading, received: float) -> Iterator[Block]:
         source = reading.source.split(" ")[0]
@@ -551,7 +547,11 @@ class MavlinkLink:
                 numbers = " ".join(f"{n} {v:.3g}" for n, v in finding.values.items() if n != "time")
                 self._say(4, f"quadid: {finding.effect} {numbers}{'' if finding.confident else ' (?)'}")
         elif output.topic == "vehicle_health":
-            self._send_health(output)
+            # Score and loss of each rotor [%] as named values; what changed is a line of text of its own
+            losses = [(f"QI_LOSS{j + 1}", 100 * v) for j, v in enumerate(output.rotor_loss)]
+            self._send_named([("QI_HEALTH", output.score), *losses])
+            if not output.has_baseline:
+                self._say(5, f"quadid: {output.text}")
         elif output.topic == "event" and output.level != "info":
             self._say(SEVERITY[output.level], f"quadid: {output.text}")
 
@@ -595,13 +595,6 @@ class MavlinkLink:
 
     def _send_values(self) -> None:
         self._send_named([(name, value) for name, value in parameters_of(self._set) if len(name) <= 10])
-
-    def _send_health(self, report: HealthReport) -> None:
-        """Score and loss of each rotor [%] as named values; what changed is a line of text of its own."""
-        losses = [(f"QI_LOSS{j + 1}", 100 * v) for j, v in enumerate(report.rotor_loss)]
-        self._send_named([("QI_HEALTH", report.score), *losses])
-        if not report.has_baseline:
-            self._say(5, f"quadid: {report.text}")
 
     def _send_named(self, values: Sequence[tuple[str, float]]) -> None:
         ms = int((self._clock() - self._begin) * 1e3) % 2**32
