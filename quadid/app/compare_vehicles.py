@@ -18,7 +18,7 @@ from quadid.chi_square import Z95
 from quadid.errors import LogError
 from quadid.parameters import NOMINAL_UNITS
 from quadid.report.page import axis, figure, level, section, trace
-from quadid.report.tables import Column, TextTable, number
+from quadid.report.tables import TextTable, heads, number
 from quadid.report.verdict import Verdict, percent
 from quadid.types import FloatArray, Json
 from quadid.vehicle import Vehicle
@@ -59,14 +59,7 @@ class Compared(Reported):
     def tables(self) -> list[TextTable]:
         """Errors after every horizon, parameters and effects side by side."""
         result = self.result
-        columns = (
-            Column("after", right=True),
-            Column("quantity"),
-            Column("A", right=True),
-            Column("B", right=True),
-            Column("B / A", right=True),
-            Column("95 % interval", right=True, rank=1),
-        )
+        columns = heads("after > | quantity | A > | B > | B / A > | 95 % interval >1")
         rows = tuple(
             (
                 after,
@@ -84,15 +77,7 @@ class Compared(Reported):
             f"runs in {result['blocks']} blocks"
         )
         out = [TextTable(title, columns, rows)]
-        sides = (
-            Column("parameter"),
-            Column("A", right=True),
-            Column("A, 95 %", right=True, rank=2),
-            Column("B", right=True),
-            Column("B, 95 %", right=True, rank=2),
-            Column("apart [sigma]", right=True),
-            Column("unit", rank=1),
-        )
+        sides = heads("parameter | A > | A, 95 % >2 | B > | B, 95 % >2 | apart [sigma] > | unit <1")
         ends = [
             [" .. ".join(number(v) for v in p[k]) if p[k] else "a guess" for k in ("a_ci95", "b_ci95")]
             for p in result["parameters"]
@@ -102,9 +87,9 @@ class Compared(Reported):
             for p, (one, two) in zip(result["parameters"], ends, strict=True)
         )
         out.append(TextTable("Parameters side by side", sides, values))
-        heads = (Column("effect"), Column("number"), Column("A", right=True), Column("B", right=True))
+        numbered = heads("effect | number | A > | B >")
         numbers = tuple((e["effect"], e["name"], number(e["a"]), number(e["b"])) for e in result["effects"])
-        return [*out, TextTable("Effects side by side", heads, numbers)] if numbers else out
+        return [*out, TextTable("Effects side by side", numbered, numbers)] if numbers else out
 
     def records(self) -> list[dict[str, Any]]:
         """One row a horizon and quantity."""

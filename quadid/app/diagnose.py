@@ -16,7 +16,7 @@ from quadid.effects import EFFECTS
 from quadid.model.layout import Layout, with_reference_voltage
 from quadid.parameters import INERTIAS, NOMINAL_NAMES, Status, unreliable
 from quadid.report.page import render
-from quadid.report.tables import Cell, Column, TextTable, number, parameter_table
+from quadid.report.tables import Cell, TextTable, heads, number, parameter_table
 from quadid.report.verdict import Verdict, digits
 from quadid.types import Json
 from quadid.vehicle import Vehicle
@@ -249,14 +249,7 @@ def _within_reach(found: Diagnosis, unreachable: Mapping[str, str], off: Mapping
 
 def finding_table(findings: Sequence[Json]) -> TextTable:
     """Every named cause with its numbers, what it gains on unseen data, and the closest rejected alternative."""
-    columns = (
-        Column("cause"),
-        Column("value"),
-        Column("without", right=True),
-        Column("with", right=True),
-        Column("95 % interval", rank=2),
-        Column("rejected alternative", rank=1),
-    )
+    columns = heads("cause | value | without > | with > | 95 % interval <2 | rejected alternative <1")
     rows = [row for finding in findings for row in _finding_rows(finding)]
     runs = ", ".join(dict.fromkeys(f"{f['gain']['seconds']:g} s" for f in findings))
     title = f"What the simulation gets wrong (error of {runs} runs in noise variances, 1 = noise floor)"

@@ -19,7 +19,7 @@ from quadid.app.outcome import LIBRARY, Reported, provenance
 from quadid.chi_square import Z95
 from quadid.report.page import axis, figure, level, number, rows_of, section, trace
 from quadid.report.page import unit as unit_text
-from quadid.report.tables import Cell, Column, TextTable
+from quadid.report.tables import Cell, TextTable, heads
 from quadid.report.tables import number as plain_number
 from quadid.report.verdict import ROUGH, Level, Verdict, percent
 from quadid.types import Json, JsonDict
@@ -451,15 +451,7 @@ class Fleet(Reported):
                     else (p["parameter"], plain_number(p["median"]), p["unit"], f"{100 * p['spread']:.2g} %")
                 )
                 rows.append((*head, *tail))
-        columns = (
-            Column("vehicle"),
-            Column("logs", right=True, rank=1),
-            Column("answers", right=True, rank=2),
-            Column("parameter"),
-            Column("median", right=True),
-            Column("unit"),
-            Column("spread", right=True),
-        )
+        columns = heads("vehicle | logs >1 | answers >2 | parameter | median > | unit | spread >")
         return [TextTable("Vehicles", columns, tuple(rows))]
 
     @property

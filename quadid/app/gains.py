@@ -26,7 +26,7 @@ from quadid.report.autopilots import AUTOPILOTS, AXES, Autopilot, authority, hov
 from quadid.report.page import axis as axis_of
 from quadid.report.page import figure, section, trace
 from quadid.report.programs import Facts
-from quadid.report.tables import Column, TextTable, number
+from quadid.report.tables import Column, TextTable, heads, number
 from quadid.report.verdict import Verdict
 from quadid.types import Json, JsonDict
 from quadid.vehicle import Vehicle
@@ -100,12 +100,7 @@ class Gains(Reported):
 
     def tables(self) -> list[TextTable]:
         """Gains, loops before and after, and what they rest on."""
-        columns = (
-            Column("parameter"),
-            Column("proposed", right=True),
-            Column("now", right=True),
-            Column("what", rank=1),
-        )
+        columns = heads("parameter | proposed > | now > | what <1")
         rows = tuple(
             (g["name"], number(g["value"], 4), number(g["current"], 4), f"{g['axis']} {g['term']}")
             for g in self.result["gains"]
@@ -154,13 +149,8 @@ class Gains(Reported):
 
 def loop_table(result: Json) -> TextTable:
     """Promises of every loop."""
-    columns = (
-        Column("loop"),
-        Column("bandwidth [Hz]", right=True),
-        Column("over the intervals", right=True, rank=1),
-        Column("phase margin [deg]", right=True),
-        Column("gain margin [dB]", right=True, rank=2),
-        Column("overshoot", right=True),
+    columns = heads(
+        "loop | bandwidth [Hz] > | over the intervals >1 | phase margin [deg] > | gain margin [dB] >2 | overshoot >"
     )
     rows = []
     for a in result["axes"]:

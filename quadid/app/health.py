@@ -17,7 +17,7 @@ from quadid.app.outcome import LIBRARY, NUMBER_COLUMNS, Reported, number_rows, p
 from quadid.data.window import Recording
 from quadid.errors import LogError, NotIdentifiableError
 from quadid.report.page import axis, figure, rows_of, section
-from quadid.report.tables import Cell, Column, TextTable
+from quadid.report.tables import Cell, TextTable, heads
 from quadid.report.templating import render
 from quadid.report.verdict import Level, Verdict
 from quadid.types import Json
@@ -315,14 +315,7 @@ def _step(change: Json) -> str:
 
 def change_table(changes: Sequence[Json]) -> TextTable:
     """Changes with intervals, and the explanations that lost."""
-    columns = (
-        Column("change"),
-        Column("value"),
-        Column("95 % interval"),
-        Column("p", right=True, rank=1),
-        Column("probability", right=True, rank=2),
-        Column("rejected alternative", rank=3),
-    )
+    columns = heads("change | value | 95 % interval | p >1 | probability >2 | rejected alternative <3")
     rows: list[tuple[str | Cell, ...]] = []
     for c in changes:
         first = True
@@ -343,13 +336,7 @@ def change_table(changes: Sequence[Json]) -> TextTable:
 
 def trim_table(result: Json) -> TextTable:
     """Each trim of the flights in question against the baseline."""
-    columns = (
-        Column("trim"),
-        Column("now", right=True),
-        Column("baseline", right=True),
-        Column("spread", right=True, rank=1),
-        Column("distance", right=True),
-    )
+    columns = heads("trim | now > | baseline > | spread >1 | distance >")
     rows = tuple(
         (
             t["name"],

@@ -20,7 +20,7 @@ from quadid.checks.motion import flying_spans, within
 from quadid.data.rotor_signal import rotor_channel
 from quadid.data.window import Channel, Recording
 from quadid.errors import LogError, ParameterError, VehicleError
-from quadid.report.tables import Cell, Column, TextTable
+from quadid.report.tables import Cell, TextTable, heads
 from quadid.report.templating import render
 from quadid.vehicle import GRAVITY, Vehicle, to_fill_in
 
@@ -99,14 +99,7 @@ class Shipped(Outcome):
 
     def tables(self) -> list[TextTable]:
         """One row a vehicle."""
-        columns = (
-            Column("vehicle"),
-            Column("rotors", right=True),
-            Column("mass [kg]", right=True),
-            Column("arm [m]", right=True),
-            Column("command", rank=1),
-            Column("description", rank=2),
-        )
+        columns = heads("vehicle | rotors > | mass [kg] > | arm [m] > | command <1 | description <2")
         rows = tuple(
             (r["name"], str(r["rotors"]), f"{r['mass']:.4g}", f"{r['arm']:.3g}", r["command"], r["description"])
             for r in self.records()

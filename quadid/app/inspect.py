@@ -29,7 +29,7 @@ from quadid.app.outcome import Outcome, json_text
 from quadid.data.window import Recording, beginning
 from quadid.errors import QuadidError
 from quadid.parameters import NOMINAL_UNITS
-from quadid.report.tables import Cell, Column, TextTable, Tone, number
+from quadid.report.tables import Cell, Column, TextTable, Tone, heads, number
 from quadid.report.verdict import parameter_name
 from quadid.sanitise import LONGEST_LINE, plain
 from quadid.vehicle import Vehicle
@@ -179,15 +179,8 @@ _TONES: dict[str, Tone] = {"ok": "good", "warning": "fair", "error": "poor", "un
 
 def channel_table(found: Inspection) -> TextTable:
     """One row a channel."""
-    columns = (
-        Column("channel"),
-        Column("rate (Hz)", right=True),
-        Column("samples", right=True, rank=4),
-        Column("from-to (s)", right=True, rank=3),
-        Column("gaps", right=True),
-        Column("longest (s)", right=True, rank=5),
-        Column("dropped", right=True, rank=2),
-        Column("source", rank=1),
+    columns = heads(
+        "channel | rate (Hz) > | samples >4 | from-to (s) >3 | gaps > | longest (s) >5 | dropped >2 | source <1"
     )
     rows = tuple(
         (
@@ -207,7 +200,7 @@ def channel_table(found: Inspection) -> TextTable:
 
 def check_table(found: Inspection) -> TextTable:
     """Verdict of every check; what was found and what to do follow as sentences."""
-    columns = (Column("check"), Column("verdict"))
+    columns = heads("check | verdict")
     rows = tuple((_spaced(c.name), Cell(c.verdict.value, _TONES[c.verdict.value])) for c in found.checks)
     return TextTable("Checks", columns, rows)
 
@@ -215,7 +208,7 @@ def check_table(found: Inspection) -> TextTable:
 def parameter_outlook_table(found: Inspection) -> TextTable:
     """Parameters that the log can show, and how sharply, unless a channel is missing or too slow."""
     expected = {str(row["name"]): float(row["relative_sigma"]) for row in found.excitation}
-    columns = [Column("parameter"), Column("possible")]
+    columns = list(heads("parameter | possible"))
     if expected:
         columns.append(Column("expected 1-sigma", right=True))
     columns.append(Column("why", rank=1))

@@ -15,7 +15,7 @@ from quadid.app.outcome import Outcome
 from quadid.chi_square import Z95
 from quadid.cli import terminal
 from quadid.errors import VehicleError
-from quadid.report.tables import Cell, Column, TextTable, number
+from quadid.report.tables import Cell, Column, TextTable, heads, number
 from quadid.vehicle import Vehicle
 
 
@@ -100,15 +100,7 @@ class Stored(Outcome):
 
 def _story(sets: Sequence[dict[str, Any]], title: str) -> TextTable:
     """Time, author and data of a set."""
-    columns = (
-        Column("set", right=True),
-        Column("when"),
-        Column("state"),
-        Column("by"),
-        Column("data [s]", right=True),
-        Column("error", right=True),
-        Column("rests on"),
-    )
+    columns = heads("set > | when | state | by | data [s] > | error > | rests on")
     rows = tuple(
         (
             str(item["sequence"]),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -40,6 +41,12 @@ class Column:
     heading: str
     right: bool = False
     rank: int = 0
+
+
+def heads(line: str) -> tuple[Column, ...]:
+    """Columns by the line of their headings: ``log | error > | unit <2``, ``>`` to the right, then the rank."""
+    found = (re.fullmatch(r"(.+?)(?: ([<>])(\d?))?", head) for head in line.split(" | "))
+    return tuple(Column(m[1], m[2] == ">", int(m[3] or 0)) for m in found if m)
 
 
 @dataclass(frozen=True)
@@ -133,15 +140,7 @@ def parameter_table(parameters: Sequence[Json], truth: Mapping[str, float] | Non
         parameters: entries of ``quadid.identify/1``.
         truth: true values by name.
     """
-    columns = [
-        Column("parameter"),
-        Column("fitted", right=True),
-        Column("±", right=True, rank=2),
-        Column("unit"),
-        Column("status"),
-        Column("current", right=True, rank=3),
-        Column("95 % interval", right=True, rank=4),
-    ]
+    columns = list(heads("parameter | fitted > | ± >2 | unit | status | current >3 | 95 % interval >4"))
     if truth:
         columns.insert(2, Column("truth", right=True, rank=1))
     rows = []
