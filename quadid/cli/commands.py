@@ -204,8 +204,7 @@ def load(name: str) -> Any:
     """Imports one command, ready to run."""
     command = COMMANDS[name]
     function = _imported(command.function)
-    if not command.function.startswith("quadid.cli."):
-        function = of_library(command, function)
+    function = in_words(function) if command.function.startswith("quadid.cli.") else of_library(command, function)
     alone = typer.Typer(rich_markup_mode=None, add_completion=False)
     # A backspace character alone on a line keeps click from joining the lines.
     examples = "\n".join(("\b", "Examples:", *(f"  {line}" for line in command.examples)))
@@ -236,6 +235,17 @@ def with_help(option: ParameterInfo, text: str, kind: Any) -> ParameterInfo:
     several = isinstance(option, OptionInfo) and "list" in str(kind)
     option.help = f"{text[0].upper()}{text[1:].rstrip('.')}{'; repeatable' * several}."
     return option
+
+
+def in_words(function: Callable[..., None]) -> Callable[..., None]:
+    """A function of the command line; the help of its options is in its docstring."""
+    function.__doc__, words = documented(function)
+    for name, kind in inspect.get_annotations(function, eval_str=True).items():
+        option = next((one for one in get_args(kind)[1:] if isinstance(one, ParameterInfo)), None)
+        if option is not None:
+            typed = get_args(kind)[0]
+            function.__annotations__[name] = Annotated[typed, with_help(option, words.get(name, ""), typed)]
+    return function
 
 
 def of_library(command: Command, function: Callable[..., Outcome]) -> Callable[..., None]:

@@ -27,23 +27,19 @@ def export(
         ),
     ] = "yaml",
     what: Annotated[bool, typer.Option("--list", help="Print which effects each form carries, and end.")] = False,
-    history: Annotated[
-        Path | None,
-        typer.Option(
-            "--history", metavar="FILE", help="Values of the set in force in this history, not of the vehicle file."
-        ),
-    ] = None,
-    name: Annotated[
-        str | None,
-        typer.Option("--id", metavar="NAME", help="Name in the history whose set is exported; default the vehicle's."),
-    ] = None,
-    anyway: Annotated[
-        bool, typer.Option("--anyway", help="Also export values that are unproven or out of date.")
-    ] = False,
+    history: Annotated[Path | None, typer.Option(metavar="FILE")] = None,
+    name: Annotated[str | None, typer.Option("--id", metavar="NAME")] = None,
+    anyway: Annotated[bool, typer.Option("--anyway")] = False,
     json: JsonTarget = None,
     out: OutFolder = Path(),
 ) -> None:
-    """Write the parameters for another program, with units and where each came from; nothing is sent to a vehicle."""
+    """Write the parameters for another program, with units and where each came from; nothing is sent to a vehicle.
+
+    Args:
+        history: values of the set in force in this history, not of the vehicle file.
+        name: name in the history whose set is exported; default the vehicle's.
+        anyway: also export values that are unproven or out of date.
+    """
     terminal.check_file(json, "--json")
     if what:
         terminal.conclude(forms(), json)

@@ -20,26 +20,19 @@ from quadid.vehicle import Vehicle
 
 
 def history(
-    vehicle: Annotated[
-        str,
-        typer.Option(
-            "--vehicle",
-            metavar="V",
-            help="A name in the history (--id of a service, a namespace), a shipped name, or a YAML file.",
-            autocompletion=shipped_names,
-        ),
-    ],
-    file: Annotated[
-        Path | None,
-        typer.Option("--history", metavar="FILE", help="History file; default QUADID_HISTORY, else the user's own."),
-    ] = None,
-    candidates: Annotated[
-        int, typer.Option("--candidates", metavar="N", min=0, help="Also the newest N estimates, accepted or not.")
-    ] = 0,
+    vehicle: Annotated[str, typer.Option(metavar="V", autocompletion=shipped_names)],
+    file: Annotated[Path | None, typer.Option("--history", metavar="FILE")] = None,
+    candidates: Annotated[int, typer.Option(metavar="N", min=0)] = 0,
     events: Annotated[int, typer.Option("--events", metavar="N", min=0, help="Also the newest N events.")] = 0,
     json: JsonTarget = None,
 ) -> None:
-    """Show the stored parameter sets of a vehicle: what, when, from which data, who approved."""
+    """Show the stored parameter sets of a vehicle: what, when, from which data, who approved.
+
+    Args:
+        vehicle: a name in the history (--id of a service, a namespace), a shipped name, or a YAML file.
+        file: history file; default QUADID_HISTORY, else the user's own.
+        candidates: also the newest N estimates, accepted or not.
+    """
     from quadid_node.history import StoreError, default_path, read_history, read_in_force
 
     terminal.check_file(json, "--json")

@@ -32,37 +32,32 @@ class ReplayError(QuadidError):
 
 
 def replay(
-    log: Annotated[
-        str, typer.Argument(metavar="LOG", help="Flight log: MCAP, .tlog, DataFlash, ULog, CSV. LOG@76:216: a span.")
-    ],
+    log: Annotated[str, typer.Argument(metavar="LOG")],
     vehicle: options.VehicleName,
     speed: Annotated[str, typer.Option("--speed", metavar="1|max", help="Multiple of real time, or max.")] = "max",
-    out: Annotated[
-        Path | None, typer.Option("--out", metavar="F.mcap", help="Write what would have been published.")
-    ] = None,
+    out: Annotated[Path | None, typer.Option(metavar="F.mcap")] = None,
     rate: options.Rate = 50.0,
     window: options.WindowSeconds = 10.0,
     refit: options.Refit = 1.0,
     diagnose: options.Diagnose = 60.0,
     approval: options.Approval = "auto",
     gate: options.Gate = "",
-    as_recorded: Annotated[
-        bool,
-        typer.Option(
-            "--as-recorded",
-            help="LOG was recorded by the node (record:=F.mcap): use its settings, start and order; repeats that "
-            "run bit for bit.",
-        ),
-    ] = False,
-    candidates: Annotated[
-        bool, typer.Option("--candidates", help="Put every estimate into the JSON, not only the published sets.")
-    ] = False,
+    as_recorded: Annotated[bool, typer.Option("--as-recorded")] = False,
+    candidates: Annotated[bool, typer.Option("--candidates")] = False,
     seed: options.Seed = 0,
     preset: options.Preset = "auto",
     columns: options.Columns = None,
     json: options.JsonTarget = None,
 ) -> None:
-    """Drive the online session from a log: the sets, findings and reasons that a live service would have published."""
+    """Drive the online session from a log: the sets, findings and reasons that a live service would have published.
+
+    Args:
+        log: flight log: MCAP, .tlog, DataFlash, ULog, CSV. LOG@76:216: a span.
+        out: write what would have been published.
+        as_recorded: LOG was recorded by the node (record:=F.mcap): use its settings, start and order; repeats that
+            run bit for bit.
+        candidates: put every estimate into the JSON, not only the published sets.
+    """
     from quadid_node.recording import arrivals, play, stream
     from quadid_node.service import Service, session_settings
     from quadid_node.worker import InlineWorker

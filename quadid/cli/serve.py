@@ -31,41 +31,33 @@ SAY_EVERY = 10.0
 
 def serve(
     vehicle: options.VehicleName,
-    mavlink: Annotated[
-        str,
-        typer.Option("--mavlink", metavar="URL", help="Link: udpin:0.0.0.0:14540, tcp:HOST:PORT, /dev/ttyACM0,921600."),
-    ],
-    system: Annotated[
-        int, typer.Option("--system", metavar="N", help="System id of the vehicle; 0: the first autopilot heard.")
-    ] = 0,
-    key: Annotated[
-        Path | None, typer.Option("--key", metavar="FILE", help="Signing key: unsigned frames are then refused.")
-    ] = None,
-    zenoh: Annotated[
-        str | None,
-        typer.Option("--zenoh", metavar="WHERE", help="Publish on Zenoh too: a locator, a config file, or 'local'."),
-    ] = None,
-    ground: Annotated[
-        str | None,
-        typer.Option("--worker", metavar="WHERE", help="Let a 'quadid worker' fit that is found there on Zenoh."),
-    ] = None,
-    name: Annotated[
-        str, typer.Option("--id", metavar="NAME", help="Name of this vehicle; default the vehicle's.")
-    ] = "",
+    mavlink: Annotated[str, typer.Option(metavar="URL")],
+    system: Annotated[int, typer.Option(metavar="N")] = 0,
+    key: Annotated[Path | None, typer.Option(metavar="FILE")] = None,
+    zenoh: Annotated[str | None, typer.Option(metavar="WHERE")] = None,
+    ground: Annotated[str | None, typer.Option("--worker", metavar="WHERE")] = None,
+    name: Annotated[str, typer.Option("--id", metavar="NAME")] = "",
     approval: options.Approval = "auto",
     window: options.WindowSeconds = 10.0,
     refit: options.Refit = 1.0,
     diagnose: options.Diagnose = 60.0,
     gate: options.Gate = "",
-    file: Annotated[
-        Path | None,
-        typer.Option("--history", metavar="FILE", help="History file; default QUADID_HISTORY, else the user's."),
-    ] = None,
+    file: Annotated[Path | None, typer.Option("--history", metavar="FILE")] = None,
     seconds: Annotated[float, typer.Option("--seconds", metavar="S", help="End after this long; 0: never.")] = 0.0,
     seed: options.Seed = 0,
     json: options.JsonTarget = None,
 ) -> None:
-    """Identify a flying vehicle over MAVLink; publish parameters, findings and health as component 191."""
+    """Identify a flying vehicle over MAVLink; publish parameters, findings and health as component 191.
+
+    Args:
+        mavlink: link: udpin:0.0.0.0:14540, tcp:HOST:PORT, /dev/ttyACM0,921600.
+        system: system id of the vehicle; 0: the first autopilot heard.
+        key: signing key: unsigned frames are then refused.
+        zenoh: publish on Zenoh too: a locator, a config file, or 'local'.
+        ground: let a 'quadid worker' fit that is found there on Zenoh.
+        name: name of this vehicle; default the vehicle's.
+        file: history file; default QUADID_HISTORY, else the user's.
+    """
     from quadid_node.process import StopSignal
 
     stop = StopSignal()
@@ -169,13 +161,15 @@ def summary(service: Service, link: MavlinkLink, name: str) -> dict[str, Any]:
 
 
 def worker(
-    connect: Annotated[
-        str, typer.Option("--connect", metavar="WHERE", help="A locator (tcp/host:7447), a config file, or 'local'.")
-    ],
+    connect: Annotated[str, typer.Option(metavar="WHERE")],
     seconds: Annotated[float, typer.Option("--seconds", metavar="S", help="End after this long; 0: never.")] = 0.0,
     json: JsonTarget = None,
 ) -> None:
-    """Fit windows on this machine for vehicles' services; they fit on board whenever this one is gone."""
+    """Fit windows on this machine for vehicles' services; they fit on board whenever this one is gone.
+
+    Args:
+        connect: a locator (tcp/host:7447), a config file, or 'local'.
+    """
     from quadid_node.process import StopSignal
 
     stop = StopSignal()
@@ -214,22 +208,19 @@ class WatchError(QuadidError):
 
 
 def watch(
-    zenoh: Annotated[
-        str, typer.Option("--zenoh", metavar="WHERE", help="A locator (tcp/host:7447), a config file, or 'local'.")
-    ] = "local",
+    zenoh: Annotated[str, typer.Option(metavar="WHERE")] = "local",
     seconds: Annotated[float, typer.Option("--seconds", metavar="S", help="End after this long; 0: never.")] = 0.0,
-    approve: Annotated[
-        str, typer.Option("--approve", metavar="VEHICLE[=N]", help="Approve set N, or the newest that waits, and end.")
-    ] = "",
-    rollback: Annotated[
-        str,
-        typer.Option(
-            "--rollback", metavar="VEHICLE", help="Take the vehicle's set in force back to the previous one, and end."
-        ),
-    ] = "",
+    approve: Annotated[str, typer.Option(metavar="VEHICLE[=N]")] = "",
+    rollback: Annotated[str, typer.Option(metavar="VEHICLE")] = "",
     json: JsonTarget = None,
 ) -> None:
-    """Show parameters with intervals, gate state and reason, findings and data rates of all vehicles, live."""
+    """Show parameters with intervals, gate state and reason, findings and data rates of all vehicles, live.
+
+    Args:
+        zenoh: a locator (tcp/host:7447), a config file, or 'local'.
+        approve: approve set N, or the newest that waits, and end.
+        rollback: take the vehicle's set in force back to the previous one, and end.
+    """
     from quadid_node.zenoh import FleetView
 
     from quadid.cli import terminal

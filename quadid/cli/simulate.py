@@ -20,49 +20,31 @@ LIVE = "udpout:"
 
 
 def simulate(
-    out: Annotated[
-        str, typer.Argument(metavar="OUT", help="File (.mcap, .tlog, .csv), or udpout:HOST:PORT for live MAVLink.")
-    ],
+    out: Annotated[str, typer.Argument(metavar="OUT")],
     vehicle: VehicleName = "pelican",
     seconds: Annotated[float, typer.Option("--seconds", metavar="S", help="Length of the flight.")] = 500.0,
     seed: Seed = 1,
-    effect: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--effect",
-            metavar="NAME[:KEY=VALUE,...]",
-            help="Hidden effect, as rotor_drag:k_x=0.3,k_y=0.3; without values it is drawn at a realistic size. "
-            "Repeatable.",
-        ),
-    ] = None,
-    profile: Annotated[
-        str, typer.Option("--profile", help="What the pilot does: excited, gentle, hover, one_axis, roll_pitch.")
-    ] = "excited",
-    manoeuvre: Annotated[
-        Path | None, typer.Option("--manoeuvre", metavar="FILE", help="Fly the segments of this YAML file instead.")
-    ] = None,
+    effect: Annotated[list[str] | None, typer.Option(metavar="NAME[:KEY=VALUE,...]")] = None,
+    profile: Annotated[str, typer.Option()] = "excited",
+    manoeuvre: Annotated[Path | None, typer.Option(metavar="FILE")] = None,
     noise: Annotated[float, typer.Option("--noise", metavar="FACTOR", min=0.0, help="Scales all sensor noise.")] = 1.0,
     rate: Annotated[float, typer.Option("--rate", metavar="HZ", help="Log rate.")] = 50.0,
-    extra: Annotated[
-        list[str] | None, typer.Option("--extra", metavar="CHANNEL", help="Log velocity, position or battery as well.")
-    ] = None,
-    spread: Annotated[
-        float,
-        typer.Option(
-            "--spread", metavar="F", min=0.0, max=0.9, help="Draw the true parameters within this fraction of the type."
-        ),
-    ] = 0.0,
-    draws: Annotated[
-        int | None,
-        typer.Option(
-            "--draws",
-            metavar="N",
-            help="Fly N vehicles within the file's uncertainty, each under its random forces; the logs are numbered.",
-        ),
-    ] = None,
+    extra: Annotated[list[str] | None, typer.Option(metavar="CHANNEL")] = None,
+    spread: Annotated[float, typer.Option(metavar="F", min=0.0, max=0.9)] = 0.0,
+    draws: Annotated[int | None, typer.Option(metavar="N")] = None,
     json: JsonTarget = None,
 ) -> None:
-    """Fly the closed-loop vehicle, controlled at 1 kHz, and log it at 50 Hz."""
+    """Fly the closed-loop vehicle, controlled at 1 kHz, and log it at 50 Hz.
+
+    Args:
+        out: file (.mcap, .tlog, .csv), or udpout:HOST:PORT for live MAVLink.
+        effect: hidden effect, as rotor_drag:k_x=0.3,k_y=0.3; without values it is drawn at a realistic size.
+        profile: what the pilot does: excited, gentle, hover, one_axis, roll_pitch.
+        manoeuvre: fly the segments of this YAML file instead.
+        extra: log velocity, position or battery as well.
+        spread: draw the true parameters within this fraction of the type.
+        draws: fly N vehicles within the file's uncertainty, each under its random forces; the logs are numbered.
+    """
     check_target(out)
     terminal.check_file(json, "--json")
     how: dict[str, Any] = {
