@@ -15,12 +15,11 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
+from quadid.files import guard
 from quadid.old_paths import install
 from quadid.version import __version__ as __version__
-from quadid.working_folder import guard
 
 if TYPE_CHECKING:
-    from quadid.app.compare_vehicles import compare_vehicles as compare_vehicles
     from quadid.app.diagnose import diagnose as diagnose
     from quadid.app.excite import propose as excite
     from quadid.app.export import export as export
@@ -31,6 +30,7 @@ if TYPE_CHECKING:
     from quadid.app.init import init as init
     from quadid.app.inspect import inspect as inspect
     from quadid.app.logs import load as load
+    from quadid.app.score import compare_vehicles as compare_vehicles
     from quadid.app.score import score as score
     from quadid.app.simulate import simulate as simulate
     from quadid.model.step import Simulator as Simulator
@@ -50,7 +50,7 @@ _PUBLIC = {
     "simulate": "quadid.app.simulate",
     "export": "quadid.app.export",
     "fleet": "quadid.app.fleet",
-    "compare_vehicles": "quadid.app.compare_vehicles",
+    "compare_vehicles": "quadid.app.score",
     "gains": "quadid.app.gains",
     "Simulator": "quadid.model.step",
     "Vehicle": "quadid.vehicle",

@@ -79,7 +79,7 @@ MOVED = {
     "quadid_node.stamps",
     "quadid_node.publish": "quadid_node.claim quadid_node.neighbours quadid_node.speaker",
     "quadid_node.node": "quadid_node.commands quadid_node.polling",
-    "quadid_node.process": "quadid_node.stopping quadid_node.transport",
+    "quadid_node.process": "quadid_node.stopping quadid_node.transport quadid_node.launching",
     "quadid_node.recording": "quadid_node.playback quadid_node.recorder",
     "quadid_node.service": "quadid_node.publication quadid_node.rounds quadid_node.node_parameters "
     "quadid_node.settings",
@@ -119,6 +119,10 @@ MOVED = {
     "quadid.flight.loop": "quadid.flight.sensors",
     "quadid.online.gate": "quadid.online.active_set",
     "quadid.cli.serve": "quadid.cli.worker quadid.cli.watch",
+    "quadid.model.simd": "quadid.model.work_array",
+    "quadid.files": "quadid.working_folder",
+    "quadid.app.score": "quadid.app.compare_vehicles",
+    "quadid.cli.main": "quadid.cli.loading",
 }
 """Old modules of each new one."""
 _NEW = {old: new for new, olds in MOVED.items() for old in olds.split()}

@@ -13,7 +13,7 @@ import numba
 from numba.core import config
 from numba.core.caching import IndexDataCacheFile
 
-from quadid.working_folder import refuse
+from quadid.files import refuse
 
 F = TypeVar("F", bound=Callable[..., object])
 

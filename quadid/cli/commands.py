@@ -170,7 +170,7 @@ COMMANDS = {
     "compare-vehicles": Command(
         "Compare two vehicle files on the same flights.",
         ("quadid compare-vehicles old.yaml new.yaml --on flight.mcap --report compared.html",),
-        "quadid.app.compare_vehicles:compare_vehicles",
+        "quadid.app.score:compare_vehicles",
         ("preset", "unchecked"),
         simulates=True,
     ),

@@ -19,8 +19,7 @@ from quadid.estimate.kalman import Beyond
 from quadid.model.layout import AHRS_K, ATT_DELAY, IMU_PERIOD, Layout
 from quadid.model.rollout import Rollout, Segments
 from quadid.model.sensor_kernel import tilt_errors
-from quadid.model.simd import LANES
-from quadid.model.work_array import N_ROWS
+from quadid.model.simd import LANES, N_ROWS
 from quadid.rotation import product, turn
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle

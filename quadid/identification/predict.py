@@ -32,9 +32,8 @@ from quadid.identification.problem import RAN_AWAY
 from quadid.model import layout as ix
 from quadid.model.layout import Layout
 from quadid.model.rollout import Rollout, Segments
-from quadid.model.simd import LANES
+from quadid.model.simd import LANES, N_STATE
 from quadid.model.step import Simulator
-from quadid.model.work_array import N_STATE
 from quadid.rotation import exponential, product, turn
 from quadid.types import BoolArray, FloatArray, IndexArray
 from quadid.vehicle import GRAVITY, RandomForces, RandomInput, ResidualTerm, Vehicle, mixer_matrix

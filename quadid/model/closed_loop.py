@@ -28,7 +28,7 @@ from quadid.types import FloatArray, IntArray, check_shapes
 from quadid.vehicle import GRAVITY, Vehicle, mixer_matrix
 
 # isort: off
-from quadid.model.work_array import (
+from quadid.model.simd import (
     A_G, C_GB, C_GS, C_R, C_SHIFT, E_QW, F1_X, F2_X, HALF, N_ROWS, N_STATE, ROTOR, R_NEXT, R_NOW, R_PAST, R_SPEED, S_FX,
     S_P, S_QW, X_P, X_QW,
 )  # fmt: skip

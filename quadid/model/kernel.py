@@ -15,7 +15,7 @@ from quadid.types import FloatArray, IntArray
 from quadid.vehicle import GRAVITY
 
 # isort: off
-from quadid.model.work_array import (
+from quadid.model.simd import (
     ALL_MOMENTS, A_G, A_M, A_O1, A_S2, A_X2, A_Y2, A_Z2, C_B, C_CGX, C_CGY, C_CLIMB, C_CPAR, C_CPAR_Z, C_D, C_DRAG_ARM,
     C_DROP, C_DROP_TIME, C_FLOW_ARM, C_GROUND, C_GX, C_GXX, C_GXY, C_GY, C_GYY, C_HOVER, C_HUB, C_HX, C_HY, C_INVM,
     C_IXX, C_IXY, C_IXZ, C_IYY, C_IYZ, C_IZZ, C_JR, C_JSPIN, C_JXX, C_JXY, C_JXZ, C_JYY, C_JYZ, C_JZZ, C_KX, C_KY, C_KZ,

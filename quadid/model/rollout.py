@@ -34,8 +34,7 @@ from quadid.model.kernel import (
 from quadid.model.layout import relative_voltage, residual_terms
 from quadid.model.rollout_kernel import roll_segments
 from quadid.model.rotor_kernel import Drive, rotor_table
-from quadid.model.simd import LANES, aligned
-from quadid.model.work_array import ALL_MOMENTS, MAX_TANGENTS, N_STATE
+from quadid.model.simd import ALL_MOMENTS, LANES, MAX_TANGENTS, N_STATE, aligned
 from quadid.types import BoolArray, FloatArray, IndexArray, IntArray, check_shapes
 from quadid.vehicle import Vehicle
 

@@ -51,7 +51,7 @@ from quadid.model.sensor_kernel import (
 
 # isort: on
 # isort: off
-from quadid.model.work_array import (
+from quadid.model.simd import (
     ALL_MOMENTS, A_G, C_VEL, C_VEL_Z, E_QW, E_QX, E_QY, E_QZ, F1_X, HALF, N_ROWS, N_STATE, ROTOR, S_FX, S_FY, S_FZ, S_P,
     S_Q, S_QW, S_QX, S_QY, S_QZ, S_R, X_N, X_P, X_QW, X_QX, X_QY, X_QZ, X_VN,
 )  # fmt: skip

@@ -14,7 +14,7 @@ from quadid.model.simd import LANES, cache_aligned, cached, exact, inlined, jit,
 from quadid.types import FloatArray
 
 # isort: off
-from quadid.model.work_array import (
+from quadid.model.simd import (
     ALL_MOMENTS, A_DO, A_O1, A_S1, A_S2, A_X1, A_X2, A_XX, A_XY, A_XZ, A_Y1, A_Y2, A_YY, A_YZ, A_Z1, A_Z2, A_ZZ,
     C_CURVE, C_GROWTH, C_HOVER, C_PART, C_ROW, C_SHIFT, C_TAU, C_TAU_DOWN, C_VOLT, C_W0, DOWN, HALF, N_ROWS, PIECE,
     P_AT, P_E, P_E1, P_E2, P_E3, P_H, ROTOR, R_DRAG, R_GAIN, R_NEXT, R_NEXT_SLOPE, R_NOW, R_NOW_SLOPE, R_PAST,

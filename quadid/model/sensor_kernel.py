@@ -14,7 +14,7 @@ from quadid.model import layout as ix
 from quadid.types import FloatArray
 
 # isort: off
-from quadid.model.work_array import (
+from quadid.model.simd import (
     C_AB, C_AHRS, C_ATT_DELAY, C_EC, C_EC2, C_ES, C_ES2, C_GB, C_GS, C_KAPPA, C_R, C_SIGMA, C_VEL, C_VEL_Z, D_H, D_P,
     D_P0, D_Q, D_Q0, D_QW, D_QX, D_QY, D_QZ, D_R, D_R0, E_QW, E_QX, E_QY, E_QZ, F1_X, F2_X, G_BEND, G_DF, G_DW, G_F,
     G_F0, G_FM, G_W, G_W0, N_QW, N_QX, N_QY, N_QZ, S_BENDX, S_FX, S_FY, S_FZ, S_P, S_Q, S_QW, S_QX, S_QY, S_QZ, S_R,

@@ -33,7 +33,7 @@ from quadid.types import FloatArray, IntArray
 from quadid.vehicle import RandomForces, Vehicle
 
 # isort: off
-from quadid.model.work_array import (
+from quadid.model.simd import (
     A_G, C_SHIFT, E_QW, F1_X, F2_X, G_BEND, G_DF, G_F, G_F0, G_FM, G_W, G_W0, HALF, L_NOW, N_QW, N_ROWS, N_STATE, ROTOR,
     R_NEXT, R_NOW, R_PAST, R_SPEED, S_BENDX, S_FX, S_P, S_QW, T_A1, X_D, X_E, X_N, X_P, X_Q, X_QW, X_QX, X_QY, X_QZ,
     X_R, X_VD, X_VE, X_VN,

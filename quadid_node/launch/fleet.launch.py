@@ -8,7 +8,7 @@ from launch.actions import DeclareLaunchArgument, GroupAction, IncludeLaunchDesc
 from launch.launch_description_sources import PythonLaunchDescriptionSource
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.substitutions import FindPackageShare
-from quadid_node.launching import ARGUMENTS, NODE_ARGUMENTS, fleet
+from quadid_node.process import ARGUMENTS, NODE_ARGUMENTS, fleet
 
 EACH = {**ARGUMENTS, "config": "parameter file", **{name: text for name, (_, text) in NODE_ARGUMENTS.items()}}
 

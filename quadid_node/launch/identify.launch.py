@@ -8,7 +8,7 @@ from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
 from launch_ros.substitutions import FindPackageShare
-from quadid_node.launching import ARGUMENTS, NODE_ARGUMENTS, parameters, truth
+from quadid_node.process import ARGUMENTS, NODE_ARGUMENTS, parameters, truth
 
 
 def _node(context: LaunchContext) -> list[Node]:

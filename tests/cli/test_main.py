@@ -33,8 +33,7 @@ from quadid.app.logs import OutputError, load, write_recording, write_text, writ
 from quadid.app.simulate import read_manoeuvre
 from quadid.cli.commands import COMMANDS
 from quadid.cli.history import Stored
-from quadid.cli.loading import Loading
-from quadid.cli.main import BLAS_THREADS
+from quadid.cli.main import BLAS_THREADS, Loading
 from quadid.cli.replay import Replayed
 from quadid.cli.terminal import check_file, conclude
 from quadid.effects import EFFECTS

@@ -18,9 +18,8 @@ import numpy as np
 import pytest
 import yaml
 from quadid_node.inputs import DECIDE, SILENT, SourceSelector, source, stamp
-from quadid_node.launching import ARGUMENTS, NODE_ARGUMENTS, fleet, parameters, truth
 from quadid_node.messages import WARN, diagnostics
-from quadid_node.process import THREADS
+from quadid_node.process import ARGUMENTS, NODE_ARGUMENTS, THREADS, fleet, parameters, truth
 from quadid_node.recording import stream
 from quadid_node.service import PARAMETERS, Service, check_change, read_settings, vehicle_id
 from quadid_node.worker import InlineWorker

@@ -14,7 +14,7 @@ import pytest
 import yaml
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
-from quadid_node.launching import ARGUMENTS, NODE_ARGUMENTS
+from quadid_node.process import ARGUMENTS, NODE_ARGUMENTS
 
 
 @pytest.fixture(scope="module")
