@@ -39,19 +39,11 @@ if TYPE_CHECKING:
 
 guard()
 
+_OF_APP = ("init", "inspect", "identify", "diagnose", "health", "score", "simulate", "export", "fleet", "gains")
 _PUBLIC = {
-    "init": "quadid.app.init",
+    **{name: f"quadid.app.{name}" for name in _OF_APP},
     "load": "quadid.app.logs",
-    "inspect": "quadid.app.inspect",
-    "identify": "quadid.app.identify",
-    "diagnose": "quadid.app.diagnose",
-    "health": "quadid.app.health",
-    "score": "quadid.app.score",
-    "simulate": "quadid.app.simulate",
-    "export": "quadid.app.export",
-    "fleet": "quadid.app.fleet",
     "compare_vehicles": "quadid.app.score",
-    "gains": "quadid.app.gains",
     "Simulator": "quadid.model.step",
     "Vehicle": "quadid.vehicle",
     "ParameterSet": "quadid.parameters",

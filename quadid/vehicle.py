@@ -307,29 +307,14 @@ def impossible_hover(low: float, high: float) -> str:
 
 
 SIGNALS: dict[str, str] = {
-    "v_x": "m/s",
-    "v_y": "m/s",
-    "v_z": "m/s",
-    "p": "rad/s",
-    "q": "rad/s",
-    "r": "rad/s",
-    "g_x": "",
-    "g_y": "",
-    "g_z": "",
-    "T": "N",
-    "W": "rad/s",
-    "V": "m/s",
+    **dict.fromkeys(("v_x", "v_y", "v_z"), "m/s"),
+    **dict.fromkeys("pqr", "rad/s"),
+    **dict.fromkeys(("g_x", "g_y", "g_z"), ""),
+    **{"T": "N", "W": "rad/s", "V": "m/s"},
 }
 """Factors of a term, with units, all in body axes (FRD): velocity through the air, rates, direction of gravity,
 thrust and speeds of all rotors together, airspeed.  In the order of `quadid.model.body_kernel`, after the one."""
-TARGETS: dict[str, str] = {
-    "force_x": "N",
-    "force_y": "N",
-    "force_z": "N",
-    "moment_x": "N m",
-    "moment_y": "N m",
-    "moment_z": "N m",
-}
+TARGETS: dict[str, str] = {f"{kind}_{a}": unit for kind, unit in (("force", "N"), ("moment", "N m")) for a in "xyz"}
 """Targets of a term, with units: force and moment in body axes at the centre of gravity."""
 MOST_FACTORS = 3
 """Signals in one product, at most."""

@@ -640,43 +640,26 @@ def _vehicle_name(text: str, folder: str) -> str:
 # --- Results of a fleet on disk: SQLite while it runs, so that a stopped run goes on where it was; Parquet at its end
 
 
-LOGS: dict[str, str] = {
-    "name": "TEXT PRIMARY KEY", "unit": "TEXT", "vehicle": "TEXT", "status": "TEXT", "reason": "TEXT",
-    "started": "REAL", "dated_by": "TEXT", "format": "TEXT", "seconds": "REAL", "mse_initial": "REAL",
-    "mse_fitted": "REAL", "verdict": "TEXT", "size": "INTEGER", "modified": "INTEGER", "sha256": "TEXT", "key": "TEXT",
-    "took": "REAL", "warnings": "TEXT",
-}  # fmt: skip
-"""Columns of the table of logs: times in [s], started since 1970, size in bytes, modified in ns."""
-PARAMETERS: dict[str, str] = {
-    "log": "TEXT",
-    "parameter": "TEXT",
-    "unit": "TEXT",
-    "value": "REAL",
-    "low": "REAL",
-    "high": "REAL",
-    "status": "TEXT",
+_FOUND = "parameter TEXT, unit TEXT, value REAL, low REAL, high REAL"
+TABLES: dict[str, dict[str, str]] = {
+    table: dict(column.split(" ", 1) for column in columns.split(", "))
+    for table, columns in {
+        "logs": "name TEXT PRIMARY KEY, unit TEXT, vehicle TEXT, status TEXT, reason TEXT, started REAL, "
+        "dated_by TEXT, format TEXT, seconds REAL, mse_initial REAL, mse_fitted REAL, verdict TEXT, size INTEGER, "
+        "modified INTEGER, sha256 TEXT, key TEXT, took REAL, warnings TEXT",
+        "parameters": f"log TEXT, {_FOUND}, status TEXT",
+        "findings": f"log TEXT, effect TEXT, confident INTEGER, {_FOUND}, mse_before REAL, mse_after REAL",
+        "trims": "log TEXT, trim TEXT",
+    }.items()
 }
-FINDINGS: dict[str, str] = {
-    "log": "TEXT",
-    "effect": "TEXT",
-    "confident": "INTEGER",
-    "parameter": "TEXT",
-    "unit": "TEXT",
-    "value": "REAL",
-    "low": "REAL",
-    "high": "REAL",
-    "mse_before": "REAL",
-    "mse_after": "REAL",
-}
-TRIMS: dict[str, str] = {"log": "TEXT", "trim": "TEXT"}
-"""Trim of a flight as JSON, for the comparison with other flights of its vehicle."""
+"""Columns of each table with their kinds: times in [s], started since 1970, size in bytes, modified in ns; the trim of
+a flight as JSON, for the comparison with other flights of its vehicle."""
 
 
 def _columns(kinds: Mapping[str, str]) -> str:
     return ", ".join(f'"{name}" {kind}' for name, kind in kinds.items())
 
 
-TABLES = {"logs": LOGS, "parameters": PARAMETERS, "findings": FINDINGS, "trims": TRIMS}
 PARTS = ("parameters", "findings", "trims")
 """Tables with rows of a log."""
 SCHEMA = "".join(
