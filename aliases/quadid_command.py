@@ -3,8 +3,6 @@
 It stands outside the package, which refuses to be imported in a folder that would run foreign code.
 """
 
-from __future__ import annotations
-
 import sys
 
 

@@ -10,8 +10,6 @@ A controller is software: it is the same in the flown vehicle and in a simulatio
 `quadid.flight` nor `quadid.model`, which share nothing else.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Linear algebra on one thread: with matrices of a few dozen rows, several only wait for each other."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import lru_cache

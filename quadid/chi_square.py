@@ -3,8 +3,6 @@
 SciPy's functions are imported where they are used: who only wants `Z95` does not wait for them.
 """
 
-from __future__ import annotations
-
 from functools import lru_cache
 
 Z95 = 1.959963984540054

@@ -4,8 +4,6 @@ Vocabulary of vehicle file, model, diagnosis, reports and flown truth.  Equation
 under test in `quadid.model`, those of the flown vehicle in `quadid.flight`.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass

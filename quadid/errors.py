@@ -4,8 +4,6 @@ Every error states what was found, what is allowed and what to do about it.  The
 `QuadidError` into one line and exit code 2 (bad input) or 3 (the data cannot support an answer).
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable
 from os.path import commonprefix

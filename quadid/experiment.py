@@ -5,8 +5,6 @@ information that a log of them would carry.  What is promised is what a fit make
 (`AsLogged`), where there is a log, since intervals also hold what the information does not know of.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any

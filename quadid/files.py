@@ -1,7 +1,5 @@
 """Files of users: opened without waiting for a pipe that nobody writes or reads, and written whole or not at all."""
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import os

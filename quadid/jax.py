@@ -9,8 +9,6 @@
 The equations are the one table of `quadid.model.terms`, as for `quadid.symbolic`.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Results as data that JSON holds."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from enum import Enum

@@ -1,7 +1,5 @@
 """Import paths of release 0.1.0: they work for one release more, with a DeprecationWarning."""
 
-from __future__ import annotations
-
 import importlib
 import importlib.util
 import pkgutil

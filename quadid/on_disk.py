@@ -1,7 +1,5 @@
 """Kernels compiled with numba, their machine code kept on disk."""
 
-from __future__ import annotations
-
 import hashlib
 import os
 from collections.abc import Callable

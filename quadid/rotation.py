@@ -1,7 +1,5 @@
 """Attitudes and turns of a body: unit quaternions, scalar first, body to world, and what a gyro adds up to."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from quadid.types import FloatArray

@@ -1,7 +1,5 @@
 """Text of others (logs, links, files) made fit for people: nothing that a terminal acts on, of bounded length."""
 
-from __future__ import annotations
-
 LONGEST_NAME = 200
 """Characters of a name that are shown; no topic, message, column or vehicle has more."""
 LONGEST_LINE = 2000

@@ -9,8 +9,6 @@ The equations are the one table of `quadid.model.terms`; `quadid.model.terms.LEF
 in it: delays before the rotors, and sensors.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

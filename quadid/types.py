@@ -1,7 +1,5 @@
 """Types that every room shares, and the check of shapes at the door of a kernel. Units stand where they are used."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any, TypeAlias
 

@@ -4,8 +4,6 @@ YAML 1.1 reads `1:30` as 90, `yes` as true and `010` as 8, keeps the last of two
 bytes expand without end.  A vehicle file needs none of that, so here it is refused.
 """
 
-from __future__ import annotations
-
 import re
 from typing import Any
 

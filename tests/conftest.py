@@ -1,7 +1,5 @@
 """Shared by all tests: the folder of the recorded flights, and the rule that nothing is skipped in CI."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Single measurements by name, for tests that drop, move and change them; the product takes blocks."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from typing import NamedTuple
 

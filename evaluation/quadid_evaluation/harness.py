@@ -1,7 +1,5 @@
 """Common parts of studies: command line, pages of sections, worker processes, tables, shares with their intervals."""
 
-from __future__ import annotations
-
 import argparse
 import multiprocessing
 import os

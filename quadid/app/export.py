@@ -1,7 +1,5 @@
 """The parameters of a vehicle for another program."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """The report of an attempt that failed: why, what to do, and the data as they are."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import asdict
 

@@ -1,7 +1,5 @@
 """Fleet: the logs of a folder identified in parallel on Dask, results on disk, and their summary."""
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import hmac

@@ -1,7 +1,5 @@
 """Fleet report: parameters over time, drift, outliers, common findings, unusable logs."""
 
-from __future__ import annotations
-
 import json
 import math
 import shlex

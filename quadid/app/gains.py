@@ -1,7 +1,5 @@
 """Gains of rate and attitude loops for a vehicle as identified, with margins; nothing is sent to a vehicle."""
 
-from __future__ import annotations
-
 import itertools
 import math
 import re

@@ -1,7 +1,5 @@
 """Vehicle files to begin with: a template to fill in, or what a log's own parameters describe."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass
 from pathlib import Path

@@ -5,8 +5,6 @@ as it is; `Typed` says how to type one to which a caller of the library gives so
 callers only.  An option without help has that of the function's docstring.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple

@@ -1,7 +1,5 @@
 """Open-loop prediction error of a vehicle on logs."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Looks at a log before anything is fitted: what is there, whether it can be true, and what it allows."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property

@@ -1,7 +1,5 @@
 """Result of an inspection: channels, checks, what is missing and how to log it, what a doubt means for estimates."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field

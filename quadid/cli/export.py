@@ -1,7 +1,5 @@
 """`quadid export`: the parameters of a vehicle file for another program."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

@@ -1,7 +1,5 @@
 """`quadid history`: stored parameter sets: what, when, from which data, who approved."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass

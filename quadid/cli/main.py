@@ -3,8 +3,6 @@
 What the commands are: `quadid.cli.commands`.
 """
 
-from __future__ import annotations
-
 import atexit
 import gc
 import importlib

@@ -1,7 +1,5 @@
 """`quadid reproduce`: the paper's protocol, its tables and figures, and what they lack."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from itertools import product
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`quadid simulate`: flies the closed-loop vehicle and logs it, to a file or live over MAVLink."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`quadid warmup`: compiles the kernels now, so that the first fit and the first flight need not."""
 
-from __future__ import annotations
-
 import time
 
 from quadid.app.kernels import PARTS, prepare

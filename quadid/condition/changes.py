@@ -1,7 +1,5 @@
 """Changes since healthy flights: hypotheses, their evidence, and the answer."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cache, lru_cache

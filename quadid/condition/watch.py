@@ -5,8 +5,6 @@ from each other, and do the last seconds differ from this flight so far more tha
 second is the sharper one, for propellers, battery and landing are the same within a flight.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Recordings to windows: channels onto uniform grids, by interpolation, holding, or one zero-phase low-pass."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Rotor speeds of a recording: their channel, the meaning of its numbers, and feedback within held commands."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """The diagnosis from windows to verdict: fit, noise floor, selection, remainder, validation."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 

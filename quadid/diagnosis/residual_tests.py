@@ -1,7 +1,5 @@
 """Tests of what remains after the named causes: is it noise, what does it follow, does it contradict them?"""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """Result of a diagnosis: verdict, findings with numbers, intervals and what lost against them; and as data for JSON."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field

@@ -1,7 +1,5 @@
 """Filter-error estimation: Fisher scoring with frozen gains, noise numbers by the full filter."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

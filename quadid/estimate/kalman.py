@@ -28,8 +28,6 @@ Sources: Jategaonkar, *Flight Vehicle System Identification*, 2nd ed., ch. 5 (fi
 RP-1077 and RP-1138; Kristensen, Madsen & Jorgensen 2004, doi:10.1016/j.automatica.2003.10.001.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any, NamedTuple
 

@@ -10,8 +10,6 @@ and tau is found by kinematics alone: least squares of the attitude's mean rate 
 in, it would pass for motors that lag, and for inertias that are too small, since it takes quick motion away.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any

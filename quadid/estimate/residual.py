@@ -7,8 +7,6 @@ Rezaiifar and Krishnaprasad 1993, doi:10.1109/ACSSC.1993.342465); parts of the d
 are worth having, and flights that were not fitted whether an axis keeps any.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from itertools import combinations_with_replacement
 from typing import NamedTuple

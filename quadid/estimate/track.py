@@ -1,7 +1,5 @@
 """Flights as the filter reads them: every channel at its own times, rotor speeds as they acted."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.interpolate import CubicSpline
 

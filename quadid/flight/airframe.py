@@ -1,7 +1,5 @@
 """The flown vehicle: Newton-Euler about the CG in body axes, attitude as a rotation matrix, and its rotors."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Flight of the vehicle, as a whole or step by step, and the log of it with the truth beside."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 

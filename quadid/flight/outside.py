@@ -1,7 +1,5 @@
 """Effects outside the catalogue, which a diagnosis must call unknown: in flight and in the log."""
 
-from __future__ import annotations
-
 import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass

@@ -5,8 +5,6 @@ attitude and rate) and its output (rotor commands) are all logged, so the gains 
 the commands it leaves unexplained shows whether the vehicle flies this law at all.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple

@@ -11,8 +11,6 @@ parts of the flight, and models with each cause of the catalogue added, estimate
 as wide as their differences.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 

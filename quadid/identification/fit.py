@@ -1,7 +1,5 @@
 """Identification from first guess to parameters with intervals: swarm, polish, noise, covariance."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace

@@ -1,7 +1,5 @@
 """Gauss-Newton with Levenberg damping, within bounds, on the scaled parameters; initial states step along exactly."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from enum import StrEnum
 

@@ -10,8 +10,6 @@ Sources:
     Eberhart & Shi 2000, doi:10.1109/CEC.2000.870279 (constriction with a velocity clamp).
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field
 from enum import StrEnum

@@ -6,8 +6,6 @@ the predicted one; a delay of the attitude likewise.  Errors are Euclidean for v
 rotation (q and -q alike), as in the IDSIA nano-drone benchmark.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Rigid body with effects and residual terms: one step for many parameter vectors at once."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -3,8 +3,6 @@
 A whole window is simulated from references and throttle only, as the paper does.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Hot kernel: one step for many parameter vectors ("lanes") at once, without the parts that none of them needs."""
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

@@ -11,8 +11,6 @@ The attitude loop asks for the rate a times the error of the angle.  Damping by 
 beside these loops, and lends margin.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Segment loop of the rollout: every segment for one block of lanes, to residuals or their cost."""
 
-from __future__ import annotations
-
 import math
 
 import numba as nb

@@ -1,7 +1,5 @@
 """Rotors of many parameter vectors at once: lag, delay, mean speeds, and their moments over each half step."""
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

@@ -4,8 +4,6 @@ The rows S_* hold what reaches the sensors at one sample; each stage works on th
 `rollout_kernel.compare` ends the chain.
 """
 
-from __future__ import annotations
-
 import math
 
 import numba as nb

@@ -1,7 +1,5 @@
 """Help for the compiler: full-width vectors and aligned memory for kernels whose innermost loop runs over lanes."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import Any

@@ -7,8 +7,6 @@ for itself.  A test holds the two together over random states.
 Delays and sensors have no place in a state derivative: `LEFT_OUT` names the effects.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field

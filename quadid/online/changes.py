@@ -21,8 +21,6 @@ speed, N rotors, f the specific force along -z, u, v, w the velocity in body axe
                            - k_y h m v / J_xx                               rotor_drag h above the centre of gravity
 """
 
-from __future__ import annotations
-
 import math
 from collections import deque
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Rows of the grid and windows cut from them, and their checks before anything is learned."""
 
-from __future__ import annotations
-
 import math
 from collections import deque
 from collections.abc import Sequence

@@ -12,8 +12,6 @@ Free are the nominal six, trim moment, biases, and what acts on every vehicle be
 else thrust may have is looked at beside that and never published: each rotor's loss, a thrust curve, a support.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 from typing import TypeGuard

@@ -1,7 +1,5 @@
 """The gate: ordered checks between an estimate and the parameter topic, each with a reason; and the set in force."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace

@@ -1,7 +1,5 @@
 """Records and jobs of a session: what it hands out and asks for."""
 
-from __future__ import annotations
-
 import math
 import traceback
 from abc import ABC, abstractmethod

@@ -15,8 +15,6 @@ session has limited `patience`: where the machine is too slow, whoever drives it
 the reply and look for changes; it counts when it comes, and no further fit begins until then.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Live streams: samples in any order and rate become rows of one uniform grid, and windows are cut from them."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter, deque
 from collections.abc import Mapping

@@ -15,8 +15,6 @@ so that one controller written in SI has the same loop in each.  Facts and sourc
                 (mixer_init.c); angle_p_gain / 10 is the gain of Angle mode [1/s].
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from typing import NamedTuple

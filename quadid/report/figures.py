@@ -1,7 +1,5 @@
 """Figures of results, and of causes in the residual, as plain descriptions without colours."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Pages of identification, diagnosis, manoeuvre and failure."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict

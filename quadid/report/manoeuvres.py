@@ -1,7 +1,5 @@
 """Manoeuvres in the forms in which they are flown: autopilot scripts, parameters, words for the sticks."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass

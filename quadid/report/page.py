@@ -1,7 +1,5 @@
 """HTML page from plain data, self-contained: no request leaves it, and nothing from a log is ever run."""
 
-from __future__ import annotations
-
 import base64
 import hashlib
 import math

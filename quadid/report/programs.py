@@ -1,7 +1,5 @@
 """Vehicles in the forms of other programs: facts about a vehicle, worked out once, and a template a form."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass

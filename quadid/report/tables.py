@@ -1,7 +1,5 @@
 """Tables of results as text that fits a width."""
 
-from __future__ import annotations
-
 import math
 import re
 import textwrap

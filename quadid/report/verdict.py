@@ -1,7 +1,5 @@
 """Verdicts in plain words: a headline, one sentence a parameter, and what to do next."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -5,8 +5,6 @@ node, held against limits and a largest step, and set in one transaction.  With 
 logs what it would set.
 """
 
-from __future__ import annotations
-
 import contextlib
 import math
 import re

@@ -4,8 +4,6 @@ A history that cannot be written never stops a service: `Store.problem` reports 
 sets are on the disk, so that no other is published.
 """
 
-from __future__ import annotations
-
 import contextlib
 import fcntl
 import json

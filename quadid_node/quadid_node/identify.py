@@ -1,7 +1,5 @@
 """`ros2 run quadid_node identify`: runs the node until SIGINT or SIGTERM, which it heeds while it still loads."""
 
-from __future__ import annotations
-
 import contextlib
 import importlib
 import sys

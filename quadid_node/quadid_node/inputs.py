@@ -1,7 +1,5 @@
 """Inputs of the node: topics and types of the stacks, decoded messages, one source a channel."""
 
-from __future__ import annotations
-
 import importlib
 import math
 import re

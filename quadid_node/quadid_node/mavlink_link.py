@@ -1,7 +1,5 @@
 """MAVLink link of the service: requests and decodes messages, sends results as component 191, and serves."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections import Counter

@@ -1,7 +1,5 @@
 """MAVLink wire: connection, peers, signatures and their memory."""
 
-from __future__ import annotations
-
 import errno
 import hashlib
 import hmac

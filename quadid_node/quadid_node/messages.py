@@ -4,8 +4,6 @@ Messages are plain dictionaries, for ROS topics and for MCAP alike; times inside
 keeps, Zenoh carries and the commands print.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace

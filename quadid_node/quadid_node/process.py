@@ -3,8 +3,6 @@
 Fast DDS is the middleware of these wheels, and of Jazzy by default.
 """
 
-from __future__ import annotations
-
 import gc
 import os
 import signal

@@ -1,7 +1,5 @@
 """Publication over ROS: publishers, ownership of topics, other nodes of the graph, and the bond."""
 
-from __future__ import annotations
-
 import math
 import random
 import time

@@ -5,8 +5,6 @@ order of arrival is another.  The `Recorder` writes the messages that the sessio
 of them what the session began with, so that a replay repeats the run bit for bit.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import time

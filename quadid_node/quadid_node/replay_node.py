@@ -1,7 +1,5 @@
 """`ros2 run quadid_node replay LOG`: plays any log onto the canonical topics, at its own pace or faster."""
 
-from __future__ import annotations
-
 import argparse
 import sys
 import time

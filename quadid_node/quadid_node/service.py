@@ -3,8 +3,6 @@
 The ROS node, the MAVLink link and the replay push messages, call `step` often, and carry out what it returns.
 """
 
-from __future__ import annotations
-
 import math
 import time
 import uuid

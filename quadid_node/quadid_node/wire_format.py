@@ -7,8 +7,6 @@ bytes never make gigabytes.
 python -m quadid_node.wire_format FILE  # does a job that failed and was kept again, and prints what becomes of it
 """
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import math

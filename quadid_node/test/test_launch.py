@@ -1,7 +1,5 @@
 """The launch files as `ros2 launch` runs them: every node gets ready, and Ctrl-C ends all of them cleanly."""
 
-from __future__ import annotations
-
 import os
 import signal
 from pathlib import Path

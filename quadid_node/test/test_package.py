@@ -1,7 +1,5 @@
 """Checks of `colcon test` without a running middleware: the package's manifest, its launch files, its lint."""
 
-from __future__ import annotations
-
 import ast
 import re
 import xml.etree.ElementTree as ET

@@ -1,7 +1,5 @@
 """The node as `ros2 run quadid_node identify` starts it: it comes up, offers its topics latched, and ends cleanly."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

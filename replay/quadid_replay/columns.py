@@ -1,7 +1,5 @@
 """Frames, clocks and channels of untrusted logs: what every reader does with the columns that it found."""
 
-from __future__ import annotations
-
 import math
 from bisect import bisect_left
 from collections.abc import Callable, Iterable, Mapping, Sequence

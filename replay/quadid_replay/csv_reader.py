@@ -1,7 +1,5 @@
 """CSV of the contract: a header row, `t` [s], then any of the known columns, SI, world NED, body FRD."""
 
-from __future__ import annotations
-
 import re
 from array import array
 from collections import Counter

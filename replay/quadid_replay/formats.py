@@ -1,7 +1,5 @@
 """The formats of logs: how each begins, for the suffix is never believed, and what reads it."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Callable, Mapping
 from dataclasses import replace

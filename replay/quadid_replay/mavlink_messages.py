@@ -1,7 +1,5 @@
 """MAVLink messages: channels, units, frames and stamps of each kind."""
 
-from __future__ import annotations
-
 import math
 import struct
 from collections.abc import Callable, Sequence

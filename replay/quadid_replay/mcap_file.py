@@ -1,7 +1,5 @@
 """Records of MCAP files, through damage and within limits."""
 
-from __future__ import annotations
-
 import io
 import struct
 import zlib

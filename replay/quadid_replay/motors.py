@@ -1,7 +1,5 @@
 """Motor outputs of autopilots: numbering, positions, spins, and rows of rotor speeds."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Mapping, Sequence

@@ -7,8 +7,6 @@ holds, whatever the format; readers need no such guards of their own.  It is for
 pays for a fork and not for an interpreter.  That process only imports readers and forks; it never looks into a log.
 """
 
-from __future__ import annotations
-
 import atexit
 import contextlib
 import errno

@@ -1,7 +1,5 @@
 """ROS 2 logs: MCAP files, SQLite databases, and folders of `ros2 bag record`."""
 
-from __future__ import annotations
-
 import re
 import sqlite3
 from collections.abc import Callable, Iterator, Mapping, Set

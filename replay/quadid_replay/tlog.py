@@ -1,7 +1,5 @@
 """MAVLink telemetry logs: frames, one vehicle's messages, channels on its boot clock."""
 
-from __future__ import annotations
-
 import mmap
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """PX4 ULog."""
 
-from __future__ import annotations
-
 import mmap
 import re
 import struct

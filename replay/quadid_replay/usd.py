@@ -1,7 +1,5 @@
 """Crazyflie µSD logs."""
 
-from __future__ import annotations
-
 import math
 import struct
 import zlib

@@ -1,7 +1,5 @@
 """Simulated flights for the command line, flown once a session."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Pages of the documents, followed: every command as it stands there, with what a person fills in."""
 
-from __future__ import annotations
-
 import re
 import shlex
 from collections.abc import Callable

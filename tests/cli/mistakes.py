@@ -3,8 +3,6 @@
 python -m tests.cli.mistakes > docs/results/mistakes.md
 """
 
-from __future__ import annotations
-
 import contextlib
 import io
 import re

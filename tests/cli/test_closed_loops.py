@@ -1,7 +1,5 @@
 """Exports flown in a closed loop by the programs themselves: hover, a roll step, a yaw step, as our simulation does."""
 
-from __future__ import annotations
-
 import inspect
 import re
 import tempfile

@@ -1,7 +1,5 @@
 """Commands, their options and what each gives: the list that users rely on."""
 
-from __future__ import annotations
-
 import json
 import shlex
 from pathlib import Path

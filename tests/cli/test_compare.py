@@ -1,7 +1,5 @@
 """`quadid compare` and `compare-vehicles`: every method of the contract, and the file nearer to the truth wins."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

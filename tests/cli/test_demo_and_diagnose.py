@@ -1,7 +1,5 @@
 """`quadid demo` and `quadid diagnose` end to end."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

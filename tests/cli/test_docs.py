@@ -1,7 +1,5 @@
 """Documents: commands run as they stand, equations become MathML, and nothing is named that is not there."""
 
-from __future__ import annotations
-
 import importlib.util
 import json
 import re

@@ -1,7 +1,5 @@
 """`quadid excite`: limits are kept, the file can be flown, and what was promised is obtained."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import replace

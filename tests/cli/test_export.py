@@ -1,7 +1,5 @@
 """`quadid export`: what other programs would make of the files is the vehicle's own physics."""
 
-from __future__ import annotations
-
 import json
 import math
 import shutil

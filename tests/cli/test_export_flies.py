@@ -1,7 +1,5 @@
 """Exports flown or read back by others: RotorPy flies the exported vehicle as our own simulation does."""
 
-from __future__ import annotations
-
 import inspect
 import json
 import re

@@ -1,7 +1,5 @@
 """`quadid fleet` on a real local cluster: bad logs among good ones, going on, files that others read."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import multiprocessing

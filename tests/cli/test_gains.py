@@ -1,7 +1,5 @@
 """`quadid gains`: the gains, flown by each autopilot's own law around the truth, keep what was promised."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

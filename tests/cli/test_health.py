@@ -1,7 +1,5 @@
 """`quadid health`, `quadid.health` and the health of a fleet: JSON, exit codes, report, recorded flights."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`quadid identify` from logs to JSON, vehicle file and report: logs and columns it takes, and what later fits use."""
 
-from __future__ import annotations
-
 import json
 import math
 import re

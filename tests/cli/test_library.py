@@ -1,7 +1,5 @@
 """The library: calls that no command makes, and what notebooks take from a result; commands are the same functions."""
 
-from __future__ import annotations
-
 import re
 import subprocess
 import sys

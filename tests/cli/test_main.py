@@ -1,7 +1,5 @@
 """The command line: help, usage errors, terminals, pipes, bad input answered in one line."""
 
-from __future__ import annotations
-
 import io
 import os
 import pty

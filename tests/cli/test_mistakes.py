@@ -1,7 +1,5 @@
 """Every mistake is answered with one line that names it, and docs/results/mistakes.md shows these lines."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

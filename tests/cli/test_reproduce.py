@@ -1,7 +1,5 @@
 """A short version of `quadid reproduce`: relations that must hold between the columns, and the files it writes."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """`quadid score`: the JSON, gaps, files, and agreement with what can be computed without a simulation."""
 
-from __future__ import annotations
-
 import warnings
 from dataclasses import replace
 from pathlib import Path

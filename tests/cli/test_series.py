@@ -1,7 +1,5 @@
 """Flights over time as files: `--series`, drawn vehicles, and public viewers that open both."""
 
-from __future__ import annotations
-
 import json
 import re
 import xml.etree.ElementTree as ET

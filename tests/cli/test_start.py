@@ -1,7 +1,5 @@
 """Start of a command: kernels compiled once, folders of strangers, import paths of the release before."""
 
-from __future__ import annotations
-
 import importlib
 import inspect
 import json

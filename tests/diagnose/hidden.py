@@ -1,7 +1,5 @@
 """Hides effects in flown data, asks for a diagnosis, and requires the right answer: the campaign in small."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import lru_cache
 

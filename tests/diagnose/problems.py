@@ -1,7 +1,5 @@
 """Fitted problems that several tests of the diagnosis share: flown and fitted once a process."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any

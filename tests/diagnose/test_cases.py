@@ -1,7 +1,5 @@
 """The independent cases: flights from other code, with what was hidden in them."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Held-out blocks: against plain refits, and an error that holds under autocorrelation."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The pages about effects and method keep up with the code."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

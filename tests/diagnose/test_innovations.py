@@ -1,7 +1,5 @@
 """Numbers of a diagnosis: by innovations, sharper than by segments, and right beside moments that no model has."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Effects that joined the catalogue last: found with their size where they are, and not where a look-alike is."""
 
-from __future__ import annotations
-
 import pytest
 
 from quadid.diagnosis import Diagnosis, diagnose

@@ -1,7 +1,5 @@
 """Effects that any vehicle may have are told from what is larger, an event or a matter of wind and ground."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

@@ -1,7 +1,5 @@
 """Numbers that no vehicle has are not believed, nor a bias that is not constant; others are."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import lru_cache
 

@@ -1,7 +1,5 @@
 """A real vehicle whose nominal model follows nothing: what is known to be there must be found all the same."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """Generic causes: silent on noise, right about where something acts and what it follows."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Remainder: noise has the spectrum of noise, a tone stands out at its frequency, verdicts follow from shares."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any, cast
 

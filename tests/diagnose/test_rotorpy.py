@@ -1,7 +1,5 @@
 """RotorPy's Hummingbird, flown by RotorPy itself: every cause is named with RotorPy's numbers, and no other."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from quadid_evaluation.studies.rotorpy_flight import RotorpyFlight, fly, hummingbird

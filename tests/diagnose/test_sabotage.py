@@ -1,7 +1,5 @@
 """The short campaign can go red: with the catalogue or the decision spoilt, its requirements are not met."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

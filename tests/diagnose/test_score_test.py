@@ -1,7 +1,5 @@
 """Screening: what one linearisation promises is what a refit delivers."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

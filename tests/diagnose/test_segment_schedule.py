@@ -1,7 +1,5 @@
 """Segments that decide: the longest that the model follows, and long ones only where airspeed must be found."""
 
-from __future__ import annotations
-
 from functools import lru_cache
 
 import pytest

@@ -1,7 +1,5 @@
 """The moves of the selection: what is superfluous goes, the wrong look-alike gives way, a right answer stays."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import lru_cache
 

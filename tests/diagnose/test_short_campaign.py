@@ -1,7 +1,5 @@
 """The short campaign: what was hidden must be found, by its name, and nothing else."""
 
-from __future__ import annotations
-
 import pytest
 
 from quadid.diagnosis import Diagnosis

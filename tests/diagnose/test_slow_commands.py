@@ -1,7 +1,5 @@
 """Commands of 10 Hz that were filled up to the rate of the log show neither inertias nor lags."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Thrust that falls with the square of a climb: found with its size, and neither a step nor the frame's drag."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

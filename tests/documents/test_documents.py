@@ -1,7 +1,5 @@
 """Documents that list what the code has: nothing missing, nothing that is not there; the API page and its recipes."""
 
-from __future__ import annotations
-
 import importlib
 import re
 import subprocess

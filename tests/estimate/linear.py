@@ -1,7 +1,5 @@
 """The filter's model about hover, where it is linear: dense matrices, joint updates, and batch least squares."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from quadid.data.window import Window

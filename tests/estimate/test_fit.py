@@ -1,7 +1,5 @@
 """The whole estimate on simulated flights: truth inside its intervals, no random forces where none act."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import lru_cache
 

@@ -1,7 +1,5 @@
 """Bands of predictions hold the share of outcomes that they promise, from logged rotor speeds and in closed loop."""
 
-from __future__ import annotations
-
 from functools import lru_cache
 
 import numpy as np

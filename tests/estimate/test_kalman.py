@@ -1,7 +1,5 @@
 """The filter against dense textbook algebra, its score against differences, its motion against the kernel's."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from dataclasses import replace

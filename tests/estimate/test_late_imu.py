@@ -1,7 +1,5 @@
 """A gyro behind a low-pass is found by the attitude alone, and brought back in time."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Terms beyond the catalogue: found on what is missing where something acts, none where nothing does; they fly."""
 
-from __future__ import annotations
-
 from functools import lru_cache
 
 import numpy as np

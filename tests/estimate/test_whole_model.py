@@ -1,7 +1,5 @@
 """The table of effects in the filter: what acts along its states, what sensors remember, how a flight begins."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from quadid.data.window import Window

@@ -1,7 +1,5 @@
 """The examples run as they stand, Foxglove's with a viewer of its own; ROS's are run by tests/node/test_ros_node.py."""
 
-from __future__ import annotations
-
 import asyncio
 import importlib.util
 import json

@@ -1,7 +1,5 @@
 """The example notebooks run from top to bottom, and show what they promise."""
 
-from __future__ import annotations
-
 import os
 import re
 from pathlib import Path

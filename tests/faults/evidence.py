@@ -6,8 +6,6 @@ a passed test said gets into it.  An account beside the page (JSON) keeps what w
 replaces what these said, and takes out those that failed, and those whose test is gone.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Mapping, Sequence
 from datetime import UTC, datetime

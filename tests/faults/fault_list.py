@@ -1,7 +1,5 @@
 """The faults that quadid must withstand, and what it promises for each: the one list that tests and page share."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 

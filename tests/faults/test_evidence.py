@@ -1,7 +1,5 @@
 """The page of faults: only passed tests speak, and rows without evidence say so."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

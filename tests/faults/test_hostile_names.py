@@ -1,7 +1,5 @@
 """Names and histories of strangers: harmless in reader, terminal, report and history."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import sqlite3

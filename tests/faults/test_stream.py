@@ -1,7 +1,5 @@
 """Rows 2, 6 and 8: a killed recorder, saturation, and a stream with duplicates, jitter and dropout."""
 
-from __future__ import annotations
-
 import signal
 import subprocess
 import sys

@@ -3,8 +3,6 @@
 Shares nothing with `quadid.flight` but the contract's wording of each effect.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Physics of the flown airframe: balances, symmetries, convergence, and a second set of equations by SciPy."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

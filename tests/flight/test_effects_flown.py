@@ -1,7 +1,5 @@
 """Every catalogue effect as flown: neutral changes nothing, sizes as the contract says, signs as expected."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.signal import butter, lsim

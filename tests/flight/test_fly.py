@@ -1,7 +1,5 @@
 """Whole flights: determinism, clocks, individuals, bounds; the vehicle stepped from outside; machine code on disk."""
 
-from __future__ import annotations
-
 import hashlib
 from pathlib import Path
 from typing import Any, cast

@@ -1,7 +1,5 @@
 """Sensor noise as specified, and independent of everything else."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation

@@ -1,7 +1,5 @@
 """`quadid simulate`: files, effects on the command line, JSON, refusals, live MAVLink."""
 
-from __future__ import annotations
-
 import socket
 import threading
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The stabiliser and the pilot: the step replays the log, gains travel, sticks excite every axis."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 

@@ -3,8 +3,6 @@
 The account is JSON: which inputs were tried when, with how many findings; a page beside it shows it.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import subprocess

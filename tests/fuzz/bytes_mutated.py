@@ -1,7 +1,5 @@
 """Mutations of bytes that know nothing of a format: flips, cuts, splices, interesting integers."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from random import Random
 

@@ -5,8 +5,6 @@ that keeps the promises of a recording, a `QuadidError` in one line, and that th
 in which `open_log` reads would be.  Everything else is a finding.  Readers run in this process, for speed.
 """
 
-from __future__ import annotations
-
 import resource
 import signal
 import tempfile

@@ -4,8 +4,6 @@ A format splits a log into records, tells where a record's length stands, repair
 says of itself, so that mutations get past the first door: a frame with a wrong checksum only ever tests the checksum.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from functools import lru_cache
 from random import Random

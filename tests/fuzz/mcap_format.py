@@ -1,7 +1,5 @@
 """Structure of MCAP for the fuzzer: records, chunks with their sizes and checksums, definitions, bombs."""
 
-from __future__ import annotations
-
 import struct
 import zlib
 from functools import lru_cache

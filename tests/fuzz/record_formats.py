@@ -1,7 +1,5 @@
 """Structure of telemetry, DataFlash, ULog, µSD and blackbox logs for the fuzzer: records, checksums, definitions."""
 
-from __future__ import annotations
-
 import re
 import struct
 import zlib

@@ -1,7 +1,5 @@
 """Structure of a rosbag2 database for the fuzzer: its rows; `finish` makes the database of what rows are left."""
 
-from __future__ import annotations
-
 import sqlite3
 from collections.abc import Sequence
 from functools import lru_cache

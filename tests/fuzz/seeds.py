@@ -1,7 +1,5 @@
 """Small whole logs that the fuzzer mutates: between them every kind of message that is read, a few samples of each."""
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Callable
 from functools import lru_cache

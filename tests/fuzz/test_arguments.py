@@ -1,7 +1,5 @@
 """Any arguments after `quadid`: an exit code of the contract, one line of reason, no traceback."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

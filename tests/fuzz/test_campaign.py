@@ -1,7 +1,5 @@
 """A short campaign over each reader, and what fuzzing has found, each as the smallest log that shows it."""
 
-from __future__ import annotations
-
 import sqlite3
 import struct
 import warnings

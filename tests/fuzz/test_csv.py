@@ -1,7 +1,5 @@
 """Any CSV is a recording that keeps its promises or one error that says what is wrong."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """Vehicle files of any content: a vehicle, or one error that says what is wrong, at once."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Mutations of the text in which formats describe themselves: message definitions, variables, headers."""
 
-from __future__ import annotations
-
 import re
 from random import Random
 

@@ -1,7 +1,5 @@
 """Health from trims and in flight: each damage is named with its size, healthy flights are left alone."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from quadid_evaluation.studies.health.flights import Wrong, hover, hover_seconds, squared_speeds

@@ -4,8 +4,6 @@ The measured arrays and the simulation itself (`Rollout.roll`) are shared; diffe
 least squares are not.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A small quadcopter under a controller that is faster than its log: rotation only, written for these tests alone."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Flights that several tests of the fit share: flown once a process, never written to."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import lru_cache
 from typing import Any

@@ -1,7 +1,5 @@
 """Any arrangement of rotors: each flies a minute in simulation and gives its parameters back."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The small quadratic problem with bounds: its optimum, also where that lies on a bound to the last digit."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

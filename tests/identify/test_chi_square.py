@@ -1,7 +1,5 @@
 """The chi-square distribution: tails of the tables, the mean of the lower part."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy import stats

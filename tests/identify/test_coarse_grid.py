@@ -1,7 +1,5 @@
 """Every second row of a flight: what it holds, and what it says of inputs that run on within a row."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Values beside a named doubt: the check says how far estimates are off if it is right, and intervals hold that."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Callable

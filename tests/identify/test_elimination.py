@@ -1,7 +1,5 @@
 """Parameters eliminated from normal equations: what is left is the cost with them at their best."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Moments that no model has: inertias must come out right beside them, and what they hide must not be called known."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from pathlib import Path

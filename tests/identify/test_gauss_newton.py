@@ -1,7 +1,5 @@
 """Gauss-Newton: reaches the optimum, stays inside the bounds, steps back from simulations that run away."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The last word on a fit: guesses stay guesses, and what is written passes our own checks."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

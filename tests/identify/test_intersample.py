@@ -1,7 +1,5 @@
 """Effect of held commands within their samples: seen where a controller is faster than the log, and nowhere else."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 

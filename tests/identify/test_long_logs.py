@@ -1,7 +1,5 @@
 """A log of many hours: its parameters come from as much of it as they need, and that is said."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The memory of attitude noise is found in the data, and intervals hold whatever it is."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Noise: what was drawn is found again, and the whitener turns it into unit white noise."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

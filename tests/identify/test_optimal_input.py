@@ -1,7 +1,5 @@
 """Choosing blocks: exchange against brute force, and what is known already counts."""
 
-from __future__ import annotations
-
 from itertools import combinations_with_replacement
 
 import numpy as np

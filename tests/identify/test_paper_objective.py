@@ -1,7 +1,5 @@
 """The paper's score: what it is made of, where it is lowest, and the stabiliser that it needs."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

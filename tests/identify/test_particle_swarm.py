@@ -1,7 +1,5 @@
 """The swarm: published test functions, Algorithm 1 against a scalar transcription, bounds, seeds, hostile costs."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import Any, Literal

@@ -1,7 +1,5 @@
 """Prior knowledge: mass, arm, thrust stand, CAD inertia; each with its uncertainty, seen in the posterior."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

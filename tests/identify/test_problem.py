@@ -1,7 +1,5 @@
 """Multiple shooting: the eliminated small matrices against plain least squares, gaps, missing samples, priors."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

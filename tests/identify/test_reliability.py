@@ -1,7 +1,5 @@
 """Estimates that a right model makes agree, and what is said when they do not."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

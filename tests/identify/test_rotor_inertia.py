@@ -1,7 +1,5 @@
 """Rotors without inertia, as many simulators have them: a guess of J_r does not bend what is beside it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 from quadid.flight import TruthParameters, fly

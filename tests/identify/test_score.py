@@ -1,7 +1,5 @@
 """Scores against what they must be for the truth: 1 on the noise floor, zero without noise, larger when wrong."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

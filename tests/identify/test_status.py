@@ -1,7 +1,5 @@
 """Status of a number from the joint covariance and from other estimates, on covariances made by hand."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Flights that the tests of the model share: inputs that move every axis, and a parameter vector for them."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

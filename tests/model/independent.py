@@ -3,8 +3,6 @@
 Vectors and cross products, integrated by SciPy's DOP853 between the jumps of its input; shares nothing with the kernel.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """Runs the rollout as a plain simulator: no measurements, whole trajectories out."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 

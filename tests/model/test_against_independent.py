@@ -1,7 +1,5 @@
 """The rollout against an independent writing of the paper's Eqs. 1-10 and of every effect, integrated by DOP853."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """The model in closed loop against the flown vehicle, which shares no equations with it, only the control law."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

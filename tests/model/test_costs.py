@@ -1,7 +1,5 @@
 """The swarm's cost: weighted squares less what the initial states explain, against the formula on residuals."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

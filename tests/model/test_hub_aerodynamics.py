@@ -1,7 +1,5 @@
 """Air at each hub: energy, symmetry, the damping that geometry gives, and frames."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

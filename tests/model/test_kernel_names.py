@@ -1,7 +1,5 @@
 """Names of compiled functions: kernels on disk come from several processes, and are linked by name."""
 
-from __future__ import annotations
-
 import gc
 import importlib
 import pkgutil

@@ -1,7 +1,5 @@
 """Lanes: exact nesting of models, independence of one another and of threads, smoothness in the parameters."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

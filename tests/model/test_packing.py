@@ -1,7 +1,5 @@
 """Vectors that share a block of lanes: a matter of time alone, never of the result."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

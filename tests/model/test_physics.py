@@ -1,7 +1,5 @@
 """Physics of the model: conservation, balances, symmetries, exact solutions, order of convergence."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation

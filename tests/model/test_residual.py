@@ -1,7 +1,5 @@
 """Terms beyond the catalogue: the same as the catalogue where both can say it, nothing where they are zero."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

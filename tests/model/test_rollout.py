@@ -1,7 +1,5 @@
 """Segments, initial states, missing measurements and refusals of the rollout."""
 
-from __future__ import annotations
-
 import pickle
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Sensors: filters, delays, errors, each against SciPy or the contract's wording."""
 
-from __future__ import annotations
-
 from functools import lru_cache
 
 import numpy as np

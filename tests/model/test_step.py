@@ -1,7 +1,5 @@
 """Steps of the simulation: the same as the rollout, for one vehicle or many, from a state that holds everything."""
 
-from __future__ import annotations
-
 import math
 import pickle
 from typing import Any

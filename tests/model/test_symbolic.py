@@ -1,7 +1,5 @@
 """The equations for those who differentiate are the kernel's: rates of every state over random states and effects."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

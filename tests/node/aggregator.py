@@ -1,7 +1,5 @@
 """Branches of diagnostic_aggregator with the configuration of the package, by the rules of its GenericAnalyzer."""
 
-from __future__ import annotations
-
 import yaml
 
 from tests.node.peers import ROOT

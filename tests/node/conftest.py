@@ -1,7 +1,5 @@
 """Tests of the service: processes, files, links and topics are real; those that start ROS nodes share a worker."""
 
-from __future__ import annotations
-
 import importlib.util
 import os
 import sys

@@ -3,8 +3,6 @@
 Run as a program it starts one, by a fork, for every line that it reads: what takes long, the imports, is done once.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import signal

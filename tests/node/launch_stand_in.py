@@ -4,8 +4,6 @@ Arguments that are declared take their defaults where they are not given, functi
 what would be started or included is kept with its arguments.
 """
 
-from __future__ import annotations
-
 import importlib.util
 import sys
 from collections.abc import Iterable

@@ -1,7 +1,5 @@
 """The other end of a MAVLink link over UDP, for tests: vehicles, ground stations, attackers."""
 
-from __future__ import annotations
-
 import socket
 import time
 from dataclasses import replace

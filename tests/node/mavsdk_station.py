@@ -1,7 +1,5 @@
 """A process of its own: MAVSDK as ground station; tells what it finds of component 191, and tries to write to it."""
 
-from __future__ import annotations
-
 import contextlib
 import sys
 import time

@@ -1,7 +1,5 @@
 """Commands and names that the documents of the online service show: options, node parameters, presets, topics exist."""
 
-from __future__ import annotations
-
 import re
 import shlex
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A job that fails by an error of the program: its input is kept beside the history, and can be done again."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The history: what was journalled comes back, whatever happens to file, disk, rows, or a second service."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import math

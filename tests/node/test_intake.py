@@ -1,7 +1,5 @@
 """Messages read a batch at a time, and the node's own recording of them."""
 
-from __future__ import annotations
-
 import json
 import os
 import struct

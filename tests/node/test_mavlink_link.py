@@ -1,7 +1,5 @@
 """MAVLink over UDP: the protocol of component 191, and bytes of any kind."""
 
-from __future__ import annotations
-
 import os
 import random
 import time

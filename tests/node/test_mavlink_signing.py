@@ -1,7 +1,5 @@
 """MAVLink over UDP: signing, peers written by others, and the order of motors of a live vehicle."""
 
-from __future__ import annotations
-
 import base64
 import contextlib
 import json

@@ -1,7 +1,5 @@
 """Publication: on the disk before on the wire, one service a topic, neighbours named."""
 
-from __future__ import annotations
-
 import math
 import os
 import random

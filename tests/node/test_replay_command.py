@@ -1,7 +1,5 @@
 """`quadid replay` and `quadid history`, run as a user runs them."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """The bridge from parameter sets to a controller's parameters, over DDS, and each reason for which it sets nothing."""
 
-from __future__ import annotations
-
 import signal
 import sys
 from collections.abc import Iterator

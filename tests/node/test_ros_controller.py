@@ -1,7 +1,5 @@
 """The shipped controller example obeys each check that the documentation asks of a controller."""
 
-from __future__ import annotations
-
 import importlib.util
 from dataclasses import replace
 from pathlib import Path

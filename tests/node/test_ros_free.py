@@ -1,7 +1,5 @@
 """Parts of the node that need no ROS: imports, sources, parameters, launch arguments, mistakes of publishers named."""
 
-from __future__ import annotations
-
 import importlib
 import importlib.util
 import math

@@ -1,7 +1,5 @@
 """The ROS node under a lifecycle manager, among faults of topics and processes, and beside a second service."""
 
-from __future__ import annotations
-
 import signal
 import time
 from collections.abc import Callable, Iterator

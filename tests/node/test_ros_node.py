@@ -1,7 +1,5 @@
 """The ROS node over DDS, every part a process of its own: vehicle, node, subscribers, services, signals, Zenoh."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

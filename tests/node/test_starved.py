@@ -1,7 +1,5 @@
 """A service on a machine that is too slow says so, leaves fits out, looks for changes first, tells nothing false."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

@@ -1,7 +1,5 @@
 """Health in the service: a baseline grows in the history, survives a restart, and a damaged rotor is named and told."""
 
-from __future__ import annotations
-
 import json
 import sqlite3
 from collections.abc import Iterator

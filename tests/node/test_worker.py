@@ -1,7 +1,5 @@
 """The fit process, killed, stopped and starved; the service lives and says so."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

@@ -1,7 +1,5 @@
 """A Zenoh router process with the example's TLS and access control, and configurations of its clients."""
 
-from __future__ import annotations
-
 import socket
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """A process of its own: routes Zenoh with the given configuration until its input ends."""
 
-from __future__ import annotations
-
 import sys
 
 import zenoh

@@ -1,7 +1,5 @@
 """Drives a session from a flight, as the services and the replay do: samples in time order, fits inline."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Sequence
 from functools import lru_cache
 

@@ -4,8 +4,6 @@ The recording follows rigid-body arithmetic of a vehicle with the parameters `TR
 times stated factors, and with a stated standard deviation.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterable, Sequence
 from functools import lru_cache

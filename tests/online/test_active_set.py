@@ -1,7 +1,5 @@
 """The ledger: numbers rise, approvals and rollbacks are idempotent, nothing unapproved is ever in force."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

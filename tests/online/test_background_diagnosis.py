@@ -1,7 +1,5 @@
 """The diagnosis beside the fits: when it is asked for, what of its answers is told."""
 
-from __future__ import annotations
-
 import itertools
 from dataclasses import replace
 

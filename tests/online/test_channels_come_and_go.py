@@ -1,7 +1,5 @@
 """Channels that begin and end in flight: fits go on with what there is; no array reaches a kernel that it overruns."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

@@ -1,7 +1,5 @@
 """Stamps become one rising session time, whatever they do; only the gyro's move it, and only several that agree."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """References through the stabiliser: the rotor commands that nobody told, and what is identified from them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Sensors against each other: what contradicts stops learning and publishing, what agrees delays nothing."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from pathlib import Path

@@ -3,8 +3,6 @@
 Session, gate, ledger, service and SQLite are real; what the fits say is made up (`tests.online.test_gate_machine`).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 

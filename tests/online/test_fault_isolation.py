@@ -1,7 +1,5 @@
 """Sudden changes: seen within two seconds, explained, and never invented."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The model that windows are fitted with: what it lacks is fitted along, and the truth is published."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """A change of flight state is no change of the vehicle: regressors, velocity, and flights of a real autopilot."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import lru_cache

@@ -1,7 +1,5 @@
 """Fusion: exact for quadratic costs, counts every second once, forgets, widens when windows scatter, sees changes."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

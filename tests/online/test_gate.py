@@ -1,7 +1,5 @@
 """The gate: what it accepts is physical, known, agreed upon, predictive and near what was approved."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """In flight nothing is loaded: an import takes as long as ten steps of the node."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path

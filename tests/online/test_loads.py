@@ -1,7 +1,5 @@
 """Loads and pulls: in hover thrust is the weight, so what is taken up or dropped is named; a landing is not."""
 
-from __future__ import annotations
-
 import math
 import re
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Faults that every single check let pass: what is accepted is within 5 % of the truth, and says what it rests on."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Quality: flights of every kind pass; broken sensors, wrong units and anything but flight are named."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Answers from another machine that are none: refused at the door, and a session that hears them goes on."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import replace

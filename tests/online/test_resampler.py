@@ -1,7 +1,5 @@
 """The buffer: a log on the grid passes bit for bit, order of arrival changes nothing, faults are counted."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

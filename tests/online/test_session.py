@@ -1,7 +1,5 @@
 """The session: learns in flight, publishes what passed, sees a change, survives faults, and is the same every time."""
 
-from __future__ import annotations
-
 import re
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The session without simulator and fit: sudden changes, and studies beside the fits."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """The session without simulator and fit: what people order, what breaks."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

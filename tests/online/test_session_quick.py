@@ -3,8 +3,6 @@
 The session and all it consists of are real; recording and fits are arithmetic (`tests.online.made_up`).
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from itertools import pairwise

@@ -1,7 +1,5 @@
 """A stream in any portions gives the same rows bit for bit; no channel's stamps judge another's samples."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 
 import numpy as np

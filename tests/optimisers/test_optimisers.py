@@ -1,7 +1,5 @@
 """Every optimiser through the one door: optimum, account, bounds, seeds, hostile costs; L-SHADE as published."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from pathlib import Path

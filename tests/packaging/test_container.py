@@ -1,7 +1,5 @@
 """The container files as far as they can be checked without an engine; `make lint` checks their syntax."""
 
-from __future__ import annotations
-
 import re
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """The node lives on its own list of requirements, beside NumPy 1.26; `make node` installs it so and runs it."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 import tomllib

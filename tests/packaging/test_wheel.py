@@ -1,7 +1,5 @@
 """Contents of `pip install .`: seven packages with their data, one version, and imports that cost nothing."""
 
-from __future__ import annotations
-
 import re
 import subprocess
 import sys

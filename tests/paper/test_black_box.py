@@ -1,7 +1,5 @@
 """Black boxes: what they see of a flight, that one is found under its stabiliser, and the score beside the model."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from quadid_evaluation.paper.black_box import FEEDTHROUGH, fit_black_box, quadrotor_io, score_black_box

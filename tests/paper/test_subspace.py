@@ -1,7 +1,5 @@
 """Subspace identification: poles of known systems, feedback, order, gaps, units, and an independent implementation."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Sequence
 from functools import lru_cache

@@ -1,7 +1,5 @@
 """Writes blackbox logs as a flight controller does, for tests: every encoding, main frames with predictors."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 
 

@@ -1,7 +1,5 @@
 """Contents of every real log, in numbers.  Write them anew with ``python -m tests.replay.golden``."""
 
-from __future__ import annotations
-
 import json
 import os
 import sys

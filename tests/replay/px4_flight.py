@@ -1,7 +1,5 @@
 """A simulated flight as PX4 logs it: a ULog with geometry, sensors, and motors or setpoints at full rate."""
 
-from __future__ import annotations
-
 import numpy as np
 from quadid_replay.ulog import allocation
 

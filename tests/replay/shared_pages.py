@@ -1,7 +1,5 @@
 """SQLite files whose rows share one chain of overflow pages: small, and without end for who reads them all."""
 
-from __future__ import annotations
-
 import sqlite3
 import struct
 from contextlib import closing

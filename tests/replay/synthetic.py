@@ -1,7 +1,5 @@
 """A made-up flight that obeys rigid-body kinematics exactly, sampled at any rate, for tests of readers and grids."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

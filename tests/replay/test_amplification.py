@@ -4,8 +4,6 @@ Each goes through the command, with 3 s of processor time and 400 MiB for the ch
 It is read or refused; a refusal is one line that says what was found, what is allowed and what to do.
 """
 
-from __future__ import annotations
-
 import os
 import resource
 import sqlite3

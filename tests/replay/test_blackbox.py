@@ -1,7 +1,5 @@
 """Betaflight blackbox: every encoding there and back, units and frames, damage, several logs in a file."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Messages without a stamp: between the stamped ones around them, whatever the receiver's clock does."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

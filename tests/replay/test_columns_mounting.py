@@ -1,7 +1,5 @@
 """Names of columns and the place of the IMU from the vehicle file: another CSV, the same windows."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

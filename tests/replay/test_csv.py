@@ -1,7 +1,5 @@
 """CSV of the contract: groups, Euler angles, blanks, damage, and errors that say what to do."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

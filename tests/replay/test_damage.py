@@ -1,7 +1,5 @@
 """Files cut at any byte, bytes flipped, garbage inside and behind: what is before the damage is read."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """ArduPilot DataFlash: values as pymavlink reads them, motors, ESC telemetry, reboots, damage."""
 
-from __future__ import annotations
-
 import math
 import struct
 from pathlib import Path

@@ -1,7 +1,5 @@
 """One rule for logs and live links: whether frame numbers of one id are those of one sender."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from quadid_replay.mavlink_messages import two_rows

@@ -1,7 +1,5 @@
 """Frames against textbook cases, clocks against wraps, reboots and wild stamps, columns against what cannot be used."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

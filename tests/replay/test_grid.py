@@ -1,7 +1,5 @@
 """Recordings on grids: bits kept, gaps kept apart, no lag between channels, held and instant kept distinct."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

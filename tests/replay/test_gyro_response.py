@@ -1,7 +1,5 @@
 """Gyros and attitudes that were filtered or come late are named by kinematics alone, with the error of estimates."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import replace

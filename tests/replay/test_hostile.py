@@ -4,8 +4,6 @@ A log is read in a child that may take 10 s and 4 s a MiB of processor time; wha
 refused there, which fails these tests.
 """
 
-from __future__ import annotations
-
 import struct
 from pathlib import Path
 

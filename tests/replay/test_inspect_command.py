@@ -1,7 +1,5 @@
 """`quadid inspect` as people and programs call it."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

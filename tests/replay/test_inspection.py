@@ -1,7 +1,5 @@
 """Faults that an inspection notices: wrong units, wrong frames, swapped motors, absent and slow channels, clocks."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from dataclasses import replace

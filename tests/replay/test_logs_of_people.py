@@ -1,7 +1,5 @@
 """Logs as people have them: flights with closed throttle and punches, single impossible readings, other outputs."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from dataclasses import replace

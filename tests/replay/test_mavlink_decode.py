@@ -1,7 +1,5 @@
 """Our decoder of telemetry and pymavlink's say the same of every message that is read, whole or damaged."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from random import Random
 from typing import Any

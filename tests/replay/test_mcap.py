@@ -1,7 +1,5 @@
 """MCAP: topics and presets of the stacks, stamps of several clocks, limits, damage, and readers that are not ours."""
 
-from __future__ import annotations
-
 import struct
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Any split of the messages into batches gives the same rows, bit for bit: in whole, changing and damaged logs."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any

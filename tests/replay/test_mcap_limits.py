@@ -1,7 +1,5 @@
 """MCAP made to exhaust memory, and MCAP with damaged chunks or without its end."""
 
-from __future__ import annotations
-
 import struct
 import tracemalloc
 from io import BytesIO

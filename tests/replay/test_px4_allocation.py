@@ -1,7 +1,5 @@
 """Motors at 50 Hz from the setpoints that PX4 logs, where it logs the motors themselves at 10 Hz."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The process in which logs are read: what comes out of it, its limits, and that no format can get around them."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

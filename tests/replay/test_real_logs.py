@@ -1,7 +1,5 @@
 """Every real log: the golden summary, plausible units and rates, and windows where the log allows them."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

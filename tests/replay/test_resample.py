@@ -1,7 +1,5 @@
 """Interpolation, holding, and the low-pass: no lag, known amplitude, constants and gaps respected."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

@@ -1,7 +1,5 @@
 """rosbag2 databases and folders, written by another library, are the same recording as the MCAP file."""
 
-from __future__ import annotations
-
 import shutil
 import sqlite3
 from pathlib import Path

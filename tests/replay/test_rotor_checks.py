@@ -1,7 +1,5 @@
 """Rotor signals that cannot be true are refused by name: dead, stuck, halved, against the thrust, out of time."""
 
-from __future__ import annotations
-
 import re
 import warnings
 from collections.abc import Callable

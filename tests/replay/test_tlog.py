@@ -1,7 +1,5 @@
 """Telemetry logs: our ESC messages against mavgen, wraps, reboots, several vehicles, receive time, damage."""
 
-from __future__ import annotations
-
 import importlib.util
 import struct
 from pathlib import Path

@@ -1,7 +1,5 @@
 """PX4 ULog: topics and units, motors, stamps, truncation that pyulog does not report, and formats made to explode."""
 
-from __future__ import annotations
-
 import struct
 from pathlib import Path
 

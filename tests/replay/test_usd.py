@@ -1,7 +1,5 @@
 """Crazyflie µSD logs: variables to channels, frames, two kinds under one name, mixer, and damage."""
 
-from __future__ import annotations
-
 import struct
 import zlib
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Vehicle files from logs: the airframe as the autopilot numbers it, guesses marked, the result judged in flight."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Written logs are read back: every channel, frames and all, to the precision that the format has."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """A short manoeuvre that the tests of its forms share."""
 
-from __future__ import annotations
-
 from dataclasses import asdict
 
 from quadid.flight import Segment

@@ -1,7 +1,5 @@
 """Statistics over many flights: drift and outliers are found where they are, and not where they are not."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The FMU that `export --format fmu` leads to flies as the simulator of the file does, in another program's loop."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

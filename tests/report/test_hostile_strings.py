@@ -3,8 +3,6 @@
 The vehicles and manoeuvres here are built past the checks of `Vehicle`, so that it is the escaping that is tested.
 """
 
-from __future__ import annotations
-
 import ast
 import copy
 import html.parser

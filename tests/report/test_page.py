@@ -1,7 +1,5 @@
 """The HTML page: complete in itself, safe against what a log may contain, small; its figures, maps and flight part."""
 
-from __future__ import annotations
-
 import base64
 import hashlib
 import json

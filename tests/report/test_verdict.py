@@ -1,7 +1,5 @@
 """Meaning of a result in plain words."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import pytest

@@ -1,7 +1,5 @@
 """ROS tests: wheels and messages present, a DDS domain of their own."""
 
-from __future__ import annotations
-
 import importlib.util
 import os
 import sys

@@ -1,7 +1,5 @@
 """A process of its own: publishes one latched ParameterSet on quadid/parameters and stays until it is told to go."""
 
-from __future__ import annotations
-
 import sys
 
 import rclpy

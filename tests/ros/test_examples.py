@@ -1,7 +1,5 @@
 """Examples for controllers: the shortest one in Python against a publisher; the checks of the one in C++, compiled."""
 
-from __future__ import annotations
-
 import importlib.util
 import shutil
 import subprocess

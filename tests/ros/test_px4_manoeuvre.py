@@ -3,8 +3,6 @@
 A stand-in of PX4 hovers, is switched to Offboard, and listens.
 """
 
-from __future__ import annotations
-
 import math
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """The checkout in a ROS environment: colcon workspace, quadid_msgs, and the recipe of docs/using-with-ros.md."""
 
-from __future__ import annotations
-
 import importlib.util
 import os
 import re

@@ -1,7 +1,5 @@
 """Size of the house: what is recorded holds, and no room escapes the count."""
 
-from __future__ import annotations
-
 import ast
 import json
 import tomllib

@@ -1,7 +1,5 @@
 """One mistake at a time on right logs of several vehicles: each is named by the first line, or nothing is said."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

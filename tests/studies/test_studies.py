@@ -1,7 +1,5 @@
 """Studies: pages, recorded results, peers, stand-ins and judgements keep what they promise."""
 
-from __future__ import annotations
-
 import ast
 import importlib.util
 import json

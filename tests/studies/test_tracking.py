@@ -1,7 +1,5 @@
 """The controller of the tracking study: gains, frames, and that the truth tracks what a wrong model does not."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from quadid_evaluation.studies.control import (

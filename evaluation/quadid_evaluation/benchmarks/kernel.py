@@ -5,8 +5,6 @@ residual.  Times are the best of many short runs, in rounds over all cases, sinc
 The NumPy step does the nominal model's step alone, vectorised over particles, and is checked against the kernel first.
 """
 
-from __future__ import annotations
-
 import functools
 import importlib.util
 import os

@@ -7,8 +7,6 @@ A part that is measured alone leaves the others as they are; `load` needs the RO
 number stands in `online.json`.
 """
 
-from __future__ import annotations
-
 import json
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping

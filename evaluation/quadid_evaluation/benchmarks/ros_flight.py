@@ -6,8 +6,6 @@
 The moment of publishing stands in the last number of each IMU message, a covariance that nobody reads.
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

@@ -8,8 +8,6 @@ stay.  Processor time (both cores together) stands beside wall time, the load av
 scaling, in flights of 360 s.
 """
 
-from __future__ import annotations
-
 import json
 import tempfile
 import time

@@ -1,7 +1,5 @@
 """Interleaved timing: every round runs each case once, so that a busy machine is busy for all of them."""
 
-from __future__ import annotations
-
 import json
 import os
 import platform

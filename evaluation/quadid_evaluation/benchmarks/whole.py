@@ -1,7 +1,5 @@
 """Whole commands and services: identification, diagnosis, refits, logs, reports, start-up, scaling."""
 
-from __future__ import annotations
-
 import os
 import pickle
 import tempfile

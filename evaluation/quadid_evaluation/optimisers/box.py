@@ -3,8 +3,6 @@
 Coordinates are logarithms of the free parameters.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -4,8 +4,6 @@ Optimisers count in their own ways: some leave out finite differences, some over
 one evaluation is one simulation of one parameter vector, whoever asks for it and whatever for.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 

@@ -7,8 +7,6 @@ Source: Tanabe & Fukunaga, "Improving the search performance of SHADE using line
 doi:10.1109/CEC.2014.6900380.  Equation and algorithm numbers below are that paper's.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field
 from enum import StrEnum

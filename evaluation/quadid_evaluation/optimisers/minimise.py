@@ -4,8 +4,6 @@ The solvers are scipy's and pycma's, and this package's own swarm and L-SHADE; h
 unit box, start from (or include) the same point, and report the best point they ever evaluated.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ Rotor speeds squared in, nine measurements out.  No physics is put in but that t
 the rotor speed, Eqs. (3)-(4) of the paper; the subspace method finds a linear relation about the mean of the data.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple
 

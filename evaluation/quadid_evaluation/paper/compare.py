@@ -4,8 +4,6 @@ Optimisers all minimise one objective in one box from one start, and may spend o
 seeds.  Subspace models are fitted to the same windows.  Whatever found it, a model is scored as every other.
 """
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Sequence

@@ -3,8 +3,6 @@
 As Markdown, and as what `quadid.report.page.render` shows.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Any

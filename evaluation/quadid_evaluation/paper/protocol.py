@@ -1,7 +1,5 @@
 """Computation of `quadid reproduce`: the paper's flights, every column of its tables, and what it lacks."""
 
-from __future__ import annotations
-
 import datetime
 import time
 from collections.abc import Mapping

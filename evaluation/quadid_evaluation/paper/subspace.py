@@ -13,8 +13,6 @@ inputs is taken out:
   Qin (2006, doi:10.1016/j.compchemeng.2006.05.045).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple

@@ -1,7 +1,5 @@
 """Errors of predictions on logs, beside those of predicting that nothing changes."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -7,8 +7,6 @@ faults that the checks of a window find (stuck, frame, motor order), every secon
 session asks three seconds after the change.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections import Counter
 from collections.abc import Iterator

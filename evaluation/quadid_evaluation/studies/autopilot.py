@@ -5,8 +5,6 @@
 Words choose the flights whose name holds one of them; `--live` plays telemetry logs into `quadid serve` in real time.
 """
 
-from __future__ import annotations
-
 import json
 import socket
 import subprocess

@@ -7,8 +7,6 @@ Files are those of `diagnose` on the training flights of `quadid_evaluation.stud
 flights; sets without another flight are left out.
 """
 
-from __future__ import annotations
-
 import sys
 import time
 from collections.abc import Sequence

@@ -6,8 +6,6 @@ Every case is decided by its class and number alone.  The diagnosis gets windows
 what was hidden never reaches it.
 """
 
-from __future__ import annotations
-
 import datetime
 import json
 import multiprocessing

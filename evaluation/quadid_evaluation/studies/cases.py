@@ -3,8 +3,6 @@
 QUADID_DATA=../shared/data python -m quadid_evaluation.studies.cases
 """
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -5,8 +5,6 @@
 Faults go by row of the list in `tests/faults/fault_list.py`: each does its harm, and returns what it did.
 """
 
-from __future__ import annotations
-
 import contextlib
 import math
 import os

@@ -16,8 +16,6 @@ The weights are the same for all; what differs are mass, b, d, inertias and, whe
 Kumar, doi:10.1109/ICRA.2011.5980409; Lee, Leok and McClamroch, doi:10.1109/CDC.2010.5717652.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import NamedTuple
 

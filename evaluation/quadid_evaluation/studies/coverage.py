@@ -4,8 +4,6 @@ python -m quadid_evaluation.studies.coverage --out docs/results        (after `c
 make coverage)
 """
 
-from __future__ import annotations
-
 import ast
 import json
 import sys

@@ -8,8 +8,6 @@ one in which he moves all sticks.  Both minutes together are identified each tim
 more: that minute by itself is forecast with what the first two told, and identified.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -3,8 +3,6 @@
 `made` inputs are made here of those of the folder, as their notes describe; nothing of the folder is changed.
 """
 
-from __future__ import annotations
-
 import ast
 import csv
 import json

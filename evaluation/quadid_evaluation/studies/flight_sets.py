@@ -1,7 +1,5 @@
 """The data sets: vehicle file, training and unseen flights, and what is known of the truth."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """`make foreign`: what is answered on vehicles of others, beside their truth and a regression."""
 
-from __future__ import annotations
-
 import dataclasses
 import datetime
 import json

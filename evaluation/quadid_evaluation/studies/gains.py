@@ -8,8 +8,6 @@ with places of rotors in place of the autopilot's tables, and close the loop aro
 the controller's output, and to the rate asked for, give the open loops as they are; steps give bandwidth and overshoot.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator, Mapping
 from functools import cache

@@ -4,8 +4,6 @@ Every log is right as it is.  One thing is made wrong at a time: axes, signs, un
 cell is `right` where the first line names the mistake, `silent` where nothing is said, else it is the wrong line.
 """
 
-from __future__ import annotations
-
 import re
 import sys
 from collections.abc import Callable, Iterator, Sequence

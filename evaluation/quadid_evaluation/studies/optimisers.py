@@ -9,8 +9,6 @@ clips at a speed to be found: two more parameters, of which one has no gradient 
 rotors saturate.
 """
 
-from __future__ import annotations
-
 import copy
 import time
 from dataclasses import dataclass

@@ -5,8 +5,6 @@
 A run goes on where the last one stopped after `--minutes`; `--fresh` forgets what earlier runs have flown.
 """
 
-from __future__ import annotations
-
 import copy
 import json
 import os

@@ -5,8 +5,6 @@
 prints what snapshots of the loop's output (RATE.ROut and POut at 400 Hz of x.bin and quad_sq.bin) make of slow torque.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -5,8 +5,6 @@ Told are the largest backlog of the status and the errors of the sets on the par
 are built with the fields that the node reads (cmake, a compiler).
 """
 
-from __future__ import annotations
-
 import math
 import os
 import shutil

@@ -3,8 +3,6 @@
 RotorPy flies in FLU and a world with z up; logs are FRD and NED.
 """
 
-from __future__ import annotations
-
 import copy
 from dataclasses import dataclass
 from typing import Any

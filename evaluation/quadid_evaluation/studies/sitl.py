@@ -12,8 +12,6 @@ alarm is false.  Without a binary the study says so and does nothing.  `--frame`
 the file is copied into the folder that the binary runs in.
 """
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 import sys

@@ -4,8 +4,6 @@ python -m quadid_evaluation.studies.soak --out docs/results
 python -m quadid_evaluation.studies.soak --parts live --seconds 3600 --out docs/results
 """
 
-from __future__ import annotations
-
 import tempfile
 import time
 from collections.abc import Callable, Mapping

@@ -7,8 +7,6 @@ example, sampled at 10 Hz; an unstable plant under the controller that keeps it.
 500 s under the stabiliser, the first fitted, all scored as the physical model is.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

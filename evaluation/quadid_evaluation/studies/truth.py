@@ -7,8 +7,6 @@ Each seed is a new individual Pelican, a new 60 s flight with all axes moving, a
 run alone replaces its own section of the page and leaves the others.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 

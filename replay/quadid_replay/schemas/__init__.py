@@ -4,8 +4,6 @@
 `msgs/msg`.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from functools import lru_cache

@@ -7,8 +7,6 @@ Parts: exact and gusty simulated flights, guesses far off, a loop faster than it
 recorded vehicles, speed.  A part that is run alone replaces its own section of the page and leaves the others.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path

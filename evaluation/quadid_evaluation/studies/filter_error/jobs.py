@@ -1,7 +1,5 @@
 """One flight each, as worker processes run them."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Sequence
 from dataclasses import replace

@@ -4,8 +4,6 @@ Rotation only, at hover thrust.  The stabiliser reads a noisy gyro and an attitu
 log holds every tenth gyro reading and attitude, the mean of force and commands since, and noise on the speeds.
 """
 
-from __future__ import annotations
-
 import numba as nb
 import numpy as np
 

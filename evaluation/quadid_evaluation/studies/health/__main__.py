@@ -3,8 +3,6 @@
 python -m quadid_evaluation.studies.health --out docs/results [--parts recorded command fleet simulated]
 """
 
-from __future__ import annotations
-
 from functools import cache
 from pathlib import Path
 

@@ -4,8 +4,6 @@ From flight to flight every rotor's thrust differs (propellers, motors), the bat
 differently; within a flight the battery empties, gusts come and go.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from typing import NamedTuple
 

@@ -3,8 +3,6 @@
 python -m quadid_evaluation.studies.health.hours --hours 100 --out docs/results
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 

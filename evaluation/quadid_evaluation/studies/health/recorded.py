@@ -1,7 +1,5 @@
 """The recorded flights: 155 of two Crazyflies with cut propellers, tape and weights; by library, command and fleet."""
 
-from __future__ import annotations
-
 import csv
 import json
 import os

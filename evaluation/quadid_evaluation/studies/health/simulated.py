@@ -4,8 +4,6 @@ One flies the vehicle in closed loop (`quadid.flight`), the other solves the bal
 (`quadid_evaluation.studies.health.flights`); neither shares an equation with the other or with the comparison.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import NamedTuple

@@ -6,8 +6,6 @@ checkout: make mutation)
 Judgements stand in `judged.yaml` beside this file, by function and changed line, so that they outlive the next run.
 """
 
-from __future__ import annotations
-
 import json
 import re
 import time

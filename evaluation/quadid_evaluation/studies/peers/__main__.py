@@ -4,8 +4,6 @@
 repeats its simulated flights.
 """
 
-from __future__ import annotations
-
 import json
 from importlib.metadata import version
 from itertools import product

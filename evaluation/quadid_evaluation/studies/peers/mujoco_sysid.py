@@ -5,8 +5,6 @@ J_r, driven by the measured rotor speeds and, for the last, rates.  The world is
 +z.  Chunks of a second begin in the measured attitude and rate; residuals are divided by the sensors' noise.
 """
 
-from __future__ import annotations
-
 import contextlib
 import io
 import time

@@ -5,8 +5,6 @@ measured rotor speeds, random walks of the logarithms; measured are the gyro and
 those of filterpy.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial

@@ -6,8 +6,6 @@ the gyro on the moments; yaw from one coefficient on the thrusts.  The grid of l
 are the authors' kind; the code is ours.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """Vehicles of others: `mujoco.sysid` and we on the same logs, beside the truth that came with them."""
 
-from __future__ import annotations
-
 import tempfile
 import time
 from collections.abc import Callable, Mapping

@@ -1,7 +1,5 @@
 """Simulated flights with known truth, estimated by others and by us: errors, coverage, unseen flights, time."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
