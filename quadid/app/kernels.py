@@ -148,7 +148,7 @@ PARTS = {
     "estimate": Part(
         _estimate, tuple(f"estimate.kalman:{name}" for name in ("moments", "filter_pass", "replay", "backward")), 30
     ),
-    "flight": Part(_flight, ("flight.march:march",), 30),
+    "flight": Part(_flight, ("flight.fly:march",), 30),
 }
 """Kernels of an identification or a diagnosis, in three parts, and the flown vehicle of `quadid simulate`."""
 FIT = ("simulation", "closed loop", "estimate")

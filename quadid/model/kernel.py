@@ -130,7 +130,7 @@ def needs_of(theta: FloatArray, rotors: int, channels: int) -> Needs:
 # --- The hot kernel: one step of the rigid body for many parameter vectors ("lanes") at once
 #
 # Lanes are the innermost, fixed-length axis, so that the compiler turns each lane loop into SIMD instructions: no
-# trigonometry in the loops, no allocation, no branch that depends on a lane.  Where each row lies: `model.work_array`.
+# trigonometry in the loops, no allocation, no branch that depends on a lane.  Where each row lies: `model.simd`.
 #
 # Integration: forces and moments are taken linear in time over the step with the rotors' half-step means
 # (`quadid.model.rotor_kernel`), and attitude, rate and velocity are integrated with the classical Runge-Kutta rule.
