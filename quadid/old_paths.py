@@ -106,7 +106,7 @@ MOVED = {
     "quadid.app.options": "quadid_cli.options",
     "quadid.app.excite": "quadid_cli.excite",
     "quadid.app.init": "quadid_replay.vehicle_from_log",
-    "quadid.cli.demo": "quadid.app.demo",
+    "quadid.cli.demo": "quadid.app.demo quadid.cli.reproduce",
     "quadid.identification.fit": "quadid.identify.global_search quadid.identification.search "
     "quadid.identify.noise_spectrum quadid.identify.noise_estimation quadid.identification.noise_fit",
     "quadid.identification.controller_gains": "quadid.identification.paper_objective",
@@ -121,6 +121,7 @@ MOVED = {
     "quadid.files": "quadid.working_folder",
     "quadid.app.score": "quadid.app.compare_vehicles",
     "quadid.cli.main": "quadid.cli.loading",
+    "quadid.report.verdict": "quadid.report.tables",
 }
 """Old modules of each new one."""
 _NEW = {old: new for new, olds in MOVED.items() for old in olds.split()}

@@ -1,7 +1,5 @@
 """Identified parameters: names, units, values, bounds, covariance and status."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -126,11 +124,11 @@ class ParameterSet:
             raise ParameterError(f"covariance of shape {self.covariance.shape}", f"shape ({n}, {n})")
         self.covariance.setflags(write=False)
 
-    def unreliable(self, names: Sequence[str]) -> ParameterSet:
+    def unreliable(self, names: Sequence[str]) -> "ParameterSet":
         """The same, with the identified ones of `names` marked unreliable."""
         return ParameterSet(unreliable(self.parameters, names), np.array(self.covariance))
 
-    def scaled_together(self, sigma: float, factor: float = 1.0, but: Collection[str] = ()) -> ParameterSet:
+    def scaled_together(self, sigma: float, factor: float = 1.0, but: Collection[str] = ()) -> "ParameterSet":
         """The same times one factor, known to `sigma` (log scale), on all that the data determine but those named."""
         fixed = [p.status is Status.PRIOR_DOMINATED or p.name in but for p in self.parameters]
         scaled = (p if stays else _scaled(p, factor, sigma) for p, stays in zip(self.parameters, fixed, strict=True))

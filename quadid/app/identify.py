@@ -23,8 +23,7 @@ from quadid.errors import ParameterError, nearest
 from quadid.model.layout import Layout, with_reference_voltage
 from quadid.parameters import NOMINAL_NAMES, ParameterSet
 from quadid.report.page import render
-from quadid.report.tables import Cell, Column, TextTable, number, parameter_table
-from quadid.report.verdict import Verdict, identify_verdict
+from quadid.report.verdict import Cell, Column, TextTable, Verdict, identify_verdict, number, parameter_table
 from quadid.sanitise import LONGEST_LINE, plain
 from quadid.types import FloatArray
 from quadid.vehicle import Proof, Vehicle

@@ -1,7 +1,5 @@
 """Checks of units and frames, by physics: gravity, gyro, attitude, velocity and position against each other."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import replace
@@ -198,7 +196,7 @@ def _attitude_explains(accel: Channel, attitude: Channel | None, inside: BoolArr
     return bool(np.linalg.norm(world + [0.0, 0.0, GRAVITY]) < 0.3 * GRAVITY)
 
 
-def attitude_check(recording: Recording, found: Response | None) -> Check:
+def attitude_check(recording: Recording, found: "Response | None") -> Check:
     """Attitude against gyro (axes, signs, degrees for radians) and against gravity (a world with z down).
 
     Args:
@@ -254,7 +252,7 @@ def attitude_check(recording: Recording, found: Response | None) -> Check:
     )
 
 
-def gyro_check(recording: Recording, found: Response | None = None) -> Check:
+def gyro_check(recording: Recording, found: "Response | None" = None) -> Check:
     """Gyro against differentiated attitude: axes, signs and scale (degrees for radians); `found` is of `response`."""
     gyro, attitude = recording.channels.get("gyro"), recording.channels.get("attitude")
     if gyro is None or attitude is None or min(len(gyro.t), len(attitude.t)) < 20:

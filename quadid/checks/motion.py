@@ -1,7 +1,5 @@
 """Times of flight, facts of channels, checks of their timing and resolution; turns by gyro and attitude."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -439,7 +437,7 @@ class Turns(NamedTuple):
     over: float
 
     @classmethod
-    def of(cls, gyro: FloatArray, q: FloatArray, step: float, over: float = TURN) -> Turns:
+    def of(cls, gyro: FloatArray, q: FloatArray, step: float, over: float = TURN) -> "Turns":
         """Changes of turn of rates (n, 3) [rad/s] and attitudes (n, 4), `step` [s] apart; rows of NaN are left out."""
         long = max(round(over / step), 1)
         # A turn from every row: readings in step with the sticks would put all others at one phase of their motion.

@@ -1,7 +1,5 @@
 """Checks of rotor signals, mass and geometry against each other and the motion."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import replace
@@ -687,7 +685,7 @@ class Lagged(NamedTuple):
     slow: Rows
 
 
-def motor_order_check(lagged: Lagged | str, vehicle: Vehicle, other: Other | None) -> Check:
+def motor_order_check(lagged: Lagged | str, vehicle: Vehicle, other: "Other | None") -> Check:
     """Correlates roll, pitch and yaw torque with angular acceleration.
 
     Args:
@@ -871,7 +869,7 @@ class _Gram(NamedTuple):
     power: FloatArray
 
     @classmethod
-    def of(cls, rows: Rows) -> _Gram:
+    def of(cls, rows: Rows) -> "_Gram":
         """Products of one lag's rows."""
         thrust, motion, _ = rows
         return cls(thrust.T @ thrust, thrust.T @ motion, np.sum(motion**2, axis=0))

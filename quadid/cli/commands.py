@@ -131,7 +131,7 @@ COMMANDS = {
     "reproduce": Command(
         "Reproduce the paper's tables and figures.",
         ("quadid reproduce --out reproduce-out",),
-        "quadid.cli.reproduce:reproduce",
+        "quadid.cli.demo:reproduce",
     ),
     "replay": Command(
         "Show what the online service would have published for a log.",

@@ -1,7 +1,5 @@
 """Trims of flights: how the rotors share the load when nothing is commanded, and the spread of healthy flights."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
@@ -247,7 +245,7 @@ class Healthy(NamedTuple):
         """Standard deviation of the mean of `flights` new healthy flights from `mean`, shape (4,)."""
         return np.asarray(self.deviation * np.sqrt(1.0 / flights + 1.0 / self.flights))
 
-    def known_from(self, flights: int) -> Healthy:
+    def known_from(self, flights: int) -> "Healthy":
         """The same trim and spread as so many baseline flights would show them."""
         return self._replace(flights=flights, freedom=_freedom(flights))
 

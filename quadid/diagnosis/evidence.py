@@ -1,7 +1,5 @@
 """Evidence: what a move of the search promises, which model is better, which numbers are possible, gain elsewhere."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
@@ -365,7 +363,7 @@ class Everything:
     place: dict[str, int]
 
     @classmethod
-    def of(cls, shooting: Shooting, model: Model, listed: Sequence[Candidate]) -> Everything:
+    def of(cls, shooting: Shooting, model: Model, listed: Sequence[Candidate]) -> "Everything":
         """Linearises `model` with all of `listed` free, but for refinements of what it has not."""
         there = {c.label for c in model.causes}
         some = [c for c in listed if not c.refines or c.requires in there]

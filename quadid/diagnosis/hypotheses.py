@@ -1,7 +1,5 @@
 """Hypotheses of a diagnosis: causes that may be named, models with them, deviance on blocks of data not fitted."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -54,14 +52,14 @@ class Candidate:
     timed: int | None = None
     label: str = field(default="")
     refines: bool = False
-    split: tuple[Candidate, ...] = ()
+    split: "tuple[Candidate, ...]" = ()
 
     @property
     def family(self) -> str:
         """Look-alikes; when one of a family is short-listed all of it is refitted."""
         return EFFECTS[self.effect].family
 
-    def carries(self, other: Candidate) -> bool:
+    def carries(self, other: "Candidate") -> bool:
         """Checks whether `other` can only be in a model that has this one; a refinement carries nothing."""
         return not self.refines and other.requires in (self.effect, self.label)
 

@@ -4,8 +4,6 @@ Within one step the order is that of a real autopilot: sensors are read, the sta
 Whatever is logged at an instant is therefore the value just before the command of that instant acts.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -388,7 +386,7 @@ class SensorNoise:
     position: float = 0.02
     battery: float = 0.02
 
-    def scaled(self, factor: float) -> SensorNoise:
+    def scaled(self, factor: float) -> "SensorNoise":
         """Returns the same noise `factor` times as large."""
         return SensorNoise(
             **{name: value if name == "attitude_time" else value * factor for name, value in vars(self).items()}

@@ -1,7 +1,5 @@
 """Pilot of the flown vehicle: stick movements, stabiliser, and what keeps the vehicle in its box."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import cache
@@ -246,7 +244,7 @@ class Segment:
             raise ParameterError(f"{self.axis} amplitude {self.amplitude:g}", f"at most {limit:g}")
 
     @classmethod
-    def from_mapping(cls, data: Mapping[str, object]) -> Segment:
+    def from_mapping(cls, data: Mapping[str, object]) -> "Segment":
         """Builds a segment from one entry of a manoeuvre file; raises ParameterError naming a wrong key."""
         known = {f.name: f for f in fields(cls)}
         values: dict[str, str | float] = {}

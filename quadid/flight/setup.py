@@ -1,7 +1,5 @@
 """Preparation of a flight: true numbers, drawn effects, and everything a flight is made of."""
 
-from __future__ import annotations
-
 import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -55,7 +53,7 @@ class TruthParameters:
                 raise ParameterError(f"{name} = {value:g}", "a positive finite number")
 
     @classmethod
-    def of(cls, vehicle: Vehicle) -> TruthParameters:
+    def of(cls, vehicle: Vehicle) -> "TruthParameters":
         """Returns the type's truth: Table 2 for a Pelican, else the initial values of the vehicle file."""
         values = TABLE_2 if vehicle.name in PELICANS else {n: vehicle.parameters[n].initial for n in NOMINAL_NAMES}
         return cls(**values, mass=vehicle.mass)

@@ -1,7 +1,5 @@
 """Scores of parameter vectors on sets, and results as plain dictionaries."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -132,7 +130,7 @@ class Tally:
     samples: FloatArray
     ran_away: bool
 
-    def __add__(self, other: Tally) -> Tally:
+    def __add__(self, other: "Tally") -> "Tally":
         return Tally(
             self.squares + other.squares,
             self.expected + other.expected,

@@ -1,7 +1,5 @@
 """Uncertainty of a fit: intervals and status, consistency of estimates, and what a flight can reveal at all."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -79,14 +77,14 @@ class Uncertainty:
         """Standard deviation of each scaled parameter without what estimates differ by, shape (P,)."""
         return self.sigma if self.grown is None else self.sigma / self.grown
 
-    def differing(self, steps: Sequence[FloatArray]) -> Uncertainty:
+    def differing(self, steps: Sequence[FloatArray]) -> "Uncertainty":
         """Intervals that hold other estimates too, which lie `steps` away, each of shape (P,); they count as spread."""
         if not steps:
             return self
         farthest = np.max(np.abs(steps), axis=0)
         return self.widened(farthest, farthest)
 
-    def widened(self, by: FloatArray, spread: FloatArray) -> Uncertainty:
+    def widened(self, by: FloatArray, spread: FloatArray) -> "Uncertainty":
         """With standard deviations `by` added, and `spread` to what has to stay below its limit, both shape (P,)."""
         grow = np.hypot(1.0, by / np.maximum(self.sigma, 1e-300))
         grown = grow if self.grown is None else grow * self.grown

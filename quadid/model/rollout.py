@@ -1,7 +1,5 @@
 """Simulation of windows: segments, initial states, many parameter vectors at once."""
 
-from __future__ import annotations
-
 import itertools
 import math
 import os
@@ -97,7 +95,7 @@ class Segments:
     starts: IntArray
 
     @classmethod
-    def cut(cls, rows: int, length: int, lead: int = 1) -> Segments:
+    def cut(cls, rows: int, length: int, lead: int = 1) -> "Segments":
         """Cuts `rows` rows into back-to-back segments of `length`, leaving `lead` rows before the first.
 
         Raises:
@@ -113,7 +111,7 @@ class Segments:
         """Scored rows of each segment, shape (segments, length)."""
         return self.starts[:, None] + np.arange(self.length)
 
-    def at(self, places: IndexArray) -> Segments:
+    def at(self, places: IndexArray) -> "Segments":
         """Returns the segments at `places`."""
         return Segments(self.length, self.lead, self.starts[places])
 

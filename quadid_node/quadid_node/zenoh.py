@@ -1,7 +1,5 @@
 """Zenoh: sessions, results of one vehicle, what is known of all, and fits on a ground machine."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import queue
@@ -620,7 +618,7 @@ class RemoteWorker:
         told, self._told = self._told, []
         return [*out, *told]
 
-    def sibling(self) -> RemoteWorker:
+    def sibling(self) -> "RemoteWorker":
         """Another one, for diagnoses, on the same way to the ground."""
         return RemoteWorker(self._local.sibling(), self._ground, self._clock)
 

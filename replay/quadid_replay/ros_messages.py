@@ -1,7 +1,5 @@
 """ROS 2 messages: topics, numbers of each type, and the signals in them."""
 
-from __future__ import annotations
-
 import re
 import struct
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -47,7 +45,7 @@ class MessageReader:
         decode: the library's decoder: bytes to message.
     """
 
-    def __init__(self, kind: MessageType, decode: Callable[[bytes], Any]) -> None:
+    def __init__(self, kind: "MessageType", decode: Callable[[bytes], Any]) -> None:
         self._kind, self._decode = kind, decode
         self._layout: np.dtype[np.void] | None = None
         self._same: list[tuple[int, int, bytes]] = []
@@ -83,7 +81,7 @@ class MessageReader:
             self._learn(messages[-1], each[-1], extras[0])
         return Read(ns, [np.array(run, dtype=np.float64) for run in zip(*each, strict=True)], extras[0])
 
-    def _learn(self, data: bytes, runs: Runs, extra: Any) -> None:
+    def _learn(self, data: bytes, runs: "Runs", extra: Any) -> None:
         self._layout = None
         if data[:2] != _LITTLE_ENDIAN:
             return

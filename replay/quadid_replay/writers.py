@@ -1,7 +1,5 @@
 """Writers of recordings: MCAP, CSV, MAVLink telemetry."""
 
-from __future__ import annotations
-
 import math
 import struct
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -210,7 +208,7 @@ class TopicWriter:
             self._schemas[kind] = self._writer.register_schema(kind, "ros2msg", text.encode())
         return self._schemas[kind]
 
-    def __enter__(self) -> TopicWriter:
+    def __enter__(self) -> "TopicWriter":
         return self
 
     def __exit__(

@@ -9,7 +9,7 @@ from matplotlib import rc_context
 from quadid_evaluation.paper.page import PAPER_GAIN, PAPER_MSE
 from quadid_evaluation.paper.protocol import Plan, reproduce
 
-from quadid.cli.reproduce import write
+from quadid.cli.demo import write
 from quadid.jsonable import jsonable
 from quadid.parameters import NOMINAL_NAMES
 

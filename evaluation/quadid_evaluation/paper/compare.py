@@ -18,7 +18,7 @@ from quadid.app.options import Logs, OfVehicle, Seed, Typed, Validate
 from quadid.app.outcome import Advance, Outcome, silent
 from quadid.errors import NotIdentifiableError, ParameterError, QuadidError, nearest
 from quadid.parameters import NOMINAL_NAMES
-from quadid.report.tables import Cell, Column, TextTable, number
+from quadid.report.verdict import Cell, Column, TextTable, number
 from quadid.types import JsonDict
 from quadid_evaluation.optimisers.minimise import NAMES, Result, minimise
 from quadid_evaluation.paper.subspace import METHODS as BLACK_BOXES
