@@ -1,4 +1,4 @@
-"""Files of users: opened without waiting for a pipe that nobody writes or reads, and written whole or not at all."""
+"""Files and folders of users: nobody waits for a pipe, files are written whole, nothing in a folder is run."""
 
 import contextlib
 import errno

@@ -1,4 +1,4 @@
-"""Open-loop prediction error of a vehicle on logs."""
+"""Open-loop prediction error of a vehicle on logs, and of two vehicles beside each other."""
 
 import math
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""Help for the compiler: full-width vectors and aligned memory for kernels whose innermost loop runs over lanes."""
+"""Kernels whose innermost loop runs over lanes: full-width vectors, aligned memory, places in the work array."""
 
 import math
 from collections.abc import Callable
