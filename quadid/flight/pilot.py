@@ -158,17 +158,14 @@ def _yaw(rng: np.random.Generator, n: int) -> FloatArray:
     return np.asarray(np.cumsum(np.clip(rate, -1.2, 1.2)) * PILOT_STEP)
 
 
+def _collective(rng: np.random.Generator, n: int) -> FloatArray:
+    a, b = rng.spawn(2)
+    return band_noise(a, n, 0.15, 1.8, 0.09) + doublets(b, n, 11.0, (0.3, 0.7), 0.13)
+
+
 def excited(rng: np.random.Generator, n: int) -> FloatArray:
     """All four axes moving together: filtered noise and doublets, tilt references mostly within 25 degrees."""
-    a, b = rng.spawn(2)
-    return np.column_stack(
-        [
-            _tilt(rng, n),
-            _tilt(rng, n),
-            _yaw(rng, n),
-            (band_noise(a, n, 0.15, 1.8, 0.09) + doublets(b, n, 11.0, (0.3, 0.7), 0.13)),
-        ]
-    )
+    return np.column_stack([_tilt(rng, n), _tilt(rng, n), _yaw(rng, n), _collective(rng, n)])
 
 
 def gentle(rng: np.random.Generator, n: int) -> FloatArray:
