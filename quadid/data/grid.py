@@ -8,7 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from quadid.data.rotor_signal import RotorSignal, follow_feedback, rotor_signal
+from quadid.data.intersample import follow_feedback
+from quadid.data.rotor_signal import RotorSignal, rotor_signal
 from quadid.data.window import (
     COINCIDENT,
     Recording,

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from quadid.data.rotor_signal import find_feedback, follow_feedback
+from quadid.data.intersample import find_feedback, follow_feedback
 from quadid.data.window import Window
 from quadid.errors import WindowError
 from quadid.flight import fly
