@@ -109,7 +109,7 @@ class ChangeRequest(Job):
         # 1. Half seconds on either side of the one around the change, which belongs to neither.
         before, after = _chunks(self)
         if len(before) < _FEWEST or len(after) < AFTER:
-            return ChangeReply(self.number, "too little data before or after the change", carried(self))
+            return ChangeReply(self.number, "too little data before or after the change", _carried(self))
         # 2. What is left after the change of what was learned before it, with its covariance, by channel.
         b = self.vehicle.mass * float(np.median(np.exp([c.thrust for c in before])))
         channels = [_Left(series, len(before)) for series in _series(self, [*before, *after], b)]
@@ -135,11 +135,11 @@ class ChangeRequest(Job):
         )
         # 4. The most probable one, unless it is that nothing has changed.
         if ranked[0][1].cause.effect == NOTHING:
-            return ChangeReply(self.number, "no known cause explains it", carried(self))
+            return ChangeReply(self.number, "no known cause explains it", _carried(self))
         return ChangeReply(self.number, finding=_finding(self, ranked, len(groups)))
 
 
-def carried(request: ChangeRequest) -> OnlineFinding | None:
+def _carried(request: ChangeRequest) -> OnlineFinding | None:
     """Finding for a step of thrust where no cause explains it: a force; None for a step of a moment."""
     change = request.change
     if change.channel != "thrust":
@@ -326,13 +326,18 @@ def _causes(request: ChangeRequest, after: Sequence[Chunk], b: float) -> list[_C
         centre[0] = mean
         out.append(_Cause(effect, 0, effects, np.diag(np.square(deviation)), centre, _ODDS[effect] * part))
 
+    # What a thrust does to the motion goes by b / J, and a torque by d / J_zz, which may be mere guesses.
+    unsure = np.hypot(sigma[[0, 0, 1]], sigma[2:5])
     for k in range(rotors):
-        thrust = -square[:, k] / square.sum(axis=1), -each[0, :, k], -each[1, :, k], none
-        effects = columns(thrust, (none, none, none, -each[2, :, k]))
+        lift_lost = -square[:, k] / square.sum(axis=1)
+        turned = [[none, *(-each[a, :, k] if a == axis else none for a in range(3))] for axis in range(3)]
+        thrust = lift_lost, -each[0, :, k], -each[1, :, k], none
+        effects = columns(thrust, *(tuple(turned[axis]) for axis in (2, 0, 1)))
         for apart, part in DRAG_APART:
-            drag = math.hypot(apart, LOSS * math.hypot(sigma[1], sigma[4]))  # d / J_zz may be a mere guess
-            prior = LOSS**2 + np.diag([0.0, drag**2])
-            out.append(_Cause("weak_rotor", k + 1, effects, prior, np.zeros(2), _ODDS["weak_rotor"] * part / rotors))
+            own = np.square([0.0, math.hypot(apart, LOSS * unsure[2]), *(LOSS * unsure[:2])])
+            prior = np.diag(own)
+            prior[:2, :2] += LOSS**2
+            out.append(_Cause("weak_rotor", k + 1, effects, prior, np.zeros(4), _ODDS["weak_rotor"] * part / rotors))
     add("cg_offset", columns(*shift), [SHIFT * vehicle.arm] * 2)
     add("thrust_drop", columns((flat, *(-whole))), [_SIZE])
     add(PULL, columns((-1.0 / lift, none, none, none, power / lift)), [_SIZE * GRAVITY])
@@ -387,8 +392,10 @@ def _finding(request: ChangeRequest, ranked: Sequence[tuple[float, _Explained]],
         f"{seen.channel} stepped by {seen.size:+.1%} ({seen.errors:.0f} standard errors) at {request.time:.1f} s; "
         f"residual {nothing.left:.2f} falls to {best.left:.2f} with {best.cause.effect}, which is {share:.0%} probable"
     )
-    if values.get("loss", 0.0) < 0.0:
-        text += f"; rotor {values['rotor']:.0f} gives {-values['loss']:.0%} more than before: it has recovered"
+    if "loss" in values:
+        gone = values["loss"]
+        text += f"; rotor {values['rotor']:.0f} gives {abs(gone):.0%} {'less' if gone > 0.0 else 'more'} than before"
+        text += ": it has recovered" * (gone < 0.0)
     if seen.channel == "thrust":
         text += f" ({np.expm1(-seen.size) * request.vehicle.mass * GRAVITY:+.2f} N to hold the vehicle up)"
     return OnlineFinding(

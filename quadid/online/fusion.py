@@ -505,6 +505,10 @@ class Estimator:
         self._enough = self._enough or 2.0 * self.fusion.flown
         fused = self.fusion.estimate()
         assert fused is not None
+        if fused.sigma[B] >= self._prior_sigma[B]:
+            # Less sure than the guess, which it contains: linear in a point that too little motion showed.
+            self.forget()
+            return
         self._z = reply.estimates[-1].z
         self.theta = self._free.placed(reply.theta, fused.z[:SIX])
         self.left_out = self._beyond_b()

@@ -31,7 +31,6 @@ from quadid.online.change_job import (
     ChangeReply,
     ChangeRequest,
     ChangeWatch,
-    carried,
 )
 from quadid.online.changes import BASELINE, LEAST, ChangePoint
 from quadid.online.checks import LEAD, Consistency, GridBuffer, Quality, Rows, WindowCut, judge, mistake
@@ -376,8 +375,6 @@ class Session:
         self._wait_for(request)
         if not request.windows:
             self._reply = request.failed("too little data after the change")
-        elif not self._estimator.learned:
-            self._reply = ChangeReply(request.number, finding=carried(request))
         else:
             self._outbox.act(request)
 
@@ -494,6 +491,7 @@ class Session:
         sets, outbox, estimator = self.active_set, self._outbox, self._estimator
         parameters = estimator.parameters(self.settings.gate.yaw_width)
         if parameters is None:
+            outbox.state(Phase.CANDIDATE, "thrust is known no better than by the vehicle file: keep flying")
             return
         scale, mass, loaded = self._diagnosis.wrong_scale, estimator.vehicle.mass, ""
         if abs(math.log(sets.load)) > LEAST:
