@@ -9,7 +9,7 @@ from quadid_node.service import PATIENCE, Service
 from quadid_node.worker import InlineWorker, Trouble
 
 from quadid.online import FitRequest
-from quadid.online.records import Event, Job, JobReply, Publish
+from quadid.online.records import Event, Job, JobReply, OnlineDiagnosis, Publish
 from tests.faults.evidence import Happened
 from tests.online.made_up import DROPPED, PELICAN, QUICK, light_flight, tells
 from tests.samples import Sample
@@ -149,6 +149,8 @@ def test_a_change_is_seen_and_the_set_withdrawn_while_fits_take_for_ever(seconds
     assert NOW[0] < 14.3 + 8.0
     assert service.session.active_set.in_force is not None
     assert service.session.active_set.in_force.outdated
+    named = [f.effect for o in out if isinstance(o, OnlineDiagnosis) for f in o.findings]
+    assert named in (["thrust_drop"], ["mass_change"]), "what it was needs no fit"
     happened(11, f"thrust lost at 14.3 s while fits take {seconds:g} s: set marked out of date at {NOW[0]:.1f} s")
 
 

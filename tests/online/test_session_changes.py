@@ -145,7 +145,7 @@ def test_a_change_of_a_vehicle_that_is_not_known_yet_is_explained_by_guesses() -
     (finding,) = told.findings
     assert (finding.effect, told.verdict) == ("thrust_drop", "unknown")
     assert "mass_change" in {one.effect for one in finding.alternatives}
-    assert finding.values["fraction"] == pytest.approx(0.15, rel=0.1)
+    assert finding.values["fraction"] == pytest.approx(0.15, abs=0.02)
 
 
 def studies(actions: list[Action]) -> list[DiagnosisRequest]:
