@@ -348,6 +348,7 @@ def _on_board(autopilot: Autopilot, known: Mapping[str, float], vehicle: Vehicle
         "derivative filter": autopilot.derivative,
         "loop rate": autopilot.rate,
         "yaw error filter": autopilot.yaw_error,
+        "target filter": autopilot.target,
     }
     for name, (parameter, default) in parts.items():
         value, source = known.get(parameter, default), parameter if parameter in known else f"default of {parameter}"
@@ -376,7 +377,14 @@ def _plant(facts: Facts, axis: int, late: list[Used], fixed: Mapping[str, Used])
     if axis == 2 and "rotor_spin_up" in facts.vehicle.effects:
         lead = facts.effect("rotor_spin_up", "J") / (2.0 * facts.value("d") * facts.hover_speed)
     error = fixed["yaw error filter"].value if axis == 2 and "yaw error filter" in fixed else math.inf
-    return AxisPlant(gain, lag, wait + held, lead, fixed["gyro filter"].value, error)
+    target = fixed["target filter"].value if "target filter" in fixed else math.inf
+    # Drag of hubs as they turn with the vehicle, and damping beside it, as far as the file has them.
+    x, y, _ = np.square(facts.arms.T).mean(axis=1)
+    drag, inflow = (facts.effect("rotor_drag", k) for k in ("k_x", "k_y")), facts.effect("axial_inflow", "k_z")
+    hubs = (y * inflow, x * inflow, float(np.dot((y, x), (*drag,))))[axis]
+    damping = facts.vehicle.mass * hubs / facts.inertia[axis][axis]
+    damping += facts.effect("rate_damping", ("l_p", "m_q", "n_r")[axis])
+    return AxisPlant(gain, lag, wait + held, lead, fixed["gyro filter"].value, error, target, damping)
 
 
 _INERTIA = ("J_xx", "J_yy", "J_zz")

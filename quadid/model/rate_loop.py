@@ -1,14 +1,14 @@
 """Rate and attitude loops about hover, linear, axis by axis: margins, step responses, and gains for a wanted margin.
 
-    L(s) = C(s) E(s) A M(s) e^(-T s) G(s) / s            rate loop, opened at the rate error
+    L(s) = C(s) E(s) A M(s) e^(-T s) G(s) / (s + n)      rate loop, opened at the rate error
     C(s) = p + i / s + d s / (1 + s / w_d)               p [1/s], i [1/s^2], d [-]: per unit of angular acceleration
     M(s) = (1 + lead s) / (1 + tau s)                    rotors; lead: their spin-up, in yaw
     G(s) = Butterworth, second order, of the gyro;  E(s) = first-order low-pass of the rate error
+    F(s) = first-order low-pass of the rate asked for, outside the loop
     T    = delay of the command + half a period of the loop, which holds its output
 
 A is the angular acceleration that a unit brings, over what it is believed to bring: 1 for the vehicle as identified.
-The attitude loop asks for the rate a times the error of the angle.  Damping by the air is left out: it is slow
-beside these loops, and lends margin.
+The attitude loop asks for the rate a times the error of the angle.  n is the damping by the air.
 """
 
 import math
@@ -58,6 +58,8 @@ class AxisPlant:
         lead: of the rotors' spin-up [s].
         cutoff: of the gyro's filter [Hz]; infinite for none.
         error: cut-off of a filter of the rate error [Hz]; infinite for none.
+        target: cut-off of a filter of the rate asked for [Hz]; infinite for none.
+        damping: of the rate by the air [1/s].
     """
 
     gain: FloatArray
@@ -66,11 +68,13 @@ class AxisPlant:
     lead: float = 0.0
     cutoff: float = math.inf
     error: float = math.inf
+    target: float = math.inf
+    damping: float = 0.0
 
     def response(self, s: ComplexArray) -> ComplexArray:
         """From the error of the rate, by a gain of one, to the true rate, shape (variants, n)."""
         rotors = (1.0 + self.lead * s) / (1.0 + self.lag[:, None] * s) / (1.0 + s / (2.0 * math.pi * self.error))
-        return np.asarray(self.gain[:, None] * rotors * np.exp(-self.delay[:, None] * s) / s)
+        return np.asarray(self.gain[:, None] * rotors * np.exp(-self.delay[:, None] * s) / (s + self.damping))
 
     def read(self, s: ComplexArray) -> ComplexArray:
         """From the true rate to what the controller reads, shape (n,)."""
@@ -147,7 +151,8 @@ class Loops:
         """From what is asked for to what comes, the rate or the angle, shape (variants, n)."""
         plant = self.plant.response(s)
         around = controller(self.rate, s) * plant * self.plant.read(s)
-        rate = controller(self.rate, s, self._on_error) * plant / (1.0 + around)
+        asked = 1.0 / (1.0 + s / (2.0 * math.pi * self.plant.target))
+        rate = asked * controller(self.rate, s, self._on_error) * plant / (1.0 + around)
         around = self.attitude * rate / s
         return np.asarray(around / (1.0 + around) if angle else rate)
 

@@ -7,7 +7,7 @@ so that one controller written in SI has the same loop in each.  Facts and sourc
     PX4         torque = K (P e + I Int e - D d(rate)/dt), e in rad/s (rate_control.cpp); motors = scaled pseudo-inverse
                 of CA_ROTOR* times torque (ControlAllocationPseudoInverse.cpp), sent to the ESCs as they are with
                 THR_MDL_FAC 0; D on the rate behind IMU_GYRO_CUTOFF and IMU_DGYRO_CUTOFF.
-    ArduPilot   output = P e + I Int e + D de/dt, e in rad/s (AC_PID.cpp); thrust of motor i += factor_i output with
+    ArduPilot   output = P e + I Int e + D de/dt, e in rad/s, from a target behind a low-pass (AC_PID.cpp); thrust of motor i += factor_i output with
                 factors of largest size 0.5 (AP_MotorsMatrix.cpp, normalise_rpy_factors); thrust to command by
                 MOT_THST_EXPO between MOT_SPIN_MIN and MOT_SPIN_MAX (AP_Motors_Thrust_Linearization.cpp).
     Betaflight  sum = 0.032029 P e + 0.244381 I Int e - 0.000529 D d(rate)/dt, e in deg/s (pid.h); motor i +=
@@ -56,6 +56,7 @@ class Autopilot(NamedTuple):
         digits: after the decimal point that it stores; None for any.
         gyro, derivative, rate: parameter and default of the gyro's filter [Hz], the derivative's [Hz], the loop [Hz].
         yaw_error: parameter and default of a filter of the error of the yaw rate [Hz].
+        target: parameter and default of a filter of the rates asked for [Hz].
         on_error: the derivative acts on the error.
         outputs: command of each rotor for a unit of output about each axis, shape (rotors, 3).
     """
@@ -68,6 +69,7 @@ class Autopilot(NamedTuple):
     derivative: tuple[str, float]
     rate: tuple[str, float]
     yaw_error: tuple[str, float]
+    target: tuple[str, float]
     on_error: bool
     outputs: Callable[[Facts, Known, Hover], FloatArray]
 
@@ -169,7 +171,7 @@ AUTOPILOTS: dict[str, Autopilot] = {
             for rates, axis in zip(_named("MC_{}RATE_{}", ("ROLL", "PITCH", "YAW"), ("P", "I", "D")), AXES, strict=True)
         ),
         (1.0, 1.0, 1.0, 1.0), None,
-        ("IMU_GYRO_CUTOFF", 40.0), ("IMU_DGYRO_CUTOFF", 30.0), ("IMU_GYRO_RATEMAX", 400.0), _NONE, False, _px4,
+        ("IMU_GYRO_CUTOFF", 40.0), ("IMU_DGYRO_CUTOFF", 30.0), ("IMU_GYRO_RATEMAX", 400.0), _NONE, _NONE, False, _px4,
     ),
     "ardupilot": Autopilot(
         "ArduPilot",
@@ -181,7 +183,7 @@ AUTOPILOTS: dict[str, Autopilot] = {
         ),
         (1.0, 1.0, 1.0, 1.0), None,
         ("INS_GYRO_FILTER", 20.0), ("ATC_RAT_RLL_FLTD", 20.0), ("SCHED_LOOP_RATE", 400.0),
-        ("ATC_RAT_YAW_FLTE", 2.5), True, _ardupilot,
+        ("ATC_RAT_YAW_FLTE", 2.5), ("ATC_RAT_RLL_FLTT", 20.0), True, _ardupilot,
     ),
     "betaflight": Autopilot(
         "Betaflight",
@@ -189,8 +191,8 @@ AUTOPILOTS: dict[str, Autopilot] = {
             (f"p_{axis}", f"i_{axis}", f"d_{axis}", "angle_p_gain" if axis != "yaw" else "") for axis in AXES
         ),
         (0.032029 * _DEGREES, 0.244381 * _DEGREES, 0.000529 * _DEGREES, 0.1), 0,
-        ("gyro_lpf1_static_hz", 250.0), ("dterm_lpf1_static_hz", 50.0), ("pid_rate", 4000.0), _NONE, False,
-        _betaflight,
+        ("gyro_lpf1_static_hz", 250.0), ("dterm_lpf1_static_hz", 50.0), ("pid_rate", 4000.0), _NONE, _NONE,
+        False, _betaflight,
     ),
 }  # fmt: skip
 """Defaults are those of PX4 1.15, ArduCopter 4.5, Betaflight 4.5; there two filters in a row count as one: 50 Hz."""

@@ -281,6 +281,7 @@ class Autopilot:
     flightmode: str = "STABILIZE"
     height: float = 0.0
     asked: list[str] = field(default_factory=list)
+    answers: int = 0
     sticks: list[tuple[int, ...]] = field(default_factory=list)
     target_system: int = 1
     target_component: int = 1
@@ -306,8 +307,12 @@ class Autopilot:
 
     def recv_match(self, type: str = "", blocking: bool = False, timeout: float = 0.0) -> Any:
         if type == "COMMAND_ACK":
-            return SimpleNamespace(result=0 if self.asked.count(self.asked[-1]) > 1 else 4)
-        if type == "GLOBAL_POSITION_INT":
+            self.answers += 1
+            own, asked = self.answers % 2 == 0, int(self.asked[-1])  # first a late answer to something else
+            return SimpleNamespace(
+                command=asked if own else 0, result=0 if not own or self.asked.count(str(asked)) > 1 else 4
+            )
+        if type == "GLOBAL_POSITION_INT" and "511" in self.asked:  # nothing comes that was not asked for
             self.height += 5000.0
             return SimpleNamespace(lat=1, relative_alt=self.height)
         return SimpleNamespace() if type else None

@@ -120,8 +120,8 @@ def flown(
     start = float(flight.rotor_speed[0]) / full
     hover = start**2 if linear else start
     filters = [butter(2, autopilot.gyro[1], fs=hz), butter(1, autopilot.derivative[1], fs=hz)]
-    if autopilot.yaw_error[0]:
-        filters.append(butter(1, autopilot.yaw_error[1], fs=hz))
+    if autopilot.on_error:
+        filters += [butter(1, autopilot.target[1], fs=hz), butter(1, autopilot.yaw_error[1], fs=hz)]
     memory = [np.zeros((len(f[0]) - 1, 3)) for f in filters]
 
     def passed(k: int, signal: FloatArray) -> FloatArray:
@@ -138,8 +138,9 @@ def flown(
         asked = wanted[k] if angle is None else wanted[k] + a * (angle[k] - tilt)
         gyro = passed(0, flight.rate)
         error = asked - gyro
-        if len(filters) > 2:
-            error[2] = passed(2, error)[2]
+        if autopilot.on_error:
+            error = passed(2, asked) - gyro
+            error[2] = passed(3, error)[2]
         seen = error if autopilot.on_error else -gyro
         change, last = (seen - last) * hz, seen
         integral = integral + error / hz

@@ -1,10 +1,11 @@
 """A running ArduCopter, flown through pymavlink, with `quadid serve` beside it: sets against the truth, and alarms.
 
-    python -m quadid_evaluation.studies.sitl --binary build/sitl/bin/arducopter --defaults copter.parm \\
-        --frame frame.json --vehicle my.yaml [--seconds 120] [b=1.94e-5 J_xx=0.011 …]
+    python -m quadid_evaluation.studies.sitl --binary build/sitl/bin/arducopter --defaults copter.parm,my.parm \\
+        --frame frame.json --model x --vehicle my.yaml [--gains | --seconds 120] [b=1.94e-5 J_xx=0.011 …]
 
 The binary is ArduCopter built for SITL (waf configure --board sitl; waf copter), the defaults are such as
-Tools/autotest/default_params/copter.parm, the frame file is the .sitl.json of `quadid export --format ardupilot`.
+Tools/autotest/default_params/copter.parm and what `quadid export --format ardupilot` writes, with FRAME_TYPE 1 for an
+X; the frame file is the .sitl.json of that export.
 
 The plan: take off in Guided, hover, then move roll, pitch and yaw sticks in Loiter for `--seconds`, with multisines out
 of step.  The table has first and last set against the truth, and every alarm; nothing changes in flight, so that every
@@ -17,17 +18,24 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from pymavlink import mavutil
+from quadid_replay.dataflash import index_dataflash
+from scipy.spatial.transform import Rotation
 
+import quadid
 from quadid.flight.pilot import AXES, PILOT_STEP, Segment, scripted
+from quadid.report.autopilots import AXES as TURNS
 from quadid.types import FloatArray
-from quadid_evaluation.harness import Given, options, put
+from quadid_evaluation.harness import Given, options, put, table
 from quadid_evaluation.studies.autopilot import TITLE, Flown, Outcome, row, section, serving, stored
+from quadid_evaluation.studies.gains import bandwidth, outside
 
 PILOT, SERVICE = 5760, 5762
 """TCP ports of ArduPilot's first two serial ports."""
@@ -49,14 +57,21 @@ def sticks(seconds: float, seed: int) -> FloatArray:
     return np.clip(scripted(segments, seed, round(seconds / PILOT_STEP)), -1.0, 1.0)
 
 
-def fly(link: mavutil.mavfile, seconds: float, seed: int) -> None:
-    """Arms, takes off, hovers, moves the sticks; raises TimeoutError where the autopilot does not come along."""
+def take_off(link: mavutil.mavfile, height: float) -> None:
+    """Arms and climbs; raises TimeoutError where the autopilot does not come along."""
     link.wait_heartbeat(timeout=READY)
+    for message in (mavutil.mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT, mavutil.mavlink.MAVLINK_MSG_ID_ATTITUDE):
+        _until(partial(_command, link, mavutil.mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, message, 2e5))
     _wait(link, "GLOBAL_POSITION_INT", lambda m: m.lat != 0)
     _mode(link, "GUIDED")
     _until(lambda: _command(link, mavutil.mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1.0))
-    _until(lambda: _command(link, mavutil.mavlink.MAV_CMD_NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, HEIGHT))
-    _wait(link, "GLOBAL_POSITION_INT", lambda m: m.relative_alt > 900.0 * HEIGHT)
+    _until(lambda: _command(link, mavutil.mavlink.MAV_CMD_NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, height))
+    _wait(link, "GLOBAL_POSITION_INT", lambda m: m.relative_alt > 900.0 * height)
+
+
+def fly(link: mavutil.mavfile, seconds: float, seed: int) -> None:
+    """Takes off, hovers, moves the sticks and lands."""
+    take_off(link, HEIGHT)
     _send_sticks(link, np.zeros(len(AXES)))
     _mode(link, "LOITER")
     rows = np.vstack([np.zeros((round(HOVER / PILOT_STEP), len(AXES))), sticks(seconds, seed)])
@@ -91,8 +106,10 @@ def _mode(link: mavutil.mavfile, name: str) -> None:
 def _command(link: mavutil.mavfile, number: int, *values: float) -> bool:
     given = [*values, *[0.0] * (7 - len(values))]
     link.mav.command_long_send(link.target_system, link.target_component, number, 0, *given)
-    answer = link.recv_match(type="COMMAND_ACK", blocking=True, timeout=3.0)
-    return answer is not None and answer.result == mavutil.mavlink.MAV_RESULT_ACCEPTED
+    while (answer := link.recv_match(type="COMMAND_ACK", blocking=True, timeout=3.0)) is not None:
+        if answer.command == number:
+            return bool(answer.result == mavutil.mavlink.MAV_RESULT_ACCEPTED)
+    return False
 
 
 def _wait(link: mavutil.mavfile, kind: str, wanted: Callable[[Any], bool]) -> None:
@@ -107,37 +124,179 @@ def _until(done: Callable[[], bool]) -> None:
         time.sleep(0.5)
 
 
+@contextmanager
+def running(given: Given, folder: Path, settings: Mapping[str, float]) -> Iterator[mavutil.mavfile]:
+    """The autopilot in a folder, with `settings` over its defaults; yields a link to it."""
+    model, own = given.model, folder / "own.parm"
+    if given.frame != Path():
+        shutil.copy(given.frame, folder / "frame.json")
+        model = f"{given.model}:frame.json"
+    own.write_text("".join(f"{name} {value}\n" for name, value in settings.items()), encoding="utf-8")
+    defaults = ",".join(str(Path(name).resolve()) for name in (*given.defaults.split(","), own))
+    autopilot = subprocess.Popen(
+        [given.binary.resolve(), "--model", model, "--defaults", defaults, "--wipe", "--speedup", "1"],
+        cwd=folder,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.STDOUT,
+    )
+    try:
+        yield mavutil.mavlink_connection(f"tcp:127.0.0.1:{PILOT}", retries=60)
+    finally:
+        autopilot.kill()
+        autopilot.wait()
+
+
 def flown(given: Given) -> Outcome:
     """Starts the autopilot and the service, flies, ends both; what the service had stored."""
     with tempfile.TemporaryDirectory() as folder:
-        model = given.model
-        if given.frame != Path():
-            shutil.copy(given.frame, Path(folder) / "frame.json")
-            model = f"{given.model}:frame.json"
         history = Path(folder) / "history.sqlite"
-        autopilot = subprocess.Popen(
-            [
-                str(given.binary.resolve()),
-                "--model",
-                model,
-                "--defaults",
-                str(given.defaults.resolve()),
-                "--wipe",
-                "--speedup",
-                "1",
-            ],
-            cwd=folder,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.STDOUT,
-        )
-        try:
-            link = mavutil.mavlink_connection(f"tcp:127.0.0.1:{PILOT}", retries=60)
-            with serving(given.vehicle, f"tcp:127.0.0.1:{SERVICE}", history) as said:
-                fly(link, given.seconds, given.seed)
-        finally:
-            autopilot.kill()
-            autopilot.wait()
+        service = f"tcp:127.0.0.1:{SERVICE}"
+        with running(given, Path(folder), {}) as link, serving(given.vehicle, service, history) as said:
+            fly(link, given.seconds, given.seed)
         return stored(given.vehicle, history, said, HOVER + given.seconds)
+
+
+# --- Steps of rate and attitude, with the gains of the defaults and with proposed ones
+
+
+NAMES = ("RLL", "PIT", "YAW")
+STEP = {"rate": (0.5, 0.5, 0.5), "attitude": (0.05, 0.05, 0.2)}
+"""Size of a step about each axis [rad/s], [rad]."""
+LASTS = {"rate": (0.8, 0.8, 2.0), "attitude": (1.6, 1.6, 3.5)}
+"""Time between two steps [s]."""
+REST = 6.0
+"""Level flight between axes [s]."""
+SETTINGS = {
+    **{f"ATC_ACCEL_{axis}_MAX": 0.0 for axis in "RPY"},
+    "LOG_BITMASK": float(176126 | 1 | 1 << 19),
+    "INS_RAW_LOG_OPT": 1.0,
+}
+"""What is asked for is not shaped; attitude is logged at the rate of the loop, and the gyro as it is read."""
+
+
+def step(link: mavutil.mavfile, gains: Mapping[str, float]) -> None:
+    """Steps to and fro, an axis at a time: of the attitude, then of the rate while no attitude is held."""
+    take_off(link, 2.0 * HEIGHT)
+    for name, value in gains.items():
+        _set(link, name, value)
+    heading = np.array([0.0, 0.0, link.recv_match(type="ATTITUDE", blocking=True, timeout=READY).yaw])
+    for loop, halves in (("attitude", (1.0,) * 6), ("rate", (0.5, 1.0, 1.0, 1.0, 1.0, 0.5))):
+        for k, axis in enumerate(NAMES):
+            _set(link, "ATC_RATE_FF_ENAB", 0.0)
+            _ask(link, REST, heading)
+            unit = 0.5 * STEP[loop][k] * np.eye(3)[k]
+            if loop == "rate":  # is passed on as it is
+                _set(link, "ATC_RATE_FF_ENAB", 1.0)
+                _set(link, f"ATC_ANG_{axis}_P", 0.0)
+            for i, part in enumerate(halves):
+                asked = unit * (-1.0) ** i
+                _ask(link, part * LASTS[loop][k], *((heading + asked,) if loop == "attitude" else (None, asked)))
+            if loop == "rate":
+                _set(link, f"ATC_ANG_{axis}_P", gains.get(f"ATC_ANG_{axis}_P", HELD))
+    _mode(link, "LAND")
+
+
+HELD = 4.5
+"""ArduCopter's default of ATC_ANG_RLL_P, ATC_ANG_PIT_P and ATC_ANG_YAW_P [1/s]."""
+
+
+def _ask(link: mavutil.mavfile, seconds: float, angle: FloatArray | None, rate: Sequence[float] = (0.0,) * 3) -> None:
+    """Asks for an attitude (roll, pitch, yaw [rad]), or for body rates [rad/s], at constant height, for some time."""
+    mask = mavutil.mavlink.ATTITUDE_TARGET_TYPEMASK_ATTITUDE_IGNORE if angle is None else 0
+    q = [1.0, 0.0, 0.0, 0.0] if angle is None else Rotation.from_euler("ZYX", angle[::-1]).as_quat()[[3, 0, 1, 2]]
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        link.mav.set_attitude_target_send(0, link.target_system, link.target_component, mask, q, *rate, 0.5)
+        while link.recv_match(blocking=False) is not None:
+            pass
+        time.sleep(0.1)
+
+
+def _set(link: mavutil.mavfile, name: str, value: float) -> None:
+    def taken() -> bool:
+        link.mav.param_set_send(link.target_system, link.target_component, name.encode(), value, 9)
+        told = link.recv_match(type="PARAM_VALUE", blocking=True, timeout=2.0)
+        return told is not None and told.param_id == name and bool(np.isclose(told.param_value, value))
+
+    _until(taken)
+
+
+def responses(log: Path) -> dict[tuple[str, str], tuple[float, FloatArray]]:
+    """Mean response to a unit step of each axis and loop, of the log of `step`; the period first [s]."""
+    index, out = index_dataflash(log), {}
+
+    def columns(name: str, *wanted: str) -> tuple[FloatArray, FloatArray]:
+        own = index.column(name, "I") == 0 if index.has(name, "I") else slice(None)
+        time_of = "SampleUS" if index.has(name, "SampleUS") else "TimeUS"
+        values = np.column_stack([index.column(name, one) for one in wanted])
+        return 1e-6 * index.column(name, time_of)[own], values[own]
+
+    for loop, given, read in (
+        ("rate", ("RATE", "RDes", "PDes", "YDes"), ("GYR", "GyrX", "GyrY", "GyrZ")),
+        ("attitude", ("ANG", "DesRoll", "DesPitch", "DesYaw"), ("ANG", "Roll", "Pitch", "Yaw")),
+    ):
+        (t, wanted), (seen, values) = columns(*given), columns(*read)
+        wanted, values = np.radians(wanted), np.radians(values) if loop == "attitude" else values
+        for k, axis in enumerate(TURNS):
+            size, lasts = STEP[loop][k], 0.9 * LASTS[loop][k]
+            asked, came = np.unwrap(wanted[:, k]), np.unwrap(values[:, k])
+            change, rows = np.diff(asked), []
+            for i in np.flatnonzero(np.abs(change) > 0.8 * size):
+                before = slice(np.searchsorted(t, t[i] - lasts), i + 1)
+                after = slice(i + 1, np.searchsorted(t, t[i] + lasts))
+                if max(np.ptp(asked[before]), np.ptp(asked[after])) < 0.02 * size:
+                    grid = t[i + 1] + np.arange(-0.05, lasts, PERIOD)  # from what had come by then
+                    response = np.interp(grid, seen, came)
+                    start = response[grid < t[i + 1]].mean()
+                    rows.append((response[grid >= t[i + 1]] - start) / change[i])
+            shortest = min(map(len, rows))
+            out[axis, loop] = PERIOD, np.mean([one[:shortest] for one in rows], axis=0)
+    return out
+
+
+def gains_flown(given: Given) -> str:
+    """Promise and flight of the gains that the autopilot had, and of those that are proposed, as Markdown."""
+    rows, found, settings = [], None, SETTINGS
+    for when in ("as it came", "proposed"):
+        with tempfile.TemporaryDirectory() as folder:
+            with running(given, Path(folder), settings) as link:
+                step(link, {} if found is None else found.values)
+            (log,) = Path(folder, "logs").glob("*.BIN")
+            flew = responses(log)
+            found = found or quadid.gains(given.vehicle, "ardupilot", current=log, motor_lag=0.0, delay=given.delay)
+        for (axis, loop), (period, response) in flew.items():
+            loops, angle = (found.before if when == "as it came" else found.loops)[axis], loop == "attitude"
+            t, band = loops.step(angle)
+            promised = float(loops.bandwidth(angle)[0]), 100.0 * max(float(band[0].max()) - 1.0, 0.0)
+            rows.append(
+                (
+                    when,
+                    f"{axis} {loop}",
+                    f"{promised[0]:.2f}, {bandwidth(period, response):.2f}",
+                    f"{promised[1]:.0f}, {100.0 * max(response.max() - 1.0, 0.0):.0f}",
+                    f"{1e3 * rise(t, band[0]):.0f}, {1e3 * rise(period * np.arange(len(response)), response):.0f}",
+                    f"{outside((period, response), loops, angle):.3f}",
+                )
+            )
+    heads = ("gains", "loop", "bandwidth [Hz]", "overshoot [%]", "rise, 10 to 90 % [ms]", "outside of the band")
+    return "\n".join(
+        [
+            "`python -m quadid_evaluation.studies.sitl --gains`: steps of ArduCopter in its own simulator, with the "
+            "gains of its defaults, then with those proposed for a file fitted to its flight. Promised, then flown; "
+            "last the largest distance of the response to a unit step from its band over the 95 % intervals.",
+            "",
+            *table(heads, rows),
+        ]
+    )
+
+
+PERIOD = 1.0 / 400.0
+"""Grid of a response [s]."""
+
+
+def rise(t: FloatArray, response: FloatArray) -> float:
+    """Time from a tenth to nine tenths [s]."""
+    return float(t[np.argmax(response >= 0.9)] - t[np.argmax(response >= 0.1)])
 
 
 def main() -> None:
@@ -146,7 +305,9 @@ def main() -> None:
         __doc__,
         words="NAME=VALUE of parameters that are known",
         binary=Path(),
-        defaults=Path(),
+        defaults="",
+        gains=False,
+        delay=0.0,
         model="+",
         frame=Path(),
         vehicle=Path(),
@@ -157,8 +318,11 @@ def main() -> None:
         print("skipped: no ArduCopter binary is named (--binary)")
         return
     for name in ("defaults", "vehicle"):
-        if getattr(given, name) == Path():
+        if getattr(given, name) in ("", Path()):
             sys.exit(f"--{name} is needed beside --binary")
+    if given.gains:
+        put(given, "gains.md", "Gains, flown", "ArduCopter", gains_flown(given))
+        return
     truth = {name: float(value) for name, value in (text.split("=", 1) for text in given.words)}
     one = Flown(given.binary.name, str(given.vehicle), truth)
     done = flown(given)
