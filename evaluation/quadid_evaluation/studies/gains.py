@@ -178,7 +178,7 @@ def step(
 
 def bandwidth(period: float, response: FloatArray) -> float:
     """Frequency at which the response has fallen by 3 dB for good [Hz], from that to a step."""
-    hz = np.arange(0.1, 20.0, 0.01)
+    hz = np.arange(0.1, 50.0, 0.01)
     t = period * (np.arange(len(response) - 1) + 0.5)
     size = np.abs(np.exp(-2j * np.pi * np.outer(hz, t)) @ np.diff(response))
     return float(hz[np.flatnonzero(size >= math.sqrt(0.5))[-1]])

@@ -13,6 +13,7 @@ alarm is false.  Without a binary the study says so and does nothing.  `--frame`
 the file is copied into the folder that the binary runs in.
 """
 
+import math
 import shutil
 import subprocess
 import sys
@@ -162,7 +163,7 @@ def flown(given: Given) -> Outcome:
 NAMES = ("RLL", "PIT", "YAW")
 STEP = {"rate": (0.5, 0.5, 0.5), "attitude": (0.05, 0.05, 0.2)}
 """Size of a step about each axis [rad/s], [rad]."""
-LASTS = {"rate": (0.8, 0.8, 2.0), "attitude": (1.6, 1.6, 3.5)}
+LASTS = {"rate": (0.8, 0.8, 3.0), "attitude": (1.6, 1.6, 3.5)}
 """Time between two steps [s]."""
 REST = 6.0
 """Level flight between axes [s]."""
@@ -193,6 +194,8 @@ def step(link: mavutil.mavfile, gains: Mapping[str, float]) -> None:
                 _ask(link, part * LASTS[loop][k], *((heading + asked,) if loop == "attitude" else (None, asked)))
             if loop == "rate":
                 _set(link, f"ATC_ANG_{axis}_P", gains.get(f"ATC_ANG_{axis}_P", HELD))
+    _set(link, "ATC_RATE_FF_ENAB", 0.0)
+    _ask(link, REST, heading)
     _mode(link, "LAND")
 
 
@@ -295,8 +298,8 @@ PERIOD = 1.0 / 400.0
 
 
 def rise(t: FloatArray, response: FloatArray) -> float:
-    """Time from a tenth to nine tenths [s]."""
-    return float(t[np.argmax(response >= 0.9)] - t[np.argmax(response >= 0.1)])
+    """Time from a tenth to nine tenths [s]; infinite where it stays below."""
+    return float(t[np.argmax(response >= 0.9)] - t[np.argmax(response >= 0.1)]) if response.max() > 0.9 else math.inf
 
 
 def main() -> None:
