@@ -460,7 +460,7 @@ class ChangeWatch:
         if self.seen is not None:
             return None
         recent = self._rows.cut(tick - ASK_FLYING, tick - _EPS)
-        quality = judge(recent, self._vehicle, estimator.thrust, estimator.learned)
+        quality = judge(recent, self._vehicle, estimator.thrust, estimator.in_order)
         # A load taken up or dropped in hover looks like a floor while the step is in what is judged, and no longer.
         self._carried = self._carried + length if quality.carried else 0.0
         if recent.reason or (quality != Quality() and not 0.0 < self._carried <= ASK_FLYING):

@@ -344,6 +344,7 @@ class Estimator:
         excitation: of the newest window, shape (6,); NaN before.
         start: first time of the data learned from [s]; NaN before.
         rows: grid rows learned from.
+        in_order: a fit was taken in, after rotors were asked for their order: no change in flight exchanges them.
         input_hash: SHA-256 over seed and windows learned from.
     """
 
@@ -369,7 +370,7 @@ class Estimator:
 
     def reset(self) -> None:
         """Begins as from the vehicle file: nothing that was learned is kept."""
-        self.theta = self._initial
+        self.theta, self.in_order = self._initial, False
         self.forget()
 
     def forget(self) -> None:
@@ -509,7 +510,7 @@ class Estimator:
             # Less sure than the guess, which it contains: linear in a point that too little motion showed.
             self.forget()
             return
-        self._z = reply.estimates[-1].z
+        self._z, self.in_order = reply.estimates[-1].z, True
         self.theta = self._free.placed(reply.theta, fused.z[:SIX])
         self.left_out = self._beyond_b()
 

@@ -398,8 +398,8 @@ class Session:
             have = f"{max(tick - start, 0.0):.0f} of {self.settings.window:g} s of flight"
             self._outbox.state(Phase.COLLECTING, f"{have}; {cut.reason or 'no gaps'}")
             return
-        known = self._estimator.learned
-        self._quality = judge(cut, self._vehicle, self._estimator.thrust, known, units=not known)
+        estimator = self._estimator
+        self._quality = judge(cut, self._vehicle, estimator.thrust, estimator.in_order, units=not estimator.learned)
         if self._quality != Quality():
             phase = Phase.BLOCKED if self._quality.fault else Phase.NOT_FLYING
             self._outbox.note(tick, phase, self._quality.fault or self._quality.grounded)

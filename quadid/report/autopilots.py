@@ -7,9 +7,10 @@ so that one controller written in SI has the same loop in each.  Facts and sourc
     PX4         torque = K (P e + I Int e - D d(rate)/dt), e in rad/s (rate_control.cpp); motors = scaled pseudo-inverse
                 of CA_ROTOR* times torque (ControlAllocationPseudoInverse.cpp), sent to the ESCs as they are with
                 THR_MDL_FAC 0; D on the rate behind IMU_GYRO_CUTOFF and IMU_DGYRO_CUTOFF.
-    ArduPilot   output = P e + I Int e + D de/dt, e in rad/s, from a target behind a low-pass (AC_PID.cpp); thrust of motor i += factor_i output with
-                factors of largest size 0.5 (AP_MotorsMatrix.cpp, normalise_rpy_factors); thrust to command by
-                MOT_THST_EXPO between MOT_SPIN_MIN and MOT_SPIN_MAX (AP_Motors_Thrust_Linearization.cpp).
+    ArduPilot   output = P e + I Int e + D de/dt, e in rad/s, from a target behind a low-pass (AC_PID.cpp); thrust of
+                motor i += factor_i output with factors of largest size 0.5 (AP_MotorsMatrix.cpp,
+                normalise_rpy_factors); thrust to command by MOT_THST_EXPO between MOT_SPIN_MIN and MOT_SPIN_MAX
+                (AP_Motors_Thrust_Linearization.cpp).
     Betaflight  sum = 0.032029 P e + 0.244381 I Int e - 0.000529 D d(rate)/dt, e in deg/s (pid.h); motor i +=
                 mix_i sum / 1000 of the range above motor_idle (mixer.c); QUADX mixes +-1, QUADP +-1 and 0
                 (mixer_init.c); angle_p_gain / 10 is the gain of Angle mode [1/s].

@@ -6,9 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from quadid.online import FitReply, FitRequest, Phase, Session
+from quadid.online import FitReply, FitRequest, Phase, Session, checks
 from quadid.online.change_job import ChangeReply, ChangeRequest, DiagnosisReply, DiagnosisRequest
+from quadid.online.checks import WindowCut
 from quadid.online.records import Action, Job, JobReply, OnlineFinding
+from quadid.vehicle import Vehicle
 from tests.faults.evidence import Happened
 from tests.online.driving import EPOCH, diagnosed, events, published
 from tests.online.made_up import (
@@ -146,6 +148,28 @@ def test_a_change_of_a_vehicle_that_is_not_known_yet_is_explained_by_guesses() -
     assert (finding.effect, told.verdict) == ("thrust_drop", "unknown")
     assert "mass_change" in {one.effect for one in finding.alternatives}
     assert finding.values["fraction"] == pytest.approx(0.15, abs=0.02)
+
+
+def test_the_order_of_rotors_is_asked_until_a_fit_is_taken_in_and_not_after_a_change(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    asked: list[float] = []
+
+    def question(cut: WindowCut, vehicle: Vehicle) -> str:
+        asked.append(float(cut.windows[-1].t[-1]))
+        return ""
+
+    monkeypatch.setattr(checks, "_wrong_order", question)
+
+    def work(request: Job) -> JobReply | None:
+        if isinstance(request, ChangeRequest):
+            return ChangeReply(request.number, finding=MASS)
+        return tells(b=0.85 if stop_of(request) > 18.0 else 1.0)(request)
+
+    actions = works(Session(PELICAN, QUICK), between(DROPPED, 0.0, 29.7), work)
+    assert len(diagnosed(actions)) == 1
+    assert asked
+    assert max(asked) < 14.0
 
 
 def studies(actions: list[Action]) -> list[DiagnosisRequest]:
