@@ -11,8 +11,7 @@ import pytest
 from quadid_evaluation.studies.alarms import watched
 from quadid_node.messages import Output
 from quadid_node.recording import play, stream
-from quadid_node.service import Service
-from quadid_node.settings import session_settings
+from quadid_node.service import Service, session_settings
 from quadid_node.worker import InlineWorker
 from quadid_replay import open_log
 
