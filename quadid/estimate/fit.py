@@ -99,7 +99,7 @@ def estimate(problem: Problem, start: FloatArray | None = None) -> Estimate:
         if (z - before) @ information @ (z - before) < FINE:
             break
     # 4. Where innovations have outliers, their density has tails.
-    tail = tails(whitened(problem.tracks, gains))
+    tail = tails(problem.tracks, gains)
     if np.any(tail > 0.0):
         heavy = replace(problem, tail=tail)
         tried = scoring(heavy, z, psi, MOST, ALL_NOISE)
@@ -179,14 +179,14 @@ def whitened(tracks: Sequence[Track], gains: Sequence[Gains]) -> tuple[FloatArra
     )
 
 
-def tails(whitened: Sequence[FloatArray]) -> FloatArray:
+def tails(tracks: Sequence[Track], gains: Sequence[Gains]) -> FloatArray:
     """1 / degrees of freedom of the Student-t density of each group of innovations, shape (4,), by their kurtosis.
 
     A Student-t density has kurtosis 3 + 6 / (k - 4); what chance alone makes of a Gaussian's counts as none.
     """
-    out = np.zeros(4)
+    out, plain = np.zeros(4), whitened(tracks, [g._replace(w=np.ones_like(g.w)) for g in gains])
     for group in range(4):
-        z = np.concatenate([w[:, 3 * group : 3 * group + 3] for w in whitened])
+        z = np.concatenate([w[:, 3 * group : 3 * group + 3] for w in plain])
         z = z[z[:, 0] != 0.0]
         if len(z):
             excess = float(np.mean(np.mean(z**4, axis=0) / np.mean(z**2, axis=0) ** 2)) - 3.0

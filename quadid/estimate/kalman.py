@@ -48,11 +48,11 @@ GYRO, ATTITUDE, ACCEL, VELOCITY, M = 0, 3, 6, 9, 12
 # Physics: the six, trim [rad/s^2], gyro bias, accelerometer bias, rotor drag [1/s], height above the hubs at which
 # it acts [m], damping [1/s], centre of gravity [m], how late rotor speeds act and their first-order lag [s],
 # share of its arm by which drag acts nearer to the centre of gravity than a hub, share of the gyroscopic coupling that
-# a simulator leaves out.
+# a simulator leaves out, speed at which a rotor's thrust begins [rad/s] and what there is then [N], axial inflow [1/s].
 B, D, JX, JY, JZ, JR, TRIM, GYRO_BIAS, ACCEL_BIAS, DRAG, TILTING, DAMP, CG, DELAY, LAG, CENTRAL, UNCOUPLED = (
     0, 1, 2, 3, 4, 5, 6, 9, 12, 15, 17, 19, 22, 24, 25, 26, 27,
 )  # fmt: skip
-N_PHYSICS = 28
+DEAD, OFFSET, INFLOW, N_PHYSICS = 28, 29, 30, 31
 # Noise: white of every scalar measurement; standard deviations of f (horizontal, vertical), alpha (roll and pitch,
 # yaw), e (tilt, heading) and of logged rotor speeds [rad/s]; correlation times of f, f, alpha, alpha, e [s].
 SIGMA, ROTOR, TIME, N_NOISE = M, M + 6, M + 7, M + 12
@@ -60,7 +60,7 @@ _GROUP = np.array([0, 0, 1, 2, 2, 3, 4, 4, 5])
 """Standard deviation of each Gauss-Markov state from FO on …"""
 _CLOCK = np.array([0, 0, 1, 2, 2, 3, 4, 4, 4])
 """… and which correlation time."""
-# Rotor moments over all rotors: squares, squares times x, y, spin, speeds times spin, speeds.
+# Rotor moments over all rotors: thrust over b, and times x, y; squares of speed times spin; speeds times spin, speeds.
 MOMENTS = 6
 STILL_TIME = 1.0
 """Correlation time of a velocity that nobody measures [s]; see `Track.still`."""
@@ -139,7 +139,7 @@ class Gains(NamedTuple):
         mean: after the updates, shape (n, N_MEAN).
         P: columns of the covariance there that belong to f, alpha, e, shape (n, N, 9).
         table: rotor moments, see `moments`.
-        late: delay and lag of these moments [s].
+        made_with: arguments of `moments`.
         beyond: see `Track.beyond`.
     """
 
@@ -151,12 +151,12 @@ class Gains(NamedTuple):
     mean: FloatArray
     P: FloatArray
     table: FloatArray
-    late: tuple[float, float]
+    made_with: tuple[float, float, float, float]
     beyond: Beyond
 
 
 @_fast
-def _courses(track: Track, lag: float) -> FloatArray:
+def _courses(track: Track, lag: float, dead: float, over: float) -> FloatArray:
     """Integral of every rotor moment up to each piece, and its course from there, shape (pieces, MOMENTS, 7).
 
     Behind a first-order lag T a rotor that should turn at u + r s turns at y = a + r s + c exp(-s / T), a = u - r T.
@@ -171,11 +171,11 @@ def _courses(track: Track, lag: float) -> FloatArray:
             a = track.speed[k, i, 0] - lag * r
             c = turning[i] - a if lag > 0.0 else 0.0
             for m in range(4):
-                w = track.share[m, i]
-                out[k, m, 1] += w * a * a
-                out[k, m, 2] += w * a * r
+                w, above = track.share[m, i], a - dead if m < 3 else a
+                out[k, m, 1] += w * (above * above + (over if m < 3 else 0.0))
+                out[k, m, 2] += w * above * r
                 out[k, m, 3] += w * r * r / 3.0
-                out[k, m, 4] += 2.0 * w * a * c
+                out[k, m, 4] += 2.0 * w * above * c
                 out[k, m, 5] += 2.0 * w * r * c
                 out[k, m, 6] += w * c * c
             for m in range(4, MOMENTS):
@@ -214,15 +214,17 @@ def _integrals(piece_t: FloatArray, courses: FloatArray, lag: float, t: float, a
 
 
 @_fast
-def moments(track: Track, delay: float, lag: float) -> FloatArray:
+def moments(track: Track, delay: float, lag: float, dead: float, over: float) -> FloatArray:
     """Mean rotor moments, shape (n, 3 MOMENTS): both halves of the step from each time; while the accelerometer reads.
 
     Args:
         track: the flight.
         delay: by which rotor speeds act later than the log has them [s].
         lag: with which they follow [s].
+        dead: speed at which thrust begins [rad/s].
+        over: thrust there, over b [rad^2/s^2].
     """
-    courses = _courses(track, lag)
+    courses = _courses(track, lag, dead, over)
     n = len(track.t)
     out = np.zeros((n, 3 * MOMENTS))
     a, b, c = np.empty(MOMENTS), np.empty(MOMENTS), np.empty(MOMENTS)
@@ -244,11 +246,16 @@ def moments(track: Track, delay: float, lag: float) -> FloatArray:
     return out
 
 
+def turning(p: FloatArray) -> tuple[float, float, float, float]:
+    """Arguments of `moments` at physics p."""
+    return p[DELAY], p[LAG], p[DEAD], p[OFFSET] / p[B]
+
+
 @_fast
 def _constants(p: FloatArray, track: Track) -> FloatArray:
     """Constants of Eqs. 2 and 3."""
-    c = np.empty(24)
-    hover = math.sqrt(track.mass * GRAVITY / track.rotors / p[B])
+    c = np.empty(30)
+    hover = p[DEAD] + math.sqrt(max(track.mass * GRAVITY / track.rotors - p[OFFSET], 1e-9) / p[B])
     c[0], c[1], c[2], c[3] = p[B] / track.mass, p[B] / p[JX], p[B] / p[JY], p[D] / p[JZ]
     c[4], c[5] = p[JR] / p[JX], p[JR] / p[JY]
     c[6], c[7], c[8] = (p[JY] - p[JZ]) / p[JX], (p[JZ] - p[JX]) / p[JY], (p[JX] - p[JY]) / p[JZ]
@@ -264,7 +271,10 @@ def _constants(p: FloatArray, track: Track) -> FloatArray:
     c[19] = track.mass * (p[TILTING] - share * z) * c[12] / p[JY]
     c[20] = track.mass * (p[TILTING + 1] - share * z) * c[13] / p[JX]
     c[21] = track.mass * share**2 * (yy * c[12] + xx * c[13]) / p[JZ]
-    c[22], c[23] = track.mass * share / p[JZ], 0.5 * track.rotors
+    c[22], c[23], c[24] = track.mass * share / p[JZ], 0.5 * track.rotors, track.rotors * p[DEAD]
+    c[25] = p[INFLOW] / (track.rotors * hover)
+    c[26], c[27] = track.mass * c[25] / p[JX], track.mass * c[25] / p[JY]
+    c[28], c[29] = c[26] * yy, c[27] * xx
     return c
 
 
@@ -272,19 +282,20 @@ def _constants(p: FloatArray, track: Track) -> FloatArray:
 def _turning(c, s2, x2, y2, z2, o1, s1, p, q, r):  # type: ignore[no-untyped-def]
     """Eq. 2 without alpha: angular acceleration for these rotor moments and rates."""
     return (
-        c[6] * q * r + c[1] * (c[18] * s2 - y2) + c[4] * o1 * q - c[14] * p + c[9],
-        c[7] * p * r + c[2] * (x2 - c[17] * s2) - c[5] * o1 * p - c[15] * q + c[10],
+        c[6] * q * r + c[1] * (c[18] * s2 - y2) + c[4] * o1 * q - (c[14] + c[28] * s1) * p + c[9],
+        c[7] * p * r + c[2] * (x2 - c[17] * s2) - c[5] * o1 * p - (c[15] + c[29] * s1) * q + c[10],
         c[8] * p * q + c[3] * z2 - (c[16] + c[21] * s1) * r + c[11],
     )
 
 
 @_piece
-def _dragged(c, x2, y2, s1, u, v):  # type: ignore[no-untyped-def]
-    """Angular acceleration by drag at the hubs, at velocity u, v in body axes."""
+def _dragged(c, x2, y2, s1, u, v, w):  # type: ignore[no-untyped-def]
+    """Angular acceleration by drag and inflow at the hubs, at velocity u, v, w in body axes."""
     # Sums of x and y times speed about the centre of gravity: of squares over twice the mean speed; 0 at rest.
-    each = c[23] / s1 if s1 > 0.0 else 0.0
+    each = c[23] / (s1 - c[24]) if s1 > max(c[24], 0.0) else 0.0
     x1, y1 = each * x2 - c[17] * s1, each * y2 - c[18] * s1
-    return -c[20] * s1 * v, c[19] * s1 * u, c[22] * (c[12] * u * y1 - c[13] * v * x1)
+    roll, pitch = -c[20] * s1 * v - c[26] * w * y1, c[19] * s1 * u + c[27] * w * x1
+    return roll, pitch, c[22] * (c[12] * u * y1 - c[13] * v * x1)
 
 
 @_piece
@@ -308,7 +319,8 @@ def _force(c, s2, s1, w, x, y, z, vn, ve, vd):  # type: ignore[no-untyped-def]
     """Specific force of rotors and drag in body axes, and velocity there."""
     r = _rotation(w, x, y, z)
     u, v = r[0] * vn + r[3] * ve + r[6] * vd, r[1] * vn + r[4] * ve + r[7] * vd
-    return -c[12] * s1 * u, -c[13] * s1 * v, -c[0] * s2, u, v, r[2] * vn + r[5] * ve + r[8] * vd
+    down = r[2] * vn + r[5] * ve + r[8] * vd
+    return -c[12] * s1 * u, -c[13] * s1 * v, -c[0] * s2 - c[25] * s1 * down, u, v, down
 
 
 @_piece
@@ -358,8 +370,8 @@ def _advance(c: FloatArray, row: FloatArray, h: float, keep: FloatArray, air: bo
     gy = 0.5 * (1.0 + keep[4]) * x[AL + 2]
     gz = 0.5 * (1.0 + keep[5]) * x[AL + 3]
     if air:
-        _, _, _, u, v, _ = _force(c, s2, s1, x[0], x[1], x[2], x[3], x[VE + 1], x[VE + 2], x[VE + 3])
-        dp, dq, dr = _dragged(c, x2, y2, s1, u, v)
+        _, _, _, u, v, w = _force(c, s2, s1, x[0], x[1], x[2], x[3], x[VE + 1], x[VE + 2], x[VE + 3])
+        dp, dq, dr = _dragged(c, x2, y2, s1, u, v, w)
         gx, gy, gz = gx + dp, gy + dq, gz + dr
     qw, qx, qy, qz, p, q, r = x[0], x[1], x[2], x[3], x[4], x[5], x[6]
     a1, b1, c1 = _turning(c, s2 + ds, x2 + dx, y2 + dy, z2 + dz, o1 + do, s1, p, q, r)
@@ -477,15 +489,15 @@ def _expected(c, p, y, seen, row, air, x, out):  # type: ignore[no-untyped-def]
         out[ATTITUDE + 1] = scale * b - x[AE + 2]
         out[ATTITUDE + 2] = scale * e - x[AE + 3]
     s2, x2, y2, z2, o1, s1 = row[2 * MOMENTS :]
-    fx, fy, fz, u, v = 0.0, 0.0, -c[0] * s2, 0.0, 0.0
+    fx, fy, fz, u, v, w = 0.0, 0.0, -c[0] * s2, 0.0, 0.0, 0.0
     if air:
-        fx, fy, fz, u, v, _ = _force(c, s2, s1, x[0], x[1], x[2], x[3], x[VE + 1], x[VE + 2], x[VE + 3])
+        fx, fy, fz, u, v, w = _force(c, s2, s1, x[0], x[1], x[2], x[3], x[VE + 1], x[VE + 2], x[VE + 3])
     rx, ry = -c[17], -c[18]
     if rx != 0.0 or ry != 0.0:
         # The IMU is fixed to the frame, at r from the centre of gravity: omega' x r + omega x (omega x r).
         p_, q_, r_ = x[4], x[5], x[6]
         dp, dq, dr = _turning(c, s2, x2, y2, z2, o1, s1, p_, q_, r_)
-        ap, aq, ar = _dragged(c, x2, y2, s1, u, v)
+        ap, aq, ar = _dragged(c, x2, y2, s1, u, v, w)
         ap, aq, ar = ap + dp + x[AL + 1], aq + dq + x[AL + 2], ar + dr + x[AL + 3]
         along, square = p_ * rx + q_ * ry, p_ * p_ + q_ * q_ + r_ * r_
         fx += p_ * along - rx * square - ar * ry
@@ -560,8 +572,8 @@ def _transition(c, row, h, keep, air, x, after, F, turn):  # type: ignore[no-unt
     p, q, r = 0.5 * (x[4] + after[4]), 0.5 * (x[5] + after[5]), 0.5 * (x[6] + after[6])
     o1, s1 = 0.5 * (row[4] + row[MOMENTS + 4]), 0.5 * (row[5] + row[MOMENTS + 5])
     A = (
-        (-c[14], c[6] * r + c[4] * o1, c[6] * q),
-        (c[7] * r - c[5] * o1, -c[15], c[7] * p),
+        (-c[14] - c[28] * s1, c[6] * r + c[4] * o1, c[6] * q),
+        (c[7] * r - c[5] * o1, -c[15] - c[29] * s1, c[7] * p),
         (c[8] * q, c[8] * p, -c[16] - c[21] * s1),
     )
     turned = (h * p, h * q, h * r)
@@ -604,14 +616,16 @@ def _transition(c, row, h, keep, air, x, after, F, turn):  # type: ignore[no-unt
             0.5 * (x[VE + 3] + after[VE + 3]),
         )
         fx, fy, fz = fx + x[FO + 1], fy + x[FO + 2], fz + x[FO + 3]
-        kx, ky = c[12] * s1, c[13] * s1
+        kx, ky, kz = c[12] * s1, c[13] * s1, c[25] * s1
         # d force / d rotation vector = -[force]x - k [velocity]x, in body axes.
-        B = ((0.0, fz + kx * down, -fy - kx * v), (-fz - ky * down, 0.0, fx + ky * u), (fy, -fx, 0.0))
+        B = ((0.0, fz + kx * down, -fy - kx * v), (-fz - ky * down, 0.0, fx + ky * u), (fy + kz * v, -fx - kz * u, 0.0))
         for i in range(3):
             for j in range(3):
                 turn[i, j] = R[3 * i + j]
                 F[VE + i, FO + j] = 0.5 * h * (1.0 + keep[j]) * R[3 * i + j]
-                F[VE + i, VE + j] = -h * (kx * R[3 * i] * R[3 * j] + ky * R[3 * i + 1] * R[3 * j + 1])
+                F[VE + i, VE + j] = -h * (
+                    kx * R[3 * i] * R[3 * j] + ky * R[3 * i + 1] * R[3 * j + 1] + kz * R[3 * i + 2] * R[3 * j + 2]
+                )
                 for m in range(3):
                     F[VE + i, TH + j] += h * R[3 * i + m] * B[m][j]
             F[VE + i, VE + i] += 1.0
@@ -694,10 +708,12 @@ def _accel_slope(c, row, air, x, slope):  # type: ignore[no-untyped-def]
     if air:
         r = _rotation(x[0], x[1], x[2], x[3])
         _, _, _, u, v, w = _force(c, 0.0, 0.0, x[0], x[1], x[2], x[3], x[VE + 1], x[VE + 2], x[VE + 3])
-        kx, ky = c[12] * row[2 * MOMENTS + 5], c[13] * row[2 * MOMENTS + 5]
+        s1 = row[2 * MOMENTS + 5]
+        kx, ky, kz = c[12] * s1, c[13] * s1, c[25] * s1
         slope[0, 1], slope[0, 2], slope[1, 0], slope[1, 2] = kx * w, -kx * v, -ky * w, ky * u
+        slope[2, 0], slope[2, 1] = kz * v, -kz * u
         for j in range(3):
-            slope[0, 3 + j], slope[1, 3 + j] = -kx * r[3 * j], -ky * r[3 * j + 1]
+            slope[0, 3 + j], slope[1, 3 + j], slope[2, 3 + j] = -kx * r[3 * j], -ky * r[3 * j + 1], -kz * r[3 * j + 2]
 
 
 @_piece
@@ -745,8 +761,8 @@ def kalman(track: Track, p: FloatArray, psi: FloatArray, tail: FloatArray, store
         np.zeros((rows, 3, 9)),
         np.zeros((rows, N_MEAN)),
         np.zeros((rows, N, 9)),
-        moments(track, p[DELAY], p[LAG]),
-        (p[DELAY], p[LAG]),
+        moments(track, *turning(p)),
+        turning(p),
         track.beyond,
     )
     return filter_pass(track, p, psi, tail, store, g), g

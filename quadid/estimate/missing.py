@@ -147,7 +147,7 @@ class Vehicles:
         problem, z = settled(windows, vehicle, theta, None)
         part = problem.liveliest(NEAR_SECONDS)
         z, self.psi, gains = settle_noise(part, z, problem.first_noise())
-        self.tail = tails(whitened(part.tracks, gains))
+        self.tail = tails(part.tracks, gains)
         if self.tail.any():
             _, self.psi, *_ = scoring(replace(part, tail=self.tail), z, self.psi, MOST, ALL_NOISE)
 

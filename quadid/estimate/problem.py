@@ -37,6 +37,9 @@ PLACES: dict[str, int] = {
     "motor_lag.tau": k.LAG,
     "rotor_drag.central": k.CENTRAL,
     "no_gyroscopic_coupling.share": k.UNCOUPLED,
+    "thrust_curve.dead_speed": k.DEAD,
+    "thrust_curve.offset": k.OFFSET,
+    "axial_inflow.k_z": k.INFLOW,
 }
 """Entries of the physics vector by name: those that the filter has in its own equations."""
 LATE = ("command_delay.delay", "motor_lag.tau")
@@ -98,7 +101,7 @@ LEAST = 1e-2
 
 def control_moment(tracks: Sequence[Track], p: FloatArray) -> FloatArray:
     """Standard deviation of the angular acceleration that the rotors ask for at physics p, shape (3,) [rad/s^2]."""
-    moment = np.concatenate([k.moments(track, 0.0, 0.0)[:-1, :4] for track in tracks])
+    moment = np.concatenate([k.moments(track, 0.0, 0.0, *k.turning(p)[2:])[:-1, :4] for track in tracks])
     arms = np.column_stack([-p[k.B] * moment[:, 2], p[k.B] * moment[:, 1], p[k.D] * moment[:, 3]])
     return np.asarray(np.std(arms / p[k.JX : k.JX + 3], axis=0) + 1e-3)
 
@@ -328,6 +331,10 @@ class Problem:
         for (_, place, where), value, size in zip(self.entries, z, self.size, strict=True):
             if where in (-1, flight) and place < k.N_PHYSICS:
                 p[place] = np.exp(value) if place < k.TRIM else value * size
+        if "thrust_curve.dead_speed" in self.names and "thrust_curve.offset" not in self.names:
+            # A curve of the rotors alone leaves the thrust at rest as it is.
+            dead, offset = (self.theta[self.layout.entry(f"thrust_curve.{n}").index] for n in ("dead_speed", "offset"))
+            p[k.OFFSET] = offset + p[k.B] * (min(dead, 0.0) ** 2 - min(p[k.DEAD], 0.0) ** 2)
         return p
 
     def vector(self, z: FloatArray, flight: int) -> FloatArray:
@@ -383,8 +390,14 @@ class Problem:
 
     @cached_property
     def acting(self) -> FloatArray:
-        """Derivative of the logarithm of what rotors make, thrust and angular accelerations, by z, shape (4, P)."""
-        return np.column_stack([ACTS[:, place] if place < 6 else np.zeros(4) for _, place, _ in self.entries])
+        """Derivative of the logarithm of what rotors make, thrust and angular accelerations, by z, shape (4, P).
+
+        A higher dead speed makes thrust and its moments follow speeds less, drag torque as before.
+        """
+        speed = self.vehicle.hover_speed(float(self.base[k.B]))
+        by = {**dict(enumerate(ACTS.T)), k.DEAD: np.array([-1.0, -1.0, -1.0, 0.0]) / speed}
+        columns = zip(self.entries, self.size, strict=True)
+        return np.column_stack([size * by.get(place, np.zeros(4)) for (_, place, _), size in columns])
 
     @cached_property
     def taken(self) -> tuple[FloatArray, FloatArray]:
@@ -652,8 +665,8 @@ class Problem:
 
 def _table(track: Track, g: Gains, p: FloatArray) -> FloatArray:
     """Rotor moments at physics p: those of the gains where nothing moved in time."""
-    delay, lag = p[[k.DELAY, k.LAG]]
-    return g.table if (delay, lag) == g.late else k.moments(track, delay, lag)
+    made_with = k.turning(p)
+    return g.table if made_with == g.made_with else k.moments(track, *made_with)
 
 
 _NO_ROWS, _NO_MEANS = np.empty((0, k.M)), np.empty((0, k.N_MEAN))

@@ -8,8 +8,8 @@ and slope, which add.  Rows before them only bring the filter's state, and its d
 so that none is counted twice, and no border takes information away.  All are linearised at one point; where twice as
 much was flown as it rests on, steps to the maximum over all of that lead to another, where all rows are estimated anew.
 
-Free are the nominal six, trim moment, biases, and what acts on every vehicle beside them (`filter_error.ALONG`).  What
-else thrust may have is looked at beside that and never published: each rotor's loss, a thrust curve, a support.
+Free are the nominal six, trim moment, biases, what acts on every vehicle beside them (`filter_error.ALONG`), and a
+thrust curve.  What else thrust may have is looked at beside that and never published: a support, each rotor's loss.
 """
 
 import math
@@ -21,9 +21,10 @@ import numpy as np
 from quadid.data.window import Window
 from quadid.effects import butterworth_delay
 from quadid.estimate import kalman as k
-from quadid.estimate.fit import ALL_NOISE, NEAR, estimate, of_square, scoring, tails, whitened
+from quadid.estimate import late_imu
+from quadid.estimate.fit import ALL_NOISE, MOST, estimate, of_square, scoring, tails
 from quadid.estimate.kalman import Gains
-from quadid.estimate.late_imu import MOST, delay_of, in_time
+from quadid.estimate.late_imu import delay_of, in_time
 from quadid.estimate.problem import TRIMMED, UPRIGHT, Problem
 from quadid.estimate.track import from_window
 from quadid.identification.filter_error import fitted_along, start_of
@@ -33,10 +34,11 @@ from quadid.identification.problem import Prior, Shooting
 from quadid.identification.uncertainty import bounds_of, coarse
 from quadid.model.layout import IMU_PERIOD, Layout
 from quadid.online.checks import wrong_unit
+from quadid.online.gate import with_room
 from quadid.online.records import Job, JobReply
 from quadid.parameters import NOMINAL_NAMES
 from quadid.types import BoolArray, FloatArray, check_shapes
-from quadid.vehicle import Vehicle
+from quadid.vehicle import GRAVITY, Vehicle
 
 SIX = len(NOMINAL_NAMES)
 ROLL_PITCH = [NOMINAL_NAMES.index(name) for name in ("J_xx", "J_yy")]
@@ -56,6 +58,10 @@ INFLOW = "axial_inflow.k_z"
 """Thrust lost in a climb, free where velocity is measured: seconds of climb would else make b smaller, and sure."""
 UNCOUPLED = "no_gyroscopic_coupling.share"
 """Free too, as simulators may lack it: inertias would stand in for it; without evidence fusion takes it to be none."""
+CURVE = "thrust_curve.dead_speed"
+"""Likewise: without it, a rotor whose thrust is nearly straight makes inertias too large; see `Curve`."""
+SUPPORT = "thrust_curve.offset"
+"""Likewise: a support, or a bias of the accelerometer, looks like a curve at hover."""
 LOOSE = 4
 """Rows of `WindowEstimate.loose`: an answer of the rotors within a step about each axis, and their noise."""
 
@@ -187,7 +193,7 @@ class FitRequest(Job):
             return False
         return (
             (reply.excitation is None or reply.excitation.shape == (SIX,))
-            and (reply.noise is None or _is_noise(reply.noise, _known_delay(self) or MOST))
+            and (reply.noise is None or _is_noise(reply.noise, _known_delay(self) or late_imu.MOST))
             and _are_estimates(reply.estimates, self)
             and (not reply.estimates or reply.noise is not None or self.noise is not None)
             and (reply.theta is None or _is_vector(reply.theta, self.theta) or not reply.finite)
@@ -240,13 +246,13 @@ def own_names(vehicle: Vehicle) -> tuple[str, ...]:
     initial, neutral = layout.initial(vehicle), layout.neutral()
     stated = {name.split(".")[0] for name, e in layout.entries.items() if initial[e.index] != neutral[e.index]}
     more = (name for name in (INFLOW, UNCOUPLED) if name.split(".")[0] not in stated)
-    return (*NOMINAL_NAMES, *TRIMMED, UPRIGHT, *fitted_along(stated), *more)
+    return (*NOMINAL_NAMES, *TRIMMED, UPRIGHT, *fitted_along(stated), *more, CURVE)
 
 
 def thrust_names(vehicle: Vehicle) -> tuple[str, ...]:
-    """Effects of thrust beside b: a loss of each rotor, a curve, and what is there while no rotor turns."""
+    """Effects of thrust beside b and its curve: what is there while no rotor turns, and a loss of each rotor."""
     losses = [n for n in Layout(vehicle).entries if n.startswith("weak_rotor.loss_")]
-    return (*losses, "thrust_curve.dead_speed", "thrust_curve.offset")
+    return (SUPPORT, *losses)
 
 
 def names_of(vehicle: Vehicle) -> tuple[str, ...]:
@@ -260,11 +266,80 @@ def prior_of(vehicle: Vehicle) -> Prior:
     return Prior(vehicle.initial, np.array([min(max(p.log_sigma, 0.2), p.log_halfwidth) for p in given]))
 
 
-def problem_of(window: Window, vehicle: Vehicle, more: tuple[str, ...] = ()) -> Problem:
-    """Likelihood of a window by what is estimated, and `more`."""
+def problem_of(window: Window, vehicle: Vehicle) -> Problem:
+    """Likelihood of a window by what is estimated; a guess may turn out to be farther off than what was searched."""
     along = [n for n in own_names(vehicle)[SIX + len(TRIMMED) + 1 :] if n != INFLOW or window.velocity is not None]
     theta = Layout(vehicle).initial(vehicle)
-    return Problem.of([from_window(window, vehicle, air=True)], vehicle, (*along, *more), [window], theta)
+    return Problem.of([from_window(window, vehicle, air=True)], with_room(vehicle), along, [window], theta)
+
+
+# --- Scaled parameters of the recursion, and as the filter has them
+
+
+class Curve:
+    """Thrust curve of a vehicle, and a support of it, beside what its file has.
+
+    By their own numbers these and the six are hard to tell apart.  In the recursion b is that with which the file's
+    curve, of dead speed w_s and offset T_s, carries the weight at the hover speed w_h of the flown one, and the other
+    five go with its slope there: curve and support hardly change those.  With u = w_h - w_0 and q = w_h - w_s above the
+    flown dead speed w_0 and the file's, where a curve alone leaves the thrust at rest as it is and a support adds T_r,
+
+        b_s q^2 = m g / R - T_s = b (u^2 + e) + T_r,  e = min(w_s, 0)^2 - min(w_0, 0)^2,  s = b u / (b_s q)      (1)
+        log b_s = z_b,  log of d, J_xx, J_yy, J_zz, J_r = z + log s
+    """
+
+    def __init__(self, vehicle: Vehicle) -> None:
+        """Takes the curve of the vehicle file."""
+        layout = Layout(vehicle)
+        initial, curve, support = layout.initial(vehicle), layout.entry(CURVE), layout.entry(SUPPORT)
+        self._at = len(own_names(vehicle)) - 1
+        self._sizes = np.array([curve.typical, support.typical])
+        self.dead, self.offset = float(initial[curve.index]), float(initial[support.index])
+        self._weight = vehicle.mass * GRAVITY / len(vehicle.rotors) - self.offset
+
+    def beside(self, z: FloatArray) -> tuple[float, float]:
+        """Flown dead speed w_0 [rad/s] and support T_r [N]."""
+        dead, support = (z[self._at : self._at + 2] * self._sizes).tolist()
+        return dead, min(support, 0.9 * self._weight)
+
+    def law(self, z: FloatArray) -> tuple[float, float, float]:
+        """Flown b, dead speed [rad/s] and offset [N]."""
+        (dead, support), square = self.beside(z), self._above(z)[2]
+        b = (self._weight - support) / square
+        return b, dead, self.offset + support + b * self._rest(dead)
+
+    def filtered(self, z: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Scaled parameters (P,) as the filter has them, and their derivatives by those of the recursion (P, P)."""
+        (dead, support), (q, u, square) = self.beside(z), self._above(z)
+        carried, by_dead = self._weight - support, 2.0 * (u + min(dead, 0.0)) / square
+        out, slopes, beside = z.copy(), np.eye(len(z)), slice(self._at, self._at + 2)
+        out[:SIX] += math.log(q * u / square * carried / self._weight)
+        out[k.B] = math.log(carried / square)
+        slopes[:SIX, k.B] += q * u / square - 0.5 * q / u - 0.5
+        slopes[:SIX, beside] = self._sizes * [by_dead - 1.0 / u, -1.0 / carried]
+        slopes[k.B, k.B], slopes[k.B, self._at] = q * u / square, self._sizes[0] * by_dead
+        return out, slopes
+
+    def fused(self, z: FloatArray) -> FloatArray:
+        """Inverse of `filtered`, shape (P,)."""
+        (dead, support), out = self.beside(z), z.copy()
+        carried = self._weight - support
+        square = carried / math.exp(z[k.B])
+        u = math.sqrt(square - self._rest(dead))
+        q = u + dead - self.dead
+        out[:SIX] -= math.log(q * u / square * carried / self._weight)
+        out[k.B] = math.log(self._weight / q**2)
+        return out
+
+    def _above(self, z: FloatArray) -> tuple[float, float, float]:
+        """Speeds q and u, and u^2 + e of Eq. 1; u is a tenth of q at least."""
+        dead, q = self.beside(z)[0], math.sqrt(self._weight / math.exp(z[k.B]))
+        u = max(q + self.dead - dead, 0.1 * q)
+        return q, u, u**2 + self._rest(dead)
+
+    def _rest(self, dead: float) -> float:
+        """Square e of Eq. 1."""
+        return float(min(self.dead, 0.0) ** 2 - min(dead, 0.0) ** 2)
 
 
 # --- The fit
@@ -357,6 +432,7 @@ def _maximum(request: FitRequest, late: float) -> tuple[FloatArray, Noise]:
     found = estimate(problem, start_of(problem, theta, own_names(vehicle)))
     z = np.zeros(len(names_of(vehicle)))
     z[_places(found.problem, vehicle)] = found.z
+    z = Curve(vehicle).fused(z)
     doubt = of_square(found.problem, found.z, found.psi, found.problem.passes(found.z, found.psi)[1])
     return z, Noise(found.psi, found.problem.tail, found.problem.control, doubt, late)
 
@@ -367,25 +443,29 @@ def _places(problem: Problem, vehicle: Vehicle) -> list[int]:
 
 
 def _like(problem: Problem, vehicle: Vehicle, z: FloatArray, noise: Noise) -> tuple[Problem, FloatArray]:
-    """The problem in the units of the noise at hand, and its own part of z."""
+    """The problem in the units of the noise at hand, and its own part of z as the filter has it."""
     shapes = ("psi", noise.psi, (k.N_NOISE,)), ("tail", noise.tail, (4,)), ("control", noise.control, (3,))
     check_shapes("filter", ("z", z, (len(names_of(vehicle)),)), *shapes)
-    own = z[_places(problem, vehicle)]
-    problem = replace(problem, control=noise.control, tail=noise.tail)
+    curve, theta = Curve(vehicle), problem.theta.copy()
+    own = curve.filtered(z)[0][_places(problem, vehicle)]
+    theta[problem.layout.entry(SUPPORT).index] = curve.offset + curve.beside(z)[1]
+    problem = replace(problem, theta=theta, control=noise.control, tail=noise.tail)
     return replace(problem.based_on(own)[0], control=noise.control), own
 
 
 def _renewed(request: FitRequest, noise: Noise) -> tuple[FloatArray, Noise]:
     """Point and noise by steps over all that was learned from, tails too: outliers show in much data only."""
     problem, own = _like(problem_of(max(request.learned, key=len), request.vehicle), request.vehicle, request.z, noise)
-    own, psi, _, gains, _ = scoring(problem, own, noise.psi, NEAR, ALL_NOISE)
-    problem = replace(problem, tail=tails(whitened(problem.tracks, gains)))
-    own, psi, value, gains, _ = scoring(problem, own, psi, NEAR, ALL_NOISE)
+    own, psi, _, gains, _ = scoring(problem, own, noise.psi, MOST, ALL_NOISE)
+    problem = replace(problem, tail=tails(problem.tracks, gains))
+    own, psi, value, gains, _ = scoring(problem, own, psi, MOST, ALL_NOISE)
     if not math.isfinite(value):
         return request.z, noise
-    z = request.z.copy()
+    curve = Curve(request.vehicle)
+    z = curve.filtered(request.z)[0]
     z[_places(problem, request.vehicle)] = own
-    return z, replace(noise, psi=psi, tail=problem.tail, doubt=of_square(problem, own, psi, gains))
+    doubt = of_square(problem, own, psi, gains)
+    return curve.fused(z), replace(noise, psi=psi, tail=problem.tail, doubt=doubt)
 
 
 def _followed(request: FitRequest, noise: Noise) -> Noise:
@@ -397,27 +477,18 @@ def _followed(request: FitRequest, noise: Noise) -> Noise:
 
 def _estimates(request: FitRequest, z: FloatArray, noise: Noise) -> tuple[tuple[WindowEstimate, ...], FloatArray]:
     """Estimate of the rows of each span, by all parameters; full vector where they are linearised."""
-    vehicle, names, count, theta = request.vehicle, names_of(request.vehicle), len(z), request.theta
+    vehicle, count, theta = request.vehicle, len(z), request.theta
     vector, square, loose = np.zeros(count), np.zeros((count, count)), np.zeros((LOOSE, count))
     out = [WindowEstimate(*span, z, square, vector, 0.0, 0.0, square, loose, square, vector) for span in request.spans]
     for window in request.learned or request.windows:
-        # 1. By what is estimated, and by what thrust may have beside that.
-        problem, own = _like(problem_of(window, vehicle), vehicle, z, noise)
-        mine, gains = _places(problem, vehicle), problem.passes(own, noise.psi)[1]
-        J = np.zeros((count, len(window), k.M))
-        _, plain, J[mine] = problem.sensitivities(0, own, noise.psi, gains[0])
-        J[len(own_names(vehicle)) :] = _by_thrust(window, problem, own, noise, gains[0])
-        # 2. What noise of rotor speeds makes of it, and an answer of the rotors within a step; a dead speed is to both
-        # another b and d, as moments then follow speeds otherwise.
-        E, (slope, curvature) = np.eye(count)[mine], problem.unbiased(own, noise.psi, gains).taken
-        typical = problem.layout.entry("thrust_curve.dead_speed").typical
-        E[:2, names.index("thrust_curve.dead_speed")] = -typical / vehicle.hover_speed(problem.physics(own, 0)[k.B])
+        # 1. Innovations and their derivatives, and the same on every second row.
+        sparse = coarse(window)
+        problem, own, E, gains, plain, J = _linearised(window, vehicle, z, noise)
+        *_, half, half_J = _linearised(sparse, vehicle, z, noise)
+        # 2. What noise of rotor speeds makes of it, and an answer of the rotors within a step.
+        slope, curvature = problem.unbiased(own, noise.psi, gains).taken
         slope, curvature = slope @ E, E.T @ curvature @ E
         unsure = np.vstack([0.5 * problem.within_a_step(own, gains) @ E, noise.doubt * slope])
-        # 3. The same on every second row.
-        sparse = coarse(window)
-        other, _ = _like(problem_of(sparse, vehicle), vehicle, z, noise)
-        _, half, half_J = other.sensitivities(0, own, noise.psi, other.passes(own, noise.psi)[1][0])
         for i, e in enumerate(out):
             start, stop = e.start - 0.5 * window.dt, e.stop - 0.5 * window.dt
             new, half_new = ((w.t > start) & (w.t < stop) for w in (window, sparse))
@@ -431,11 +502,32 @@ def _estimates(request: FitRequest, z: FloatArray, noise: Noise) -> tuple[tuple[
                 rows=e.rows + 3.0 * np.count_nonzero(problem.tracks[0].seen[new]),
                 noise=e.noise + share * curvature,
                 loose=e.loose + share * unsure,
-                half_information=e.half_information + E.T @ of_half[0] @ E,
-                half_score=e.half_score + of_half[1] @ E,
+                half_information=e.half_information + of_half[0],
+                half_score=e.half_score + of_half[1],
             )
         theta = problem.vector(own, 0)
+    curve = Curve(vehicle)
+    for name, value in (CURVE, curve.dead), (SUPPORT, curve.offset):
+        theta[Layout(vehicle).entry(name).index] = value
+    theta[:SIX] = np.exp(z[:SIX])
     return tuple(out), theta
+
+
+def _linearised(
+    window: Window, vehicle: Vehicle, z: FloatArray, noise: Noise
+) -> tuple[Problem, FloatArray, FloatArray, list[Gains], FloatArray, FloatArray]:
+    """Likelihood of a window near z.
+
+    Returns:
+        The problem; its scaled parameters (N,) and their derivatives by z (N, P); gains; whitened innovations (n, M),
+        and their derivatives by z (P, n, M).
+    """
+    problem, own = _like(problem_of(window, vehicle), vehicle, z, noise)
+    by_z, gains = Curve(vehicle).filtered(z)[1][_places(problem, vehicle)], problem.passes(own, noise.psi)[1]
+    _, plain, by_own = problem.sensitivities(0, own, noise.psi, gains[0])
+    J = np.tensordot(by_z, by_own, (0, 0))
+    J[len(own_names(vehicle)) :] += _by_thrust(window, problem, own, noise, gains[0])
+    return problem, own, by_z, gains, plain, J
 
 
 def _quadratic(J: FloatArray, plain: FloatArray, rows: BoolArray, root: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -447,31 +539,30 @@ def _quadratic(J: FloatArray, plain: FloatArray, rows: BoolArray, root: FloatArr
 def _by_thrust(window: Window, problem: Problem, z: FloatArray, noise: Noise, gains: Gains) -> FloatArray:
     """Derivatives of whitened innovations by what thrust may have beside b, shape (R + 2, n, M).
 
-    To the filter each is other rotor speeds: those at which b alone gives as much.  A loss of all rotors is b itself;
-    a rotor's is what it loses beyond their mean.
+    To the filter each is other rotor speeds: those at which b and its curve give as much.  A loss of all rotors is b
+    itself; a rotor's is what it loses beyond their mean.
     """
-    speed, p = window.rotor_speed, problem.physics(z, 0)
-    track = problem.tracks[0]._replace(beyond=gains.beyond)
+    p, track = problem.physics(z, 0), problem.tracks[0]._replace(beyond=gains.beyond)
+    above = window.rotor_speed - p[k.DEAD]
 
     def whitened(square: FloatArray) -> FloatArray:
-        moved = from_window(replace(window, rotor_speed=np.sqrt(square)), problem.vehicle, air=True)
-        out = np.zeros((len(window), k.M))
-        k.replay(track, p, noise.psi, gains, k.moments(moved, p[k.DELAY], p[k.LAG]), out, np.empty((0, k.N_MEAN)))
+        moved = from_window(
+            replace(window, rotor_speed=p[k.DEAD] + np.sqrt(np.maximum(square, 0.0))), problem.vehicle, air=True
+        )
+        table, out = k.moments(moved, *k.turning(p)), np.zeros((len(window), k.M))
+        k.replay(track, p, noise.psi, gains, table, out, np.empty((0, k.N_MEAN)))
         return out
 
-    plain, out = whitened(speed**2), []
+    plain, out = whitened(above**2), []
     for name in thrust_names(problem.vehicle):
-        step = NUDGE * problem.layout.entry(name).typical
-        square = speed**2
-        if name == "thrust_curve.dead_speed":
-            square = np.maximum(speed - step, 0.0) ** 2
-        elif name == "thrust_curve.offset":
-            square = square + step / p[k.B]
+        step, square = NUDGE * problem.layout.entry(name).typical, above**2
+        if name == SUPPORT:
+            square += step / p[k.B]
         else:
             square[:, int(name.rsplit("_", 1)[1]) - 1] *= 1.0 - step
         out.append((whitened(square) - plain) / NUDGE)
     by = np.array(out)
-    by[:-2] -= by[:-2].mean(axis=0)
+    by[1:] -= by[1:].mean(axis=0)
     return by
 
 

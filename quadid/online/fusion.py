@@ -30,9 +30,12 @@ from quadid.identification.uncertainty import CHANCE, SHARE, Uncertainty, parame
 from quadid.model.layout import B, Layout, ThrustModel
 from quadid.online.checks import GridBuffer, WindowCut
 from quadid.online.fit_job import (
+    CURVE,
     LOOSE,
     SIX,
+    SUPPORT,
     UNCOUPLED,
+    Curve,
     FitReply,
     FitRequest,
     Noise,
@@ -41,7 +44,7 @@ from quadid.online.fit_job import (
     prior_of,
     thrust_names,
 )
-from quadid.online.gate import ActiveSet, Case
+from quadid.online.gate import ActiveSet, Case, with_room
 from quadid.online.records import OnlineSet
 from quadid.parameters import NOMINAL_NAMES, NOMINAL_UNITS, TANGENT, Parameter, ParameterSet, Status
 from quadid.types import FloatArray
@@ -171,9 +174,8 @@ class Fusion:
             positive: places of those that are not negative.
             unusual: of those that are none without evidence, their prior's mean being none.
         """
-        self._mean, self._sigma, self._positive, self._unusual = mean, sigma, positive, unusual
-        self._without = np.where(np.isin(np.arange(len(sigma)), unusual), NOTHING * sigma, sigma)
-        self._met = False
+        self._mean, self._sigma, self._positive, self._unusual = mean, sigma, positive, list(unusual)
+        self._met = ~np.isin(np.arange(len(sigma)), unusual)
         self._own, self._memory, self._length = own, memory, length
         self._sums: deque[Sum] = deque(maxlen=KEPT)
         self._known: dict[bool, Fused] = {}
@@ -199,10 +201,11 @@ class Fusion:
             self._sums.append(Sum.none(window.start, len(self._mean)))
         self._sums.append(total)
         self._known.clear()
-        before, self._met = self._met, True
+        before, self._met = self._met, np.ones(len(self._mean), dtype=np.bool_)
         free = self._solve(total, self._own)
-        self._met = any(free.z[i] ** 2 > exceeded(CHANCE, 1) * free.covariance[i, i] for i in self._unusual)
-        if self._met != before:
+        found = (free.z - self._mean[: self._own]) ** 2 > exceeded(CHANCE, 1) * np.diag(free.covariance)
+        self._met[self._unusual] = found[self._unusual]
+        if not np.array_equal(self._met, before):
             self._stretches.clear()
         self.newest, self.taken = window, self.taken + 1
         self.counted = max(self.counted, window.stop)
@@ -305,7 +308,9 @@ class Fusion:
 
     def _solve(self, total: Sum, own: int) -> Fused:
         """Estimate from a sum by the first `own` parameters, the rest taken to be none."""
-        part, mean, sigma = slice(own), self._mean[:own], (self._sigma if self._met else self._without)[:own]
+        part, mean = slice(own), self._mean[:own]
+        met = self._met if own == self._own else np.ones_like(self._met)
+        sigma = np.where(met, self._sigma, NOTHING * self._sigma)[part]
         precision, net, loose = 1.0 / sigma**2, total.information[part, part], total.loose[:, part]
         # What noise of the rotors explains is no information, but there is never less than the prior's; where noise
         # explains more than there is, nothing was told.
@@ -353,17 +358,21 @@ class Estimator:
         self.vehicle, self._seed = vehicle, seed
         self.excitation = np.full(SIX, np.nan)
         self._hash = hashlib.sha256(f"quadid {vehicle.to_yaml()} {seed}".encode()).digest()
-        self._layout = Layout(vehicle)
+        self._layout = Layout(with_room(vehicle))
         self._initial = self._layout.initial(vehicle)
         self._stated = ThrustModel(self._layout, self._initial)
         self._free = Free(tuple(self._layout.entry(n) for n in NOMINAL_NAMES))
-        self._thrust = [self._layout.entry(name) for name in thrust_names(vehicle)]
-        names = own_names(vehicle)
-        prior, count, own = prior_of(vehicle), len(names) + len(self._thrust), len(names)
+        curve, thrust = self._layout.entry(CURVE), [self._layout.entry(name) for name in thrust_names(vehicle)]
+        self._thrust = [curve, *thrust]
+        names = (*own_names(vehicle), SUPPORT)
+        prior, count, own = prior_of(vehicle), len(names) + len(thrust) - 1, len(names)
         self._prior_sigma = prior.sigma
         mean, sigma = np.zeros(count), np.ones(count)
-        mean[:SIX], sigma[:SIX], sigma[own:] = np.log(prior.mean), prior.sigma, WIDTH
-        lags, unusual = ([i for i, name in enumerate(names) if name == one] for one in ("motor_lag.tau", UNCOUPLED))
+        mean[:SIX], sigma[:SIX] = np.log(prior.mean), prior.sigma
+        self._dead = names.index(CURVE)
+        mean[self._dead], sigma[self._dead :] = self._initial[curve.index] / curve.typical, WIDTH
+        lags = [i for i, name in enumerate(names) if name == "motor_lag.tau"]
+        unusual = [i for i, name in enumerate(names) if name in (UNCOUPLED, CURVE, SUPPORT)]
         self._nothing = partial(Fusion, mean, sigma, own, memory, length, lags, unusual)
         self._z = mean
         self.reset()
@@ -557,18 +566,15 @@ class Estimator:
         """
         fused, weight = self.fusion.estimate(wide=True), self.vehicle.mass * GRAVITY
         assert fused is not None
-        places = [*range(SIX), *range(len(fused.z) - len(self._thrust), len(fused.z))]
-        at = math.exp(self._z[B])
-        dead, rest = (self._layout.entry(f"thrust_curve.{n}").index for n in ("dead_speed", "offset"))
+        places = [*range(SIX), *range(self._dead, len(fused.z))]
+        curve, (dead, offset, *losses) = Curve(self.vehicle), self._thrust
 
-        def value(z: FloatArray) -> FloatArray:
-            theta = self._initial.copy()
-            for entry, effect in zip(self._thrust, z[SIX:], strict=True):
+        def value(changed: FloatArray) -> FloatArray:
+            z, theta = fused.z.copy(), self._initial.copy()
+            z[places] = changed
+            theta[B], theta[dead.index], theta[offset.index] = curve.law(z)
+            for entry, effect in zip(losses, changed[SIX + 2 :], strict=True):
                 theta[entry.index] += effect * entry.typical
-            # What was linearised is b w^2, its slope and what is at rest: that is a parabola, whose root is this.
-            b, was = max(at * (1.0 + z[B] - self._z[B]), 0.1 * at), self._initial[dead]
-            theta[B], theta[dead] = b, was + (theta[dead] - was) * at / b
-            theta[rest] += b * (was**2 - theta[dead] ** 2)
             full = ThrustModel(self._layout, theta)
             six = self._stated.with_b(full.like(self._stated, weight))
             own = np.log(np.maximum(full.slope(weight), 1e-12) / six.slope(weight))

@@ -26,7 +26,7 @@ from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 
 ROOM = 16.0
-"""A number that somebody stored may be off a bare guess by this factor each way."""
+"""An estimate, or a number that somebody stored, may be off a bare guess by this factor each way."""
 LIMITED = (*NOMINAL_NAMES, TANGENT)
 """Parameters that may not jump from one set to the next; effects may."""
 MUST_BE_KNOWN = ("b", "J_xx", "J_yy")

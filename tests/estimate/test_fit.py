@@ -50,7 +50,7 @@ def test_truth_lies_inside_the_intervals_and_no_random_force_is_found() -> None:
     assert np.all(share < 0.1), share
     white = np.mean(found.whitened[0][:, :9] ** 2, axis=0)
     assert np.all(np.abs(white - 1.0) < 0.05), white
-    assert not tails(found.whitened).any()
+    assert not tails(found.problem.tracks, found.problem.passes(found.z, found.psi)[1]).any()
 
 
 def test_a_velocity_that_nobody_measures_has_no_innovations_and_no_outliers() -> None:

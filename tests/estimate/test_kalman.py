@@ -52,17 +52,20 @@ def test_smoother_needs_no_attitude() -> None:
     assert np.abs(found[0, : k.AE - k.FO]).max() > 0.0
 
 
-@pytest.mark.parametrize(("share", "lost"), [(0.1, 0.003), (0.2, 0.015), (0.25, 0.035)])
+@pytest.mark.parametrize(("share", "lost"), [(0.1, 1e-3), (0.2, 3e-3), (0.3, 6e-3), (0.4, 1e-2)])
 def test_rotors_that_turn_between_readings_keep_their_moments(share: float, lost: float) -> None:
-    """Lines from reading to reading lose sinc^2: 3, 12 and 19 %, and inertias would be as much too small."""
+    """Lines from reading to reading lose sinc^2: 3, 12, 26 and 43 %, and inertias would be as much too small.
+
+    A cubic spline loses 28 % of what turns at two fifths of the rate of readings, where a low-pass for the grid ends.
+    """
     dt, rows, y = 0.02, 300, PELICAN.rotor_positions[:, 1]
     phase = 2.0 * np.pi * share * np.arange(rows)
     speed = 500.0 + 10.0 * np.sin(phase)[:, None] * np.sign(y)
     track = from_window(Window(0.0, dt, speed, gyro=np.zeros((rows, 3)), sampling="instant"), PELICAN)
-    roll = k.moments(track, 0.0, 0.0)[:-1, [2, 2 + k.MOMENTS]].mean(axis=1)
+    roll = k.moments(track, 0.0, 0.0, 0.0, 0.0)[:-1, [2, 2 + k.MOMENTS]].mean(axis=1)
     exact = 1e4 * np.abs(y).sum() * -np.diff(np.cos(phase)) / (2.0 * np.pi * share)
     gain = roll[20:-20] @ exact[20:-20] / (exact[20:-20] @ exact[20:-20])
-    assert 1.0 - lost < gain < 1.0
+    assert gain == pytest.approx(1.0, abs=lost)
 
 
 def test_a_gap_in_readings_is_a_straight_line() -> None:

@@ -84,14 +84,19 @@ def test_a_weak_rotor_moves_b_by_its_share_whichever_it_is(rotor: int, happened:
     happened(37, f"rotor {rotor} 12 % weak on a first flight: waits with b {off(waits, 'b'):+.1%}")
 
 
-def test_a_thrust_curve_that_the_vehicle_file_lacks_waits_and_one_that_it_has_is_published() -> None:
-    made = flight(SECONDS, 3, "excited", (("thrust_curve", "dead_speed", 60.0),))
+def test_a_thrust_curve_is_published_whether_the_vehicle_file_has_it_or_not() -> None:
+    """Beside b w^2 a curve moves J by its slope; as a parameter of the filter it is published as `b_tangent`."""
+    dead = 60.0
+    made = flight(SECONDS, 3, "excited", (("thrust_curve", "dead_speed", dead),))
+    rise = np.sqrt(PELICAN.mass * GRAVITY / 4.0 / TRUE["b"])
+    secant, tangent = (rise / (rise + dead)) ** 2, rise / (rise + dead)
     session, sets = flown(made.recording)
-    assert not sets
-    waits = session.active_set.pending
-    assert waits is not None
-    assert "thrust curve" in waits.reason
-    knows = PELICAN.model_copy(update={"effects": {"thrust_curve": {"dead_speed": 60.0}}})
+    assert sets, session.status().reason
+    for item in sets:
+        true = {"b": secant * TRUE["b"], "b_tangent": tangent * TRUE["b"], "J_xx": TRUE["J_xx"], "J_yy": TRUE["J_yy"]}
+        for name, value in true.items():
+            assert item.parameters[name].value == pytest.approx(value, rel=0.02), name
+    knows = PELICAN.model_copy(update={"effects": {"thrust_curve": {"dead_speed": dead}}})
     told = Session(knows, SETTINGS)
     accepted = published(drive(told, samples(made.recording)))
     assert accepted, told.status().reason
