@@ -224,3 +224,16 @@ def test_the_search_stays_in_a_corner_of_the_delay_that_a_short_lag_rounds() -> 
     assert min(found.problem.objective(at + side, found.psi) for side in (-beside, beside)) > value + 0.1
     below, above, _ = found.problem.corner(at, found.psi, gains)
     assert below[delay] == above[delay] == 0.0
+
+
+def test_outliers_stay_what_they_are_where_they_were_expected() -> None:
+    """Weights lower outliers: tails that are taken from weighted innovations vanish, and outliers then pull."""
+    flight = fly(PELICAN, draw_truth(PELICAN, 1), SECONDS, 1)
+    assert flight.window.accel is not None
+    accel, rng = flight.window.accel.copy(), np.random.default_rng(0)
+    struck = rng.random(len(accel)) < 0.03
+    accel[struck] += rng.normal(0.0, 3.0, (int(struck.sum()), 3))
+    found = estimate(Problem.of([from_window(replace(flight.window, accel=accel), PELICAN)], PELICAN))
+    again = tails(found.problem.tracks, found.problem.passes(found.z, found.psi)[1])
+    assert found.problem.tail[2] > 0.1
+    assert again[2] > 0.1

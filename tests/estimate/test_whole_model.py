@@ -1,6 +1,7 @@
 """The table of effects in the filter: what acts along its states, what sensors remember, how a flight begins."""
 
 import numpy as np
+import pytest
 
 from quadid.data.window import Window
 from quadid.estimate import kalman as k
@@ -73,3 +74,42 @@ def simulated(window: Window, vehicle: Vehicle, thetas: np.ndarray) -> np.ndarra
     rollout = WholeModel(window, vehicle, PLACES)._rollout
     lanes, _ = rollout.roll(Segments(100, 1, np.array([1])), thetas, start[None])
     return np.moveaxis(lanes[:, 0], 3, 1).reshape(-1, *lanes.shape[2:4])[: len(thetas)]
+
+
+@pytest.mark.parametrize(
+    "numbers",
+    [
+        {"thrust_curve.dead_speed": 40.0},
+        {"thrust_curve.dead_speed": -80.0, "thrust_curve.offset": 0.2},
+        {"axial_inflow.k_z": 0.6},
+    ],
+    ids=["dead speed", "curve with an offset", "inflow"],
+)
+def test_what_the_filter_has_in_its_own_equations_moves_it_as_the_model_moves(numbers: dict[str, float]) -> None:
+    """Steps of the filter from the same states, with an effect in its equations and with the model's addition."""
+    window = fly(PELICAN, draw_truth(PELICAN, SEED), 12.0, SEED).window
+    layout = Layout(PELICAN)
+    theta = layout.initial(PELICAN)
+    for name, value in numbers.items():
+        theta[layout.entry(name).index] = value
+    track = from_window(window, PELICAN, air=True)
+    own = Problem.fixed([track], PELICAN, theta, [window])
+    gains = own.passes(own.start(), own.first_noise())[1][0]
+    assert not len(gains.beyond.added), "nothing is added to the filter's own equations"
+    without = [name for name in PLACES if name not in numbers]
+    added = WholeModel(window, PELICAN, without).beyond(theta[None], gains.mean)[0]
+    acting = own.physics(own.start(), 0)
+    plain = acting.copy()
+    plain[[PLACES[name] for name in numbers]] = 0.0
+    for row in (20, 33, 46, 300, 313, 326):
+        moved = one_step(track, gains, acting, row) - one_step(track, gains, plain, row)
+        np.testing.assert_allclose(moved[4:7], added[row, :3], atol=0.02 * np.abs(added[:, :3]).max())
+        np.testing.assert_allclose(moved[7:10], added[row, 6:9], atol=0.02 * np.abs(added[:, 6:9]).max())
+
+
+def one_step(track: k.Track, gains: k.Gains, p: np.ndarray, row: int) -> np.ndarray:
+    """Mean after one step of the filter's own equations from a row, nothing random, shape (N_MEAN,)."""
+    x, table = gains.mean[row].copy(), k.moments(track, *k.turning(p))
+    x[k.FO + 1 :] = 0.0
+    k._advance(k._constants(p, track), table[row], float(track.t[row + 1] - track.t[row]), np.zeros(9), True, x)
+    return x

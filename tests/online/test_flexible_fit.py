@@ -9,6 +9,7 @@ import pytest
 from quadid.model.layout import LOSS, Layout, ThrustModel
 from quadid.online import Session, SessionSettings
 from quadid.online.checks import WindowCut
+from quadid.online.fit_job import Curve, names_of, own_names
 from quadid.online.fusion import Estimator
 from quadid.online.gate import with_room
 from quadid.vehicle import GRAVITY, ParameterPrior, Vehicle
@@ -70,10 +71,21 @@ def test_a_bare_guess_has_room_and_given_bounds_stay() -> None:
     assert given == PELICAN.parameters["b"]
 
 
-def test_a_guess_at_the_end_of_its_bounds_is_found_whatever_the_first_fit_made_of_it() -> None:
-    """The nominal model of a first window may miss an inertia by as much as its bounds allow."""
+@pytest.mark.parametrize("times", [3.9, 4.0, 4.4])
+def test_a_guess_at_the_end_of_its_range_is_found_whatever_the_first_fit_made_of_it(times: float) -> None:
+    """The nominal model of a first window may miss an inertia by as much as its bounds allow.
+
+    ArduCopter's default frame by the recipe for new vehicles has guesses of exactly four times the truth.
+    """
     window = flight(24.0, 5, effects=LAGGING).window.slice(0, 500)
-    far = {"b": 2.0e-5, "d": 4.0e-7, "J_xx": 3.9 * TRUE["J_xx"], "J_yy": 3.9 * TRUE["J_yy"], "J_zz": 0.05, "J_r": 5e-5}
+    far = {
+        "b": 2.0e-5,
+        "d": 4.0e-7,
+        "J_xx": times * TRUE["J_xx"],
+        "J_yy": times * TRUE["J_yy"],
+        "J_zz": 0.05,
+        "J_r": 5e-5,
+    }
     vehicle = PELICAN.model_copy(update={"parameters": {n: ParameterPrior(initial=v) for n, v in far.items()}})
     start = Layout(vehicle).initial(vehicle)
     start[2:4] *= 2.0
@@ -82,3 +94,23 @@ def test_a_guess_at_the_end_of_its_bounds_is_found_whatever_the_first_fit_made_o
     learner.take(asked, asked.answer())
     for name in ("J_xx", "J_yy"):
         assert learner.value(name) == pytest.approx(TRUE[name], rel=0.1)
+
+
+@pytest.mark.parametrize("stated", [{}, {"dead_speed": -60.0, "offset": 0.3}, {"dead_speed": 30.0}], ids=str)
+@pytest.mark.parametrize(("curve", "support"), [(-4.0, 0.0), (-0.5, 0.4), (0.5, -0.3)])
+def test_a_curve_and_a_support_change_what_the_filter_has_and_not_what_is_fused(
+    stated: dict[str, float], curve: float, support: float
+) -> None:
+    model = PELICAN.model_copy(update={"effects": {"thrust_curve": stated} if stated else {}})
+    law, z, layout = Curve(model), np.zeros(len(names_of(model))), Layout(model)
+    z[:6], at = np.log(model.initial), len(own_names(model)) - 1
+    z[at : at + 2] = curve, support
+    filtered, slopes = law.filtered(z)
+    np.testing.assert_allclose(law.fused(filtered), z, atol=1e-12)
+    steps = 1e-6 * np.eye(len(z))
+    found = np.array([(law.filtered(z + s)[0] - law.filtered(z - s)[0]) / 2e-6 for s in steps]).T
+    np.testing.assert_allclose(slopes, found, atol=1e-7)
+    # The flown law carries the weight where the file's law with the fused b does.
+    theta, weight = layout.initial(model), model.mass * GRAVITY
+    theta[[layout.entry(n).index for n in ("b", "thrust_curve.dead_speed", "thrust_curve.offset")]] = law.law(z)
+    assert ThrustModel(layout, theta).like(ThrustModel.stated(model), weight) == pytest.approx(model.initial[0])
