@@ -13,6 +13,7 @@ from quadid.flight import draw_truth, fly
 from quadid.model.layout import Layout
 from quadid.model.rollout import Segments
 from quadid.rotation import turn
+from quadid.types import FloatArray
 from quadid.vehicle import ParameterPrior, Vehicle
 from tests.estimate.test_fit import PELICAN, guessed
 
@@ -107,9 +108,10 @@ def test_what_the_filter_has_in_its_own_equations_moves_it_as_the_model_moves(nu
         np.testing.assert_allclose(moved[7:10], added[row, 6:9], atol=0.02 * np.abs(added[:, 6:9]).max())
 
 
-def one_step(track: k.Track, gains: k.Gains, p: np.ndarray, row: int) -> np.ndarray:
+def one_step(track: k.Track, gains: k.Gains, p: FloatArray, row: int) -> FloatArray:
     """Mean after one step of the filter's own equations from a row, nothing random, shape (N_MEAN,)."""
-    x, table = gains.mean[row].copy(), k.moments(track, *k.turning(p))
+    x: FloatArray = gains.mean[row].copy()
+    table = k.moments(track, *k.turning(p))
     x[k.FO + 1 :] = 0.0
     k._advance(k._constants(p, track), table[row], float(track.t[row + 1] - track.t[row]), np.zeros(9), True, x)
     return x
