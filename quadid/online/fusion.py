@@ -324,13 +324,12 @@ class Fusion:
             z = z - inverse[:, i] / inverse[i, i] * min(z[i], 0.0)
         spread = net + total.noise[part, part] + np.diag(precision) + loose.T @ loose
         covariance = inverse @ spread @ inverse
-        # Errors by the length of rows: a share of the step to every second row, none where chance explains that.
-        own = min(own, self._own)
-        precision, mean, between = precision[:own], mean[:own], np.zeros(len(z))
-        twice = np.linalg.inv(total.half_information[:own, :own] + np.diag(precision))
-        step = twice @ (total.half_vector[:own] + precision * mean) - z[:own]
-        chance = exceeded(CHANCE, 1) * (np.diag(twice) + np.diag(covariance)[:own])
-        between[:own] = np.where(step**2 > chance, SHARE * np.abs(step), 0.0)
+        # Errors of the six by the length of rows: a share of the step to every second row, none where chance explains
+        # that.
+        twice = np.linalg.inv(total.half_information[part, part] + np.diag(precision))
+        step = twice @ (total.half_vector[part] + precision * mean) - z
+        chance = exceeded(CHANCE, 1) * (np.diag(twice) + np.diag(covariance))
+        between = np.where((step**2 > chance) & (np.arange(len(z)) < SIX), SHARE * np.abs(step), 0.0)
         return Fused(z, covariance + np.diag(between**2), between)
 
 
@@ -580,9 +579,11 @@ class Estimator:
             own = np.log(np.maximum(full.slope(weight), 1e-12) / six.slope(weight))
             return np.append(own, (full.at_rest - six.at_rest) / weight)
 
-        z, step = fused.z[places], 1e-5
+        # Where it was linearised: a curve and a support are known well together, and badly by themselves.
+        z, step = self._z[places], 1e-5
         here = value(z)
         slopes = np.array([(value(z + one) - here) / step for one in step * np.eye(len(z))])
+        here += (fused.z[places] - z) @ slopes
         covariance = fused.covariance[np.ix_(places, places)]
         return np.stack([here, np.sqrt(np.einsum("pr,pq,qr->r", slopes, covariance, slopes))])
 

@@ -234,7 +234,7 @@ def _too_far(off: FloatArray, sigma: FloatArray, settings: GateSettings) -> tupl
     """True if something may be off by more than a parameter's interval may be wide; and if more data would show it."""
     half = Z95 * sigma
     far, surely = np.abs(off) + half > settings.width, np.abs(off) - half > settings.width
-    return bool(far.any()), bool((far & ~surely & (half > 0.5 * settings.width)).any())
+    return bool(far.any()), bool((far & (half > 0.5 * settings.width)).any() and not surely.any())
 
 
 def _unproven(case: Case, settings: GateSettings) -> str | None:
