@@ -22,7 +22,7 @@ from quadid.data.window import Window
 from quadid.effects import butterworth_delay
 from quadid.estimate import kalman as k
 from quadid.estimate import late_imu
-from quadid.estimate.fit import ALL_NOISE, MOST, estimate, of_square, scoring, tails
+from quadid.estimate.fit import ALL_NOISE, estimate, of_square, scoring
 from quadid.estimate.kalman import Gains
 from quadid.estimate.late_imu import delay_of, in_time
 from quadid.estimate.problem import TRIMMED, UPRIGHT, Problem
@@ -359,18 +359,19 @@ def fit(request: FitRequest) -> FitReply:
     # 2. Gyro and accelerometer in time.
     late, period = _late(request), request.theta[IMU_PERIOD]
     request = _in_time(request, late)
-    # 3. Where nothing is known yet, or a delay shows first: global search, then the maximum over the longest stretch;
-    # steps to it over much more than before; now and then the noise numbers of this window.
+    # 3. The maximum of the likelihood: from a global search where nothing is known yet, or a delay shows first, else
+    # over much more than before; now and then the noise numbers of this window.
     z, noise, found = request.z, request.noise, None
-    if noise is None:
-        z, noise = _maximum(request, late)
+    if noise is None or (request.learned and (late > 0.0) != (noise.late > 0.0)):
+        z, noise = _maximum(request, late, *_searched(request))
         found = noise
         if not np.isfinite(z).all():
             return FitReply(request.number, problem="the simulation diverges at every point tried", excitation=bounds)
     elif request.learned:
-        if (late > 0.0) != (noise.late > 0.0):  # what is known was found with a gyro out of time
-            z, noise = _maximum(request, late)
-        z, noise = _renewed(replace(request, z=z), replace(noise, late=late))
+        known = problem_of(max(request.learned, key=len), request.vehicle)
+        better, renewed = _maximum(request, late, *_like(known, request.vehicle, z, noise))
+        if np.isfinite(better).all():
+            z, noise = better, renewed
         found = noise
     elif request.measure:
         found = _followed(request, noise)
@@ -422,19 +423,28 @@ def _excitation(request: FitRequest) -> FloatArray | None:
     return bounds_of(lin.information)
 
 
-def _maximum(request: FitRequest, late: float) -> tuple[FloatArray, Noise]:
-    """Scaled parameters (P,) and noise of the largest likelihood; not finite where there is none."""
+def _searched(request: FitRequest) -> tuple[Problem, FloatArray]:
+    """Likelihood of the longest window, and where a global search ends."""
     vehicle, short = request.vehicle, Shooting.cut(request.windows, request.vehicle, SWARM_SECONDS, None)
     # 48 particles find six parameters that are known to a factor of 4 each way.
     swarm, free = SwarmOptions(iterations=40), short.free(NOMINAL_NAMES)
     theta, _ = swarm_search(short, request.theta, free, swarm, 48, request.seed, lambda stage, share: None)
-    problem = problem_of(max(request.windows, key=len), vehicle)
-    found = estimate(problem, start_of(problem, theta, own_names(vehicle)))
-    z = np.zeros(len(names_of(vehicle)))
-    z[_places(found.problem, vehicle)] = found.z
-    z = Curve(vehicle).fused(z)
+    problem = problem_of(max(request.learned or request.windows, key=len), vehicle)
+    return problem, start_of(problem, theta, own_names(vehicle))
+
+
+def _maximum(request: FitRequest, late: float, problem: Problem, begin: FloatArray) -> tuple[FloatArray, Noise]:
+    """Scaled parameters (P,) and noise of the largest likelihood, from `begin`; not finite where there is none.
+
+    Random forces are large at first: with those of a calm flight the steps stop early once it is rough.
+    """
+    found = estimate(problem, begin)
+    z, support = np.zeros(len(request.z)), problem.layout.entry(SUPPORT)
+    curve = Curve(request.vehicle)
+    z[len(own_names(request.vehicle))] = (problem.theta[support.index] - curve.offset) / support.typical
+    z[_places(found.problem, request.vehicle)] = found.z
     doubt = of_square(found.problem, found.z, found.psi, found.problem.passes(found.z, found.psi)[1])
-    return z, Noise(found.psi, found.problem.tail, found.problem.control, doubt, late)
+    return curve.fused(z), Noise(found.psi, found.problem.tail, found.problem.control, doubt, late)
 
 
 def _places(problem: Problem, vehicle: Vehicle) -> list[int]:
@@ -451,21 +461,6 @@ def _like(problem: Problem, vehicle: Vehicle, z: FloatArray, noise: Noise) -> tu
     theta[problem.layout.entry(SUPPORT).index] = curve.offset + curve.beside(z)[1]
     problem = replace(problem, theta=theta, control=noise.control, tail=noise.tail)
     return replace(problem.based_on(own)[0], control=noise.control), own
-
-
-def _renewed(request: FitRequest, noise: Noise) -> tuple[FloatArray, Noise]:
-    """Point and noise by steps over all that was learned from, tails too: outliers show in much data only."""
-    problem, own = _like(problem_of(max(request.learned, key=len), request.vehicle), request.vehicle, request.z, noise)
-    own, psi, _, gains, _ = scoring(problem, own, noise.psi, MOST, ALL_NOISE)
-    problem = replace(problem, tail=tails(problem.tracks, gains))
-    own, psi, value, gains, _ = scoring(problem, own, psi, MOST, ALL_NOISE)
-    if not math.isfinite(value):
-        return request.z, noise
-    curve = Curve(request.vehicle)
-    z = curve.filtered(request.z)[0]
-    z[_places(problem, request.vehicle)] = own
-    doubt = of_square(problem, own, psi, gains)
-    return curve.fused(z), replace(noise, psi=psi, tail=problem.tail, doubt=doubt)
 
 
 def _followed(request: FitRequest, noise: Noise) -> Noise:
@@ -578,7 +573,7 @@ def warm_up(vehicle: Vehicle) -> None:
         span, theta = (0.0, rows * dt), Layout(vehicle).initial(vehicle)
         request = FitRequest(0, vehicle, (window,), *span, theta, z, None, 0, (span,))
         try:
-            z, noise = _maximum(request, 0.0)
+            z, noise = _maximum(request, 0.0, *_searched(request))
             for velocity in (None, np.zeros((rows, 3))):
                 _estimates(replace(request, windows=(replace(window, velocity=velocity),)), z, noise)
         except np.linalg.LinAlgError:
