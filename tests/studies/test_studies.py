@@ -92,7 +92,7 @@ def test_every_judgement_is_of_a_function_that_is_spoilt() -> None:
         (ROOT / "evaluation" / "quadid_evaluation" / "studies" / "mutation" / "judged.yaml").read_text(encoding="utf-8")
     )
     there: set[str] = set()
-    for module in ("gate", "active_set", "session"):
+    for module in ("gate", "session"):
         spec = importlib.util.find_spec(f"quadid.online.{module}")
         assert spec is not None
         assert spec.origin is not None
