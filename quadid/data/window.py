@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeGuard
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeGuard, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,7 +19,7 @@ from quadid.types import BoolArray, FloatArray, IndexArray
 if TYPE_CHECKING:
     from quadid.vehicle import Vehicle
 
-Sampling = Literal["held", "instant"]
+Sampling = Literal["held", "instant", "smooth"]
 
 CHANNELS: dict[str, tuple[int | None, str]] = {
     "gyro": (3, "rad/s"),
@@ -224,7 +224,8 @@ class Window:
         position: shape (n, 3) [m], world NED; or None.
         battery: shape (n, 1) [V]; or None.
         attitude_reference: shape (n, 4): roll, pitch, yaw [rad], throttle 0..1; or None.
-        sampling: ``held``: row k of `rotor_speed` acts from t_k to t_k+1; ``instant``: a reading, linear in between.
+        sampling: ``held``: row k of `rotor_speed` acts from t_k to t_k+1; ``instant``: a reading; ``smooth``: a reading
+            behind a low-pass for this grid, without frequencies above half its rate.
         rotor_slope: shape (n, rotors) [rad/s^2]: a held row is the mean of a speed that runs on at this slope within
             its sample (`quadid.data.rotor_signal`); None: it stays the same.
         log_span: first and last time [s] of the whole log, for effects that run over a flight.
@@ -249,8 +250,8 @@ class Window:
         """Checks shapes, finiteness and quaternion norms; normalises the sign of time span; raises WindowError."""
         if not (np.isfinite(self.dt) and self.dt > 0.0):
             raise WindowError(f"grid step {self.dt} s", "a positive step")
-        if self.sampling not in ("held", "instant"):
-            raise WindowError(f"sampling '{self.sampling}'", "held, instant")
+        if self.sampling not in get_args(Sampling):
+            raise WindowError(f"sampling '{self.sampling}'", ", ".join(get_args(Sampling)))
         rotor = _frozen(self.rotor_speed, "rotor_speed", None)
         if not np.all(np.isfinite(rotor)):
             bad = int(np.count_nonzero(~np.isfinite(rotor).all(axis=1)))

@@ -1,11 +1,12 @@
 """Flights as the filter reads them: every channel at its own times, rotor speeds as they acted."""
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 from scipy.signal import firwin, upfirdn
 
 from quadid.data.grid import linear
 from quadid.data.rotor_signal import rotor_signal
-from quadid.data.window import Recording, Window, copied, in_body_axes, sample_period
+from quadid.data.window import Recording, Sampling, Window, copied, in_body_axes, sample_period
 from quadid.estimate.kalman import Track, nothing_beyond
 from quadid.types import BoolArray, FloatArray
 from quadid.vehicle import Vehicle
@@ -40,15 +41,7 @@ def from_window(window: Window, vehicle: Vehicle, air: bool = False) -> Track:
             good = np.isfinite(values).all(axis=1)
             channels[name] = window.t[good], values[good]
     return _track(
-        channels,
-        window.t,
-        window.t,
-        window.rotor_speed,
-        window.rotor_slope,
-        window.sampling == "held",
-        window.dt,
-        vehicle,
-        air,
+        channels, window.t, window.t, window.rotor_speed, window.rotor_slope, window.sampling, window.dt, vehicle, air
     )
 
 
@@ -72,7 +65,7 @@ def from_recording(recording: Recording, vehicle: Vehicle, air: bool = False) ->
             rows = (channel.t >= rotor.t[0]) & (channel.t <= rotor.t[-1]) & _new(channel.values)
             channels[name] = channel.t[rows], channel.values[rows]
     period = sample_period(recording.channels["accel"].t) if "accel" in recording.channels else 0.02
-    return _track(channels, np.empty(0), rotor.t, rotor.values, None, rotor.sampling == "held", period, vehicle, air)
+    return _track(channels, np.empty(0), rotor.t, rotor.values, None, rotor.sampling, period, vehicle, air)
 
 
 def _new(values: FloatArray) -> BoolArray:
@@ -86,7 +79,7 @@ def _track(
     rotor_t: FloatArray,
     speed: FloatArray,
     slope: FloatArray | None,
-    held: bool,
+    sampling: Sampling,
     period: float,
     vehicle: Vehicle,
     air: bool,
@@ -106,7 +99,10 @@ def _track(
     share = np.ascontiguousarray([np.ones_like(hub_x), hub_x, hub_y, vehicle.spins])
     hubs = float(np.mean(hub_x**2)), float(np.mean(hub_y**2)), float(np.mean(hub_z))
     between = np.diff(rotor_t[new]) if new.sum() > 1 else np.diff(rotor_t)
-    piece_t, pieces = _held(rotor_t, speed, slope) if held else _curved(rotor_t, speed)
+    if sampling == "held":
+        piece_t, pieces = _held(rotor_t, speed, slope)
+    else:
+        piece_t, pieces = _curved(rotor_t, speed, sampling == "smooth")
     return Track(
         t, y, seen, 0.5 * period, piece_t, pieces, share, vehicle.mass, len(vehicle.rotors), hubs,
         wavering(vehicle, vehicle.initial), float(np.median(between)), _speed_noise(speed[new]), still,
@@ -148,15 +144,19 @@ def _held(t: FloatArray, speed: FloatArray, slope: FloatArray | None) -> tuple[F
     return np.ascontiguousarray(t), np.stack([speed - 0.5 * rise * step, rise], axis=-1)
 
 
-def _curved(t: FloatArray, speed: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """The same of readings: the curve without frequencies above half their rate, by straight lines.
+def _curved(t: FloatArray, speed: FloatArray, smooth: bool) -> tuple[FloatArray, FloatArray]:
+    """The same of readings: a curve through them, by straight lines.
 
-    Integrated from reading to reading, lines lose 13 % of what turns at a fifth of the rate and a cubic spline 28 % of
-    what turns at two fifths, and inertias would be as much too small.
+    Integrated from reading to reading, lines lose 13 % of what turns at a fifth of the rate, and inertias would be as
+    much too small.  A cubic spline loses 28 % of what turns at two fifths: behind a low-pass that ends there (`smooth`)
+    it is the curve without frequencies above half the rate, which would ring where nothing was low-passed.
     """
     every = np.interp(np.arange(PIECES * (len(t) - 1) + 1) / PIECES, np.arange(len(t)), t)
-    longer = np.pad(speed, ((REACH, REACH), (0, 0)), mode="reflect", reflect_type="odd")
-    curve = upfirdn(_BETWEEN, longer, PIECES, axis=0)[2 * REACH * PIECES :][: len(every)]
+    if smooth:
+        longer = np.pad(speed, ((REACH, REACH), (0, 0)), mode="reflect", reflect_type="odd")
+        curve = upfirdn(_BETWEEN, longer, PIECES, axis=0)[2 * REACH * PIECES :][: len(every)]
+    else:
+        curve = CubicSpline(t, speed)(every)
     lost = np.append(np.repeat(np.diff(t) > GAP * np.median(np.diff(t)), PIECES), False)
     value = np.where(lost[:, None], linear(t, speed, every), np.maximum(curve, 0.0))
     rise = np.vstack([np.diff(value, axis=0) / np.diff(every)[:, None], np.zeros((1, speed.shape[1]))])

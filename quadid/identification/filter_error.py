@@ -22,6 +22,7 @@ from quadid.effects import EFFECTS
 from quadid.estimate import kalman as k
 from quadid.estimate.fit import ACTS, NEAR_SECONDS, Estimate, estimate, newton_step
 from quadid.estimate.kalman import Gains
+from quadid.estimate.late_imu import delay_of, in_time
 from quadid.estimate.problem import LATE, Problem, Sensitivities
 from quadid.estimate.track import from_window
 from quadid.identification.noise import NoiseModel
@@ -127,10 +128,14 @@ def filtered(
 def _filtered(
     windows: Sequence[Window], vehicle: Vehicle, theta: FloatArray, free: Free, per_flight: Sequence[str]
 ) -> Filtered | None:
-    # 1. The estimate, with what acts on every vehicle fitted along.
+    # 1. The estimate, with what acts on every vehicle fitted along; gyro and accelerometer in time.
     layout = Layout(vehicle)
     known = {e.name.split(".")[0] for e in layout.entries.values() if theta[e.index] != e.neutral}
-    along = fitted_along(known | {n.split(".")[0] for n in free.names})
+    stated = known | {n.split(".")[0] for n in free.names}
+    if "imu_lag" not in stated:
+        delay = delay_of(windows)
+        windows = [in_time(window, delay) for window in windows]
+    along = fitted_along(stated)
     late = [n for n in along if n in LATE]
     nominal = [n for n in free.names if n in NOMINAL_NAMES]
     beside = [*(n for n in free.names if n not in NOMINAL_NAMES), *per_flight, *along]

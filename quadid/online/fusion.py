@@ -309,6 +309,7 @@ class Fusion:
     def _solve(self, total: Sum, own: int) -> Fused:
         """Estimate from a sum by the first `own` parameters, the rest taken to be none."""
         part, mean = slice(own), self._mean[:own]
+        # Beside all that thrust may have, nothing is taken to be none.
         met = self._met if own == self._own else np.ones_like(self._met)
         sigma = np.where(met, self._sigma, NOTHING * self._sigma)[part]
         precision, net, loose = 1.0 / sigma**2, total.information[part, part], total.loose[:, part]

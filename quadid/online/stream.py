@@ -12,7 +12,7 @@ import numpy as np
 from quadid.attitude_controller import pack_gains, stabilise_rows
 from quadid.data.grid import GAP, HALF_WIDTH, linear, lowpass, make_plan
 from quadid.data.rotor_signal import RotorSignal, rotor_channel, rotor_signal
-from quadid.data.window import CHANNELS, Block, Channel, Recording, in_body_axes
+from quadid.data.window import CHANNELS, Block, Channel, Recording, Sampling, in_body_axes
 from quadid.errors import LogError, QuadidError
 from quadid.online.checks import Rows, columns_on_grid
 from quadid.rotation import continuous_sign
@@ -662,7 +662,9 @@ class Resampler:
         plan = make_plan(recording, rotor.t, rotor.values, rotor.sampling, 1.0 / self._step)
         columns = columns_on_grid(plan, at)
         spacing = plan.tracks["rotor_speed"].period / self._step
-        return Rows(at, columns, plan.sampling, rotor.source, spacing=spacing)
+        # Of logs `quadid.data.grid` says "instant": J of recorded Crazyflie flights of 5 s is less sure with "smooth".
+        sampling: Sampling = "smooth" if plan.filtered else plan.sampling
+        return Rows(at, columns, sampling, rotor.source, spacing=spacing)
 
     def _rotor_signal(self, recording: Recording, at: FloatArray) -> RotorSignal:
         """Rotor commands or speeds: as published, else references through the stabiliser; raises QuadidError."""

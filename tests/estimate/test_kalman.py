@@ -61,17 +61,18 @@ def test_rotors_that_turn_between_readings_keep_their_moments(share: float, lost
     dt, rows, y = 0.02, 300, PELICAN.rotor_positions[:, 1]
     phase = 2.0 * np.pi * share * np.arange(rows)
     speed = 500.0 + 10.0 * np.sin(phase)[:, None] * np.sign(y)
-    track = from_window(Window(0.0, dt, speed, gyro=np.zeros((rows, 3)), sampling="instant"), PELICAN)
+    track = from_window(Window(0.0, dt, speed, gyro=np.zeros((rows, 3)), sampling="smooth"), PELICAN)
     roll = k.moments(track, 0.0, 0.0, 0.0, 0.0)[:-1, [2, 2 + k.MOMENTS]].mean(axis=1)
     exact = 1e4 * np.abs(y).sum() * -np.diff(np.cos(phase)) / (2.0 * np.pi * share)
     gain = roll[20:-20] @ exact[20:-20] / (exact[20:-20] @ exact[20:-20])
     assert gain == pytest.approx(1.0, abs=lost)
 
 
-def test_a_gap_in_readings_is_a_straight_line() -> None:
+@pytest.mark.parametrize("smooth", [False, True])
+def test_a_gap_in_readings_is_a_straight_line(smooth: bool) -> None:
     t = np.concatenate([0.02 * np.arange(50), 2.0 + 0.02 * np.arange(50)])
     speed = np.column_stack([400.0 + 100.0 * np.sin(20.0 * t)] * 4)
-    at, (value, _) = _curved(t, speed)[0], np.moveaxis(_curved(t, speed)[1], -1, 0)
+    at, (value, _) = _curved(t, speed, smooth)[0], np.moveaxis(_curved(t, speed, smooth)[1], -1, 0)
     inside = (at >= t[49]) & (at <= t[50])
     np.testing.assert_allclose(value[inside, 0], np.interp(at[inside], t, speed[:, 0]))
 
