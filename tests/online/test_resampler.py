@@ -59,7 +59,7 @@ def test_a_fast_log_comes_out_as_it_does_offline() -> None:
     (offline,) = to_windows(fast.recording, PELICAN)
     rows, _ = run(samples(fast.recording))
     at = np.concatenate([r.t for r in rows])
-    assert {r.sampling for r in rows} == {"instant"}
+    assert {r.sampling for r in rows} == {"smooth"}
     first = round((offline.t0 - at[0]) / 0.02)
     for name in ("gyro", "accel", "rotor_speed"):
         online = stacked(rows, name)[first:]
