@@ -21,10 +21,9 @@ import numpy as np
 from quadid.data.window import Window
 from quadid.effects import butterworth_delay
 from quadid.estimate import kalman as k
-from quadid.estimate import late_imu
 from quadid.estimate.fit import ALL_NOISE, estimate, of_square, scoring
 from quadid.estimate.kalman import Gains
-from quadid.estimate.late_imu import delay_of, in_time
+from quadid.estimate.late_imu import MOST, delay_of, in_time
 from quadid.estimate.problem import TRIMMED, UPRIGHT, Problem
 from quadid.estimate.track import from_window
 from quadid.identification.filter_error import fitted_along, start_of
@@ -193,7 +192,7 @@ class FitRequest(Job):
             return False
         return (
             (reply.excitation is None or reply.excitation.shape == (SIX,))
-            and (reply.noise is None or _is_noise(reply.noise, _known_delay(self) or late_imu.MOST))
+            and (reply.noise is None or _is_noise(reply.noise, _known_delay(self) or MOST))
             and _are_estimates(reply.estimates, self)
             and (not reply.estimates or reply.noise is not None or self.noise is not None)
             and (reply.theta is None or _is_vector(reply.theta, self.theta) or not reply.finite)
@@ -368,8 +367,8 @@ def fit(request: FitRequest) -> FitReply:
         if not np.isfinite(z).all():
             return FitReply(request.number, problem="the simulation diverges at every point tried", excitation=bounds)
     elif request.learned:
-        known = problem_of(max(request.learned, key=len), request.vehicle)
-        better, renewed = _maximum(request, late, *_like(known, request.vehicle, z, noise))
+        problem, begin, _ = _like(max(request.learned, key=len), request.vehicle, z, noise)
+        better, renewed = _maximum(request, late, problem, begin)
         if np.isfinite(better).all():
             z, noise = better, renewed
         found = noise
@@ -452,20 +451,21 @@ def _places(problem: Problem, vehicle: Vehicle) -> list[int]:
     return [names.index(name) for name, *_ in problem.entries]
 
 
-def _like(problem: Problem, vehicle: Vehicle, z: FloatArray, noise: Noise) -> tuple[Problem, FloatArray]:
-    """The problem in the units of the noise at hand, and its own part of z as the filter has it."""
+def _like(window: Window, vehicle: Vehicle, z: FloatArray, noise: Noise) -> tuple[Problem, FloatArray, FloatArray]:
+    """Likelihood of a window in the noise's units, its scaled parameters (N,) at z, and their derivatives by z (N, P)."""
     shapes = ("psi", noise.psi, (k.N_NOISE,)), ("tail", noise.tail, (4,)), ("control", noise.control, (3,))
     check_shapes("filter", ("z", z, (len(names_of(vehicle)),)), *shapes)
-    curve, theta = Curve(vehicle), problem.theta.copy()
-    own = curve.filtered(z)[0][_places(problem, vehicle)]
+    problem, curve = problem_of(window, vehicle), Curve(vehicle)
+    own, by_z = (part[_places(problem, vehicle)] for part in curve.filtered(z))
+    theta = problem.theta.copy()
     theta[problem.layout.entry(SUPPORT).index] = curve.offset + curve.beside(z)[1]
     problem = replace(problem, theta=theta, control=noise.control, tail=noise.tail)
-    return replace(problem.based_on(own)[0], control=noise.control), own
+    return replace(problem.based_on(own)[0], control=noise.control), own, by_z
 
 
 def _followed(request: FitRequest, noise: Noise) -> Noise:
     """The noise numbers after one step towards those of this window."""
-    problem, own = _like(problem_of(max(request.windows, key=len), request.vehicle), request.vehicle, request.z, noise)
+    problem, own, _ = _like(max(request.windows, key=len), request.vehicle, request.z, noise)
     _, psi, value, *_ = scoring(problem, own, noise.psi, TURNS, ALL_NOISE, physics=False)
     return replace(noise, psi=psi) if math.isfinite(value) else noise
 
@@ -501,10 +501,10 @@ def _estimates(request: FitRequest, z: FloatArray, noise: Noise) -> tuple[tuple[
                 half_score=e.half_score + of_half[1],
             )
         theta = problem.vector(own, 0)
-    curve = Curve(vehicle)
-    for name, value in (CURVE, curve.dead), (SUPPORT, curve.offset):
-        theta[Layout(vehicle).entry(name).index] = value
-    theta[:SIX] = np.exp(z[:SIX])
+    # The six go with the vehicle file's curve.
+    layout = Layout(vehicle)
+    curve = [layout.entry(name).index for name in (CURVE, SUPPORT)]
+    theta[:SIX], theta[curve] = np.exp(z[:SIX]), layout.initial(vehicle)[curve]
     return tuple(out), theta
 
 
@@ -517,8 +517,8 @@ def _linearised(
         The problem; its scaled parameters (N,) and their derivatives by z (N, P); gains; whitened innovations (n, M),
         and their derivatives by z (P, n, M).
     """
-    problem, own = _like(problem_of(window, vehicle), vehicle, z, noise)
-    by_z, gains = Curve(vehicle).filtered(z)[1][_places(problem, vehicle)], problem.passes(own, noise.psi)[1]
+    problem, own, by_z = _like(window, vehicle, z, noise)
+    gains = problem.passes(own, noise.psi)[1]
     _, plain, by_own = problem.sensitivities(0, own, noise.psi, gains[0])
     J = np.tensordot(by_z, by_own, (0, 0))
     J[len(own_names(vehicle)) :] += _by_thrust(window, problem, own, noise, gains[0])

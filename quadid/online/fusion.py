@@ -33,7 +33,6 @@ from quadid.online.fit_job import (
     CURVE,
     LOOSE,
     SIX,
-    SUPPORT,
     UNCOUPLED,
     Curve,
     FitReply,
@@ -362,17 +361,17 @@ class Estimator:
         self._initial = self._layout.initial(vehicle)
         self._stated = ThrustModel(self._layout, self._initial)
         self._free = Free(tuple(self._layout.entry(n) for n in NOMINAL_NAMES))
-        curve, thrust = self._layout.entry(CURVE), [self._layout.entry(name) for name in thrust_names(vehicle)]
-        self._thrust = [curve, *thrust]
-        names = (*own_names(vehicle), SUPPORT)
-        prior, count, own = prior_of(vehicle), len(names) + len(thrust) - 1, len(names)
+        names, beside = own_names(vehicle), thrust_names(vehicle)
+        self._thrust = [self._layout.entry(name) for name in (CURVE, *beside)]
+        # A support is estimated too, losses of single rotors are looked at beside.
+        prior, count, own = prior_of(vehicle), len(names) + len(beside), len(names) + 1
         self._prior_sigma = prior.sigma
         mean, sigma = np.zeros(count), np.ones(count)
         mean[:SIX], sigma[:SIX] = np.log(prior.mean), prior.sigma
-        self._dead = names.index(CURVE)
+        self._dead, curve = names.index(CURVE), self._thrust[0]
         mean[self._dead], sigma[self._dead :] = self._initial[curve.index] / curve.typical, WIDTH
         lags = [i for i, name in enumerate(names) if name == "motor_lag.tau"]
-        unusual = [i for i, name in enumerate(names) if name in (UNCOUPLED, CURVE, SUPPORT)]
+        unusual = [*(i for i, name in enumerate(names) if name in (UNCOUPLED, CURVE)), len(names)]
         self._nothing = partial(Fusion, mean, sigma, own, memory, length, lags, unusual)
         self._z = mean
         self.reset()

@@ -470,7 +470,7 @@ def _two_pairs(facts: Facts, program: str) -> list[int]:
 def _ordered(facts: Facts, order: list[int]) -> dict[str, Any]:
     """The rotors in another order, which ``order`` states, and the inertia without products.
 
-    Where there are products, Bullet tells the attitude of the principal axes, which these programs take for the body's.
+    Where there are products, Bullet reports the attitude of the principal axes; these programs take it for the body's.
     """
     tensor = np.diag(np.diag(facts.inertia))
     return {"rotors": [facts.rotors[i] for i in order], "order": [i + 1 for i in order], "tensor": tensor}

@@ -164,7 +164,7 @@ def bullet(vehicle: Vehicle) -> Program:
 
 
 def of_bullet(program: Any, client: int, body: int) -> Motion:
-    """Where Bullet has a body; it tells the attitude of the principal axes."""
+    """Place of a body in Bullet, which reports the attitude of the principal axes."""
     axes = program.invertTransform([0.0, 0.0, 0.0], program.getDynamicsInfo(body, -1, client)[4])
     position, xyzw = program.multiplyTransforms(*program.getBasePositionAndOrientation(body, client), *axes)
     velocity, rate = program.getBaseVelocity(body, client)

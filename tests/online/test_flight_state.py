@@ -3,12 +3,12 @@
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import lru_cache
-from itertools import chain, takewhile
 from pathlib import Path
 
 import numpy as np
 import pytest
 from quadid_evaluation.studies.alarms import watched
+from quadid_evaluation.studies.autopilot import until
 from quadid_node.messages import Output
 from quadid_node.recording import play, stream
 from quadid_node.service import Service, session_settings
@@ -170,11 +170,9 @@ def test_payload_and_weak_motors_of_a_recorded_flight_are_seen_and_nothing_else(
 
 
 def session_of(log: Path, file: Path, seconds: float = np.inf) -> list[Output]:
-    """What a session says of the first `seconds` of a recorded flight."""
+    """Outputs of a session that flies the first `seconds` of a recorded flight."""
     vehicle = Vehicle.from_yaml(file.read_text())
-    blocks = stream(open_log(str(log), "auto", vehicle.columns))
-    first = next(blocks)
-    flown = chain([first], takewhile(lambda b: b.t[0] - first.t[0] <= seconds, blocks))
+    flown = until(stream(open_log(str(log), "auto", vehicle.columns)), seconds)
     return play(Service(vehicle, session_settings("auto", seed=0), InlineWorker()), flown)
 
 

@@ -172,7 +172,7 @@ SETTINGS = {
     "LOG_BITMASK": float(176126 | 1 | 1 << 19),
     "INS_RAW_LOG_OPT": 1.0,
 }
-"""What is asked for is not shaped; attitude is logged at the rate of the loop, and the gyro as it is read."""
+"""Commands are not shaped; attitude is logged at the rate of the loop, and the gyro as it is read."""
 
 
 def step(link: mavutil.mavfile, gains: Mapping[str, float]) -> None:
@@ -218,8 +218,8 @@ def _ask(link: mavutil.mavfile, seconds: float, angle: FloatArray | None, rate: 
 def _set(link: mavutil.mavfile, name: str, value: float) -> None:
     def taken() -> bool:
         link.mav.param_set_send(link.target_system, link.target_component, name.encode(), value, 9)
-        told = link.recv_match(type="PARAM_VALUE", blocking=True, timeout=2.0)
-        return told is not None and told.param_id == name and bool(np.isclose(told.param_value, value))
+        answer = link.recv_match(type="PARAM_VALUE", blocking=True, timeout=2.0)
+        return answer is not None and answer.param_id == name and bool(np.isclose(answer.param_value, value))
 
     _until(taken)
 
