@@ -452,7 +452,7 @@ def _places(problem: Problem, vehicle: Vehicle) -> list[int]:
 
 
 def _like(window: Window, vehicle: Vehicle, z: FloatArray, noise: Noise) -> tuple[Problem, FloatArray, FloatArray]:
-    """Likelihood of a window in the noise's units, its scaled parameters (N,) at z, and their derivatives by z (N, P)."""
+    """Likelihood of a window in the noise's units, scaled parameters (N,) at z, and their derivatives by z (N, P)."""
     shapes = ("psi", noise.psi, (k.N_NOISE,)), ("tail", noise.tail, (4,)), ("control", noise.control, (3,))
     check_shapes("filter", ("z", z, (len(names_of(vehicle)),)), *shapes)
     problem, curve = problem_of(window, vehicle), Curve(vehicle)
