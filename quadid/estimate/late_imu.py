@@ -41,6 +41,9 @@ def delay_of(windows: Sequence[Window]) -> float:
             if window.gyro is None or window.attitude is None or len(window) < BLOCK:
                 continue
             off, first, second = _rates(window)
+            if not np.isfinite(off).any():  # never two attitudes in neighbouring rows
+                continue
+            off = off - np.nanmean(off, axis=0)
             slope, left = first + tau * second, off - tau * first - 0.5 * tau**2 * second
             good = np.isfinite(slope) & np.isfinite(left)
             left, slope = np.where(good, left, 0.0), np.where(good, slope, 0.0)
@@ -65,8 +68,7 @@ def _rates(window: Window) -> tuple[FloatArray, FloatArray, FloatArray]:
     second = (y[3:] - y[2:-1] - y[1:-2] + y[:-3]) / (2.0 * h**2)
     # The mean of y over a step is that of its ends less h^2 / 12 of the mean of y''.
     mean = 0.5 * (y[2:-1] + y[1:-2]) - h**2 / 12.0 * second
-    off = turn(window.attitude[1:-2], window.attitude[2:-1]) / h - mean
-    return off - np.nanmean(off, axis=0), first, second
+    return turn(window.attitude[1:-2], window.attitude[2:-1]) / h - mean, first, second
 
 
 def in_time(window: Window, delay: float) -> Window:

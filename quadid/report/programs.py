@@ -153,7 +153,8 @@ class Facts:
     @property
     def lag_down(self) -> float:
         """Time constant of a rotor that slows down [s]."""
-        return self.effect("motor_lag", "tau_down") or self.lag
+        down = self.effect("motor_lag", "tau_down")
+        return max(down, SHORTEST_LAG) if down else self.lag
 
     @property
     def mean_drag(self) -> float:

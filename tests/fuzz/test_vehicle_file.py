@@ -74,7 +74,7 @@ def test_any_text_is_a_vehicle_or_one_error(text: str) -> None:
 
 WITH_EFFECTS = PELICAN | {
     "effects": {
-        "motor_lag": {"tau": 0.03},
+        "motor_lag": {"tau": 0.03, "tau_down": 0.05},
         "rotor_drag": {"k_x": 0.2, "k_y": 0.2},
         "weak_rotor": {"rotor": 3.0, "loss": 0.1},
         "cg_offset": {"x": 0.001, "y": 0.0},
