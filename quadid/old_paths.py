@@ -46,7 +46,7 @@ MOVED = {
     "quadid.online.session": "quadid.online.settings quadid.online.supervisor",
     "quadid.online.stream": "quadid.online.channel_buffer quadid.online.clock quadid.online.command_reconstruction "
     "quadid.online.resampler",
-    "quadid.online.checks": "quadid.online.quality quadid.online.grid_buffer",
+    "quadid.online.checks": "quadid.online.quality",
     "quadid.online.records": "quadid.online.jobs quadid.online.outbox",
     "quadid.vehicle": "quadid.residual quadid.vehicle_size",
     "quadid.data.rotor_signal": "quadid.rotor_signal",
@@ -110,7 +110,7 @@ MOVED = {
     "quadid.cli.demo": "quadid.app.demo quadid.cli.reproduce",
     "quadid.identification.fit": "quadid.identify.global_search quadid.identification.search "
     "quadid.identify.noise_spectrum quadid.identify.noise_estimation quadid.identification.noise_fit",
-    "quadid.identification.controller_gains": "quadid.identification.paper_objective",
+    "quadid_evaluation.paper.objective": "quadid.identification.paper_objective",
     "quadid.identification.result": "quadid.identification.score",
     "quadid.diagnosis.pipeline": "quadid.diagnosis.innovations",
     "quadid.report.figures": "quadid.report.residual_maps",
@@ -122,7 +122,6 @@ MOVED = {
     "quadid.files": "quadid.working_folder",
     "quadid.app.score": "quadid.app.compare_vehicles",
     "quadid.cli.main": "quadid.cli.loading",
-    "quadid.report.verdict": "quadid.report.tables",
 }
 """Old modules of each new one."""
 _NEW = {old: new for new, olds in MOVED.items() for old in olds.split()}

@@ -16,7 +16,8 @@ from quadid.effects import EFFECTS
 from quadid.model.layout import Layout, with_reference_voltage
 from quadid.parameters import INERTIAS, NOMINAL_NAMES, Status, unreliable
 from quadid.report.page import render
-from quadid.report.verdict import Cell, TextTable, Verdict, digits, heads, number, parameter_table
+from quadid.report.tables import Cell, TextTable, heads, number, parameter_table
+from quadid.report.verdict import Verdict, digits
 from quadid.types import Json
 from quadid.vehicle import Vehicle
 

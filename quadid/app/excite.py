@@ -21,7 +21,8 @@ from quadid.errors import ParameterError
 from quadid.parameters import NOMINAL_NAMES
 from quadid.report.manoeuvres import ManoeuvrePlan, check_form, half_width, written_as
 from quadid.report.page import axis, figure, rows_of, section, trace
-from quadid.report.verdict import Cell, Column, TextTable, Verdict
+from quadid.report.tables import Cell, Column, TextTable
+from quadid.report.verdict import Verdict
 from quadid.rotation import euler
 from quadid.types import FloatArray, Json
 from quadid.vehicle import Vehicle

@@ -10,7 +10,7 @@ from quadid.effects import EFFECTS
 from quadid.errors import QuadidError
 from quadid.report.programs import FORMS, form_of, refused
 from quadid.report.programs import export as written_as
-from quadid.report.verdict import Cell, Column, TextTable
+from quadid.report.tables import Cell, Column, TextTable
 from quadid.vehicle import Vehicle
 
 MOST_COLUMNS = 5

@@ -17,8 +17,9 @@ from quadid.app.outcome import LIBRARY, Reported, provenance
 from quadid.chi_square import Z95
 from quadid.report.page import axis, figure, level, number, rows_of, section, trace
 from quadid.report.page import unit as unit_text
-from quadid.report.verdict import ROUGH, Cell, Level, TextTable, Verdict, heads, percent
-from quadid.report.verdict import number as plain_number
+from quadid.report.tables import Cell, TextTable, heads
+from quadid.report.tables import number as plain_number
+from quadid.report.verdict import ROUGH, Level, Verdict, percent
 from quadid.types import Json, JsonDict
 from quadid.vehicle import Vehicle
 

@@ -24,7 +24,8 @@ from quadid.report.autopilots import AUTOPILOTS, AXES, Autopilot, authority, hov
 from quadid.report.page import axis as axis_of
 from quadid.report.page import figure, section, trace
 from quadid.report.programs import Facts
-from quadid.report.verdict import Column, TextTable, Verdict, heads, number
+from quadid.report.tables import Column, TextTable, heads, number
+from quadid.report.verdict import Verdict
 from quadid.types import Json, JsonDict
 from quadid.vehicle import Vehicle
 

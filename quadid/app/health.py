@@ -17,8 +17,9 @@ from quadid.app.outcome import LIBRARY, NUMBER_COLUMNS, Reported, number_rows, p
 from quadid.data.window import Recording
 from quadid.errors import LogError, NotIdentifiableError
 from quadid.report.page import axis, figure, rows_of, section
+from quadid.report.tables import Cell, TextTable, heads
 from quadid.report.templating import render
-from quadid.report.verdict import Cell, Level, TextTable, Verdict, heads
+from quadid.report.verdict import Level, Verdict
 from quadid.types import Json
 from quadid.vehicle import Vehicle
 

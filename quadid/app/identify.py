@@ -23,7 +23,8 @@ from quadid.errors import ParameterError, nearest
 from quadid.model.layout import Layout, with_reference_voltage
 from quadid.parameters import NOMINAL_NAMES, ParameterSet
 from quadid.report.page import render
-from quadid.report.verdict import Cell, Column, TextTable, Verdict, identify_verdict, number, parameter_table
+from quadid.report.tables import Cell, Column, TextTable, number, parameter_table
+from quadid.report.verdict import Verdict, identify_verdict
 from quadid.sanitise import LONGEST_LINE, plain
 from quadid.types import FloatArray
 from quadid.vehicle import Proof, Vehicle
@@ -391,7 +392,8 @@ def out_of_reach(logs: Sequence[Log]) -> dict[str, str]:
 
 def scored(log: Log, role: str, fit: Fit, autopilot: Autopilot | None, mse: tuple[float, float]) -> ScoredSet:
     """Scores the initial guess and the fit on one log; as the paper does, too, where the stabiliser is known."""
-    from quadid.identification.controller_gains import paper_score
+    from quadid_evaluation.paper.objective import paper_score
+
     from quadid.identification.result import ScoredSet, mse_score
 
     initial = Layout(fit.vehicle).initial(fit.vehicle)

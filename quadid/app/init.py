@@ -18,8 +18,8 @@ from quadid.checks.motion import flying_spans, within
 from quadid.data.rotor_signal import rotor_channel
 from quadid.data.window import Channel, Recording
 from quadid.errors import LogError, ParameterError, VehicleError
+from quadid.report.tables import Cell, TextTable, heads
 from quadid.report.templating import render
-from quadid.report.verdict import Cell, TextTable, heads
 from quadid.vehicle import GRAVITY, Vehicle, to_fill_in
 
 

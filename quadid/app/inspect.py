@@ -29,7 +29,8 @@ from quadid.app.outcome import Outcome, json_text
 from quadid.data.window import Recording, beginning
 from quadid.errors import QuadidError
 from quadid.parameters import NOMINAL_UNITS
-from quadid.report.verdict import Cell, Column, TextTable, Tone, heads, number, parameter_name
+from quadid.report.tables import Cell, Column, TextTable, Tone, heads, number
+from quadid.report.verdict import parameter_name
 from quadid.sanitise import LONGEST_LINE, plain
 from quadid.vehicle import Vehicle
 

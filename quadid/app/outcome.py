@@ -27,7 +27,8 @@ from quadid.data.window import CHANNEL_NAMES, Channel, Recording, beginning, sam
 from quadid.errors import LogError, NotIdentifiableError
 from quadid.jsonable import jsonable
 from quadid.report.page import measures, number, part, quiet, render
-from quadid.report.verdict import Cell, TextTable, Verdict
+from quadid.report.tables import Cell, TextTable
+from quadid.report.verdict import Verdict
 from quadid.types import FloatArray, Json, JsonDict
 from quadid.vehicle import Vehicle
 from quadid.version import __version__

@@ -18,7 +18,8 @@ from quadid.errors import LogError, NotIdentifiableError, ParameterError
 from quadid.model.layout import Layout
 from quadid.parameters import NOMINAL_UNITS
 from quadid.report.page import axis, band, figure, level, section, stacked, trace
-from quadid.report.verdict import Cell, Column, TextTable, Verdict, heads, number, percent, score_verdict
+from quadid.report.tables import Cell, Column, TextTable, heads, number
+from quadid.report.verdict import Verdict, percent, score_verdict
 from quadid.types import FloatArray, Json
 from quadid.vehicle import Vehicle
 

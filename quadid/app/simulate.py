@@ -16,7 +16,7 @@ from quadid.effects import EFFECTS
 from quadid.errors import ParameterError, QuadidError, nearest
 from quadid.files import read_regular
 from quadid.parameters import NOMINAL_UNITS, Parameter, ParameterSet, Status
-from quadid.report.verdict import Cell
+from quadid.report.tables import Cell
 from quadid.rotation import down
 from quadid.vehicle import ParameterPrior, Vehicle
 from quadid.yaml_text import read_value

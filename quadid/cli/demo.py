@@ -11,6 +11,7 @@ from typing import Annotated, Any
 import typer
 from quadid_evaluation.paper import protocol
 from quadid_evaluation.paper.figures import FIGURES, draw, interactive
+from quadid_evaluation.paper.objective import PaperScore
 from quadid_evaluation.paper.page import all_tables, paper_markdown, paper_sections
 
 from quadid.app.diagnose import Diagnosed, diagnose
@@ -20,7 +21,6 @@ from quadid.app.logs import Log, check_folder, load, write_recording, write_text
 from quadid.app.options import JsonTarget, OutFolder, Seed
 from quadid.app.outcome import Advance, provenance, quality, told
 from quadid.cli import terminal
-from quadid.identification.controller_gains import PaperScore
 from quadid.report.fit_pages import diagnosis_part, findings_section, identify_page
 from quadid.report.page import render
 from quadid.report.verdict import effects_words

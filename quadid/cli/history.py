@@ -13,7 +13,7 @@ from quadid.app.outcome import Outcome
 from quadid.chi_square import Z95
 from quadid.cli import terminal
 from quadid.errors import VehicleError
-from quadid.report.verdict import Cell, Column, TextTable, heads, number
+from quadid.report.tables import Cell, Column, TextTable, heads, number
 from quadid.vehicle import Vehicle
 
 

@@ -14,7 +14,7 @@ from quadid.app import options
 from quadid.app.logs import written_whole
 from quadid.app.outcome import Outcome
 from quadid.errors import QuadidError
-from quadid.report.verdict import Cell, TextTable, parameter_table
+from quadid.report.tables import Cell, TextTable, parameter_table
 
 if TYPE_CHECKING:
     from quadid_node.messages import Output

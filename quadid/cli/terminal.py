@@ -14,7 +14,8 @@ from quadid.app.kernels import prepare
 from quadid.app.logs import OutputError, check_place, write_text
 from quadid.app.outcome import Advance, Outcome, json_text, silent
 from quadid.errors import QuadidError, nearest
-from quadid.report.verdict import SPACE, Cell, TextTable, Verdict
+from quadid.report.tables import SPACE, Cell, TextTable
+from quadid.report.verdict import Verdict
 from quadid.sanitise import one_line, plain
 
 if TYPE_CHECKING:

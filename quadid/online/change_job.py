@@ -45,8 +45,9 @@ from quadid.online.changes import (
     FlightState,
     learned,
 )
-from quadid.online.checks import COMPLETE, GridBuffer, Quality, Rows, judge
+from quadid.online.checks import Quality, judge
 from quadid.online.fusion import DRIFT, Estimator
+from quadid.online.grid_buffer import COMPLETE, GridBuffer, Rows
 from quadid.online.records import MOST_ERRORS, Job, JobReply, OnlineAlternative, OnlineDiagnosis, OnlineFinding
 from quadid.types import FloatArray
 from quadid.vehicle import GRAVITY, Vehicle

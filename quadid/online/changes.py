@@ -30,7 +30,7 @@ import numpy as np
 
 from quadid.data.window import median
 from quadid.model.layout import Layout
-from quadid.online.checks import Rows
+from quadid.online.grid_buffer import Rows
 from quadid.rotation import conjugate, rotated
 from quadid.types import BoolArray, FloatArray
 from quadid.vehicle import GRAVITY, Vehicle

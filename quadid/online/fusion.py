@@ -28,7 +28,6 @@ from quadid.data.window import Window
 from quadid.identification.problem import Free
 from quadid.identification.uncertainty import CHANCE, SHARE, Uncertainty, parameter_set
 from quadid.model.layout import B, Layout, ThrustModel
-from quadid.online.checks import GridBuffer, WindowCut
 from quadid.online.fit_job import (
     CURVE,
     LOOSE,
@@ -44,6 +43,7 @@ from quadid.online.fit_job import (
     thrust_names,
 )
 from quadid.online.gate import ActiveSet, Case, with_room
+from quadid.online.grid_buffer import GridBuffer, WindowCut
 from quadid.online.records import OnlineSet
 from quadid.parameters import NOMINAL_NAMES, NOMINAL_UNITS, TANGENT, Parameter, ParameterSet, Status
 from quadid.types import FloatArray

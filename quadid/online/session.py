@@ -33,10 +33,11 @@ from quadid.online.change_job import (
     ChangeWatch,
 )
 from quadid.online.changes import BASELINE, LEAST, ChangePoint
-from quadid.online.checks import LEAD, Consistency, GridBuffer, Quality, Rows, WindowCut, judge, mistake
+from quadid.online.checks import LEAD, Consistency, Quality, judge, mistake
 from quadid.online.fit_job import FitReply, FitRequest, is_excited
 from quadid.online.fusion import Estimator
 from quadid.online.gate import ActiveSet, Answer, GateSettings, decide
+from quadid.online.grid_buffer import GridBuffer, Rows, WindowCut
 from quadid.online.records import (
     MOST_ERRORS,
     Action,

@@ -14,7 +14,7 @@ from quadid.data.grid import GAP, HALF_WIDTH, linear, lowpass, make_plan
 from quadid.data.rotor_signal import RotorSignal, rotor_channel, rotor_signal
 from quadid.data.window import CHANNELS, Block, Channel, Recording, Sampling, in_body_axes
 from quadid.errors import LogError, QuadidError
-from quadid.online.checks import Rows, columns_on_grid
+from quadid.online.grid_buffer import Rows, columns_on_grid
 from quadid.rotation import continuous_sign
 from quadid.types import BoolArray, FloatArray
 from quadid.vehicle import GRAVITY, Vehicle, mixer_matrix

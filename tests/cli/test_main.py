@@ -37,7 +37,7 @@ from quadid.cli.terminal import check_file, conclude
 from quadid.effects import EFFECTS
 from quadid.errors import QuadidError, nearest
 from quadid.parameters import NOMINAL_UNITS
-from quadid.report.verdict import Column, TextTable
+from quadid.report.tables import Column, TextTable
 from quadid.vehicle import Command, Noise, Vehicle
 from quadid.version import __version__
 from tests.cli.conftest import Flights, table, write_table

@@ -14,8 +14,9 @@ from quadid_replay.mcap_file import McapFile
 from quadid.checks import inspect
 from quadid.data.window import at_limit, data_faults
 from quadid.online import Session, SessionSettings
-from quadid.online.checks import WindowCut, judge
+from quadid.online.checks import judge
 from quadid.online.gate import GateSettings
+from quadid.online.grid_buffer import WindowCut
 from quadid.vehicle import Vehicle
 from tests.faults.evidence import Happened
 from tests.online.driving import drive, flight, published, samples

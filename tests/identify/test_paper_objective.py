@@ -4,16 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from quadid_evaluation.optimisers.box import PaperBox
+from quadid_evaluation.paper.objective import PaperBox, PaperProblem, measured_outputs, paper_score
 
 from quadid.errors import NotIdentifiableError
-from quadid.identification.controller_gains import (
-    Autopilot,
-    PaperProblem,
-    find_autopilot,
-    measured_outputs,
-    paper_score,
-)
+from quadid.identification.controller_gains import Autopilot, find_autopilot
 from quadid.model.layout import Layout
 from quadid.parameters import NOMINAL_NAMES
 from quadid.vehicle import Stabiliser

@@ -10,7 +10,7 @@ from quadid_node.wire_format import MOST, ParcelError, folder_of, keep, repeat
 from quadid_node.worker import InlineWorker, Trouble
 
 from quadid.online import FitReply, FitRequest
-from quadid.online.checks import WindowCut
+from quadid.online.grid_buffer import WindowCut
 from quadid.online.records import JobReply
 from tests.faults.evidence import Happened
 from tests.online.made_up import PELICAN, QUICK, light_flight

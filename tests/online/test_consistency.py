@@ -13,8 +13,9 @@ from scipy.signal import butter, sosfiltfilt
 from quadid.checks.motion import ALLOWED, AXES, Factor
 from quadid.data.window import Recording
 from quadid.online import Phase, Session
-from quadid.online.checks import LEAD, Consistency, GridBuffer
+from quadid.online.checks import LEAD, Consistency
 from quadid.online.gate import GateSettings, decide
+from quadid.online.grid_buffer import GridBuffer
 from quadid.online.records import SetState
 from quadid.online.stream import Resampler
 from quadid.vehicle import ParameterPrior, Vehicle

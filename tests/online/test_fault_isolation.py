@@ -8,7 +8,7 @@ import pytest
 from quadid.model.layout import LOSS, Layout
 from quadid.online.change_job import ChangeRequest
 from quadid.online.changes import BASELINE, ChangeDetector, ChangePoint
-from quadid.online.checks import Rows
+from quadid.online.grid_buffer import Rows
 from quadid.vehicle import GRAVITY, Vehicle
 from tests.online.driving import flight
 

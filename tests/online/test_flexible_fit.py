@@ -8,10 +8,10 @@ import pytest
 
 from quadid.model.layout import LOSS, Layout, ThrustModel
 from quadid.online import Session, SessionSettings
-from quadid.online.checks import WindowCut
 from quadid.online.fit_job import Curve, names_of, own_names
 from quadid.online.fusion import Estimator
 from quadid.online.gate import with_room
+from quadid.online.grid_buffer import WindowCut
 from quadid.vehicle import GRAVITY, ParameterPrior, Vehicle
 from tests.online.driving import drive, flight, published, samples
 from tests.online.test_gate import TRUE

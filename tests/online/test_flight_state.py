@@ -19,8 +19,8 @@ from quadid.flight import Segment, draw_truth, fly
 from quadid.online import Event, OnlineDiagnosis, Publish
 from quadid.online.change_job import ChangeWatch
 from quadid.online.changes import CHUNK, ChangeDetector, FlightState, Velocity, learned, step_beside
-from quadid.online.checks import GridBuffer, Rows
 from quadid.online.fusion import Estimator
+from quadid.online.grid_buffer import GridBuffer, Rows
 from quadid.online.stream import Resampler
 from quadid.rotation import conjugate, rotated
 from quadid.types import FloatArray

@@ -11,9 +11,9 @@ from quadid.estimate.kalman import N_NOISE
 from quadid.flight import Flight, Segment, fly
 from quadid.model.layout import B
 from quadid.online import FitReply, FitRequest, Session, SessionSettings
-from quadid.online.checks import WindowCut
 from quadid.online.fit_job import LOOSE, ROLL_PITCH, SIX, WindowEstimate
 from quadid.online.fusion import Estimator, Fusion
+from quadid.online.grid_buffer import WindowCut
 from quadid.online.records import Job, JobReply
 from quadid.parameters import NOMINAL_NAMES, Status
 from quadid.types import FloatArray

@@ -8,8 +8,8 @@ import pytest
 
 from quadid.data.window import Recording
 from quadid.online import Session, SessionSettings
-from quadid.online.checks import WindowCut
 from quadid.online.fusion import Estimator
+from quadid.online.grid_buffer import WindowCut
 from quadid.online.records import OnlineSet, SetState
 from quadid.parameters import ParameterSet
 from quadid.types import FloatArray

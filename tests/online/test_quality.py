@@ -12,8 +12,9 @@ from quadid.checks.findings import CheckResult
 from quadid.data.window import Window
 from quadid.flight import draw_truth, fly
 from quadid.model.layout import Layout, ThrustModel
-from quadid.online.checks import Quality, WindowCut, judge, mistake
+from quadid.online.checks import Quality, judge, mistake
 from quadid.online.fusion import Estimator
+from quadid.online.grid_buffer import WindowCut
 from quadid.vehicle import GRAVITY, Vehicle
 from tests.faults.evidence import Happened
 from tests.online.driving import flight

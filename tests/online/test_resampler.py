@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from quadid.data.grid import to_windows
 from quadid.data.window import Block
 from quadid.flight import fly
-from quadid.online.checks import GridBuffer, Rows
+from quadid.online.grid_buffer import GridBuffer, Rows
 from quadid.online.stream import BLOCK, SETTLE, Resampler
 from quadid.vehicle import Vehicle
 from tests.faults.evidence import Happened

@@ -8,7 +8,7 @@ import pytest
 
 from quadid.online import FitReply, FitRequest, Phase, Session, checks
 from quadid.online.change_job import ChangeReply, ChangeRequest, DiagnosisReply, DiagnosisRequest
-from quadid.online.checks import WindowCut
+from quadid.online.grid_buffer import WindowCut
 from quadid.online.records import Action, Job, JobReply, OnlineFinding
 from quadid.vehicle import Vehicle
 from tests.faults.evidence import Happened

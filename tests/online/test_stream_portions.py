@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from quadid.data.window import Block
 from quadid.flight import fly
-from quadid.online.checks import Rows
+from quadid.online.grid_buffer import Rows
 from quadid.online.stream import APART, BLOCK, CONFIRMATIONS, MOST_EARLY, ChannelBuffer, Resampler
 from quadid.vehicle import Vehicle
 from tests.faults.evidence import Happened

@@ -18,8 +18,8 @@ from quadid.identification.fit import Fit, FitOptions, fit
 from quadid.identification.particle_swarm import SwarmOptions
 from quadid.identification.result import mse_score
 from quadid.model.layout import Layout
-from quadid.online.checks import WindowCut
 from quadid.online.fusion import Estimator
+from quadid.online.grid_buffer import WindowCut
 from quadid.parameters import NOMINAL_NAMES
 from quadid.vehicle import Vehicle
 from quadid_evaluation.benchmarks.timing import child, command, interleaved

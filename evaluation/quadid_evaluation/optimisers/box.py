@@ -1,4 +1,4 @@
-"""The identification, and the paper's objective, as plain problems in a box, for general optimisers.
+"""The identification as a plain problem in a box, for general optimisers.
 
 Coordinates are logarithms of the free parameters.
 """
@@ -9,7 +9,6 @@ import numpy as np
 
 from quadid.data.window import Window
 from quadid.errors import NotIdentifiableError
-from quadid.identification.controller_gains import Autopilot, PaperProblem
 from quadid.identification.fit import SWARM_SECONDS, Fit, Projected
 from quadid.identification.gauss_newton import Convergence
 from quadid.identification.noise import NoiseModel
@@ -76,23 +75,6 @@ class BoxProblem(Box):
     def cost(self, points: FloatArray) -> FloatArray:
         """Half the sum of squared residuals, shapes (k, 6) -> (k,)."""
         return 0.5 * self._projected.costs(self.thetas(points))
-
-
-class PaperBox(Box, PaperProblem):
-    """The paper's objective: mean squared error over the nine outputs of the closed loop, Eq. (13)."""
-
-    def __init__(self, windows: Sequence[Window], vehicle: Vehicle, autopilot: Autopilot) -> None:
-        """Prepares the windows; raises NotIdentifiableError without references."""
-        Box.__init__(self, vehicle)
-        PaperProblem.__init__(self, windows, vehicle, autopilot)
-
-    def residual(self, points: FloatArray) -> FloatArray:
-        """Shapes (k, 6) -> (k, samples); the sum of squares is twice the mean squared error."""
-        return np.asarray(self.errors(self.thetas(points)) * np.sqrt(2.0))
-
-    def cost(self, points: FloatArray) -> FloatArray:
-        """Mean squared errors, shapes (k, 6) -> (k,)."""
-        return self.mse(self.thetas(points))
 
 
 def fit_at(

@@ -18,7 +18,7 @@ from quadid.app.options import Logs, OfVehicle, Seed, Typed, Validate
 from quadid.app.outcome import Advance, Outcome, silent
 from quadid.errors import NotIdentifiableError, ParameterError, QuadidError, nearest
 from quadid.parameters import NOMINAL_NAMES
-from quadid.report.verdict import Cell, Column, TextTable, number
+from quadid.report.tables import Cell, Column, TextTable, number
 from quadid.types import JsonDict
 from quadid_evaluation.optimisers.minimise import NAMES, Result, minimise
 from quadid_evaluation.paper.subspace import METHODS as BLACK_BOXES
@@ -135,11 +135,12 @@ def compare(
         ParameterError: an unknown method or objective.
         NotIdentifiableError: too little data, or no stabiliser for the closed loop.
     """
-    from quadid.identification.controller_gains import find_autopilot, paper_score
+    from quadid.identification.controller_gains import find_autopilot
     from quadid.identification.fit import FitOptions, fit
     from quadid.identification.result import mse_score
-    from quadid_evaluation.optimisers.box import BoxProblem, PaperBox
+    from quadid_evaluation.optimisers.box import BoxProblem
     from quadid_evaluation.paper.black_box import fit_black_box, score_black_box
+    from quadid_evaluation.paper.objective import PaperBox, paper_score
 
     names = check_names(methods, objective)
     if seeds < 1:

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from quadid.identification.controller_gains import PaperScore
 from quadid.report.figures import liveliest
 from quadid.report.page import axis, trace
 from quadid.types import FloatArray, JsonDict
+from quadid_evaluation.paper.objective import PaperScore
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -9,7 +9,8 @@ from typing import Any
 
 from quadid.parameters import NOMINAL_NAMES, NOMINAL_UNITS
 from quadid.report.page import section
-from quadid.report.verdict import Column, TextTable, effects_words
+from quadid.report.tables import Column, TextTable
+from quadid.report.verdict import effects_words
 from quadid.types import Json
 from quadid_evaluation.harness import table as markdown
 from quadid_evaluation.paper.figures import FIGURES

@@ -13,7 +13,7 @@ from quadid.app.outcome import Advance
 from quadid.chi_square import Z95
 from quadid.diagnosis import diagnose
 from quadid.flight import fly
-from quadid.identification.controller_gains import PaperScore, find_autopilot
+from quadid.identification.controller_gains import find_autopilot
 from quadid.identification.fit import FitOptions, fit
 from quadid.identification.particle_swarm import Stop, Swarm
 from quadid.identification.result import mse_score
@@ -22,9 +22,9 @@ from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray, JsonDict
 from quadid.vehicle import Stabiliser, Vehicle
 from quadid.version import __version__
-from quadid_evaluation.optimisers.box import PaperBox
 from quadid_evaluation.optimisers.minimise import algorithm_1, minimise
 from quadid_evaluation.paper.black_box import fit_black_box, score_black_box
+from quadid_evaluation.paper.objective import PaperBox, PaperScore
 from quadid_evaluation.paper.subspace import METHODS
 
 VEHICLE = "pelican"

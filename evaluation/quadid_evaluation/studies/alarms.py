@@ -19,7 +19,8 @@ from quadid.flight import Flight, draw_truth, fly
 from quadid.model.layout import Layout, ThrustModel
 from quadid.online.change_job import AFTER_CHANGE, ASK_FLYING, ChangeRequest
 from quadid.online.changes import BASELINE, CHUNK, ChangeDetector, ChangePoint
-from quadid.online.checks import Rows, WindowCut, judge
+from quadid.online.checks import judge
+from quadid.online.grid_buffer import Rows, WindowCut
 from quadid.online.records import OnlineFinding
 from quadid.parameters import NOMINAL_NAMES
 from quadid.vehicle import Vehicle
