@@ -428,12 +428,14 @@ def _angle_rates(gyro: Channel, attitude: Channel) -> Check | None:
     measured, turned, angles = _without_jumps(measured, turned, angles)
     if len(angles) < FEWEST_SAMPLES:
         return None
-    # On the axis about which they differ most; the others add their noise.
-    axis = int(np.argmax(np.sum((angles - turned) ** 2, axis=0)))
-    apart, missed = ((rates - turned)[:, axis] for rates in (angles, measured))
-    size = float(np.sum(apart**2))
-    like = float(np.sum(apart * missed))
-    if not size > 0.0 or like < 0.5 * size or like**2 < _CLEAR * size * float(np.sum(missed**2)):
+    # What this difference, as it is, takes of what the gyro misses beside its bias: on the axis about which they differ
+    # most, where the others add their noise, and part by part of all: a swing that dies away looks like any other.
+    apart, missed = angles - turned, measured - turned
+    was, left = ((x - x.mean(axis=0)) ** 2 for x in (missed, missed - apart))
+    axis = int(np.argmax(np.sum(apart**2, axis=0)))
+    share = 1.0 - float(left[:, axis].sum() / max(was[:, axis].sum(), 1e-300))
+    taken = np.array([part.sum() for part in np.array_split(was - left, _PARTS)])
+    if share < _CLEAR or taken.mean() < 2.0 * taken.std(ddof=1) / math.sqrt(_PARTS):
         return None
     return Check(
         "gyro_attitude",
@@ -441,7 +443,7 @@ def _angle_rates(gyro: Channel, attitude: Channel) -> Check | None:
         "gyro is the rates of roll, pitch and yaw angle (Euler rates), not those about the body's axes",
         "log the gyro; or p = phi' - psi' sin(theta), q = theta' cos(phi) + psi' sin(phi) cos(theta), "
         "r = psi' cos(phi) cos(theta) - theta' sin(phi)",
-        {"share": like / size},
+        {"share": share},
     )
 
 

@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 from quadid_replay import open_log
 from scipy.signal import butter, filtfilt, lfilter
+from scipy.spatial.transform import Rotation
 
 import quadid
 from quadid.checks import Check, CheckResult, inspect
-from quadid.checks.frames import response
+from quadid.checks.frames import gyro_check, response
 from quadid.data.window import Channel, Recording, sample_period
 from quadid.rotation import product
 from quadid.types import FloatArray
@@ -140,3 +141,42 @@ def test_attitude_of_which_only_noise_is_left_tells_nothing() -> None:
     """A heading that drifts in hover goes with the gyro's noise by chance."""
     hover = quadid.simulate("pelican_x", seconds=40.0, seed=3, profile="hover", rate=100.0).flight.recording
     assert response(hover.channels["gyro"], hover.channels["attitude"]) is None
+
+
+# --- Rates of angles, or the end of a swing
+
+
+def hover_after_swing(seed: int) -> Recording:
+    """Ten seconds of hover at whose beginning a swing of all axes dies away; the gyro has a low-pass and a bias."""
+    rng, step = np.random.default_rng(seed), 0.0025
+    t, angles = np.arange(0.0, 12.0, step), np.zeros((4800, 3))
+    for axis, size in enumerate((0.2, 0.2, 0.5)):
+        omega, damping = rng.uniform(2.0, 5.0), rng.uniform(0.5, 1.0)
+        swing = np.cos(omega * math.sqrt(max(1.0 - damping**2, 0.01)) * t + rng.uniform(0.0, 6.0))
+        angles[:, axis] = size * rng.normal() * np.exp(-damping * omega * t) * swing
+    body = Rotation.from_euler("ZYX", angles[:, ::-1])
+    rates = (body[:-1].inv() * body[1:]).as_rotvec() / step
+    bias, noise = rng.normal(0.0, 0.002, 3), rng.normal(0.0, 0.0003, rates.shape)
+    gyro = lfilter(*butter(2, 20.0, fs=1.0 / step), rates, axis=0) + bias + noise
+    first = int(rng.uniform(0.0, 1.5) / step)
+    rows = np.arange(first, first + 4000, 8)
+    attitude = Channel("attitude", t[rows], body.as_quat()[rows][:, [3, 0, 1, 2]])
+    return Recording("hover", "csv", {"gyro": Channel("gyro", t[rows], gyro[rows]), "attitude": attitude})
+
+
+@pytest.mark.parametrize("seed", [64, 168, 198, 211, 302, 335])
+def test_a_swing_that_dies_away_makes_no_rates_of_angles_of_a_gyro(seed: int) -> None:
+    """A live flight was blocked so in the first hover after its sticks: one swing looks much like another."""
+    assert "Euler" not in gyro_check(hover_after_swing(seed)).message
+
+
+@pytest.mark.parametrize("name", ["x.bin", "quad_sq.bin"])
+def test_rates_of_angles_in_a_flight_are_named_as_before(name: str, data_dir: Path) -> None:
+    flight = open_log(data_dir / "ardupilot_sitl" / name)
+    attitude = flight.channels["attitude"]
+    rows = slice(80 * 400, 100 * 400, 8)
+    angles = np.unwrap(Rotation.from_quat(attitude.values[:, [1, 2, 3, 0]]).as_euler("ZYX")[:, ::-1], axis=0)
+    rates = np.gradient(angles, attitude.t, axis=0)
+    t = attitude.t[rows]
+    told = {"gyro": Channel("gyro", t, rates[rows]), "attitude": replace(attitude, t=t, values=attitude.values[rows])}
+    assert "Euler" in gyro_check(replace(flight, channels=told)).message
