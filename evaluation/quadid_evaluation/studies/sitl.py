@@ -5,7 +5,8 @@
 
 The binary is ArduCopter built for SITL (waf configure --board sitl; waf copter), the defaults are such as
 Tools/autotest/default_params/copter.parm and what `quadid export --format ardupilot` writes, with FRAME_TYPE 1 for an
-X; the frame file is the .sitl.json of that export.
+X; the frame file is the .sitl.json of that export.  `--keep` names a folder for the autopilot's log and for
+`telemetry.tlog`, the bytes that the service received, at their times.
 
 The plan: take off in Guided, hover, then move roll, pitch and yaw sticks in Loiter for `--seconds`, with multisines out
 of step.  The table has first and last set against the truth, and every alarm; nothing changes in flight, so that every
@@ -15,15 +16,18 @@ the file is copied into the folder that the binary runs in.
 
 import math
 import shutil
+import socket
+import struct
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from pymavlink import mavutil
@@ -73,15 +77,13 @@ def take_off(link: mavutil.mavfile, height: float) -> None:
 def fly(link: mavutil.mavfile, seconds: float, seed: int) -> None:
     """Takes off, hovers, moves the sticks and lands."""
     take_off(link, HEIGHT)
-    _send_sticks(link, np.zeros(len(AXES)))
-    _mode(link, "LOITER")
+    _mode(link, "LOITER", held=np.zeros(len(AXES)))
     rows = np.vstack([np.zeros((round(HOVER / PILOT_STEP), len(AXES))), sticks(seconds, seed)])
     begin = time.monotonic()
     for k, at in enumerate(rows):
         time.sleep(max(begin + k * PILOT_STEP - time.monotonic(), 0.0))
         _send_sticks(link, at)
-        while link.recv_match(blocking=False) is not None:
-            pass
+        _drain(link)
     _send_sticks(link, np.zeros(len(AXES)))
     _mode(link, "LAND")
 
@@ -93,15 +95,25 @@ def _send_sticks(link: mavutil.mavfile, row: FloatArray) -> None:
     link.mav.rc_channels_override_send(link.target_system, link.target_component, *values)
 
 
-def _mode(link: mavutil.mavfile, name: str) -> None:
+def _mode(link: mavutil.mavfile, name: str, held: FloatArray | None = None) -> None:
+    """Asks for a mode until it is flown; `held` are sticks, which the autopilot forgets after 3 s."""
     number = link.mode_mapping()[name]
 
     def reached() -> bool:
+        if held is not None:
+            _send_sticks(link, held)
+        _drain(link)
         link.set_mode(number)
         link.recv_match(type="HEARTBEAT", blocking=True, timeout=2.0)
         return str(link.flightmode) == name
 
-    _until(reached)
+    _until(reached, pause=0.0)
+
+
+def _drain(link: mavutil.mavfile) -> None:
+    """Reads all that has come: who reads later what came earlier waits for what has long been."""
+    while link.recv_match(blocking=False) is not None:
+        pass
 
 
 def _command(link: mavutil.mavfile, number: int, *values: float) -> bool:
@@ -114,15 +126,19 @@ def _command(link: mavutil.mavfile, number: int, *values: float) -> bool:
 
 
 def _wait(link: mavutil.mavfile, kind: str, wanted: Callable[[Any], bool]) -> None:
-    _until(lambda: (m := link.recv_match(type=kind, blocking=True, timeout=2.0)) is not None and wanted(m))
+    def come() -> bool:
+        _drain(link)
+        return (m := link.recv_match(type=kind, blocking=True, timeout=2.0)) is not None and wanted(m)
+
+    _until(come, pause=0.0)
 
 
-def _until(done: Callable[[], bool]) -> None:
+def _until(done: Callable[[], bool], pause: float = 0.5) -> None:
     end = time.monotonic() + READY
     while not done():
         if time.monotonic() > end:
             raise TimeoutError(f"the autopilot did not come along within {READY:g} s")
-        time.sleep(0.5)
+        time.sleep(pause)
 
 
 @contextmanager
@@ -147,12 +163,46 @@ def running(given: Given, folder: Path, settings: Mapping[str, float]) -> Iterat
         autopilot.wait()
 
 
+@contextmanager
+def recorded(file: Path) -> Iterator[str]:
+    """A connection to `SERVICE` through which the autopilot's frames are kept in a telemetry log; yields its URL."""
+    with socket.create_server(("127.0.0.1", 0)) as door, file.open("wb") as log:
+        threading.Thread(target=_relay, args=(door, log), daemon=True).start()
+        yield f"tcp:127.0.0.1:{door.getsockname()[1]}"
+
+
+def _relay(door: socket.socket, log: BinaryIO) -> None:
+    """Passes on what comes from either side until one of them ends."""
+    with suppress(OSError, ValueError):  # the service or the autopilot has ended, or the log is closed
+        near = door.accept()[0]
+        far = socket.create_connection(("127.0.0.1", SERVICE))
+        threading.Thread(target=_pass_on, args=(near, far), daemon=True).start()
+        frames = mavutil.mavlink.MAVLink(None)
+        frames.robust_parsing = True
+        while data := far.recv(65536):
+            near.sendall(data)
+            stamp = struct.pack(">Q", time.time_ns() // 1000)
+            for message in frames.parse_buffer(data) or ():
+                log.write(stamp + bytes(message.get_msgbuf()))
+
+
+def _pass_on(near: socket.socket, far: socket.socket) -> None:
+    with suppress(OSError):
+        while data := near.recv(65536):
+            far.sendall(data)
+
+
 def flown(given: Given) -> Outcome:
     """Starts the autopilot and the service, flies, ends both; what the service had stored."""
-    with tempfile.TemporaryDirectory() as folder:
-        history = Path(folder) / "history.sqlite"
-        service = f"tcp:127.0.0.1:{SERVICE}"
-        with running(given, Path(folder), {}) as link, serving(given.vehicle, service, history) as said:
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name) if given.keep == Path() else given.keep
+        folder.mkdir(parents=True, exist_ok=True)
+        history = folder / "history.sqlite"
+        with (
+            running(given, folder, {}) as link,
+            recorded(folder / "telemetry.tlog") as url,
+            serving(given.vehicle, url, history) as said,
+        ):
             fly(link, given.seconds, given.seed)
         return stored(given.vehicle, history, said, HOVER + given.seconds)
 
@@ -210,8 +260,7 @@ def _ask(link: mavutil.mavfile, seconds: float, angle: FloatArray | None, rate: 
     end = time.monotonic() + seconds
     while time.monotonic() < end:
         link.mav.set_attitude_target_send(0, link.target_system, link.target_component, mask, q, *rate, 0.5)
-        while link.recv_match(blocking=False) is not None:
-            pass
+        _drain(link)
         time.sleep(0.1)
 
 
@@ -311,6 +360,7 @@ def main() -> None:
         defaults="",
         gains=False,
         delay=0.0,
+        keep=Path(),
         model="+",
         frame=Path(),
         vehicle=Path(),
