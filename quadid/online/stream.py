@@ -586,6 +586,8 @@ class Resampler:
                 self._apart.pop(name, None)
                 continue
             count, since = self._apart.get(name, (0, self._leads))
+            if offset < 0.0 and count and self._leads == since:
+                continue  # what was held back comes at once: that is one delay, not many
             self._apart[name] = count + 1, since
             if count + 1 == APART and self._leads == since:
                 self._notice(LEADER, f"no gyro for {offset:.1f} s while {name} goes on; fix: connect the IMU")
