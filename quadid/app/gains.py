@@ -247,7 +247,13 @@ def gains(
     inertia = np.diag(facts.inertia)
     most = SHARE * authority(facts, at) / inertia / STEP
     fixed = _on_board(autopilot, known, described)
-    used = [*_measured(facts), *late, *fixed.values()]
+    # Parameters of the vehicle that set the gains
+    units = {"b": "N s^2/rad^2", "d": "N m s^2/rad^2"}
+    used = [
+        Used(n, units.get(n, "kg m^2"), facts.value(n), *facts.interval(n), facts.origin(n))
+        for n in ("b", "d", *_INERTIA)
+    ]
+    used += [*late, *fixed.values()]
     # Axis by axis: the fastest loop that keeps its margins, slower where that is wanted, in the autopilot's parameters.
     designed, gain = list[Loops](), dict[str, float]()
     cutoff, per = fixed["derivative filter"].value, turning / inertia  # angular acceleration of one unit of output
@@ -258,7 +264,15 @@ def gains(
             wanted = bandwidth if k < 2 or bandwidth is None else min(bandwidth, float(best.bandwidth()[0]))
             found = best if wanted is None else slowed(best, wanted, phase_margin, derivative)
         except ParameterError as error:
-            raise ParameterError(f"{axis}: {error.found}", error.allowed, _remedy(plant, phase_margin)) from error
+            # Remedies for a loop that is too slow
+            hz = 1.0 / (2.0 * math.pi * max(float(plant.delay[0] + plant.lag[0]), 1e-3))
+            phases = plant.phases(hz, with_rate(plant, 1.0, math.inf, False))
+            largest = max(("delay", "motor lag", "gyro filter"), key=lambda name: phases[name])
+            raise ParameterError(
+                f"{axis}: {error.found}",
+                error.allowed,
+                f"ask for less, for a smaller margin than {phase_margin:g} deg, or for less {largest}",
+            ) from error
         designed.append(best)
         for name, value in zip(autopilot.names[k], _parameters(found, per[k], autopilot), strict=True):
             gain[name] = min(gain.get(name, math.inf), value)  # one that axes share is that of the slowest
@@ -330,15 +344,6 @@ def _lateness(vehicle: Vehicle, motor_lag: float | None, delay: float | None) ->
         spread = f"; the file holds no interval, {UNSTATED:.0%} each way assumed" if stated and given is None else ""
         out.append(Used(name, "s", value, value * (1.0 - UNSTATED), value * (1.0 + UNSTATED), source + spread))
     return out
-
-
-def _measured(facts: Facts) -> list[Used]:
-    """Parameters of the vehicle that set the gains."""
-    units = {"b": "N s^2/rad^2", "d": "N m s^2/rad^2"}
-    return [
-        Used(n, units.get(n, "kg m^2"), facts.value(n), *facts.interval(n), facts.origin(n))
-        for n in ("b", "d", "J_xx", "J_yy", "J_zz")
-    ]
 
 
 def _on_board(autopilot: Autopilot, known: Mapping[str, float], vehicle: Vehicle) -> dict[str, Used]:
@@ -442,14 +447,6 @@ def _promises(loops: Loops) -> Json:
             "overshoot_most": max(float(top.max()), 0.0),
         }
     return out
-
-
-def _remedy(plant: AxisPlant, phase_margin: float) -> str:
-    """Remedies for a loop that is too slow."""
-    hz = 1.0 / (2.0 * math.pi * max(float(plant.delay[0] + plant.lag[0]), 1e-3))
-    phases = plant.phases(hz, with_rate(plant, 1.0, math.inf, False))
-    largest = max(("delay", "motor lag", "gyro filter"), key=lambda name: phases[name])
-    return f"ask for less, for a smaller margin than {phase_margin:g} deg, or for less {largest}"
 
 
 def _told(current: str | Path | Mapping[str, float] | None, autopilot: Autopilot) -> dict[str, float]:

@@ -186,18 +186,15 @@ class LogPart:
             if inside[name].any()
         }
         if not channels:
-            raise self._empty(recording)
+            # Nothing is there: which span was asked for, and which there is
+            zero = recording.first_imu_time
+            first, last = recording.span
+            asked = f"between {self.start} and {self.stop} s" if self.stop is not None else f"after {self.start} s"
+            if self.start is None:
+                asked = f"before {self.stop} s"
+            there = f", {first - zero:.1f} to {last - zero:.1f} s" if last > first else ""
+            raise LogError(f"{recording.name}: nothing {asked}", f"a span inside the log{there}")
         return replace(recording, channels=channels, breaks=tuple(b for b in recording.breaks if low <= b <= high))
-
-    def _empty(self, recording: Recording) -> LogError:
-        """Nothing is there: which span was asked for, and which there is."""
-        zero = recording.first_imu_time
-        first, last = recording.span
-        asked = f"between {self.start} and {self.stop} s" if self.stop is not None else f"after {self.start} s"
-        if self.start is None:
-            asked = f"before {self.stop} s"
-        there = f", {first - zero:.1f} to {last - zero:.1f} s" if last > first else ""
-        return LogError(f"{recording.name}: nothing {asked}", f"a span inside the log{there}")
 
 
 def parse_part(text: str, start: float | None = None, stop: float | None = None) -> LogPart:

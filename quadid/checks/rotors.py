@@ -509,17 +509,6 @@ def _misread(share: FloatArray, lever: FloatArray) -> _Odd | None:
     return min(fits, default=None)
 
 
-def _misplaced(share: FloatArray, lever: FloatArray) -> list[_Odd]:
-    """Each rotor with its arm set to what balance needs, and the arm's length over that."""
-    fits = []
-    for rotor, arm in enumerate(lever):
-        needed = 1.0 - float(share @ lever @ arm / (share[rotor] * (arm @ arm)))
-        if needed > 0.0:
-            scale = np.where(np.arange(len(lever)) == rotor, needed, 1.0)[:, None]
-            fits.append(_Odd(_misfit(share, lever * scale), rotor, 1.0 / needed))
-    return sorted(fits)
-
-
 def balance_check(recording: Recording, vehicle: Vehicle, spans: Spans) -> Check | None:
     """A warning where rotors balance on the average so far from the centre as a quarter more thrust of one moves it.
 
@@ -538,7 +527,14 @@ def balance_check(recording: Recording, vehicle: Vehicle, spans: Spans) -> Check
         return None
     here = f"the rotors balance {100.0 * off:.2g} % of the arm from the centre, as if rotor"
     check = partial(Check, "balance", CheckResult.WARNING)
-    if placed := [odd for odd in _misplaced(share, lever) if odd < read]:
+    # Each rotor with its arm set to what balance needs, and the arm's length over that
+    fits = []
+    for rotor, arm in enumerate(lever):
+        needed = 1.0 - float(share @ lever @ arm / (share[rotor] * (arm @ arm)))
+        if needed > 0.0:
+            scale = np.where(np.arange(len(lever)) == rotor, needed, 1.0)[:, None]
+            fits.append(_Odd(_misfit(share, lever * scale), rotor, 1.0 / needed))
+    if placed := [odd for odd in sorted(fits) if odd < read]:
         farther = " or ".join(f"{odd.rotor + 1} stood {1.0 / odd.ratio:.2f}" for odd in placed)
         return check(
             f"{here} {farther} times as far from it as in the vehicle file: then inertias are wrong, else the centre "

@@ -241,7 +241,13 @@ def watch(
             terminal.write_json(snapshot(fleet), json)
             return
         with contextlib.suppress(KeyboardInterrupt):
-            _live(fleet, seconds, terminal.console())
+            from rich.live import Live
+
+            end = time.monotonic() + seconds if seconds > 0.0 else float("inf")
+            with Live(table(snapshot(fleet)), console=terminal.console(), auto_refresh=False) as live:
+                while time.monotonic() < end:
+                    time.sleep(REFRESH)
+                    live.update(table(snapshot(fleet)), refresh=True)
     finally:
         fleet.close()
 
@@ -259,16 +265,6 @@ def _command(fleet: FleetView, vehicle: str, name: str) -> dict[str, Any]:
     if not done:
         raise WatchError(f"{vehicle}: {name} was not done: {text}")
     return {"schema": "quadid.command/1", "vehicle": vehicle, "command": name, "text": plain(text)}
-
-
-def _live(fleet: FleetView, seconds: float, console: Any) -> None:
-    from rich.live import Live
-
-    end = time.monotonic() + seconds if seconds > 0.0 else float("inf")
-    with Live(table(snapshot(fleet)), console=console, auto_refresh=False) as live:
-        while time.monotonic() < end:
-            time.sleep(REFRESH)
-            live.update(table(snapshot(fleet)), refresh=True)
 
 
 def snapshot(fleet: FleetView) -> dict[str, Any]:

@@ -167,7 +167,10 @@ class HealthWatch:
         if before > 0:
             self._before += self._trims[before - 1]
         if before >= 10:
-            against.append(self._of_flight(self._before / before, before, healthy))
+            # The yardstick for seconds of the same flight
+            mean, freedom = self._before / before, np.full(len(AXES), 10.0 * len(self.history))
+            own = healthy._replace(mean=mean, deviation=self._wander, freedom=freedom, flights=max(before // RECENT, 1))
+            against.append(own)
         chances = [p_healthy(now - one.mean, one.predictive(1), one.freedom) for one in against]
         worst = int(np.argmin(chances))
         rare = chances[worst] < RARE
@@ -183,12 +186,6 @@ class HealthWatch:
         """The yardstick for seconds of another flight: between flights, and within one."""
         between, within = healthy.deviation**2 * (1.0 + 1.0 / healthy.flights), self._wander**2
         return healthy._replace(deviation=np.sqrt((between + within) / 2.0), flights=1)
-
-    def _of_flight(self, mean: FloatArray, seconds: int, healthy: Healthy) -> Healthy:
-        """The yardstick for seconds of the same flight."""
-        freedom = np.full(len(AXES), 10.0 * len(self.history))
-        flights = max(seconds // RECENT, 1)
-        return healthy._replace(mean=mean, deviation=self._wander, freedom=freedom, flights=flights)
 
     def _report(self, t: float, now: FloatArray, against: Healthy, verdict: str) -> HealthReport:
         change = now - against.mean

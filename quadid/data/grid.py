@@ -4,7 +4,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -448,7 +448,10 @@ def grid_recording(
         for low, high in _common([span], parts):
             at = _grid_times(plan, max(a, low), min(b, high))
             if len(at) >= 2 and (len(at) - 1) * plan.step >= shortest - 0.5 * plan.step:
-                windows.append(_window(plan, at, recording.name, log_span))
+                read = {name: on_grid(name, track, at, plan) for name, track in plan.tracks.items()}
+                columns = {name: values for name, values in read.items() if not np.isnan(values).all()}
+                about: dict[str, Any] = {"name": recording.name, "log_span": log_span}
+                windows.append(Window(float(at[0]), plan.step, **columns, sampling=plan.sampling, **about))
             elif low < high:
                 dropped.append(high - low)
     if not windows:
@@ -529,15 +532,6 @@ def _grid_times(plan: GridPlan, a: float, b: float) -> FloatArray:
     if first >= len(t) or t[first] > b + tolerance:
         return np.empty(0)
     return np.asarray(t[first] + plan.step * np.arange(math.floor((b - t[first] + tolerance) / plan.step) + 1))
-
-
-def _window(plan: GridPlan, at: FloatArray, name: str, log_span: Span) -> Window:
-    columns = {}
-    for channel, track in plan.tracks.items():
-        values = on_grid(channel, track, at, plan)
-        if not np.isnan(values).all():
-            columns[channel] = values
-    return Window(float(at[0]), plan.step, **columns, sampling=plan.sampling, name=name, log_span=log_span)
 
 
 def _nothing_left(

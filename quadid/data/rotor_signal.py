@@ -57,7 +57,21 @@ def rotor_signal(recording: Recording, vehicle: Vehicle) -> RotorSignal:
         )
     source = channel.source or channel.name
     if channel.name == "rotor_speed":
-        _check_speeds(recording, channel)
+        # Rotors that carry a vehicle turn at tens of rad/s at least; commands from 0 to 1 do not, nor signed speeds
+        top = float(np.quantile(channel.values, 0.99))
+        backwards = [str(k + 1) for k, middle in enumerate(np.median(channel.values, axis=0)) if middle < 0.0]
+        if backwards:
+            raise LogError(
+                f"{recording.name}: rotor speeds below zero ({channel.source}, rotor {', '.join(backwards)})",
+                "speeds without a sign",
+                "write their sizes; which way a rotor turns is its `spin` in the vehicle file",
+            )
+        if 0.0 < top <= 1.5:
+            raise LogError(
+                f"{recording.name}: rotor speeds up to {top:.3g} ({channel.source}) are commands from 0 to 1, no rad/s",
+                "rad/s",
+                "name the columns u1 … uN, with command: {kind: normalized, max_speed: <rad/s>} in the vehicle file",
+            )
         measured = described and recording.format != "csv"
         signal = RotorSignal(channel.t, channel.values, "instant" if measured else vehicle.command.sampling, source)
     else:
@@ -131,24 +145,6 @@ def _passed_over(speed: Channel, command: Channel | None, vehicle: Vehicle | Non
 def _usable(recording: Recording, name: str) -> Channel | None:
     channel = recording.channels.get(name)
     return channel if channel is not None and len(channel.t) and channel.t[-1] > channel.t[0] else None
-
-
-def _check_speeds(recording: Recording, speed: Channel) -> None:
-    """Rotors that carry a vehicle turn at tens of rad/s at least; commands from 0 to 1 do not, nor signed speeds."""
-    top = float(np.quantile(speed.values, 0.99))
-    backwards = [str(k + 1) for k, middle in enumerate(np.median(speed.values, axis=0)) if middle < 0.0]
-    if backwards:
-        raise LogError(
-            f"{recording.name}: rotor speeds below zero ({speed.source}, rotor {', '.join(backwards)})",
-            "speeds without a sign",
-            "write their sizes; which way a rotor turns is its `spin` in the vehicle file",
-        )
-    if 0.0 < top <= 1.5:
-        raise LogError(
-            f"{recording.name}: rotor speeds up to {top:.3g} ({speed.source}) are commands from 0 to 1, no rad/s",
-            "rad/s",
-            "name the columns u1 … uN, with command: {kind: normalized, max_speed: <rad/s>} in the vehicle file",
-        )
 
 
 def _needs_command_kind(

@@ -425,13 +425,6 @@ def _empty_track(plan: Plan, rotors: int) -> Track:
     )
 
 
-def _streams(seed: int) -> dict[str, np.random.Generator]:
-    """Independent generators, so that no effect shifts another's noise."""
-    names = ("gyro", "attitude", "attitude_slow", "accel", "velocity", "position", "battery", "shake")
-    children = np.random.SeedSequence([seed, 0xF117]).spawn(len(names))
-    return {name: np.random.default_rng(child) for name, child in zip(names, children, strict=True)}
-
-
 def fly(
     vehicle: Vehicle, truth: TruthParameters | None = None, seconds: float = 120.0, seed: int = 0,
     profile: str = "excited", *, effects: Effects | None = None, outside: Effects | None = None,
@@ -469,7 +462,11 @@ def fly(
     check_outside(outside)
     # 1. Clock, noise, and everything the vehicle is made of.
     plan = _clock(seconds, log_rate, log_rate if command_rate is None else command_rate)
-    streams, rotors = _streams(seed), len(vehicle.rotors)
+    # Independent generators, so that no effect shifts another's noise
+    names = ("gyro", "attitude", "attitude_slow", "accel", "velocity", "position", "battery", "shake")
+    children = np.random.SeedSequence([seed, 0xF117]).spawn(len(names))
+    streams = {name: np.random.default_rng(child) for name, child in zip(names, children, strict=True)}
+    rotors = len(vehicle.rotors)
     sensor = (noise or SensorNoise()).scaled(noise_scale)
     phase = streams["shake"].uniform(0.0, 2.0 * np.pi, (6, rotors))
     mode = np.stack([np.cos(phase), np.sin(phase)], axis=2)

@@ -274,7 +274,12 @@ def _shape(segment: Segment, rng: np.random.Generator, t: FloatArray) -> FloatAr
     if segment.kind == "chirp":
         return np.asarray(np.sin(2.0 * np.pi * (f0 * t + 0.5 * (f1 - f0) * t * phase)))
     if segment.kind == "sweep":
-        swing = _sweep(t, span, f0, f1)
+        # An exponential sweep from `low` to `high` [Hz] over `span` [s], after two swings of the lowest frequency
+        steady = min(2.0 / f0, 0.5 * span)
+        grown = np.log(f1 / f0) * np.maximum(t - steady, 0.0) / (span - steady)
+        turns = f0 * np.where(grown > 0.0, (span - steady) * np.expm1(grown) / max(np.log(f1 / f0), 1e-9), t - steady)
+        fade = np.clip(np.minimum(t, span - t) / SWEEP_FADE, 0.0, 1.0)
+        swing = np.asarray(np.sin(0.5 * np.pi * fade) ** 2 * np.sin(2.0 * np.pi * turns))
         return np.asarray(np.cumsum(swing) * PILOT_STEP) if segment.axis == "yaw" else swing
     if segment.kind == "noise":
         return band_noise(rng, len(t), f0, max(f1, 1.2 * f0), 1.0)
@@ -286,15 +291,6 @@ def _shape(segment: Segment, rng: np.random.Generator, t: FloatArray) -> FloatAr
     k, n = np.arange(len(lines)), len(lines)
     angles = 2.0 * np.pi * (np.outer(t, lines) + AXES.index(segment.axis) * k / n) - np.pi * k * (k + 1) / n
     return np.asarray(np.sin(angles).sum(axis=1) * np.sqrt(2.0 / len(lines)))
-
-
-def _sweep(t: FloatArray, span: float, low: float, high: float) -> FloatArray:
-    """An exponential sweep from `low` to `high` [Hz] over `span` [s], after two swings of the lowest frequency."""
-    steady = min(2.0 / low, 0.5 * span)
-    grown = np.log(high / low) * np.maximum(t - steady, 0.0) / (span - steady)
-    turns = low * np.where(grown > 0.0, (span - steady) * np.expm1(grown) / max(np.log(high / low), 1e-9), t - steady)
-    fade = np.clip(np.minimum(t, span - t) / SWEEP_FADE, 0.0, 1.0)
-    return np.asarray(np.sin(0.5 * np.pi * fade) ** 2 * np.sin(2.0 * np.pi * turns))
 
 
 def scripted(segments: Sequence[Segment], seed: int, n: int) -> FloatArray:

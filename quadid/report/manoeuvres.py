@@ -100,7 +100,12 @@ def written_as(plan: ManoeuvrePlan, form: str, hover_throttle: float) -> dict[st
         return {".manoeuvre_px4.py": render("manoeuvres/px4.py", facts)}
     if form == "sticks":
         facts["header"] = plan.header(plan.promise, "what to do with the sticks")
-        return {".sticks.txt": render("manoeuvres/sticks.txt", {**facts, "blocks": _blocks(plan)})}
+        # Movements of the sticks at one time, alike ones counted
+        peaks = [(s, PEAK * s["amplitude"]) for s in plan.segments]
+        moved = [{**s, "peak": peak, "peak_deg": math.degrees(peak)} for s, peak in peaks]
+        alike = groupby([{**s, "start": 0.0} for s in b] for _, b in groupby(moved, key=lambda s: s["start"]))
+        facts["blocks"] = [(block, len(list(same))) for block, same in alike]
+        return {".sticks.txt": render("manoeuvres/sticks.txt", facts)}
     if not plan.sweeps:
         raise ParameterError(
             f"too short for sweeps of one axis after the other: {plan.seconds:g} s", "36 s or more", "use --seconds 60"
@@ -119,12 +124,3 @@ def _sweep(plan: ManoeuvrePlan, i: int, sweep: Json, hover_throttle: float) -> d
     magnitude = size * hover_throttle if axis == "throttle" else math.degrees(size)
     header = plan.header(plan.promise_sweeps, what)
     return {"sweep": sweep, "axis": SID_AXES[axis], "magnitude": magnitude, "header": header}
-
-
-def _blocks(plan: ManoeuvrePlan) -> list[tuple[list[dict[str, Any]], int]]:
-    """Movements of the sticks at one time, alike ones counted."""
-    shown = [
-        [{**s, "start": 0.0, "peak": PEAK * s["amplitude"], "peak_deg": math.degrees(PEAK * s["amplitude"])} for s in b]
-        for _, b in groupby(plan.segments, key=lambda s: s["start"])
-    ]
-    return [(block, len(list(same))) for block, same in groupby(shown)]

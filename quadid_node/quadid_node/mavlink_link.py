@@ -207,7 +207,15 @@ class MavlinkDecoder:
         source = reading.source.split(" ")[0]
         channel, values = reading.signal, tuple(float(v) for v in reading.values)
         if channel in ("esc", "servo"):
-            t, values = self._joined(t, reading, source)
+            # The row so far of a round of messages (four ESCs or sixteen outputs each), at the time of the first
+            joined = self._rounds.setdefault(source, _Round())
+            if reading.place <= joined.place:
+                joined.row, joined.t = [math.nan] * ESCS, t
+            joined.place = reading.place
+            for k, value in enumerate(reading.values[: max(ESCS - reading.place, 0)]):
+                joined.row[reading.place + k] = float(value)
+            joined.width = ESCS if reading.signal == "esc" else max(joined.width, reading.place + len(reading.values))
+            t, values = joined.t, tuple(joined.row[: joined.width])
         if channel in _MOTORS:
             channel, values = _MOTORS[channel], self.order.take(values, source, received)
         rank = RANKS.get((channel, source))
@@ -216,17 +224,6 @@ class MavlinkDecoder:
         if reading.signal in ("esc", "servo"):
             self._rounds[source].row = [math.nan] * ESCS  # it is told once
         yield from self._chooser.take(Block.one(t, channel, values), rank)
-
-    def _joined(self, t: float, reading: Reading, source: str) -> tuple[float, tuple[float, ...]]:
-        """The row so far of a round of messages (four ESCs or sixteen outputs each), at the time of the first."""
-        joined = self._rounds.setdefault(source, _Round())
-        if reading.place <= joined.place:
-            joined.row, joined.t = [math.nan] * ESCS, t
-        joined.place = reading.place
-        for k, value in enumerate(reading.values[: max(ESCS - reading.place, 0)]):
-            joined.row[reading.place + k] = float(value)
-        joined.width = ESCS if reading.signal == "esc" else max(joined.width, reading.place + len(reading.values))
-        return joined.t, tuple(joined.row[: joined.width])
 
 
 # --- A parameter set as read-only MAVLink parameters
@@ -526,7 +523,14 @@ class MavlinkLink:
             for index in range(len(parameters_of(self._set))):
                 self._send_parameter(index)
         if self.vehicle_system:
-            self._ask(now)
+            # Asks for the messages that do not come at 60 % of their rate
+            wanted = REQUESTED | dict.fromkeys(self._decoder.order.esc_groups(), MOTORS)
+            lacking = [n for n, rate in wanted.items() if n in _IDS and self._rates.get(n, 0.0) < 0.6 * rate]
+            for name in self._requests.due(lacking, now):
+                command = dialect.MAV_CMD_SET_MESSAGE_INTERVAL
+                numbers = float(_IDS[name]), 1e6 / wanted[name], 0.0, 0.0, 0.0, 0.0, 0.0
+                to = self.vehicle_system, self._target
+                self._send(dialect.MAVLink_command_long_message(*to, command, 0, *numbers))
         if self._set is not None and now - self._tell >= 5.0:
             self._tell = now
             self._send_values()
@@ -572,16 +576,6 @@ class MavlinkLink:
     def close(self) -> None:
         """Closes the link."""
         self._wire.close()
-
-    def _ask(self, now: float) -> None:
-        """Asks for the messages that do not come at 60 % of their rate."""
-        wanted = REQUESTED | dict.fromkeys(self._decoder.order.esc_groups(), MOTORS)
-        lacking = [n for n, rate in wanted.items() if n in _IDS and self._rates.get(n, 0.0) < 0.6 * rate]
-        for name in self._requests.due(lacking, now):
-            self._send(dialect.MAVLink_command_long_message(
-                self.vehicle_system, self._target, dialect.MAV_CMD_SET_MESSAGE_INTERVAL, 0,
-                float(_IDS[name]), 1e6 / wanted[name], 0.0, 0.0, 0.0, 0.0, 0.0,
-            ))  # fmt: skip
 
     def _send(self, message: Any, answer: bool = False) -> None:
         self._wire.send(message, self._clock(), answer)

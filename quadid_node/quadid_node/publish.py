@@ -90,22 +90,20 @@ class TopicOwnership:
                 self.publisher, self._since, self.problem = self._create(), now, ""
                 return True
         elif others > 0:
-            self._beside(now)
+            # Gives way at once while young; later only to a service, each after a pause of its own: one of them
+            # stays.
+            if now - self._since >= YOUNG and self._kin() < 2:
+                self.problem, self._leaves = STRANGER, math.inf
+            elif now - self._since >= YOUNG and now < self._leaves:
+                self.problem = BESIDE
+                if math.isinf(self._leaves):
+                    self._leaves = now + random.uniform(*PAUSES)
+            else:
+                self.let_go()
+                self._wait(now)
         else:
             self.problem, self._leaves = "", math.inf
         return False
-
-    def _beside(self, now: float) -> None:
-        """Gives way at once while young; later only to a service, each after a pause of its own: one of them stays."""
-        if now - self._since >= YOUNG and self._kin() < 2:
-            self.problem, self._leaves = STRANGER, math.inf
-        elif now - self._since >= YOUNG and now < self._leaves:
-            self.problem = BESIDE
-            if math.isinf(self._leaves):
-                self._leaves = now + random.uniform(*PAUSES)
-        else:
-            self.let_go()
-            self._wait(now)
 
     def let_go(self) -> None:
         """Takes our publisher away."""

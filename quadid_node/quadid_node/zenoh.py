@@ -234,7 +234,11 @@ class ZenohLink:
         )
         self._reports += 1
         if self._reports % REPEAT == 0:
-            self._repeat()
+            # Sends again what a crowded network may have lost, since it never waits for one
+            with self._session.lock:
+                for kind in ("parameters", "diagnosis", "vehicle_health"):
+                    if kind in self._latest and kind in self._publishers:
+                        self._publishers[kind].put(self._latest[kind], encoding=_JSON)
 
     def attend(self) -> None:
         """Carries out commands that have come; called by the loop that owns the service."""
@@ -250,13 +254,6 @@ class ZenohLink:
     def close(self) -> None:
         """Leaves."""
         self._session.close()
-
-    def _repeat(self) -> None:
-        """Sends again what a crowded network may have lost, since it never waits for one."""
-        with self._session.lock:
-            for kind in ("parameters", "diagnosis", "vehicle_health"):
-                if kind in self._latest and kind in self._publishers:
-                    self._publishers[kind].put(self._latest[kind], encoding=_JSON)
 
     def _carry_out(self, name: str, asked: str) -> tuple[bool, str]:
         number = re.fullmatch(r"sequence=(\d{1,18})", asked)

@@ -313,7 +313,17 @@ def read_ulog(path: Path) -> Recording:
         LogError: nothing usable in it.
     """
     records = collect_records(path, _TOPICS)
-    log = _load(path, records)
+    try:
+        ulog = ULog(records.clean)
+    except (ULogException, ValueError, LookupError, TypeError, ArithmeticError, struct.error, RecursionError) as error:
+        raise LogError(
+            f"{path.name}: its definitions are damaged ({type(error).__name__}: {plain(str(error), 80)})",
+            "a PX4 ULog",
+            "copy the file again from the vehicle",
+        ) from error
+    topics = {(unversioned(d.name), d.multi_id): d.data for d in reversed(ulog.data_list)}
+    parameters = {str(k): float(v) for k, v in ulog.initial_parameters.items() if isinstance(v, int | float)}
+    log = _Log(topics, parameters)
     again = records.described_anew
     notes = damage(
         path.stat().st_size,
@@ -332,20 +342,6 @@ def read_ulog(path: Path) -> Recording:
         return recording
     modes = mode_changes(_times(status, "timestamp"), status["nav_state"].astype(np.float64), _MODES)
     return replace(recording, modes=modes)
-
-
-def _load(path: Path, records: UlogRecords) -> _Log:
-    try:
-        ulog = ULog(records.clean)
-    except (ULogException, ValueError, LookupError, TypeError, ArithmeticError, struct.error, RecursionError) as error:
-        raise LogError(
-            f"{path.name}: its definitions are damaged ({type(error).__name__}: {plain(str(error), 80)})",
-            "a PX4 ULog",
-            "copy the file again from the vehicle",
-        ) from error
-    topics = {(unversioned(d.name), d.multi_id): d.data for d in reversed(ulog.data_list)}
-    parameters = {str(k): float(v) for k, v in ulog.initial_parameters.items() if isinstance(v, int | float)}
-    return _Log(topics, parameters)
 
 
 def _raw(log: _Log, channel: str, key: tuple[str, int], values: FloatArray, note: str = "") -> RawChannel:

@@ -118,7 +118,10 @@ def _declarations(data: bytes, name: str) -> tuple[dict[int, _Declared], int]:
             fields = list(_STAMP)
             for _ in range(width):
                 variable, at = _text(data, at)
-                fields.append(_field(variable))
+                # Name and layout of a variable such as ``gyro.x(f)``
+                if len(variable) < 4 or variable[-3] != "(" or variable[-1] != ")" or variable[-2] not in _NUMBERS:
+                    raise ValueError(f"variable '{plain(variable)}' of unknown type")
+                fields.append((variable[:-3], "<" + _NUMBERS[variable[-2]]))
             if number in types:
                 raise ValueError(f"event type {number} twice")
             types[number] = _Declared(title, np.dtype(fields))
@@ -135,13 +138,6 @@ def _text(data: bytes, at: int) -> tuple[str, int]:
     if end < 0:
         raise ValueError("a name without end")
     return data[at:end].decode("ascii"), end + 1
-
-
-def _field(variable: str) -> tuple[str, str]:
-    """Name and layout of a variable such as ``gyro.x(f)``."""
-    if len(variable) < 4 or variable[-3] != "(" or variable[-1] != ")" or variable[-2] not in _NUMBERS:
-        raise ValueError(f"variable '{plain(variable)}' of unknown type")
-    return variable[:-3], "<" + _NUMBERS[variable[-2]]
 
 
 # --- Crazyflie µSD logs: which of the firmware's variables are which channel, in core units and frames
