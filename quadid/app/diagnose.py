@@ -15,7 +15,6 @@ from quadid.checks.findings import farthest
 from quadid.effects import EFFECTS
 from quadid.model.layout import Layout, with_reference_voltage
 from quadid.parameters import INERTIAS, NOMINAL_NAMES, Status, unreliable
-from quadid.report.page import render
 from quadid.report.tables import Cell, TextTable, heads, number, parameter_table
 from quadid.report.verdict import Verdict, digits
 from quadid.types import Json
@@ -105,19 +104,20 @@ class Diagnosed(Fitted):
 
     def page(self, command: str = LIBRARY) -> str:
         """The page: findings with their pictures, parameters, residuals."""
-        from quadid.report.fit_pages import diagnose_page
+        from quadid.report.fit_pages import diagnosis_part, findings_section, parameter_section, quality_section
 
         rows = provenance(self.logs, command) + [
             {"name": "seed", "value": str(self.result["seed"])},
             {"name": "vehicle file", "value": self.result["vehicle_file"] or "not written"},
         ]
-        logs = [quality(log) for log in self.logs]
-        warnings = self.result["warnings"]
-        missing = None if self.forces is None else self.forces.section()
-        page = diagnose_page(
-            self.result, self.nominal.name, self.sets, self.noise, logs, rows, warnings, self.maps(), missing
-        )
-        return render(page)
+        parameters = self.result.get("parameters")
+        sections = [
+            None if self.forces is None else self.forces.section(),
+            parameter_section(parameters) if parameters else None,
+            findings_section([diagnosis_part(self.result, self.sets, maps=self.maps(), judged=False)]),
+            quality_section([quality(log) for log in self.logs], self.noise),
+        ]
+        return self.rendered(f"Diagnosis of {self.nominal.name}", self.used("diagnosed"), sections, rows)
 
     def maps(self) -> dict[str, ResidualMap]:
         """Picture of every cause in the residual of the diagnosed logs, by name of the effect."""

@@ -22,11 +22,10 @@ from quadid.data.window import Window
 from quadid.errors import ParameterError, nearest
 from quadid.model.layout import Layout, with_reference_voltage
 from quadid.parameters import NOMINAL_NAMES, ParameterSet
-from quadid.report.page import render
 from quadid.report.tables import Cell, Column, TextTable, number, parameter_table
 from quadid.report.verdict import Verdict, identify_verdict
 from quadid.sanitise import LONGEST_LINE, plain
-from quadid.types import FloatArray
+from quadid.types import FloatArray, Json
 from quadid.vehicle import Proof, Vehicle
 from quadid.version import __version__
 
@@ -221,7 +220,7 @@ class Identified(Fitted):
     def page(self, command: str = LIBRARY) -> str:
         """The page: parameters, errors of every log, correlations, what the flights excite."""
         from quadid.report.figures import MOST_LOGS
-        from quadid.report.fit_pages import correlation_section, flight_section, identify_page
+        from quadid.report.fit_pages import correlation_section, flight_section
 
         result, fit = self.result, self.fit
         rows = provenance(self.logs, command) + [
@@ -234,17 +233,26 @@ class Identified(Fitted):
             {"name": "taken as known", "value": known(fit.vehicle)},
         ]
         flights = [flight_section(log.recording, fit.vehicle, i) for i, log in enumerate(self.logs[:MOST_LOGS])]
-        page = identify_page(
-            result,
-            self.sets,
-            fit.noise,
-            [quality(log) for log in self.logs],
-            rows,
-            missing=None if self.forces is None else self.forces.section(),
-            more=[correlation_section(fit.parameters), *(f for f in flights if f is not None)],
-            excitation=told(fit, self.train),
-        )
-        return render(page)
+        more = [correlation_section(fit.parameters), *(f for f in flights if f is not None)]
+        lacking = None if self.forces is None else self.forces.section()
+        return self.written_up(f"Identification of {result['vehicle']}", lacking, more, self.logs, rows)
+
+    def written_up(
+        self,
+        title: str,
+        lacking: Json | None,
+        more: Sequence[Json],
+        logs: Sequence[Log],
+        origin: Sequence[Json],
+        truth: Mapping[str, float] | None = None,
+    ) -> str:
+        """The page, with other sections among its own; arguments as of `identify_sections` and `rendered`."""
+        from quadid.report.fit_pages import identify_sections, quality_section
+
+        after = [told(self.fit, self.train), quality_section([quality(log) for log in logs], self.fit.noise)]
+        sections = identify_sections(self.result, self.sets, lacking, more, after, truth)
+        subtitle = f"{self.used('fitted')}; search {self.result['optimizer']}, {self.result['seconds']:.1f} s"
+        return self.rendered(title, subtitle, sections, origin)
 
 
 def identify(

@@ -237,14 +237,14 @@ class Reported(Outcome):
         """Writes the HTML report, as `page`."""
         return write_text(path, self.page(command))
 
-    def rendered(self, title: str, subtitle: str, sections: Sequence[Json], origin: Sequence[Json]) -> str:
-        """A page of sections below the verdict; `origin` as of `provenance`."""
+    def rendered(self, title: str, subtitle: str, sections: Sequence[Json | None], origin: Sequence[Json]) -> str:
+        """A page of the sections that there are below the verdict; `origin` as of `provenance`."""
         return render(
             {
                 "title": title,
                 "subtitle": subtitle,
                 "verdict": None if self.verdict is None else asdict(self.verdict),
-                "sections": sections,
+                "sections": [s for s in sections if s],
                 "warnings": self.warnings,
                 "provenance": origin,
             }
@@ -292,6 +292,12 @@ class Fitted(Reported):
     def train(self) -> list[Log]:
         """The logs that were fitted."""
         return [log for log, s in zip(self.logs, self.sets, strict=True) if s.role == "train"]
+
+    def used(self, task: str) -> str:
+        """How many logs were fitted, as `task` has it, and how many were held out."""
+        fitted = len(self.train)
+        held = len(self.logs) - fitted or "none"
+        return f"{fitted} log{'s' * (fitted != 1)} {task}, {held} held out for validation"
 
     def residuals(self, log: int = -1) -> OverTime:
         """Measured and simulated outputs of one log in runs of a second, their difference, and the sensors' sigma.

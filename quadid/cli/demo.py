@@ -19,9 +19,9 @@ from quadid.app.identify import Identified, identify
 from quadid.app.kernels import FIT
 from quadid.app.logs import Log, check_folder, load, write_recording, write_text, written_whole
 from quadid.app.options import JsonTarget, OutFolder, Seed
-from quadid.app.outcome import Advance, provenance, quality, told
+from quadid.app.outcome import Advance, provenance
 from quadid.cli import terminal
-from quadid.report.fit_pages import diagnosis_part, findings_section, identify_page
+from quadid.report.fit_pages import diagnosis_part, findings_section
 from quadid.report.page import render
 from quadid.report.verdict import effects_words
 from quadid.types import JsonDict
@@ -173,18 +173,8 @@ def html(shown: Shown, seed: int, command: str) -> str:
         hidden.maps(),
         None if hidden.forces is None else hidden.forces.section(),
     )
-    page = identify_page(
-        done.result,
-        done.sets,
-        done.fit.noise,
-        [quality(log) for log in logs],
-        rows,
-        shown.truth,
-        more=[findings_section([same, apart])],
-        excitation=told(done.fit, done.logs[:1]),
-    )
-    page["title"] = "Demonstration: a simulated Pelican"
-    return render(page)
+    more = [findings_section([same, apart])]
+    return done.written_up("Demonstration: a simulated Pelican", None, more, logs, rows, shown.truth)
 
 
 # --- `quadid reproduce`: the paper's protocol, its tables and figures, and what they lack

@@ -39,7 +39,6 @@ from quadid.report.verdict import (
     Verdict,
     at_bounds,
     digits,
-    identify_verdict,
     parameter_name,
     percent,
     reason,
@@ -209,56 +208,36 @@ def _advice(name: str, bound: float, alone: float, seconds: float) -> str:
     return f"{motion}; flown like this, {percent(SHARP)} would take {need:.0f} s"
 
 
-# --- The page of an identification: its dictionary, the scored logs and where all came from, as `render` wants them
+# --- The page of an identification: its parts, as `render` wants them
 
 
 FIT_NAMES = ("p", "q", "r", "phi", "theta", "psi", "a_z")
 
 
-def identify_page(
+def identify_sections(
     result: Json,
     sets: Sequence[ScoredSet],
-    noise: NoiseModel,
-    quality: Sequence[Json],
-    provenance: Sequence[Json],
+    lacking: Json | None,
+    more: Sequence[Json],
+    after: Sequence[Json],
     truth: Mapping[str, float] | None = None,
-    *,
-    missing: Json | None = None,
-    more: Sequence[Json] = (),
-    excitation: Json | None = None,
-) -> dict[str, Any]:
-    """Builds the page of an identification.
+) -> list[Json]:
+    """Sections of the page of an identification.
 
     Args:
         result: of the form ``quadid.identify/1``.
         sets: the scored logs in the order of ``result["sets"]``.
-        quality: a part of the page for each log.
-        truth: true parameters of a simulation, where there is one.
-        missing: of `missing_section`.
+        lacking: of `missing_section`.
         more: sections below the parameters.
-        excitation: of `excitation_part`.
+        after: sections below the prediction.
+        truth: true parameters of a simulation, where there is one.
     """
-    stuck, parameters = at_bounds(result), result["parameters"]
-    fitted, held = ([s["role"] for s in result["sets"]].count(role) for role in ("train", "validate"))
-    search = f"search {result['optimizer']}, {result['seconds']:.1f} s"
-    fit = section(
-        "fit",
-        "How well the simulation predicts",
-        _PREDICTION,
-        (),
-        [fit_table(result["sets"])],
-        parts=set_parts(result["sets"], sets),
-        menu="Prediction",
-    )
-    shown = parameter_section(parameters, truth, stuck, [parameter_figure(parameters, truth)])
-    return {
-        "title": f"Identification of {result['vehicle']}",
-        "subtitle": f"{fitted} log{'s' * (fitted != 1)} fitted, {held or 'none'} held out for validation; {search}",
-        "verdict": asdict(identify_verdict(result)),
-        "sections": [s for s in (missing, shown, *more, fit, excitation, quality_section(quality, noise)) if s],
-        "warnings": result["warnings"],
-        "provenance": provenance,
-    }
+    parameters, entries = result["parameters"], result["sets"]
+    shown = parameter_section(parameters, truth, at_bounds(result), [parameter_figure(parameters, truth)])
+    table, parts = fit_table(entries), set_parts(entries, sets)
+    title = "How well the simulation predicts"
+    predicted = section("fit", title, _PREDICTION, (), [table], parts=parts, menu="Prediction")
+    return [*([lacking] if lacking else []), shown, *more, predicted, *after]
 
 
 _APPLIED = "Nothing has been applied to any vehicle. The interval is where the value lies in 95 of 100 such flights."
@@ -647,28 +626,3 @@ def remaining(result: Json, sets: Sequence[ScoredSet]) -> list[JsonDict]:
     tables = [measures(head, rows, (1, 2))] if rows else []
     after = [f"What the rest follows: {'; '.join(follows)}."] if follows else []
     return [part("What remains, and where" if rows else "", tables=tables, after=after)]
-
-
-def diagnose_page(
-    result: Json,
-    vehicle: str,
-    sets: Sequence[ScoredSet],
-    noise: NoiseModel,
-    quality: Sequence[Json],
-    provenance: Sequence[Json],
-    warnings: Sequence[str] = (),
-    maps: Mapping[str, ResidualMap] | None = None,
-    missing: Json | None = None,
-) -> dict[str, Any]:
-    """Builds the page of a diagnosis; arguments as in `diagnosis_part` and `identify_page`."""
-    fitted, held = (sum(s.role == role for s in sets) for role in ("train", "validate"))
-    parameters = parameter_section(result["parameters"]) if result.get("parameters") else None
-    found = findings_section([diagnosis_part(result, sets, maps=maps, judged=False)])
-    return {
-        "title": f"Diagnosis of {vehicle}",
-        "subtitle": f"{fitted} log{'s' * (fitted != 1)} diagnosed, {held or 'none'} held out for validation",
-        "verdict": asdict(diagnose_verdict(result)),
-        "sections": [s for s in (missing, parameters, found, quality_section(quality, noise)) if s],
-        "warnings": list(warnings),
-        "provenance": provenance,
-    }

@@ -4,7 +4,7 @@ import base64
 import hashlib
 import json
 import re
-from dataclasses import replace
+from dataclasses import asdict, replace
 from enum import StrEnum
 from html.parser import HTMLParser
 from pathlib import Path
@@ -48,11 +48,13 @@ from quadid.report.fit_pages import (
     excitation_part,
     findings_section,
     flight_section,
-    identify_page,
+    identify_sections,
     mode_rows,
+    quality_section,
     spectrum,
 )
 from quadid.report.page import code, fit, listed, measures, number, packed, part, render
+from quadid.report.verdict import identify_verdict
 from quadid.vehicle import Vehicle
 from tests.faults.evidence import Happened
 
@@ -122,7 +124,12 @@ def page(sets: list[ScoredSet]) -> str:
 
     quality = [part(EVIL, tables=[measures(("Channel", "Source"), [("gyro", EVIL)], ())], lines=[EVIL])]
     provenance = [{"name": EVIL, "value": EVIL}]
-    return render(identify_page(result(sets), sets, NoiseModel.guess(9), quality, provenance, {"b": 1.05}))
+    found = result(sets)
+    sections = identify_sections(found, sets, None, [], [quality_section(quality, NoiseModel.guess(9))], {"b": 1.05})
+    verdict = asdict(identify_verdict(found))
+    return render(
+        {"title": EVIL, "verdict": verdict, "sections": sections, "warnings": [EVIL], "provenance": provenance}
+    )
 
 
 class Reader(HTMLParser):
