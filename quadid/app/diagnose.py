@@ -172,7 +172,10 @@ def diagnose(
     models = {"nominal": fit.theta, "extended": model.theta}
     # What force and moment the vehicle misses without and with the causes: too little taken off, and none is confident.
     forces, squares = compared(train, held, fit.vehicle, models, {}, advance)
-    removed = None if forces is None else _removed(forces, found, selection, fit.vehicle)
+    # Share that the confident findings take on flights that were not fitted, or without any all of them.
+    sure = {f.effect for f in found.findings if f.confident} or {f.effect for f in found.findings}
+    doubtful = [n for c in model.causes if c.effect not in sure for n in c.names]
+    removed = None if forces is None else forces.removed(Layout(fit.vehicle).without(model.theta, doubtful))
     if found.verdict is Explanation.PARTLY_EXPLAINED and removed is not None and removed < LEAST_REMOVED:
         told = (
             f"the causes remove only {100.0 * removed:.0f} % of the squared missing force and moment: none is confident"
@@ -219,16 +222,6 @@ def diagnose(
     return Diagnosed(result, found, sets, fit.noise, [*train, *held], described, selection, forces, beside)
 
 
-def _removed(forces: MissingForces, found: Diagnosis, selection: Search, vehicle: Vehicle) -> float:
-    """Share of the squared missing force and moment that the confident findings take, on flights that were not fitted.
-
-    Of a diagnosis without any, that of all findings.
-    """
-    trusted = {f.effect for f in found.findings if f.confident} or {f.effect for f in found.findings}
-    doubtful = [n for c in selection.model.causes if c.effect not in trusted for n in c.names]
-    return forces.removed(Layout(vehicle).without(selection.model.theta, doubtful))
-
-
 def _within_reach(found: Diagnosis, unreachable: Mapping[str, str], off: Mapping[str, float]) -> Diagnosis:
     """The diagnosis without trust in what the channels of its logs cannot show, by parameter, and why.
 
@@ -250,31 +243,23 @@ def _within_reach(found: Diagnosis, unreachable: Mapping[str, str], off: Mapping
 def finding_table(findings: Sequence[Json]) -> TextTable:
     """Every named cause with its numbers, what it gains on unseen data, and the closest rejected alternative."""
     columns = heads("cause | value | without > | with > | 95 % interval <2 | rejected alternative <1")
-    rows = [row for finding in findings for row in _finding_rows(finding)]
+    rows = []
+    for finding in findings:
+        gain, rival = finding["gain"], min(finding["alternatives"], key=lambda a: a["mse_after"], default=None)
+        first: list[str | Cell] = [
+            Cell(finding["effect"].replace("_", " "), "" if finding["confident"] else "fair"),
+            number(gain["mse_before"], 3),
+            number(gain["mse_after"], 3),
+            f"{rival['effect'].replace('_', ' ')} ({number(rival['mse_after'], 3)})" if rival else "",
+        ]
+        for p in finding["parameters"]:
+            value, limits = f"rotor {p['value']:.0f}", ""
+            if p["name"] != "rotor":
+                value = f"{p['name']} = {number(p['value'], digits(p))} {p['unit']}".rstrip()
+                limits = " .. ".join(number(end, digits(p)) for end in p["ci95"] or (None, None))
+            name, before, after, other = first
+            rows.append((name, value, before, after, limits, other))
+            first = [""] * 4
     runs = ", ".join(dict.fromkeys(f"{f['gain']['seconds']:g} s" for f in findings))
     title = f"What the simulation gets wrong (error of {runs} runs in noise variances, 1 = noise floor)"
     return TextTable(title, columns, tuple(rows))
-
-
-def _finding_rows(finding: Json) -> list[tuple[str | Cell, ...]]:
-    rival = min(finding["alternatives"], key=lambda a: a["mse_after"], default=None)
-    gain = finding["gain"]
-    first: list[str | Cell] = [
-        Cell(finding["effect"].replace("_", " "), "" if finding["confident"] else "fair"),
-        number(gain["mse_before"], 3),
-        number(gain["mse_after"], 3),
-        f"{rival['effect'].replace('_', ' ')} ({number(rival['mse_after'], 3)})" if rival else "",
-    ]
-    rows: list[tuple[str | Cell, ...]] = []
-    for p in finding["parameters"]:
-        name, before, after, other = first if not rows else ["", "", "", ""]
-        rows.append((name, *_finding_value(p, before, after), other))
-    return rows
-
-
-def _finding_value(p: Json, before: str | Cell, after: str | Cell) -> tuple[str | Cell, ...]:
-    low, high = p["ci95"] or (None, None)
-    if p["name"] == "rotor":
-        return f"rotor {p['value']:.0f}", before, after, ""
-    value = f"{p['name']} = {number(p['value'], digits(p))} {p['unit']}".rstrip()
-    return value, before, after, f"{number(low, digits(p))} .. {number(high, digits(p))}"

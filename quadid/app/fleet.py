@@ -220,22 +220,12 @@ def _seen(recording: Recording, vehicle: Vehicle, doubts: Sequence[str]) -> Row:
 def _identified(job: Job, log: Log) -> Row:
     from quadid.app.identify import identify
 
-    result = identify(log, seed=job.seed).result
-    error = result["sets"][0]["mse"]
+    found = identify(log, seed=job.seed)
+    error, kept = found.result["sets"][0]["mse"], ("unit", "value", "low", "high", "status")
     row: Row = {
         "mse_initial": error["initial"],
         "mse_fitted": error["fitted"],
-        "parameters": [
-            {
-                "parameter": p["name"],
-                "unit": p["unit"],
-                "value": p["value"],
-                "low": p["ci95"][0],
-                "high": p["ci95"][1],
-                "status": p["status"],
-            }
-            for p in result["parameters"]
-        ],
+        "parameters": [{"parameter": r["name"], **{k: r[k] for k in kept}} for r in found.records()],
     }
     if job.diagnose:
         from quadid.app.diagnose import diagnose

@@ -62,7 +62,7 @@ def summarise(
         "drifts": _drifts(series),
         "outliers": _outliers(series),
         "common": _common(by_name, findings),
-        "reasons": [*_reasons(logs), *_copied(copies)],
+        "reasons": _reasons(logs, copies),
         "copies": [{"log": log, "of": of} for log, of in copies],
     }
 
@@ -183,26 +183,17 @@ def _common(by_name: Mapping[str, Json], findings: Sequence[Json]) -> list[dict[
     return sorted(out, key=lambda c: (-c["flights"], c["unit"], c["effect"]))
 
 
-def _reasons(logs: Sequence[Json]) -> list[dict[str, Any]]:
-    """Logs without a result by what kept them from one, most frequent first."""
-    grouped: dict[tuple[str, str], list[str]] = defaultdict(list)
+def _reasons(logs: Sequence[Json], copies: Sequence[tuple[str, str]]) -> list[dict[str, Any]]:
+    """Logs without a result by what kept them from one, most frequent first; then copies in the same form."""
+    lost, copied = defaultdict[tuple[str, str], list[str]](list), defaultdict[tuple[str, str], list[str]](list)
     for log in logs:
         if log["status"] != "done":
             reason = log["reason"].replace(f"{log['name'].rsplit('/', 1)[-1]}: ", "")
-            grouped[log["status"], reason].append(log["name"])
-    ordered = sorted(grouped.items(), key=lambda item: (-len(item[1]), item[0]))
+            lost[log["status"], reason].append(log["name"])
+    for name, of in sorted(copies, key=lambda pair: pair[1]):
+        copied["copy", f"the bytes of {of}, which is counted once"].append(name)
+    ordered = [*sorted(lost.items(), key=lambda item: (-len(item[1]), item[0])), *copied.items()]
     return [{"status": s, "reason": r, "logs": len(names), "names": names} for (s, r), names in ordered]
-
-
-def _copied(copies: Sequence[tuple[str, str]]) -> list[dict[str, Any]]:
-    """Copies in the form of logs without a result."""
-    grouped: dict[str, list[str]] = defaultdict(list)
-    for log, of in copies:
-        grouped[of].append(log)
-    return [
-        {"status": "copy", "reason": f"the bytes of {of}, which is counted once", "logs": len(names), "names": names}
-        for of, names in sorted(grouped.items())
-    ]
 
 
 # --- Health of every vehicle of a fleet over its flights: each flight against the vehicle's first ones
@@ -527,25 +518,20 @@ def _health(rows: Sequence[Json], logs: Sequence[Json]) -> dict[str, Any] | None
         "shapes": [level(HEALTHY_SCORE)],
     }
     drawn = figure("fleet-health", "Distance from healthy", data, layout, 280)
-    changed = [cells for _, own in sorted(by_unit.items()) if (cells := _changes_of(own))]
+    changed = []
+    for unit, own in sorted(by_unit.items()):
+        if some := [row for row in own if has_changed(row)]:
+            count, last = f"{len(some)} of {len(own)}", some[-1]
+            changed.append((unit, count, some[0]["log"], last["log"], _what_changed(last)))
     table = rows_of(("Vehicle", "Flights changed", "First", "Last", "Changed"), changed[:MOST_ROWS], kind="compact")
-    count = Counter(row["unit"] for row in rows if row["baseline"]).values()
-    most = "up to " * (len(set(count)) > 1) + str(max(count))
+    counts = Counter(row["unit"] for row in rows if row["baseline"]).values()
+    most = "up to " * (len(set(counts)) > 1) + str(max(counts))
     intro = (
         f"Each flight against the first {most} of its vehicle, which are assumed healthy. 99 of 100 healthy flights "
         f"are below {HEALTHY_SCORE:.1f}, the line."
         f"{_counted(time)}"
     )
     return section("health", "Health over flights", intro, [drawn], [table] if changed else [])
-
-
-def _changes_of(own: Sequence[Json]) -> tuple[str, ...]:
-    """Changed flights of a vehicle: their number, first and last, and what had changed at the last; or nothing."""
-    changed = [row for row in own if has_changed(row)]
-    if not changed:
-        return ()
-    first, last = changed[0], changed[-1]
-    return last["unit"], f"{len(changed)} of {len(own)}", first["log"], last["log"], _what_changed(last)
 
 
 def _what_changed(row: Json) -> str:

@@ -16,7 +16,18 @@ from quadid_evaluation.optimisers.minimise import minimise
 from quadid.app.logs import Log, file_name, remembered, settled
 from quadid.app.missing import Beside, MissingForces, compared
 from quadid.app.options import Bounds, Fix, Free, KnownEffects, Logs, OfVehicle, Priors, Seed, Validate
-from quadid.app.outcome import LIBRARY, Advance, Fitted, UnansweredError, known, provenance, quality, silent, told
+from quadid.app.outcome import (
+    LIBRARY,
+    Advance,
+    Fitted,
+    UnansweredError,
+    known,
+    provenance,
+    quality,
+    silent,
+    told,
+    with_ends,
+)
 from quadid.checks.findings import farthest
 from quadid.data.window import Window
 from quadid.errors import ParameterError, nearest
@@ -176,15 +187,8 @@ class Identified(Fitted):
 
     def records(self) -> list[dict[str, Any]]:
         """One row a parameter."""
-        return [
-            {
-                **{k: v for k, v in p.items() if k != "ci95"},
-                "sigma": fitted.sigma,
-                "low": p["ci95"][0],
-                "high": p["ci95"][1],
-            }
-            for p, fitted in zip(self.result["parameters"], self.parameters, strict=True)
-        ]
+        found = zip(self.result["parameters"], self.parameters, strict=True)
+        return [with_ends({**p, "sigma": fitted.sigma}) for p, fitted in found]
 
     def sample(self, n: int, seed: int = 0) -> tuple[FloatArray, dict[str, str]]:
         """Draws vehicles from the joint covariance, for `quadid.Simulator(fit.vehicle, thetas)`.

@@ -167,6 +167,12 @@ def number_rows(found: Sequence[Json]) -> Iterator[tuple[Json, tuple[Any, ...]]]
             yield one, (name, one["effect"], one["confident"], p["name"], p["unit"], p["value"], sigma, low, high)
 
 
+def with_ends(entry: Json) -> dict[str, Any]:
+    """An entry of a result with the two ends of its interval as columns of a table."""
+    low, high = entry["ci95"]
+    return {**{k: v for k, v in entry.items() if k != "ci95"}, "low": low, "high": high}
+
+
 def json_text(result: Any) -> str:
     """A result as JSON for people and programs; numbers that JSON has no word for become null."""
     text = json.dumps(jsonable(result), indent=2, ensure_ascii=False, allow_nan=False) + "\n"

@@ -11,7 +11,7 @@ import typer
 from quadid.app.logs import Given, Log, fitted_before, listed, read, settled
 from quadid.app.missing import ROWS, SECONDS
 from quadid.app.options import Described, Horizons, Logs, OfVehicle, OwnRate, Seed, Typed
-from quadid.app.outcome import LIBRARY, Reported, provenance
+from quadid.app.outcome import LIBRARY, Reported, provenance, with_ends
 from quadid.chi_square import Z95
 from quadid.data.window import Window, beginning, sample_period
 from quadid.errors import LogError, NotIdentifiableError, ParameterError
@@ -400,14 +400,7 @@ class Compared(Reported):
     def records(self) -> list[dict[str, Any]]:
         """One row a horizon and quantity."""
         return [
-            {
-                "name": f"{name}.{h}",
-                "after": int(h),
-                "quantity": name,
-                **{k: v for k, v in e.items() if k != "ci95"},
-                "low": e["ci95"][0],
-                "high": e["ci95"][1],
-            }
+            {"name": f"{name}.{h}", "after": int(h), "quantity": name, **with_ends(e)}
             for h, errors in self.result["horizons"].items()
             for name, e in errors.items()
         ]

@@ -13,7 +13,6 @@ import msgspec
 import numpy as np
 
 from quadid.chi_square import Z95
-from quadid.condition.changes import Change
 from quadid.condition.watch import HealthReport
 from quadid.jsonable import jsonable
 from quadid.online.gate import FORCE
@@ -171,7 +170,7 @@ def diagnosis(item: OnlineDiagnosis, vehicle: str) -> Message:
         "header": {"stamp": stamp(item.t), "frame_id": BODY_FRAME},
         "vehicle_id": vehicle,
         "verdict": VERDICTS.get(item.verdict, 3),
-        "findings": [_finding(f) for f in item.findings],
+        "findings": [_finding(_as_plain(f)) for f in item.findings],
         "mse_nominal": first.mse_before if first else nan,
         "mse_extended": first.mse_after if first else nan,
         "unexplained_channels": [],
@@ -181,30 +180,39 @@ def diagnosis(item: OnlineDiagnosis, vehicle: str) -> Message:
     }
 
 
-def _finding(found: OnlineFinding | Change) -> Message:
-    """quadid_msgs/Finding; what belongs to fits is NaN for a change since healthy flights."""
-    nan = math.nan
-    if isinstance(found, Change):
-        rows = [(name, unit, value, ci or (value, value)) for name, unit, value, ci in found.parameters]
-        before, after, rivals = nan, nan, [(rival.effects[0], nan) for rival in found.rivals]
-    else:
-        rows = [(n, found.units.get(n, ""), v, interval(v, found.sigma.get(n, nan))) for n, v in found.values.items()]
-        before, after, rivals = found.mse_before, found.mse_after, [(a.effect, a.mse_after) for a in found.alternatives]
+def _finding(found: Mapping[str, Any]) -> Message:
+    """quadid_msgs/Finding of plain data; what belongs to fits is NaN for a change since healthy flights."""
+    nan, gain, rows, rivals = math.nan, found.get("gain", {}), found["parameters"], found["alternatives"]
+    intervals = [p["ci95"] or (float(p["value"]),) * 2 for p in rows]
+    return {
+        **{key: found[key] for key in ("effect", "confident", "p_value", "evidence")},
+        "parameter_names": [p["name"] for p in rows],
+        "parameter_units": [p["unit"] or "1" for p in rows],
+        "parameter_values": [float(p["value"]) for p in rows],
+        "ci95_lower": [low for low, _ in intervals],
+        "ci95_upper": [high for _, high in intervals],
+        "mse_before": gain.get("mse_before", nan),
+        "mse_after": gain.get("mse_after", nan),
+        "gain_ci95": [nan, nan],
+        "alternatives": [a["effect"] for a in rivals],
+        "alternatives_mse": [a.get("mse_after", nan) for a in rivals],
+    }
+
+
+def _as_plain(found: OnlineFinding) -> dict[str, Any]:
+    """A finding as plain data, as in `quadid diagnose`'s JSON."""
+    intervals = {n: interval(v, found.sigma.get(n, math.nan)) for n, v in found.values.items()}
     return {
         "effect": found.effect,
         "confident": found.confident,
-        "parameter_names": [name for name, *_ in rows],
-        "parameter_units": [unit or "1" for _, unit, *_ in rows],
-        "parameter_values": [float(value) for _, _, value, _ in rows],
-        "ci95_lower": [low for *_, (low, _) in rows],
-        "ci95_upper": [high for *_, (_, high) in rows],
-        "mse_before": before,
-        "mse_after": after,
-        "gain_ci95": [nan, nan],
+        "parameters": [
+            {"name": n, "unit": found.units.get(n, ""), "value": v, "ci95": intervals[n]}
+            for n, v in found.values.items()
+        ],
+        "gain": {"mse_before": found.mse_before, "mse_after": found.mse_after},
         "p_value": found.p_value,
-        "alternatives": [effect for effect, _ in rivals],
-        "alternatives_mse": [mse for _, mse in rivals],
         "evidence": found.evidence,
+        "alternatives": [vars(a) for a in found.alternatives],
     }
 
 
@@ -228,7 +236,7 @@ def health_message(report: HealthReport, vehicle: str) -> Message:
         "mass": mass,
         "mass_lower": low,
         "mass_upper": high,
-        "changes": [_finding(change) for change in report.changes],
+        "changes": [_finding(change.to_dict()) for change in report.changes],
         "text": report.text,
     }
 
@@ -374,23 +382,7 @@ def set_from_dict(data: Mapping[str, Any]) -> OnlineSet:
 
 def diagnosis_to_dict(item: OnlineDiagnosis) -> dict[str, Any]:
     """A diagnosis; times are stamps [s], findings as in `quadid diagnose`'s JSON."""
-    nan = math.nan
-    findings = [
-        {
-            "effect": found.effect,
-            "confident": found.confident,
-            "parameters": [
-                {"name": n, "unit": found.units.get(n, ""), "value": v, "ci95": interval(v, found.sigma.get(n, nan))}
-                for n, v in found.values.items()
-            ],
-            "gain": {"mse_before": found.mse_before, "mse_after": found.mse_after},
-            "p_value": found.p_value,
-            "evidence": found.evidence,
-            "alternatives": [vars(a) for a in found.alternatives],
-        }
-        for found in item.findings
-    ]
-    data: dict[str, Any] = jsonable({**vars(item), "findings": findings})
+    data: dict[str, Any] = jsonable({**vars(item), "findings": list(map(_as_plain, item.findings))})
     return data
 
 
