@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from quadid.app.identify import OPTIMIZERS, check_seed, out_of_reach, proven, search
-from quadid.app.logs import Log, file_name, settled
-from quadid.app.missing import Beside, MissingForces, compared
+from quadid.app.logs import file_name, settled
+from quadid.app.missing import compared
 from quadid.app.options import Logs, OfVehicle, Seed, Validate
 from quadid.app.outcome import LIBRARY, NUMBER_COLUMNS, Advance, Fitted, number_rows, provenance, quality, silent
 from quadid.checks.findings import farthest
@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from quadid.diagnosis import Diagnosis
     from quadid.diagnosis.search import Search
     from quadid.identification.noise import NoiseModel
-    from quadid.identification.result import ScoredSet
     from quadid.report.figures import ResidualMap
 
 
@@ -44,15 +43,10 @@ class Diagnosed(Fitted):
     """
 
     title = "Diagnosis"
-    result: dict[str, Any]
     found: Diagnosis
-    sets: list[ScoredSet]
     noise: NoiseModel
-    logs: list[Log]
     nominal: Vehicle
     search: Search
-    forces: MissingForces | None = None
-    beside: Beside | None = None
 
     @property
     def vehicle(self) -> Vehicle:
@@ -219,7 +213,7 @@ def diagnose(
     if diagnose_verdict(result).level == "poor":  # what is left without a name may have bent the numbers too
         found = replace(found, parameters=unreliable(found.parameters, NOMINAL_NAMES))
         result["parameters"] = [parameter_entry(p) for p in found.parameters]
-    return Diagnosed(result, found, sets, fit.noise, [*train, *held], described, selection, forces, beside)
+    return Diagnosed(result, sets, [*train, *held], forces, beside, found, fit.noise, described, selection)
 
 
 def _within_reach(found: Diagnosis, unreachable: Mapping[str, str], off: Mapping[str, float]) -> Diagnosis:

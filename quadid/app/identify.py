@@ -14,7 +14,7 @@ import typer
 from quadid_evaluation.optimisers.minimise import minimise
 
 from quadid.app.logs import Log, file_name, remembered, settled
-from quadid.app.missing import Beside, MissingForces, compared
+from quadid.app.missing import Beside, compared
 from quadid.app.options import Bounds, Fix, Free, KnownEffects, Logs, OfVehicle, Priors, Seed, Validate
 from quadid.app.outcome import (
     LIBRARY,
@@ -125,12 +125,7 @@ class Identified(Fitted):
     """
 
     title = "Identification"
-    result: dict[str, Any]
     fit: Fit
-    sets: list[ScoredSet]
-    logs: list[Log]
-    forces: MissingForces | None = None
-    beside: Beside | None = None
 
     @property
     def parameters(self) -> ParameterSet:
@@ -331,7 +326,7 @@ def identify(
         result["parameters"] = [parameter_entry(p) for p in fit.parameters]
     advance("random forces", 0.0)
     beside = None if forces is None else forces.beside(fitted_vehicle(fit), terms=False)
-    done = Identified(result, fit, sets, flown, forces, beside)
+    done = Identified(result, sets, flown, forces, beside, fit)
     result["verdict"] = done.verdict.level
     if not answered(fit.parameters):
         raise UnansweredError(done)

@@ -9,7 +9,7 @@ import platform
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -257,6 +257,7 @@ class Reported(Outcome):
         )
 
 
+@dataclass(frozen=True, repr=False)
 class Fitted(Reported):
     """A result from logs that were fitted and scored.
 
@@ -270,10 +271,11 @@ class Fitted(Reported):
 
     endings = ("*.yaml",)
     over_time: ClassVar[tuple[str, ...]] = (".*simulated.*", ".*missing.csv")
+    result: dict[str, Any]
     sets: list[ScoredSet]
     logs: list[Log]
-    forces: MissingForces | None = None
-    beside: Beside | None = None
+    forces: MissingForces | None
+    beside: Beside | None
 
     @property
     @abstractmethod

@@ -332,16 +332,16 @@ def _one_axis(rows: tuple[FloatArray, ...]) -> Check | None:
     )
 
 
-def _sizes(gyro: Channel, attitude: Channel, over: float = TURN) -> list[Factor]:
+def _sizes(gyro: Channel, attitude: Channel) -> list[Factor]:
     """Turns of the attitude over those of the gyro about x, y and z; empty where they are too slow or too few."""
-    step = max(sample_period(attitude.t), 0.1 * over)
+    step = max(sample_period(attitude.t), 0.1 * TURN)
     at, q = _on_steps(gyro, attitude, step)
-    if step > 0.25 * over or len(at) < FEWEST * over / step:
+    if step > 0.25 * TURN or len(at) < FEWEST * TURN / step:
         return []
-    turns = Turns.of(linear(gyro.t, gyro.values, at), q, step, over)
+    turns = Turns.of(linear(gyro.t, gyro.values, at), q, step, TURN)
     felt, turned, rate = _without_jumps(turns.gyro, turns.attitude, turns.rate)
-    turns = Turns(felt, rate, turned, over)
-    number = len(felt) * step / over
+    turns = Turns(felt, rate, turned, TURN)
+    number = len(felt) * step / TURN
     if number < FEWEST:
         return []
     return [factors(axis, number, turns.moments(axis, step))[0] for axis in range(3)]
