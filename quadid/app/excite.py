@@ -297,8 +297,24 @@ def propose(
             swept=promised(proposal.sweeps) if proposal.sweeps else proposal.swept,
         )
     plan = made_into_plan(believed.name, proposal, tilt, height, battery)
+    halves, worst = (proposal.now, proposal.pilot, proposal.after, proposal.swept), int(np.argmax(proposal.pilot))
+    told = ("name", "now", "gentle_flight", "manoeuvre", "one_axis_at_a_time")
     result = {
-        **_result(believed.name, proposal, tilt, rate_limit),
+        "schema": "quadid.excite/1",
+        "vehicle": believed.name,
+        "seconds": proposal.seconds,
+        "limits": {"tilt_deg": tilt, "rate_deg_s": rate_limit},
+        "peak": {"tilt_deg": math.degrees(proposal.peak.tilt), "rate_deg_s": math.degrees(proposal.peak.rate)},
+        "movements": [
+            {"name": m.name, "amplitudes": {s.axis: s.amplitude for s in m.segments}} for m in proposal.movements
+        ],
+        "room": dict(zip(("sideways_m", "up_m", "down_m"), proposal.room.tolist(), strict=True)),
+        "parameters": [
+            dict(zip(told, row, strict=True))
+            for row in zip(NOMINAL_NAMES, *(half.tolist() for half in halves), strict=True)
+        ],
+        "worst": NOMINAL_NAMES[worst],
+        "gain": float(np.log1p(proposal.pilot[worst]) / np.log1p(proposal.after[worst])),
         "envelope": dict(plan.envelope),
         "manoeuvre_file": None,
         "files": [],
@@ -330,34 +346,6 @@ def made_into_plan(
     promises = (dict(zip(NOMINAL_NAMES, half.tolist(), strict=True)) for half in (proposal.after, proposal.swept))
     segments, sweeps = ([asdict(s) for s in part] for part in (proposal.segments, proposal.sweeps))
     return ManoeuvrePlan(vehicle, proposal.seconds, segments, sweeps, envelope, *promises)
-
-
-def _result(vehicle: str, proposal: Proposal, tilt: float, rate_limit: float) -> dict[str, Any]:
-    rows = zip(NOMINAL_NAMES, proposal.now, proposal.pilot, proposal.after, proposal.swept, strict=True)
-    worst = int(np.argmax(proposal.pilot))
-    return {
-        "schema": "quadid.excite/1",
-        "vehicle": vehicle,
-        "seconds": proposal.seconds,
-        "limits": {"tilt_deg": tilt, "rate_deg_s": rate_limit},
-        "peak": {"tilt_deg": math.degrees(proposal.peak.tilt), "rate_deg_s": math.degrees(proposal.peak.rate)},
-        "movements": [
-            {"name": m.name, "amplitudes": {s.axis: s.amplitude for s in m.segments}} for m in proposal.movements
-        ],
-        "room": dict(zip(("sideways_m", "up_m", "down_m"), proposal.room.tolist(), strict=True)),
-        "parameters": [
-            {
-                "name": n,
-                "now": float(a),
-                "gentle_flight": float(b),
-                "manoeuvre": float(c),
-                "one_axis_at_a_time": float(d),
-            }
-            for n, a, b, c, d in rows
-        ],
-        "worst": NOMINAL_NAMES[worst],
-        "gain": float(np.log1p(proposal.pilot[worst]) / np.log1p(proposal.after[worst])),
-    }
 
 
 def grouped(movements: Sequence[Json]) -> list[tuple[str, str, str]]:

@@ -15,7 +15,6 @@ from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
-from multiprocessing.process import BaseProcess
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from tempfile import TemporaryDirectory
@@ -332,7 +331,17 @@ def cluster(address: str | None, workers: int | None, memory: str) -> Iterator[A
             with Client(own, set_as_default=False) as client:
                 yield client
         finally:
-            _close(own, others)
+            from distributed.core import Status
+
+            try:
+                own.close(timeout=STARTING)
+            except (AssertionError, TimeoutError):
+                # Dask cannot close a cluster while the worker that replaces a dead one starts, and fails; its process
+                # is then killed, and it can.
+                for child in set(multiprocessing.active_children()) - others:
+                    child.kill()
+                own.status = Status.failed  # is closed once more
+                own.close(timeout=STARTING)
 
 
 @contextmanager
@@ -352,23 +361,6 @@ def _program_unseen() -> Iterator[None]:
         sys.path[:] = path
         del main["__file__"], main["__spec__"]
         main.update(kept)
-
-
-def _close(own: Any, others: set[BaseProcess]) -> None:
-    """Ends an embedded cluster and its processes; `others` are children of this process that it did not start.
-
-    Dask cannot close a cluster while the worker that replaces a dead one starts, and fails; its process is then killed,
-    and it can.
-    """
-    from distributed.core import Status
-
-    try:
-        own.close(timeout=STARTING)
-    except (AssertionError, TimeoutError):
-        for child in set(multiprocessing.active_children()) - others:
-            child.kill()
-        own.status = Status.failed  # is closed once more
-        own.close(timeout=STARTING)
 
 
 def results(client: Any, jobs: Sequence[Job], work: Callable[[Job], Row] = identify_one) -> Iterator[Row]:
