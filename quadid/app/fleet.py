@@ -220,11 +220,11 @@ def _identified(job: Job, log: Log) -> Row:
     from quadid.app.identify import identify
 
     found = identify(log, seed=job.seed)
-    error, kept = found.result["sets"][0]["mse"], ("unit", "value", "low", "high", "status")
+    error, columns = found.result["sets"][0]["mse"], ("unit", "value", "low", "high", "status")
     row: Row = {
         "mse_initial": error["initial"],
         "mse_fitted": error["fitted"],
-        "parameters": [{"parameter": r["name"], **{k: r[k] for k in kept}} for r in found.records()],
+        "parameters": [{"parameter": r["name"], **{k: r[k] for k in columns}} for r in found.records()],
     }
     if job.diagnose:
         from quadid.app.diagnose import diagnose

@@ -449,9 +449,9 @@ def grid_recording(
             at = _grid_times(plan, max(a, low), min(b, high))
             if len(at) >= 2 and (len(at) - 1) * plan.step >= shortest - 0.5 * plan.step:
                 read = {name: on_grid(name, track, at, plan) for name, track in plan.tracks.items()}
-                columns = {name: values for name, values in read.items() if not np.isnan(values).all()}
-                about: dict[str, Any] = {"name": recording.name, "log_span": log_span}
-                windows.append(Window(float(at[0]), plan.step, **columns, sampling=plan.sampling, **about))
+                kept: dict[str, Any] = {name: values for name, values in read.items() if not np.isnan(values).all()}
+                kept |= {"sampling": plan.sampling, "name": recording.name, "log_span": log_span}
+                windows.append(Window(float(at[0]), plan.step, **kept))
             elif low < high:
                 dropped.append(high - low)
     if not windows:
