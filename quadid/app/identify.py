@@ -410,13 +410,6 @@ def scored(log: Log, role: str, fit: Fit, autopilot: Autopilot | None, mse: tupl
     return ScoredSet(log.recording.name, role, before, after, paper, mse)
 
 
-def origin_remark(logs: Sequence[Log]) -> str:
-    """Sources of a fitted vehicle file."""
-    lines = [f"Fitted by quadid {__version__}; `initial` with a `sigma` was fitted, without it was not. From:"]
-    lines += [f"  {log.recording.name}  sha256 {log.recording.sha256 or 'unknown'}" for log in logs]
-    return "\n".join(plain(line, LONGEST_LINE) for line in lines)
-
-
 def proven(
     vehicle: Vehicle,
     former: Vehicle,
@@ -448,4 +441,7 @@ def proven(
     if verdict.level == "poor":
         guesses = {n: p.model_copy(update={"sigma": None}) for n, p in former.parameters.items()}
         update |= {"parameters": guesses, "correlation": {}}
-    return whole.model_copy(update=update).with_remark(origin_remark(train))
+    # Sources of a fitted vehicle file
+    lines = [f"Fitted by quadid {__version__}; `initial` with a `sigma` was fitted, without it was not. From:"]
+    lines += [f"  {log.recording.name}  sha256 {log.recording.sha256 or 'unknown'}" for log in train]
+    return whole.model_copy(update=update).with_remark("\n".join(plain(line, LONGEST_LINE) for line in lines))

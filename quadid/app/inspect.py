@@ -81,7 +81,10 @@ class Inspected(Outcome):
 
     def tables(self) -> list[TextTable]:
         """Channels, checks, and parameters."""
-        return [channel_table(self.found), check_table(self.found), parameter_outlook_table(self.found)]
+        # Verdict of every check; what was found and what to do follow as sentences
+        columns = heads("check | verdict")
+        rows = tuple((_spaced(c.name), Cell(c.verdict.value, _TONES[c.verdict.value])) for c in self.found.checks)
+        return [channel_table(self.found), TextTable("Checks", columns, rows), parameter_outlook_table(self.found)]
 
     def write(self, folder: Path, kept: str | None = None) -> list[tuple[str, Path]]:
         """Writes the inspection as JSON."""
@@ -196,13 +199,6 @@ def channel_table(found: Inspection) -> TextTable:
         for f in found.channels
     )
     return TextTable("Channels", columns, rows)
-
-
-def check_table(found: Inspection) -> TextTable:
-    """Verdict of every check; what was found and what to do follow as sentences."""
-    columns = heads("check | verdict")
-    rows = tuple((_spaced(c.name), Cell(c.verdict.value, _TONES[c.verdict.value])) for c in found.checks)
-    return TextTable("Checks", columns, rows)
 
 
 def parameter_outlook_table(found: Inspection) -> TextTable:

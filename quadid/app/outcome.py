@@ -128,8 +128,13 @@ class Outcome(ABC):
         return text
 
     def to_frame(self) -> pd.DataFrame:
-        """The main table with plain numbers as a pandas data frame."""
-        return data_frame(self.records(), self.columns)
+        """The main table with plain numbers as a pandas data frame, whose rows are found by their names, if any."""
+        records = self.records()
+        pandas = imported("pandas")
+        frame = pandas.DataFrame(records) if records else pandas.DataFrame(columns=list(self.columns))
+        if "name" in frame:
+            frame.index = pandas.Index(frame["name"].to_numpy())
+        return frame
 
     @property
     def columns(self) -> Sequence[str]:
@@ -180,19 +185,6 @@ def json_text(result: Any) -> str:
         return text
     # JSON's escape of what does not print: a terminal acts on some characters, and no file holds a surrogate.
     return re.sub(r"[^\x20-\x7e\n]", lambda m: m[0] if m[0].isprintable() else json.dumps(m[0])[1:-1], text)
-
-
-def data_frame(records: list[dict[str, Any]], columns: Sequence[str] = ()) -> pd.DataFrame:
-    """Rows as a data frame, found by their names where they have some; without rows with these columns.
-
-    Raises:
-        QuadidError: pandas is not installed.
-    """
-    pandas = imported("pandas")
-    frame = pandas.DataFrame(records) if records else pandas.DataFrame(columns=list(columns))
-    if "name" in frame:
-        frame.index = pandas.Index(frame["name"].to_numpy())
-    return frame
 
 
 # --- Simulated against measured outputs of scored logs as files, for PlotJuggler, Foxglove and programs of one's own

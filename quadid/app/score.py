@@ -49,7 +49,30 @@ class Scored(Reported):
 
     def tables(self) -> list[TextTable]:
         """Errors after every horizon, pooled and a log; what lies inside the predicted bands."""
-        return [horizon_table(self.result), coverage_table(self.result)]
+        # Open-loop prediction errors, pooled and for each file
+        result = self.result
+        many = len(result["files"]) > 1
+        columns = (
+            Column("log"),
+            Column("after", right=True),
+            *(
+                Column(f"{name} [{unit}]", right=True, rank=max(2 - i, 0))
+                for i, (name, unit) in enumerate(result["units"].items())
+            ),
+        )
+        rows = []
+        for entry in [*(result["files"] if many else []), result]:
+            label = entry.get("log", "all" if many else result["files"][0]["log"])
+            for horizon, errors in entry["horizons"].items():
+                rows.append((label, str(horizon), *(_error(errors[n]) for n in result["units"])))
+                label = ""
+            total = entry["sum"]
+            rows.append(("", f"sum 1..{total['to']}", *(_error(total[n]) for n in result["units"])))
+        last = list(result["horizons"])[-1]
+        for label, key in (("noise floor", "noise_floor"), ("no change predicted", "no_change")):
+            rows.append((label, last, *(number(result[key][last][n]) for n in result["units"])))
+        title = f"Open-loop prediction error of '{result['vehicle']}' after n samples, mean of {result['samples']} runs"
+        return [TextTable(title, columns, tuple(rows)), coverage_table(self.result)]
 
     @property
     def sentences(self) -> list[Cell]:
@@ -274,36 +297,6 @@ def coverage(
     if any(h not in total for h in wanted):
         told.append(f"none beyond {OPEN:g} s from logged rotor speeds, which already contain the controller's answer")
     return out, f"{'; '.join([*told, *reasons])}."
-
-
-def horizon_table(result: Json) -> TextTable:
-    """Open-loop prediction errors, pooled and for each file.
-
-    Args:
-        result: of the form ``quadid.score/1``.
-    """
-    many = len(result["files"]) > 1
-    columns = (
-        Column("log"),
-        Column("after", right=True),
-        *(
-            Column(f"{name} [{unit}]", right=True, rank=max(2 - i, 0))
-            for i, (name, unit) in enumerate(result["units"].items())
-        ),
-    )
-    rows = []
-    for entry in [*(result["files"] if many else []), result]:
-        label = entry.get("log", "all" if many else result["files"][0]["log"])
-        for horizon, errors in entry["horizons"].items():
-            rows.append((label, str(horizon), *(_error(errors[n]) for n in result["units"])))
-            label = ""
-        total = entry["sum"]
-        rows.append(("", f"sum 1..{total['to']}", *(_error(total[n]) for n in result["units"])))
-    last = list(result["horizons"])[-1]
-    for label, key in (("noise floor", "noise_floor"), ("no change predicted", "no_change")):
-        rows.append((label, last, *(number(result[key][last][n]) for n in result["units"])))
-    title = f"Open-loop prediction error of '{result['vehicle']}' after n samples, mean of {result['samples']} runs"
-    return TextTable(title, columns, tuple(rows))
 
 
 def coverage_table(result: Json) -> TextTable:

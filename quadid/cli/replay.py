@@ -93,7 +93,15 @@ def replay(
         result = summary(recording, service, outputs, candidates)
         if out is not None:
             advance(f"writing {out.name}", 1.0)
-            write_outputs(out, outputs, described.name)
+            # Writes what would have been published as MCAP: topics, types and stamps as of the live service
+            from quadid_node.messages import RESULTS, TOPICS
+
+            with written_whole(out.absolute()) as part, TopicWriter(part) as writer:
+                for output in outputs:
+                    if output.topic in RESULTS:
+                        message = RESULTS[output.topic].message(output, described.name, "")
+                        stamp = message["header"]["stamp"]
+                        writer.write(*TOPICS[output.topic], message, stamp["sec"] * 10**9 + stamp["nanosec"])
             result["out"] = str(out.absolute())
     terminal.conclude(Replayed(result), json)
     if not result["published"]:
@@ -152,18 +160,6 @@ def summary(
         "status": status_to_dict(service.session.status()),
         "warnings": [*recording.warnings, *doubts_of(inspect(recording, service.vehicle).checks)],
     }
-
-
-def write_outputs(path: Path, outputs: Sequence[Output], vehicle: str) -> None:
-    """Writes what would have been published as MCAP: topics, types and stamps as of the live service."""
-    from quadid_node.messages import RESULTS, TOPICS
-
-    with written_whole(path.absolute()) as part, TopicWriter(part) as writer:
-        for output in outputs:
-            if output.topic in RESULTS:
-                message = RESULTS[output.topic].message(output, vehicle, "")
-                stamp = message["header"]["stamp"]
-                writer.write(*TOPICS[output.topic], message, stamp["sec"] * 10**9 + stamp["nanosec"])
 
 
 @dataclass(frozen=True, repr=False)

@@ -234,8 +234,21 @@ def identify_sections(
     """
     parameters, entries = result["parameters"], result["sets"]
     shown = parameter_section(parameters, truth, at_bounds(result), [parameter_figure(parameters, truth)])
-    table, parts = fit_table(entries), set_parts(entries, sets)
-    title = "How well the simulation predicts"
+    # Errors of every log before and after, and how well channels fit
+    names = [n for n in FIT_NAMES if any(n in s["fit_percent"] for s in entries)]
+    head = ("Log", "Used for", "Error before", "Error after", *(f"Fit {n}" for n in names))
+    rows = [
+        (
+            s["log"],
+            "fitting" if s["role"] == "train" else "validation",
+            number(s["mse"]["initial"], 3),
+            number(s["mse"]["fitted"], 3),
+            *(fit(s["fit_percent"].get(n)) for n in names),
+        )
+        for s in entries
+    ]
+    table = rows_of(head, rows, classes=("", "", "number", "number strong", *["number"] * len(names)))
+    title, parts = "How well the simulation predicts", set_parts(entries, sets)
     predicted = section("fit", title, _PREDICTION, (), [table], parts=parts, menu="Prediction")
     return [*([lacking] if lacking else []), shown, *more, predicted, *after]
 
@@ -310,33 +323,12 @@ def set_parts(entries: Sequence[Json], sets: Sequence[ScoredSet]) -> list[JsonDi
 
 
 def quality_section(logs: Sequence[Json], noise: NoiseModel) -> JsonDict:
-    """Used parts of every log, and the sensor noise."""
-    white = part("Sensor noise, estimated from the flight", tables=[noise_table(noise)])
-    return section("quality", "Data quality", parts=[*logs, white])
-
-
-def fit_table(entries: Sequence[Json]) -> JsonDict:
-    """Errors of every log before and after, and how well channels fit."""
-    names = [n for n in FIT_NAMES if any(n in s["fit_percent"] for s in entries)]
-    head = ("Log", "Used for", "Error before", "Error after", *(f"Fit {n}" for n in names))
-    rows = [
-        (
-            s["log"],
-            "fitting" if s["role"] == "train" else "validation",
-            number(s["mse"]["initial"], 3),
-            number(s["mse"]["fitted"], 3),
-            *(fit(s["fit_percent"].get(n)) for n in names),
-        )
-        for s in entries
-    ]
-    return rows_of(head, rows, classes=("", "", "number", "number strong", *["number"] * len(names)))
-
-
-def noise_table(noise: NoiseModel) -> JsonDict:
-    """Standard deviations of the white and the slow part of every channel."""
+    """Used parts of every log, and the standard deviations of the white and the slow part of the sensor noise."""
     each = zip(CHANNEL_NAMES, noise.white, noise.slow, CHANNEL_UNITS, strict=False)
     rows = [(name, number(float(white), 3), number(float(slow), 3), unit(of)) for name, white, slow, of in each]
-    return measures(("Channel", "White", "Slow", "Unit"), rows, (1, 2))
+    deviations = measures(("Channel", "White", "Slow", "Unit"), rows, (1, 2))
+    sensors = part("Sensor noise, estimated from the flight", tables=[deviations])
+    return section("quality", "Data quality", parts=[*logs, sensors])
 
 
 def correlation_section(parameters: ParameterSet) -> dict[str, Any]:
