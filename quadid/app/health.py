@@ -24,7 +24,6 @@ from quadid.types import Json
 from quadid.vehicle import Vehicle
 
 if TYPE_CHECKING:
-    from quadid.condition import FlightTrim
     from quadid.condition.changes import Health
 
 LEAST_THRUST = 0.25
@@ -147,8 +146,15 @@ def health(
     opened = [[_open(one, described, preset, unchecked, warnings) for one in part] for part in (tested, healthy)]
     _distinct(*opened)
     trims = [[flight_trim(recording, described) for recording in part] for part in opened]
+    usual = sum(one.mean[-1] for one in trims[1]) / len(trims[1])
     for trim in trims[0]:
-        _check_flown(trim, trims[1])
+        if (share := math.exp(trim.mean[-1] - usual)) < LEAST_THRUST:
+            raise NotIdentifiableError(
+                f"{trim.name}: the rotors give {100.0 * share:.0f} % of the thrust of the baseline flights: "
+                "not a flight",
+                "flights",
+                "use a flight; a hover is enough",
+            )
     found = assess(trims[0], trims[1], described)
     if len(trims[1]) < 3:
         warnings.append(
@@ -160,17 +166,6 @@ def health(
     result["logs"], result["baseline"] = ([recording.name for recording in part] for part in opened)
     result["warnings"] = warnings
     return HealthOutcome(result, found, described, tuple(opened[0] + opened[1]))
-
-
-def _check_flown(trim: FlightTrim, healthy: Sequence[FlightTrim]) -> None:
-    """Raises NotIdentifiableError where rotors give far less thrust than the healthy vehicle weighs."""
-    share = math.exp(trim.mean[-1] - sum(one.mean[-1] for one in healthy) / len(healthy))
-    if share < LEAST_THRUST:
-        raise NotIdentifiableError(
-            f"{trim.name}: the rotors give {100.0 * share:.0f} % of the thrust of the baseline flights: not a flight",
-            "flights",
-            "use a flight; a hover is enough",
-        )
 
 
 def _open(given: Flight, vehicle: Vehicle, preset: str, unchecked: bool, warnings: list[str]) -> Recording:

@@ -509,7 +509,11 @@ def compare_vehicles(
         "after": wanted[-1],
         "better": "b" if high < 1.0 else "a" if low > 1.0 else "neither",
         "parameters": _parameters(*pair),
-        "effects": _effects(*pair),
+        # Numbers of the effects of either; None where one has none.
+        "effects": [
+            {"effect": e, "name": k, **{x: v.effects.get(e, {}).get(k) for x, v in zip("ab", pair, strict=True)}}
+            for e, k in dict.fromkeys((e, k) for v in pair for e, numbers in v.effects.items() for k in numbers)
+        ],
         "warnings": [*dict.fromkeys([*warnings, *(text for log in opened[0] for text in log.warnings)])],
     }
     return Compared(result, tuple(opened[0]))
@@ -570,11 +574,3 @@ def _parameters(a: Vehicle, b: Vehicle) -> list[Json]:
             }
         )
     return out
-
-
-def _effects(a: Vehicle, b: Vehicle) -> Sequence[Json]:
-    """Numbers of the effects of either; None where one has none."""
-    keys = dict.fromkeys((e, k) for v in (a, b) for e, numbers in v.effects.items() for k in numbers)
-    return [
-        {"effect": e, "name": k, "a": a.effects.get(e, {}).get(k), "b": b.effects.get(e, {}).get(k)} for e, k in keys
-    ]

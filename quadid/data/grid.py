@@ -2,14 +2,14 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from quadid.data.intersample import follow_feedback
-from quadid.data.rotor_signal import RotorSignal, rotor_signal
+from quadid.data.rotor_signal import rotor_signal
 from quadid.data.window import (
     COINCIDENT,
     Recording,
@@ -331,20 +331,13 @@ def _stretch_on_grid(name: str, track: ChannelTrack, cut: slice, at: FloatArray,
         out = interpolate(t, values, at, smooth=fast)
         # Inputs act between their samples; what is measured is known there only, lost samples least.
         if name != "rotor_speed" and not (fast and name == "attitude_reference"):
-            out = _at_nearest(t, out, at, HOLE * step if fast else step)
+            after = np.clip(np.searchsorted(t, at), 0, len(t) - 1)
+            distance = np.minimum(np.abs(t[after] - at), np.abs(at - t[np.maximum(after - 1, 0)]))
+            out = np.where((distance <= 0.5 * (HOLE * step if fast else step))[:, None], out, np.nan)
     if name == "attitude":
         out = out / np.linalg.norm(out, axis=1, keepdims=True)
     elif name == "attitude_reference":
         out[:, :3] = np.remainder(out[:, :3] + np.pi, 2.0 * np.pi) - np.pi
-    return out
-
-
-def _at_nearest(t: FloatArray, values: FloatArray, at: FloatArray, step: float) -> FloatArray:
-    """Keeps only the grid rows within half a `step` [s] of a real sample."""
-    after = np.clip(np.searchsorted(t, at), 0, len(t) - 1)
-    before = np.maximum(after - 1, 0)
-    distance = np.minimum(np.abs(t[after] - at), np.abs(at - t[before]))
-    out: FloatArray = np.where((distance <= 0.5 * step)[:, None], values, np.nan)
     return out
 
 
@@ -437,14 +430,18 @@ def grid_recording(
     recording = in_body_axes(recording, vehicle)
     rotor = rotor_signal(recording, vehicle)
     plan = make_plan(recording, rotor.t, rotor.values, rotor.sampling, rate)
-    # Windows where every required channel is there, inside the parts that are asked for.
-    spans = _spans(plan)
+    # Windows where every required channel is there, without gaps and breaks, inside the parts that are asked for.
+    required, spans = [plan.tracks[name] for name in REQUIRED if name in plan.tracks], [(-math.inf, math.inf)]
+    for track in required:
+        spans = _common(spans, list(zip(track.begins.tolist(), track.ends.tolist(), strict=True)))
     shortest = SHORTEST if rate is not None else 0.0
     log_span = recording.span
     windows: list[Window] = []
     dropped: list[float] = []
     for span in spans:
-        a, b = _inside(plan, span)
+        # The low-pass, if there is one, needs samples on both sides in every required channel.
+        ends = [reach(track, cut, plan) for track in required for cut in track.stretches_within(*span)]
+        a, b = max([span[0], *(low for low, _ in ends)]), min([span[1], *(high for _, high in ends)])
         for low, high in _common([span], parts):
             at = _grid_times(plan, max(a, low), min(b, high))
             if len(at) >= 2 and (len(at) - 1) * plan.step >= shortest - 0.5 * plan.step:
@@ -458,46 +455,27 @@ def grid_recording(
         longest = max((b - a for a, b in spans), default=0.0)
         raise _nothing_left(recording, longest, max(shortest, 2.0 * plan.step), parts)
     windows, followed = follow_feedback(windows, vehicle)
-    report = _report(plan, rotor, windows, len(spans) - 1, dropped, log_span)
-    return Gridded(windows, replace(report, notes=(*report.notes, followed)) if followed else report)
-
-
-def _report(
-    plan: GridPlan, rotor: RotorSignal, windows: list[Window], gaps: int, dropped: list[float], log_span: Span
-) -> GridReport:
-    period = measured_period(rotor.t, rotor.values)
-    slow = (
-        [
+    period, notes = measured_period(rotor.t, rotor.values), list(rotor.notes)
+    if period > 1.5 * plan.step:
+        notes.append(
             f"rotor signal at {1 / period:.3g} Hz is slower than the grid at {1 / plan.step:.3g} Hz: "
             "fast motion cannot be attributed to the rotors"
-        ]
-        if period > 1.5 * plan.step
-        else []
-    )
-    return GridReport(
+        )
+    report = GridReport(
         rate=1.0 / plan.step,
         windows=len(windows),
         seconds_used=sum((len(w) - 1) * w.dt for w in windows),
         seconds_log=log_span[1] - log_span[0],
-        gaps=gaps,
+        gaps=len(spans) - 1,
         dropped=len(dropped),
         seconds_dropped=sum(dropped),
         rotor_source=rotor.source,
         rotor_rate=1.0 / period,
         filtered=plan.filtered,
-        bridged=sum(holes(plan.tracks[name].t, plan.step) for name in REQUIRED if name in plan.tracks),
-        notes=(*rotor.notes, *slow),
+        bridged=sum(holes(track.t, plan.step) for track in required),
+        notes=(*notes, *([followed] if followed else [])),
     )
-
-
-def _spans(plan: GridPlan) -> list[Span]:
-    """Returns the times [s] during which every required channel is there, cut at gaps and breaks."""
-    spans: list[Span] = [(-math.inf, math.inf)]
-    for name in REQUIRED:
-        if name in plan.tracks:
-            track = plan.tracks[name]
-            spans = _common(spans, list(zip(track.begins.tolist(), track.ends.tolist(), strict=True)))
-    return spans
+    return Gridded(windows, report)
 
 
 def _common(one: Sequence[Span], other: Sequence[Span]) -> list[Span]:
@@ -512,16 +490,6 @@ def _common(one: Sequence[Span], other: Sequence[Span]) -> list[Span]:
         else:
             j += 1
     return out
-
-
-def _inside(plan: GridPlan, span: Span) -> Span:
-    """Shrinks a span to where the low-pass, if there is one, has samples on both sides in every required channel."""
-    a, b = span
-    for name in REQUIRED:
-        for cut in plan.tracks[name].stretches_within(*span) if name in plan.tracks else ():
-            c, d = reach(plan.tracks[name], cut, plan)
-            a, b = max(a, c), min(b, d)
-    return a, b
 
 
 def _grid_times(plan: GridPlan, a: float, b: float) -> FloatArray:

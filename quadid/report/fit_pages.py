@@ -360,8 +360,10 @@ _LEVELS: dict[str, Level] = {
 
 def diagnose_verdict(result: Json) -> Verdict:
     """Judges a result of the form ``quadid.diagnose/1``."""
-    large, small = _named(result)
-    verdict = result["verdict"]
+    # Confident findings by name: those to do something about, and those no larger than on most vehicles.
+    sure, verdict = [f for f in result["findings"] if f["confident"]], result["verdict"]
+    large = [f["effect"].replace("_", " ") for f in sure if not f.get("ordinary")]
+    small = [f["effect"].replace("_", " ") for f in sure if f.get("ordinary")]
     headline = result["statement"]
     if (large or small) and verdict != "unknown":
         found = [", ".join(large)] if large else []
@@ -409,14 +411,6 @@ def chance(p_value: float) -> str:
 
 def _short(value: float | None) -> str:
     return "unknown" if value is None else f"{value:.3g}"
-
-
-def _named(result: Json) -> tuple[list[str], list[str]]:
-    """Confident findings by name: those to do something about, and those no larger than on most vehicles."""
-    sure = [f for f in result["findings"] if f["confident"]]
-    large = [f["effect"].replace("_", " ") for f in sure if not f.get("ordinary")]
-    small = [f["effect"].replace("_", " ") for f in sure if f.get("ordinary")]
-    return large, small
 
 
 def _next_steps(result: Json) -> tuple[str, ...]:

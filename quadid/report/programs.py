@@ -273,7 +273,11 @@ def px4(facts: Facts) -> dict[str, Any]:
     lost = () if facts.max_speed is not None else ("weak_rotor",)
     refused = _no_cross(facts, "no SIH_*: PX4 simulates")
     rows = [] if refused else _in_hardware(facts)
-    return {"lost": lost, "rows": [*rows, *_drag_fusion(facts)], "refused": refused}
+    # Drag of EKF2: momentum drag of the propellers [1/s], ballistic coefficients [kg/m^2]; only what was fitted
+    rows += [("EKF2_MCOEF", facts.mean_drag)] if "rotor_drag" in facts.vehicle.effects else []
+    c = facts.effect("parasitic_drag", "c")
+    rows += [(f"EKF2_BCOEF_{axis}", 0.5 * AIR_DENSITY / c) for axis in "XY" if c > 0.0]
+    return {"lost": lost, "rows": rows, "refused": refused}
 
 
 def _no_cross(facts: Facts, what: str) -> str:
@@ -310,13 +314,6 @@ def _in_hardware(facts: Facts) -> list[tuple[str, float]]:
     if "motor_lag" in effects:
         rows.append(("SIH_T_TAU", k("motor_lag", "tau")))
     return rows
-
-
-def _drag_fusion(facts: Facts) -> list[tuple[str, float]]:
-    """Drag of EKF2: momentum drag of the propellers [1/s], ballistic coefficients [kg/m^2]; only what was fitted."""
-    rows = [("EKF2_MCOEF", facts.mean_drag)] if "rotor_drag" in facts.vehicle.effects else []
-    c = facts.effect("parasitic_drag", "c")
-    return [*rows, *((f"EKF2_BCOEF_{axis}", 0.5 * AIR_DENSITY / c) for axis in "XY" if c > 0.0)]
 
 
 def ardupilot(facts: Facts) -> dict[str, Any]:
