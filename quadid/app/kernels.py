@@ -1,6 +1,6 @@
 """The compiled kernels: which there are, whether this machine has them already, and short runs that compile them.
 
-The parts are made so that two processes side by side take about the same time.
+What calls the same pieces is one part, or each process would compile them again.
 """
 
 from __future__ import annotations
@@ -94,6 +94,8 @@ def _hover() -> tuple[Vehicle, Window]:
 
 
 def _simulation() -> None:
+    from quadid.flight.pilot import default_gains
+    from quadid.model.closed_loop import ClosedLoop
     from quadid.model.layout import Layout
     from quadid.model.rollout import Rollout, Segments
 
@@ -105,15 +107,7 @@ def _simulation() -> None:
     rollout.roll(segments, theta, states)  # rotors do the same in both lanes: from a table
     theta[1, Layout(vehicle).entry("motor_lag.tau").index] = 0.02
     rollout.roll(segments, theta, states)
-
-
-def _closed_loop() -> None:
-    from quadid.flight.pilot import default_gains
-    from quadid.model.closed_loop import ClosedLoop
-    from quadid.model.layout import Layout
-
-    vehicle, window = _hover()
-    ClosedLoop(window, vehicle, default_gains(vehicle)).fly(Layout(vehicle).initial(vehicle)[None])
+    ClosedLoop(window, vehicle, default_gains(vehicle)).fly(theta[:1])
 
 
 def _estimate() -> None:
@@ -141,17 +135,16 @@ def _flight() -> None:
 PARTS = {
     "simulation": Part(
         _simulation,
-        ("model.kernel:needs_of", "model.rollout_kernel:roll_segments", "model.rotor_kernel:rotor_table"),
-        100,
+        ("model.rollout_kernel:roll_segments", "model.rotor_kernel:rotor_table", "model.closed_loop:fly_closed_loop"),
+        110,
     ),
-    "closed loop": Part(_closed_loop, ("model.closed_loop:fly_closed_loop",), 80),
     "estimate": Part(
         _estimate, tuple(f"estimate.kalman:{name}" for name in ("moments", "filter_pass", "replay", "backward")), 30
     ),
     "flight": Part(_flight, ("flight.fly:march",), 30),
 }
-"""Kernels of an identification or a diagnosis, in three parts, and the flown vehicle of `quadid simulate`."""
-FIT = ("simulation", "closed loop", "estimate")
+"""Kernels of an identification or a diagnosis, in two parts, and the flown vehicle of `quadid simulate`."""
+FIT = ("simulation", "estimate")
 
 
 # --- Compiling what a command needs before it works, in processes side by side

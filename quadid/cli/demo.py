@@ -48,7 +48,7 @@ def demo(
     folder = check_folder(out, "--out", *WRITTEN)
     for name in FOLDERS:
         check_folder(folder / name, "--out", *WRITTEN)
-    with terminal.progress(("simulation", "closed loop", "estimate", "flight")) as advance:
+    with terminal.progress((*FIT, "flight")) as advance:
         shown = run(QUICK_SECONDS if quick else SECONDS, seed, folder, advance)
         advance("writing the report", 1.0)
         page = write_text(folder / "report.html", html(shown, seed, terminal.command_line()))

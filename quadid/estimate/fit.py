@@ -89,22 +89,27 @@ def estimate(problem: Problem, start: FloatArray | None = None) -> Estimate:
     if part is whole and not problem.objective(z, psi) <= near.objective(z, psi):  # effects that run away
         problem = near
     z, psi, value, gains, information = scoring(problem, z, psi, MOST, ALL_NOISE)
+
+    def moved(new: Problem) -> bool:
+        """Moves to the maximum of another problem; stays where it has none."""
+        nonlocal problem, z, psi, value, gains, information
+        gains.clear()  # of a long flight, each list of them is a third of all memory
+        tried = scoring(new, z, psi, MOST, ALL_NOISE)
+        if there := bool(np.isfinite(tried[2])):
+            problem, (z, psi, value, gains, information) = new, tried
+        else:
+            gains = problem.passes(z, psi)[1]
+        return there
+
     # 3. Effects stay as simulated along states: simulate them anew where the search ended, until both stay.
     for _ in range(0 if problem is whole else ROUNDS):
-        anew, before = whole.along(z, psi), z
-        tried = scoring(anew, z, psi, MOST, ALL_NOISE)
-        if not np.isfinite(tried[2]):
-            break
-        problem, (z, psi, value, gains, information) = anew, tried
-        if (z - before) @ information @ (z - before) < FINE:
+        before = z
+        if not moved(whole.along(z, psi)) or (z - before) @ information @ (z - before) < FINE:
             break
     # 4. Where innovations have outliers, their density has tails.
     tail = tails(problem.tracks, gains)
     if np.any(tail > 0.0):
-        heavy = replace(problem, tail=tail)
-        tried = scoring(heavy, z, psi, MOST, ALL_NOISE)
-        if np.isfinite(tried[2]):
-            problem, (z, psi, value, gains, information) = heavy, tried
+        moved(replace(problem, tail=tail))
     # 5. Noise of logged rotor speeds makes inertias too large by as much as it explains.
     for _ in range(ROUNDS):
         tilted = problem.unbiased(z, psi, gains)
@@ -115,12 +120,8 @@ def estimate(problem: Problem, start: FloatArray | None = None) -> Estimate:
         if slope @ step < FINE:
             problem = tilted
             break
-        tried = scoring(tilted, z, psi, MOST, ALL_NOISE)
-        if not np.isfinite(tried[2]):
-            break
         before = z
-        problem, (z, psi, value, gains, information) = tilted, tried
-        if (z - before) @ information @ (z - before) < FINE:
+        if not moved(tilted) or (z - before) @ information @ (z - before) < FINE:
             break
     taken, noise = problem.taken
     # 6. A loop faster than the log answers a random moment within a step: by half of what it may, give or take as much.
@@ -213,6 +214,7 @@ def scoring(
     curvature, slope, at = np.eye(len(psi)), np.zeros(len(psi)), np.full(len(psi), np.inf)
     damping = calm = 0.0
     below = above = np.zeros(len(z))
+    renewed: list[Gains] = []
     for _ in range(turns if np.isfinite(value) else 0):
         if physics:
             below, above, nudge = problem.corner(z, psi, gains)
@@ -234,10 +236,12 @@ def scoring(
             by_physics, by_noise = -float(gradient @ step), -0.5 * float(slope @ bold)
             done = by_physics < FINE and by_noise < ENOUGH
             moved, changed = z + step, changed_noise(psi, bold)
+            renewed.clear()  # what did not help makes room
             better, renewed = problem.passes(moved, changed, gains)
             if better < value or done:
                 break
             if by_physics > FINE and noise.any():
+                renewed.clear()
                 better, renewed = problem.passes(moved, psi, gains)
             if better < value:
                 changed, by_noise, calm = psi, 0.0, more(calm)
@@ -249,7 +253,7 @@ def scoring(
             damping, calm = less(damping), calm if changed is psi else less(calm)
         else:
             damping, calm = more(damping), calm if changed is psi else more(calm)
-        z, psi, value, gains = moved, changed, better, renewed
+        z, psi, value, gains, renewed = moved, changed, better, renewed, []
         if done:
             break
     return z, psi, value, gains, information

@@ -229,7 +229,8 @@ def moments(track: Track, delay: float, lag: float, dead: float, over: float) ->
     out = np.zeros((n, 3 * MOMENTS))
     a, b, c = np.empty(MOMENTS), np.empty(MOMENTS), np.empty(MOMENTS)
     d, e = np.empty(MOMENTS), np.empty(MOMENTS)
-    at = _integrals(track.piece_t, courses, lag, track.t[0] - delay, 0, a)
+    at = 0
+    at = _integrals(track.piece_t, courses, lag, track.t[0] - delay, at, a)
     for k in range(n):
         t = track.t[k] - delay
         _integrals(track.piece_t, courses, lag, t - track.half, at, d)
@@ -488,7 +489,9 @@ def _expected(c, p, y, seen, row, air, x, out):  # type: ignore[no-untyped-def]
         out[ATTITUDE] = scale * a - x[AE + 1]
         out[ATTITUDE + 1] = scale * b - x[AE + 2]
         out[ATTITUDE + 2] = scale * e - x[AE + 3]
-    s2, x2, y2, z2, o1, s1 = row[2 * MOMENTS :]
+    reading = 2 * MOMENTS
+    s2, x2, y2 = row[reading], row[reading + 1], row[reading + 2]
+    z2, o1, s1 = row[reading + 3], row[reading + 4], row[reading + 5]
     fx, fy, fz, u, v, w = 0.0, 0.0, -c[0] * s2, 0.0, 0.0, 0.0
     if air:
         fx, fy, fz, u, v, w = _force(c, s2, s1, x[0], x[1], x[2], x[3], x[VE + 1], x[VE + 2], x[VE + 3])
@@ -534,18 +537,36 @@ def _start(track: Track, p: FloatArray) -> FloatArray:
     x = np.zeros(N_MEAN)
     x[0] = 1.0
     if len(track.beyond.added) > 0:
-        x[VE + 1 : VE + 4] = track.beyond.at[0, 3:]
+        for i in range(3):
+            x[VE + 1 + i] = track.beyond.at[0, 3 + i]
     for group in range(4):
         for k in range(len(track.t)):
             if track.seen[k, group]:
-                if group == 0:
-                    x[4:7] = track.y[k, :3] - p[GYRO_BIAS : GYRO_BIAS + 3]
-                elif group == 1:
-                    x[:4] = track.y[k, 3:7]
-                elif group == 3:
-                    x[VE + 1 : VE + 4] = track.y[k, 10:13]
+                for i in range(3):
+                    if group == 0:
+                        x[4 + i] = track.y[k, i] - p[GYRO_BIAS + i]
+                    elif group == 1:
+                        x[i], x[3] = track.y[k, 3 + i], track.y[k, 6]
+                    elif group == 3:
+                        x[VE + 1 + i] = track.y[k, 10 + i]
                 break
     return x
+
+
+@_piece
+def _copy(source: FloatArray, target: FloatArray) -> None:
+    """Copies a mean; a loop, because an assignment of arrays compiles a check of their shapes and its message."""
+    for i in range(N_MEAN):
+        target[i] = source[i]
+
+
+@_piece
+def _in_air(track: Track) -> bool:
+    """Whether velocity plays a part."""
+    air = track.still > 0.0
+    for k in range(len(track.t)):
+        air |= track.seen[k, 3]
+    return air
 
 
 @_piece
@@ -832,7 +853,7 @@ def _update(track, psi, tail, k, nu, slope, P, PH, gain, where, what, dx, store,
 def filter_pass(track: Track, p: FloatArray, psi: FloatArray, tail: FloatArray, store: bool, g: Gains) -> float:
     """Writes the gains of `kalman`; returns -2 ln L."""
     n = len(track.t)
-    air = track.still > 0.0 or track.seen[:, 3].any()
+    air = _in_air(track)
     c, keep = _constants(p, track), np.empty(9)
     x, after = _start(track, p), np.empty(N_MEAN)
     P, FP, F, turn = np.zeros((N, N)), np.zeros((N, N)), np.zeros((N, N)), np.zeros((3, 3))
@@ -856,7 +877,7 @@ def filter_pass(track: Track, p: FloatArray, psi: FloatArray, tail: FloatArray, 
         total += _update(track, psi, tail, k, nu, slope, P, PH, taken, where, what, dx, store, g)
         _correct(dx, x)
         if store:
-            g.mean[k] = x
+            _copy(x, g.mean[k])
             for i in range(N):
                 for j in range(9):
                     g.P[k, i, j] = P[i, FO + j]
@@ -867,12 +888,12 @@ def filter_pass(track: Track, p: FloatArray, psi: FloatArray, tail: FloatArray, 
         if abs(h - before) > 1e-12:
             _keep(psi, h, keep)
             before = h
-        after[:] = x
+        _copy(x, after)
         _advance(c, g.table[k], h, keep, air, after)
         _transition(c, g.table[k], h, keep, air, x, after, F, turn)
         _bend(track.beyond, k, F)
         _step_beyond(track.beyond, k, x, step)
-        x[:] = after
+        _copy(after, x)
         _go_beyond(track.beyond, step, dx, x)
         _sandwich(F, P, FP, False)
         for i in range(9):
@@ -937,7 +958,7 @@ def replay(
         mean: as in `Gains`, written; shape (0, N_MEAN): not wanted.
     """
     n = len(track.t)
-    air = track.still > 0.0 or track.seen[:, 3].any()
+    air = _in_air(track)
     c, keep, x = _constants(p, track), np.empty(9), _start(track, p)
     dx, nu, step = np.empty(N), np.zeros(M), np.zeros(12)
     where, what = np.zeros(10, dtype=np.int64), np.zeros(10)
@@ -961,7 +982,7 @@ def replay(
                 out[k, m] = z
         _correct(dx, x)
         if len(mean) > 0:
-            mean[k] = x
+            _copy(x, mean[k])
         if k + 1 < n:
             h = track.t[k + 1] - track.t[k]
             if abs(h - before) > 1e-12:
@@ -1003,7 +1024,7 @@ def backward(
         variances, shape (n, 9); sum of G' N G Q over each rotor noise of `_wavering`, shape (4,).
     """
     n = len(track.t)
-    air = track.still > 0.0 or track.seen[:, 3].any()
+    air = _in_air(track)
     score, mean, variance = np.zeros(N_NOISE), np.zeros((n, 9)), np.zeros((n, 9))
     l, fl, L, FL = np.zeros(N), np.zeros(N), np.zeros((N, N)), np.zeros((N, N))
     NK, G, turn, F = np.empty(N), np.empty(N), np.zeros((3, 3)), np.zeros((N, N))
@@ -1016,7 +1037,7 @@ def backward(
             if abs(h - before) > 1e-12:
                 _keep(psi, h, keep)
                 before = h
-            after[:] = g.mean[k]
+            _copy(g.mean[k], after)
             _advance(c, g.table[k], h, keep, air, after)
             _transition(c, g.table[k], h, keep, air, g.mean[k], after, F, turn)
             _bend(g.beyond, k, F)

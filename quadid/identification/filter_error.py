@@ -237,7 +237,8 @@ def _compared(found: Estimate, wide: Problem, half: Problem, places: IndexArray,
     )
     # 1. Parts of the flights: the step of each block of time from the optimum of all, and its variance.
     gains = problem.passes(found.z, found.psi)[1]
-    whole = _sensitivities(problem, found, gains)
+    whole, lost = _sensitivities(problem, found, gains), bool(carried(gains) > LOST * problem.noise_scale[1])
+    gains.clear()  # of a long flight, they are as much as all else together
     grams, slopes = _blocks(problem, whole)
     grams, slopes = grams + np.diag(1.0 / (BLOCKS * problem.prior[1] ** 2)), slopes - slopes.mean(axis=0)
     box = problem.limits - found.z
@@ -252,7 +253,6 @@ def _compared(found: Estimate, wide: Problem, half: Problem, places: IndexArray,
         for name, step in _with_causes(found, near, wide.liveliest(NEAR_SECONDS))
     ]
     # 3. Every second row: what inputs do within a row is a third of the step to rows twice as long.
-    lost = bool(carried(gains) > LOST * problem.noise_scale[1])
     try:
         others.append(("when the flight is fitted on a finer grid", _on_coarse_grid(found, half)[places] * unit))
     except np.linalg.LinAlgError:  # it runs away there

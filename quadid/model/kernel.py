@@ -8,8 +8,8 @@ import numpy as np
 
 from quadid.model import layout as ix
 from quadid.model.layout import places
-from quadid.model.simd import LANES, cached, exact, inlined, jit, lane_kernel
-from quadid.types import FloatArray, IntArray
+from quadid.model.simd import LANES, exact, inlined, jit, lane_kernel
+from quadid.types import FloatArray
 from quadid.vehicle import GRAVITY
 
 # isort: off
@@ -83,47 +83,30 @@ ROTOR_ENTRIES = places(
     "motor_lag", "command_delay", "rotor_telemetry_delay", "thrust_curve", "supply_voltage", "drag_torque_curve"
 )
 """Differences between the rotors of one lane and those of another; losses beside them."""
-# As arrays, which all are of one type: `_any_of` would be compiled anew for each length of a tuple.
-_HUB, _RARE, _PAYLOAD, _FACTORS = (np.array(e) for e in (HUB_ENTRIES, RARE_ENTRIES, PAYLOAD_ENTRIES, FACTOR_ENTRIES))
-_SOLID, _IMU, _DELAY = (np.array(e) for e in (SOLID_ENTRIES, IMU_ENTRIES, DELAY_ENTRIES))
-_SLOWER, _EXPONENT = np.array(places("motor_lag.slower")), np.array(places("supply_voltage"))
-_GROWTH, _AHRS = np.array(places("drag_torque_curve")), np.array([ix.AHRS_K])
-_IMU_LAG, _ATT_DELAY = np.array([ix.IMU_PERIOD]), np.array([ix.ATT_DELAY])
+_SLOWER, _EXPONENT, _GROWTH = places("motor_lag.slower"), places("supply_voltage"), places("drag_torque_curve")
 
 
-@nb.njit(**jit)
-def _any_of(theta: FloatArray, entries: IntArray) -> bool:
-    """Checks whether any of these entries is not neutral in any lane."""
-    found = False
-    for lane in range(len(theta)):
-        for i in entries:
-            found |= theta[lane, i] != 0.0
-    return found
-
-
-@cached
 def needs_of(theta: FloatArray, rotors: int, channels: int) -> Needs:
     """Returns what a block of parameter vectors (LANES, size) needs of the model."""
-    rare, factors, payload = (_any_of(theta, _RARE), _any_of(theta, _FACTORS), _any_of(theta, _PAYLOAD))
-    learned = False
-    for lane in range(len(theta)):
-        for i in range(ix.LOSS + 2 * rotors, theta.shape[1]):
-            learned |= theta[lane, i] != 0.0
-    rare |= learned
-    hub = rare or _any_of(theta, _HUB)
-    air, solid = channels > 9 or hub, factors or learned or _any_of(theta, _SOLID)
-    growth = _any_of(theta, _GROWTH)
-    varied = growth
-    for lane in range(len(theta)):
-        for i in ROTOR_ENTRIES:
-            varied |= theta[lane, i] != theta[0, i]
-        for i in range(ix.LOSS, ix.LOSS + 2 * rotors):
-            varied |= theta[lane, i] != theta[0, i]
-        varied |= theta[lane, ix.OFFSET] != 0.0 and theta[lane, ix.B] != theta[0, ix.B]
+    last = ix.LOSS + 2 * rotors
+    # Entries that are not neutral in any lane, and those in which the lanes differ.
+    used = set(np.flatnonzero((theta != 0.0).any(axis=0)).tolist())
+    split = set(np.flatnonzero((theta != theta[0]).any(axis=0)).tolist())
+
+    def acts(*entries: int) -> bool:
+        return not used.isdisjoint(entries)
+
+    learned = acts(*range(last, theta.shape[1]))
+    factors, growth = acts(*FACTOR_ENTRIES), acts(*_GROWTH)
+    rare = learned or acts(*RARE_ENTRIES)
+    hub = rare or acts(*HUB_ENTRIES)
+    air, solid = channels > 9 or hub, factors or learned or acts(*SOLID_ENTRIES)
+    varied = growth or not split.isdisjoint((*ROTOR_ENTRIES, *range(ix.LOSS, last)))
+    varied = varied or (acts(ix.OFFSET) and ix.B in split)
     return Needs(
-        air or solid, air, hub, solid, rare, not varied, _any_of(theta, _DELAY), _any_of(theta, _SLOWER),
-        _any_of(theta, _EXPONENT), growth, factors, payload, _any_of(theta, _IMU_LAG),
-        _any_of(theta, _ATT_DELAY), _any_of(theta, _IMU), _any_of(theta, _AHRS), learned,
+        air or solid, air, hub, solid, rare, not varied, acts(*DELAY_ENTRIES), acts(*_SLOWER), acts(*_EXPONENT),
+        growth, factors, acts(*PAYLOAD_ENTRIES), acts(ix.IMU_PERIOD), acts(ix.ATT_DELAY), acts(*IMU_ENTRIES),
+        acts(ix.AHRS_K), learned,
     )  # fmt: skip
 
 

@@ -20,7 +20,7 @@ from quadid.model.simd import (
 )  # fmt: skip
 
 # isort: on
-from quadid.model.simd import LANES, exact, inlined, jit, lane_kernel
+from quadid.model.simd import LANES, cached, exact, inlined, jit, lane_kernel
 
 Y1, Y2 = LANES, 2 * LANES
 """Offsets of the second and third component of a vector."""
@@ -179,7 +179,7 @@ def step_tilt_error(s: FloatArray) -> None:
         s[N_QW + lane], s[N_QX + lane], s[N_QY + lane], s[N_QZ + lane] = e0, e1, e2, e3
 
 
-@nb.njit(**jit)
+@cached
 def tilt_errors(
     gain: FloatArray, dt: float, attitude: FloatArray, force: FloatArray, s: FloatArray, out: FloatArray
 ) -> None:

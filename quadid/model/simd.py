@@ -26,8 +26,9 @@ whole: dict[str, Any] = {"nogil": True, "fastmath": FREE, "error_model": "numpy"
 _ORDER = ",".join(f"{e.name}.{p.name}" for e in EFFECTS.values() for p in e.parameters)
 cached: Any = kept(sources("quadid.model", _ORDER), fastmath=FREE)
 """Compiles such a function as one of the kernels on disk, which the order of parameters is built into."""
-jit: dict[str, Any] = {**whole, "_nrt": False}
-"""Options of the pieces of kernels: no reference counts, whose atomic updates cost more than a short lane loop."""
+jit: dict[str, Any] = {**whole, "_nrt": False, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+"""Options of the pieces of kernels: no reference counts, whose atomic updates cost more than a short lane loop, and
+nothing compiled to call them from Python."""
 exact: dict[str, Any] = {**jit, "fastmath": False}
 """Options of pieces that prepare constants, whose loops are not all vectors: fused or not, lanes must round alike."""
 inlined: dict[str, Any] = {**jit, "forceinline": True}

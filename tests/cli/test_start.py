@@ -46,12 +46,12 @@ def python(text: str, *arguments: str, **environment: str) -> str:
 
 
 def test_what_is_missing_is_known_without_compiling(tmp_path: Path) -> None:
-    assert python(ASK, NUMBA_CACHE_DIR=str(tmp_path)).splitlines() == ["simulation closed loop estimate"]
+    assert python(ASK, NUMBA_CACHE_DIR=str(tmp_path)).splitlines() == ["simulation estimate"]
 
 
 def test_a_fit_calls_what_was_compiled_and_nothing_else(flights: Flights, inside: Cli) -> None:
     counts = json.loads(python(SIGNATURES, str(flights.train)).splitlines()[-1])
-    names = ("needs_of", "roll_segments", "rotor_table", "fly_closed_loop")
+    names = ("roll_segments", "rotor_table", "fly_closed_loop")
     filters = ("moments", "filter_pass", "replay", "backward")
     assert counts == dict.fromkeys((*names, *filters), 1)
     assert inside("warmup").out.startswith("Kernels: compiled")

@@ -1,5 +1,6 @@
 """The table of effects in the filter: what acts along its states, what sensors remember, how a flight begins."""
 
+import numba as nb
 import numpy as np
 import pytest
 
@@ -113,5 +114,10 @@ def one_step(track: k.Track, gains: k.Gains, p: FloatArray, row: int) -> FloatAr
     x: FloatArray = gains.mean[row].copy()
     table = k.moments(track, *k.turning(p))
     x[k.FO + 1 :] = 0.0
-    k._advance(k._constants(p, track), table[row], float(track.t[row + 1] - track.t[row]), np.zeros(9), True, x)
+    _advance(k._constants(p, track), table[row], float(track.t[row + 1] - track.t[row]), np.zeros(9), x)
     return x
+
+
+@nb.njit
+def _advance(c, row, h, keep, x):  # type: ignore[no-untyped-def]
+    k._advance(c, row, h, keep, True, x)

@@ -173,7 +173,7 @@ def test_a_second_start_compiles_nothing() -> None:
         "from tests.model.test_rollout import test_results_can_be_written_into_earlier_ones as run\n"
         "from quadid.model import rollout as k\n"
         "run()\n"
-        "for kernel in (k.roll_segments, k.needs_of, k.rotor_table):\n"
+        "for kernel in (k.roll_segments, k.rotor_table):\n"
         "    assert not kernel.stats.cache_misses, kernel\n"
     )
     test_results_can_be_written_into_earlier_ones()
