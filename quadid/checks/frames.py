@@ -429,13 +429,16 @@ def _angle_rates(gyro: Channel, attitude: Channel) -> Check | None:
     if len(angles) < FEWEST_SAMPLES:
         return None
     # What this difference, as it is, takes of what the gyro misses beside its bias: on the axis about which they differ
-    # most, where the others add their noise, and part by part of all: a swing that dies away looks like any other.
+    # most, where the others add their noise, and in the rest of the flight too: a swing that dies away looks like any.
     apart, missed = angles - turned, measured - turned
-    was, left = ((x - x.mean(axis=0)) ** 2 for x in (missed, missed - apart))
     axis = int(np.argmax(np.sum(apart**2, axis=0)))
-    share = 1.0 - float(left[:, axis].sum() / max(was[:, axis].sum(), 1e-300))
-    taken = np.array([part.sum() for part in np.array_split(was - left, _PARTS)])
-    if share < _CLEAR or taken.mean() < 2.0 * taken.std(ddof=1) / math.sqrt(_PARTS):
+    was, left = (
+        np.array([part.sum() for part in np.array_split((x[:, axis] - x[:, axis].mean()) ** 2, _PARTS)])
+        for x in (missed, missed - apart)
+    )
+    others = np.arange(_PARTS) != np.argmax(was - left)
+    share, rest = (1.0 - float(left[some].sum() / max(was[some].sum(), 1e-300)) for some in (others | True, others))
+    if min(share, rest) < _CLEAR:
         return None
     return Check(
         "gyro_attitude",
