@@ -24,8 +24,8 @@ from quadid.identification.fit import FitOptions, fit
 from quadid.parameters import NOMINAL_NAMES
 from quadid.vehicle import ParameterPrior, Vehicle
 from quadid_evaluation.harness import Given, options, pooled, put
-from quadid_evaluation.studies.filter_error.causes import search
 from quadid_evaluation.studies.filter_error.jobs import BRIEF, GUSTS, LATE, SECONDS, caused, exact, fast_loop, lagging
+from quadid_evaluation.studies.innovations import searched
 from quadid_evaluation.studies.truth import poor_guess
 
 EFFECTS = (
@@ -225,10 +225,11 @@ def causes(flights: int, processes: int, data: Path) -> str:
     for folder, train, test in APART:
         vehicle = Vehicle.from_yaml((data / folder / "vehicle.yaml").read_text(encoding="utf-8"))
         fitted, unseen = (grid_recording(open_log(data / folder / n), vehicle, 100.0).windows for n in (train, test))
-        nominal, model = search(fitted, vehicle)
-        judge = Vehicles(fitted, vehicle, nominal.theta())
-        before, after = (judge.missing(unseen, one.theta()) for one in (nominal, model))
-        inertia = ", ".join(f"{v:.3g}" for v in model.theta()[2:4])
+        found = searched(fitted, vehicle)
+        nominal, model = found.nominal, found.model
+        judge = Vehicles(fitted, vehicle, nominal.theta)
+        before, after = (judge.missing(unseen, one.theta) for one in (nominal, model))
+        inertia = ", ".join(f"{v:.3g}" for v in model.theta[2:4])
         lines.append(
             f"| `{folder}` {train.removesuffix('.csv')} | {test.removesuffix('.csv')} | "
             f"{', '.join(model.names) or 'nothing'} | {inertia} | {removed(before, after):.0%} |"

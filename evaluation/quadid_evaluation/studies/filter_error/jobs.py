@@ -18,7 +18,8 @@ from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 from quadid_evaluation.studies.campaign import cases, flown
-from quadid_evaluation.studies.filter_error import causes, loop
+from quadid_evaluation.studies.filter_error import loop
+from quadid_evaluation.studies.innovations import searched
 from quadid_evaluation.studies.truth import poor_guess
 
 SECONDS, BRIEF = 60.0, 40.0
@@ -84,7 +85,7 @@ def caused(job: tuple[str, int, bool]) -> tuple[str, bool, bool, str, str, float
     case = replace(case, seconds=BRIEF)
     train, _, vehicle = flown(case)
     begin = time.process_time()
-    _, model = causes.search([train], vehicle)
+    model = searched([train], vehicle).model
     seconds = time.process_time() - begin
     today, _ = diagnose([train], vehicle, seed=case.seed)
     named = tuple(f.effect for f in today.findings if f.confident)

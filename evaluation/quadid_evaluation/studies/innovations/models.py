@@ -1,0 +1,410 @@
+"""Models of a diagnosis at the maximum of their likelihood, random forces and all noise with them."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from scipy.special import gammaln
+
+from quadid.data.window import Window
+from quadid.diagnosis.hypotheses import Candidate, HeldOut, free_names, held_out
+from quadid.effects import EFFECTS, NEVER
+from quadid.estimate import kalman as k
+from quadid.estimate.fit import ALL_NOISE, MOST, NEAR, NO_NOISE, scoring, settle_noise, tails
+from quadid.estimate.kalman import Beyond, Gains, Track
+from quadid.estimate.problem import PER_FLIGHT, PLACES, Problem, Sensitivities
+from quadid.estimate.track import from_window
+from quadid.identification.problem import Free
+from quadid.identification.uncertainty import Uncertainty, score_products
+from quadid.model.layout import places
+from quadid.parameters import NOMINAL_NAMES
+from quadid.types import BoolArray, FloatArray, IndexArray
+from quadid.vehicle import Vehicle
+
+# --- The likelihood near a model, by stretches of time
+
+
+STRETCH = 1.0
+"""Length of the stretches whose scores are summed [s]."""
+
+
+@dataclass(frozen=True)
+class Quadratic:
+    """-2 ln of the likelihood near a point, ``cost + 2 grad z + z gram z`` of a scaled step z, by stretches of time.
+
+    Attributes:
+        gram: shape (stretches, P, P).
+        grad: shape (stretches, P).
+        cost: shape (stretches,).
+        rows: scalar measurements of each stretch.
+        window: index of the flight of each stretch.
+        time: when it begins [s].
+    """
+
+    gram: FloatArray
+    grad: FloatArray
+    cost: FloatArray
+    rows: FloatArray
+    window: IndexArray
+    time: FloatArray
+
+    @property
+    def occam(self) -> float:
+        """No initial states are found: what a comparison by blocks adds to the cost."""
+        return 0.0
+
+    @cached_property
+    def information(self) -> FloatArray:
+        """Of all stretches on the scaled parameters, shape (P, P)."""
+        return np.asarray(self.gram.sum(axis=0))
+
+    @cached_property
+    def gradient(self) -> FloatArray:
+        """Half the slope of all stretches, shape (P,)."""
+        return np.asarray(self.grad.sum(axis=0))
+
+    @cached_property
+    def total_rows(self) -> float:
+        """Scalar measurements of all stretches."""
+        return float(self.rows.sum())
+
+    @property
+    def spacing(self) -> float:
+        """Time from one stretch to the next [s]; 1 s where there is one only."""
+        return float(np.median(np.diff(self.time))) if len(self.time) > 1 else 1.0
+
+
+class Costs(NamedTuple):
+    """Deviance of every stretch, its scalar measurements, flight and first time [s], shapes (stretches,)."""
+
+    cost: FloatArray
+    rows: FloatArray
+    window: IndexArray
+    time: FloatArray
+
+
+def stretches(track: Track) -> IndexArray:
+    """First row of each stretch of a flight."""
+    count = max(int((track.t[-1] - track.t[0]) / STRETCH), 1)
+    return np.unique(np.linspace(0, len(track.t), count, endpoint=False).astype(np.intp))
+
+
+def densities(g: Gains, tail: FloatArray) -> tuple[FloatArray, BoolArray]:
+    """-2 ln of the density of every scalar measurement of a pass, as `kalman.kalman` sums them, and which there are."""
+    seen = g.S > 0.0
+    S = np.where(seen, g.S, 1.0)
+    out = np.where(seen, g.nu**2 / S, 0.0)
+    for group, k_inv in enumerate(tail.tolist()):
+        if k_inv > 0.0:
+            axes, degrees = slice(3 * group, 3 * group + 3), 1.0 / k_inv
+            at_zero = 2.0 * (gammaln(0.5 * degrees) - gammaln(0.5 * (degrees + 1.0))) + np.log(0.5 * degrees)
+            out[:, axes] = (1.0 + degrees) * np.log1p(k_inv * out[:, axes]) + at_zero
+    return np.where(seen, out + np.log(S), 0.0), seen
+
+
+def innovations(track: Track, p: FloatArray, psi: FloatArray, g: Gains) -> FloatArray:
+    """Whitened innovations of a flight at physics p under the gains of a pass nearby, shape (n, M)."""
+    table = g.table if k.turning(p) == g.made_with else k.moments(track, *k.turning(p))
+    out = np.zeros((len(track.t), k.M))
+    k.replay(track, p, psi, g, table, out, np.empty((0, k.N_MEAN)))
+    return out
+
+
+def costs(tracks: Sequence[Track], gains: Sequence[Gains], tail: FloatArray) -> Costs:
+    """-2 ln of the density of innovations under the gains of a pass, by stretches."""
+    parts = []
+    for j, (track, g) in enumerate(zip(tracks, gains, strict=True)):
+        first = stretches(track)
+        value, seen = densities(g, tail)
+        summed = (np.add.reduceat(a.sum(axis=1), first) for a in (value, seen.astype(float)))
+        parts.append((*summed, np.full(len(first), j), track.t[first]))
+    return Costs(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+
+
+def quadratic(problem: Problem, gains: Sequence[Gains], found: Sequence[Sensitivities], size: int) -> Quadratic:
+    """The likelihood near the point of these sensitivities, one a flight, by `size` entries."""
+    grams, grads = [], []
+    for track, mine in zip(problem.tracks, found, strict=True):
+        for first, last in _spans(track):
+            gram, grad = np.zeros((size, size)), np.zeros(size)
+            J = mine.J[:, first:last]
+            grad[mine.entries] = J.reshape(len(J), -1) @ mine.plain[first:last].ravel()
+            J = (J * problem.expected).reshape(len(J), -1)
+            gram[np.ix_(mine.entries, mine.entries)] = J @ J.T
+            grams.append(gram)
+            grads.append(grad)
+    return Quadratic(np.array(grams), np.array(grads), *costs(problem.tracks, gains, problem.tail))
+
+
+def _spans(track: Track) -> list[tuple[int, int]]:
+    first = stretches(track).tolist()
+    return list(zip(first, [*first[1:], len(track.t)], strict=True))
+
+
+# --- A model at the maximum of its likelihood, random forces and all noise with it
+
+
+@dataclass(frozen=True)
+class Model:
+    """A model at the maximum of its likelihood.
+
+    Attributes:
+        causes: candidates it contains.
+        problem: the flights, and what is free.
+        z: scaled parameters; psi: noise numbers.
+        deviance: -2 ln of likelihood and prior.
+        gains: of the pass there, one a flight.
+        near: the likelihood near it.
+        left_out: deviances with one block left out each.
+        tried: how many alternatives (causes, and onsets of them) were looked at when each cause was, by label.
+        known: uncertainty of the parameters in `free`, once they are fitted as an identification fits.
+        numbers_of: full vector, once they are.
+    """
+
+    causes: tuple[Candidate, ...]
+    problem: Problem
+    z: FloatArray
+    psi: FloatArray
+    deviance: float
+    gains: Sequence[Gains]
+    near: Quadratic
+    left_out: HeldOut
+    tried: Mapping[str, float] = field(default_factory=dict)
+    known: Uncertainty | None = None
+    final: FloatArray | None = None
+
+    @cached_property
+    def keys(self) -> tuple[tuple[str, int], ...]:
+        """Name and flight (-1: all) of every scaled parameter."""
+        return tuple((name, flight) for name, _, flight in self.problem.entries)
+
+    @cached_property
+    def free(self) -> Free:
+        """Entries of the full vector that are free."""
+        return Free(tuple(self.problem.layout.entry(n) for n in free_names(self.causes)))
+
+    @cached_property
+    def theta(self) -> FloatArray:
+        """Full vector; what belongs to a flight is that of the first."""
+        if self.final is not None:
+            return self.final
+        theta = self.problem.vector(self.z, 0)
+        for entry in self.free.entries:
+            if not entry.name.startswith(PER_FLIGHT):  # a filter has biases beside the vector
+                continue
+            place = self._place(entry.name)
+            theta[entry.index] = self.z[place] * self.problem.size[place]
+        return theta
+
+    @property
+    def rows(self) -> float:
+        """Scalar measurements."""
+        return self.near.total_rows
+
+    @cached_property
+    def precision(self) -> FloatArray:
+        """Precision of the prior of the scaled parameters, shape (P,)."""
+        return np.asarray(self.problem.prior[1] ** -2.0)
+
+    @cached_property
+    def covariance(self) -> FloatArray:
+        """Of the scaled parameters, by this likelihood, shape (P, P)."""
+        return np.asarray(np.linalg.inv(self.near.information + np.diag(self.precision)))
+
+    @cached_property
+    def inflation(self) -> FloatArray:
+        """True variance of each parameter over what the model counts on, from the scores of its stretches, (P,)."""
+        meat, _ = score_products(self.near)
+        return np.asarray(np.diag(self.covariance @ meat @ self.covariance) / np.diag(self.covariance))
+
+    @cached_property
+    def uncertainty(self) -> Uncertainty:
+        """Covariance of the parameters in `free`, in their scale."""
+        if self.known is not None:
+            return self.known
+        at = [self._place(name) for name in self.free.names]
+        unit = np.where(self.free.is_log, 1.0, self.problem.size[at] / self.free.scale)
+        covariance = self.covariance[np.ix_(at, at)] * np.outer(unit, unit)
+        return Uncertainty(covariance, np.ones(len(at)), unit * self.problem.prior[1][at])
+
+    def _place(self, name: str) -> int:
+        return next(i for i, (n, _) in enumerate(self.keys) if n == name)
+
+    @property
+    def deviations(self) -> dict[str, float]:
+        """Standard deviations of the fitted entries in their own units, by name."""
+        sigma = self.uncertainty.sigma * self.free.jacobian(self.theta)
+        return dict(zip(self.free.names, sigma.tolist(), strict=True))
+
+    def numbers(self, cause: Candidate) -> Free:
+        """The free parameters that belong to `cause`."""
+        return Free(tuple(e for e in self.free.entries if e.name in cause.names))
+
+    def wald(self, cause: Candidate) -> float:
+        """Chi-square of the parameters of `cause` against neutral."""
+        z = self.free.from_neutral(self.theta)
+        place = [self.free.names.index(n) for n in cause.names]
+        covariance = self.uncertainty.covariance[np.ix_(place, place)]
+        return float(z[place] @ np.linalg.solve(covariance, z[place]))
+
+    @property
+    def effects(self) -> set[str]:
+        """Names of the effects it contains."""
+        return {c.effect for c in self.causes}
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Effects in the order in which they were found."""
+        return tuple(dict.fromkeys(c.effect for c in self.causes))
+
+    @property
+    def labels(self) -> frozenset[str]:
+        """Labels of its causes."""
+        return frozenset(c.label for c in self.causes)
+
+
+def left_without(causes: tuple[Candidate, ...], gone: Candidate | None) -> tuple[Candidate, ...]:
+    """`causes` without `gone`, if any, and what requires it."""
+    return tuple(c for c in causes if gone is None or (c.label != gone.label and not gone.carries(c)))
+
+
+class Possible(Problem):
+    """A problem whose effects stay within the bounds of the catalogue."""
+
+    @cached_property
+    def limits(self) -> FloatArray:
+        """Bounds of the scaled parameters, shape (2, P)."""
+        out = super().limits
+        for i, (name, place, _) in enumerate(self.entries):
+            if place >= k.TRIM and name in self.layout.entries:
+                entry = self.layout.entry(name)
+                out[:, i] = (np.array([entry.lower, entry.upper]) - entry.neutral) / self.size[i]
+        return out
+
+
+ONSET_STEP, ONSET_REACH, ONSET_ROUNDS = 0.8, 4.0, 3
+"""Of the search for an onset: first step, what is looked at on either side [s], and most refits."""
+
+
+@dataclass(frozen=True)
+class Flights:
+    """Flights to diagnose, and every cause that these data could show.
+
+    Attributes:
+        windows: the flights.
+        whole: the same, everything free that any cause frees.
+        listed: the causes.
+    """
+
+    windows: tuple[Window, ...]
+    whole: Problem
+    listed: tuple[Candidate, ...]
+
+    @classmethod
+    def of(cls, windows: Sequence[Window], vehicle: Vehicle, listed: Sequence[Candidate]) -> "Flights":
+        """The flights of `windows`."""
+        tracks = [from_window(w, vehicle, air=True) for w in windows]
+        names = tuple(dict.fromkeys(n for c in listed for n in c.names))
+        return cls(tuple(windows), Possible.of(tracks, vehicle, names, windows), tuple(listed))
+
+    def problem(self, names: Sequence[str], times: Mapping[str, float]) -> Problem:
+        """The same flights with these entries free, and effects that begin at these `times` [s].
+
+        The others lie before the flight, so that the derivative by their size covers all of it.
+        """
+        theta, layout = self.whole.theta.copy(), self.whole.layout
+        for spec in EFFECTS.values():
+            if spec.timed:
+                theta[list(places(f"{spec.name}.time"))] = times.get(spec.name, -NEVER)
+        rest = [e for e in layout.entries.values() if e.name not in PLACES and not e.name.endswith(".time")]
+        own = set(names) <= set(PLACES) and not any(theta[e.index] != e.neutral for e in rest)
+        return replace(self.whole, names=tuple(names), theta=theta, models=() if own else self.whole.models)
+
+    def nominal(self, theta: FloatArray) -> tuple["Flights", Model]:
+        """The model without causes, from where the six are those of `theta`, and the flights with its unit of noise."""
+        problem = self.problem(NOMINAL_NAMES, {})
+        z = np.log(theta[: len(NOMINAL_NAMES)])
+        # Random forces large at first, so that no flight runs away from a bad guess; then they shrink.
+        z = scoring(problem, z, problem.first_noise(), 2 * NEAR, NO_NOISE)[0]
+        problem, z = problem.based_on(z)
+        z, psi, gains = settle_noise(problem, z, problem.first_noise())
+        tail = tails(problem.tracks, gains)
+        whole = replace(self.whole, base=problem.base, control=problem.control, tracks=problem.tracks, tail=tail)
+        flights = replace(self, whole=whole)
+        return flights, flights.fit((), dict(zip(_keys(problem), z, strict=True)), psi, {}, {})
+
+    def fit(
+        self,
+        causes: tuple[Candidate, ...],
+        start: Mapping[tuple[str, int], float],
+        psi: FloatArray,
+        times: Mapping[str, float],
+        tried: Mapping[str, float],
+        turns: int = MOST,
+    ) -> Model:
+        """The model with `causes`, from scaled parameters `start` by key and noise numbers `psi`."""
+        problem = self.problem(free_names(causes), times)
+        z = np.clip([start.get(key, 0.0) for key in _keys(problem)], *problem.limits)
+        z, psi, deviance, gains, _ = scoring(problem, z, psi, turns, ALL_NOISE)
+        found = [problem.sensitivities(j, z, psi, g) for j, g in enumerate(gains)]
+        near = quadratic(problem, gains, found, len(z))
+        left_out = held_out(near, problem.prior[1] ** -2.0)
+        return Model(causes, problem, z, psi, deviance, gains, near, left_out, tried)
+
+    def in_time(self, model: Model, cause: Candidate) -> Model:
+        """Refits `model` with the onset of a timed `cause` where it is most likely, everything else as it is.
+
+        A scan is linear, at random forces that stood in for the cause: it may be off by a second.
+        """
+        assert cause.timed is not None
+        for _ in range(ONSET_ROUNDS):
+            time, step = float(model.problem.theta[cause.timed]), ONSET_STEP
+            # Only what is measured around the onset tells when it was.
+            rows = [np.searchsorted(t.t, [time - ONSET_REACH, time + ONSET_REACH]) for t in model.problem.tracks]
+            near = model.problem.cut([(max(int(a), 0), max(int(b), int(a) + 2)) for a, b in rows])
+            while step > 0.5 * self.windows[0].dt:
+                tried = {t: self._at(near, model, cause.timed, t) for t in time + step * np.arange(-2.0, 3.0)}
+                time, step = min(tried, key=lambda t: tried[t]), 0.4 * step
+            if abs(time - model.problem.theta[cause.timed]) < self.windows[0].dt:
+                break
+            times = times_of(model, model.causes) | {cause.effect: time}
+            start = dict(zip(model.keys, model.z, strict=True))
+            moved = self.fit(model.causes, start, model.psi, times, model.tried)
+            if not moved.deviance < model.deviance:
+                break
+            model = moved
+        return model
+
+    @staticmethod
+    def _at(near: Problem, model: Model, place: int, time: float) -> float:
+        """Deviance of a part of the flights if an effect begins at `time` [s]."""
+        theta = near.theta.copy()
+        theta[place] = time
+        return replace(near, theta=theta).objective(model.z, model.psi)
+
+    def without(self, model: Model, cause: Candidate) -> Model:
+        """Refits `model` without `cause` and what requires it."""
+        left = left_without(model.causes, cause)
+        start = dict(zip(model.keys, model.z, strict=True))
+        return self.fit(left, start, model.psi, times_of(model, left), model.tried)
+
+
+def times_of(model: Model, causes: Sequence[Candidate]) -> dict[str, float]:
+    """When those of `causes` begin that `model` has, by effect [s]."""
+    timed = {c.effect: c.timed for c in causes if c.timed is not None}
+    return {effect: float(model.problem.theta[index]) for effect, index in timed.items() if effect in model.effects}
+
+
+def _keys(problem: Problem) -> list[tuple[str, int]]:
+    return [(name, flight) for name, _, flight in problem.entries]
+
+
+def with_additions(g: Gains) -> Gains:
+    """Gains of a pass without additions, with additions of nothing: what is simulated beside it may then be added."""
+    if len(g.beyond.slope):
+        return g
+    rows = len(g.mean)
+    none = Beyond(np.zeros((rows, 9 + k.M)), np.zeros((rows, 12, 6)), np.ascontiguousarray(g.mean[:, 4:10]))
+    return g._replace(beyond=none)
