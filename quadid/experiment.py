@@ -2,7 +2,8 @@
 
 The flights are those of the simulated vehicle with the parameters believed so far; movements are chosen by the Fisher
 information that a log of them would carry.  What is promised is what a fit makes of a log of the whole manoeuvre
-(`AsLogged`), where there is a log, since intervals also hold what the information does not know of.
+(`AsLogged`), where a log or a fit of one tells what moves the vehicle beyond its model: the information knows of
+sensor noise alone.
 """
 
 from collections.abc import Sequence
@@ -15,16 +16,16 @@ import yaml
 from quadid.data.grid import to_windows
 from quadid.data.window import Recording, Window
 from quadid.errors import NotIdentifiableError
-from quadid.estimate import missing
 from quadid.flight import Flight, FlightError, Segment, TruthParameters, fly
 from quadid.flight.loop import SensorNoise
+from quadid.flight.pilot import PILOT_STEP
 from quadid.identification.fit import Progress as Advance
 from quadid.identification.noise import NoiseModel
 from quadid.identification.uncertainty import d_optimal, excitation, halfwidths
 from quadid.parameters import NOMINAL_NAMES
 from quadid.rotation import down
 from quadid.types import FloatArray
-from quadid.vehicle import Vehicle
+from quadid.vehicle import RandomForces, Vehicle
 
 BLOCK = 6.0
 """Length of one movement [s]."""
@@ -153,26 +154,23 @@ class AsLogged:
     """Flies manoeuvres as they would be logged: random forces and sensor noise found so far, the log's own rates."""
 
     def __init__(
-        self, simulator: TrialFlights, recording: Recording, rate: float, windows: Sequence[Window], theta: FloatArray
+        self, simulator: TrialFlights, random: RandomForces, like: Recording | None = None, rate: float | None = None
     ) -> None:
-        """Finds the random forces.
+        """Takes what was found.
 
         Args:
             simulator: what is believed of the vehicle, with the noise that was found.
-            recording: a log of the vehicle; each channel will come as often as there.
-            rate: of its grid [Hz].
-            theta: parameters identified from them, shape (L,).
+            random: what moves it beyond its model.
+            like: a log of the vehicle; each channel will come as often as there.
+            rate: of its grid [Hz].  Without a log, rows come as the pilot's; a loop whose rotors are measured between
+                its commands is faster.
         """
-        vehicle = simulator.vehicle
-        parts = missing.Vehicles(windows, vehicle, theta).missing(windows, theta)
-        force, moment = (missing.size(parts, is_force)[0][:2] for is_force in (True, False))
-        push, turn = (float(np.sqrt(np.mean(a**2))) for a in (force / vehicle.mass, moment / theta[2:4]))
-        self.gusts = {"push": push, "turn": turn, "time": float(parts[0].times[0])}
         white = NoiseModel.guess(9).white if simulator.noise is None else simulator.noise.white
         gyro, attitude, accel = (float(np.mean(white[i : i + 3])) for i in (0, 3, 6))
         self._noise = SensorNoise(gyro=gyro, attitude=attitude, accel=accel)
-        self._simulator, self._recording = simulator, recording
-        self._rate = FASTEST / max(round(FASTEST / rate), 1)
+        self._simulator, self._random, self._like = simulator, random, {} if like is None else like.channels
+        self._grid = FASTEST / max(round(FASTEST * (PILOT_STEP if rate is None else 1.0 / rate)), 1)
+        self._rate = FASTEST if rate is None and simulator.vehicle.command.sampling == "instant" else self._grid
 
     def windows(self, segments: Sequence[Segment], seconds: float, profile: str = "scripted") -> list[Window]:
         """One flight, logged; raises FlightError when it ends on the ground."""
@@ -184,17 +182,17 @@ class AsLogged:
             simulator.seed,
             profile,
             effects=simulator.vehicle.effects,
-            outside={"gusts": self.gusts},
+            random=self._random,
             segments=segments if profile == "scripted" else None,
             noise=self._noise,
             log_rate=self._rate,
         ).recording
         channels = {}
         for name, channel in flown.channels.items():
-            there = self._recording.channels.get(name, channel)
-            rows = slice(None, None, max(round(self._rate * float(np.median(np.diff(there.t)))), 1))
+            step = float(np.median(np.diff(self._like[name].t))) if name in self._like else 1.0 / self._grid
+            rows = slice(None, None, max(round(self._rate * step), 1))
             channels[name] = replace(channel, t=channel.t[rows], values=channel.values[rows])
-        return to_windows(replace(flown, channels=channels), simulator.vehicle, self._rate)
+        return to_windows(replace(flown, channels=channels), simulator.vehicle, self._grid)
 
 
 def peaks(flight: Flight) -> Limits:

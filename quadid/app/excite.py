@@ -104,6 +104,7 @@ class Proposed(Reported):
         return [
             Cell(f"Manoeuvre: movements of {BLOCK:g} s, amplitudes rms"),
             *(Cell(f"  {times} × {name}: {size}") for name, times, size in grouped(self.result["movements"])),
+            Cell(f"Half-widths are predicted by {self.plan.rests_on}."),
             Cell(
                 f"In simulation it reaches {peak['tilt_deg']:.0f} degrees and {peak['rate_deg_s']:.0f} deg/s, and "
                 f"needs {room['sideways_m']:.0f} m to each side, {room['up_m']:.1f} m upwards and "
@@ -157,7 +158,7 @@ class Proposed(Reported):
             section(
                 "gain",
                 "What it would gain",
-                "Relative half-width of the 95 % interval, from the Fisher information of simulated flights.",
+                f"Relative half-width of the 95 % interval, predicted by {self.plan.rests_on}.",
                 [figure("gain-bars", "Half-widths", bars, widths, 320)],
                 [self.tables()[0].part()],
             ),
@@ -268,6 +269,7 @@ def propose(
         ParameterError: limits that cannot be flown.
         NotIdentifiableError: no movement stays within the limits, or too little data.
     """
+    from quadid.estimate.missing import Vehicles, random_forces
     from quadid.experiment import AsLogged, Limits, TrialFlights, design_manoeuvre, manoeuvre_file
     from quadid.identification.uncertainty import halfwidths
     from quadid.report.programs import Facts
@@ -281,8 +283,12 @@ def propose(
     believed, known, before = knowledge(described, windows, seed, advance)
     simulator = TrialFlights(believed, None if before is None else before.noise, seed)
     proposal = design_manoeuvre(simulator, known, limits, seconds, advance)
+    random, like = believed.random, given[-1] if given else None
     if before is not None:
-        as_logged = AsLogged(simulator, given[-1].recording, given[-1].grid.rate, windows, before.theta)
+        parts = Vehicles(windows, believed, before.theta).missing(windows, before.theta)
+        random = random_forces(parts)
+    if random is not None:
+        as_logged = AsLogged(simulator, random, *(() if like is None else (like.recording, like.grid.rate)))
 
         def promised(segments: Sequence[Segment], profile: str = "scripted") -> FloatArray:
             flown = as_logged.windows(segments, proposal.seconds, profile)
@@ -296,7 +302,7 @@ def propose(
             after=promised(proposal.segments),
             swept=promised(proposal.sweeps) if proposal.sweeps else proposal.swept,
         )
-    plan = made_into_plan(believed.name, proposal, tilt, height, battery)
+    plan = made_into_plan(believed.name, proposal, tilt, height, battery, random is not None)
     halves, worst = (proposal.now, proposal.pilot, proposal.after, proposal.swept), int(np.argmax(proposal.pilot))
     told = ("name", "now", "gentle_flight", "manoeuvre", "one_axis_at_a_time")
     result = {
@@ -325,7 +331,7 @@ def propose(
 
 
 def made_into_plan(
-    vehicle: str, proposal: Proposal, tilt: float, height: tuple[float, float], battery: float
+    vehicle: str, proposal: Proposal, tilt: float, height: tuple[float, float], battery: float, disturbed: bool
 ) -> ManoeuvrePlan:
     """The manoeuvre with its envelope; raises ParameterError where it needs more height than there is."""
     sideways, up, down = proposal.room.tolist()
@@ -343,9 +349,9 @@ def made_into_plan(
         "abort_tilt_deg": round(ABORT * math.degrees(proposal.peak.tilt), 1),
         "battery_percent": battery,
     }
-    promises = (dict(zip(NOMINAL_NAMES, half.tolist(), strict=True)) for half in (proposal.after, proposal.swept))
+    flown, swept = (dict(zip(NOMINAL_NAMES, half.tolist(), strict=True)) for half in (proposal.after, proposal.swept))
     segments, sweeps = ([asdict(s) for s in part] for part in (proposal.segments, proposal.sweeps))
-    return ManoeuvrePlan(vehicle, proposal.seconds, segments, sweeps, envelope, *promises)
+    return ManoeuvrePlan(vehicle, proposal.seconds, segments, sweeps, envelope, flown, swept, disturbed)
 
 
 def grouped(movements: Sequence[Json]) -> list[tuple[str, str, str]]:

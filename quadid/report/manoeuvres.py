@@ -26,6 +26,7 @@ class ManoeuvrePlan:
             battery_percent.
         promise: relative 95 % half-widths by parameter, flown as `segments`.
         promise_sweeps: likewise, flown as `sweeps`.
+        disturbed: whether they know what moves the vehicle beyond its model, as a fit found it.
     """
 
     vehicle: str
@@ -35,6 +36,17 @@ class ManoeuvrePlan:
     envelope: Json
     promise: Mapping[str, float]
     promise_sweeps: Mapping[str, float]
+    disturbed: bool = False
+
+    @property
+    def rests_on(self) -> str:
+        """Origin of the promise, and what it leaves out."""
+        if self.disturbed:
+            return "a fit of a simulated flight with the random forces that a fit of this vehicle found"
+        return (
+            "a simulated flight with the current values and sensor noise alone, many times too narrow where more moves "
+            "the vehicle, as a log of it would show"
+        )
 
     def header(self, promise: Mapping[str, float], what: str) -> list[str]:
         """The lines at the top of every form: what it is, the envelope, the promise and what that rests on."""
@@ -45,8 +57,7 @@ class ManoeuvrePlan:
             f"Envelope: {e['lowest_m']:g} to {e['highest_m']:g} m above take-off, {e['radius_m']:g} m around the "
             f"start, tilt {e['abort_tilt_deg']:.0f} deg, {e['battery_percent']:g} % of the battery left.",
             f"Promised 95 % intervals: {', '.join(f'{n} {half_width(v)}' for n, v in promise.items())}.",
-            "They are predicted by a simulated flight with the current values; `quadid identify` states what "
-            "a real log obtained.",
+            f"They are predicted by {self.rests_on}; `quadid identify` states what a real log obtained.",
         ]
 
 

@@ -116,6 +116,19 @@ def test_alike_movements_stand_together_and_every_form_is_written(inside: Cli, t
     compile(Path(result["files"][5]).read_text(encoding="utf-8"), "fly.py", "exec")
 
 
+def test_random_forces_of_a_vehicle_file_are_in_the_promise() -> None:
+    """A manoeuvre flown by ArduCopter was promised J to 0.1 %, and a log of it gave 5 and 12."""
+    pelican = Vehicle.shipped("pelican")
+    of = {"horizontal": (0.03, 0.3), "vertical": (0.1, 6.0), "roll_pitch": (1.3, 0.16), "yaw": (0.3, 0.8)}
+    random = {name: {"sigma": sigma, "time": time} for name, (sigma, time) in of.items()}
+    moved = Vehicle.model_validate(pelican.model_dump() | {"random": random})
+    alone, beside = (propose(vehicle=one, seconds=13.0) for one in (pelican, moved))
+    place = NOMINAL_NAMES.index("J_xx")
+    assert beside.proposal.after[place] > 4.0 * alone.proposal.after[place]
+    assert "sensor noise alone" in alone.plan.rests_on
+    assert "random forces" in beside.plan.rests_on
+
+
 def test_throttle_at_hover_follows_the_thrust_curve() -> None:
     pelican = Vehicle.shipped("pelican")
     b, full = pelican.parameters["b"].initial, 900.0
@@ -133,7 +146,7 @@ def test_too_little_height_is_refused() -> None:
     proposal = replace(propose(vehicle=pelican, seconds=6.5).proposal, flight=flight)
     assert proposal.room[1:].sum() > 0.2
     with pytest.raises(ParameterError, match="which the manoeuvre needs"):
-        made_into_plan("pelican", proposal, 25.0, (10.0, 10.05), 40.0)
+        made_into_plan("pelican", proposal, 25.0, (10.0, 10.05), 40.0, disturbed=False)
 
 
 def test_too_little_time_is_refused(inside: Cli, tmp_path: Path) -> None:
