@@ -40,6 +40,8 @@ from quadid_evaluation.studies.truth import with_values
 
 GUESS = 0.2
 """Standard deviation of the logarithm of the initial guess against the truth."""
+GUSTS = {"gusts": {"push": 0.6, "turn": 1.0, "time": 0.5}}
+"""Forces of 0.6 m/s^2, moments of 1 rad/s^2: a quarter of the control moment of these flights."""
 LATER = (
     "translational_lift",
     "supply_voltage",

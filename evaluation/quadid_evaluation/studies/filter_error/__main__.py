@@ -24,7 +24,8 @@ from quadid.identification.fit import FitOptions, fit
 from quadid.parameters import NOMINAL_NAMES
 from quadid.vehicle import ParameterPrior, Vehicle
 from quadid_evaluation.harness import Given, options, pooled, put
-from quadid_evaluation.studies.filter_error.jobs import BRIEF, GUSTS, LATE, SECONDS, caused, exact, fast_loop, lagging
+from quadid_evaluation.studies.campaign import GUSTS
+from quadid_evaluation.studies.filter_error.jobs import BRIEF, LATE, SECONDS, caused, exact, fast_loop, lagging
 from quadid_evaluation.studies.innovations import searched
 from quadid_evaluation.studies.truth import poor_guess
 

@@ -17,14 +17,12 @@ from quadid.identification.fit import FitOptions, fit
 from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
-from quadid_evaluation.studies.campaign import cases, flown
+from quadid_evaluation.studies.campaign import GUSTS, cases, flown
 from quadid_evaluation.studies.filter_error import loop
 from quadid_evaluation.studies.innovations import searched
 from quadid_evaluation.studies.truth import poor_guess
 
 SECONDS, BRIEF = 60.0, 40.0
-GUSTS = {"gusts": {"push": 0.6, "turn": 1.0, "time": 0.5}}
-"""Forces of 0.6 m/s^2, moments of 1 rad/s^2: a quarter of the control moment of these flights."""
 
 
 def identified(window: Window, vehicle: Vehicle, truth: Sequence[float], seed: int) -> FloatArray:

@@ -9,8 +9,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from quadid.diagnosis import diagnose
-from quadid_evaluation.studies.campaign import Case, cases, flown
-from quadid_evaluation.studies.filter_error.jobs import GUSTS
+from quadid_evaluation.studies.campaign import GUSTS, Case, cases, flown
 from quadid_evaluation.studies.innovations import diagnosed
 
 
