@@ -37,6 +37,7 @@ from quadid.cli.terminal import check_file, conclude
 from quadid.effects import EFFECTS
 from quadid.errors import QuadidError, nearest
 from quadid.parameters import NOMINAL_UNITS
+from quadid.report.manoeuvres import ManoeuvrePlan
 from quadid.report.tables import Column, TextTable
 from quadid.vehicle import Command, Noise, Vehicle
 from quadid.version import __version__
@@ -508,7 +509,10 @@ FLEET = {
 }  # fmt: skip
 SHOWN: dict[str, tuple[Callable[..., Any], tuple[str, ...]]] = {
     "excite": (
-        lambda: conclude(Proposed(EXCITED, *[cast(Any, None)] * 4), None),
+        lambda: conclude(
+            Proposed(EXCITED, *[cast(Any, x) for x in (None, None, ManoeuvrePlan("p", 1.0, [], [], {}, {}, {}), 0.5)]),
+            None,
+        ),
         ("0.569 %", "0.567 %", "0.409 %", "0.543 %"),
     ),
     "compare": (
