@@ -429,16 +429,15 @@ def _angle_rates(gyro: Channel, attitude: Channel) -> Check | None:
     if len(angles) < FEWEST_SAMPLES:
         return None
     # What this difference, as it is, takes of what the gyro misses beside its bias: on the axis about which they differ
-    # most, where the others add their noise, and in the rest of the flight too: a swing that dies away looks like any.
+    # most, where the others add their noise, and in every part of the flight: a swing that dies away looks like any.
     apart, missed = angles - turned, measured - turned
     axis = int(np.argmax(np.sum(apart**2, axis=0)))
     was, left = (
         np.array([part.sum() for part in np.array_split((x[:, axis] - x[:, axis].mean()) ** 2, _PARTS)])
         for x in (missed, missed - apart)
     )
-    others = np.arange(_PARTS) != np.argmax(was - left)
-    share, rest = (1.0 - float(left[some].sum() / max(was[some].sum(), 1e-300)) for some in (others | True, others))
-    if min(share, rest) < _CLEAR:
+    share = 1.0 - float(left.sum() / max(was.sum(), 1e-300))
+    if share < _CLEAR or not np.all(left < was):
         return None
     return Check(
         "gyro_attitude",
