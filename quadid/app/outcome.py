@@ -294,7 +294,7 @@ class Fitted(Reported):
         return [log for log, s in zip(self.logs, self.sets, strict=True) if s.role == "train"]
 
     def used(self, task: str) -> str:
-        """How many logs were fitted, as `task` has it, and how many were held out."""
+        """Numbers of logs that were fitted, as `task` has it, and held out."""
         fitted = len(self.train)
         held = len(self.logs) - fitted or "none"
         return f"{fitted} log{'s' * (fitted != 1)} {task}, {held} held out for validation"

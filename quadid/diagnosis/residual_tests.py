@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from quadid.data.window import CHANNEL_NAMES
+from quadid.data.window import CHANNEL_NAMES, Window
 from quadid.diagnosis.hypotheses import Candidate, Gain, Model, held_out, paired_gain
 from quadid.effects import EFFECTS
 from quadid.identification.elimination import freed
@@ -179,7 +179,7 @@ def signals(part: Columns) -> dict[str, FloatArray]:
     Args:
         part: one window's segments with their prediction.
     """
-    out = {f"{name} input": s[part.rows - 1] for name, s in _inputs(part).items()}
+    out = {f"{name} input": s[part.rows - 1] for name, s in inputs(part.window).items()}
     out |= _motions(part)
     first, last = part.window.log_span
     share = (part.window.t[part.rows] - first) / max(last - first, part.window.dt)
@@ -189,9 +189,9 @@ def signals(part: Columns) -> dict[str, FloatArray]:
     return out
 
 
-def _inputs(part: Columns) -> dict[str, FloatArray]:
+def inputs(window: Window) -> dict[str, FloatArray]:
     """Rotor commands, by row of the window: thrust and differences of squared speeds, their shapes."""
-    square = part.window.rotor_speed**2
+    square = window.rotor_speed**2
     mean = square.mean(axis=1)
     # Principal differences between rotors stand for the moments, whatever the geometry.
     apart = square - mean[:, None]

@@ -562,7 +562,7 @@ def _copy(source: FloatArray, target: FloatArray) -> None:
 
 @_piece
 def _in_air(track: Track) -> bool:
-    """Whether velocity plays a part."""
+    """Checks whether velocity plays a part."""
     air = track.still > 0.0
     for k in range(len(track.t)):
         air |= track.seen[k, 3]

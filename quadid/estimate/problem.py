@@ -262,14 +262,14 @@ class Problem:
         total = sum(float(track.t[-1] - track.t[0]) for track in self.tracks)
         if total <= 1.2 * seconds:
             return self
-        return self._cut([_rows(track, seconds / total) for track in self.tracks])
+        return self.cut([_rows(track, seconds / total) for track in self.tracks])
 
     def settled(self, seconds: float) -> Problem:
         """The same flights without their first `seconds`, a tenth at most: rotors behind a lag begin unknown."""
         rows = [(min(int(np.searchsorted(t.t, t.t[0] + seconds)), len(t.t) // 10), len(t.t)) for t in self.tracks]
-        return self._cut(rows)
+        return self.cut(rows)
 
-    def _cut(self, rows: Sequence[tuple[int, int]]) -> Problem:
+    def cut(self, rows: Sequence[tuple[int, int]]) -> Problem:
         """The same flights, of each the rows from a first one to before a last one."""
         tracks = tuple(cut(track, *span) for track, span in zip(self.tracks, rows, strict=True))
         models = tuple(model.cut(*span) for model, span in zip(self.models, rows, strict=True)) if self.models else ()

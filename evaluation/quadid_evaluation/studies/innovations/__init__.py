@@ -18,9 +18,8 @@ from quadid.diagnosis.hypotheses import candidates
 from quadid.diagnosis.residual_tests import inconstant_causes
 from quadid.diagnosis.result import Explanation
 from quadid.model.layout import Layout, with_reference_voltage
-from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
-from quadid_evaluation.studies.innovations.models import Flights, Model
+from quadid_evaluation.studies.innovations.models import Flights
 from quadid_evaluation.studies.innovations.remainder import Remainder, judge, remainder
 from quadid_evaluation.studies.innovations.search import Search, select
 
@@ -35,8 +34,8 @@ class Answer(NamedTuple):
     left: Remainder
 
 
-def searched(windows: Sequence[Window], vehicle: Vehicle, theta: FloatArray | None = None) -> Search:
-    """The causes that flights support, from where the six are those of `theta`, by default the vehicle file's."""
+def searched(windows: Sequence[Window], vehicle: Vehicle) -> Search:
+    """The causes that flights support, from the guess of the vehicle file."""
     windows = without_copies(windows)
     vehicle = with_reference_voltage(vehicle, windows)
     rotors = ["readings" if vehicle.command.sampling == "instant" else "commands"]
@@ -44,9 +43,8 @@ def searched(windows: Sequence[Window], vehicle: Vehicle, theta: FloatArray | No
         rotors.append("battery")
     velocity, position = (all(getattr(w, n) is not None for w in windows) for n in ("velocity", "position"))
     listed = [c for c in candidates(Layout(vehicle), velocity, position, rotors) if c.effect not in vehicle.effects]
-    start = Layout(vehicle).initial(vehicle) if theta is None else theta
-    flights, nominal = Flights.of(windows, vehicle, listed).nominal(start)
-    return select(flights, nominal, lambda *_: None)
+    flights, nominal = Flights.of(windows, vehicle, listed).nominal(Layout(vehicle).initial(vehicle))
+    return select(flights, nominal)
 
 
 @one_thread()
@@ -61,6 +59,3 @@ def diagnosed(windows: Sequence[Window], vehicle: Vehicle) -> Answer:
         doubts = {c.label: doubts.get(c.label, "something else remains") for c in model.causes}
     named = tuple(dict.fromkeys(c.effect for c in model.causes if c.label not in doubts))
     return Answer(verdict, named, doubts, search, left)
-
-
-__all__ = ["Answer", "Model", "diagnosed", "searched"]

@@ -168,7 +168,7 @@ class Everything:
         return self._best(self._own, self._g)[1]
 
     def losses(self) -> dict[str, Score]:
-        """What the deviance rises by when each cause that no other stands on is dropped, the others following."""
+        """Predicted fall of the deviance without each cause that no other stands on, the others following: a loss."""
         out = {}
         for gone in removable(self.model):
             stay, slope, risen = self._left(gone)

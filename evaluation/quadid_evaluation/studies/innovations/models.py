@@ -159,8 +159,6 @@ class Model:
         near: the likelihood near it.
         left_out: deviances with one block left out each.
         tried: how many alternatives (causes, and onsets of them) were looked at when each cause was, by label.
-        known: uncertainty of the parameters in `free`, once they are fitted as an identification fits.
-        numbers_of: full vector, once they are.
     """
 
     causes: tuple[Candidate, ...]
@@ -172,8 +170,6 @@ class Model:
     near: Quadratic
     left_out: HeldOut
     tried: Mapping[str, float] = field(default_factory=dict)
-    known: Uncertainty | None = None
-    final: FloatArray | None = None
 
     @cached_property
     def keys(self) -> tuple[tuple[str, int], ...]:
@@ -188,8 +184,6 @@ class Model:
     @cached_property
     def theta(self) -> FloatArray:
         """Full vector; what belongs to a flight is that of the first."""
-        if self.final is not None:
-            return self.final
         theta = self.problem.vector(self.z, 0)
         for entry in self.free.entries:
             if not entry.name.startswith(PER_FLIGHT):  # a filter has biases beside the vector
@@ -222,8 +216,6 @@ class Model:
     @cached_property
     def uncertainty(self) -> Uncertainty:
         """Covariance of the parameters in `free`, in their scale."""
-        if self.known is not None:
-            return self.known
         at = [self._place(name) for name in self.free.names]
         unit = np.where(self.free.is_log, 1.0, self.problem.size[at] / self.free.scale)
         covariance = self.covariance[np.ix_(at, at)] * np.outer(unit, unit)
@@ -231,12 +223,6 @@ class Model:
 
     def _place(self, name: str) -> int:
         return next(i for i, (n, _) in enumerate(self.keys) if n == name)
-
-    @property
-    def deviations(self) -> dict[str, float]:
-        """Standard deviations of the fitted entries in their own units, by name."""
-        sigma = self.uncertainty.sigma * self.free.jacobian(self.theta)
-        return dict(zip(self.free.names, sigma.tolist(), strict=True))
 
     def numbers(self, cause: Candidate) -> Free:
         """The free parameters that belong to `cause`."""
@@ -342,12 +328,11 @@ class Flights:
         psi: FloatArray,
         times: Mapping[str, float],
         tried: Mapping[str, float],
-        turns: int = MOST,
     ) -> Model:
         """The model with `causes`, from scaled parameters `start` by key and noise numbers `psi`."""
         problem = self.problem(free_names(causes), times)
         z = np.clip([start.get(key, 0.0) for key in _keys(problem)], *problem.limits)
-        z, psi, deviance, gains, _ = scoring(problem, z, psi, turns, ALL_NOISE)
+        z, psi, deviance, gains, _ = scoring(problem, z, psi, MOST, ALL_NOISE)
         found = [problem.sensitivities(j, z, psi, g) for j, g in enumerate(gains)]
         near = quadratic(problem, gains, found, len(z))
         left_out = held_out(near, problem.prior[1] ** -2.0)
@@ -361,7 +346,7 @@ class Flights:
         assert cause.timed is not None
         for _ in range(ONSET_ROUNDS):
             time, step = float(model.problem.theta[cause.timed]), ONSET_STEP
-            # Only what is measured around the onset tells when it was.
+            # Measurements around the onset determine its time.
             rows = [np.searchsorted(t.t, [time - ONSET_REACH, time + ONSET_REACH]) for t in model.problem.tracks]
             near = model.problem.cut([(max(int(a), 0), max(int(b), int(a) + 2)) for a, b in rows])
             while step > 0.5 * self.windows[0].dt:
@@ -384,15 +369,9 @@ class Flights:
         theta[place] = time
         return replace(near, theta=theta).objective(model.z, model.psi)
 
-    def without(self, model: Model, cause: Candidate) -> Model:
-        """Refits `model` without `cause` and what requires it."""
-        left = left_without(model.causes, cause)
-        start = dict(zip(model.keys, model.z, strict=True))
-        return self.fit(left, start, model.psi, times_of(model, left), model.tried)
-
 
 def times_of(model: Model, causes: Sequence[Candidate]) -> dict[str, float]:
-    """When those of `causes` begin that `model` has, by effect [s]."""
+    """Onsets of those of `causes` that `model` has, by effect [s]."""
     timed = {c.effect: c.timed for c in causes if c.timed is not None}
     return {effect: float(model.problem.theta[index]) for effect, index in timed.items() if effect in model.effects}
 

@@ -1,15 +1,15 @@
-"""What remains after the named causes: random forces, and what the innovations follow; and the verdict on it."""
+"""Rest after the named causes: random forces, and signals that the innovations follow; and the verdict on it."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from quadid.data.window import CHANNEL_NAMES, Window
+from quadid.data.window import Window
 from quadid.diagnosis.evidence import RELEVANT
 from quadid.diagnosis.hypotheses import held_out, paired_gain
 from quadid.diagnosis.pipeline import LEAST_OF_EXPLAINED, LEAST_STRUCTURE, SHARE_TO_NAME
-from quadid.diagnosis.residual_tests import SITES, WAVES, Follows, Site, strongest
+from quadid.diagnosis.residual_tests import SITES, WAVES, Follows, Site, inputs, strongest
 from quadid.diagnosis.result import Explanation
 from quadid.estimate import kalman as k
 from quadid.estimate.fit import ACTS, ALL_NOISE, MOST, scoring
@@ -115,36 +115,13 @@ def signals(window: Window, g: Gains) -> dict[str, FloatArray]:
         window: the flight.
         g: gains of a pass over it, whose means are the motion.
     """
-    out = {f"{name} input": _before(s) for name, s in _inputs(window).items()}
+    out = {f"{name} input": _before(s) for name, s in inputs(window).items()}
     out |= {name: _before(s) for name, s in _motions(window, g).items()}
     first, last = window.log_span
     share = (window.t - first) / max(last - first, window.dt)
     out["constant"] = np.ones_like(share)
     for n in range(1, WAVES + 1):
         out[f"time, {n} half waves"] = np.cos(n * np.pi * share)
-    return out
-
-
-def _inputs(window: Window) -> dict[str, FloatArray]:
-    """Rotor commands, by row of the window: thrust and differences of squared speeds, their shapes."""
-    square = window.rotor_speed**2
-    mean = square.mean(axis=1)
-    # Principal differences between rotors stand for the moments, whatever the geometry.
-    apart = square - mean[:, None]
-    apart = apart - apart.mean(axis=0)
-    axes = np.linalg.svd(apart, full_matrices=False)[2][: min(3, square.shape[1] - 1)]
-    level = float(mean.mean())
-    thrust = mean / level - 1.0
-    basic = {"thrust": thrust}
-    for i, axis in enumerate(axes):
-        basic[f"moment {i + 1}"] = apart @ axis / level
-    out = dict(basic)
-    for name, s in basic.items():
-        change = np.diff(s, prepend=s[0])
-        out[f"changing {name}"] = change
-        out[f"|changing {name}|"] = np.abs(change)
-        out[f"squared {name}"] = s**2
-        out[f"cubed {name}"] = s**3
     return out
 
 
@@ -187,20 +164,11 @@ class Remainder:
 
     Attributes:
         random: deviance that random forces and moments take away.
-        channels: share of each output's innovations that they make.
         sites: what the innovations follow at each site.
-        rows: scalar measurements.
     """
 
     random: float
-    channels: Mapping[str, float]
     sites: tuple[Follows, ...]
-    rows: float
-
-    @property
-    def deviance(self) -> float:
-        """Deviance of the structure, by the look that sees more of it; the two overlap."""
-        return max(self.random, self.followed_deviance)
 
     @property
     def followed_deviance(self) -> float:
@@ -212,56 +180,35 @@ class Remainder:
         """Generic causes that predict unseen innovations beyond chance, strongest first."""
         return tuple(f for f in strongest(self.sites) if f.significant)
 
-    @property
-    def shares(self) -> dict[str, float]:
-        """Share of each output's innovations that is structure, for outputs where there is any."""
-        out = dict(self.channels)
-        rows = self.rows / len(CHANNEL_NAMES[:9])
-        for f in self.followed:
-            name = CHANNEL_NAMES[_channel(f.site)]
-            out[name] = max(out.get(name, 0.0), min(f.gain.total / rows, 1.0))
-        return out
-
 
 def remainder(flights: Flights, model: Model) -> Remainder:
     """Judges what `model` leaves: what random forces take away of it, and what it follows."""
-    random, shares = 0.0, dict[str, float]()
+    random = 0.0
     least = model.problem.noise_bounds[FORCES, 0]
     if np.any(model.psi[FORCES] > ACTS * least):
         still = model.psi.copy()
         still[FORCES] = least
         others = ALL_NOISE.copy()
         others[FORCES] = False
-        _, _, value, gains, _ = scoring(model.problem, model.z, still, MOST, others, physics=False)
+        value = scoring(model.problem, model.z, still, MOST, others, physics=False)[2]
         random = max(value - model.deviance, 0.0)
-        for place, name in [*enumerate(CHANNEL_NAMES[:3]), *enumerate(CHANNEL_NAMES[6:9], k.ACCEL)]:
-            without, found = (_variance(some, place) for some in (gains, model.gains))
-            if without > found > 0.0:
-                shares[name] = 1.0 - found / without
-    return Remainder(random, shares, follows(flights, model), model.rows)
-
-
-def _variance(gains: Sequence[Gains], place: int) -> float:
-    """Mean square of one output's innovations; 0 where it was not measured."""
-    nu = np.concatenate([g.nu[g.S[:, place] > 0.0, place] for g in gains])
-    return float(np.mean(nu**2)) if len(nu) else 0.0
+    return Remainder(random, follows(flights, model))
 
 
 # --- Verdict from what the causes explain and what is left
 
 
-def judge(nominal: Model, model: Model, left: Remainder, unnamed: float = 0.0) -> Explanation:
+def judge(nominal: Model, model: Model, left: Remainder) -> Explanation:
     """Verdict from what the causes explain and what is left.
 
     Args:
         nominal: model without causes.
         model: the selected one.
         left: what it leaves.
-        unnamed: deviance that causes with implausible numbers take away; it counts as left.
     """
-    explained = max(float(nominal.left_out.block.sum() - model.left_out.block.sum()) - unnamed, 0.0)
+    explained = max(float(nominal.left_out.block.sum() - model.left_out.block.sum()), 0.0)
     least = max(LEAST_STRUCTURE * model.rows, LEAST_OF_EXPLAINED * explained)
-    followed, acts = left.followed_deviance + unnamed, left.random > RELEVANT * model.rows
+    followed, acts = left.followed_deviance, left.random > RELEVANT * model.rows
     if followed <= least and not acts:
         return Explanation.EXPLAINED if model.causes else Explanation.NOTHING_FOUND
     # What random forces take up of a missing cause shows in their size, what the innovations follow in the likelihood.

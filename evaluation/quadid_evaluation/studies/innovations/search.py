@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-from quadid.chi_square import exceeded
-from quadid.diagnosis.evidence import FALSE_ALARM, RELEVANT, impossible_causes
+from quadid.diagnosis.evidence import impossible_causes, worth_a_refit
 from quadid.diagnosis.hypotheses import Candidate
 from quadid_evaluation.studies.innovations.evidence import Everything, Score, better
 from quadid_evaluation.studies.innovations.models import Flights, Model, left_without, times_of
@@ -47,32 +46,22 @@ class Search:
         flights: what was diagnosed.
         nominal: model without causes; model: the selected one.
         rounds: what was tried, in order.
-        tests: number of causes looked at in one round.
     """
 
     flights: Flights
     nominal: Model
     model: Model
     rounds: tuple[Round, ...]
-    tests: int
-
-    def without(self, cause: Candidate) -> Model:
-        """The selected model without `cause` and what requires it: as it was tried, or refitted."""
-        left = frozenset(c.label for c in left_without(self.model.causes, cause))
-        tried = [self.nominal, *(m.model for r in self.rounds for m in r.moves)]
-        known = min((m for m in tried if m.labels == left), key=lambda m: m.deviance, default=None)
-        return known or self.flights.without(self.model, cause)
 
 
-def select(flights: Flights, nominal: Model, report: Callable[[str, float], None]) -> Search:
+def select(flights: Flights, nominal: Model) -> Search:
     """Selects the causes that the data support, from the model without any."""
     model, rounds = nominal, list[Round]()
     seen = {model.labels}
     while True:  # no model is visited twice
-        report("search", len(rounds) / (len(rounds) + 2.0))
         rounds.append(_round(flights, model, seen))
         if (accepted := rounds[-1].accepted) is None:
-            return Search(flights, nominal, model, tuple(rounds), len(flights.listed))
+            return Search(flights, nominal, model, tuple(rounds))
         model = accepted.model
         seen.add(model.labels)
 
@@ -80,7 +69,7 @@ def select(flights: Flights, nominal: Model, report: Callable[[str, float], None
 def _round(flights: Flights, model: Model, seen: set[frozenset[str]]) -> Round:
     """Refits the most promising additions and what can be dropped; where none is better, causes in others' places."""
     everything = Everything(flights, model)
-    least = 0.5 * max(exceeded(FALSE_ALARM / len(flights.listed), 1), RELEVANT * model.rows)
+    least = worth_a_refit(len(flights.listed), model.rows)
     moves: list[Move] = []
     best = None
     for generated in (_adds, _drops, _swaps):
@@ -143,7 +132,7 @@ def _refits(
     """
     gained, count = 0.0, 0
     for score in scores:
-        if count == MOST_REFITS or score.drop < max(least, near * gained if near else least):
+        if count == MOST_REFITS or score.drop < (max(least, near * gained) if near else least):
             return
         new = tuple(x for c in score.causes for x in c.split or (c,))
         causes = (*left_without(model.causes, score.gone), *new)
