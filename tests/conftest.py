@@ -15,13 +15,8 @@ from tests.faults.evidence import Collector
 from tests.faults.evidence import happened as happened
 
 REPOSITORY = Path(__file__).resolve().parent.parent
-LONG = ("diagnose", "online", "examples", "node", "cli", "identify", "health", "studies")
-"""Folders that take long; those that compute begin while the nodes, which mostly wait, are at it."""
-THIS_MACHINE = {
-    "ROS_AUTOMATIC_DISCOVERY_RANGE": "SYSTEM_DEFAULT",
-    "FASTRTPS_DEFAULT_PROFILES_FILE": str(REPOSITORY / "quadid_node" / "config" / "loopback.xml"),
-}
-"""Environment of ROS processes that meet within this machine alone, without shared memory."""
+LONG = ("node", "cli", "diagnose", "online", "documents", "examples", "identify", "health", "studies")
+"""Folders whose files take long, in the order in which they begin."""
 
 # The first call of a numba kernel compiles it: an example's time says nothing. In CI every run draws the same examples.
 hypothesis.settings.register_profile("quadid", deadline=None, print_blob=True, derandomize=bool(os.environ.get("CI")))
@@ -45,22 +40,16 @@ def pytest_configure(config: pytest.Config) -> None:
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """One process runs a file from beginning to end: what its tests share is flown, fitted or compiled once.
 
-    Files that start ROS nodes are one group, because a process has one DDS domain, and nodes find each other by clocks.
-    That group, which is the longest, comes first, then the folders whose files take long, so that no process ends late.
+    Files that take long come first, so that no process ends late; among them those whose nodes mostly wait.
     """
     items.sort(key=_turn)
     for item in items:
-        place = item.path.relative_to(REPOSITORY)
-        item.add_marker(pytest.mark.xdist_group("ros" if _starts_nodes(item) else str(place)))
-
-
-def _starts_nodes(item: pytest.Item) -> bool:
-    return item.path.stem.startswith("test_ros") and item.path.parent.name == "node"
+        item.add_marker(pytest.mark.xdist_group(str(item.path.relative_to(REPOSITORY))))
 
 
 def _turn(item: pytest.Item) -> int:
     folder = item.path.relative_to(REPOSITORY).parts[1]
-    return 0 if _starts_nodes(item) else 1 + (LONG.index(folder) if folder in LONG else len(LONG))
+    return LONG.index(folder) if folder in LONG else len(LONG)
 
 
 def in_ci() -> bool:

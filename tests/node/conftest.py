@@ -1,8 +1,5 @@
-"""Tests of the service: processes, files, links and topics are real; those that start ROS nodes share a worker."""
+"""Tests of the service: processes, files, links and topics are real."""
 
-import importlib.util
-import os
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -11,9 +8,9 @@ from quadid_replay import write_mcap
 
 from quadid.online.fit_job import warm_up
 from quadid.vehicle import Vehicle
-from tests.conftest import THIS_MACHINE, absent
 from tests.node.peers import Ear
 from tests.online.driving import flight
+from tests.ros_domain import ros as ros
 
 HERE = Path(__file__).resolve().parent
 
@@ -30,22 +27,6 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 def warm_kernels() -> None:
     """Compiles what fits need once: after a change of a kernel every niced fit process would do it for minutes."""
     warm_up(Vehicle.shipped("pelican"))
-
-
-@pytest.fixture(scope="session")
-def ros(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """A DDS domain of this run's own, reachable from this machine only."""
-    for module in ("rclpy", "quadid_msgs"):
-        if importlib.util.find_spec(module) is None:
-            absent(f"{module} is not installed in {sys.prefix}: run 'make messages'")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("ROS_DOMAIN_ID", str(1 + (os.getpid() + 50) % 100))
-        for name, value in THIS_MACHINE.items():
-            patch.setenv(name, value)
-        patch.setenv("ROS_LOG_DIR", str(tmp_path_factory.mktemp("ros_log")))
-        patch.setenv("AMENT_PREFIX_PATH", sys.prefix)
-        patch.delenv("RMW_IMPLEMENTATION", raising=False)
-        yield
 
 
 @pytest.fixture(scope="session")
