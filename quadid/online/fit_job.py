@@ -13,6 +13,7 @@ thrust curve.  What else thrust may have is looked at beside that and never publ
 """
 
 import math
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import TypeGuard
 
@@ -562,19 +563,17 @@ def _by_thrust(window: Window, problem: Problem, z: FloatArray, noise: Noise, ga
 
 
 def warm_up(vehicle: Vehicle) -> None:
-    """Compiles or loads every kernel that a fit needs, on six seconds of made-up flight."""
-    rows, dt = 300, 0.02
+    """Compiles or loads every kernel that a fit needs, on two seconds of made-up flight."""
+    rows, dt = 100, 0.02
     swing = np.sin(np.arange(rows)[:, None] * 0.3 + np.arange(len(vehicle.rotors)))
     speed = vehicle.hover_speed() + 5.0 * swing
     attitude, accel = np.tile([1.0, 0.0, 0.0, 0.0], (rows, 1)), np.tile([0.0, 0.0, -9.80665], (rows, 1))
     gyro, z = 0.3 * np.cos(np.arange(rows)[:, None] * [0.3, 0.29, 0.2]), np.zeros(len(names_of(vehicle)))
-    for sampling in ("held", "instant"):
-        window = Window(0.0, dt, speed, gyro, attitude, accel, sampling=sampling)
-        span, theta = (0.0, rows * dt), Layout(vehicle).initial(vehicle)
-        request = FitRequest(0, vehicle, (window,), *span, theta, z, None, 0, (span,))
-        try:
-            z, noise = _maximum(request, 0.0, *_searched(request))
-            for velocity in (None, np.zeros((rows, 3))):
-                _estimates(replace(request, windows=(replace(window, velocity=velocity),)), z, noise)
-        except np.linalg.LinAlgError:
-            pass
+    window, span, theta = (
+        Window(0.0, dt, speed, gyro, attitude, accel),
+        (0.0, rows * dt),
+        Layout(vehicle).initial(vehicle),
+    )
+    request = FitRequest(0, vehicle, (window,), *span, theta, z, None, 0, (span,))
+    with suppress(np.linalg.LinAlgError):
+        _estimates(request, *_maximum(request, 0.0, *_searched(request)))

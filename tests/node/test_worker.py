@@ -87,6 +87,23 @@ def test_a_child_gives_what_inline_gives_bit_for_bit(worker: ProcessWorker, requ
         assert same(there, here)
 
 
+def test_a_warm_process_holds_every_kernel_of_a_fit() -> None:
+    """Two seconds of made-up flight call them all; a fit of a real one loads none."""
+    script = (
+        "from quadid.app.kernels import PARTS\n"
+        "from quadid.online.fit_job import warm_up\n"
+        "from tests.online.driving import drive, flight, samples, Session, Vehicle\n"
+        "kernels = [kernel for name in ('simulation', 'estimate') for kernel in PARTS[name].kernels()]\n"
+        "count = lambda: [len(kernel.signatures) for kernel in kernels]\n"
+        "warm_up(Vehicle.shipped('pelican'))\n"
+        "warm = count()\n"
+        "assert any(drive(Session(Vehicle.shipped('pelican')), samples(flight(11.0, 6).recording)))\n"
+        "assert count() == warm, (count(), warm)\n"
+        "assert sum(warm) >= len(kernels) - 1, 'all but the closed loop'\n"
+    )
+    subprocess.run([sys.executable, "-c", script], check=True, timeout=900)
+
+
 def test_a_child_is_polite(worker: ProcessWorker) -> None:
     assert os.getpriority(os.PRIO_PROCESS, worker.pid) >= 10
     cores = os.sched_getaffinity(worker.pid)
