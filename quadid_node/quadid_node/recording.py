@@ -14,10 +14,10 @@ from pathlib import Path
 
 import msgspec
 import numpy as np
-from mcap_ros2._dynamic import generate_dynamic
 from quadid_replay import TopicWriter
 from quadid_replay.mcap_file import McapFile, read_metadata
 from quadid_replay.ros_messages import type_name
+from quadid_replay.rosbag import decoder
 from quadid_replay.schemas import has_definition, whole_text
 from quadid_replay.writers import in_time_order
 
@@ -170,7 +170,7 @@ def arrivals(path: Path, preset: str, rotors: int) -> Iterator[Block]:
         if entry is None:
             continue
         try:
-            decode = generate_dynamic(topic.type, topic.definition)[topic.type]
+            decode = decoder(topic.type, topic.definition)
         except Exception as error:
             raise LogError(
                 f"{path.name}: the definition of {topic.type} is damaged ({type(error).__name__})"

@@ -223,7 +223,7 @@ def _sources(bag: Bag, preset: str, notes: list[str]) -> dict[int, TopicSource]:
         if all(rank is None for rank in listed):
             continue
         try:
-            decode = _decoder(topic.type, topic.definition)
+            decode = decoder(topic.type, topic.definition)
         except Exception as error:  # noqa: BLE001 - the parser of untrusted definitions raises anything; it is reported
             notes.append(f"{topic.name}: its message definition is damaged ({type(error).__name__}): not used")
             continue
@@ -232,9 +232,13 @@ def _sources(bag: Bag, preset: str, notes: list[str]) -> dict[int, TopicSource]:
 
 
 @lru_cache(maxsize=64)
-def _decoder(kind: str, definition: str) -> Callable[[bytes], Any]:
-    """The library's decoder of a type; making one costs more than decoding a hundred messages."""
-    decode: Callable[[bytes], Any] = generate_dynamic(kind, definition)[kind]
+def decoder(kind: str, definition: str) -> Callable[[bytes], Any]:
+    """The library's decoder of a type; making one costs more than decoding a hundred messages.
+
+    Without comments, in which the library looks for units for as long as their length squared.
+    """
+    stated = "\n".join(line.partition("#")[0] for line in definition.splitlines())
+    decode: Callable[[bytes], Any] = generate_dynamic(kind, stated)[kind]
     return decode
 
 
