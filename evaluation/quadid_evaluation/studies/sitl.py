@@ -1,7 +1,7 @@
 """A running ArduCopter, flown through pymavlink, with `quadid serve` beside it: sets against the truth, and alarms.
 
     python -m quadid_evaluation.studies.sitl --binary build/sitl/bin/arducopter --defaults copter.parm,my.parm \\
-        --frame frame.json --model x --vehicle my.yaml [--gains | --seconds 120] [b=1.94e-5 J_xx=0.011 …]
+        --frame frame.json --model x --vehicle my.yaml [--gains | --seconds 120 --changes] [b=1.94e-5 J_xx=0.011 …]
 
 The binary is ArduCopter built for SITL (waf configure --board sitl; waf copter), the defaults are such as
 Tools/autotest/default_params/copter.parm and what `quadid export --format ardupilot` writes, with FRAME_TYPE 1 for an
@@ -9,9 +9,12 @@ X; the frame file is the .sitl.json of that export.  `--keep` names a folder for
 `telemetry.tlog`, the bytes that the service received, at their times.
 
 The plan: take off in Guided, hover, then move roll, pitch and yaw sticks in Loiter for `--seconds`, with multisines out
-of step.  The table has first and last set against the truth, and every alarm; nothing changes in flight, so that every
-alarm is false.  Without a binary the study says so and does nothing.  `--frame` must be a relative path for ArduPilot:
-the file is copied into the folder that the binary runs in.
+of step.  The table has first and last set against the truth, and every alarm; nothing changes in that time, so that
+every alarm is false.  With `--changes` a payload is then taken up and dropped and rotors weaken and recover, in hover
+and on the move, and a second table says when each was seen and what it was called (weak rotors only where the vehicle
+file reads pulses: measured speeds fall with them).  Wind is a line of the defaults (SIM_WIND_SPD, SIM_WIND_TURB).
+Without a binary the study says so and does nothing.  `--frame` must be a relative path for ArduPilot: the file is
+copied into the folder that the binary runs in.
 """
 
 import math
@@ -25,6 +28,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -38,6 +42,7 @@ import quadid
 from quadid.flight.pilot import AXES, PILOT_STEP, Segment, scripted
 from quadid.report.autopilots import AXES as TURNS
 from quadid.types import FloatArray
+from quadid.vehicle import Vehicle
 from quadid_evaluation.harness import Given, options, put, table
 from quadid_evaluation.studies.autopilot import TITLE, Flown, Outcome, row, section, serving, stored
 from quadid_evaluation.studies.gains import bandwidth, outside
@@ -74,18 +79,29 @@ def take_off(link: mavutil.mavfile, height: float) -> None:
     _wait(link, "GLOBAL_POSITION_INT", lambda m: m.relative_alt > 900.0 * height)
 
 
-def fly(link: mavutil.mavfile, seconds: float, seed: int) -> None:
-    """Takes off, hovers, moves the sticks and lands."""
+def fly(link: mavutil.mavfile, seconds: float, seed: int, changes: Sequence["Change"]) -> list[float]:
+    """Takes off, hovers, moves the sticks, makes the changes and lands; returns when each change was made [s]."""
     take_off(link, HEIGHT)
     _mode(link, "LOITER", held=np.zeros(len(AXES)))
-    rows = np.vstack([np.zeros((round(HOVER / PILOT_STEP), len(AXES))), sticks(seconds, seed)])
+    calm, moments = np.zeros((round(HOVER / PILOT_STEP), len(AXES))), []
+    _move(link, np.vstack([calm, sticks(seconds, seed)]))
+    for k, change in enumerate(changes):
+        _move(link, change.moving * sticks(BETWEEN, seed + k))
+        _set(link, change.parameter, change.value)
+        moments.append(time.time())
+    if changes:
+        _move(link, changes[-1].moving * sticks(BETWEEN, seed))
+    _send_sticks(link, np.zeros(len(AXES)))
+    _mode(link, "LAND")
+    return moments
+
+
+def _move(link: mavutil.mavfile, rows: FloatArray) -> None:
     begin = time.monotonic()
     for k, at in enumerate(rows):
         time.sleep(max(begin + k * PILOT_STEP - time.monotonic(), 0.0))
         _send_sticks(link, at)
         _drain(link)
-    _send_sticks(link, np.zeros(len(AXES)))
-    _mode(link, "LAND")
 
 
 def _send_sticks(link: mavutil.mavfile, row: FloatArray) -> None:
@@ -192,19 +208,60 @@ def _pass_on(near: socket.socket, far: socket.socket) -> None:
             far.sendall(data)
 
 
-def flown(given: Given) -> Outcome:
-    """Starts the autopilot and the service, flies, ends both; what the service had stored."""
+def flown(given: Given, changes: Sequence["Change"]) -> tuple[Outcome, list[float]]:
+    """Starts the autopilot and the service, flies, ends both; what the service had stored, and when what changed."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name) if given.keep == Path() else given.keep
         folder.mkdir(parents=True, exist_ok=True)
         history = folder / "history.sqlite"
         with (
-            running(given, folder, {}) as link,
+            running(given, folder, STRENGTH if changes else {}) as link,
             recorded(folder / "telemetry.tlog") as url,
             serving(given.vehicle, url, history) as said,
         ):
-            fly(link, given.seconds, given.seed)
-        return stored(given.vehicle, history, said, HOVER + given.seconds)
+            moments = fly(link, given.seconds, given.seed, changes)
+        return stored(given.vehicle, history, said, HOVER + given.seconds), moments
+
+
+# --- Changes in flight, and what the service said of them
+
+
+@dataclass(frozen=True)
+class Change:
+    """A simulator's parameter that is set, with sticks at `moving` times their size around it, and what that does."""
+
+    what: str
+    parameter: str
+    value: float
+    moving: float = 0.0
+
+
+PAYLOAD, ENGINES = "SIM_SPR_ENABLE", "SIM_ENGINE_FAIL"
+STRENGTH = {"SIM_ENGINE_MUL": 0.92, PAYLOAD: 0.0}
+"""Share of its pulse above the least that a weak motor gets, so that its thrust falls by some 15 %; no payload yet."""
+BETWEEN = 20.0
+"""Time between two changes [s]."""
+MASSES = tuple(
+    Change(f"{what}, {how}", PAYLOAD, on, size)
+    for how, size in (("hover", 0.0), ("moving", 0.6))
+    for what, on in (("+0.25 kg", 1.0), ("-0.25 kg", 0.0))
+)
+ROTORS = tuple(
+    Change(f"{what}, {how}", ENGINES, mask, size)
+    for how, size, rotor in (("hover", 0.0, 1), ("moving", 0.6, 2))
+    for what, mask in ((f"rotor {rotor} weak", float(rotor)), (f"rotor {rotor} recovers", 0.0))
+)
+
+
+def changes_seen(changes: Sequence[Change], moments: Sequence[float], done: Outcome) -> str:
+    """Markdown: when each change was seen and shown, and what it was called, and the alarms between them."""
+    rows = []
+    for change, at, end in zip(changes, moments, [*moments[1:], math.inf], strict=True):
+        seen = [e for e in done.events if at <= e["wall"] < end and e["kind"] in ("change", "finding")]
+        first = next((f"{e['wall'] - at:.1f}" for e in seen if e["kind"] == "change"), "not")
+        named = next((f"{e['wall'] - at:.1f}: {e['text']}" for e in seen if e["kind"] == "finding"), "not named")
+        rows.append((change.what, first, named, sum(e["kind"] == "change" for e in seen)))
+    return "\n".join(table(("change", "shown after [s]", "named after [s], how", "alarms until the next"), rows))
 
 
 # --- Steps of rate and attitude, with the gains of the defaults and with proposed ones
@@ -359,6 +416,7 @@ def main() -> None:
         binary=Path(),
         defaults="",
         gains=False,
+        changes=False,
         delay=0.0,
         keep=Path(),
         model="+",
@@ -377,10 +435,14 @@ def main() -> None:
         put(given, "gains.md", "Gains, flown", "ArduCopter", gains_flown(given))
         return
     truth = {name: float(value) for name, value in (text.split("=", 1) for text in given.words)}
-    one = Flown(given.binary.name, str(given.vehicle), truth)
-    done = flown(given)
-    text = [section("ArduCopter", "flown by this study", [row(one, done)], 1e9), *done.alarms]
-    put(given, "autopilot.md", TITLE, "ArduCopter SITL", text)
+    one, file = Flown(given.binary.name, str(given.vehicle), truth), Vehicle.named(given.vehicle)
+    changes = () if not given.changes else (*MASSES, *ROTORS) if file.command.kind == "pwm" else MASSES
+    done, moments = flown(given, changes)
+    before = replace(done, events=[e for e in done.events if not moments or e["wall"] < moments[0]])
+    text = [section("ArduCopter", "flown by this study", [row(one, before)], 1e9), *before.alarms]
+    if changes:
+        text += ["", changes_seen(changes, moments, done)]
+    put(given, "autopilot.md", TITLE, "ArduCopter SITL", "\n".join(text))
 
 
 if __name__ == "__main__":
