@@ -151,7 +151,7 @@ class TrialFlights:
 
 
 class AsLogged:
-    """Flies manoeuvres as they would be logged: random forces and sensor noise found so far, the log's own rates."""
+    """Flies manoeuvres as they would be logged: effects, random forces and noise found so far, the log's own rates."""
 
     def __init__(
         self, simulator: TrialFlights, random: RandomForces, like: Recording | None = None, rate: float | None = None
@@ -159,7 +159,8 @@ class AsLogged:
         """Takes what was found.
 
         Args:
-            simulator: what is believed of the vehicle, with the noise that was found.
+            simulator: what is believed of the vehicle, with the noise that was found.  A delay below nothing is that
+                of its rotors' readings.
             random: what moves it beyond its model.
             like: a log of the vehicle; each channel will come as often as there.
             rate: of its grid [Hz].  Without a log, rows come as the pilot's; a loop whose rotors are measured between
@@ -169,6 +170,11 @@ class AsLogged:
         gyro, attitude, accel = (float(np.mean(white[i : i + 3])) for i in (0, 3, 6))
         self._noise = SensorNoise(gyro=gyro, attitude=attitude, accel=accel)
         self._simulator, self._random, self._like = simulator, random, {} if like is None else like.channels
+        self._effects = dict(simulator.vehicle.effects)
+        delay = self._effects.get("command_delay", {}).get("delay", 0.0)
+        self._late = max(-delay, 0.0)
+        if self._late:
+            del self._effects["command_delay"]
         self._grid = FASTEST / max(round(FASTEST * (PILOT_STEP if rate is None else 1.0 / rate)), 1)
         self._rate = FASTEST if rate is None and simulator.vehicle.command.sampling == "instant" else self._grid
 
@@ -181,7 +187,7 @@ class AsLogged:
             seconds,
             simulator.seed,
             profile,
-            effects=simulator.vehicle.effects,
+            effects=self._effects,
             random=self._random,
             segments=segments if profile == "scripted" else None,
             noise=self._noise,
@@ -191,7 +197,8 @@ class AsLogged:
         for name, channel in flown.channels.items():
             step = float(np.median(np.diff(self._like[name].t))) if name in self._like else 1.0 / self._grid
             rows = slice(None, None, max(round(self._rate * step), 1))
-            channels[name] = replace(channel, t=channel.t[rows], values=channel.values[rows])
+            late = self._late if name == "rotor_speed" else 0.0
+            channels[name] = replace(channel, t=channel.t[rows] + late, values=channel.values[rows])
         return to_windows(replace(flown, channels=channels), simulator.vehicle, self._grid)
 
 

@@ -272,6 +272,7 @@ def propose(
     from quadid.estimate.missing import Vehicles, random_forces
     from quadid.experiment import AsLogged, Limits, TrialFlights, design_manoeuvre, manoeuvre_file
     from quadid.identification.uncertainty import halfwidths
+    from quadid.model.layout import Layout
     from quadid.report.programs import Facts
 
     check_limits(seconds, tilt, rate_limit, height, battery, forms)
@@ -284,11 +285,15 @@ def propose(
     simulator = TrialFlights(believed, None if before is None else before.noise, seed)
     proposal = design_manoeuvre(simulator, known, limits, seconds, advance)
     random, like = believed.random, given[-1] if given else None
-    if before is not None:
-        parts = Vehicles(windows, believed, before.theta).missing(windows, before.theta)
-        random = random_forces(parts)
+    flier = simulator
+    if before is not None:  # the fit of a log tells what else moves the vehicle, and what its model misses beside that
+        effects = {**before.beside, **believed.effects}
+        real = believed.model_copy(update={"effects": effects})
+        flier = TrialFlights(real, before.noise, seed)
+        theta = Layout(real).initial(real)
+        random = random_forces(Vehicles(windows, real, theta).missing(windows, theta))
     if random is not None:
-        as_logged = AsLogged(simulator, random, *(() if like is None else (like.recording, like.grid.rate)))
+        as_logged = AsLogged(flier, random, *(() if like is None else (like.recording, like.grid.rate)))
 
         def promised(segments: Sequence[Segment], profile: str = "scripted") -> FloatArray:
             flown = as_logged.windows(segments, proposal.seconds, profile)

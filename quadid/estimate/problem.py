@@ -574,15 +574,19 @@ class Problem:
     ) -> tuple[FloatArray, FloatArray]:
         """Information (P, P) and gradient (P,) of the likelihood in scaled parameters, gains frozen, prior included.
 
-        Sensitivities are differences of innovations over `nudge`, one for all parameters or one each, shape (P,).
+        Sensitivities are differences of innovations over `nudge`, one for all parameters or one each, shape (P,).  Of a
+        model that runs away beside these gains they are not finite.
         """
         mean, sigma = self.prior
         information, gradient = np.diag(1.0 / sigma**2) - self.taken[1], (z - mean) / sigma**2 - self.taken[0]
         for j, g in enumerate(gains):
             mine, plain, J = self.sensitivities(j, z, psi, g, nudge)
-            gradient[mine] += J.reshape(len(mine), -1) @ plain.ravel()
-            J *= self.expected
-            information[np.ix_(mine, mine)] += J.reshape(len(mine), -1) @ J.reshape(len(mine), -1).T
+            with np.errstate(over="ignore", invalid="ignore"):
+                gradient[mine] += J.reshape(len(mine), -1) @ plain.ravel()
+                J *= self.expected
+                information[np.ix_(mine, mine)] += J.reshape(len(mine), -1) @ J.reshape(len(mine), -1).T
+        if not np.isfinite(information).all():
+            return information, gradient
         # What noise of rotor speeds explains is no information, but there is never less than the prior's.
         own, turned = np.linalg.eigh(sigma[:, None] * information * sigma - np.eye(len(z)))
         turned = turned / sigma[:, None]

@@ -18,7 +18,7 @@ import numpy as np
 
 from quadid.chi_square import exceeded
 from quadid.data.window import Window
-from quadid.effects import EFFECTS
+from quadid.effects import EFFECTS, butterworth_delay
 from quadid.estimate import kalman as k
 from quadid.estimate.fit import ACTS, NEAR_SECONDS, Estimate, estimate, newton_step
 from quadid.estimate.kalman import Gains
@@ -58,6 +58,8 @@ ALONG = (
     "cg_offset.y",
 )
 """Fitted along, with what is late, unless the model has numbers of that effect."""
+INFLOW, UNCOUPLED = "axial_inflow.k_z", "no_gyroscopic_coupling.share"
+"""Fitted along where a flight shows them."""
 MOST_SECONDS = 600.0
 """Of longer flights the liveliest so many seconds are fitted: then a minute's interval is a third."""
 FORGOTTEN = 4.0
@@ -83,6 +85,7 @@ class Filtered:
         trust: what other estimates differ by.
         tilting: random moments act about roll or pitch.
         noise: of the sensors, white and, of the attitude, slow.
+        beside: what was fitted along and undone, as effects of a vehicle file.
     """
 
     theta: FloatArray
@@ -91,6 +94,7 @@ class Filtered:
     trust: Reliability
     tilting: bool
     noise: NoiseModel
+    beside: dict[str, dict[str, float]]
 
     def held(self, uncertainty: Uncertainty) -> Uncertainty:
         """An uncertainty of these parameters with what other estimates differ by."""
@@ -129,20 +133,22 @@ def _filtered(
     windows: Sequence[Window], vehicle: Vehicle, theta: FloatArray, free: Free, per_flight: Sequence[str]
 ) -> Filtered | None:
     # 1. The estimate, with what acts on every vehicle fitted along; gyro and accelerometer in time.
-    layout = Layout(vehicle)
+    layout, beside = Layout(vehicle), dict[str, dict[str, float]]()
     known = {e.name.split(".")[0] for e in layout.entries.values() if theta[e.index] != e.neutral}
     stated = known | {n.split(".")[0] for n in free.names}
     if "imu_lag" not in stated:
         delay = delay_of(windows)
         windows = [in_time(window, delay) for window in windows]
-    along = fitted_along(stated)
+        if delay:
+            beside["imu_lag"] = {"cutoff": butterworth_delay(delay)}
+    along = [*fitted_along(stated)]
     late = [n for n in along if n in LATE]
     nominal = [n for n in free.names if n in NOMINAL_NAMES]
-    beside = [*(n for n in free.names if n not in NOMINAL_NAMES), *per_flight, *along]
+    others = [*(n for n in free.names if n not in NOMINAL_NAMES), *per_flight]
 
     def problem_of(windows: Sequence[Window], names: Sequence[str] = ()) -> Problem:
         tracks = [from_window(w, vehicle, air=True) for w in windows]
-        return Problem.of(tracks, vehicle, (*beside, *names), windows, theta, nominal).liveliest(MOST_SECONDS)
+        return Problem.of(tracks, vehicle, (*others, *along, *names), windows, theta, nominal).liveliest(MOST_SECONDS)
 
     # How rotors behind a lag began is not known.
     unsettled = FORGOTTEN * float(theta[layout.entry("motor_lag.tau").index])
@@ -153,9 +159,21 @@ def _filtered(
         unsettled = FORGOTTEN * lag
         again = problem_of(windows).settled(unsettled)
         found = estimate(again, found.z * found.problem.size / again.size)
+    # What these flights show beside: in a climb b would stand in for inflow, J_zz for rotations that do not couple.
+    seen = (INFLOW, UNCOUPLED) if all(w.velocity is not None for w in windows) else (UNCOUPLED,)
+    asked = [name for name in seen if name.split(".")[0] not in stated]
+    while shown := _shown(found, problem_of(windows, asked).settled(unsettled)) if asked else []:
+        along += shown
+        again = problem_of(windows).settled(unsettled)
+        beyond = estimate(again, _without(found, again))
+        if UNCOUPLED not in shown or beyond.value(UNCOUPLED)[0] > 0.5:
+            found = beyond
+            break
+        # A simulator leaves all of the coupling out, or nothing: something else passes for that.
+        along, asked = [n for n in along if n not in shown], [n for n in asked if n != UNCOUPLED]
     if not (np.isfinite(found.objective) and np.isfinite(found.z).all() and np.isfinite(found.covariance).all()):
         return None
-    problem, names = found.problem, [name for name, *_ in whole.entries]
+    problem, names = found.problem, [name for name, *_ in found.problem.entries]
     out, places = theta.copy(), np.array([names.index(n) for n in free.names])
     out[free.index] = [found.value(n, 0)[0] for n in free.names]
     # 2. Its covariance: both scale the six by logarithms, but effects by sizes of their own.
@@ -169,12 +187,35 @@ def _filtered(
         pull = np.linalg.solve(found.covariance[np.ix_(where, where)], found.z[where])
         prompt = -unit * (found.covariance[np.ix_(places, where)] @ pull)
     # 4. Parts of the flights, every second row, and models with one cause more.
-    more = [n for n in _catalogue(layout, windows) if n not in whole.names and n.split(".")[0] not in known]
-    wide, half = problem_of(windows, more), replace(problem_of([coarse(w) for w in windows]), names=whole.names)
+    more = [n for n in _catalogue(layout, windows) if n not in problem.names and n.split(".")[0] not in known]
+    wide, half = problem_of(windows, more), replace(problem_of([coarse(w) for w in windows]), names=problem.names)
     wide, half = wide.settled(unsettled), half.settled(unsettled)
     trust = _compared(found, wide, half, places, unit)
     share = found.psi[k.SIGMA : k.TIME] / problem.noise_scale
-    return Filtered(out, own, prompt, trust, bool(share[2] > LARGE), sensor_noise(found))
+    for name in along:
+        value, (effect, number) = found.value(name)[0], name.split(".")
+        if not layout.entry(name).sign * value < 0.0:  # less than nothing is noise about nothing
+            beside.setdefault(effect, {})[number] = value
+    return Filtered(out, own, prompt, trust, bool(share[2] > LARGE), sensor_noise(found), beside)
+
+
+def _without(found: Estimate, more: Problem) -> FloatArray:
+    """Scaled parameters of an estimate in a problem that has more, without that."""
+    z = dict(zip(((name, flight) for name, _, flight in found.problem.entries), found.z.tolist(), strict=True))
+    return np.array([z.get((name, flight), 0.0) for name, _, flight in more.entries])
+
+
+def _shown(found: Estimate, more: Problem) -> list[str]:
+    """Entries of a problem with more of them than an estimate that are proven beside it, each by a score test."""
+    problem = found.problem
+    more = replace(more, base=problem.base, control=problem.control, tail=problem.tail)
+    z, own = _without(found, more), np.array([name in problem.names for name, *_ in more.entries])
+    h, g = more.normal_equations(z, found.psi, more.passes(z, found.psi)[1])
+    across = np.linalg.solve(h[np.ix_(own, own)], np.column_stack([h[np.ix_(own, ~own)], g[own]]))
+    left = h[~own][:, ~own].diagonal() - np.sum(h[np.ix_(own, ~own)] * across[:, :-1], axis=0)
+    gain = (g[~own] - h[np.ix_(~own, own)] @ across[:, -1]) ** 2 / left
+    names = [name for name, *_ in more.entries if name not in problem.names]
+    return [name for name, one in zip(names, gain.tolist(), strict=True) if one > exceeded(SELDOM, 1)]
 
 
 def carried(gains: Sequence[Gains]) -> float:

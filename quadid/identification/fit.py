@@ -406,6 +406,7 @@ class Fit:
         outcome: how the polish ended.
         evaluations: parameter vectors simulated by search and fits (finite differences included); the noise's apart.
         warnings: for the user.
+        beside: what was fitted along, as effects of a vehicle file.
     """
 
     vehicle: Vehicle
@@ -416,6 +417,7 @@ class Fit:
     outcome: Convergence
     evaluations: int
     warnings: tuple[str, ...] = ()
+    beside: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
 
 
 def final_answer(fit: Fit, out_of_reach: Mapping[str, str], off: Mapping[str, float] | None = None) -> Fit:
@@ -654,4 +656,5 @@ def beside_random_forces(short: Shooting, found: Filtered, free: Free) -> Fit:
     unc = found.held(unc)
     rows = parameter_set(free, theta, short.layout.initial(short.vehicle), unc)
     noise = found.noise.extended(short.noise)
-    return Fit(short.vehicle, theta, rows, noise, unc, Convergence.CONVERGED, 0, (*remarks, *on_bounds(rows)))
+    warnings = (*remarks, *on_bounds(rows))
+    return Fit(short.vehicle, theta, rows, noise, unc, Convergence.CONVERGED, 0, warnings, found.beside)

@@ -27,7 +27,7 @@ from quadid.estimate.kalman import Gains
 from quadid.estimate.late_imu import MOST, delay_of, in_time
 from quadid.estimate.problem import TRIMMED, UPRIGHT, Problem
 from quadid.estimate.track import from_window
-from quadid.identification.filter_error import fitted_along, start_of
+from quadid.identification.filter_error import INFLOW, UNCOUPLED, fitted_along, start_of
 from quadid.identification.fit import SWARM_SECONDS, swarm_search
 from quadid.identification.particle_swarm import SwarmOptions
 from quadid.identification.problem import Prior, Shooting
@@ -54,12 +54,9 @@ BEYOND = 2.0
 """An estimate may lie so far outside the bounds, log scale: the step from where it was linearised."""
 NUDGE = 1e-3
 """Difference of a scaled effect of thrust for its derivative."""
-INFLOW = "axial_inflow.k_z"
-"""Thrust lost in a climb, free where velocity is measured: seconds of climb would else make b smaller, and sure."""
-UNCOUPLED = "no_gyroscopic_coupling.share"
-"""Free too, as simulators may lack it: inertias would stand in for it; without evidence fusion takes it to be none."""
 CURVE = "thrust_curve.dead_speed"
-"""Likewise: without it, a rotor whose thrust is nearly straight makes inertias too large; see `Curve`."""
+"""Free as inflow and coupling are: without it, a rotor whose thrust is nearly straight makes inertias too large; see
+`Curve`.  Without evidence fusion takes curve and lack of coupling to be none."""
 SUPPORT = "thrust_curve.offset"
 """Likewise: a support, or a bias of the accelerometer, looks like a curve at hover."""
 LOOSE = 4

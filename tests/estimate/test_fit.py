@@ -68,6 +68,14 @@ def test_guesses_off_by_up_to_four_end_at_the_same_optimum() -> None:
             assert abs(np.log(value / same)) < 0.2 * sigma, name
 
 
+def test_a_model_that_runs_away_has_no_finite_information() -> None:
+    """A guess of a hexacopter's file did on a right flight, and `identify` refused the flight."""
+    found, _ = estimated(1)
+    gains = found.problem.passes(found.z, found.psi)[1]
+    information, _ = found.problem.normal_equations(found.z, found.psi, gains, nudge=500.0)
+    assert not np.isfinite(information).all()
+
+
 def test_gusts_are_found_in_newtons() -> None:
     found, _ = estimated(3, gusty=True)
     parts = smoothed(found)
