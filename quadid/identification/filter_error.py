@@ -59,7 +59,9 @@ ALONG = (
 )
 """Fitted along, with what is late, unless the model has numbers of that effect."""
 INFLOW, UNCOUPLED = "axial_inflow.k_z", "no_gyroscopic_coupling.share"
-"""Fitted along where a flight shows them."""
+SHOWN = {INFLOW: 0.0, UNCOUPLED: 0.5}
+"""Fitted along where a flight shows that, and what they then are at least: climbs take thrust away, and a simulator
+leaves all of the coupling out or nothing.  Below, something else passes for them."""
 MOST_SECONDS = 600.0
 """Of longer flights the liveliest so many seconds are fitted: then a minute's interval is a third."""
 FORGOTTEN = 4.0
@@ -160,17 +162,17 @@ def _filtered(
         again = problem_of(windows).settled(unsettled)
         found = estimate(again, found.z * found.problem.size / again.size)
     # What these flights show beside: in a climb b would stand in for inflow, J_zz for rotations that do not couple.
-    seen = (INFLOW, UNCOUPLED) if all(w.velocity is not None for w in windows) else (UNCOUPLED,)
-    asked = [name for name in seen if name.split(".")[0] not in stated]
+    velocity = all(w.velocity is not None for w in windows)
+    asked = [name for name in SHOWN if name.split(".")[0] not in stated and (velocity or name != INFLOW)]
     while shown := _shown(found, problem_of(windows, asked).settled(unsettled)) if asked else []:
         along += shown
         again = problem_of(windows).settled(unsettled)
         beyond = estimate(again, _without(found, again))
-        if UNCOUPLED not in shown or beyond.value(UNCOUPLED)[0] > 0.5:
+        wrong = [name for name in shown if beyond.value(name)[0] < SHOWN[name]]
+        if not wrong:
             found = beyond
             break
-        # A simulator leaves all of the coupling out, or nothing: something else passes for that.
-        along, asked = [n for n in along if n not in shown], [n for n in asked if n != UNCOUPLED]
+        along, asked = [n for n in along if n not in shown], [n for n in asked if n not in wrong]
     if not (np.isfinite(found.objective) and np.isfinite(found.z).all() and np.isfinite(found.covariance).all()):
         return None
     problem, names = found.problem, [name for name, *_ in found.problem.entries]
