@@ -79,7 +79,7 @@ def take_off(link: mavutil.mavfile, height: float) -> None:
     _wait(link, "GLOBAL_POSITION_INT", lambda m: m.relative_alt > 900.0 * height)
 
 
-def fly(link: mavutil.mavfile, seconds: float, seed: int, changes: Sequence["Change"]) -> list[float]:
+def fly(link: mavutil.mavfile, seconds: float, seed: int, changes: Sequence["Change"] = ()) -> list[float]:
     """Takes off, hovers, moves the sticks, makes the changes and lands; returns when each change was made [s]."""
     take_off(link, HEIGHT)
     _mode(link, "LOITER", held=np.zeros(len(AXES)))
