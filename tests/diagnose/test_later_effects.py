@@ -15,7 +15,6 @@ FLOWN: dict[str, tuple[Vehicle, tuple[str, ...], dict[str, dict[str, float]]]] =
     "late telemetry": (READ, (), {"rotor_telemetry_delay": {"delay": 0.012}}),
     "late motors": (READ, (), {"motor_lag": {"tau": 0.02}}),
     "lift": (PELICAN, ("velocity",), DRAG | {"translational_lift": {"k": 0.02}}),
-    "drag alone": (PELICAN, ("velocity",), DRAG),
     "drag in wind": (PELICAN, ("velocity",), DRAG | {"wind": {"north": 4.0, "east": -3.0}}),
     "no gyroscopic coupling": (PELICAN, (), {"no_gyroscopic_coupling": {"share": 1.0}}),
     "emptying battery": (PELICAN, ("battery",), {"supply_voltage": {"exponent": 1.0}}),

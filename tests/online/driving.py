@@ -8,7 +8,7 @@ from quadid.flight import Flight, fly
 from quadid.online import Job, JobReply, Session
 from quadid.online.records import Action, Event, OnlineDiagnosis, OnlineSet, Publish
 from quadid.vehicle import Vehicle
-from tests.samples import Sample
+from tests.samples import Sample, gathered
 
 Background = Callable[[Job], JobReply | None]
 EPOCH = 1_700_000_000.0
@@ -49,8 +49,8 @@ def unanswered(job: Job) -> None:
     """Leaves a job to the caller."""
 
 
-def answer(session: Session, diagnose: Background = run) -> list[Action]:
-    """Polls until the session needs more samples, doing every fit at once, and diagnoses as told."""
+def answer(session: Session, diagnose: Background = run, work: Background = run) -> list[Action]:
+    """Polls until the session needs more samples, doing every fit at once, fits and diagnoses as told."""
     out: list[Action] = []
     while True:
         for action in session.poll():
@@ -60,16 +60,20 @@ def answer(session: Session, diagnose: Background = run) -> list[Action]:
         request = session.running
         if request is None:
             return out
-        session.deliver(request.run())
+        reply = work(request)
+        assert reply is not None
+        session.deliver(reply)
 
 
-def drive(session: Session, stream: Sequence[Sample], chunk: int = 40, diagnose: Background = run) -> list[Action]:
+def drive(
+    session: Session, stream: Sequence[Sample], chunk: int = 40, diagnose: Background = run, work: Background = run
+) -> list[Action]:
     """Pushes all samples, polling after every `chunk` of them."""
     out: list[Action] = []
     for start in range(0, len(stream), chunk):
-        for sample in stream[start : start + chunk]:
-            session.push(sample.block)
-        out.extend(answer(session, diagnose))
+        for block in gathered(sample.block for sample in stream[start : start + chunk]):
+            session.push(block)
+        out.extend(answer(session, diagnose, work))
     return out
 
 

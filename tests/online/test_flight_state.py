@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import lru_cache
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +26,7 @@ from quadid.online.stream import Resampler
 from quadid.rotation import conjugate, rotated
 from quadid.types import FloatArray
 from quadid.vehicle import GRAVITY, Vehicle
+from tests.samples import gathered
 
 RATE = 50.0
 
@@ -43,10 +45,11 @@ def rows_of(log: Path, vehicle: Path) -> Iterator[Rows]:
 
 def resampled(log: Path, vehicle: Vehicle) -> Iterator[Rows]:
     """Rows as they come."""
-    resampler = Resampler(vehicle, RATE)
-    for count, block in enumerate(stream(open_log(str(log), "auto", vehicle.columns))):
-        resampler.push(block)
-        while count % 200 == 0 and (rows := resampler.next_rows()) is not None:
+    resampler, messages = Resampler(vehicle, RATE), stream(open_log(str(log), "auto", vehicle.columns))
+    while portion := list(gathered(islice(messages, 200))):
+        for block in portion:
+            resampler.push(block)
+        while (rows := resampler.next_rows()) is not None:
             yield rows
 
 
