@@ -7,7 +7,8 @@ from functools import cached_property
 import numpy as np
 
 from quadid.diagnosis.evidence import FALSE_ALARM, RELEVANT
-from quadid.diagnosis.hypotheses import Candidate, free_names, paired_gain
+from quadid.diagnosis.hypotheses import Candidate, HeldOut, free_names, paired_gain
+from quadid.effects import EFFECTS
 from quadid.estimate import kalman as k
 from quadid.estimate.fit import newton_step
 from quadid.estimate.kalman import Beyond, Gains
@@ -18,7 +19,9 @@ from quadid_evaluation.studies.innovations.models import (
     Model,
     innovations,
     left_without,
+    long_run,
     quadratic,
+    stretches,
     times_of,
     with_additions,
 )
@@ -67,19 +70,29 @@ def _cost(model: Model, other: Model) -> float:
 
 def calibration(model: Model, own: BoolArray) -> float:
     """By how much scores of the parameters `own` of `model` vary more than its deviance counts on, or 1."""
-    return max(float(np.mean(model.inflation[own])), 1.0)
+    return max(float(np.mean(model.inflation[own])), 1.0) if own.any() else 1.0
 
 
 def relevant(small: Model, large: Model) -> bool:
     """True if what `large` has more gains enough on unseen blocks, and half of that where the best of them is missing.
 
     It is missing in the fit as well: what a single stretch determines, such as a step near the end, gains elsewhere by
-    keeping that stretch apart.
+    keeping that stretch apart.  What belongs to the vehicle must do so on unseen flights too, where there are several.
     """
-    gain = paired_gain(small.left_out.block, large.left_out.block)
+    own = np.array([key not in small.keys for key in large.keys])
+    needed = RELEVANT * small.rows * calibration(large, own)
+    parts = [(small.left_out, large.left_out)]
+    more = [c for c in large.causes if c.label not in small.labels]
+    if len(small.by_flight.block) > 1 and not any(c.timed is not None or EFFECTS[c.effect].per_log for c in more):
+        parts.append((small.by_flight, large.by_flight))
+    return all(_gained(*pair) > needed for pair in parts)
+
+
+def _gained(small: HeldOut, large: HeldOut) -> float:
+    """Gain on unseen parts, or twice that without the best of them where that is less."""
+    gain = paired_gain(small.block, large.block)
     best = int(np.argmax(gain.blocks))
-    least = min(gain.total, 2.0 * float(small.left_out.rest[best] - large.left_out.rest[best]))
-    return least > RELEVANT * small.rows
+    return min(gain.total, 2.0 * float(small.rest[best] - large.rest[best]))
 
 
 # --- Score tests: what each move of the selection should bring, from one linearisation of everything
@@ -90,12 +103,14 @@ def relevant(small: Model, large: Model) -> bool:
 # the flight, ever closer ones around the best.
 
 
-ONSETS = 60
+ONSETS = 24
 """Onsets that are tried at first, spread over a flight."""
 END = 0.025
 """Share of a flight at either end in which nothing begins …"""
 LEAST_ROWS = 50
 """… and how many rows there are at least."""
+TRUSTED = 2.0
+"""Ratio of a score's variance to its information up to which a model is near enough for several causes at once."""
 NUDGE, LATER = 1e-3, 0.1
 """Steps of scaled differences: of an effect's size, and of a delay where nothing is late."""
 
@@ -107,6 +122,7 @@ class Score:
     Attributes:
         causes: those that come in.
         drop: predicted fall of the deviance, negative for a rise.
+        ratio: by how much the scores there vary more than that counts on, or 1.
         start: scaled parameters that the model then has, by key.
         time: best moment of onset [s] for timed causes.
         trials: how many alternatives were looked at: causes, and onsets of them.
@@ -119,6 +135,12 @@ class Score:
     time: float | None = None
     trials: int = 1
     gone: Candidate | None = None
+    ratio: float = 1.0
+
+    @property
+    def worth(self) -> float:
+        """Fall of the deviance in units that the scores themselves vary by."""
+        return self.drop / self.ratio
 
     @property
     def candidate(self) -> Candidate | None:
@@ -147,7 +169,7 @@ class Everything:
         nudge[[place == k.DELAY and z[i] == 0.0 for i, (_, place, _) in enumerate(problem.entries)]] = LATER
         self._gains = [with_additions(g) for g in model.gains]
         self._found = [self._whole(problem.sensitivities(j, z, model.psi, g, nudge)) for j, g in enumerate(self._gains)]
-        near = quadratic(problem, self._gains, self._found, len(z))
+        self._near = near = quadratic(problem, self._gains, self._found, len(z))
         mean, sigma = problem.prior
         self._h = near.information + np.diag(sigma**-2.0)
         self._g = near.gradient + (z - mean) / sigma**2
@@ -173,7 +195,9 @@ class Everything:
         for gone in removable(self.model):
             stay, slope, risen = self._left(gone)
             step, fall = self._best(stay, slope)
-            out[gone.label] = Score((), fall - risen - self.unspent, self._start(stay, step), gone=gone)
+            away = np.array([name in gone.names for name, _ in self.model.keys])
+            ratio, drop = calibration(self.model, away), fall - risen - self.unspent
+            out[gone.label] = Score((), drop, self._start(stay, step), gone=gone, ratio=ratio)
         return out
 
     def scores(self, gone: Candidate | None = None) -> list[Score]:
@@ -193,20 +217,33 @@ class Everything:
             if c.timed is None:
                 free = stay + [i for i, (name, _) in enumerate(self._keys) if name in c.names]
                 step, fall = self._best(free, slope)
-                found = Score((c,), fall, self._start(free, step))
+                found = Score((c,), fall, self._start(free, step), ratio=self._ratio(free, len(stay), step, gone))
             elif gone is None:
                 found = self._scan(c)
             else:
                 continue
             trials = found.trials * len(self.flights.listed)
             out.append(replace(found, drop=found.drop - risen - self.unspent, trials=trials, gone=gone))
-        return sorted(out, key=lambda s: -s.drop)
+        return sorted(out, key=lambda s: -s.worth)
+
+    def _ratio(self, free: list[int], own: int, step: FloatArray, gone: Candidate | None) -> float:
+        """By how much scores of the entries `free` from the `own`-th on vary more than information says, or 1.
+
+        They are taken a step away, or a cause that is missing would itself make them vary.
+        """
+        if len(free) == own:
+            return 1.0
+        whole = self._away(gone)
+        whole[free] = step
+        inverse = np.linalg.inv(self._h[np.ix_(free, free)])
+        return max(float(np.mean(self._near.spread(free, whole, inverse)[own:])), 1.0)
 
     def together(self, scores: Sequence[Score], least: float) -> Score:
         """The causes that still promise at least so much beside those before them, the most promising first."""
         free, chosen, fall, families = list(self._own), list[Candidate](), self.unspent, set[str]()
         step = self._best(free, self._g)[0]
-        waiting = [c for s in scores for c in s.causes if s.drop > least and c.timed is None]
+        trusted = [s for s in scores if s.drop > least and s.ratio < TRUSTED]
+        waiting = [c for s in trusted for c in s.causes if c.timed is None]
         while waiting:
             tried = []
             for c in waiting:
@@ -234,17 +271,23 @@ class Everything:
         """Entries of the model without `gone`, the slope where that is neutral, and the rise of the deviance."""
         names = free_names(left_without(self.model.causes, gone))
         stay = [i for i in self._own if self._keys[i][0] in names]
-        z = np.zeros(len(self._keys))
-        away = [i for i in self._own if i not in stay]
-        z[away] = -self._z[away]
+        z = self._away(gone)
         moved = self._h @ z
         return stay, self._g + moved, float(2.0 * self._g @ z + z @ moved)
+
+    def _away(self, gone: Candidate | None) -> FloatArray:
+        """Step that makes what leaves with `gone` neutral, shape (P,)."""
+        z, names = np.zeros(len(self._keys)), free_names(left_without(self.model.causes, gone))
+        away = [i for i in self._own if self._keys[i][0] not in names]
+        z[away] = -self._z[away]
+        return z
 
     def _scan(self, candidate: Candidate) -> Score:
         """Score of a cause at its best onset: additions to the motion from there on, each a column of its own."""
         own, best = self._own, Score((candidate,), -np.inf, {})
         root, trials = np.linalg.cholesky(self._h[np.ix_(own, own)]), 0
         pull = np.linalg.solve(root, self._g[own])
+        settled = np.linalg.solve(root.T, pull)
         for j, g in enumerate(self._gains):
             track, n = self._problem.tracks[j], len(self._problem.tracks[j].t)
             mine = {(candidate.names[0], j), (candidate.names[0], -1)}
@@ -252,15 +295,20 @@ class Everything:
             columns = _Onsets(self._problem, j, self._z, self.model.psi, g, place)
             plain, J = self._found[j].plain, self._found[j].J[own]
             weighted = (J * self._problem.expected).reshape(len(own), -1)
-            prior = float(self._problem.prior[1][place]) ** -2.0
+            prior, starts = float(self._problem.prior[1][place]) ** -2.0, stretches(track)
 
-            def at(row: int) -> tuple[float, float]:
+            def at(row: int) -> tuple[float, float, float]:
                 column = columns.from_row(row)  # noqa: B023
                 flat = (column * self._problem.expected).ravel()
                 across = np.linalg.solve(root, weighted @ flat)  # noqa: B023
                 left = float(flat @ flat) + prior - float(across @ across)  # noqa: B023
                 slope = float(np.sum(column * plain)) - float(across @ pull)  # noqa: B023
-                return slope**2 / left, -slope / left
+                # What of it the model's own entries do not take up, times what is left there, stretch by stretch.
+                apart = flat - np.linalg.solve(root.T, across) @ weighted  # noqa: B023
+                rest = plain.ravel() - settled @ weighted - slope / left * apart  # noqa: B023
+                scores = np.add.reduceat((apart * rest).reshape(column.shape).sum(axis=1), starts)  # noqa: B023
+                ratio = float(long_run(scores[:, None], np.zeros(len(starts)))[0]) / left  # noqa: B023
+                return slope**2 / left, -slope / left, max(ratio, 1.0)
 
             margin = max(int(END * n), LEAST_ROWS)
             if n <= 2 * margin:
@@ -277,7 +325,9 @@ class Everything:
             top = max(found, key=lambda row: found[row][0])
             if found[top][0] + self.unspent > best.drop:
                 start = self._start([*own, place], np.append(np.zeros(len(own)), found[top][1]))
-                best = Score((candidate,), found[top][0] + self.unspent, start, float(track.t[top]))
+                best = Score(
+                    (candidate,), found[top][0] + self.unspent, start, float(track.t[top]), ratio=found[top][2]
+                )
         return replace(best, trials=max(trials, 1))
 
 

@@ -9,15 +9,15 @@ import numpy as np
 from scipy.special import gammaln
 
 from quadid.data.window import Window
-from quadid.diagnosis.hypotheses import Candidate, HeldOut, free_names, held_out
+from quadid.diagnosis.hypotheses import Candidate, HeldOut, free_names, held_out, sum_by_block
 from quadid.effects import EFFECTS, NEVER
 from quadid.estimate import kalman as k
-from quadid.estimate.fit import ALL_NOISE, MOST, NEAR, NO_NOISE, scoring, settle_noise, tails
+from quadid.estimate.fit import ALL_NOISE, ENOUGH, MOST, NEAR, NO_NOISE, scoring, settle_noise, tails
 from quadid.estimate.kalman import Beyond, Gains, Track
 from quadid.estimate.problem import PER_FLIGHT, PLACES, Problem, Sensitivities
 from quadid.estimate.track import from_window
 from quadid.identification.problem import Free
-from quadid.identification.uncertainty import Uncertainty, score_products
+from quadid.identification.uncertainty import Uncertainty
 from quadid.model.layout import places
 from quadid.parameters import NOMINAL_NAMES
 from quadid.types import BoolArray, FloatArray, IndexArray
@@ -71,9 +71,39 @@ class Quadratic:
         return float(self.rows.sum())
 
     @property
+    def by_flight(self) -> "Quadratic":
+        """The same by whole flights."""
+        parts = (self.gram, self.grad, self.cost, self.rows)
+        summed = (sum_by_block(part, self.window) for part in parts)
+        first = np.unique(self.window, return_index=True)[1]
+        return Quadratic(*summed, self.window[first], self.time[first])
+
+    def spread(self, free: Sequence[int], step: FloatArray, inverse: FloatArray) -> FloatArray:
+        """True variance of each of the entries `free` over that in `inverse`, as if the point were a `step` away."""
+        scores = (self.grad + self.gram @ step)[:, free] @ inverse
+        return long_run(scores, self.window) / np.diag(inverse)
+
+    @property
     def spacing(self) -> float:
         """Time from one stretch to the next [s]; 1 s where there is one only."""
         return float(np.median(np.diff(self.time))) if len(self.time) > 1 else 1.0
+
+
+def long_run(series: FloatArray, window: IndexArray) -> FloatArray:
+    """Variance of the sum of each series of scores of stretches (T, P), with the memory that they have, shape (P,).
+
+    Sums of Bartlett-weighted products within flights, over as many stretches as is best for a series that forgets like
+    a first-order one (Andrews, Econometrica 59 (1991) 817, Eq. 6.2).
+    """
+    centred = series - series.mean(axis=0)
+    follows = window[1:] == window[:-1]
+    out = np.sum(centred**2, axis=0)
+    rho = np.clip(np.sum((centred[1:] * centred[:-1])[follows], axis=0) / np.maximum(out, 1e-300), -0.97, 0.97)
+    reach = 1.1447 * (4.0 * rho**2 / (1.0 - rho**2) ** 2 * len(series)) ** (1.0 / 3.0)
+    for lag in range(1, min(int(np.ceil(reach.max(initial=0.0))), len(series) - 1) + 1):
+        products = (centred[lag:] * centred[:-lag])[window[lag:] == window[:-lag]]
+        out = out + 2.0 * np.maximum(1.0 - lag / (np.ceil(reach) + 1.0), 0.0) * products.sum(axis=0)
+    return np.maximum(out, 0.0)
 
 
 class Costs(NamedTuple):
@@ -157,7 +187,7 @@ class Model:
         deviance: -2 ln of likelihood and prior.
         gains: of the pass there, one a flight.
         near: the likelihood near it.
-        left_out: deviances with one block left out each.
+        left_out: deviances with one block left out each; by_flight: with one flight left out each.
         tried: how many alternatives (causes, and onsets of them) were looked at when each cause was, by label.
     """
 
@@ -169,6 +199,7 @@ class Model:
     gains: Sequence[Gains]
     near: Quadratic
     left_out: HeldOut
+    by_flight: HeldOut
     tried: Mapping[str, float] = field(default_factory=dict)
 
     @cached_property
@@ -210,8 +241,7 @@ class Model:
     @cached_property
     def inflation(self) -> FloatArray:
         """True variance of each parameter over what the model counts on, from the scores of its stretches, (P,)."""
-        meat, _ = score_products(self.near)
-        return np.asarray(np.diag(self.covariance @ meat @ self.covariance) / np.diag(self.covariance))
+        return self.near.spread(range(len(self.z)), np.zeros(len(self.z)), self.covariance)
 
     @cached_property
     def uncertainty(self) -> Uncertainty:
@@ -319,7 +349,9 @@ class Flights:
         tail = tails(problem.tracks, gains)
         whole = replace(self.whole, base=problem.base, control=problem.control, tracks=problem.tracks, tail=tail)
         flights = replace(self, whole=whole)
-        return flights, flights.fit((), dict(zip(_keys(problem), z, strict=True)), psi, {}, {})
+        nominal = flights.fit((), dict(zip(_keys(problem), z, strict=True)), psi, {}, {})
+        assert nominal is not None
+        return flights, nominal
 
     def fit(
         self,
@@ -328,15 +360,30 @@ class Flights:
         psi: FloatArray,
         times: Mapping[str, float],
         tried: Mapping[str, float],
-    ) -> Model:
-        """The model with `causes`, from scaled parameters `start` by key and noise numbers `psi`."""
+        wanted: float = np.inf,
+    ) -> Model | None:
+        """The model with `causes`, from scaled parameters `start` by key and noise numbers `psi`.
+
+        None as soon as its deviance will not come down to what is `wanted` in the steps that it may take, or where it
+        runs away.
+        """
         problem = self.problem(free_names(causes), times)
         z = np.clip([start.get(key, 0.0) for key in _keys(problem)], *problem.limits)
-        z, psi, deviance, gains, _ = scoring(problem, z, psi, MOST, ALL_NOISE)
+        deviance, before, gains = np.inf, np.inf, list[Gains]()
+        for turns in range(NEAR, MOST + 1, NEAR):
+            gains.clear()
+            z, psi, deviance, gains, _ = scoring(problem, z, psi, NEAR, ALL_NOISE)
+            if not deviance < before - ENOUGH:
+                break
+            if deviance - wanted > (before - deviance) * (MOST - turns) / NEAR:
+                return None
+            before = deviance
         found = [problem.sensitivities(j, z, psi, g) for j, g in enumerate(gains)]
         near = quadratic(problem, gains, found, len(z))
-        left_out = held_out(near, problem.prior[1] ** -2.0)
-        return Model(causes, problem, z, psi, deviance, gains, near, left_out, tried)
+        if not (np.isfinite(deviance) and np.isfinite(near.information).all()):
+            return None
+        left_out = (held_out(part, problem.prior[1] ** -2.0) for part in (near, near.by_flight))
+        return Model(causes, problem, z, psi, deviance, gains, near, *left_out, tried)
 
     def in_time(self, model: Model, cause: Candidate) -> Model:
         """Refits `model` with the onset of a timed `cause` where it is most likely, everything else as it is.
@@ -356,8 +403,8 @@ class Flights:
                 break
             times = times_of(model, model.causes) | {cause.effect: time}
             start = dict(zip(model.keys, model.z, strict=True))
-            moved = self.fit(model.causes, start, model.psi, times, model.tried)
-            if not moved.deviance < model.deviance:
+            moved = self.fit(model.causes, start, model.psi, times, model.tried, model.deviance)
+            if moved is None or not moved.deviance < model.deviance:
                 break
             model = moved
         return model

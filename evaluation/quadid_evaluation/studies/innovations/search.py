@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from quadid.diagnosis.evidence import impossible_causes, worth_a_refit
 from quadid.diagnosis.hypotheses import Candidate
 from quadid_evaluation.studies.innovations.evidence import Everything, Score, better
@@ -102,7 +104,7 @@ def _adds(flights: Flights, everything: Everything, least: float, seen: set[froz
 
 
 def _drops(flights: Flights, everything: Everything, least: float, seen: set[frozenset[str]]) -> Iterator[Move]:
-    losses = sorted(everything.losses().values(), key=lambda s: -s.drop)
+    losses = sorted(everything.losses().values(), key=lambda s: -s.worth)
     yield from _refits(flights, everything.model, losses, -SPARE * least, 0.0, seen)
 
 
@@ -112,7 +114,7 @@ def _swaps(flights: Flights, everything: Everything, least: float, seen: set[fro
         cause = next(c for c in everything.model.causes if c.label == label)
         others = [c for c in everything.scores(cause) if not any(x.split for x in c.causes)]
         rivals = [s for s in others if s.causes[0].effect != cause.effect]
-        yield from _refits(flights, everything.model, rivals, lost.drop * (1.0 - ALIKE), 0.0, seen)
+        yield from _refits(flights, everything.model, rivals, lost.worth * (1.0 - ALIKE), 0.0, seen)
 
 
 def _refits(
@@ -132,7 +134,7 @@ def _refits(
     """
     gained, count = 0.0, 0
     for score in scores:
-        if count == MOST_REFITS or score.drop < (max(least, near * gained) if near else least):
+        if count == MOST_REFITS or score.worth < (max(least, near * gained) if near else least):
             return
         new = tuple(x for c in score.causes for x in c.split or (c,))
         causes = (*left_without(model.causes, score.gone), *new)
@@ -142,8 +144,12 @@ def _refits(
         if score.time is not None:
             times |= {c.effect: score.time for c in new if c.timed is not None}
         tried = {**model.tried, **{c.label: float(score.trials) for c in new}}
-        found = flights.fit(causes, score.start, model.psi, times, tried)
+        # Without a cause the deviance rises; with another or one more it has to fall.
+        wanted = model.deviance if new else np.inf
+        found, count = flights.fit(causes, score.start, model.psi, times, tried, wanted), count + 1
+        if found is None:
+            continue
         if score.time is not None:
             found = flights.in_time(found, score.causes[0])
-        gained, count = max(gained, model.deviance - found.deviance), count + 1
+        gained = max(gained, (model.deviance - found.deviance) / score.ratio)
         yield Move(score.candidate, score.gone, found)
