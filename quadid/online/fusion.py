@@ -25,6 +25,7 @@ import numpy as np
 
 from quadid.chi_square import Z95, exceeded
 from quadid.data.window import Window
+from quadid.identification.filter_error import UNCOUPLED
 from quadid.identification.problem import Free
 from quadid.identification.uncertainty import CHANCE, SHARE, Uncertainty, parameter_set
 from quadid.model.layout import B, Layout, ThrustModel
@@ -32,7 +33,6 @@ from quadid.online.fit_job import (
     CURVE,
     LOOSE,
     SIX,
-    UNCOUPLED,
     Curve,
     FitReply,
     FitRequest,

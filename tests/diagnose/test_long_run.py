@@ -9,13 +9,13 @@ WHITE = np.random.default_rng(3).standard_normal((4000, 2))
 
 
 def test_white_scores_vary_as_much_as_they_say() -> None:
-    assert long_run(WHITE, np.zeros(4000)) / 4000 == pytest.approx([1.0, 1.0], abs=0.15)
+    assert long_run(WHITE, np.zeros(4000, int)) / 4000 == pytest.approx([1.0, 1.0], abs=0.15)
 
 
 def test_memory_multiplies_the_variance_of_their_sum() -> None:
     # A first-order series sums to (1 + rho) / (1 - rho) times its own variance, here 1 / (1 - rho)^2 of its noise.
     slow = lfilter([1.0], [1.0, -0.8], WHITE, axis=0)
-    assert long_run(slow, np.zeros(4000)) / 4000 == pytest.approx([25.0, 25.0], rel=0.3)
+    assert long_run(slow, np.zeros(4000, int)) / 4000 == pytest.approx([25.0, 25.0], rel=0.3)
 
 
 def test_flights_have_no_memory_of_one_another() -> None:
@@ -23,4 +23,4 @@ def test_flights_have_no_memory_of_one_another() -> None:
     pairs = np.repeat(WHITE[:1000], 2, axis=0)
     apart = long_run(pairs, np.arange(2000))
     assert apart == pytest.approx(np.sum((pairs - pairs.mean(axis=0)) ** 2, axis=0))
-    assert np.all(long_run(pairs, np.zeros(2000)) > 1.5 * apart)
+    assert np.all(long_run(pairs, np.zeros(2000, int)) > 1.5 * apart)
