@@ -171,8 +171,7 @@ class AsLogged:
         self._noise = SensorNoise(gyro=gyro, attitude=attitude, accel=accel)
         self._simulator, self._random, self._like = simulator, random, {} if like is None else like.channels
         self._effects = dict(simulator.vehicle.effects)
-        delay = self._effects.get("command_delay", {}).get("delay", 0.0)
-        self._late = max(-delay, 0.0)
+        self._late = max(-self._effects.get("command_delay", {}).get("delay", 0.0), 0.0)
         if self._late:
             del self._effects["command_delay"]
         self._grid = FASTEST / max(round(FASTEST * (PILOT_STEP if rate is None else 1.0 / rate)), 1)

@@ -286,9 +286,8 @@ def propose(
     proposal = design_manoeuvre(simulator, known, limits, seconds, advance)
     random, like = believed.random, given[-1] if given else None
     flier = simulator
-    if before is not None:  # the fit of a log tells what else moves the vehicle, and what its model misses beside that
-        effects = {**before.beside, **believed.effects}
-        real = believed.model_copy(update={"effects": effects})
+    if before is not None:  # effects that the fit of a log found beside the parameters, and the random forces left
+        real = believed.model_copy(update={"effects": {**before.beside, **believed.effects}})
         flier = TrialFlights(real, before.noise, seed)
         theta = Layout(real).initial(real)
         random = random_forces(Vehicles(windows, real, theta).missing(windows, theta))

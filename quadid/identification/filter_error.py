@@ -11,7 +11,7 @@ parts of the flight, and models with each cause of the catalogue added, estimate
 as wide as their differences.
 """
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -164,7 +164,7 @@ def _filtered(
     # What these flights show beside: in a climb b would stand in for inflow, J_zz for rotations that do not couple.
     velocity = all(w.velocity is not None for w in windows)
     asked = [name for name in SHOWN if name.split(".")[0] not in stated and (velocity or name != INFLOW)]
-    while shown := _shown(found, problem_of(windows, asked).settled(unsettled)) if asked else []:
+    while asked and (shown := _shown(found, problem_of(windows, asked).settled(unsettled))):
         along += shown
         again = problem_of(windows).settled(unsettled)
         beyond = estimate(again, _without(found, again))
@@ -211,13 +211,27 @@ def _shown(found: Estimate, more: Problem) -> list[str]:
     """Entries of a problem with more of them than an estimate that are proven beside it, each by a score test."""
     problem = found.problem
     more = replace(more, base=problem.base, control=problem.control, tail=problem.tail)
-    z, own = _without(found, more), np.array([name in problem.names for name, *_ in more.entries])
+    z, anywhere = _without(found, more), np.full(len(more.entries), np.inf)
     h, g = more.normal_equations(z, found.psi, more.passes(z, found.psi)[1])
-    across = np.linalg.solve(h[np.ix_(own, own)], np.column_stack([h[np.ix_(own, ~own)], g[own]]))
-    left = h[~own][:, ~own].diagonal() - np.sum(h[np.ix_(own, ~own)] * across[:, :-1], axis=0)
-    gain = (g[~own] - h[np.ix_(~own, own)] @ across[:, -1]) ** 2 / left
-    names = [name for name, *_ in more.entries if name not in problem.names]
-    return [name for name, one in zip(names, gain.tolist(), strict=True) if one > exceeded(SELDOM, 1)]
+    own = [i for i, (name, *_) in enumerate(more.entries) if name in problem.names]
+    others = {name: [i] for i, (name, *_) in enumerate(more.entries) if i not in own}
+    promises = _promises(h, g, (-anywhere, anywhere), own, others)
+    return [name for name, gain, _ in promises if gain > exceeded(SELDOM, 1)]
+
+
+def _promises(
+    h: FloatArray, g: FloatArray, box: tuple[FloatArray, FloatArray], own: list[int], causes: Mapping[str, list[int]]
+) -> list[tuple[str, float, FloatArray]]:
+    """Result of `promised` by information h and gradient g, steps within a box; causes that run away are left out."""
+
+    def best(free: list[int]) -> tuple[FloatArray, float]:
+        """Step with these entries free, and how much of the objective it takes away."""
+        at = np.ix_(free, free)
+        step = newton_step(h[at], g[free], 0.0, box[0][free], box[1][free])
+        return step, -float(2.0 * g[free] @ step + step @ h[at] @ step)
+
+    finite = np.isfinite(np.diag(h)) & np.isfinite(g)
+    return promised(best, own, {name: entries for name, entries in causes.items() if finite[entries].all()})
 
 
 def carried(gains: Sequence[Gains]) -> float:
@@ -316,8 +330,7 @@ def _with_causes(found: Estimate, near: Sequence[Sensitivities], wide: Problem) 
     """
     index = {(name, flight): i for i, (name, _, flight) in enumerate(wide.entries)}
     own = [index[name, flight] for name, _, flight in found.problem.entries]
-    z, nudge = np.zeros(len(index)), np.full(len(index), 1e-5)
-    z[own] = found.z
+    z, nudge = _without(found, wide), np.full(len(index), 1e-5)
     # Entries of a cause are freed together; rotors are causes by themselves.
     causes: dict[str, list[int]] = {}
     for (name, _), i in index.items():
@@ -342,15 +355,7 @@ def _with_causes(found: Estimate, near: Sequence[Sensitivities], wide: Problem) 
     least, most = wide.limits - z
     least[added], most[added] = np.maximum(least[added], -MET), np.minimum(most[added], MET)
 
-    def best(free: list[int]) -> tuple[FloatArray, float]:
-        """Step within bounds with these entries free, and how much of the objective it takes away."""
-        at = np.ix_(free, free)
-        step = newton_step(information[at], gradient[free], 0.0, least[free], most[free])
-        return step, -float(2.0 * gradient[free] @ step + step @ information[at] @ step)
-
-    # What runs away if it is in the model is no cause.
-    finite = np.isfinite(np.diag(information)) & np.isfinite(gradient)
-    promises = promised(best, own, {name: entries for name, entries in causes.items() if finite[entries].all()})
+    promises = _promises(information, gradient, (least, most), own, causes)
     limit = NEAR_BEST * max((gain for _, gain, _ in promises), default=0.0)
     return [(n, step) for n, gain, step in promises if gain > max(exceeded(SELDOM, len(causes[n])), limit)]
 

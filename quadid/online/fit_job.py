@@ -566,11 +566,8 @@ def warm_up(vehicle: Vehicle) -> None:
     speed = vehicle.hover_speed() + 5.0 * swing
     attitude, accel = np.tile([1.0, 0.0, 0.0, 0.0], (rows, 1)), np.tile([0.0, 0.0, -9.80665], (rows, 1))
     gyro, z = 0.3 * np.cos(np.arange(rows)[:, None] * [0.3, 0.29, 0.2]), np.zeros(len(names_of(vehicle)))
-    window, span, theta = (
-        Window(0.0, dt, speed, gyro, attitude, accel),
-        (0.0, rows * dt),
-        Layout(vehicle).initial(vehicle),
-    )
+    window, span = Window(0.0, dt, speed, gyro, attitude, accel), (0.0, rows * dt)
+    theta = Layout(vehicle).initial(vehicle)
     request = FitRequest(0, vehicle, (window,), *span, theta, z, None, 0, (span,))
     with suppress(np.linalg.LinAlgError):
         _estimates(request, *_maximum(request, 0.0, *_searched(request)))

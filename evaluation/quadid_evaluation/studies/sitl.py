@@ -11,9 +11,9 @@ X; the frame file is the .sitl.json of that export.  `--keep` names a folder for
 The plan: take off in Guided, hover, then move roll, pitch and yaw sticks in Loiter for `--seconds`, with multisines out
 of step.  The table has first and last set against the truth, and every alarm; nothing changes in that time, so that
 every alarm is false.  With `--changes` a payload is then taken up and dropped and rotors weaken and recover, in hover
-and on the move, and a second table says when each was seen and what it was called (weak rotors only where the vehicle
+and on the move, and a second table lists when each was seen and what it was called (weak rotors only where the vehicle
 file reads pulses: measured speeds fall with them).  Wind is a line of the defaults (SIM_WIND_SPD, SIM_WIND_TURB).
-Without a binary the study says so and does nothing.  `--frame` must be a relative path for ArduPilot: the file is
+Without a binary the study prints that and does nothing.  `--frame` must be a relative path for ArduPilot: the file is
 copied into the folder that the binary runs in.
 """
 
