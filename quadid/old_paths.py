@@ -25,15 +25,15 @@ MOVED = {
     "quadid.flight.setup": "quadid.flight.draw quadid.flight.truth",
     "quadid.flight.outside": "quadid.flight.outside_flight quadid.flight.outside_log",
     "quadid.flight.pilot": "quadid.flight.profiles quadid.flight.stabiliser",
-    "quadid.flight.fly": "quadid.flight.record quadid.flight.march quadid.flight.stepped",
+    "quadid.flight.fly": "quadid.flight.record quadid.flight.march",
     "quadid.data.grid": "quadid.grid quadid.resampling_plan quadid.resample",
     "quadid.condition.changes": "quadid.health.hypotheses",
     "quadid.condition.trim": "quadid.health.spread",
     "quadid.checks.frames": "quadid.inspection.conventions",
-    "quadid.checks.motion": "quadid.inspection.airborne quadid.inspection.timing quadid.checks.turns",
-    "quadid.checks.rotors": "quadid.inspection.geometry quadid.inspection.motor_checks "
-    "quadid.inspection.rotor_checks quadid.inspection.rotor_timing",
-    "quadid.checks.findings": "quadid.inspection.outlook quadid.checks.doubts",
+    "quadid.checks.motion": "quadid.inspection.airborne quadid.inspection.timing",
+    "quadid.checks.rotors": "quadid.inspection.geometry quadid.inspection.motor_checks quadid.inspection.rotor_checks "
+    "quadid.inspection.rotor_timing",
+    "quadid.checks.findings": "quadid.inspection.outlook",
     "quadid.model.rollout": "quadid.model.packing",
     "quadid.model.rotor_kernel": "quadid.model.lag_kernel",
     "quadid.model.kernel": "quadid.model.needs_kernel",
@@ -60,9 +60,9 @@ MOVED = {
     "quadid.identification.gauss_newton": "quadid.identify.box_qp",
     "quadid.identification.noise": "quadid.identify.noise_model",
     "quadid.identification.uncertainty": "quadid.identify.covariance quadid.identify.composite_likelihood "
-    "quadid.identification.reliability quadid.identify.optimal_input quadid.identification.excitation",
+    "quadid.identify.optimal_input quadid.identification.excitation",
     "quadid.identification.predict": "quadid.identify.open_loop quadid.identify.prediction "
-    "quadid.identify.prediction_floor quadid.identification.forecast",
+    "quadid.identify.prediction_floor",
     "quadid_evaluation.optimisers.box": "quadid.identify.shooting_objective",
     "quadid_evaluation.paper.subspace": "quadid_evaluation.paper.hankel quadid_evaluation.paper.order "
     "quadid_evaluation.paper.state_space",
@@ -108,20 +108,15 @@ MOVED = {
     "quadid.app.excite": "quadid_cli.excite",
     "quadid.app.init": "quadid_replay.vehicle_from_log",
     "quadid.cli.demo": "quadid.app.demo quadid.cli.reproduce",
-    "quadid.identification.fit": "quadid.identify.global_search quadid.identification.search "
-    "quadid.identify.noise_spectrum quadid.identify.noise_estimation quadid.identification.noise_fit",
+    "quadid.identification.fit": "quadid.identify.global_search quadid.identify.noise_spectrum "
+    "quadid.identify.noise_estimation",
     "quadid_evaluation.paper.objective": "quadid.identification.paper_objective",
     "quadid.identification.result": "quadid.identification.score",
-    "quadid.diagnosis.pipeline": "quadid.diagnosis.innovations",
     "quadid.report.figures": "quadid.report.residual_maps",
     "quadid.flight.airframe": "quadid.flight.jit quadid.flight.rotors",
     "quadid.flight.loop": "quadid.flight.sensors",
     "quadid.online.gate": "quadid.online.active_set",
     "quadid.cli.serve": "quadid.cli.worker quadid.cli.watch",
-    "quadid.model.simd": "quadid.model.work_array",
-    "quadid.files": "quadid.working_folder",
-    "quadid.app.score": "quadid.app.compare_vehicles",
-    "quadid.cli.main": "quadid.cli.loading",
 }
 """Old modules of each new one."""
 _NEW = {old: new for new, olds in MOVED.items() for old in olds.split()}

@@ -7,6 +7,9 @@ replaces what these said, and takes out those that failed, and those whose test 
 """
 
 import json
+import re
+import sys
+import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
@@ -20,6 +23,14 @@ from tests.faults.fault_list import FAULTS
 Happened = Callable[[int, str], None]
 
 _KEY = "fault"
+_FOLDERS = (
+    Path(__file__).resolve().parents[2],
+    Path(sys.prefix),
+    Path.home(),
+    Path(tempfile.gettempdir()) / "pytest-of-",
+)
+_HERE = re.compile(f"(?:{'|'.join(re.escape(str(folder)) for folder in _FOLDERS)})(?:[^\\s'\":,;]*/)?")
+"""Where files lie on this machine: the page, which is in the repository, names them without."""
 
 
 class Evidence(NamedTuple):
@@ -40,7 +51,7 @@ def happened(request: pytest.FixtureRequest) -> Happened:
             raise ValueError(
                 f"no row {row} among the faults {min(FAULTS)}..{max(FAULTS)} of tests/faults/fault_list.py"
             )
-        request.node.user_properties.append((_KEY, [row, " ".join(text.split())]))
+        request.node.user_properties.append((_KEY, [row, _HERE.sub("", " ".join(text.split()))]))
 
     return say
 

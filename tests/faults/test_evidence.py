@@ -11,9 +11,12 @@ from tests.faults.fault_list import FAULTS
 TESTS = """
 from tests.faults.evidence import Collector, happened
 from pathlib import Path
+import sys
 import pytest
 
-def test_green(happened): happened(1, "cut at | 300 places\\n of <b>")
+def test_green(happened, tmp_path):
+    happened(1, "cut at | 300 places\\n of <b>")
+    happened(1, f"'{sys.executable}: {tmp_path / 'out' / 'f.csv'}' in /tmp")
 def test_red(happened):
     happened(2, "never true"); assert False
 def test_absent(happened):
@@ -42,7 +45,7 @@ def test_only_what_a_passed_test_said_gets_into_the_page(tmp_path: Path, reposit
     text = (tmp_path / "page.md").read_text()
     account = json.loads((tmp_path / "page.json").read_text())
     said = {text for _, text, _, _ in account}
-    assert {"cut at | 300 places of <b>", "not run now"} <= said
+    assert {"cut at | 300 places of <b>", f"'{Path(sys.executable).name}: f.csv' in /tmp", "not run now"} <= said
     assert not said & {"never true", "never seen", "renamed since"}
     assert "of an earlier run" not in (tmp_path / "page.json").read_text()
     assert {t for _, _, t, _ in account} == {
