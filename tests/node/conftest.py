@@ -16,11 +16,10 @@ HERE = Path(__file__).resolve().parent
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Marks those that need ROS; each of their waits has a limit of its own."""
+    """Marks those that need ROS."""
     for item in items:
         if HERE in item.path.parents and item.path.stem.startswith("test_ros"):
             item.add_marker(pytest.mark.ros)
-            item.add_marker(pytest.mark.timeout(900))
 
 
 @pytest.fixture(scope="session", autouse=True)

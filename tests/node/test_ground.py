@@ -39,7 +39,8 @@ from quadid.vehicle import Vehicle
 from quadid_node import zenoh as ground
 from tests.commands import QUADID
 from tests.faults.evidence import Happened
-from tests.node.zenoh_net import Net, accepted, free_port, service, until
+from tests.node.peers import LIMIT, until
+from tests.node.zenoh_net import Net, accepted, free_port, service
 from tests.online.driving import flight, samples
 
 PELICAN = Vehicle.shipped("pelican")
@@ -71,7 +72,7 @@ def router(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     yield where
     assert process.stdin is not None
     process.stdin.close()
-    process.wait(10)
+    process.wait(LIMIT)
 
 
 Start = Callable[[], "subprocess.Popen[str]"]
@@ -92,7 +93,7 @@ def ground_machine(router: str) -> Iterator[Start]:
     yield start
     for process in started:
         process.kill()
-        process.wait(10)
+        process.wait(LIMIT)
 
 
 @pytest.fixture
@@ -135,7 +136,7 @@ def same(a: FitReply, b: FitReply) -> bool:
 def test_a_ground_machine_fits_and_what_it_leaves_is_fitted_on_board(
     worker: RemoteWorker, ground_machine: Start, request_: FitRequest, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(ground, "FAR_LIMIT", 60.0)  # however busy this machine is
+    monkeypatch.setattr(ground, "FAR_LIMIT", LIMIT)  # however busy this machine is
     inline = InlineWorker()
     inline.submit(request_)
     (here,) = inline.poll()
@@ -179,10 +180,10 @@ def test_a_ground_machine_ends_in_peace_and_refuses_what_is_no_request(router: s
     config.insert_json5("connect/endpoints", f'["{router}"]')
     with zenoh.open(config) as session:
         for payload in (b"", b"junk", pickle.dumps(PELICAN), pickle.dumps(builtins.eval)):
-            (reply,) = session.get("quadid/quad1/work/fit", payload=payload, timeout=60.0)
+            (reply,) = session.get("quadid/quad1/work/fit", payload=payload, timeout=LIMIT)
             assert reply.ok is None
     machine.send_signal(signal.SIGTERM)
-    out, _ = machine.communicate(timeout=900)
+    out, _ = machine.communicate(timeout=LIMIT)
     assert machine.returncode == 0
     assert "4 refused" in out
 
@@ -203,7 +204,7 @@ def secure_ground(net: Net) -> Iterator[None]:
     assert until(lambda: any("ready" in text for text in told)), told
     yield
     stop.set()
-    thread.join(120)
+    thread.join(LIMIT)
 
 
 @pytest.mark.usefixtures("secure_ground")
@@ -222,8 +223,8 @@ def test_through_mutual_tls_only_the_ground_machine_fits(net: Net, request_: Fit
     try:
         assert until(lambda: ground.there)
         for _ in range(3):
-            ground.ask(request_, answers, 100.0)
-            number, data = answers.get(timeout=150.0)
+            ground.ask(request_, answers, LIMIT)
+            number, data = answers.get(timeout=LIMIT)
             assert isinstance(data, bytes)
             far = unpack(data)
             assert isinstance(far, FitReply)
@@ -248,15 +249,17 @@ def test_the_ground_machine_sees_and_sends_windows_and_fits_only(net: Net) -> No
     link, fleet = ZenohLink(net.client("quad1"), "quad1", service()), FleetView(net.client("watch"))
     try:
         assert until(lambda: fleet.alive.get("quad1", False))
-        time.sleep(0.3)
-        ground.put("quadid/quad1/health", b'{"sequence": 666}')
-        link.publish(accepted(1))
-        assert until(lambda: "parameters" in fleet.latest.get("quad1", {}))
+
+        def speak() -> None:
+            ground.put("quadid/quad1/health", b'{"sequence": 666}')
+            link.publish(accepted(1))
+
+        assert until(lambda: "parameters" in fleet.latest.get("quad1", {}), speak)
         time.sleep(0.3)
         assert "health" not in fleet.latest["quad1"]
         for key in ("quadid/quad1/command/rollback", "quadid/quad1/parameters"):
             assert [reply for reply in ground.get(key, timeout=1.0) if reply.ok is not None] == []
-        assert heard in ([], [b'{"sequence": 666}']), "at most its own, from its own session"
+        assert set(heard) <= {b'{"sequence": 666}'}, "at most its own, from its own session"
     finally:
         spy.undeclare()  # type: ignore[no-untyped-call]
         ground.close()  # type: ignore[no-untyped-call]

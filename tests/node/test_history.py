@@ -31,6 +31,7 @@ from quadid.online.records import Event, OnlineDiagnosis, OnlineFinding, OnlineS
 from quadid.vehicle import Vehicle
 from quadid_node import history as storing
 from tests.faults.evidence import Happened
+from tests.node.peers import until
 from tests.online.driving import flight, samples
 from tests.online.made_up import QUICK, between, light_flight, tells, works
 from tests.online.test_gate import TRUE, online_set
@@ -67,13 +68,6 @@ def another_process(path: Path, vehicle: str = "pelican") -> str:
     told.write(f"{path}\t{vehicle}\n")
     told.flush()
     return heard.readline().strip()
-
-
-def until(done: Callable[[], object], seconds: float = 60.0) -> bool:
-    deadline = time.monotonic() + seconds
-    while not done() and time.monotonic() < deadline:
-        time.sleep(0.02)
-    return bool(done())
 
 
 def in_force(sequence: int) -> OnlineSet:
@@ -142,11 +136,11 @@ def test_every_set_stands_with_the_run_that_numbered_it(tmp_path: Path) -> None:
     """Also where a file that was lost is begun anew with the sets of earlier runs."""
     path = tmp_path / "h.sqlite"
     first = filled(path, sets=1)
-    first.close()
+    first.close(60.0)
     second = Store(path, "pelican")
     assert second.restore().item is not None
     second.numbered(replace(online_set(TRUE), sequence=9, approved_by="auto"))
-    second.close()
+    second.close(60.0)
     assert second.boot_id != first.boot_id
     told = [(s["sequence"], s["boot_id"]) for s in read_history(path, "pelican")["sets"]]
     assert told == [(1, first.boot_id), (9, second.boot_id)]
@@ -191,7 +185,7 @@ def test_the_baseline_is_the_last_set_a_person_approved(tmp_path: Path) -> None:
     store.close(60.0)
     again = Store(tmp_path / "h.sqlite", "pelican")
     baseline = again.restore().baseline
-    again.close()
+    again.close(60.0)
     assert baseline is not None
     assert baseline.sequence == 3
 
@@ -204,7 +198,7 @@ def test_old_candidates_are_forgotten_sets_never(tmp_path: Path, monkeypatch: py
     for k in range(30):
         again.event(Event(float(k), "info", "test", "x"))
         time.sleep(0.005)
-    again.close()
+    again.close(60.0)
     found = read_history(tmp_path / "h.sqlite", "pelican", candidates=1000, events=1000)
     assert len(found["sets"]) == 40
     assert len(found["candidates"]) <= 10
@@ -257,10 +251,10 @@ def test_a_file_that_another_service_put_there_is_not_written(tmp_path: Path) ->
     other.replace(path)
     ours.event(Event(1.0, "info", "x", "second"))
     assert until(lambda: "another service" in ours.problem)
-    theirs.close()
+    theirs.close(60.0)
     assert ours.flush(30.0)
     assert lines(path) == ["theirs", "second"]
-    ours.close()
+    ours.close(60.0)
 
 
 def test_services_of_several_vehicles_share_a_file_by_one_name_only(tmp_path: Path, happened: Happened) -> None:
@@ -308,7 +302,7 @@ def test_a_first_start_and_another_vehicles_sets_are_nothing_unread(tmp_path: Pa
     assert store.restore().approval == ""
     other = Store(path, "hexacopter")
     other.numbered(replace(online_set(TRUE), sequence=1, approved_by="auto"))
-    other.close()
+    other.close(60.0)
     assert "another service" in another_process(path), "the end of the other one's lock must not end this one's"
     store.close(60.0)
 
@@ -318,7 +312,7 @@ def test_a_history_of_a_newer_version_is_refused_and_not_touched(
     tmp_path: Path, change: str, happened: Happened
 ) -> None:
     path = tmp_path / "h.sqlite"
-    Store(path, "pelican").close()
+    Store(path, "pelican").close(60.0)
     with closing(sqlite3.connect(path)) as db, db:
         db.execute(change)
         db.execute(f"PRAGMA user_version = {VERSION + 1}")
@@ -637,7 +631,7 @@ def test_damage_while_running_sets_the_file_aside_and_the_new_one_has_the_set_in
     store.close(60.0)
     again = Store(path, "pelican")
     restored = again.restore()
-    again.close()
+    again.close(60.0)
     assert restored.item is not None
     assert (restored.item.sequence, restored.item.state) == (40, SetState.ACCEPTED)
     what = "new file" if damage == "removed" else "set aside whole, said"

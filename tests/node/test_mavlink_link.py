@@ -53,7 +53,7 @@ def test_the_first_autopilot_is_the_vehicle_and_is_asked_for_messages(link: Mavl
     gyro = [s for s in got if s.channel == "gyro"]
     assert len(gyro) == 20
     assert [s.values[0] for s in gyro] == pytest.approx([0.1] * 20)
-    assert abs(gyro[0].t - time.time()) < 60.0, "absolute, not since boot"
+    assert abs(gyro[0].t - time.time()) < 3600.0, "absolute, not since boot"
     assert gyro[-1].t - gyro[0].t == pytest.approx(0.19, abs=1e-5)
     heard = vehicle.heard()
     asked = {int(m.param1) for m in heard if m.get_type() == "COMMAND_LONG" and m.command == 511}

@@ -21,6 +21,7 @@ from quadid.online.records import Event, OnlineSet, Publish
 from quadid.vehicle import Vehicle
 from tests.faults.evidence import Happened
 from tests.node.killed_services import Services
+from tests.node.peers import LIMIT
 from tests.online.test_gate import TRUE, online_set
 
 # --- On the disk before on the wire: what was published has its row, and its number is never given again
@@ -70,7 +71,7 @@ def accept(service: Service, **changes: float) -> OnlineSet:
 
 def said(service: Service, *wanted: Callable[[Output], bool]) -> list[Output]:
     """Outputs of a service until each `wanted` output has come; without any, in one step."""
-    out, deadline = service.step(), time.monotonic() + 120.0
+    out, deadline = service.step(), time.monotonic() + LIMIT
     while not all(any(map(one, out)) for one in wanted):
         assert time.monotonic() < deadline, out
         time.sleep(0.01)
@@ -213,7 +214,7 @@ def test_a_rollback_is_never_on_the_disk_without_the_mode_that_it_sets(tmp_path:
                 assert not row.insert(db)
         again = Store(path, "pelican")
         restored = again.restore()
-        again.close()
+        again.close(60.0)
         seen.add((restored.item is not None and restored.item.state is SetState.ROLLED_BACK, restored.approval))
     assert (True, "manual") in seen
     assert (True, "") not in seen
@@ -273,7 +274,7 @@ def test_while_the_disk_takes_nothing_candidates_are_forgotten_before_sets_and_d
     service.close()
     again = Store(tmp_path / "h.sqlite", "pelican")
     assert again.restore().approval == "manual"
-    again.close()
+    again.close(60.0)
     happened(23, f"{many} candidates while the disk is full: the set and the decision before them are kept")
 
 
@@ -347,7 +348,7 @@ def test_a_history_held_at_the_start_is_refused(
     import quadid_node.history as files
 
     path = tmp_path / "h.sqlite"
-    Store(path, "pelican").close()
+    Store(path, "pelican").close(60.0)
     monkeypatch.setattr(files, "BUSY_SECONDS", 0.3)
     holder = sqlite3.connect(path)
     holder.execute("PRAGMA journal_mode = DELETE")
@@ -356,7 +357,7 @@ def test_a_history_held_at_the_start_is_refused(
         Store(path, "pelican")
     holder.rollback()
     holder.close()
-    Store(path, "pelican").close()
+    Store(path, "pelican").close(60.0)
     happened(25, "history held exclusively at the start: waited for, then refused with the fix; no number is given")
 
 

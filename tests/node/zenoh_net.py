@@ -3,8 +3,6 @@
 import socket
 import subprocess
 import sys
-import time
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,6 +12,7 @@ from quadid_node.worker import InlineWorker
 from quadid.online import SessionSettings
 from quadid.online.records import Publish
 from quadid.vehicle import Vehicle
+from tests.node.peers import LIMIT
 from tests.online.test_gate import TRUE, online_set
 
 PELICAN = Vehicle.shipped("pelican")
@@ -24,14 +23,6 @@ def free_port() -> int:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
-
-
-def until(done: Callable[[], object], seconds: float = 120.0) -> bool:
-    """Waits until something is true; a busy machine may take its time."""
-    deadline = time.monotonic() + seconds
-    while not done() and time.monotonic() < deadline:
-        time.sleep(0.02)
-    return bool(done())
 
 
 class Net:
@@ -68,7 +59,7 @@ class Net:
         """Ends the router."""
         assert self.process.stdin is not None
         self.process.stdin.close()
-        self.process.wait(10)
+        self.process.wait(LIMIT)
 
 
 def service() -> Service:
