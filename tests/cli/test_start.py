@@ -114,7 +114,8 @@ def test_settings_of_numba_that_lie_in_the_folder_are_refused(
     assert done.returncode == 2
     assert ".numba_config.yaml in this folder" in done.stderr
     assert done.stderr.count("\n") == 1
-    happened(34, f"a .numba_config.yaml in the folder we stand in, {Path(command[-2]).name}: '{done.stderr.strip()[:80]}'")
+    program = Path(command[-2]).name
+    happened(34, f"a .numba_config.yaml in the folder we stand in, {program}: '{done.stderr.strip()[:80]}'")
 
 
 def test_modules_that_lie_in_the_folder_are_not_imported(tmp_path: Path, happened: Happened) -> None:
