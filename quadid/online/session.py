@@ -179,11 +179,8 @@ class Session:
             self._diagnosis.deliver(reply)
 
     def go_on(self) -> None:
-        """Waits no longer for a fit, whose reply is taken when it comes; what a change was is told here if it lags."""
-        if isinstance(self._waiting, FitRequest):
-            self._overdue = True
-        elif isinstance(self._waiting, ChangeRequest) and self._reply is None and self.backlog > self._patience:
-            self._reply = self._waiting.answer()  # a few hundredths of a second
+        """Waits no longer for a fit, whose reply is taken when it comes."""
+        self._overdue |= isinstance(self._waiting, FitRequest)
 
     def approve(self, by: str, sequence: int | None = None) -> Answer:
         """A person approves the set that waits."""

@@ -16,8 +16,9 @@ from pydantic import ValidationError
 from quadid.data.window import Block
 from quadid.errors import QuadidError, nearest
 from quadid.online import GateSettings, Job, Session, SessionSettings
+from quadid.online.change_job import ChangeRequest
 from quadid.online.gate import Answer
-from quadid.online.records import Action, Event, OnlineSet, Publish
+from quadid.online.records import Action, Event, JobReply, OnlineSet, Publish
 from quadid.vehicle import Vehicle
 from quadid_node.history import UNREADABLE, Restored, Store, StoreError, read_history
 from quadid_node.messages import BEHIND, Feed, Message, Output, ServiceHealth, lag, parameter_set, set_from_dict
@@ -190,11 +191,14 @@ class Service:
         return self._journalled([*outputs, *self._lag()])
 
     def _carried_out(self, actions: list[Action]) -> list[Output]:
-        """Gives requests to the workers; returns the rest."""
+        """Answers questions about changes, gives other requests to the workers; returns the rest."""
         outputs: list[Output] = []
         for action in actions:
             if not isinstance(action, Job):
                 outputs.append(action)
+                continue
+            if isinstance(action, ChangeRequest):  # less work than its wait for a fit that runs
+                outputs += self._delivered(action.run(), action)
                 continue
             self._jobs[action.background] = action
             if action.background:
@@ -224,15 +228,20 @@ class Service:
             if self.session.running is not None and item.number == self.session.running.number:
                 self._fit_seconds = self._clock() - self._fit_began
             job = next((job for job in self._jobs.values() if job.number == item.number), None)
-            if item.is_unexpected and job is not None:
-                kept = keep(self._store.path, job) if self._store is not None else "without a history nothing is kept"
-                outputs.append(self._event("error", "worker", f"{item.problem}; {kept}"))
-            self.session.deliver(item)
+            outputs += self._delivered(item, job)
         if self._store is not None and self._store.problem != self._problem:
             self._problem = self._store.problem
             level = "error" if self._problem else "info"
             outputs.append(self._event(level, "history", self._problem or "the history is written again"))
         return outputs
+
+    def _delivered(self, reply: JobReply, job: Job | None) -> list[Event]:
+        """Hands a reply to the session; keeps the input of a job that failed by an error of this program."""
+        self.session.deliver(reply)
+        if not reply.is_unexpected or job is None:
+            return []
+        kept = keep(self._store.path, job) if self._store is not None else "without a history nothing is kept"
+        return [self._event("error", "worker", f"{reply.problem}; {kept}")]
 
     def _lag(self) -> list[Event]:
         """Reports a live session that falls behind its data, and that it has caught up."""
