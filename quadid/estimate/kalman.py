@@ -15,7 +15,7 @@ One step:
     a(t + h) = exp(-h / T) a(t) + w,  w ~ N(0, sigma^2 (1 - exp(-2 h / T))),  for a of f, alpha, e            (4)
     P <- F P F' + G Q G'                                                                                      (5)
 where Q holds, beside the w, the noise of logged rotor speeds, which acts as forces and moments that change with every
-sample;
+sample, and is in the thrust that the accelerometer is compared with (r);
 and for every scalar measurement y = h(x) + N(0, r):
     S = H P H' + r,  K = P H' / S,  x <- x + K nu,  P <- P - K S K'                                           (6)
 backwards (Bryson & Frazier; de Jong 1989; no inverse of P, which random forces of size zero leave singular):
@@ -744,12 +744,24 @@ def _is_measured(track: Track, k: int, channel: int) -> bool:
 
 
 @_piece
-def _white(track: Track, psi: FloatArray, k: int, channel: int) -> float:
-    """Variance r of a scalar measurement."""
+def _white(track: Track, psi: FloatArray, row: FloatArray, k: int, channel: int) -> float:
+    """Variance r of a scalar measurement, with that of the thrust which it is compared with."""
     if channel >= VELOCITY and not track.seen[k, 3]:
         h = track.t[k] - track.t[k - 1] if k > 0 else STILL_TIME
         return float(track.still * track.still * 2.0 * STILL_TIME / h)
-    return float(psi[channel] * psi[channel])
+    own = psi[channel] * psi[channel]
+    return float(own + psi[ROTOR] ** 2 * _felt(track, row) if channel == ACCEL + 2 else own)
+
+
+@_piece
+def _felt(track: Track, row: FloatArray) -> float:
+    """Variance of the mean specific thrust while the accelerometer reads, by rotor speeds of noise 1 rad/s.
+
+    A sample acts for `period`, which may begin at any time within that of a reading.
+    """
+    share = 2.0 * track.half / track.period
+    kept = 1.0 - share / 3.0 if share < 1.0 else (1.0 - 1.0 / (3.0 * share)) / share
+    return float(4.0 * row[2 * MOMENTS] * kept * track.waver[0])
 
 
 @_piece
@@ -811,7 +823,7 @@ def _update(track, psi, tail, k, nu, slope, P, PH, gain, where, what, dx, store,
         if not _is_measured(track, k, m):
             continue
         axis, count = m % 3, _places(m, slope, where, what)
-        v, S = nu[m], _white(track, psi, k, m)
+        v, S = nu[m], _white(track, psi, g.table[k], k, m)
         for i in range(N):
             PH[axis, i] = 0.0
         for j in range(count):
@@ -1021,7 +1033,8 @@ def backward(
 
     Returns:
         Derivative of -2 ln L by the noise numbers, shape (N_NOISE,); smoothed f, alpha, e, shape (n, 9), and their
-        variances, shape (n, 9); sum of G' N G Q over each rotor noise of `_wavering`, shape (4,).
+        variances, shape (n, 9); sum of G' N G Q over each rotor noise of `_wavering`, and of D r over that which the
+        accelerometer is compared with, shape (4,).
     """
     n = len(track.t)
     air = _in_air(track)
@@ -1105,6 +1118,10 @@ def backward(
                 D += K[i] * NK[i]
             if m < VELOCITY or track.seen[k, 3]:
                 score[m] -= (u * u - D) / g.w[k, m] * 2.0 * psi[m]
+            if m == ACCEL + 2:
+                felt = _felt(track, g.table[k])
+                score[ROTOR] -= (u * u - D) / g.w[k, m] * 2.0 * psi[ROTOR] * felt
+                borrowed[0] += D * psi[ROTOR] ** 2 * felt
             for a in range(count):
                 l[where[a]] += what[a] * u
                 for b in range(N):

@@ -59,8 +59,6 @@ AFTER_CHANGE = 3.0
 """Data that a change is explained from [s]."""
 ASK_FLYING = 2.2
 """Flight judged before a change is looked for [s]."""
-CONFIRMED = 2
-"""Windows without a common sample that must agree before moments are judged."""
 SURE = 0.95
 """Probability from which a cause is named with confidence."""
 PULL = "steady_pull"
@@ -470,9 +468,7 @@ class ChangeWatch:
         if quality.carried:
             return None
         inertia = np.array([estimator.value(n) for n in ("J_xx", "J_yy", "J_zz")])
-        # One window may have moved too little for its own interval to be right: another has to say the same.
-        known = estimator.learned and estimator.fusion.agreement(CONFIRMED)[0] == CONFIRMED
-        doubt = np.hypot(DRIFT, estimator.torque_sigma) if known else None
+        doubt = np.hypot(DRIFT, estimator.torque_sigma) if estimator.confirmed else None
         step = self._detector.look(estimator.value("b"), inertia, doubt)
         if step is not None:
             self._since = self._detector.since

@@ -55,6 +55,8 @@ SCATTER_PRIOR = 30.0
 """Degrees of freedom with which stretches are believed to scatter as they claim."""
 KEPT = 600
 """Sums kept for agreement and held-out gain."""
+CONFIRMED = 2
+"""Windows without a common sample that must agree before a change is judged by what they say."""
 POOLED = 24
 """The newest of so many measured noises counts fully."""
 _YAW = [NOMINAL_NAMES.index(n) for n in ("d", "J_zz", "J_r")]
@@ -392,6 +394,11 @@ class Estimator:
     def learned(self) -> bool:
         """True if `theta` rests on data of this flight."""
         return self.fusion.newest is not None
+
+    @property
+    def confirmed(self) -> bool:
+        """True if windows agree: one may have moved too little for its own interval to be right."""
+        return self.learned and self.fusion.agreement(CONFIRMED)[0] == CONFIRMED
 
     @property
     def thrust(self) -> ThrustModel:

@@ -463,9 +463,14 @@ class Session:
             # It is left out; when one without a common sample disagrees too, the vehicle has changed.
             since = self._disagrees_since = min(self._disagrees_since, request.stop)
             outbox.state(Phase.CANDIDATE, "the newest window disagrees with what was known: held back")
-            if request.start >= since - _EPS:
-                text = "windows disagree with the earlier estimate for the length of a window: learning restarts"
-                self._has_changed((since, request.stop), "change", text, "disagreement", request.start)
+            if request.start < since - _EPS:
+                return
+            text = "windows disagree with the earlier estimate for the length of a window"
+            if estimator.confirmed:
+                span = since, request.stop
+                self._has_changed(span, "change", f"{text}: learning restarts", "disagreement", request.start)
+            else:  # what nothing had confirmed was wrong itself
+                self._relearn(request.start, text)
             return
         self._disagrees_since = math.inf
         estimator.take(request, reply)

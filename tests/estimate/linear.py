@@ -72,6 +72,18 @@ def matrices() -> tuple[FloatArray, FloatArray, FloatArray]:
     return F, G @ np.diag(sigma**2 * (1.0 - keep**2)) @ G.T + act @ act.T, H
 
 
+def white() -> FloatArray:
+    """Variances of the measurements, shape (12,): the accelerometer is compared with a thrust by noisy rotor speeds.
+
+    They are means over its time, as long as a sample acts, of two samples: of 1/4 + 1/4 to 1 of their variance.
+    """
+    out = NOISE[: k.M] ** 2
+    out[k.ACCEL + 2] += (
+        4.0 * 2.0 / 3.0 * (2.0 * PELICAN.hover_speed() * NOISE[k.ROTOR] * PELICAN.initial[0] / PELICAN.mass) ** 2
+    )
+    return out
+
+
 def measured(track: Track) -> tuple[FloatArray, FloatArray]:
     """Measurements as deviations from hover, shape (n, 12), and whether there are any."""
     y = np.column_stack(
@@ -98,7 +110,7 @@ def dense_filter(track: Track) -> tuple[float, FloatArray]:
     total, means = 0.0, []
     for now, there in zip(y, seen, strict=True):
         h = H[there]
-        S = h @ P @ h.T + np.diag(NOISE[: k.M][there] ** 2)
+        S = h @ P @ h.T + np.diag(white()[there])
         nu = now[there] - h @ x
         total += float(nu @ np.linalg.solve(S, nu) + np.linalg.slogdet(S)[1])
         K = P @ h.T @ np.linalg.inv(S)
@@ -127,7 +139,7 @@ def batch(track: Track) -> tuple[FloatArray, FloatArray]:
             prior[i * k.N : (i + 1) * k.N, j * k.N : (j + 1) * k.N] = column.T
             column = F @ column
     A = np.kron(np.eye(n), H)[seen.ravel()]
-    S = A @ prior @ A.T + np.diag(np.tile(NOISE[: k.M] ** 2, n)[seen.ravel()])
+    S = A @ prior @ A.T + np.diag(np.tile(white(), n)[seen.ravel()])
     m = np.concatenate(mean)
     K = np.linalg.solve(S, A @ prior).T
     return (m + K @ (y.ravel()[seen.ravel()] - A @ m)).reshape(n, k.N), np.diag(prior - K @ A @ prior).reshape(n, k.N)

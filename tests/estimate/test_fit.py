@@ -14,6 +14,7 @@ from quadid.estimate.missing import Vehicles, removed, size, smoothed
 from quadid.estimate.problem import Problem
 from quadid.estimate.track import from_window
 from quadid.flight import TruthParameters, draw_truth, fly
+from quadid.flight.loop import SensorNoise
 from quadid.model.layout import Layout
 from quadid.parameters import NOMINAL_NAMES
 from quadid.vehicle import ParameterPrior, Vehicle
@@ -98,6 +99,20 @@ def test_noisy_rotor_speeds_leave_the_inertias_alone(speed: float) -> None:
         assert sigma < 0.03
     if speed:
         assert found.psi[k.ROTOR] == pytest.approx(speed * PELICAN.hover_speed(), rel=0.15)
+
+
+def test_noisy_rotor_speeds_make_no_thrust_curve() -> None:
+    """Where thrust hardly varies, that noise took 7 % off its slope: the accelerometer is compared with it too."""
+    quiet = SensorNoise(0.002, 0.002, 1e-4, 1e-4, gyro_shake=0.0, accel_shake=0.0, velocity=0.002)
+    window = fly(PELICAN, None, 40.0, 1, "roll_pitch", noise=quiet, extras=("velocity",)).window
+    noise = 0.4 * np.random.default_rng(0).standard_normal(window.rotor_speed.shape)  # [rad/s]
+    noisy = replace(window, rotor_speed=window.rotor_speed + noise)
+    found = estimate(Problem.of([from_window(noisy, PELICAN)], PELICAN, ("thrust_curve.dead_speed",), [noisy]))
+    value, sigma = found.value("thrust_curve.dead_speed")
+    assert abs(value) < 2.0 * sigma
+    assert sigma < 1.0  # of 370 rad/s
+    inertia, share = found.value("J_xx")
+    assert abs(np.log(inertia / TruthParameters.of(PELICAN).as_dict()["J_xx"])) < 3.0 * share
 
 
 HIDDEN = {"cg_offset": {"x": 0.01, "y": 0.0}, "rotor_drag": {"k_x": 0.4, "k_y": 0.4}}

@@ -12,7 +12,7 @@ import pytest
 
 from quadid.data.window import Block
 from quadid.online import FitReply, FitRequest, GateSettings, Phase, Session, SessionSettings, SetState
-from quadid.online.records import Action, Publish
+from quadid.online.records import Action, Job, JobReply, Publish
 from quadid.parameters import NOMINAL_NAMES
 from tests.online.driving import EPOCH, events, published
 from tests.online.made_up import PELICAN, answered, between, light_flight, tells, works
@@ -335,3 +335,18 @@ def test_creeping_is_measured_from_the_baseline_of_earlier_runs() -> None:
 
     assert creeping(0.97)[1] is SetState.ACCEPTED
     assert creeping(0.65)[1] is SetState.PENDING, "54 % above what a person last approved"
+
+
+@pytest.mark.parametrize(("until", "alarms"), [(4.0, 0), (18.0, 1)])
+def test_only_what_windows_had_agreed_on_makes_another_estimate_a_change(until: float, alarms: int) -> None:
+    """The first window of a hexacopter held its climb: wrong by itself, it made an alarm of the flight after it."""
+    session = Session(PELICAN, QUICK)
+
+    def work(request: Job) -> JobReply | None:
+        assert isinstance(request, FitRequest)
+        return tells(J_xx=1.5 if request.stop <= until else 1.0)(request)
+
+    actions = works(session, light_flight(30.0), work)
+    assert len(events(actions, "change")) == alarms
+    last = published(actions, "candidate")[-1]
+    assert last.parameters["J_xx"].value == pytest.approx(TRUE["J_xx"], rel=0.01)

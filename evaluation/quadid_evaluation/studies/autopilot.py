@@ -263,7 +263,7 @@ def flown(one: Flown, data: Path, live: bool, seconds: float) -> Outcome:
     recording = open_log(str(data / one.log), "auto", vehicle.columns)
     if one.interval:
         recording = telemetry(recording, one.interval, one.pulses)
-    service = Service(vehicle, session_settings("auto", seed=0), InlineWorker())
+    service = Service(vehicle, session_settings("auto", seed=0), InlineWorker(), live=False)
     outputs = play(service, until(stream(recording), seconds))
     sets: dict[str, list[dict[str, Any]]] = {"parameters": [], "candidate": []}
     for output in outputs:
