@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from quadid.experiment import Proposal
     from quadid.flight import Segment
     from quadid.identification.fit import Fit
+    from quadid.identification.uncertainty import Uncertainty
 
 MOST_SECONDS = 600.0
 _HEIGHTS = "LOWEST:HIGHEST in m above take-off, 2 to 500"
@@ -235,6 +236,20 @@ def knowledge(
     return vehicle, np.diag(1.0 / sigma**2), None
 
 
+def halves_after(found: Uncertainty, before: Uncertainty | None) -> FloatArray:
+    """Relative 95 % half-widths (6,) by a fit of real flights and a simulated one.
+
+    Estimates of the simulated flight differ by what its model holds.  By as much as those of the real ones before it
+    differ, beyond chance, the next real one is off too: it is flown and logged as they were.
+    """
+    from quadid.identification.uncertainty import halfwidths
+
+    beyond = 0.0 if before is None else before.sigma**2 - before.from_noise**2
+    variance = np.maximum(np.diag(found.covariance), found.from_noise**2 + beyond)
+    grown = np.sqrt(variance / np.diag(found.covariance))
+    return halfwidths(np.linalg.inv(found.covariance * np.outer(grown, grown)))
+
+
 def propose(
     logs: Annotated[Given, Typed(list[str] | None, typer.Argument(metavar="LOG"), opened=True)] = (),
     *,
@@ -271,7 +286,6 @@ def propose(
     """
     from quadid.estimate.missing import Vehicles, random_forces
     from quadid.experiment import AsLogged, Limits, TrialFlights, design_manoeuvre, manoeuvre_file
-    from quadid.identification.uncertainty import halfwidths
     from quadid.model.layout import Layout
     from quadid.report.programs import Facts
 
@@ -296,9 +310,9 @@ def propose(
 
         def promised(segments: Sequence[Segment], profile: str = "scripted") -> FloatArray:
             flown = as_logged.windows(segments, proposal.seconds, profile)
-            covariance = search("pso_polish", [*windows, *flown], described, seed, advance).uncertainty.covariance
+            found = search("pso_polish", [*windows, *flown], described, seed, advance).uncertainty
             # What was known stays known, whatever noise the fit of one more flight finds.
-            return np.minimum(proposal.now, halfwidths(np.asarray(np.linalg.inv(covariance), dtype=np.float64)))
+            return np.minimum(proposal.now, halves_after(found, None if before is None else before.uncertainty))
 
         proposal = replace(
             proposal,

@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 import yaml
 
-from quadid.app.excite import made_into_plan, propose
+from quadid.app.excite import halves_after, made_into_plan, propose
 from quadid.errors import ParameterError
 from quadid.flight import Segment, fly
+from quadid.identification.uncertainty import Uncertainty
 from quadid.parameters import NOMINAL_NAMES
 from quadid.vehicle import GRAVITY, Vehicle
 from tests.cli.conftest import Flights
@@ -153,3 +154,16 @@ def test_too_little_time_is_refused(inside: Cli, tmp_path: Path) -> None:
     short = ("excite", "--vehicle", "pelican", "--seconds", "13", "--out", tmp_path)
     # Four sweeps do not fit into so short a time.
     assert "--seconds" in one_line(inside(*short, "--format", "ardupilot-sid"), 2)
+
+
+def test_what_estimates_of_real_flights_differ_by_is_promised_again() -> None:
+    """A simulated flight holds what its model holds: J of a flown log was known a tenth as well as was promised."""
+    sigma = np.full(6, 0.004)
+    simulated = Uncertainty(np.diag(sigma**2), np.ones(6), np.ones(6))
+    steps = np.array([0.0, 0.0, 0.03, 0.0, 0.0, 0.0])
+    real = simulated.differing([steps])
+    widths = halves_after(simulated, real)
+    assert widths[2] == pytest.approx(np.expm1(1.96 * np.hypot(0.004, 0.03)), rel=1e-3)
+    np.testing.assert_allclose(np.delete(widths, 2), np.expm1(1.96 * 0.004), rtol=1e-3)
+    np.testing.assert_allclose(halves_after(simulated, None), np.expm1(1.96 * sigma), rtol=1e-3)
+    np.testing.assert_allclose(halves_after(real, real), widths, rtol=1e-9, err_msg="counted once")
