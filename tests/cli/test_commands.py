@@ -97,4 +97,3 @@ def test_a_result_is_text_json_and_a_page(line: str, inside: Cli, flights: Fligh
     assert (result["schema"], result["report"]) == (schema, str(page))
     html = page.read_text(encoding="utf-8")
     assert all(text in html for text in (*shown, f"quadid {words[0]}"))
-    assert inside(*words, "--out", tmp_path, "--json", "-").data["schema"] == schema

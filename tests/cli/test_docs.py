@@ -310,10 +310,13 @@ def test_commands_of_the_readme_work(
     found = commands(repository / "README.md", "Use")
     assert len(found) == 7
     for arguments in found:
-        run = inside(*arguments)
+        more = ("--json", "found.json", "--report", "why.html") if arguments[0] == "diagnose" else ()
+        run = inside(*arguments, *more)
         assert run.code == 0, (arguments, run.err)
-    for file in ("report.html", "pelican.fitted.yaml", "pelican.params"):
+    for file in ("report.html", "pelican.fitted.yaml", "pelican.params", "why.html"):
         assert (tmp_path / file).is_file()
+    result = json.loads((tmp_path / "found.json").read_text(encoding="utf-8"))
+    assert {"schema", "verdict", "findings", "validation", "unexplained", "vehicle_file"} <= result.keys()
 
 
 def test_vehicles_named_in_the_readme_are_shipped(repository: Path) -> None:

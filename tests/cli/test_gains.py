@@ -1,6 +1,7 @@
 """`quadid gains`: the gains, flown by each autopilot's own law around the truth, keep what was promised."""
 
 import json
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ from quadid_evaluation.studies.gains import LATE, RATE, bandwidth, margins, step
 
 import quadid
 from quadid.app.export import UnprovenError
+from quadid.app.gains import Gains
 from quadid.errors import LogError, ParameterError
 from quadid.flight import TruthParameters
 from quadid.report.autopilots import AUTOPILOTS
@@ -29,11 +31,16 @@ def identified(name: str = "pelican", **more: Any) -> Vehicle:
     return vehicle.model_copy(update=more)
 
 
+@cache
+def proposed(form: str) -> Gains:
+    """Gains of the identified vehicle for an autopilot whose rate loop runs as the studies fly it."""
+    return quadid.gains(identified(), form, current={RATE[form][0]: RATE[form][1]})
+
+
 @pytest.mark.parametrize("form", AUTOPILOTS)
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_the_loop_around_the_truth_is_as_promised(form: str, axis: int) -> None:
-    vehicle = identified()
-    found = quadid.gains(vehicle, form, current={RATE[form][0]: RATE[form][1]})
+    vehicle, found = identified(), proposed(form)
     promised = found.result["axes"][axis]["rate"]
     period, response = step(found, vehicle, TRUTH, LATE, axis)
     assert bandwidth(period, response) == pytest.approx(promised["bandwidth"], rel=0.06)
@@ -45,8 +52,7 @@ def test_the_loop_around_the_truth_is_as_promised(form: str, axis: int) -> None:
 
 @pytest.mark.parametrize("form", AUTOPILOTS)
 def test_margins_hold_over_the_intervals_and_end_where_they_are_said_to(form: str) -> None:
-    vehicle = identified()
-    found = quadid.gains(vehicle, form, current={RATE[form][0]: RATE[form][1]})
+    vehicle, found = identified(), proposed(form)
     promised = found.result["axes"][0]["rate"]
     used = {u["name"]: u["ci95"] for u in found.result["used"]}
     assert promised["phase_margin_least"] >= 54.0
@@ -68,8 +74,7 @@ def test_margins_hold_over_the_intervals_and_end_where_they_are_said_to(form: st
 @pytest.mark.parametrize("form", AUTOPILOTS)
 @pytest.mark.parametrize("loop", ["rate", "attitude"])
 def test_open_loops_that_tones_show_have_the_margins_of_the_promise(form: str, loop: str) -> None:
-    vehicle = identified()
-    found = quadid.gains(vehicle, form, current={RATE[form][0]: RATE[form][1]})
+    vehicle, found = identified(), proposed(form)
     flew = margins(found, vehicle, TRUTH, LATE, loop == "attitude")
     for axis, (phase, gain) in zip(found.result["axes"], flew, strict=True):
         if form == "betaflight" and (axis["axis"], loop) == ("yaw", "attitude"):

@@ -6,7 +6,7 @@ import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -247,7 +247,7 @@ def renamed(flights: Flights, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_columns_are_named_wherever_a_log_is_read(command: str, renamed: Path, inside: Cli, tmp_path: Path) -> None:
-    log = renamed if command == "fleet" else renamed / "a.csv"
+    log = {"fleet": renamed, "excite": f"{renamed / 'a.csv'}@0:12"}.get(command, renamed / "a.csv")
     out = ("--out", tmp_path) if command in ("excite", "fleet") else ()
     call = (command, log, "--vehicle", "pelican", *COMMANDS[command], *out, "--json", "-")
     named = inside(*call, "--columns", "gyro_x=p,gyro_y=q,gyro_z=r")
@@ -319,17 +319,6 @@ def test_a_second_recorder_of_the_same_flight(flights: Flights, tmp_path: Path) 
 # --- A red fit teaches the next one nothing: its values are guesses, and no export takes them unasked
 
 
-@pytest.fixture(scope="module")
-def logs(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """Two flights of a vehicle with a weak rotor and rotor drag."""
-    folder = tmp_path_factory.mktemp("flown")
-    effects = ["weak_rotor:rotor=2,loss=0.1", "motor_lag:tau=0.08"]
-    one, other = (
-        quadid.simulate(seconds=30, seed=seed, effects=effects).save(folder / f"{seed}.csv") for seed in (3, 4)
-    )
-    return one, other
-
-
 def test_a_red_fit_writes_guesses(tmp_path: Path) -> None:
     """The unseen flight drops a payload, which the model of the other one does not expect."""
     train, unseen = (
@@ -382,11 +371,26 @@ def test_what_a_flight_does_not_show_keeps_its_guess(tmp_path: Path) -> None:
         assert "the file keeps its guess" in reason(p)
 
 
-def test_only_an_unseen_flight_makes_it_green(tmp_path: Path) -> None:
-    paths = [quadid.simulate(seconds=25, seed=seed).save(tmp_path / f"{seed}.csv") for seed in (5, 6)]
-    one, other = (quadid.load(path, vehicle="pelican") for path in paths)
-    alone, proven = quadid.identify(one), quadid.identify(one, validate=other)
-    short = quadid.identify(one, validate=quadid.load(f"{paths[1]}@0:5", vehicle="pelican"))
+class Flown(NamedTuple):
+    """Two flights of a Pelican as it is, the fit of the first alone, and its file."""
+
+    one: Path
+    other: Path
+    alone: Identified
+    fitted: Path
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory: pytest.TempPathFactory) -> Flown:
+    folder = tmp_path_factory.mktemp("again")
+    one, other = (quadid.simulate(seconds=25, seed=seed).save(folder / f"{seed}.csv") for seed in (5, 6))
+    alone = quadid.identify(quadid.load(one, vehicle="pelican"))
+    return Flown(one, other, alone, alone.vehicle.save(folder / "fitted.yaml"))
+
+
+def test_only_an_unseen_flight_makes_it_green(flown: Flown) -> None:
+    one, other, early = (quadid.load(log, vehicle="pelican") for log in (flown.one, flown.other, f"{flown.other}@0:5"))
+    alone, proven, short = flown.alone, quadid.identify(one, validate=other), quadid.identify(one, validate=early)
     assert [fit.verdict.level for fit in (alone, short, proven)] == ["fair", "fair", "good"]
     assert "--validate" in alone.verdict.next_steps[0]
     assert alone.vehicle.proof is not None
@@ -400,31 +404,22 @@ def test_only_an_unseen_flight_makes_it_green(tmp_path: Path) -> None:
     assert any("no unseen flight" in line for line in found.verdict.details)
 
 
-@pytest.fixture(scope="module")
-def flown(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, Path]:
-    """Two flights of a Pelican as it is, and the file fitted to the first."""
-    folder = tmp_path_factory.mktemp("again")
-    one, other = (quadid.simulate(seconds=25, seed=seed).save(folder / f"{seed}.csv") for seed in (5, 6))
-    return one, other, quadid.identify(quadid.load(one, vehicle="pelican")).vehicle.save(folder / "fitted.yaml")
-
-
-@pytest.mark.parametrize("part", ["", "@5:20"])
-def test_a_flight_is_not_counted_twice(flown: tuple[Path, Path, Path], part: str, tmp_path: Path) -> None:
-    one, _, fitted = flown
-    copy = shutil.copy(one, tmp_path / "copy.csv")
-    again = quadid.identify(quadid.load(f"{copy}{part}", vehicle=fitted))
+def test_a_flight_is_not_counted_twice(flown: Flown, tmp_path: Path) -> None:
+    """Nor a part of it under another name."""
+    copy, fitted = f"{shutil.copy(flown.one, tmp_path / 'copy.csv')}@5:20", flown.fitted
+    again = quadid.identify(quadid.load(copy, vehicle=fitted))
     assert any("copy.csv (5.csv) already" in warning for warning in again.warnings)
     # What the flight says alone, from the same start: nothing is sharper for having been fitted before.
     bare = Vehicle.from_yaml(fitted.read_text(encoding="utf-8")).model_copy(update={"proof": None})
     guesses = {n: p.model_copy(update={"sigma": None}) for n, p in bare.parameters.items()}
-    alone = quadid.identify(quadid.load(f"{copy}{part}", vehicle=bare.model_copy(update={"parameters": guesses})))
+    alone = quadid.identify(quadid.load(copy, vehicle=bare.model_copy(update={"parameters": guesses})))
     assert again.parameters.values.tolist() == alone.parameters.values.tolist()
     assert [p["ci95"] for p in again.result["parameters"]] == [p["ci95"] for p in alone.result["parameters"]]
     assert all(p.status is Status.IDENTIFIED for p in again.parameters if p.name in ("b", "J_xx", "J_yy"))
 
 
-def test_a_prior_that_decides_is_named(flown: tuple[Path, Path, Path]) -> None:
-    _, other, fitted = flown
+def test_a_prior_that_decides_is_named(flown: Flown) -> None:
+    _, other, _, fitted = flown
     second = quadid.identify(quadid.load(f"{other}@0:12", vehicle=fitted))
     entry = {p["name"]: p for p in second.result["parameters"]}["b"]
     assert entry["status"] == "prior_dominated"
@@ -440,8 +435,8 @@ def test_a_prior_that_decides_is_named(flown: tuple[Path, Path, Path]) -> None:
     assert written["b"] == former.model_copy(update={"sigma": None})
 
 
-def test_a_file_is_not_proven_on_its_own_flight(flown: tuple[Path, Path, Path]) -> None:
-    one, other, fitted = flown
+def test_a_file_is_not_proven_on_its_own_flight(flown: Flown) -> None:
+    one, other, _, fitted = flown
     with pytest.raises(LogError, match="to which this vehicle file was fitted"):
         quadid.identify(quadid.load(other, vehicle=fitted), validate=quadid.load(one, vehicle=fitted))
     scored = quadid.score(quadid.load(one, vehicle=fitted))
@@ -619,8 +614,7 @@ def test_no_value_is_identified_where_the_model_is_wrong_about_its_errors_on_ano
         quadid.simulate(seconds=40, seed=s, effects=e).save(tmp_path / f"{s}.mcap")
         for s, e in ((5, ()), (6, ("mass_change:time=20,fraction=-0.2",)))
     ]
-    alone, beside = quadid.identify(paths[0], vehicle="pelican"), quadid.identify(*paths, vehicle="pelican")
-    assert {p["status"] for p in alone.result["parameters"]} == {"identified"}
+    beside = quadid.identify(*paths, vehicle="pelican")
     assert beside.verdict.level == "poor"
     assert beside.verdict.headline.startswith("Not to be used yet")
     assert {p["status"] for p in beside.result["parameters"]} == {"unreliable"}

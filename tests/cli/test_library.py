@@ -16,6 +16,7 @@ from quadid_replay import write_csv
 import quadid
 from quadid.app.excite import propose
 from quadid.app.health import HealthOutcome
+from quadid.app.identify import Identified
 from quadid.app.init import init
 from quadid.app.logs import settled
 from quadid.condition import assess, flight_trim
@@ -42,6 +43,18 @@ def logs(flights: Flights) -> dict[str, str]:
     return {"good": str(flights.train), "other": str(flights.unseen), "absent": str(flights.train.parent / "no.csv")}
 
 
+@pytest.fixture(scope="module")
+def alone(logs: dict[str, str]) -> Identified:
+    """A fit to one flight, called with its path."""
+    return quadid.identify(logs["good"], vehicle="pelican")
+
+
+@pytest.fixture(scope="module")
+def proven(logs: dict[str, str]) -> Identified:
+    """The same with another flight to validate."""
+    return quadid.identify(load(logs["good"]), validate=load(logs["other"]))
+
+
 def load(path: str, vehicle: str = "pelican") -> Any:
     """A log of the library."""
     return quadid.load(path, vehicle=vehicle)
@@ -57,10 +70,9 @@ PATHS: dict[str, Callable[..., Any]] = {
 """Functions about a log, called with its path."""
 
 
-@pytest.mark.parametrize("name", ["identify", "score"])
-def test_a_path_stands_for_the_loaded_log(name: str, logs: dict[str, str]) -> None:
-    given = PATHS[name](logs["good"], vehicle="pelican")
-    assert same(given.result) == same(PATHS[name](load(logs["good"])).result)
+def test_a_path_stands_for_the_loaded_log(logs: dict[str, str], alone: Identified) -> None:
+    assert same(alone.result) == same(quadid.identify(load(logs["good"])).result)
+    assert same(quadid.score(logs["good"], vehicle="pelican").result) == same(quadid.score(load(logs["good"])).result)
 
 
 @pytest.mark.parametrize("name", PATHS)
@@ -72,8 +84,8 @@ def test_paths_are_refused_alike(name: str, logs: dict[str, str]) -> None:
             PATHS[name](logs["good"])
 
 
-def test_what_a_notebook_needs(logs: dict[str, str], tmp_path: Path) -> None:
-    fit = quadid.identify(load(logs["good"]), validate=load(logs["other"]))
+def test_what_a_notebook_needs(logs: dict[str, str], proven: Identified, tmp_path: Path) -> None:
+    fit = proven
     assert "Thrust coefficient b" in repr(fit)
     assert "<table>" in fit._repr_html_()
     frame = fit.to_frame()
@@ -86,8 +98,8 @@ def test_what_a_notebook_needs(logs: dict[str, str], tmp_path: Path) -> None:
     )
 
 
-def test_drawn_vehicles_have_the_covariance_and_fly(logs: dict[str, str]) -> None:
-    fit = quadid.identify(logs["good"], vehicle="pelican")
+def test_drawn_vehicles_have_the_covariance_and_fly(alone: Identified) -> None:
+    fit = alone
     thetas, floors = fit.sample(4000, seed=3)
     p = fit.parameters
     known = [i for i, name in enumerate(p.names) if name not in floors]
@@ -259,10 +271,9 @@ def test_what_the_command_refuses_the_call_refuses_too(
     assert refused.value.allowed
 
 
-def test_a_printed_fit_says_what_its_values_rest_on(logs: dict[str, str]) -> None:
-    fit = quadid.identify(logs["good"], vehicle="pelican")
-    assert "mass" in fit.opening[0].text
-    assert str(fit).startswith(fit.opening[0].text)
+def test_a_printed_fit_says_what_its_values_rest_on(alone: Identified) -> None:
+    assert "mass" in alone.opening[0].text
+    assert str(alone).startswith(alone.opening[0].text)
 
 
 def test_vehicles_are_drawn_by_the_names_that_were_fitted(tmp_path: Path) -> None:
@@ -286,9 +297,8 @@ def test_vehicles_are_drawn_by_the_names_that_were_fitted(tmp_path: Path) -> Non
     assert "motor_lag" not in floors
 
 
-def test_what_a_fit_leaves_is_a_table_and_arrays(logs: dict[str, str], tmp_path: Path) -> None:
-    xarray = pytest.importorskip("xarray")
-    fit = quadid.identify(load(logs["good"]), validate=load(logs["other"]))
+def test_what_a_fit_leaves_is_a_table_and_arrays(logs: dict[str, str], proven: Identified, tmp_path: Path) -> None:
+    xarray, fit = pytest.importorskip("xarray"), proven
     left = fit.residuals()
     frame, arrays = left.to_frame(), left.to_xarray()
     assert isinstance(arrays, xarray.Dataset)

@@ -144,13 +144,6 @@ def test_tables_name_units(inside: Cli, flights: Flights) -> None:
     assert "\x1b" not in run.out
 
 
-def test_shipped_vehicle_equals_its_file(inside: Cli, flights: Flights, tmp_path: Path) -> None:
-    file = tmp_path / "pelican.yaml"
-    file.write_text(Vehicle.shipped("pelican").to_yaml(), encoding="utf-8")
-    one = inside("score", flights.train, "--vehicle", "pelican", "--json", "-").data
-    assert inside("score", flights.train, "--vehicle", file, "--json", "-").data == one
-
-
 def test_a_quantity_measured_too_seldom_for_the_horizons_is_said(flights: Flights, tmp_path: Path) -> None:
     flown = flights.unseen_flight.recording
     known = flown.channels["velocity"]

@@ -13,6 +13,7 @@ from quadid.online.records import Phase, SetState
 from quadid.online.stream import SOURCE, Resampler
 from quadid.vehicle import Stabiliser, Vehicle
 from tests.online.driving import drive, samples
+from tests.samples import gathered
 
 PELICAN = Vehicle.shipped("pelican")
 HOVER = PELICAN.hover_speed(PELICAN.parameters["b"].initial)
@@ -28,10 +29,9 @@ def without_rotors(recording: Recording) -> Recording:
 def test_the_commands_are_those_of_the_vehicle(rate: float) -> None:
     flight = fly(STEERED, seconds=16.0, seed=2, profile="excited", log_rate=rate, command_rate=rate)
     told, steered = Resampler(STEERED), Resampler(STEERED)
-    for sample in samples(flight.recording):
-        told.push(sample.block)
-    for sample in samples(without_rotors(flight.recording)):
-        steered.push(sample.block)
+    for resampler, recording in ((told, flight.recording), (steered, without_rotors(flight.recording))):
+        for block in gathered(sample.block for sample in samples(recording)):
+            resampler.push(block)
     differences, count = [], 0
     while (a := told.next_rows()) is not None and (b := steered.next_rows()) is not None:
         both = np.isfinite(a.columns["rotor_speed"]).all(axis=1) & np.isfinite(b.columns["rotor_speed"]).all(axis=1)

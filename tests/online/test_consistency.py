@@ -23,6 +23,7 @@ from tests.faults.evidence import Happened
 from tests.online.driving import flight, published, samples
 from tests.online.made_up import GATE, PELICAN, QUICK, between, light_flight, tells, works
 from tests.online.test_gate import TRUE, good
+from tests.samples import gathered
 
 FLIGHT = light_flight(60.0)
 
@@ -36,8 +37,8 @@ def consistency_of(recording: Recording, vehicle: Vehicle = PELICAN) -> Consiste
     """Knowledge of a session about the sensors at the end of a flight."""
     resampler, store, found = Resampler(vehicle, 50.0), GridBuffer(50.0, 20.0), Consistency()
     tick = 1.0
-    for sample in samples(recording):
-        resampler.push(sample.block)
+    for block in gathered(sample.block for sample in samples(recording)):
+        resampler.push(block)
         while (rows := resampler.next_rows()) is not None:
             store.add(rows)
             while rows.t[-1] >= tick:

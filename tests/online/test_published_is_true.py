@@ -54,9 +54,7 @@ def about_the_mean(factor: float) -> Callable[[FloatArray], FloatArray]:
     [
         ("rotor_speed", lambda w: w * [0.9, 1.0, 1.0, 1.0], "thrust", "rotor 1"),
         ("rotor_speed", lambda w: w * [0.95, 0.95, 1.0, 1.0], "thrust", "rotor"),
-        ("rotor_speed", supported(0.15), "thrust", "support"),
         ("rotor_speed", supported(0.08), "thrust", "support"),
-        ("accel", about_the_mean(1.3), "thrust", "accelerometer"),
         ("accel", about_the_mean(1.12), "thrust", "accelerometer"),
     ],
 )
@@ -186,7 +184,7 @@ def test_a_support_beside_two_sensors_within_their_limits_waits(
     happened(39, f"support 4 %, {told}: {len(sets)} published; '{session.status().reason[:90]}'")
 
 
-@pytest.mark.parametrize(("carried", "scale"), [(0.08, 1.06), (-0.08, 0.92), (0.15, 1.17)])
+@pytest.mark.parametrize(("carried", "scale"), [(-0.08, 0.92), (0.15, 1.17)])
 def test_an_interval_holds_a_support_that_an_accelerometer_hides(
     carried: float, scale: float, happened: Happened
 ) -> None:
