@@ -130,6 +130,7 @@ TRAPS = {
     "a list of thousands": ("a: [" + "1," * 30_000 + "1]\n", "unknown key 'a'"),
     "nothing": ("", "holds nothing"),
     "no text": ("\x00", "not YAML"),
+    "words": ("just text", "mapping"),
 }
 
 SLIPS = {
@@ -137,6 +138,9 @@ SLIPS = {
     "millimetres": (TEXT.replace("0.21", "210.0"), "rotor positions in millimetres? 0.21 m would fit"),
     "centimetres": (TEXT.replace("0.21", "21.0"), "rotor positions in "),
     "a wrong key": (TEXT.replace("mass:", "mas:"), "unknown key 'mas'; did you mean 'mass'"),
+    "a mass below nothing": (with_mass("-1.0"), "mass"),
+    "a wrong effect": (with_effects("motor_lga: {tau: 0.1}"), "did you mean 'motor_lag'?"),
+    "a list of effects": (TEXT.replace("effects: {}", "effects: [1]"), "effects must map names"),
     "a lag before its command": (with_effects("motor_lag: {tau: -0.05}"), "effects.motor_lag.tau = -0.05"),
     "a lag of a minute": (with_effects("motor_lag: {tau: 50}"), "allowed: 0 to 0.3 s on a vehicle of this"),
     "a slower lag in ms": (with_effects("motor_lag: {tau: 0.03, tau_down: 40}"), "motor_lag.tau_down = 40"),

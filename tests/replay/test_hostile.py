@@ -187,9 +187,3 @@ def test_a_wild_first_stamp_moves_nothing(tmp_path: Path, happened: Happened) ->
         assert recording.breaks == ()
         assert any("1 stamps that no neighbour confirms" in w for w in recording.warnings)
     happened(31, "first stamp of 1e9, -5000 and 99999 s: dropped and said, the others keep their times")
-
-
-def test_decimal_commas_are_named(tmp_path: Path) -> None:
-    for row in ("0,02;0,1;0,2;0,3", "0,02,0,1,0,2,0,3"):
-        header = "t;p;q;r" if ";" in row else "t,p,q,r"
-        assert "decimal commas (0,02" in opened(tmp_path, f"{header}\n{row}\n{row}\n".encode())

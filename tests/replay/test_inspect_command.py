@@ -10,7 +10,6 @@ from quadid_replay import write_csv
 
 from quadid.app.inspect import channel_table, parameter_outlook_table
 from quadid.checks import inspect
-from quadid.data.window import Recording
 from quadid.parameters import NOMINAL_NAMES
 from tests.commands import Cli, one_line
 from tests.replay.synthetic import Flight
@@ -65,8 +64,6 @@ def test_a_span_of_the_log(log: Path, inside: Cli) -> None:
 @pytest.mark.parametrize(
     ("arguments", "text"),
     [
-        (["absent.csv"], "no file"),
-        (["{log}", "--vehicle", "pelikan"], "pelican"),
         (["{log}", "--preset", "mavro", "--json", "-"], "did you mean 'mavros'"),
         (["{log}@100:200"], "nothing between 100.0 and 200.0 s; allowed: a span inside the log, 0.0 to "),
         (["{log}@100:"], "nothing after 100.0 s; allowed: a span inside the log, 0.0 to "),
@@ -74,13 +71,6 @@ def test_a_span_of_the_log(log: Path, inside: Cli) -> None:
 )
 def test_bad_input_is_one_line_and_exit_2(log: Path, inside: Cli, arguments: list[str], text: str) -> None:
     assert text in one_line(inside("inspect", *(a.format(log=log) for a in arguments)), 2)
-
-
-def test_control_characters_of_a_log_do_not_reach_the_terminal(tmp_path: Path, inside: Cli) -> None:
-    recording = Flight().recording(seconds=5.0)
-    path = tmp_path / "evil\x1b[31m[bold]name.csv"
-    write_csv(path, Recording(recording.name, "csv", recording.channels))
-    assert "\x1b" not in inside("inspect", path).out
 
 
 def test_a_single_sample_has_no_rate(tmp_path: Path, inside: Cli) -> None:

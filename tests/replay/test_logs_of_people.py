@@ -63,13 +63,6 @@ def test_commands_that_are_zero_together_are_a_closed_throttle(data_dir: Path) -
     assert not any("dead" in c.message for c in found.checks)
 
 
-def test_one_rotor_that_reads_nothing_is_dead(flight: Recording) -> None:
-    speeds = flight.channels["rotor_speed"].values.copy()
-    speeds[200:500, 2] = 0.0
-    found = verdict(with_channel(flight, "rotor_speed", speeds), "rotor_speed")
-    assert "rotor 3 reads nothing" in found.message
-
-
 @pytest.mark.parametrize("wrong", [65535.0 * 2.0 * np.pi / 60.0, 0.0])
 def test_single_impossible_readings_are_dropped_and_counted(flight: Recording, wrong: float) -> None:
     channel = flight.channels["rotor_speed"]
@@ -258,10 +251,7 @@ def test_without_a_velocity_the_position_is_compared_with_the_force(flight: Reco
     ("channel", "scale", "zero", "error", "said"),
     [
         ("gyro", [1.0, 0.5, 1.0], [0.0, 0.0, 0.0], True, r"attitude rate / gyro = (1\.9\d|2|2\.0\d) about y"),
-        ("gyro", [1.0, 1.0, 57.3], [0.0, 0.0, 0.0], True, r"attitude rate / gyro = 0\.017\d about z"),
-        ("gyro", [1.0, 0.0, 1.0], [0.0, 0.0, 0.0], True, "gyro does not turn about y"),
         ("gyro", [1.0, 1.0, 1.0], [0.5, 0.0, 0.0], False, r"gyro reads \+0\.5 rad/s about x"),
-        ("accel", [1.3, 1.3, 1.3], [0.0, 0.0, 0.0], True, r"force is 12\.[78] m/s\^2 upwards"),
         ("accel", [0.8, 0.8, 0.8], [0.0, 0.0, 0.0], True, r"force is 7\.[89]\d? m"),
         ("accel", [1.0, 1.0, 1.0], [0.0, 0.0, 1.0], False, r"force is 8\.[89]\d? m"),
         ("velocity", [0.0, 0.0, 0.0], [0.0, 0.0, 0.0], False, "velocity: does not change for .* or one axis does not"),
@@ -285,16 +275,9 @@ def test_a_heading_that_was_held_is_named(flight: Recording) -> None:
     assert "does not follow the attitude about z" in check.message
 
 
-def test_inertia_in_grams_and_thrust_per_rpm_are_named(flight: Recording) -> None:
-    text = Vehicle.shipped("pelican").to_yaml()
-    made = yaml.safe_load(text)
-    for name in ("J_xx", "J_yy", "J_zz"):
-        made["parameters"][name] = 1e3 * Vehicle.shipped("pelican").parameters[name].initial
-    with pytest.raises(QuadidError, match="is it in g m"):
-        Vehicle.from_yaml(yaml.safe_dump(made), "mine")
-    made = yaml.safe_load(text) | {
-        "parameters": yaml.safe_load(text)["parameters"] | {"b": 2.0e-5 / 91.2, "d": 4.0e-7 / 91.2}
-    }
+def test_thrust_per_rpm_is_named(flight: Recording) -> None:
+    made = yaml.safe_load(Vehicle.shipped("pelican").to_yaml())
+    made["parameters"] |= {"b": 2.0e-5 / 91.2, "d": 4.0e-7 / 91.2}
     check = verdict(flight, "hover", Vehicle.from_yaml(yaml.safe_dump(made), "mine"))
     assert "b by 91.2" in check.fix
 
@@ -402,10 +385,8 @@ def test_commands_that_count_to_another_number_are_no_pulses_nor_speeds(full: fl
     assert said in found.fix
 
 
-def test_a_column_written_twice_and_speeds_with_a_sign_are_named(flight: Recording) -> None:
+def test_speeds_with_a_sign_are_named(flight: Recording) -> None:
     speeds = flight.channels["rotor_speed"].values
-    twice = verdict(with_channel(flight, "rotor_speed", speeds[:, [0, 0, 2, 3]]), "rotor_speed")
-    assert "rotor columns 1 and 2 are the same" in twice.message
     signed = verdict(with_channel(flight, "rotor_speed", speeds * [1.0, -1.0, 1.0, -1.0]), "hover")
     assert "rotor 2, 4" in signed.message
 
