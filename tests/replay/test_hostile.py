@@ -39,9 +39,7 @@ def tlog() -> bytes:
     return bytes(log.data)
 
 
-@pytest.mark.parametrize(
-    "filler", [b"\xfe", b"\xfd", b"\xfd\xfe", struct.pack(">Q", 1_700_000_000_000_000) + b"\xfe\xff"]
-)
+@pytest.mark.parametrize("filler", [b"\xfd\xfe", struct.pack(">Q", 1_700_000_000_000_000) + b"\xfe\xff"])
 def test_a_telemetry_log_of_filler_takes_linear_time(tmp_path: Path, filler: bytes, happened: Happened) -> None:
     said = opened(tmp_path, tlog() + filler * ((12 << 20) // len(filler)))
     assert "bytes are damaged and were skipped" in said
