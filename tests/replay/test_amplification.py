@@ -25,7 +25,6 @@ from tests.faults.evidence import Happened
 from tests.fuzz.seeds import mcap_of
 from tests.replay.shared_pages import share_first_row
 from tests.replay.test_mcap import header
-from tests.replay.test_tlog import Tlog, attitude
 from tests.replay.test_ulog import Ulog
 
 SECONDS, MEMORY = 3, 400
@@ -180,16 +179,6 @@ def a_long_number() -> bytes:
     return bytes(log.data)
 
 
-def senders() -> bytes:
-    out = bytearray()
-    for k in range(5000):
-        log = Tlog(1 + k % 255)
-        log.mav.srcComponent = k // 255
-        log.add(0.001 * k, attitude(0.001 * k))
-        out += log.data
-    return bytes(out)
-
-
 def blackbox_headers() -> bytes:
     return b"H Product:Blackbox flight data recorder by Nicholas Sherlock\n" * 60_000
 
@@ -213,7 +202,6 @@ KINDS: dict[str, Callable[[], bytes]] = {
     "ulog: two types in each other": in_itself("other"),
     "ulog: 3000 topics of 4900 numbers": topics_without_end,
     "ulog: a length of 5000 digits": a_long_number,
-    "tlog: 5000 senders": senders,
     "blackbox: 60,000 headers": blackbox_headers,
 }
 
