@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 
 from tests.conftest import absent
+from tests.node.peers import LIMIT
 
 # --- The checkout as source of a colcon workspace: three packages, laid out as `ros2 run` and `ros2 launch` want them
 
@@ -213,7 +214,7 @@ def test_a_late_joiner_in_another_process_receives_the_latched_set() -> None:
         node.create_subscription(ParameterSet, "quadid/parameters", received.append, LATCHED)
         executor = SingleThreadedExecutor(context=context)
         executor.add_node(node)
-        deadline = time.monotonic() + 30.0
+        deadline = time.monotonic() + LIMIT
         while not received and time.monotonic() < deadline:
             executor.spin_once(timeout_sec=0.1)
         executor.spin_once(timeout_sec=0.5)  # a second message would be one too many
@@ -222,7 +223,7 @@ def test_a_late_joiner_in_another_process_receives_the_latched_set() -> None:
         context.shutdown()
 
         publisher.stdin.close()
-        assert publisher.wait(timeout=20.0) == 0
+        assert publisher.wait(timeout=LIMIT) == 0
     assert received == [example(2)]
 
 
