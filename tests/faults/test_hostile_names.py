@@ -224,7 +224,7 @@ def test_a_history_of_a_stranger_is_shown_as_text_or_refused_in_one_line(
     store = Store(path, "pelican")
     store.numbered(replace(online_set(TRUE), sequence=7, approved_by="auto"))
     assert store.flush(10.0)
-    store.close()
+    store.close(60.0)
     with contextlib.closing(sqlite3.connect(path)) as db, db:
         db.execute(f"UPDATE sets SET {column} = ?", (value,))
         db.execute(

@@ -1,4 +1,4 @@
-"""Commands and names that the documents of the online service show: options, node parameters, presets, topics exist."""
+"""Names that the documents of the online service show: node parameters, presets, checks, topics exist."""
 
 import re
 import shlex
@@ -10,11 +10,10 @@ from quadid_node.mavlink_link import PARAMETERS as MAVLINK_NAMES
 from quadid_node.mavlink_link import REQUESTED
 from quadid_node.service import PARAMETERS
 
-from quadid.cli.commands import load
 from quadid.online.gate import CHECKS, GateSettings
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
-PAGES = ("online", "using-with-ros", "using-with-px4", "using-with-ardupilot")
+PAGES = ("using-with-ros", "using-with-px4", "using-with-ardupilot")
 
 
 def commands(page: str) -> list[list[str]]:
@@ -27,16 +26,6 @@ def commands(page: str) -> list[list[str]]:
 
 
 @pytest.mark.parametrize("page", PAGES)
-def test_commands_and_their_options_exist(page: str) -> None:
-    used = [words[1:] for words in commands(page) if words[:1] == ["quadid"]]
-    assert used
-    for name, *arguments in used:
-        known = {option for p in load(name).params for option in p.opts}
-        unknown = [a for a in arguments if a.startswith("--") and a not in known]
-        assert not unknown, (name, unknown)
-
-
-@pytest.mark.parametrize("page", PAGES[1:])
 def test_node_parameters_and_presets_exist(page: str) -> None:
     names = {p.name for p in PARAMETERS}
     for words in commands(page):

@@ -101,7 +101,7 @@ def test_history_shows_what_was_stored(tmp_path: Path, inside: Cli, monkeypatch:
     path = tmp_path / "h.sqlite"
     store = Store(path, "pelican")
     store.numbered(replace(online_set(TRUE), sequence=1, approved_by="ann", reason="three windows agree"))
-    store.close()
+    store.close(60.0)
     monkeypatch.setenv("QUADID_HISTORY", str(path))
     done = inside("history", "--vehicle", "pelican", "--json", "-")
     assert done.code == 0, done.err
@@ -119,7 +119,7 @@ def test_a_vehicle_of_a_fleet_is_found_by_its_name_and_its_set_exported(tmp_path
     store = Store(path, "quad1")
     wide = online_set(TRUE).parameters.scaled_together(0.09)
     store.numbered(replace(online_set(TRUE), parameters=wide, reference_sd=0.09, sequence=1, approved_by="ann"))
-    store.close()
+    store.close(60.0)
     told = inside("history", "--vehicle", "quad1", "--history", str(path), "--json", "-")
     assert [s["sequence"] for s in json.loads(told.out)["sets"]] == [1]
     unknown = inside("history", "--vehicle", "quad7", "--history", str(path))
@@ -144,7 +144,7 @@ def history_of(path: Path, *items: OnlineSet) -> Path:
     store = Store(path, "pelican")
     for number, item in enumerate(items, 1):
         store.numbered(replace(item, sequence=number, approved_by=item.approved_by or "auto"))
-    store.close()
+    store.close(60.0)
     return path
 
 
@@ -204,7 +204,7 @@ def test_a_set_that_is_not_in_force_is_exported_only_when_insisted(
     # The service takes up none of these as it is: one rule for all who read a history.
     store = Store(path, "pelican")
     item = store.restore(vehicle=Vehicle.shipped("pelican")).item
-    store.close()
+    store.close(60.0)
     assert item is None or item.outdated or case == "not confirmed since a restart"
     happened(36, f"export of a set {case}: '{refused.err.strip()[:100]}'")
 
@@ -242,7 +242,7 @@ def test_a_set_that_rests_on_another_vehicle_file_is_exported_only_when_insisted
     store = Store(path, "pelican")
     store.restore(vehicle=before)
     store.numbered(replace(GOOD, sequence=1, approved_by="auto"))
-    store.close()
+    store.close(60.0)
     for vehicle in (before, now):
         vehicle.save(file)
         why = f"{other} than the vehicle file has now" if vehicle is now and other else ""
@@ -251,7 +251,7 @@ def test_a_set_that_rests_on_another_vehicle_file_is_exported_only_when_insisted
         assert why in run.err
         store = Store(path, "pelican")
         item = store.restore(vehicle=Vehicle.named(file)).item
-        store.close()
+        store.close(60.0)
         assert item is not None
         assert bool(item.outdated) == bool(why)
         assert why in item.outdated
@@ -273,7 +273,7 @@ def test_a_set_that_states_a_slope_of_thrust_is_taken_up_and_exported_as_a_curve
     store = Store(path, "pelican")
     pelican = Vehicle.shipped("pelican")
     item = store.restore(vehicle=pelican).item
-    store.close()
+    store.close(60.0)
     assert item is not None
     assert item.parameters["b_tangent"].value == pytest.approx(0.75 * TRUE["b"])
     done = inside("export", "--vehicle", "pelican", "--history", str(path), "--out", str(tmp_path), "--json", "-")
