@@ -13,8 +13,6 @@ from quadid.cli.demo import write
 from quadid.jsonable import jsonable
 from quadid.parameters import NOMINAL_NAMES
 
-pytestmark = pytest.mark.timeout(900)
-
 
 @pytest.fixture(scope="module")
 def done(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], Path]:

@@ -101,7 +101,6 @@ def test_the_page_says_for_which_machines_and_how_large(dockerfile: str, reposit
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(1200)
 def test_everything_that_is_pinned_has_a_wheel_for_each_machine(tmp_path: Path, repository: Path) -> None:
     """The image compiles nothing of the package index: `--only-binary :all:` with the hashes, for Ubuntu 24.04."""
     for machine in built_for((repository / "docs" / "using-with-ros.md").read_text(encoding="utf-8")):

@@ -16,7 +16,7 @@ from quadid.flight.pilot import AXES, PILOT_STEP, scripted
 from quadid.report.manoeuvres import written_as
 from tests.report.manoeuvre_plan import PLAN, SECONDS, SEGMENTS
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
+pytestmark = pytest.mark.slow
 POSITION_MODE, OFFBOARD = 2, 14
 SETTLE = 5.0
 MESSAGES = {
