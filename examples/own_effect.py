@@ -54,7 +54,7 @@ def main() -> None:
         inside = weak_supply(seen, float(x[0]) * hover, float(x[1]))
         return mse_score(inside, pelican, fit(inside, near, LOCAL).theta, plain.noise).mse
 
-    best = minimize(cost, [1.0, 0.7], method="Nelder-Mead", options={"maxfev": 24, "xatol": 2e-3, "fatol": 1e-3})
+    best = minimize(cost, [1.0, 0.7], method="COBYQA", options={"maxfev": 13, "initial_tr_radius": 0.1})
     knee, share = float(best.x[0]) * hover, float(best.x[1])
     # Judged by the noise that the better model leaves; that of the plain fit holds some of what it lacks.
     better = fit(weak_supply(seen, knee, share), near, LOCAL)

@@ -305,7 +305,6 @@ def restarts(health: list[Any]) -> int:
     ("parameters", "word"),
     [
         ({"source": "mavros"}, "package mavros_msgs is not installed"),
-        ({"source": "mavroz"}, "did you mean 'mavros'?"),
         ({"vehicle": "pelikan"}, "no shipped vehicle 'pelikan'"),
     ],
 )

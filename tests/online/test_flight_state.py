@@ -79,7 +79,7 @@ def steps(
 FLIGHTS = [
     pytest.param("x.tlog", "sitl_x.yaml", marks=pytest.mark.slow),
     pytest.param("quad_sq.bin", "quad_sq.yaml", marks=pytest.mark.slow),
-    ("quad_sq.tlog", "quad_sq.yaml"),
+    pytest.param("quad_sq.tlog", "quad_sq.yaml", marks=pytest.mark.slow),
     ("quad_sq_pwm.tlog", "quad_sq_pwm.yaml"),
     ("x_zero_rpm.tlog", "sitl_x_pwm.yaml"),
     ("x.bin", "sitl_x.yaml"),
