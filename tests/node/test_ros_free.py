@@ -331,11 +331,7 @@ MISTAKES: dict[str, tuple[dict[str, Callable[[Values], Values]], str]] = {
     "PX4's body axes in the gyro": ({"gyro": flipped}, "gyro axes differ"),
     "PX4's world": ({"attitude": world}, "its world has z up"),
     "no gravity": ({"accel": lambda v: (v[0], v[1], v[2] + GRAVITY)}, "gravity is missing"),
-    "acceleration in g": ({"accel": lambda v: tuple(c / GRAVITY for c in v)}, "in g"),
-    "degrees": ({"gyro": lambda v: tuple(map(math.degrees, v))}, "deg/s"),
-    "rpm": ({"rotor_speed": lambda v: tuple(c * 30.0 / math.pi for c in v)}, "rpm"),
     "two rotors exchanged": ({"rotor_speed": lambda v: (v[1], v[0], *v[2:])}, "in the order 2, 1, 3, 4"),
-    "rotors numbered around": ({"rotor_speed": lambda v: (v[1], v[2], v[3], v[0])}, "in the order 4, 1, 2, 3"),
 }
 
 

@@ -5,14 +5,11 @@ import os
 import signal
 import sys
 import time
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from quadid_node.history import read_history, read_in_force
-from quadid_node.messages import WARN
 from quadid_node.process import without_shared_memory
 from quadid_node.zenoh import FleetView
 from quadid_replay import write_mcap
@@ -21,7 +18,6 @@ from quadid.vehicle import Vehicle
 from tests.faults.evidence import Happened
 from tests.node.aggregator import branches
 from tests.node.peers import LIMIT, ROOT, Ear, Process, latched, node, player, until
-from tests.node.test_ros_free import MISTAKES
 from tests.node.zenoh_net import Net
 from tests.online.driving import flight
 
@@ -389,31 +385,3 @@ def test_watch_sees_the_state_of_a_ros_node(tmp_path: Path) -> None:
     finally:
         fleet.close()
         net.close()
-
-
-# --- What ROS users publish wrongly is named in /diagnostics of a real node; `test_mistakes_are_said` has the others
-
-
-def test_a_mistake_on_the_topics_is_named_at_warn(tmp_path: Path, ear: Ear) -> None:
-    from diagnostic_msgs.msg import DiagnosticArray
-
-    changes, word = MISTAKES["two rotors exchanged"]
-    recording = flight(240.0, 3).recording
-    channels = dict(recording.channels)
-    for name, change in changes.items():
-        values = np.array([change(tuple(row)) for row in channels[name].values.tolist()])
-        channels[name] = replace(channels[name], values=values)
-    write_mcap(tmp_path / "spoilt.mcap", replace(recording, channels=channels))
-    health = ear.listen("/diagnostics", DiagnosticArray)
-
-    def said() -> list[Any]:
-        return [s for h in health for s in h.status if s.name == "quadid: session" and word in s.message]
-
-    with node(tmp_path / "h.sqlite") as identify:
-        identify.wait_for("ready")
-        with player(tmp_path / "spoilt.mcap", 3.0):
-            assert ear.until(said), identify.text
-    assert {s.level for s in said()} == {WARN}
-    inputs = [s.message for h in health for s in h.status if s.name == "quadid: inputs"]
-    assert "data arrive" in inputs
-    assert not [text for text in inputs if "bursts" in text or "_covariance" in text], "of evenly sent messages"
