@@ -583,17 +583,11 @@ def test_logs_that_cannot_be_read_are_named(inside: Cli, flights: Flights, tmp_p
 # --- One flight, one error: what `identify` states for it is what `diagnose` starts from
 
 
-@pytest.fixture(scope="module")
-def two_flights(tmp_path_factory: pytest.TempPathFactory) -> tuple[Log, Log]:
+def test_on_an_unseen_flight(tmp_path: Path) -> None:
     """Two flights with rotor drag and a weak rotor, as in the tutorial."""
-    folder = tmp_path_factory.mktemp("two_flights")
     hidden = ("rotor_drag:k_x=0.3,k_y=0.3", "weak_rotor:rotor=2,loss=0.04")
-    paths = [quadid.simulate(seconds=40, seed=s, effects=hidden).save(folder / f"{s}.mcap") for s in (3, 4)]
-    return quadid.load(paths[0], vehicle="pelican"), quadid.load(paths[1], vehicle="pelican")
-
-
-def test_on_an_unseen_flight(two_flights: tuple[Log, Log]) -> None:
-    train, unseen = two_flights
+    paths = [quadid.simulate(seconds=40, seed=s, effects=hidden).save(tmp_path / f"{s}.mcap") for s in (3, 4)]
+    train, unseen = (quadid.load(path, vehicle="pelican") for path in paths)
     fit, found = quadid.identify(train, validate=unseen), quadid.diagnose(train, validate=unseen)
     assert_alike(fit, found)
     stated = found.result["validation"]
@@ -617,24 +611,17 @@ def test_no_value_is_identified_where_the_model_is_wrong_about_its_errors_on_ano
     assert all(p.sigma is None for p in beside.vehicle.parameters.values())
 
 
-def test_blocks_left_out_are_called_that_and_lie_near_the_fitted_flight(two_flights: tuple[Log, Log]) -> None:
-    train, _ = two_flights
-    fit, found = quadid.identify(train), quadid.diagnose(train)
-    assert_alike(fit, found)
-    assert found.result["validation"]["on"] == "held-out blocks"
-    assert "held-out blocks of the same flight" in found.verdict.details[1]
-    assert found.verdict.level == "fair"
-    assert any("no unseen flight" in line for line in found.verdict.details)
-    assert found.file_name != fit.file_name, "one command never writes over the other's file"
-
-
-def test_on_motion_capture(data_dir: Path) -> None:
+def test_on_motion_capture_and_blocks_left_out(data_dir: Path) -> None:
     """Noise of two millimetres, and a model that misses slow moments: it is right about its errors, and the same."""
     folder = data_dir / "crazyflie_rpm"
     log = quadid.load(f"{folder / 'figure8_27.csv'}@0:25", vehicle=folder / "vehicle.yaml")
     fit, found = quadid.identify(log), quadid.diagnose(log)
     assert_alike(fit, found)
     assert any("random forces" in warning for warning in fit.warnings)
+    assert found.result["validation"]["on"] == "held-out blocks"
+    assert "held-out blocks of the same flight" in found.verdict.details[1]
+    assert any("no unseen flight" in line for line in found.verdict.details)
+    assert found.file_name != fit.file_name, "one command never writes over the other's file"
     # What the model lacks is no noise: a Crazyflie's gyro is quieter than 0.15 rad/s.
     assert np.all(np.sqrt(fit.fit.noise.variance[:3]) < 0.15)
 
