@@ -81,20 +81,6 @@ def test_parameter_files_are_read_by_the_ground_station_libraries(tmp_path: Path
     assert "MOT_THST_EXPO" not in read  # no curve was fitted
 
 
-def test_urdf_holds_mass_inertia_and_rotors() -> None:
-    import xml.etree.ElementTree as ET
-
-    vehicle = Vehicle.shipped("pelican")
-    root = ET.fromstring(export(vehicle, "urdf", "x")[".urdf"])
-    mass, inertia = root.find(".//mass"), root.find(".//inertia")
-    assert mass is not None
-    assert inertia is not None
-    assert float(mass.attrib["value"]) == vehicle.mass
-    assert float(inertia.attrib["ixx"]) == pytest.approx(vehicle.parameters["J_xx"].initial)
-    places = [[float(v) for v in o.attrib["xyz"].split()] for o in root.findall(".//joint/origin")]
-    np.testing.assert_allclose(places, vehicle.rotor_positions * TO_FLU, atol=1e-9)
-
-
 def test_px4_simulation_in_hardware_and_drag_fusion_get_only_what_was_fitted() -> None:
     pelican = as_px4_has_it(Vehicle.shipped("pelican_x"))
     bare = export(pelican, "px4", "x")[".params"]
