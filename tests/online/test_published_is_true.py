@@ -19,7 +19,7 @@ from tests.online.driving import drive, flight, published, samples
 from tests.online.made_up import GATE, PELICAN, QUICK, between, light_flight, tells, works
 from tests.online.test_gate import TRUE, online_set
 
-SETTINGS = SessionSettings(refit=5.0, diagnose=0.0)
+SETTINGS = SessionSettings(refit=10.0, diagnose=0.0)
 SECONDS = 41.0
 
 
