@@ -8,7 +8,7 @@ import pytest
 from quadid.online import Job, JobReply, Session, SessionSettings
 from quadid.online.change_job import DiagnosisReply, DiagnosisRequest
 from quadid.online.records import Action, OnlineFinding
-from tests.online.driving import diagnosed, drive, flight, run, samples, unanswered
+from tests.online.driving import diagnosed, drive, flight, samples, unanswered
 from tests.online.made_up import PELICAN, light_flight, tells
 from tests.samples import Sample
 
@@ -46,7 +46,7 @@ def test_an_answer_from_before_a_change_is_not_told() -> None:
 def test_a_flight_with_drag_is_diagnosed_as_such() -> None:
     made = flight(72.0, 11, effects=DRAGGED)
     session = Session(PELICAN, QUICK)
-    (request,) = studies(drive(session, samples(made.recording), diagnose=unanswered))
+    (request,) = studies(drive(session, samples(made.recording), diagnose=unanswered, work=tells()))
     reply = request.run()
     assert isinstance(reply, DiagnosisReply)
     assert not reply.problem
@@ -61,8 +61,7 @@ def test_a_lag_is_not_named_with_confidence_where_rotors_are_read_slowly() -> No
     kept = itertools.count()
     slow = [s for s in fast if s.channel != "rotor_speed" or next(kept) % 4 == 0]
     asked = [
-        studies(drive(Session(PELICAN, QUICK), stream, diagnose=unanswered, work=work))[0]
-        for stream, work in ((fast, run), (slow, tells()))
+        studies(drive(Session(PELICAN, QUICK), stream, diagnose=unanswered, work=tells()))[0] for stream in (fast, slow)
     ]
     assert [request.slow for request in asked] == [False, True]
     for request in (asked[0], replace(asked[0], slow=True)):
