@@ -19,7 +19,7 @@ from quadid.estimate.whole_model import WholeModel
 from quadid.model.layout import Layout
 from quadid.parameters import NOMINAL_NAMES
 from quadid.rotation import rotated
-from quadid.types import FloatArray
+from quadid.types import FloatArray, IndexArray
 from quadid.vehicle import GRAVITY, Vehicle
 
 T = TypeVar("T")
@@ -525,10 +525,13 @@ class Problem:
         return float(value), gains
 
     def _simulated(self, j: int, z: FloatArray, psi: FloatArray, near: Gains) -> Track:
-        """Flight j with its effects simulated at z along the states that these gains give, until both settle."""
+        """Flight j with its effects simulated at z along the states that these gains give, until both settle.
+
+        States that other sizes of the same effects gave differ by less than the step that led from there.
+        """
         track, p, model, theta = self.tracks[j], self.physics(z, j), self.models[j], self.vector(z, j)
         mean = near.mean
-        for _ in range(SETTLING):
+        for _ in range(0 if len(near.beyond.added) else SETTLING):
             track = track._replace(beyond=model.along(theta, reckoned(track, mean)))
             mean = np.empty_like(mean)
             k.replay(track, p, psi, near, _table(track, near, p), _NO_ROWS, mean)
@@ -652,18 +655,21 @@ class Problem:
         track = self.tracks[j]
         out = np.zeros((len(points), len(track.t), k.M))
         mean = reckoned(track, g.mean) if self.models else g.mean
-        for first in range(0, len(points), AT_ONCE):
-            some = points[first : first + AT_ONCE]
-            tracks = [track] * len(some)
+        # Trim and biases change no effect: what is the same is simulated once.
+        same = np.array([self.vector(z, j) for z in points]) if self.models else np.zeros((len(points), 1))
+        kinds, which = np.unique(same, axis=0, return_inverse=True)
+        for first in range(0, len(kinds), AT_ONCE):
+            mine = np.flatnonzero((which.ravel() >= first) & (which.ravel() < first + AT_ONCE))
+            tracks = [track] * len(mine)
             if self.models:
-                added = self.models[j].beyond(np.array([self.vector(z, j) for z in some]), mean)
+                added = self.models[j].beyond(kinds[first : first + AT_ONCE], mean)[which.ravel()[mine] - first]
                 tracks = [track._replace(beyond=Beyond(a, g.beyond.slope, mean[:, 4:10].copy())) for a in added]
 
-            def whiten(i: int, first: int = first, tracks: Sequence[Track] = tracks) -> None:
-                p = self.physics(points[first + i], j)
-                k.replay(tracks[i], p, psi, g, _table(tracks[i], g, p), out[first + i], _NO_MEANS)
+            def whiten(i: int, mine: IndexArray = mine, tracks: Sequence[Track] = tracks) -> None:
+                p = self.physics(points[mine[i]], j)
+                k.replay(tracks[i], p, psi, g, _table(tracks[i], g, p), out[mine[i]], _NO_MEANS)
 
-            _each(whiten, len(some))
+            _each(whiten, len(mine))
         return out
 
 

@@ -78,16 +78,23 @@ class WholeModel:
 
         The difference of two models, so that it holds no difference of two integrations.
         """
+        return self._beyond(thetas, means, np.zeros((1, 12)))[0]
+
+    def _beyond(self, thetas: FloatArray, means: FloatArray, moves: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Additions of several vectors, and steps (moves, n - 2, 12) of the first; `moves` are added to the means."""
         plain, motion = self._models(thetas)
+        beside = np.repeat(moves, len(thetas), axis=0)
         # 1. One step of the motion from every mean, beside one without what the filter has not.
         late = _SETTLED * max(thetas[:, IMU_PERIOD].max(), 0.0) + max(thetas[:, ATT_DELAY].max(), 0.0)
         pull, thetas = thetas[:, AHRS_K], thetas.copy()
         thetas[:, AHRS_K] = 0.0
         sensed = not np.array_equal(thetas, motion)
-        own, moved, *read = self._rolled([plain, motion, *([thetas] if sensed and late == 0.0 else [])], means, 1)
+        both = [np.tile(v, (len(moves), 1)) for v in (plain, motion)]
+        own, moved, *read = self._rolled([*both, *([thetas] if sensed and late == 0.0 else [])], means, 1, beside)
         out, step = np.zeros((len(thetas), len(means), 9 + k.M)), _step(own, moved)
-        out[:, :-2, :9] = step[..., :9]
-        out[:, 1:-1, 9 + k.ACCEL : 9 + k.VELOCITY] = step[..., 9:]
+        moved = moved[: len(thetas)]
+        out[:, :-2, :9] = step[: len(thetas), :, :9]
+        out[:, 1:-1, 9 + k.ACCEL : 9 + k.VELOCITY] = step[: len(thetas), :, 9:]
         # 2. What sensors make of it; those with a memory look back over as many steps.
         lead = 1 + int(np.ceil(late / self._window.dt))
         if sensed and lead < len(means) - 1:  # of a stretch shorter than the memory nothing is known
@@ -98,7 +105,7 @@ class WholeModel:
         # 3. The attitude filter remembers a whole flight.
         if pull.any():
             out[:, 1:-1, 12:15] += self._pulled(pull, means, moved[0, :, 6:9])
-        return out
+        return out, step[:: len(thetas)]
 
     def _pulled(self, gain: FloatArray, means: FloatArray, force: FloatArray) -> FloatArray:
         """Rotation vectors by which an AHRS of each gain (m,) [1/s] is off in body axes, shape (m, n - 2, 3).
@@ -118,16 +125,12 @@ class WholeModel:
 
     def along(self, theta: FloatArray, means: FloatArray) -> Beyond:
         """Addition of a full parameter vector (size,) along filtered means (n, N_MEAN), with its slope there."""
-        return Beyond(self.beyond(theta[None], means)[0], self._slope(theta, means), means[:, 4:10].copy())
-
-    def _slope(self, theta: FloatArray, means: FloatArray) -> FloatArray:
-        """`Beyond.slope` of a full parameter vector (size,) at filtered means (n, N_MEAN), shape (n, 12, 6)."""
         moves = np.zeros((7, 12))
         moves[1:, 3:9] = NUDGE * np.eye(6)
-        own, moved = self._rolled([np.tile(v, (7, 1)) for v in self._models(theta[None])], means, 1, moves)
-        step, out = _step(own, moved), np.zeros((len(means), 12, 6))
-        out[:-2] = np.moveaxis((step[1:] - step[0]) / NUDGE, 0, -1)
-        return out
+        added, step = self._beyond(theta[None], means, moves)
+        slope = np.zeros((len(means), 12, 6))
+        slope[:-2] = np.moveaxis((step[1:] - step[0]) / NUDGE, 0, -1)
+        return Beyond(added[0], slope, means[:, 4:10].copy())
 
     def _models(self, thetas: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Full vectors of the filter's own equations, and of the motion with all effects, of (m, size) each."""
@@ -143,17 +146,22 @@ class WholeModel:
     ) -> list[FloatArray]:
         """Measurements `lead` steps after every mean but the last two, a (m, n - 1 - lead, 12) array each.
 
-        `moves` (m, 12) are added to the means, as rotation vector, rates, velocity and position.
+        `moves` (m, 12) are added to the means of the first two, as rotation vector, rates, velocity and position.
         """
         states = np.zeros((len(means) - 1 - lead, 13))
         states[:, :10] = means[: len(states), :10]
         if self._window.position is not None:
             states[:, 10:] = np.nan_to_num(self._window.position[: len(states)])
         cut = Segments(1, lead, np.arange(lead, len(means) - 1, dtype=np.int64))
-        dx = None if moves is None else np.tile(moves, (len(vectors), 1))
-        lanes, _ = self._rollout.roll(cut, np.concatenate(vectors), states, dx, n_pre=lead)
-        each = np.moveaxis(lanes[:, :, 0], 3, 1).reshape(-1, *lanes.shape[1:2], lanes.shape[3])
-        return [each[i : i + len(v)] for v, i in zip(vectors, range(0, len(each), len(vectors[0])), strict=False)]
+        every = np.concatenate(vectors)
+        beside = np.zeros((len(every), 12))
+        if moves is not None:
+            beside[: 2 * len(moves)] = np.tile(moves, (2, 1))
+        # Most entries change one of the models only: what is the same is simulated once.
+        kinds, which = np.unique(np.hstack([every, beside]), axis=0, return_inverse=True)
+        lanes, _ = self._rollout.roll(cut, kinds[:, :-12], states, kinds[:, -12:], n_pre=lead)
+        block, lane = np.divmod(which.ravel(), LANES)
+        return np.split(lanes[block, :, 0, :, lane], np.cumsum([len(v) for v in vectors])[:-1])
 
 
 def _step(own: FloatArray, moved: FloatArray) -> FloatArray:
