@@ -27,10 +27,6 @@ if TYPE_CHECKING:
     from quadid.report.figures import ResidualMap
 
 
-LEAST_REMOVED = 0.3
-"""Share of the squared missing force and moment that confident findings must take to explain a flight in part."""
-
-
 @dataclass(frozen=True, repr=False)
 class Diagnosed(Fitted):
     """Result of a diagnosis.
@@ -142,6 +138,7 @@ def diagnose(
         NotIdentifiableError: too little data.
         LogError: a log that does not fit the vehicle.
     """
+    from quadid.diagnosis.pipeline import LEAST_REMOVED
     from quadid.diagnosis.pipeline import diagnose as diagnose_windows
     from quadid.diagnosis.result import Explanation
     from quadid.identification.result import ScoredSet, mse_score, parameter_entry, with_values

@@ -4,16 +4,20 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
 from operator import add
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
 from quadid.chi_square import Z95, exceeded, survival
 from quadid.data.window import Window
+from quadid.diagnosis import random_forces
 from quadid.diagnosis.hypotheses import (
+    RELEVANT,
     Candidate,
     Model,
+    Named,
     block_labels,
+    calibration,
     free_names,
     paired_gain,
     steps_without,
@@ -29,7 +33,7 @@ from quadid.identification.noise import NoiseModel
 from quadid.identification.problem import Linearised, Shooting, default_prior, posterior_covariance, prior_terms
 from quadid.identification.result import Tally, mse_score, scored_problem, settle_states, tallied
 from quadid.parameters import NOMINAL_NAMES, Parameter, Status, at_bound
-from quadid.types import BoolArray, FloatArray, IndexArray
+from quadid.types import FloatArray, IndexArray
 from quadid.vehicle import Vehicle
 
 # --- Gain of the findings on data that neither the fit nor the selection saw: each of them, and all together
@@ -93,12 +97,12 @@ class Validation:
     contradicted: bool = False
 
 
-def untidy_sized(model: Model, cause: Candidate) -> bool:
+def untidy_sized(model: Named, cause: Candidate) -> bool:
     """Checks whether no number of `cause` is further from neutral in `model` than it may be on any vehicle."""
     return bool(np.all(np.abs(model.numbers(cause).from_neutral(model.theta)) <= UNTIDY))
 
 
-def ordinary(model: Model, cause: Candidate) -> bool:
+def ordinary(model: Named, cause: Candidate) -> bool:
     """True if any vehicle may have `cause` as large as it is in `model`; no event, wind or ground is ordinary."""
     apart = cause.timed is not None or cause.refines or bool(EFFECTS[cause.effect].needs)
     return not apart and untidy_sized(model, cause)
@@ -245,22 +249,22 @@ def _second_halves(nominal: NominalFit | Fit, model: Model, logs: Sequence[Windo
 
 FALSE_ALARM = 1e-3
 """Prior probability that a flight has any cause to be named, shared by all that are tried: that of a false alarm."""
-RELEVANT = 0.002
-"""Share of the noise that a cause must take away on unseen blocks.  Smaller gains are irrelevant in practice, and what
-the time step of a simulation or of an autopilot's own filter can imitate: nulls reach 0.0008."""
 
 
-def better(b: Model, a: Model) -> bool:
+M = TypeVar("M", Model, random_forces.Model)
+"""A model fitted by either likelihood."""
+
+
+def better(b: M, a: M) -> bool:
     """Checks whether `b` is better than `a`: more likely, and of models of which one contains the other also of use."""
-    more, less = {c.label for c in b.causes}, {c.label for c in a.causes}
-    if more < less:
+    if b.labels < a.labels:
         return not better(a, b)
-    if less < more and not relevant(a, b):
+    if a.labels < b.labels and not b.gains_beside(a):
         return False
     return advantage(b, a) > 0.0
 
 
-def advantage(b: Model, a: Model) -> float:
+def advantage(b: M, a: M) -> float:
     """Twice the log evidence of `b` less that of `a`, times the calibration, between models of the same data and noise.
 
     Each model pays for what only it has by the calibration of its own scores: where a parameter's scores vary much more
@@ -269,35 +273,17 @@ def advantage(b: Model, a: Model) -> float:
     return a.deviance - b.deviance + _cost(a, b) - _cost(b, a)
 
 
-def _cost(model: Model, other: Model) -> float:
+def _cost(model: M, other: M) -> float:
     """Deviance that the causes and parameters which only `model` has must take away for it to be as likely."""
-    own = np.array([n not in other.free.names for n in model.free.names])
-    present = {c.label for c in other.causes}
-    prior = sum(2.0 * np.log(model.tried[c.label] / FALSE_ALARM) for c in model.causes if c.label not in present)
+    own = np.array([key not in other.keys for key in model.keys])
+    prior = float(sum(2.0 * np.log(model.tried[label] / FALSE_ALARM) for label in model.labels - other.labels))
     if not own.any():
-        return float(prior)
-    ratio = calibration(model, own)
-    gram = model.lin.information / np.sqrt(np.outer(model.prior.precision, model.prior.precision))
+        return prior
+    ratio = calibration(model.inflation[own])
+    gram = model.information / np.sqrt(np.outer(model.precision, model.precision))
     wide = np.eye(len(gram)) + gram / ratio
     occam = np.linalg.slogdet(wide)[1] - np.linalg.slogdet(wide[np.ix_(~own, ~own)])[1]
-    return ratio * float(occam + prior)
-
-
-def calibration(model: Model, own: BoolArray) -> float:
-    """By how much scores of the parameters `own` of `model` vary more than its deviance counts on, or 1."""
-    return max(float(np.mean(model.inflation[own])), 1.0)
-
-
-def relevant(small: Model, large: Model) -> bool:
-    """True if what `large` has more gains enough on unseen blocks, and half of that where the best of them is missing.
-
-    It is missing in the fit as well: what a single stretch determines, such as a step near the end, gains elsewhere by
-    keeping that stretch apart.
-    """
-    gain = paired_gain(small.held_out, large.held_out)
-    best = int(np.argmax(gain.blocks))
-    least = min(gain.total, 2.0 * float(small.rest[best] - large.rest[best]))
-    return least > RELEVANT * small.rows
+    return ratio * (float(occam) + prior)
 
 
 def worth_a_refit(tests: int, rows: float) -> float:
@@ -488,7 +474,7 @@ WRONG_SIGN = 0.1
 """Share of its typical size by which a number that cannot be negative may be, for what a fit lays beside the truth."""
 
 
-def impossible_causes(model: Model) -> dict[str, str]:
+def impossible_causes(model: Named) -> dict[str, str]:
     """Causes of `model` with a number that no vehicle has, and which, by label."""
     reasons = {c.label: impossible(model, c) for c in model.causes}
     return {label: reason for label, reason in reasons.items() if reason}
@@ -507,7 +493,7 @@ def late_unknown(model: Model, parameters: Sequence[Parameter]) -> dict[str, str
     return {c.label: reason for c in model.causes if c.family == "late" and EFFECTS[c.effect].turns}
 
 
-def slight_causes(model: Model) -> dict[str, str]:
+def slight_causes(model: Named) -> dict[str, str]:
     """Causes of `model` that something on any vehicle passes for while they are small, by label, and what.
 
     Air gets thinner in a climb, rotors carry otherwise in it, and motors warm up: from one part of a flight to the next
@@ -526,7 +512,7 @@ def unproven_causes(model: Model, tests: int) -> dict[str, str]:
     return {label: reason for label, p in chance.items() if p > FALSE_ALARM}
 
 
-def impossible(model: Model, cause: Candidate) -> str:
+def impossible(model: Named, cause: Candidate) -> str:
     """Number of `cause` that no vehicle has; empty when all are possible."""
     sigma = dict(zip(model.free.names, model.uncertainty.sigma, strict=True))
     for e in model.numbers(cause).entries:

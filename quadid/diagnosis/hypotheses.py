@@ -1,9 +1,11 @@
 """Hypotheses of a diagnosis: causes that may be named, models with them, deviance on blocks of data not fitted."""
 
+from __future__ import annotations
+
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from scipy.special import stdtrit
@@ -13,7 +15,6 @@ from quadid.identification.elimination import InitialStates
 from quadid.identification.gauss_newton import Polished, bounded_step, polish
 from quadid.identification.problem import (
     Free,
-    Linearised,
     Prior,
     Shooting,
     default_prior,
@@ -26,6 +27,10 @@ from quadid.identification.uncertainty import Uncertainty, uncertainty, variance
 from quadid.model.layout import Layout, places
 from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray, IndexArray
+
+if TYPE_CHECKING:
+    from quadid.diagnosis.random_forces import Quadratic
+    from quadid.identification.problem import Linearised
 
 # --- The causes a diagnosis may name: which entries of the parameter vector each frees, and how its search starts
 
@@ -52,14 +57,14 @@ class Candidate:
     timed: int | None = None
     label: str = field(default="")
     refines: bool = False
-    split: "tuple[Candidate, ...]" = ()
+    split: tuple[Candidate, ...] = ()
 
     @property
     def family(self) -> str:
         """Look-alikes; when one of a family is short-listed all of it is refitted."""
         return EFFECTS[self.effect].family
 
-    def carries(self, other: "Candidate") -> bool:
+    def carries(self, other: Candidate) -> bool:
         """Checks whether `other` can only be in a model that has this one; a refinement carries nothing."""
         return not self.refines and other.requires in (self.effect, self.label)
 
@@ -143,7 +148,7 @@ BLOCKS = 10
 """With so many the error of a gain is known to a quarter, and each is many times the memory of the noise."""
 
 
-def block_labels(lin: Linearised) -> IndexArray:
+def block_labels(lin: Linearised | Quadratic) -> IndexArray:
     """Block number of each segment, shape (segments,): stretches of a tenth of all data, none over two flights."""
     length = max(lin.spacing * len(lin.time) / BLOCKS, 2.0 * lin.spacing)
     _, first, window = np.unique(lin.window, return_index=True, return_inverse=True)
@@ -164,7 +169,7 @@ class HeldOut(NamedTuple):
 
 
 @INFINITE
-def held_out(lin: Linearised, prior_precision: FloatArray) -> HeldOut:
+def held_out(lin: Linearised | Quadratic, prior_precision: FloatArray) -> HeldOut:
     """Deviance of each block in the density that the other blocks predict, and of those.
 
     Twice the negative logarithm of N(r; r(z), I + B V B'), with z and V mean and covariance of the parameters from the
@@ -239,11 +244,66 @@ def paired_gain(before: FloatArray, after: FloatArray) -> Gain:
     return Gain(float(difference.sum()), error, difference)
 
 
+RELEVANT = 0.002
+"""Share of the noise that a cause must take away on unseen blocks.  Smaller gains are irrelevant in practice, and what
+the time step of a simulation or of an autopilot's own filter can imitate: nulls reach 0.0008."""
+
+
+def surely_gained(small: HeldOut, large: HeldOut) -> float:
+    """Gain on unseen parts of the data, or twice that without the best of them where that is less.
+
+    It is missing in the fit as well: what a single stretch determines, such as a step near the end, gains elsewhere by
+    keeping that stretch apart.
+    """
+    gain = paired_gain(small.block, large.block)
+    best = int(np.argmax(gain.blocks))
+    return min(gain.total, 2.0 * float(small.rest[best] - large.rest[best]))
+
+
+def calibration(inflation: FloatArray) -> float:
+    """By how much scores of parameters vary more than a deviance counts on, from those of each, or 1."""
+    return max(float(np.mean(inflation)), 1.0) if len(inflation) else 1.0
+
+
 # --- A fitted model during a diagnosis, and how it is extended by a candidate
 
 
+class Named:
+    """Causes of a fitted model, and their numbers."""
+
+    causes: tuple[Candidate, ...]
+    free: Free
+    theta: FloatArray
+
+    @cached_property
+    def uncertainty(self) -> Uncertainty:
+        """Covariance of the scaled parameters in `free`."""
+        raise NotImplementedError
+
+    def numbers(self, cause: Candidate) -> Free:
+        """The free parameters that belong to `cause`."""
+        return Free(tuple(e for e in self.free.entries if e.name in cause.names))
+
+    def wald(self, cause: Candidate) -> float:
+        """Robust chi-square of the parameters of `cause` against neutral."""
+        z = self.free.from_neutral(self.theta)
+        place = [self.free.names.index(n) for n in cause.names]
+        covariance = self.uncertainty.covariance[np.ix_(place, place)]
+        return float(z[place] @ np.linalg.solve(covariance, z[place]))
+
+    @property
+    def effects(self) -> set[str]:
+        """Names of the effects it contains."""
+        return {c.effect for c in self.causes}
+
+    @property
+    def labels(self) -> frozenset[str]:
+        """Labels of its causes."""
+        return frozenset(c.label for c in self.causes)
+
+
 @dataclass(frozen=True)
-class Model(Polished):
+class Model(Polished, Named):
     """A model fitted to the training data: an optimum, and what is free there.
 
     Attributes:
@@ -273,6 +333,26 @@ class Model(Polished):
         """Independent residuals."""
         return self.lin.total_rows
 
+    @property
+    def keys(self) -> tuple[str, ...]:
+        """Names of the scaled parameters."""
+        return self.free.names
+
+    @property
+    def information(self) -> FloatArray:
+        """Information of the data on the scaled parameters, shape (P, P)."""
+        return self.lin.information
+
+    @property
+    def precision(self) -> FloatArray:
+        """Precision of their prior, shape (P,)."""
+        return self.prior.precision
+
+    def gains_beside(self, small: Model) -> bool:
+        """Checks whether what it has more than a `small` model gains enough on unseen blocks."""
+        parts = HeldOut(small.held_out, small.rest), HeldOut(self.held_out, self.rest)
+        return surely_gained(*parts) > RELEVANT * small.rows
+
     @cached_property
     def inflation(self) -> FloatArray:
         """True variance of each parameter over what the model counts on, from the scores of its segments, (P,)."""
@@ -289,26 +369,10 @@ class Model(Polished):
         sigma = self.uncertainty.sigma * self.free.jacobian(self.theta)
         return dict(zip(self.free.names, sigma.tolist(), strict=True))
 
-    def numbers(self, cause: Candidate) -> Free:
-        """The free parameters that belong to `cause`."""
-        return Free(tuple(e for e in self.free.entries if e.name in cause.names))
-
-    def wald(self, cause: Candidate) -> float:
-        """Robust chi-square of the parameters of `cause` against neutral."""
-        z = self.free.from_neutral(self.theta)
-        place = [self.free.names.index(n) for n in cause.names]
-        covariance = self.uncertainty.covariance[np.ix_(place, place)]
-        return float(z[place] @ np.linalg.solve(covariance, z[place]))
-
     @property
     def finds_velocity(self) -> bool:
         """Checks whether airspeed matters and is not measured, so that the segments' initial velocities are fitted."""
         return bool(np.any(self.lin.occam))
-
-    @property
-    def effects(self) -> set[str]:
-        """Names of the effects it contains."""
-        return {c.effect for c in self.causes}
 
 
 def free_names(causes: tuple[Candidate, ...]) -> list[str]:

@@ -17,9 +17,10 @@ from quadid.diagnosis.evidence import (
     stated_errors,
     unproven_causes,
 )
-from quadid.diagnosis.hypotheses import BLOCKS, Model, candidates, free_names, refit, without
+from quadid.diagnosis.hypotheses import BLOCKS, Model, candidates, fit_model, free_names, refit, without
 from quadid.diagnosis.residual_tests import Remainder, inconstant_causes, remainder
 from quadid.diagnosis.result import Diagnosis, Explanation, describe
+from quadid.diagnosis.rough_air import RoughAir, in_rough_air
 from quadid.diagnosis.search import LINEAR_MISFIT, Search, from_everything, pruned, select
 from quadid.effects import EFFECTS
 from quadid.identification.filter_error import filtered
@@ -97,6 +98,10 @@ SHARE_TO_NAME = 0.8
 """Named causes must account for this share of all structure, else the answer is `unknown` …"""
 SHARE_ALONE = 0.9
 """… and a cause that stands alone for this one: nothing else is there to have left the rest, so its form is wrong."""
+LEAST_REMOVED = 0.3
+"""Share of the squared missing force and moment that causes must take beside random forces to be named …"""
+REMOVED_ALONE = 0.5
+"""… and one that stands alone, as above."""
 LEAST_STRUCTURE = 0.01
 """Structure below this share of the noise is not worth a word …"""
 LEAST_OF_EXPLAINED = 1e-3
@@ -132,15 +137,22 @@ def diagnose(
     faults = data_faults([*windows, *validation])
     windows, validation = without_copies(windows), without_copies(validation)
     vehicle = with_reference_voltage(vehicle, windows)
-    # Which causes, on short segments; their numbers and the vehicle's, by the likelihood of innovations.
+    # Which causes, on short segments; where they leave too much for a name, beside random forces.
     schedule, search = _selected(windows, vehicle, FitOptions(seed=seed) if swarm else None, report)
-    short = schedule[-1]
+    short, decisive, selected = schedule[-1], search.shooting, search.model
+    left, rough = remainder(decisive, selected, seed), None
+    if judge(search.nominal, selected, left) is Explanation.UNKNOWN:
+        report("random forces", 0.0)
+        rough = in_rough_air(windows, search)
+    if rough is not None:
+        search = with_causes_of(search, rough)
+        selected = search.model
+        left = remainder(decisive, selected, seed)
+    # Their numbers and the vehicle's, by the likelihood of innovations.
     report("numbers", 0.0)
-    found = nominal if nominal and not search.model.causes else fit_numbers(windows, short, search.model)
-    # What remains, and what each cause gains on unseen data.
-    decisive, selected = search.shooting, search.model
+    found = nominal if nominal and not selected.causes else fit_numbers(windows, short, selected)
     model = selected if found is None else with_numbers(selected, found)
-    left = remainder(decisive, selected, seed)
+    # What each cause gains on unseen data.
     report("validation", 0.0)
     fewer = {c.label: without(decisive, selected, c) for c in selected.causes}
     deciding, worth = cause_gains(decisive, search.nominal, selected, fewer, validation)
@@ -149,9 +161,14 @@ def diagnose(
     # Blocks are left out of the fit to segments, at whose optimum their part in it is known.
     outcome = stated_errors(stated, model if validation else selected, windows, validation, deciding)
     # The verdict; causes with numbers that no vehicle has, or of another form, count as left.
-    doubts = impossible_causes(model) | inconstant_causes(selected, left)
-    unnamed = sum(max(w.deviance, 0.0) for w in worth if w.cause.label in doubts)
-    verdict = judge(search.nominal, selected, left, unnamed)
+    doubts = impossible_causes(model)
+    if rough is None:
+        doubts |= inconstant_causes(selected, left.sites)
+        unnamed = sum(max(w.deviance, 0.0) for w in worth if w.cause.label in doubts)
+        verdict = judge(search.nominal, selected, left, unnamed)
+    else:
+        doubts |= inconstant_causes(rough.model, rough.sites)
+        verdict = judge_in_rough_air(rough)
     saturated = any(f.kind == "saturated" for f in faults)
     if model.causes and (outcome.contradicted or saturated or len(doubts) == len(model.causes)):
         verdict = Explanation.UNKNOWN
@@ -162,7 +179,7 @@ def diagnose(
         fits.append(nominal or (fit_numbers(windows, short, search.nominal) if model.causes else found))
     parameters, reasons = _nominal_parameters(short, model, fits, doubted)
     parameters, moved = possible_moments(parameters)
-    weak = late_unknown(model, parameters) | slight_causes(model) | unproven_causes(model, search.tests)
+    weak = late_unknown(model, parameters) | slight_causes(model) | unproven_causes(model, len(search.listed))
     alike = {c.family for c in model.causes if c.label in doubts}
     believed = [c for c in model.causes if c.family not in alike and c.label not in weak]
     search = replace(search, model=model)
@@ -278,11 +295,26 @@ def _noise_around(windows: Sequence[Window], short: Shooting, model: Model) -> N
     return flexible_fit(windows, short, [model.theta], wide, iterations=2).noise
 
 
+def with_causes_of(search: Search, rough: RoughAir) -> Search:
+    """`search` with the causes selected beside random forces, fitted to the segments that decided."""
+    model = fit_model(search.shooting, rough.model.theta, rough.model.causes, tried=rough.model.tried)
+    return replace(search, model=model, rounds=(*search.rounds, *rough.rounds))
+
+
 def _with_noise(noise: NoiseModel, schedule: Sequence[Shooting], search: Search) -> tuple[list[Shooting], Search]:
     """Problems under another noise model, nominal and selected model refitted there."""
     decisive = search.shooting.with_noise(noise)
     model, nominal = (refit(decisive, m, m.states) for m in (search.model, search.nominal))
     return [s.with_noise(noise) for s in schedule], replace(search, shooting=decisive, model=model, nominal=nominal)
+
+
+def judge_in_rough_air(rough: RoughAir) -> Explanation:
+    """Verdict where random forces act: what causes take of them, and whether innovations follow anything else."""
+    followed, explained = rough.followed, rough.explained
+    least = max(LEAST_STRUCTURE * rough.model.rows, LEAST_OF_EXPLAINED * explained)
+    enough = rough.removed >= (LEAST_REMOVED if len(rough.model.effects) > 1 else REMOVED_ALONE)
+    named = followed <= least or explained >= SHARE_TO_NAME * (explained + followed)
+    return Explanation.PARTLY_EXPLAINED if enough and named else Explanation.UNKNOWN
 
 
 def judge(nominal: Model, model: Model, left: Remainder, unnamed: float = 0.0) -> Explanation:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from quadid.data.window import CHANNEL_NAMES, Window
-from quadid.diagnosis.hypotheses import Candidate, Gain, Model, held_out, paired_gain
+from quadid.diagnosis.hypotheses import Candidate, Gain, Model, Named, held_out, paired_gain
 from quadid.effects import EFFECTS
 from quadid.identification.elimination import freed
 from quadid.identification.fit import LEAST_LEFT, SMOOTH, SPECTRUM_SECONDS, band_power, mode_power
@@ -29,7 +29,7 @@ from quadid.types import FloatArray
 
 ERRORS = 2.5
 """Standard errors of a gain on unseen blocks above which a site counts as structured."""
-_RIDGE = 1e-6
+RIDGE = 1e-6
 """Prior precision of a probe, relative to its information: keeps signals finite that double one another."""
 WAVES = 4
 """Half waves over the log, for what comes and goes slowly."""
@@ -141,7 +141,7 @@ def _followed(site: Site, names: tuple[str, ...], prepared: list[_Prepared], mod
     own = model.lin.gram.shape[1]
     total, slope = gram.sum(axis=0), grad.sum(axis=0)
     sizes = np.diag(total)[own:]
-    precision = np.concatenate([model.prior.precision, _RIDGE * sizes + 1e-9])
+    precision = np.concatenate([model.prior.precision, RIDGE * sizes + 1e-9])
     both = replace(model.lin, gram=gram, grad=grad)
     none = replace(model.lin, gram=gram[:, :own, :own], grad=grad[:, :own])
     gain = paired_gain(held_out(none, precision[:own]).block, held_out(both, precision).block)
@@ -179,14 +179,25 @@ def signals(part: Columns) -> dict[str, FloatArray]:
     Args:
         part: one window's segments with their prediction.
     """
-    out = {f"{name} input": s[part.rows - 1] for name, s in inputs(part.window).items()}
-    out |= _motions(part)
-    first, last = part.window.log_span
-    share = (part.window.t[part.rows] - first) / max(last - first, part.window.dt)
-    out["constant"] = np.ones_like(share)
-    for n in range(1, WAVES + 1):
-        out[f"time, {n} half waves"] = np.cos(n * np.pi * share)
-    return out
+    window = part.window
+    rates, force = (_predicted(part, values, channel) for values, channel in ((window.gyro, 0), (window.accel, 6)))
+    turned = None
+    if window.attitude is not None:
+        # The predicted attitude is the measured one turned by its residual, a body rotation.
+        error = 0.5 * part.base[:, :, 3:6].reshape(-1, 3)
+        turned = product(
+            np.nan_to_num(window.attitude[part.rows.ravel()]), np.column_stack([np.ones(len(error)), error])
+        ).reshape(*part.rows.shape, 4)
+    out = {f"{name} input": s[part.rows - 1] for name, s in inputs(window).items()}
+    return out | motions(rates, _before(force), turned) | {name: s[part.rows] for name, s in slow(window).items()}
+
+
+def slow(window: Window) -> dict[str, FloatArray]:
+    """Functions of time that come and go slowly, by row of the window."""
+    first, last = window.log_span
+    share = (window.t - first) / max(last - first, window.dt)
+    waves = {f"time, {n} half waves": np.cos(n * np.pi * share) for n in range(1, WAVES + 1)}
+    return {"constant": np.ones_like(share)} | waves
 
 
 def inputs(window: Window) -> dict[str, FloatArray]:
@@ -212,36 +223,32 @@ def inputs(window: Window) -> dict[str, FloatArray]:
     return out
 
 
-def _motions(part: Columns) -> dict[str, FloatArray]:
-    """Predicted rates, tilt and specific force, and products of them."""
-    window = part.window
-    p, q, r = (_predicted(part, window.gyro, i, i) for i in range(3))
-    f_x, f_y, f_z = (_before(_predicted(part, window.accel, i, 6 + i)) for i in range(3))
+def motions(rates: FloatArray, force: FloatArray | None, attitude: FloatArray | None) -> dict[str, FloatArray]:
+    """Rates, tilt and specific force, and products of them, from arrays (..., 3), (..., 3) and (..., 4)."""
+    p, q, r = np.moveaxis(rates, -1, 0)
     out = {"p": p, "q": q, "r": r, "p|p|": p * np.abs(p), "q|q|": q * np.abs(q), "r|r|": r * np.abs(r)}
     out |= {"p q": p * q, "q r": q * r, "r p": r * p, "|p|": np.abs(p), "|q|": np.abs(q)}
-    lift = f_z - np.mean(f_z)
-    out |= {"a_x": f_x, "a_y": f_y, "a_z": lift, "a_z squared": lift**2, "a_x a_z": f_x * lift, "a_y a_z": f_y * lift}
-    if window.attitude is not None:
-        # Predicted quaternion, shape (4, segments, length): the measured one turned by its residual, a body rotation
-        error = 0.5 * part.base[:, :, 3:6].reshape(-1, 3)
-        turned = product(
-            np.nan_to_num(window.attitude[part.rows.ravel()]), np.column_stack([np.ones(len(error)), error])
-        )
-        w, x, y, z = turned.T.reshape(4, *part.rows.shape)
+    if force is not None:
+        f_x, f_y, f_z = np.moveaxis(force, -1, 0)
+        lift = f_z - np.mean(f_z)
+        out |= {"a_x": f_x, "a_y": f_y, "a_z": lift, "a_z squared": lift**2}
+        out |= {"a_x a_z": f_x * lift, "a_y a_z": f_y * lift}
+    if attitude is not None:
+        w, x, y, z = np.moveaxis(attitude, -1, 0)
         out |= {"pitched": 2.0 * (x * z - w * y), "rolled": 2.0 * (y * z + w * x)}
         out |= {"heading north": w * w + x * x - y * y - z * z, "heading east": 2.0 * (x * y + w * z)}
     return out
 
 
 def _before(signal: FloatArray) -> FloatArray:
-    """The signal one step before; at the first sample of a segment, there."""
+    """The signal (segments, length, ...) one step before; at the first sample of a segment, there."""
     return np.concatenate([signal[:, :1], signal[:, :-1]], axis=1)
 
 
-def _predicted(part: Columns, measured: FloatArray | None, axis: int, channel: int) -> FloatArray:
-    """Predicted value of a channel; where nothing was measured, 0, as its residual."""
-    value = part.base[:, :, channel]
-    return value if measured is None else value + np.nan_to_num(measured[part.rows][..., axis])
+def _predicted(part: Columns, measured: FloatArray | None, channel: int) -> FloatArray:
+    """Predicted values of three channels from one on; where nothing was measured, 0, as their residual."""
+    value = part.base[:, :, channel : channel + 3]
+    return value if measured is None else value + np.nan_to_num(measured[part.rows])
 
 
 # --- What remains after the named causes: is it noise, and does it contradict them?
@@ -347,18 +354,18 @@ def _structure(name: str, found: FloatArray, null: FloatArray, segments: int, ra
     return Structure(name, share, deviance, k * spacing, float(z[k]))
 
 
-def inconstant_causes(model: Model, left: Remainder) -> dict[str, str]:
+def inconstant_causes(model: Named, sites: Sequence[Follows]) -> dict[str, str]:
     """Offsets in `model` that are not constant, and what they follow, by label.
 
     A bias is constant.  Anything whose mean is not zero looks like one at first: a gyro that senses acceleration, warms
     up or is shaken.  The difference is small beside the mean: the rest at the same sensor follows acceleration,
     thrust or time.  A test of all generic signals together is too blunt for that; each alone is not.
     """
-    reasons = {c.label: _inconstant(model, c, left) for c in model.causes}
+    reasons = {c.label: _inconstant(model, c, sites) for c in model.causes}
     return {label: reason for label, reason in reasons.items() if reason}
 
 
-def _inconstant(model: Model, cause: Candidate, left: Remainder) -> str:
+def _inconstant(model: Named, cause: Candidate, sites: Sequence[Follows]) -> str:
     """Signal that an offset that is not constant follows; empty where it follows nothing, or claims no constancy."""
     kind = EFFECTS[cause.effect].constant_on
     if not kind:
@@ -366,12 +373,12 @@ def _inconstant(model: Model, cause: Candidate, left: Remainder) -> str:
     least = max(ALARM**2, CHANGE_SHARE * model.wald(cause))
     followed = [
         (chi_square, f.site.name, signal)
-        for f in left.sites
+        for f in sites
         if f.site.name.startswith(kind)
         for signal, chi_square in f.alone.items()
         # Of sites that look alike from afar the best counts.
         if signal.startswith(CHANGES)
-        and chi_square >= max(g.alone[signal] for g in left.sites if g.site.group == f.site.group)
+        and chi_square >= max(g.alone[signal] for g in sites if g.site.group == f.site.group)
     ]
     chi_square, site, signal = max(followed, default=(0.0, "", ""))
     return f"{cause.effect} is not constant (what remains at {site} follows {signal})" if chi_square > least else ""

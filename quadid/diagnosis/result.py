@@ -167,7 +167,7 @@ def _finding(shooting: Shooting, search: Search, worth: Worth, sigma: dict[str, 
         confident=confident,
         parameters=numbers,
         gain=benefit,
-        p_value=min(1.0, survival(search.model.wald(cause), len(cause.names)) * search.tests),
+        p_value=min(1.0, survival(search.model.wald(cause), len(cause.names)) * len(search.listed)),
         alternatives=_alternatives(search, cause, benefit.mse_after),
         evidence=f"{body[0].upper()}{body[1:]}; on unseen data the error of {benefit.seconds:g} s runs falls from "
         f"{benefit.mse_before:.3g} to {benefit.mse_after:.3g} times the noise.",

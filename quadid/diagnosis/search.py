@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Generic
 
 import numpy as np
 
-from quadid.diagnosis.evidence import Everything, Score, better, impossible_causes, missed, worth_a_refit
+from quadid.diagnosis import random_forces
+from quadid.diagnosis.evidence import Everything, M, Score, better, impossible_causes, missed, worth_a_refit
 from quadid.diagnosis.hypotheses import Candidate, Model, Start, extend, fit_model, refit, sketch, taken_out, without
 from quadid.identification.fit import flexible_names
 from quadid.identification.problem import Shooting
@@ -96,21 +98,21 @@ MOST_REFITS = 7
 
 
 @dataclass(frozen=True)
-class Move:
+class Move(Generic[M]):
     """A move made: the cause that came (None: none), the one that left (None: none), and the refitted model."""
 
     candidate: Candidate | None
     gone: Candidate | None
-    model: Model
+    model: M
 
 
 @dataclass(frozen=True)
-class Round:
-    """One step of the selection: the moves refitted, and the one made (or None)."""
+class Round(Generic[M]):
+    """One step of a selection: the moves refitted, and the one made (or None)."""
 
-    before: Model
-    moves: tuple[Move, ...]
-    accepted: Move | None
+    before: M
+    moves: tuple[Move[M], ...]
+    accepted: Move[M] | None
 
 
 @dataclass(frozen=True)
@@ -120,15 +122,15 @@ class Search:
     Attributes:
         shooting: the problem that decided.
         nominal: model without causes; model: the selected one.
-        rounds: what was tried, in order.
-        tests: number of causes looked at in one round.
+        rounds: what was tried, in order, last by innovations where random forces act.
+        listed: causes looked at in every round.
     """
 
     shooting: Shooting
     nominal: Model
     model: Model
-    rounds: tuple[Round, ...]
-    tests: int
+    rounds: tuple[Round[Model] | Round[random_forces.Model], ...]
+    listed: tuple[Candidate, ...]
 
 
 def select(
@@ -148,7 +150,7 @@ def select(
         known: selection to go on from.
     """
     stage = Stage.begin(schedule, theta, known)
-    rounds: list[Round] = []
+    rounds: list[Round[Model]] = []
     seen = {_key(stage.shooting, stage.model)}
     while True:  # no model is visited twice
         report("search", len(rounds) / (len(rounds) + 2.0))
@@ -165,7 +167,7 @@ def select(
         stage = replace(where, model=accepted.model).continued()
         seen.add(_key(stage.shooting, stage.model))
     nominal = fit_model(stage.shooting, theta, ()) if stage.model.causes else stage.model
-    return Search(stage.shooting, nominal, stage.model, tuple(rounds), len(listed))
+    return Search(stage.shooting, nominal, stage.model, tuple(rounds), tuple(listed))
 
 
 def _key(shooting: Shooting, model: Model) -> tuple[int, frozenset[str]]:
@@ -197,27 +199,27 @@ def _only(shooting: Shooting, theta: FloatArray, causes: Sequence[Candidate]) ->
 
 def pruned(shooting: Shooting, model: Model) -> Model:
     """`model` without the causes that make it no better."""
-    while best := _best(model, [Move(None, c, without(shooting, model, c)) for c in _removable(model)]):
+    while best := best_move(model, [Move(None, c, without(shooting, model, c)) for c in removable(model.causes)]):
         model = best.model
     return model
 
 
-def _round(stage: Stage, listed: Sequence[Candidate], seen: Collection[tuple[int, frozenset[str]]]) -> Round:
+def _round(stage: Stage, listed: Sequence[Candidate], seen: Collection[tuple[int, frozenset[str]]]) -> Round[Model]:
     """Refits the most promising additions and what can be dropped; where none is better, causes in others' places."""
     shooting, model = stage.shooting, stage.model
     everything = Everything.of(shooting, model, listed)
     least = worth_a_refit(len(listed), model.rows)
-    moves: list[Move] = []
+    moves: list[Move[Model]] = []
     best = None
     for generated in (_adds_and_drops, _swaps):
         if best is None:
             new = generated(shooting, everything, least)
             moves += [t for t in new if _key(shooting, t.model) not in seen]
-            best = _best(model, moves)
+            best = best_move(model, moves)
     return Round(model, tuple(moves), best)
 
 
-def _best(model: Model, moves: Sequence[Move]) -> Move | None:
+def best_move(model: M, moves: Sequence[Move[M]]) -> Move[M] | None:
     """The best of the moves that are better than `model`; those with impossible numbers only where no other is."""
     good = [t for t in moves if better(t.model, model)]
     best = None
@@ -227,19 +229,19 @@ def _best(model: Model, moves: Sequence[Move]) -> Move | None:
     return best
 
 
-def _adds_and_drops(shooting: Shooting, everything: Everything, least: float) -> Iterator[Move]:
+def _adds_and_drops(shooting: Shooting, everything: Everything, least: float) -> Iterator[Move[Model]]:
     model = everything.model
     scores = [s for s in everything.scores() if s.candidate.start or s.drop > least]
     yield from _refits(shooting, model, scores, least, NEAR)
-    for cause in _removable(model):
+    for cause in removable(model.causes):
         if everything.loss(cause) < 4.0 * least:
             yield Move(None, cause, without(shooting, model, cause))
 
 
-def _swaps(shooting: Shooting, everything: Everything, least: float) -> Iterator[Move]:
+def _swaps(shooting: Shooting, everything: Everything, least: float) -> Iterator[Move[Model]]:
     """Look-alikes in the place of each cause."""
     model = everything.model
-    for cause in _removable(model):
+    for cause in removable(model.causes):
         lost = everything.loss(cause)
         wanted = max(ALIKE * lost, least)
         rivals = [s for s in everything.scores(cause) if _rivals(s, cause, lost + s.drop > wanted)]
@@ -256,7 +258,7 @@ def _rivals(score: Score, cause: Candidate, regains: bool) -> bool:
 
 def _refits(
     shooting: Shooting, model: Model, scores: Sequence[Score], least: float, near: float, lost: float = 0.0
-) -> Iterator[Move]:
+) -> Iterator[Move[Model]]:
     """Refits with one cause each, at most `MOST_REFITS`, until none is predicted to come `near` what one did gain.
 
     A prediction is linear and the effects are not, so what a refit brought counts, not what another one promised.
@@ -281,9 +283,9 @@ def _refits(
         yield Move(score.candidate, score.gone, extended)
 
 
-def _removable(model: Model) -> list[Candidate]:
+def removable(causes: Collection[Candidate]) -> list[Candidate]:
     """Causes that no other stands on; their own refinements leave with them."""
-    return [c for c in model.causes if not any(c.carries(x) and not x.refines for x in model.causes)]
+    return [c for c in causes if not any(c.carries(x) and not x.refines for x in causes)]
 
 
 def _start(shooting: Shooting, model: Model, score: Score) -> Start:

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from quadid.diagnosis import evidence
-from quadid.diagnosis.hypotheses import BLOCKS
+from quadid.diagnosis.evidence import FALSE_ALARM
+from quadid.diagnosis.hypotheses import BLOCKS, RELEVANT
 from quadid.diagnosis.pipeline import SHARE_TO_NAME
 from quadid.effects import EFFECTS
 
@@ -27,8 +27,8 @@ def test_every_effect_has_its_part_and_no_other_is_explained(repository: Path) -
 @pytest.mark.parametrize(
     "words",
     [
-        f"{100 * evidence.RELEVANT:.1f} % of the independent residuals",
-        f"{evidence.FALSE_ALARM} divided by",
+        f"{100 * RELEVANT:.1f} % of the independent residuals",
+        f"{FALSE_ALARM} divided by",
         f"{BLOCKS} blocks of time",
         f"at least {100 * SHARE_TO_NAME:.0f} % of all structure",
     ],

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from quadid.diagnosis import Diagnosis, diagnose, pipeline
+from quadid.diagnosis.result import Explanation
 from quadid.flight import draw_truth, fly
 from quadid.identification.filter_error import filtered
 from quadid.identification.fit import SWARM_SECONDS
@@ -37,6 +38,8 @@ def errors(found: Diagnosis, seed: int = SEED) -> dict[str, float]:
 
 def test_turbulence_does_not_pass_for_inertia() -> None:
     found, truth = diagnosed(), draw_truth(PELICAN, SEED).as_dict()
+    assert found.verdict is Explanation.UNKNOWN
+    assert not found.findings, "gusts are random forces, no cause of the catalogue"
     assert max(map(abs, errors(found).values())) < 0.04, errors(found)
     parameters = {p.name: p for p in found.parameters}
     for name in ("J_xx", "J_yy"):
@@ -62,8 +65,16 @@ def test_by_segments_alone_it_does(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_nor_does_it_beside_a_cause_that_is_found(seed: int) -> None:
     """Without the cause it would count as a random moment."""
     found = diagnosed(seed, cg_offset={"x": 0.01, "y": -0.01})
-    assert "cg_offset" in {f.effect for f in found.findings}
+    assert [f.effect for f in found.findings] == ["cg_offset"]
     assert max(map(abs, errors(found, seed).values())) < 0.05, errors(found, seed)
+
+
+def test_a_lag_in_turbulence_is_neither_a_delay_nor_drag() -> None:
+    """Segments simulated freely take it for a command delay, and the gusts for parasitic drag."""
+    found = diagnosed(motor_lag={"tau": 0.04})
+    assert [f.effect for f in found.findings] == ["motor_lag"]
+    (tau,) = found.findings[0].parameters
+    assert tau.ci95[0] < 0.04 < tau.ci95[1]
 
 
 def test_they_are_sharper_than_those_of_segments() -> None:

@@ -1,9 +1,10 @@
-"""Variance of summed scores in the study of causes by innovations: as long a memory as the scores have."""
+"""Variance of summed scores of a diagnosis beside random forces: as long a memory as the scores have."""
 
 import numpy as np
 import pytest
-from quadid_evaluation.studies.innovations.models import long_run
 from scipy.signal import lfilter
+
+from quadid.diagnosis.random_forces import long_run
 
 WHITE = np.random.default_rng(3).standard_normal((4000, 2))
 

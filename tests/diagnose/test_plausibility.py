@@ -95,7 +95,7 @@ def with_bias(problem: Problem, effect: str) -> Model:
 
 def doubts_about(problem: Problem, effect: str) -> dict[str, str]:
     model = with_bias(problem, effect)
-    return inconstant_causes(model, remainder(problem.shooting, model))
+    return inconstant_causes(model, remainder(problem.shooting, model).sites)
 
 
 def test_a_constant_bias_is_believed() -> None:

@@ -6,7 +6,7 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
-from quadid.diagnosis.evidence import Everything, better, relevant
+from quadid.diagnosis.evidence import Everything, better
 from quadid.diagnosis.hypotheses import Model, extend, without
 from quadid.diagnosis.search import pruned, select
 from tests.diagnose.problems import Problem, cause, clean, fitted, window_with
@@ -62,11 +62,11 @@ def test_a_cause_is_not_replaced_because_scores_of_the_other_one_vary() -> None:
 
 def test_what_gains_in_a_single_block_is_not_relevant() -> None:
     lag = named("motor_lag")
-    assert relevant(named(), lag)
+    assert lag.gains_beside(named())
     held_out = named().held_out.copy()
     held_out[1:] = lag.held_out[1:]
     held_out[0] += 1e6
-    assert not relevant(replace(named(), held_out=held_out, rest=lag.rest), lag)
+    assert not lag.gains_beside(replace(named(), held_out=held_out, rest=lag.rest))
 
 
 def test_what_only_one_block_determines_is_not_relevant_whatever_the_others_gain_by_it() -> None:
@@ -75,7 +75,7 @@ def test_what_only_one_block_determines_is_not_relevant_whatever_the_others_gain
     best = int(np.argmax(named().held_out - lag.held_out))
     rest[best] = lag.rest[best]
     assert (named().held_out - lag.held_out).sum() > 0.5 * named().rows
-    assert not relevant(replace(named(), rest=rest), lag)
+    assert not lag.gains_beside(replace(named(), rest=rest))
 
 
 def test_what_gains_nothing_is_dropped_and_nothing_else() -> None:

@@ -32,8 +32,8 @@ import quadid
 import quadid.diagnosis
 from quadid.data.window import Window
 from quadid.diagnosis import diagnose
-from quadid.diagnosis.evidence import RELEVANT, stated_errors
-from quadid.diagnosis.hypotheses import Model, candidates, fit_model, paired_gain
+from quadid.diagnosis.evidence import stated_errors
+from quadid.diagnosis.hypotheses import RELEVANT, Model, candidates, fit_model, paired_gain
 from quadid.diagnosis.pipeline import SHARE_TO_NAME
 from quadid.diagnosis.search import LINEAR_MISFIT
 from quadid.errors import QuadidError

@@ -111,10 +111,11 @@ def _case(group: str, n: int) -> Case:
     hidden: dict[str, dict[str, float]]
     if group == "null":
         return blank
-    if group in ("single", "noisy", "short", "weak"):
+    if group in ("single", "rough", "noisy", "short", "weak"):
         name = SINGLES[n % len(SINGLES)]
         hidden = draw(name, seconds=60.0 if group == "short" else 120.0)
         changed: dict[str, dict[str, Any]] = {
+            "rough": {"outside": GUSTS},
             "noisy": {"noise_scale": 3.0},
             "short": {"seconds": 60.0},
             "weak": {"profile": "gentle"},
@@ -154,6 +155,7 @@ GROUPS = {
     "look_alike": 24,
     "outside": 48,
     "clutter": 50,
+    "rough": 25,
     "noisy": 25,
     "short": 25,
     "weak": 25,

@@ -3,8 +3,8 @@
     python -m quadid_evaluation.studies.filter_error --out docs/results
     python -m quadid_evaluation.studies.filter_error --parts exact speed --flights 20
 
-Parts: exact and gusty simulated flights, guesses far off, a loop faster than its log, a hidden motor lag, causes,
-recorded vehicles, speed.  A part that is run alone replaces its own section of the page and leaves the others.
+Parts: exact and gusty simulated flights, guesses far off, a loop faster than its log, a hidden motor lag, recorded
+vehicles, speed.  A part that is run alone replaces its own section of the page and leaves the others.
 """
 
 import time
@@ -16,7 +16,7 @@ from quadid_replay.opening import open_log
 
 from quadid.data.grid import grid_recording
 from quadid.estimate.fit import estimate
-from quadid.estimate.missing import Vehicles, control_size, removed, size, smoothed
+from quadid.estimate.missing import control_size, size, smoothed
 from quadid.estimate.problem import Problem
 from quadid.estimate.track import from_recording, from_window
 from quadid.flight import draw_truth, fly
@@ -25,8 +25,7 @@ from quadid.parameters import NOMINAL_NAMES
 from quadid.vehicle import ParameterPrior, Vehicle
 from quadid_evaluation.harness import Given, options, pooled, put
 from quadid_evaluation.studies.campaign import GUSTS
-from quadid_evaluation.studies.filter_error.jobs import BRIEF, LATE, SECONDS, caused, exact, fast_loop, lagging
-from quadid_evaluation.studies.innovations import searched
+from quadid_evaluation.studies.filter_error.jobs import LATE, SECONDS, exact, fast_loop, lagging
 from quadid_evaluation.studies.truth import poor_guess
 
 EFFECTS = (
@@ -49,14 +48,6 @@ RECORDED: tuple[tuple[str, tuple[str, ...], float | None], ...] = (
     ("iris", ("sideways.csv",), 50.0),
 )
 """Folder of the recorded data, flights, rate [Hz]; None: every channel at its own rate."""
-APART: tuple[tuple[str, str, str], ...] = (
-    ("brushed", "jana00.csv", "jana02.csv"),
-    ("brushed", "jana02.csv", "jana00.csv"),
-    ("crazyflie_rpm", "figure8_17.csv", "figure8_22.csv"),
-    ("crazyflie_rpm", "figure8_27.csv", "figure8_34.csv"),
-    ("nanobench", "B2_circle_fast_rep1.csv", "B9_trefoil_fast_rep10.csv"),
-)
-"""Folder of the recorded data, the flight on which causes are searched, and the one on which they are judged."""
 KNOWN = {
     "brushed": "b 2.02e-8 (thrust stand), J 1.5–1.9e-5, speeds act 4–8 ms late",
     "crazyflie_rpm": "b 3.70e-8",
@@ -181,63 +172,6 @@ def late(flights: int, processes: int) -> str:
     return "\n".join(lines)
 
 
-def named(flights: int, processes: int) -> str:
-    """Causes by innovations beside today's diagnosis: single causes in still and rough air, nothing hidden."""
-    lines = [
-        f"Single causes of the campaign (classes `single`, `null`), {BRIEF:.0f} s each; rough air: the gusts above.  "
-        "Right: exactly what was hidden is named.",
-        "",
-        "| hidden | still air: filter | today | rough air: filter | today |",
-        "|---|---|---|---|---|",
-    ]
-    kinds = [("single", n) for n in range(flights)] + [("null", n) for n in range(max(flights // 6, 2))]
-    jobs = [(group, n, gusty) for group, n in kinds for gusty in (False, True)]
-    found = pooled(caused, jobs, processes)
-    for still, rough in zip(found[::2], found[1::2], strict=True):
-        cells = [
-            f"{'' if good else '**'}{name}{'' if good else '**'}"
-            for one in (still, rough)
-            for good, name in ((one[1], one[3]), (one[2], one[4]))
-        ]
-        lines.append(f"| {still[0]} | " + " | ".join(cells) + " |")
-    counts = [sum(bool(one[1 + which]) for one in found[rough::2]) for rough in (0, 1) for which in (0, 1)]
-    total, seconds = len(found) // 2, np.median([one[5] for one in found])
-    return "\n".join(
-        [
-            *lines,
-            "",
-            f"Right of {total}: still air {counts[0]} (today {counts[1]}), rough air {counts[2]} (today {counts[3]}); "
-            f"processor time of the filter's search, median {seconds:.0f} s.",
-        ]
-    )
-
-
-def causes(flights: int, processes: int, data: Path) -> str:
-    """Causes on simulated flights, and on recorded ones what they take from the missing force and moment."""
-    lines = [
-        named(flights, processes),
-        "",
-        "Recorded vehicles at 100 Hz: causes searched on one flight; removed: share of the squared missing force and "
-        "moment on the other one, which was not fitted.",
-        "",
-        "| data | judged on | named | J_xx, J_yy | removed |",
-        "|---|---|---|---|---|",
-    ]
-    for folder, train, test in APART:
-        vehicle = Vehicle.from_yaml((data / folder / "vehicle.yaml").read_text(encoding="utf-8"))
-        fitted, unseen = (grid_recording(open_log(data / folder / n), vehicle, 100.0).windows for n in (train, test))
-        found = searched(fitted, vehicle)
-        nominal, model = found.nominal, found.model
-        judge = Vehicles(fitted, vehicle, nominal.theta)
-        before, after = (judge.missing(unseen, one.theta) for one in (nominal, model))
-        inertia = ", ".join(f"{v:.3g}" for v in model.theta[2:4])
-        lines.append(
-            f"| `{folder}` {train.removesuffix('.csv')} | {test.removesuffix('.csv')} | "
-            f"{', '.join(model.names) or 'nothing'} | {inertia} | {removed(before, after):.0%} |"
-        )
-    return "\n".join(lines)
-
-
 def speed() -> str:
     """Time of `identify` for a flight of 500 s at 50 Hz, calm and in gusts, and of one filter pass."""
     begin = time.perf_counter()
@@ -272,7 +206,6 @@ PARTS: Mapping[str, tuple[str, Callable[[Given], str]]] = {
     "guesses": ("Guesses far off", lambda g: guesses(max(g.flights // 3, 3))),
     "loop": ("A loop faster than its log", lambda g: feedback(max(g.flights // 5, 4), g.processes)),
     "late": ("A hidden motor lag", lambda g: late(max(g.flights // 10, 4), g.processes)),
-    "causes": ("Causes by innovations", lambda g: causes(max(g.flights // 2, 4), g.processes, g.data)),
     "recorded": ("Recorded vehicles", lambda g: recorded(g.data)),
     "speed": ("Speed", lambda g: speed()),
 }

@@ -1,13 +1,10 @@
 """One flight each, as worker processes run them."""
 
-import time
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
 from quadid.data.window import Window
-from quadid.diagnosis import diagnose
 from quadid.effects import EFFECTS
 from quadid.estimate.fit import Estimate, estimate
 from quadid.estimate.problem import Problem
@@ -17,12 +14,11 @@ from quadid.identification.fit import FitOptions, fit
 from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
-from quadid_evaluation.studies.campaign import GUSTS, cases, flown
+from quadid_evaluation.studies.campaign import GUSTS
 from quadid_evaluation.studies.filter_error import loop
-from quadid_evaluation.studies.innovations import searched
 from quadid_evaluation.studies.truth import poor_guess
 
-SECONDS, BRIEF = 60.0, 40.0
+SECONDS = 60.0
 
 
 def identified(window: Window, vehicle: Vehicle, truth: Sequence[float], seed: int) -> FloatArray:
@@ -72,21 +68,3 @@ def lagging(job: tuple[int, float]) -> FloatArray:
     track = from_window(window, vehicle)
     found = [estimate(Problem.of([track], vehicle, names, [window])) for names in ((), LATE)]
     return np.array([errors(one, list(numbers.values())) for one in found])
-
-
-def caused(job: tuple[str, int, bool]) -> tuple[str, bool, bool, str, str, float]:
-    """One case of the campaign: what is hidden, whether both searches are right, what they name, seconds of ours."""
-    group, number, gusty = job
-    case = cases(group, 1, number)[0]
-    if gusty:
-        case = replace(case, outside=GUSTS)
-    case = replace(case, seconds=BRIEF)
-    train, _, vehicle = flown(case)
-    begin = time.process_time()
-    model = searched([train], vehicle).model
-    seconds = time.process_time() - begin
-    today, _ = diagnose([train], vehicle, seed=case.seed)
-    named = tuple(f.effect for f in today.findings if f.confident)
-    hidden = ", ".join(case.expected) or "nothing"
-    good = set(model.names) == set(case.expected), set(named) == set(case.expected)
-    return hidden, *good, ", ".join(model.names) or "nothing", ", ".join(named) or "nothing", seconds

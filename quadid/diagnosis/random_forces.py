@@ -1,5 +1,7 @@
 """Models of a diagnosis at the maximum of their likelihood, random forces and all noise with them."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -9,7 +11,17 @@ import numpy as np
 from scipy.special import gammaln
 
 from quadid.data.window import Window
-from quadid.diagnosis.hypotheses import Candidate, HeldOut, free_names, held_out, sum_by_block
+from quadid.diagnosis.hypotheses import (
+    RELEVANT,
+    Candidate,
+    HeldOut,
+    Named,
+    calibration,
+    free_names,
+    held_out,
+    sum_by_block,
+    surely_gained,
+)
 from quadid.effects import EFFECTS, NEVER
 from quadid.estimate import kalman as k
 from quadid.estimate.fit import ALL_NOISE, ENOUGH, MOST, NEAR, NO_NOISE, scoring, settle_noise, tails
@@ -71,12 +83,13 @@ class Quadratic:
         return float(self.rows.sum())
 
     @property
-    def by_flight(self) -> "Quadratic":
+    def by_flight(self) -> Quadratic:
         """The same by whole flights."""
-        parts = (self.gram, self.grad, self.cost, self.rows)
-        summed = (sum_by_block(part, self.window) for part in parts)
+        gram, grad, cost, rows = (
+            sum_by_block(part, self.window) for part in (self.gram, self.grad, self.cost, self.rows)
+        )
         first = np.unique(self.window, return_index=True)[1]
-        return Quadratic(*summed, self.window[first], self.time[first])
+        return Quadratic(gram, grad, cost, rows, self.window[first], self.time[first])
 
     def spread(self, free: Sequence[int], step: FloatArray, inverse: FloatArray) -> FloatArray:
         """True variance of each of the entries `free` over that in `inverse`, as if the point were a `step` away."""
@@ -103,7 +116,7 @@ def long_run(series: FloatArray, window: IndexArray) -> FloatArray:
     for lag in range(1, min(int(np.ceil(reach.max(initial=0.0))), len(series) - 1) + 1):
         products = (centred[lag:] * centred[:-lag])[window[lag:] == window[:-lag]]
         out = out + 2.0 * np.maximum(1.0 - lag / (np.ceil(reach) + 1.0), 0.0) * products.sum(axis=0)
-    return np.maximum(out, 0.0)
+    return np.asarray(np.maximum(out, 0.0))
 
 
 class Costs(NamedTuple):
@@ -177,28 +190,34 @@ def _spans(track: Track) -> list[tuple[int, int]]:
 
 
 @dataclass(frozen=True)
-class Model:
+class Model(Named):
     """A model at the maximum of its likelihood.
 
     Attributes:
         causes: candidates it contains.
-        problem: the flights, and what is free.
+        free: entries of the full vector that are free; theta: that vector, of the first flight.
+        problem: the flights.
         z: scaled parameters; psi: noise numbers.
         deviance: -2 ln of likelihood and prior.
-        gains: of the pass there, one a flight.
+        gains: of the filter's pass there, one a flight.
         near: the likelihood near it.
-        left_out: deviances with one block left out each; by_flight: with one flight left out each.
+        held_out: deviance of each block in the density that the others predict.
+        rest: deviance of all blocks but one under parameters fitted to them, for each block.
+        by_flight: the same two of whole flights.
         tried: how many alternatives (causes, and onsets of them) were looked at when each cause was, by label.
     """
 
     causes: tuple[Candidate, ...]
+    free: Free
+    theta: FloatArray
     problem: Problem
     z: FloatArray
     psi: FloatArray
     deviance: float
     gains: Sequence[Gains]
     near: Quadratic
-    left_out: HeldOut
+    held_out: FloatArray
+    rest: FloatArray
     by_flight: HeldOut
     tried: Mapping[str, float] = field(default_factory=dict)
 
@@ -207,26 +226,15 @@ class Model:
         """Name and flight (-1: all) of every scaled parameter."""
         return tuple((name, flight) for name, _, flight in self.problem.entries)
 
-    @cached_property
-    def free(self) -> Free:
-        """Entries of the full vector that are free."""
-        return Free(tuple(self.problem.layout.entry(n) for n in free_names(self.causes)))
-
-    @cached_property
-    def theta(self) -> FloatArray:
-        """Full vector; what belongs to a flight is that of the first."""
-        theta = self.problem.vector(self.z, 0)
-        for entry in self.free.entries:
-            if not entry.name.startswith(PER_FLIGHT):  # a filter has biases beside the vector
-                continue
-            place = self._place(entry.name)
-            theta[entry.index] = self.z[place] * self.problem.size[place]
-        return theta
-
     @property
     def rows(self) -> float:
         """Scalar measurements."""
         return self.near.total_rows
+
+    @property
+    def information(self) -> FloatArray:
+        """Information of the data on the scaled parameters, shape (P, P)."""
+        return self.near.information
 
     @cached_property
     def precision(self) -> FloatArray:
@@ -236,7 +244,7 @@ class Model:
     @cached_property
     def covariance(self) -> FloatArray:
         """Of the scaled parameters, by this likelihood, shape (P, P)."""
-        return np.asarray(np.linalg.inv(self.near.information + np.diag(self.precision)))
+        return np.asarray(np.linalg.inv(self.information + np.diag(self.precision)))
 
     @cached_property
     def inflation(self) -> FloatArray:
@@ -246,44 +254,24 @@ class Model:
     @cached_property
     def uncertainty(self) -> Uncertainty:
         """Covariance of the parameters in `free`, in their scale."""
-        at = [self._place(name) for name in self.free.names]
+        names = [name for name, _ in self.keys]
+        at = [names.index(name) for name in self.free.names]
         unit = np.where(self.free.is_log, 1.0, self.problem.size[at] / self.free.scale)
         covariance = self.covariance[np.ix_(at, at)] * np.outer(unit, unit)
         return Uncertainty(covariance, np.ones(len(at)), unit * self.problem.prior[1][at])
 
-    def _place(self, name: str) -> int:
-        return next(i for i, (n, _) in enumerate(self.keys) if n == name)
+    def gains_beside(self, small: Model) -> bool:
+        """Checks whether what it has more than a `small` model gains enough on unseen blocks, in units of its scores.
 
-    def numbers(self, cause: Candidate) -> Free:
-        """The free parameters that belong to `cause`."""
-        return Free(tuple(e for e in self.free.entries if e.name in cause.names))
-
-    def wald(self, cause: Candidate) -> float:
-        """Chi-square of the parameters of `cause` against neutral."""
-        z = self.free.from_neutral(self.theta)
-        place = [self.free.names.index(n) for n in cause.names]
-        covariance = self.uncertainty.covariance[np.ix_(place, place)]
-        return float(z[place] @ np.linalg.solve(covariance, z[place]))
-
-    @property
-    def effects(self) -> set[str]:
-        """Names of the effects it contains."""
-        return {c.effect for c in self.causes}
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Effects in the order in which they were found."""
-        return tuple(dict.fromkeys(c.effect for c in self.causes))
-
-    @property
-    def labels(self) -> frozenset[str]:
-        """Labels of its causes."""
-        return frozenset(c.label for c in self.causes)
-
-
-def left_without(causes: tuple[Candidate, ...], gone: Candidate | None) -> tuple[Candidate, ...]:
-    """`causes` without `gone`, if any, and what requires it."""
-    return tuple(c for c in causes if gone is None or (c.label != gone.label and not gone.carries(c)))
+        What belongs to the vehicle must do so on unseen flights too, where there are several.
+        """
+        own = np.array([key not in small.keys for key in self.keys])
+        parts = [(HeldOut(small.held_out, small.rest), HeldOut(self.held_out, self.rest))]
+        more = [c for c in self.causes if c.label not in small.labels]
+        if len(small.by_flight.block) > 1 and not any(c.timed is not None or EFFECTS[c.effect].per_log for c in more):
+            parts.append((small.by_flight, self.by_flight))
+        needed = RELEVANT * small.rows * calibration(self.inflation[own])
+        return all(surely_gained(*pair) > needed for pair in parts)
 
 
 class Possible(Problem):
@@ -298,10 +286,6 @@ class Possible(Problem):
                 entry = self.layout.entry(name)
                 out[:, i] = (np.array([entry.lower, entry.upper]) - entry.neutral) / self.size[i]
         return out
-
-
-ONSET_STEP, ONSET_REACH, ONSET_ROUNDS = 0.8, 4.0, 3
-"""Of the search for an onset: first step, what is looked at on either side [s], and most refits."""
 
 
 @dataclass(frozen=True)
@@ -319,7 +303,7 @@ class Flights:
     listed: tuple[Candidate, ...]
 
     @classmethod
-    def of(cls, windows: Sequence[Window], vehicle: Vehicle, listed: Sequence[Candidate]) -> "Flights":
+    def of(cls, windows: Sequence[Window], vehicle: Vehicle, listed: Sequence[Candidate]) -> Flights:
         """The flights of `windows`."""
         tracks = [from_window(w, vehicle, air=True) for w in windows]
         names = tuple(dict.fromkeys(n for c in listed for n in c.names))
@@ -338,7 +322,7 @@ class Flights:
         own = set(names) <= set(PLACES) and not any(theta[e.index] != e.neutral for e in rest)
         return replace(self.whole, names=tuple(names), theta=theta, models=() if own else self.whole.models)
 
-    def nominal(self, theta: FloatArray) -> tuple["Flights", Model]:
+    def nominal(self, theta: FloatArray) -> tuple[Flights, Model]:
         """The model without causes, from where the six are those of `theta`, and the flights with its unit of noise."""
         problem = self.problem(NOMINAL_NAMES, {})
         z = np.log(theta[: len(NOMINAL_NAMES)])
@@ -382,39 +366,13 @@ class Flights:
         near = quadratic(problem, gains, found, len(z))
         if not (np.isfinite(deviance) and np.isfinite(near.information).all()):
             return None
-        left_out = (held_out(part, problem.prior[1] ** -2.0) for part in (near, near.by_flight))
-        return Model(causes, problem, z, psi, deviance, gains, near, *left_out, tried)
-
-    def in_time(self, model: Model, cause: Candidate) -> Model:
-        """Refits `model` with the onset of a timed `cause` where it is most likely, everything else as it is.
-
-        A scan is linear, at random forces that stood in for the cause: it may be off by a second.
-        """
-        assert cause.timed is not None
-        for _ in range(ONSET_ROUNDS):
-            time, step = float(model.problem.theta[cause.timed]), ONSET_STEP
-            # Measurements around the onset determine its time.
-            rows = [np.searchsorted(t.t, [time - ONSET_REACH, time + ONSET_REACH]) for t in model.problem.tracks]
-            near = model.problem.cut([(max(int(a), 0), max(int(b), int(a) + 2)) for a, b in rows])
-            while step > 0.5 * self.windows[0].dt:
-                tried = {t: self._at(near, model, cause.timed, t) for t in time + step * np.arange(-2.0, 3.0)}
-                time, step = min(tried, key=lambda t: tried[t]), 0.4 * step
-            if abs(time - model.problem.theta[cause.timed]) < self.windows[0].dt:
-                break
-            times = times_of(model, model.causes) | {cause.effect: time}
-            start = dict(zip(model.keys, model.z, strict=True))
-            moved = self.fit(model.causes, start, model.psi, times, model.tried, model.deviance)
-            if moved is None or not moved.deviance < model.deviance:
-                break
-            model = moved
-        return model
-
-    @staticmethod
-    def _at(near: Problem, model: Model, place: int, time: float) -> float:
-        """Deviance of a part of the flights if an effect begins at `time` [s]."""
-        theta = near.theta.copy()
-        theta[place] = time
-        return replace(near, theta=theta).objective(model.z, model.psi)
+        blocks, flights = (held_out(part, problem.prior[1] ** -2.0) for part in (near, near.by_flight))
+        free = Free(tuple(problem.layout.entry(n) for n in free_names(causes)))
+        theta = problem.vector(z, 0)
+        for i, (name, place, _) in reversed([*enumerate(problem.entries)]):
+            if name in free.names and place < k.N_PHYSICS and name.startswith(PER_FLIGHT):  # biases beside the vector
+                theta[problem.layout.entry(name).index] = z[i] * problem.size[i]
+        return Model(causes, free, theta, problem, z, psi, deviance, gains, near, *blocks, flights, tried)
 
 
 def times_of(model: Model, causes: Sequence[Candidate]) -> dict[str, float]:
