@@ -29,7 +29,7 @@ from quadid.estimate.kalman import Beyond, Gains, Track
 from quadid.estimate.problem import PER_FLIGHT, PLACES, Problem, Sensitivities
 from quadid.estimate.track import from_window
 from quadid.identification.problem import Free
-from quadid.identification.uncertainty import Uncertainty
+from quadid.identification.uncertainty import Uncertainty, score_products
 from quadid.model.layout import places
 from quadid.parameters import NOMINAL_NAMES
 from quadid.types import BoolArray, FloatArray, IndexArray
@@ -93,30 +93,14 @@ class Quadratic:
 
     def spread(self, free: Sequence[int], step: FloatArray, inverse: FloatArray) -> FloatArray:
         """True variance of each of the entries `free` over that in `inverse`, as if the point were a `step` away."""
-        scores = (self.grad + self.gram @ step)[:, free] @ inverse
-        return long_run(scores, self.window) / np.diag(inverse)
+        scores = (self.grad + self.gram @ step)[:, free]
+        meat, _ = score_products(scores, self.window, self.time, self.spacing)
+        return np.asarray(np.diag(inverse @ meat @ inverse) / np.diag(inverse))
 
     @property
     def spacing(self) -> float:
         """Time from one stretch to the next [s]; 1 s where there is one only."""
         return float(np.median(np.diff(self.time))) if len(self.time) > 1 else 1.0
-
-
-def long_run(series: FloatArray, window: IndexArray) -> FloatArray:
-    """Variance of the sum of each series of scores of stretches (T, P), with the memory that they have, shape (P,).
-
-    Sums of Bartlett-weighted products within flights, over as many stretches as is best for a series that forgets like
-    a first-order one (Andrews, Econometrica 59 (1991) 817, Eq. 6.2).
-    """
-    centred = series - series.mean(axis=0)
-    follows = window[1:] == window[:-1]
-    out = np.sum(centred**2, axis=0)
-    rho = np.clip(np.sum((centred[1:] * centred[:-1])[follows], axis=0) / np.maximum(out, 1e-300), -0.97, 0.97)
-    reach = 1.1447 * (4.0 * rho**2 / (1.0 - rho**2) ** 2 * len(series)) ** (1.0 / 3.0)
-    for lag in range(1, min(int(np.ceil(reach.max(initial=0.0))), len(series) - 1) + 1):
-        products = (centred[lag:] * centred[:-lag])[window[lag:] == window[:-lag]]
-        out = out + 2.0 * np.maximum(1.0 - lag / (np.ceil(reach) + 1.0), 0.0) * products.sum(axis=0)
-    return np.asarray(np.maximum(out, 0.0))
 
 
 class Costs(NamedTuple):

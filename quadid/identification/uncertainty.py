@@ -24,7 +24,7 @@ from quadid.parameters import (
     unreliable,
 )
 from quadid.rotation import continuous_sign
-from quadid.types import FloatArray
+from quadid.types import FloatArray, IndexArray
 from quadid.vehicle import Vehicle
 
 # --- Covariance, corrected for autocorrelation, and status
@@ -117,19 +117,24 @@ def variance_ratio(lin: Linearised, covariance: FloatArray) -> tuple[FloatArray,
 
     The true one is the "sandwich" of `score_products`.
     """
-    meat, lags = score_products(lin)
+    meat, lags = score_products(lin.grad, lin.window, lin.time, lin.spacing)
     return np.asarray(np.diag(covariance @ meat @ covariance) / np.diag(covariance)), lags
 
 
-def score_products(lin: Linearised) -> tuple[FloatArray, int]:
-    """Bartlett-weighted (P, P) sum of score products over segments of the same window, and the number of lags used."""
+def score_products(scores: FloatArray, window: IndexArray, time: FloatArray, step: float) -> tuple[FloatArray, int]:
+    """Bartlett-weighted (P, P) sum of score products over segments of the same window, and the number of lags used.
+
+    Args:
+        scores: of each segment, shape (segments, P).
+        window: to which it belongs; time: when it begins [s].
+        step: time from one segment to the next [s].
+    """
     # Newey and West: sum over lags l of (1 - l / (L + 1)) (s_t s_t-l' + s_t-l s_t'), s_t the score of segment t.
-    step = lin.spacing
     lags = max(int(round(LAG_SECONDS / max(step, 1e-6))), 1)
-    scores = lin.grad - lin.grad.mean(axis=0)
+    scores = scores - scores.mean(axis=0)
     meat = scores.T @ scores
     for lag in range(1, min(lags, len(scores) - 1) + 1):
-        near = (lin.window[lag:] == lin.window[:-lag]) & (lin.time[lag:] - lin.time[:-lag] < (lag + 0.5) * step)
+        near = (window[lag:] == window[:-lag]) & (time[lag:] - time[:-lag] < (lag + 0.5) * step)
         cross = scores[lag:][near].T @ scores[:-lag][near]
         meat += (1.0 - lag / (lags + 1.0)) * (cross + cross.T)
     return meat, lags
