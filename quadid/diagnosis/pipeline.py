@@ -2,11 +2,12 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
 from quadid.blas import one_thread
-from quadid.data.window import Window, data_faults, without_copies
+from quadid.data.window import DataFault, Window, data_faults, without_copies
 from quadid.diagnosis.evidence import (
     NominalFit,
     better,
@@ -137,23 +138,51 @@ def diagnose(
     faults = data_faults([*windows, *validation])
     windows, validation = without_copies(windows), without_copies(validation)
     vehicle = with_reference_voltage(vehicle, windows)
-    # Which causes, on short segments; where they leave too much for a name, beside random forces.
+    data = _Data(windows, vehicle, validation, faults, nominal)
+    # Which causes, on short segments; their numbers and the vehicle's, by the likelihood of innovations.
     schedule, search = _selected(windows, vehicle, FitOptions(seed=seed) if swarm else None, report)
-    short, decisive, selected = schedule[-1], search.shooting, search.model
-    left, rough = remainder(decisive, selected, seed), None
-    if judge(search.nominal, selected, left) is Explanation.UNKNOWN:
-        report("random forces", 0.0)
-        rough = in_rough_air(windows, search)
-    if rough is not None:
-        search = with_causes_of(search, rough)
-        selected = search.model
-        left = remainder(decisive, selected, seed)
-    # Their numbers and the vehicle's, by the likelihood of innovations.
     report("numbers", 0.0)
+    answer = _concluded(data, schedule[-1], search, remainder(search.shooting, search.model, seed))
+    # Where something remains and no cause is sure: beside random forces.
+    left = answer[0].verdict not in (Explanation.NOTHING_FOUND, Explanation.EXPLAINED)
+    if left and not any(f.confident for f in answer[0].findings):
+        report("random forces", 0.0)
+        if (rough := in_rough_air(windows, search)) is not None:
+            report("numbers", 0.5)
+            search = with_causes_of(search, rough)
+            left_over = remainder(search.shooting, search.model, seed)
+            answer = _concluded(data, schedule[-1], search, left_over, rough)
+    report("done", 1.0)
+    return answer
+
+
+class _Data(NamedTuple):
+    """Data of a diagnosis, as `diagnose` has them, with what is wrong with them."""
+
+    windows: Sequence[Window]
+    vehicle: Vehicle
+    validation: Sequence[Window]
+    faults: Sequence[DataFault]
+    nominal: Fit | None
+
+
+def _concluded(
+    data: _Data, short: Shooting, search: Search, left: Remainder, rough: RoughAir | None = None
+) -> tuple[Diagnosis, Search]:
+    """The answer that a selection leads to, and the selection with the final numbers.
+
+    Args:
+        data: the data.
+        short: short segments of them.
+        search: the selection.
+        left: what it leaves in segments.
+        rough: what it leaves beside random forces, if it was made there.
+    """
+    windows, vehicle, validation, faults, nominal = data
+    # Numbers; what each cause gains on unseen data.
+    decisive, selected = search.shooting, search.model
     found = nominal if nominal and not selected.causes else fit_numbers(windows, short, selected)
     model = selected if found is None else with_numbers(selected, found)
-    # What each cause gains on unseen data.
-    report("validation", 0.0)
     fewer = {c.label: without(decisive, selected, c) for c in selected.causes}
     deciding, worth = cause_gains(decisive, search.nominal, selected, fewer, validation)
     plain = model if validation and not model.causes else search.nominal
@@ -202,7 +231,6 @@ def diagnose(
         "+".join([vehicle.name, *dict.fromkeys(f.effect for f in findings)]),
         tuple(warnings),
     )
-    report("done", 1.0)
     return result, search
 
 

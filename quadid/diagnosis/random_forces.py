@@ -40,6 +40,8 @@ from quadid.vehicle import Vehicle
 
 STRETCH = 1.0
 """Length of the stretches whose scores are summed [s]."""
+PROMISE = 2.0
+"""Times what its last few steps gained that a fit may gain by all that follow."""
 
 
 @dataclass(frozen=True)
@@ -332,18 +334,20 @@ class Flights:
     ) -> Model | None:
         """The model with `causes`, from scaled parameters `start` by key and noise numbers `psi`.
 
-        None as soon as its deviance will not come down to what is `wanted` in the steps that it may take, or where it
-        runs away.
+        None as soon as its deviance will hardly come down to what is `wanted`, or where it runs away.
         """
         problem = self.problem(free_names(causes), times)
         z = np.clip([start.get(key, 0.0) for key in _keys(problem)], *problem.limits)
         deviance, before, gains = np.inf, np.inf, list[Gains]()
-        for turns in range(NEAR, MOST + 1, NEAR):
+        for _ in range(MOST // NEAR):
             gains.clear()
-            z, psi, deviance, gains, _ = scoring(problem, z, psi, NEAR, ALL_NOISE)
+            try:
+                z, psi, deviance, gains, _ = scoring(problem, z, psi, NEAR, ALL_NOISE)
+            except np.linalg.LinAlgError:  # the filter ran away
+                return None
             if not deviance < before - ENOUGH:
                 break
-            if deviance - wanted > (before - deviance) * (MOST - turns) / NEAR:
+            if deviance - wanted > PROMISE * (before - deviance):
                 return None
             before = deviance
         found = [problem.sensitivities(j, z, psi, g) for j, g in enumerate(gains)]

@@ -98,8 +98,8 @@ def _refits(
         if frozenset(c.label for c in causes) in seen:
             continue
         tried = {**model.tried, **{c.label: float(score.trials) for c in new}}
-        # Without a cause the deviance rises; with another or one more it has to fall.
-        wanted = model.deviance if new else np.inf
+        # With another cause or one more the deviance has to fall; without one it may rise by what is of no use.
+        wanted = model.deviance - (0.0 if new else least * score.ratio)
         found, count = flights.fit(causes, score.start, model.psi, times_of(model, causes), tried, wanted), count + 1
         if found is None:
             continue

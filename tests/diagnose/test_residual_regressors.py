@@ -125,7 +125,7 @@ def test_signals_that_double_one_another_change_nothing(monkeypatch: pytest.Monk
     monkeypatch.setattr(residual_tests, "signals", doubled)
     twice = {f.site.name: f.gain.total for f in follows(problem.shooting, problem.nominal)}
     assert twice == pytest.approx(once, rel=0.01)
-    monkeypatch.setattr(residual_tests, "_RIDGE", 0.0)
+    monkeypatch.setattr(residual_tests, "RIDGE", 0.0)
     try:
         without = {f.site.name: f.gain.total for f in follows(problem.shooting, problem.nominal)}
     except np.linalg.LinAlgError:  # unless rounding leaves something to divide by
