@@ -189,26 +189,34 @@ def _concluded(
     stated = nominal or NominalFit(vehicle, plain.theta, decisive.noise)
     # Blocks are left out of the fit to segments, at whose optimum their part in it is known.
     outcome = stated_errors(stated, model if validation else selected, windows, validation, deciding)
-    # The verdict; causes with numbers that no vehicle has, or of another form, count as left.
+    # Doubtful causes, with numbers that no vehicle has or of another form, and the six beside the others.
     doubts = impossible_causes(model)
-    if rough is None:
-        doubts |= inconstant_causes(selected, left.sites)
-        unnamed = sum(max(w.deviance, 0.0) for w in worth if w.cause.label in doubts)
-        verdict = judge(search.nominal, selected, left, unnamed)
-    else:
-        doubts |= inconstant_causes(rough.model, rough.sites)
-        verdict = judge_in_rough_air(rough)
+    doubts |= inconstant_causes(rough.model, rough.sites) if rough else inconstant_causes(selected, left.sites)
+    doubted = {label: selected.free.step(selected.theta, fewer[label].theta) for label in doubts}
+    slight = slight_causes(model) | unproven_causes(model, len(search.listed))
+
+    def beside(without_causes: bool) -> tuple[tuple[Parameter, ...], tuple[str, ...], dict[str, str]]:
+        fits = [found]
+        if without_causes:
+            fits.append(nominal or (fit_numbers(windows, short, search.nominal) if model.causes else found))
+        parameters, reasons = _nominal_parameters(short, model, fits, doubted)
+        parameters, moved = possible_moments(parameters)
+        told = (*reasons, *([] if moved is None else [moved]))
+        return parameters, told, late_unknown(model, parameters) | slight
+
+    parameters, told, weak = beside(without_causes=bool(doubts))
+    # The verdict: what doubtful causes take away counts as left, beside random forces what any takes that is not sure.
+    taken = {w.cause.label: max(w.deviance, 0.0) for w in worth}
+    verdict = judge(search.nominal, selected, left, sum(taken[label] for label in doubts))
+    if rough is not None:
+        unsure = sum(taken[label] for label in doubts | weak)
+        verdict = judge_in_rough_air(rough, unsure / max(sum(taken.values()), 1.0))
     saturated = any(f.kind == "saturated" for f in faults)
     if model.causes and (outcome.contradicted or saturated or len(doubts) == len(model.causes)):
         verdict = Explanation.UNKNOWN
-    # Parameters beside the causes, and findings; those are confident that nothing speaks against.
-    doubted = {label: selected.free.step(selected.theta, fewer[label].theta) for label in doubts}
-    fits = [found]
-    if doubts or verdict is Explanation.UNKNOWN:
-        fits.append(nominal or (fit_numbers(windows, short, search.nominal) if model.causes else found))
-    parameters, reasons = _nominal_parameters(short, model, fits, doubted)
-    parameters, moved = possible_moments(parameters)
-    weak = late_unknown(model, parameters) | slight_causes(model) | unproven_causes(model, len(search.listed))
+    if verdict is Explanation.UNKNOWN and not doubts:
+        parameters, told, weak = beside(without_causes=True)
+    # Findings; those are confident that nothing speaks against.
     alike = {c.family for c in model.causes if c.label in doubts}
     believed = [c for c in model.causes if c.family not in alike and c.label not in weak]
     search = replace(search, model=model)
@@ -217,8 +225,7 @@ def _concluded(
         *(f.text for f in faults),
         *(f"{reason}: it replaces another cause and is not confident" for reason in doubts.values()),
         *(f"{label} is not named with confidence: {reason}" for label, reason in weak.items()),
-        *reasons,
-        *([] if moved is None else [moved]),
+        *told,
     ]
     physical = with_values(vehicle, parameters, [c.effect for c in model.causes], model.theta)
     result = Diagnosis(
@@ -336,9 +343,14 @@ def _with_noise(noise: NoiseModel, schedule: Sequence[Shooting], search: Search)
     return [s.with_noise(noise) for s in schedule], replace(search, shooting=decisive, model=model, nominal=nominal)
 
 
-def judge_in_rough_air(rough: RoughAir) -> Explanation:
-    """Verdict where random forces act: what causes take of them, and whether innovations follow anything else."""
-    followed, explained = rough.followed, rough.explained
+def judge_in_rough_air(rough: RoughAir, unnamed: float = 0.0) -> Explanation:
+    """Verdict where random forces act: what causes take of them, and whether innovations follow anything else.
+
+    Args:
+        rough: what was found there.
+        unnamed: share of what causes take away that is of doubtful ones; it counts as left.
+    """
+    followed, explained = rough.followed + unnamed * rough.explained, (1.0 - unnamed) * rough.explained
     least = max(LEAST_STRUCTURE * rough.model.rows, LEAST_OF_EXPLAINED * explained)
     enough = rough.removed >= (LEAST_REMOVED if len(rough.model.effects) > 1 else REMOVED_ALONE)
     named = followed <= least or explained >= SHARE_TO_NAME * (explained + followed)

@@ -143,7 +143,7 @@ class Everything:
         self._some = [c for c in flights.listed if not c.refines or c.requires in there]
         names = dict.fromkeys([*model.problem.names, *(n for c in self._some for n in c.names)])
         problem = flights.problem(tuple(names), times_of(model, model.causes))
-        self._problem = problem = replace(problem, models=flights.whole.models)
+        problem = replace(problem, models=flights.whole.models)
         self._keys = [(name, flight) for name, _, flight in problem.entries]
         known = dict(zip(model.keys, model.z, strict=True))
         self._z = z = np.array([known.get(key, 0.0) for key in self._keys])
@@ -152,9 +152,16 @@ class Everything:
         secant = np.array([begin.get(name, 0.0) for name, _ in self._keys]) / problem.size
         nudge = np.where((z == 0.0) & (secant != 0.0), secant, NUDGE)
         nudge[[place == k.DELAY and z[i] == 0.0 for i, (_, place, _) in enumerate(problem.entries)]] = LATER
-        self._gains = [with_additions(g) for g in model.gains]
-        self._found = [self._whole(problem.sensitivities(j, z, model.psi, g, nudge)) for j, g in enumerate(self._gains)]
-        self._near = near = quadratic(problem, self._gains, self._found, len(z))
+        gains = [with_additions(g) for g in model.gains]
+        found = [self._whole(problem.sensitivities(j, z, model.psi, g, nudge)) for j, g in enumerate(gains)]
+        # What runs away where the model is promises nothing.
+        with np.errstate(over="ignore", invalid="ignore"):
+            tame = np.all([np.isfinite(np.sum(one.J**2, axis=(1, 2))) for one in found], axis=0)
+        wild = {name for (name, _), stays in zip(self._keys, tame, strict=True) if not stays}
+        self._some = [c for c in self._some if wild.isdisjoint(c.names)]
+        for one in found:
+            one.J[[name in wild for name, _ in self._keys]] = 0.0
+        self._near = near = quadratic(problem, gains, found, len(z))
         mean, sigma = problem.prior
         self._h = near.information + np.diag(sigma**-2.0)
         self._g = near.gradient + (z - mean) / sigma**2
