@@ -61,17 +61,19 @@ def _adds(flights: Flights, everything: Everything, least: float, seen: set[froz
 
 
 def _drops(flights: Flights, everything: Everything, least: float, seen: set[frozenset[str]]) -> Iterator[Move[Model]]:
-    losses = sorted(everything.losses().values(), key=lambda s: -s.worth)
+    losses = sorted(everything.losses(), key=lambda s: -s.worth)
     yield from _refits(flights, everything.model, losses, -SPARE * least, 0.0, seen)
 
 
 def _swaps(flights: Flights, everything: Everything, least: float, seen: set[frozenset[str]]) -> Iterator[Move[Model]]:
-    """Look-alikes in the place of each cause."""
-    for label, lost in everything.losses().items():
-        cause = next(c for c in everything.model.causes if c.label == label)
-        rivals = [s for s in everything.scores(cause) if s.candidate and not s.candidate.split]
-        rivals = [s for s in rivals if s.candidate and s.candidate.effect != cause.effect]
-        yield from _refits(flights, everything.model, rivals, lost.worth * (1.0 - ALIKE), 0.0, seen)
+    """Look-alikes in the place of causes, those first that lose least by it."""
+    rivals: list[Score] = []
+    for lost in everything.losses():
+        for score in everything.scores(lost.gone):
+            alike = score.candidate and lost.gone and score.candidate.effect != lost.gone.effect
+            if alike and score.candidate and not score.candidate.split and score.worth > (1.0 - ALIKE) * lost.worth:
+                rivals.append(score)
+    yield from _refits(flights, everything.model, sorted(rivals, key=lambda s: -s.worth), -np.inf, 0.0, seen)
 
 
 def _refits(
@@ -181,15 +183,15 @@ class Everything:
         """Fall of the deviance that the fit of the model itself left undone."""
         return self._best(self._own, self._g)[1]
 
-    def losses(self) -> dict[str, Score]:
+    def losses(self) -> list[Score]:
         """Predicted fall of the deviance without each cause that no other stands on, the others following: a loss."""
-        out = {}
+        out = []
         for gone in removable(self.model.causes):
             stay, slope, risen = self._left(gone)
             step, fall = self._best(stay, slope)
             away = np.array([name in gone.names for name, _ in self.model.keys])
             ratio, drop = calibration(self.model.inflation[away]), fall - risen - self.unspent
-            out[gone.label] = Score(None, drop, self._start(stay, step), 0, gone, ratio)
+            out.append(Score(None, drop, self._start(stay, step), 0, gone, ratio))
         return out
 
     def scores(self, gone: Candidate | None = None) -> list[Score]:
