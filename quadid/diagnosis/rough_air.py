@@ -59,6 +59,7 @@ class RoughAir:
         return 1.0 - missing_square(self.model) / missing_square(self.nominal)
 
 
+@np.errstate(over="ignore", invalid="ignore")
 def in_rough_air(windows: Sequence[Window], search: Search) -> RoughAir | None:
     """Causes of what moves a vehicle beside random forces, from the quick search on; None where no such forces act.
 
