@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import stdtrit
@@ -15,6 +15,7 @@ from quadid.identification.elimination import InitialStates
 from quadid.identification.gauss_newton import Polished, bounded_step, polish
 from quadid.identification.problem import (
     Free,
+    Linearised,
     Prior,
     Shooting,
     default_prior,
@@ -23,14 +24,10 @@ from quadid.identification.problem import (
     prior_terms,
 )
 from quadid.identification.result import INFINITE
-from quadid.identification.uncertainty import Uncertainty, uncertainty, variance_ratio
+from quadid.identification.uncertainty import Uncertainty, score_products, uncertainty, variance_ratio
 from quadid.model.layout import Layout, places
 from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray, IndexArray
-
-if TYPE_CHECKING:
-    from quadid.diagnosis.random_forces import Quadratic
-    from quadid.identification.problem import Linearised
 
 # --- The causes a diagnosis may name: which entries of the parameter vector each frees, and how its search starts
 
@@ -146,6 +143,67 @@ def unset_times(theta: FloatArray, active: set[str]) -> FloatArray:
 
 BLOCKS = 10
 """With so many the error of a gain is known to a quarter, and each is many times the memory of the noise."""
+
+
+@dataclass(frozen=True)
+class Quadratic:
+    """-2 ln of the likelihood near a point, ``cost + 2 grad z + z gram z`` of a scaled step z, by stretches of time.
+
+    Attributes:
+        gram: shape (stretches, P, P).
+        grad: shape (stretches, P).
+        cost: shape (stretches,).
+        rows: scalar measurements of each stretch.
+        window: index of the flight of each stretch.
+        time: when it begins [s].
+    """
+
+    gram: FloatArray
+    grad: FloatArray
+    cost: FloatArray
+    rows: FloatArray
+    window: IndexArray
+    time: FloatArray
+
+    @property
+    def occam(self) -> float:
+        """No initial states are found: what a comparison by blocks adds to the cost."""
+        return 0.0
+
+    @cached_property
+    def information(self) -> FloatArray:
+        """Of all stretches on the scaled parameters, shape (P, P)."""
+        return np.asarray(self.gram.sum(axis=0))
+
+    @cached_property
+    def gradient(self) -> FloatArray:
+        """Half the slope of all stretches, shape (P,)."""
+        return np.asarray(self.grad.sum(axis=0))
+
+    @cached_property
+    def total_rows(self) -> float:
+        """Scalar measurements of all stretches."""
+        return float(self.rows.sum())
+
+    @property
+    def by_flight(self) -> Quadratic:
+        """The same by whole flights."""
+        gram, grad, cost, rows = (
+            sum_by_block(part, self.window) for part in (self.gram, self.grad, self.cost, self.rows)
+        )
+        first = np.unique(self.window, return_index=True)[1]
+        return Quadratic(gram, grad, cost, rows, self.window[first], self.time[first])
+
+    def spread(self, free: Sequence[int], step: FloatArray, inverse: FloatArray) -> FloatArray:
+        """True variance of each of the entries `free` over that in `inverse`, as if the point were a `step` away."""
+        scores = (self.grad + self.gram @ step)[:, free]
+        meat, _ = score_products(scores, self.window, self.time, self.spacing)
+        return np.asarray(np.diag(inverse @ meat @ inverse) / np.diag(inverse))
+
+    @property
+    def spacing(self) -> float:
+        """Time from one stretch to the next [s]; 1 s where there is one only."""
+        return float(np.median(np.diff(self.time))) if len(self.time) > 1 else 1.0
 
 
 def block_labels(lin: Linearised | Quadratic) -> IndexArray:

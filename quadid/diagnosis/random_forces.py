@@ -16,10 +16,10 @@ from quadid.diagnosis.hypotheses import (
     Candidate,
     HeldOut,
     Named,
+    Quadratic,
     calibration,
     free_names,
     held_out,
-    sum_by_block,
     surely_gained,
 )
 from quadid.effects import EFFECTS, NEVER
@@ -29,7 +29,7 @@ from quadid.estimate.kalman import Beyond, Gains, Track
 from quadid.estimate.problem import PER_FLIGHT, PLACES, Problem, Sensitivities
 from quadid.estimate.track import from_window
 from quadid.identification.problem import Free
-from quadid.identification.uncertainty import Uncertainty, score_products
+from quadid.identification.uncertainty import Uncertainty
 from quadid.model.layout import places
 from quadid.parameters import NOMINAL_NAMES
 from quadid.types import BoolArray, FloatArray, IndexArray
@@ -42,67 +42,6 @@ STRETCH = 1.0
 """Length of the stretches whose scores are summed [s]."""
 PROMISE = 2.0
 """Times what its last few steps gained that a fit may gain by all that follow."""
-
-
-@dataclass(frozen=True)
-class Quadratic:
-    """-2 ln of the likelihood near a point, ``cost + 2 grad z + z gram z`` of a scaled step z, by stretches of time.
-
-    Attributes:
-        gram: shape (stretches, P, P).
-        grad: shape (stretches, P).
-        cost: shape (stretches,).
-        rows: scalar measurements of each stretch.
-        window: index of the flight of each stretch.
-        time: when it begins [s].
-    """
-
-    gram: FloatArray
-    grad: FloatArray
-    cost: FloatArray
-    rows: FloatArray
-    window: IndexArray
-    time: FloatArray
-
-    @property
-    def occam(self) -> float:
-        """No initial states are found: what a comparison by blocks adds to the cost."""
-        return 0.0
-
-    @cached_property
-    def information(self) -> FloatArray:
-        """Of all stretches on the scaled parameters, shape (P, P)."""
-        return np.asarray(self.gram.sum(axis=0))
-
-    @cached_property
-    def gradient(self) -> FloatArray:
-        """Half the slope of all stretches, shape (P,)."""
-        return np.asarray(self.grad.sum(axis=0))
-
-    @cached_property
-    def total_rows(self) -> float:
-        """Scalar measurements of all stretches."""
-        return float(self.rows.sum())
-
-    @property
-    def by_flight(self) -> Quadratic:
-        """The same by whole flights."""
-        gram, grad, cost, rows = (
-            sum_by_block(part, self.window) for part in (self.gram, self.grad, self.cost, self.rows)
-        )
-        first = np.unique(self.window, return_index=True)[1]
-        return Quadratic(gram, grad, cost, rows, self.window[first], self.time[first])
-
-    def spread(self, free: Sequence[int], step: FloatArray, inverse: FloatArray) -> FloatArray:
-        """True variance of each of the entries `free` over that in `inverse`, as if the point were a `step` away."""
-        scores = (self.grad + self.gram @ step)[:, free]
-        meat, _ = score_products(scores, self.window, self.time, self.spacing)
-        return np.asarray(np.diag(inverse @ meat @ inverse) / np.diag(inverse))
-
-    @property
-    def spacing(self) -> float:
-        """Time from one stretch to the next [s]; 1 s where there is one only."""
-        return float(np.median(np.diff(self.time))) if len(self.time) > 1 else 1.0
 
 
 class Costs(NamedTuple):
