@@ -212,7 +212,9 @@ def _concluded(
         unsure = sum(taken[label] for label in doubts | weak)
         verdict = judge_in_rough_air(rough, unsure / max(sum(taken.values()), 1.0))
     saturated = any(f.kind == "saturated" for f in faults)
-    if model.causes and (outcome.contradicted or saturated or len(doubts) == len(model.causes)):
+    # In gusts inertias that are too large, answering them as the autopilot did, predict best: no measure of causes.
+    contradicted = outcome.contradicted and rough is None
+    if model.causes and (contradicted or saturated or len(doubts) == len(model.causes)):
         verdict = Explanation.UNKNOWN
     if verdict is Explanation.UNKNOWN and not doubts:
         parameters, told, weak = beside(without_causes=True)

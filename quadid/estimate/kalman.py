@@ -15,7 +15,7 @@ One step:
     a(t + h) = exp(-h / T) a(t) + w,  w ~ N(0, sigma^2 (1 - exp(-2 h / T))),  for a of f, alpha, e            (4)
     P <- F P F' + G Q G'                                                                                      (5)
 where Q holds, beside the w, the noise of logged rotor speeds, which acts as forces and moments that change with every
-sample, and is in the thrust that the accelerometer is compared with (r);
+sample, and that of readings is in the thrust that the accelerometer is compared with (r);
 and for every scalar measurement y = h(x) + N(0, r):
     S = H P H' + r,  K = P H' / S,  x <- x + K nu,  P <- P - K S K'                                           (6)
 backwards (Bryson & Frazier; de Jong 1989; no inverse of P, which random forces of size zero leave singular):
@@ -107,6 +107,7 @@ class Track(NamedTuple):
         hubs: means of x^2, y^2 [m^2] and z [m] of their hubs in body axes, from the centre of gravity.
         waver: see `track.wavering`.
         period: time between rotor samples [s].
+        read: whether they are readings: only the noise of a reading is no thrust.
         speed_noise: least and most standard deviation of a logged rotor speed [rad/s].
         still: standard deviation of a velocity that nobody measures [m/s]; 0: velocity plays no part.
         beyond: what a larger model adds, see `whole_model`.
@@ -124,6 +125,7 @@ class Track(NamedTuple):
     hubs: tuple[float, float, float]
     waver: FloatArray
     period: float
+    read: bool
     speed_noise: tuple[float, float]
     still: float
     beyond: Beyond
@@ -755,10 +757,12 @@ def _white(track: Track, psi: FloatArray, row: FloatArray, k: int, channel: int)
 
 @_piece
 def _felt(track: Track, row: FloatArray) -> float:
-    """Variance of the mean specific thrust while the accelerometer reads, by rotor speeds of noise 1 rad/s.
+    """Variance of the mean specific thrust while the accelerometer reads, by readings of noise 1 rad/s.
 
     A sample acts for `period`, which may begin at any time within that of a reading.
     """
+    if not track.read:
+        return 0.0
     share = 2.0 * track.half / track.period
     kept = 1.0 - share / 3.0 if share < 1.0 else (1.0 - 1.0 / (3.0 * share)) / share
     return float(4.0 * row[2 * MOMENTS] * kept * track.waver[0])

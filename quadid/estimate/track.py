@@ -105,8 +105,8 @@ def _track(
         piece_t, pieces = _curved(rotor_t, speed, sampling == "smooth")
     return Track(
         t, y, seen, 0.5 * period, piece_t, pieces, share, vehicle.mass, len(vehicle.rotors), hubs,
-        wavering(vehicle, vehicle.initial), float(np.median(between)), _speed_noise(speed[new]), still,
-        nothing_beyond(),
+        wavering(vehicle, vehicle.initial), float(np.median(between)),
+        vehicle.command.sampling == "instant", _speed_noise(speed[new]), still, nothing_beyond(),
     )  # fmt: skip
 
 

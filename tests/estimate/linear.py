@@ -31,7 +31,7 @@ def tiny_flight(seed: int = 3) -> Track:
     attitude[::3] = np.nan
     force = 1e-4 * rng.standard_normal((ROWS, 3)) - [0.0, 0.0, 9.80665]
     rate, velocity = 1e-6 * rng.standard_normal((ROWS, 3)), 1e-4 * rng.standard_normal((ROWS, 3))
-    return from_window(Window(0.0, STEP, speed, rate, attitude, force, velocity), PELICAN)
+    return from_window(Window(0.0, STEP, speed, rate, attitude, force, velocity), PELICAN)._replace(read=True)
 
 
 def matrices() -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -17,7 +17,7 @@ from quadid.flight import TruthParameters, draw_truth, fly
 from quadid.flight.loop import SensorNoise
 from quadid.model.layout import Layout
 from quadid.parameters import NOMINAL_NAMES
-from quadid.vehicle import ParameterPrior, Vehicle
+from quadid.vehicle import Command, ParameterPrior, Vehicle
 
 PELICAN = Vehicle.shipped("pelican")
 SECONDS = 30.0
@@ -107,7 +107,8 @@ def test_noisy_rotor_speeds_make_no_thrust_curve() -> None:
     window = fly(PELICAN, None, 40.0, 1, "roll_pitch", noise=quiet, extras=("velocity",)).window
     noise = 0.4 * np.random.default_rng(0).standard_normal(window.rotor_speed.shape)  # [rad/s]
     noisy = replace(window, rotor_speed=window.rotor_speed + noise)
-    found = estimate(Problem.of([from_window(noisy, PELICAN)], PELICAN, ("thrust_curve.dead_speed",), [noisy]))
+    reads = PELICAN.model_copy(update={"command": Command(sampling="instant")})
+    found = estimate(Problem.of([from_window(noisy, reads)], reads, ("thrust_curve.dead_speed",), [noisy]))
     value, sigma = found.value("thrust_curve.dead_speed")
     assert abs(value) < 2.0 * sigma
     assert sigma < 1.0  # of 370 rad/s
