@@ -97,12 +97,12 @@ class Validation:
     contradicted: bool = False
 
 
-def untidy_sized(model: Named, cause: Candidate) -> bool:
+def untidy_sized(model: Model, cause: Candidate) -> bool:
     """Checks whether no number of `cause` is further from neutral in `model` than it may be on any vehicle."""
     return bool(np.all(np.abs(model.numbers(cause).from_neutral(model.theta)) <= UNTIDY))
 
 
-def ordinary(model: Named, cause: Candidate) -> bool:
+def ordinary(model: Model, cause: Candidate) -> bool:
     """True if any vehicle may have `cause` as large as it is in `model`; no event, wind or ground is ordinary."""
     apart = cause.timed is not None or cause.refines or bool(EFFECTS[cause.effect].needs)
     return not apart and untidy_sized(model, cause)
@@ -493,7 +493,7 @@ def late_unknown(model: Model, parameters: Sequence[Parameter]) -> dict[str, str
     return {c.label: reason for c in model.causes if c.family == "late" and EFFECTS[c.effect].turns}
 
 
-def slight_causes(model: Named) -> dict[str, str]:
+def slight_causes(model: Model) -> dict[str, str]:
     """Causes of `model` that something on any vehicle passes for while they are small, by label, and what.
 
     Air gets thinner in a climb, rotors carry otherwise in it, and motors warm up: from one part of a flight to the next

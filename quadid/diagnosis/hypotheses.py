@@ -24,7 +24,7 @@ from quadid.identification.problem import (
     prior_terms,
 )
 from quadid.identification.result import INFINITE
-from quadid.identification.uncertainty import Uncertainty, score_products, uncertainty, variance_ratio
+from quadid.identification.uncertainty import Uncertainty, uncertainty, variance_ratio
 from quadid.model.layout import Layout, places
 from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray, IndexArray
@@ -197,8 +197,7 @@ class Quadratic:
     def spread(self, free: Sequence[int], step: FloatArray, inverse: FloatArray) -> FloatArray:
         """True variance of each of the entries `free` over that in `inverse`, as if the point were a `step` away."""
         scores = (self.grad + self.gram @ step)[:, free]
-        meat, _ = score_products(scores, self.window, self.time, self.spacing)
-        return np.asarray(np.diag(inverse @ meat @ inverse) / np.diag(inverse))
+        return variance_ratio(inverse, scores, self.window, self.time, self.spacing)[0]
 
     @property
     def spacing(self) -> float:
@@ -414,7 +413,8 @@ class Model(Polished, Named):
     @cached_property
     def inflation(self) -> FloatArray:
         """True variance of each parameter over what the model counts on, from the scores of its segments, (P,)."""
-        return variance_ratio(self.lin, posterior_covariance(self.lin.information, self.prior))[0]
+        covariance, lin = posterior_covariance(self.lin.information, self.prior), self.lin
+        return variance_ratio(covariance, lin.grad, lin.window, lin.time, lin.spacing)[0]
 
     @cached_property
     def uncertainty(self) -> Uncertainty:

@@ -1,7 +1,8 @@
 """The diagnosis from windows to verdict: fit, noise floor, selection, remainder, validation."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -138,36 +139,37 @@ def diagnose(
     faults = data_faults([*windows, *validation])
     windows, validation = without_copies(windows), without_copies(validation)
     vehicle = with_reference_voltage(vehicle, windows)
-    data = _Data(windows, vehicle, validation, faults, nominal)
     # Which causes, on short segments; their numbers and the vehicle's, by the likelihood of innovations.
     schedule, search = _selected(windows, vehicle, FitOptions(seed=seed) if swarm else None, report)
-    report("numbers", 0.0)
-    answer = _concluded(data, schedule[-1], search, remainder(search.shooting, search.model, seed))
+    plain = search.nominal
+    alone = cache(lambda: nominal or fit_numbers(windows, schedule[-1], plain))
+    data = _Data(windows, vehicle, validation, faults, nominal, alone)
+    answer = _concluded(data, schedule[-1], search, remainder(search.shooting, search.model, seed), report)
     # Where something remains and no cause is sure: beside random forces.
     left = answer[0].verdict not in (Explanation.NOTHING_FOUND, Explanation.EXPLAINED)
     if left and not any(f.confident for f in answer[0].findings):
         report("random forces", 0.0)
         if (rough := in_rough_air(windows, search)) is not None:
-            report("numbers", 0.5)
             search = with_causes_of(search, rough)
             left_over = remainder(search.shooting, search.model, seed)
-            answer = _concluded(data, schedule[-1], search, left_over, rough)
+            answer = _concluded(data, schedule[-1], search, left_over, report, rough)
     report("done", 1.0)
     return answer
 
 
 class _Data(NamedTuple):
-    """Data of a diagnosis, as `diagnose` has them, with what is wrong with them."""
+    """Data of a diagnosis, as `diagnose` has them, with what is wrong with them; `alone` fits no cause, once."""
 
     windows: Sequence[Window]
     vehicle: Vehicle
     validation: Sequence[Window]
     faults: Sequence[DataFault]
     nominal: Fit | None
+    alone: Callable[[], Fit | None]
 
 
 def _concluded(
-    data: _Data, short: Shooting, search: Search, left: Remainder, rough: RoughAir | None = None
+    data: _Data, short: Shooting, search: Search, left: Remainder, report: Progress, rough: RoughAir | None = None
 ) -> tuple[Diagnosis, Search]:
     """The answer that a selection leads to, and the selection with the final numbers.
 
@@ -176,13 +178,17 @@ def _concluded(
         short: short segments of them.
         search: the selection.
         left: what it leaves in segments.
+        report: progress.
         rough: what it leaves beside random forces, if it was made there.
     """
-    windows, vehicle, validation, faults, nominal = data
-    # Numbers; what each cause gains on unseen data.
+    windows, vehicle, validation, faults, nominal, alone = data
+    # Numbers.
+    report("numbers", 0.0)
     decisive, selected = search.shooting, search.model
     found = nominal if nominal and not selected.causes else fit_numbers(windows, short, selected)
     model = selected if found is None else with_numbers(selected, found)
+    # What each cause gains on unseen data.
+    report("validation", 0.0)
     fewer = {c.label: without(decisive, selected, c) for c in selected.causes}
     deciding, worth = cause_gains(decisive, search.nominal, selected, fewer, validation)
     plain = model if validation and not model.causes else search.nominal
@@ -198,17 +204,18 @@ def _concluded(
     def beside(without_causes: bool) -> tuple[tuple[Parameter, ...], tuple[str, ...], dict[str, str]]:
         fits = [found]
         if without_causes:
-            fits.append(nominal or (fit_numbers(windows, short, search.nominal) if model.causes else found))
+            fits.append(alone() if model.causes else nominal or found)
         parameters, reasons = _nominal_parameters(short, model, fits, doubted)
         parameters, moved = possible_moments(parameters)
-        told = (*reasons, *([] if moved is None else [moved]))
-        return parameters, told, late_unknown(model, parameters) | slight
+        remarks = (*reasons, *([] if moved is None else [moved]))
+        return parameters, remarks, late_unknown(model, parameters) | slight
 
-    parameters, told, weak = beside(without_causes=bool(doubts))
+    parameters, remarks, weak = beside(without_causes=bool(doubts))
     # The verdict: what doubtful causes take away counts as left, beside random forces what any takes that is not sure.
     taken = {w.cause.label: max(w.deviance, 0.0) for w in worth}
-    verdict = judge(search.nominal, selected, left, sum(taken[label] for label in doubts))
-    if rough is not None:
+    if rough is None:
+        verdict = judge(search.nominal, selected, left, sum(taken[label] for label in doubts))
+    else:
         unsure = sum(taken[label] for label in doubts | weak)
         verdict = judge_in_rough_air(rough, unsure / max(sum(taken.values()), 1.0))
     saturated = any(f.kind == "saturated" for f in faults)
@@ -217,7 +224,7 @@ def _concluded(
     if model.causes and (contradicted or saturated or len(doubts) == len(model.causes)):
         verdict = Explanation.UNKNOWN
     if verdict is Explanation.UNKNOWN and not doubts:
-        parameters, told, weak = beside(without_causes=True)
+        parameters, remarks, weak = beside(without_causes=True)
     # Findings; those are confident that nothing speaks against.
     alike = {c.family for c in model.causes if c.label in doubts}
     believed = [c for c in model.causes if c.family not in alike and c.label not in weak]
@@ -227,7 +234,7 @@ def _concluded(
         *(f.text for f in faults),
         *(f"{reason}: it replaces another cause and is not confident" for reason in doubts.values()),
         *(f"{label} is not named with confidence: {reason}" for label, reason in weak.items()),
-        *told,
+        *remarks,
     ]
     physical = with_values(vehicle, parameters, [c.effect for c in model.causes], model.theta)
     result = Diagnosis(

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 from scipy.special import gammaln
@@ -26,7 +25,7 @@ from quadid.effects import EFFECTS, NEVER
 from quadid.estimate import kalman as k
 from quadid.estimate.fit import ALL_NOISE, ENOUGH, MOST, NEAR, NO_NOISE, scoring, settle_noise, tails
 from quadid.estimate.kalman import Beyond, Gains, Track
-from quadid.estimate.problem import PER_FLIGHT, PLACES, Problem, Sensitivities
+from quadid.estimate.problem import PER_FLIGHT, PLACES, Problem, Sensitivities, moments_at
 from quadid.estimate.track import from_window
 from quadid.identification.problem import Free
 from quadid.identification.uncertainty import Uncertainty
@@ -42,15 +41,6 @@ STRETCH = 1.0
 """Length of the stretches whose scores are summed [s]."""
 PROMISE = 2.0
 """Times what its last few steps gained that a fit may gain by all that follow."""
-
-
-class Costs(NamedTuple):
-    """Deviance of every stretch, its scalar measurements, flight and first time [s], shapes (stretches,)."""
-
-    cost: FloatArray
-    rows: FloatArray
-    window: IndexArray
-    time: FloatArray
 
 
 def stretches(track: Track) -> IndexArray:
@@ -74,21 +64,22 @@ def densities(g: Gains, tail: FloatArray) -> tuple[FloatArray, BoolArray]:
 
 def innovations(track: Track, p: FloatArray, psi: FloatArray, g: Gains) -> FloatArray:
     """Whitened innovations of a flight at physics p under the gains of a pass nearby, shape (n, M)."""
-    table = g.table if k.turning(p) == g.made_with else k.moments(track, *k.turning(p))
     out = np.zeros((len(track.t), k.M))
-    k.replay(track, p, psi, g, table, out, np.empty((0, k.N_MEAN)))
+    k.replay(track, p, psi, g, moments_at(track, g, p), out, np.empty((0, k.N_MEAN)))
     return out
 
 
-def costs(tracks: Sequence[Track], gains: Sequence[Gains], tail: FloatArray) -> Costs:
-    """-2 ln of the density of innovations under the gains of a pass, by stretches."""
+def costs(
+    tracks: Sequence[Track], gains: Sequence[Gains], tail: FloatArray
+) -> tuple[FloatArray, FloatArray, IndexArray, FloatArray]:
+    """Deviance of every stretch under the gains of a pass, its scalar measurements, its flight, its begin [s]."""
     parts = []
     for j, (track, g) in enumerate(zip(tracks, gains, strict=True)):
         first = stretches(track)
-        value, seen = densities(g, tail)
-        summed = (np.add.reduceat(a.sum(axis=1), first) for a in (value, seen.astype(float)))
-        parts.append((*summed, np.full(len(first), j), track.t[first]))
-    return Costs(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+        cost, seen = (np.add.reduceat(a.sum(axis=1), first) for a in densities(g, tail))
+        parts.append((cost, seen.astype(float), np.full(len(first), j), track.t[first]))
+    cost, rows, window, time = (np.concatenate(column) for column in zip(*parts, strict=True))
+    return cost, rows, window, time
 
 
 def quadratic(problem: Problem, gains: Sequence[Gains], found: Sequence[Sensitivities], size: int) -> Quadratic:
@@ -146,10 +137,10 @@ class Model(Named):
     by_flight: HeldOut
     tried: Mapping[str, float] = field(default_factory=dict)
 
-    @cached_property
+    @property
     def keys(self) -> tuple[tuple[str, int], ...]:
         """Name and flight (-1: all) of every scaled parameter."""
-        return tuple((name, flight) for name, _, flight in self.problem.entries)
+        return self.problem.keys
 
     @property
     def rows(self) -> float:
@@ -258,7 +249,7 @@ class Flights:
         tail = tails(problem.tracks, gains)
         whole = replace(self.whole, base=problem.base, control=problem.control, tracks=problem.tracks, tail=tail)
         flights = replace(self, whole=whole)
-        nominal = flights.fit((), dict(zip(_keys(problem), z, strict=True)), psi, {}, {})
+        nominal = flights.fit((), dict(zip(problem.keys, z, strict=True)), psi, {}, {})
         assert nominal is not None
         return flights, nominal
 
@@ -276,7 +267,7 @@ class Flights:
         None as soon as its deviance will hardly come down to what is `wanted`, or where it runs away.
         """
         problem = self.problem(free_names(causes), times)
-        z = np.clip([start.get(key, 0.0) for key in _keys(problem)], *problem.limits)
+        z = np.clip([start.get(key, 0.0) for key in problem.keys], *problem.limits)
         deviance, before, gains = np.inf, np.inf, list[Gains]()
         for _ in range(MOST // NEAR):
             gains.clear()
@@ -306,10 +297,6 @@ def times_of(model: Model, causes: Sequence[Candidate]) -> dict[str, float]:
     """Onsets of those of `causes` that `model` has, by effect [s]."""
     timed = {c.effect: c.timed for c in causes if c.timed is not None}
     return {effect: float(model.problem.theta[index]) for effect, index in timed.items() if effect in model.effects}
-
-
-def _keys(problem: Problem) -> list[tuple[str, int]]:
-    return [(name, flight) for name, _, flight in problem.entries]
 
 
 def with_additions(g: Gains) -> Gains:

@@ -71,7 +71,7 @@ def in_rough_air(windows: Sequence[Window], search: Search) -> RoughAir | None:
     flights, nominal = Flights.of(windows, vehicle, search.listed).nominal(search.nominal.theta)
     times = {c.effect: float(quick.theta[c.timed]) for c in quick.causes if c.timed is not None}
     problem = flights.problem(free_names(quick.causes), times)
-    start = {(name, flight): z for (name, _, flight), z in zip(problem.entries, problem.at(quick.theta), strict=True)}
+    start = dict(zip(problem.keys, problem.at(quick.theta), strict=True))
     start |= {key: z for key, z in zip(nominal.keys, nominal.z, strict=True) if key[0].startswith(PER_FLIGHT)}
     known = flights.fit(quick.causes, start, nominal.psi, times, quick.tried)
     model, rounds = select(flights, known or nominal)

@@ -1,9 +1,9 @@
 """Search for causes by innovations, where random forces act: the quick search's answer made better move by move.
 
 Segments that are simulated freely take what gusts do for structure; there the quick search (`quadid.diagnosis.search`)
-names too much, though what acts is nearly always among it.  Innovations tell both apart.  A linearisation of everything
-predicts what each move brings (Rao, Proc. Camb. Phil. Soc. 44 (1948) 50), moves are refitted, every model at its own
-random forces and noise, and compared.
+names too much, though what acts is nearly always among it.  Innovations separate the two.  A linearisation of
+everything predicts what each move brings (Rao, Proc. Camb. Phil. Soc. 44 (1948) 50), moves are refitted, every model at
+its own random forces and noise, and compared.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from quadid.diagnosis.hypotheses import Candidate, calibration, free_names, take
 from quadid.diagnosis.random_forces import Flights, Model, quadratic, times_of, with_additions
 from quadid.diagnosis.search import ALIKE, NEAR, Move, Round, best_move, removable
 from quadid.estimate import kalman as k
-from quadid.estimate.fit import newton_step
+from quadid.estimate.fit import best_step
 from quadid.estimate.problem import Sensitivities
 from quadid.types import FloatArray
 
@@ -146,7 +146,7 @@ class Everything:
         names = dict.fromkeys([*model.problem.names, *(n for c in self._some for n in c.names)])
         problem = flights.problem(tuple(names), times_of(model, model.causes))
         problem = replace(problem, models=flights.whole.models)
-        self._keys = [(name, flight) for name, _, flight in problem.entries]
+        self._keys = problem.keys
         known = dict(zip(model.keys, model.z, strict=True))
         self._z = z = np.array([known.get(key, 0.0) for key in self._keys])
         # What has no slope at neutral has one to where its search begins.
@@ -225,9 +225,7 @@ class Everything:
 
     def _best(self, free: list[int], slope: FloatArray) -> tuple[FloatArray, float]:
         """Step of these entries to the minimum within bounds, and the fall of the deviance."""
-        h, g = self._h[np.ix_(free, free)], slope[free]
-        step = newton_step(h, g, 0.0, self._box[0][free], self._box[1][free])
-        return step, -float(2.0 * g @ step + step @ h @ step)
+        return best_step(self._h, slope, self._box, free)
 
     def _start(self, free: list[int], step: FloatArray) -> dict[tuple[str, int], float]:
         return {self._keys[i]: float(self._z[i] + s) for i, s in zip(free, step, strict=True)}

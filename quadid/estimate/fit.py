@@ -290,6 +290,15 @@ def changed_noise(psi: FloatArray, step: FloatArray) -> FloatArray:
     return out
 
 
+def best_step(
+    h: FloatArray, g: FloatArray, box: tuple[FloatArray, FloatArray], free: list[int]
+) -> tuple[FloatArray, float]:
+    """Step of the entries `free` within a box to the minimum of 2 g z + z h z, and how far that falls."""
+    at = np.ix_(free, free)
+    step = newton_step(h[at], g[free], 0.0, box[0][free], box[1][free])
+    return step, -float(2.0 * g[free] @ step + step @ h[at] @ step)
+
+
 def newton_step(
     curvature: FloatArray, slope: FloatArray, damping: float, least: FloatArray, most: FloatArray
 ) -> FloatArray:

@@ -289,6 +289,11 @@ class Problem:
         return tuple(common + own)
 
     @cached_property
+    def keys(self) -> tuple[tuple[str, int], ...]:
+        """Name and flight (-1: all) of every scaled parameter."""
+        return tuple((name, flight) for name, _, flight in self.entries)
+
+    @cached_property
     def size(self) -> FloatArray:
         """Unit of every scaled parameter and standard deviation of its prior; the six are logarithms, of unit 1."""
         out = np.ones(len(self.entries))
@@ -534,7 +539,7 @@ class Problem:
         for _ in range(0 if len(near.beyond.added) else SETTLING):
             track = track._replace(beyond=model.along(theta, reckoned(track, mean)))
             mean = np.empty_like(mean)
-            k.replay(track, p, psi, near, _table(track, near, p), _NO_ROWS, mean)
+            k.replay(track, p, psi, near, moments_at(track, near, p), _NO_ROWS, mean)
         return track._replace(beyond=model.along(theta, reckoned(track, mean)))
 
     def score(self, z: FloatArray, psi: FloatArray, gains: Sequence[Gains]) -> FloatArray:
@@ -667,13 +672,13 @@ class Problem:
 
             def whiten(i: int, mine: IndexArray = mine, tracks: Sequence[Track] = tracks) -> None:
                 p = self.physics(points[mine[i]], j)
-                k.replay(tracks[i], p, psi, g, _table(tracks[i], g, p), out[mine[i]], _NO_MEANS)
+                k.replay(tracks[i], p, psi, g, moments_at(tracks[i], g, p), out[mine[i]], _NO_MEANS)
 
             _each(whiten, len(mine))
         return out
 
 
-def _table(track: Track, g: Gains, p: FloatArray) -> FloatArray:
+def moments_at(track: Track, g: Gains, p: FloatArray) -> FloatArray:
     """Rotor moments at physics p: those of the gains where nothing moved in time."""
     made_with = k.turning(p)
     return g.table if made_with == g.made_with else k.moments(track, *made_with)

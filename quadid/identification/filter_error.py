@@ -20,7 +20,7 @@ from quadid.chi_square import exceeded
 from quadid.data.window import Window
 from quadid.effects import EFFECTS, butterworth_delay
 from quadid.estimate import kalman as k
-from quadid.estimate.fit import ACTS, NEAR_SECONDS, Estimate, estimate, newton_step
+from quadid.estimate.fit import ACTS, NEAR_SECONDS, Estimate, best_step, estimate, newton_step
 from quadid.estimate.kalman import Gains
 from quadid.estimate.late_imu import delay_of, in_time
 from quadid.estimate.problem import LATE, Problem, Sensitivities
@@ -203,8 +203,8 @@ def _filtered(
 
 def _without(found: Estimate, more: Problem) -> FloatArray:
     """Scaled parameters of an estimate in a problem that has more, without that."""
-    z = dict(zip(((name, flight) for name, _, flight in found.problem.entries), found.z.tolist(), strict=True))
-    return np.array([z.get((name, flight), 0.0) for name, _, flight in more.entries])
+    z = dict(zip(found.problem.keys, found.z.tolist(), strict=True))
+    return np.array([z.get(key, 0.0) for key in more.keys])
 
 
 def _shown(found: Estimate, more: Problem) -> list[str]:
@@ -223,15 +223,12 @@ def _promises(
     h: FloatArray, g: FloatArray, box: tuple[FloatArray, FloatArray], own: list[int], causes: Mapping[str, list[int]]
 ) -> list[tuple[str, float, FloatArray]]:
     """Result of `promised` by information h and gradient g, steps within a box; causes that run away are left out."""
-
-    def best(free: list[int]) -> tuple[FloatArray, float]:
-        """Step with these entries free, and how much of the objective it takes away."""
-        at = np.ix_(free, free)
-        step = newton_step(h[at], g[free], 0.0, box[0][free], box[1][free])
-        return step, -float(2.0 * g[free] @ step + step @ h[at] @ step)
-
     finite = np.isfinite(np.diag(h)) & np.isfinite(g)
-    return promised(best, own, {name: entries for name, entries in causes.items() if finite[entries].all()})
+    return promised(
+        lambda free: best_step(h, g, box, free),
+        own,
+        {name: entries for name, entries in causes.items() if finite[entries].all()},
+    )
 
 
 def carried(gains: Sequence[Gains]) -> float:
@@ -328,8 +325,8 @@ def _with_causes(found: Estimate, near: Sequence[Sensitivities], wide: Problem) 
         near: sensitivities by its own parameters.
         wide: the same rows with the whole catalogue free.
     """
-    index = {(name, flight): i for i, (name, _, flight) in enumerate(wide.entries)}
-    own = [index[name, flight] for name, _, flight in found.problem.entries]
+    index = {key: i for i, key in enumerate(wide.keys)}
+    own = [index[key] for key in found.problem.keys]
     z, nudge = _without(found, wide), np.full(len(index), 1e-5)
     # Entries of a cause are freed together; rotors are causes by themselves.
     causes: dict[str, list[int]] = {}

@@ -106,25 +106,21 @@ def uncertainty(lin: Linearised, prior: Prior) -> Uncertainty:
     covariance = posterior_covariance(lin.information, prior)
     inflation = np.ones(len(prior.sigma))
     if len(lin.grad) >= 10:
-        ratio, lags = variance_ratio(lin, covariance)
+        ratio, lags = variance_ratio(covariance, lin.grad, lin.window, lin.time, lin.spacing)
         sampling = math.sqrt(2.0 / len(lin.grad) * (1.0 + 4.0 / 3.0 * lags))
         inflation = np.where(ratio > 1.0 + 2.0 * sampling, np.sqrt(np.maximum(ratio, 1.0)), 1.0)
     return Uncertainty(covariance * np.outer(inflation, inflation), inflation, prior.sigma)
 
 
-def variance_ratio(lin: Linearised, covariance: FloatArray) -> tuple[FloatArray, int]:
+def variance_ratio(
+    covariance: FloatArray, scores: FloatArray, window: IndexArray, time: FloatArray, step: float
+) -> tuple[FloatArray, int]:
     """True variance of each parameter over that in `covariance` (P, P), shape (P,), and the number of lags used.
 
-    The true one is the "sandwich" of `score_products`.
-    """
-    meat, lags = score_products(lin.grad, lin.window, lin.time, lin.spacing)
-    return np.asarray(np.diag(covariance @ meat @ covariance) / np.diag(covariance)), lags
-
-
-def score_products(scores: FloatArray, window: IndexArray, time: FloatArray, step: float) -> tuple[FloatArray, int]:
-    """Bartlett-weighted (P, P) sum of score products over segments of the same window, and the number of lags used.
+    The true one is the "sandwich" of Bartlett-weighted sums of score products over segments of the same window.
 
     Args:
+        covariance: by the information of the data.
         scores: of each segment, shape (segments, P).
         window: to which it belongs; time: when it begins [s].
         step: time from one segment to the next [s].
@@ -137,7 +133,7 @@ def score_products(scores: FloatArray, window: IndexArray, time: FloatArray, ste
         near = (window[lag:] == window[:-lag]) & (time[lag:] - time[:-lag] < (lag + 0.5) * step)
         cross = scores[lag:][near].T @ scores[:-lag][near]
         meat += (1.0 - lag / (lags + 1.0)) * (cross + cross.T)
-    return meat, lags
+    return np.asarray(np.diag(covariance @ meat @ covariance) / np.diag(covariance)), lags
 
 
 def parameter_set(free: Free, theta: FloatArray, initial: FloatArray, unc: Uncertainty) -> ParameterSet:

@@ -102,7 +102,7 @@ def test_noisy_rotor_speeds_leave_the_inertias_alone(speed: float) -> None:
 
 
 def test_noisy_rotor_speeds_make_no_thrust_curve() -> None:
-    """Where thrust hardly varies, that noise took 7 % off its slope: the accelerometer is compared with it too."""
+    """Noise took 7 % off the slope of a thrust that hardly varies: the accelerometer is compared with it too."""
     quiet = SensorNoise(0.002, 0.002, 1e-4, 1e-4, gyro_shake=0.0, accel_shake=0.0, velocity=0.002)
     window = fly(PELICAN, None, 40.0, 1, "roll_pitch", noise=quiet, extras=("velocity",)).window
     noise = 0.4 * np.random.default_rng(0).standard_normal(window.rotor_speed.shape)  # [rad/s]

@@ -30,7 +30,7 @@ _FOLDERS = (
     Path(tempfile.gettempdir()) / "pytest-of-",
 )
 _HERE = re.compile(f"(?:{'|'.join(re.escape(str(folder)) for folder in _FOLDERS)})(?:[^\\s'\":,;]*/)?")
-"""Where files lie on this machine: the page, which is in the repository, names them without."""
+"""Folders of this machine, which the page in the repository leaves out."""
 
 
 class Evidence(NamedTuple):

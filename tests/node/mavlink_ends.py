@@ -67,7 +67,7 @@ def decoded(message: Any) -> Any:
 
 
 def samples(link: MavlinkLink, seconds: float = 0.3) -> list[Any]:
-    """What a link hears in so long [s], in five looks at least: what was sent before waits in its socket."""
+    """Messages that a link receives in so long [s], in five looks at least: earlier ones wait in its socket."""
     out: list[Any] = []
     deadline, looks = time.monotonic() + seconds, 0
     while time.monotonic() < deadline or looks < 5:
