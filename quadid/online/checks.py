@@ -152,11 +152,13 @@ class Quality:
 
     `carried`: it is not flight only because the specific force does not follow the thrust.  A load that is taken up in
     hover looks alike: there the thrust follows the weight.
+    `until`: end of the last second in which the rotors carry too little [s], where there is one.
     """
 
     fault: str = ""
     grounded: str = ""
     carried: bool = False
+    until: float = -math.inf
 
 
 def judge(cut: WindowCut, vehicle: Vehicle, thrust: ThrustModel, known: bool, units: bool = True) -> Quality:
@@ -169,7 +171,7 @@ def judge(cut: WindowCut, vehicle: Vehicle, thrust: ThrustModel, known: bool, un
     """
     # First whether the rotors lift: at rest sensors and rotors may well repeat themselves.
     for window in cut.windows:
-        lift = _lift(_weight_share(window, vehicle, thrust), window.dt, known)
+        lift = _lift(window, _weight_share(window, vehicle, thrust), known)
         if lift != Quality():
             return lift
         if fault := _broken(window):
@@ -253,15 +255,16 @@ def _weight_share(window: Window, vehicle: Vehicle, thrust: ThrustModel) -> Floa
     return np.asarray(thrust.total(window.rotor_speed) / (vehicle.mass * GRAVITY))
 
 
-def _lift(share: FloatArray, dt: float, known: bool) -> Quality:
-    """Verdict on whether the rotors carry the vehicle, second by second, back from the end."""
+def _lift(window: Window, share: FloatArray, known: bool) -> Quality:
+    """Verdict on whether the rotors carry the vehicle by thrust over weight (n,), second by second, from the end."""
     # Mean thrust over weight of a flying vehicle; a thrust coefficient that is a guess leaves more room.
     low, high = (0.4, 4.0) if known else (0.2, 5.0)
-    second = max(round(1.0 / dt), 1)
+    second = max(round(1.0 / window.dt), 1)
     first = len(share) % second or second
     means = [float(part.mean()) for part in np.split(share, np.arange(first, len(share), second))]
-    if not min(means) > low:
-        return Quality(grounded=f"rotors carry {min(means):.0%} of the weight: on the ground")
+    if idle := [i for i, mean in enumerate(means) if not mean > low]:
+        until = float(window.t[0]) + window.dt * (first + idle[-1] * second)
+        return Quality(grounded=f"rotors carry {min(means):.0%} of the weight: on the ground", until=until)
     if not max(means) < high and low < float(np.mean(means)) / (30.0 / np.pi) ** 2 < high:
         return Quality(fault="rotor speeds look like rpm, wanted rad/s")
     if not max(means) < high:

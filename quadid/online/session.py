@@ -36,7 +36,7 @@ from quadid.online.changes import BASELINE, LEAST, ChangePoint
 from quadid.online.checks import LEAD, Consistency, Quality, judge, mistake
 from quadid.online.fit_job import FitReply, FitRequest, is_excited
 from quadid.online.fusion import Estimator
-from quadid.online.gate import ActiveSet, Answer, GateSettings, decide
+from quadid.online.gate import ActiveSet, Answer, GateSettings, decide, implausible
 from quadid.online.grid_buffer import GridBuffer, Rows, WindowCut
 from quadid.online.records import (
     MOST_ERRORS,
@@ -62,6 +62,8 @@ WARM_UP = 0.22
 """Flight before a window in which filters and delays settle [s]."""
 STARTING = 3.0
 """Time from the begin of a stream [s] in which channels may still come, once the vehicle sends what was asked."""
+LIFT_OFF = 5.0
+"""Longest time from when rotors begin to carry until nothing else does [s]: autopilots ramp thrust up over 3 s."""
 FOUND_AFTER = 3.0
 """An answer that takes long is used so long after it was asked for [s], so that a replay does what was done live."""
 _EPS = 1e-6
@@ -148,9 +150,10 @@ class Session:
         self._search: FitRequest | None = None
         self._found: JobReply | None = None
         self._number = self._outdated = self.skipped = 0
-        # Learning: nothing before `_learn_from` [s] counts; since when [s] windows have disagreed with the estimate.
+        # Learning: nothing before `_learn_from` [s] counts; since when [s] windows have disagreed with the estimate;
+        # when the rotors last did not carry [s].
         self._learn_from, self._disagrees_since = -math.inf, math.inf
-        self._cut, self._quality = WindowCut((), 0.0, 0), Quality()
+        self._cut, self._quality, self._grounded = WindowCut((), 0.0, 0), Quality(), -math.inf
         self._last_fit, self._asked_now = -math.inf, False
         self._fits = self._rejected = self._errors = 0
         if self.active_set.in_force is not None:
@@ -399,8 +402,12 @@ class Session:
         estimator = self._estimator
         self._quality = judge(cut, self._vehicle, estimator.thrust, estimator.in_order, units=not estimator.learned)
         if self._quality != Quality():
+            self._grounded = max(self._grounded, self._quality.until)
             phase = Phase.BLOCKED if self._quality.fault else Phase.NOT_FLYING
             self._outbox.note(tick, phase, self._quality.fault or self._quality.grounded)
+            return
+        if start < self._grounded + LIFT_OFF:
+            self._outbox.state(Phase.COLLECTING, f"the rotors have carried for {tick - self._grounded:.0f} s only")
             return
         self._last_fit = tick
         start = max(start, tick - self.settings.window)
@@ -522,6 +529,11 @@ class Session:
         else:
             self._rejected += 1
         outbox.act(Publish("candidate", item))
+        if impossible := implausible(parameters, self.settings.gate):
+            # No vehicle is like that: something else was learned, which would spoil what comes.
+            estimator.reset()
+            self._relearn(request.stop, impossible)
+            return
         force, waiting = sets.in_force, sets.pending
         if waiting is not None and decision.state is SetState.REJECTED:
             kept = f"set {waiting.sequence} waits for approval; a newer estimate was held back ({decision.check})"

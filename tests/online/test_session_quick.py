@@ -15,7 +15,7 @@ from quadid.online import FitReply, FitRequest, GateSettings, Phase, Session, Se
 from quadid.online.records import Action, Job, JobReply, Publish
 from quadid.parameters import NOMINAL_NAMES
 from tests.online.driving import EPOCH, events, published
-from tests.online.made_up import PELICAN, answered, between, light_flight, tells, works
+from tests.online.made_up import PELICAN, answered, between, light_flight, on_the_ground, tells, works
 from tests.online.test_gate import TRUE, online_set, scaled
 
 QUICK = SessionSettings(window=4.0, diagnose=0.0, gate=GateSettings(windows=2, width=0.15))
@@ -350,3 +350,23 @@ def test_only_what_windows_had_agreed_on_makes_another_estimate_a_change(until: 
     assert len(events(actions, "change")) == alarms
     last = published(actions, "candidate")[-1]
     assert last.parameters["J_xx"].value == pytest.approx(TRUE["J_xx"], rel=0.01)
+
+
+@pytest.mark.parametrize("phase", [0.0, 0.3, 0.6, 0.9])
+def test_the_take_off_is_in_no_window(phase: float) -> None:
+    """Half a second of it, still on the ground, made J_xx 0.12 instead of 0.011, and no set came for 100 s."""
+    landed = on_the_ground(5.0 + phase)
+    asked = fits(works(Session(PELICAN, QUICK), [*landed, *between(FLIGHT, 0.0, 20.0, 5.0 + phase)], tells()))
+    assert asked
+    assert asked[0].start >= 9.9 + phase
+
+
+def test_an_estimate_that_no_vehicle_has_is_forgotten_with_what_it_was_learned_from() -> None:
+    """The noise that came with it made every later window wrong, which the gate refused 70 times in a row."""
+    session, impossible = Session(PELICAN, QUICK), tells(J_xx=0.1, J_yy=0.1)
+    assert not published(works(session, between(FLIGHT, 0.0, 8.7), impossible))
+    assert session.status().phase is Phase.COLLECTING
+    assert "breaks the triangle inequality" in session.status().reason
+    later = works(session, between(FLIGHT, 8.7, 25.0), tells())
+    assert fits(later)[0].noise is None
+    assert published(later)

@@ -1,149 +1,130 @@
-"""Promises of proposed manoeuvres.  Predicted intervals against those obtained, and against the pilot's.
+"""Promises of proposed manoeuvres: predicted intervals beside those that their flights gave.
 
     python -m quadid_evaluation.studies.excite --out docs/results
+    python -m quadid_evaluation.studies.excite --parts recorded --vehicle FILE BEFORE.bin FLOWN.bin
 
-Each seed is a new individual Pelican with a poor guess.  Its pilot flies gently for a minute; `quadid excite` looks at
-that log and proposes a minute; the true vehicle flies it, and as a yardstick the pilot flies another gentle minute, and
-one in which he moves all sticks.  Both minutes together are identified each time.  Then the manoeuvre is flown once
-more: that minute by itself is forecast with what the first two told, and identified.
+Each seed is a new individual Pelican with a poor guess.  Its pilot flies gently for a minute; `quadid excite` proposes
+a minute by that log, the true vehicle flies it, and both logs together go through `quadid identify`.  Once the vehicle
+is as the model, once rotors lag, hubs drag and random forces act that the model lacks.  `recorded` compares the
+promises by a given log with what it and a log of the flown manoeuvre give.
 """
 
 import math
+from collections.abc import Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
+from quadid_replay.writers import write_csv
 
-from quadid.app.excite import knowledge
-from quadid.data.window import Window
-from quadid.experiment import Limits, Proposal, TrialFlights, design_manoeuvre, peaks
-from quadid.flight import Flight, draw_truth, fly
-from quadid.identification.fit import FitOptions, fit
-from quadid.identification.result import fitted_vehicle
-from quadid.identification.uncertainty import halfwidths
+import quadid
+from quadid.chi_square import Z95
+from quadid.errors import QuadidError
+from quadid.flight import draw_truth, fly
 from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray
-from quadid.vehicle import Vehicle
-from quadid_evaluation.harness import study, table
+from quadid.vehicle import RandomForces, RandomInput, Vehicle
+from quadid_evaluation.harness import Given, options, put, share, table
 from quadid_evaluation.studies.truth import poor_guess
 
-LIMITS = Limits(math.radians(25.0), math.radians(150.0))
-CRAFT = Vehicle.shipped("pelican")
+CRAFT, PAGE, TITLE = Vehicle.shipped("pelican"), "excite.md", "What to fly next"
+GUSTS = RandomForces(
+    horizontal=RandomInput(sigma=0.2, time=1.0), vertical=RandomInput(sigma=0.2, time=1.0),
+    roll_pitch=RandomInput(sigma=0.5, time=0.3), yaw=RandomInput(sigma=0.2, time=0.5),
+)  # fmt: skip
+AIRS: dict[str, dict[str, Any]] = {
+    "as the model": {},
+    "with a lag of 30 ms, drag and gusts": {
+        "effects": {"motor_lag": {"tau": 0.03}, "rotor_drag": {"k_x": 0.3, "k_y": 0.3}},
+        "random": GUSTS,
+    },
+}
+KEYS = ("now", "gentle_flight", "manoeuvre")
 
 
-def quiet(stage: str, share: float) -> None:
-    """Takes no notice of progress."""
+def obtained(logs: Sequence[str | Path], vehicle: Vehicle, seed: int = 1) -> tuple[FloatArray, FloatArray]:
+    """Relative 95 % half-widths and values, each (6,), after identifying `logs`; NaN for what they do not reveal."""
+    found = quadid.identify(list(logs), vehicle=vehicle, seed=seed).parameters
+    known = [found[n] if n in found.names else None for n in NOMINAL_NAMES]
+    half = [math.nan if p is None else p.ci95[1] / p.value - 1.0 for p in known]
+    return np.array(half), np.array([math.nan if p is None else p.value for p in known])
 
 
-def obtained(windows: list[Window], vehicle: Vehicle, seed: int) -> FloatArray:
-    """Relative 95 % half-widths (6,) after identifying `windows`."""
-    found = fit(windows, vehicle, FitOptions(iterations=0, seed=seed))
-    return halfwidths(np.linalg.inv(found.uncertainty.covariance))
+def promised(logs: Sequence[str | Path], vehicle: Vehicle, seconds: float, seed: int = 1) -> tuple[Any, FloatArray]:
+    """The proposal of `quadid excite`, and half-widths (3, 6) now, after a gentle flight, and after the manoeuvre."""
+    found = quadid.excite(list(logs), vehicle=vehicle, seconds=seconds, seed=seed)
+    rows = {p["name"]: p for p in found.result["parameters"]}
+    return found.proposal, np.array([[rows[n][key] for n in NOMINAL_NAMES] for key in KEYS])
 
 
-def run(seed: int, seconds: float) -> tuple[FloatArray, FloatArray, bool]:
-    """One seed: half-widths (8, 6) after one gentle flight, two, a lively one, predicted, predicted anew, obtained, and
-    of the manoeuvre flown again, predicted and obtained; errors (6,) in standard deviations; whether the true vehicle
-    stayed within the limits, a tenth allowed."""
+def run(seed: int, seconds: float, air: dict[str, Any]) -> tuple[FloatArray, FloatArray]:
+    """One vehicle: half-widths (4, 6) as `promised` and obtained; errors (6,) over standard deviations."""
     truth = draw_truth(CRAFT, seed)
     vehicle = poor_guess(CRAFT, truth.as_dict(), seed)
-    first = fly(CRAFT, truth, seconds, seed, "gentle").window
-    believed, known, before = knowledge(vehicle, [first], seed, quiet)
-    noise = None if before is None else before.noise
-    proposal = design_manoeuvre(TrialFlights(believed, noise, seed), known, LIMITS, seconds, quiet)
-    length = proposal.seconds
-    flown = fly(CRAFT, truth, length, seed + 1, "scripted", segments=proposal.segments)
-    widths = [proposal.now]
-    for profile in ("gentle", "excited"):
-        widths.append(obtained([first, fly(CRAFT, truth, length, seed + 1, profile).window], vehicle, seed))
-    found = fit([first, flown.window], vehicle, FitOptions(iterations=0, seed=seed))
-    # The same manoeuvre weighed again with what it told: differs from the forecast where the guess was poor.
-    wiser = TrialFlights(fitted_vehicle(found), found.noise, seed)
-    again = wiser.information(wiser.fly(proposal.segments, length))
-    widths += [proposal.after, halfwidths(known + again), obtained([first, flown.window], vehicle, seed)]
-    second = fly(CRAFT, truth, length, seed + 2, "scripted", segments=proposal.segments).window
-    widths += [halfwidths(again), obtained([second], vehicle, seed)]
-    exact = np.log([truth.as_dict()[n] for n in NOMINAL_NAMES])
-    errors = np.asarray((np.log(found.theta[:6]) - exact) / found.uncertainty.sigma)
-    return np.array(widths), errors, held(flown, proposal)
+    with TemporaryDirectory() as folder:
+        before, after = (str(Path(folder) / f"{name}.csv") for name in ("before", "after"))
+        write_csv(before, fly(CRAFT, truth, seconds, seed, "gentle", **air).recording)
+        proposal, widths = promised([before], vehicle, seconds, seed)
+        flown = fly(CRAFT, truth, proposal.seconds, seed + 1, "scripted", segments=proposal.segments, **air)
+        write_csv(after, flown.recording)
+        half, values = obtained([before, after], vehicle, seed)
+    errors = np.log(values / [truth.as_dict()[n] for n in NOMINAL_NAMES]) * Z95 / np.log1p(half)
+    return np.vstack([widths, half]), errors
 
 
-def held(flown: Flight, proposal: Proposal) -> bool:
-    """Checks whether the true vehicle stayed within a tenth of the limits that its simulation kept."""
-
-    peak = peaks(flown)
-    return peak.tilt < 1.1 * LIMITS.tilt and peak.rate < 1.1 * LIMITS.rate
-
-
-def sentences(widths: FloatArray, inside: float, kept: int) -> list[str]:
-    """Sentences on the figures; half-widths (seeds, 8, 6) as of `run`."""
-    out = []
-    for k, got, name in (
-        (3, 5, "the forecast, made with the values believed before"),
-        (4, 5, "the same weighed anew"),
-        (6, 7, "the forecast of the manoeuvre flown again, made with what the minutes before it told"),
-    ):
-        ratio = widths[:, got] / widths[:, k]
-        out.append(
-            f"* Obtained intervals are within 20 % of {name}, in {np.mean(np.abs(ratio - 1.0) < 0.2):.0%} of all cases "
-            f"({ratio.min():.2f} to {ratio.max():.2f})."
-        )
-    worst = np.argmax(widths[:, 1], axis=1)
-    gains = np.array([w[1, j] / w[5, j] for w, j in zip(widths, worst, strict=True)])
-    known = np.array([w[1] / w[5] for w in widths])[:, 2:4]
-    out.append(
-        f"* The worst interval of two gentle minutes becomes {gains.min():.0f} to {gains.max():.0f} times narrower; "
-        f"those of J_xx and J_yy, which gentle flight does tell, {known.min():.0f} to {known.max():.0f} times."
-    )
-    out.append(f"* {inside:.0%} of all errors lie within the 95 % interval.")
-    out.append(f"* {kept} of {len(widths)} vehicles stayed within the limits, a tenth allowed.")
-    return out
-
-
-REMARK = """\
-* Where the forecast is off: a relative interval depends on the parameter's own value, and after a gentle minute d, J_zz
-  and J_r are not known at all. With the values that the manoeuvre taught the same calculation agrees."""
-
-
-def page(seeds: int, seconds: float) -> str:
-    """The page of so many vehicles."""
-    results = [run(30_000 + seed, seconds) for seed in range(seeds)]
-    widths = 100.0 * np.array([r[0] for r in results])
-    inside = np.mean(np.abs([r[1] for r in results]) < 1.96)
-    middle = np.median(widths, axis=0)
-    heads = (
-        "parameter",
-        "one gentle minute",
-        "two",
-        "gentle, then lively",
-        "manoeuvre, forecast",
-        "obtained",
-        "times narrower than two gentle",
-    )
-    rows = [
-        (name, *(f"{middle[k, j]:.3g}" for k in (0, 1, 2, 3, 5)), f"{np.median(widths[:, 1, j] / widths[:, 5, j]):.1f}")
-        for j, name in enumerate(NOMINAL_NAMES)
+def rows_of(widths: FloatArray) -> list[tuple[str, ...]]:
+    """A row a parameter of half-widths (4, 6) [%]: predictions, what was obtained, and that over the promise."""
+    return [
+        (name, *(f"{100.0 * w:.2g}" for w in column), f"{column[3] / column[2]:.2g}")
+        for name, column in zip(NOMINAL_NAMES, widths.T, strict=True)
     ]
-    return "\n".join(
-        [
-            "`make excite`",
+
+
+HEADS = ("parameter", "now", "after a gentle flight", "promised", "obtained", "over the promise")
+
+
+def simulated(given: Given) -> list[str]:
+    """The section of simulated vehicles."""
+    lines = ["## Simulated vehicles", "", (__doc__ or "").split("\n\n")[2].replace("  ", " ")]
+    for name, air in AIRS.items():
+        found = []
+        for seed in range(given.seeds):
+            try:
+                found.append(run(30_000 + seed, given.seconds, air))
+            except QuadidError as error:
+                lines += ["", f"Vehicle {seed} {name}: {error}"]
+        widths, errors = np.array([w for w, _ in found]), np.array([e for _, e in found])
+        ratio = widths[:, 3] / widths[:, 2]
+        known = np.isfinite(errors)
+        lines += [
             "",
-            (__doc__ or "").split("\n\n")[2].replace("  ", " "),
+            f"Vehicles {name}: median half-width of {len(found)} in per cent.",
             "",
-            f"Relative 95 % half-width in per cent, median of {seeds} vehicles:",
+            *table(HEADS, rows_of(np.nanmedian(widths, axis=0))),
             "",
-            *table(heads, rows),
-            "",
-            *sentences(widths, float(inside), sum(r[2] for r in results)),
-            REMARK,
+            f"* Obtained is at most twice the promise in {share(int((ratio <= 2.0).sum()), ratio.size)} of all cases "
+            f"({np.nanmin(ratio):.2f} to {np.nanmax(ratio):.2f} of it).",
+            f"* The truth is inside {share(int((np.abs(errors[known]) < Z95).sum()), int(known.sum()))}.",
         ]
-    )
+    return lines
+
+
+def recorded(given: Given) -> list[str]:
+    """The section of recorded flights: the last word is the log of the flown manoeuvre."""
+    vehicle, (*before, flown) = Vehicle.named(given.vehicle), given.words
+    _, widths = promised(before, vehicle, given.seconds)
+    rows = rows_of(np.vstack([widths, obtained([*before, flown], vehicle)[0]]))
+    names = [Path(word).name for word in given.words]
+    title = f"Half-widths in per cent, promised by {', '.join(names[:-1])} and obtained with {names[-1]}."
+    return [f"## {vehicle.name}", "", title, "", *table(HEADS, rows)]
 
 
 if __name__ == "__main__":
-    study(
-        __doc__,
-        "excite.md",
-        "What to fly next",
-        {"measured": lambda g: page(g.seeds, g.seconds)},
-        seeds=10,
-        seconds=60.0,
-    )
+    asked = options(
+        __doc__, ("simulated", "recorded"), "logs: those before, then that of the flown manoeuvre",
+        vehicle="pelican", seeds=10, seconds=60.0,
+    )  # fmt: skip
+    for part, section in (("simulated", simulated), ("recorded", recorded)):
+        if part in asked.parts and (part == "simulated" or asked.words):
+            put(asked, PAGE, TITLE, part, section(asked))
