@@ -240,12 +240,16 @@ def halves_after(found: Uncertainty, before: Uncertainty | None) -> FloatArray:
     """Relative 95 % half-widths (6,) by a fit of real flights and a simulated one.
 
     Estimates of the simulated flight differ by what its model holds.  By as much as those of the real ones before it
-    differ, beyond chance, the next real one is off too: it is flown and logged as they were.
+    differ, beyond chance, the next real one is off too, or by as many times what noise makes: it is flown and logged as
+    they were, but a livelier flight leaves less open.
     """
     from quadid.identification.uncertainty import halfwidths
 
-    beyond = 0.0 if before is None else before.sigma**2 - before.from_noise**2
-    variance = np.maximum(np.diag(found.covariance), found.from_noise**2 + beyond)
+    differing = found.from_noise
+    if before is not None:
+        beyond = np.sqrt(found.from_noise**2 + np.maximum(before.sigma**2 - before.from_noise**2, 0.0))
+        differing = np.minimum(beyond, found.from_noise * np.maximum(before.sigma / before.from_noise, 1.0))
+    variance = np.maximum(np.diag(found.covariance), differing**2)
     grown = np.sqrt(variance / np.diag(found.covariance))
     return halfwidths(np.linalg.inv(found.covariance * np.outer(grown, grown)))
 
