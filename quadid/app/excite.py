@@ -239,17 +239,16 @@ def knowledge(
 def halves_after(found: Uncertainty, before: Uncertainty | None) -> FloatArray:
     """Relative 95 % half-widths (6,) by a fit of real flights and a simulated one.
 
-    Estimates of the simulated flight differ by what its model holds.  By as much as those of the real ones before it
-    differ, beyond chance, the next real one is off too, or by as many times what noise makes: it is flown and logged as
-    they were, but a livelier flight leaves less open.
+    Estimates of the simulated flight differ by what its model holds.  Those of the next real one, flown and logged as
+    those before it were, differ by as many times what noise makes; at most by as much, as a livelier flight leaves less
+    open.
     """
     from quadid.identification.uncertainty import halfwidths
 
-    differing = found.from_noise
-    if before is not None:
-        beyond = np.sqrt(found.from_noise**2 + np.maximum(before.sigma**2 - before.from_noise**2, 0.0))
-        differing = np.minimum(beyond, found.from_noise * np.maximum(before.sigma / before.from_noise, 1.0))
-    variance = np.maximum(np.diag(found.covariance), differing**2)
+    variance = found.from_noise**2
+    if before is not None and before.grown is not None:
+        variance = variance + (before.grown**2 - 1.0) * np.minimum(variance, before.from_noise**2)
+    variance = np.maximum(np.diag(found.covariance), variance)
     grown = np.sqrt(variance / np.diag(found.covariance))
     return halfwidths(np.linalg.inv(found.covariance * np.outer(grown, grown)))
 

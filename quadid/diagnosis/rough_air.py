@@ -16,16 +16,13 @@ from quadid.diagnosis.residual_tests import RIDGE, SITES, Follows, Site, inputs,
 from quadid.diagnosis.search import Round, Search
 from quadid.diagnosis.second_search import select
 from quadid.estimate import kalman as k
-from quadid.estimate.fit import ACTS, ALL_NOISE, MOST, scoring
+from quadid.estimate.fit import ACTS, ALL_NOISE, FORCES, MOST, scoring
 from quadid.estimate.kalman import Gains
 from quadid.estimate.problem import PER_FLIGHT, Sensitivities
 from quadid.identification.elimination import freed
 from quadid.rotation import rotated
 from quadid.types import FloatArray
 from quadid.vehicle import GRAVITY
-
-FORCES = slice(k.SIGMA, k.SIGMA + 4)
-"""Places of the random forces and moments among the noise numbers."""
 
 
 @dataclass(frozen=True)

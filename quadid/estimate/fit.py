@@ -21,6 +21,8 @@ ENOUGH, FINE = 0.5, 0.1
 """Gain in -2 ln L that no step of the noise is worth taking for, and none of the physics."""
 ALL_NOISE, NO_NOISE = np.ones(k.N_NOISE, dtype=np.bool_), np.zeros(k.N_NOISE, dtype=np.bool_)
 """Noise numbers that a step may change."""
+FORCES = slice(k.SIGMA, k.SIGMA + 4)
+"""Places of the sizes of random forces and moments among the noise numbers."""
 ROUNDS = 4
 """Most times that effects are simulated anew, and that the noise of rotor speeds is taken out anew."""
 CHANCE = 4.0
@@ -147,7 +149,7 @@ def settle_noise(problem: Problem, z: FloatArray, psi: FloatArray) -> tuple[Floa
     rough = scoring(problem, z, exact, NEAR, others & sizes, physics=False)[1]
     first = scoring(problem, z, rough, MOST, others)
     # Large random forces have peaks of their own, of long and of short times: search from where they come to rest, too.
-    if np.any(first[1][k.SIGMA : k.SIGMA + 4] > problem.noise_scale[:4]):
+    if np.any(first[1][FORCES] > problem.noise_scale[:4]):
         settled = scoring(problem, z, rough, MOST, others & sizes, physics=False)[1]
         first = min((first, scoring(problem, z, settled, MOST, others)), key=lambda found: found[2])
     noisy = first[1].copy()

@@ -1,12 +1,13 @@
 """Promises of proposed manoeuvres: predicted intervals beside those that their flights gave.
 
     python -m quadid_evaluation.studies.excite --out docs/results
-    python -m quadid_evaluation.studies.excite --parts recorded --vehicle FILE BEFORE.bin FLOWN.bin
+    python -m quadid_evaluation.studies.excite --vehicle FILE BEFORE.bin FLOWN.bin
 
 Each seed is a new individual Pelican with a poor guess.  Its pilot flies gently for a minute; `quadid excite` proposes
 a minute by that log, the true vehicle flies it, and both logs together go through `quadid identify`.  Once the vehicle
-is as the model, once rotors lag, hubs drag and random forces act that the model lacks.  `recorded` compares the
-promises by a given log with what it and a log of the flown manoeuvre give.
+is as the model, once rotors lag, hubs drag and random forces act that the model lacks.
+
+With logs, the promises by those before are compared with what they and a log of the flown manoeuvre give.
 """
 
 import math
@@ -121,10 +122,7 @@ def recorded(given: Given) -> list[str]:
 
 
 if __name__ == "__main__":
-    asked = options(
-        __doc__, ("simulated", "recorded"), "logs: those before, then that of the flown manoeuvre",
-        vehicle="pelican", seeds=10, seconds=60.0,
-    )  # fmt: skip
-    for part, section in (("simulated", simulated), ("recorded", recorded)):
-        if part in asked.parts and (part == "simulated" or asked.words):
-            put(asked, PAGE, TITLE, part, section(asked))
+    logs = "logs: those before, then that of the flown manoeuvre"
+    asked = options(__doc__, words=logs, vehicle="pelican", seeds=10, seconds=60.0)
+    section = recorded if asked.words else simulated
+    put(asked, PAGE, TITLE, section.__name__, section(asked))
