@@ -22,7 +22,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, NamedTuple, TypedDict
 
 import msgspec
 import numpy as np
@@ -61,7 +61,6 @@ CREATE TABLE IF NOT EXISTS masses (
 """
 """A file whose tables were made by another text is refused as foreign: old ones were made by exactly this one."""
 VERSION = 2
-"""2: stamps are UNIX seconds; before, seconds of a day."""
 BUSY_SECONDS = 5.0
 """Longest wait for another program's lock [s]."""
 LARGEST_NUMBER = 1 << 53
@@ -101,26 +100,21 @@ def connect(path: Path, read_only: bool = False) -> sqlite3.Connection:
                 f"up to {VERSION}",
                 "use the version of quadid that wrote it, or another history",
             )
-        if not read_only:
-            _into_wal(db)
-            db.execute("PRAGMA synchronous = FULL")
+        deadline = time.monotonic() + BUSY_SECONDS
+        while not read_only:
+            try:
+                db.execute("PRAGMA journal_mode = WAL")
+                db.execute("PRAGMA synchronous = FULL")
+                break
+            except sqlite3.OperationalError as error:
+                # Of two that enter WAL mode at once on a new file SQLite refuses one without waiting.
+                if "locked" not in str(error) or time.monotonic() > deadline:
+                    raise
+                time.sleep(0.02)
     except BaseException:
         db.close()
         raise
     return db
-
-
-def _into_wal(db: sqlite3.Connection) -> None:
-    """Enters WAL mode; of two that do so at once on a new file SQLite refuses one without waiting."""
-    deadline = time.monotonic() + BUSY_SECONDS
-    while True:
-        try:
-            db.execute("PRAGMA journal_mode = WAL")
-            return
-        except sqlite3.OperationalError as error:
-            if "locked" not in str(error) or time.monotonic() > deadline:
-                raise
-            time.sleep(0.02)
 
 
 def make_tables(path: Path) -> None:
@@ -233,28 +227,33 @@ def read_history(
         StoreError: no such file, or not a history.
     """
 
-    def newest(kind: Any, columns: str, table: str, most: int) -> list[Any]:
-        rows = db.execute(
-            f"SELECT {columns} FROM {table} WHERE vehicle = ? ORDER BY rowid DESC LIMIT ?", (vehicle, most)
-        )
-        return [msgspec.convert(row, kind) for row in rows.fetchall()[::-1]]
+    def latest(table: str, most: int) -> list[dict[str, Any]]:
+        return newest(db, table, vehicle, f"ORDER BY rowid DESC LIMIT {most}")[::-1]
 
     with opened(path) as db:
         names = " UNION ".join(f"SELECT vehicle FROM {table}" for table in _SHOWN)
         return {
-            "sets": [_set(*row) for row in newest(_SET, "wall, data", "sets", sets)],
-            "candidates": [_set(*row) for row in newest(_SET, "wall, data", "candidates", candidates)],
-            "events": [e._asdict() for e in newest(_Event, "wall, t, level, kind, text", "events", events)],
+            "sets": [_set(row) for row in latest("sets", sets)],
+            "candidates": [_set(row) for row in latest("candidates", candidates)],
+            "events": [dict(msgspec.convert(row, _Event)) for row in latest("events", events)],
             "vehicles": [{"name": name} for (name,) in db.execute(names)],
         }
 
 
+def newest(
+    db: sqlite3.Connection, table: str, vehicle: str, which: str = "ORDER BY id DESC LIMIT 1"
+) -> list[dict[str, Any]]:
+    """Rows of a vehicle, each by its columns; `which` of them in SQL."""
+    found = db.execute(f"SELECT * FROM {table} WHERE vehicle = ? {which}", (vehicle,))
+    columns = [column for column, *_ in found.description]
+    return [dict(zip(columns, row, strict=True)) for row in found]
+
+
 _WALL = Annotated[float, msgspec.Meta(ge=0.0, lt=1e11)]
 """UNIX seconds that every calendar has."""
-_SET = tuple[_WALL, str]
 
 
-class _Event(NamedTuple):
+class _Event(TypedDict):
     wall: _WALL
     t: float | None
     level: str
@@ -262,9 +261,9 @@ class _Event(NamedTuple):
     text: str
 
 
-def _set(wall: float, data: str) -> dict[str, Any]:
+def _set(row: Mapping[str, Any]) -> dict[str, Any]:
     """A set as the service would read it back; raises one of `UNREADABLE` for what is none."""
-    found = json.loads(data)
+    wall, found = msgspec.convert(row["wall"], _WALL), json.loads(row["data"])
     boot = {"boot_id": str(found["boot_id"])} if "boot_id" in found else {}
     return {"wall": wall, **set_to_dict(set_from_dict(found), "covariance" in found), **boot}
 
@@ -280,16 +279,13 @@ _FIRST, _NAMES = 1 << 60, (1 << 60) + (1 << 32)
 """First bytes of the locks of vehicles and names: SQLite's lie at 2^30."""
 _LOCK, _TEST = (getattr(fcntl, f"F_OFD_{do}", getattr(fcntl, f"F_{do}")) for do in ("SETLK", "GETLK"))
 _FREE = struct.pack("h", fcntl.F_UNLCK)
-_File = tuple[int, int]
-"""Device and inode."""
-_guard = threading.Lock()
-_locked: dict[_File, tuple[int, set[str], int]] = {}
-"""Files with a lock of this process: descriptor, vehicles and name; each is opened once, since closing a second
-descriptor would take SQLite's own locks of it away."""
 
 
 class HistoryLock:
-    """The right to write a vehicle's rows into the file that stands under a name."""
+    """The right to write a vehicle's rows into the file that stands under a name.
+
+    A process has one history: the end of a second one on the same file would take SQLite's own locks of it away.
+    """
 
     def __init__(self, path: Path, vehicle: str) -> None:
         """Takes the lock; makes the file where there is none.
@@ -299,8 +295,7 @@ class HistoryLock:
             OSError: the file cannot be written.
         """
         self._path, self._vehicle = path, vehicle
-        self._file: _File | None = None
-        self._take()
+        self._descriptor = self._taken()
 
     def moved(self) -> bool:
         """True if another file stands under the name now than before; then that one is locked.
@@ -309,73 +304,56 @@ class HistoryLock:
             StoreError: another service has that one.
             OSError: it cannot be written.
         """
-        try:
-            found = self._path.stat()
-        except FileNotFoundError:
-            found = None
-        if found is not None and (found.st_dev, found.st_ino) == self._file:
-            return False
+        with contextlib.suppress(FileNotFoundError):
+            if self._descriptor >= 0 and os.path.samestat(self._path.stat(), os.fstat(self._descriptor)):
+                return False
         self.close()
-        self._take()
+        self._descriptor = self._taken()
         return True
 
     def close(self) -> None:
         """Lets others write."""
-        with _guard:
-            file, self._file = self._file, None
-            if file is not None:
-                descriptor, vehicles, _ = _locked[file]
-                vehicles.remove(self._vehicle)
-                fcntl.fcntl(descriptor, _LOCK, self._byte(fcntl.F_UNLCK))
-                _close_unused(file)
+        if self._descriptor >= 0:
+            os.close(self._descriptor)
+        self._descriptor = -1
 
-    def _take(self) -> None:
-        opened = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_NONBLOCK, 0o644)
-        found = os.fstat(opened)
-        file, folder = (found.st_dev, found.st_ino), self._path.parent.stat()
-        name = zlib.crc32(f"{folder.st_dev} {folder.st_ino} {self._path.name}".encode())
-        with _guard:
-            descriptor, vehicles, known = _locked.setdefault(file, (opened, set(), name))
-            if descriptor != opened:
-                os.close(opened)
-            try:
-                if not stat.S_ISREG(found.st_mode):
-                    raise OSError(0, "not a regular file")
-                if found.st_nlink > 1:
-                    raise StoreError(
-                        f"the history {self._path} has {found.st_nlink} names (hard links): by each it would be "
-                        "another database",
-                        "one name",
-                        "remove the other names, or copy the file instead of linking it",
-                    )
-                if self._vehicle in vehicles:
-                    raise BlockingIOError
-                fcntl.fcntl(descriptor, _LOCK, _flock(fcntl.F_RDLCK, _NAMES + known))
-                # Nobody else may have a lock on the byte of another name, before or behind ours.
-                beside = [(_NAMES, known), (_NAMES + known + 1, (1 << 32) - known - 1)]
-                tests = [fcntl.fcntl(descriptor, _TEST, _flock(fcntl.F_WRLCK, *part)) for part in beside if part[1]]
-                if name != known or any(lock[:2] != _FREE for lock in tests):
-                    raise StoreError(
-                        f"another service has the history {self._path} open by another name (as by a bind mount of the "
-                        "file): by each it would be another database",
-                        "one name in one folder",
-                        "mount the folder, not the file",
-                    )
-                fcntl.fcntl(descriptor, _LOCK, self._byte(fcntl.F_WRLCK))
-                vehicles.add(self._vehicle)
-                self._file = file
-            except BlockingIOError as error:
+    def _taken(self) -> int:
+        """Descriptor of the file, locked."""
+        descriptor = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_NONBLOCK, 0o644)
+        try:
+            found, folder = os.fstat(descriptor), self._path.parent.stat()
+            if not stat.S_ISREG(found.st_mode):
+                raise OSError(0, "not a regular file")
+            if found.st_nlink > 1:
+                raise StoreError(
+                    f"the history {self._path} has {found.st_nlink} names (hard links): by each it would be "
+                    "another database",
+                    "one name",
+                    "remove the other names, or copy the file instead of linking it",
+                )
+            # Nobody else may have a lock on the byte of another name, before or behind ours.
+            name = zlib.crc32(f"{folder.st_dev} {folder.st_ino} {self._path.name}".encode())
+            fcntl.fcntl(descriptor, _LOCK, _flock(fcntl.F_RDLCK, _NAMES + name))
+            beside = [(_NAMES, name), (_NAMES + name + 1, (1 << 32) - name - 1)]
+            tests = [fcntl.fcntl(descriptor, _TEST, _flock(fcntl.F_WRLCK, *part)) for part in beside if part[1]]
+            if any(lock[:2] != _FREE for lock in tests):
+                raise StoreError(
+                    f"another service has the history {self._path} open by another name (as by a bind mount of the "
+                    "file): by each it would be another database",
+                    "one name in one folder",
+                    "mount the folder, not the file",
+                )
+            fcntl.fcntl(descriptor, _LOCK, _flock(fcntl.F_WRLCK, _FIRST + zlib.crc32(self._vehicle.encode())))
+        except BaseException as error:
+            os.close(descriptor)
+            if isinstance(error, BlockingIOError):
                 raise StoreError(
                     f"another service writes the history of '{self._vehicle[:80]}' in {self._path}",
                     "one service a vehicle",
                     "stop the other one, give another history, or start as observer",
                 ) from error
-            finally:
-                _close_unused(file)
-
-    def _byte(self, kind: int) -> bytes:
-        """Lock of the byte that stands for the vehicle."""
-        return _flock(kind, _FIRST + zlib.crc32(self._vehicle.encode()))
+            raise
+        return descriptor
 
 
 def _flock(kind: int, first: int, count: int = 1) -> bytes:
@@ -383,18 +361,16 @@ def _flock(kind: int, first: int, count: int = 1) -> bytes:
     return struct.pack("hhqqi", kind, os.SEEK_SET, first, count, 0)
 
 
-def _close_unused(file: _File) -> None:
-    descriptor, vehicles, _ = _locked[file]
-    if not vehicles:
-        del _locked[file]
-        os.close(descriptor)
-
-
 # --- The set in force by a history: one rule for the service that takes it up and for all who read it
 #
 # Nothing in a file is believed: a set of an earlier run must be one that this run could have estimated.
 
-_FORCE = "state IN ('accepted', 'rolled_back')"
+IN_FORCE = "state IN ('accepted', 'rolled_back') ORDER BY rowid DESC"
+SAID = "state IN ('accepted', 'rolled_back', 'stale') ORDER BY rowid DESC"
+"""The row of the set last in force, and the row that was last said of it, in SQL;"""
+APPROVED = "approved_by NOT IN ('auto', '') AND state != 'stale' ORDER BY rowid DESC"
+FIRST = "state = 'accepted' ORDER BY rowid"
+"""... the last set that a person approved, and the first one."""
 _SAME_MASS = 1e-6
 """Relative difference of masses that were written and read back."""
 
@@ -406,15 +382,15 @@ class StoredSet(NamedTuple):
         item: the set; None where there is none, or none that can be read.
         why_none: why it cannot be taken up; empty where it can, or where there is none.
         confirmed: whether a flight of the last run confirmed it; after a restart a set is stale until one does.
-        boot_id: of the run that numbered it; empty where the history does not say.
         rests: `rests_on` of the vehicle that it was estimated for, as far as the history says.
+        row: its columns.
     """
 
     item: OnlineSet | None
     why_none: str = ""
     confirmed: bool = True
-    boot_id: str = ""
     rests: Mapping[str, Any] = MappingProxyType({})
+    row: Mapping[str, Any] = MappingProxyType({})
 
     @property
     def doubt(self) -> str:
@@ -440,10 +416,10 @@ def in_force(db: sqlite3.Connection, name: str, gate: GateSettings, vehicle: Veh
     Args:
         vehicle: of this run; None: nothing of it is compared.
     """
-    last = stored(db, name, f"{_FORCE} ORDER BY rowid DESC", gate, vehicle)
+    last = stored(db, name, IN_FORCE, gate, vehicle)
     if last.item is None or last.why_none:
         return last
-    told = stored(db, name, f"({_FORCE} OR state = 'stale') ORDER BY rowid DESC", gate, vehicle).item or last.item
+    told = stored(db, name, SAID, gate, vehicle).item or last.item
     item = replace(last.item, outdated=told.outdated, outdated_code=told.outdated_code)
     other = [] if vehicle is None else [n for n, now in rests_on(vehicle).items() if last.rests.get(n, now) != now]
     if other and not item.outdated:
@@ -463,15 +439,15 @@ def read_in_force(path: Path, name: str, vehicle: Vehicle | None) -> StoredSet:
 
 def stored(db: sqlite3.Connection, name: str, which: str, gate: GateSettings, vehicle: Vehicle | None) -> StoredSet:
     """The first set of a vehicle for which the SQL condition `which` holds."""
-    row = db.execute(f"SELECT data, sequence FROM sets WHERE vehicle = ? AND {which} LIMIT 1", (name,)).fetchone()
-    if row is None:
+    rows = newest(db, "sets", name, f"AND {which} LIMIT 1")
+    if not rows:
         return StoredSet(None)
-    found = None
+    (row,), found = rows, None
     try:
-        data = json.loads(row[0])
+        data = json.loads(row["data"])
         found = set_from_dict(data)
-        why, boot = why_none(found, row[1], gate, vehicle), str(data.get("boot_id", ""))
-        return StoredSet(found, why, boot_id=boot, rests={n: v for n, v in data.items() if v is not None})
+        why = why_none(found, row["sequence"], gate, vehicle)
+        return StoredSet(found, why, rests={n: v for n, v in data.items() if v is not None}, row=row)
     except UNREADABLE as error:
         return StoredSet(found, f"{type(error).__name__}: {str(error)[:120]}")
 
@@ -626,16 +602,14 @@ class Store:
         except ValueError as error:
             raise StoreError(f"{str(path)!r} names no file ({error})", "a path", "give another --history") from error
         self.vehicle, self.boot_id, self._kept = vehicle, uuid.uuid4().hex, kept
-        self._boots: dict[int, str] = {}
+        self.notes, self.problem = list[str](), ""
+        self.written, self.lost = set[int](), set[int]()
         self._rests: dict[str, Any] = {}
-        self.notes: list[str] = []
-        self.problem = ""
         self._unread = False
+        # What waits, and what a new file would begin with: rows by what they stand for, and the healthy flights.
+        self._rows: list[Row] = []
         self._standing: dict[str, Row] = {}
         self._flights: deque[Row] = deque(maxlen=MOST_FLIGHTS)
-        self._rows: list[Row] = []
-        self.written: set[int] = set()
-        self.lost: set[int] = set()
         self._changed = threading.Condition()
         self._closing, self._since_pruned = False, 0
         self._lock: HistoryLock | None = None
@@ -670,76 +644,53 @@ class Store:
 
         From now on each set is noted with what it rests on.
         """
-        gate = gate or GateSettings()
+        gate, left = gate or GateSettings(), Restored(None, first_number())
         self._rests = rests_on(vehicle) if vehicle is not None else {}
         if self._lock is None or not self.path.is_file() or not self.path.stat().st_size:
-            return Restored(None, first_number())
+            return left
         try:
             with contextlib.closing(connect(self.path)) as db:
-                return self._restored(db, gate, vehicle)
+                left = self._restored(db, gate, vehicle)
         except sqlite3.Error as error:
             self.notes.append(f"the last set cannot be read back ({error})")
             self._unread = True
-            approval, decided = self._decided(None, gate)
-            return Restored(None, first_number(), approval=approval, decided=decided)
+        if self._unread:  # nobody knows what people decided
+            self.decision(gate.approval, "manual")
+            left = replace(left, approval="manual", decided="what people decided in earlier runs cannot be read")
+        return left
 
     def _restored(self, db: sqlite3.Connection, gate: GateSettings, vehicle: Vehicle | None) -> Restored:
-        def taken_up(found: StoredSet) -> OnlineSet | None:
-            """The set; one that no fresh estimate could be is left out, and reported."""
-            if found.why_none:
-                self.notes.append(f"a set of the history is no set and is not taken up again ({found.why_none})")
-                return None
-            if found.item is not None:
-                self._boots[found.item.sequence] = found.boot_id
-            return found.item
-
-        def first_with(which: str) -> OnlineSet | None:
-            return taken_up(stored(db, self.vehicle, which, gate, vehicle))
-
-        last = taken_up(in_force(db, self.vehicle, gate, vehicle))
-        approved = first_with("approved_by NOT IN ('auto', '') AND state != 'stale' ORDER BY rowid DESC")
-        first = first_with("state = 'accepted' ORDER BY rowid")
-        for item in (first, approved, last):
-            if item is not None:
-                self._stands(item)
+        # Sets: the first, the last that a person approved, the one in force, and what was last said of that.
+        sets = [stored(db, self.vehicle, which, gate, vehicle) for which in (FIRST, APPROVED)]
+        sets += [in_force(db, self.vehicle, gate, vehicle), stored(db, self.vehicle, SAID, gate, vehicle)]
+        for found in sets:
+            if found.item is not None and not found.why_none:
+                self._stands(self._again("sets", found.row, found.item.sequence))
+        first, approved, last = (found.item if not found.why_none else None for found in sets[:3])
+        whys = dict.fromkeys(found.why_none for found in sets if found.why_none)
+        self.notes += [f"a set of the history is no set and is not taken up again ({why})" for why in whys]
+        # Healthy flights, the oldest first.
         healthy = []
-        for (data,) in db.execute(
-            "SELECT data FROM (SELECT * FROM healthy_flights WHERE vehicle = ? ORDER BY id DESC LIMIT ?) ORDER BY id",
-            (self.vehicle, MOST_FLIGHTS),
-        ):
+        for row in newest(db, "healthy_flights", self.vehicle, f"ORDER BY id DESC LIMIT {MOST_FLIGHTS}")[::-1]:
             try:
-                healthy.append(flight_from_dict(json.loads(data)))
-                self._flights.append(self._flight_row(healthy[-1]))
+                healthy.append(flight_from_dict(json.loads(row["data"])))
+                self._flights.append(self._again("healthy_flights", row))
             except UNREADABLE as error:
                 self.notes.append(f"a healthy flight of the history cannot be read back ({error})")
-        mass = self._mass_left(db)
-        decision = "SELECT configured, approval FROM decisions WHERE vehicle = ? ORDER BY id DESC LIMIT 1"
-        approval, decided = self._decided(db.execute(decision, (self.vehicle,)).fetchone(), gate)
+        # What people decided, as long as the service is configured as it was then, and the mass that changes left.
+        approval, mass = "", 0.0
+        for row in newest(db, "decisions", self.vehicle):
+            self._unread |= row["approval"] not in ("auto", "manual")
+            if row["configured"] == gate.approval:
+                approval, self._standing["decision"] = row["approval"], self._again("decisions", row)
+        for row in newest(db, "masses", self.vehicle):
+            try:
+                mass = msgspec.convert(row["mass"], MASS)
+                self._standing["mass"] = self._again("masses", row)
+            except UNREADABLE:
+                self._unread = True
         (highest,) = db.execute("SELECT max(sequence) FROM sets WHERE vehicle = ?", (self.vehicle,)).fetchone()
-        return Restored(last, first_number(highest or 0), approved or first, approval, tuple(healthy), decided, mass)
-
-    def _mass_left(self, db: sqlite3.Connection) -> float:
-        """Mass that changes in flight left [kg]; 0: none did."""
-        made = db.execute("SELECT 1 FROM sqlite_master WHERE name = 'masses'").fetchone()
-        newest = "SELECT mass FROM masses WHERE vehicle = ? ORDER BY id DESC LIMIT 1"
-        row = db.execute(newest, (self.vehicle,)).fetchone() if made else None
-        try:
-            mass = msgspec.convert(row[0], MASS) if row is not None else 0.0
-        except UNREADABLE:
-            self._unread = True
-            return 0.0
-        self._standing["mass"] = self._row("masses", mass=mass)
-        return mass
-
-    def _decided(self, row: tuple[Any, Any] | None, gate: GateSettings) -> tuple[str, str]:
-        """Approval by the newest row of what people decided, and why: manual where that cannot be read."""
-        if self._unread or (row is not None and row[1] not in ("auto", "manual")):
-            self.decision(gate.approval, "manual")
-            return "manual", "what people decided in earlier runs cannot be read"
-        if row is None or row[0] != gate.approval:
-            return "", ""
-        self._standing["decision"] = self._row("decisions", configured=row[0], approval=row[1])
-        return str(row[1]), Restored.decided
+        return Restored(last, first_number(highest or 0), approved or first, approval, tuple(healthy), mass=mass)
 
     # --- what is journalled
 
@@ -758,21 +709,15 @@ class Store:
 
     def numbered(self, item: OnlineSet) -> None:
         """Journals a set that was put in force, rolled back to, restored, or waits for approval."""
-        self._put(self._stands(item))
+        number, data = item.sequence, {**set_to_dict(item), "boot_id": self.boot_id, **self._rests}
+        row = self._set_row("sets", item, data, number, sequence=number, approved_by=item.approved_by)
+        self._stands(row)
+        self._put(row)
 
     def candidate(self, item: OnlineSet) -> None:
         """Journals an estimate and what the gate said of it."""
-        self._put(
-            self._row(
-                "candidates",
-                passes=True,
-                state=item.state.value,
-                gate=item.check,
-                reason=item.reason,
-                stop=item.stop,
-                data=json.dumps(set_to_dict(item, covariance=False)),
-            )
-        )
+        data = set_to_dict(item, covariance=False)
+        self._put(self._set_row("candidates", item, data, passes=True, gate=item.check))
 
     def event(self, item: Event, data: str | None = None) -> None:
         """Journals an event, with JSON that belongs to it."""
@@ -790,7 +735,7 @@ class Store:
 
     def healthy_flight(self, flight: FlightTrim) -> None:
         """Journals a flight that later ones are compared with."""
-        self._flights.append(self._flight_row(flight))
+        self._flights.append(self._row("healthy_flights", data=json.dumps(flight_to_dict(flight))))
         self._put(self._flights[-1])
 
     def decision(self, configured: str, approval: str) -> None:
@@ -821,32 +766,25 @@ class Store:
     def _row(self, table: str, number: int = 0, passes: bool = False, **values: Any) -> Row:
         return Row(table, {"vehicle": self.vehicle, "wall": time.time(), **values}, number, passes)
 
-    def _flight_row(self, flight: FlightTrim) -> Row:
-        return self._row("healthy_flights", data=json.dumps(flight_to_dict(flight)))
+    def _set_row(self, table: str, item: OnlineSet, data: dict[str, Any], number: int = 0, **more: Any) -> Row:
+        about: dict[str, Any] = {"state": item.state.value, "reason": item.reason, "stop": item.stop}
+        return self._row(table, number, **about, data=json.dumps(data), **more)
 
-    def _stands(self, item: OnlineSet) -> Row:
-        """The row of a set, kept where a new file would have to begin with it; what `_restored` looks for."""
-        state = item.state.value
-        data = {**set_to_dict(item), "boot_id": self._boots.get(item.sequence, self.boot_id), **self._rests}
-        row = self._row(
-            "sets",
-            item.sequence,
-            sequence=item.sequence,
-            state=state,
-            reason=item.reason,
-            approved_by=item.approved_by,
-            stop=item.stop,
-            data=json.dumps(data),
-        )
+    def _again(self, table: str, row: Mapping[str, Any], number: int = 0) -> Row:
+        """A row of an earlier run as one that a new file would begin with."""
+        return self._row(table, number, **{name: v for name, v in row.items() if name not in ("id", "vehicle", "wall")})
+
+    def _stands(self, row: Row) -> None:
+        """Keeps the row of a set where a new file would have to begin with it; what `_restored` looks for."""
+        state, by = row.values["state"], row.values["approved_by"]
         if state == "accepted":
             self._standing.setdefault("first", row)
-        if state != "stale" and item.approved_by not in ("auto", ""):
+        if state != "stale" and by not in ("auto", ""):
             self._standing["approved"] = row
         if state in ("accepted", "rolled_back"):
             self._standing["last"] = row
         if state in ("accepted", "rolled_back", "stale"):
-            self._standing["told"] = row
-        return row
+            self._standing["said"] = row
 
     # --- the thread that writes
 
@@ -894,8 +832,7 @@ class Store:
 
     def _commit(self, batch: list[Row]) -> dict[int, str]:
         """Writes and commits; returns why rows can never be written, by the id of the row."""
-        lock = self._lock
-        if lock is None:
+        if (lock := self._lock) is None:
             raise StoreError(f"the history {self.path} is closed")
         lock.moved()
         with contextlib.closing(connect(self.path)) as db, db:
@@ -917,6 +854,6 @@ class Store:
             self.problem = f"{self.path} cannot be written ({failure}): kept in memory until it can"
             return
         self.notes += [note] if note else []
-        standing = {id(row): row for row in (*self._standing.values(), *self._flights)}.values()
+        standing = {row.number or -id(row): row for row in (*self._standing.values(), *self._flights)}.values()
         with self._changed:
             self._rows[:0] = [row for row in sorted(standing, key=lambda row: row.number) if row not in self._rows]

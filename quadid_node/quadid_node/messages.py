@@ -6,7 +6,7 @@ keeps, Zenoh carries and the commands print.
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import msgspec
@@ -15,7 +15,6 @@ import numpy as np
 from quadid.chi_square import Z95
 from quadid.condition.watch import HealthReport
 from quadid.jsonable import jsonable
-from quadid.online.gate import FORCE
 from quadid.online.records import (
     Event,
     HealthyFlight,
@@ -112,6 +111,8 @@ PHASES = {
 HEALTH_VERDICTS = {"unchanged": 0, "changed": 1, "unknown": 2}
 VERDICTS = {"nothing_found": 0, "explained": 1, "partly_explained": 2, "unknown": 3}
 OK, WARN, ERROR = b"\x00", b"\x01", b"\x02"
+WORKING, NO_HISTORY = ("idle", "busy", "inline"), "none kept"
+"""States of a worker, and of no history, that are as they should be."""
 
 
 def parameter_set(item: OnlineSet, vehicle: str, boot_id: str = "") -> Message:
@@ -200,13 +201,13 @@ def _finding(found: Mapping[str, Any]) -> Message:
 
 
 def _as_plain(found: OnlineFinding) -> dict[str, Any]:
-    """A finding as plain data, as in `quadid diagnose`'s JSON."""
-    intervals = {n: interval(v, found.sigma.get(n, math.nan)) for n, v in found.values.items()}
+    """A finding as plain data, as in `quadid diagnose`'s JSON, with 95 % intervals."""
+    half = {n: Z95 * found.sigma.get(n, math.nan) for n in found.values}
     return {
         "effect": found.effect,
         "confident": found.confident,
         "parameters": [
-            {"name": n, "unit": found.units.get(n, ""), "value": v, "ci95": intervals[n]}
+            {"name": n, "unit": found.units.get(n, ""), "value": v, "ci95": (v - half[n], v + half[n])}
             for n, v in found.values.items()
         ],
         "gain": {"mse_before": found.mse_before, "mse_after": found.mse_after},
@@ -214,11 +215,6 @@ def _as_plain(found: OnlineFinding) -> dict[str, Any]:
         "evidence": found.evidence,
         "alternatives": [vars(a) for a in found.alternatives],
     }
-
-
-def interval(value: float, sigma: float) -> tuple[float, float]:
-    """95 % interval of a value with a standard deviation."""
-    return value - Z95 * sigma, value + Z95 * sigma
 
 
 def health_message(report: HealthReport, vehicle: str) -> Message:
@@ -279,24 +275,28 @@ def diagnostics(
         notes: errors of the transport by topic or link (a QoS that does not match, a second publisher).
         idle: why the node is not active, and what to do; empty while it is.
     """
+
+    def part(what: str, level: bytes, text: str, values: dict[str, Any] | None = None) -> Message:
+        return entry(name, what, hardware, level, text, values or {})
+
     if health is None:
-        said = f"{idle}; {problem}" if problem else idle
-        entries = [entry(name, "session", hardware, ERROR if problem else WARN, said, {})]
+        entries = [part("session", ERROR if problem else WARN, f"{idle}; {problem}" if problem else idle)]
         return {"header": {"stamp": now, "frame_id": ""}, "status": entries}
-    status = health.status
-    warned = bool(idle) or status.phase in (Phase.BLOCKED, Phase.FAILED) or bool(lag(status.backlog))
-    said = idle or f"{status.phase.value}: {status.reason}"
-    if lag(status.backlog):
-        said = f"{lag(status.backlog)}; {said}"
-    session = entry(name, "session", hardware, WARN if warned else OK, said, {
-        "set in force": f"{status.in_force}{' (stale)' * status.stale}", "waiting for approval": status.pending,
-        "approval": status.approval, "fits": status.fits, "refused": status.rejected, "mse": f"{status.mse:.3f}",
-        "backlog [s]": f"{status.backlog:.2f}", "fits left out": status.skipped,
-    })  # fmt: skip
-    worker_level = OK if health.worker in ("idle", "busy", "inline") else WARN
-    worker = entry(name, "worker", hardware, worker_level, health.worker, {"restarts": health.restarts})
-    history_level = OK if health.history in ("", "none kept") else ERROR
-    history = entry(name, "history", hardware, history_level, health.history or "written", {})
+    # The session: its phase and reason, and what it has done.
+    status, late = health.status, lag(health.status.backlog)
+    warned = bool(idle or late) or status.phase in (Phase.BLOCKED, Phase.FAILED)
+    said = "; ".join(filter(None, (late, idle or f"{status.phase.value}: {status.reason}")))
+    counts = {
+        "set in force": f"{status.in_force}{' (stale)' * status.stale}",
+        "waiting for approval": status.pending,
+        "approval": status.approval,
+        "fits": status.fits,
+        "refused": status.rejected,
+        "mse": f"{status.mse:.3f}",
+        "backlog [s]": f"{status.backlog:.2f}",
+        "fits left out": status.skipped,
+    }
+    # Inputs: the channel that is silent for longest, and what is wrong on topics and links.
     worst, silence = max(((n, feed.silence) for n, feed in health.feeds.items()), key=lambda f: f[1], default=("", 0.0))
     level, arrive = (OK, "data arrive") if health.feeds else (WARN, "nothing arrives yet")
     if silence > SILENT_WARNING:
@@ -304,18 +304,15 @@ def diagnostics(
     if troubles := [f"{topic}: {why}" for topic, why in [*notes.items(), *hints.items()]]:
         arrive = "; ".join(troubles if level == OK else [arrive, *troubles])
         level = ERROR if notes else max(level, WARN)
-    inputs = entry(
-        name,
-        "inputs",
-        hardware,
-        level,
-        arrive,
-        {
-            **{f"{k} [Hz]": f"{feed.rate:.1f}" for k, feed in health.feeds.items()},
-            **{f"dropped: {reason}": count for reason, count in status.faults.items()},
-        },
-    )
-    return {"header": {"stamp": now, "frame_id": ""}, "status": [session, inputs, worker, history]}
+    rates = {f"{k} [Hz]": f"{feed.rate:.1f}" for k, feed in health.feeds.items()}
+    dropped = {f"dropped: {reason}": count for reason, count in status.faults.items()}
+    entries = [
+        part("session", WARN if warned else OK, said, counts),
+        part("inputs", level, arrive, rates | dropped),
+        part("worker", OK if health.worker in WORKING else WARN, health.worker, {"restarts": health.restarts}),
+        part("history", OK if health.history in ("", NO_HISTORY) else ERROR, health.history or "written"),
+    ]
+    return {"header": {"stamp": now, "frame_id": ""}, "status": entries}
 
 
 def entry(name: str, part: str, hardware: str, level: bytes, message: str, values: dict[str, Any]) -> Message:
@@ -333,22 +330,13 @@ def entry(name: str, part: str, hardware: str, level: bytes, message: str, value
 # --- JSON
 
 
+_TOLD = ("name", "unit", "value", "sigma", "ci95", "initial", "bounds", "status", "relative_to")
+"""What others are told of a parameter."""
+
+
 def set_to_dict(item: OnlineSet, covariance: bool = True) -> dict[str, Any]:
     """A set; times are stamps [s], parameters as in `quadid identify`'s JSON, with standard deviation and bounds."""
-    parameters = [
-        {
-            "name": p.name,
-            "unit": p.unit,
-            "value": p.value,
-            "sigma": p.sigma,
-            "ci95": p.ci95,
-            "initial": p.initial,
-            "bounds": p.bounds,
-            "status": p.status,
-            **({"relative_to": p.relative_to} if p.relative_to else {}),
-        }
-        for p in item.parameters
-    ]
+    parameters = [{name: v for name in _TOLD if (v := getattr(p, name)) is not None} for p in item.parameters]
     data: dict[str, Any] = jsonable(
         {**vars(item), "parameters": parameters, **({"covariance": item.parameters.covariance} if covariance else {})}
     )
@@ -364,15 +352,13 @@ def set_from_dict(data: Mapping[str, Any]) -> OnlineSet:
     """
     msgspec.json.encode(data)  # raises for such text
     found = _with_nan(data)
-    parameters = found["parameters"]
+    parameters, _ = found["parameters"], found["reference_sd"]  # without the second it would count as known
     covariance = data.get("covariance") or np.diag([p["sigma"] ** 2 for p in parameters])
     found["parameters"] = {"parameters": parameters, "covariance": covariance}
     made: OnlineSet = msgspec.convert(found, OnlineSet, dec_hook=lambda _, rows: np.array(rows, dtype=np.float64))
     for p in made.parameters:
         if p.ci95[1] < p.value or p.value < p.ci95[0]:
             raise ValueError(f"a set with {p.name} = {p.value:g} outside its interval")
-    if "reference_sd" not in data:  # of a version that did not ask
-        made = replace(made, parameters=made.parameters.scaled_together(FORCE), reference_sd=FORCE)
     if not 0.0 <= made.reference_sd <= 1.0:
         raise ValueError(f"a set whose reference has a standard deviation of {made.reference_sd:g}")
     if not 0 <= made.samples < 1 << 32 or any(abs(t) >= 1 << 31 for t in (made.start, made.stop)):
@@ -388,20 +374,8 @@ def diagnosis_to_dict(item: OnlineDiagnosis) -> dict[str, Any]:
 
 def health_to_dict(report: HealthReport) -> dict[str, Any]:
     """A report as JSON: ``quadid.health/1`` as far as a flight in progress has it, with the loss of every rotor."""
-    data: dict[str, Any] = jsonable(
-        {
-            "schema": "quadid.health/1",
-            "t": report.t,
-            "verdict": report.verdict,
-            "has_baseline": report.has_baseline,
-            "changes": [change.to_dict() for change in report.changes],
-            "score": report.score,
-            "rotor_loss": report.rotor_loss,
-            "rotor_interval": report.rotor_interval,
-            "mass": report.mass,
-            "text": report.text,
-        }
-    )
+    changes = [change.to_dict() for change in report.changes]
+    data: dict[str, Any] = jsonable({"schema": "quadid.health/1", **vars(report), "changes": changes})
     return data
 
 
