@@ -175,7 +175,7 @@ class ProcessWorker:
         self._request: Job | None = None
         self._tries = self._failures = self.restarts = 0
         self._since = self._last_failure = -1e9
-        self._told: list[Trouble] = []
+        self._out: list[JobReply | Trouble] = []
         self.state = "starting"
         self._start()
 
@@ -197,14 +197,14 @@ class ProcessWorker:
 
     def poll(self) -> list[JobReply | Trouble]:
         """Takes answers, checks on the child, restarts it when it is time; never blocks."""
-        replies: list[JobReply | Trouble] = []
         if self.state == "resting" and self._clock() >= self._since:
             self._start()
         if self._child is not None:
-            replies.extend(self._received())
-            self._check(replies)
-        told, self._told = self._told, []
-        return [*replies, *told]
+            self._receive()
+            if why := self._failure(self._child):
+                self._replace(why, self._child.poll() is not None)
+        out, self._out = self._out, []
+        return out
 
     def sibling(self) -> ProcessWorker:
         """A child of its own for diagnoses."""
@@ -237,48 +237,42 @@ class ProcessWorker:
         self._asked.put(self._request)
         self.state, self._since = "busy", self._clock()
 
-    def _received(self) -> list[JobReply]:
-        replies: list[JobReply] = []
+    def _receive(self) -> None:
+        """Takes answers, and gives the child what waits for it."""
         while not self._heard.empty():
             item, self.state = self._heard.get(), "idle"
-            if item == READY:
-                if self._request is not None:
-                    self._give()
-            else:
-                replies.append(item)
-                if self._request is not None and item.number != self._request.number:
-                    self._give()  # what was asked while this one took too long
-                else:
-                    self._request = None
+            if item != READY:
+                self._out.append(item)
+                if self._request is not None and item.number == self._request.number:
+                    self._request = None  # else: asked while this one took too long
+            if self._request is not None:
+                self._give()
         if self._failures and self._clock() - self._last_failure > CALM and self.state == "idle":
             self._failures = 0
-        return replies
 
-    def _check(self, replies: list[JobReply | Trouble]) -> None:
-        """Looks whether the child died or hangs; keeps or gives up its request."""
-        assert self._child is not None
-        code = self._child.poll()
-        waited = self._clock() - self._since
+    def _failure(self, child: subprocess.Popen[bytes]) -> str:
+        """Why the child is of no use any more; empty while it is."""
+        code = child.poll()
         if code is not None:
-            why = f"ended by signal {-code}" if code < 0 else f"ended with code {code}"
-        elif self.state == "starting" and (given_up := self._warm_up.given_up()):
-            why = given_up
-        elif self.state == "busy" and waited > self._limit:
-            why = f"hung for {self._limit:g} s"
-        else:
-            return
+            return f"ended by signal {-code}" if code < 0 else f"ended with code {code}"
+        if self.state == "starting":
+            return self._warm_up.given_up()
+        hangs = self.state == "busy" and self._clock() - self._since > self._limit
+        return f"hung for {self._limit:g} s" if hangs else ""
+
+    def _replace(self, why: str, died: bool) -> None:
+        """Ends the child, the next one starts after a pause; its request is kept, or given up after some tries."""
         self._end_child()
         pause = BACKOFF[min(self._failures, len(BACKOFF) - 1)]
         self._failures, self.restarts = self._failures + 1, self.restarts + 1
         self._last_failure = self._clock()
         self.state, self._since = "resting", self._clock() + pause
-        self._told.append(Trouble("warning", f"the {self._name} process {why}; the next one starts in {pause:g} s"))
+        self._out.append(Trouble("warning", f"the {self._name} process {why}; the next one starts in {pause:g} s"))
         self._tries += 1
         if self._request is not None and self._tries >= TRIES:
             problem = f"{TRIES} {self._name} processes failed before this window was done (the last one {why})"
-            problem = UNEXPECTED + problem if code is not None else problem
-            replies.append(self._request.failed(problem))
-            self._told.append(Trouble("error", problem))
+            problem = UNEXPECTED + problem if died else problem
+            self._out += [self._request.failed(problem), Trouble("error", problem)]
             self._request = None
 
     def _end_child(self) -> None:

@@ -60,19 +60,6 @@ def open_session(where: str) -> Any:
         ) from error
 
 
-def wait_for_session(
-    where: str, wait: Callable[[float], bool], told: Callable[[str], None], retry: float = RETRY
-) -> Any:
-    """Opens a session as soon as somebody listens there; None once `wait`, given a pause [s], returns True."""
-    while True:
-        try:
-            return open_session(where)
-        except ZenohError as error:
-            told(str(error))
-        if wait(retry):
-            return None
-
-
 class LateSession:
     """A session that is opened in the background, as soon as somebody listens there; routers that go come back."""
 
@@ -98,7 +85,13 @@ class LateSession:
         self.lock, self._closed, self._session = threading.Lock(), threading.Event(), None
 
         def connect() -> None:
-            session = wait_for_session(where, self._closed.wait, told, retry)
+            session = None
+            while session is None and not self._closed.is_set():
+                try:
+                    session = open_session(where)
+                except ZenohError as error:
+                    told(str(error))
+                    self._closed.wait(retry)
             with self.lock:
                 if session is not None and self._closed.is_set():
                     session.close()
@@ -418,22 +411,13 @@ class Done:
 
 def work(where: str, stop: Callable[[], bool], told: Callable[[str], None]) -> Done:
     """Answers requests until `stop` is true; waits for a router that is not there yet."""
-    config_of(where)
-    said = set[str]()
+    done, said, declared = Done(), set[str](), list[Any]()
+    waiting: queue.Queue[Any] = queue.Queue(MOST_WAITING)
 
     def tell_once(problem: str) -> None:
         if problem not in said:
             told(f"{problem}; trying again")
         said.add(problem)
-
-    def stopped_after(pause: float) -> bool:
-        time.sleep(pause)
-        return stop()
-
-    done, session = Done(), wait_for_session(where, stopped_after, tell_once)
-    if session is None:
-        return done
-    waiting: queue.Queue[Any] = queue.Queue(MOST_WAITING)
 
     def take(query: Any) -> None:
         with waiting.mutex:
@@ -446,10 +430,13 @@ def work(where: str, stop: Callable[[], bool], told: Callable[[str], None]) -> D
             with query:
                 query.reply_err(b"too much to do")
 
-    try:
-        served = session.declare_queryable(WORK, take)
-        alive = session.liveliness().declare_token(ALIVE.replace("*", str(session.zid())))
+    def serve(session: Any) -> None:
+        declared.append(session.declare_queryable(WORK, take))
+        declared.append(session.liveliness().declare_token(ALIVE.replace("*", str(session.zid()))))
         told("ready: takes windows and answers fits")
+
+    session = LateSession(where, serve, tell_once)
+    try:
         while not stop():
             try:
                 query = waiting.get(timeout=WAIT)
@@ -459,8 +446,6 @@ def work(where: str, stop: Callable[[], bool], told: Callable[[str], None]) -> D
             with query:
                 _answer(query, done, told)
             done.seconds += time.monotonic() - begin
-        alive.undeclare()
-        served.undeclare()
     finally:
         session.close()
     return done
@@ -568,7 +553,7 @@ class RemoteWorker:
         self._answers: queue.Queue[tuple[int, Any]] = queue.Queue(MOST_ANSWERS)
         self._asked: Job | None = None
         self._until = 0.0
-        self._told: list[Trouble] = []
+        self._out: list[JobReply | Trouble] = []
         self._was_there = False
         self.far = 0
 
@@ -601,19 +586,19 @@ class RemoteWorker:
 
     def poll(self) -> list[JobReply | Trouble]:
         """Replies of either; never waits."""
-        out: list[JobReply | Trouble] = list(self._local.poll())
+        self._out += self._local.poll()
         while not self._answers.empty():
             number, data = self._answers.get_nowait()
             if self._asked is not None and number == self._asked.number:
-                self._take(data, out)
+                self._take(self._asked, data)
         if self._asked is not None and (not self._ground.alive or self._clock() > self._until):
             self._fall_back("does not answer" if self._ground.alive else "vanished")
         there = self._ground.there
         if there and not self._was_there:
-            self._told.append(Trouble("info", "a ground machine is there: fits go to it"))
+            self._out.append(Trouble("info", "a ground machine is there: fits go to it"))
         self._was_there = there
-        told, self._told = self._told, []
-        return [*out, *told]
+        out, self._out = self._out, []
+        return out
 
     def sibling(self) -> "RemoteWorker":
         """Another one, for diagnoses, on the same way to the ground."""
@@ -624,28 +609,27 @@ class RemoteWorker:
         self._local.close()
         self._ground.close()
 
-    def _take(self, data: bytes | None, out: list[JobReply | Trouble]) -> None:
+    def _take(self, asked: Job, data: bytes | None) -> None:
         try:
             reply = unpack(data) if data is not None else None
         except ParcelError as error:
             self._fall_back(f"answers what cannot be read ({error})")
             return
-        if self._asked is None or not self._asked.is_answered_by(reply):
+        if not asked.is_answered_by(reply):
             self._fall_back("refused the request" if data is None else "answers something else")
-            return
-        if reply.is_unexpected:
+        elif reply.is_unexpected:
             self._fall_back("fails at the request")
-            return
-        self._asked = None
-        self.far += 1
-        sentences: dict[str, Any] = {n: one_line(text) for n, text in vars(reply).items() if isinstance(text, str)}
-        out.append(replace(reply, **sentences))
+        else:
+            self._asked = None
+            self.far += 1
+            sentences: dict[str, Any] = {n: one_line(text) for n, text in vars(reply).items() if isinstance(text, str)}
+            self._out.append(replace(reply, **sentences))
 
     def _fall_back(self, why: str) -> None:
         request, self._asked = self._asked, None
         self._ground.rest()
         self._was_there = False
-        self._told.append(Trouble("warning", f"the ground machine {why}: work on board for {REST:g} s or longer"))
+        self._out.append(Trouble("warning", f"the ground machine {why}: work on board for {REST:g} s or longer"))
         if request is not None:
             self._local.submit(request)
 

@@ -418,7 +418,7 @@ class _Session:
 def served(monkeypatch: pytest.MonkeyPatch, payloads: list[bytes]) -> list[_Query]:
     """Answers of a ground machine to payloads that are there when it begins."""
     queries = [_Query(payload) for payload in payloads]
-    monkeypatch.setattr(ground, "wait_for_session", lambda *_: _Session(queries))
+    monkeypatch.setattr(ground, "open_session", lambda where: _Session(queries))
     work("local", lambda: all(q.answers or q.errors for q in queries), lambda text: None)
     return queries
 
