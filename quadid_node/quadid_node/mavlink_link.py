@@ -91,26 +91,21 @@ class MotorOrder:
         if message in _ESC_MESSAGES:
             self._turning = [turns or value > 0.0 for turns, value in zip(self._turning, values, strict=True)]
         columns = self._used.get((message, len(values)))
-        if columns is None:
-            columns = self._found(values, message, now)
+        if columns is None:  # none is used for good as long as an ArduPilot may tell more, or where there is a problem
+            self._first = now if math.isnan(self._first) else self._first
+            found = self._columns(message, len(values))
+            silent = self.ardupilot and not found.told
+            if silent and now - self._first < PATIENCE:
+                return ()
+            columns, self.problem = found.columns, found.problem
+            if silent and not found.problem:
+                outputs = ", ".join(str(k + 1) for k in columns)
+                self.problem = (
+                    f"the autopilot has not sent SERVOn_FUNCTION, which names the motor outputs: {outputs} are used"
+                )
+            if columns and (message not in _ESC_MESSAGES or any(self._turning)):
+                self._used[message, len(values)] = columns
         return tuple(values[i] for i in columns)
-
-    def _found(self, values: tuple[float, ...], message: str, now: float) -> list[int]:
-        """Columns to use from now on; none as long as an ArduPilot may still tell more, or where there is a problem."""
-        self._first = now if math.isnan(self._first) else self._first
-        found = self._columns(message, len(values))
-        silent = self.ardupilot and not found.told
-        if silent and now - self._first < PATIENCE:
-            return []
-        self.problem = found.problem
-        if silent and not found.problem:
-            outputs = ", ".join(str(k + 1) for k in found.columns)
-            self.problem = (
-                f"the autopilot has not sent SERVOn_FUNCTION, which names the motor outputs: {outputs} are used"
-            )
-        if found.columns and (message not in _ESC_MESSAGES or any(self._turning)):
-            self._used[message, len(values)] = found.columns
-        return found.columns
 
     def _columns(self, message: str, width: int) -> Outputs:
         if other := no_multirotor({}, self.kind):
@@ -333,7 +328,7 @@ LIST_EVERY = 1.0
 SEVERITY = {"error": 3, "warning": 4, "info": 6}
 _READ_ONLY, _UNKNOWN = dialect.MAV_PARAM_ERROR_READ_ONLY, dialect.MAV_PARAM_ERROR_DOES_NOT_EXIST
 _REAL32 = 9
-_TEXT = 50
+_TEXT, _NAME = 50, 10
 _IDS = {m.msgname: n for n, m in dialect.mavlink_map.items()}
 _ANSWERED = ("HEARTBEAT", "PARAM_REQUEST_LIST", "PARAM_REQUEST_READ", "PARAM_SET")
 _OF_OTHERS = frozenset(_IDS[n] for n in _ANSWERED)
@@ -396,7 +391,7 @@ class MavlinkLink:
         self._before: dict[str, int] = {}
         self._rates: dict[str, float] = {}
         self._requests = Requests()
-        self._set: OnlineSet | None = None
+        self._parameters = parameters_of(None)
         self._text = 0
         self._left, self._second = {True: FRAMES_A_SECOND, False: OTHERS_A_SECOND}, 0
         self._flooded = {True: -math.inf, False: -math.inf}
@@ -459,11 +454,8 @@ class MavlinkLink:
             self._source.count(self._wire.source, number, self._wire.listened, frame)
 
     def _is_vehicle(self, message: Any) -> bool:
-        return bool(
-            self.vehicle_system
-            and message.get_srcSystem() == self.vehicle_system
-            and message.get_srcComponent() == self._target
-        )
+        who = message.get_srcSystem(), message.get_srcComponent()
+        return self.vehicle_system > 0 and who == (self.vehicle_system, self._target)
 
     def _on_ack(self, message: Any) -> None:
         """Notes a refused request for a message."""
@@ -483,7 +475,7 @@ class MavlinkLink:
         if kind == "PARAM_REQUEST_LIST":
             self._list_due = True
             return
-        names = [name for name, _ in parameters_of(self._set)]
+        names = [name for name, _ in self._parameters]
         wanted, index = str(message.param_id), getattr(message, "param_index", -1)
         if kind == "PARAM_REQUEST_READ" and 0 <= index < len(names):
             self._send_parameter(index, answer=True)
@@ -503,25 +495,15 @@ class MavlinkLink:
         now = self._clock()
         if now - self._beat >= 1.0:
             self._beat = now
-            self._send(
-                dialect.MAVLink_heartbeat_message(
-                    dialect.MAV_TYPE_ONBOARD_CONTROLLER,
-                    dialect.MAV_AUTOPILOT_INVALID,
-                    0,
-                    0,
-                    dialect.MAV_STATE_ACTIVE,
-                    3,
-                )
-            )
+            kind, none = dialect.MAV_TYPE_ONBOARD_CONTROLLER, dialect.MAV_AUTOPILOT_INVALID
+            self._send(dialect.MAVLink_heartbeat_message(kind, none, 0, 0, dialect.MAV_STATE_ACTIVE, 3))
         if now - self._measured >= 2.0:
-            counts = self._decoder.counts
-            span = now - self._measured
+            counts, span = self._decoder.counts, now - self._measured
             self._rates = {n: (c - self._before.get(n, 0)) / span for n, c in counts.items()}
             self._before, self._measured = dict(counts), now
         if self._list_due and now - self._listed >= LIST_EVERY:
             self._list_due, self._listed = False, now
-            for index in range(len(parameters_of(self._set))):
-                self._send_parameter(index)
+            self._send_parameters()
         if self.vehicle_system:
             # Asks for the messages that do not come at 60 % of their rate
             wanted = REQUESTED | dict.fromkeys(self._decoder.order.esc_groups(), MOTORS)
@@ -531,18 +513,16 @@ class MavlinkLink:
                 numbers = float(_IDS[name]), 1e6 / wanted[name], 0.0, 0.0, 0.0, 0.0, 0.0
                 to = self.vehicle_system, self._target
                 self._send(dialect.MAVLink_command_long_message(*to, command, 0, *numbers))
-        if self._set is not None and now - self._tell >= 5.0:
+        if len(self._parameters) > 1 and now - self._tell >= 5.0:
             self._tell = now
-            self._send_values()
+            self._send_named(self._parameters)
 
     def publish(self, output: Output) -> None:
         """Tells a result: numbers of a set in force, a line of text for what people should know."""
         if output.topic == "parameters":
-            self._set = output.item
-            self._tell = self._clock()
-            for index in range(len(parameters_of(self._set))):
-                self._send_parameter(index)
-            self._send_values()
+            self._parameters, self._tell = parameters_of(output.item), self._clock()
+            self._send_parameters()
+            self._send_named(self._parameters)
             self._say(6, f"quadid: set {output.item.sequence} {output.item.state.value}")
         elif output.topic == "diagnosis":
             for finding in output.findings:
@@ -580,18 +560,20 @@ class MavlinkLink:
     def _send(self, message: Any, answer: bool = False) -> None:
         self._wire.send(message, self._clock(), answer)
 
-    def _send_parameter(self, index: int, answer: bool = False) -> None:
-        entries = parameters_of(self._set)
-        name, value = entries[index]
-        self._send(dialect.MAVLink_param_value_message(name.encode(), value, _REAL32, len(entries), index), answer)
+    def _send_parameters(self) -> None:
+        for index in range(len(self._parameters)):
+            self._send_parameter(index)
 
-    def _send_values(self) -> None:
-        self._send_named([(name, value) for name, value in parameters_of(self._set) if len(name) <= 10])
+    def _send_parameter(self, index: int, answer: bool = False) -> None:
+        (name, value), count = self._parameters[index], len(self._parameters)
+        self._send(dialect.MAVLink_param_value_message(name.encode(), value, _REAL32, count, index), answer)
 
     def _send_named(self, values: Sequence[tuple[str, float]]) -> None:
+        """Sends values by names that the message has room for."""
         ms = int((self._clock() - self._begin) * 1e3) % 2**32
         for name, value in values:
-            self._send(dialect.MAVLink_named_value_float_message(ms, name.encode(), value))
+            if len(name) <= _NAME:
+                self._send(dialect.MAVLink_named_value_float_message(ms, name.encode(), value))
 
     def _say(self, severity: int, text: str) -> None:
         plain = "".join(c if 32 <= ord(c) < 127 else "?" for c in text).encode()

@@ -343,8 +343,6 @@ def _check_port(device: str) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
             probe.bind((host, int(port)))
-        except OverflowError as error:
-            raise LinkError(f"UDP port {port}", "1 to 65535") from error
         except OSError as error:
             if error.errno == errno.EADDRINUSE:
                 raise LinkError(
