@@ -5,23 +5,21 @@ node, held against limits and a largest step, and set in one transaction.  With 
 logs what it would set.
 """
 
-import contextlib
 import math
 import re
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import rclpy
 import rclpy.parameter
 from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
-from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.parameter_client import AsyncParameterClient
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 
@@ -31,8 +29,8 @@ from quadid_node import messages
 from quadid_node.inputs import message_class, service_class, to_message
 from quadid_node.messages import PARAMETER_SET, SCHEMA_VERSION, TOPICS
 from quadid_node.process import SPIN_SECONDS, StopSignal, end_middleware, without_shared_memory
+from quadid_node.publish import LATCHED_QOS
 
-LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL, reliability=ReliabilityPolicy.RELIABLE)
 SAME_MASS = 0.02
 """Relative difference of masses [1] within which a set belongs to the controller's vehicle."""
 RETRY_SECONDS = 1.0
@@ -143,22 +141,23 @@ class BridgeNode(Node):
         self._entries = [entry(text) for text in self._option("map") if text]
         if not self._entries:
             raise QuadidError("map is empty", fix="give a parameter file, as quadid_node/config/bridge.yaml")
-        group = ReentrantCallbackGroup()  # callbacks wait for answers, which must come meanwhile
-        self._client = AsyncParameterClient(self, controller, callback_group=group)
+        # One set at a time: who works waits for answers of the controller, which come meanwhile, as do reports.
+        meanwhile, work = ReentrantCallbackGroup(), MutuallyExclusiveCallbackGroup()
+        self._client = AsyncParameterClient(self, controller, callback_group=meanwhile)
         self._newest: Any = None
         self._applied, self._said, self._level = 0, "no set yet", b"\x00"
-        self._busy: Future | None = None
         self._asked, self._asked_at = Future(), 0.0
         self._original: dict[str, float] = {}
         self._before: dict[str, float] = {}
         self._tried = 0
         self.add_post_set_parameters_callback(self._on_option)
         kind, topic = message_class(PARAMETER_SET), TOPICS["parameters"][0]
-        self.create_subscription(kind, topic, self._on_set, LATCHED, callback_group=group)
+        self.create_subscription(kind, topic, self._on_set, LATCHED_QOS, callback_group=work)
         trigger = service_class("std_srvs/Trigger")
-        self.create_service(trigger, "~/rollback", self._on_rollback, callback_group=group)
+        self.create_service(trigger, "~/rollback", self._on_rollback, callback_group=work)
         self._health = self.create_publisher(message_class(TOPICS["diagnostics"][1]), TOPICS["diagnostics"][0], 10)
-        self.create_timer(RETRY_SECONDS, self._report, callback_group=group)
+        self.create_timer(RETRY_SECONDS, self._report, callback_group=meanwhile)
+        self.create_timer(RETRY_SECONDS, self._work, callback_group=work)
 
     def _option(self, name: str) -> Any:
         return self.get_parameter(name).value
@@ -172,8 +171,8 @@ class BridgeNode(Node):
             else:
                 self.get_logger().warning(text)
 
-    async def _report(self) -> None:
-        """Once a second: health, and what could not be applied yet; a question without an answer is given up."""
+    def _report(self) -> None:
+        """Once a second: health; a question without an answer is given up."""
         if time.monotonic() > self._asked_at + ANSWER_SECONDS:
             self._asked.cancel()
         stamp = self.get_clock().now().to_msg()
@@ -187,32 +186,20 @@ class BridgeNode(Node):
         )
         fields = {"header": {"stamp": {"sec": stamp.sec, "nanosec": stamp.nanosec}}, "status": [status]}
         self._health.publish(to_message(TOPICS["diagnostics"][1], fields))
-        await self._work()
 
     async def _on_set(self, message: Any) -> None:
         self._newest = message
         await self._work()
 
     def _on_option(self, changed: Sequence[Any]) -> None:
-        """A plan that was only shown is carried out once `dry_run` is false: with the next report."""
+        """A plan that was only shown is carried out once `dry_run` is false: within a second."""
         if any(option.name == "dry_run" for option in changed):
             self._said = ""
 
     async def _work(self) -> None:
-        """Applies the newest set, if that is asked for and possible."""
-        if self._busy is None and self._newest is not None:
-            with self._turn():
-                await self._apply(self._newest)
-
-    @contextlib.contextmanager
-    def _turn(self) -> Iterator[None]:
-        """Lets others wait for the end of what is done within."""
-        self._busy = turn = Future()
-        try:
-            yield
-        finally:
-            self._busy = None
-            turn.set_result(None)
+        """Applies the newest set, if that is asked for and possible; once a second as long as it is not."""
+        if self._newest is not None:
+            await self._apply(self._newest)
 
     async def _ask(self, question: Callable[[Any], Future], about: Any) -> Any:
         """The controller's answer; None, and said, where none comes."""
@@ -273,13 +260,10 @@ class BridgeNode(Node):
     async def _on_rollback(self, request: Any, response: Any) -> Any:
         """Puts the values from before the last set back; from then on the bridge only shows what it would set."""
         self.set_parameters([Parameter("dry_run", value=True)])
-        while self._busy is not None:
-            await self._busy
         if not self._before:
             response.success, response.message = False, "no set was applied"
             return response
-        with self._turn():
-            response.success = bool(await self._set(self._before, "rolled back: dry_run is true from now on"))
+        response.success = bool(await self._set(self._before, "rolled back: dry_run is true from now on"))
         response.message = self._said
         if response.success:
             self._before, self._applied = {}, 0

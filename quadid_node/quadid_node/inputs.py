@@ -5,7 +5,7 @@ import math
 import re
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from typing import Any, NamedTuple
@@ -424,17 +424,13 @@ DEPTH = 4000
 """Messages of a topic that are kept for the next look, and the most that one look takes."""
 
 
-class _Topic(NamedTuple):
+class Topic(NamedTuple):
+    """A topic of an `Intake`, by the name that it is resolved to."""
+
+    name: str
     entry: Input
     decoder: Decoder
     take: Callable[[], bytes | None]
-
-
-class Waiting(NamedTuple):
-    """Messages that were taken and not read yet: of each topic, and in how many slices of time they came."""
-
-    slices: int
-    messages: list[list[bytes]]
 
 
 class Intake:
@@ -442,8 +438,7 @@ class Intake:
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         """Takes a clock that never steps [s]."""
-        self.decoders: dict[str, Decoder] = {}
-        self._topics: list[_Topic] = []
+        self._topics: list[Topic] = []
         self._clock, self._looked = clock, clock()
 
     def open(self, entry: Input, topic: str, decoder: Decoder, take: Callable[[], bytes | None]) -> None:
@@ -452,39 +447,38 @@ class Intake:
         Args:
             take: gives the next serialized message that waits; None when there is none.
         """
-        self.decoders[topic] = decoder
-        self._topics.append(_Topic(entry, decoder, take))
+        self._topics.append(Topic(topic, entry, decoder, take))
         # The gyro sets the pace of the grid: what came with it has been taken in before it.
         self._topics.sort(key=lambda item: any(channel == "gyro" for channel, _ in item.entry.channels))
 
-    def take(self) -> Waiting:
-        """Takes all messages that wait; those that are not read are forgotten."""
+    def take(self) -> list[tuple[Topic, list[bytes]]]:
+        """Takes all messages that wait, in the order in which to read them: slice of time by slice, topic by topic."""
         before, self._looked = self._looked, self._clock()
-        messages = [list(islice(iter(topic.take, None), DEPTH)) for topic in self._topics]
-        for topic, taken in zip(self._topics, messages, strict=True):
+        slices = max(1, math.ceil((self._looked - before) / SLICE))
+        pieces: list[list[tuple[Topic, list[bytes]]]] = [[] for _ in range(slices)]
+        for topic in self._topics:
+            taken = list(islice(iter(topic.take, None), DEPTH))
             topic.decoder.pace.look(self._looked, before, len(taken))
-        return Waiting(max(1, math.ceil((self._looked - before) / SLICE)), messages)
+            for k, slice_ in enumerate(pieces):
+                slice_.append((topic, taken[k * len(taken) // slices : (k + 1) * len(taken) // slices]))
+        return [(topic, messages) for slice_ in pieces for topic, messages in slice_ if messages]
 
-    def read(self, waiting: Waiting, record: Record | None = None) -> Iterator[Block]:
-        """Reads what was taken, one topic after the other.
+    def read(self, taken: Iterable[tuple[Topic, list[bytes]]], record: Record | None = None) -> Iterator[Block]:
+        """Reads what was taken; what is not read is forgotten.
 
         Args:
             record: writes a message down (topic, type, bytes), in the order in which they are read.
         """
-        for k in range(waiting.slices):
-            for (entry, decoder, _), messages in zip(self._topics, waiting.messages, strict=True):
-                piece = messages[k * len(messages) // waiting.slices : (k + 1) * len(messages) // waiting.slices]
-                if record is not None:
-                    for data in piece:
-                        record(entry.topic, entry.type.replace("/", "/msg/"), data)
-                if piece:
-                    yield from decoder.take(piece)
+        for topic, messages in taken:
+            if record is not None:
+                for data in messages:
+                    record(topic.entry.topic, topic.entry.type.replace("/", "/msg/"), data)
+            yield from topic.decoder.take(messages)
 
     def troubles(self) -> dict[str, str]:
         """Problems of the messages of topics, by topic name as resolved."""
-        return {topic: why for topic, decoder in self.decoders.items() if (why := decoder.trouble)}
+        return {topic.name: why for topic in self._topics if (why := topic.decoder.trouble)}
 
     def clear(self) -> None:
         """Forgets the topics."""
         self._topics.clear()
-        self.decoders.clear()

@@ -5,6 +5,7 @@ Callbacks convert, call and publish; everything else is in `service` and in the 
 
 from __future__ import annotations
 
+import contextlib
 import gc
 import math
 import time
@@ -34,6 +35,7 @@ from quadid_node.inputs import (
     Decoder,
     InputPreset,
     Intake,
+    MessageTypeError,
     SourceSelector,
     best_ranks,
     deserializer,
@@ -42,18 +44,10 @@ from quadid_node.inputs import (
     source,
     to_message,
 )
-from quadid_node.publish import NO_SUBSCRIPTION_EVENTS, Bond, GraphMonitor, Offer, Publishers, bond_of
+from quadid_node.process import PARAMETERS, READ_BACK, as_declared, descriptor
+from quadid_node.publish import NO_SUBSCRIPTION_EVENTS, Bond, GraphMonitor, Offer, Publishers
 from quadid_node.recording import Beginning, Recorder
-from quadid_node.service import (
-    PARAMETERS,
-    READ_BACK,
-    Service,
-    as_declared,
-    check_change,
-    descriptor,
-    read_settings,
-    vehicle_id,
-)
+from quadid_node.service import Service, check_change, read_settings, vehicle_id
 from quadid_node.zenoh import ZenohLink, fit_worker
 
 ROUND_SECONDS = 0.1
@@ -115,6 +109,12 @@ class PollingNode(Node):
 
         return take
 
+    def poll_no_more(self) -> None:
+        """Ends the polled subscriptions."""
+        while self._polled:
+            self.destroy_subscription(self._polled.pop())
+        self._broken_at.clear()
+
     def unbroken(self, topic: str) -> float:
         """For how long [s] the messages of a polled topic have been one publisher's, each numbered one above the last.
 
@@ -145,7 +145,7 @@ class IdentifyNode(PollingNode, LifecycleNode):
         self._intake = Intake()
         self._bond: Bond | None = None
         self._zenoh: ZenohLink | None = None
-        self._offered: list[Any] = []
+        self._opened = contextlib.ExitStack()
         self._outputs = Publishers(self)
         self._change_state = self._service_change_state.callback
         self._service_change_state.callback = self._on_change_state
@@ -193,7 +193,8 @@ class IdentifyNode(PollingNode, LifecycleNode):
         self._active = True
         self._claim_topic()
         if not self._given["autostart"]:
-            self._bond = bond_of(self)
+            with contextlib.suppress(MessageTypeError):  # without the package `bond` a manager needs bond_timeout: 0.0
+                self._bond = Bond(self)
         self._log("info", f"ready: identifies '{self._id}'")
         return result
 
@@ -229,23 +230,27 @@ class IdentifyNode(PollingNode, LifecycleNode):
         self._observer = bool(values["observer"])
         inputs = {self.resolve_topic_name(entry.topic): entry.type.replace("/", "/msg/") for entry in preset.inputs}
         self._graph = GraphMonitor(inputs, self._offers_on, self.unbroken, lambda text: self._log("error", text))
+        self._given, opened = values, self._opened.callback
+        opened(self.poll_no_more)
+        opened(self._intake.clear)
         self._subscribe(preset, vehicle)
-        self._given = values
         keeps = not self._observer and values["history"] != "none"
         store = Store(Path(values["history"] or default_path()), self._id) if keeps else None
-        try:
-            fits = fit_worker(vehicle, self._id, values["ground_worker"], values["worker_memory"])
-        except QuadidError:
-            if store is not None:
-                store.close()
-            raise
+        if store is not None:
+            opened(store.close)
+        fits = fit_worker(vehicle, self._id, values["ground_worker"], values["worker_memory"])
+        opened(self._read_back, {name: values[name] for name in READ_BACK})
         self._service = Service(vehicle, settings, fits, store)
+        opened(self._service.close)
         if values["record"]:
             beginning = Beginning(vehicle, settings, values["source"], self._service.restored)
             self._recorder = Recorder(Path(values["record"]), beginning, preset.inputs)
+            opened(self._recorder.close)
         self._hint = preset.motor_hint
         if values["zenoh"]:
             self._zenoh = ZenohLink(values["zenoh"], self._id, self._service)
+            opened(self._zenoh.close)
+        opened(self._outputs.close)
         self._outputs.open(self._observer)
         by, trigger = "ros service", service_class("std_srvs/Trigger")
         for name, kind, answer in (
@@ -258,7 +263,7 @@ class IdentifyNode(PollingNode, LifecycleNode):
             ),
             ("get_history", service_class("quadid_msgs/GetHistory"), self._on_get_history),
         ):
-            self._offered.append(self.create_service(kind, f"quadid/{name}", answer))
+            opened(self.destroy_service, self.create_service(kind, f"quadid/{name}", answer))
         self._warm_up(self._service, values["warm_up"])
         history = str(store.path) if store is not None else "none"
         self._read_back({**values, "vehicle_id": self._id, "history": history, "approval": self._service.approval})
@@ -314,23 +319,8 @@ class IdentifyNode(PollingNode, LifecycleNode):
         self._active = False
         gc.unfreeze()
         self._break_bond()
-        self._intake.clear()
-        while self._polled:
-            self.destroy_subscription(self._polled.pop())
-        self._broken_at.clear()
-        while self._offered:
-            self.destroy_service(self._offered.pop())
-        self._outputs.close()
-        if self._zenoh is not None:
-            self._zenoh.close()
-            self._zenoh = None
-        if self._service is not None:
-            self._service.close()
-            self._service = None
-            self._read_back({name: self._given[name] for name in READ_BACK})
-        if self._recorder is not None:
-            self._recorder.close()
-            self._recorder = None
+        self._opened.close()
+        self._service = self._recorder = self._zenoh = None
 
     # --- callbacks
 

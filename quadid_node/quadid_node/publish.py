@@ -23,7 +23,7 @@ from rclpy.qos import (
 )
 
 from quadid.sanitise import plain
-from quadid_node.inputs import MessageTypeError, message_class, to_message
+from quadid_node.inputs import message_class, to_message
 from quadid_node.messages import TOPICS, Message
 
 # An event that the events executor watches outlives its topic's end, and takes the process down with it
@@ -171,9 +171,15 @@ class Publishers:
             )
 
     @property
+    def _speaking(self) -> dict[str, Any]:
+        """The publishers by topic; that of parameter sets only while the topic is ours."""
+        own = self._ownership.publisher if self._ownership is not None else None
+        return self._publishers if own is None else {**self._publishers, "parameters": own}
+
+    @property
     def silent(self) -> bool:
         """Checks whether results stay unsaid: an observer, or another service speaks for this vehicle."""
-        return self._ownership is None or self._ownership.publisher is None
+        return "parameters" not in self._speaking
 
     @property
     def problem(self) -> str:
@@ -190,23 +196,17 @@ class Publishers:
 
     def publish(self, topic: str, fields: Message) -> None:
         """Publishes a message given as a dictionary; parameter sets only while the topic is ours."""
-        publisher = self._publishers.get(topic)
-        if topic == "parameters" and self._ownership is not None:
-            publisher = self._ownership.publisher
-        if publisher is not None:
+        if publisher := self._speaking.get(topic):
             publisher.publish(to_message(TOPICS[topic][1], fields))
 
     def deaf(self) -> dict[str, bool]:
         """For each topic of ours: whether somebody subscribes with a QoS that is not offered, and hears nothing."""
-        published = dict(self._publishers)
-        if self._ownership is not None and self._ownership.publisher is not None:
-            published["parameters"] = self._ownership.publisher
-        return {p.topic_name: self._unheard(p) for p in published.values()}
 
-    def _unheard(self, publisher: Any) -> bool:
-        asked = [info.qos_profile for info in self._node.get_subscriptions_info_by_topic(publisher.topic_name)]
-        offered = publisher.qos_profile
-        return any(qos_check_compatible(offered, wish)[0] == QoSCompatibility.ERROR for wish in asked)
+        def unheard(publisher: Any) -> bool:
+            asked = [info.qos_profile for info in self._node.get_subscriptions_info_by_topic(publisher.topic_name)]
+            return any(qos_check_compatible(publisher.qos_profile, q)[0] == QoSCompatibility.ERROR for q in asked)
+
+        return {publisher.topic_name: unheard(publisher) for publisher in self._speaking.values()}
 
     def close(self) -> None:
         """Takes the publishers of results away."""
@@ -356,11 +356,3 @@ class Bond:
         self._node.destroy_timer(self._timer)
         self._node.destroy_subscription(self._subscription)
         self._node.destroy_publisher(self._publisher)
-
-
-def bond_of(node: Node) -> Bond | None:
-    """A bond, where the package `bond` is installed; None elsewhere: then the manager needs `bond_timeout: 0.0`."""
-    try:
-        return Bond(node)
-    except MessageTypeError:
-        return None

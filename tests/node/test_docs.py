@@ -8,7 +8,7 @@ import pytest
 from quadid_node.inputs import source
 from quadid_node.mavlink_link import PARAMETERS as MAVLINK_NAMES
 from quadid_node.mavlink_link import REQUESTED
-from quadid_node.service import PARAMETERS
+from quadid_node.process import PARAMETERS
 
 from quadid.online.gate import CHECKS, GateSettings
 

@@ -17,9 +17,9 @@ import pytest
 import yaml
 from quadid_node.inputs import DECIDE, SILENT, SourceSelector, source, stamp
 from quadid_node.messages import WARN, diagnostics
-from quadid_node.process import ARGUMENTS, NODE_ARGUMENTS, THREADS, fleet, parameters, truth
+from quadid_node.process import ARGUMENTS, NODE_ARGUMENTS, PARAMETERS, THREADS, fleet, parameters, truth
 from quadid_node.recording import stream
-from quadid_node.service import PARAMETERS, Service, check_change, read_settings, vehicle_id
+from quadid_node.service import Service, check_change, read_settings, vehicle_id
 from quadid_node.worker import InlineWorker
 from quadid_replay import open_log, write_mcap
 from quadid_replay.ros_messages import TYPES
@@ -223,12 +223,6 @@ def test_every_argument_is_a_parameter_of_the_node() -> None:
         assert type(value) is type(known[name]), name
     assert {"record", "history", "observer", "autostart"} <= set(ARGUMENTS)
     assert {"log_level", "respawn"} <= set(NODE_ARGUMENTS)
-
-
-def test_the_configuration_file_of_the_package_and_a_launch_argument_are_merged_as_ros_does() -> None:
-    given = yaml.safe_load((ROOT / "quadid_node" / "config" / "quadid.yaml").read_text())["/**"]["ros__parameters"]
-    file = {**given, "approval": "manual"}
-    assert {**file, **parameters({"vehicle": "x.yaml"})} == {**file, "vehicle": "x.yaml"}
 
 
 def test_a_fleet_has_a_vehicle_and_a_configuration_each() -> None:
