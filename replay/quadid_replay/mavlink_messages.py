@@ -4,53 +4,23 @@ import math
 import struct
 from collections.abc import Callable, Sequence
 from functools import partial
+from pathlib import Path
 from types import ModuleType
 from typing import Any, Generic, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
+from pymavlink.generator.mavgen_python import mavfmt, native_mavfmt
+from pymavlink.generator.mavparse import MAVXML, PROTOCOL_2_0
 
-from quadid.types import BoolArray, FloatArray, IntArray
+from quadid.types import FloatArray, IntArray
 from quadid_replay.columns import GRAVITY, from_euler, to_euler
 from quadid_replay.motors import ESCS, RPM
 
 # --- ESC_INFO (290) and ESC_STATUS (291) of MAVLink's common dialect, which pymavlink lacks, added at run time
-#
-# The definitions are those of `dialects/quadid.xml`; a test generates that file with mavgen and compares.
 
 
 ESC_INFO, ESC_STATUS = 290, 291
-
-
-class _Field(NamedTuple):
-    """A field: name, C type, array length (0: none)."""
-
-    name: str
-    kind: str
-    length: int
-
-
-_CODES = {
-    "uint8_t": "B",
-    "uint16_t": "H",
-    "int16_t": "h",
-    "uint32_t": "I",
-    "int32_t": "i",
-    "uint64_t": "Q",
-    "float": "f",
-}
-"""Codes of `struct` by C type."""
-_ONE = "index:uint8_t time_usec:uint64_t"
-_MESSAGES = (
-    (
-        ESC_INFO,
-        "ESC_INFO",
-        251,
-        f"{_ONE} counter:uint16_t count:uint8_t connection_type:uint8_t info:uint8_t "
-        "failure_flags:uint16_t[4] error_count:uint32_t[4] temperature:int16_t[4]",
-    ),
-    (ESC_STATUS, "ESC_STATUS", 10, f"{_ONE} rpm:int32_t[4] voltage:float[4] current:float[4]"),
-)
-"""Number, name, seed of the checksum and fields in the order of the XML."""
+_DEFINITIONS = Path(__file__).parent / "dialects" / "quadid.xml"
 
 
 def extend_dialect(dialect: ModuleType) -> ModuleType:
@@ -59,61 +29,53 @@ def extend_dialect(dialect: ModuleType) -> ModuleType:
     The module gains ``MAVLink_esc_info_message`` and ``MAVLink_esc_status_message``, whose arguments are the fields in
     the order of the XML, and decodes both.
     """
-    for number, name, crc_extra, text in _MESSAGES:
-        if number not in dialect.mavlink_map:
-            told = (field.replace("[", ":").rstrip("]").split(":") for field in text.split())
-            fields = [_Field(field, kind, int(length[0]) if length else 0) for field, kind, *length in told]
-            message = _message_class(dialect, number, name, crc_extra, fields)
-            dialect.mavlink_map[number] = message
+    if ESC_INFO not in dialect.mavlink_map or ESC_STATUS not in dialect.mavlink_map:
+        for described in MAVXML(str(_DEFINITIONS), PROTOCOL_2_0).message:
+            message = _message_class(dialect, described)
+            dialect.mavlink_map[message.id] = message
             setattr(dialect, message.__name__, message)
-            setattr(dialect, f"MAVLINK_MSG_ID_{name}", number)
+            setattr(dialect, f"MAVLINK_MSG_ID_{message.msgname}", message.id)
     return dialect
 
 
-def _message_class(dialect: ModuleType, number: int, name: str, crc_extra: int, fields: Sequence[_Field]) -> type[Any]:
-    """Builds the class that mavgen would have written: on the wire wide fields come first."""
-    packed = sorted(fields, key=lambda f: -struct.calcsize(_CODES[f.kind]))
-    base = dialect.MAVLink_message
-    codes = [f"{f.length or ''}{_CODES[f.kind]}" for f in packed]
-    unpacker = struct.Struct("<" + "".join(codes))
+def _message_class(dialect: ModuleType, m: Any) -> type[Any]:
+    """Builds the class that mavgen would have written of a described message; a test compares both."""
+    unpacker = struct.Struct("<" + "".join(map(mavfmt, m.ordered_fields)))
 
     def initialise(self: Any, *values: Any) -> None:
-        if len(values) != len(fields):
-            raise TypeError(f"{name} takes {len(fields)} values: {', '.join(f.name for f in fields)}")
-        base.__init__(self, number, name)
-        self._fieldnames = [f.name for f in fields]
-        self._instance_field, self._instance_offset = "index", unpacker.size
-        for field, value in zip(fields, values, strict=True):
-            setattr(self, field.name, value)
+        dialect.MAVLink_message.__init__(self, m.id, m.name)
+        self._fieldnames, self._instance_field, self._instance_offset = m.fieldnames, "index", m.field_offsets["index"]
+        for name, value in zip(m.fieldnames, values, strict=True):
+            setattr(self, name, value)
 
     def pack(self: Any, mav: Any, force_mavlink1: bool = False) -> bytes:
         flat: list[Any] = []
-        for field in packed:
+        for field in m.ordered_fields:
             value = getattr(self, field.name)
-            flat.extend(value if field.length else [value])
-        return bytes(self._pack(mav, crc_extra, unpacker.pack(*flat), force_mavlink1=force_mavlink1))
+            flat += value if field.array_length else [value]
+        return bytes(self._pack(mav, m.crc_extra, unpacker.pack(*flat), force_mavlink1=force_mavlink1))
 
     attributes = {
-        "id": number,
-        "msgname": name,
-        "fieldnames": [f.name for f in fields],
-        "ordered_fieldnames": [f.name for f in packed],
-        "fieldtypes": [f.kind for f in fields],
+        "id": m.id,
+        "msgname": m.name,
+        "fieldnames": m.fieldnames,
+        "ordered_fieldnames": m.ordered_fieldnames,
+        "fieldtypes": m.fieldtypes,
         "fielddisplays_by_name": {},
         "fieldenums_by_name": {},
         "fieldunits_by_name": {},
-        "native_format": bytearray(("<" + "".join(_CODES[f.kind] for f in packed)).encode()),
-        "orders": [packed.index(f) for f in fields],
-        "lengths": [f.length or 1 for f in packed],
-        "array_lengths": [f.length for f in packed],
-        "crc_extra": crc_extra,
+        "native_format": bytearray(("<" + "".join(map(native_mavfmt, m.ordered_fields))).encode()),
+        "orders": [m.ordered_fieldnames.index(name) for name in m.fieldnames],
+        "lengths": [field.array_length or 1 for field in m.ordered_fields],
+        "array_lengths": [field.array_length for field in m.ordered_fields],
+        "crc_extra": m.crc_extra,
         "unpacker": unpacker,
         "instance_field": "index",
-        "instance_offset": struct.calcsize("<" + "".join(codes[: packed.index(fields[0])])),
+        "instance_offset": m.field_offsets["index"],
         "__init__": initialise,
         "pack": pack,
     }
-    return type(f"MAVLink_{name.lower()}_message", (base,), attributes)
+    return type(f"MAVLink_{m.name_lower}_message", (dialect.MAVLink_message,), attributes)
 
 
 # --- What frame numbers tell of who sent them: one sender counts from 0 to 255 over and over, two do so each by itself
@@ -147,8 +109,6 @@ def two_rows(number: IntArray) -> bool:
 
 
 MILLI = 1e-3
-_BACKWARDS = 0.5
-"""Boot time that falls by more than this [s] is counted."""
 SERVO_TURN = 2.0**32 * 1e-6
 """SERVO_OUTPUT_RAW counts microseconds in 32 bits: [s] until it starts over."""
 ZERO_IS_BOOT = 1.0
@@ -393,50 +353,3 @@ class BootClock(Generic[T]):
         if following is not None and following >= self.newest:
             return min(self.newest + later, following)
         return self.newest + later if later <= FARTHEST else None
-
-
-# --- Times of all messages of one vehicle on its boot clock, as `BootClock` places them one by one
-
-
-class Stamps(NamedTuple):
-    """Times of n messages of one vehicle, in file order; NaN where nothing.
-
-    Attributes:
-        received: when they came [s, UNIX], shape (n,).
-        boot: their own stamps as `boot_seconds` [s], shape (n,).
-        other: stamps of another clock put on the boot clock [s], which go before, shape (n,).
-        servo: which are SERVO_OUTPUT_RAW, shape (n,).
-    """
-
-    received: FloatArray
-    boot: FloatArray
-    other: FloatArray
-    servo: BoolArray
-
-
-class Placing(NamedTuple):
-    """Times of n messages on the boot clock [s], NaN where it is unknown; how many are known only at the end of the
-    log; and how often the boot time falls."""
-
-    time: FloatArray
-    waited: int
-    backwards: int
-
-
-def place(stamps: Stamps) -> Placing:
-    """Puts messages on the boot clock."""
-    clock: BootClock[int] = BootClock()
-    placed: list[Placed[int]] = []
-    before, backwards = 0.0, 0
-    for k, (received, raw, other, servo) in enumerate(zip(*(column.tolist() for column in stamps), strict=True)):
-        own = boot_stamp(raw, servo, clock.newest)
-        if own is not None and not servo:
-            backwards += own < before - _BACKWARDS
-            before = own
-        time = own if other != other else other
-        placed += clock.unstamped(k, received) if time is None else clock.stamped(k, time, received)
-    late = clock.finish()
-    times = np.full(len(stamps.received), np.nan)
-    for k, time in (*placed, *late):
-        times[k] = np.nan if time is None else time
-    return Placing(times, len(late), backwards)

@@ -2,8 +2,6 @@
 
 import mmap
 from collections.abc import Mapping
-from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
@@ -20,11 +18,11 @@ from quadid_replay.mavlink_messages import (
     PREFERENCE,
     READERS,
     STATE_MESSAGES,
-    Placing,
-    Stamps,
+    BootClock,
+    Placed,
     boot_seconds,
+    boot_stamp,
     extend_dialect,
-    place,
     two_rows,
     unix_seconds,
 )
@@ -95,17 +93,28 @@ def read_frames(path: Path) -> Frames:
     """Finds the frames of a tlog."""
     with path.open("rb") as file:
         data = np.frombuffer(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ), dtype=np.uint8)
-    marks = _marks(data)
+
+    # Places at which the high bytes of a receive time between the years 2000 and 2100 stand, and a mark behind it.
+    found = [np.empty(0, dtype=np.int64)]
+    for begin in range(0, len(data) - _STAMP, _BLOCK):
+        block = data[begin : begin + _BLOCK + _STAMP]
+        first, high, mark = block[:-_STAMP], block[1 : 1 - _STAMP], block[_STAMP:]
+        looks = (mark >= 0xFD) & (mark != 0xFF) & (first == 0) & (high >= 0x03) & (high <= 0x0E)
+        found.append(np.flatnonzero(looks) + begin)
+    marks = np.concatenate(found)
     received = np.zeros(len(marks), dtype=np.int64)  # [us, UNIX], its highest byte zero
     for k in range(1, _STAMP):
         received = received << 8 | data[marks + k]
     possible = (received > EARLIEST_US) & (received < LATEST_US) & (marks + _HEAD <= len(data))
     places, received = marks[possible], received[possible]
+
+    # Where each of them would end.
     version_1 = data[places + _STAMP] == 0xFE
     head = np.where(version_1, 6, 10)
     end = places + _STAMP + head + data[places + _STAMP + 1]
     signed = ~version_1 & (data[places + _STAMP + 2] & _SIGNED != 0)
     stop = end + 2 + _SIGNATURE * signed
+
     kept, skipped, cut = _walk(places, stop, len(data))
     start, head, end = places[kept] + _STAMP, head[kept], end[kept]
     short = np.where(head == 6, 0, 2)  # MAVLink 2 has two flags more before these
@@ -129,19 +138,8 @@ def read_frames(path: Path) -> Frames:
     )
 
 
-def _marks(data: Bytes) -> IntArray:
-    """Places at which the high bytes of a receive time between the years 2000 and 2100 stand, and a mark behind it."""
-    found = [np.empty(0, dtype=np.int64)]
-    for begin in range(0, len(data) - _STAMP, _BLOCK):
-        end = min(begin + _BLOCK, len(data) - _STAMP)
-        mark, high = data[begin + _STAMP : end + _STAMP], data[begin + 1 : end + 1]
-        looks = (mark >= 0xFD) & (mark != 0xFF) & (data[begin:end] == 0) & (high >= 0x03) & (high <= 0x0E)
-        found.append(np.flatnonzero(looks) + begin)
-    return np.concatenate(found)
-
-
-def _walk(places: IntArray, stops: IntArray, size: int) -> tuple[IntArray, int, bool]:
-    """Follows the frames from one to the next.
+def _walk(places: IntArray, stops: IntArray, size: int) -> tuple[list[int], int, bool]:
+    """Follows the frames from one to the next; after damage goes on at the next one that another follows.
 
     Args:
         places: offsets where a frame may begin, rising; stops: where each ends.
@@ -150,39 +148,25 @@ def _walk(places: IntArray, stops: IntArray, size: int) -> tuple[IntArray, int, 
     Returns:
         Which of the places are frames, the bytes skipped, and whether the file ends inside a frame.
     """
-    count = len(places)
     following = np.searchsorted(places, stops)
     linked = np.append(places, -1)[following] == stops
     certain = np.flatnonzero((stops <= size) & (linked | (stops >= size)))
-    """Frames that another follows: what is looked for after damage."""
     certain_places = places[certain]
-    turns = np.flatnonzero(~linked | (following != np.arange(1, count + 1)))
-    run_ends = turns[np.searchsorted(turns, np.arange(count))]
-    """The last place of a run that simply goes from each to the next."""
-    runs: list[tuple[int, int]] = []
-    skipped, offset, at = 0, 0, 0 if count and places[0] == 0 else -1
+    ends, next_one = stops.tolist(), np.where(linked, following, -1).tolist()
+    kept: list[int] = []
+    skipped, offset, at = 0, 0, 0 if len(places) and places[0] == 0 else -1
     while True:
         while at >= 0:
-            last = int(run_ends[at])
-            runs.append((at, last))
-            offset, at = int(stops[last]), int(following[last]) if linked[last] else -1
+            kept.append(at)
+            offset, at = ends[at], next_one[at]
         if offset > size:
-            return _members(runs, count)[:-1], skipped, True
+            return kept[:-1], skipped, True
         if offset + _STAMP >= size:
-            return _members(runs, count), skipped, offset < size
+            return kept, skipped, offset < size
         found = int(np.searchsorted(certain_places, offset, side="right"))
         at = int(certain[found]) if found < len(certain) else -1
         resumed = int(places[at]) if at >= 0 else size
         skipped, offset = skipped + resumed - offset, resumed
-
-
-def _members(runs: list[tuple[int, int]], count: int) -> IntArray:
-    """Indices in all of these runs, first and last included, of `count` places."""
-    steps = np.zeros(count + 1, dtype=np.int64)
-    bounds = np.array(runs, dtype=np.int64).reshape(-1, 2)
-    steps[bounds[:, 0]] += 1
-    steps[bounds[:, 1] + 1] -= 1
-    return np.flatnonzero(np.cumsum(steps[:-1]))
 
 
 # --- MAVLink messages of one kind to columns, all at once, from the dialect's own descriptions
@@ -190,7 +174,6 @@ def _members(runs: list[tuple[int, int]], count: int) -> IntArray:
 # Fields, their order, padding and text are pymavlink's, message by message; a test compares both.
 
 
-_TYPES = {"float": "<f4", "double": "<f8", "char": "u1"}
 _AT_ONCE = 4096
 """Frames that are looked at together: what they need stays in the processor's cache."""
 
@@ -200,16 +183,19 @@ class Messages:
 
     def __init__(self, kind: Any, payloads: Bytes) -> None:
         """Takes a message class of the dialect and payloads padded with zeros, shape (n, size)."""
-        self._rows = payloads.view(_layout(kind))[:, 0]
-        self._texts = {f for f, t in zip(kind.fieldnames, kind.fieldtypes, strict=True) if t == "char"}
+        fields = zip(kind.ordered_fieldnames, kind.native_format.decode()[1:], kind.array_lengths, strict=True)
+        wire = [
+            (name, f"S{n}", ()) if code == "c" else (name, f"<{code}", (n,) if n else ()) for name, code, n in fields
+        ]
+        self._rows = payloads.view(np.dtype(wire))[:, 0]
 
     def __getattr__(self, name: str) -> Any:
         """The field of this name, whole numbers of up to 32 bits as int64, others as float64 or uint64."""
         if name not in (self._rows.dtype.names or ()):
             raise AttributeError(name)
         values = self._rows[name]
-        if name in self._texts:
-            return [row.tobytes().split(b"\0", 1)[0].decode("ascii", "replace") for row in values]
+        if values.dtype.kind == "S":
+            return [text.split(b"\0", 1)[0].decode("ascii", "replace") for text in values.tolist()]
         if values.dtype != np.uint64:
             with np.errstate(invalid="ignore"):  # a signalling NaN
                 values = values.astype(np.float64 if values.dtype.kind == "f" else np.int64)
@@ -238,140 +224,98 @@ def intact(frames: Frames, which: IntArray, seeds: IntArray) -> BoolArray:
     return np.asarray(crc == (frames.data[at].astype(np.uint16) | frames.data[at + 1].astype(np.uint16) << 8))
 
 
-@cache
-def _layout(kind: Any) -> np.dtype[np.void]:
-    """The fields of a payload in the order of the wire."""
-    types = dict(zip(kind.fieldnames, kind.fieldtypes, strict=True))
-    return np.dtype(
-        [
-            (name, _TYPES.get(types[name]) or _whole(types[name]), (length,) if length else ())
-            for name, length in zip(kind.ordered_fieldnames, kind.array_lengths, strict=True)
-        ]
-    )
-
-
-def _whole(kind: str) -> str:
-    """A whole number's type, of C in NumPy's words: ``uint16_t`` is ``<u2``."""
-    return f"<{'u' if kind.startswith('u') else 'i'}{int(kind.strip('uint_')) // 8}"
-
-
-# --- Contents of one vehicle's telemetry: its signals on one clock, parameters and type
+# --- Contents of one vehicle's telemetry: its signals on one clock
+#
+# Signals are those of the messages' `Reading`s, by name and message; times are the messages' own stamps, else those of
+# the stamped messages around them (`BootClock`), on the clock of the log.
 
 
 _INVALID, _ARDUPILOT = 8, 3
 _EPOCH_US = 1e14
 """SYSTEM_TIME holds a date where it counts more than this [us]."""
-_WIDTH = {"esc": ESCS, "servo": ESCS, "actuator": 32, "attitude": 4, "attitude_reference": 4, "battery": 1}
+_BACKWARDS = 0.5
+"""Boot time that falls by more than this [s] is counted."""
 Told: TypeAlias = Mapping[str, tuple[IntArray, Messages]]
 """Messages by name, and which frames of the log they are, rising, shape (n,)."""
 
 
-@dataclass(frozen=True)
-class VehicleLog:
+class VehicleLog(NamedTuple):
     """Messages of one MAVLink component.
 
     Attributes:
+        told: its messages.
         clock: of the log.
         signals: by channel and message, times [s] of n samples, NaN where refused, and values (n, columns).
-        parameters: of the autopilot, by name.
-        changed: which of them that name a motor change within the log; empty for none.
-        ardupilot: whether it calls itself one.
-        kind: its MAV_TYPE; 0 for unknown.
-        rotors: by ESC_INFO; 0 for unknown, and for more than a vehicle has.
         heard: whether a measurement has its time before the log ends.
         backwards: how often the boot time fell.
     """
 
+    told: Told
     clock: LogClock
     signals: Mapping[tuple[str, str], tuple[FloatArray, FloatArray]]
-    parameters: Mapping[str, float]
-    changed: str
-    ardupilot: bool
-    kind: int
-    rotors: int
     heard: bool
     backwards: int
 
 
 def vehicle_log(told: Told, received: FloatArray) -> VehicleLog:
-    """Gathers signals, parameters and type of a vehicle.
+    """Gathers the signals of a vehicle, in the order in which they first appear.
 
     Args:
         told: its messages.
         received: receive times of all frames of the log [s, UNIX].
     """
-    _, beats = told.get("HEARTBEAT", (None, None))
-    _, escs = told.get("ESC_INFO", (None, None))
-    _, parameters = told.get("PARAM_VALUE", (None, None))
-    names, values = ([], []) if parameters is None else (list(parameters.param_id), parameters.param_value.tolist())
-    rotors = 0 if escs is None else int(escs.count.max())
-    clock = LogClock()
-    signals, placing = _signals(told, received, clock)
-    return VehicleLog(
-        clock,
-        signals,
-        dict(zip(names, values, strict=True)),
-        changed_within(names, values),
-        beats is not None and int(beats.autopilot[-1]) == _ARDUPILOT,
-        0 if beats is None else int(beats.type[-1]),
-        rotors if rotors <= MOST_ROTORS else 0,
-        placing.waited < len(placing.time),
-        placing.backwards,
-    )
-
-
-def _signals(
-    told: Told, received: FloatArray, clock: LogClock
-) -> tuple[dict[tuple[str, str], tuple[FloatArray, FloatArray]], Placing]:
-    """Signals in the order in which they first appear, and the times of all messages with one."""
-    frames: list[IntArray] = []
-    stamps: list[Stamps] = []
-    parts: dict[tuple[str, str], list[tuple[IntArray, IntArray, FloatArray]]] = {}  # frames, first columns, values
-    for name, read in READERS.items():
-        which, m = told.get(name, (np.empty(0, dtype=np.int64), None))
-        if not len(which):
-            continue
+    # What its messages tell, by signal: frames, first columns and values; and of each frame its own stamps.
+    parts: dict[tuple[str, str], list[tuple[IntArray, IntArray, FloatArray]]] = {}
+    stamped: list[tuple[IntArray, FloatArray, FloatArray, BoolArray]] = []
+    for name in (name for name in READERS if name in told):
+        which, m = told[name]
         sensible: BoolArray | bool = True
         if name == "RAW_IMU":  # elsewhere than in ArduPilot it counts in sensor units
             at, beats = told.get("HEARTBEAT", (which[:0], None))
             autopilot = np.empty(0) if beats is None else beats.autopilot
             sensible = _latest(at, autopilot, which, _INVALID) == _ARDUPILOT
-        readings = read(m)
-        known = [np.broadcast_to(r.known & sensible, len(which)) for r in readings]
-        for reading, tells in zip(readings, known, strict=True):
-            values = np.empty((len(which), len(reading.values)))
-            for column, value in enumerate(reading.values):
-                values[:, column] = value
+        some = np.zeros(len(which), dtype=np.bool_)
+        for reading in READERS[name](m):
+            tells = np.broadcast_to(reading.known & sensible, len(which))
             places = np.broadcast_to(reading.place, len(which))
+            values = np.column_stack([np.broadcast_to(v, len(which)).astype(np.float64) for v in reading.values])
+            some |= tells
             if tells.any():
                 key = reading.signal, reading.source
                 parts.setdefault(key, []).append((which[tells], places[tells], values[tells]))
-        some = np.any(known, axis=0)
-        frames.append(which[some])
         boot, unix = (np.broadcast_to(seconds(m), len(which))[some] for seconds in (boot_seconds, unix_seconds))
         servo = np.full(len(boot), name == "SERVO_OUTPUT_RAW")
-        stamps.append(Stamps(received[which[some]], boot, unix - _unix_offset(told, which[some]), servo))
-    if not frames:
-        return {}, Placing(np.empty(0), 0, 0)
-    every = np.concatenate(frames)
-    order = np.argsort(every)
-    every = every[order]
-    placing = place(Stamps(*(np.concatenate(column)[order] for column in zip(*stamps, strict=True))))
-    timed = np.isfinite(placing.time)
-    t = np.full(len(every), np.nan)
-    t[timed] = clock.times(placing.time[timed])
+        stamped.append((which[some], boot, unix - _unix_offset(told, which[some]), servo))
+
+    # Every message in file order goes to its stamp on the boot clock, or between the stamped ones around it.
+    clock, boot_clock = LogClock(), BootClock[int]()
+    placed: list[Placed[int]] = []
+    before, backwards = 0.0, 0
+    columns = [np.concatenate(column) for column in zip(*stamped, strict=True)] if stamped else [np.empty(0)] * 4
+    order = np.argsort(columns[0])
+    for k, raw, dated, servo in zip(*(column[order].tolist() for column in columns), strict=True):
+        own, came = boot_stamp(raw, servo, boot_clock.newest), float(received[k])
+        if own is not None and not servo:
+            backwards += own < before - _BACKWARDS
+            before = own
+        time = own if dated != dated else dated
+        placed += boot_clock.unstamped(k, came) if time is None else boot_clock.stamped(k, time, came)
+    waited = boot_clock.finish()
+    at_boot = np.full(len(received), np.nan)
+    for k, time in (*placed, *waited):
+        at_boot[k] = np.nan if time is None else time
+    timed = np.flatnonzero(np.isfinite(at_boot))
+    t = np.full(len(received), np.nan)
+    t[timed] = clock.times(at_boot[timed])
+
     signals = {}
     for key in sorted(parts, key=lambda key: min(which[0] for which, _, _ in parts[key])):
-        which, places = (np.concatenate([part[k] for part in parts[key]]) for k in (0, 1))
+        which, places, values = (np.concatenate(column) for column in zip(*parts[key], strict=True))
         in_file = np.argsort(which, kind="stable")
-        values = np.concatenate([part[2] for part in parts[key]])[in_file]
-        moments, places = t[np.searchsorted(every, which[in_file])], places[in_file]
-        width = _WIDTH.get(key[0], 3)
-        if key[0] in ("esc", "servo"):
-            signals[key] = _rounds(moments, places, values, width)
-        else:
-            signals[key] = moments, np.pad(values, ((0, 0), (0, width - values.shape[1])))
-    return signals, placing
+        told_of = t[which[in_file]], values[in_file]
+        joined = key[0] in ("esc", "servo")
+        signals[key] = _rounds(told_of[0], places[in_file], told_of[1], ESCS) if joined else told_of
+    return VehicleLog(told, clock, signals, len(waited) < len(order), backwards)
 
 
 def _unix_offset(told: Told, which: IntArray) -> FloatArray:
@@ -453,9 +397,29 @@ def read_tlog(path: Path) -> Recording:
         named = ", ".join(f"{s}/{c}" for s, c in others[:_NAMED])
         notes.append(f"vehicle {who[0]} used; also in the log: {named}{more}")
     used = vehicles[who]
-    other = no_multirotor(used.parameters, used.kind)
-    raw = _channels(used) + ([] if other else _motors(used, notes))
-    return assemble(path.name, "tlog", raw, used.clock, notes, used.parameters, other)
+    _, beats = used.told.get("HEARTBEAT", (None, None))
+    kind = 0 if beats is None else int(beats.type[-1])
+    _, said = used.told.get("PARAM_VALUE", (None, None))
+    names, values = ([], []) if said is None else (said.param_id, said.param_value.tolist())
+    parameters = dict(zip(names, values, strict=True))
+    raw = [
+        channel
+        for name, messages in PREFERENCE.items()
+        for channel in fastest_first(
+            [
+                RawChannel(name, *told, source)
+                for message in messages
+                for (signal, source), told in used.signals.items()
+                if signal == name and source.split(" ")[0] == message
+            ],
+            2.0,
+        )
+    ]
+    other = no_multirotor(parameters, kind)
+    if not other:
+        notes += filter(None, [changed_within(names, values)])
+        raw += _motors(used, parameters, kind, notes)
+    return assemble(path.name, "tlog", raw, used.clock, notes, parameters, other)
 
 
 def _vehicles(frames: Frames, which: IntArray) -> dict[tuple[int, int], VehicleLog]:
@@ -477,38 +441,30 @@ def _vehicles(frames: Frames, which: IntArray) -> dict[tuple[int, int], VehicleL
     return out
 
 
-def _channels(vehicle: VehicleLog) -> list[RawChannel]:
-    raw: list[RawChannel] = []
-    for channel, messages in PREFERENCE.items():
-        found = []
-        for message in messages:
-            for (signal, source), (t, values) in vehicle.signals.items():
-                if signal == channel and source.split(" ")[0] == message:
-                    found.append(RawChannel(channel, t, values, source))
-        raw += fastest_first(found, 2.0)
-    return raw
-
-
-def _motors(vehicle: VehicleLog, notes: list[str]) -> list[RawChannel]:
+def _motors(vehicle: VehicleLog, parameters: Mapping[str, float], kind: int, notes: list[str]) -> list[RawChannel]:
     """Rotor speeds and outputs, each of the motors in their order."""
-    rotors = vehicle.rotors or px4_rotor_count(vehicle.parameters) or MULTIROTORS.get(vehicle.kind, 0)
-    notes += [vehicle.changed] if vehicle.changed else []
+    _, beats = vehicle.told.get("HEARTBEAT", (None, None))
+    _, escs = vehicle.told.get("ESC_INFO", (None, None))
+    ardupilot = beats is not None and int(beats.autopilot[-1]) == _ARDUPILOT
+    rotors = 0 if escs is None else int(escs.count.max())
+    rotors = rotors if 0 < rotors <= MOST_ROTORS else px4_rotor_count(parameters) or MULTIROTORS.get(kind, 0)
     raw: list[RawChannel] = []
     for (signal, source), (t, values) in vehicle.signals.items():
         if signal == "esc":
             turning = (np.nan_to_num(values) != 0.0).any(axis=0)
-            found = esc_columns(vehicle.parameters, rotors, turning, source, vehicle.ardupilot)
-            notes += [found.problem] if found.problem else []
+            found = esc_columns(parameters, rotors, turning, source, ardupilot)
+            notes += filter(None, [found.problem])
             raw.append(RawChannel("rotor_speed", t, values[:, found.columns], f"{source} (rpm)"))
         elif signal in ("servo", "actuator"):
             told = np.flatnonzero(np.isfinite(values).any(axis=0))
             values = values[:, : told.max(initial=-1) + 1]
-            found = motor_outputs(vehicle.parameters, rotors, values.shape[1], source, vehicle.ardupilot)
-            notes += [found.problem] if found.problem else []
-            values, how = in_pulses(values) if signal == "servo" else (values, "")
-            guessed = active_outputs(values) if signal == "servo" and not found.problem else []
-            motors = found.columns or guessed
-            which = " ".join([*(str(i + 1) for i in motors), how]).strip() if signal == "servo" else "(normalized)"
+            found = motor_outputs(parameters, rotors, values.shape[1], source, ardupilot)
+            notes += filter(None, [found.problem])
+            motors, which = found.columns, "(normalized)"
+            if signal == "servo":
+                values, how = in_pulses(values)
+                motors = motors or ([] if found.problem else active_outputs(values))
+                which = " ".join([*(str(i + 1) for i in motors), how]).strip()
             if motors:
                 raw.append(RawChannel("motor_command", t, values[:, motors], f"{source} {which}"))
     return sorted(raw, key=lambda r: "ACTUATOR" not in r.source)
