@@ -4,7 +4,7 @@ import mmap
 import re
 import struct
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -18,7 +18,7 @@ from quadid.data.rotor_signal import px4_allocation
 from quadid.data.window import Recording
 from quadid.errors import LogError
 from quadid.sanitise import plain
-from quadid.types import FloatArray, IntArray
+from quadid.types import FloatArray
 from quadid_replay.columns import (
     LogClock,
     RawChannel,
@@ -30,8 +30,6 @@ from quadid_replay.columns import (
     mode_changes,
     to_euler,
 )
-
-# isort: off
 from quadid_replay.motors import (
     DSHOT,
     MOST_ROTORS,
@@ -46,7 +44,6 @@ from quadid_replay.motors import (
     px4_motor_outputs,
     px4_rotor_count,
 )
-# isort: on
 
 # --- Walks through the records of a PX4 ULog and hands pyulog only whole ones, of the topics that are wanted
 #
@@ -54,8 +51,8 @@ from quadid_replay.motors import (
 # some damaged definitions.
 
 
-_KNOWN = frozenset(b"BFIMPQARDLCSO")
-_DEFINITIONS = frozenset(b"FP")
+_KNOWN = "BFIMPQARDLCSO"
+"""Kinds of records."""
 _SYNC = bytes((0x2F, 0x73, 0x13, 0x20, 0x25, 0x0C, 0xBB, 0x12))
 _HEADER = 16
 _NEAR = 65536
@@ -64,8 +61,7 @@ _CHAIN = 3
 """So many plausible records in a row are believed to be records."""
 
 
-@dataclass
-class UlogRecords:
+class UlogRecords(NamedTuple):
     """Result of a walk.
 
     Attributes:
@@ -76,17 +72,9 @@ class UlogRecords:
     """
 
     clean: BytesIO
-    skipped: int = 0
-    cut: bool = False
-    described_anew: str = ""
-    formats: dict[str, str] = field(default_factory=dict)
-    topics: dict[tuple[str, int], str] = field(default_factory=dict)
-    """Message by topic without its version and instance."""
-    wanted: set[int] = field(default_factory=set)
-    lengths: dict[int, int] = field(default_factory=dict)
-    boundaries: list[int] = field(default_factory=list)
-    sync: int = 0
-    """Begin of the next sync mark, as far as it was looked for; the end of the file when there is none."""
+    skipped: int
+    cut: bool
+    described_anew: str
 
 
 def collect_records(path: Path, topics: frozenset[str]) -> UlogRecords:
@@ -99,55 +87,63 @@ def collect_records(path: Path, topics: frozenset[str]) -> UlogRecords:
         raise LogError(f"{path.name}: holds a header and nothing else", "a complete ULog", "copy it again")
     with path.open("rb") as file:
         data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
-    found = UlogRecords(BytesIO())
-    found.clean.write(data[:_HEADER])
+    clean = BytesIO()
+    clean.write(data[:_HEADER])
+    formats: dict[str, str] = {}
+    instances: set[tuple[str, int]] = set()
+    wanted: set[int] = set()
+    lengths: dict[int, int] = {}  # of the data records, by the number of their topic
+    boundaries: tuple[int, ...] = ()
+    skipped, sync, anew = 0, 0, ""
     offset, size = _HEADER, len(data)
-    while offset + 3 <= size:
-        length, kind = data[offset] | data[offset + 1] << 8, data[offset + 2]
+    while offset + 3 <= size and not anew:
+        length, kind = data[offset] | data[offset + 1] << 8, chr(data[offset + 2])
         end = offset + 3 + length
-        appended = next((b for b in found.boundaries if offset < b < end), None)
-        if appended is not None:  # the logger stopped here and went on at the boundary
+        # The logger stopped here and went on at a boundary.
+        appended = next((b for b in boundaries if offset < b < end), None)
+        if appended is not None:
             offset = appended
-        elif kind not in _KNOWN or length == 0 or (end > size and found.skipped):
-            following = _next_record(data, offset + 1, found)
-            found.skipped += following - offset
+            continue
+        # Damage: records go on after the next sync mark, or nearby where several plausible ones follow.
+        if kind not in _KNOWN or length == 0 or (end > size and skipped):
+            if sync <= offset:
+                sync = data.find(_SYNC, offset + 1)
+                sync = size if sync < 0 else sync
+            after = min(sync + len(_SYNC), size)
+            near = range(offset + 1, min(offset + 1 + _NEAR, after))
+            following = next((place for place in near if _plausible(data, place, lengths)), after)
+            skipped += following - offset
             offset = following
-        elif end > size:
-            found.cut = True
+            continue
+        if end > size:
             break
-        else:
-            _take(found, path.name, kind, data[offset + 3 : end], topics)
-            offset = size if found.described_anew else end
-    found.cut |= offset < size
-    found.clean.seek(0)
-    return found
-
-
-def _take(found: UlogRecords, name: str, kind: int, body: bytes, topics: frozenset[str]) -> None:
-    if kind == ord("B"):
-        _note_flags(found, name, body)
-        return
-    if kind == ord("F"):
-        name, _, fields = body.decode("utf-8", "replace").partition(":")
-        if found.formats.setdefault(name, fields) != fields:
-            found.described_anew = plain(name, 40)
-            return
-    elif kind == ord("A"):
-        message = body[3:].decode("utf-8", "replace")
-        if unversioned(message) not in topics or len(body) < 4:
-            return
-        if (unversioned(message), body[0]) in found.topics:  # the first one of a topic's instance is read
-            return
-        found.topics[unversioned(message), body[0]] = message
-        found.wanted.add(body[1] | body[2] << 8)
-    elif kind == ord("D") and len(body) > 2:
-        number = body[0] | body[1] << 8
-        found.lengths.setdefault(number, len(body))
-        if number not in found.wanted:
-            return
-    elif kind not in _DEFINITIONS:
-        return
-    found.clean.write(struct.pack("<HB", len(body), kind) + body)
+        body = data[offset + 3 : end]
+        offset = end
+        # Which of the whole records are kept.
+        if kind == "B":
+            boundaries = _boundaries(path.name, body)
+            continue
+        if kind == "F":
+            name, _, fields = body.decode("utf-8", "replace").partition(":")
+            if formats.setdefault(name, fields) != fields:
+                anew = plain(name, 40)
+                continue
+        elif kind == "A":
+            topic = unversioned(body[3:].decode("utf-8", "replace"))
+            if topic not in topics or (topic, body[0]) in instances:  # the first one of a topic's instance is read
+                continue
+            instances.add((topic, body[0]))
+            wanted.add(body[1] | body[2] << 8)
+        elif kind == "D" and length > 2:
+            number = body[0] | body[1] << 8
+            lengths.setdefault(number, length)
+            if number not in wanted:
+                continue
+        elif kind != "P":
+            continue
+        clean.write(data[end - 3 - length : end])
+    clean.seek(0)
+    return UlogRecords(clean, skipped, offset < size and not anew, anew)
 
 
 def unversioned(topic: str) -> str:
@@ -155,38 +151,27 @@ def unversioned(topic: str) -> str:
     return re.sub(r"_v\d{1,3}$", "", topic)
 
 
-def _next_record(data: mmap.mmap, offset: int, found: UlogRecords) -> int:
-    """Returns where records go on: after the next sync mark, or nearby where several plausible ones follow."""
-    if found.sync < offset:
-        sync = data.find(_SYNC, offset)
-        found.sync = len(data) if sync < 0 else sync
-    after = min(found.sync + len(_SYNC), len(data))
-    for place in range(offset, min(offset + _NEAR, after)):
-        if data[place + 2 : place + 3] == b"D" and _plausible(data, place, found):
-            return place
-    return after
-
-
-def _plausible(data: mmap.mmap, offset: int, found: UlogRecords) -> bool:
-    for _ in range(_CHAIN):
+def _plausible(data: mmap.mmap, offset: int, lengths: Mapping[int, int]) -> bool:
+    """True if a data record seems to begin here, with others behind it."""
+    for k in range(_CHAIN):
         if offset + 5 > len(data):
             return False
-        length, kind = data[offset] | data[offset + 1] << 8, data[offset + 2]
-        if kind not in _KNOWN or not 0 < length <= 10000:
+        length, kind = data[offset] | data[offset + 1] << 8, chr(data[offset + 2])
+        if kind not in (_KNOWN if k else "D") or not 0 < length <= 10000:
             return False
-        if kind == ord("D") and found.lengths.get(data[offset + 3] | data[offset + 4] << 8) != length:
+        if kind == "D" and lengths.get(data[offset + 3] | data[offset + 4] << 8) != length:
             return False
         offset += 3 + length
     return True
 
 
-def _note_flags(found: UlogRecords, name: str, body: bytes) -> None:
+def _boundaries(name: str, body: bytes) -> tuple[int, ...]:
+    """Offsets at which data were appended, of a record of flags; raises LogError for flags of a future format."""
     if len(body) < 40:
-        return
+        return ()
     if body[8] & ~1 or any(body[9:16]):
         raise LogError(f"{name}: flags that this version cannot read", "ULog version 1", "update quadid")
-    if body[8] & 1:
-        found.boundaries = [b for b in struct.unpack("<3Q", body[16:40]) if b]
+    return struct.unpack("<3Q", body[16:40]) if body[8] & 1 else ()
 
 
 # --- PX4's control allocation: from torque and thrust setpoints, logged at 50 Hz, to the motors, logged at 10 Hz
@@ -238,13 +223,6 @@ def allocated(mix: FloatArray, setpoints: FloatArray) -> FloatArray:
 # Body FRD and world NED are PX4's own; time is microseconds since boot, `timestamp_sample` where a topic has it.
 
 
-_TOPICS = frozenset((
-    "sensor_combined", "vehicle_imu", "vehicle_angular_velocity", "vehicle_acceleration", "vehicle_attitude",
-    "vehicle_attitude_setpoint", "vehicle_local_position", "battery_status", "actuator_motors", "actuator_outputs",
-    "esc_status", "vehicle_status", "vehicle_torque_setpoint", "vehicle_thrust_setpoint",
-))  # fmt: skip
-
-
 def _numbered(name: str, count: int) -> tuple[str, ...]:
     return tuple(f"{name}[{i}]" for i in range(count))
 
@@ -264,6 +242,7 @@ def _volts(rows: FloatArray) -> FloatArray:
 
 
 _XYZ = _numbered("xyz", 3)
+_SETPOINTS = ("torque", "thrust")
 SOURCES = (
     Source("gyro", "sensor_combined", (*_numbered("gyro_rad", 3), "gyro_integral_dt"), lambda rows: rows[:, :3]),
     Source("gyro", "vehicle_imu", (*_numbered("delta_angle", 3), "delta_angle_dt"), _increments),
@@ -283,6 +262,14 @@ SOURCES = (
     Source("battery", "battery_status", ("voltage_v",), _volts),
 )
 """In order of preference."""
+_TOPICS = frozenset(
+    {
+        *(source.records for source in SOURCES),
+        *(f"vehicle_{name}_setpoint" for name in _SETPOINTS),
+        *("actuator_motors", "actuator_outputs"),
+        *("esc_status", "vehicle_status"),
+    }
+)
 _MODES = {
     0: "Manual", 1: "Altitude", 2: "Position", 3: "Mission", 4: "Hold", 5: "Return", 10: "Acro", 12: "Descend",
     13: "Termination", 14: "Offboard", 15: "Stabilized", 17: "Takeoff", 18: "Land", 19: "Follow", 20: "Precision land",
@@ -304,6 +291,28 @@ class _Log(NamedTuple):
 
     topics: dict[tuple[str, int], dict[str, NDArray[Any]]]
     parameters: dict[str, float]
+
+    def columns(self, topic: str, *names: str, instance: int = 0) -> FloatArray | None:
+        """Fields of a topic, shape (n, len(names)); None where the log lacks one of them."""
+        data = self.topics.get((topic, instance), {})
+        if not {"timestamp", *names} <= data.keys():
+            return None
+        with np.errstate(invalid="ignore"):  # damaged records hold signalling NaN
+            return np.column_stack([data[name].astype(np.float64) for name in names])
+
+    def times(self, topic: str, stamp: str = "timestamp", instance: int = 0) -> FloatArray:
+        """Times [s] of a topic; NaN for stamps far from their neighbours.
+
+        A ULog is written by one boot, so each topic has its own clock and a step back is damage, not a reboot.
+        """
+        data = self.topics[topic, instance]
+        raw = data[stamp if stamp in data and np.any(data[stamp]) else "timestamp"].astype(np.float64) * 1e-6
+        return np.where(LogClock().times(raw) == raw, raw, np.nan)
+
+    def motors(self, topic: str, values: FloatArray, note: str, instance: int = 0) -> RawChannel:
+        """Outputs in a topic, shape (n, rotors)."""
+        name = f"{topic} {instance}" if instance else topic
+        return RawChannel("motor_command", self.times(topic, instance=instance), values, f"{name} ({note})")
 
 
 def read_ulog(path: Path) -> Recording:
@@ -337,101 +346,69 @@ def read_ulog(path: Path) -> Recording:
         raw += fastest_first([*_actuator_motors(log), *_actuator_outputs(log), *_allocated(log)], 2.0)
         raw += _esc(log, notes)
     recording = assemble(path.name, "ulog", raw, LogClock(), notes, log.parameters, other)
-    status = log.topics.get(("vehicle_status", 0), {})
-    if not {"timestamp", "nav_state"} <= status.keys():
+    states = log.columns("vehicle_status", "nav_state")
+    if states is None:
         return recording
-    modes = mode_changes(_times(status, "timestamp"), status["nav_state"].astype(np.float64), _MODES)
-    return replace(recording, modes=modes)
-
-
-def _raw(log: _Log, channel: str, key: tuple[str, int], values: FloatArray, note: str = "") -> RawChannel:
-    source = f"{key[0]}{f' {key[1]}' if key[1] else ''}{f' ({note})' if note else ''}"
-    return RawChannel(channel, _times(log.topics[key], "timestamp"), values, source)
-
-
-def _times(data: dict[str, NDArray[Any]], stamp: str = "timestamp_sample") -> FloatArray:
-    """Times [s] of a topic; NaN for stamps far from their neighbours.
-
-    A ULog is written by one boot, so each topic has its own clock and a step back is damage, not a reboot.
-    """
-    raw = data[stamp if stamp in data and np.any(data[stamp]) else "timestamp"].astype(np.float64) * 1e-6
-    return np.where(LogClock().times(raw) == raw, raw, np.nan)
+    return replace(recording, modes=mode_changes(log.times("vehicle_status"), states[:, 0], _MODES))
 
 
 def _rows(log: _Log, source: Source) -> tuple[FloatArray, FloatArray] | None:
     """Times and columns of a topic's first instance; a mean over an interval before its stamp counts at the middle."""
-    key, first = (source.records, 0), source.columns[0]
-    if not _has(log, key, *source.columns):
+    values = log.columns(source.records, *source.columns)
+    if values is None:
         return None
-    data = log.topics[key]
-    t, values = _times(data), _stack(data, source.columns)
-    if first in _VALID and _has(log, key, _VALID[first]):
-        values[data[_VALID[first]] == 0] = np.nan
+    t = log.times(source.records, "timestamp_sample")
+    valid = log.columns(source.records, _VALID.get(source.columns[0], ""))
+    if valid is not None:
+        values[valid[:, 0] == 0.0] = np.nan
     if source.columns[-1].endswith("_dt"):
         t = t - 0.5e-6 * values[:, -1]
-    if source.channel == "accel" and _has(log, key, "accelerometer_timestamp_relative"):
-        relative = data["accelerometer_timestamp_relative"].astype(np.float64) * 1e-6
-        t = t + relative
-        values[np.abs(relative) >= 1.0] = np.nan  # a huge one marks an invalid sample
+    relative = log.columns(source.records, "accelerometer_timestamp_relative")
+    if source.channel == "accel" and relative is not None:
+        t = t + relative[:, 0] * 1e-6
+        values[np.abs(relative[:, 0] * 1e-6) >= 1.0] = np.nan  # a huge one marks an invalid sample
     return t, values
 
 
-def _stack(data: dict[str, NDArray[Any]], columns: tuple[str, ...]) -> FloatArray:
-    with np.errstate(invalid="ignore"):  # damaged records hold signalling NaN
-        return np.column_stack([data[c].astype(np.float64) for c in columns])
-
-
-def _has(log: _Log, key: tuple[str, int], *columns: str) -> bool:
-    return key in log.topics and "timestamp" in log.topics[key] and all(c in log.topics[key] for c in columns)
-
-
 def _actuator_motors(log: _Log) -> list[RawChannel]:
-    key = ("actuator_motors", 0)
-    columns = tuple(f"control[{i}]" for i in range(12))
-    if not _has(log, key, *columns):
+    values = log.columns("actuator_motors", *_numbered("control", 12))
+    if values is None:
         return []
-    values = _stack(log.topics[key], columns)
     count = px4_rotor_count(log.parameters) or int(np.count_nonzero(np.isfinite(values).any(axis=0)))
-    return [_motor_command(log, key, values[:, :count])]
+    return [log.motors("actuator_motors", *_commanded(log, values[:, :count], "normalized"))]
 
 
-def _motor_command(log: _Log, key: tuple[str, int], thrust: FloatArray, how: str = "normalized") -> RawChannel:
+def _commanded(log: _Log, thrust: FloatArray, how: str) -> tuple[FloatArray, str]:
     """Output to the ESCs of relative thrust (n, rotors), as PX4 itself makes it with THR_MDL_FAC."""
     factor = log.parameters.get("THR_MDL_FAC", 0.0)
-    if factor > 0.0:
-        rest = 1.0 - factor
-        thrust = (np.sqrt(rest**2 + 4.0 * factor * np.maximum(thrust, 0.0)) - rest) / (2.0 * factor)
-        how += f", THR_MDL_FAC {factor:g} undone"
-    return _raw(log, "motor_command", key, thrust, note=how)
+    if factor <= 0.0:
+        return thrust, how
+    rest = 1.0 - factor
+    command = (np.sqrt(rest**2 + 4.0 * factor * np.maximum(thrust, 0.0)) - rest) / (2.0 * factor)
+    return command, f"{how}, THR_MDL_FAC {factor:g} undone"
 
 
 def _allocated(log: _Log) -> list[RawChannel]:
     """Motors as PX4 allocates them, of torque and thrust setpoints of one moment; only where logged motors agree."""
-    torque, thrust = ("vehicle_torque_setpoint", 0), ("vehicle_thrust_setpoint", 0)
     mix = allocation(log.parameters)
-    columns = (*_XYZ, "timestamp_sample")
-    if mix is None or not (_has(log, torque, *columns) and _has(log, thrust, *columns)):
+    torque, thrust = (log.columns(f"vehicle_{name}_setpoint", "timestamp_sample", *_XYZ) for name in _SETPOINTS)
+    if mix is None or torque is None or thrust is None:
         return []
-    moment, of_torque, of_thrust = np.intersect1d(
-        log.topics[torque]["timestamp_sample"], log.topics[thrust]["timestamp_sample"], return_indices=True
-    )
-    setpoints = np.hstack([_stack(log.topics[torque], _XYZ)[of_torque], _stack(log.topics[thrust], _XYZ)[of_thrust]])
-    values = np.full((len(log.topics[torque]["timestamp"]), len(mix)), np.nan)
-    values[of_torque] = allocated(mix, setpoints)
-    if not _motors_agree(log, moment, values[of_torque]):
+    moment, of_torque, of_thrust = np.intersect1d(torque[:, 0], thrust[:, 0], return_indices=True)
+    motors = allocated(mix, np.hstack([torque[of_torque, 1:], thrust[of_thrust, 1:]]))
+    # Logged motors must be those allocated, where both are there.
+    logged = log.columns("actuator_motors", "timestamp_sample", *_numbered("control", len(mix)))
+    if logged is None:
         return []
-    return [_motor_command(log, torque, values, "allocated as actuator_motors, normalized")]
-
-
-def _motors_agree(log: _Log, moment: IntArray, thrust: FloatArray) -> bool:
-    """True if logged motors are those allocated (n, rotors) of setpoints at `moment` (n,), where both are there."""
-    motors, columns = ("actuator_motors", 0), tuple(f"control[{i}]" for i in range(thrust.shape[1]))
-    if not _has(log, motors, *columns, "timestamp_sample"):
-        return False
-    _, here, there = np.intersect1d(moment, log.topics[motors]["timestamp_sample"], return_indices=True)
-    off = thrust[here] - _stack(log.topics[motors], columns)[there]
+    _, here, there = np.intersect1d(moment, logged[:, 0], return_indices=True)
+    off = motors[here] - logged[there, 1:]
     off = off[np.isfinite(off).all(axis=1)]
-    return len(off) >= _FEWEST_COMPARED and bool(np.quantile(np.abs(off), 0.9) < _ALLOCATED_ALIKE)
+    if len(off) < _FEWEST_COMPARED or np.quantile(np.abs(off), 0.9) >= _ALLOCATED_ALIKE:
+        return []
+    values = np.full((len(torque), len(mix)), np.nan)
+    values[of_torque] = motors
+    how = "allocated as actuator_motors, normalized"
+    return [log.motors("vehicle_torque_setpoint", *_commanded(log, values, how))]
 
 
 def _actuator_outputs(log: _Log) -> list[RawChannel]:
@@ -439,44 +416,42 @@ def _actuator_outputs(log: _Log) -> list[RawChannel]:
 
     Pulse widths, but with DShot or UAVCAN numbers up to their full command.
     """
-    count = px4_rotor_count(log.parameters)
+    topic, count = "actuator_outputs", px4_rotor_count(log.parameters)
     full = DSHOT if log.parameters.get("DSHOT_CONFIG", 0.0) > 0.0 else None
     if log.parameters.get("UAVCAN_ENABLE", 0.0) >= _UAVCAN_OUTPUTS:
         full = UAVCAN
     for instance in range(4):
-        key = ("actuator_outputs", instance)
-        columns = tuple(f"output[{i}]" for i in range(16))
-        if not _has(log, key, *columns):
+        outputs = log.columns(topic, *_numbered("output", 16), instance=instance)
+        if outputs is None:
             continue
-        values, how = in_pulses(_stack(log.topics[key], columns))
+        values, how = in_pulses(outputs)
         pulses = values
         if full is not None and np.max(values) <= full:  # made to look like pulses, to find those that vary
             values, how, pulses = values / full, f"of {full:g}", 1000.0 + 1000.0 / full * values
         for bank in PX4_BANKS:
             motors = px4_motor_outputs(log.parameters, bank)
             if motors and len(active_outputs(pulses[:, motors])) == len(motors):
-                return [_raw(log, "motor_command", key, values[:, motors], note=f"{how or 'us'}, {bank}")]
+                return [log.motors(topic, values[:, motors], f"{how or 'us'}, {bank}", instance)]
         motors = active_outputs(pulses)
         if motors and (not count or len(motors) >= count):
-            return [_raw(log, "motor_command", key, values[:, : count or len(motors)], note=how or "us")]
+            return [log.motors(topic, values[:, : count or len(motors)], how or "us", instance)]
     return []
 
 
 def _esc(log: _Log, notes: list[str]) -> list[RawChannel]:
-    key = ("esc_status", 0)
-    count = px4_rotor_count(log.parameters)
-    if not _has(log, key, "esc[0].esc_rpm"):
+    topic, count = "esc_status", px4_rotor_count(log.parameters)
+    if log.columns(topic, "esc[0].esc_rpm") is None:
         return []
-    data = log.topics[key]
+    data = log.topics[topic, 0]
     rpm = [data[name] for k in range(MOST_ROTORS) if (name := f"esc[{k}].esc_rpm") in data]
     functions = [int(data.get(f"esc[{k}].actuator_function", [0])[-1]) for k in range(len(rpm))]
     columns, problem = motor_columns(functions), ""
     if not columns:  # older logs do not say which motor an ESC drives
-        columns, problem, _ = esc_columns(log.parameters, count, [bool(np.any(r)) for r in rpm], "esc_status")
+        columns, problem, _ = esc_columns(log.parameters, count, [bool(np.any(r)) for r in rpm], topic)
     if not problem and (not columns or max(columns) >= len(rpm) or (count and len(columns) != count)):
-        problem = f"esc_status: speeds of {len(columns)} motors, but the vehicle has {count}: they are not used"
-    if problem:
+        problem = f"{topic}: speeds of {len(columns)} motors, but the vehicle has {count}: they are not used"
+    speeds = None if problem else log.columns(topic, *(f"esc[{k}].esc_rpm" for k in columns))
+    if speeds is None:
         notes.append(problem)
         return []
-    values = np.abs(_stack(data, tuple(f"esc[{k}].esc_rpm" for k in columns))) * RPM
-    return [_raw(log, "rotor_speed", key, values, note="rpm")]
+    return [RawChannel("rotor_speed", log.times(topic), np.abs(speeds) * RPM, f"{topic} (rpm)")]
