@@ -16,16 +16,15 @@ from quadid_replay.columns import LogClock, cross, flip_attitude, flip_body, fli
 from quadid_replay.mcap_file import Message, Topic
 from quadid_replay.motors import RPM, motor_columns
 
-# --- Fast reading and writing of messages whose numbers stand in the same places each time
+# --- Fast reading of messages whose numbers stand in the same places each time
 #
-# The library (`mcap_ros2`) decodes or encodes the first message of a topic; where its runs of doubles stand is found
-# by looking for them in the bytes.  As long as nothing else in the message but stamp and numbers changes, later
-# messages are read and written at those places, many at once; any other message goes the library's way.  No layout is
-# assumed that the library did not show.
+# The library (`mcap_ros2`) decodes the first message of a topic; where its runs of doubles stand is found by looking
+# for them in the bytes.  As long as nothing else in the message but stamp and numbers changes, later messages are read
+# at those places, many at once; any other message goes the library's way.  No layout is assumed that the library did
+# not show.
 
 
 _LITTLE_ENDIAN = b"\x00\x01"
-_STAMP = struct.Struct("<iI")
 _STAMP_AT, _AFTER_STAMP = 4, 12
 
 
@@ -104,32 +103,6 @@ class MessageReader:
 
 def _header_stamp(message: Any) -> int:
     return int(message.header.stamp.sec) * 10**9 + int(message.header.stamp.nanosec)
-
-
-class BlockWriter:
-    """Writes messages of one topic that differ in stamp and one run of doubles only.
-
-    Args:
-        encode: the library's encoder: message to bytes.
-        build: makes a message of the doubles; its stamp does not matter.
-        size: how many they are.
-
-    Raises:
-        ValueError: the numbers do not stand together in this message.
-    """
-
-    def __init__(self, encode: Callable[[Any], bytes], build: Callable[[list[float]], Any], size: int) -> None:
-        marks = [1.0 + 0.001 * k for k in range(size)]
-        self._bytes, self._numbers = bytearray(encode(build(marks))), struct.Struct(f"<{size}d")
-        self._at = self._bytes.find(self._numbers.pack(*marks), _AFTER_STAMP)
-        if self._at < 0:
-            raise ValueError("the numbers do not stand together in this message")
-
-    def write(self, nanoseconds: int, values: Sequence[float]) -> bytes:
-        """Returns the message with this stamp [ns] and these numbers."""
-        _STAMP.pack_into(self._bytes, _STAMP_AT, nanoseconds // 1_000_000_000, nanoseconds % 1_000_000_000)
-        self._numbers.pack_into(self._bytes, self._at, *values)
-        return bytes(self._bytes)
 
 
 # --- Contents of each ROS 2 message type: runs of numbers, the signals in them, and how those become the core's

@@ -4,7 +4,7 @@ import math
 import struct
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from types import SimpleNamespace, TracebackType
 from typing import Any, BinaryIO, NamedTuple, TypeAlias
@@ -24,7 +24,6 @@ from quadid_replay.columns import flip_attitude, flip_body, flip_world, from_eul
 from quadid_replay.csv_reader import EULER, GROUPS
 from quadid_replay.mavlink_messages import extend_dialect
 from quadid_replay.motors import MULTIROTORS, RPM
-from quadid_replay.ros_messages import BlockWriter
 from quadid_replay.schemas import has_definition, schema_text
 
 # --- What the writers share: recordings of windows, samples in time order, files that can be written
@@ -238,22 +237,18 @@ def _definition(kind: str) -> str:
 
 
 _ABSENT = -1.0
-_STAMP = {"sec": 0, "nanosec": 0}
-_MAP, _BODY = {"stamp": _STAMP, "frame_id": "map"}, {"stamp": _STAMP, "frame_id": "base_link"}
+_STAMP, _STAMP_AT, _AFTER_STAMP = struct.Struct("<iI"), 4, 12
+"""Stamp of a header in CDR, and its place."""
 
 
 class _Series(NamedTuple):
-    """Messages of one topic: type, times [s] (n,), rows of numbers (n, k), and what makes a message of such a row.
-
-    A type whose numbers are no doubles is `plain`: its messages are encoded one by one, with their stamp.
-    """
+    """Messages of one topic: type, times [s] (n,), rows of numbers (n, k), and what makes a message of such a row."""
 
     topic: str
     kind: str
     t: FloatArray
     rows: FloatArray
     build: Callable[[list[float]], dict[str, Any]]
-    plain: bool = False
 
 
 def write_mcap(file: str | Path | BinaryIO, source: Source, epoch_ns: int = 0) -> None:
@@ -298,21 +293,36 @@ def write_recordings(
     for topic, (times, rows) in (wrenches or {}).items():
         both = np.hstack([flip_body(rows[:, :3]), flip_body(rows[:, 3:])])
         each.append(_Series(topic, "geometry_msgs/msg/WrenchStamped", times, both, _wrench))
-    encoders = [writer.encoder(s.kind) for s in each]
-    blocks = [
-        None if s.plain else BlockWriter(encode, s.build, s.rows.shape[1])
-        for s, encode in zip(each, encoders, strict=True)
-    ]
+    encoders = [_encoder(writer.encoder(s.kind), s.build, s.rows.shape[1]) for s in each]
     for which, row in in_time_order([s.t for s in each]):
-        s, block = each[which], blocks[which]
-        ns, values = epoch_ns + round(float(s.t[row]) * 1e9), s.rows[row].tolist()
-        if block is None:
-            stamp = {"sec": ns // 10**9, "nanosec": ns % 10**9}
-            message = s.build(values)
-            data = encoders[which]({**message, "header": {**message["header"], "stamp": stamp}})
-        else:
-            data = block.write(ns, values)
-        writer.write_cdr(s.topic, s.kind, data, ns)
+        s = each[which]
+        ns = epoch_ns + round(float(s.t[row]) * 1e9)
+        writer.write_cdr(s.topic, s.kind, encoders[which](ns, s.rows[row].tolist()), ns)
+
+
+def _encoder(
+    encode: Callable[[Any], bytes], build: Callable[[list[float]], dict[str, Any]], size: int
+) -> Callable[[int, list[float]], bytes]:
+    """Encodes messages of one topic that differ in stamp [ns] and `size` numbers only.
+
+    The library encodes one; the stamp and numbers of others are put where those of this one are found.  A type whose
+    numbers are no doubles goes the library's way each time.
+    """
+    marks = [1.0 + 0.001 * k for k in range(size)]
+    data, numbers = bytearray(encode(build(marks))), struct.Struct(f"<{size}d")
+    at = data.find(numbers.pack(*marks), _AFTER_STAMP)
+
+    def encoded(ns: int, values: list[float]) -> bytes:
+        stamp = divmod(ns, 10**9)
+        if at < 0:
+            message = build(values)
+            header = {**message["header"], "stamp": _named(("sec", "nanosec"), stamp)}
+            return encode({**message, "header": header})
+        _STAMP.pack_into(data, _STAMP_AT, *stamp)
+        numbers.pack_into(data, at, *values)
+        return bytes(data)
+
+    return encoded
 
 
 def _all_series(recording: Recording, epoch_ns: int) -> Iterator[_Series]:
@@ -334,40 +344,19 @@ def _all_series(recording: Recording, epoch_ns: int) -> Iterator[_Series]:
         yield _Series("imu", "sensor_msgs/msg/Imu", t, rows, _imu)
     if (c := channels.get("attitude")) is not None:
         rows = flip_attitude(c.values)[:, [1, 2, 3, 0]]
-        yield _Series(
-            "attitude",
-            "geometry_msgs/msg/QuaternionStamped",
-            c.t,
-            rows,
-            lambda v: {"header": _MAP, "quaternion": _named("xyzw", v)},
-        )
+        yield _Series("attitude", "geometry_msgs/msg/QuaternionStamped", c.t, rows, _attitude)
     if (c := channels.get("rotor_speed")) is not None:
-        names = [f"rotor_{i + 1}" for i in range(c.values.shape[1])]
-        yield _Series(
-            "rotor_speeds",
-            "sensor_msgs/msg/JointState",
-            c.t,
-            c.values,
-            lambda v: {"header": _BODY, "name": names, "position": [], "velocity": v, "effort": []},
-        )
+        yield _Series("rotor_speeds", "sensor_msgs/msg/JointState", c.t, c.values, _rotor_speeds)
     if (c := channels.get("motor_command")) is not None:
-        kind = 1 if np.nanmedian(np.abs(c.values)) > 100.0 else 0  # KIND_PWM, KIND_NORMALIZED
-        yield _Series(
-            "motor_command",
-            "quadid_msgs/msg/MotorCommand",
-            c.t,
-            c.values,
-            lambda v: {"header": _BODY, "kind": kind, "values": v},
-        )
+        kind = 1 if _are_pulses(c) else 0  # KIND_PWM, KIND_NORMALIZED
+
+        def motor_command(v: list[float]) -> dict[str, Any]:
+            return {"header": _header("base_link"), "kind": kind, "values": v}
+
+        yield _Series("motor_command", "quadid_msgs/msg/MotorCommand", c.t, c.values, motor_command)
     if (c := channels.get("attitude_reference")) is not None:
         rows = np.column_stack([to_euler(flip_attitude(from_euler(c.values[:, :3]))), c.values[:, 3]])
-        yield _Series(
-            "command",
-            "quadid_msgs/msg/AttitudeCommand",
-            c.t,
-            rows,
-            lambda v: {"header": _MAP, **_named(("roll", "pitch", "yaw", "throttle"), v)},
-        )
+        yield _Series("command", "quadid_msgs/msg/AttitudeCommand", c.t, rows, _command)
     # Pose in the world; twist in the body where there is an attitude, else in the world (child frame = frame).
     t, (position, velocity) = union_rows([channels.get("position"), channels.get("velocity")])
     if len(t):
@@ -375,33 +364,29 @@ def _all_series(recording: Recording, epoch_ns: int) -> Iterator[_Series]:
         rows[:, :3] = np.nan if position is None else flip_world(position)
         rows[:, 6] = 1.0
         world = np.full((len(t), 3), np.nan) if velocity is None else flip_world(velocity)
+        child = "map"
         if (c := channels.get("attitude")) is not None:
-            q = linear(c.t, c.values, t)
+            child, q = "base_link", linear(c.t, c.values, t)
             q = flip_attitude(q / np.linalg.norm(q, axis=1, keepdims=True))
             rows[:, 3:7] = q[:, [1, 2, 3, 0]]
             world = rotated(conjugate(q), world)
         rows[:, 43:46] = world
-        child = "map" if c is None else "base_link"
-        yield _Series("odom", "nav_msgs/msg/Odometry", t, rows, lambda v: _odometry(v, child))
+        yield _Series("odom", "nav_msgs/msg/Odometry", t, rows, partial(_odometry, child=child))
     if (c := channels.get("battery")) is not None:
-        unknown = ("temperature", "current", "charge", "capacity", "design_capacity", "percentage")
-        yield _Series(
-            "battery",
-            "sensor_msgs/msg/BatteryState",
-            c.t,
-            c.values,
-            lambda v: {"header": _BODY, "voltage": v[0], **dict.fromkeys(unknown, math.nan), "present": True},
-            plain=True,
-        )
+        yield _Series("battery", "sensor_msgs/msg/BatteryState", c.t, c.values, _battery)
 
 
-def _named(names: Iterable[str], values: list[float]) -> dict[str, float]:
+def _named(names: Iterable[str], values: Sequence[float]) -> dict[str, float]:
     return dict(zip(names, values, strict=True))
+
+
+def _header(frame: str) -> dict[str, Any]:
+    return {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": frame}
 
 
 def _imu(v: list[float]) -> dict[str, Any]:
     return {
-        "header": _BODY,
+        "header": _header("base_link"),
         "orientation": _named("xyzw", v[:4]),
         "orientation_covariance": v[4:13],
         "angular_velocity": _named("xyz", v[13:16]),
@@ -411,15 +396,34 @@ def _imu(v: list[float]) -> dict[str, Any]:
     }
 
 
+def _attitude(v: list[float]) -> dict[str, Any]:
+    return {"header": _header("map"), "quaternion": _named("xyzw", v)}
+
+
+def _rotor_speeds(v: list[float]) -> dict[str, Any]:
+    names = [f"rotor_{k + 1}" for k in range(len(v))]
+    return {"header": _header("base_link"), "name": names, "position": [], "velocity": v, "effort": []}
+
+
+def _command(v: list[float]) -> dict[str, Any]:
+    return {"header": _header("map"), **_named(("roll", "pitch", "yaw", "throttle"), v)}
+
+
+def _battery(v: list[float]) -> dict[str, Any]:
+    unknown = ("temperature", "current", "charge", "capacity", "design_capacity", "percentage")
+    return {"header": _header("base_link"), "voltage": v[0], **dict.fromkeys(unknown, math.nan), "present": True}
+
+
 def _wrench(v: list[float]) -> dict[str, Any]:
-    return {"header": _BODY, "wrench": {"force": _named("xyz", v[:3]), "torque": _named("xyz", v[3:])}}
+    wrench = {"force": _named("xyz", v[:3]), "torque": _named("xyz", v[3:])}
+    return {"header": _header("base_link"), "wrench": wrench}
 
 
 def _odometry(v: list[float], child: str) -> dict[str, Any]:
     pose = {"position": _named("xyz", v[:3]), "orientation": _named("xyzw", v[3:7])}
     twist = {"linear": _named("xyz", v[43:46]), "angular": _named("xyz", v[46:49])}
     return {
-        "header": _MAP,
+        "header": _header("map"),
         "child_frame_id": child,
         "pose": {"pose": pose, "covariance": v[7:43]},
         "twist": {"twist": twist, "covariance": v[49:85]},
@@ -478,8 +482,6 @@ _TYPES = {rotors: kind for kind, rotors in MULTIROTORS.items()}
 _GENERIC_AUTOPILOT, _ACTIVE = 0, 4
 _LONGEST_MS = 2**32
 _GYRO_BITS, _ACCEL_BITS = 0x38, 0x07
-_Messages = tuple[FloatArray, Callable[[int], list[Any]]]
-"""Times [s], and the messages of a row."""
 
 
 @cache
@@ -516,125 +518,84 @@ def mavlink_messages(recording: Recording) -> Iterator[tuple[float, Any]]:
     first, last = min(c.t[0] for c in channels.values()), max(c.t[-1] for c in channels.values())
     if first < 0.0 or last * 1e3 >= _LONGEST_MS:
         raise LogError(f"times from {first:.3f} to {last:.3f} s", "0 to 49 days, as boot clocks count")
-    series = [*_mavlink_series(channels, float(first), float(last))]
-    for which, row in in_time_order([t for t, _ in series]):
-        t, messages = series[which]
-        for message in messages(row):
-            yield float(t[row]), message
+
+    # Times, rows of numbers, and what they are in messages: name and fields of each.
+    series: list[tuple[FloatArray, FloatArray, Callable[[float, list[float]], list[tuple[Any, ...]]]]] = []
+    motors = channels.get("rotor_speed") or channels.get("motor_command")
+    rotors = motors.values.shape[1] if motors is not None else 4
+    seconds, escs = np.arange(first, last + 1.0, 1.0), range(0, rotors, 4) if "rotor_speed" in channels else ()
+    beat = ("heartbeat", _TYPES.get(rotors, 2), _GENERIC_AUTOPILOT, 0, 0, _ACTIVE, 3)
+    zeros = [0, 0, 0, 0]
+    series.append(
+        (
+            seconds,
+            np.empty((len(seconds), 0)),
+            lambda t, v: [beat, *(("esc_info", i, _us(t), 0, rotors, 0, 0, zeros, zeros, zeros) for i in escs)],
+        )
+    )
+    for names, messages in (
+        (("accel", "gyro"), _highres_imu),
+        (("attitude",), lambda t, v: [("attitude_quaternion", _ms(t), *v, 0.0, 0.0, 0.0)]),
+        (("rotor_speed",), _esc_status),
+        (("motor_command",), _outputs),
+        (("attitude_reference",), _attitude_target),
+        (("battery",), _battery_status),
+        (("position", "velocity"), lambda t, v: [("local_position_ned", _ms(t), *v)]),
+    ):
+        # One message a time; NaN stands for what was not measured there.
+        t, parts = union_rows([channels.get(name) for name in names])
+        if names == ("motor_command",) and t.size and not _are_pulses(channels["motor_command"]):
+            messages = _actuator_output_status
+        if len(t):
+            absent = np.full((len(t), 3), np.nan)
+            series.append((t, np.hstack([absent if part is None else part for part in parts]), messages))
+    for which, row in in_time_order([t for t, _, _ in series]):
+        times, rows, messages = series[which]
+        at = float(times[row])
+        for name, *fields in messages(at, rows[row].tolist()):
+            yield at, getattr(_dialect(), f"MAVLink_{name}_message")(*fields)
 
 
 def _ms(t: float) -> int:
-    return round(float(t) * 1e3)
+    return round(t * 1e3)
 
 
 def _us(t: float) -> int:
-    return round(float(t) * 1e6)
+    return round(t * 1e6)
 
 
-def _mavlink_series(channels: Mapping[str, Channel], first: float, last: float) -> Iterator[_Messages]:
-    motors = channels.get("rotor_speed") or channels.get("motor_command")
-    rotors = motors.values.shape[1] if motors is not None else 4
-    seconds = np.arange(first, last + 1.0, 1.0)
-
-    def heartbeat(row: int) -> list[Any]:
-        zeros = [0, 0, 0, 0]
-        escs = range(0, rotors, 4) if "rotor_speed" in channels else ()
-        return [_dialect().MAVLink_heartbeat_message(_TYPES.get(rotors, 2), _GENERIC_AUTOPILOT, 0, 0, _ACTIVE, 3)] + [
-            _dialect().MAVLink_esc_info_message(i, _us(seconds[row]), 0, rotors, 0, 0, zeros, zeros, zeros)
-            for i in escs
-        ]
-
-    yield seconds, heartbeat
-
-    imu, (force, rate) = union_rows([channels.get("accel"), channels.get("gyro")])
-
-    def highres_imu(row: int) -> list[Any]:
-        updated, fields = 0, [0.0] * 6
-        for values, place, bits in ((force, 0, _ACCEL_BITS), (rate, 3, _GYRO_BITS)):
-            if values is not None and np.isfinite(values[row]).all():
-                updated |= bits
-                fields[place : place + 3] = values[row].tolist()
-        return [_dialect().MAVLink_highres_imu_message(_us(imu[row]), *fields, *[0.0] * 7, updated)]
-
-    if len(imu):
-        yield imu, highres_imu
-
-    for name, build in _CHANNELS.items():
-        if (channel := channels.get(name)) is not None:
-            yield channel.t, build(channel)
-
-    # One LOCAL_POSITION_NED a time; NaN stands for what was not measured there.
-    local, states = union_rows([channels.get("position"), channels.get("velocity")])
-
-    def local_position(row: int) -> list[Any]:
-        numbers = [v for part in states for v in ([math.nan] * 3 if part is None else part[row].tolist())]
-        return [_dialect().MAVLink_local_position_ned_message(_ms(local[row]), *numbers)]
-
-    if len(local):
-        yield local, local_position
+def _are_pulses(commands: Channel) -> bool:
+    """True for pulse widths [us], false for normalized commands."""
+    return bool(np.nanmedian(np.abs(commands.values)) > 100.0)
 
 
-def _attitude(c: Channel) -> Callable[[int], list[Any]]:
-    return lambda row: [
-        _dialect().MAVLink_attitude_quaternion_message(_ms(c.t[row]), *c.values[row].tolist(), 0.0, 0.0, 0.0)
-    ]
+def _highres_imu(t: float, v: list[float]) -> list[tuple[Any, ...]]:
+    force, rate = np.isfinite(v[:3]).all(), np.isfinite(v[3:]).all()
+    fields = [*(v[:3] if force else [0.0] * 3), *(v[3:] if rate else [0.0] * 3)]
+    return [("highres_imu", _us(t), *fields, *[0.0] * 7, _ACCEL_BITS * int(force) | _GYRO_BITS * int(rate))]
 
 
-def _escs(c: Channel) -> Callable[[int], list[Any]]:
-    width, zeros = c.values.shape[1], [0.0] * 4
-
-    def messages(row: int) -> list[Any]:
-        rpm = [round(w / RPM) for w in c.values[row].tolist()] + [0] * (-width % 4)
-        return [
-            _dialect().MAVLink_esc_status_message(i, _us(c.t[row]), rpm[i : i + 4], zeros, zeros)
-            for i in range(0, width, 4)
-        ]
-
-    return messages
+def _esc_status(t: float, v: list[float]) -> list[tuple[Any, ...]]:
+    rpm, zeros = [round(w / RPM) for w in v] + [0] * (-len(v) % 4), [0.0] * 4
+    return [("esc_status", i, _us(t), rpm[i : i + 4], zeros, zeros) for i in range(0, len(v), 4)]
 
 
-def _outputs(c: Channel) -> Callable[[int], list[Any]]:
-    """Pulse widths as SERVO_OUTPUT_RAW, normalized commands as ACTUATOR_OUTPUT_STATUS."""
-    width = c.values.shape[1]
-    if np.nanmedian(np.abs(c.values)) > 100.0:
-        return lambda row: [
-            _dialect().MAVLink_servo_output_raw_message(
-                _us(c.t[row]) % 2**32, 0, *(round(v) for v in c.values[row].tolist()), *[0] * (16 - width)
-            )
-        ]
-    return lambda row: [
-        _dialect().MAVLink_actuator_output_status_message(
-            _us(c.t[row]), width, [*c.values[row].tolist(), *[0.0] * (32 - width)]
-        )
-    ]
+def _outputs(t: float, v: list[float]) -> list[tuple[Any, ...]]:
+    return [("servo_output_raw", _us(t) % 2**32, 0, *map(round, v), *[0] * (16 - len(v)))]
 
 
-def _reference(c: Channel) -> Callable[[int], list[Any]]:
-    q = from_euler(c.values[:, :3])
-    return lambda row: [
-        _dialect().MAVLink_attitude_target_message(
-            _ms(c.t[row]), 0, q[row].tolist(), 0.0, 0.0, 0.0, float(c.values[row, 3])
-        )
-    ]
+def _actuator_output_status(t: float, v: list[float]) -> list[tuple[Any, ...]]:
+    return [("actuator_output_status", _us(t), len(v), v + [0.0] * (32 - len(v)))]
 
 
-def _voltage(c: Channel) -> Callable[[int], list[Any]]:
+def _attitude_target(t: float, v: list[float]) -> list[tuple[Any, ...]]:
+    return [("attitude_target", _ms(t), 0, from_euler(np.array([v[:3]]))[0].tolist(), 0.0, 0.0, 0.0, v[3])]
+
+
+def _battery_status(t: float, v: list[float]) -> list[tuple[Any, ...]]:
     """The whole pack's voltage as if of one cell [mV]."""
-    return lambda row: [
-        _dialect().MAVLink_battery_status_message(
-            0, 0, 0, 32767, [min(round(float(c.values[row, 0]) * 1e3), 65534)] + [65535] * 9, -1, -1, -1, -1
-        )
-    ]
-
-
-_CHANNELS: dict[str, Callable[[Channel], Callable[[int], list[Any]]]] = {
-    "attitude": _attitude,
-    "rotor_speed": _escs,
-    "motor_command": _outputs,
-    "attitude_reference": _reference,
-    "battery": _voltage,
-}
-"""Makers of the messages of a channel's rows."""
+    cells = [min(round(v[0] * 1e3), 65534)] + [65535] * 9
+    return [("battery_status", 0, 0, 0, 32767, cells, -1, -1, -1, -1)]
 
 
 # --- Writes recordings of one flight side by side, such as measured and simulated, for viewers that draw curves
