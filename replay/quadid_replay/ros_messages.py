@@ -5,6 +5,7 @@ import struct
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from operator import attrgetter
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -68,7 +69,8 @@ class MessageReader:
             return None
         try:
             decoded = [self._decode(data) for data in messages]
-            each, extras = [self._kind.blocks(m) for m in decoded], [self._kind.extra(m) for m in decoded]
+            each = [[run(m) for run in self._kind.runs] for m in decoded]
+            extras = [self._kind.extra(m) for m in decoded]
             ns = np.array([(self._kind.stamp or _header_stamp)(m) for m in decoded], dtype=np.int64)
         except Exception:
             if len(messages) > 1:
@@ -80,7 +82,7 @@ class MessageReader:
             self._learn(messages[-1], each[-1], extras[0])
         return Read(ns, [np.array(run, dtype=np.float64) for run in zip(*each, strict=True)], extras[0])
 
-    def _learn(self, data: bytes, runs: "Runs", extra: Any) -> None:
+    def _learn(self, data: bytes, runs: Sequence[Sequence[float]], extra: Any) -> None:
         self._layout = None
         if data[:2] != _LITTLE_ENDIAN:
             return
@@ -108,7 +110,6 @@ def _header_stamp(message: Any) -> int:
 # --- Contents of each ROS 2 message type: runs of numbers, the signals in them, and how those become the core's
 
 
-Runs = list[Sequence[float]]
 Signals = list[tuple[str, FloatArray, Any]]
 """Names, values (n, size), and whether the messages hold the signal: of each a mask (n,), or of all one truth."""
 _LAST_NUMBER = re.compile(r"(\d{1,9})\D*$", re.ASCII)
@@ -130,13 +131,13 @@ class MessageType:
     """Reader of one type.
 
     Attributes:
-        blocks: runs of doubles of a decoded message, in the order in which they stand.
+        runs: each of a run of doubles of a decoded message, in the order in which they stand.
         signals: the signals of n messages, of their runs (n, size) and what `extra` noted.
         extra: what else to note of a message (constant while nothing but numbers changes).
         stamp: nanoseconds, for types without a header, which have no layout to be learnt.
     """
 
-    blocks: Callable[[Any], Runs]
+    runs: tuple[Callable[[Any], Sequence[float]], ...]
     signals: Callable[[list[FloatArray], Any], Signals]
     extra: Callable[[Any], Any] = lambda message: None
     stamp: Callable[[Any], int] | None = None
@@ -147,29 +148,24 @@ def _runs(*names: str, some: bool = False) -> Callable[[list[FloatArray], Any], 
     return lambda runs, extra: [(n, run, run.shape[1] > 0 or not some) for n, run in zip(names, runs, strict=True)]
 
 
-def _vector(v: Any) -> list[float]:
-    return [v.x, v.y, v.z]
+def _run(*paths: str) -> Callable[[Any], list[float]]:
+    """The numbers of a message in fields of these names, arrays whole; ``.xyzw`` stands for four fields."""
+    fields: list[str] = []
+    for stem, dot, axes in (path.rpartition(".") for path in paths):
+        fields += [f"{stem}.{axis}" for axis in axes] if axes in ("xyz", "xyzw") else [stem + dot + axes]
+    getters = [attrgetter(field) for field in fields]
 
+    def numbers(message: Any) -> list[float]:
+        out: list[float] = []
+        for value in (get(message) for get in getters):
+            out += value if hasattr(value, "__len__") else [value]
+        return out
 
-def _quaternion(q: Any) -> list[float]:
-    return [q.x, q.y, q.z, q.w]
+    return numbers
 
 
 def _wxyz(q: FloatArray) -> FloatArray:
     return q[:, [3, 0, 1, 2]]
-
-
-def _imu_block(m: Any) -> Runs:
-    return [
-        [
-            *_quaternion(m.orientation),
-            *m.orientation_covariance,
-            *_vector(m.angular_velocity),
-            *m.angular_velocity_covariance,
-            *_vector(m.linear_acceleration),
-            *m.linear_acceleration_covariance,
-        ]
-    ]
 
 
 def _imu_signals(runs: list[FloatArray], extra: Any) -> Signals:
@@ -180,18 +176,6 @@ def _imu_signals(runs: list[FloatArray], extra: Any) -> Signals:
         ("body_force", v[:, 25:28], v[:, 28] != -1.0),
         ("attitude", _wxyz(v[:, :4]), v[:, 4] != -1.0),
     ]
-
-
-def _pose(p: Any) -> list[float]:
-    return [*_vector(p.position), *_quaternion(p.orientation)]
-
-
-def _twist(t: Any) -> list[float]:
-    return [*_vector(t.linear), *_vector(t.angular)]
-
-
-def _odometry_block(m: Any) -> Runs:
-    return [[*_pose(m.pose.pose), *m.pose.covariance, *_twist(m.twist.twist), *m.twist.covariance]]
 
 
 def _odometry_signals(runs: list[FloatArray], in_world: Any) -> Signals:
@@ -229,7 +213,7 @@ def _px4_stamp(m: Any) -> int:
 
 def _px4(name: str, values: Callable[[Any], Sequence[float]], published: bool = False) -> MessageType:
     stamp = (lambda m: int(m.timestamp) * 1000) if published else _px4_stamp
-    return MessageType(lambda m: [values(m)], _runs(name), stamp=stamp)
+    return MessageType((values,), _runs(name), stamp=stamp)
 
 
 def _px4_speeds(m: Any) -> list[float]:
@@ -246,65 +230,79 @@ def _px4_speeds(m: Any) -> list[float]:
 
 
 def _escs(name: str) -> MessageType:
-    return MessageType(lambda m: [[abs(e.rpm) * RPM for e in getattr(m, name)]], _runs("rotor_speed"))
+    return MessageType((lambda m: [abs(e.rpm) * RPM for e in getattr(m, name)],), _runs("rotor_speed"))
 
 
 def _actuators(speed: str) -> MessageType:
     """mav_msgs (RotorS: angular_velocities) and actuator_msgs (Gazebo: velocity), both with `normalized`."""
-    told = _runs("rotor_speed", "motor_command", some=True)
-    return MessageType(lambda m: [list(getattr(m, speed)), list(m.normalized)], told)
+    return MessageType((_run(speed), _run("normalized")), _runs("rotor_speed", "motor_command", some=True))
 
 
 def _set_if(valid: bool, values: list[float]) -> list[float]:
     return values if valid else [float("nan")] * len(values)
 
 
+_POSE, _TWIST = ("position.xyz", "orientation.xyzw"), ("linear.xyz", "angular.xyz")
 TYPES: dict[str, MessageType] = {
-    "sensor_msgs/Imu": MessageType(_imu_block, _imu_signals),
-    "geometry_msgs/QuaternionStamped": MessageType(
-        lambda m: [_quaternion(m.quaternion)], lambda runs, extra: [("attitude", _wxyz(runs[0]), True)]
+    "sensor_msgs/Imu": MessageType(
+        (
+            _run(
+                *("orientation.xyzw", "orientation_covariance"),
+                *("angular_velocity.xyz", "angular_velocity_covariance"),
+                *("linear_acceleration.xyz", "linear_acceleration_covariance"),
+            ),
+        ),
+        _imu_signals,
     ),
-    "sensor_msgs/JointState": MessageType(lambda m: [list(m.velocity), list(m.effort)], _joint_signals, _joint_order),
+    "geometry_msgs/QuaternionStamped": MessageType(
+        (_run("quaternion.xyzw"),), lambda runs, extra: [("attitude", _wxyz(runs[0]), True)]
+    ),
+    "sensor_msgs/JointState": MessageType((_run("velocity"), _run("effort")), _joint_signals, _joint_order),
     "nav_msgs/Odometry": MessageType(
-        _odometry_block, _odometry_signals, extra=lambda m: m.child_frame_id == m.header.frame_id
+        (
+            _run(
+                *(*(f"pose.pose.{field}" for field in _POSE), "pose.covariance"),
+                *(*(f"twist.twist.{field}" for field in _TWIST), "twist.covariance"),
+            ),
+        ),
+        _odometry_signals,
+        extra=lambda m: m.child_frame_id == m.header.frame_id,
     ),
     "geometry_msgs/PoseStamped": MessageType(
-        lambda m: [_pose(m.pose)],
+        (_run(*(f"pose.{field}" for field in _POSE)),),
         lambda runs, extra: [("position", runs[0][:, :3], True), ("pose_attitude", _wxyz(runs[0][:, 3:]), True)],
     ),
     "geometry_msgs/TwistStamped": MessageType(
-        lambda m: [_twist(m.twist)], lambda runs, extra: [("velocity", runs[0][:, :3], True)]
+        (_run(*(f"twist.{field}" for field in _TWIST)),), lambda runs, extra: [("velocity", runs[0][:, :3], True)]
     ),
-    "sensor_msgs/BatteryState": MessageType(lambda m: [[m.voltage]], _runs("battery")),
-    "quadid_msgs/AttitudeCommand": MessageType(
-        lambda m: [[m.roll, m.pitch, m.yaw, m.throttle]], _runs("euler_reference")
-    ),
-    "quadid_msgs/MotorCommand": MessageType(lambda m: [list(m.values)], _runs("motor_command")),
-    "mavros_msgs/RCOut": MessageType(lambda m: [[float(c) for c in m.channels]], _runs("outputs")),
+    "sensor_msgs/BatteryState": MessageType((_run("voltage"),), _runs("battery")),
+    "quadid_msgs/AttitudeCommand": MessageType((_run("roll", "pitch", "yaw", "throttle"),), _runs("euler_reference")),
+    "quadid_msgs/MotorCommand": MessageType((_run("values"),), _runs("motor_command")),
+    "mavros_msgs/RCOut": MessageType((_run("channels"),), _runs("outputs")),
     "mavros_msgs/ESCStatus": _escs("esc_status"),
     "mavros_msgs/ESCTelemetry": _escs("esc_telemetry"),
     "mavros_msgs/AttitudeTarget": MessageType(
-        lambda m: [[m.orientation.w, *_vector(m.orientation), m.thrust]], _runs("quaternion_reference")
+        (_run("orientation.w", "orientation.xyz", "thrust"),), _runs("quaternion_reference")
     ),
     "mav_msgs/Actuators": _actuators("angular_velocities"),
     "actuator_msgs/Actuators": _actuators("velocity"),
     "px4_msgs/SensorCombined": MessageType(
-        lambda m: [list(m.gyro_rad), list(m.accelerometer_m_s2)],
+        (_run("gyro_rad"), _run("accelerometer_m_s2")),
         _runs("gyro", "accel"),
         stamp=lambda m: int(m.timestamp - 0.5 * m.gyro_integral_dt) * 1000,  # a mean counts at its middle
     ),
-    "px4_msgs/VehicleAttitude": _px4("frd_attitude", lambda m: list(m.q)),
+    "px4_msgs/VehicleAttitude": _px4("frd_attitude", _run("q")),
     "px4_msgs/VehicleAttitudeSetpoint": _px4("frd_reference", lambda m: [*m.q_d, -m.thrust_body[2]], True),
     "px4_msgs/VehicleLocalPosition": MessageType(
-        lambda m: [_set_if(m.xy_valid, [m.x, m.y, m.z]), _set_if(m.v_xy_valid, [m.vx, m.vy, m.vz])],
+        (lambda m: _set_if(m.xy_valid, [m.x, m.y, m.z]), lambda m: _set_if(m.v_xy_valid, [m.vx, m.vy, m.vz])),
         _runs("ned_position", "ned_velocity"),
         stamp=_px4_stamp,
     ),
-    "px4_msgs/BatteryStatus": _px4("battery", lambda m: [m.voltage_v], True),
-    "px4_msgs/ActuatorMotors": _px4("actuator_motors", lambda m: list(m.control), True),
-    "px4_msgs/ActuatorOutputs": _px4("outputs", lambda m: list(m.output), True),
+    "px4_msgs/BatteryStatus": _px4("battery", _run("voltage_v"), True),
+    "px4_msgs/ActuatorMotors": _px4("actuator_motors", _run("control"), True),
+    "px4_msgs/ActuatorOutputs": _px4("outputs", _run("output"), True),
     "px4_msgs/EscStatus": _px4("rotor_speed", _px4_speeds, True),
-    "px4_msgs/VehicleStatus": _px4("vehicle_kind", lambda m: [float(m.system_type)], True),
+    "px4_msgs/VehicleStatus": _px4("vehicle_kind", _run("system_type"), True),
 }
 """Message types that are read, without the ``msg`` in the middle of their name."""
 
@@ -375,36 +373,25 @@ _OTHER_CLOCK = 3600.0
 _LARGEST_NS = 1 << 62
 
 
-class Stamps:
-    """Turns stamps of headers and of PX4 into recording time."""
+def _recording_times(clock: LogClock, headed: BoolArray, stamps: IntArray, logged: IntArray) -> tuple[FloatArray, int]:
+    """Recording times [s] of n messages in file order, NaN for those refused, and the UNIX time [s] they count from.
 
-    def __init__(self) -> None:
-        self.clock = LogClock()
-        self.base_ns: int | None = None
-        self._offsets: dict[bool, float] = {}
-
-    def times(self, headed: BoolArray, stamps: IntArray, logged: Sequence[int]) -> FloatArray:
-        """Recording times [s] of messages in file order, shape (n,); NaN for those refused.
-
-        Args:
-            headed: whether the stamp stands in a header; the others are PX4's, of a clock of their own, shape (n,).
-            stamps: [ns], shape (n,); log time stands in for zero.
-            logged: log times [ns].
-        """
-        log_ns = np.array([max(min(t, _LARGEST_NS), -_LARGEST_NS) for t in logged], dtype=np.int64)
-        if self.base_ns is None:
-            self.base_ns = int(log_ns[0]) // 10**9 * 10**9 if log_ns[0] > _EPOCH_NS else 0
-        since, times = (log_ns - self.base_ns) * 1e-9, (stamps - self.base_ns) * 1e-9
-        for group in (True, False):
-            its = np.flatnonzero((headed == group) & (stamps != 0))
-            if len(its) and group not in self._offsets:
-                # Boot or simulation time beside a log on UNIX time: the first message that is no exception tells the
-                # distance.
-                apart = since[its] - times[its]
-                ahead = float(apart[np.abs(apart - np.sort(apart)[len(apart) // 2]) < _OTHER_CLOCK][0])
-                self._offsets[group] = ahead if abs(ahead) > _OTHER_CLOCK else 0.0
-            times[its] += self._offsets.get(group, 0.0)
-        return self.clock.times(np.where(stamps == 0, since, times))
+    Args:
+        headed: whether the stamp stands in a header; the others are PX4's, of a clock of their own, shape (n,).
+        stamps: [ns], shape (n,); log time stands in for zero.
+        logged: log times [ns], shape (n,).
+    """
+    epoch = int(logged[0]) // 10**9 if len(logged) and logged[0] > _EPOCH_NS else 0
+    since, times = (logged - epoch * 10**9) * 1e-9, (stamps - epoch * 10**9) * 1e-9
+    for group in (headed, ~headed):
+        its = np.flatnonzero(group & (stamps != 0))
+        if len(its):
+            # Boot or simulation time beside a log on UNIX time: the first message that is no exception tells the
+            # distance.
+            apart = since[its] - times[its]
+            ahead = float(apart[np.abs(apart - np.sort(apart)[len(apart) // 2]) < _OTHER_CLOCK][0])
+            times[its] += ahead if abs(ahead) > _OTHER_CLOCK else 0.0
+    return clock.times(np.where(stamps == 0, since, times)), epoch
 
 
 class TopicSource(NamedTuple):
@@ -416,21 +403,13 @@ class TopicSource(NamedTuple):
 
 
 class Decoded(NamedTuple):
-    """Times (n,), NaN where refused, and values (n, size) by topic and signal, the clock, and how many messages could
-    not be decoded."""
+    """Times (n,), NaN where refused, and values (n, size) by topic and signal; the clock, the UNIX time [s] from which
+    times count (0: none), and how many messages could not be decoded."""
 
     columns: dict[tuple[int, str], tuple[FloatArray, FloatArray]]
-    stamps: Stamps
+    clock: LogClock
+    epoch: int
     failed: int
-
-
-class _Part(NamedTuple):
-    """Samples of one signal in a batch: which messages, and values (n, size)."""
-
-    key: tuple[int, str]
-    order: int
-    rows: IndexArray
-    values: FloatArray
 
 
 def decode_messages(messages: Iterable[Message], sources: Mapping[int, TopicSource]) -> Decoded:
@@ -440,37 +419,40 @@ def decode_messages(messages: Iterable[Message], sources: Mapping[int, TopicSour
         messages: of the topics in `sources`, in file order.
         sources: what reads them, by channel id.
     """
-    parts_of: dict[tuple[int, str], list[tuple[FloatArray, FloatArray]]] = {}
-    stamps, failed = Stamps(), 0
+    # Numbers of each topic, batch by batch: which messages of the log, and their values; of each message its times.
+    found: dict[tuple[int, str], list[tuple[IndexArray, FloatArray]]] = {}
+    stamped: list[tuple[IndexArray, IntArray, IntArray, BoolArray]] = []
+    count = failed = 0
     for batch in _batches(messages):
-        numbers = np.array([number for number, _, _ in batch])
-        stamped, decoded = np.zeros(len(batch), np.int64), np.zeros(len(batch), np.bool_)
-        parts: list[_Part] = []
-        for number in dict.fromkeys(numbers.tolist()):
-            rows = np.flatnonzero(numbers == number)
-            for some, read in _read(sources[number].reader, rows, [batch[row][2] for row in rows]):
-                stamped[some], decoded[some] = read.ns, True
-                for order, (name, values, known) in enumerate(sources[number].kind.signals(read.blocks, read.extra)):
+        rows_of: dict[int, list[int]] = {}
+        for row, (number, _, _) in enumerate(batch):
+            rows_of.setdefault(number, []).append(row)
+        logged = np.array([max(min(t, _LARGEST_NS), -_LARGEST_NS) for _, t, _ in batch], dtype=np.int64)
+        failed += len(batch)
+        for number, rows in rows_of.items():
+            kind = sources[number].kind
+            for some, read in _read(sources[number].reader, np.array(rows), [batch[row][2] for row in rows]):
+                failed -= len(some)
+                stamped.append((count + some, read.ns, logged[some], np.full(len(some), kind.stamp is None)))
+                for name, values, known in kind.signals(read.blocks, read.extra):
                     here = slice(None) if np.all(known) else np.broadcast_to(known, len(some))
-                    parts.append(_Part((number, name), order, some[here], values[here]))
-        headed = np.isin(numbers, [number for number, source in sources.items() if source.kind.stamp is None])
-        times = np.full(len(batch), np.nan)
-        if decoded.any():
-            logged = [batch[row][1] for row in np.flatnonzero(decoded)]
-            times[decoded] = stamps.times(headed[decoded], stamped[decoded], logged)
-        failed += len(batch) - int(np.count_nonzero(decoded))
-        for part in sorted((p for p in parts if len(p.rows)), key=lambda p: (p.rows[0], p.order)):
-            width = part.values.shape[1]
-            kept = parts_of.setdefault(part.key, []) if width else []
-            if width == 0 or (kept and kept[0][1].shape[1] != width):
-                failed += len(part.rows)
-            else:
-                kept.append((times[part.rows], part.values.copy()))  # of the batch only what is kept
-    columns = {
-        key: (np.concatenate([t for t, _ in kept]), np.concatenate([values for _, values in kept]))
-        for key, kept in parts_of.items()
-    }
-    return Decoded(columns, stamps, failed)
+                    kept = found.setdefault((number, name), [])
+                    if values.shape[1] == 0 or (kept and kept[0][1].shape[1] != values.shape[1]):
+                        failed += len(some[here])
+                    elif len(some[here]):
+                        kept.append((count + some[here], values[here].copy()))  # of the batch only what is kept
+        count += len(batch)
+
+    # Stamps of all topics, in file order, on one clock.
+    clock, epoch, times = LogClock(), 0, np.full(count, np.nan)
+    if stamped:
+        places, stamps, logged, headed = (np.concatenate(column) for column in zip(*stamped, strict=True))
+        order = np.argsort(places)
+        times[places[order]], epoch = _recording_times(clock, headed[order], stamps[order], logged[order])
+    columns = {}
+    for key, kept in sorted(((k, v) for k, v in found.items() if v), key=lambda item: item[1][0][0][0]):
+        columns[key] = times[np.concatenate([rows for rows, _ in kept])], np.concatenate([v for _, v in kept])
+    return Decoded(columns, clock, epoch, failed)
 
 
 def _batches(messages: Iterable[Message]) -> Iterator[list[Message]]:

@@ -196,18 +196,18 @@ def read_mcap(path: Path, preset: str = AUTO) -> Recording:
     sources = _sources(bag, preset, notes)
     if not sources:
         raise _no_topic(path, bag, preset, notes)
-    columns, stamps, failed = decode_messages(bag.messages(sources.keys()), sources)
+    columns, clock, epoch, failed = decode_messages(bag.messages(sources.keys()), sources)
     notes = [*bag.damage(), *notes]
     if failed:
         notes.append(f"{failed} messages could not be decoded and were dropped")
-    if stamps.base_ns:
-        notes.append(f"times count from UNIX time {stamps.base_ns // 10**9} s")
+    if epoch:
+        notes.append(f"times count from UNIX time {epoch} s")
     raw = _channels(columns, sources, preset)
     kinds = [entry for entry in raw if entry.name == "vehicle_kind"]
     other = no_multirotor({}, int(kinds[0].values[-1, 0])) if kinds else ""
     raw = [entry for entry in raw if entry.name != "vehicle_kind"]
-    recording = assemble(path.name, "mcap", raw, stamps.clock, notes, other=other)
-    return replace(recording, epoch=float(stamps.base_ns // 10**9) if stamps.base_ns else None)
+    recording = assemble(path.name, "mcap", raw, clock, notes, other=other)
+    return replace(recording, epoch=float(epoch) if epoch else None)
 
 
 def _sources(bag: Bag, preset: str, notes: list[str]) -> dict[int, TopicSource]:

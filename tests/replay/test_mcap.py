@@ -332,13 +332,13 @@ def _escs_of(*functions: int) -> SimpleNamespace:
 )
 def test_px4_escs_go_to_the_motors_that_they_name(functions: tuple[int, ...], places: tuple[int, ...]) -> None:
     kind = TYPES["px4_msgs/EscStatus"]
-    (row,) = kind.blocks(_escs_of(*functions))
+    row = kind.runs[0](_escs_of(*functions))
     np.testing.assert_allclose(row, [100 * place * RPM for place in places])
 
 
 def test_px4_escs_that_name_no_complete_row_of_motors_are_refused() -> None:
     with pytest.raises(ValueError, match="no complete row of motors"):
-        TYPES["px4_msgs/EscStatus"].blocks(_escs_of(101, 103, 104, 0))
+        TYPES["px4_msgs/EscStatus"].runs[0](_escs_of(101, 103, 104, 0))
 
 
 def test_written_topics_say_how_they_are_offered_so_that_a_bag_is_played_latched(tmp_path: Path) -> None:

@@ -156,6 +156,6 @@ def test_types_without_a_layout_are_read_one_by_one() -> None:
     def unread(data: bytes) -> Any:
         raise ValueError(data)
 
-    kind = MessageType(lambda m: [[0.0]], lambda runs, extra: [("battery", runs[0], True)], stamp=lambda m: 1)
+    kind = MessageType((lambda m: [0.0],), lambda runs, extra: [("battery", runs[0], True)], stamp=lambda m: 1)
     source = TopicSource(Topic("t", "k", "", "cdr"), kind, MessageReader(kind, unread))
     assert decode_messages([(1, 0, b"x")], {1: source}).failed == 1
