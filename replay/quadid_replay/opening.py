@@ -15,7 +15,7 @@ import json
 import math
 import os
 import resource
-import selectors
+import select
 import signal
 import socket
 import subprocess
@@ -53,6 +53,8 @@ OPEN_FILES = 512
 """Files that a child may have open at once: a recording of rosbag2 is in some tens."""
 _MIB = 1 << 20
 _STATUS_BYTES = 4
+LONGEST_NAME = 64
+"""Bytes of the name of a format."""
 
 
 def open_log(path: str | Path, preset: str = AUTO, columns: Mapping[str, str] | None = None) -> Recording:
@@ -76,18 +78,11 @@ def open_log(path: str | Path, preset: str = AUTO, columns: Mapping[str, str] | 
         check_columns(columns)
     kind = kind_of(file, columns)
     allowed = limits(stored_size(file))
-    request = {
-        "format": kind.name,
-        "path": str(file.absolute()),
-        "preset": preset,
-        "columns": dict(columns or {}),
-        "memory": allowed.memory,
-        "seconds": allowed.seconds,
-    }
+    request = {"path": str(file.absolute()), "preset": preset, "columns": dict(columns or {}), **allowed._asdict()}
     ours, theirs = socket.socketpair()
     with ours:
         with theirs:
-            _PROCESS.ask(theirs)
+            _PROCESS.ask(kind.name, theirs)
         ours.settimeout(STANDING * allowed.seconds + LEAST_SECONDS)  # the child's own clock stops it before
         try:
             ours.sendall(json.dumps(request).encode() + b"\n")
@@ -291,14 +286,14 @@ class _Process:
         self._control: socket.socket | None = None
         self._process: subprocess.Popen[bytes] | None = None
 
-    def ask(self, answer: socket.socket) -> None:
-        """Hands over the socket on which a request and its answer go."""
+    def ask(self, kind: str, answer: socket.socket) -> None:
+        """Hands over the name of a format, and the socket on which a request and its answer go."""
         with self._lock:
             try:
-                socket.send_fds(self._control or self._start(), [b"\0"], [answer.fileno()])
+                socket.send_fds(self._control or self._start(), [kind.encode()], [answer.fileno()])
             except OSError:
                 self._stop()
-                socket.send_fds(self._start(), [b"\0"], [answer.fileno()])
+                socket.send_fds(self._start(), [kind.encode()], [answer.fileno()])
 
     def start(self) -> None:
         """Starts the process, where there is none, without waiting for it: who calls has other things to import."""
@@ -320,7 +315,7 @@ class _Process:
         self.__init__()  # type: ignore[misc]
 
     def _start(self) -> socket.socket:
-        self._control, theirs = socket.socketpair()
+        self._control, theirs = socket.socketpair(type=socket.SOCK_SEQPACKET)
         # Nothing leads to the folder we stand in by an empty name, and NumPy starts no threads.
         path = [os.path.abspath(part) for part in os.environ.get("PYTHONPATH", "").split(os.pathsep) if part]
         with theirs:
@@ -349,58 +344,35 @@ os.register_at_fork(after_in_child=_PROCESS.forget)
 
 # --- The process that stands ready, and the children that it forks
 #
-# A request comes as one byte with a socket beside it; on that socket follow a line of JSON from the program, the
-# answer of the child, and at last its wait status in four bytes.
-
-
-class _Child(NamedTuple):
-    """A child that reads, the socket its answer goes to, and a pipe that ends when it does."""
-
-    pid: int
-    answer: socket.socket
-    alive: int
+# A request comes as the name of a format with a socket beside it; on that socket follow a line of JSON from the
+# program, the answer of the child, and at last its wait status in four bytes.
 
 
 def serve(control: socket.socket) -> None:
-    """Takes requests until the program that makes them ends; its children end with it."""
-    children: set[_Child] = set()
-    with selectors.DefaultSelector() as ready:
-        ready.register(control, selectors.EVENT_READ)
-        while True:
-            for key, _ in ready.select():
-                if key.fileobj is control:
-                    said, sockets, _, _ = socket.recv_fds(control, 1, 1)
-                    if not said:
-                        for child in children:
-                            os.kill(child.pid, signal.SIGKILL)
-                        return
-                    child = _begin(socket.socket(fileno=sockets[0]))
-                    children.add(child)
-                    ready.register(child.alive, selectors.EVENT_READ, child)
-                    ready.register(child.answer, selectors.EVENT_READ, child)
-                elif key.fileobj == key.data.alive:
-                    _, status = os.waitpid(key.data.pid, 0)
-                    with contextlib.suppress(OSError):  # who asked has gone
-                        key.data.answer.sendall(status.to_bytes(_STATUS_BYTES, "little"))
-                        key.data.answer.shutdown(socket.SHUT_RDWR)  # also for copies that a fork elsewhere has made
-                    with contextlib.suppress(KeyError):
-                        ready.unregister(key.data.answer)
-                    ready.unregister(key.data.alive)
-                    key.data.answer.close()
-                    os.close(key.data.alive)
-                    children.remove(key.data)
-                elif key.data in children:  # whoever asked has hung up
-                    ready.unregister(key.data.answer)
-                    os.kill(key.data.pid, signal.SIGKILL)
+    """Takes requests until the program that makes them ends, and all that is read with it."""
+    while kind := (received := socket.recv_fds(control, LONGEST_NAME, 1))[0]:
+        with contextlib.suppress(Exception):  # the child meets it again, and says so
+            reader_of(kind.decode())  # imported once, here
+        gc.freeze()
+        (answer,) = received[1]
+        if os.fork() == 0:
+            try:
+                _attend(socket.socket(fileno=answer), control)
+            finally:
+                os._exit(1)
+        os.close(answer)
+        with contextlib.suppress(ChildProcessError):
+            while os.waitpid(-1, os.WNOHANG)[0]:  # of those before
+                pass
+    with contextlib.suppress(ChildProcessError):
+        while os.waitpid(-1, 0)[0]:
+            pass
 
 
-def _begin(answer: socket.socket) -> _Child:
-    """Forks a child for the request on this socket."""
+def _attend(answer: socket.socket, control: socket.socket) -> None:
+    """Forks the child that reads what is asked on this socket, and tells how it ended."""
     with answer.makefile("rb", buffering=0) as stream:  # nothing behind the line is taken
-        request = json.loads(stream.readline() or b'{"format": ""}')
-    with contextlib.suppress(Exception):  # the child meets it again, and says so
-        reader_of(request["format"])  # imported once, here
-    gc.freeze()
+        request = json.loads(stream.readline())
     alive, ends_with_child = os.pipe()
     pid = os.fork()
     if pid == 0:
@@ -409,17 +381,19 @@ def _begin(answer: socket.socket) -> _Child:
         finally:
             os._exit(1)
     os.close(ends_with_child)
-    return _Child(pid, answer, alive)
+    ended = select.poll()
+    for other_side in (alive, answer.fileno(), control.fileno()):
+        ended.register(other_side, 0)  # only that it hangs up
+    if alive not in dict(ended.poll()):
+        os.kill(pid, signal.SIGKILL)
+    _, status = os.waitpid(pid, 0)
+    with contextlib.suppress(OSError):  # who asked has gone
+        answer.sendall(status.to_bytes(_STATUS_BYTES, "little"))
+        answer.shutdown(socket.SHUT_RDWR)  # also for copies that a fork elsewhere has made
 
 
 def _read(
-    answer: socket.socket,
-    format: str,
-    path: str = "",
-    preset: str = "",
-    columns: dict[str, str] | None = None,
-    memory: int = 0,
-    seconds: float = 0.0,
+    answer: socket.socket, path: str, preset: str, columns: Mapping[str, str], memory: int, seconds: float
 ) -> None:
     """Runs the child.  It never returns."""
     nothing = os.open(os.devnull, os.O_RDWR)
