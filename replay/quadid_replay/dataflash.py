@@ -8,10 +8,11 @@ import struct
 from array import array
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from pymavlink.DFReader import FORMAT_TO_STRUCT, DFFormat, null_term
+from pymavlink.DFReader import FORMAT_TO_STRUCT
 
 from quadid.data.window import Recording
 from quadid.types import FloatArray, IntArray
@@ -27,12 +28,10 @@ from quadid_replay.columns import (
     rising,
     spikes,
 )
-
-# isort: off
 from quadid_replay.motors import (
     ESCS,
-    Outputs,
     RPM,
+    Outputs,
     active_outputs,
     changed_within,
     esc_columns,
@@ -42,13 +41,12 @@ from quadid_replay.motors import (
     motor_outputs,
     no_multirotor,
 )
-# isort: on
 
 # --- Finds the records of an ArduPilot DataFlash log and reads their columns
 #
-# The format descriptions are pymavlink's (`DFFormat`); finding and reading are ours, because pymavlink makes one
-# Python object a record, stops at the first unknown record and raises on a damaged description.  Here a damaged place
-# is skipped and counted.
+# The types of columns are pymavlink's; finding and reading are ours, because pymavlink makes one Python object a
+# record, stops at the first unknown record and raises on a damaged description.  Here a damaged place is skipped and
+# counted.
 
 
 _HEAD = b"\xa3\x95"
@@ -56,6 +54,17 @@ _FMT_TYPE, _FMT_LENGTH = 0x80, 89
 _PADDING = 528
 """Block-based logs end with up to this many bytes of padding, which is not damage."""
 _ROWS = 65536
+_TYPES = {
+    code: f"S{kind[:-1]}" if kind.endswith("s") else f"<{kind}" for code, (kind, _, _) in FORMAT_TO_STRUCT.items()
+}
+
+
+class Description(NamedTuple):
+    """A kind of record: codes and names of its columns, and its bytes, where column k is the field of that number."""
+
+    codes: str
+    columns: tuple[str, ...]
+    layout: np.dtype[np.void]
 
 
 @dataclass
@@ -73,59 +82,47 @@ class DataflashIndex:
     """
 
     data: mmap.mmap
-    formats: dict[str, DFFormat] = field(default_factory=dict)
+    formats: dict[str, Description] = field(default_factory=dict)
     offsets: dict[str, array[int]] = field(default_factory=dict)
     skipped: int = 0
     damaged: list[str] = field(default_factory=list)
     redefined: list[str] = field(default_factory=list)
     cut: bool = False
 
-    def count(self, name: str) -> int:
-        """Returns the number of records called `name`."""
-        return len(self.offsets.get(name, ()))
-
     def has(self, name: str, *columns: str) -> bool:
         """Tells whether there are records called `name` with all these columns."""
-        return self.count(name) > 0 and all(c in self.formats[name].columns for c in columns)
+        return len(self.offsets.get(name, ())) > 0 and set(columns) <= set(self.formats[name].columns)
 
     def rows(self, name: str) -> IntArray:
         """Returns the byte offsets of the records, shape (n,): their order in the file."""
         return np.array(self.offsets.get(name, ()), dtype=np.int64)
 
     def column(self, name: str, column: str) -> FloatArray:
-        """Returns one numeric column, scaled as its format defines, shape (n,)."""
-        description = self.formats[name]
-        place, kind = _place(description, description.columns.index(column))
-        scale = FORMAT_TO_STRUCT[description.format[description.columns.index(column)]][1]
-        code = FORMAT_TO_STRUCT[description.format[description.columns.index(column)]][0]
-        raw = self._bytes(name, place, struct.calcsize("<" + code))
+        """Returns one numeric column, scaled as its format defines, shape (n,); NaN where it holds text."""
+        raw, scale = self._raw(name, column)
+        if raw.dtype.kind == "S":
+            return np.full(len(raw), np.nan)
         with np.errstate(invalid="ignore"):  # damaged records hold signalling NaN
-            values = np.asarray(raw.view(kind)[:, 0], dtype=np.float64)
+            values = np.asarray(raw, dtype=np.float64)
         return values if scale is None else values * scale
 
     def text(self, name: str, column: str) -> list[str]:
-        """Returns one text column."""
-        description = self.formats[name]
-        position = description.columns.index(column)
-        width = struct.calcsize("<" + FORMAT_TO_STRUCT[description.format[position]][0])
-        raw = self._bytes(name, _place(description, position)[0], width)
-        return [bytes(row).split(b"\x00")[0].decode("ascii", "replace") for row in raw]
+        """Returns one text column; empty where it holds numbers."""
+        raw, _ = self._raw(name, column)
+        texts = raw if raw.dtype.kind == "S" else np.full(len(raw), b"")
+        return [text.split(b"\0")[0].decode("ascii", "replace") for text in texts.tolist()]
 
-    def _bytes(self, name: str, place: int, width: int) -> NDArray[np.uint8]:
-        buffer = np.frombuffer(self.data, dtype=np.uint8)
-        starts = self.rows(name) + place
-        out = np.empty((len(starts), width), dtype=np.uint8)
+    def _raw(self, name: str, column: str) -> tuple[NDArray[Any], float | None]:
+        """A column as it stands in the file, shape (n,), and its scale."""
+        codes, columns, layout = self.formats[name]
+        k = columns.index(column)
+        kind, place = layout[str(k)], layout.fields[str(k)][1]  # type: ignore[index]
+        buffer, starts = np.frombuffer(self.data, dtype=np.uint8), self.rows(name) + place
+        out = np.empty((len(starts), kind.itemsize), dtype=np.uint8)
         for begin in range(0, len(starts), _ROWS):
             part = starts[begin : begin + _ROWS]
-            out[begin : begin + _ROWS] = buffer[part[:, None] + np.arange(width)]
-        return out
-
-
-def _place(description: DFFormat, position: int) -> tuple[int, str]:
-    codes = [FORMAT_TO_STRUCT[c][0] for c in description.format]
-    offset = 3 + struct.calcsize("<" + "".join(codes[:position]))
-    code = codes[position]
-    return offset, "<f2" if code == "e" else f"<{code}" if len(code) == 1 else "u1"
+            out[begin : begin + _ROWS] = buffer[part[:, None] + np.arange(kind.itemsize)]
+        return out.view(kind)[:, 0], FORMAT_TO_STRUCT[codes[k]][1]
 
 
 def index_dataflash(path: Path) -> DataflashIndex:
@@ -166,41 +163,31 @@ def index_dataflash(path: Path) -> DataflashIndex:
 
 
 def _note_format(index: DataflashIndex, body: bytes, names: dict[int, str], lengths: list[int]) -> None:
-    kind, length, raw_name, raw_format, raw_columns = struct.unpack("<BB4s16s64s", body)
+    """Notes a description; once rows have two meanings, they make no column: what follows is left out."""
+    kind, length, *texts = struct.unpack("<BB4s16s64s", body)
     if kind == _FMT_TYPE:
         return
-    if not set(raw_format.split(b"\x00")[0].decode("latin-1")) <= set(FORMAT_TO_STRUCT):
-        index.damaged.append(f"type {kind}")  # pymavlink would print this
-        return
     try:
-        name = null_term(raw_name.decode("ascii"))
-        description = DFFormat(
-            kind, name, length, null_term(raw_format.decode("ascii")), null_term(raw_columns.decode("ascii"))
-        )
-        size = 3 + struct.calcsize("<" + "".join(FORMAT_TO_STRUCT[c][0] for c in description.format))
-        fits = size == length and len(description.format) == len(description.columns) and name.isalnum()
-    except Exception as error:  # noqa: BLE001 - pymavlink raises bare Exception and more on damaged text; it is reported
-        index.damaged.append(f"type {kind} ({type(error).__name__})")
-        return
-    if not fits:
+        name, codes, titles = (text.split(b"\0")[0].decode("ascii") for text in texts)
+        layout = np.dtype([("head", "S3"), *((str(k), _TYPES[code]) for k, code in enumerate(codes))])
+        described = Description(codes, tuple(titles.split(",") if titles else ()), layout)
+        if layout.itemsize != length or len(codes) != len(described.columns) or not name.isalnum():
+            raise ValueError("sizes that do not fit")
+    except (KeyError, ValueError):
         index.damaged.append(f"type {kind}")
         return
     closed = names.get(kind) == ""
-    known = None if closed else index.formats.get(names.get(kind, name))
-    same = known is not None and _meaning(known) == _meaning(description)
-    if same and kind in names:
+    before = None if closed else names.get(kind, name)
+    known = index.formats.get(before or "")
+    if known == described and before == name and kind in names:
         return
-    if closed or known is not None:  # rows of two meanings make no column: what follows is left out
-        index.redefined += [] if known is None else [known.name]
+    if closed or known is not None:
+        index.redefined += [] if known is None or before is None else [before]
         names[kind], lengths[kind] = "", length
         return
     names[kind], lengths[kind] = name, length
-    index.formats[name] = description
+    index.formats[name] = described
     index.offsets.setdefault(name, array("Q"))
-
-
-def _meaning(description: DFFormat) -> tuple[str, str, list[str]]:
-    return description.name, description.format, list(description.columns)
 
 
 # --- ArduPilot DataFlash logs: which record holds which channel, and its units
@@ -270,8 +257,13 @@ def read_dataflash(path: Path) -> Recording:
         if index.has(name, column)
     }
     times = clock.times_of(stamps, {name: index.rows(name) for name in stamps})
-    names, values = _parameters(index)
+    names, values = list[str](), list[float]()  # in file order; a parameter that is changed comes again
+    if index.has("PARM", "Name", "Value"):
+        names, values = index.text("PARM", "Name"), index.column("PARM", "Value").tolist()
     parameters = dict(zip(names, values, strict=True))
+    messages = index.text("MSG", "Message") if index.has("MSG", "Message") else []
+    firmware = next(filter(None, map(_FIRMWARE.search, messages)), None)
+    frame = next((text.split(":", 1)[1].strip() for text in messages if text.startswith("Frame:")), "")
     damaged, redefined = (", ".join(sorted(set(names))[:8]) for names in (index.damaged, index.redefined))
     notes = damage(
         len(index.data),
@@ -290,12 +282,12 @@ def read_dataflash(path: Path) -> Recording:
         return _rows(index, times, source.records, source.columns)
 
     raw = channels_of(sources, rows)
-    firmware = _firmware(index)
     other = no_multirotor(parameters, firmware=firmware[1] if firmware else "")
     if not other:
-        raw += [*_outputs(index, times, parameters, notes), *_esc(index, times, parameters, notes)]
-    changed = changed_within(names, values)
-    notes += [changed] if changed else []
+        version = (int(firmware[2]), int(firmware[3])) if firmware else None
+        raw += _outputs(index, times, parameters, frame_rotors(frame), notes)
+        raw += _esc(index, times, parameters, frame_rotors(frame), version, notes)
+    notes += filter(None, [changed_within(names, values)])
     # ArduPilot numbers its logs from 1 on every vehicle: such a name identifies a log only with its folder's.
     name = f"{path.absolute().parent.name}/{path.name}" if path.stem.isdigit() else path.name
     recording = assemble(name, "dataflash", raw, clock, notes, parameters, other)
@@ -303,13 +295,6 @@ def read_dataflash(path: Path) -> Recording:
     if mode is None or "MODE" not in times:
         return recording
     return replace(recording, modes=mode_changes(times["MODE"], index.column("MODE", mode), ARDUCOPTER))
-
-
-def _parameters(index: DataflashIndex) -> tuple[list[str], list[float]]:
-    """Names and values in file order; a parameter that is changed comes again."""
-    if not index.has("PARM", "Name", "Value"):
-        return [], []
-    return index.text("PARM", "Name"), index.column("PARM", "Value").tolist()
 
 
 def _rows(
@@ -353,8 +338,9 @@ def _reference(
 
 
 def _outputs(
-    index: DataflashIndex, times: dict[str, FloatArray], parameters: dict[str, float], notes: list[str]
+    index: DataflashIndex, times: dict[str, FloatArray], parameters: dict[str, float], rotors: int, notes: list[str]
 ) -> list[RawChannel]:
+    """Outputs that are motors; of one moment those of all records."""
     place: dict[int, tuple[str, str]] = {}  # record and column of each output
     for name in _OUTPUTS:
         columns = index.formats[name].columns if name in index.formats else ()
@@ -371,8 +357,8 @@ def _outputs(
             _, here, there = np.intersect1d(first[0], rows[0], return_indices=True)  # of one moment
             outputs = [output for output, (n, _) in place.items() if n == name]
             pulses[here[:, None], outputs] = rows[1][there]
-    found = motor_outputs(parameters, frame_rotors(_frame(index)), pulses.shape[1], "RCOU", ardupilot=True)
-    notes += [found.problem] if found.problem else []
+    found = motor_outputs(parameters, rotors, pulses.shape[1], "RCOU", ardupilot=True)
+    notes += filter(None, [found.problem])
     motors = [] if found.problem else found.columns or active_outputs(in_pulses(pulses)[0])
     lost = [k + 1 for k in motors if k not in place]
     if lost:
@@ -384,20 +370,13 @@ def _outputs(
     return [RawChannel("motor_command", first[0], values, f"{label}{how and f' ({how})'}")]
 
 
-def _frame(index: DataflashIndex) -> str:
-    return next((text.split(":", 1)[1].strip() for text in _messages(index) if text.startswith("Frame:")), "")
-
-
-def _firmware(index: DataflashIndex) -> re.Match[str] | None:
-    return next((m for m in map(_FIRMWARE.search, _messages(index)) if m), None)
-
-
-def _messages(index: DataflashIndex) -> list[str]:
-    return index.text("MSG", "Message") if index.has("MSG", "Message") else []
-
-
 def _esc(
-    index: DataflashIndex, times: dict[str, FloatArray], parameters: dict[str, float], notes: list[str]
+    index: DataflashIndex,
+    times: dict[str, FloatArray],
+    parameters: dict[str, float],
+    rotors: int,
+    version: tuple[int, int] | None,
+    notes: list[str],
 ) -> list[RawChannel]:
     """ESC telemetry comes one motor at a time."""
     number = next((c for c in ("Instance", "I") if index.has("ESC", c)), None)
@@ -405,9 +384,7 @@ def _esc(
         return []
     instance, rpm, t = index.column("ESC", number), index.column("ESC", "RPM"), times["ESC"]
     turning = [bool(np.any(rpm[instance == k] != 0.0)) for k in range(ESCS)]
-    version = _firmware(index)
-    told = (int(version[2]), int(version[3])) if version else None
-    found = esc_columns(parameters, frame_rotors(_frame(index)), turning, "ESC", ardupilot=True, version=told)
+    found = esc_columns(parameters, rotors, turning, "ESC", ardupilot=True, version=version)
     silent = [k for k in found.columns if not np.any(instance == k)]
     if silent and any(turning):
         found = Outputs([], f"ESC: no records of instance {', '.join(map(str, silent))}, a motor: they are not used")
