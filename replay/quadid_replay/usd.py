@@ -4,8 +4,8 @@ import math
 import struct
 import zlib
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,8 +31,7 @@ _CRC = 4
 _FIRST_LOOK = 16
 
 
-@dataclass
-class UsdRecords:
+class UsdRecords(NamedTuple):
     """Result of a walk.
 
     Attributes:
@@ -41,18 +40,9 @@ class UsdRecords:
         notes: what is wrong with the file, in sentences.
     """
 
-    tables: dict[str, NDArray[np.void]] = field(default_factory=dict)
-    places: dict[str, IntArray] = field(default_factory=dict)
-    notes: list[str] = field(default_factory=list)
-
-
-class _Declared:
-    """An event type: its name and the layout of its records."""
-
-    def __init__(self, name: str, layout: np.dtype[np.void]) -> None:
-        self.name, self.layout = name, layout
-        self.parts: list[NDArray[np.void]] = []
-        self.places: list[IntArray] = []
+    tables: dict[str, NDArray[np.void]]
+    places: dict[str, IntArray]
+    notes: list[str]
 
 
 def collect_usd_records(data: bytes, name: str) -> UsdRecords:
@@ -62,35 +52,34 @@ def collect_usd_records(data: bytes, name: str) -> UsdRecords:
         LogError: declarations that are damaged: without them no record can be read.
     """
     types, at = _declarations(data, name)
-    found = UsdRecords()
+    parts: dict[int, list[NDArray[np.void]]] = {}
+    places: dict[int, list[IntArray]] = {}
+    notes = []
     end = len(data)
     if end - at >= _CRC and zlib.crc32(data[:-_CRC]) == int.from_bytes(data[-_CRC:], "little"):
         end -= _CRC
     else:
-        found.notes.append("checksum does not match: the log was cut off or damaged")
-    while at + 2 <= end:
-        declared = types.get(int.from_bytes(data[at : at + 2], "little"))
-        if declared is None:
-            break
-        run = _run(data, at, end, declared)
+        notes.append("checksum does not match: the log was cut off or damaged")
+    while at + 2 <= end and (number := int.from_bytes(data[at : at + 2], "little")) in types:
+        _, layout = types[number]
+        run = _run(data, at, end, layout)
         if len(run) == 0:
             break
-        declared.parts.append(run)
-        declared.places.append(at + declared.layout.itemsize * np.arange(len(run), dtype=np.int64))
-        at += len(run) * declared.layout.itemsize
+        parts.setdefault(number, []).append(run)
+        places.setdefault(number, []).append(at + layout.itemsize * np.arange(len(run), dtype=np.int64))
+        at += run.nbytes
     if at < end:
-        found.notes.append(f"{end - at} bytes at the end belong to no record")
-    found.tables = {d.name: np.concatenate(d.parts) for d in types.values() if d.parts}
-    found.places = {d.name: np.concatenate(d.places) for d in types.values() if d.parts}
-    return found
+        notes.append(f"{end - at} bytes at the end belong to no record")
+    found = [(number, title) for number, (title, _) in types.items() if number in parts]
+    tables = {title: np.concatenate(parts[number]) for number, title in found}
+    return UsdRecords(tables, {title: np.concatenate(places[number]) for number, title in found}, notes)
 
 
-def _run(data: bytes, at: int, end: int, declared: _Declared) -> NDArray[np.void]:
+def _run(data: bytes, at: int, end: int, layout: np.dtype[np.void]) -> NDArray[np.void]:
     """The records of one type that follow each other from `at` on, without one of another between them.
 
     It is looked for in stretches that double, so that the work is that of its own length, however much follows.
     """
-    layout = declared.layout
     rows = np.frombuffer(data, layout, max((end - at) // layout.itemsize, 0), at)
     known, looked = 0, _FIRST_LOOK
     while known < len(rows):
@@ -101,8 +90,8 @@ def _run(data: bytes, at: int, end: int, declared: _Declared) -> NDArray[np.void
     return rows
 
 
-def _declarations(data: bytes, name: str) -> tuple[dict[int, _Declared], int]:
-    """The event types by id, and where the records begin."""
+def _declarations(data: bytes, name: str) -> tuple[dict[int, tuple[str, np.dtype[np.void]]], int]:
+    """Name and layout of the records of each event type, by id, and where the records begin."""
     at, types = 5, {}
     try:
         (count,) = struct.unpack_from("<H", data, 3)
@@ -124,7 +113,7 @@ def _declarations(data: bytes, name: str) -> tuple[dict[int, _Declared], int]:
                 fields.append((variable[:-3], "<" + _NUMBERS[variable[-2]]))
             if number in types:
                 raise ValueError(f"event type {number} twice")
-            types[number] = _Declared(title, np.dtype(fields))
+            types[number] = title, np.dtype(fields)
     except (struct.error, ValueError) as error:
         raise LogError(
             f"{name}: damaged list of variables ({error})", "a Crazyflie µSD log, version 2", "copy the file again"
