@@ -60,6 +60,12 @@ MOST_SETS = 100
 """Sets that one answer of `get_history` holds at most."""
 INACTIVE = "the node is not active; fix: activate it (ros2 lifecycle set)"
 SENSOR_QOS = QoSProfile(depth=DEPTH, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.BEST_EFFORT)
+COMMANDS: dict[str, tuple[str, Callable[[Service, Any], Answer]]] = {
+    "fit_now": ("std_srvs/Trigger", lambda service, _: service.session.fit_now()),
+    "rollback": ("std_srvs/Trigger", lambda service, _: service.roll_back("ros service")),
+    "approve": ("quadid_msgs/Approve", lambda service, request: service.approve("ros service", request.sequence)),
+}
+"""What a person may ask for, by the service: its type, and what is done."""
 Return = TransitionCallbackReturn
 IDLE = {
     "unconfigured": "not configured yet; next: ros2 lifecycle set {name} configure",
@@ -252,18 +258,10 @@ class IdentifyNode(PollingNode, LifecycleNode):
             opened(self._zenoh.close)
         opened(self._outputs.close)
         self._outputs.open(self._observer)
-        by, trigger = "ros service", service_class("std_srvs/Trigger")
-        for name, kind, answer in (
-            ("fit_now", trigger, self._command(lambda service, _: service.session.fit_now())),
-            ("rollback", trigger, self._command(lambda service, _: service.roll_back(by))),
-            (
-                "approve",
-                service_class("quadid_msgs/Approve"),
-                self._command(lambda service, request: service.approve(by, request.sequence)),
-            ),
-            ("get_history", service_class("quadid_msgs/GetHistory"), self._on_get_history),
-        ):
-            opened(self.destroy_service, self.create_service(kind, f"quadid/{name}", answer))
+        answers = {name: (kind, self._command(do)) for name, (kind, do) in COMMANDS.items()}
+        answers["get_history"] = ("quadid_msgs/GetHistory", self._on_get_history)
+        for name, (kind, answer) in answers.items():
+            opened(self.destroy_service, self.create_service(service_class(kind), f"quadid/{name}", answer))
         self._warm_up(self._service, values["warm_up"])
         history = str(store.path) if store is not None else "none"
         self._read_back({**values, "vehicle_id": self._id, "history": history, "approval": self._service.approval})

@@ -55,19 +55,10 @@ class TopicOwnership:
     """
 
     def __init__(
-        self,
-        count: Callable[[], int],
-        kin: Callable[[], int],
-        create: Callable[[], Any],
-        destroy: Callable[[Any], Any],
-        clock: Callable[[], float] = time.monotonic,
+        self, node: Any, topic: str, create: Callable[[], Any], clock: Callable[[], float] = time.monotonic
     ) -> None:
-        """Claims nothing yet.
-
-        Args:
-            kin: those of them that are services like this one, ours included.
-        """
-        self._count, self._kin, self._create, self._destroy, self._clock = count, kin, create, destroy, clock
+        """Claims nothing yet; `create` makes our publisher on the topic of this full name."""
+        self._node, self._topic, self._create, self._clock = node, topic, create, clock
         self._not_before, self._since = clock() + FOUND_WITHIN, 0.0
         self._leaves = math.inf
         self.publisher: Any = None
@@ -80,7 +71,7 @@ class TopicOwnership:
             wanted: False while nothing is to be published yet: only looks.
         """
         now = self._clock()
-        others = self._count() - (self.publisher is not None)
+        others = self._node.count_publishers(self._topic) - (self.publisher is not None)
         if self.publisher is None:
             if others > 0:
                 self._wait(now)
@@ -108,8 +99,13 @@ class TopicOwnership:
     def let_go(self) -> None:
         """Takes our publisher away."""
         if self.publisher is not None:
-            self._destroy(self.publisher)
+            self._node.destroy_lifecycle_publisher(self.publisher)
             self.publisher, self._leaves = None, math.inf
+
+    def _kin(self) -> int:
+        """Publishers that belong to a node of our name: services of this vehicle, this one too."""
+        found = self._node.get_publishers_info_by_topic(self._topic)
+        return sum(info.node_name == self._node.get_name() for info in found)
 
     def _wait(self, now: float) -> None:
         self._not_before = now + random.uniform(*PAUSES)
@@ -119,21 +115,21 @@ class TopicOwnership:
 # --- The node's publishers: status and diagnostics always; results; parameter sets while the topic is ours
 
 
-# Said in full, so that they can be compared with what subscribers ask for.
-_ALWAYS = {"deadline": Infinite, "liveliness": LivelinessPolicy.AUTOMATIC, "liveliness_lease_duration": Infinite}
-USUAL_QOS = QoSProfile(
-    depth=10, durability=DurabilityPolicy.VOLATILE, reliability=ReliabilityPolicy.RELIABLE, **_ALWAYS
-)
-LATCHED_QOS = QoSProfile(
-    depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL, reliability=ReliabilityPolicy.RELIABLE, **_ALWAYS
-)
 LEASE = 5.0
 """A service that asserts its liveliness on the parameter topic for longer than this [s] no more is dead or hangs."""
-PARAMETERS_QOS = QoSProfile(
-    depth=1,
-    durability=DurabilityPolicy.TRANSIENT_LOCAL,
-    reliability=ReliabilityPolicy.RELIABLE,
-    deadline=Infinite,
+
+
+def _qos(depth: int, durability: DurabilityPolicy, **more: Any) -> QoSProfile:
+    """A profile, said in full so that it can be compared with what subscribers ask for."""
+    usual = {"deadline": Infinite, "liveliness": LivelinessPolicy.AUTOMATIC, "liveliness_lease_duration": Infinite}
+    return QoSProfile(depth=depth, durability=durability, reliability=ReliabilityPolicy.RELIABLE, **(usual | more))
+
+
+USUAL_QOS = _qos(10, DurabilityPolicy.VOLATILE)
+LATCHED_QOS = _qos(1, DurabilityPolicy.TRANSIENT_LOCAL)
+PARAMETERS_QOS = _qos(
+    1,
+    DurabilityPolicy.TRANSIENT_LOCAL,
     liveliness=LivelinessPolicy.MANUAL_BY_TOPIC,
     liveliness_lease_duration=Duration(seconds=LEASE),
 )
@@ -163,12 +159,7 @@ class Publishers:
         for topic in TOPICS.keys() - {"parameters", *ALWAYS}:
             self._publishers[topic] = self._create(topic, LATCHED_QOS if topic in LATCHED else USUAL_QOS, managed)
         if not observer:
-            self._ownership = TopicOwnership(
-                lambda: self._node.count_publishers(self.ours),
-                self._kin,
-                self._claimed,
-                self._node.destroy_lifecycle_publisher,
-            )
+            self._ownership = TopicOwnership(self._node, self.ours, self._claimed)
 
     @property
     def _speaking(self) -> dict[str, Any]:
@@ -219,11 +210,6 @@ class Publishers:
     def _create(self, topic: str, qos: Any, create: Callable[..., Any]) -> Any:
         name, kind = TOPICS[topic]
         return create(message_class(kind), name, qos, event_callbacks=NO_PUBLISHER_EVENTS)
-
-    def _kin(self) -> int:
-        """Publishers of parameter sets that belong to a node of our name: services of this vehicle, this one too."""
-        found = self._node.get_publishers_info_by_topic(self.ours)
-        return sum(info.node_name == self._node.get_name() for info in found)
 
     def _claimed(self) -> Any:
         publisher = self._create("parameters", PARAMETERS_QOS, self._node.create_lifecycle_publisher)

@@ -8,6 +8,8 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from quadid_node.history import LARGEST_NUMBER, Restored, Row, Store, StoreError, connect, read_history
@@ -395,24 +397,8 @@ class Topic:
 
     def service(self) -> TopicOwnership:
         """A service that looks at this topic; its own publisher it always sees."""
-        mine: set[int] = set()
-
-        def count() -> int:
-            return len(mine) if self.apart else len(self.publishers)
-
-        def kin() -> int:
-            return len(mine) if self.apart else sum(name == "quadid" for name in self.publishers.values())
-
-        def create() -> int:
-            number = self.stranger("quadid")
-            mine.add(number)
-            return number
-
-        def destroy(number: int) -> None:
-            mine.discard(number)
-            del self.publishers[number]
-
-        return TopicOwnership(count, kin, create, destroy, lambda: self.now)
+        seen = Seen(self)
+        return TopicOwnership(seen, "topic", seen.create, lambda: self.now)
 
     def stranger(self, name: str = "someone") -> int:
         self._next += 1
@@ -424,6 +410,32 @@ class Topic:
             self.now += 1.0
             for service in services:
                 service.step()
+
+
+class Seen:
+    """The topic as the node of one service sees it."""
+
+    def __init__(self, topic: Topic) -> None:
+        self._topic, self._mine = topic, set[int]()
+
+    def get_publishers_info_by_topic(self, topic: str) -> list[Any]:
+        seen = self._mine if self._topic.apart else self._topic.publishers
+        return [SimpleNamespace(node_name=self._topic.publishers[number]) for number in seen]
+
+    def count_publishers(self, topic: str) -> int:
+        return len(self.get_publishers_info_by_topic(topic))
+
+    def get_name(self) -> str:
+        return "quadid"
+
+    def create(self) -> int:
+        number = self._topic.stranger("quadid")
+        self._mine.add(number)
+        return number
+
+    def destroy_lifecycle_publisher(self, number: int) -> None:
+        self._mine.discard(number)
+        del self._topic.publishers[number]
 
 
 def speaking(*services: TopicOwnership) -> int:
