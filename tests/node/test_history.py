@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from quadid_node.history import VERSION, Store, StoreError, make_usable, read_history
+from quadid_node.history import VERSION, Restored, Store, StoreError, make_usable, read_history
 from quadid_node.messages import Output, set_from_dict, set_to_dict
 from quadid_node.service import Service
 from quadid_node.worker import InlineWorker
@@ -101,6 +101,12 @@ def filled(path: Path, sets: int = 2) -> Store:
     return store
 
 
+def left(path: Path, vehicle: Vehicle | None = None) -> Restored:
+    """What a history leaves to the next run."""
+    with closing(Store(path, "pelican")) as store:
+        return store.restore(vehicle=vehicle)
+
+
 # --- What comes back
 
 
@@ -118,9 +124,7 @@ def test_a_set_survives_the_round_trip_bit_for_bit() -> None:
 def test_everything_is_there_after_a_restart(tmp_path: Path) -> None:
     path = tmp_path / "deep" / "history.sqlite"
     filled(path).close(60.0)
-    store = Store(path, "pelican")
-    restored = store.restore()
-    store.close(60.0)
+    restored = left(path)
     assert restored.item is not None
     assert restored.item.parameters["b"].value == 2.3e-5 + 1e-7
     assert restored.next_sequence > 3, "above the known ones, and above those of a history that may be lost"
@@ -171,9 +175,8 @@ def test_a_set_known_to_be_out_of_date_is_still_so_after_two_restarts(tmp_path: 
         store.close(60.0)
     store = Store(path, "pelican")
     store.numbered(replace(online_set(TRUE), sequence=found.next_sequence + 10, approved_by="auto"))
-    store.flush(5.0)
-    item = store.restore().item
     store.close(60.0)
+    item = left(path).item
     assert item is not None
     assert not item.outdated
 
@@ -183,9 +186,7 @@ def test_the_baseline_is_the_last_set_a_person_approved(tmp_path: Path) -> None:
     store.numbered(replace(online_set(TRUE), sequence=3, approved_by="ann"))
     store.numbered(replace(online_set(TRUE), sequence=4, approved_by="auto"))
     store.close(60.0)
-    again = Store(tmp_path / "h.sqlite", "pelican")
-    baseline = again.restore().baseline
-    again.close(60.0)
+    baseline = left(tmp_path / "h.sqlite").baseline
     assert baseline is not None
     assert baseline.sequence == 3
 
@@ -470,7 +471,7 @@ def test_rows_behind_the_last_that_can_be_numbered_do_not_stay_the_newest(
     store.restore()
     store.decision("auto", "manual")
     store.close(60.0)
-    assert Store(path, "pelican").restore().approval == "manual"
+    assert left(path).approval == "manual"
     happened(44, f"a row of {table} with the largest number there is: '{store.notes[0][:90]}'")
 
 
@@ -622,9 +623,7 @@ def test_damage_while_running_sets_the_file_aside_and_the_new_one_has_the_set_in
         assert [p.stat().st_size for p in aside] == [len(before)], "set aside as it was"
         assert any(isinstance(o, Event) and "set aside" in o.text for o in service.step())
     store.close(60.0)
-    again = Store(path, "pelican")
-    restored = again.restore()
-    again.close(60.0)
+    restored = left(path)
     assert restored.item is not None
     assert (restored.item.sequence, restored.item.state) == (40, SetState.ACCEPTED)
     what = "new file" if damage == "removed" else "set aside whole, said"
@@ -661,9 +660,7 @@ def test_what_people_decided_outlives_a_history_damaged_in_service(tmp_path: Pat
     service.close()
     assert any("set aside" in note for note in store.notes)
 
-    store = Store(path, "pelican")
-    restored = store.restore()
-    store.close(60.0)
+    restored = left(path)
     assert restored.approval == "manual"
     assert restored.baseline is not None
     assert (restored.baseline.sequence, restored.baseline.approved_by) == (1000, "ann")

@@ -24,6 +24,7 @@ from quadid.vehicle import Vehicle
 from tests.faults.evidence import Happened
 from tests.node.killed_services import Services
 from tests.node.peers import LIMIT
+from tests.node.test_history import left
 from tests.online.test_gate import TRUE, online_set
 
 # --- On the disk before on the wire: what was published has its row, and its number is never given again
@@ -214,9 +215,7 @@ def test_a_rollback_is_never_on_the_disk_without_the_mode_that_it_sets(tmp_path:
                 db.execute(f"DELETE FROM {table}")
             for row in rows[: cut + 1]:
                 assert not row.insert(db)
-        again = Store(path, "pelican")
-        restored = again.restore()
-        again.close(60.0)
+        restored = left(path)
         seen.add((restored.item is not None and restored.item.state is SetState.ROLLED_BACK, restored.approval))
     assert (True, "manual") in seen
     assert (True, "") not in seen
@@ -274,9 +273,7 @@ def test_while_the_disk_takes_nothing_candidates_are_forgotten_before_sets_and_d
     monkeypatch.setattr(writing, "connect", connect)
     said(service, numbered(first.sequence))  # it was forgotten, and everything after it waited for good
     service.close()
-    again = Store(tmp_path / "h.sqlite", "pelican")
-    assert again.restore().approval == "manual"
-    again.close(60.0)
+    assert left(tmp_path / "h.sqlite").approval == "manual"
     happened(23, f"{many} candidates while the disk is full: the set and the decision before them are kept")
 
 

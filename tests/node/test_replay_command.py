@@ -17,6 +17,7 @@ from quadid.online.records import OnlineSet, SetState
 from quadid.vehicle import GRAVITY, Command, Mounting, Vehicle
 from tests.commands import Cli
 from tests.faults.evidence import Happened
+from tests.node.test_history import left
 from tests.online.driving import flight
 from tests.online.test_gate import TRUE, online_set
 
@@ -202,9 +203,7 @@ def test_a_set_that_is_not_in_force_is_exported_only_when_insisted(
     shown = inside("history", "--vehicle", "pelican", "--history", str(path), "--json", "-")
     assert why in json.loads(shown.out)["in_force"]["doubt"]
     # The service takes up none of these as it is: one rule for all who read a history.
-    store = Store(path, "pelican")
-    item = store.restore(vehicle=Vehicle.shipped("pelican")).item
-    store.close(60.0)
+    item = left(path, Vehicle.shipped("pelican")).item
     assert item is None or item.outdated or case == "not confirmed since a restart"
     happened(36, f"export of a set {case}: '{refused.err.strip()[:100]}'")
 
@@ -249,9 +248,7 @@ def test_a_set_that_rests_on_another_vehicle_file_is_exported_only_when_insisted
         run = inside("export", "--vehicle", file, "--history", path, "--out", tmp_path / "out")
         assert run.code == (2 if why else 0), run.err
         assert why in run.err
-        store = Store(path, "pelican")
-        item = store.restore(vehicle=Vehicle.named(file)).item
-        store.close(60.0)
+        item = left(path, Vehicle.named(file)).item
         assert item is not None
         assert bool(item.outdated) == bool(why)
         assert why in item.outdated
@@ -270,10 +267,8 @@ def test_a_set_in_force_is_exported_without_a_word(tmp_path: Path, inside: Cli) 
 def test_a_set_that_states_a_slope_of_thrust_is_taken_up_and_exported_as_a_curve(tmp_path: Path, inside: Cli) -> None:
     curved = replace(GOOD, parameters=with_tangent(GOOD.parameters, math.log(0.75), 0.01))
     path = history_of(tmp_path / "h.sqlite", curved)
-    store = Store(path, "pelican")
     pelican = Vehicle.shipped("pelican")
-    item = store.restore(vehicle=pelican).item
-    store.close(60.0)
+    item = left(path, pelican).item
     assert item is not None
     assert item.parameters["b_tangent"].value == pytest.approx(0.75 * TRUE["b"])
     done = inside("export", "--vehicle", "pelican", "--history", str(path), "--out", str(tmp_path), "--json", "-")
