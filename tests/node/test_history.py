@@ -630,6 +630,17 @@ def test_damage_while_running_sets_the_file_aside_and_the_new_one_has_the_set_in
     happened(12, f"history damaged in service ({damage}): {what}; the new one begins with the set in force")
 
 
+def test_a_file_begun_anew_has_each_set_once(tmp_path: Path) -> None:
+    path = tmp_path / "h.sqlite"
+    filled(path, sets=1).close(60.0)
+    store = Store(path, "pelican")
+    store.restore()
+    path.write_bytes(b"no history" * 1000)
+    assert say(store, "after")
+    store.close(60.0)
+    assert [s["sequence"] for s in read_history(path, "pelican")["sets"]] == [1]
+
+
 TRIM = FlightTrim("log1", np.full(4, 0.1), np.full((2, 4), 0.1), np.full(4, 0.25), np.full(4, 0.01), 30.0, "made up")
 
 
