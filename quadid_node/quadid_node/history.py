@@ -32,7 +32,7 @@ from quadid.condition.watch import MOST_FLIGHTS
 from quadid.errors import QuadidError
 from quadid.files import check_beside
 from quadid.online.gate import LIMITED, ROOM, GateSettings, implausible, with_room
-from quadid.online.records import Event, OnlineDiagnosis, OnlineSet, SetState
+from quadid.online.records import Event, HealthyFlight, OnlineDiagnosis, OnlineSet, Publish, SetState
 from quadid.parameters import NOMINAL_NAMES, TANGENT, ParameterSet
 from quadid.sanitise import plain
 from quadid.vehicle import Vehicle
@@ -696,16 +696,25 @@ class Store:
 
     def journal(self, output: Output) -> None:
         """Journals what a service hands out."""
-        if output.topic == "event":
-            self.event(output)
-        elif output.topic == "diagnosis":
-            self.diagnosis(output)
-        elif output.topic == "healthy_flight":
-            self.healthy_flight(output.trim)
-        elif output.topic == "candidate":
-            self.candidate(output.item)
-        if output.topic == "parameters" or (output.topic == "candidate" and output.item.state is SetState.PENDING):
-            self.numbered(output.item)
+        match output:
+            case Event(t, level, kind, text):
+                self._put(self._row("events", passes=True, level=level, kind=kind, text=text, t=t))
+            case OnlineDiagnosis():
+                quiet = output.verdict == "nothing_found"
+                empty = "the simulation agrees with the flight" if quiet else "a change without a known cause"
+                text = "; ".join(f"{f.effect}: {f.evidence}" for f in output.findings) or empty
+                level, full = "info" if quiet else "warning", json.dumps(diagnosis_to_dict(output))
+                row = self._row("events", passes=True, level=level, kind="diagnosis", text=text, t=output.t, data=full)
+                self._put(row)
+            case HealthyFlight(_, trim):
+                self._flights.append(self._row("healthy_flights", data=json.dumps(flight_to_dict(trim))))
+                self._put(self._flights[-1])
+            case Publish(topic, item):
+                if topic == "candidate":
+                    data = set_to_dict(item, covariance=False)
+                    self._put(self._set_row("candidates", item, data, passes=True, gate=item.check))
+                if topic == "parameters" or item.state is SetState.PENDING:
+                    self.numbered(item)
 
     def numbered(self, item: OnlineSet) -> None:
         """Journals a set that was put in force, rolled back to, restored, or waits for approval."""
@@ -713,30 +722,6 @@ class Store:
         row = self._set_row("sets", item, data, number, sequence=number, approved_by=item.approved_by)
         self._stands(row)
         self._put(row)
-
-    def candidate(self, item: OnlineSet) -> None:
-        """Journals an estimate and what the gate said of it."""
-        data = set_to_dict(item, covariance=False)
-        self._put(self._set_row("candidates", item, data, passes=True, gate=item.check))
-
-    def event(self, item: Event, data: str | None = None) -> None:
-        """Journals an event, with JSON that belongs to it."""
-        self._put(
-            self._row("events", passes=True, level=item.level, kind=item.kind, text=item.text, t=item.t, data=data)
-        )
-
-    def diagnosis(self, item: OnlineDiagnosis) -> None:
-        """Journals findings."""
-        quiet = item.verdict == "nothing_found"
-        empty = "the simulation agrees with the flight" if quiet else "a change without a known cause"
-        text = "; ".join(f"{f.effect}: {f.evidence}" for f in item.findings) or empty
-        event = Event(item.t, "info" if quiet else "warning", "diagnosis", text)
-        self.event(event, json.dumps(diagnosis_to_dict(item)))
-
-    def healthy_flight(self, flight: FlightTrim) -> None:
-        """Journals a flight that later ones are compared with."""
-        self._flights.append(self._row("healthy_flights", data=json.dumps(flight_to_dict(flight))))
-        self._put(self._flights[-1])
 
     def decision(self, configured: str, approval: str) -> None:
         """Journals that approval is now auto or manual by a person's decision, where it was `configured` otherwise."""

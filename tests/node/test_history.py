@@ -27,7 +27,7 @@ from quadid.app.fleet import open_store
 from quadid.condition.trim import FlightTrim
 from quadid.online import SessionSettings, SetState
 from quadid.online.gate import ActiveSet
-from quadid.online.records import Event, OnlineDiagnosis, OnlineFinding, OnlineSet, Publish
+from quadid.online.records import Event, HealthyFlight, OnlineDiagnosis, OnlineFinding, OnlineSet, Publish
 from quadid.vehicle import Vehicle
 from quadid_node import history as storing
 from tests.faults.evidence import Happened
@@ -76,7 +76,7 @@ def in_force(sequence: int) -> OnlineSet:
 
 def say(store: Store, text: str) -> bool:
     """Journals a line; whether it is reported on the disk."""
-    store.event(Event(1.0, "info", "x", text))
+    store.journal(Event(1.0, "info", "x", text))
     return store.flush(30.0)
 
 
@@ -91,13 +91,13 @@ def filled(path: Path, sets: int = 2) -> Store:
         item = replace(
             online_set({**TRUE, "b": 2.3e-5 + 1e-7 * k}), sequence=k + 1, approved_by="auto", check="approval"
         )
-        store.candidate(item)
+        store.journal(Publish("candidate", item))
         store.numbered(item)
-    store.event(Event(30.0, "warning", "change", "thrust stepped"))
+    store.journal(Event(30.0, "warning", "change", "thrust stepped"))
     finding = OnlineFinding(
         "mass_change", {"fraction": 0.15}, {"fraction": 0.01}, {"fraction": ""}, 3.0, 1.0, 1e-9, (), "seen"
     )
-    store.diagnosis(OnlineDiagnosis(44.0, 40.0, 44.0, (finding,), "explained"))
+    store.journal(OnlineDiagnosis(44.0, 40.0, 44.0, (finding,), "explained"))
     return store
 
 
@@ -197,7 +197,7 @@ def test_old_candidates_are_forgotten_sets_never(tmp_path: Path, monkeypatch: py
     store.close(60.0)
     again = Store(tmp_path / "h.sqlite", "pelican", {"candidates": 10, "events": 10})
     for k in range(30):
-        again.event(Event(float(k), "info", "test", "x"))
+        again.journal(Event(float(k), "info", "test", "x"))
         time.sleep(0.005)
     again.close(60.0)
     found = read_history(tmp_path / "h.sqlite", "pelican", candidates=1000, events=1000)
@@ -250,7 +250,7 @@ def test_a_file_that_another_service_put_there_is_not_written(tmp_path: Path) ->
     with closing(sqlite3.connect(other)) as db:
         db.execute("PRAGMA wal_checkpoint(TRUNCATE)")
     other.replace(path)
-    ours.event(Event(1.0, "info", "x", "second"))
+    ours.journal(Event(1.0, "info", "x", "second"))
     assert until(lambda: "another service" in ours.problem)
     theirs.close(60.0)
     assert ours.flush(30.0)
@@ -513,7 +513,7 @@ def test_a_disk_that_is_full_is_said_and_what_came_meanwhile_is_written_later(
         service.push(sample.block)
         said += service.step()
     for k in range(20):
-        store.event(Event(float(k), "info", "test", "x" * 2000))
+        store.journal(Event(float(k), "info", "test", "x" * 2000))
     assert until(lambda: store.problem)
     assert "full" in store.problem or "I/O" in store.problem
     said += service.step()
@@ -561,7 +561,7 @@ def test_a_lock_held_by_another_program_delays_and_loses_nothing(tmp_path: Path,
         assert other.stdin is not None
         assert other.stdout.readline() == "locked\n"
         for k in range(300):
-            store.event(Event(float(k), "info", "test", "while locked"))
+            store.journal(Event(float(k), "info", "test", "while locked"))
         store.numbered(in_force(1))
         assert until(lambda: "locked" in store.problem)
         other.stdin.close()
@@ -614,7 +614,7 @@ def test_damage_while_running_sets_the_file_aside_and_the_new_one_has_the_set_in
         path.write_bytes(before[:keep] + os.urandom(len(before) - keep))
     service = Service(PELICAN, SessionSettings(), InlineWorker(), store)
     for k in range(10):
-        store.event(Event(float(k), "info", "test", "after"))
+        store.journal(Event(float(k), "info", "test", "after"))
     assert store.flush(60.0), store.problem
     assert lines(path).count("after") == 10
     assert until(lambda: not store.problem)
@@ -650,7 +650,7 @@ def test_what_people_decided_outlives_a_history_damaged_in_service(tmp_path: Pat
     store = Store(path, "pelican")
     service = Service(PELICAN, SessionSettings(), InlineWorker(), store)
     store.numbered(replace(online_set(TRUE), sequence=1000, approved_by="ann"))
-    store.healthy_flight(TRIM)
+    store.journal(HealthyFlight(1.0, TRIM))
     assert service.decide_approval("manual").done
     service.close()
 
@@ -666,7 +666,7 @@ def test_what_people_decided_outlives_a_history_damaged_in_service(tmp_path: Pat
     with closing(sqlite3.connect(path)) as db:
         db.execute("PRAGMA wal_checkpoint(TRUNCATE)")
     path.write_bytes(b"no history" * 1000)
-    store.event(Event(1.0, "info", "test", "after"))
+    store.journal(Event(1.0, "info", "test", "after"))
     assert store.flush(60.0)
     service.close()
     assert any("set aside" in note for note in store.notes)

@@ -269,7 +269,7 @@ def test_while_the_disk_takes_nothing_candidates_are_forgotten_before_sets_and_d
     assert "NOT on the disk" in service.decide_approval("manual").text
     many = writing.MOST_WAITING + 10
     for _ in range(many):
-        store.candidate(replace(online_set(TRUE, SetState.REJECTED), sequence=0))
+        store.journal(Publish("candidate", replace(online_set(TRUE, SetState.REJECTED), sequence=0)))
     monkeypatch.setattr(writing, "connect", connect)
     said(service, numbered(first.sequence))  # it was forgotten, and everything after it waited for good
     service.close()
@@ -314,9 +314,9 @@ def test_a_restored_set_is_checked_as_a_fresh_estimate(tmp_path: Path, value: fl
 
 def test_the_writer_outlives_what_no_history_can_hold(tmp_path: Path, happened: Happened) -> None:
     store = Store(tmp_path / "h.sqlite", "pelican")
-    store.event(Event(1.0, "info", "test", "odd \udcff bytes"))
+    store.journal(Event(1.0, "info", "test", "odd \udcff bytes"))
     store.numbered(replace(online_set(TRUE), sequence=2**63 + 5, approved_by="auto"))
-    store.event(Event(2.0, "info", "test", "afterwards"))
+    store.journal(Event(2.0, "info", "test", "afterwards"))
     assert store.flush(60.0)
     store.close(60.0)
     found = read_history(tmp_path / "h.sqlite", "pelican", events=10)
