@@ -327,6 +327,7 @@ LIST_EVERY = 1.0
 """All our parameters are sent so often at most [s]: one short request asks for seventeen frames."""
 SEVERITY = {"error": 3, "warning": 4, "info": 6}
 _READ_ONLY, _UNKNOWN = dialect.MAV_PARAM_ERROR_READ_ONLY, dialect.MAV_PARAM_ERROR_DOES_NOT_EXIST
+_ACCEPTED = (dialect.MAV_RESULT_ACCEPTED, dialect.MAV_RESULT_IN_PROGRESS)
 _REAL32 = 9
 _TEXT, _NAME = 50, 10
 _IDS = {m.msgname: n for n, m in dialect.mavlink_map.items()}
@@ -405,29 +406,34 @@ class MavlinkLink:
             self._second, self._left = int(now), {True: FRAMES_A_SECOND, False: OTHERS_A_SECOND}
         for message in self._wire.receive(_WANTED, self._admits, now, None if self._key else self._count):
             last, kind = self._clock(), message.get_type()
+            who = message.get_srcSystem(), message.get_srcComponent()
             autopilot = kind == "HEARTBEAT" and message.autopilot != dialect.MAV_AUTOPILOT_INVALID
-            if autopilot and not self.vehicle_system and self._only in (0, message.get_srcSystem()):
+            if autopilot and not self.vehicle_system and self._only in (0, who[0]):
                 # The first autopilot heard is our vehicle; we speak under its system id.
-                self.vehicle_system, self._target = message.get_srcSystem(), message.get_srcComponent()
+                self.vehicle_system, self._target = who
                 self._wire.mav.srcSystem = self.vehicle_system
                 self._decoder.order.ardupilot = message.autopilot == dialect.MAV_AUTOPILOT_ARDUPILOTMEGA
                 self._decoder.order.kind = message.type
-            if self._is_vehicle(message):
+            ours = self.vehicle_system > 0 and who == (self.vehicle_system, self._target)
+            if ours:
                 if not self._source.take(self._wire.source, self._wire.listened):
                     continue
                 self._wire.follow(self._wire.source)
             if kind == "HEARTBEAT":
                 # Notes who is heard again and again and will be answered; asks the vehicle for the parameters we lack.
-                self._wire.peers.hello(self._wire.source, self._wire.listened, self._is_vehicle(message))
-                if self._is_vehicle(message):
+                self._wire.peers.hello(self._wire.source, self._wire.listened, ours)
+                if ours:
                     for name in self._decoder.order.lacking():
                         wanted = self.vehicle_system, self._target, name.encode(), -1
                         self._send(dialect.MAVLink_param_request_read_message(*wanted))
             elif kind in ("PARAM_REQUEST_LIST", "PARAM_REQUEST_READ", "PARAM_SET"):
                 self._on_parameter(kind, message)
-            elif kind == "COMMAND_ACK" and self._is_vehicle(message):
-                self._on_ack(message)
-            elif self._is_vehicle(message):
+            elif kind == "COMMAND_ACK" and ours:
+                if message.command == dialect.MAV_CMD_SET_MESSAGE_INTERVAL:
+                    known = dialect.enums["MAV_RESULT"].get(message.result)
+                    refusal = known.name if known is not None else f"result {message.result}"
+                    self._requests.answered("" if message.result in _ACCEPTED else refusal)
+            elif ours:
                 yield from self._decoder.blocks(message, last, self._empty)
         if self._wire.drained:
             self._empty = last
@@ -452,20 +458,6 @@ class MavlinkLink:
         number, system, component = sender(frame)
         if (system, component) == (self.vehicle_system, self._target):
             self._source.count(self._wire.source, number, self._wire.listened, frame)
-
-    def _is_vehicle(self, message: Any) -> bool:
-        who = message.get_srcSystem(), message.get_srcComponent()
-        return self.vehicle_system > 0 and who == (self.vehicle_system, self._target)
-
-    def _on_ack(self, message: Any) -> None:
-        """Notes a refused request for a message."""
-        if message.command != dialect.MAV_CMD_SET_MESSAGE_INTERVAL:
-            return
-        if message.result in (dialect.MAV_RESULT_ACCEPTED, dialect.MAV_RESULT_IN_PROGRESS):
-            self._requests.answered("")
-        else:
-            known = dialect.enums["MAV_RESULT"].get(message.result)
-            self._requests.answered(known.name if known is not None else f"result {message.result}")
 
     def _on_parameter(self, kind: str, message: Any) -> None:
         """Lists and reads our parameters, and refuses to set them."""
