@@ -323,7 +323,7 @@ class IdentifyNode(PollingNode, LifecycleNode):
     # --- callbacks
 
     def _round(self) -> None:
-        """All there is to do again and again: take in what has arrived, write it down, report, work on it."""
+        """All there is to do again and again: take in what has arrived, write it down, work on it, report."""
         service, graph, recorder = self._service, self._graph, self._recorder
         # What has arrived since the last round, topic by topic; while two publish an input it is forgotten.
         waiting = self._intake.take()
@@ -333,8 +333,6 @@ class IdentifyNode(PollingNode, LifecycleNode):
         if service is not None and graph is not None and self._active and not graph.paused:
             for block in self._intake.read(waiting, recorder.take if recorder is not None else None):
                 service.push(block)
-        if recorder is not None:
-            recorder.write()
         if service is not None:
             self._put(service.step() if self._active else service.idle())
         self._report_if_due()

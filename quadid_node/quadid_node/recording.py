@@ -67,26 +67,18 @@ class Recorder:
         }
         self._writer = TopicWriter(path, {RECORD: record}, CHUNK_BYTES)
         self._last = 0
-        self._waiting: list[tuple[str, str, bytes, int]] = []
         for entry in inputs:
             kind = entry.type.replace("/", "/msg/")
             if not has_definition(kind):
                 self._writer.define(kind, whole_text(kind, installed_definition))
 
     def take(self, topic: str, kind: str, data: bytes) -> None:
-        """Takes a message; its log time never runs back, so that every reader keeps the order of arrival."""
+        """Writes a message; its log time never runs back, so that every reader keeps the order of arrival."""
         self._last = max(time.time_ns(), self._last + 1)
-        self._waiting.append((topic, kind, data, self._last))
-
-    def write(self) -> None:
-        """Writes what waits."""
-        for message in self._waiting:
-            self._writer.write_cdr(*message)
-        self._waiting.clear()
+        self._writer.write_cdr(topic, kind, data, self._last)
 
     def close(self) -> None:
-        """Writes what waits and the end of the file."""
-        self.write()
+        """Writes the end of the file."""
         self._writer.close()
 
 
@@ -115,17 +107,12 @@ def read_beginning(path: Path) -> Beginning | None:
         left = json.loads(found["restored"])
         vehicle = Vehicle.from_yaml(found["vehicle"], path.name)
         settings = SessionSettings.model_validate_json(found["settings"])
-        item, baseline = (_set(left[name], settings.gate, vehicle) for name in ("item", "baseline"))
-        restored = Restored(
-            item,
-            msgspec.convert(left["next_sequence"], NUMBER),
-            baseline,
-            str(left.get("approval", "")),
-            tuple(map(flight_from_dict, left.get("healthy", ()))),
-            str(left.get("decided", Restored.decided)),
-            msgspec.convert(left.get("mass", 0.0), MASS),
-        )
-        return Beginning(vehicle, settings, found["source"], restored)
+        for name in ("item", "baseline"):
+            left[name] = _set(left[name], settings.gate, vehicle)
+        for name, kind in (("next_sequence", NUMBER), ("mass", MASS), ("approval", str), ("decided", str)):
+            left[name] = msgspec.convert(left[name], kind)
+        left["healthy"] = tuple(map(flight_from_dict, left["healthy"]))
+        return Beginning(vehicle, settings, found["source"], Restored(**left))
     except UNREADABLE as error:
         raise LogError(f"{path.name}: what its session began with cannot be read ({error})") from error
 
