@@ -18,7 +18,6 @@ from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock as RosClock
 from rclpy.clock_type import ClockType
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
-from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import HistoryPolicy, QoSCompatibility, QoSProfile, ReliabilityPolicy, qos_check_compatible
 from rclpy.subscription import Subscription
@@ -76,60 +75,7 @@ IDLE = {
 """Messages of a node that is not active, by its state."""
 
 
-class PollingNode(Node):
-    """Takes the messages of some topics when it wants them, instead of being woken for each.
-
-    Polled subscriptions are kept from the executor; all others it serves as ever.
-    """
-
-    def __init__(self, *arguments: Any, **options: Any) -> None:
-        """As the class that follows."""
-        self._polled: list[Subscription[Any]] = []
-        self._broken_at: dict[str, float] = {}
-        super().__init__(*arguments, **options)
-
-    @property
-    def subscriptions(self) -> Iterator[Subscription[Any]]:
-        """Entities for which the executor waits."""
-        return (s for s in super().subscriptions if s not in self._polled)
-
-    def poll(self, kind: Any, topic: str, qos: Any) -> Callable[[], bytes | None]:
-        """Subscribes to a topic; returns what gives its next serialized message that waits, None when there is none."""
-        subscription = self.create_subscription(
-            kind, topic, lambda message: None, qos, raw=True, event_callbacks=NO_SUBSCRIPTION_EVENTS
-        )
-        self._polled.append(subscription)
-        handle, name, last = subscription.handle, subscription.topic_name, None
-
-        def take() -> bytes | None:
-            nonlocal last
-            with handle:
-                taken = handle.take_message(kind, True)
-            if taken is None:
-                return None
-            number = taken[1]["publication_sequence_number"]
-            if number is None or last is None or number != last + 1:
-                self._broken_at[name] = time.monotonic()
-            last = number
-            return bytes(taken[0])
-
-        return take
-
-    def poll_no_more(self) -> None:
-        """Ends the polled subscriptions."""
-        while self._polled:
-            self.destroy_subscription(self._polled.pop())
-        self._broken_at.clear()
-
-    def unbroken(self, topic: str) -> float:
-        """For how long [s] the messages of a polled topic have been one publisher's, each numbered one above the last.
-
-        Publishers number their own messages, so two that are heard break each other's row; so does a loss.
-        """
-        return time.monotonic() - self._broken_at.get(topic, -math.inf)
-
-
-class IdentifyNode(PollingNode, LifecycleNode):
+class IdentifyNode(LifecycleNode):
     """Identifies one vehicle from its topics and publishes the parameter sets that passed the gate."""
 
     def __init__(self, stopping: Callable[[], bool] = lambda: False) -> None:
@@ -138,6 +84,8 @@ class IdentifyNode(PollingNode, LifecycleNode):
         Args:
             stopping: True once the process is asked to end, so that nothing is waited for any more.
         """
+        self._polled: list[Subscription[Any]] = []
+        self._broken_at: dict[str, float] = {}
         super().__init__("quadid")
         self._stopping = stopping
         for p in PARAMETERS:
@@ -237,7 +185,7 @@ class IdentifyNode(PollingNode, LifecycleNode):
         inputs = {self.resolve_topic_name(entry.topic): entry.type.replace("/", "/msg/") for entry in preset.inputs}
         self._graph = GraphMonitor(inputs, self._offers_on, self.unbroken, lambda text: self._log("error", text))
         self._given, opened = values, self._opened.callback
-        opened(self.poll_no_more)
+        opened(self._poll_no_more)
         opened(self._intake.clear)
         self._subscribe(preset, vehicle)
         keeps = not self._observer and values["history"] != "none"
@@ -319,6 +267,47 @@ class IdentifyNode(PollingNode, LifecycleNode):
         self._break_bond()
         self._opened.close()
         self._service = self._recorder = self._zenoh = None
+
+    # --- topics whose messages are taken when they are wanted, instead of the node being woken for each
+
+    @property
+    def subscriptions(self) -> Iterator[Subscription[Any]]:
+        """Entities for which the executor waits: all but the polled ones."""
+        return (s for s in super().subscriptions if s not in self._polled)
+
+    def poll(self, kind: Any, topic: str, qos: Any) -> Callable[[], bytes | None]:
+        """Subscribes to a topic; returns what gives its next serialized message that waits, None when there is none."""
+        subscription = self.create_subscription(
+            kind, topic, lambda message: None, qos, raw=True, event_callbacks=NO_SUBSCRIPTION_EVENTS
+        )
+        self._polled.append(subscription)
+        handle, name, last = subscription.handle, subscription.topic_name, None
+
+        def take() -> bytes | None:
+            nonlocal last
+            with handle:
+                taken = handle.take_message(kind, True)
+            if taken is None:
+                return None
+            number = taken[1]["publication_sequence_number"]
+            if number is None or last is None or number != last + 1:
+                self._broken_at[name] = time.monotonic()
+            last = number
+            return bytes(taken[0])
+
+        return take
+
+    def _poll_no_more(self) -> None:
+        while self._polled:
+            self.destroy_subscription(self._polled.pop())
+        self._broken_at.clear()
+
+    def unbroken(self, topic: str) -> float:
+        """For how long [s] the messages of a polled topic have been one publisher's, each numbered one above the last.
+
+        Publishers number their own messages, so two that are heard break each other's row; so does a loss.
+        """
+        return time.monotonic() - self._broken_at.get(topic, -math.inf)
 
     # --- callbacks
 
