@@ -6,14 +6,12 @@ import re
 import shutil
 import subprocess
 import sys
-import time
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from tests.conftest import absent
-from tests.node.peers import LIMIT
 
 # --- The checkout as source of a colcon workspace: three packages, laid out as `ros2 run` and `ros2 launch` want them
 
@@ -156,7 +154,7 @@ def test_who_wants_the_messages_needs_no_linters(target: str, wanted: bool, tmp_
         assert done.stdout.index(".[dev]") < done.stdout.index(".[ros]")
 
 
-# --- quadid_msgs in this environment: complete, documented, and a latched set crosses to another process over DDS
+# --- quadid_msgs in this environment: complete and documented
 
 
 NAMES = ("AttitudeCommand", "Diagnosis", "Finding", "FitStatus", "MotorCommand", "ParameterSet")
@@ -187,44 +185,6 @@ def test_every_number_names_its_unit_or_meaning(name: str, repository: Path) -> 
         assert "#" in line, f"{name}: no comment on '{line}'"
         if line.startswith("float64"):
             assert re.search(r"# \[\S+\]|# row-major", line), f"{name}: no unit in '{line}'"
-
-
-def test_a_late_joiner_in_another_process_receives_the_latched_set() -> None:
-    """The contract's parameter topic: reliable, transient local, depth 1."""
-    import rclpy
-    from quadid_msgs.msg import ParameterSet
-    from rclpy.executors import SingleThreadedExecutor
-
-    from tests.ros.latched_publisher import LATCHED, example
-
-    with subprocess.Popen(
-        [sys.executable, str(Path(__file__).with_name("latched_publisher.py"))],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-    ) as publisher:
-        assert publisher.stdin is not None
-        assert publisher.stdout is not None
-        assert publisher.stdout.readline() == "published\n"
-
-        context = rclpy.Context()
-        context.init()
-        node = rclpy.create_node("late_joiner", context=context)
-        received: list[Any] = []
-        node.create_subscription(ParameterSet, "quadid/parameters", received.append, LATCHED)
-        executor = SingleThreadedExecutor(context=context)
-        executor.add_node(node)
-        deadline = time.monotonic() + LIMIT
-        while not received and time.monotonic() < deadline:
-            executor.spin_once(timeout_sec=0.1)
-        executor.spin_once(timeout_sec=0.5)  # a second message would be one too many
-        executor.shutdown()
-        node.destroy_node()
-        context.shutdown()
-
-        publisher.stdin.close()
-        assert publisher.wait(timeout=LIMIT) == 0
-    assert received == [example(2)]
 
 
 def test_the_study_of_load_builds_every_message_of_its_stacks() -> None:
