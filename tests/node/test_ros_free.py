@@ -1,7 +1,5 @@
 """Parts of the node that need no ROS: imports, sources, parameters, launch arguments, mistakes of publishers named."""
 
-import importlib
-import importlib.util
 import math
 import os
 import re
@@ -10,7 +8,6 @@ import sys
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -274,26 +271,6 @@ def test_the_launch_file_of_a_fleet_gives_each_vehicle_its_own(monkeypatch: pyte
     ]
     with pytest.raises(AssertionError, match="required: namespaces"):
         launched(LAUNCH / "fleet.launch.py", {}, monkeypatch)
-
-
-@pytest.mark.ros
-@pytest.mark.parametrize("name", ["identify", "fleet"])
-def test_the_launch_file_starts_nodes(name: str) -> None:
-    """With ROS' own launch, where it is installed (the wheels of the package index have none)."""
-    if importlib.util.find_spec("launch_ros") is None:
-        pytest.skip("launch_ros is on no package index: run where ROS is installed")
-    launch, actions = importlib.import_module("launch"), importlib.import_module("launch.actions")
-    spec = importlib.util.spec_from_file_location(name, LAUNCH / f"{name}.launch.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    context, made = launch.LaunchContext(), list[Any]()
-    context.launch_configurations.update({"namespaces": "quad1,quad2", "vehicle": "pelican"})
-    for entity in module.generate_launch_description().entities:
-        done = entity.visit(context)
-        made += done if isinstance(entity, actions.OpaqueFunction) and done else []
-    assert len(made) == (1 if name == "identify" else 2)
 
 
 # --- What ROS users publish wrongly is named in /diagnostics, at WARN, and nothing is learned from it
