@@ -135,7 +135,7 @@ class IdentifyNode(LifecycleNode):
             self._problem = f"configure failed: {error!r} ({traceback.extract_tb(error.__traceback__)[-1]})"
         if self._problem:
             self._log("error", self._problem)
-            self._tear_down()
+            self.on_cleanup(state)
             return Return.FAILURE
         gc.collect()
         gc.freeze()  # what there is now need not be looked through in flight
@@ -159,17 +159,15 @@ class IdentifyNode(LifecycleNode):
         return super().on_deactivate(state)
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Ends fit process and history."""
-        self._tear_down()
+        """Puts away what `configure` opened; also at the end and after an error: it can be configured again."""
+        self._active = False
+        gc.unfreeze()
+        self._break_bond()
+        self._opened.close()
+        self._service = self._recorder = self._zenoh = None
         return Return.SUCCESS
 
-    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """As `on_cleanup`."""
-        return self.on_cleanup(state)
-
-    def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """As `on_cleanup`: the node can be configured again."""
-        return self.on_cleanup(state)
+    on_shutdown = on_error = on_cleanup
 
     @property
     def _state(self) -> str:
@@ -260,13 +258,6 @@ class IdentifyNode(LifecycleNode):
         if self._bond is not None:
             self._bond.close()
             self._bond = None
-
-    def _tear_down(self) -> None:
-        self._active = False
-        gc.unfreeze()
-        self._break_bond()
-        self._opened.close()
-        self._service = self._recorder = self._zenoh = None
 
     # --- topics whose messages are taken when they are wanted, instead of the node being woken for each
 
