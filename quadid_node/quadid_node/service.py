@@ -60,23 +60,12 @@ class Publication:
 
     def take(self, outputs: list[Output]) -> list[Output]:
         """Takes further outputs; returns those that may be published now."""
-        free = list[Output]()
+        store, out, free = self._store, list[Output](), list[Output]()
         for output in outputs:
             waits = isinstance(output, Publish) and output.item.sequence > 0
             waits |= output.topic == "event" and output.kind in OF_SETS and bool(self._waiting)
-            (self._waiting if waits and self._store is not None else free).append(output)
-        out = [*self._released(), *free]
-        while len(self._waiting) > MOST_WAITING:  # the oldest but the newest set in force
-            newest = next((o for o in reversed(self._waiting) if o.topic == "parameters"), None)
-            self._waiting.remove(next(o for o in self._waiting if o is not newest))
-        for output in out:
-            if output.topic == "parameters":
-                self.in_force = output.item
-        return out
-
-    def _released(self) -> list[Output]:
-        """Outputs up to the first set that is not on the disk yet; one that never will be holds up no other."""
-        store, out = self._store, list[Output]()
+            (self._waiting if waits and store is not None else free).append(output)
+        # Up to the first set that is not on the disk yet; one that never will be holds up no other.
         while store is not None and self._waiting:
             output = self._waiting[0]
             if not isinstance(output, Publish) or output.item.sequence in store.written:
@@ -84,7 +73,14 @@ class Publication:
             elif output.item.sequence not in store.lost:
                 break
             del self._waiting[0]
-        return out
+        # Of too many the oldest go, but not the newest set in force.
+        while len(self._waiting) > MOST_WAITING:
+            newest = next((o for o in reversed(self._waiting) if o.topic == "parameters"), None)
+            self._waiting.remove(next(o for o in self._waiting if o is not newest))
+        for output in [*out, *free]:
+            if output.topic == "parameters":
+                self.in_force = output.item
+        return [*out, *free]
 
 
 # --- The service of one vehicle
