@@ -5,6 +5,7 @@ from array import array
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -69,14 +70,13 @@ def read_csv(path: Path, columns: Mapping[str, str] | None = None) -> Recording:
 
 
 def _no_rows(path: Path, names: Sequence[str], delimiter: str) -> LogError:
-    _, lines, _ = next(_blocks(path))
-    width = len(names)
-    commas = lines[0].count(",") if lines else 0
+    _, line = next(_lines(path), (0, ""))
+    width, cells = len(names), line.rstrip("\r\n").split(delimiter)
+    commas = line.count(",")
     if (delimiter != "," and commas) or (delimiter == "," and width < commas + 1 <= 2 * width):
-        found = f"{path.name}: decimal commas ({plain(lines[0], 40)})"
+        found = f"{path.name}: decimal commas ({plain(line, 40)})"
         return LogError(found, "decimal points: 0.02", "export with decimal points, or in an English locale")
-    cells = lines[0].rstrip("\r\n").split(delimiter) if lines else []
-    words = [(name, cell) for name, cell in zip(names, cells, strict=False) if not _is_number(cell)]
+    words = [(name, cell) for name, cell in zip(names, cells, strict=False) if not _numbers(cell, delimiter)]
     if len(cells) == width and words:
         name, cell = words[0]
         return LogError(
@@ -85,14 +85,6 @@ def _no_rows(path: Path, names: Sequence[str], delimiter: str) -> LogError:
             "write times as seconds: 0.02, 0.04 …" if name == "t" else "leave that column out, or export numbers",
         )
     return LogError(f"{path.name}: no usable row below the header", "numbers in every row", "check the export")
-
-
-def _is_number(cell: str) -> bool:
-    try:
-        _number(cell)
-    except ValueError:
-        return False
-    return True
 
 
 def _check_radians(angles: FloatArray, origin: str) -> None:
@@ -178,10 +170,12 @@ def _known() -> list[str]:
 def _layout(names: list[str], origin: str) -> tuple[dict[str, tuple[str, ...]], list[str]]:
     """Assigns columns to channels; returns the unused columns as well."""
     layout: dict[str, tuple[str, ...]] = {}
-    for channel, group in GROUPS.items():
-        _take(layout, channel, group, names, origin)
-    if "attitude" not in layout:
-        _take(layout, "attitude", EULER, names, origin)
+    for channel, group in (*GROUPS.items(), ("attitude", EULER)):
+        missing = [c for c in group if c not in names]
+        if not missing:
+            layout.setdefault(channel, group)
+        elif len(missing) < len(group) and channel not in layout:
+            raise LogError(f"{origin}: {channel} lacks column {', '.join(missing)}", "all of " + " ".join(group))
     for channel, pattern in _ROTOR.items():
         numbers = sorted(int(m[1]) for m in map(pattern.fullmatch, names) if m)
         if numbers and numbers != list(range(1, len(numbers) + 1)):
@@ -194,33 +188,28 @@ def _layout(names: list[str], origin: str) -> tuple[dict[str, tuple[str, ...]], 
     return layout, [n for n in names if n not in used]
 
 
-def _take(
-    layout: dict[str, tuple[str, ...]], channel: str, group: tuple[str, ...], names: list[str], origin: str
-) -> None:
-    missing = [c for c in group if c not in names]
-    if not missing:
-        layout[channel] = group
-    elif len(missing) < len(group):
-        raise LogError(f"{origin}: {channel} lacks column {', '.join(missing)}", "all of " + " ".join(group))
-
-
 def _table(path: Path, width: int, delimiter: str) -> tuple[FloatArray, list[str]]:
     """Reads the numbers in blocks; a line that does not fit is dropped and counted."""
-    rows = array("d")
+    rows, told = array("d"), _lines(path)
     bad: list[int] = []
     cut = False
-    for number, lines, unfinished in _blocks(path):
-        # A last line without line end whose last number is shorter than in those before may lack digits.
-        width_of_last = [len(line.rstrip().rpartition(",")[2]) for line in lines[-20:]] if unfinished else []
-        if len(width_of_last) > 1 and width_of_last[-1] < min(width_of_last[:-1]):
-            lines, cut = lines[:-1], True
+    while block := list(islice(told, _LINES)):
+        numbers, lines = zip(*block, strict=True)
+        if not lines[-1].endswith("\n"):
+            # A last line without line end whose last number is shorter than in those before may lack digits.
+            *before, last = (len(line.rstrip().rpartition(",")[2]) for line in lines[-20:])
+            cut = last < min(before, default=0)
+            lines = lines[: len(lines) - cut]
         try:
-            block = np.loadtxt(lines, delimiter=delimiter, ndmin=2, comments=None) if lines else np.empty((0, width))
+            table = np.loadtxt(lines, delimiter=delimiter, ndmin=2, comments=None)
+            fits = table.shape[1] == width
         except ValueError:
-            block = _line_by_line(lines, number, width, delimiter, bad)
-        if block.shape[1] != width:
-            block = _line_by_line(lines, number, width, delimiter, bad)
-        rows.frombytes(np.ascontiguousarray(block).tobytes())
+            fits = False
+        if not fits:
+            each = [(number, _numbers(line, delimiter)) for number, line in zip(numbers, lines, strict=False)]
+            bad += [number for number, values in each if len(values) != width]
+            table = np.array([values for _, values in each if len(values) == width], dtype=np.float64)
+        rows.frombytes(np.ascontiguousarray(table).tobytes())
     notes = []
     if bad:
         notes.append(
@@ -231,37 +220,20 @@ def _table(path: Path, width: int, delimiter: str) -> tuple[FloatArray, list[str
     return np.frombuffer(rows, dtype=np.float64).reshape(-1, width), notes
 
 
-def _blocks(path: Path) -> Iterator[tuple[int, list[str], bool]]:
-    """Yields line number, up to `_LINES` data lines, and whether the last of them lacks its line end."""
-    lines: list[str] = []
-    seen_header, first, last = False, 0, ""
+def _lines(path: Path) -> Iterator[tuple[int, str]]:
+    """Yields number and text of the lines below the header."""
     with path.open(encoding="utf-8-sig", errors="replace") as file:
-        for number, last in enumerate(file, 1):
-            if not last.strip() or last.lstrip().startswith("#"):
-                continue
-            if not seen_header:
-                seen_header, first = True, number + 1
-                continue
-            lines.append(last)
-            if len(lines) == _LINES:
-                yield first, lines, False
-                lines, first = [], number + 1
-    yield first, lines, bool(lines) and not last.endswith("\n")
+        told = ((n, line) for n, line in enumerate(file, 1) if line.strip() and not line.lstrip().startswith("#"))
+        next(told, None)
+        yield from told
 
 
-def _line_by_line(lines: list[str], first: int, width: int, delimiter: str, bad: list[int]) -> FloatArray:
-    good: list[list[float]] = []
-    for number, line in enumerate(lines, first):
-        cells = line.rstrip("\r\n").split(delimiter)
-        try:
-            values = [_number(cell) for cell in cells]
-        except ValueError:
-            values = []
-        if len(values) == width:
-            good.append(values)
-        else:
-            bad.append(number)
-    return np.array(good, dtype=np.float64).reshape(-1, width)
+def _numbers(line: str, delimiter: str) -> list[float]:
+    """The numbers of a line; none where a cell is unreadable."""
+    try:
+        return [_number(cell) for cell in line.rstrip("\r\n").split(delimiter)]
+    except ValueError:
+        return []
 
 
 def _number(cell: str) -> float:
