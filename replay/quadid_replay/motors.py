@@ -36,6 +36,7 @@ class Frame(NamedTuple):
 CCW, CW = 1, -1
 _CLASSES = {1: "QUAD", 2: "HEXA", 3: "OCTA", 4: "OCTAQUAD", 5: "Y6", 7: "TRI"}
 _TYPES = {0: "PLUS", 1: "X", 2: "V", 3: "H", 12: "BF_X", 13: "DJI_X", 14: "CW_X", 18: "BF_X_REV"}
+_OCTA_SPINS = (CW, CW, CCW, CCW, CCW, CCW, CW, CW)
 
 ARDUPILOT: Mapping[str, tuple[tuple[float, int], ...]] = MappingProxyType(
     {
@@ -48,17 +49,8 @@ ARDUPILOT: Mapping[str, tuple[tuple[float, int], ...]] = MappingProxyType(
         "QUAD/CW_X": ((45, CCW), (135, CW), (-135, CCW), (-45, CW)),
         "HEXA/PLUS": ((0, CW), (180, CCW), (-120, CW), (60, CCW), (-60, CCW), (120, CW)),
         "HEXA/X": ((90, CW), (-90, CCW), (-30, CW), (150, CCW), (30, CCW), (-150, CW)),
-        "OCTA/PLUS": ((0, CW), (180, CW), (45, CCW), (135, CCW), (-45, CCW), (-135, CCW), (-90, CW), (90, CW)),
-        "OCTA/X": (
-            (22.5, CW),
-            (-157.5, CW),
-            (67.5, CCW),
-            (157.5, CCW),
-            (-22.5, CCW),
-            (-112.5, CCW),
-            (-67.5, CW),
-            (112.5, CW),
-        ),
+        "OCTA/PLUS": tuple(zip((0, 180, 45, 135, -45, -135, -90, 90), _OCTA_SPINS, strict=True)),
+        "OCTA/X": tuple(zip((22.5, -157.5, 67.5, 157.5, -22.5, -112.5, -67.5, 112.5), _OCTA_SPINS, strict=True)),
         "OCTAQUAD/X": ((45, CCW), (-45, CW), (-135, CCW), (135, CW), (-45, CCW), (45, CW), (135, CCW), (-135, CW)),
     }
 )
@@ -179,33 +171,20 @@ def motor_outputs(
         motors.pop(_TAIL, None)
     order = list(_TRICOPTER) if tricopter else list(range(rotors or len(motors)))
     told = bool(motors) and set(motors) == set(order)
-    against = (
-        []
-        if told
-        else [
-            f"{name} {_whole(parameters, name)}"
-            for name, output, motor in said
-            if motor != (output if output in order else None) and (ardupilot or motor in order)
-        ]
-    )
+    against = [
+        f"{name} {_whole(parameters, name)}"
+        for name, output, motor in said
+        if not told and motor != (output if output in order else None) and (ardupilot or motor in order)
+    ]
     if against:
-        return Outputs(
-            [],
-            (
-                f"{', '.join(against[:_NAMED])}: no order of {rotors or 'the'} motors, {message} is not used; "
-                "let all of the autopilot's parameters be heard, or record rotor speeds"
-            ),
-        )
+        problem = f"{', '.join(against[:_NAMED])}: no order of {rotors or 'the'} motors, {message} is not used"
+        return Outputs([], f"{problem}; let all of the autopilot's parameters be heard, or record rotor speeds")
     columns = [motors[m] if told else m for m in order]
     far = [f"motor {m + 1} on output {k + 1}" for m, k in zip(order, columns, strict=True) if k >= width]
     if far:
-        return Outputs(
-            [],
-            (
-                f"{', '.join(far)} (SERVOn_FUNCTION, else the frame), but {message} holds outputs 1 to {width}: "
-                f"it is not used; put the motors on the first {width} outputs, or record rotor speeds"
-            ),
-        )
+        problem = f"{', '.join(far)} (SERVOn_FUNCTION, else the frame), but {message} holds outputs 1 to {width}"
+        fix = f"put the motors on the first {width} outputs, or record rotor speeds"
+        return Outputs([], f"{problem}: it is not used; {fix}")
     return Outputs(columns, told=told)
 
 
