@@ -24,7 +24,7 @@ import threading
 import traceback
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
@@ -98,16 +98,13 @@ def open_log(path: str | Path, preset: str = AUTO, columns: Mapping[str, str] | 
         ended = os.waitstatus_to_exitcode(int.from_bytes(answer[-_STATUS_BYTES:], "little")) if len(answer) else 1
         if ended:
             raise _stopped(file, ended, allowed)
-        result = unpack(answer[:-_STATUS_BYTES])
+        return unpack(answer[:-_STATUS_BYTES])
     except ValueError as error:
         raise LogError(
             f"{file.name}: what its reader returned is no recording ({plain(str(error))})",
             "a log",
             "try again, or report it with the file",
         ) from error
-    if isinstance(result, str):
-        raise _limited(file, result, allowed)
-    return result
 
 
 def stored_size(file: Path) -> int:
@@ -165,7 +162,7 @@ _BY_SIGNAL = {
     signal.SIGXFSZ: "written",
     signal.SIGABRT: "memory",  # how Python ends where there is not even enough for an error
 }
-_BY_ERROR: dict[int, Literal["written", "open files"]] = {errno.EFBIG: "written", errno.EMFILE: "open files"}
+_BY_ERROR = {errno.EFBIG: "written", errno.EMFILE: "open files"}
 
 
 def _stopped(path: Path, ended: int, allowed: ReadLimits) -> LogError:
@@ -211,17 +208,11 @@ class BadAnswerError(ValueError):
     """An answer that is none: sizes that do not fit, numbers that are not finite, a name that is not known."""
 
 
-class ReaderError(LogError):
-    """A reader that failed on a log in a way that it should have reported; a fault of the program."""
-
-
 class Answer(msgspec.Struct, omit_defaults=True):
-    """One of these: the recording, why there is none (as of `LogError`), how the reader failed, the limit it met."""
+    """One of these: the recording, or why there is none: found, allowed and fix, as of `LogError`."""
 
     recording: Recording | None = None
     refused: tuple[str, str, str] | None = None
-    failed: str = ""
-    limit: Literal["", "memory", "written", "open files"] = ""
 
 
 def pack(answer: Answer) -> bytes:
@@ -231,12 +222,11 @@ def pack(answer: Answer) -> bytes:
     )
 
 
-def unpack(data: bytes | memoryview) -> Recording | str:
-    """Checks an answer; returns the recording, or the name of the limit that its reader met.
+def unpack(data: bytes | memoryview) -> Recording:
+    """Checks an answer and returns the recording.
 
     Raises:
         LogError: the refusal that the answer holds.
-        ReaderError: the failure that it holds.
         BadAnswerError: anything that is no answer.
     """
 
@@ -268,11 +258,9 @@ def unpack(data: bytes | memoryview) -> Recording | str:
         raise BadAnswerError(str(error)) from error
     if told.refused is not None:
         raise LogError(*told.refused)
-    if told.failed:
-        raise ReaderError(told.failed, "", "report it with the file: the reader of this format failed on it")
-    if found is None and not told.limit:
+    if found is None:
         raise BadAnswerError("nothing in it")
-    return found or told.limit
+    return found
 
 
 # --- The process that stands ready, as the program sees it
@@ -409,21 +397,25 @@ def _read(
     ):
         resource.setrlimit(limit, (soft, hard))
     signal.setitimer(signal.ITIMER_REAL, STANDING * seconds)
-    file = Path(path)
-    try:
+    file, allowed = Path(path), ReadLimits(memory, seconds)
+
+    def refused(error: QuadidError) -> bytes:
+        return pack(Answer(refused=(error.found, error.allowed, error.fix)))
+
+    told = refused(_limited(file, "memory", allowed))  # made while there is memory
+    with contextlib.suppress(MemoryError):
         try:
-            told = Answer(read_here(file, preset, columns))
+            told = pack(Answer(read_here(file, preset, columns)))
         except QuadidError as error:
-            noticed = _BY_ERROR.get(getattr(error.__cause__, "errno", 0) or 0)
-            told = Answer(limit=noticed) if noticed else Answer(refused=(error.found, error.allowed, error.fix))
+            met = _BY_ERROR.get(getattr(error.__cause__, "errno", 0) or 0)
+            told = refused(_limited(file, met, allowed) if met else error)
         except MemoryError:
-            raise
+            pass
         except Exception as error:  # noqa: BLE001 - the reader of a stranger's file: told, with the place it is met at
             where = " < ".join(f"{f.filename}:{f.lineno}" for f in traceback.extract_tb(error.__traceback__)[:-4:-1])
-            told = Answer(failed=f"{file.name}: its reader failed ({type(error).__name__}: {error}) at {where}")
-        answer.sendall(pack(told))
-    except MemoryError:
-        answer.sendall(pack(Answer(limit="memory")))
+            found = f"{file.name}: its reader failed ({type(error).__name__}: {error}) at {where}"
+            told = refused(LogError(found, "", "report it with the file: the reader of this format failed on it"))
+    answer.sendall(told)
     os._exit(0)
 
 

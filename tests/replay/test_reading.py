@@ -9,7 +9,6 @@ import subprocess
 import sys
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import cast
 
 import msgspec
 import numpy as np
@@ -155,7 +154,7 @@ def test_a_reading_process_that_was_killed_is_started_again(tmp_path: Path) -> N
 def test_an_answer_is_checked_at_the_door() -> None:
     recording = full_recording(0.1, 50.0)
     whole = pack(Answer(recording))
-    same(recording, cast(Recording, unpack(whole)))
+    same(recording, unpack(whole))
     line = msgspec.msgpack.decode(whole)["recording"]
     name, first = next(iter(line["channels"].items()))
     (rows, columns), values = first["values"]
@@ -175,7 +174,6 @@ def test_an_answer_is_checked_at_the_door() -> None:
         with pytest.raises(BadAnswerError):
             unpack(bad)
     told = unpack(changed(warnings=["a\x1b[2Jb\nc" + "x" * 10_000]))
-    assert isinstance(told, Recording)
     assert told.warnings[0].startswith("a?[2Jb?c")
     assert len(told.warnings[0]) <= 2000
 
