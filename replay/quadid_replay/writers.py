@@ -5,6 +5,7 @@ import struct
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from functools import cache, partial
+from itertools import count
 from pathlib import Path
 from types import SimpleNamespace, TracebackType
 from typing import Any, BinaryIO, NamedTuple, TypeAlias
@@ -142,8 +143,7 @@ class TopicWriter:
         self._definitions: dict[str, str] = {}
         self._encoders: dict[str, Callable[[Any], bytes]] = {}
         self._schemas: dict[str, int] = {}
-        self._channels: dict[str, int] = {}
-        self._sequence: dict[int, int] = {}
+        self._channels: dict[str, tuple[int, Iterator[int]]] = {}
         self._open = True
         self._flushed = 0
 
@@ -169,15 +169,11 @@ class TopicWriter:
 
     def write_cdr(self, topic: str, kind: str, data: bytes, stamp_ns: int) -> None:
         """Writes one message that is CDR already."""
-        channel = self._channels.get(topic)
-        if channel is None:
-            channel = self._writer.register_channel(
-                topic, "cdr", self._schema(kind), {"offered_qos_profiles": offered_qos(topic)}
-            )
-            self._channels[topic] = channel
-        sequence = self._sequence.get(channel, 0)
-        self._sequence[channel] = sequence + 1
-        self._writer.add_message(channel, stamp_ns, data, stamp_ns, sequence)
+        if topic not in self._channels:
+            qos = {"offered_qos_profiles": offered_qos(topic)}
+            self._channels[topic] = self._writer.register_channel(topic, "cdr", self._schema(kind), qos), count()
+        channel, numbers = self._channels[topic]
+        self._writer.add_message(channel, stamp_ns, data, stamp_ns, next(numbers))
         if self._owned is not None and self._owned.tell() != self._flushed:
             # A chunk was written: its end must not wait in a buffer, or a killed process would lose two chunks.
             self._owned.flush()
