@@ -7,8 +7,9 @@ import re
 import struct
 from array import array
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
-from itertools import islice
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import groupby, islice
 from pathlib import Path
 from typing import NamedTuple
 
@@ -135,19 +136,17 @@ def _tag8_8svb(r: Reader, count: int) -> list[int]:
     return [r.signed() if present >> i & 1 else 0 for i in range(count)]
 
 
-_GROUPS: Mapping[int, tuple[int, Callable[[Reader, int], list[int]]]] = {
+_ENCODINGS: Mapping[int, tuple[int, Callable[[Reader, int], list[int]]]] = {
+    0: (1, lambda r, count: [r.signed()]),
+    1: (1, lambda r, count: [r.unsigned()]),
+    3: (1, lambda r, count: [-extended(r.unsigned(), 14)]),
     6: (8, _tag8_8svb),
     7: (3, _three(((2, 2, 2), (4, 4, 4), (8, 8, 8)), 6)),
     8: (4, _tag8_4s16),
+    9: (1, lambda r, count: [0]),
     10: (3, _three(((2, 2, 2), (5, 5, 4), (8, 7, 7)), 8)),
 }
-"""Encodings of several fields at once: most fields in a group, and decoder."""
-_SINGLE: Mapping[int, Callable[[Reader], int]] = {
-    0: Reader.signed,
-    1: Reader.unsigned,
-    3: lambda r: -extended(r.unsigned(), 14),
-    9: lambda r: 0,
-}
+"""Encodings: most fields that are encoded together, and decoder."""
 
 
 @dataclass(frozen=True)
@@ -159,30 +158,26 @@ class FrameDefinition:
     encodings: tuple[int, ...]
     signed: tuple[bool, ...] = ()
 
-    def raw(self, r: Reader) -> list[int]:
-        """Decodes one frame, before prediction."""
-        out: list[int] = []
-        while len(out) < len(self.encodings):
-            encoding = self.encodings[len(out)]
-            if encoding in _SINGLE:
-                out.append(_SINGLE[encoding](r))
-                continue
-            most, decode = _GROUPS[encoding]
-            same = 1
-            while same < most and len(out) + same < len(self.encodings) and self.encodings[len(out) + same] == encoding:
-                same += 1
-            out += decode(r, same)[:same]
+    @cached_property
+    def _groups(self) -> list[tuple[Callable[[Reader, int], list[int]], int]]:
+        """Decoders one after the other, and of how many fields each."""
+        out = []
+        for encoding, alike in groupby(self.encodings):
+            (most, decode), left = _ENCODINGS[encoding], len([*alike])
+            out += [(decode, min(most, left - k)) for k in range(0, left, most)]
         return out
 
+    def raw(self, r: Reader) -> list[int]:
+        """Decodes one frame, before prediction."""
+        return [value for decode, count in self._groups for value in decode(r, count)[:count]]
 
-@dataclass
-class Decoded:
-    """Main frames as rows of numbers, and what could not be read."""
 
-    width: int
-    rows: array[int] = field(default_factory=lambda: array("q"))
-    skipped: int = 0
-    ended: bool = False
+class Decoded(NamedTuple):
+    """Main frames as rows of numbers, the bytes that could not be read, and whether the log was ended."""
+
+    rows: FloatArray
+    skipped: int
+    ended: bool
 
 
 def decode_frames(
@@ -198,12 +193,13 @@ def decode_frames(
         constants: values of the predictors that the header holds: 4 minthrottle, 8 (1500), 9 vbatref, 11 minmotor.
     """
     names = definitions["I"].names
-    out, clock = Decoded(len(names)), _Clock(names.index("time"), names.index("loopIteration"))
+    rows, skipped, ended = array("q"), 0, False
+    clock = _Clock(names.index("time"), names.index("loopIteration"))
     r = Reader(data[:stop], start)
     previous: list[int] | None = None
     before: list[int] = []
     resumed: int | None = None  # place of an I frame that the next main frame has to confirm
-    while r.at < stop:
+    while r.at < stop and not ended:
         place = r.at
         mark = chr(r.byte())
         try:
@@ -211,9 +207,7 @@ def decode_frames(
                 raise BadFrameError("no main frame follows")
             if mark == "E":
                 kind, numbers = _event(r)
-                out.ended = kind == _LOG_ENDS
-                if out.ended:
-                    break
+                ended = kind == _LOG_ENDS
                 if kind == _RESUMED:
                     clock.last, previous, resumed = (numbers[1], numbers[0]), None, None
                 continue
@@ -221,33 +215,34 @@ def decode_frames(
                 raise BadFrameError(mark)
             frame = definitions[mark]
             raw = frame.raw(r)
-            if mark in "IP":
-                values = _predicted(raw, frame, definitions["I"].signed, previous, before, constants)
-                if r.at < stop and data[r.at] not in MARKS:
-                    raise BadFrameError("no frame follows")
-                if not clock.follows(values, previous, whole=mark == "I"):
-                    raise BadFrameError("time")
-                if previous is None:
-                    resumed = place
-                else:
-                    if resumed is not None:
-                        clock.take(previous)
-                        out.rows.extend(previous)
-                        resumed = None
-                    if mark == "I":
-                        clock.take(values)
-                    out.rows.extend(values)
-                before, previous = (values, values) if mark == "I" else (previous or values, values)
+            if mark not in "IP":
+                continue
+            values = _predicted(raw, frame, definitions["I"].signed, previous, before, constants)
+            if r.at < stop and data[r.at] not in MARKS:
+                raise BadFrameError("no frame follows")
+            if not clock.follows(values, previous, whole=mark == "I"):
+                raise BadFrameError("time")
+            if previous is None:
+                resumed = place
+            else:
+                if resumed is not None:
+                    clock.take(previous)
+                    rows.extend(previous)
+                    resumed = None
+                if mark == "I":
+                    clock.take(values)
+                rows.extend(values)
+            before, previous = (values, values) if mark == "I" else (previous or values, values)
         except BadFrameError:
-            previous = None
-            place, resumed = place if resumed is None else resumed, None
+            # On to the next I frame, behind this place or behind the one that is not confirmed.
+            place = place if resumed is None else resumed
+            previous = resumed = None
             following = data.find(b"I", place + 1, stop)
-            following = stop if following < 0 else following
-            out.skipped += following - place
-            r.at = following
-    if resumed is not None and previous is not None and not len(out.rows):
-        out.rows.extend(previous)
-    return out
+            r.at = stop if following < 0 else following
+            skipped += r.at - place
+    if resumed is not None and previous is not None and not len(rows):
+        rows.extend(previous)
+    return Decoded(np.array(rows, dtype=np.float64).reshape(-1, len(names)), skipped, ended)
 
 
 @dataclass
@@ -377,7 +372,7 @@ def read_blackbox(path: Path) -> Recording:
             11: int(_value(header.values, "motorOutput", 0.0)),
         }
         decoded = decode_frames(data, header.end, stop, header.definitions, constants)
-        if best is None or len(decoded.rows) * best[1].width > len(best[1].rows) * decoded.width:
+        if best is None or len(decoded.rows) > len(best[1].rows):
             best = header, decoded
     assert best is not None
     notes = []
@@ -415,7 +410,7 @@ def _header(data: bytes, start: int, stop: int, origin: str) -> _Header:
                     signs = ["0" if name in ("loopIteration", "time") else "1" for name in names]
                 if len({len(names), *map(len, parts)}) == 1:
                     definition = FrameDefinition(tuple(names), parts[0], parts[1], tuple(sign == "1" for sign in signs))
-                    if {*definition.encodings} <= {*_SINGLE, *_GROUPS} and {*definition.predictors} <= {*range(12)}:
+                    if {*definition.encodings} <= {*_ENCODINGS} and {*definition.predictors} <= {*range(12)}:
                         definitions[kind] = definition
     except (KeyError, ValueError) as error:
         raise _bad_header(origin, str(error)) from error
@@ -444,7 +439,7 @@ def _value(values: dict[str, str], name: str, otherwise: float) -> float:
 
 def _channels(header: _Header, decoded: Decoded, clock: LogClock) -> list[RawChannel]:
     names = header.definitions["I"].names
-    table = np.array(decoded.rows, dtype=np.float64).reshape(-1, decoded.width)
+    table = decoded.rows
     t = clock.times(np.unwrap(table[:, names.index("time")], period=2.0**32) * 1e-6)  # 71.6 minutes of 32 bits
     out: list[RawChannel] = []
 
