@@ -2,9 +2,10 @@
 caller down.
 
 The child has limits of processor time, time by the clock, memory, files open and bytes written, which the kernel
-holds, whatever the format; readers need no such guards of their own.  It is forked by a process that stands ready
-(`python -m quadid_replay.opening FD`), one for each program that reads logs, from its first log on, so that a small log
-pays for a fork and not for an interpreter.  That process only imports readers and forks; it never looks into a log.
+holds, whatever the format; readers need no such guards of their own.  It is forked, with a process that watches it, by
+one that stands ready (`python -m quadid_replay.opening FD`), one for each program that reads logs, from its first log
+on, so that a small log pays for forks and not for an interpreter.  That process only imports readers and forks; it
+never looks into a log.
 """
 
 import atexit
