@@ -402,19 +402,11 @@ def read_tlog(path: Path) -> Recording:
     _, said = used.told.get("PARAM_VALUE", (None, None))
     names, values = ([], []) if said is None else (said.param_id, said.param_value.tolist())
     parameters = dict(zip(names, values, strict=True))
-    raw = [
-        channel
-        for name, messages in PREFERENCE.items()
-        for channel in fastest_first(
-            [
-                RawChannel(name, *told, source)
-                for message in messages
-                for (signal, source), told in used.signals.items()
-                if signal == name and source.split(" ")[0] == message
-            ],
-            2.0,
-        )
-    ]
+    raw: list[RawChannel] = []
+    for name, messages in PREFERENCE.items():
+        found = [RawChannel(name, *told, source) for (signal, source), told in used.signals.items() if signal == name]
+        found.sort(key=lambda entry: messages.index(entry.source.split(" ")[0]))
+        raw += fastest_first(found, 2.0)
     other = no_multirotor(parameters, kind)
     if not other:
         notes += filter(None, [changed_within(names, values)])
