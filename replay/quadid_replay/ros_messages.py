@@ -386,9 +386,9 @@ def _recording_times(clock: LogClock, headed: BoolArray, stamps: IntArray, logge
     for group in (headed, ~headed):
         its = np.flatnonzero(group & (stamps != 0))
         if len(its):
-            # Boot or simulation time beside a log on UNIX time: the first message that is no exception tells the
-            # distance.
-            apart = since[its] - times[its]
+            # Boot or simulation time beside a log on UNIX time: of those at its beginning the first message that is no
+            # exception tells the distance.
+            apart = (since[its] - times[its])[:BATCH]
             ahead = float(apart[np.abs(apart - np.sort(apart)[len(apart) // 2]) < _OTHER_CLOCK][0])
             times[its] += ahead if abs(ahead) > _OTHER_CLOCK else 0.0
     return clock.times(np.where(stamps == 0, since, times)), epoch
