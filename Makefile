@@ -87,7 +87,7 @@ reproduce: venv ## the paper's tables and figures, into docs/results
 
 STUDY = OPENBLAS_NUM_THREADS=1 $(BIN)/python -m
 
-.PHONY: findings mpc gains alarms autopilot peers health health-hours truth filter-error bands cases campaign ablation foreign paper-scale excite optimisers subspace control kernel-speed bench
+.PHONY: findings mpc gains alarms autopilot peers health health-hours truth filter-error bands cases campaign ablation foreign paper-scale excite optimisers subspace kernel-speed bench
 truth: venv ## errors against their bound, coverage, bias with noise, status (an hour)
 	$(STUDY) quadid_evaluation.studies.truth --out docs/results
 
@@ -95,10 +95,10 @@ filter-error: venv ## the estimator: coverage, guesses, recorded vehicles, a fas
 	$(STUDY) quadid_evaluation.studies.filter_error --out docs/results
 
 bands: venv ## coverage of predicted bands on recorded flights that were not fitted (ten minutes)
-	$(STUDY) quadid_evaluation.studies.bands --out docs/results
+	$(STUDY) quadid_evaluation.studies.foreign --bands --out docs/results
 
 cases: venv ## the independent simulated cases, diagnosed
-	$(STUDY) quadid_evaluation.studies.cases
+	$(STUDY) quadid_evaluation.studies.campaign --groups cases:12,cases_hub:12
 
 foreign: venv ## vehicles and logs of others: truth, answers, predictions beside regression (half an hour)
 	$(STUDY) quadid_evaluation.studies.foreign --out docs/results
@@ -130,7 +130,7 @@ campaign: venv ## blinded campaign of hidden effects (hours)
 	$(STUDY) quadid_evaluation.studies.campaign --out docs/results
 
 ablation: venv ## the diagnosis without each rule and number, with half and twice each number (hours; goes on where it stopped)
-	$(STUDY) quadid_evaluation.studies.ablation --records ablation.jsonl --cache build/ablation --out docs/results
+	$(STUDY) quadid_evaluation.studies.ablation --records ablation.jsonl --out docs/results
 
 health-hours: venv ## online rotor health: alarms in 100 h of healthy hover, seconds to name a loss (accelerated)
 	$(STUDY) quadid_evaluation.studies.health.hours --out docs/results
@@ -149,9 +149,6 @@ optimisers: venv ## every optimiser on smooth and non-smooth problems, narrow an
 
 subspace: venv ## CVA and MOESP: poles of known systems, prediction of flights
 	$(STUDY) quadid_evaluation.studies.subspace --out docs/results
-
-control: venv ## tracking with guessed, identified, extended and true parameters
-	$(STUDY) quadid_evaluation.studies.control --out docs/results
 
 kernel-speed: dev ## nanoseconds per particle and step of the kernel; a step of `quadid.Simulator`, RotorPy, crazyflow, gym-pybullet-drones
 	SCIPY_ARRAY_API=1 $(STUDY) quadid_evaluation.benchmarks.speed --parts kernel step

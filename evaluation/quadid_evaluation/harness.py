@@ -1,16 +1,19 @@
 """Common parts of studies: command line, pages of sections, worker processes, tables, shares with their intervals."""
 
 import argparse
+import json
 import multiprocessing
 import os
 import re
 import socket
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, TypeVar
 
+from pydantic import TypeAdapter
 from scipy.stats import binomtest
 
 DATA = Path(os.environ.get("QUADID_DATA", "../shared/data"))
@@ -47,7 +50,9 @@ def options(doc: str | None, parts: Iterable[str] = (), words: str = "", **more:
     return parser.parse_args()
 
 
-def study(doc: str | None, page: str, title: str, parts: Mapping[str, Callable[[Given], str]], **more: Any) -> None:
+def study(
+    doc: str | None, page: str, title: str, parts: Mapping[str, Callable[[Given], str | Sequence[str]]], **more: Any
+) -> None:
     """Runs the parts that are asked for; prints each, and replaces it on the page in `--out`.
 
     Args:
@@ -88,10 +93,15 @@ def judged(page: Path) -> str:
     return f"\n{title}{rest.rstrip()}\n" if title else ""
 
 
-def pooled(work: Callable[[Job], Found], jobs: Iterable[Job], processes: int = 2) -> list[Found]:
-    """Answers to all jobs, in order, from worker processes."""
+def pooled(
+    work: Callable[[Job], Found],
+    jobs: Iterable[Job],
+    processes: int = 2,
+    tell: Callable[[Found], object] = lambda found: None,
+) -> list[Found]:
+    """Answers to all jobs, in order, from worker processes; `tell` gets each as it comes."""
     with multiprocessing.get_context("spawn").Pool(processes) as pool:
-        return list(pool.imap(work, jobs))
+        return [(tell(found), found)[1] for found in pool.imap(work, jobs)]
 
 
 def table(heads: Sequence[str], rows: Iterable[Sequence[object]]) -> list[str]:
@@ -118,3 +128,19 @@ def free_port() -> int:
 def machine() -> str:
     """Cores and how busy they are."""
     return f"{os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}"
+
+
+def kept(records: Path | None, kind: type[Found]) -> list[Found]:
+    """Answers (dataclasses) that earlier runs of a study wrote with `keep`."""
+    if records is None or not records.exists():
+        return []
+    adapter, lines = TypeAdapter(kind), records.read_text(encoding="utf-8").splitlines()
+    return [adapter.validate_python(json.loads(line)) for line in lines]
+
+
+def keep(records: Path | None, answer: Any) -> None:
+    """Appends an answer to the records, so that a study goes on where it stopped."""
+    if records is not None:
+        records.parent.mkdir(parents=True, exist_ok=True)
+        with records.open("a", encoding="utf-8") as file:
+            file.write(json.dumps(asdict(answer), default=float) + "\n")

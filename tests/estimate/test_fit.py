@@ -5,8 +5,8 @@ from functools import lru_cache
 
 import numpy as np
 import pytest
-from quadid_evaluation.studies.filter_error.jobs import LATE
-from quadid_evaluation.studies.filter_error.loop import fly as fast_loop
+from quadid_evaluation.studies.fast_loop import fly as fast_loop
+from quadid_evaluation.studies.filter_error import LATE
 
 from quadid.estimate import kalman as k
 from quadid.estimate.fit import Estimate, estimate, tails

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from quadid_evaluation.studies.filter_error import loop
+from quadid_evaluation.studies import fast_loop as loop
 
 import quadid
 from quadid.chi_square import Z95

@@ -18,8 +18,8 @@ import yaml
 from quadid_evaluation.benchmarks.online import flown
 from quadid_evaluation.harness import judged
 from quadid_evaluation.studies import coverage, findings, sitl
-from quadid_evaluation.studies.flight_sets import SETS
-from quadid_evaluation.studies.foreign import of_set, outside_table
+from quadid_evaluation.studies.flight_sets import SETS, of_set
+from quadid_evaluation.studies.foreign import outside_table
 from quadid_evaluation.studies.peers import online, simulated
 from quadid_evaluation.studies.readings import LOOP, errors
 from quadid_evaluation.studies.soak import BATCH, batches, slope

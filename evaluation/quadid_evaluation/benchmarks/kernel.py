@@ -9,10 +9,9 @@ import functools
 import importlib.util
 import os
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Callable, Collection, Mapping
+from itertools import product
+from typing import Any, NamedTuple
 
 import numba as nb
 import numpy as np
@@ -27,32 +26,26 @@ from quadid.model.step import RandomInputs, Simulator
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 
-SECONDS, RATE, LENGTH = 40, 50, 50
+SECONDS, RATE, LENGTH, CHANNELS = 40, 50, 50, 9
 PEAK_ROUNDS, PEAK_CHAINS, PEAK_DEPTH = 2000, 12, 16
 NOMINAL_OPERATIONS = 190 + 35
 """Additions, multiplications and fused pairs per particle in the compiled nominal step and comparison."""
 
 
-@dataclass
-class Case:
+class Case(NamedTuple):
     """Something to be timed: `run` does `steps` particle-steps (or operations)."""
 
-    name: str
     steps: int
     run: Callable[[], object]
 
 
-def recorded(vehicle: Vehicle, channels: int) -> Window:
+def recorded(vehicle: Vehicle) -> Window:
     """A window of lively rotor speeds and noise for measurements: the kernel's speed does not depend on values."""
     rng = np.random.default_rng(1)
     n = SECONDS * RATE
     rotor_speed = vehicle.hover_speed() * (1.0 + 0.02 * rng.standard_normal((n, len(vehicle.rotors))))
-    level = np.tile([1.0, 0.0, 0.0, 0.0], (n, 1))
-    gyro, accel, velocity, position = 0.1 * rng.standard_normal((4, n, 3))
-    motion = channels > 9
-    return Window(
-        0.0, 1.0 / RATE, rotor_speed, gyro, level, accel, velocity if motion else None, position if motion else None
-    )
+    gyro, accel = 0.1 * rng.standard_normal((2, n, 3))
+    return Window(0.0, 1.0 / RATE, rotor_speed, gyro, np.tile([1.0, 0.0, 0.0, 0.0], (n, 1)), accel)
 
 
 def particles(vehicle: Vehicle, m: int) -> FloatArray:
@@ -72,32 +65,27 @@ def free(thetas: FloatArray, *entries: tuple[int, float]) -> FloatArray:
     return out
 
 
-LAG, DELAY, SAG = (ix.TAU, 0.02), (ix.DELAY, 0.02), (ix.SAG, 0.1)
-DRAG = ((ix.KX, 0.2), (ix.KY, 0.2))
-
-
 def every_effect(vehicle: Vehicle, thetas: FloatArray) -> FloatArray:
     """Parameter vectors with all effects of the catalogue."""
     entries = Layout(vehicle).entries.values()
     return free(thetas, *((e.index, e.typical) for e in entries if e.index > ix.JR and not e.name.endswith(".time")))
 
 
-def model_cases(name: str, vehicle: Vehicle, thetas: FloatArray, channels: int, score: bool) -> tuple[Case, Case]:
+def model_cases(vehicle: Vehicle, thetas: FloatArray, score: bool) -> tuple[Case, Case]:
     """Residuals (`roll` into memory in use) or the swarm's cost (`costs`), on one core and on all."""
-    rollout = Rollout(recorded(vehicle, channels), vehicle)
+    rollout = Rollout(recorded(vehicle), vehicle)
     segments = Segments.cut(len(rollout), LENGTH)
     x0 = rollout.initial_states(segments)
     steps = len(segments.starts) * (LENGTH + 1)
-    weights = np.ones((len(rollout), channels))
-    directions = 6 if channels == 9 else 12
-    shape = (len(segments.starts), LENGTH * channels, directions)
+    weights = np.ones((len(rollout), CHANNELS))
+    shape = (len(segments.starts), LENGTH * CHANNELS, 6)
     basis = np.linalg.qr(np.random.default_rng(4).standard_normal(shape))[0]
 
     def case(vectors: FloatArray) -> Case:
         if score:
-            return Case(name, steps * len(vectors), lambda: rollout.costs(segments, vectors, x0, weights, basis))
+            return Case(steps * len(vectors), lambda: rollout.costs(segments, vectors, x0, weights, basis))
         out = rollout.roll(segments, vectors, x0)
-        return Case(name, steps * len(vectors), lambda: rollout.roll(segments, vectors, x0, out=out))
+        return Case(steps * len(vectors), lambda: rollout.roll(segments, vectors, x0, out=out))
 
     return case(thetas[:LANES]), case(thetas)  # a single block of lanes stays on the calling thread
 
@@ -144,34 +132,27 @@ def numpy_step(x: FloatArray, theta: FloatArray, moments: FloatArray, mass: floa
     return np.asarray(-b * moments[0] / mass)
 
 
-def numpy_moments(vehicle: Vehicle, speeds: FloatArray) -> FloatArray:
-    """Rotor sums of every row, shape (n, 5)."""
-    square = speeds**2
-    x, y = vehicle.rotor_positions[:, 0], vehicle.rotor_positions[:, 1]
-    return np.column_stack([square.sum(axis=1), square @ x, square @ y, square @ vehicle.spins, speeds @ vehicle.spins])
-
-
 def numpy_case(vehicle: Vehicle, thetas: FloatArray) -> Case:
     """The NumPy step, once it has been checked against the kernel."""
-    window = recorded(vehicle, 9)
-    moments, theta = numpy_moments(vehicle, window.rotor_speed), np.ascontiguousarray(thetas[:, :6].T)
+    window, theta = recorded(vehicle), np.ascontiguousarray(thetas[:, :6].T)
+    speeds, (x, y, _) = window.rotor_speed, vehicle.rotor_positions.T
+    square, spins = speeds**2, vehicle.spins
+    moments = np.column_stack([square.sum(axis=1), square @ x, square @ y, square @ spins, speeds @ spins])
     rollout, segments = Rollout(window, vehicle), Segments(LENGTH, 1, np.array([1]))
     start = rollout.initial_states(segments)
-    x = np.tile(start[0, :7, None], (1, len(thetas)))
-    for k in range(LENGTH + 1):
-        numpy_step(x, theta, moments[k], vehicle.mass, window.dt)
+
+    def stepped(steps: int) -> FloatArray:
+        states = np.tile(start[0, :7, None], (1, len(thetas)))
+        for k in range(steps):
+            numpy_step(states, theta, moments[k], vehicle.mass, window.dt)
+        return states
+
     ends = rollout.roll(segments, thetas, start)[1]
     ends = np.moveaxis(ends, -1, 1).reshape(-1, *ends.shape[1:3])[: len(thetas), 0, :7]
-    worst = float(np.abs(ends - x.T).max())
+    worst = float(np.abs(ends - stepped(LENGTH + 1).T).max())
     if worst > 1e-9:
         raise AssertionError(f"NumPy and the kernel differ by {worst:g}")
-
-    def run() -> None:
-        y = np.tile(start[0, :7, None], (1, len(thetas)))
-        for k in range(20):
-            numpy_step(y, theta, moments[k], vehicle.mass, window.dt)
-
-    return Case(f"NumPy, nominal step alone, {len(thetas)} particles", 20 * len(thetas), run)
+    return Case(20 * len(thetas), lambda: stepped(20))
 
 
 # --- the processor's peak
@@ -193,26 +174,7 @@ def peak_case() -> Case:
     peak = nb.njit(**whole)(scope["peak"])
     x = aligned((8 * PEAK_CHAINS,))
     x[:] = 0.0
-    return Case("peak", PEAK_ROUNDS * PEAK_CHAINS * PEAK_DEPTH * 8, lambda: peak(PEAK_ROUNDS, 0.5, x))
-
-
-def all_model_cases(vehicle: Vehicle, m: int) -> list[tuple[Case, Case]]:
-    """Every line of the table that times the model."""
-    nominal = particles(vehicle, m)
-    lines: list[tuple[str, FloatArray, int]] = [
-        ("nominal", nominal, 9),
-        ("motor lag, one a particle", free(nominal, LAG), 9),
-        ("motor lag and delay", free(nominal, LAG, DELAY), 9),
-        ("rotor drag", free(nominal, *DRAG), 9),
-        ("rotor drag, lag, delay, sag", free(nominal, *DRAG, LAG, DELAY, SAG), 9),
-        ("every effect", every_effect(vehicle, nominal), 9),
-        ("every effect, velocity and position", every_effect(vehicle, nominal), 15),
-    ]
-    return [
-        model_cases(name + (", cost" if score else ""), vehicle, thetas, channels, score)
-        for score in (False, True)
-        for name, thetas, channels in lines
-    ]
+    return Case(PEAK_ROUNDS * PEAK_CHAINS * PEAK_DEPTH * 8, lambda: peak(PEAK_ROUNDS, 0.5, x))
 
 
 # --- The tables
@@ -226,36 +188,53 @@ other programs only take cache and memory from a run; on both it is time by the 
 """
 
 
+def shortest(cases: Mapping[str, Case], turns: int, by_clock: Collection[str] = ()) -> dict[str, dict[str, float]]:
+    """Nanoseconds per particle-step of each case, all run in turn; of those `by_clock` by the clock."""
+    seen: dict[str, list[float]] = {name: [] for name in cases}
+    for turn in range(turns + 1):
+        for name, case in cases.items():
+            clock = time.perf_counter if name in by_clock else time.thread_time
+            end, best = time.perf_counter() + SLICE, np.inf
+            while time.perf_counter() < end:
+                begin = clock()
+                case.run()
+                best = min(best, clock() - begin)
+            if turn:  # the first one warms up
+                seen[name].append(1e9 * best / case.steps)
+    quartiles = {name: np.percentile(ns, [50, 25, 75, 0]).tolist() for name, ns in seen.items()}
+    return {name: dict(zip(("median", "low", "high", "least"), q, strict=True)) for name, q in quartiles.items()}
+
+
 def kernel_table(rounds: int) -> dict[str, Any]:
-    """Measures every line, NumPy and the peak, in turn."""
+    """Measures the model without and with effects, NumPy and the peak, in turn."""
     vehicle = Vehicle.shipped("pelican")
-    model = all_model_cases(vehicle, 8 * LANES)
-    plain = [numpy_case(vehicle, particles(vehicle, m)) for m in (256, 4096)]
-    peak = peak_case()
-    every = [*(c for pair in model for c in pair), *plain, peak]
-    both = {id(c) for _, c in model}
-    seen: dict[int, list[float]] = {id(c): [] for c in every}
-    for turn in range(TURNS * rounds + 1):
-        for case in every:
-            best = _best(case, time.perf_counter if id(case) in both else time.thread_time)
-            if turn:
-                seen[id(case)].append(1e9 * best / case.steps)
-    nominal, full, plainest, top = (
-        _told(seen, c)["least"]
-        for c in (model[0][0], model[3][0], min(plain, key=lambda c: _told(seen, c)["least"]), peak)
-    )
+    nominal = particles(vehicle, 8 * LANES)
+    lines = {
+        "nominal": nominal,
+        "motor lag, one a particle": free(nominal, (ix.TAU, 0.02)),
+        "rotor drag": free(nominal, (ix.KX, 0.2), (ix.KY, 0.2)),
+        "every effect": every_effect(vehicle, nominal),
+    }
+    cases, told = {"peak": peak_case()}, dict[str, tuple[str, str]]()
+    for score, line in product((False, True), lines):
+        name = line + (", cost" if score else "")
+        told[name] = f"{name}, one core", f"{name}, all cores"
+        cases |= zip(told[name], model_cases(vehicle, lines[line], score), strict=True)
+    for m in (256, 4096):
+        cases[f"NumPy, nominal step alone, {m} particles"] = numpy_case(vehicle, particles(vehicle, m))
+    found = shortest(cases, TURNS * rounds, [all_cores for _, all_cores in told.values()])
+    least = {name: ns["least"] for name, ns in found.items()}
+    first, numpy = least["nominal, one core"], {name: ns for name, ns in found.items() if name.startswith("NumPy")}
     return {
         "lanes": LANES,
-        "timings": [
-            {"name": one.name, "one_core": _told(seen, one), "all_cores": _told(seen, both)} for one, both in model
-        ],
-        "numpy": {c.name: _told(seen, c) for c in plain},
-        "fma_per_ns": 1.0 / top,
+        "timings": [{"name": n, "one_core": found[one], "all_cores": found[both]} for n, (one, both) in told.items()],
+        "numpy": numpy,
+        "fma_per_ns": 1.0 / least["peak"],
         "operations": NOMINAL_OPERATIONS,
-        "share_of_peak": NOMINAL_OPERATIONS * top / nominal,
-        "gain_over_numpy": plainest / nominal,
-        "extended_over_nominal": full / nominal,
-        "every_over_nominal": _told(seen, model[5][0])["least"] / nominal,
+        "share_of_peak": NOMINAL_OPERATIONS * least["peak"] / first,
+        "gain_over_numpy": min(ns["least"] for ns in numpy.values()) / first,
+        "extended_over_nominal": least["rotor drag, one core"] / first,
+        "every_over_nominal": least["every effect, one core"] / first,
     }
 
 
@@ -267,32 +246,11 @@ def effect_table(rounds: int) -> dict[str, Any]:
     for effect in EFFECTS:
         own = [e for e in entries if e.name.startswith(f"{effect}.") and not e.name.endswith(".time")]
         vectors[effect] = free(nominal, *((e.index, e.typical) for e in own))
-    cases = {name: model_cases(name, vehicle, thetas, 9, True)[0] for name, thetas in vectors.items()}
-    least = dict.fromkeys(cases, np.inf)
-    for _ in range(TURNS * rounds):
-        for name, case in cases.items():
-            least[name] = min(least[name], 1e9 * _best(case, time.thread_time) / case.steps)
+    cases = {name: model_cases(vehicle, thetas, True)[0] for name, thetas in vectors.items()}
+    least = {name: ns["least"] for name, ns in shortest(cases, TURNS * rounds).items()}
     ratios = {name: ns / least["nominal"] for name, ns in least.items() if name != "nominal"}
-    return {
-        "ns": least,
-        "ratios": ratios,
-        "median": float(np.median(list(ratios.values()))),
-        "largest": max(ratios, key=lambda name: ratios[name]),
-    }
-
-
-def _best(case: Case, clock: Callable[[], float]) -> float:
-    end, best = time.perf_counter() + SLICE, np.inf
-    while time.perf_counter() < end:
-        begin = clock()
-        case.run()
-        best = min(best, clock() - begin)
-    return best
-
-
-def _told(seen: dict[int, list[float]], case: Case) -> dict[str, float]:
-    low, middle, high = np.percentile(seen[id(case)], [25, 50, 75])
-    return {"median": middle, "low": low, "high": high, "least": min(seen[id(case)])}
+    median = float(np.median(list(ratios.values())))
+    return {"ns": least, "ratios": ratios, "median": median, "largest": max(ratios, key=lambda name: ratios[name])}
 
 
 # --- One step of `quadid.Simulator`
@@ -312,83 +270,8 @@ def fastest(run: Callable[[], object], calls: int) -> float:
     return float(shortest)
 
 
-def rotorpy_steps() -> dict[str, float]:
-    """Time of one step of RotorPy's Hummingbird [s]."""
-    from rotorpy.vehicles.hummingbird_params import quad_params
-    from rotorpy.vehicles.multirotor import Multirotor
-
-    craft = Multirotor(quad_params)
-    state, control = craft.initial_state, {"cmd_motor_speeds": np.full(4, 350.0)}
-    return {"RotorPy, one vehicle": fastest(lambda: craft.step(state, control, DT), 1)}
-
-
-def crazyflow_steps() -> dict[str, float]:
-    """Time of a step of crazyflow [s], one vehicle, and each of a batch; float32, Runge-Kutta of fourth order."""
-    from crazyflow.control import Control
-    from crazyflow.dynamics import Dynamics
-    from crazyflow.sim import Sim
-    from crazyflow.sim.integration import Integrator
-
-    times = {}
-    for n in (1, BATCH):
-        sim = Sim(
-            n, 1, dynamics=Dynamics.first_principles, control=Control.rotor_vel, integrator=Integrator.rk4, freq=500
-        )
-        sim.rotor_vel_control(np.full((n, 1, 4), 15000.0))
-
-        def step(sim: Any = sim) -> None:
-            sim.step()
-            sim.data.states.pos.block_until_ready()
-
-        step()
-        times["crazyflow, one vehicle" if n == 1 else f"crazyflow, {n} vehicles, each"] = fastest(step, 1) / n
-    return times
-
-
-def pybullet_steps() -> dict[str, float]:
-    """Time of a step of gym-pybullet-drones [s], by the engine and by its own equations."""
-    from gym_pybullet_drones.envs.CtrlAviary import CtrlAviary
-    from gym_pybullet_drones.utils.enums import Physics
-
-    times = {}
-    for physics in (Physics.PYB, Physics.DYN):
-        flown = CtrlAviary(physics=physics, pyb_freq=500, ctrl_freq=500, gui=False)
-        flown.reset()
-        action = np.full((1, 4), flown.HOVER_RPM)
-        times[f"gym-pybullet-drones, one vehicle, {physics.value}"] = fastest(functools.partial(flown.step, action), 10)
-        flown.close()
-    return times
-
-
-@contextmanager
-def one_core() -> Iterator[None]:
-    """Keeps this process, and the threads that it starts within, on one core."""
-    cores = os.sched_getaffinity(0)
-    os.sched_setaffinity(0, {max(cores)})
-    try:
-        yield
-    finally:
-        os.sched_setaffinity(0, cores)
-
-
-def step_table() -> dict[str, Any]:
-    """Seconds of a step of one vehicle and of batches on one core, beside those of other simulators that are there."""
-    with one_core():
-        times, absent = own_steps(), []
-        for name, steps in (
-            ("rotorpy", rotorpy_steps),
-            ("crazyflow", crazyflow_steps),
-            ("gym_pybullet_drones", pybullet_steps),
-        ):
-            if importlib.util.find_spec(name) is None:
-                absent.append(name)
-            else:
-                times |= steps()
-    return {"times": times, "absent": absent}
-
-
 def own_steps() -> dict[str, float]:
-    """Seconds of a step of `quadid.Simulator`."""
+    """Time of a step of `quadid.Simulator` [s]."""
     pelican = Vehicle.shipped("pelican")
     hover, one = np.full(4, pelican.hover_speed()), Simulator(pelican)
     state, rows = one.start(dt=DT), np.tile(hover, (1000, 1))
@@ -408,3 +291,70 @@ def own_steps() -> dict[str, float]:
         each = fastest(functools.partial(batch.advance, flying, commands, DT), 1) / BATCH
         times[f"{BATCH} vehicles, {name}, each"] = each
     return times
+
+
+def rotorpy_steps() -> dict[str, float]:
+    """Time of one step of RotorPy's Hummingbird [s]."""
+    from rotorpy.vehicles.hummingbird_params import quad_params
+    from rotorpy.vehicles.multirotor import Multirotor
+
+    craft = Multirotor(quad_params)
+    state, control = craft.initial_state, {"cmd_motor_speeds": np.full(4, 350.0)}
+    return {"RotorPy, one vehicle": fastest(lambda: craft.step(state, control, DT), 1)}
+
+
+def crazyflow_steps() -> dict[str, float]:
+    """Time of a step of crazyflow [s], one vehicle, and each of a batch; float32, Runge-Kutta of fourth order."""
+    from crazyflow.control import Control
+    from crazyflow.dynamics import Dynamics
+    from crazyflow.sim import Sim
+    from crazyflow.sim.integration import Integrator
+
+    times, how = {}, {"dynamics": Dynamics.first_principles, "control": Control.rotor_vel, "integrator": Integrator.rk4}
+    for n, name in ((1, "one vehicle"), (BATCH, f"{BATCH} vehicles, each")):
+        sim = Sim(n, 1, freq=500, **how)
+        sim.rotor_vel_control(np.full((n, 1, 4), 15000.0))
+
+        def step(sim: Any = sim) -> None:
+            sim.step()
+            sim.data.states.pos.block_until_ready()
+
+        step()
+        times[f"crazyflow, {name}"] = fastest(step, 1) / n
+    return times
+
+
+def pybullet_steps() -> dict[str, float]:
+    """Time of a step of gym-pybullet-drones [s], by the engine and by its own equations."""
+    from gym_pybullet_drones.envs.CtrlAviary import CtrlAviary
+    from gym_pybullet_drones.utils.enums import Physics
+
+    times = {}
+    for physics in (Physics.PYB, Physics.DYN):
+        flown = CtrlAviary(physics=physics, pyb_freq=500, ctrl_freq=500, gui=False)
+        flown.reset()
+        action = np.full((1, 4), flown.HOVER_RPM)
+        times[f"gym-pybullet-drones, one vehicle, {physics.value}"] = fastest(functools.partial(flown.step, action), 10)
+        flown.close()
+    return times
+
+
+STEPS = {
+    "quadid": own_steps,
+    "rotorpy": rotorpy_steps,
+    "crazyflow": crazyflow_steps,
+    "gym_pybullet_drones": pybullet_steps,
+}
+
+
+def step_table() -> dict[str, Any]:
+    """Seconds of a step of one vehicle and of batches on one core, beside those of other simulators that are there."""
+    cores, times = os.sched_getaffinity(0), dict[str, float]()
+    absent = [name for name in STEPS if importlib.util.find_spec(name) is None]
+    os.sched_setaffinity(0, {max(cores)})
+    try:
+        for name, steps in STEPS.items():
+            times |= {} if name in absent else steps()
+    finally:
+        os.sched_setaffinity(0, cores)
+    return {"times": times, "absent": absent}

@@ -54,6 +54,11 @@ def flown(seconds: float, seed: int, profile: str = "excited", **effects: dict[s
     return fly(PELICAN, seconds=seconds, seed=seed, profile=profile, effects=effects)
 
 
+def published(actions: Iterable[Action], topic: str = "parameters") -> list[Any]:
+    """Sets on a topic."""
+    return [a.item for a in actions if isinstance(a, Publish) and a.topic == topic]
+
+
 def against_batch(seeds: range) -> dict[str, Any]:
     """The last estimate of 60 s against `quadid.identify` on the same 60 s, and both against the truth.
 
@@ -63,93 +68,66 @@ def against_batch(seeds: range) -> dict[str, Any]:
     for seed in seeds:
         flight = flown(SECONDS + 1.0, seed)
         actions = list(drive(Session(PELICAN), stream(flight.recording)))
-        sets = [a.item for a in actions if isinstance(a, Publish) and a.topic == "parameters"]
-        every = [a.item for a in actions if isinstance(a, Publish) and a.topic == "candidate"]
+        sets, every = published(actions), published(actions, "candidate")
+        last, truth = every[-1].parameters, flight.truth.parameters.as_dict()
         batch, later = (
             fit([flight.window.slice(first, round(SECONDS * 50))], PELICAN, FitOptions()).parameters
             for first in (0, 12)
         )
-        truth = flight.truth.parameters.as_dict()
-        last, told = every[-1].parameters, every[-1].told_by_flight
-        rows.append(
-            {
-                "seed": seed,
-                "first_set_at": sets[0].stop if sets else None,
-                "sets": len(sets),
-                "to_batch": {n: last[n].value / batch[n].value - 1.0 for n in NOMINAL_NAMES},
-                "to_truth": {n: last[n].value / truth[n] - 1.0 for n in NOMINAL_NAMES},
-                "batch_cut_later": {n: later[n].value / batch[n].value - 1.0 for n in NOMINAL_NAMES},
-                "batch_to_truth": {n: batch[n].value / truth[n] - 1.0 for n in NOMINAL_NAMES},
-                "sigma": {n: told(n) / last[n].value for n in NOMINAL_NAMES},
-            }
-        )
+        ours, theirs, shifted = ({n: p[n].value for n in NOMINAL_NAMES} for p in (last, batch, later))
+        pairs = {
+            "to_batch": (ours, theirs),
+            "to_truth": (ours, truth),
+            "batch_cut_later": (shifted, theirs),
+            "batch_to_truth": (theirs, truth),
+        }
+        row = {"seed": seed, "first_set_at": sets[0].stop if sets else None, "sets": len(sets)}
+        row |= {name: {n: a[n] / b[n] - 1.0 for n in NOMINAL_NAMES} for name, (a, b) in pairs.items()}
+        rows.append(row | {"sigma": {n: every[-1].told_by_flight(n) / ours[n] for n in NOMINAL_NAMES}})
     return {"seconds": SECONDS, "flights": rows}
 
 
 def mass_changes(seeds: range) -> dict[str, Any]:
-    """Mass up or down by 15 % in flight: when it is known, and what it is said to be."""
-    rows = []
+    """Mass up or down by 15 % in flight: when it is known, and what it is said to be.
+
+    A hit is `mass_change`, named first, within 5 s, with its size within 10 %.
+    """
+    rows, hits = [], 0
     for seed in seeds:
         fraction = CHANGE if seed % 2 == 0 else -CHANGE
         flight = flown(CHANGE_AT + 8.0, seed, mass_change={"time": CHANGE_AT, "fraction": fraction})
-        actions = list(drive(Session(PELICAN), stream(flight.recording)))
+        actions = drive(Session(PELICAN), stream(flight.recording))
         found = [a for a in actions if isinstance(a, OnlineDiagnosis)]
-        finding = found[0].findings[0] if found and found[0].findings else None
-        rows.append(
-            {
-                "seed": seed,
-                "fraction": fraction,
-                "said": [f.effect for d in found for f in d.findings],
-                "after": found[0].t - CHANGE_AT if found else None,
-                "size": finding.values.get("fraction") if finding is not None else None,
-                "confident": finding.confident if finding is not None else None,
-            }
-        )
-    good = [r for r in rows if _hit(r)]
-    return {"at": CHANGE_AT, "flights": rows, "hits": len(good)}
-
-
-def _hit(row: dict[str, Any]) -> bool:
-    """Named mass_change within 5 s with its size within 10 %."""
-    if row["said"][:1] != ["mass_change"] or row["size"] is None:
-        return False
-    return bool(row["after"] <= FOUND_WITHIN and abs(row["size"] / row["fraction"] - 1.0) <= SIZE_WITHIN)
+        first = found[0].findings[0] if found and found[0].findings else None
+        said = [f.effect for d in found for f in d.findings]
+        after = found[0].t - CHANGE_AT if found else None
+        size, confident = (None, None) if first is None else (first.values.get("fraction"), first.confident)
+        if said[:1] == ["mass_change"] and size is not None and after is not None:
+            hits += after <= FOUND_WITHIN and abs(size / fraction - 1.0) <= SIZE_WITHIN
+        row = {"seed": seed, "fraction": fraction, "said": said, "after": after}
+        rows.append(row | {"size": size, "confident": confident})
+    return {"at": CHANGE_AT, "flights": rows, "hits": hits}
 
 
 def hover(seconds: float, seeds: range) -> dict[str, Any]:
-    """Ten minutes of hover: what is published, and how far any number in the session moved."""
+    """Ten minutes of hover: what is published; and whether a set in force before one stays as it is, to the bit."""
     rows = []
     for seed in seeds:
-        flight = flown(seconds, seed, "hover")
         session = Session(PELICAN)
-        actions = list(drive(session, stream(flight.recording)))
-        sets = [a for a in actions if isinstance(a, Publish)]
-        rows.append(
-            {
-                "seed": seed,
-                "seconds": seconds,
-                "published": sum(a.topic == "parameters" for a in sets),
-                "candidates": sum(a.topic == "candidate" for a in sets),
-                "diagnoses": sum(isinstance(a, OnlineDiagnosis) for a in actions),
-                "phase": session.status().phase.value,
-            }
-        )
-    return {"flights": rows}
-
-
-def hover_after_flight(seconds: float, seed: int) -> dict[str, Any]:
-    """Excited flight first, hover after it: the set in force must stay as it is, to the bit."""
-    first, quiet = flown(SECONDS, seed), flown(seconds, seed, "hover")
+        actions = list(drive(session, stream(flown(seconds, seed, "hover").recording)))
+        row = {"seed": seed, "seconds": seconds, "published": len(published(actions))}
+        row |= {"candidates": len(published(actions, "candidate")), "phase": session.status().phase.value}
+        rows.append(row | {"diagnoses": sum(isinstance(a, OnlineDiagnosis) for a in actions)})
+    first, quiet = flown(SECONDS, seeds[-1] + 1), flown(seconds, seeds[-1] + 1, "hover")
     session = Session(PELICAN)
     list(drive(session, stream(first.recording)))
     before = session.active_set.in_force
     later = list(drive(session, (Block(b.t + SECONDS + 3.0, b.columns) for b in stream(quiet.recording))))
     after = session.active_set.in_force
-    same = (
-        before is not None and after is not None and np.array_equal(before.parameters.values, after.parameters.values)
-    )
-    published = sum(isinstance(a, Publish) and a.topic == "parameters" for a in later)
-    return {"seconds": seconds, "same_bits": bool(same), "published": published}
+    both = before is not None and after is not None
+    same = both and np.array_equal(before.parameters.values, after.parameters.values)
+    told = {"seconds": seconds, "same_bits": bool(same), "published": len(published(later))}
+    return {"flights": rows, "after_flight": told}
 
 
 DELAYS = {"attitude": 0.1, "rotor_speed": 0.3}
@@ -228,18 +206,20 @@ def page(results: Mapping[str, Any]) -> str:
 
 
 def _estimate(r: Result) -> list[str]:
-    flights = r["flights"]
+    flights, rows = r["flights"], []
     first = [f["first_set_at"] for f in flights if f["first_set_at"] is not None]
-    rows = []
     for n in NOMINAL_NAMES:
-        batch = _column(flights, "to_batch", n)
+        batch, online, alone, sigma = (
+            100.0 * np.array([f[what][n] for f in flights])
+            for what in ("to_batch", "to_truth", "batch_to_truth", "sigma")
+        )
         rows.append(
             (
                 n,
                 f"{_rms(batch):.3f}, {np.abs(batch).max():.3f}",
                 f"{np.sum(np.abs(batch) <= 1.0)} of {len(batch)}",
-                f"{_rms(_column(flights, 'to_truth', n)):.3f}, {_rms(_column(flights, 'batch_to_truth', n)):.3f}",
-                f"{np.median(_column(flights, 'sigma', n)):.3f}",
+                f"{_rms(online):.3f}, {_rms(alone):.3f}",
+                f"{np.median(sigma):.3f}",
             )
         )
     heads = ("parameter", "online to batch: RMS, worst [%]", "within 1 %", "RMS error [%]: online, batch", "sigma [%]")
@@ -251,15 +231,10 @@ def _estimate(r: Result) -> list[str]:
     ]
 
 
-def _column(flights: list[Result], what: str, name: str) -> np.ndarray[Any, np.dtype[np.float64]]:
-    return 100.0 * np.array([f[what][name] for f in flights])
-
-
 def _change(r: Result) -> list[str]:
     flights = r["flights"]
     after = [f["after"] for f in flights if f["after"] is not None]
-    sized = [f for f in flights if f["size"] is not None]
-    error = np.array([abs(f["size"] / f["fraction"] - 1.0) for f in sized]) * 100.0
+    error = 100.0 * np.array([abs(f["size"] / f["fraction"] - 1.0) for f in flights if f["size"] is not None])
     named = sum(f["said"][:1] == ["mass_change"] for f in flights)
     return [
         f"Mass +15 % or −15 % at {r['at']} s of {len(flights)} excited flights. Named `mass_change` within 5 s with "
@@ -322,6 +297,11 @@ def _median(x: list[float]) -> float:
     return float(np.median(x)) if x else float("nan")
 
 
+def _loads(seconds: float) -> dict[str, Any]:
+    runs = {"excited": ("excited", False), "hover": ("hover", False), "recording": ("excited", True)}
+    return {name: ros_flight.under_load(seconds, *how) for name, how in runs.items()}
+
+
 PARTS: dict[str, tuple[str, Callable[[Given], Any], Callable[[Result], list[str]]]] = {
     "estimate": (
         "Sixty seconds of excited flight against the offline batch",
@@ -329,21 +309,9 @@ PARTS: dict[str, tuple[str, Callable[[Given], Any], Callable[[Result], list[str]
         _estimate,
     ),
     "change": ("Mass changed by 15 % in flight", lambda g: mass_changes(range(g.flights)), _change),
-    "hover": (
-        "Ten minutes of hover",
-        lambda g: {**hover(600.0, range(3)), "after_flight": hover_after_flight(600.0, 3)},
-        _hover,
-    ),
+    "hover": ("Ten minutes of hover", lambda g: hover(600.0, range(3)), _hover),
     "repeat": ("Live and replayed", lambda g: repeatability(60.0, 1), _repeat),
-    "load": (
-        "Load",
-        lambda g: {
-            "excited": ros_flight.under_load(g.load_seconds, "excited"),
-            "hover": ros_flight.under_load(g.load_seconds, "hover"),
-            "recording": ros_flight.under_load(g.load_seconds, "excited", record=True),
-        },
-        _load,
-    ),
+    "load": ("Load", lambda g: _loads(g.load_seconds), _load),
 }
 """Title, measurement and lines of each part; memory over many hours is what the soak shows."""
 
@@ -356,8 +324,7 @@ def keep(file: Path, name: str, result: object) -> dict[str, Any]:
     return dict(results)
 
 
-def main() -> None:
-    """Measures what was asked for."""
+if __name__ == "__main__":
     given = options(__doc__, PARTS, flights=40, load_seconds=60.0)
     out = given.out or Path("docs/results")
     for name in given.parts:
@@ -365,7 +332,3 @@ def main() -> None:
         results = keep(out / "online.json", name, PARTS[name][1](given))
         (out / "online.md").write_text(page(results), encoding="utf-8")
         print(f"{name}: {time.monotonic() - begin:.1f} s", flush=True)
-
-
-if __name__ == "__main__":
-    main()

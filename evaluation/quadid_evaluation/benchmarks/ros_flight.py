@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import psutil
 
 THIS_MACHINE = {
     "ROS_AUTOMATIC_DISCOVERY_RANGE": "SYSTEM_DEFAULT",
@@ -174,9 +175,18 @@ def latency(seconds: Any) -> dict[str, float]:
 # --- Both
 
 
-def resident(pid: int | str = "self") -> float:
-    """Memory of a process [MiB]."""
-    return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 2**20
+def resident(process: psutil.Process | None) -> float:
+    """Memory of a process [MiB]; NaN for none."""
+    return float("nan") if process is None else process.memory_info().rss / 2**20
+
+
+def fit_process(service: int) -> psutil.Process | None:
+    """The fit process of a service, by the service's process id; None while there is none."""
+    try:
+        children = psutil.Process(service).children()
+        return next((child for child in children if any("node.worker" in word for word in child.cmdline())), None)
+    except psutil.Error:
+        return None
 
 
 def flown(
@@ -222,14 +232,8 @@ def flown(
         noted = [json.loads(line) for line in Path(f"{folder}/notes.jsonl").read_text().splitlines()]
         said.seek(0)
         problems = [line.strip() for line in said if "[ERROR]" in line or "[WARN]" in line or "Traceback" in line]
-    return {
-        "asked_seconds": seconds,
-        "sent": sent,
-        "points": points,
-        "minutes": noted,
-        "exit_code": node.returncode,
-        "problems": problems,
-    }
+    whole = {"sent": sent, "points": points, "minutes": noted, "problems": problems}
+    return {"asked_seconds": seconds, "exit_code": node.returncode, **whole}
 
 
 def under_load(seconds: float, profile: str, record: bool = False) -> dict[str, Any]:
@@ -243,8 +247,10 @@ def under_load(seconds: float, profile: str, record: bool = False) -> dict[str, 
         "profile": profile,
         "record": record,
         "exit_code": found["exit_code"],
-        "cpu_node": (last["processor"] - first["processor"]) / span,
-        "cpu_worker": (last["worker_processor"] - first["worker_processor"]) / span,
+        **{
+            f"cpu_{who}": (last[name] - first[name]) / span
+            for who, name in (("node", "processor"), ("worker", "worker_processor"))
+        },
         "memory_begin": first["memory_mib"],
         "memory_end": last["memory_mib"],
         "memory_worker": last["worker_mib"],
@@ -279,41 +285,39 @@ def _drain(child: subprocess.Popen[str], into: Any) -> None:
         into.flush()
 
 
-def _processor(pid: int) -> float:
+def _processor(process: psutil.Process | None) -> float:
     """Processor time of a process [s]; 0 for none."""
-    if not pid:
-        return 0.0
-    fields = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+    return 0.0 if process is None else float(sum(process.cpu_times()[:2]))
 
 
 def _watch(
     pid: int, feeder: subprocess.Popen[str], kept: Path, between: float, tell: Callable[[str], None]
 ) -> list[dict[str, float]]:
-    begin, points = time.monotonic(), list[dict[str, float]]()
+    begin, node, points = time.monotonic(), psutil.Process(pid), list[dict[str, float]]()
     while True:
-        try:
+        with contextlib.suppress(subprocess.TimeoutExpired):
             feeder.wait(between if points else SETTLE)
             return points
-        except subprocess.TimeoutExpired:
-            pass
-        children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
-        workers = (int(c) for c in children if b"node.worker" in Path(f"/proc/{c}/cmdline").read_bytes())
-        worker = next(workers, 0)
+        worker = fit_process(pid)
         points.append(
             {
                 "hours": (time.monotonic() - begin) / 3600.0,
-                "memory_mib": resident(pid),
-                "files_mib": sum(f.stat().st_size for f in kept.rglob("*") if f.is_file()) / 2**20,
-                "worker_mib": resident(worker) if worker else float("nan"),
+                "memory_mib": resident(node),
+                "files_mib": size_of(kept),
+                "worker_mib": resident(worker),
                 "load": os.getloadavg()[0],
-                "processor": _processor(pid),
+                "processor": _processor(node),
                 "worker_processor": _processor(worker),
-                "handles": len(list(Path(f"/proc/{pid}/fd").iterdir())),
-                "threads": len(list(Path(f"/proc/{pid}/task").iterdir())),
+                "handles": node.num_fds(),
+                "threads": node.num_threads(),
             }
         )
         tell(f"{points[-1]['hours'] * 60:.0f} min, {points[-1]['memory_mib']:.0f} MiB")
+
+
+def size_of(folder: Path) -> float:
+    """Files in a folder [MiB]."""
+    return sum(f.stat().st_size for f in folder.rglob("*") if f.is_file()) / 2**20
 
 
 if __name__ == "__main__":

@@ -23,7 +23,7 @@ import matplotlib.pyplot as plt
 from quadid_evaluation.benchmarks import whole
 from quadid_evaluation.benchmarks.kernel import effect_table, kernel_table, step_table
 from quadid_evaluation.benchmarks.timing import machine
-from quadid_evaluation.harness import options, table
+from quadid_evaluation.harness import Given, options, table
 
 Result = Mapping[str, Any]
 
@@ -75,52 +75,11 @@ def _of(r: Result, name: str) -> str:
     return _both(r["times"][name]) if name in r["times"] else "–"
 
 
-def goals(results: Result) -> list[str]:
-    """Lines of a table: what, wanted, measured, limit of this machine; only of parts that were measured."""
-    rows = [(what, wanted, told(results[part])) for part, what, wanted, told in GOALS if part in results]
-    return [*table(("what", "wanted", "measured"), rows), ""]
-
-
 # --- The page
 
 
 SAMPLE_BYTES = 144
 """Of one row of a window: four rotors, rates, attitude, force, references, in doubles."""
-SHOWN = ("nominal, cost", "motor lag, one a particle, cost", "rotor drag, cost", "every effect, cost")
-"""Cases of the kernel in the table."""
-INTRODUCTION = (
-    "Medians of interleaved runs; compare ratios, since other programs share the machine. In brackets: processor time "
-    "of all threads and child processes. `speed.json` has every value."
-)
-
-
-def page(results: Result) -> str:
-    """Markdown of the goals, and of the parts of `PARTS` that were measured."""
-    out = [
-        "# Speed",
-        "",
-        "`make bench`, that is `python -m quadid_evaluation.benchmarks.speed --out docs/results`",
-        "",
-        INTRODUCTION,
-        "",
-    ]
-    shown = [name for name in PARTS if name in results]
-    out += [*goals(results), *([_machine(results[shown[0]]["machine"]), ""] if shown else [])]
-    for name in shown:
-        title, write = PARTS[name]
-        out += [f"## {title}", "", *write(results[name]), ""]
-        if results[name]["machine"] != results[shown[0]]["machine"]:
-            out += [_measured(results[name]["machine"]), ""]
-    return "\n".join(out)
-
-
-def _machine(m: Result) -> str:
-    versions = ", ".join(f"{name} {number}" for name, number in m["versions"].items())
-    return f"{m['date']}; {m['processor']}, {m['cores']} cores, load {m['load']:.1f}; Python {m['python']}, {versions}"
-
-
-def _measured(m: Result) -> str:
-    return f"Measured {m['date']}, load {m['load']:.1f}, {m['processor']}."
 
 
 def _kernel(r: Result) -> list[str]:
@@ -128,7 +87,7 @@ def _kernel(r: Result) -> list[str]:
     rows = [
         (t["name"], *(f"{t[cores]['least']:.1f}" for cores in ("one_core", "all_cores")))
         for t in r["timings"]
-        if t["name"] in SHOWN
+        if t["name"].endswith(", cost")
     ]
     return [
         "Best runs in float64: processor time on one core, wall time on both. The arithmetic of the nominal step "
@@ -136,6 +95,24 @@ def _kernel(r: Result) -> list[str]:
         f"per ns; NumPy at its best {r['gain_over_numpy']:.0f} times the nominal.",
         "",
         *table(("nanoseconds per particle and step", "one core", "both cores"), rows),
+    ]
+
+
+def _step(r: Result) -> list[str]:
+    rows = [(name, f"{1e6 * t:.3g}") for name, t in r["times"].items()]
+    absent = [f"Not installed: {', '.join(r['absent'])}.", ""] if r["absent"] else []
+    return [*absent, *table(("one step on one core; without a name, of `quadid.Simulator`", "us"), rows)]
+
+
+def _logs(r: Result) -> list[str]:
+    return [
+        "A simulated log of 500 s, and the largest recorded ones. quadid reads, checks, hashes and puts all channels "
+        "on one clock; large files in a process of their own.",
+        "",
+        *table(
+            ("what", "wall [s]", "ms of processor per MB"),
+            [(n, f"{t['wall']:.3g}", f"{t['ms_per_mb']:.3g}") for n, t in r["times"].items()],
+        ),
     ]
 
 
@@ -160,39 +137,64 @@ def _scaling(r: Result) -> list[str]:
     ]
 
 
-def _logs(r: Result) -> list[str]:
-    return [
-        "A simulated log of 500 s, and the largest recorded ones. quadid reads, checks, hashes and puts all channels "
-        "on one clock; large files in a process of their own.",
-        "",
-        *table(
-            ("what", "wall [s]", "ms of processor per MB"),
-            [(n, f"{t['wall']:.3g}", f"{t['ms_per_mb']:.3g}") for n, t in r["times"].items()],
-        ),
-    ]
-
-
-def _step(r: Result) -> list[str]:
-    rows = [(name, f"{1e6 * t:.3g}") for name, t in r["times"].items()]
-    absent = [f"Not installed: {', '.join(r['absent'])}.", ""] if r["absent"] else []
-    return [*absent, *table(("one step on one core; without a name, of `quadid.Simulator`", "us"), rows)]
-
-
-PARTS: dict[str, tuple[str, Callable[[Result], list[str]]]] = {
+SHOWN: dict[str, tuple[str, Callable[[Result], list[str]]]] = {
     "kernel": ("The kernel", _kernel),
     "step": ("One step", _step),
     "logs": ("Reading of logs", _logs),
     "scaling": ("Length of the log", _scaling),
 }
-"""Parts that are shown."""
+"""Parts with a section of their own."""
+PARTS: dict[str, Callable[[Given, Path], dict[str, Any]]] = {
+    "kernel": lambda g, folder: kernel_table(g.rounds),
+    "effects": lambda g, folder: effect_table(g.rounds),
+    "step": lambda g, folder: step_table(),
+    "identification": lambda g, folder: whole.identification(g.rounds),
+    "diagnoses": lambda g, folder: whole.diagnoses(max(g.rounds // 2, 1)),
+    "refits": lambda g, folder: whole.refits(3 * g.rounds),
+    "help": lambda g, folder: whole.sayings(g.rounds),
+    "commands": lambda g, folder: whole.commands(max(g.rounds // 2, 1), folder),
+    "starts": lambda g, folder: whole.starts(g.rounds, folder),
+    "memory": lambda g, folder: whole.memory(folder),
+    "logs": lambda g, folder: whole.logs(g.rounds, folder),
+    "scaling": lambda g, folder: whole.scaling(folder, g.longest),
+}
+"""Measurements, in order; the folder is for logs."""
 
 
-def draw_scaling(r: Mapping[str, Any], path: Path) -> None:
+def page(results: Result) -> str:
+    """Markdown: what was wanted beside what was measured, then the parts of `SHOWN`; only of what was measured."""
+    rows = [(what, wanted, told(results[part])) for part, what, wanted, told in GOALS if part in results]
+    out = [
+        "# Speed",
+        "",
+        "`make bench`, that is `python -m quadid_evaluation.benchmarks.speed --out docs/results`",
+        "",
+        "Medians of interleaved runs; compare ratios, since other programs share the machine. In brackets: processor "
+        "time of all threads and child processes. `speed.json` has every value.",
+        "",
+        *table(("what", "wanted", "measured"), rows),
+        "",
+    ]
+    first: Result = {}
+    for name, (title, write) in SHOWN.items():
+        if name not in results:
+            continue
+        m, end = results[name]["machine"], list[str]()
+        versions = ", ".join(f"{library} {number}" for library, number in m["versions"].items())
+        where = f"{m['processor']}, {m['cores']} cores, load {m['load']:.1f}; Python {m['python']}, {versions}"
+        if not first:
+            first, out = m, [*out, f"{m['date']}; {where}", ""]
+        elif m != first:
+            end = [f"Measured {m['date']}, load {m['load']:.1f}, {m['processor']}.", ""]
+        out += [f"## {title}", "", *write(results[name]), "", *end]
+    return "\n".join(out)
+
+
+def draw_scaling(r: Result, path: Path) -> None:
+    """Time and memory of a fit over the length of the log."""
     figure, axes = plt.subplots(1, 2, figsize=(9, 3.5), layout="constrained")
-    for axis, key, label in (
-        (axes[0], "fit_processor", "processor time of a fit [s]"),
-        (axes[1], "peak_mb", "peak memory [MB]"),
-    ):
+    labels = {"fit_processor": "processor time of a fit [s]", "peak_mb": "peak memory [MB]"}
+    for axis, (key, label) in zip(axes, labels.items(), strict=True):
         axis.loglog(r["hours"], [run[key] for run in r["runs"]], "o-")
         axis.set(xlabel="hours of flight at 50 Hz", ylabel=label, title=f"exponent {r['exponents'][key]:.2f}")
         axis.grid(alpha=0.3, which="both")
@@ -200,48 +202,21 @@ def draw_scaling(r: Mapping[str, Any], path: Path) -> None:
     plt.close(figure)
 
 
-def parts(rounds: int, longest: int, folder: Path) -> dict[str, Callable[[], dict[str, Any]]]:
-    """Parts that can be measured, in the order of the page."""
-    few = max(rounds // 2, 1)
-    return {
-        "kernel": lambda: kernel_table(rounds),
-        "effects": lambda: effect_table(rounds),
-        "step": step_table,
-        "identification": lambda: whole.identification(rounds),
-        "diagnoses": lambda: whole.diagnoses(few),
-        "refits": lambda: whole.refits(3 * rounds),
-        "help": lambda: whole.sayings(rounds),
-        "commands": lambda: whole.commands(few, folder),
-        "starts": lambda: whole.starts(rounds, folder),
-        "memory": lambda: whole.memory(folder),
-        "logs": lambda: whole.logs(rounds, folder),
-        "scaling": lambda: whole.scaling(folder, longest),
-    }
-
-
-def main() -> None:
-    """Measures, prints each part, writes page, picture and JSON."""
-    names = list(parts(1, 1, Path()))
-    given = options(__doc__, names, rounds=5, longest=100)
+if __name__ == "__main__":
+    given = options(__doc__, PARTS, rounds=5, longest=100)
     target = (given.out or Path("docs/results")) / "speed.json"
     known = json.loads(target.read_text(encoding="utf-8")) if target.exists() else {}
     results: dict[str, Any] = {"schema": "quadid.benchmark.speed/1", **known}
     with tempfile.TemporaryDirectory() as folder:
-        measured = parts(given.rounds, given.longest, Path(folder))
         for name in given.parts:
             begin = time.perf_counter()
-            results[name] = {"machine": machine(), "rounds": given.rounds, **measured[name]()}
+            results[name] = {"machine": machine(), "rounds": given.rounds, **PARTS[name](given, Path(folder))}
             print(f"{name}: measured in {time.perf_counter() - begin:.0f} s", flush=True)
-            print(
-                *(PARTS[name][1](results[name]) if name in PARTS else [json.dumps(results[name], indent=1)]), sep="\n"
-            )
+            told = SHOWN[name][1](results[name]) if name in SHOWN else [json.dumps(results[name], indent=1)]
+            print(*told, sep="\n", flush=True)
             if given.out is not None:
                 target.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
     if given.out is not None:
         if "scaling" in results:
             draw_scaling(results["scaling"], given.out / "speed-scaling.png")
         (given.out / "speed.md").write_text(page(results), encoding="utf-8")
-
-
-if __name__ == "__main__":
-    main()

@@ -3,64 +3,50 @@
 import json
 import os
 import platform
-import resource
 import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import psutil
 
 from quadid_evaluation.harness import QUADID
 
 LIBRARIES = ("numpy", "numba", "scipy")
 
 
-@dataclass
-class Times:
-    """Wall and processor seconds of every run of a case."""
-
-    wall: list[float] = field(default_factory=list)
-    processor: list[float] = field(default_factory=list)
-
-    def summary(self) -> dict[str, Any]:
-        """Medians, quartiles and number of runs."""
-        low, middle, high = np.percentile(self.wall, [25, 50, 75])
-        return {
-            "wall": middle,
-            "wall_quartiles": [low, high],
-            "processor": float(np.median(self.processor)),
-            "processor_least": min(self.processor),
-            "runs": len(self.wall),
-        }
-
-
 def interleaved(cases: Mapping[str, Callable[[], object]], rounds: int) -> dict[str, dict[str, Any]]:
-    """Runs every case once, to warm up, and then in turn; returns the summary of each."""
-    found = {name: Times() for name in cases}
+    """Runs every case once, to warm up, and then in turn.
+
+    Returns:
+        Of each case medians and quartiles of wall and processor seconds, and the number of runs.
+    """
+    spent: dict[str, list[tuple[float, float]]] = {name: [] for name in cases}
     for turn in range(rounds + 1):
         for name, run in cases.items():
             wall, processor = time.perf_counter(), processor_seconds()
             run()
             if turn:
-                found[name].wall.append(time.perf_counter() - wall)
-                found[name].processor.append(processor_seconds() - processor)
-    return {name: times.summary() for name, times in found.items()}
+                spent[name].append((time.perf_counter() - wall, processor_seconds() - processor))
+    found = {}
+    for name, times in spent.items():
+        (low, _), (wall, processor), (high, _) = np.percentile(times, [25, 50, 75], axis=0).tolist()
+        least = min(used for _, used in times)
+        found[name] = {"wall": wall, "wall_quartiles": [low, high], "processor": processor}
+        found[name] |= {"processor_least": least, "runs": len(times)}
+    return found
 
 
 def processor_seconds() -> float:
     """Processor time of this process and of its children, also those that still live, as readers of logs do [s]."""
-    used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
-    living = [pid for task in Path("/proc/self/task").iterdir() for pid in (task / "children").read_text().split()]
-    stats = [Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split() for pid in living]
-    ticks = sum(int(number) for fields in stats for number in fields[11:15])
-    return sum(u.ru_utime + u.ru_stime for u in used) + ticks / os.sysconf("SC_CLK_TCK")
+    own = psutil.Process()
+    used = [own.cpu_times(), *(child.cpu_times() for child in own.children())]
+    return float(sum(t.user + t.system + t.children_user + t.children_system for t in used))
 
 
 def child(code: str, *arguments: str, environment: Mapping[str, str] | None = None) -> dict[str, Any]:
@@ -68,53 +54,34 @@ def child(code: str, *arguments: str, environment: Mapping[str, str] | None = No
 
     Whoever starts a process lends it its own peak memory on Linux, so the peak is that of the child's own status.
     """
-    wrapped = code + (
-        "\nprint('PEAK', [line.split()[1] for line in open('/proc/self/status') if line.startswith('VmHWM')][0])\n"
-    )
+    peak = "print('PEAK', [line.split()[1] for line in open('/proc/self/status') if line.startswith('VmHWM')][0])"
     wall, processor = time.perf_counter(), processor_seconds()
-    done = subprocess.run(
-        [sys.executable, "-c", wrapped, *arguments],
-        capture_output=True,
-        text=True,
-        check=True,
-        env={**_surroundings(), **(environment or {})},
-    )
-    lines = done.stdout.splitlines()
-    told = json.loads(lines[-2]) if len(lines) > 1 else {}
+    said = _run([sys.executable, "-c", f"{code}\n{peak}\n", *arguments], environment)
     spent = {"wall": time.perf_counter() - wall, "processor": processor_seconds() - processor}
-    return {**told, **spent, "peak_mb": int(lines[-1].split()[1]) / 1024.0}
+    *_, told, last = ["{}", *said.splitlines()]
+    return {**json.loads(told), **spent, "peak_mb": int(last.split()[1]) / 1024.0}
 
 
 def command(*arguments: str, environment: Mapping[str, str] | None = None) -> None:
     """Runs `quadid` in a process of its own, quietly."""
-    with tempfile.TemporaryFile() as nothing:
-        subprocess.run(
-            [QUADID, *arguments],
-            stdout=nothing,
-            stderr=nothing,
-            check=True,
-            env={**_surroundings(), **(environment or {})},
-        )
+    _run([QUADID, *arguments], environment)
 
 
-def _surroundings() -> dict[str, str]:
-    """Environment of a started process: that of a user, where Python keeps what it has compiled."""
-    return {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
+def _run(words: list[str], environment: Mapping[str, str] | None) -> str:
+    """Runs a program in the environment of a user, where Python keeps what it has compiled; returns what it prints."""
+    variables = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
+    done = subprocess.run(words, capture_output=True, text=True, check=True, env={**variables, **(environment or {})})
+    return done.stdout
 
 
 def machine() -> dict[str, Any]:
     """Processor, versions, date and load."""
-    cpu = next((line.split(":")[1].strip() for line in _cpu_lines() if line.startswith("model name")), "unknown")
+    about = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     return {
-        "processor": cpu,
+        "processor": next((line.split(":")[1].strip() for line in about if line.startswith("model name")), "unknown"),
         "cores": os.cpu_count(),
         "python": platform.python_version(),
         "versions": {name: version(name) for name in LIBRARIES},
         "date": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
         "load": os.getloadavg()[0],
     }
-
-
-def _cpu_lines() -> list[str]:
-    path = Path("/proc/cpuinfo")
-    return path.read_text(encoding="utf-8").splitlines() if path.exists() else []

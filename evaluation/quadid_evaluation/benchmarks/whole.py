@@ -1,10 +1,9 @@
 """Whole commands and services: identification, diagnosis, refits, logs, reports, start-up, scaling."""
 
-import os
 import pickle
 import tempfile
 from collections.abc import Callable
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,7 @@ from quadid_replay import open_log
 from quadid.data.window import Window
 from quadid.diagnosis import diagnose
 from quadid.flight import draw_truth, fly
-from quadid.identification.fit import Fit, FitOptions, fit
+from quadid.identification.fit import FitOptions, fit
 from quadid.identification.particle_swarm import SwarmOptions
 from quadid.identification.result import mse_score
 from quadid.model.layout import Layout
@@ -23,6 +22,7 @@ from quadid.online.grid_buffer import WindowCut
 from quadid.parameters import NOMINAL_NAMES
 from quadid.vehicle import Vehicle
 from quadid_evaluation.benchmarks.timing import child, command, interleaved
+from quadid_evaluation.harness import DATA
 
 SEED = 2026
 
@@ -55,7 +55,7 @@ print(json.dumps({"evaluations": found.evaluations}))
 LONG_FIT = """
 import pickle, sys, json, time, numpy as np
 from dataclasses import replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from quadid.identification.fit import FitOptions, fit
 from quadid.vehicle import Vehicle
 window = pickle.load(open(sys.argv[1], "rb"))
@@ -77,19 +77,15 @@ def identification(rounds: int) -> dict[str, Any]:
     Errors over one second on that set and on two that were not fitted, beside those of the true parameters.
     """
     vehicle, window = Vehicle.shipped("pelican"), flight(500.0)
-    kept: dict[str, Fit] = {}
-
-    def run(name: str, options: FitOptions) -> None:
-        kept[name] = fit([window], vehicle, options)
-
     cases = {"64 x 100, polish, intervals": FULL, "standard search": FitOptions(seed=1)}
-    times = interleaved({n: lambda n=n, o=o: run(n, o) for n, o in cases.items()}, rounds)  # type: ignore[misc]
-    found, truth = kept["64 x 100, polish, intervals"], draw_truth(vehicle, SEED)
-    exact = Layout(vehicle).initial(vehicle)
+    times = interleaved({n: partial(fit, [window], vehicle, options) for n, options in cases.items()}, rounds)
+    found, standard = (fit([window], vehicle, options) for options in cases.values())
+    truth, exact = draw_truth(vehicle, SEED), Layout(vehicle).initial(vehicle)
     exact[: len(NOMINAL_NAMES)] = list(truth.as_dict().values())
     sets = [window, *(fly(vehicle, truth, 500.0, SEED + k).window for k in (1, 2))]
     errors = [[mse_score([w], vehicle, x, found.noise).mse for x in (found.theta, exact)] for w in sets]
-    return {"times": times, "evaluations": {n: f.evaluations for n, f in kept.items()}, "errors": errors}
+    evaluations = dict(zip(cases, (found.evaluations, standard.evaluations), strict=True))
+    return {"times": times, "evaluations": evaluations, "errors": errors}
 
 
 def refits(rounds: int) -> dict[str, Any]:
@@ -106,21 +102,15 @@ def refits(rounds: int) -> dict[str, Any]:
     return {"times": interleaved(cases, rounds)}
 
 
-def _mcap(path: Path) -> int:
-    """Messages as bytes, by mcap's reader: nothing in them is decoded."""
-    from mcap.reader import make_reader
-
-    with path.open("rb") as file:
-        return sum(1 for _ in make_reader(file).iter_messages(log_time_order=False))
-
-
-def _mcap_decoded(path: Path) -> int:
+def _mcap(path: Path, decoded: bool) -> int:
+    """Messages by mcap's reader: as bytes, in which nothing is decoded, or decoded."""
     from mcap.reader import make_reader
     from mcap_ros2.decoder import DecoderFactory
 
     with path.open("rb") as file:
-        reader = make_reader(file, decoder_factories=[DecoderFactory()])
-        return sum(1 for _ in reader.iter_decoded_messages(log_time_order=False))
+        reader = make_reader(file, decoder_factories=[DecoderFactory()] if decoded else [])
+        read = reader.iter_decoded_messages if decoded else reader.iter_messages
+        return sum(1 for _ in read(log_time_order=False))
 
 
 def _pymavlink(path: Path) -> int:
@@ -140,7 +130,10 @@ def _pyulog(path: Path) -> int:
 
 
 LIBRARIES: dict[str, dict[str, Callable[[Path], int]]] = {
-    ".mcap": {"mcap, bytes only": _mcap, "mcap and mcap-ros2-support": _mcap_decoded},
+    ".mcap": {
+        "mcap, bytes only": partial(_mcap, decoded=False),
+        "mcap and mcap-ros2-support": partial(_mcap, decoded=True),
+    },
     ".tlog": {"pymavlink": _pymavlink},
     ".bin": {"pymavlink": _pymavlink},
     ".ulg": {"pyulog": _pyulog},
@@ -150,16 +143,13 @@ LIBRARIES: dict[str, dict[str, Callable[[Path], int]]] = {
 
 def logs(rounds: int, folder: Path) -> dict[str, Any]:
     """Reading of logs by format, beside the libraries of others on the same file."""
-
     paths = [logged(folder, 500.0, suffix) for suffix in (".mcap", ".tlog", ".csv")]
-    recorded = Path(os.environ.get("QUADID_DATA", ""))
     for pattern in ("ardupilot/**/*.bin", "px4/**/*.ulg"):
-        paths += sorted(recorded.glob(pattern), key=lambda p: p.stat().st_size)[-1:]
-    cases: dict[str, Any] = {}
+        paths += sorted(DATA.glob(pattern), key=lambda p: p.stat().st_size)[-1:]
+    cases: dict[str, Callable[[], object]] = {}
     for path in paths:
-        cases[f"{path.suffix}, quadid"] = lambda p=path: open_log(p)
-        for name, read in LIBRARIES.get(path.suffix, {}).items():
-            cases[f"{path.suffix}, {name}"] = lambda p=path, read=read: read(p)
+        for name, read in ({"quadid": open_log} | LIBRARIES.get(path.suffix, {})).items():
+            cases[f"{path.suffix}, {name}"] = partial(read, path)
     times = interleaved(cases, rounds)
     sizes = {path.suffix: path.stat().st_size / 1e6 for path in paths}
     for name, t in times.items():
@@ -170,16 +160,15 @@ def logs(rounds: int, folder: Path) -> dict[str, Any]:
 
 def commands(rounds: int, folder: Path) -> dict[str, Any]:
     """Commands as a user calls them, each in a process of its own."""
-    flown, short = logged(folder, 500.0, ".mcap"), logged(folder, 120.0, ".mcap")
-    out = str(folder)
-    model = ("--vehicle", "pelican", "--out", out)
+    short, longer, whole = (logged(folder, seconds, ".mcap") for seconds in (60.0, 120.0, 500.0))
     cases = {
-        "quadid identify, 60 s MCAP": ("identify", str(logged(folder, 60.0, ".mcap")), *model),
-        "quadid identify, 500 s MCAP": ("identify", str(flown), *model),
-        "... with --report": ("identify", str(flown), *model, "--report", str(folder / "report.html")),
-        "quadid diagnose, 120 s MCAP": ("diagnose", str(short), *model),
+        "quadid identify, 60 s MCAP": ("identify", short),
+        "quadid identify, 500 s MCAP": ("identify", whole),
+        "... with --report": ("identify", whole, "--report", folder / "report.html"),
+        "quadid diagnose, 120 s MCAP": ("diagnose", longer),
     }
-    times = interleaved({n: lambda a=a: command(*a) for n, a in cases.items()}, rounds)  # type: ignore[misc]
+    model = ("--vehicle", "pelican", "--out", folder)
+    times = interleaved({n: partial(command, *map(str, (*a, *model))) for n, a in cases.items()}, rounds)
     return {"times": times, "megabytes": {n: Path(a[1]).stat().st_size / 1e6 for n, a in cases.items()}}
 
 
@@ -194,20 +183,17 @@ def diagnoses(rounds: int) -> dict[str, Any]:
     """Diagnosis of 120 s over the whole catalogue in a process whose kernels are warm."""
     vehicle = Vehicle.shipped("pelican")
     flights = {n: fly(vehicle, draw_truth(vehicle, SEED), 120.0, SEED, effects=e).window for n, e in HIDDEN.items()}
-    found = {n: diagnose([w], vehicle)[0] for n, w in flights.items()}
-    cases: dict[str, Any] = {n: lambda w=w: diagnose([w], vehicle) for n, w in flights.items()}
-    named = {n: [f.effect for f in d.findings] for n, d in found.items()}
-    return {"times": interleaved(cases, rounds), "found": named}
+    named = {n: [f.effect for f in diagnose([w], vehicle)[0].findings] for n, w in flights.items()}
+    return {
+        "times": interleaved({n: partial(diagnose, [w], vehicle) for n, w in flights.items()}, rounds),
+        "found": named,
+    }
 
 
 def sayings(rounds: int) -> dict[str, Any]:
     """Commands that only say something."""
-    cases = {
-        "quadid --help": ("--help",),
-        "quadid --version": ("--version",),
-        "quadid identify --help": ("identify", "--help"),
-    }
-    return {"times": interleaved({n: lambda a=a: command(*a) for n, a in cases.items()}, rounds)}  # type: ignore[misc]
+    words = ("--help", "--version", "identify --help")
+    return {"times": interleaved({f"quadid {w}": partial(command, *w.split()) for w in words}, rounds)}
 
 
 def starts(rounds: int, folder: Path) -> dict[str, Any]:
@@ -215,47 +201,31 @@ def starts(rounds: int, folder: Path) -> dict[str, Any]:
 
     And `quadid identify` of 60 s where nothing is compiled, which compiles in processes side by side.
     """
-
-    flown = str(logged(folder, 60.0, ".mcap"))
+    path, flown = folder / "window.pkl", str(logged(folder, 60.0, ".mcap"))
+    path.write_bytes(pickle.dumps(flight(60.0).slice(500, 1000)))
 
     def identified() -> None:
         with tempfile.TemporaryDirectory() as cache:
-            command(
-                "identify", flown, "--vehicle", "pelican", "--out", str(folder), environment={"NUMBA_CACHE_DIR": cache}
-            )
+            words = ("identify", flown, "--vehicle", "pelican", "--out", str(folder))
+            command(*words, environment={"NUMBA_CACHE_DIR": cache})
 
-    path = folder / "window.pkl"
-    path.write_bytes(pickle.dumps(flight(60.0).slice(500, 1000)))
     with tempfile.TemporaryDirectory() as cache:
-        first = child(FIRST_FIT, str(path), environment={"NUMBA_CACHE_DIR": cache})
-        times = interleaved(
-            {
-                "import of the fit": lambda: child("import quadid.identification.fit\nprint('{}')"),
-                "second start to first fit": lambda: child(
-                    FIRST_FIT, str(path), environment={"NUMBA_CACHE_DIR": cache}
-                ),
-            },
-            rounds,
-        )
+        started = partial(child, FIRST_FIT, str(path), environment={"NUMBA_CACHE_DIR": cache})
+        first = started()
+        imported = partial(child, "import quadid.identification.fit\nprint('{}')")
+        times = interleaved({"import of the fit": imported, "second start to first fit": started}, rounds)
     return {"first": first, "times": times | interleaved({"first quadid identify, 60 s MCAP": identified}, 1)}
 
 
 def scaling(folder: Path, longest: int) -> dict[str, Any]:
     """Time and memory of a fit against length of the log, each in a process of its own."""
-
     path = folder / "base.pkl"
     path.write_bytes(pickle.dumps(flight(360.0)))
     child(FIRST_FIT, str(path))  # kernels are on disk afterwards
     rows = [child(LONG_FIT, str(path), str(n)) for n in (1, 3, 10, 30, 100) if n <= longest]
-    hours = [r["rows"] / 50.0 / 3600.0 for r in rows]
-    return {"hours": hours, "runs": rows, "exponents": _exponents(rows)}
-
-
-def _exponents(rows: list[dict[str, Any]]) -> dict[str, float]:
     length = np.log([r["rows"] for r in rows])
-    return {
-        name: float(np.polyfit(length, np.log([r[name] for r in rows]), 1)[0]) for name in ("fit_processor", "peak_mb")
-    }
+    exponents = {n: float(np.polyfit(length, np.log([r[n] for r in rows]), 1)[0]) for n in ("fit_processor", "peak_mb")}
+    return {"hours": [r["rows"] / 50.0 / 3600.0 for r in rows], "runs": rows, "exponents": exponents}
 
 
 def memory(folder: Path) -> dict[str, Any]:

@@ -10,7 +10,8 @@ session asks three seconds after the change.
 import itertools
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.stats import chi2
@@ -23,6 +24,7 @@ from quadid.online.checks import judge
 from quadid.online.grid_buffer import Rows, WindowCut
 from quadid.online.records import OnlineFinding
 from quadid.parameters import NOMINAL_NAMES
+from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 from quadid_evaluation.harness import study, table
 
@@ -42,8 +44,7 @@ LOSS = 0.12
 """Loss of a rotor that is looked for."""
 
 
-@dataclass(frozen=True)
-class Seen:
+class Seen(NamedTuple):
     """A change that was seen at `t` [s], and what it was."""
 
     t: float
@@ -78,26 +79,28 @@ def watched(vehicle: Vehicle, flight: Flight, seed: int) -> Iterator[Seen]:
             detector.restart()
 
 
+def known_theta(vehicle: Vehicle, flight: Flight) -> FloatArray:
+    """Parameter vector of a session that knows the vehicle."""
+    theta = Layout(vehicle).initial(vehicle)
+    theta[: len(NOMINAL_NAMES)] = list(flight.truth.parameters.as_dict().values())
+    return theta
+
+
 def faults(vehicle: Vehicle, flight: Flight) -> Iterator[str]:
     """Complaints of the checks about the windows of a healthy flight, before and after the vehicle is known."""
-    window, layout = flight.window, Layout(vehicle)
-    theta = layout.initial(vehicle)
-    theta[: len(NOMINAL_NAMES)] = list(flight.truth.parameters.as_dict().values())
-    thrust, second = ThrustModel(layout, theta), round(1.0 / window.dt)
+    window, second = flight.window, round(1.0 / flight.window.dt)
+    thrust = ThrustModel(Layout(vehicle), known_theta(vehicle, flight))
     for known, length in ((False, 10.0), (True, ASK_FLYING)):
         rows = round(length / window.dt)
         for k in range(0, len(window) - rows, second):
-            part = window.slice(k, k + rows)
-            quality = judge(WindowCut((part,), length, 0), vehicle, thrust, known)
-            if quality.fault or quality.grounded:
-                yield (quality.fault or quality.grounded).split(":")[0].split(" (")[0]
+            quality = judge(WindowCut((window.slice(k, k + rows),), length, 0), vehicle, thrust, known)
+            if said := quality.fault or quality.grounded:
+                yield said.split(":")[0].split(" (")[0]
 
 
 def named(vehicle: Vehicle, flight: Flight, seen: Seen) -> OnlineFinding | None:
     """Report of a session on a change, `AFTER_CHANGE` [s] after it."""
-    window, theta = flight.window, Layout(vehicle).initial(vehicle)
-    theta[: len(NOMINAL_NAMES)] = list(flight.truth.parameters.as_dict().values())
-    at = seen.change.time
+    window, at, theta = flight.window, seen.change.time, known_theta(vehicle, flight)
     first, last = np.searchsorted(window.t, [at - BASELINE, at + AFTER_CHANGE]).tolist()
     part = window.slice(first, last)
     request = ChangeRequest(1, vehicle, (part,), part.t0, part.t0 + AFTER_CHANGE, theta, SIGMA, seen.change, at)
@@ -109,9 +112,9 @@ def upper(count: int, hours: float) -> float:
     return float(chi2.ppf(0.95, 2 * (count + 1))) / 2.0 / hours
 
 
-def healthy(hours: float, seed: int) -> str:
+def healthy(hours: float, seed: int) -> list[str]:
     """Alarms on healthy flights, as Markdown."""
-    rows, total, flights = [], Counter[str](), 0
+    rows, changes, refused, flights = [], 0, 0, 0
     each = max(round(hours * 3600.0 / SECONDS / len(VEHICLES) / len(PROFILES) / len(AIR)), 1)
     for (air, strength), profile in itertools.product(AIR.items(), PROFILES):
         alarms, said = Counter[str](), Counter[str]()
@@ -120,25 +123,21 @@ def healthy(hours: float, seed: int) -> str:
             flight = flown(vehicle, seed + k, profile, strength, SECONDS)
             alarms += Counter(s.change.channel for s in watched(vehicle, flight, k))
             said += Counter(faults(vehicle, flight))
-        total += alarms + Counter({"windows refused": said.total()})
-        flights += each * len(VEHICLES)
+        changes, refused, flights = changes + alarms.total(), refused + said.total(), flights + each * len(VEHICLES)
         texts = "; ".join(f"{what} ({n})" for what, n in (alarms + said).items())
         flew_here = f"{each * len(VEHICLES) * SECONDS / 3600.0:.2f}"
         rows.append((air, profile, flew_here, alarms.total(), said.total(), texts))
         print(*rows[-1], flush=True)
-    flew, refused = flights * SECONDS / 3600.0, total.pop("windows refused", 0)
-    heads = ("air", "flight", "hours", "changes", "windows refused", "what")
-    return "\n".join(
-        [
-            f"## Healthy flights\n`make alarms`, seed {seed}. {', '.join(VEHICLES)}; individuals "
-            f"known to {KNOWN:.0%}, with motor lag, rotor drag and inflow. **{total.total()} false changes in "
-            f"{flew:.1f} h, at most {upper(total.total(), flew):.2f} an hour (95 %); {refused} windows refused.**\n",
-            *table(heads, rows),
-        ]
-    )
+    flew = flights * SECONDS / 3600.0
+    return [
+        f"## Healthy flights\n`make alarms`, seed {seed}. {', '.join(VEHICLES)}; individuals known to {KNOWN:.0%}, "
+        f"with motor lag, rotor drag and inflow. **{changes} false changes in {flew:.1f} h, at most "
+        f"{upper(changes, flew):.2f} an hour (95 %); {refused} windows refused.**\n",
+        *table(("air", "flight", "hours", "changes", "windows refused", "what"), rows),
+    ]
 
 
-def detections(each: int, seed: int) -> str:
+def detections(each: int, seed: int) -> list[str]:
     """Delays until changes are named, as Markdown."""
     pelican, rows = Vehicle.shipped("pelican"), []
     cases = [*((what, "mass_change") for what in CHANGES), (f"-{LOSS:.0%} of a rotor", "weak_rotor")]
@@ -164,14 +163,12 @@ def detections(each: int, seed: int) -> str:
         rows.append((what, profile, air, f"{within} of {each}", len(soon) - within, times, right, false, size))
         print(*rows[-1], flush=True)
     heads = ("change", "flight", "air", "within 5 s", "later", "delay [s]", "right", "wrong and sure", "size")
-    return "\n".join(
-        [
-            f"## Changes\n`make alarms`, seed {seed}. Seen and named within 5 s, and within 8 s; "
-            "median delay; right: named, a rotor by its number, or among the alternatives of a finding that is not "
-            "sure; wrong and sure: another cause, with confidence; median size.\n",
-            *table(heads, rows),
-        ]
-    )
+    return [
+        f"## Changes\n`make alarms`, seed {seed}. Seen and named within 5 s, and within 8 s; median delay; right: "
+        "named, a rotor by its number, or among the alternatives of a finding that is not sure; wrong and sure: "
+        "another cause, with confidence; median size.\n",
+        *table(heads, rows),
+    ]
 
 
 def _changed(vehicle: Vehicle, seed: int, profile: str, air: float, what: str, rotor: int) -> Flight:
@@ -189,12 +186,5 @@ def _changed(vehicle: Vehicle, seed: int, profile: str, air: float, what: str, r
 
 
 if __name__ == "__main__":
-    study(
-        __doc__,
-        "alarms.md",
-        "False alarms, and changes that are seen",
-        {"healthy": lambda g: healthy(g.hours, g.seed), "changes": lambda g: detections(g.each, g.seed)},
-        hours=6.0,
-        each=4,
-        seed=500,
-    )
+    parts = {"healthy": lambda g: healthy(g.hours, g.seed), "changes": lambda g: detections(g.each, g.seed)}
+    study(__doc__, "alarms.md", "False alarms, and changes that are seen", parts, hours=6.0, each=4, seed=500)

@@ -1,19 +1,21 @@
 """Blinded campaign: hides effects in flown data, lets the diagnosis look at the log alone, and grades the answer.
 
     python -m quadid_evaluation.studies.campaign --out docs/results
+    python -m quadid_evaluation.studies.campaign --groups cases:12,cases_hub:12
 
 Every case is decided by its class and number alone.  The diagnosis gets windows and a vehicle file with a poor guess;
-what was hidden never reaches it.
+what was hidden never reaches it.  `cases` and `cases_hub` are flights of simulators written by others, `recorded` the
+sets of `quadid_evaluation.studies.flight_sets`.
 """
 
 import datetime
 import json
-import multiprocessing
 import time
 import zlib
 from collections import Counter
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -23,16 +25,18 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 
+import quadid
 from quadid.data.window import Window
-from quadid.diagnosis import Search, diagnose
+from quadid.diagnosis import Diagnosis, Search, diagnose
 from quadid.diagnosis.evidence import block_deviance
-from quadid.diagnosis.hypotheses import Model, Start, candidates, extend, fit_model
+from quadid.diagnosis.hypotheses import Start, candidates, extend, fit_model
 from quadid.effects import EFFECTS
 from quadid.errors import QuadidError
 from quadid.flight import OUTSIDE, FlightError, draw_effect, draw_outside, draw_truth, fly
 from quadid.parameters import NOMINAL_NAMES
 from quadid.vehicle import Command, Vehicle
-from quadid_evaluation.harness import options, share, table
+from quadid_evaluation.harness import DATA, keep, kept, options, pooled, share, table
+from quadid_evaluation.studies.flight_sets import SETS, of_set
 from quadid_evaluation.studies.truth import with_values
 
 # --- The cases
@@ -51,6 +55,8 @@ LATER = (
     "velocity_scale",
 )
 """Effects that joined the catalogue when the numbers of the cases below were in use; a class of their own."""
+INDEPENDENT, RECORDED = ("cases", "cases_hub"), "recorded"
+"""Flights of simulators of others: rotors whose air acts at the centre of gravity, and at each hub; recorded ones."""
 SINGLES = tuple(name for name in EFFECTS if name not in LATER)
 PAIRS = (
     ("motor_lag", "rotor_drag"),
@@ -76,76 +82,86 @@ LOOK_ALIKES = (
 
 @dataclass(frozen=True)
 class Case:
-    """One blinded case: what is hidden and how it is flown."""
+    """One blinded case: what is hidden and how it is flown.
+
+    Attributes:
+        number: within its class; the name of a recorded set.
+        hidden: effects with their numbers; expected: those that an answer has to name.
+    """
 
     group: str
-    number: int
-    hidden: dict[str, dict[str, float]]
-    expected: tuple[str, ...]
+    number: int | str
+    hidden: dict[str, dict[str, float]] = field(default_factory=dict)
+    expected: tuple[str, ...] = ()
     outside: dict[str, dict[str, float]] = field(default_factory=dict)
     vehicle: str = "pelican"
     seconds: float = 120.0
-    noise_scale: float = 1.0
-    profile: str = "excited"
-    scale: float = 1.0
 
     @property
     def seed(self) -> int:
-        """Seed of the flight."""
+        """Seed of the flight and of the diagnosis; 0 for flights of others."""
+        if self.group in (*INDEPENDENT, RECORDED):
+            return 0
         return zlib.crc32(f"{self.group}/{self.number}".encode()) % 2**31
 
 
 def cases(group: str, count: int, start: int = 0) -> list[Case]:
     """Returns cases `start` to `start + count` of one class."""
+    if group == RECORDED:
+        return [Case(group, name) for name in SETS][start : start + count]
+    if group in INDEPENDENT:
+        return [independent(group, answer) for answer in answers(group)[start : start + count]]
     return [_case(group, n) for n in range(start, start + count)]
+
+
+def case(name: str) -> Case:
+    """One case by class and number, or name: ``single 7000``, ``cases 12``, ``recorded iris``."""
+    group, _, number = name.partition(" ")
+    if group in (*INDEPENDENT, RECORDED):
+        return next(c for c in cases(group, len(SETS)) if str(c.number) == number)
+    return _case(group, int(number))
+
+
+@cache
+def answers(folder: str) -> list[dict[str, Any]]:
+    """The answer sheet of an independent simulator."""
+    return list(json.loads((DATA / folder / "answers.json").read_text(encoding="utf-8")))
+
+
+def independent(folder: str, answer: dict[str, Any]) -> Case:
+    """A case of an independent simulator; what is hidden amid clutter is the large effect."""
+    expected, kind = tuple(answer["effects"]), answer["kind"]
+    hidden = answer["truth"] if kind == "clutter" else {n: answer["truth"].get(n, {}) for n in expected}
+    return Case(folder, int(answer["case"].removeprefix("case_")), hidden, expected)
 
 
 def _case(group: str, n: int) -> Case:
     vehicle = "pelican_x" if n % 3 == 2 else "pelican"
-    craft = Vehicle.shipped(vehicle)
-
-    def draw(name: str, scale: float = 1.0, seconds: float = 120.0) -> dict[str, dict[str, float]]:
-        return draw_effect(name, n, scale, craft, seconds)
-
-    blank = Case(group, n, {}, (), vehicle=vehicle)
-    hidden: dict[str, dict[str, float]]
-    if group == "null":
-        return blank
-    if group in ("single", "rough", "noisy", "short", "weak"):
-        name = SINGLES[n % len(SINGLES)]
-        hidden = draw(name, seconds=60.0 if group == "short" else 120.0)
-        changed: dict[str, dict[str, Any]] = {
-            "rough": {"outside": GUSTS},
-            "noisy": {"noise_scale": 3.0},
-            "short": {"seconds": 60.0},
-            "weak": {"profile": "gentle"},
-        }
-        return replace(blank, hidden=hidden, expected=tuple(hidden), **changed.get(group, {}))
-    if group.startswith("size_"):
-        name = SINGLES[n % len(SINGLES)]
-        scale = float(group.split("_")[1])
-        hidden = draw(name, scale)
-        return replace(blank, hidden=hidden, expected=tuple(hidden), scale=scale)
-    if group == "later":
-        hidden = draw(LATER[n % len(LATER)])
-        return replace(blank, hidden=hidden, expected=tuple(hidden))
-    if group in ("pair", "look_alike"):
+    craft, blank = Vehicle.shipped(vehicle), Case(group, n, vehicle=vehicle)
+    if group in ("single", "rough", "short"):
+        names: Sequence[str] = (SINGLES[n % len(SINGLES)],)
+    elif group == "later":
+        names = (LATER[n % len(LATER)],)
+    elif group in ("pair", "look_alike"):
         pool = PAIRS if group == "pair" else LOOK_ALIKES
-        hidden = {k: v for name in pool[n % len(pool)] for k, v in draw(name).items()}
-        return replace(blank, hidden=hidden, expected=tuple(hidden))
-    if group == "outside":
+        names = pool[n % len(pool)]
+    elif group == "null":
+        return blank
+    elif group == "outside":
         name = sorted(OUTSIDE)[n % len(OUTSIDE)]
         return replace(blank, outside={name: draw_outside(name, n)})
-    if group == "clutter":
-        large = SINGLES[n % len(SINGLES)]
-        hidden = {}
-        for i, name in enumerate(SINGLES):
-            if name not in ("mass_change", "thrust_drop", "ground_effect", "wind"):
-                hidden.update({k: v for k, v in draw_effect(name, n + 1000 * i, 0.05, craft).items() if k == name})
-        # What is invisible without a companion is drawn with it, both at full size.
-        hidden.update(draw(large))
-        return replace(blank, hidden=hidden, expected=tuple(draw(large)))
-    raise ValueError(f"unknown class '{group}'")
+    elif group == "clutter":
+        # Every effect at a twentieth; what is invisible without a companion is drawn with it, both at full size.
+        small = [name for name in SINGLES if name not in ("mass_change", "thrust_drop", "ground_effect", "wind")]
+        hidden = {name: draw_effect(name, n + 1000 * SINGLES.index(name), 0.05, craft)[name] for name in small}
+        large = draw_effect(SINGLES[n % len(SINGLES)], n, 1.0, craft, 120.0)
+        return replace(blank, hidden=hidden | large, expected=tuple(large))
+    else:
+        raise ValueError(f"unknown class '{group}'")
+    seconds = 60.0 if group == "short" else 120.0
+    drawn = {k: v for name in names for k, v in draw_effect(name, n, 1.0, craft, seconds).items()}
+    outside = GUSTS if group == "rough" else {}
+    return replace(blank, hidden=drawn, expected=tuple(drawn), seconds=seconds, outside=outside)
 
 
 GROUPS = {
@@ -156,12 +172,7 @@ GROUPS = {
     "outside": 48,
     "clutter": 50,
     "rough": 25,
-    "noisy": 25,
-    "short": 25,
-    "weak": 25,
-    "size_0.3": 25,
-    "size_0.1": 25,
-    "size_0.03": 25,
+    "later": 30,
 }
 
 
@@ -189,24 +200,26 @@ def flown(case: Case) -> tuple[Window, Window, Vehicle]:
     craft = shipped(case)
     truth = draw_truth(craft, case.seed)
     extras = tuple(sorted(needs(case) & {"velocity", "position", "battery"}))
-    windows = []
-    for k in range(2):
-        flight = fly(
-            craft,
-            truth,
-            case.seconds,
-            case.seed + 7919 * k,
-            case.profile,
-            effects=case.hidden,
-            outside=case.outside,
-            noise_scale=case.noise_scale,
-            extras=extras,
-        )
-        windows.append(flight.window)
-    return windows[0], windows[1], guessed_vehicle(case, truth.as_dict())
+    how = {"effects": case.hidden, "outside": case.outside, "extras": extras}
+    first, second = (fly(craft, truth, case.seconds, case.seed + 7919 * k, **how).window for k in range(2))
+    return first, second, guessed_vehicle(case, truth.as_dict())
 
 
-# --- One case flown, diagnosed, and graded against what was hidden and an oracle that knows the structure
+def given(case: Case) -> tuple[list[Window], list[Window], Vehicle]:
+    """Windows to diagnose, windows to measure the gain on, and the vehicle as guessed."""
+    if case.group == RECORDED:
+        vehicle, train, held = SETS[str(case.number)].windows()
+    elif case.group in INDEPENDENT:
+        folder = DATA / case.group / f"case_{case.number:03d}"
+        vehicle = Vehicle.named(folder / "vehicle.yaml")
+        train, held = (list(quadid.load(folder / f"{log}.csv", vehicle).windows) for log in ("train", "validate"))
+    else:
+        one, other, vehicle = flown(case)
+        train, held = [one], [other]
+    return train, held, vehicle
+
+
+# --- One case diagnosed, and graded against what was hidden and an oracle that knows the structure
 
 
 WITH_ORACLE = ("single", "pair", "look_alike")
@@ -219,96 +232,118 @@ class Graded:
 
     Attributes:
         verdict: of the diagnosis, or ``failed``.
-        named: effects called confident; listed: all findings; first: the first of them.
+        named: effects called confident; listed: all findings.
+        right: all that was hidden and nothing else, `unknown` for the unknown; of recorded flights, no number called
+            identified excludes what is known of the vehicle.
         values: found parameters by effect and name; intervals: their 95 % intervals.
-        mse_nominal, mse_extended: on the second flight; mse_oracle: of the true structure fitted to the first.
-        rest: structure left, as a share of the noise.
+        mse_nominal, mse_extended: in the segments that decided; mse_oracle: of the true structure fitted to the first
+            flight; stated: the first two as `diagnose` states them.
+        rest: structure left, as a share of the noise; follows: what it follows most, and where.
     """
 
     case: Case
-    verdict: str
-    named: tuple[str, ...]
-    listed: tuple[str, ...]
-    first: str | None
-    values: dict[str, dict[str, float]]
-    intervals: dict[str, dict[str, tuple[float, float]]]
-    mse_nominal: float
-    mse_extended: float
-    mse_oracle: float | None
-    rest: float
-    seconds: float
+    verdict: str = "failed"
+    named: tuple[str, ...] = ()
+    listed: tuple[str, ...] = ()
+    right: bool = False
+    values: dict[str, dict[str, float]] = field(default_factory=dict)
+    intervals: dict[str, dict[str, tuple[float, float]]] = field(default_factory=dict)
+    mse_nominal: float = float("nan")
+    mse_extended: float = float("nan")
+    mse_oracle: float | None = None
+    stated: tuple[float, float] = (float("nan"), float("nan"))
+    rest: float = 0.0
+    follows: str = ""
+    seconds: float = 0.0
     note: str = ""
+
+    @property
+    def first(self) -> str | None:
+        """The first finding."""
+        return self.listed[0] if self.listed else None
 
 
 def run(case: Case) -> Graded:
-    """Flies, diagnoses and grades one case."""
+    """Flies or reads, diagnoses and grades one case."""
     try:
-        train, validate, vehicle = flown(case)
+        train, held, vehicle = given(case)
     except (FlightError, QuadidError) as error:
-        return _failed(case, f"not flown: {error}")
+        return Graded(case, note=f"not flown: {error}")
+    return grade(case, train, held, vehicle)
+
+
+def grade(case: Case, train: Sequence[Window], held: Sequence[Window], vehicle: Vehicle) -> Graded:
+    """Diagnoses and grades the windows of one case."""
     began = time.perf_counter()
     try:
-        found, search = diagnose([train], vehicle, [validate], seed=case.seed)
+        found, search = diagnose(train, vehicle, held, seed=case.seed)
     except QuadidError as error:
-        return _failed(case, f"refused: {error}")
+        return Graded(case, note=f"refused: {error}")
     seconds = time.perf_counter() - began
-    oracle = _oracle(case, search, validate) if case.group in WITH_ORACLE else None
     return Graded(
         case,
         found.verdict.value,
         tuple(f.effect for f in found.findings if f.confident),
         tuple(f.effect for f in found.findings),
-        found.findings[0].effect if found.findings else None,
+        right(case, found),
         {f.effect: {p.name: p.value for p in f.parameters} for f in found.findings},
         {f.effect: {p.name: p.ci95 for p in f.parameters} for f in found.findings},
         *found.validation.deciding,
-        oracle,
+        _oracle(case, search, held) if case.group in WITH_ORACLE else None,
+        (found.validation.nominal, found.validation.extended),
         found.remainder.deviance / search.model.rows,
+        next((f"{f.signal} at {f.site.name}" for f in found.remainder.followed), ""),
         seconds,
     )
 
 
-def _failed(case: Case, note: str) -> Graded:
-    return Graded(case, "failed", (), (), None, {}, {}, float("nan"), float("nan"), None, 0.0, 0.0, note)
+def right(case: Case, found: Diagnosis) -> bool:
+    """Checks whether an answer is right in full."""
+    named = [f.effect for f in found.findings if f.confident]
+    if case.group == RECORDED:
+        numbers = of_set("", SETS[str(case.number)], {"": found.to_dict()})
+        return all(n.inside for n in numbers if n.identified)
+    if case.expected == ("unknown",):
+        return found.verdict.value == "unknown"
+    if case.outside and not case.hidden:
+        return not named
+    if len(case.hidden) > len(case.expected):  # amid clutter the large one comes first
+        first = found.findings[0].effect if found.findings else None
+        return first in case.expected and set(named) <= set(case.hidden)
+    return set(named) == set(case.expected) and (bool(named) or found.verdict.value == "nothing_found")
 
 
-def _oracle(case: Case, search: Search, validate: Window) -> float:
+def _oracle(case: Case, search: Search, held: Sequence[Window]) -> float:
     """Error on the second flight of the model with the true causes, each fitted from the truth's neighbourhood."""
-    shooting = search.shooting
+    shooting, model = search.shooting, search.nominal
     listed = candidates(shooting.layout, shooting.has_velocity, shooting.channels >= 15)
-    model: Model = search.nominal
     for effect, values in sorted(case.hidden.items(), key=lambda item: item[0] != "rotor_drag"):
         # From the true effect, and nominal parameters of the vehicle file.
         theta = np.asarray(model.theta).copy()
         shooting.layout.write_effects(theta, {effect: values})
-        start = Start(theta, model.states)
         label = f"weak_rotor {round(values['rotor'])}" if effect == "weak_rotor" else effect
-        model = extend(shooting, model, next(c for c in listed if c.label == label), start, 12)
+        cause = next(c for c in listed if c.label == label)
+        model = extend(shooting, model, cause, Start(theta, model.states), 12)
     model = fit_model(shooting, model.theta, model.causes, model.states, 12)
-    deviance, rows = block_deviance(shooting.on([validate]), model)
+    deviance, rows = block_deviance(shooting.on(held), model)
     return float(deviance.sum()) / rows
 
 
-def right(g: Graded) -> bool:
-    """Checks whether the answer is right in full: all that was hidden, nothing else; `unknown` for the unknown."""
-    group = g.case.group
-    if group == "null":
-        return g.verdict == "nothing_found"
-    if group == "outside":
-        return not g.named and g.verdict != "failed"
-    if group == "clutter":
-        return g.first in g.case.expected and all(n in g.case.hidden for n in g.named)
-    return set(g.named) == set(g.case.expected)
+HEADS = ("case", "hidden", "found", "error on the unseen flight")
 
 
-def line(g: Graded) -> str:
-    """One answer on a line, for the log of a campaign."""
-    what = g.case.expected if g.case.group == "clutter" else g.case.hidden or g.case.outside
-    return (
-        f"{'right' if right(g) else 'WRONG'} {g.seconds:.1f} s {g.case.group} {g.case.number} {g.case.vehicle} "
-        f"{g.verdict} {list(g.listed)} hidden {what} mse {g.mse_nominal:.3f} -> {g.mse_extended:.3f} "
-        f"rest {g.rest:.3f} {g.note}"
+def row(g: Graded) -> tuple[str, ...]:
+    """One answer as cells under `HEADS`; the verdict is told unless it is what the cell says."""
+    what = {n: g.case.hidden.get(n, {}) for n in g.case.expected} or g.case.outside
+    hidden = ", ".join(" ".join([name, *(f"{k} {v:.4g}" for k, v in values.items())]) for name, values in what.items())
+    found = ", ".join(
+        " ".join([name, *(f"{values[k]:.4g}" for k in g.case.hidden.get(name, {}) if k in values)])
+        for name, values in g.values.items()
     )
+    verdict = "" if g.right and g.verdict in ("explained", "nothing_found") else f"{g.verdict}: "
+    verdict = verdict if g.right else f"**wrong**, {verdict}"
+    errors = f"{g.stated[0]:.3g} → {g.stated[1]:.3g}"
+    return f"{g.case.group} {g.case.number}", hidden or "–", f"{verdict}{found or g.note or '–'}", errors
 
 
 # --- Figures and page
@@ -356,14 +391,14 @@ def oracle_ratios(graded: Sequence[Graded]) -> list[float]:
 
 
 def write(graded: Sequence[Graded], folder: Path, command: str) -> Path:
-    """Writes `diagnosis.md` and its pictures into `folder`; returns the page."""
+    """Writes `diagnosis.md` and its picture into `folder`; returns the page."""
     folder.mkdir(parents=True, exist_ok=True)
     groups = {g.case.group: [x for x in graded if x.case.group == g.case.group] for g in graded}
     lines = [
         "# Diagnosis: blinded campaign",
         "",
         f"{len(graded)} cases, `{command}`, {datetime.date.today().isoformat()}. Class and number of a case are its "
-        "seed. Flights of 120 s unless said otherwise; intervals in brackets are exact 95 % binomial ones.",
+        "seed. Flights of 120 s; intervals in brackets are exact 95 % binomial ones.",
         "",
         "## By class",
         "",
@@ -376,8 +411,7 @@ def write(graded: Sequence[Graded], folder: Path, command: str) -> Path:
         "the catalogue; in clutter (every effect at a twentieth of its size, one large) the large one first.",
         "",
     ]
-    singles = groups.get("single", [])
-    if singles:
+    if singles := groups.get("single", []):
         ratios = {name: found for name, part in groups.items() if (found := oracle_ratios(part))}
         told = "; ".join(f"{n} {np.median(r):.3f} ({min(r):.3f}), {len(r)} cases" for n, r in ratios.items())
         confusion(singles, folder / "diagnosis-confusion.png")
@@ -397,13 +431,9 @@ def write(graded: Sequence[Graded], folder: Path, command: str) -> Path:
             "![Hidden effect against first finding](diagnosis-confusion.png)",
             "",
         ]
-    sizes = {float(k.split("_")[1]): v for k, v in groups.items() if k.startswith("size_")}
-    if sizes:
-        detection({**sizes, 1.0: singles}, folder / "diagnosis-detection.png")
-        lines += ["## How small an effect is found", "", "![Detection curve](diagnosis-detection.png)", ""]
-    wrong = [g for g in graded if not right(g)]
-    lines += [f"## Wrong answers ({len(wrong)})", "", *(f"* {_told(g)}" for g in wrong)]
+    wrong = [g for g in graded if not g.right]
     page = folder / "diagnosis.md"
+    lines += [f"## Wrong answers ({len(wrong)})", "", *table(HEADS, map(row, wrong))]
     page.write_text("\n".join(lines) + "\n", encoding="utf-8")
     return page
 
@@ -415,7 +445,7 @@ def _class(name: str, graded: Sequence[Graded]) -> tuple[str, ...]:
         name,
         "–" if name in ("null", "outside") else f"{found} of {len(graded)}",
         f"{alone} of {len(graded)}",
-        share(sum(map(right, graded)), len(graded)),
+        share(sum(g.right for g in graded), len(graded)),
         ", ".join(f"{verdict} {count}" for verdict, count in Counter(g.verdict for g in graded).most_common()),
         f"{np.median([g.seconds for g in graded]):.1f}",
     )
@@ -436,16 +466,6 @@ def _parameters(singles: Sequence[Graded]) -> list[str]:
 def _sizes(errors: Sequence[float]) -> tuple[str, str, str]:
     """Cells of a table: how many relative errors, the middle one, the largest."""
     return str(len(errors)), f"{100 * np.median(errors):.1f}", f"{100 * max(errors):.1f}"
-
-
-def _told(g: Graded) -> str:
-    """A wrong answer in words; the sizes of what was hidden follow from its class and number."""
-    hidden = ", ".join(g.case.hidden or g.case.outside)
-    said = ", ".join(g.listed) or g.note or "nothing"
-    return (
-        f"{g.case.group} {g.case.number}, {g.case.vehicle}: hidden {hidden}; {g.verdict}: {said}; error "
-        f"{g.mse_nominal:.3g} → {g.mse_extended:.3g}"
-    )
 
 
 def confusion(singles: Sequence[Graded], path: Path) -> None:
@@ -470,62 +490,30 @@ def confusion(singles: Sequence[Graded], path: Path) -> None:
     plt.close(figure)
 
 
-def detection(sizes: dict[float, list[Graded]], path: Path) -> None:
-    """Draws the share found and the share of wrong names against the size of the effect."""
-    figure, axes = plt.subplots(figsize=(7, 4), layout="constrained")
-    scales = sorted(s for s in sizes if sizes[s])
-    found = [np.mean([set(g.case.expected) <= set(g.named) for g in sizes[s]]) for s in scales]
-    wrong = [np.mean([any(n not in g.case.hidden for n in g.named) for g in sizes[s]]) for s in scales]
-    axes.semilogx(scales, found, "o-", label="found and named")
-    axes.semilogx(scales, wrong, "s--", label="something else named")
-    axes.set_xticks(scales, [f"{s:g}" for s in scales])
-    axes.set_xlabel("size of the effect, realistic size = 1")
-    axes.set_ylabel("share of cases")
-    axes.set_ylim(-0.03, 1.03)
-    axes.grid(alpha=0.3)
-    axes.legend()
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
-
-
 # --- The command
 
 
-def kept(records: Path) -> list[Graded]:
-    """Answers of an earlier run of the same code, the latest to each case."""
-    out = {}
-    for text in records.read_text(encoding="utf-8").splitlines():
-        data = json.loads(text)
-        case = Case(**{**data.pop("case")})
-        data["intervals"] = {e: {n: tuple(v) for n, v in p.items()} for e, p in data["intervals"].items()}
-        case = Case(**{**asdict(case), "expected": tuple(case.expected)})
-        graded = Graded(case, **{**data, "named": tuple(data["named"]), "listed": tuple(data["listed"])})
-        out[case.group, case.number] = graded
-    return list(out.values())
+def answered(wanted: Iterable[Case], records: Path | None, processes: int) -> list[Graded]:
+    """Answers to cases, those of an earlier run from its records; each new one is printed and kept."""
+    have = {(g.case.group, g.case.number): g for g in kept(records, Graded)}
 
+    def told(found: Graded) -> None:
+        keep(records, found)
+        have[found.case.group, found.case.number] = found
+        print(*table(HEADS, [row(found)])[2:], f"{found.seconds:.1f} s {found.note}", flush=True)
 
-def main() -> None:
-    """Runs the classes asked for, goes on where `--records` stopped, and writes the page."""
-    given = options(__doc__, groups=",".join(GROUPS), count=0, start=0, processes=2, records="")
-    records = Path(given.records) if given.records else None
-    graded = kept(records) if records is not None and records.exists() else []
-    with multiprocessing.get_context("spawn").Pool(given.processes) as pool:
-        for group in given.groups.split(","):
-            name, _, count = group.partition(":")
-            have = {(g.case.group, g.case.number) for g in graded}
-            wanted = cases(name, int(count or given.count or GROUPS[name]), given.start)
-            for found in pool.imap(run, [c for c in wanted if (c.group, c.number) not in have]):
-                print("   ", line(found), flush=True)
-                graded.append(found)
-                if records is not None:
-                    with records.open("a", encoding="utf-8") as file:
-                        file.write(json.dumps(asdict(found), default=float) + "\n")
-            mine = [g for g in graded if g.case.group == name]
-            print(f"{name}: {sum(map(right, mine))} of {len(mine)} right", flush=True)
-    if given.out is not None:
-        command = f"--start {given.start} --groups {given.groups} --out docs/results"
-        print(write(graded, given.out, f"python -m quadid_evaluation.studies.campaign {command}"))
+    pooled(run, [c for c in wanted if (c.group, c.number) not in have], processes, told)
+    return [have[c.group, c.number] for c in wanted]
 
 
 if __name__ == "__main__":
-    main()
+    asked = options(__doc__, groups=",".join(GROUPS), count=0, start=0, processes=2, records="")
+    parts = [group.partition(":") for group in asked.groups.split(",")]
+    wanted = [c for name, _, n in parts for c in cases(name, int(n or asked.count or GROUPS[name]), asked.start)]
+    graded = answered(wanted, Path(asked.records) if asked.records else None, asked.processes)
+    for name, *_ in parts:
+        mine = [g.right for g in graded if g.case.group == name]
+        print(f"{name}: {sum(mine)} of {len(mine)} right", flush=True)
+    if asked.out is not None:
+        command = f"--start {asked.start} --groups {asked.groups} --out docs/results"
+        print(write(graded, asked.out, f"python -m quadid_evaluation.studies.campaign {command}"))

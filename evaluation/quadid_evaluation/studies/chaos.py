@@ -9,7 +9,6 @@ import contextlib
 import math
 import os
 import random
-import resource
 import signal
 import socket
 import sqlite3
@@ -19,18 +18,19 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import psutil
 from quadid_node.mavlink_wire import SIGNING_EPOCH, dialect
 from quadid_replay.writers import mavlink_messages
 
-from quadid.data.window import Channel, Recording
 from quadid.flight import Flight, fly
 from quadid.parameters import NOMINAL_NAMES
 from quadid.vehicle import Vehicle
+from quadid_evaluation.benchmarks.ros_flight import fit_process
 from quadid_evaluation.harness import QUADID, free_port, judged, options, table
 
 # --- The service under fire, its history as it is seen from outside, its fit process
@@ -94,16 +94,9 @@ class Running:
             self.crashes.append(f"ended by itself with code {self.child.returncode}: {self.lines[-3:]}")
             self.start()
 
-    def worker(self) -> int:
-        """Process id of the fit process; 0 while there is none."""
-        if self.child is None:
-            return 0
-        pid = self.child.pid
-        try:
-            children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
-            return next((int(c) for c in children if b"node.worker" in Path(f"/proc/{c}/cmdline").read_bytes()), 0)
-        except OSError:
-            return 0
+    def worker(self) -> psutil.Process | None:
+        """The fit process; None while there is none."""
+        return None if self.child is None else fit_process(self.child.pid)
 
     def asked(self, query: str) -> list[tuple[Any, ...]]:
         """Rows of the history; none where it cannot be read now."""
@@ -169,21 +162,16 @@ class Sender:
 
     def raw(self, data: bytes) -> None:
         """Sends bytes; nobody listening is no error."""
-        try:
+        with contextlib.suppress(OSError):
             self.socket.send(data)
-        except OSError:
-            return
 
     def heard(self) -> Iterator[Any]:
         """Messages that came back."""
         reader: Any = dialect.MAVLink(None)
         reader.robust_parsing = True
-        while True:
-            try:
-                data = self.socket.recv(4096)
-            except OSError:
-                return
-            yield from reader.parse_buffer(data) or []
+        with contextlib.suppress(OSError):  # nothing more has come
+            while True:
+                yield from reader.parse_buffer(self.socket.recv(4096)) or []
 
 
 class SignedVehicle(threading.Thread):
@@ -209,45 +197,29 @@ class SignedVehicle(threading.Thread):
 
     def run(self) -> None:
         """Flies."""
-        shift = 10.0
+        shift, recording = 10.0, self._flight.recording
         while not self._end.is_set():
-            begin = time.monotonic()
-            jumped = self.jump
-            for t, message in mavlink_messages(_later(self._flight.recording, max(shift + jumped, 1.0))):
-                due = begin + t - max(shift + jumped, 1.0)
-                self._wait(due)
+            begin, jumped = time.monotonic(), self.jump
+            later = max(shift + jumped, 1.0)
+            channels = {n: replace(c, t=c.t + later) for n, c in recording.channels.items()}
+            for t, message in mavlink_messages(replace(recording, channels=channels)):
+                self._end.wait(max(begin + t - later - time.monotonic(), 0.0))
                 if self._end.is_set() or self.jump != jumped:
                     break
-                self._send(message)
-                self._listen()
+                sent = message if self.spoil is None else self.spoil(message)
+                if sent is not None and not self.silent:
+                    self._sender.tell_time()
+                    self.frames = [*self.frames[-50:], self._sender.send(sent)]
+                for answer in self._sender.heard():
+                    if answer.get_type() == "PARAM_VALUE" and answer.get_srcComponent() == 191:
+                        self.told.append((time.time(), str(answer.param_id), float(answer.param_value)))
             shift += time.monotonic() - begin + GROUND
-            self._wait(time.monotonic() + GROUND)
+            self._end.wait(GROUND)
 
     def stop(self) -> None:
         """Lands for good."""
         self._end.set()
         self.join(10.0)
-
-    def _send(self, message: Any) -> None:
-        changed = self.spoil(message) if self.spoil is not None else message
-        if changed is not None and not self.silent:
-            self._sender.tell_time()
-            self.frames = [*self.frames[-50:], self._sender.send(changed)]
-
-    def _listen(self) -> None:
-        for message in self._sender.heard():
-            if message.get_type() == "PARAM_VALUE" and message.get_srcComponent() == 191:
-                self.told.append((time.time(), str(message.param_id), float(message.param_value)))
-
-    def _wait(self, due: float) -> None:
-        left = due - time.monotonic()
-        if left > 0.0:
-            self._end.wait(left)
-
-
-def _later(recording: Recording, shift: float) -> Recording:
-    channels = {n: Channel(n, c.t + shift, c.values, n) for n, c in recording.channels.items()}
-    return Recording(recording.name, recording.format, channels)
 
 
 # --- The faults
@@ -271,20 +243,17 @@ REFUSED_LIMIT = 300.0
 """A second service has to say within this time [s] that it is refused; starting took a minute on a crowded machine."""
 
 
+def _worker(scene: Scene, harm: Callable[[psutil.Process], object], did: str) -> str:
+    worker = scene.service.worker()
+    if worker is None:
+        return "no fit process at that moment"
+    harm(worker)
+    return did
+
+
 def worker_out_of_memory(scene: Scene) -> str:
-    pid = scene.service.worker()
-    if not pid:
-        return "no fit process at that moment"
-    resource.prlimit(pid, resource.RLIMIT_DATA, (1 << 20, 1 << 20))
-    return "its memory limited to 1 MiB"
-
-
-def _signal_worker(scene: Scene, number: signal.Signals) -> str:
-    pid = scene.service.worker()
-    if not pid:
-        return "no fit process at that moment"
-    os.kill(pid, number)
-    return number.name
+    limit = (1 << 20, 1 << 20)
+    return _worker(scene, lambda worker: worker.rlimit(psutil.RLIMIT_DATA, limit), "its memory limited to 1 MiB")
 
 
 def terminated(scene: Scene) -> str:
@@ -458,8 +427,8 @@ def history_removed(scene: Scene) -> str:
 
 
 FAULTS: dict[str, tuple[int, Fault]] = {
-    "fit process killed": (11, lambda scene: _signal_worker(scene, signal.SIGKILL)),
-    "fit process stopped": (11, lambda scene: _signal_worker(scene, signal.SIGSTOP)),
+    "fit process killed": (11, lambda scene: _worker(scene, psutil.Process.kill, "SIGKILL")),
+    "fit process stopped": (11, lambda scene: _worker(scene, psutil.Process.suspend, "SIGSTOP")),
     "fit process out of memory": (11, worker_out_of_memory),
     "SIGTERM or SIGINT": (13, terminated),
     "power cut": (13, power_cut),
@@ -548,16 +517,8 @@ def _throw(scene: Scene, names: Sequence[str], entries: list[Entry], until: floa
         did = harm(scene)
         over = time.time()
         recovered = _recovered(scene.service, over)
-        entries.append(
-            {
-                "row": row,
-                "name": name,
-                "did": did,
-                "lasted": over - at,
-                "recovered": recovered,
-                "load": os.getloadavg()[0],
-            }
-        )
+        entry = {"row": row, "name": name, "did": did, "lasted": over - at, "recovered": recovered}
+        entries.append(entry | {"load": os.getloadavg()[0]})
         _say(f"{name} ({did}): {'not recovered' if recovered is None else f'{recovered:.1f} s'}")
         if recovered is None:
             said = "; ".join(scene.service.lines[-2:])

@@ -1,7 +1,18 @@
-"""The data sets: vehicle file, training and unseen flights, and what is known of the truth."""
+"""The data sets: vehicle file, training and unseen flights, what is known of the truth; answers beside it."""
 
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import quadid
+from quadid.data.window import Window
+from quadid.identification.predict import QUANTITIES, no_change, start_errors
+from quadid.parameters import Status
+from quadid.vehicle import Vehicle
+from quadid_evaluation.harness import DATA
 
 
 @dataclass(frozen=True)
@@ -23,6 +34,15 @@ class FlightSet:
     truth: dict[str, tuple[float, float]] = field(default_factory=dict)
     source: str = ""
     beside_curve: dict[str, tuple[float, float]] = field(default_factory=dict)
+
+    def windows(self, data: Path = DATA, rate: float | None = 50.0) -> tuple[Vehicle, list[Window], list[Window]]:
+        """The vehicle, and windows of the training and of the unseen flights on a grid [Hz]."""
+        vehicle = Vehicle.named(data / self.vehicle)
+        train, unseen = (
+            [w for log in part for w in quadid.load(data / log, vehicle, rate=rate).windows]
+            for part in (self.train, self.unseen)
+        )
+        return vehicle, train, unseen
 
 
 def _near(value: float, share: float = 0.0) -> tuple[float, float]:
@@ -100,3 +120,52 @@ SETS: dict[str, FlightSet] = {
     ),
     "px4 ascend": FlightSet(f"{_VEHICLES}/ascend.yaml", ("px4/ascend_cubeorange_test.ulg",), ()),
 }  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Number:
+    """One parameter beside what it is.
+
+    Attributes:
+        data: set, flight or case; by: command.
+        name: of the parameter; status: as the command gives it; value: its estimate.
+        interval: 95 %; truth: interval in which the truth lies.
+    """
+
+    data: str
+    by: str
+    name: str
+    status: str
+    value: float
+    interval: tuple[float, float]
+    truth: tuple[float, float]
+
+    @property
+    def inside(self) -> bool:
+        """Checks whether the interval holds the truth, or part of what is known of it."""
+        return self.interval[0] <= self.truth[1] and self.truth[0] <= self.interval[1]
+
+    @property
+    def identified(self) -> bool:
+        """Checks whether the command calls the value identified."""
+        return self.status == Status.IDENTIFIED.value
+
+
+def of_set(name: str, one: FlightSet, answers: Mapping[str, Mapping[str, Any] | None]) -> Iterator[Number]:
+    """Numbers of one set whose truth is known; `answers` by command, as JSON results."""
+    for by, answer in answers.items():
+        found = {f["effect"] for f in (answer or {}).get("findings", [])}
+        truth = one.truth | (one.beside_curve if "thrust_curve" in found else {})
+        for p in (answer or {}).get("parameters", []):
+            if p["name"] in truth:
+                low, high = p["ci95"]
+                yield Number(name, by, p["name"], p["status"], p["value"], (low, high), truth[p["name"]])
+
+
+def shares_of_no_change(windows: Sequence[Window], vehicle: Vehicle, seconds: float) -> dict[str, float]:
+    """Mean error so long after every start, by quantity, as a share of that of no change; NaN if not measured."""
+    samples = round(seconds / windows[0].dt)
+    errors = np.concatenate(start_errors(windows, vehicle, [samples]))[:, 0]
+    mean = np.ma.array(errors, mask=np.isnan(errors)).mean(axis=0).filled(np.nan).tolist()
+    still = no_change(windows, vehicle, samples)
+    return {name: miss / still[name] for name, miss in zip(QUANTITIES, mean, strict=True)}

@@ -1,4 +1,7 @@
-"""`make foreign`: what is answered on vehicles of others, beside their truth and a regression."""
+"""`make foreign`: what is answered on vehicles of others, beside their truth and a regression.
+
+`--others` measures RotorPy and the independent cases; `--bands` (`make bands`) prints the coverage of predicted bands.
+"""
 
 import dataclasses
 import datetime
@@ -13,66 +16,26 @@ from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
+from scipy.stats import binomtest
 
 import quadid
 from quadid.data.window import Window
 from quadid.diagnosis import diagnose
 from quadid.errors import QuadidError
-from quadid.identification.predict import QUANTITIES, lengths
-from quadid.parameters import Parameter, Status
+from quadid.identification.predict import BANDS, PHASES, QUANTITIES, Forecast, lengths
+from quadid.model.layout import Layout
+from quadid.parameters import Parameter
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
-from quadid_evaluation.harness import options, table
-from quadid_evaluation.studies.ahead import shares_of_no_change
-from quadid_evaluation.studies.cases import FOLDERS, windows
-from quadid_evaluation.studies.flight_sets import SETS, FlightSet
-from quadid_evaluation.studies.rotorpy_flight import fly, hummingbird
+from quadid_evaluation.harness import options, put, table
+from quadid_evaluation.studies.campaign import INDEPENDENT, answers, given, independent
+from quadid_evaluation.studies.flight_sets import SETS, FlightSet, Number, of_set, shares_of_no_change
+from quadid_evaluation.studies.rotorpy_flight import NAMES, fly, hummingbird
 
 # --- Numbers beside their truth
 
 
 ROTORPY_SECONDS = 30.0
-ROTORPY_NAMES = {"b": "k_eta", "d": "k_m", "J_xx": "Ixx", "J_yy": "Iyy", "J_zz": "Izz"}
-
-
-@dataclass(frozen=True)
-class Number:
-    """One parameter beside what it is.
-
-    Attributes:
-        data: set, flight or case; by: command.
-        name: of the parameter; status: as the command gives it; value: its estimate.
-        interval: 95 %; truth: interval in which the truth lies.
-    """
-
-    data: str
-    by: str
-    name: str
-    status: str
-    value: float
-    interval: tuple[float, float]
-    truth: tuple[float, float]
-
-    @property
-    def inside(self) -> bool:
-        """Checks whether the interval holds the truth, or part of what is known of it."""
-        return self.interval[0] <= self.truth[1] and self.truth[0] <= self.interval[1]
-
-    @property
-    def identified(self) -> bool:
-        """Checks whether the command calls the value identified."""
-        return self.status == Status.IDENTIFIED.value
-
-
-def of_set(name: str, one: FlightSet, answers: Mapping[str, Mapping[str, Any] | None]) -> Iterator[Number]:
-    """Numbers of one set whose truth is known; `answers` by command, as JSON results."""
-    for by, answer in answers.items():
-        found = {f["effect"] for f in (answer or {}).get("findings", [])}
-        truth = one.truth | (one.beside_curve if "thrust_curve" in found else {})
-        for p in (answer or {}).get("parameters", []):
-            if p["name"] in truth:
-                low, high = p["ci95"]
-                yield Number(name, by, p["name"], p["status"], p["value"], (low, high), truth[p["name"]])
 
 
 def of_rotorpy() -> Iterator[Number]:
@@ -83,18 +46,15 @@ def of_rotorpy() -> Iterator[Number]:
     ):
         flight = fly(truth, ROTORPY_SECONDS, **how)
         found, _ = diagnose([flight.window], flight.vehicle)
-        yield from _beside(name, found.parameters, {ours: truth[theirs] for ours, theirs in ROTORPY_NAMES.items()})
+        yield from _beside(name, found.parameters, {ours: truth[theirs] for ours, theirs in NAMES.items()})
 
 
-def of_cases(data: Path) -> Iterator[Number]:
-    """Nominal parameters of the independent cases, diagnosed as `quadid_evaluation.studies.cases` does, the hidden
-    effect not told."""
-    for folder in FOLDERS:
-        for answer in json.loads((data / folder / "answers.json").read_text(encoding="utf-8")):
-            place = data / folder / answer["case"]
-            vehicle = Vehicle.from_yaml((place / "vehicle.yaml").read_text(encoding="utf-8"))
-            train, other = (windows(place / f"{flight}.csv", vehicle) for flight in ("train", "validate"))
-            found, _ = diagnose(train, vehicle, other)
+def of_cases() -> Iterator[Number]:
+    """Nominal parameters of the independent cases, the hidden effect not told."""
+    for folder in INDEPENDENT:
+        for answer in answers(folder):
+            train, held, vehicle = given(independent(folder, answer))
+            found, _ = diagnose(train, vehicle, held)
             yield from _beside(f"{folder} {answer['case']}", found.parameters, answer["nominal"])
 
 
@@ -113,11 +73,15 @@ def outside_table(numbers: Sequence[Number], short: Sequence[str] = ("cases", "R
     named = [n for n in numbers if n.identified]
     if not named:
         return ""
+    groups: dict[str, list[bool]] = {}
+    for n in sorted(named, key=lambda n: n.data.startswith(tuple(short))):
+        group = next((g for g in short if n.data.startswith(g)), "recorded vehicles")
+        groups.setdefault(group, []).append(n.inside)
     held = sum(n.inside for n in named)
     lines = [
         f"Of {len(named)} identified values with known truth, {held} have it inside the 95 % interval "
         f"({held / len(named):.0%}; wanted 90 %): "
-        + ", ".join(f"{group} {sum(n.inside for n in mine)} of {len(mine)}" for group, mine in _groups(named, short))
+        + ", ".join(f"{group} {sum(mine)} of {len(mine)}" for group, mine in groups.items())
         + ". All values: `foreign.json`.",
         "",
     ]
@@ -133,24 +97,11 @@ def outside_table(numbers: Sequence[Number], short: Sequence[str] = ("cases", "R
     return "\n".join([*lines, *table(("outside", "parameter", "estimate [95 %]", "truth"), rows)])
 
 
-def _groups(named: Sequence[Number], short: Sequence[str]) -> Iterator[tuple[str, list[Number]]]:
-    """Numbers of the recorded vehicles, and those of each of `short`; empty groups are left out."""
-    recorded = [n for n in named if not n.data.startswith(tuple(short))]
-    for group, mine in (
-        ("recorded vehicles", recorded),
-        *((g, [n for n in named if n.data.startswith(g)]) for g in short),
-    ):
-        if mine:
-            yield group, mine
-
-
-# --- The page; `section` is what the command prints of each set
+# --- The page
 
 
 AHEAD = 0.5
 COMMAND = "make foreign"
-SHOWN = 6
-"""Residual terms that are printed."""
 _LEARNT = ("ridge", "random features")
 
 
@@ -244,45 +195,6 @@ def _numbers(rows: Mapping[str, Row], others: Sequence[Number]) -> str:
     return outside_table([*own, *others])
 
 
-def section(name: str, one: FlightSet, row: Row) -> str:
-    """Markdown of one set."""
-    lines = [f"## {name}", "", f"`{COMMAND}` ({row.seconds:.0f} s), trained on {', '.join(one.train)}.", ""]
-    if row.identified is None or row.diagnosed is None:
-        return "\n".join([*lines, f"Refused: {row.failed}"])
-    after, rows = {p["name"]: p for p in row.diagnosed.get("parameters", [])}, []
-    for p in row.identified["parameters"]:
-        low, high = one.truth.get(p["name"], (np.nan, np.nan))
-        truth = "" if np.isnan(low) else f"{low:.3g}" if low == high else f"{low:.3g} to {high:.3g}"
-        both = ((_cell(q), q["status"]) if q else ("", "") for q in (p, after.get(p["name"])))
-        rows.append((p["name"], truth, *chain.from_iterable(both)))
-    lines += table(("parameter", "truth", "identify", "status", "diagnose", "status"), rows)
-    lines += [
-        "",
-        f"Verdict `{row.diagnosed['verdict']}`, error on data not fitted "
-        f"{row.diagnosed['validation']['mse_nominal']:.3g} → {row.diagnosed['validation']['mse_extended']:.3g} "
-        "noise variances. Found: " + (", ".join(_finding(f) for f in row.diagnosed["findings"]) or "nothing") + ".",
-    ]
-    if row.prediction:
-        lines += ["", f"Error {AHEAD:g} s ahead on {', '.join(one.unseen)}, as a share of no change:", ""]
-        lines += table(("", *QUANTITIES), [(who, *(f"{s:.2f}" for s in s4)) for who, s4 in row.prediction.items()])
-    if row.soon:
-        lines += ["", "Rate after 0.1 s: " + ", ".join(f"{who} {share:.2f}" for who, share in row.soon.items()) + "."]
-    if row.terms:
-        shown = "; ".join(f"`{t}`" for t in row.terms[:SHOWN])
-        lines += ["", f"Beyond the catalogue {len(row.terms)} terms, first {shown}."]
-    return "\n".join([*lines, "", f"Measured {row.date}."])
-
-
-def _cell(p: dict[str, Any]) -> str:
-    low, high = p["ci95"]
-    return f"{p['value']:.3g} [{low:.3g}, {high:.3g}]"
-
-
-def _finding(f: dict[str, Any]) -> str:
-    numbers = ", ".join(f"{p['name']} {p['value']:.3g} {p['unit']}".strip() for p in f["parameters"])
-    return f"{f['effect']} ({numbers}{'' if f['confident'] else '; not confident'})"
-
-
 # --- What about a hundred lines of learning reach: ridge regression, also on random features
 
 
@@ -295,12 +207,8 @@ EVERY = 0.02
 """Time between runs [s]."""
 
 
-@dataclass(frozen=True)
-class Runs:
-    """States and inputs (runs, inputs) and changes over half a second (runs, 4, 3): position, velocity, turn, rate."""
-
-    x: FloatArray
-    y: FloatArray
+Runs = tuple[FloatArray, FloatArray]
+"""States and inputs (runs, inputs); changes over half a second (runs, 4, 3): position, velocity, turn, rate."""
 
 
 def runs_of(windows: Sequence[Window], seconds: float = 0.5) -> Runs:
@@ -310,31 +218,30 @@ def runs_of(windows: Sequence[Window], seconds: float = 0.5) -> Runs:
     and the rotor speeds of that half second, in body axes: more than a simulation gets to see, since in closed loop the
     later rotor speeds betray the motion that they answer.
     """
-    parts = [p for w in windows if (p := _runs(w, seconds)) is not None]
-    return Runs(np.concatenate([p[0] for p in parts]), np.concatenate([p[1] for p in parts]))
-
-
-def _runs(w: Window, seconds: float) -> tuple[FloatArray, FloatArray] | None:
-    steps, every = round(seconds / w.dt), max(round(EVERY / w.dt), 1)
-    if w.attitude is None or w.velocity is None or w.gyro is None or len(w) <= steps + 1:
-        return None
-    known = np.isfinite(w.attitude).all(axis=1) & np.isfinite(w.velocity).all(axis=1) & np.isfinite(w.gyro).all(axis=1)
-    start = np.arange(0, len(w) - steps, every)
-    start = start[known[start] & known[start + steps]]
-    end = start + steps
-    before, after = (Rotation.from_quat(w.attitude[rows], scalar_first=True) for rows in (start, end))
-    edges = np.linspace(0, steps, BINS + 1).astype(int)
-    sums = np.cumsum(np.vstack([np.zeros(w.rotor_speed.shape[1]), w.rotor_speed]), axis=0)
-    inputs = [(sums[start + b] - sums[start + a]) / (b - a) for a, b in zip(edges[:-1], edges[1:], strict=True)]
-    state = [before.apply(w.velocity[start], inverse=True), w.gyro[start], before.apply([0.0, 0.0, 1.0], inverse=True)]
-    place = np.zeros_like(w.velocity) if w.position is None else np.nan_to_num(w.position)
-    changes = [
-        before.apply(place[end] - place[start], inverse=True),
-        before.apply(w.velocity[end] - w.velocity[start], inverse=True),
-        (before.inv() * after).as_rotvec(),
-        w.gyro[end] - w.gyro[start],
-    ]
-    return np.concatenate([*state, *inputs], axis=1), np.stack(changes, axis=1)
+    xs, ys = [], []
+    for w in windows:
+        steps, every = round(seconds / w.dt), max(round(EVERY / w.dt), 1)
+        if w.attitude is None or w.velocity is None or w.gyro is None or len(w) <= steps + 1:
+            continue
+        known = np.isfinite(np.hstack([w.attitude, w.velocity, w.gyro])).all(axis=1)
+        start = np.arange(0, len(w) - steps, every)
+        start = start[known[start] & known[start + steps]]
+        end = start + steps
+        before, after = (Rotation.from_quat(w.attitude[rows], scalar_first=True) for rows in (start, end))
+        edges = np.linspace(0, steps, BINS + 1).astype(int)
+        sums = np.cumsum(np.vstack([np.zeros(w.rotor_speed.shape[1]), w.rotor_speed]), axis=0)
+        inputs = [(sums[start + b] - sums[start + a]) / (b - a) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+        place = np.zeros_like(w.velocity) if w.position is None else np.nan_to_num(w.position)
+        velocity, down = before.apply(w.velocity[start], inverse=True), before.apply([0.0, 0.0, 1.0], inverse=True)
+        xs.append(np.concatenate([velocity, w.gyro[start], down, *inputs], axis=1))
+        changes = [
+            before.apply(place[end] - place[start], inverse=True),
+            before.apply(w.velocity[end] - w.velocity[start], inverse=True),
+            (before.inv() * after).as_rotvec(),
+            w.gyro[end] - w.gyro[start],
+        ]
+        ys.append(np.stack(changes, axis=1))
+    return np.concatenate(xs), np.concatenate(ys)
 
 
 def velocity_against_position(windows: Sequence[Window], seconds: float = 0.5) -> tuple[float, float]:
@@ -365,9 +272,10 @@ Predictor = Callable[[FloatArray], FloatArray]
 
 def ridge(train: Runs, features: int = 0, seed: int = 1) -> Predictor:
     """Ridge regression, with random cosine features beside the inputs where asked for (Rahimi and Recht, 2007)."""
-    mean, spread = train.x.mean(axis=0), train.x.std(axis=0) + 1e-9
+    inputs, changes = train
+    mean, spread = inputs.mean(axis=0), inputs.std(axis=0) + 1e-9
     rng = np.random.default_rng(seed)
-    weights = rng.normal(size=(train.x.shape[1], features)) * 0.7 / np.sqrt(train.x.shape[1])
+    weights = rng.normal(size=(inputs.shape[1], features)) * 0.7 / np.sqrt(inputs.shape[1])
     phases = rng.uniform(0.0, 2.0 * np.pi, features)
 
     def mapped(x: FloatArray) -> FloatArray:
@@ -375,7 +283,7 @@ def ridge(train: Runs, features: int = 0, seed: int = 1) -> Predictor:
         bends = np.cos(z @ weights + phases) * 5.0 * np.sqrt(2.0 / max(features, 1))
         return np.concatenate([np.ones((len(z), 1)), z, bends], axis=1)
 
-    a, y = mapped(train.x), train.y.reshape(len(train.y), -1)
+    a, y = mapped(inputs), changes.reshape(len(changes), -1)
     cut = 4 * len(a) // 5
 
     def solved(rows: int, weight: float) -> FloatArray:
@@ -388,10 +296,14 @@ def ridge(train: Runs, features: int = 0, seed: int = 1) -> Predictor:
     return lambda x: (mapped(x) @ coefficients).reshape(-1, 4, 3)
 
 
-def shares(predict: Predictor, unseen: Runs) -> FloatArray:
-    """Mean error of each quantity as a share of predicting no change, shape (4,)."""
-    guess = predict(unseen.x)
-    return np.asarray(_errors(unseen.y, guess).mean(axis=0) / _errors(unseen.y, np.zeros_like(guess)).mean(axis=0))
+def learners(seen: Sequence[Window], new: Sequence[Window]) -> dict[str, list[float]]:
+    """Errors of ridge and random features half a second ahead, as shares of no change, by quantity."""
+    if all(w.velocity is None for w in new):
+        return {}
+    learn, (inputs, changes) = runs_of(seen), runs_of(new)
+    still = _errors(changes, np.zeros_like(changes)).mean(axis=0)
+    guesses = {"ridge": ridge(learn), "random features": ridge(learn, FEATURES)}
+    return {who: (_errors(changes, g(inputs)).mean(axis=0) / still).tolist() for who, g in guesses.items()}
 
 
 def _errors(truth: FloatArray, guess: FloatArray) -> FloatArray:
@@ -416,68 +328,103 @@ NUMBERS = "numbers"
 _KEPT = ("parameters", "verdict", "validation", "findings")
 
 
-def main() -> None:
-    """Runs the sets that were asked for, or all, prints them and writes the page from all results so far."""
-    given = options(__doc__, words=", ".join(SETS), others=False)
-    if unknown := [n for n in given.words if n not in SETS]:
-        sys.exit(f"no set called {unknown[0]}; there are {', '.join(SETS)}")
-    given.out = given.out or Path("docs/results")
-    kept = given.out / "foreign.json"
-    rows = json.loads(kept.read_text()) if kept.exists() else {}
-    if given.others:
-        rows[NUMBERS] = [dataclasses.asdict(n) for n in (*of_rotorpy(), *of_cases(given.data))]
-        _write(kept, rows)
-    for name in given.words or ([] if given.others else SETS):
-        row = measured(SETS[name], given.data)
-        print(section(name, SETS[name], row), flush=True)
-        rows[name] = dataclasses.asdict(row)
-        _write(kept, rows)
-
-
-def _write(kept: Path, rows: dict[str, Any]) -> None:
-    """Keeps all results so far, and writes the page of them."""
-    kept.write_text(json.dumps(rows, indent=1) + "\n")
-    sets = {n: Row(**rows[n]) for n in SETS if n in rows}
-    text = page(sets, NOTES.read_text(), [Number(**n) for n in rows.get(NUMBERS, [])])
-    kept.with_suffix(".md").write_text(text)
-
-
 def measured(one: FlightSet, data: Path) -> Row:
     """Identifies, diagnoses and predicts one set."""
-    begin = time.perf_counter()
-    vehicle = Vehicle.named(data / one.vehicle)
+    begin, vehicle = time.perf_counter(), Vehicle.named(data / one.vehicle)
     try:
         train = [quadid.load(str(data / log), vehicle) for log in one.train]
-        identified = quadid.identify(train).result
-        found = quadid.diagnose(train)
+        identified, found = quadid.identify(train).result, quadid.diagnose(train)
     except QuadidError as error:
         return Row(None, None, {}, time.perf_counter() - begin, str(error))
-    files = {"physical file": found.vehicle}
     prediction: dict[str, list[float]] = {}
     soon: dict[str, float] = {}
     velocity = (float("nan"), float("nan"))
     if one.unseen:
-        seen, new = ([w for log in part for w in _fine(data, log, vehicle)] for part in (one.train, one.unseen))
-        ours = {name: [*shares_of_no_change(new, v, AHEAD).values()] for name, v in files.items()}
-        prediction = ours | learners(seen, new)
-        soon = {name: shares_of_no_change(new, v, SOON)["rate"] for name, v in files.items()}
+        _, seen, new = one.windows(data, RATE)
+        prediction = {
+            "physical file": [*shares_of_no_change(new, found.vehicle, AHEAD).values()],
+            **learners(seen, new),
+        }
+        soon = {"physical file": shares_of_no_change(new, found.vehicle, SOON)["rate"]}
         velocity = velocity_against_position(new)
     first, second = ({key: r[key] for key in _KEPT if key in r} for r in (identified, found.result))
     terms = tuple(t.formula for t in found.vehicle.residual)
     return Row(first, second, prediction, time.perf_counter() - begin, terms=terms, soon=soon, velocity=velocity)
 
 
-def _fine(data: Path, log: str, vehicle: Vehicle) -> Sequence[Window]:
-    return quadid.load(str(data / log), vehicle, rate=RATE).windows
+# --- Bands of predictions on flights that were not fitted: share of outcomes inside them
 
 
-def learners(seen: Sequence[Window], new: Sequence[Window]) -> dict[str, list[float]]:
-    """Errors of ridge and random features half a second ahead, as shares of no change."""
-    if all(w.velocity is None for w in new):
-        return {}
-    learn, test = runs_of(seen), runs_of(new)
-    guesses = {"ridge": ridge(learn), "random features": ridge(learn, FEATURES)}
-    return {name: shares(guess, test).tolist() for name, guess in guesses.items()}
+WANTED = {"50": (0.40, 0.60), "95": (0.90, 0.99)}
+"""Shares that a band must hold, by per cent."""
+BANDS_HEADS = ("data", "of", *(f"{band} % band" for band in BANDS), "outcomes", "missing removed")
+
+
+def bands(name: str, one: FlightSet, data: Path) -> list[Sequence[str]]:
+    """Rows of one set, a quantity each: the file of `diagnose` on the training flights, scored `SOON` on the others."""
+    vehicle = Vehicle.named(data / one.vehicle)
+    try:
+        train, unseen = ([quadid.load(str(data / log), vehicle) for log in part] for part in (one.train, one.unseen))
+        found = quadid.diagnose(train, unseen)
+        file, total = found.vehicle, dict[str, FloatArray]()
+        for log in one.unseen:
+            windows = quadid.load(str(data / log), vehicle, rate=RATE).windows
+            samples = round(SOON / windows[0].dt)
+            forecast = Forecast(windows, file, Layout(file).initial(file), file.random)
+            for quantity, counts in forecast.covered([samples])[samples].items():
+                total[quantity] = total.get(quantity, 0.0) + counts
+    except QuadidError as error:
+        return [(name, f"refused: {error.found}", *[""] * 5)]
+    removed = found.result["removed"]
+    told = "–" if removed is None else f"{100.0 * removed:.0f} %"
+    return [
+        (name, quantity, *(_inside(c, i) for i in range(len(BANDS))), f"{c[-1]:.0f}", told)
+        for quantity, c in total.items()
+        if c[-1]
+    ]
+
+
+def _inside(counts: FloatArray, i: int) -> str:
+    """Share inside one band, bold where it is not what is wanted, with its interval (Wilson 1927)."""
+    share, low, high = counts[i] / counts[-1], *WANTED.get(list(BANDS)[i], (0.0, 1.0))
+    around = binomtest(round(share * counts[-1] / PHASES), round(counts[-1] / PHASES)).proportion_ci(method="wilson")
+    text = f"{100.0 * share:.0f}"
+    text = text if low <= share <= high else f"**{text}**"
+    return f"{text} [{100.0 * around.low:.0f}, {100.0 * around.high:.0f}]"
+
+
+# --- The command
+
+
+def main() -> None:
+    """Runs the sets that were asked for, or all, prints them and writes the page from all results so far."""
+    asked = options(__doc__, words=", ".join(SETS), others=False, bands=False)
+    if unknown := [n for n in asked.words if n not in SETS]:
+        sys.exit(f"no set called {unknown[0]}; there are {', '.join(SETS)}")
+    if asked.bands:
+        rows = [bands(name, SETS[name], asked.data) for name in asked.words or SETS if SETS[name].unseen]
+        told = (
+            f"`make bands`: files of `diagnose`, scored {SOON:g} s ahead on flights that were not fitted, from the "
+            "filtered state and the logged rotor speeds. Random forces are those of the file; sensor noise, trim and "
+            "biases come from the first third of each flight, outcomes from the rest. Brackets: 95 % interval, "
+            f"predictions as if one in {PHASES} were independent; bold: outside what is wanted (50 % bands 40 to 60, "
+            "95 % bands 90 to 99). Last column: what the findings take off the squared missing force and moment there."
+        )
+        put(asked, "bands.md", "Bands of predictions", "bands", [told, "", *table(BANDS_HEADS, chain(*rows))])
+        return
+    kept = (asked.out or Path("docs/results")) / "foreign.json"
+    known = json.loads(kept.read_text()) if kept.exists() else {}
+    if asked.others:
+        known[NUMBERS] = [dataclasses.asdict(n) for n in (*of_rotorpy(), *of_cases())]
+    for name in asked.words or ([] if asked.others else SETS):
+        row = measured(SETS[name], asked.data)
+        known[name] = dataclasses.asdict(row)
+        print(page({name: row}), flush=True)
+        kept.write_text(json.dumps(known, indent=1) + "\n")
+    kept.write_text(json.dumps(known, indent=1) + "\n")
+    sets = {n: Row(**known[n]) for n in SETS if n in known}
+    numbers = [Number(**n) for n in known.get(NUMBERS, [])]
+    kept.with_suffix(".md").write_text(page(sets, NOTES.read_text(), numbers))
 
 
 if __name__ == "__main__":

@@ -6,6 +6,7 @@ cell is `right` where the first line names the mistake, `silent` where nothing i
 
 import re
 import sys
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from itertools import permutations
@@ -16,6 +17,7 @@ import numpy as np
 from quadid_replay import open_log
 from quadid_replay.columns import from_euler
 from scipy.signal import butter, filtfilt
+from scipy.spatial.transform import Rotation
 
 import quadid
 from quadid.app.logs import LogPart, check_conventions
@@ -28,6 +30,9 @@ from quadid.vehicle import Rotor, Vehicle
 from quadid_evaluation.harness import options, put, table
 
 Log = tuple[Recording, Vehicle]
+Made = Callable[[Recording, Vehicle], Log]
+"""A right log, made wrong."""
+ROTORS = "rotors"
 TITLE = "Mistakes by vehicle"
 
 
@@ -35,7 +40,7 @@ class Mistake(NamedTuple):
     """One thing made wrong: its name, how, and what the first line must contain (a regular expression)."""
 
     name: str
-    made: Callable[[Recording, Vehicle], Log]
+    made: Made
     named: str
 
 
@@ -80,106 +85,119 @@ def flown(name: str, data: Path) -> Log:
     return flight.recording, vehicle
 
 
-# --- Ways to spoil a channel
+# --- Ways to spoil a channel; each raises KeyError where the log has none
 
 
 def changed(recording: Recording, **values: FloatArray) -> Recording:
-    """A recording with other numbers in some channels."""
+    """A recording with other numbers in those of these channels that it has."""
     new = {n: replace(recording.channels[n], values=v) for n, v in values.items() if n in recording.channels}
     return replace(recording, channels={**recording.channels, **new})
 
 
-def values(recording: Recording, name: str) -> FloatArray:
-    """Numbers of a channel; one row where it is absent."""
-    channel = recording.channels.get(name)
-    return np.zeros((1, 4 if name == "attitude" else 3)) if channel is None else channel.values
+def channel(r: Recording, name: str) -> Channel:
+    """A channel; `ROTORS` is that of speeds or commands."""
+    if name == ROTORS:
+        name = "rotor_speed" if "rotor_speed" in r.channels else "motor_command"
+    return r.channels[name]
 
 
-def scaled(name: str, factor: float | Sequence[float]) -> Callable[[Recording, Vehicle], Log]:
-    """A channel, times a factor or one for each column; raises KeyError where there is none."""
-    return lambda r, v: (changed(r, **{name: r.channels[name].values * np.asarray(factor)}), v)
+def of(name: str, change: Callable[[FloatArray], FloatArray]) -> Made:
+    """A channel whose numbers, shape (n, k), something is done to."""
+
+    def made(r: Recording, v: Vehicle) -> Log:
+        c = channel(r, name)
+        return changed(r, **{c.name: np.asarray(change(c.values.copy()))}), v
+
+    return made
 
 
-def columns(name: str, order: Sequence[int]) -> Callable[[Recording, Vehicle], Log]:
+def scaled(name: str, factor: float | Sequence[float]) -> Made:
+    """A channel, times a factor or one for each column."""
+    return of(name, lambda values: values * np.asarray(factor))
+
+
+def columns(name: str, order: Sequence[int]) -> Made:
     """A channel with its columns in another order."""
-    return lambda r, v: (changed(r, **{name: values(r, name)[:, list(order)]}), v)
+    return of(name, lambda values: values[:, list(order)])
 
 
-def late(names: str, seconds: float) -> Callable[[Recording, Vehicle], Log]:
-    """Channels with stamps so much later."""
+def exchanged(a: int, b: int) -> Made:
+    """Two rotor columns exchanged (counted from 0)."""
+    return of(ROTORS, lambda w: w[:, [{a: b, b: a}.get(k, k) for k in range(w.shape[1])]])
+
+
+def one_rotor(rotor: int, change: Callable[[FloatArray], FloatArray | float]) -> Made:
+    """One rotor column changed."""
+
+    def changed_one(w: FloatArray) -> FloatArray:
+        w[:, rotor] = change(w[:, rotor])
+        return w
+
+    return of(ROTORS, changed_one)
+
+
+def late(name: str, seconds: float) -> Made:
+    """A channel with stamps so much later."""
 
     def made(r: Recording, v: Vehicle) -> Log:
-        new = {n: replace(c, t=c.t + seconds) for n, c in r.channels.items() if n in names.split()}
-        return replace(r, channels={**r.channels, **new}), v
+        c = channel(r, name)
+        return replace(r, channels={**r.channels, c.name: replace(c, t=c.t + seconds)}), v
 
     return made
 
 
-def held(names: str, rate: float) -> Callable[[Recording, Vehicle], Log]:
-    """Channels that change at a lower rate [Hz] and are repeated between."""
+def held(name: str, rate: float) -> Made:
+    """A channel that changes at a lower rate [Hz] and is repeated between."""
 
     def made(r: Recording, v: Vehicle) -> Log:
-        new = {}
-        for n in names.split():
-            if n in r.channels:
-                c = r.channels[n]
-                at = np.searchsorted(c.t, np.floor((c.t - c.t[0]) * rate + 1e-6) / rate + c.t[0] - 1e-9)
-                new[n] = c.values[np.clip(at, 0, len(c.t) - 1)]
-        return changed(r, **new), v
+        c = channel(r, name)
+        at = np.searchsorted(c.t, np.floor((c.t - c.t[0]) * rate + 1e-6) / rate + c.t[0] - 1e-9)
+        return changed(r, **{c.name: c.values[np.clip(at, 0, len(c.t) - 1)]}), v
 
     return made
-
-
-def attitude(change: Callable[[FloatArray], FloatArray]) -> Callable[[Recording, Vehicle], Log]:
-    """A recording whose attitude is changed, where it has one."""
-    return lambda r, v: (changed(r, attitude=change(values(r, "attitude"))) if "attitude" in r.channels else r, v)
 
 
 def enu(r: Recording, v: Vehicle) -> Log:
     """World axes east, north, up; the body stays forward, right, down."""
-    swap = np.array([0.0, np.sqrt(0.5), np.sqrt(0.5), 0.0])
-    q = product(np.broadcast_to(swap, values(r, "attitude").shape), values(r, "attitude"))
-    world = {n: values(r, n)[:, [1, 0, 2]] * [1.0, 1.0, -1.0] for n in ("velocity", "position")}
-    return changed(r, attitude=q, **world), v
+    q, swap = r.channels["attitude"].values, np.array([0.0, np.sqrt(0.5), np.sqrt(0.5), 0.0])
+    moving = [c for n, c in r.channels.items() if n in ("velocity", "position")]
+    world = {c.name: c.values[:, [1, 0, 2]] * [1.0, 1.0, -1.0] for c in moving}
+    return changed(r, attitude=product(np.broadcast_to(swap, q.shape), q), **world), v
 
 
 def flu(r: Recording, v: Vehicle) -> Log:
     """Body axes forward, left, up in gyro, accelerometer and attitude."""
-    turned = {n: values(r, n) * [1.0, -1.0, -1.0] for n in ("gyro", "accel")}
-    half = np.array([0.0, 1.0, 0.0, 0.0])
-    q = product(values(r, "attitude"), np.broadcast_to(half, values(r, "attitude").shape))
-    return changed(r, attitude=q, **turned), v
+    turned = {n: r.channels[n].values * [1.0, -1.0, -1.0] for n in ("gyro", "accel")}
+    q, half = r.channels["attitude"].values, np.array([0.0, 1.0, 0.0, 0.0])
+    return changed(r, attitude=product(q, np.broadcast_to(half, q.shape)), **turned), v
 
 
 def imu_turned(r: Recording, v: Vehicle) -> Log:
     """Gyro and accelerometer stand 10 deg further about z than the attitude."""
     turn = mounting_matrix((0.0, 0.0, np.radians(10.0)))
-    return changed(r, **{n: values(r, n) @ turn.T for n in ("gyro", "accel")}), v
+    return changed(r, **{n: r.channels[n].values @ turn.T for n in ("gyro", "accel")}), v
 
 
-def ros(r: Recording, v: Vehicle) -> Log:
-    """World east, north, up and body forward, left, up."""
-    return flu(*enu(r, v))
+def angles_at(r: Recording, t: FloatArray) -> FloatArray:
+    """Roll, pitch and yaw [rad], yaw unwrapped, at times [s], shape (n, 3)."""
+    q = r.channels["attitude"]
+    return np.column_stack([np.interp(t, q.t, column) for column in np.unwrap(euler(q.values), axis=0).T])
 
 
 def euler_rates(r: Recording, v: Vehicle) -> Log:
     """The gyro holds rates of roll, pitch and yaw angle."""
     c = r.channels["gyro"]
-    q = r.channels["attitude"]
-    angles = np.column_stack([np.interp(c.t, q.t, column) for column in np.unwrap(euler(q.values), axis=0).T])
-    roll, pitch = angles[:, 0], angles[:, 1]
+    roll, pitch, _ = angles_at(r, c.t).T
     p, q_, r_ = c.values.T
     heading = (q_ * np.sin(roll) + r_ * np.cos(roll)) / np.cos(pitch)
-    return changed(
-        r, gyro=np.column_stack([p + heading * np.sin(pitch), q_ * np.cos(roll) - r_ * np.sin(roll), heading])
-    ), v
+    rates = (p + heading * np.sin(pitch), q_ * np.cos(roll) - r_ * np.sin(roll), heading)
+    return changed(r, gyro=np.column_stack(rates)), v
 
 
 def differentiated(r: Recording, v: Vehicle) -> Log:
     """The gyro is the change of roll, pitch and yaw from row to row."""
-    c, q = r.channels["gyro"], r.channels["attitude"]
-    angles = np.column_stack([np.interp(c.t, q.t, column) for column in np.unwrap(euler(q.values), axis=0).T])
-    return changed(r, gyro=np.gradient(angles, c.t, axis=0)), v
+    t = r.channels["gyro"].t
+    return changed(r, gyro=np.gradient(angles_at(r, t), t, axis=0)), v
 
 
 def turned_rates(r: Recording, v: Vehicle) -> Log:
@@ -188,15 +206,13 @@ def turned_rates(r: Recording, v: Vehicle) -> Log:
     t, first = np.unique(q.t, return_index=True)
     whole = continuous_sign(q.values[first])
     rates = 2.0 * product(conjugate(whole[:-1]), np.diff(whole, axis=0))[:, 1:] / np.diff(t)[:, None]
-    gyro = Channel("gyro", t[1:], rates, "made")
-    return replace(r, channels={**r.channels, "gyro": gyro}), v
+    return replace(r, channels={**r.channels, "gyro": Channel("gyro", t[1:], rates, "made")}), v
 
 
-def clipped(r: Recording, v: Vehicle) -> Log:
+def clipped(gyro: FloatArray) -> FloatArray:
     """The gyro ends at 1.5 standard deviations."""
-    g = values(r, "gyro")
-    most = 1.5 * np.std(g)
-    return changed(r, gyro=np.clip(g, -most, most)), v
+    most = 1.5 * np.std(gyro)
+    return np.clip(gyro, -most, most)
 
 
 def smoothed(r: Recording, v: Vehicle) -> Log:
@@ -210,54 +226,8 @@ def gravity_out(r: Recording, v: Vehicle) -> Log:
     """Linear acceleration in place of specific force, as an estimator makes it."""
     c, q = r.channels["accel"], r.channels["attitude"]
     near = np.clip(np.searchsorted(q.t, c.t), 0, len(q.t) - 1)
-    w, x, y, z = q.values[near].T
-    down = np.column_stack([2 * (x * z - w * y), 2 * (y * z + w * x), w * w - x * x - y * y + z * z])
-    return changed(r, accel=c.values + 9.80665 * down), v
-
-
-def rotor_name(r: Recording) -> str:
-    """The rotor channel that a log has."""
-    return "rotor_speed" if "rotor_speed" in r.channels else "motor_command"
-
-
-def of_rotors(change: Callable[[FloatArray], FloatArray]) -> Callable[[Recording, Vehicle], Log]:
-    """A recording whose rotor columns are changed."""
-    return lambda r, v: (changed(r, **{rotor_name(r): change(values(r, rotor_name(r)).copy())}), v)
-
-
-def squared(r: Recording, v: Vehicle) -> Log:
-    """Squares of rotor speeds."""
-    return changed(r, rotor_speed=r.channels["rotor_speed"].values ** 2), v
-
-
-def exchanged(a: int, b: int) -> Callable[[Recording, Vehicle], Log]:
-    """Two rotor columns exchanged (counted from 0)."""
-
-    def change(w: FloatArray) -> FloatArray:
-        w[:, [a, b]] = w[:, [b, a]]
-        return w
-
-    return of_rotors(change)
-
-
-def rotor_late(seconds: float) -> Callable[[Recording, Vehicle], Log]:
-    """The rotor signal stamped so much later."""
-    return lambda r, v: late(rotor_name(r), seconds)(r, v)
-
-
-def rotor_held(rate: float) -> Callable[[Recording, Vehicle], Log]:
-    """The rotor signal held at a lower rate [Hz]."""
-    return lambda r, v: held(rotor_name(r), rate)(r, v)
-
-
-def one_rotor(rotor: int, change: Callable[[FloatArray], FloatArray | float]) -> Callable[[Recording, Vehicle], Log]:
-    """One rotor column changed."""
-
-    def changed_one(w: FloatArray) -> FloatArray:
-        w[:, rotor] = change(w[:, rotor])
-        return w
-
-    return of_rotors(changed_one)
+    down = Rotation.from_quat(q.values[near], scalar_first=True).apply([0.0, 0.0, 9.80665], inverse=True)
+    return changed(r, accel=c.values + down), v
 
 
 def half_speed(r: Recording, v: Vehicle) -> Log:
@@ -265,37 +235,23 @@ def half_speed(r: Recording, v: Vehicle) -> Log:
     return one_rotor(1, lambda w: (0.25 if v.command.kind == "thrust" else 0.5) * w)(r, v)
 
 
-def spun(*rotors: int) -> Callable[[Recording, Vehicle], Log]:
-    """A vehicle file with the spins of some rotors the other way; of all without numbers."""
+def _as_is(x: float, y: float) -> tuple[float, float]:
+    return x, y
+
+
+def file(
+    mass: float = 1.0, spun: Sequence[int] = (), placed: Callable[[float, float], tuple[float, float]] = _as_is
+) -> Made:
+    """A vehicle file with another mass, some spins (of rotors from 0) the other way, rotors at other places."""
 
     def made(r: Recording, v: Vehicle) -> Log:
-        new = tuple(
-            Rotor(position=x.position, spin=-x.spin) if not rotors or k in rotors else x for k, x in enumerate(v.rotors)
+        rotors = tuple(
+            Rotor(position=(*placed(*x.position[:2]), x.position[2]), spin=-x.spin if k in spun else x.spin)
+            for k, x in enumerate(v.rotors)
         )
-        return r, v.model_copy(update={"rotors": new})
+        return r, v.model_copy(update={"mass": mass * v.mass, "rotors": rotors})
 
     return made
-
-
-def placed(turn: Callable[[float, float], tuple[float, float]]) -> Callable[[Recording, Vehicle], Log]:
-    """A vehicle file with rotors at other places."""
-
-    def made(r: Recording, v: Vehicle) -> Log:
-        new = tuple(Rotor(position=(*turn(*x.position[:2]), x.position[2]), spin=x.spin) for x in v.rotors)
-        return r, v.model_copy(update={"rotors": new})
-
-    return made
-
-
-def heavier(r: Recording, v: Vehicle) -> Log:
-    """A vehicle file with 1.3 times the mass."""
-    return r, v.model_copy(update={"mass": 1.3 * v.mass})
-
-
-def oversized(r: Recording, v: Vehicle) -> Log:
-    """A vehicle file with 1.5 times the mass and the arms."""
-    r, v = placed(lambda x, y: (1.5 * x, 1.5 * y))(r, v)
-    return r, v.model_copy(update={"mass": 1.5 * v.mass})
 
 
 ORDER = "reorder the rotors|in the order"
@@ -312,9 +268,9 @@ MISTAKES: tuple[Mistake, ...] = (
     Mistake("pitch rate reversed", scaled("gyro", (1.0, -1.0, 1.0)), "gyro axes differ.*x = x, y = -y, z = z"),
     Mistake("gyro x and y exchanged", columns("gyro", (1, 0, 2)), "gyro axes differ.*x = y, y = x, z = z"),
     Mistake("world ENU", enu, "ENU"),
-    Mistake("world ENU, body FLU", ros, "ENU|FLU"),
-    Mistake("quaternion scalar last", attitude(lambda q: q[:, [1, 2, 3, 0]]), "scalar last"),
-    Mistake("attitude inverse", attitude(conjugate), "world to body"),
+    Mistake("world ENU, body FLU", lambda r, v: flu(*enu(r, v)), "ENU|FLU"),
+    Mistake("quaternion scalar last", columns("attitude", (1, 2, 3, 0)), "scalar last"),
+    Mistake("attitude inverse", of("attitude", conjugate), "world to body"),
     Mistake("vz up", scaled("velocity", (1.0, 1.0, -1.0)), "points up"),
     Mistake("z up", scaled("position", (1.0, 1.0, -1.0)), "points up"),
     Mistake("vx, vy exchanged", columns("velocity", (1, 0, 2)), "world axes.*x = y, y = x"),
@@ -328,50 +284,50 @@ MISTAKES: tuple[Mistake, ...] = (
     Mistake("accelerometer 50 ms late", late("accel", 0.05), "accelerometer answers the rotors"),
     Mistake(
         "attitude in steps of 1 deg",
-        attitude(lambda q: from_euler(np.radians(np.round(np.degrees(euler(q)))))),
+        of("attitude", lambda q: from_euler(np.radians(np.round(np.degrees(euler(q)))))),
         "in steps",
     ),
     Mistake(
         "attitude in steps of 5 deg",
-        attitude(lambda q: from_euler(np.radians(5.0 * np.round(np.degrees(euler(q)) / 5.0)))),
+        of("attitude", lambda q: from_euler(np.radians(5.0 * np.round(np.degrees(euler(q)) / 5.0)))),
         "in steps",
     ),
     Mistake("attitude held at 10 Hz", held("attitude", 10.0), "^$|attitude.*Hz"),
     Mistake("IMU turned by 10 deg", imu_turned, "turned against the attitude"),
-    Mistake("gyro clipped", clipped, "limit of its range"),
+    Mistake("gyro clipped", of("gyro", clipped), "limit of its range"),
     Mistake("gyro smoothed at 4 Hz", smoothed, "smoothed without a delay"),
     Mistake("rotors in rpm", scaled("rotor_speed", 30.0 / np.pi), "in rpm"),
     Mistake("rotors in rev/s", scaled("rotor_speed", 0.5 / np.pi), "in rev/s"),
     Mistake("rotors electrical", scaled("rotor_speed", 7.0), "electrical"),
-    Mistake("rotors squared", squared, "squared"),
+    Mistake("rotors squared", of("rotor_speed", np.square), "squared"),
     Mistake("rotor 2 dead", one_rotor(1, lambda w: 0.0), "rotor 2 reads nothing"),
     Mistake("rotor 2 stuck", one_rotor(1, lambda w: float(np.median(w))), "rotor 2 holds"),
     Mistake("rotor 2 in rpm", one_rotor(1, lambda w: w * 30.0 / np.pi), "rotor 2 reads|neither shares"),
     Mistake("rotor 2 at half speed", half_speed, "rotor 2 reads"),
-    Mistake("one column for all", of_rotors(lambda w: np.repeat(w[:, :1], w.shape[1], axis=1)), "are the same"),
-    Mistake("rotors 30 ms late", rotor_late(0.03), LATE_ROTORS),
-    Mistake("rotors 60 ms late", rotor_late(0.06), LATE_ROTORS),
-    Mistake("rotors 120 ms late", rotor_late(0.12), LATE_ROTORS),
-    Mistake("rotors 0.5 s late", rotor_late(0.5), LATE_ROTORS),
-    Mistake("rotors held at 10 Hz", rotor_held(10.0), "too slow|Hz"),
+    Mistake("one column for all", of(ROTORS, lambda w: np.repeat(w[:, :1], w.shape[1], axis=1)), "are the same"),
+    Mistake("rotors 30 ms late", late(ROTORS, 0.03), LATE_ROTORS),
+    Mistake("rotors 60 ms late", late(ROTORS, 0.06), LATE_ROTORS),
+    Mistake("rotors 120 ms late", late(ROTORS, 0.12), LATE_ROTORS),
+    Mistake("rotors 0.5 s late", late(ROTORS, 0.5), LATE_ROTORS),
+    Mistake("rotors held at 10 Hz", held(ROTORS, 10.0), "too slow|Hz"),
     Mistake("motors 1, 2 exchanged", exchanged(0, 1), ORDER),
     Mistake("motors 1, 3 exchanged", exchanged(0, 2), ORDER),
     Mistake("motors 2, 4 exchanged", exchanged(1, 3), ORDER),
-    Mistake("motors one place on", of_rotors(lambda w: np.roll(w, 1, axis=1)), ORDER),
-    Mistake("motors backwards", of_rotors(lambda w: w[:, ::-1]), ORDER),
-    Mistake("spins reversed", spun(), "negate the spins"),
-    Mistake("spin of rotor 1 reversed", spun(0), r"spin of rotor 1\b"),
-    Mistake("spins of rotors 1, 2 reversed", spun(0, 1), r"\b1 and 2\b"),
-    Mistake("spins of rotors 1, 3 reversed", spun(0, 2), r"\b1 and 3\b"),
+    Mistake("motors one place on", of(ROTORS, lambda w: np.roll(w, 1, axis=1)), ORDER),
+    Mistake("motors backwards", of(ROTORS, lambda w: w[:, ::-1]), ORDER),
+    Mistake("spins reversed", file(spun=range(12)), "negate the spins"),
+    Mistake("spin of rotor 1 reversed", file(spun=(0,)), r"spin of rotor 1\b"),
+    Mistake("spins of rotors 1, 2 reversed", file(spun=(0, 1)), r"\b1 and 2\b"),
+    Mistake("spins of rotors 1, 3 reversed", file(spun=(0, 2)), r"\b1 and 3\b"),
     Mistake(
         "frame turned by 45 deg",
-        placed(lambda x, y: ((x - y) * 0.70710678, (x + y) * 0.70710678)),
+        file(placed=lambda x, y: ((x - y) * 0.70710678, (x + y) * 0.70710678)),
         "turn the rotor positions",
     ),
-    Mistake("positions mirrored", placed(lambda x, y: (x, -y)), f"{ORDER}|mirror"),
-    Mistake("arms 1.35 times", placed(lambda x, y: (1.35 * x, 1.35 * y)), "arm"),
-    Mistake("mass 1.3 times", heavier, "mass|weigh"),
-    Mistake("arms and mass 1.5 times", oversized, "the arm .* and the mass"),
+    Mistake("positions mirrored", file(placed=lambda x, y: (x, -y)), f"{ORDER}|mirror"),
+    Mistake("arms 1.35 times", file(placed=lambda x, y: (1.35 * x, 1.35 * y)), "arm"),
+    Mistake("mass 1.3 times", file(1.3), "mass|weigh"),
+    Mistake("arms and mass 1.5 times", file(1.5, placed=lambda x, y: (1.5 * x, 1.5 * y)), "the arm .* and the mass"),
 )
 
 
@@ -381,7 +337,7 @@ def orders(rotors: int) -> Iterator[Mistake]:
         if order != tuple(range(rotors)):
             name = "".join(str(k + 1) for k in order)
             back = ", ".join(str(order.index(k) + 1) for k in range(rotors))
-            yield Mistake(f"order {name}", of_rotors(lambda w, o=order: w[:, list(o)]), back)  # type: ignore[misc]
+            yield Mistake(f"order {name}", columns(ROTORS, order), back)
 
 
 # --- The table
@@ -432,36 +388,21 @@ def main() -> int:
     given = options(
         __doc__, words="parts of mistakes; all without", vehicles=",".join((*SIMULATED, *RECORDED)), orders=False
     )
-    vehicles, found = given.vehicles.split(","), dict[str, dict[str, tuple[str, str]]]()
+    vehicles, found = given.vehicles.split(","), dict[str, dict[str, str]]()
+    wrong, count = list[str](), Counter[str]()
     for vehicle in vehicles:
         for mistake, verdict, line in cells(vehicle, given.data, given.words, given.orders):
-            found.setdefault(mistake, {})[vehicle] = verdict, line
-    put(given, "judging.md", TITLE, "table", _text(found, vehicles))
-    return min(sum(v == "WRONG" for row in found.values() for v, _ in row.values()), 99)
-
-
-def _text(found: dict[str, dict[str, tuple[str, str]]], vehicles: Sequence[str]) -> str:
-    rows = [(mistake, *(row.get(v, ("–", ""))[0] for v in vehicles)) for mistake, row in found.items()]
-    wrong = [
-        f"* {mistake}, {vehicle}: {line.replace('|', '/')[:200]}"
-        for mistake, row in found.items()
-        for vehicle, (verdict, line) in row.items()
-        if verdict == "WRONG"
-    ]
-    count = {
-        v: sum(cell[0] == v for row in found.values() for cell in row.values()) for v in ("right", "silent", "WRONG")
-    }
-    return "\n".join(
-        [
-            "`make judging`: one mistake at a time on logs that are right; the first line that a user reads. *right*: "
-            "it names the mistake; *silent*: nothing is said; –: the log has no such channel or rotor. "
-            f"{count['right']} right, {count['silent']} silent, {count['WRONG']} wrong.",
-            "",
-            *table(("mistake", *vehicles), rows),
-            "",
-            *wrong,
-        ]
+            found.setdefault(mistake, {})[vehicle] = verdict
+            count[verdict] += 1
+            wrong += [f"* {mistake}, {vehicle}: {line.replace('|', '/')[:200]}"] if verdict == "WRONG" else []
+    rows = [(mistake, *(row.get(v, "–") for v in vehicles)) for mistake, row in found.items()]
+    about = (
+        "`make judging`: one mistake at a time on logs that are right; the first line that a user reads. *right*: it "
+        "names the mistake; *silent*: nothing is said; –: the log has no such channel or rotor. "
+        f"{count['right']} right, {count['silent']} silent, {count['WRONG']} wrong."
     )
+    put(given, "judging.md", TITLE, "table", [about, "", *table(("mistake", *vehicles), rows), "", *wrong])
+    return min(count["WRONG"], 99)
 
 
 if __name__ == "__main__":

@@ -11,7 +11,7 @@ import os
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from itertools import combinations
+from itertools import combinations, product
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,7 @@ import numpy as np
 from quadid_replay.columns import from_euler
 from scipy.signal import butter, sosfiltfilt
 
-from quadid.data.window import Block, Recording
+from quadid.data.window import Block, Channel, Recording
 from quadid.flight import Flight, fly
 from quadid.online import Job, Publish, Session, SessionSettings
 from quadid.online.records import OnlineSet
@@ -60,16 +60,17 @@ class Poison:
         channel = recording.channels[self.channel]
         factor = self.factors(channel.t)
         if self.channel == "attitude":
-            values = turned(channel.values, factor)
+            # Roll and pitch are multiplied, the heading is as it was.
+            values = from_euler(euler(channel.values) * np.column_stack([factor, factor, np.ones(len(factor))]))
         else:
-            scale = np.ones_like(channel.values)
-            scale[:, slice(None) if self.column is None else self.column] = (
-                factor[:, None] if self.column is None else factor
-            )
-            values = channel.values * scale
-        return replace(
-            recording, channels={**recording.channels, self.channel: replace(channel, values=np.asarray(values))}
-        )
+            values = channel.values.copy()
+            values.T[slice(None) if self.column is None else self.column] *= factor
+        return with_channel(recording, replace(channel, values=values))
+
+
+def with_channel(recording: Recording, channel: Channel) -> Recording:
+    """The recording with one channel changed."""
+    return replace(recording, channels={**recording.channels, channel.name: channel})
 
 
 def scaled(channel: str, factor: float, column: int | None = None) -> Spoil:
@@ -82,8 +83,7 @@ def changed(channel: str, change: Callable[[FloatArray], FloatArray]) -> Spoil:
 
     def spoil(recording: Recording) -> Recording:
         old = recording.channels[channel]
-        new = replace(old, values=np.asarray(change(old.values)))
-        return replace(recording, channels={**recording.channels, channel: new})
+        return with_channel(recording, replace(old, values=np.asarray(change(old.values))))
 
     return spoil
 
@@ -123,14 +123,9 @@ def late(channel: str, seconds: float) -> Spoil:
 
     def spoil(recording: Recording) -> Recording:
         old = recording.channels[channel]
-        return replace(recording, channels={**recording.channels, channel: replace(old, t=old.t + seconds)})
+        return with_channel(recording, replace(old, t=old.t + seconds))
 
     return spoil
-
-
-def turned(q: FloatArray, factor: FloatArray) -> FloatArray:
-    """Attitudes whose roll and pitch are multiplied, heading as it was; shapes (n, 4) and (n,)."""
-    return from_euler(euler(q) * np.column_stack([factor, factor, np.ones(len(q))]))
 
 
 def fly_online(session: Session, recording: Recording, start: float, stop: float) -> list[OnlineSet]:
@@ -228,15 +223,14 @@ Cell = dict[str, Any]
 
 def cells() -> list[Cell]:
     """All cells of both tables: steps first, because they take the shortest flights."""
-    out = []
-    for ramp in RAMPS:
-        for name in CHANNELS:
-            for factor in FACTORS + (STEPS if ramp == 0.0 else ()):
-                out.append({"when": "in flight", "channel": name, "factor": factor, "ramp": ramp})
-                if ramp == 0.0 or name == "all rotor speeds":
-                    out.append({"when": "from take-off", "channel": name, "factor": factor, "ramp": ramp})
-    names = [*SINGLE, *(" + ".join(c) for c in TOGETHER + HIDING)]
-    return out + [{"when": "first flight", "channel": name, "factor": 1.0, "ramp": 0.0} for name in names]
+    out: list[tuple[str, str, float, float]] = []
+    for ramp, name in product(RAMPS, CHANNELS):
+        for factor in FACTORS + (STEPS if ramp == 0.0 else ()):
+            out.append(("in flight", name, factor, ramp))
+            if ramp == 0.0 or name == "all rotor speeds":
+                out.append(("from take-off", name, factor, ramp))
+    out += [("first flight", name, 1.0, 0.0) for name in (*SINGLE, *(" + ".join(c) for c in TOGETHER + HIDING))]
+    return [dict(zip(("when", "channel", "factor", "ramp"), cell, strict=True)) for cell in out]
 
 
 class Study:
@@ -253,41 +247,31 @@ class Study:
         """Relative errors of what must be known."""
         return {n: item.parameters[n].value / getattr(self.flight.truth.parameters, n) - 1.0 for n in MUST}
 
-    def holds(self, item: OnlineSet, name: str) -> bool:
-        """True if the 95 % interval of a parameter holds the truth."""
-        low, high = item.parameters[name].ci95
-        return low <= float(getattr(self.flight.truth.parameters, name)) <= high
-
     def run(self, cell: Cell) -> Cell:
         """Flies a cell and notes the errors of what was published after the poison had begun."""
+        recording, begin, end, known = self.flight.recording, self.begin, LEARNT, 0
         if cell["when"] == "first flight":
-            return self.first_flight(cell)
-        begin = LEARNT if cell["when"] == "in flight" else self.begin
-        channel, column = CHANNELS[cell["channel"]]
-        poison = Poison(channel, column, cell["factor"], begin, cell["ramp"])
-        restored = self.healthy[-1]
-        session = copy.deepcopy(self.session) if begin == LEARNT else Session(self.vehicle, SETTINGS, restored, 100)
-        known = len(session.poll())
-        sets = fly_online(session, poison.spoil(self.flight.recording), begin, begin + cell["ramp"] + AFTER)
-        return self.judged(cell, session, sets, known)
-
-    def first_flight(self, cell: Cell) -> Cell:
-        """A flight with faults from take-off, of a vehicle that nothing is known of."""
-        recording, session = self.flight.recording, Session(self.vehicle, SETTINGS)
-        for name in cell["channel"].split(" + "):
-            recording = (SINGLE | PARTS)[name](recording)
-        return self.judged(cell, session, fly_online(session, recording, self.begin, LEARNT), 0)
-
-    def judged(self, cell: Cell, session: Session, sets: list[OnlineSet], known: int) -> Cell:
-        """The cell with what was published."""
+            session = Session(self.vehicle, SETTINGS)
+            for name in cell["channel"].split(" + "):
+                recording = (SINGLE | PARTS)[name](recording)
+        else:
+            if cell["when"] == "in flight":
+                begin, session = LEARNT, copy.deepcopy(self.session)
+            else:
+                session = Session(self.vehicle, SETTINGS, self.healthy[-1], 100)
+            channel, column = CHANNELS[cell["channel"]]
+            recording = Poison(channel, column, cell["factor"], begin, cell["ramp"]).spoil(recording)
+            known, end = len(session.poll()), begin + cell["ramp"] + AFTER
+        sets = fly_online(session, recording, begin, end)
         fresh = [s for s in sets if not s.outdated and s.state.value in ("accepted", "rolled_back")]
-        worst = {n: max((self.error(s)[n] for s in fresh), key=abs, default=None) for n in MUST}
+        truth = {n: float(getattr(self.flight.truth.parameters, n)) for n in MUST}
+        intervals = [(n, s.parameters[n].ci95) for s in fresh for n in MUST]
         return {
             **cell,
             "flown": time.strftime("%Y-%m-%d"),
             "sets": len(fresh),
-            "worst": worst,
-            "held": all(self.holds(s, n) for s in fresh for n in MUST),
+            "worst": {n: max((self.error(s)[n] for s in fresh), key=abs, default=None) for n in MUST},
+            "held": all(low <= truth[n] <= high for n, (low, high) in intervals),
             "says": session.status().reason,
             "known": known,
         }
@@ -296,20 +280,18 @@ class Study:
 def main() -> None:
     """Flies the cells that no earlier run has flown, until the time is over, and writes the page."""
     given = options(__doc__, minutes=240.0, only="", fresh=False)
-    given.out = given.out or Path("docs/results")
-    kept = given.out / "poisoning.json"
+    where = (given.out or Path("docs/results")) / "poisoning.md"
+    kept = where.with_suffix(".json")
     done: list[Cell] = json.loads(kept.read_text()) if kept.exists() and not given.fresh else []
     study, until = Study(), time.monotonic() + 60.0 * given.minutes
     for cell in cells():
-        if given.only not in f"{cell['when']} {cell['channel']}":
-            continue
-        if any(all(d[k] == v for k, v in cell.items()) for d in done) or time.monotonic() > until:
+        known = any(all(d[k] == v for k, v in cell.items()) for d in done)
+        if known or given.only not in f"{cell['when']} {cell['channel']}" or time.monotonic() > until:
             continue
         done.append(study.run(cell))
         print(done[-1], flush=True)
         kept.write_text("[\n" + ",\n".join(json.dumps(d) for d in done) + "\n]\n")
     healthy = [(s.stop, study.error(s)) for s in study.healthy]
-    where = given.out / "poisoning.md"
     where.write_text(page(cells(), done, healthy, SEED) + judged(where))
 
 

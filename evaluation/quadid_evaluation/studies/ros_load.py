@@ -14,6 +14,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -130,8 +131,8 @@ def importing(prefix: Path) -> dict[str, str]:
     return {**os.environ, "PYTHONPATH": str(packages), "LD_LIBRARY_PATH": libraries}
 
 
-Row = tuple[float, str, str, Callable[[float], dict[str, Any]]]
-"""Time in the flight [s], topic, type, and the message of an absolute time [s]."""
+Rows = Iterator[tuple[float, str, str, Callable[[float], dict[str, Any]]]]
+"""Time in the flight [s], topic, type, and the fields of the message at an absolute time [s]."""
 
 
 def _header(t: float) -> dict[str, Any]:
@@ -139,93 +140,54 @@ def _header(t: float) -> dict[str, Any]:
     return {"stamp": {"sec": ns // 10**9, "nanosec": ns % 10**9}, "frame_id": "base_link"}
 
 
-def _xyz(values: Any) -> dict[str, float]:
-    return dict(zip("xyz", map(float, values), strict=True))
+def _axes(names: str, values: Any) -> dict[str, float]:
+    return dict(zip(names, map(float, values), strict=True))
 
 
-def px4(recording: Recording) -> Iterator[Row]:
+def px4(recording: Recording) -> Rows:
     """Messages as the uXRCE-DDS bridge publishes them, with ESCs that report."""
     gyro, accel, attitude, rotors = (recording.channels[c] for c in ("gyro", "accel", "attitude", "rotor_speed"))
-    for k, t in enumerate(gyro.t):
-        yield (
-            t,
-            "fmu/out/sensor_combined",
-            "px4_msgs/SensorCombined",
-            lambda at, k=k: {
-                "timestamp": round(at * 1e6),
-                "gyro_rad": gyro.values[k],
-                "accelerometer_m_s2": accel.values[k],
-            },
-        )
-    for k, t in enumerate(attitude.t):
+
+    def stamped(at: float, **fields: Any) -> dict[str, Any]:
+        return {"timestamp": round(at * 1e6), **fields}
+
+    for t, rates, force in zip(gyro.t, gyro.values, accel.values, strict=True):
+        fields = partial(stamped, gyro_rad=rates, accelerometer_m_s2=force)
+        yield t, "fmu/out/sensor_combined", "px4_msgs/SensorCombined", fields
+    for t, q in zip(attitude.t, attitude.values, strict=True):
         yield (
             t,
             "fmu/out/vehicle_attitude",
             "px4_msgs/VehicleAttitude",
-            lambda at, k=k: {
-                "timestamp": round(at * 1e6),
-                "timestamp_sample": round(at * 1e6),
-                "q": attitude.values[k],
-            },
+            lambda at, q=q: stamped(at, timestamp_sample=round(at * 1e6), q=q),
         )
-    for k, t in enumerate(rotors.t):
-        yield (
-            t,
-            "fmu/out/esc_status",
-            "px4_msgs/EscStatus",
-            lambda at, k=k: {
-                "timestamp": round(at * 1e6),
-                "esc_count": rotors.values.shape[1],
-                "esc": [
-                    {"esc_rpm": round(w / RPM), "actuator_function": 101 + i} for i, w in enumerate(rotors.values[k])
-                ]
-                + [{}] * (8 - rotors.values.shape[1]),
-            },
-        )
+    for t, speeds in zip(rotors.t, rotors.values, strict=True):
+        reports = [{"esc_rpm": round(w / RPM), "actuator_function": 101 + i} for i, w in enumerate(speeds)]
+        fields = partial(stamped, esc_count=len(speeds), esc=reports + [{}] * (8 - len(speeds)))
+        yield t, "fmu/out/esc_status", "px4_msgs/EscStatus", fields
 
 
-def mavros(recording: Recording) -> Iterator[Row]:
+def mavros(recording: Recording) -> Rows:
     """Messages as MAVROS publishes them, with telemetry of the ESCs."""
     gyro, accel, attitude, rotors = (recording.channels[c] for c in ("gyro", "accel", "attitude", "rotor_speed"))
-    rates, forces, turned = flip_body(gyro.values), flip_body(accel.values), flip_attitude(attitude.values)
     absent = [-1.0] + [0.0] * 8
-    for k, t in enumerate(gyro.t):
-        yield (
-            t,
-            "mavros/imu/data_raw",
-            "sensor_msgs/Imu",
-            lambda at, k=k: {
-                "header": _header(at),
-                "orientation_covariance": absent,
-                "angular_velocity": _xyz(rates[k]),
-                "linear_acceleration": _xyz(forces[k]),
-            },
-        )
-    for k, t in enumerate(attitude.t):
-        yield (
-            t,
-            "mavros/imu/data",
-            "sensor_msgs/Imu",
-            lambda at, k=k: {
-                "header": _header(at),
-                "orientation": dict(zip("wxyz", map(float, turned[k]), strict=True)),
-            },
-        )
-    for k, t in enumerate(rotors.t):
-        yield (
-            t,
-            "mavros/esc_telemetry/telemetry",
-            "mavros_msgs/ESCTelemetry",
-            lambda at, k=k: {
-                "header": _header(at),
-                "esc_telemetry": [{"rpm": round(w / RPM)} for w in rotors.values[k]],
-            },
-        )
+
+    def stamped(at: float, **fields: Any) -> dict[str, Any]:
+        return {"header": _header(at), **fields}
+
+    for t, rates, force in zip(gyro.t, flip_body(gyro.values), flip_body(accel.values), strict=True):
+        motion = {"angular_velocity": _axes("xyz", rates), "linear_acceleration": _axes("xyz", force)}
+        fields = partial(stamped, orientation_covariance=absent, **motion)
+        yield t, "mavros/imu/data_raw", "sensor_msgs/Imu", fields
+    for t, q in zip(attitude.t, flip_attitude(attitude.values), strict=True):
+        yield t, "mavros/imu/data", "sensor_msgs/Imu", partial(stamped, orientation=_axes("wxyz", q))
+    for t, speeds in zip(rotors.t, rotors.values, strict=True):
+        fields = partial(stamped, esc_telemetry=[{"rpm": round(w / RPM)} for w in speeds])
+        yield t, "mavros/esc_telemetry/telemetry", "mavros_msgs/ESCTelemetry", fields
 
 
 def publish(stack: str, recording: Recording) -> None:
     """Publishes the messages of a stack, each when its time has come."""
-
     qos = QoSProfile(depth=100, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.BEST_EFFORT)
     rclpy.init()
     node, publishers = rclpy.create_node("stack"), dict[str, Any]()
@@ -332,8 +294,7 @@ def main() -> None:
     if given.publish:
         publish(given.publish, flight(given.seconds))
         return
-    seconds = 60.0 * given.minutes
-    rows = []
+    seconds, rows = 60.0 * given.minutes, list[tuple[object, ...]]()
     os.environ["ROS_DOMAIN_ID"] = str(1 + os.getpid() % 100)
     with tempfile.TemporaryDirectory() as scratch, ExitStack() as ends:
         log = Path(scratch, "flight.mcap")
@@ -344,27 +305,11 @@ def main() -> None:
         for source in SOURCES:
             seen = run(source, log, seconds, environment)
             errors = ", ".join(f"{100 * e:.2g}" for e in seen.errors)
-            rows.append(
-                (
-                    source,
-                    f"{seen.load:.1f}",
-                    f"{seen.backlog:.2f} s",
-                    seen.fits,
-                    seen.sets,
-                    f"{seen.first:.0f} s",
-                    f"{errors} %",
-                )
-            )
+            counts = (f"{seen.load:.1f}", f"{seen.backlog:.2f} s", seen.fits, seen.sets, f"{seen.first:.0f} s")
+            rows.append((source, *counts, f"{errors} %"))
             print(*rows[-1], sep=" | ", flush=True)
-    heads = (
-        "preset",
-        "load",
-        "largest backlog",
-        "fits",
-        "sets",
-        "first set",
-        "largest error of b, d, J_xx, J_yy, J_zz, J_r",
-    )
+    worst = f"largest error of {', '.join(NOMINAL_NAMES)}"
+    heads = ("preset", "load", "largest backlog", "fits", "sets", "first set", worst)
     told = f"{given.minutes:g} min of flight a preset, {RATE:g} Hz a channel, {os.cpu_count()} processors."
     title, name = "The ROS node on a loaded machine", f"load {given.load:g}, {given.minutes:g} minutes"
     put(given, "ros-load.md", title, name, [told, "", *table(heads, rows)])

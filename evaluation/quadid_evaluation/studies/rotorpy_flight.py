@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from quadid.data.window import Window
 from quadid.types import FloatArray
@@ -17,6 +18,8 @@ DT = 0.01
 HALF = 0.5 * DT
 FLIP = np.array([1.0, -1.0, -1.0])
 """FLU to FRD, and north-west-up to north-east-down."""
+NAMES = {"b": "k_eta", "d": "k_m", "J_xx": "Ixx", "J_yy": "Iyy", "J_zz": "Izz"}
+"""RotorPy's names of our parameters."""
 
 
 @dataclass(frozen=True)
@@ -103,16 +106,8 @@ def _logged(command: FloatArray, state: list[dict[str, Any]], between: FloatArra
     n = len(command)
     q = np.array([s["q"] for s in state])
     attitude = np.column_stack([q[:, 3], q[:, 0], -q[:, 1], -q[:, 2]])
-    w, x, y, z = attitude.T
-    rotation = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
     world = np.diff(between, axis=0) / DT * FLIP - np.array([0.0, 0.0, GRAVITY])
-    force = np.einsum("jik,kj->ki", rotation, world)
+    force = Rotation.from_quat(attitude, scalar_first=True).apply(world, inverse=True)
     gyro = np.array([s["w"] for s in state]) * FLIP
     velocity = np.array([s["v"] for s in state]) * FLIP
     noise = rng.standard_normal((3, n, 3)) * np.array([0.02, 0.1, 0.02])[:, None, None]

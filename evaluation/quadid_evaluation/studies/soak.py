@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import psutil
 from quadid_node.history import KEPT, Store
 from quadid_node.service import Service
 from quadid_node.worker import InlineWorker, Trouble
@@ -69,34 +70,51 @@ def day(
         One entry an hour of flight: memory, files, time a sample and a fit, samples sent, taken and dropped.
     """
     flight = batches(flown(FLIGHT, 3).recording)
-    begin, points = time.monotonic(), []
+    samples = sum(len(block.t) * len(block.columns) for batch in flight for block in batch)
+    begin, points, whole = time.monotonic(), list[dict[str, Any]](), FLIGHT + GROUND
+    last = round(hours * 3600.0 / whole)
+    every = max(round(min(hours / 12.0, 1.0) * 3600.0 / whole), 1)
     with tempfile.TemporaryDirectory() as folder:
-        worker = TimedWorker()
+        worker, sent, published, own = TimedWorker(), 0, 0, 0.0
         store = Store(Path(folder) / "history.sqlite", "pelican", {"candidates": kept, "events": kept})
         service = Service(PELICAN, SessionSettings(refit=refit, diagnose=diagnose), worker, store)
-        tally = _Tally(service, worker, flight)
-        last = round(hours * 3600.0 / (FLIGHT + GROUND))
-        every = max(round(min(hours / 12.0, 1.0) * 3600.0 / (FLIGHT + GROUND)), 1)
+        before = {"sent": 0, "fits": 0, "spent": 0.0}  # at the last point
         for loop in range(last):
-            tally.fly(loop * (FLIGHT + GROUND))
+            # One flight, later than the recording; what the fits take is not the session's own time.
+            start, fitted = time.thread_time(), worker.spent
+            for batch in flight:
+                for block in batch:
+                    service.push(Block(block.t + loop * whole, block.columns))
+                outputs = service.step()
+                while service.session.running is not None:
+                    outputs += service.step()
+                published += sum(isinstance(o, Publish) and o.topic == "parameters" for o in outputs)
+            sent, own = sent + samples, own + time.thread_time() - start - (worker.spent - fitted)
             over = time.monotonic() - begin > limit
             if (loop + 1) % every and loop + 1 != last and not over:
                 continue
+            buffer = service.session.resampler
             points.append(
-                {**tally.point(), "hours": (loop + 1) * (FLIGHT + GROUND) / 3600.0, "files_mib": _size(folder)}
+                {
+                    "memory_mib": ros_flight.resident(psutil.Process()),
+                    "sent": sent,
+                    "taken": sum(buffer.counts.values()),
+                    "dropped": sum(buffer.faults.values()),
+                    "us_a_sample": 1e6 * own / max(sent - before["sent"], 1),
+                    "ms_a_fit": 1e3 * (worker.spent - before["spent"]) / max(worker.fits - before["fits"], 1),
+                    "fits": worker.fits,
+                    "published": published,
+                    "hours": (loop + 1) * whole / 3600.0,
+                    "files_mib": ros_flight.size_of(Path(folder)),
+                }
             )
+            own, before = 0.0, {"sent": sent, "fits": worker.fits, "spent": worker.spent}
             tell(f"{points[-1]['hours']:.1f} h of flight, {points[-1]['memory_mib']:.0f} MiB")
             if over:
                 break
         service.close()
-    return {
-        "asked_hours": hours,
-        "refit": refit,
-        "diagnose": diagnose,
-        "kept": kept,
-        "wall_seconds": time.monotonic() - begin,
-        "points": points,
-    }
+    given = {"asked_hours": hours, "refit": refit, "diagnose": diagnose, "kept": kept}
+    return given | {"wall_seconds": time.monotonic() - begin, "points": points}
 
 
 def batches(recording: Recording) -> list[tuple[Block, ...]]:
@@ -116,61 +134,12 @@ def batches(recording: Recording) -> list[tuple[Block, ...]]:
     return [batch for batch in made if batch]
 
 
-class _Tally:
-    """Flies, and counts since the last point."""
-
-    def __init__(self, service: Service, worker: TimedWorker, flight: list[tuple[Block, ...]]) -> None:
-        self._service, self._worker, self._flight = service, worker, flight
-        self._size = sum(len(block.t) * len(block.columns) for batch in flight for block in batch)
-        self._sent = self._published = 0
-        self._sent_before = self._fits_before = 0
-        self._own = self._fits_spent = 0.0
-
-    def fly(self, shift: float) -> None:
-        """One flight, `shift` [s] later than the recording."""
-        service, spent = self._service, self._worker.spent
-        begin = time.thread_time()
-        for batch in self._flight:
-            for block in batch:
-                service.push(Block(block.t + shift, block.columns))
-            self._note(service.step())
-            while service.session.running is not None:
-                self._note(service.step())
-        self._sent += self._size
-        self._own += time.thread_time() - begin - (self._worker.spent - spent)
-
-    def _note(self, outputs: list[Any]) -> None:
-        self._published += sum(isinstance(o, Publish) and o.topic == "parameters" for o in outputs)
-
-    def point(self) -> dict[str, Any]:
-        """Counts since the last point, and memory now."""
-        buffer, worker = self._service.session.resampler, self._worker
-        taken, dropped = sum(buffer.counts.values()), sum(buffer.faults.values())
-        out = {
-            "memory_mib": ros_flight.resident(),
-            "sent": self._sent,
-            "taken": taken,
-            "dropped": dropped,
-            "us_a_sample": 1e6 * self._own / max(self._sent - self._sent_before, 1),
-            "ms_a_fit": 1e3 * (worker.spent - self._fits_spent) / max(worker.fits - self._fits_before, 1),
-            "fits": worker.fits,
-            "published": self._published,
-        }
-        self._sent_before, self._fits_before = self._sent, worker.fits
-        self._own, self._fits_spent = 0.0, worker.spent
-        return out
-
-
 def slope(points: list[dict[str, Any]], name: str) -> float:
     """Least-squares slope of a column over the last three quarters [1/h]; NaN for fewer than three points."""
     late = [p for p in points if p["hours"] > 0.25 * points[-1]["hours"]]
     if len(late) < 3:
         return float("nan")
     return float(np.polyfit([p["hours"] for p in late], [p[name] for p in late], 1)[0])
-
-
-def _size(folder: str) -> float:
-    return sum(f.stat().st_size for f in Path(folder).rglob("*") if f.is_file()) / 2**20
 
 
 Result = Mapping[str, Any]

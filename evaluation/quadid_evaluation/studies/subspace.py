@@ -89,19 +89,18 @@ def unstable(dither: float) -> System:
 def poles(seeds: int) -> list[str]:
     """Markdown rows: pole errors of every system, method and form."""
     rows = []
-    cases = (
+    for system, noise, count in (
         (resonance(), 0.1, ROWS),
         (two_masses(), 0.1, ROWS),
         (unstable(3.0), 1.0, 2 * ROWS),
         (unstable(0.3), 1.0, 2 * ROWS),
-    )
-    for system, noise, count in cases:
+    ):
         data = [system.run(np.random.default_rng([seed, 3]), count, noise) for seed in range(seeds)]
+        how = (len(system.A), PAST, FUTURE)
         for method in METHODS:
             cells = [f"{system.name}, {noise:.0%} noise", method]
             for loop in LOOPS:
-                direct = not system.feedback
-                models = [fit_subspace(method, u, y, len(system.A), PAST, FUTURE, loop, direct) for u, y in data]
+                models = [fit_subspace(method, u, y, *how, loop, not system.feedback) for u, y in data]
                 errors = np.array([system.pole_error(m.poles) for m in models])
                 inside = int(np.count_nonzero(errors < ALLOWED))
                 cells.append(f"{100 * np.median(errors):.3f}, {100 * errors.max():.3f}, {inside}/{seeds}")
@@ -111,48 +110,42 @@ def poles(seeds: int) -> list[str]:
 
 def flights(seconds: float, orders: tuple[int, ...]) -> list[str]:
     """Markdown rows: prediction of three flights over 1 s, error over that of a perfect physical model."""
-    pelican = Vehicle.shipped("pelican")
+    pelican, noise = Vehicle.shipped("pelican"), NoiseModel.guess(9)
     windows = [fly(pelican, seconds=seconds, seed=seed).window for seed in (1, 2, 3)]
-    noise = NoiseModel.guess(9)
     inputs, outputs = quadrotor_io(windows[0])
-    rows = []
-    for order in orders:
-        for method in METHODS:
-            cells = [f"{method}, {order}"]
-            for loop in LOOPS:
-                model = fit_subspace(method, inputs, outputs, order, loop=loop, feedthrough=FEEDTHROUGH)
-                box = BlackBox(model, 1)
-                cells.append(", ".join(f"{score_black_box(box, [w], pelican, noise):.2f}" for w in windows))
-            rows.append(cells)
+
+    def cell(method: str, order: int, loop: Loop) -> str:
+        box = BlackBox(fit_subspace(method, inputs, outputs, order, loop=loop, feedthrough=FEEDTHROUGH), 1)
+        return ", ".join(f"{score_black_box(box, [w], pelican, noise):.2f}" for w in windows)
+
+    rows = [
+        (f"{method}, {order}", *(cell(method, order, loop) for loop in LOOPS)) for order in orders for method in METHODS
+    ]
     return table(("method, order", f"sets 1 (train), 2, 3: {LOOPS[0]}", *LOOPS[1:]), rows)
 
 
 if __name__ == "__main__":
     given = options(__doc__, seeds=20, seconds=500.0)
-    text = "\n".join(
-        [
-            "# CVA and MOESP: poles of known systems, prediction of flights",
-            "",
-            f"`python -m quadid_evaluation.studies.subspace --seeds {given.seeds} --seconds {given.seconds:g} "
-            f"--out docs/results`",
-            "",
-            "## Poles",
-            "",
-            f"{ROWS} rows a record ({2 * ROWS} under feedback); noise: innovations relative to the output without "
-            "them. The order is given. Median and largest pole error [%], records within 1 "
-            "%. quadid uses the form `closed`.",
-            "",
-            *poles(given.seeds),
-            "",
-            "## Flights",
-            "",
-            f"Three simulated Pelican flights of {given.seconds:g} s under the stabiliser, fitted on the first; mean "
-            "squared error over 1 s relative to a perfect physical model.",
-            "",
-            *flights(given.seconds, (12, 22)),
-            "",
-        ]
-    )
-    print(text)
+    lines = [
+        "# CVA and MOESP: poles of known systems, prediction of flights",
+        "",
+        f"`python -m quadid_evaluation.studies.subspace --seeds {given.seeds} --seconds {given.seconds:g} "
+        f"--out docs/results`",
+        "",
+        "## Poles",
+        "",
+        f"{ROWS} rows a record ({2 * ROWS} under feedback); noise: innovations relative to the output without them. "
+        "The order is given. Median and largest pole error [%], records within 1 %. quadid uses the form `closed`.",
+        "",
+        *poles(given.seeds),
+        "",
+        "## Flights",
+        "",
+        f"Three simulated Pelican flights of {given.seconds:g} s under the stabiliser, fitted on the first; mean "
+        "squared error over 1 s relative to a perfect physical model.",
+        "",
+        *flights(given.seconds, (12, 22)),
+    ]
+    print(*lines, sep="\n")
     if given.out is not None:
-        (given.out / "subspace.md").write_text(text, encoding="utf-8")
+        (given.out / "subspace.md").write_text("\n".join([*lines, ""]), encoding="utf-8")

@@ -7,8 +7,8 @@ Each seed is a new individual Pelican, a new 60 s flight with all axes moving, a
 run alone replaces its own section of the page and leaves the others.
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -30,17 +30,8 @@ SEGMENT = 1.0
 NOISE_SCALES = (0.3, 1.0, 3.0)
 MEMORIES = (0.3, 0.66, 1.5, 3.0)
 """Of the attitude noise [s]."""
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """One seed: log errors, stated log sigma, bound, status of each nominal parameter."""
-
-    seed: int
-    error: FloatArray
-    sigma: FloatArray
-    bound: FloatArray
-    status: tuple[str, ...]
+PROFILES = ("hover", "one_axis", "roll_pitch")
+"""Flights that do not move enough."""
 
 
 def with_values(vehicle: Vehicle, values: FloatArray) -> Vehicle:
@@ -71,29 +62,54 @@ def bound(window: Window, vehicle: Vehicle, truth: FloatArray) -> FloatArray:
     return bounds_of(shooting.linearise(theta, shooting.free(NOMINAL_NAMES), lin.states).information)
 
 
-def run(job: tuple[int, str, float, float]) -> Outcome:
-    """Flies and fits one seed: (seed, profile, seconds, noise scale)."""
-    seed, profile, seconds, noise_scale = job
-    craft = Vehicle.shipped("pelican")
+class Flight(NamedTuple):
+    """A flight of a new individual: what `quadid.flight.fly` is told."""
+
+    seed: int
+    profile: str = "excited"
+    noise_scale: float = 1.0
+    outside: Mapping[str, dict[str, float]] = {}
+    bounded: bool = True
+
+
+class Outcome(NamedTuple):
+    """One flight: log errors, stated log sigma, bound (NaN if not `bounded`), status of each nominal parameter."""
+
+    error: FloatArray
+    sigma: FloatArray
+    bound: FloatArray
+    status: tuple[str, ...]
+
+
+def run(flight: Flight) -> Outcome:
+    """Flies 60 s and fits them."""
+    seed, craft = flight.seed, Vehicle.shipped("pelican")
     truth = draw_truth(craft, seed)
     values = np.array(list(truth.as_dict().values()))
-    window = fly(craft, truth, seconds, seed, profile, noise_scale=noise_scale).window
+    how: dict[str, Any] = {"noise_scale": flight.noise_scale, "outside": flight.outside}
+    window = fly(craft, truth, 60.0, seed, flight.profile, **how).window
     result = fit([window], poor_guess(craft, truth.as_dict(), seed), FitOptions(iterations=0, seed=seed))
-    return Outcome(
-        seed,
-        np.log(result.theta[: len(values)] / values),
-        result.uncertainty.sigma,
-        bound(window, craft, values),
-        tuple(p.status.value for p in result.parameters),
-    )
+    least = bound(window, craft, values) if flight.bounded else np.full(len(values), np.nan)
+    error = np.log(result.theta[: len(values)] / values)
+    return Outcome(error, result.uncertainty.sigma, least, tuple(p.status.value for p in result.parameters))
 
 
-def efficiency(outcomes: list[Outcome]) -> list[str]:
-    """Lines of a table of efficiency and coverage."""
-    error, sigma = np.array([o.error for o in outcomes]), np.array([o.sigma for o in outcomes])
-    limit = np.array([o.bound for o in outcomes])
-    n = len(outcomes)
+def excited(seeds: int, processes: int) -> list[str]:
+    """Section on efficiency and coverage."""
+    outcomes = pooled(run, [Flight(s) for s in range(seeds)], processes)
+    error, sigma, least = (np.array([o[k] for o in outcomes]) for k in range(3))
     inside = np.mean(np.abs(error) <= Z95 * sigma, axis=0)
+    rows = [
+        (
+            name,
+            f"{100 * np.sqrt(np.mean(e**2)):.4f}",
+            f"{100 * np.sqrt(np.mean(limit**2)):.4f}",
+            f"{np.sqrt(np.mean((e / limit) ** 2)):.3f}",
+            f"{100 * np.mean(e):.4f} ± {100 * np.std(e) / np.sqrt(seeds):.4f}",
+            f"{100 * cover:.1f} ± {100 * np.sqrt(max(cover * (1 - cover), 1e-9) / seeds):.1f}",
+        )
+        for name, e, limit, cover in zip(NOMINAL_NAMES, error.T, least.T, inside, strict=True)
+    ]
     heads = (
         "parameter",
         "RMS error %",
@@ -102,72 +118,42 @@ def efficiency(outcomes: list[Outcome]) -> list[str]:
         "bias % ± s.e.",
         "coverage % ± s.e.",
     )
-    rows = []
-    for j, name in enumerate(NOMINAL_NAMES):
-        rms, crb = np.sqrt(np.mean(error[:, j] ** 2)), np.sqrt(np.mean(limit[:, j] ** 2))
-        normal = np.sqrt(np.mean((error[:, j] / limit[:, j]) ** 2))
-        mean, spread = np.mean(error[:, j]), np.std(error[:, j]) / np.sqrt(n)
-        cover = inside[j]
-        rows.append(
-            (
-                name,
-                f"{100 * rms:.4f}",
-                f"{100 * crb:.4f}",
-                f"{normal:.3f}",
-                f"{100 * mean:.4f} ± {100 * spread:.4f}",
-                f"{100 * cover:.1f} ± {100 * np.sqrt(max(cover * (1 - cover), 1e-9) / n):.1f}",
-            )
-        )
-    return table(heads, rows)
+    return [f"## {seeds} excited flights of 60 s", "", *table(heads, rows)]
 
 
-def excited(seeds: int, processes: int) -> str:
-    """Section on efficiency and coverage."""
-    part = pooled(run, [(s, "excited", 60.0, 1.0) for s in range(seeds)], processes)
-    return "\n".join([f"## {seeds} excited flights of 60 s", "", *efficiency(part)])
-
-
-def noise_levels(seeds: int, processes: int) -> str:
+def noise_levels(seeds: int, processes: int) -> list[str]:
     """Section on bias: the same vehicles and flights at three noise levels of the sensors.
 
     In a closed loop the inputs answer the noise, which biases a plain regression more the noisier the sensors are.
     """
-    parts = {x: pooled(run, [(10_000 + s, "excited", 60.0, x) for s in range(seeds)], processes) for x in NOISE_SCALES}
-    text = [
+    rows = []
+    for x in NOISE_SCALES:
+        part = pooled(run, [Flight(10_000 + s, noise_scale=x) for s in range(seeds)], processes)
+        z = np.array([o.error / o.sigma for o in part])
+        inside = 100.0 * np.mean(np.abs(z) <= Z95, axis=0)
+        means = ", ".join(f"{m:+.2f}" for m in np.mean(z, axis=0))
+        rows.append((f"× {x:g}", means, f"{inside.min():.1f} to {inside.max():.1f}"))
+    return [
         f"## Bias with noise: {seeds} flights of 60 s at three noise levels",
         "",
         f"Mean error in stated standard deviations (standard error {1.0 / np.sqrt(seeds):.2f}) of "
         f"{', '.join(NOMINAL_NAMES)}; coverage [%].",
         "",
-        "| noise | mean errors | coverage |",
-        "|---|---|---|",
+        *table(("noise", "mean errors", "coverage"), rows),
     ]
-    for x, part in parts.items():
-        z = np.array([o.error / o.sigma for o in part])
-        means = ", ".join(f"{m:+.2f}" for m in np.mean(z, axis=0))
-        inside = 100.0 * np.mean(np.abs(z) <= Z95, axis=0)
-        text.append(f"| × {x:g} | {means} | {inside.min():.1f} to {inside.max():.1f} |")
-    return "\n".join(text)
 
 
-def status(seeds: int, processes: int) -> str:
+def status(seeds: int, processes: int) -> list[str]:
     """Section on what is claimed where flights do not move enough."""
-    profiles = ("hover", "one_axis", "roll_pitch")
-    parts = [pooled(run, [(20_000 + s, profile, 60.0, 1.0) for s in range(seeds)], processes) for profile in profiles]
-    text = [
-        f"## Status in {seeds} flights of 60 s, and the bound [%]",
-        "",
-        "| parameter | " + " | ".join(profiles) + " |",
-        "|---" * (len(profiles) + 1) + "|",
-    ]
-    for j, name in enumerate(NOMINAL_NAMES):
-        cells = []
-        for part in parts:
-            names = [o.status[j] for o in part]
-            counts = ", ".join(f"{names.count(s)} {s}" for s in sorted(set(names)))
-            cells.append(f"{counts}; {100 * np.median([o.bound[j] for o in part]):.3g}")
-        text.append(f"| {name} | " + " | ".join(cells) + " |")
-    return "\n".join(text)
+    parts = [pooled(run, [Flight(20_000 + s, profile) for s in range(seeds)], processes) for profile in PROFILES]
+
+    def cell(part: Sequence[Outcome], j: int) -> str:
+        names = [o.status[j] for o in part]
+        counts = ", ".join(f"{names.count(s)} {s}" for s in sorted(set(names)))
+        return f"{counts}; {100 * np.median([o.bound[j] for o in part]):.3g}"
+
+    rows = [(name, *(cell(part, j) for part in parts)) for j, name in enumerate(NOMINAL_NAMES)]
+    return [f"## Status in {seeds} flights of 60 s, and the bound [%]", "", *table(("parameter", *PROFILES), rows)]
 
 
 def remembering(job: tuple[int, float]) -> tuple[FloatArray, float]:
@@ -175,37 +161,25 @@ def remembering(job: tuple[int, float]) -> tuple[FloatArray, float]:
     seed, memory = job
     craft = Vehicle.shipped("pelican")
     scale = dict(zip("xyz", np.random.default_rng([seed, 7]).uniform(-0.05, 0.05, 3).tolist(), strict=True))
-    flown = fly(
-        craft,
-        draw_truth(craft, seed),
-        120.0,
-        seed,
-        effects={"gyro_scale": scale},
-        noise=SensorNoise(attitude_time=memory),
-    )
+    noise = SensorNoise(attitude_time=memory)
+    flown = fly(craft, draw_truth(craft, seed), 120.0, seed, effects={"gyro_scale": scale}, noise=noise)
     names = {f"gyro_scale.{axis}": value for axis, value in scale.items()}
     found = fit([flown.window], craft, FitOptions(iterations=0), names=[*NOMINAL_NAMES, *names])
     error = [(found.parameters[n].value - value) / found.parameters[n].sigma for n, value in names.items()]
     return np.array(error), found.noise.slow_time
 
 
-def memories(seeds: int, processes: int) -> str:
+def memories(seeds: int, processes: int) -> list[str]:
     """Section on attitude noise that is remembered for another time."""
-    text = [
-        f"## Correlation time of attitude noise: {seeds} flights of 120 s, gyro scale of up to 5 % fitted",
-        "",
-        "| time [s] | estimate: median (range) | gyro scale: coverage [%] | RMS error [sigma] |",
-        "|---|---|---|---|",
-    ]
+    rows = []
     for memory in MEMORIES:
-        part = pooled(remembering, [(30_000 + s, memory) for s in range(seeds)], processes)
-        z, found = np.array([error for error, _ in part]), np.array([time for _, time in part])
-        inside = 100.0 * np.mean(np.abs(z) <= Z95)
-        text.append(
-            f"| {memory:g} | {np.median(found):.2f} ({found.min():.2f} … {found.max():.2f}) | {inside:.1f} of "
-            f"{z.size} | {np.sqrt(np.mean(z**2)):.2f} |"
-        )
-    return "\n".join(text)
+        errors, times = zip(*pooled(remembering, [(30_000 + s, memory) for s in range(seeds)], processes), strict=True)
+        z, inside = np.array(errors), 100.0 * np.mean(np.abs(errors) <= Z95)
+        estimate = f"{np.median(times):.2f} ({min(times):.2f} … {max(times):.2f})"
+        rows.append((f"{memory:g}", estimate, f"{inside:.1f} of {z.size}", f"{np.sqrt(np.mean(z**2)):.2f}"))
+    title = f"## Correlation time of attitude noise: {seeds} flights of 120 s, gyro scale of up to 5 % fitted"
+    heads = ("time [s]", "estimate: median (range)", "gyro scale: coverage [%]", "RMS error [sigma]")
+    return [title, "", *table(heads, rows)]
 
 
 if __name__ == "__main__":

@@ -4,7 +4,6 @@ python -m quadid_evaluation.studies.health.hours --hours 100 --out docs/results
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from functools import partial
 
 import numpy as np
 
@@ -12,7 +11,7 @@ from quadid.condition.watch import HealthReport, HealthWatch
 from quadid.online import Session, SessionSettings
 from quadid.online.records import Action
 from quadid.vehicle import Vehicle
-from quadid_evaluation.harness import study
+from quadid_evaluation.harness import study, table
 from quadid_evaluation.studies.health.flights import Wrong, hover_blocks, hover_seconds
 
 FLIGHT, HISTORY, ONSET = 1200, 12, 60
@@ -45,10 +44,6 @@ def named(watch: HealthWatch, rng: np.random.Generator, rotor: int, loss: float)
     reports = list(_watched(watch, rng, ONSET + AFTER, _lost(rotor, loss)))
     watch.landed()
     return _alarm(reports, float(ONSET))
-
-
-def _practised(rng: np.random.Generator, loss: float, rotor: int) -> Found:
-    return named(practised(rng), rng, rotor, loss)
 
 
 def _lost(rotor: int, loss: float) -> Wrong:
@@ -101,12 +96,12 @@ class Flown:
         return _alarm(self.fly(ONSET + AFTER, _lost(rotor, loss)), onset)
 
 
-def _row(what: str, loss: float, each: int, flown: Callable[[int], Found]) -> str:
+def _row(what: str, loss: float, each: int, flown: Callable[[int], Found]) -> tuple[object, ...]:
     found = [flown(k % 4) for k in range(each)]
     seconds = [f[0] if f is not None else np.inf for f in found]
     rotors = [f is not None and f[1] == k % 4 + 1 for k, f in enumerate(found)]
     soon = sum(s <= 5.0 and r for s, r in zip(seconds, rotors, strict=True))
-    return f"| {100 * loss:.0f} % | {what} | {soon} of {each} | {sum(rotors)} | {np.median(seconds):.0f} |"
+    return f"{100 * loss:.0f} %", what, f"{soon} of {each}", sum(rotors), f"{np.median(seconds):.0f}"
 
 
 def quiet(hours: float, session: float) -> str:
@@ -124,26 +119,20 @@ def quiet(hours: float, session: float) -> str:
     )
 
 
-def soon(each: int) -> str:
+def soon(each: int) -> list[str]:
     """Delays until losses of a rotor are named, as Markdown; `each`: of every size."""
     rng = np.random.default_rng(12)
-    lines = [
-        f"### A loss in flight\n`make health-hours`, seed 12. A rotor loses thrust and drag torque after {ONSET} s.\n",
-        "| loss of one rotor | through | named within 5 s | rotor right | median delay [s] |",
-        "|---|---|---|---|---|",
+    rows = [
+        _row("watch", loss, each, lambda j, loss=loss: named(practised(rng), rng, j, loss))  # type: ignore[misc]
+        for loss in (0.03, 0.05, 0.1, 0.2)
     ]
-    lines += [_row("watch", loss, each, partial(_practised, rng, loss)) for loss in (0.03, 0.05, 0.1, 0.2)]
     session = Flown(rng)
-    return "\n".join([*lines, _row("session", 0.1, each, lambda j: session.named(j, 0.1))])
+    rows.append(_row("session", 0.1, each, lambda j: session.named(j, 0.1)))
+    heads = ("loss of one rotor", "through", "named within 5 s", "rotor right", "median delay [s]")
+    about = f"`make health-hours`, seed 12. A rotor loses thrust and drag torque after {ONSET} s."
+    return ["### A loss in flight", about, "", *table(heads, rows)]
 
 
 if __name__ == "__main__":
-    study(
-        __doc__,
-        "health.md",
-        "Health: what changed in this vehicle",
-        {"online": lambda g: quiet(g.hours, g.session), "losses": lambda g: soon(g.each)},
-        hours=100.0,
-        session=10.0,
-        each=25,
-    )
+    parts = {"online": lambda g: quiet(g.hours, g.session), "losses": lambda g: soon(g.each)}
+    study(__doc__, "health.md", "Health: what changed in this vehicle", parts, hours=100.0, session=10.0, each=25)

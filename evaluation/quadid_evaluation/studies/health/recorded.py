@@ -7,9 +7,11 @@ import shutil
 import subprocess
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache
 from itertools import product
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import NamedTuple
 
 import numpy as np
 from quadid_replay import open_log
@@ -18,7 +20,6 @@ from scipy.stats import spearmanr
 import quadid
 from quadid.app.health import has_changed
 from quadid.condition import FlightTrim, Health, assess, flight_trim
-from quadid.data.window import Recording
 from quadid.errors import QuadidError
 from quadid.vehicle import Vehicle
 from quadid_evaluation.harness import QUADID, share, table
@@ -30,20 +31,15 @@ LARGE = 3.0
 
 @dataclass(frozen=True)
 class Flown:
-    """One recorded flight: its file, airframe, kind of log by content, what was done to it, its trim and the log.
-
-    `uneven`: a propeller's two blades were cut unlike.
-    """
+    """One recorded flight: its file, airframe, kind of log by content, what was done to it, its trim."""
 
     file: str
     airframe: str
     kind: str
     condition: str
-    cut: tuple[float, float, float]
-    uneven: bool
+    cut: tuple[float, ...]
     weight: str
     trim: FlightTrim
-    recording: Recording
 
     @property
     def total(self) -> float:
@@ -76,51 +72,45 @@ class Judged:
             return []
         return [int(c.parameters[0][2]) for c in changes if c.effect == "weak_rotor"]
 
+    @property
+    def of(self) -> str:
+        """What was done: ``healthy``, ``large`` (cuts from `LARGE` on, glued weights), ``small``, or nothing told."""
+        one = self.flown
+        if one.condition == "cut" and one.total >= LARGE or (one.condition == "weight" and "glued" in one.weight):
+            return "large"
+        small = one.condition == "tape" or (one.condition == "cut" and one.total < LARGE)
+        return "small" if small else one.condition
 
+
+@cache
 def read(folder: Path) -> list[Flown]:
     """All flights with a trim; a file whose bytes are those of another one is left out with its label."""
     seen: set[str] = set()
     out = []
-    with (folder / "labels.csv").open(encoding="utf-8") as table:
-        for row in csv.DictReader(table):
+    with (folder / "labels.csv").open(encoding="utf-8") as labels:
+        for row in csv.DictReader(labels):
             recording = open_log(folder / row["file"])
             if recording.sha256 in seen:
                 print(f"{row['file']}: the bytes of another file, left out")
                 continue
             seen.add(recording.sha256)
             kind = "controller" if "mixer_input" in recording.channels else "motor"
-            blades = [_blades(row[f"cut_M{j}"]) for j in (1, 2, 3)]
-            first, second, third = (sum(pair) for pair in blades)
-            trim, uneven = flight_trim(recording, CRAZYFLIE), any(a != b for a, b in blades)
-            out.append(Flown(row["file"], row["drone"], kind, row["condition"], (first, second, third), uneven,
-                             row["weight"], trim, recording))  # fmt: skip
+            # Both blades of a propeller, as in "1.5+2".
+            cut = tuple(sum(float(part) for part in row[f"cut_M{j}"].split("+")[:2] if part) for j in (1, 2, 3))
+            trim = flight_trim(recording, CRAZYFLIE)
+            out.append(Flown(row["file"], row["drone"], kind, row["condition"], cut, row["weight"], trim))
     return out
-
-
-def _blades(text: str) -> tuple[float, float]:
-    """Millimetres cut from either blade."""
-    one, other, *_ = [*(float(part) for part in text.split("+") if part), 0.0, 0.0]
-    return one, other
 
 
 def judge(flights: Sequence[Flown]) -> list[Judged]:
     """Each flight against the healthy ones of its airframe, of both kinds of log, itself left out."""
-    out = []
-    for one in flights:
-        healthy = [
-            f.trim for f in flights if f.airframe == one.airframe and f.condition == "healthy" and f.file != one.file
-        ]
-        out.append(Judged(one, assess([one.trim], healthy, CRAZYFLIE)))
-    return out
-
-
-def is_large(one: Flown) -> bool:
-    """Checks whether a flight's damage must be found: cuts from `LARGE` on, glued weights."""
-    return one.condition == "cut" and one.total >= LARGE or (one.condition == "weight" and "glued" in one.weight)
-
-
-def _small(one: Judged) -> bool:
-    return one.flown.condition == "tape" or (one.flown.condition == "cut" and one.flown.total < LARGE)
+    healthy = [f for f in flights if f.condition == "healthy"]
+    return [
+        Judged(
+            one, assess([one.trim], [f.trim for f in healthy if f.airframe == one.airframe and f is not one], CRAZYFLIE)
+        )
+        for one in flights
+    ]
 
 
 def is_single(one: Judged, low: float, high: float) -> bool:
@@ -135,21 +125,16 @@ def named_first(one: Judged) -> bool:
 
 def kind_right(one: Judged) -> bool:
     """Checks whether a propeller is told from a weight."""
-    rotor = bool(one.health.changes) and one.health.changes[0].effect == "weak_rotor"
-    return rotor == (one.flown.condition == "cut")
+    return bool(one.named) == (one.flown.condition == "cut")
 
 
 def order(judged: Sequence[Judged], airframe: str, kind: str) -> list[Judged]:
     """Cuts and healthy flights of an airframe in one kind of log."""
-    return [
-        j
-        for j in judged
-        if (j.flown.airframe, j.flown.kind) == (airframe, kind) and j.flown.condition in ("cut", "healthy")
-    ]
+    own = [j for j in judged if (j.flown.airframe, j.flown.kind) == (airframe, kind)]
+    return [j for j in own if j.flown.condition in ("cut", "healthy")]
 
 
-@dataclass(frozen=True)
-class Question:
+class Question(NamedTuple):
     """A question about some of the flights, the wanted rate, and the check of an answer."""
 
     text: str
@@ -157,21 +142,20 @@ class Question:
     of: Callable[[Judged], bool]
     right: Callable[[Judged], bool]
 
+    def answers(self, flights: Sequence[Judged]) -> list[bool]:
+        """Right or wrong, of the flights in question."""
+        return [self.right(one) for one in flights if self.of(one)]
+
     def figure(self, flights: Sequence[Judged]) -> float:
         """Share of right answers; NaN of no flight."""
-        right = [self.right(one) for one in flights if self.of(one)]
+        right = self.answers(flights)
         return float(np.mean(right)) if right else float("nan")
-
-    def told(self, flights: Sequence[Judged]) -> str:
-        """The share with its interval."""
-        right = [self.right(one) for one in flights if self.of(one)]
-        return share(sum(right), len(right))
 
 
 QUESTIONS = (
-    Question("healthy flights: unchanged", "all", lambda j: j.flown.condition == "healthy", lambda j: not j.changed),
-    Question("cuts from 3 mm, glued weights: found", "≥ 95 %", lambda j: is_large(j.flown), lambda j: j.changed),
-    Question("cuts below 3 mm and tape: found", "", _small, lambda j: j.changed),
+    Question("healthy flights: unchanged", "all", lambda j: j.of == "healthy", lambda j: not j.changed),
+    Question("cuts from 3 mm, glued weights: found", "≥ 95 %", lambda j: j.of == "large", lambda j: j.changed),
+    Question("cuts below 3 mm and tape: found", "", lambda j: j.of == "small", lambda j: j.changed),
     Question("one propeller, 3 mm or more: named first", "≥ 95 %", lambda j: is_single(j, LARGE, 99.0), named_first),
     Question("one propeller, 1 to 2.5 mm: named first", "≥ 75 %", lambda j: is_single(j, 1.0, LARGE), named_first),
     Question(
@@ -180,8 +164,8 @@ QUESTIONS = (
         lambda j: min(j.flown.cut[:2]) >= LARGE,
         lambda j: j.flown.rotors <= set(j.named),
     ),
-    Question("propeller told from glued weight", "≥ 90 %", lambda j: is_large(j.flown), kind_right),
-    Question("the same, of those found", "", lambda j: is_large(j.flown) and j.changed, kind_right),
+    Question("propeller told from glued weight", "≥ 90 %", lambda j: j.of == "large", kind_right),
+    Question("the same, of those found", "", lambda j: j.of == "large" and j.changed, kind_right),
 )
 
 
@@ -197,8 +181,9 @@ def _order(cuts: Sequence[Judged]) -> float:
     return float(spearmanr([j.flown.total for j in cuts], [j.health.score for j in cuts])[0])
 
 
-def recorded(judged: Sequence[Judged], picture: Path | None) -> str:
+def recorded(folder: Path, picture: Path | None) -> list[str]:
     """Every flight against all other healthy ones of its airframe, as Markdown."""
+    judged = judge(read(folder))
     if picture is not None:
         curve(judged, picture)
     healthy = [j.flown.airframe for j in judged if j.flown.condition == "healthy"]
@@ -208,80 +193,74 @@ def recorded(judged: Sequence[Judged], picture: Path | None) -> str:
         cuts = order(judged, airframe, kind)
         both = (f"{_order(part):.2f}" for part in (cuts, [j for j in cuts if j.flown.total > 0.0]))
         orders.append(f"{airframe} {kind} {' / '.join(both)}")
+    answers = [(q, q.answers(judged)) for q in QUESTIONS]
     rows = [
         ("balanced accuracy of the next two", "≥ 0.95", f"{balanced(judged):.3f}"),
-        *((q.text, q.wanted, q.told(judged)) for q in QUESTIONS),
+        *((q.text, q.wanted, share(sum(right), len(right))) for q, right in answers),
         ("rank correlation of score and mm cut (with healthy flights / cuts alone)", "≥ 0.9", "; ".join(orders)),
     ]
-    return "\n".join(
-        [
-            "## Recorded flights",
-            f"`make health`; {len(judged)} flights of two Crazyflies, each against the other healthy flights of its "
-            f"airframe ({each}). Brackets: exact binomial 95 % intervals.",
-            "",
-            *table(("question", "wanted", "measured"), rows),
-            "",
-            "![Score against millimetres cut](health-score.png)",
-        ]
-    )
+    return [
+        "## Recorded flights",
+        f"`make health`; {len(judged)} flights of two Crazyflies, each against the other healthy flights of its "
+        f"airframe ({each}). Brackets: exact binomial 95 % intervals.",
+        "",
+        *table(("question", "wanted", "measured"), rows),
+        "",
+        "![Score against millimetres cut](health-score.png)",
+    ]
 
 
 BASELINES, SEED = 3, 3
 
 
-def command(flights: Sequence[Flown], folder: Path) -> str:
+def command(folder: Path) -> list[str]:
     """`quadid health` as a user runs it, three healthy flights as baseline, all others in question, as Markdown.
 
     Flights of one set (an airframe with the same rotors damaged in the same way) share their propellers, so that they
     are not independent: figures stand for each airframe, and for what they become without one of its sets.
     """
-    rng = np.random.default_rng(SEED)
-    judged, refused = list[Judged](), list[str]()
-    airframes = sorted({f.airframe for f in flights})
-    for airframe in airframes:
-        own = [f for f in flights if f.airframe == airframe]
+    flights, rng = read(folder), np.random.default_rng(SEED)
+    judged, refused = dict[str, list[Judged]](), list[str]()
+    for airframe in sorted({f.airframe for f in flights}):
+        own, judged[airframe] = [f for f in flights if f.airframe == airframe], []
         healthy = [f for f in own if f.condition == "healthy"]
         chosen = [healthy[k] for k in sorted(rng.permutation(len(healthy))[:BASELINES])]
         for one in (f for f in own if f not in chosen):
             try:
                 found = quadid.health(folder / one.file, [folder / f.file for f in chosen], vehicle="crazyflie").found
-                judged.append(Judged(one, found))
+                judged[airframe].append(Judged(one, found))
             except QuadidError as error:
                 refused.append(f"{one.file}: {error}")
+
+    def cell(mine: Sequence[Judged], of: Callable[[Judged], bool], figure: Callable[[Sequence[Judged]], float]) -> str:
+        groups = {id(j): (j.flown.condition, *sorted(j.flown.rotors)) for j in mine}
+        sets = {groups[id(j)] for j in mine if of(j) and j.flown.condition != "healthy"}
+        without = [figure([j for j in mine if groups[id(j)] != one]) for one in sets]
+        known = [value for value in without if np.isfinite(value)]
+        spread = f" ({min(known):.2f} to {max(known):.2f} without one of {len(sets)} sets)" if known else ""
+        asked = sum(map(of, mine))
+        return f"{figure(mine):.2f} of {asked}{spread}" if asked else "–"
+
+    def ordered(some: Sequence[Judged]) -> float:
+        return _order([j for j in some if j.flown.condition == "cut"])
+
     figures: list[tuple[str, Callable[[Judged], bool], Callable[[Sequence[Judged]], float]]] = [
-        ("balanced accuracy", lambda j: is_large(j.flown) or j.flown.condition == "healthy", balanced),
+        ("balanced accuracy", lambda j: j.of in ("large", "healthy"), balanced),
         *((q.text, q.of, q.figure) for q in QUESTIONS),
-        (
-            "rank correlation of score and mm cut",
-            lambda j: j.flown.condition == "cut",
-            lambda some: _order([j for j in some if j.flown.condition == "cut"]),
-        ),
+        ("rank correlation of score and mm cut", lambda j: j.flown.condition == "cut", ordered),
     ]
-    rows = []
-    for name, of, figure in figures:
-        cells = [name]
-        for airframe in airframes:
-            mine = [j for j in judged if j.flown.airframe == airframe]
-            sets = {(j.flown.condition, *sorted(j.flown.rotors)) for j in mine if of(j)}
-            sets = {one for one in sets if one[0] != "healthy"}
-            without = [figure([j for j in mine if (j.flown.condition, *sorted(j.flown.rotors)) != s]) for s in sets]
-            known = [value for value in without if np.isfinite(value)]
-            spread = f" ({min(known):.2f} to {max(known):.2f} without one of {len(sets)} sets)" if known else ""
-            asked = sum(map(of, mine))
-            cells.append(f"{figure(mine):.2f} of {asked}{spread}" if asked else "–")
-        rows.append(cells)
-    return "\n".join(
-        [
-            "## The command, three baseline flights",
-            f"`quadid health` with the shipped vehicle and {BASELINES} healthy flights of the airframe, drawn once; "
-            "all other flights are in question. The comparison's priors were chosen with both airframes at hand: "
-            "neither row is of an airframe that nobody had seen.",
-            "",
-            *table(("question", *airframes), rows),
-            "",
-            f"Refused: {len(refused)} of {len(judged) + len(refused)}" + (f": {refused[0]} …" if refused else "."),
-        ]
-    )
+    rows = [(name, *(cell(mine, of, figure) for mine in judged.values())) for name, of, figure in figures]
+    whole = len(refused) + sum(map(len, judged.values()))
+    return [
+        "## The command, three baseline flights",
+        f"`quadid health` with the shipped vehicle and {BASELINES} healthy flights of the airframe, drawn once; all "
+        "other flights are in question. The comparison's priors were chosen with both airframes at hand: neither row "
+        "is of an airframe that nobody had seen.",
+        "",
+        *table(("question", *judged), rows),
+        "",
+        f"Refused: {len(refused)} of {whole}" + (f": {refused[0]} …" if refused else "."),
+    ]
 
 
 SERIES: tuple[tuple[str, str, frozenset[int]], ...] = (
@@ -293,60 +272,43 @@ SERIES: tuple[tuple[str, str, frozenset[int]], ...] = (
 _DAY, _FIRST = 86400.0, 1.7e9
 
 
-def fleet(flights: Sequence[Flown], data: Path) -> str:
+def fleet(data: Path) -> list[str]:
     """The trend that `quadid fleet` shows an owner: healthy flights of an airframe first, then cuts by size."""
+    flights = read(data)
     with TemporaryDirectory() as place:
         logs, out = Path(place) / "logs", Path(place) / "out"
         out.mkdir()
         for name, airframe, rotors in SERIES:
             (logs / name).mkdir(parents=True)
-            mine = [f for f in flights if f.airframe == airframe and f.condition in ("healthy", "cut")]
-            mine = [f for f in mine if f.condition == "healthy" or f.rotors == rotors]
+            mine = [f for f in flights if f.airframe == airframe]
+            mine = [f for f in mine if f.condition == "healthy" or f.condition == "cut" and f.rotors == rotors]
             for k, flown in enumerate(sorted(mine, key=lambda f: (f.total, f.file))):
                 copy = shutil.copy(data / flown.file, logs / name)
                 os.utime(copy, (_FIRST + _DAY * k, _FIRST + _DAY * k))
-        command = [QUADID, "fleet", str(logs), "--vehicle", "crazyflie"]
-        subprocess.run(
-            [*command, "--out", str(out), "--json", str(out / "fleet.json")], check=True, stdout=subprocess.DEVNULL
-        )
+        command = [QUADID, "fleet", logs, "--vehicle", "crazyflie", "--out", out, "--json", out / "fleet.json"]
+        subprocess.run([*map(str, command)], check=True, stdout=subprocess.DEVNULL)
         found = json.loads((out / "fleet.json").read_text(encoding="utf-8"))["health"]
     millimetres, rows = {f.file: f.total for f in flights}, []
     for name, *_ in SERIES:
         of_unit = [row for row in found if row["unit"] == name]
-        later = [(millimetres[Path(row["log"]).name], row) for row in of_unit if not row["baseline"]]
-        changed = [(mm, has_changed(row)) for mm, row in later]
+        later = [(millimetres[Path(r["log"]).name], has_changed(r), r["score"]) for r in of_unit if not r["baseline"]]
         groups = (
-            [c for mm, c in changed if low <= mm < high] for low, high in ((0.0, 0.1), (0.1, LARGE), (LARGE, 99.0))
+            [c for mm, c, _ in later if low <= mm < high] for low, high in ((0.0, 0.1), (0.1, LARGE), (LARGE, 99.0))
         )
-        missed = max((mm for mm, c in changed if not c), default=-1.0)
-        first = next((f"{mm:g}" for mm, c in changed if c), "none")
-        after = next((f"{mm:g}" for mm, _ in changed if mm > missed), "none")
-        correlation = spearmanr([mm for mm, _ in later], [row["score"] for _, row in later])[0]
-        rows.append(
-            (
-                name,
-                f"{len(of_unit)} ({len(of_unit) - len(later)})",
-                ", ".join(f"{sum(g)} of {len(g)}" for g in groups),
-                f"{first}, {after}",
-                f"{correlation:.2f}",
-            )
-        )
-    heads = (
-        "vehicle",
-        "flights (baseline)",
-        "changed: healthy, below 3 mm, from 3 mm",
-        "first, all from [mm]",
-        "order",
-    )
-    return "\n".join(
-        [
-            "## Trend of a fleet",
-            "`quadid fleet`, called by `make health`: the first five flights are the baseline, the others follow by "
-            "millimetres cut; order: Spearman correlation of score and cut.",
-            "",
-            *table(heads, rows),
-        ]
-    )
+        missed = max((mm for mm, c, _ in later if not c), default=-1.0)
+        first = next((f"{mm:g}" for mm, c, _ in later if c), "none")
+        after = next((f"{mm:g}" for mm, *_ in later if mm > missed), "none")
+        correlation = spearmanr([mm for mm, *_ in later], [score for *_, score in later])[0]
+        counts = f"{len(of_unit)} ({len(of_unit) - len(later)})", ", ".join(f"{sum(g)} of {len(g)}" for g in groups)
+        rows.append((name, *counts, f"{first}, {after}", f"{correlation:.2f}"))
+    changed = "changed: healthy, below 3 mm, from 3 mm"
+    return [
+        "## Trend of a fleet",
+        "`quadid fleet`, called by `make health`: the first five flights are the baseline, the others follow by "
+        "millimetres cut; order: Spearman correlation of score and cut.",
+        "",
+        *table(("vehicle", "flights (baseline)", changed, "first, all from [mm]", "order"), rows),
+    ]
 
 
 def curve(judged: Sequence[Judged], path: Path) -> None:

@@ -138,31 +138,29 @@ def judged(case: Case, k: int, simulate: Simulator) -> Outcome:
     return Outcome(changed, good, not good and any(c.confident for c in found.changes), *errors)
 
 
-def text(each: int) -> str:
+def text(each: int) -> list[str]:
     """The campaign as Markdown; `each` cases of every kind."""
     done: dict[str, dict[str, list[Outcome]]] = {}
     for k, case in enumerate(cases(each)):
         for name, simulate in SIMULATORS.items():
             done.setdefault(case.group, {}).setdefault(name, []).append(judged(case, k, simulate))
-    head = "; ".join(SIMULATORS)
-    heads = ("hidden (flights)", f"changed, right, wrong with confidence: {head}", "error of loss, of drag loss [%]")
     rows = []
     for group, by in done.items():
-        cells = [", ".join(f"{int(sum(flags))}" for flags in list(np.array(answers).T)[:3]) for answers in by.values()]
-        errors = np.array(by["closed loop"]).T[3:]
+        counts = "; ".join(
+            ", ".join(str(sum(flags)) for flags in list(zip(*by[name], strict=True))[:3]) for name in SIMULATORS
+        )
+        errors = np.array([answer[3:] for answer in by["closed loop"]]).T
         sizes = [f"{100.0 * np.nanmedian(e):.1f}" for e in errors if np.isfinite(e).any()]
-        cells.append(", ".join(sizes) or "–")
-        rows.append((f"{group} ({len(errors.T)})", "; ".join(cells[:-1]), cells[-1]))
-    return "\n".join(
-        [
-            f"## Simulated flights\n`make health`, seed {SEED}; Pelican (plus and X frame) of {SECONDS:.0f} s, "
-            f"{BASELINES} baseline flights each, in closed loop (`quadid.flight`) and by the balance of a hover. "
-            "Between flights, rotor thrust varies by 1 %, the battery by 0.7 mm, the load by 1 % (1 sigma).",
-            "",
-            *table(heads, rows),
-            "",
-            "A rotor that lost only thrust and a weight at its hub have the same trims; the likelier weight is named. "
-            "Drag torque alone moves the yaw trim alone, as much for every rotor: the change is found, the rotor is a "
-            "guess (one right in four).",
-        ]
-    )
+        rows.append((f"{group} ({len(errors.T)})", counts, ", ".join(sizes) or "–"))
+    counted = f"changed, right, wrong with confidence: {'; '.join(SIMULATORS)}"
+    return [
+        f"## Simulated flights\n`make health`, seed {SEED}; Pelican (plus and X frame) of {SECONDS:.0f} s, "
+        f"{BASELINES} baseline flights each, in closed loop (`quadid.flight`) and by the balance of a hover. "
+        "Between flights, rotor thrust varies by 1 %, the battery by 0.7 mm, the load by 1 % (1 sigma).",
+        "",
+        *table(("hidden (flights)", counted, "error of loss, of drag loss [%]"), rows),
+        "",
+        "A rotor that lost only thrust and a weight at its hub have the same trims; the likelier weight is named. "
+        "Drag torque alone moves the yaw trim alone, as much for every rotor: the change is found, the rotor is a "
+        "guess (one right in four).",
+    ]

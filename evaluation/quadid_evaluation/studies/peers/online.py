@@ -15,10 +15,11 @@ from filterpy.kalman import ExtendedKalmanFilter, MerweScaledSigmaPoints, Unscen
 from quadid_node.recording import stream
 
 from quadid.data.window import Window
-from quadid.online import OnlineDiagnosis, Publish, Session
+from quadid.online import OnlineDiagnosis, Session
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
-from quadid_evaluation.benchmarks.online import CHANGE, CHANGE_AT, PELICAN, drive, flown
+from quadid_evaluation.benchmarks.online import CHANGE, CHANGE_AT, PELICAN, drive, flown, published
+from quadid_evaluation.harness import table
 from quadid_evaluation.studies.truth import poor_guess
 
 NAMES = ("b", "d", "J_xx", "J_yy", "J_zz")
@@ -47,13 +48,11 @@ class _Model:
         torque = np.array([-b * self._y @ square, b * self._x @ square, d * self._spins @ square])
         spin = self._J_r * float(self._spins @ omega)
 
-        def slope(w: FloatArray) -> FloatArray:
-            turning = np.array(
-                [
-                    (J[1] - J[2]) * w[1] * w[2] + spin * w[1],
-                    (J[2] - J[0]) * w[2] * w[0] - spin * w[0],
-                    (J[0] - J[1]) * w[0] * w[1],
-                ]
+        def slope(w: FloatArray) -> FloatArray:  # np.cross would take several times as long
+            turning = (
+                (J[1] - J[2]) * w[1] * w[2] + spin * w[1],
+                (J[2] - J[0]) * w[2] * w[0] - spin * w[0],
+                (J[0] - J[1]) * w[0] * w[1],
             )
             return np.asarray((torque + turning) / J)
 
@@ -71,26 +70,22 @@ def _slopes(f: Callable[[FloatArray], FloatArray], x: FloatArray) -> FloatArray:
     return np.column_stack([(f(x + _STEP * e) - base) / _STEP for e in np.eye(len(x))])
 
 
-def _settings(filter_: Any, start: FloatArray) -> None:
+def _started(filter_: Any, start: FloatArray) -> Any:
     filter_.x = start
     filter_.P = np.diag([1e-3] * 3 + [0.09] * 5)
     filter_.Q = np.diag([1e-6] * 3 + [WALK**2] * 5)
     filter_.R = np.diag(np.square(_NOISE))
+    return filter_
 
 
 def extended(window: Window, vehicle: Vehicle, start: FloatArray) -> Iterator[FloatArray]:
     """Logarithms of the parameters after each sample, extended Kalman filter."""
-    model, ekf = _Model(vehicle, window.dt), ExtendedKalmanFilter(8, 4)
-    _settings(ekf, start)
-    for gyro, accel, before, now in _rows(window):
+    model, ekf = _Model(vehicle, window.dt), _started(ExtendedKalmanFilter(8, 4), start)
+    for z, before, both in _rows(window):
         ekf.F = _slopes(partial(model.step, dt=0.0, omega=before), ekf.x)
         ekf.x = model.step(ekf.x, 0.0, before)
         ekf.P = ekf.F @ ekf.P @ ekf.F.T + ekf.Q
-        z, both = np.append(gyro, accel[2]), np.stack([before, now])
-
-        def measured(x: FloatArray, u: FloatArray = both) -> FloatArray:
-            return model.measured(x, u)
-
+        measured = partial(model.measured, omega=both)
         ekf.update(z, partial(_slopes, measured), measured)
         yield ekf.x[3:].copy()
 
@@ -99,20 +94,20 @@ def unscented(window: Window, vehicle: Vehicle, start: FloatArray) -> Iterator[F
     """As `extended`, by an unscented Kalman filter."""
     model = _Model(vehicle, window.dt)
     points = MerweScaledSigmaPoints(8, alpha=0.1, beta=2.0, kappa=0.0)
-    ukf = UnscentedKalmanFilter(8, 4, window.dt, hx=model.measured, fx=model.step, points=points)
-    _settings(ukf, start)
-    for gyro, accel, before, now in _rows(window):
+    ukf = _started(UnscentedKalmanFilter(8, 4, window.dt, hx=model.measured, fx=model.step, points=points), start)
+    for z, before, both in _rows(window):
         ukf.predict(omega=before)
-        ukf.update(np.append(gyro, accel[2]), omega=np.stack([before, now]))
+        ukf.update(z, omega=both)
         yield ukf.x[3:].copy()
 
 
-def _rows(window: Window) -> Iterator[tuple[FloatArray, FloatArray, FloatArray, FloatArray]]:
-    """Gyro, accelerometer, and rotor speeds before and from each sample on."""
+def _rows(window: Window) -> Iterator[tuple[FloatArray, FloatArray, FloatArray]]:
+    """Measurements of each sample, and rotor speeds before it, and both before and from it on."""
     assert window.gyro is not None
     assert window.accel is not None
     for k in range(1, len(window)):
-        yield window.gyro[k], window.accel[k], window.rotor_speed[k - 1], window.rotor_speed[k]
+        both = window.rotor_speed[k - 1 : k + 1]
+        yield np.append(window.gyro[k], window.accel[k, 2]), both[0], both
 
 
 FILTERS = {"extended Kalman filter": extended, "unscented Kalman filter": unscented}
@@ -142,34 +137,29 @@ def _session(seed: int) -> tuple[FloatArray, float, float]:
     begin = time.process_time()
     actions = list(drive(Session(poor_guess(PELICAN, truth, seed)), stream(flight.recording)))
     cost = (time.process_time() - begin) / SECONDS
-    last = [a.item for a in actions if isinstance(a, Publish) and a.topic == "candidate"][-1].parameters
+    last = published(actions, "candidate")[-1].parameters
     changed = flown(CHANGE_AT + 12.0, seed, mass_change={"time": CHANGE_AT, "fraction": CHANGE})
     found = [a for a in drive(Session(PELICAN), stream(changed.recording)) if isinstance(a, OnlineDiagnosis)]
-    named = [a for a in found if a.findings and a.findings[0].effect == "mass_change"]
-    after = named[0].t - CHANGE_AT if named else float("nan")
-    return np.log([last[n].value / truth[n] for n in NAMES]), after, cost
+    named = [a.t - CHANGE_AT for a in found if a.findings and a.findings[0].effect == "mass_change"]
+    return np.log([last[n].value / truth[n] for n in NAMES]), named[0] if named else float("nan"), cost
 
 
 def section() -> list[str]:
     """The part of the page."""
-    rows = [
-        "| estimator | RMS error after 60 s of " + ", ".join(NAMES) + " [%] | delay to +15 % mass [s] | name | "
-        "processor [s per s] |",
-        "|---|---|---|---|---|",
-    ]
+    rows = []
     for who in (*FILTERS, "quadid.online.Session"):
-        runs = [_session(seed) if who not in FILTERS else _filtered(who, seed) for seed in SEEDS]
+        runs = [_filtered(who, seed) if who in FILTERS else _session(seed) for seed in SEEDS]
         rms = np.sqrt(np.mean(np.square([error for error, _, _ in runs]), axis=0))
         after, cost = (float(np.median([run[k] for run in runs])) for k in (1, 2))
         names = "none" if who in FILTERS else "mass_change"
-        rows.append(f"| {who} | {', '.join(f'{100 * v:.2g}' for v in rms)} | {after:.1f} | {names} | {cost:.3f} |")
+        rows.append((who, ", ".join(f"{100 * v:.2g}" for v in rms), f"{after:.1f}", names, f"{cost:.3f}"))
+    errors = f"RMS error after 60 s of {', '.join(NAMES)} [%]"
     return [
         "## Online: Kalman filters",
         "",
-        f"`python -m quadid_evaluation.studies.peers online`: {len(SEEDS)} flights of a Pelican (seeds "
-        f"{SEEDS[0]} to {SEEDS[-1]}), the "
-        f"guess off by up to 35 %. The filters receive J_r, the true noise and a random walk of {WALK:g} per sample; a "
-        "change counts as seen when b has moved half of it.",
+        f"`python -m quadid_evaluation.studies.peers online`: {len(SEEDS)} flights of a Pelican (seeds {SEEDS[0]} to "
+        f"{SEEDS[-1]}), the guess off by up to 35 %. The filters receive J_r, the true noise and a random walk of "
+        f"{WALK:g} per sample; a change counts as seen when b has moved half of it.",
         "",
-        *rows,
+        *table(("estimator", errors, "delay to +15 % mass [s]", "name", "processor [s per s]"), rows),
     ]

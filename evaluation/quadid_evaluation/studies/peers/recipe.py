@@ -6,7 +6,6 @@ the gyro on the moments; yaw from one coefficient on the thrusts.  The grid of l
 are the authors' kind; the code is ours.
 """
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,7 +17,8 @@ from quadid.data.grid import linear
 from quadid.data.window import Recording
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
-from quadid_evaluation.studies.ahead import shares_of_no_change
+from quadid_evaluation.harness import table
+from quadid_evaluation.studies.flight_sets import shares_of_no_change
 
 LOG, CUT, MODEL = "arpl/log15.csv", 18.0, "arpl/vehicle.yaml"
 """The log, fitted up to the cut [s] and predicted from there."""
@@ -39,9 +39,8 @@ class Fitted(NamedTuple):
 
 
 class Signals(NamedTuple):
-    """At 1 kHz: times [s], commands (n, 4), rates (n, 3) [rad/s], specific force along z (n,) [m/s^2]."""
+    """At 1 kHz: commands (n, 4), rates (n, 3) [rad/s], specific force along z (n,) [m/s^2]."""
 
-    t: FloatArray
     u: FloatArray
     gyro: FloatArray
     az: FloatArray
@@ -51,11 +50,8 @@ def signals(recording: Recording, begin: float, end: float) -> Signals:
     """Channels of a part of a log on one grid."""
     c = recording.channels
     t = np.arange(max(begin, c["gyro"].t[0]), min(end, *(v.t[-1] for v in c.values())), 1.0 / RATE)
-
-    def on_grid(name: str) -> FloatArray:
-        return linear(c[name].t, c[name].values, t)
-
-    return Signals(t, on_grid("motor_command"), on_grid("gyro"), on_grid("accel")[:, 2])
+    u, gyro, accel = (linear(c[name].t, c[name].values, t) for name in ("motor_command", "gyro", "accel"))
+    return Signals(u, gyro, accel[:, 2])
 
 
 def _lagged(u: FloatArray, lag: float) -> FloatArray:
@@ -71,17 +67,13 @@ def _moments(vehicle: Vehicle, thrust: FloatArray, u: FloatArray) -> FloatArray:
 
 def fitted(log: Signals, vehicle: Vehicle) -> Fitted:
     """The recipe."""
-    best, answer = np.inf, None
+    fits, target = [], -vehicle.mass * log.az
     for lag in LAGS:
         u = _lagged(log.u, lag)
         columns = np.column_stack([(u**k).sum(axis=1) for k in range(3)])
-        target = -vehicle.mass * log.az
         thrust = np.linalg.lstsq(columns, target, rcond=None)[0]
-        left = float(np.sum((columns @ thrust - target) ** 2))
-        if left < best:
-            best, answer = left, (lag, thrust, u)
-    assert answer is not None
-    lag, thrust, u = answer
+        fits.append((float(np.sum((columns @ thrust - target) ** 2)), lag, thrust, u))
+    _, lag, thrust, u = min(fits, key=lambda one: one[0])
     turning = savgol_filter(log.gyro, SMOOTH, 3, deriv=1, delta=1.0 / RATE, axis=0)
     moments = savgol_filter(_moments(vehicle, thrust, u), SMOOTH, 3, axis=0)
     share = np.sum(moments * turning, axis=0) / np.sum(moments**2, axis=0)
@@ -94,16 +86,10 @@ def rate_error(log: Signals, vehicle: Vehicle, found: Fitted, seconds: float) ->
     steps, every = round(seconds * RATE), round(0.02 * RATE)
     turning = found.scale * _moments(vehicle, found.thrust, _lagged(log.u, found.lag))
     grown = np.vstack([np.zeros(3), np.cumsum(turning, axis=0)]) / RATE
-    start = np.arange(0, len(log.t) - steps, every)
+    start = np.arange(0, len(log.u) - steps, every)
     change = log.gyro[start + steps] - log.gyro[start]
     miss = grown[start + steps] - grown[start] - change
     return float(np.linalg.norm(miss, axis=1).mean()), float(np.linalg.norm(change, axis=1).mean())
-
-
-def _row(name: str, errors: Sequence[float]) -> str:
-    """Table row of errors on the fitted log, then on the unseen one, both by horizon."""
-    pairs = zip(errors[: len(AHEAD)], errors[len(AHEAD) :], strict=True)
-    return f"| {name} | " + " | ".join(f"{a:.2f}, {b:.2f}" for a, b in pairs) + " |"
 
 
 def section(data: Path) -> list[str]:
@@ -112,25 +98,21 @@ def section(data: Path) -> list[str]:
     train, other = (quadid.load(str(data / name), vehicle) for name in (f"{LOG}@:{CUT:g}", f"{LOG}@{CUT:g}:"))
     first, new = signals(train.recording, 0.0, CUT), signals(other.recording, CUT, np.inf)
     found = fitted(first, vehicle)
-    rows = ["| rate error, fitted and unseen | " + " | ".join(f"after {s:g} s" for s in AHEAD) + " |"]
-    rows += ["|---|" + "---|" * len(AHEAD)]
-    theirs = [rate_error(log, vehicle, found, s) for log in (first, new) for s in AHEAD]
-    rows.append(_row("recipe", [miss / still for miss, still in theirs]))
+    errors = {"recipe": [[np.divide(*rate_error(log, vehicle, found, s)) for log in (first, new)] for s in AHEAD]}
     identified, diagnosed = quadid.identify([train]), quadid.diagnose([train])
     for name, model in (("quadid identify", identified.vehicle), ("quadid diagnose", diagnosed.vehicle)):
-        cells = [shares_of_no_change(log.windows, model, s)["rate"] for log in (train, other) for s in AHEAD]
-        rows.append(_row(name, cells))
+        errors[name] = [[shares_of_no_change(log.windows, model, s)["rate"] for log in (train, other)] for s in AHEAD]
     j = 1.0 / found.scale[:2]
     ours = {p["name"]: p for p in diagnosed.result["parameters"]}
     told = " and ".join(f"{ours[n]['value']:.2e} ({ours[n]['status']})" for n in ("J_xx", "J_yy"))
+    heads = ("rate error, fitted and unseen", *(f"after {s:g} s" for s in AHEAD))
     return [
         "## The least squares of sysid.tools on its authors' logs",
         "",
-        f"`python -m quadid_evaluation.studies.peers recipe`: fitted to {LOG} up to {CUT:g} s, predicted from "
-        f"there; rate errors "
-        "relative to no change.",
+        f"`python -m quadid_evaluation.studies.peers recipe`: fitted to {LOG} up to {CUT:g} s, predicted from there; "
+        "rate errors relative to no change.",
         "",
-        *rows,
+        *table(heads, [(name, *(f"{a:.2f}, {b:.2f}" for a, b in cells)) for name, cells in errors.items()]),
         "",
         f"Recipe: J_xx {j[0]:.2e}, J_yy {j[1]:.2e} kg m^2 "
         f"without intervals, R² of its accelerations {', '.join(f'{v:.2f}' for v in found.r2)}. "

@@ -2,21 +2,19 @@
 
 import tempfile
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 import quadid
 from quadid.app.logs import Log
-from quadid.data.window import Window
 from quadid.parameters import NOMINAL_NAMES
 from quadid.vehicle import Vehicle
+from quadid_evaluation.harness import table
 from quadid_evaluation.studies import rotorpy_flight
-from quadid_evaluation.studies.ahead import shares_of_no_change
-from quadid_evaluation.studies.flight_sets import SETS
+from quadid_evaluation.studies.flight_sets import SETS, shares_of_no_change
 from quadid_evaluation.studies.peers import mujoco_sysid
 from quadid_evaluation.studies.truth import with_values
 
@@ -32,8 +30,7 @@ AHEAD = 0.5
 ROTORPY, RECORDED = "RotorPy Hummingbird, air and lag", ("iris", "brushed rpm")
 
 
-@dataclass(frozen=True)
-class Flights:
+class Flights(NamedTuple):
     """Flights of one vehicle: fitted and unseen ones, and the interval in which each known parameter lies."""
 
     vehicle: Vehicle
@@ -43,24 +40,19 @@ class Flights:
 
 
 def rotorpy() -> Flights:
-    """RotorPy's own Hummingbird, flown by RotorPy, through CSV files."""
+    """RotorPy's own Hummingbird, flown by RotorPy, through CSV files (contract §5)."""
     truth = rotorpy_flight.hummingbird(tau_m=LAG)
-    flown = [rotorpy_flight.fly(truth, SECONDS, seed, reach=1.4) for seed in (1, 2)]
-    vehicle = flown[0].vehicle
-    with tempfile.TemporaryDirectory() as folder:
-        first, second = (
-            quadid.load(_written(f.window, Path(folder) / f"{k}.csv"), vehicle) for k, f in enumerate(flown)
-        )
-    names = {"b": "k_eta", "d": "k_m", "J_xx": "Ixx", "J_yy": "Iyy", "J_zz": "Izz"}
-    return Flights(vehicle, [first], [second], {n: (truth[k],) * 2 for n, k in names.items()})
-
-
-def _written(window: Window, path: Path) -> Path:
-    """A log in our own CSV form (contract §5)."""
-    t = window.t0 + window.dt * np.arange(len(window))
-    columns = (t, window.rotor_speed, window.gyro, window.attitude, window.accel, window.velocity)
-    np.savetxt(path, np.column_stack(columns), delimiter=",", header=HEADER, comments="")  # type: ignore[arg-type]
-    return path
+    logs = []
+    for seed in (1, 2):
+        flown = rotorpy_flight.fly(truth, SECONDS, seed, reach=1.4)
+        vehicle, w = flown.vehicle, flown.window
+        columns = (w.t, w.rotor_speed, w.gyro, w.attitude, w.accel, w.velocity)
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / f"{seed}.csv"
+            np.savetxt(path, np.column_stack(columns), delimiter=",", header=HEADER, comments="")  # type: ignore[arg-type]
+            logs.append(quadid.load(path, vehicle))
+    known = {n: (truth[k],) * 2 for n, k in rotorpy_flight.NAMES.items()}
+    return Flights(vehicle, logs[:1], logs[1:], known)
 
 
 def recorded(name: str, data: Path) -> Flights:
@@ -71,15 +63,52 @@ def recorded(name: str, data: Path) -> Flights:
     return Flights(vehicle, train, unseen, one.truth)
 
 
+def rows(name: str, flights: Flights) -> Iterator[tuple[str, ...]]:
+    """A row a program: errors, intervals, prediction of unseen flights, processor time."""
+    vehicle, known = flights.vehicle, [n for n in NOMINAL_NAMES if n in flights.truth]
+    ours = {}
+    for command in (quadid.identify, quadid.diagnose):
+        begin = time.process_time()
+        ours[command.__name__] = command(flights.train), time.process_time() - begin
+
+    # Value, interval and status by parameter, the file and the time of every program.
+    answers: dict[str, tuple[Mapping[str, tuple[Any, ...]], Vehicle, float]] = {}
+    sigma = np.sqrt(ours["identify"][0].fit.noise.variance)
+    noise = float(sigma[:3].mean()), float(sigma[6:9].mean()), float(sigma[3:6].mean()) / 2.0  # half an angle
+    windows = [w for log in flights.train for w in log.windows]
+    for chunk in CHUNKS:
+        theirs = mujoco_sysid.identify(windows, vehicle, noise, chunk=chunk)
+        low, value, high = (np.exp(theirs.values + k * theirs.half) for k in (-1.0, 0.0, 1.0))
+        told = {n: (value[k], low[k], high[k], "") for k, n in enumerate(NOMINAL_NAMES)}
+        answers[f"mujoco.sysid, {chunk:g} s"] = told, with_values(vehicle, value), theirs.seconds
+    for program, (answer, seconds) in ours.items():
+        told = {p["name"]: (p["value"], *p["ci95"], p["status"]) for p in answer.result["parameters"]}
+        answers[f"quadid {program}"] = told, answer.vehicle, seconds
+
+    seen = [w for log in flights.unseen for w in log.windows]
+    for program, (told, model, seconds) in answers.items():
+        cells, held = [], 0
+        for n in known:
+            (low, high), (value, least, most, status) = flights.truth[n], told[n]
+            off = 100.0 * (value / np.clip(value, low, high) - 1.0)
+            cells.append(f"{n} {off:+.1f}" + (f" ({status})" if status not in ("", "identified") else ""))
+            held += bool(least <= high and low <= most)
+        ahead = shares_of_no_change(seen, model, AHEAD)["rate"]
+        yield name, program, ", ".join(cells), f"{held} of {len(known)}", f"{ahead:.2f}", f"{seconds:.1f}"
+        name = ""
+
+
 def section(data: Path) -> list[str]:
     """The part of the page."""
-    rows = [
-        "| flights | program | error of parameters with known truth [%] | 95 % intervals contain it | "
-        "rate error after 0.5 s | processor [s] |",
-        "|---|---|---|---|---|---|",
-    ]
-    for name in (ROTORPY, *RECORDED):
-        rows += _rows(name, rotorpy() if name == ROTORPY else recorded(name, data))
+    heads = (
+        "flights",
+        "program",
+        "error of parameters with known truth [%]",
+        "95 % intervals contain it",
+        "rate error after 0.5 s",
+        "processor [s]",
+    )
+    flights = [(ROTORPY, rotorpy()), *((name, recorded(name, data)) for name in RECORDED)]
     return [
         "## mujoco.sysid on vehicles of others",
         "",
@@ -89,47 +118,5 @@ def section(data: Path) -> list[str]:
         "benchmark column, which may get worse: the logged inputs of a closed loop already answer the disturbances to "
         "come, and whoever takes torque for less than it is predicts better.",
         "",
-        *rows,
+        *table(heads, (row for name, flown in flights for row in rows(name, flown))),
     ]
-
-
-def _rows(name: str, flights: Flights) -> list[str]:
-    vehicle = flights.vehicle
-    identified, seconds = _timed(lambda: quadid.identify(flights.train))
-    diagnosed, longer = _timed(lambda: quadid.diagnose(flights.train))
-    sigma = np.sqrt(identified.fit.noise.variance)
-    noise = float(sigma[:3].mean()), float(sigma[6:9].mean()), float(sigma[3:6].mean()) / 2.0  # half an angle
-    windows = [w for log in flights.train for w in log.windows]
-    rows = []
-    for chunk in CHUNKS:
-        theirs = mujoco_sysid.identify(windows, vehicle, noise, chunk=chunk)
-        low, value, high = (np.exp(theirs.values + k * theirs.half) for k in (-1.0, 0.0, 1.0))
-        told = {n: (value[k], low[k], high[k], "") for k, n in enumerate(NOMINAL_NAMES)}
-        program = f"mujoco.sysid, {chunk:g} s"
-        rows.append(_row("" if rows else name, program, told, with_values(vehicle, value), flights, theirs.seconds))
-    for program, answer, spent in (("identify", identified, seconds), ("diagnose", diagnosed, longer)):
-        told = {p["name"]: (p["value"], *p["ci95"], p["status"]) for p in answer.result["parameters"]}
-        rows.append(_row("", f"quadid {program}", told, answer.vehicle, flights, spent))
-    return rows
-
-
-def _timed(call: Callable[[], Any]) -> tuple[Any, float]:
-    begin = time.process_time()
-    return call(), time.process_time() - begin
-
-
-_Told = Mapping[str, tuple[float, float, float, str]]
-"""Value, interval and status by parameter."""
-
-
-def _row(name: str, program: str, told: _Told, model: Vehicle, flights: Flights, seconds: float) -> str:
-    cells, held = [], 0
-    known = [n for n in NOMINAL_NAMES if n in flights.truth]
-    for n in known:
-        (low, high), (value, least, most, status) = flights.truth[n], told[n]
-        off = 100.0 * (value / np.clip(value, low, high) - 1.0)
-        cells.append(f"{n} {off:+.1f}" + (f" ({status})" if status not in ("", "identified") else ""))
-        held += bool(least <= high and low <= most)
-    ahead = shares_of_no_change([w for log in flights.unseen for w in log.windows], model, AHEAD)["rate"]
-    row = [name, program, ", ".join(cells), f"{held} of {len(known)}", f"{ahead:.2f}", f"{seconds:.1f}"]
-    return f"| {' | '.join(row)} |".replace("|  |", "| |")

@@ -15,7 +15,7 @@ from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray
 from quadid.vehicle import Vehicle
 from quadid_evaluation.harness import share, table
-from quadid_evaluation.studies.ahead import shares_of_no_change
+from quadid_evaluation.studies.flight_sets import shares_of_no_change
 from quadid_evaluation.studies.peers import mujoco_sysid, output_error
 from quadid_evaluation.studies.peers.mujoco_sysid import Answer
 from quadid_evaluation.studies.truth import poor_guess, with_values
@@ -72,16 +72,8 @@ def record(case: str, seed: int, program: str) -> Record:
     answer, statuses = PROGRAMS[program](window, poor_guess(vehicle, numbers, seed))
     ahead = shares_of_no_change([unseen], with_values(vehicle, np.exp(answer.values)), AHEAD)["rate"]
     error = answer.values - np.log([numbers[n] for n in NOMINAL_NAMES])
-    return {
-        "case": case,
-        "seed": seed,
-        "program": program,
-        "error": rounded(error),
-        "half": rounded(answer.half),
-        "seconds": round(answer.seconds, 3),
-        "ahead": round(ahead, 5),
-        "status": statuses,
-    }
+    told = {"case": case, "seed": seed, "program": program, "error": rounded(error), "half": rounded(answer.half)}
+    return told | {"seconds": round(answer.seconds, 3), "ahead": round(ahead, 5), "status": statuses}
 
 
 def rounded(values: FloatArray) -> list[float]:
@@ -101,8 +93,7 @@ def errors_table(records: Sequence[Record]) -> list[str]:
         "rate error after 0.5 s",
         "processor [s]",
     )
-    rows = []
-    told = ""
+    rows, told = [], ""
     for case, program in product(list(CASES)[1:], PROGRAMS):
         mine = [r for r in records if (r["case"], r["program"]) == (case, program)]
         if not mine:
@@ -112,18 +103,8 @@ def errors_table(records: Sequence[Record]) -> list[str]:
         hold = np.abs(error) <= half
         each = ", ".join(f"{100.0 * v:.0f}" for v in hold.mean(axis=0))
         ahead, seconds = (float(np.median([r[k] for r in mine])) for k in ("ahead", "seconds"))
-        rows.append(
-            (
-                "" if case == told else case,
-                program,
-                len(mine),
-                median,
-                share(int(hold.sum()), hold.size),
-                each,
-                f"{ahead:.3f}",
-                f"{seconds:.2f}",
-            )
-        )
+        shares = (share(int(hold.sum()), hold.size), each, f"{ahead:.3f}", f"{seconds:.2f}")
+        rows.append(("" if case == told else case, program, len(mine), median, *shares))
         told = case
     return table(heads, rows)
 

@@ -1,4 +1,4 @@
-"""A quadcopter under a stabiliser faster than its log, with random moments; written for this study alone.
+"""A quadcopter under a stabiliser faster than its log, with random moments, of its study alone.
 
 Rotation only, at hover thrust.  The stabiliser reads a noisy gyro and an attitude estimator fed by the same gyro; the
 log holds every tenth gyro reading and attitude, the mean of force and commands since, and noise on the speeds.
@@ -6,6 +6,7 @@ log holds every tenth gyro reading and attitude, the mean of force and commands 
 
 import numba as nb
 import numpy as np
+from scipy.signal import lfilter
 
 from quadid.data.window import Window
 from quadid.types import FloatArray
@@ -83,11 +84,10 @@ def _between(a, b):  # type: ignore[no-untyped-def]
 
 
 def _memory(rng: np.random.Generator, n: int, sigma: FloatArray, time: float) -> FloatArray:
-    keep, out = np.exp(-STEP / time), np.empty((n, 3))
-    out[0], drive = rng.standard_normal(3), np.sqrt(1.0 - keep**2) * rng.standard_normal((n, 3))
-    for k in range(1, n):
-        out[k] = keep * out[k - 1] + drive[k]
-    return np.asarray(sigma * out)
+    keep, first = np.exp(-STEP / time), rng.standard_normal(3)
+    drive = np.sqrt(1.0 - keep**2) * rng.standard_normal((n, 3))
+    drive[0] = first
+    return np.asarray(sigma * lfilter([1.0], [1.0, -keep], drive, axis=0))
 
 
 def fly(

@@ -1,1 +1,0 @@
-"""The estimator of `identify` (filter error) on simulated and recorded flights."""
