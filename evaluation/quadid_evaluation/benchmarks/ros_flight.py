@@ -18,7 +18,7 @@ import threading
 import time
 from array import array
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -189,51 +189,76 @@ def fit_process(service: int) -> psutil.Process | None:
         return None
 
 
+def beside(
+    stream: Sequence[str],
+    kept: Path,
+    parameters: Sequence[str],
+    between: float,
+    tell: Callable[[str], None] = lambda line: None,
+    more: Mapping[str, str] = {},
+    word: str = "",
+) -> dict[str, Any]:
+    """Runs the node beside a stream.
+
+    Args:
+        stream: module and arguments of who publishes; it ends with the flight.
+        kept: folder to be made, of `h.sqlite` and the node's logs.
+        parameters: of the node, NAME:=VALUE.
+        between: time between two points [s]; the first comes after `SETTLE`.
+        more: variables of both.
+        word: that the stream says when it begins; its start counts without.
+
+    Returns:
+        The `points` seen from outside, the notes of the node (`minutes`), `problems` that it said, its `exit_code`, and
+        the last line of the stream (`said`).
+    """
+    notes, said = kept.with_suffix(".jsonl"), list[str]()
+    kept.mkdir()
+    environment = {
+        **os.environ,
+        **THIS_MACHINE,
+        **more,
+        OUT: str(notes),
+        EVERY: str(between),
+        "PYTHONUNBUFFERED": "1",
+        "AMENT_PREFIX_PATH": sys.prefix,
+        "ROS_DOMAIN_ID": str(1 + os.getpid() % 100),
+        "ROS_LOG_DIR": f"{kept}/log",
+    }
+    given = (f"history:={kept}/h.sqlite", *parameters)
+    node = _start(environment, __spec__.name, "node", "--ros-args", *(a for g in given for a in ("-p", g)))
+    try:
+        _wait_for(node, "ready")
+        # Somebody has to go on reading what it says, so that its pipe never fills.
+        threading.Thread(target=lambda: said.extend(node.stdout or ()), daemon=True).start()
+        streaming = _start(environment, *stream)
+        if word:
+            _wait_for(streaming, word)
+        points = _watch(node.pid, streaming, kept, between, tell)
+        told, _ = streaming.communicate()
+        if streaming.returncode:
+            raise RuntimeError(f"the stream ended: {told[-2000:]}")
+    finally:
+        node.send_signal(signal.SIGINT)
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            node.wait(300)  # on a crowded machine; what was measured must not be lost for it
+    return {
+        "exit_code": node.returncode,
+        "points": points,
+        "minutes": [json.loads(line) for line in notes.read_text().splitlines()],
+        "problems": [line.strip() for line in said if any(w in line for w in ("[ERROR]", "[WARN]", "Traceback"))],
+        "said": told.strip().splitlines()[-1:],
+    }
+
+
 def flown(
     seconds: float, rate: float, profile: str, record: bool, between: float, tell: Callable[[str], None]
 ) -> dict[str, Any]:
-    """Runs the node beside a vehicle.
-
-    Args:
-        rate: of its channels [Hz].
-        between: time between two points [s]; the first comes after `SETTLE`.
-
-    Returns:
-        What was `sent` by topic, the `points` seen from outside, the notes of the node (`minutes`), `problems` that it
-        said, and its `exit_code`.
-    """
+    """Runs the node beside a vehicle whose channels have a rate [Hz]; as `beside`, and what was `sent` by topic."""
     with tempfile.TemporaryDirectory() as folder:
-        kept = Path(folder) / "kept"
-        kept.mkdir()
-        environment = {
-            **os.environ,
-            OUT: f"{folder}/notes.jsonl",
-            EVERY: str(between),
-            "PYTHONUNBUFFERED": "1",
-            "AMENT_PREFIX_PATH": sys.prefix,
-            "ROS_DOMAIN_ID": str(1 + os.getpid() % 100),
-            **THIS_MACHINE,
-            "ROS_LOG_DIR": f"{kept}/log",
-        }
-        given = [f"history:={kept}/h.sqlite", *([f"record:={kept}/r.mcap"] if record else [])]
-        said = (Path(folder) / "said.txt").open("w+")
-        node = _start(environment, "node", "--ros-args", *(a for g in given for a in ("-p", g)))
-        try:
-            _wait_for(node, "ready")
-            threading.Thread(target=_drain, args=(node, said), daemon=True).start()
-            feeder = _start(environment, "fly", str(seconds), str(rate), profile)
-            _wait_for(feeder, "flying")
-            points = _watch(node.pid, feeder, kept, between, tell)
-        finally:
-            node.send_signal(signal.SIGINT)
-            with contextlib.suppress(subprocess.TimeoutExpired):
-                node.wait(300)  # on a crowded machine; what was measured must not be lost for it
-        sent = json.loads(feeder.stdout.read().strip().splitlines()[-1]) if feeder.stdout else {}
-        noted = [json.loads(line) for line in Path(f"{folder}/notes.jsonl").read_text().splitlines()]
-        said.seek(0)
-        problems = [line.strip() for line in said if "[ERROR]" in line or "[WARN]" in line or "Traceback" in line]
-    whole = {"sent": sent, "points": points, "minutes": noted, "problems": problems}
-    return {"asked_seconds": seconds, "exit_code": node.returncode, **whole}
+        stream, kept = (__spec__.name, "fly", str(seconds), str(rate), profile), Path(folder) / "kept"
+        found = beside(stream, kept, [f"record:={kept}/r.mcap"] if record else [], between, tell, word="flying")
+    return {"asked_seconds": seconds, "sent": json.loads(found.pop("said")[0]), **found}
 
 
 def under_load(seconds: float, profile: str, record: bool = False) -> dict[str, Any]:
@@ -261,8 +286,8 @@ def under_load(seconds: float, profile: str, record: bool = False) -> dict[str, 
     }
 
 
-def _start(environment: dict[str, str], *arguments: str) -> subprocess.Popen[str]:
-    command = [sys.executable, "-m", "quadid_evaluation.benchmarks.ros_flight", *arguments]
+def _start(environment: dict[str, str], *module: str) -> subprocess.Popen[str]:
+    command = [sys.executable, "-m", *module]
     return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
 
 
@@ -275,14 +300,6 @@ def _wait_for(child: subprocess.Popen[str], word: str) -> None:
         if time.monotonic() > deadline:
             break
     raise RuntimeError(f"'{word}' was not said")
-
-
-def _drain(child: subprocess.Popen[str], into: Any) -> None:
-    """Keeps reading what a child says, so that its pipe never fills."""
-    assert child.stdout is not None
-    for line in child.stdout:
-        into.write(line)
-        into.flush()
 
 
 def _processor(process: psutil.Process | None) -> float:

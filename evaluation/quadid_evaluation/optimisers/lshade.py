@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from quadid.errors import ParameterError
 from quadid.identification.particle_swarm import checked_box, place, read_only
-from quadid.types import FloatArray, IntArray
+from quadid.types import FloatArray
 
 SMALLEST_POPULATION = 4
 """N_min: current-to-pbest/1 needs this many."""
@@ -101,26 +101,38 @@ class LShade:
 
     def ask(self) -> FloatArray:
         """Returns positions to be evaluated, shape (k, n); the same ones until they are told."""
-        if not self._asked:
-            size, n = self._x.shape
-            entry = self._rng.integers(len(self._m_f), size=size)
-            # Eq. (1): CR_i = 0 if M_CR is terminal, else N(M_CR, 0.1) cut to [0, 1].
-            mean = self._m_cr[entry]
-            normal = np.clip(mean + 0.1 * self._rng.standard_normal(size), 0.0, 1.0)
-            self._cr = np.where(np.isnan(mean), 0.0, normal)
-            # Eq. (2): F_i = Cauchy(M_F, 0.1), drawn again while not positive, cut at 1.
-            location = self._m_f[entry]
-            f = np.zeros(len(location))
-            while np.any(pending := f <= 0.0):
-                f[pending] = location[pending] + 0.1 * self._rng.standard_cauchy(int(pending.sum()))
-            self._f = np.minimum(f, 1.0)
-            mutant = self._mutate(self._f)
-            # Eq. (5): binomial crossover; component j_rand always comes from the mutant.
-            keep = self._rng.random((size, n)) > self._cr[:, None]
-            keep[np.arange(size), self._rng.integers(n, size=size)] = False
-            # No trial beyond the budget: the last generation may be incomplete.
-            self._trials = np.where(keep, self._x, mutant)[: self.budget - self.evaluations]
-            self._asked = True
+        if self._asked:
+            return self._trials.copy()
+        (size, n), rng = self._x.shape, self._rng
+        i, entry = np.arange(size), rng.integers(len(self._m_f), size=size)
+        # Eq. (1): CR_i = 0 if M_CR is terminal, else N(M_CR, 0.1) cut to [0, 1].
+        mean = self._m_cr[entry]
+        self._cr = np.where(np.isnan(mean), 0.0, np.clip(mean + 0.1 * rng.standard_normal(size), 0.0, 1.0))
+        # Eq. (2): F_i = Cauchy(M_F, 0.1), drawn again while not positive, cut at 1.
+        location, f = self._m_f[entry], np.zeros(size)
+        while np.any(pending := f <= 0.0):
+            f[pending] = location[pending] + 0.1 * rng.standard_cauchy(int(pending.sum()))
+        self._f = np.minimum(f, 1.0)
+        # Eq. (3), current-to-pbest/1: v_i = x_i + F_i (x_pbest - x_i) + F_i (x_r1 - x_r2), r2 also from the archive;
+        # r1 != i and r2 != i, r1 are drawn uniformly.
+        elite = np.argsort(self._cost, kind="stable")[: max(round(self.options.best_fraction * size), 2)]
+        p_best = self._x[elite[rng.integers(len(elite), size=size)]]
+        everyone = np.concatenate([self._x, self._archive])
+        r1 = rng.integers(size - 1, size=size)
+        r1 += r1 >= i
+        r2 = rng.integers(len(everyone) - 2, size=size)
+        for taken in (np.minimum(i, r1), np.maximum(i, r1)):
+            r2 += r2 >= taken
+        mutant = self._x + self._f[:, None] * (p_best - self._x + self._x[r1] - everyone[r2])
+        # Eq. (4): a component outside the box is put midway between the parent and the bound.
+        mutant = np.where(mutant < self._lower, 0.5 * (self._lower + self._x), mutant)
+        mutant = np.where(mutant > self._upper, 0.5 * (self._upper + self._x), mutant)
+        # Eq. (5): binomial crossover; component j_rand always comes from the mutant.
+        keep = rng.random((size, n)) > self._cr[:, None]
+        keep[i, rng.integers(n, size=size)] = False
+        # No trial beyond the budget: the last generation may be incomplete.
+        self._trials = np.where(keep, self._x, mutant)[: self.budget - self.evaluations]
+        self._asked = True
         return self._trials.copy()
 
     def tell(self, costs: ArrayLike) -> None:
@@ -160,33 +172,17 @@ class LShade:
         leader = int(np.argmin(self._cost))
         if self._cost[leader] < self.best_cost:
             self.best, self.best_cost = read_only(self._x[leader]), float(self._cost[leader])
-        self._judge()
+        finite = math.isfinite(self.best_cost)
+        spread = np.max(np.abs(self._x - self.best) / (self._upper - self._lower))
+        if finite and spread < self.options.tolerance:
+            self.stop = Stop.CONVERGED
+        elif self.evaluations >= self.budget:
+            self.stop = Stop.BUDGET if finite else Stop.NO_FINITE_COST
 
     @property
     def population(self) -> int:
         """Present number of individuals."""
         return len(self._x) or self._first_size
-
-    def _mutate(self, f: FloatArray) -> FloatArray:
-        # Eq. (3), current-to-pbest/1: v_i = x_i + F_i (x_pbest - x_i) + F_i (x_r1 - x_r2), r2 also from the archive.
-        size, i = len(self._x), np.arange(len(self._x))
-        elite = np.argsort(self._cost, kind="stable")[: max(round(self.options.best_fraction * size), 2)]
-        p_best = self._x[elite[self._rng.integers(len(elite), size=size)]]
-        everyone = np.concatenate([self._x, self._archive])
-        r1, r2 = self._distinct(i, len(everyone))
-        mutant = self._x + f[:, None] * (p_best - self._x + self._x[r1] - everyone[r2])
-        # Eq. (4): a component outside the box is put midway between the parent and the bound.
-        mutant = np.where(mutant < self._lower, 0.5 * (self._lower + self._x), mutant)
-        return np.where(mutant > self._upper, 0.5 * (self._upper + self._x), mutant)
-
-    def _distinct(self, i: IntArray, everyone: int) -> tuple[IntArray, IntArray]:
-        """Draws r1 != i from the population and r2 != i, r1 from population and archive, uniformly, shape (size,)."""
-        r1 = self._rng.integers(len(i) - 1, size=len(i))
-        r1 += r1 >= i
-        r2 = self._rng.integers(everyone - 2, size=len(i))
-        for taken in (np.minimum(i, r1), np.maximum(i, r1)):
-            r2 += r2 >= taken
-        return r1, r2
 
     def _learn(self, gain: FloatArray, cr: FloatArray, f: FloatArray) -> None:
         # Algorithm 1 and Eqs. (7)-(9): weighted Lehmer means of the successful CR and F replace the oldest entry.
@@ -200,11 +196,3 @@ class LShade:
         self._m_cr[self._entry] = np.nan if terminal else (weight @ cr**2) / (weight @ cr)
         self._m_f[self._entry] = (weight @ f**2) / (weight @ f)
         self._entry = (self._entry + 1) % len(self._m_f)
-
-    def _judge(self) -> None:
-        finite = math.isfinite(self.best_cost)
-        spread = np.max(np.abs(self._x - self.best) / (self._upper - self._lower))
-        if finite and spread < self.options.tolerance:
-            self.stop = Stop.CONVERGED
-        elif self.evaluations >= self.budget:
-            self.stop = Stop.BUDGET if finite else Stop.NO_FINITE_COST

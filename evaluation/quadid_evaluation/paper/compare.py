@@ -41,6 +41,7 @@ SEEDLESS = ("initial", "quasi_newton", "least_squares")
 """Optimisers without randomness: run once, whatever the number of seeds."""
 SUCCESS = 1.01
 """A run has failed when its cost is above this multiple of the lowest cost that any run of any method found."""
+BLACK_BOX = "a black box: predicts, gives no physical parameters"
 OBJECTIVES = ("shooting", "closed_loop")
 """What optimisers may be asked to minimise."""
 
@@ -173,20 +174,12 @@ def compare(
             try:
                 box = fit_black_box(name, windows, noise)
                 seconds = time.perf_counter() - begin
-                first, *others = (score_black_box(box, part, craft, noise) for part in sets)
+                scores = [score_black_box(box, part, craft, noise) for part in sets]
+                more = {"order": box.model.order, "failures": 0, "note": BLACK_BOX}
+                boxes[name] = _entry(name, scores, None, box.tried + 1, seconds) | {"runs": 1, **more}
             except QuadidError as error:  # cannot be fitted to these data
-                boxes[name] = _entry(name, math.nan, [], None, 0, math.nan) | {
-                    "runs": 1,
-                    "failures": 1,
-                    "note": str(error),
-                }
-                continue
-            boxes[name] = _entry(name, first, others, None, box.tried + 1, seconds) | {
-                "order": box.model.order,
-                "runs": 1,
-                "failures": 0,
-                "note": "a black box: predicts, gives no physical parameters",
-            }
+                more = {"failures": 1, "note": str(error)}
+                boxes[name] = _entry(name, [math.nan], None, 0, math.nan) | {"runs": 1, **more}
         else:
             runs[name] = [
                 (s, minimise(name, p.cost, p.start, p.lower, p.upper, budget, s, p.residual, time.perf_counter))
@@ -198,12 +191,10 @@ def compare(
     for name, tried in runs.items():
         chosen, found = sorted(tried, key=lambda run: run[1].cost)[(len(tried) - 1) // 2]
         theta = problem.theta(found.x)
-        first, *others = (mse_score(part, craft, theta, noise).mse for part in sets)
-        paper = None
-        if autopilot is not None:
-            scores = [paper_score(part, craft, theta, autopilot) for part in sets]
-            paper = [math.nan if s is None else s.mse for s in scores]
-        boxes[name] = _entry(name, first, others, paper, found.evaluations, found.seconds) | {
+        scores = [mse_score(part, craft, theta, noise).mse for part in sets]
+        judged = (paper_score(part, craft, theta, autopilot) for part in sets)
+        paper = None if autopilot is None else [math.nan if s is None else s.mse for s in judged]
+        boxes[name] = _entry(name, scores, paper, found.evaluations, found.seconds) | {
             "cost": found.cost,
             "parameters": dict(zip(NOMINAL_NAMES, theta[:6].tolist(), strict=True)),
             "seed": chosen,
@@ -229,13 +220,11 @@ def compare(
     return Methods(result, tuple(text for log in (*train, *held) for text in log.warnings))
 
 
-def _entry(
-    name: str, train: float, validate: list[float], paper: list[float] | None, evaluations: int, seconds: float
-) -> JsonDict:
-    """Entries of every method in ``quadid.compare/1``; `paper` is its score on each set."""
+def _entry(name: str, mse: Sequence[float], paper: list[float] | None, evaluations: int, seconds: float) -> JsonDict:
+    """Entries of every method in ``quadid.compare/1``; `mse` and `paper` are its scores on each set."""
     return {
         "name": name,
-        "mse": {"train": train, "validate": validate},
+        "mse": {"train": mse[0], "validate": list(mse[1:])},
         "mse_paper": None if paper is None else {"train": paper[0], "validate": paper[1:]},
         "evaluations": evaluations,
         "seconds": seconds,

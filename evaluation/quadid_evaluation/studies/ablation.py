@@ -186,10 +186,11 @@ class Answer:
 def run(flight: str, chosen: Sequence[Variant], records: Path) -> list[Answer]:
     """Diagnoses one flight under each variant that `records` lacks, and keeps the answers there."""
     have = {a.variant: a for a in kept(records, Answer) if a.flight == flight}
-    one = case(flight)
-    windows = given(one) if any(v.name not in have for v in chosen) else None
-    for variant in chosen:
-        if windows is not None and variant.name not in have:
+    left = [v for v in chosen if v.name not in have]
+    if left:
+        one = case(flight)
+        windows = given(one)
+        for variant in left:
             with variant.in_force(), _counted() as count:
                 graded = grade(one, *windows)
             have[variant.name] = Answer(flight, variant.name, graded, len(count))

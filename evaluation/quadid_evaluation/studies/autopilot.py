@@ -18,6 +18,7 @@ from itertools import chain, takewhile
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from quadid_node.messages import set_to_dict
 from quadid_node.recording import play, stream
 from quadid_node.service import Service, session_settings
@@ -108,26 +109,15 @@ class Outcome:
     status: str
     seconds: float
 
-    @property
-    def alarms(self) -> list[str]:
-        """Changes that were reported."""
-        return [f"{e['t'] - self.begin:.0f} s: {e['text']}" for e in self.events if e["kind"] == "change"]
-
-    @property
-    def models(self) -> list[str]:
-        """Effects that the model took in."""
-        return [f"{e['t'] - self.begin:.0f} s: {e['text']}" for e in self.events if e["kind"] == "model"]
+    def told(self, kind: str) -> list[str]:
+        """Events of a kind with their times: ``change`` (alarms), ``model`` (effects that the model took in)."""
+        return [f"{e['t'] - self.begin:.0f} s: {e['text']}" for e in self.events if e["kind"] == kind]
 
     @property
     def begin(self) -> float:
         """Beginning of the excited flight: the first data learned from; before any, that of the stream [s]."""
         times = [s["start"] for s in (*self.candidates, *self.published) if s.get("start")]
         return min(times, default=min((e["t"] for e in self.events if e["t"] is not None), default=0.0))
-
-    @property
-    def first(self) -> float | None:
-        """Excited flight before the first set [s]; None: nothing was published."""
-        return self.published[0]["stop"] - self.begin if self.published else None
 
 
 def errors_of(item: Mapping[str, Any], truth: Mapping[str, float]) -> list[str]:
@@ -163,12 +153,16 @@ def serve(log: Path, vehicle: Path, seconds: float) -> Outcome:
         vehicle: vehicle file.
         seconds: of the log to play at most.
     """
-    begin = time.monotonic()
+    begin, frames = time.monotonic(), read_frames(log)
     with tempfile.TemporaryDirectory() as folder, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as wire:
         wire.bind(("127.0.0.1", 0))
         port, history = free_port(), Path(folder) / "history.sqlite"
         with serving(vehicle, f"udpin:127.0.0.1:{port}", history) as said:
-            _send(log, wire, port, seconds)
+            # Every frame when it came, counted from the first; what is asked of the vehicle finds no ear.
+            start, due = time.monotonic(), frames.received - frames.received[:1]
+            for k in range(int(np.searchsorted(due, seconds, "right"))):
+                time.sleep(max(start + due[k] - time.monotonic(), 0.0))
+                wire.sendto(frames.frame(k), ("127.0.0.1", port))
             time.sleep(LINGER)
         return stored(vehicle, history, said, time.monotonic() - begin)
 
@@ -216,16 +210,6 @@ def _listen(served: subprocess.Popen[str], said: list[str], ready: threading.Eve
             ready.set()
 
 
-def _send(log: Path, wire: socket.socket, port: int, seconds: float) -> None:
-    """Sends every frame when it came, counted from the first; what is asked of the vehicle finds no ear."""
-    frames, begin = read_frames(log), time.monotonic()
-    for k, due in enumerate(frames.received - frames.received[:1]):
-        if due > seconds:
-            return
-        time.sleep(max(begin + due - time.monotonic(), 0.0))
-        wire.sendto(frames.frame(k), ("127.0.0.1", port))
-
-
 # --- The study
 
 
@@ -247,7 +231,7 @@ def main() -> None:
             done = flown(one, given.data, given.live, given.seconds)
             rows.append(row(one, done))
             print(*rows[-1], sep=" | ", flush=True)
-            for text in (*done.models, *done.alarms):
+            for text in (*done.told("model"), *done.told("change")):
                 print(f"    {text}", flush=True)
         if rows:
             put(given, "autopilot.md", TITLE, f"{kind} {way}", section(kind, way, rows, given.seconds))
@@ -265,14 +249,12 @@ def flown(one: Flown, data: Path, live: bool, seconds: float) -> Outcome:
         recording = telemetry(recording, one.interval, one.pulses)
     service = Service(vehicle, session_settings("auto", seed=0), InlineWorker(), live=False)
     outputs = play(service, until(stream(recording), seconds))
-    sets: dict[str, list[dict[str, Any]]] = {"parameters": [], "candidate": []}
-    for output in outputs:
-        if isinstance(output, Publish):
-            sets[output.topic].append(set_to_dict(output.item, covariance=False))
+    sets = [(o.topic, set_to_dict(o.item, covariance=False)) for o in outputs if isinstance(o, Publish)]
     events = [{"t": o.t, "kind": o.kind, "text": o.text} for o in outputs if isinstance(o, Event)]
     status = service.session.status()
+    published, candidates = ([one for topic, one in sets if topic == name] for name in ("parameters", "candidate"))
     said = f"{status.phase.value}: {status.reason}"
-    return Outcome(sets["parameters"], sets["candidate"], events, said, time.monotonic() - begin)
+    return Outcome(published, candidates, events, said, time.monotonic() - begin)
 
 
 def until(blocks: Iterator[Block], seconds: float) -> Iterator[Block]:
@@ -283,9 +265,9 @@ def until(blocks: Iterator[Block], seconds: float) -> Iterator[Block]:
 
 def row(one: Flown, done: Outcome) -> list[str]:
     """The cells of one flight."""
-    first = "none" if done.first is None else f"{done.first:.0f}"
+    first = f"{done.published[0]['stop'] - done.begin:.0f}" if done.published else "none"
     wrong = sum("**" in " ".join(errors_of(s, one.truth)) for s in done.published) if one.truth else None
-    counts = [len(done.published), *([] if wrong is None else [wrong]), len(done.alarms)]
+    counts = [len(done.published), *([] if wrong is None else [wrong]), len(done.told("change"))]
     cells = [one.name, ", ".join(map(str, counts)), first]
     if one.truth:
         sets = (done.published[0], done.published[-1]) if done.published else ()

@@ -355,32 +355,6 @@ NEAR = 0.05
 """Relative error below which an effect has no row of its own."""
 
 
-def parameter_errors(graded: Sequence[Graded]) -> dict[str, list[float]]:
-    """Relative error of each hidden effect found, as a vector: |found - hidden| / |hidden|, by effect."""
-    out: dict[str, list[float]] = {}
-    for g in graded:
-        for effect in g.case.expected:
-            if effect not in g.values:
-                continue
-            names = [n for n in g.case.hidden[effect] if n not in ("rotor", "time")]
-            found = np.array([g.values[effect].get(n, np.nan) for n in names])
-            truth = np.array([g.case.hidden[effect][n] for n in names])
-            out.setdefault(effect, []).append(float(np.linalg.norm(found - truth) / np.linalg.norm(truth)))
-    return out
-
-
-def coverage(graded: Sequence[Graded]) -> dict[str, tuple[int, int]]:
-    """Number of times that the 95 % interval of a found effect's own parameters holds the truth, by effect."""
-    inside: dict[str, list[bool]] = {}
-    for g in graded:
-        for effect in g.case.expected:
-            for name, (low, high) in g.intervals.get(effect, {}).items():
-                if name in ("rotor", "time") or name not in g.case.hidden[effect]:
-                    continue
-                inside.setdefault(effect, []).append(bool(low <= g.case.hidden[effect][name] <= high))
-    return {effect: (sum(v), len(v)) for effect, v in inside.items()}
-
-
 def oracle_ratios(graded: Sequence[Graded]) -> list[float]:
     """Gain of the extended model over that of the oracle, on the flight not used, where there is a gain to speak of."""
     return [
@@ -452,20 +426,27 @@ def _class(name: str, graded: Sequence[Graded]) -> tuple[str, ...]:
 
 
 def _parameters(singles: Sequence[Graded]) -> list[str]:
-    errors, inside = parameter_errors(singles), coverage(singles)
+    """Errors |found - hidden| / |hidden| of each hidden effect that was found; how often intervals hold the truth."""
+    errors, inside = dict[str, list[float]](), dict[str, list[bool]]()
+    for g in singles:
+        for effect in g.values.keys() & set(g.case.expected):
+            truth = {n: v for n, v in g.case.hidden[effect].items() if n not in ("rotor", "time")}
+            off = [g.values[effect].get(n, np.nan) - v for n, v in truth.items()]
+            errors.setdefault(effect, []).append(float(np.linalg.norm(off) / np.linalg.norm([*truth.values()])))
+            held = [low <= truth[n] <= high for n, (low, high) in g.intervals[effect].items() if n in truth]
+            inside.setdefault(effect, []).extend(held)
+
+    def cells(sizes: Sequence[float]) -> tuple[str, str, str]:
+        return str(len(sizes)), f"{100 * np.median(sizes):.1f}", f"{100 * max(sizes):.1f}"
+
     rows = [
-        (effect, *_sizes(values), f"{inside[effect][0]} of {inside[effect][1]}" if effect in inside else "–")
-        for effect, values in errors.items()
-        if not (max(values) < NEAR and effect in inside and inside[effect][0] + 1 >= inside[effect][1])
+        (effect, *cells(errors[effect]), f"{sum(inside[effect])} of {len(inside[effect])}")
+        for effect in EFFECTS
+        if effect in errors and (max(errors[effect]) >= NEAR or sum(inside[effect]) + 1 < len(inside[effect]))
     ]
-    held, total = (sum(pair[k] for pair in inside.values()) for k in (0, 1))
-    rows.append(("**all**", *_sizes([e for v in errors.values() for e in v]), share(held, total)))
+    every, held = [e for sizes in errors.values() for e in sizes], [h for some in inside.values() for h in some]
+    rows.append(("**all**", *cells(every), share(sum(held), len(held))))
     return table(("effect", "found", "median error %", "largest error %", "truth in the 95 % interval"), rows)
-
-
-def _sizes(errors: Sequence[float]) -> tuple[str, str, str]:
-    """Cells of a table: how many relative errors, the middle one, the largest."""
-    return str(len(errors)), f"{100 * np.median(errors):.1f}", f"{100 * max(errors):.1f}"
 
 
 def confusion(singles: Sequence[Graded], path: Path) -> None:

@@ -48,8 +48,7 @@ class Running:
     """
 
     def __init__(self, folder: Path, port: int, key: Path) -> None:
-        self.folder, self.history = folder, folder / "disk" / "h.sqlite"
-        self._port, self._key = port, key
+        self.history, self._port, self._key = folder / "disk" / "h.sqlite", port, key
         self.crashes: list[str] = []
         self.rows: set[tuple[int, float]] = set()
         self.lines: list[str] = []
@@ -58,16 +57,14 @@ class Running:
 
     def start(self) -> None:
         """Starts the service."""
-        self.child = self.another(self.history)
+        self.child = self.another()
         threading.Thread(target=self._read, args=(self.child,), daemon=True).start()
 
-    def another(self, history: Path) -> subprocess.Popen[str]:
-        """A further service on the same vehicle."""
-        command = [
-            QUADID, "serve", "--vehicle", "pelican", "--window", "5",
-            "--diagnose", "0", "--gate", GATE, "--history", str(history), "--key", str(self._key),
-            "--mavlink", f"udpin:127.0.0.1:{self._port}",
-        ]  # fmt: skip
+    def another(self) -> subprocess.Popen[str]:
+        """A further service on the same vehicle and history."""
+        command = [QUADID, "serve", "--vehicle", "pelican", "--window", "5", "--diagnose", "0", "--gate", GATE]
+        command += ["--history", str(self.history), "--key", str(self._key)]
+        command += ["--mavlink", f"udpin:127.0.0.1:{self._port}"]
         environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
         return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=environment)
 
@@ -79,13 +76,12 @@ class Running:
         child.send_signal(number)
         try:
             code = child.wait(60)
+            if number != signal.SIGKILL and code != 0:
+                self.crashes.append(f"exit code {code} after signal {number}: {self.lines[-3:]}")
         except subprocess.TimeoutExpired:
             self.crashes.append(f"not gone within 60 s of signal {number}: {self.lines[-3:]}")
             child.kill()
             child.wait(30)
-            return time.monotonic() - begin
-        if number != signal.SIGKILL and code != 0:
-            self.crashes.append(f"exit code {code} after signal {number}: {self.lines[-3:]}")
         return time.monotonic() - begin
 
     def check(self) -> None:
@@ -93,10 +89,6 @@ class Running:
         if self.child is not None and self.child.poll() is not None:
             self.crashes.append(f"ended by itself with code {self.child.returncode}: {self.lines[-3:]}")
             self.start()
-
-    def worker(self) -> psutil.Process | None:
-        """The fit process; None while there is none."""
-        return None if self.child is None else fit_process(self.child.pid)
 
     def asked(self, query: str) -> list[tuple[Any, ...]]:
         """Rows of the history; none where it cannot be read now."""
@@ -115,6 +107,15 @@ class Running:
     def newest_number(self) -> int:
         """Largest number of a set in the history; 0 for none."""
         return sum(number or 0 for (number,) in self.asked("SELECT max(sequence) FROM sets"))
+
+    def recovered(self, since: float, limit: float) -> float | None:
+        """Time until the next estimate was journalled [s]; None when none came within `limit`."""
+        while time.time() - since < limit:
+            self.check()
+            if (newest := self.newest_estimate()) > since:
+                return newest - since
+            time.sleep(0.3)
+        return None
 
     def _read(self, child: subprocess.Popen[str]) -> None:
         assert child.stdout is not None
@@ -243,30 +244,24 @@ REFUSED_LIMIT = 300.0
 """A second service has to say within this time [s] that it is refused; starting took a minute on a crowded machine."""
 
 
-def _worker(scene: Scene, harm: Callable[[psutil.Process], object], did: str) -> str:
-    worker = scene.service.worker()
+def fit_process_hit(scene: Scene, harm: Callable[[psutil.Process], object], did: str) -> str:
+    child = scene.service.child
+    worker = None if child is None else fit_process(child.pid)
     if worker is None:
         return "no fit process at that moment"
     harm(worker)
     return did
 
 
-def worker_out_of_memory(scene: Scene) -> str:
-    limit = (1 << 20, 1 << 20)
-    return _worker(scene, lambda worker: worker.rlimit(psutil.RLIMIT_DATA, limit), "its memory limited to 1 MiB")
+def short_of_memory(worker: psutil.Process) -> None:
+    worker.rlimit(psutil.RLIMIT_DATA, (1 << 20, 1 << 20))
 
 
-def terminated(scene: Scene) -> str:
-    number = scene.rng.choice((signal.SIGTERM, signal.SIGINT))
+def ended(scene: Scene, *signals: signal.Signals) -> str:
+    number = scene.rng.choice(signals)
     took = scene.service.end(number)
     scene.service.start()
     return f"{number.name}, gone after {took:.1f} s, started again"
-
-
-def power_cut(scene: Scene) -> str:
-    scene.service.end(signal.SIGKILL)
-    scene.service.start()
-    return "kill -9, started again"
 
 
 def killed_at_commit(scene: Scene) -> str:
@@ -335,40 +330,41 @@ def vehicle_reboots(scene: Scene) -> str:
     return "boot clock back to zero, then on again"
 
 
-def sensor_not_a_number(scene: Scene) -> str:
-    value = scene.rng.choice((math.nan, math.inf, 1e30))
-    return _spoilt(scene, lambda m: _scaled(m, value), f"gyro times {value} for 5 s")
-
-
-def sensor_stuck(scene: Scene) -> str:
-    kept: list[Any] = []
-
-    def spoil(message: Any) -> Any:
-        if message.get_type() == "HIGHRES_IMU":
-            kept.append(message)
-            message.xgyro, message.ygyro, message.zgyro = kept[0].xgyro, kept[0].ygyro, kept[0].zgyro
-        return message
-
-    return _spoilt(scene, spoil, "gyro frozen for 5 s")
-
-
-def half_lost(scene: Scene) -> str:
-    return _spoilt(scene, lambda m: m if scene.rng.random() < 0.5 else None, "half of all messages lost for 5 s")
-
-
-def _spoilt(scene: Scene, spoil: Callable[[Any], Any], told: str) -> str:
+def spoilt(scene: Scene, spoil: Callable[[Any], Any], did: str) -> str:
     scene.vehicle.spoil = spoil
     time.sleep(5.0)
     scene.vehicle.spoil = None
-    return told
+    return f"{did} for 5 s"
 
 
-def _scaled(message: Any, factor: float) -> Any:
-    if message.get_type() == "HIGHRES_IMU":
-        message.xgyro, message.ygyro, message.zgyro = (
-            factor * v for v in (message.xgyro, message.ygyro, message.zgyro)
-        )
-    return message
+def gyro(change: Callable[[Any], Sequence[float]]) -> Callable[[Any], Any]:
+    """Messages whose gyro, (x, y, z) of an IMU message, is changed."""
+
+    def spoil(message: Any) -> Any:
+        if message.get_type() == "HIGHRES_IMU":
+            message.xgyro, message.ygyro, message.zgyro = change(message)
+        return message
+
+    return spoil
+
+
+def gyro_times(factor: float) -> Callable[[Any], Any]:
+    return gyro(lambda m: [factor * v for v in (m.xgyro, m.ygyro, m.zgyro)])
+
+
+def sensor_not_a_number(scene: Scene) -> str:
+    value = scene.rng.choice((math.nan, math.inf, 1e30))
+    return spoilt(scene, gyro_times(value), f"gyro times {value}")
+
+
+def sensor_stuck(scene: Scene) -> str:
+    first = list[tuple[float, float, float]]()
+
+    def frozen(m: Any) -> tuple[float, float, float]:
+        first.append((m.xgyro, m.ygyro, m.zgyro))
+        return first[0]
+
+    return spoilt(scene, gyro(frozen), "gyro frozen")
 
 
 def forged(scene: Scene) -> str:
@@ -406,7 +402,7 @@ def flood(scene: Scene) -> str:
 
 
 def second_service(scene: Scene) -> str:
-    other = scene.service.another(scene.service.history)
+    other = scene.service.another()
     try:
         out, _ = other.communicate(timeout=REFUSED_LIMIT)
     except subprocess.TimeoutExpired:
@@ -427,11 +423,11 @@ def history_removed(scene: Scene) -> str:
 
 
 FAULTS: dict[str, tuple[int, Fault]] = {
-    "fit process killed": (11, lambda scene: _worker(scene, psutil.Process.kill, "SIGKILL")),
-    "fit process stopped": (11, lambda scene: _worker(scene, psutil.Process.suspend, "SIGSTOP")),
-    "fit process out of memory": (11, worker_out_of_memory),
-    "SIGTERM or SIGINT": (13, terminated),
-    "power cut": (13, power_cut),
+    "fit process killed": (11, lambda s: fit_process_hit(s, psutil.Process.kill, "SIGKILL")),
+    "fit process stopped": (11, lambda s: fit_process_hit(s, psutil.Process.suspend, "SIGSTOP")),
+    "fit process out of memory": (11, lambda s: fit_process_hit(s, short_of_memory, "its memory limited to 1 MiB")),
+    "SIGTERM or SIGINT": (13, lambda s: ended(s, signal.SIGTERM, signal.SIGINT)),
+    "power cut": (13, lambda s: ended(s, signal.SIGKILL)),
     "kill between commit and publication": (23, killed_at_commit),
     "history locked": (12, history_locked),
     "history damaged": (12, history_damaged),
@@ -441,9 +437,12 @@ FAULTS: dict[str, tuple[int, Fault]] = {
     "vehicle reboots": (7, vehicle_reboots),
     "sensor not a number": (6, sensor_not_a_number),
     "sensor stuck": (6, sensor_stuck),
-    "wrong units": (10, lambda s: _spoilt(s, lambda m: _scaled(m, 180.0 / math.pi), "gyro in deg/s for 5 s")),
-    "wrong sign": (17, lambda s: _spoilt(s, lambda m: _scaled(m, -1.0), "gyro with the sign flipped for 5 s")),
-    "half of the messages lost": (8, half_lost),
+    "wrong units": (10, lambda s: spoilt(s, gyro_times(180.0 / math.pi), "gyro in deg/s")),
+    "wrong sign": (17, lambda s: spoilt(s, gyro_times(-1.0), "gyro with the sign flipped")),
+    "half of the messages lost": (
+        8,
+        lambda s: spoilt(s, lambda m: m if s.rng.random() < 0.5 else None, "half of all messages lost"),
+    ),
     "forged frames": (14, forged),
     "replayed frames": (14, replayed),
     "flood": (14, flood),
@@ -482,7 +481,7 @@ def main() -> None:
         vehicle.start()
         scene = Scene(service, vehicle, port, random.Random(given.seed), small)
         try:
-            first = _recovered(service, time.time(), START_LIMIT)
+            first = service.recovered(time.time(), START_LIMIT)
             if first is None:
                 sys.exit(f"the service made no estimate within {START_LIMIT:.0f} s: {service.lines[-3:]}")
             _say(f"first estimate after {first:.0f} s; now the faults")
@@ -509,14 +508,11 @@ def _throw(scene: Scene, names: Sequence[str], entries: list[Entry], until: floa
     """Every fault once in random order, then again in another, until the time is over."""
     waiting: list[str] = []
     while time.time() < until:
-        if not waiting:
-            waiting = scene.rng.sample(list(names), len(names))
+        waiting = waiting or scene.rng.sample(list(names), len(names))
         name = waiting.pop()
         row, harm = FAULTS[name]
-        at = time.time()
-        did = harm(scene)
-        over = time.time()
-        recovered = _recovered(scene.service, over)
+        at, did, over = time.time(), harm(scene), time.time()
+        recovered = scene.service.recovered(over, RECOVERY_LIMIT)
         entry = {"row": row, "name": name, "did": did, "lasted": over - at, "recovered": recovered}
         entries.append(entry | {"load": os.getloadavg()[0]})
         _say(f"{name} ({did}): {'not recovered' if recovered is None else f'{recovered:.1f} s'}")
@@ -525,17 +521,6 @@ def _throw(scene: Scene, names: Sequence[str], entries: list[Entry], until: floa
             scene.service.crashes.append(f"{name}: no estimate within {RECOVERY_LIMIT:.0f} s; said: {said}")
             _say(said)
         time.sleep(scene.rng.uniform(0.0, 3.0))
-
-
-def _recovered(service: Running, since: float, limit: float = RECOVERY_LIMIT) -> float | None:
-    """Time until the next estimate was journalled [s]; None when none came."""
-    while time.time() - since < limit:
-        service.check()
-        newest = service.newest_estimate()
-        if newest > since:
-            return newest - since
-        time.sleep(0.3)
-    return None
 
 
 def judge(

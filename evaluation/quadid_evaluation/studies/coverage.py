@@ -43,18 +43,13 @@ def counted() -> dict[str, Counts]:
         file = Path(folder) / "coverage.json"
         data.json_report(include=["quadid/*"], outfile=str(file))
         found: Mapping[str, Any] = json.loads(file.read_text(encoding="utf-8"))["files"]
-    return {name: _counts(entry["summary"]) for name, entry in sorted(found.items())}
-
-
-def _counts(summary: Mapping[str, int]) -> Counts:
-    return Counter(
-        {
-            "statements": summary["num_statements"],
-            "run": summary["covered_lines"],
-            "branches": summary["num_branches"],
-            "taken": summary["covered_branches"],
-        }
-    )
+    names = {
+        "statements": "num_statements",
+        "run": "covered_lines",
+        "branches": "num_branches",
+        "taken": "covered_branches",
+    }
+    return {f: Counter({n: found[f]["summary"][key] for n, key in names.items()}) for f in sorted(found)}
 
 
 def percent(c: Counts) -> float:

@@ -47,9 +47,9 @@ KEYS = ("now", "gentle_flight", "manoeuvre")
 def obtained(logs: Sequence[str | Path], vehicle: Vehicle, seed: int = 1) -> tuple[FloatArray, FloatArray]:
     """Relative 95 % half-widths and values, each (6,), after identifying `logs`; NaN for what they do not reveal."""
     found = quadid.identify(list(logs), vehicle=vehicle, seed=seed).parameters
-    known = [found[n] if n in found.names else None for n in NOMINAL_NAMES]
-    half = [math.nan if p is None else p.ci95[1] / p.value - 1.0 for p in known]
-    return np.array(half), np.array([math.nan if p is None else p.value for p in known])
+    known = [(found[n].ci95[1], found[n].value) if n in found.names else (math.nan, math.nan) for n in NOMINAL_NAMES]
+    most, values = np.array(known).T
+    return most / values - 1.0, values
 
 
 def promised(logs: Sequence[str | Path], vehicle: Vehicle, seconds: float, seed: int = 1) -> tuple[Any, FloatArray]:

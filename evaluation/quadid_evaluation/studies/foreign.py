@@ -102,7 +102,7 @@ def outside_table(numbers: Sequence[Number], short: Sequence[str] = ("cases", "R
 
 AHEAD = 0.5
 COMMAND = "make foreign"
-_LEARNT = ("ridge", "random features")
+ANSWERS = ("data", "verdict", "error on held-out data [noise variances]", "causes (brackets: not confident)")
 
 
 @dataclass(frozen=True)
@@ -133,66 +133,40 @@ def page(rows: Mapping[str, Row], notes: str = "", others: Sequence[Number] = ()
 
     `others` are numbers with truth of data beside the sets.
     """
-    head = (
-        f"# Vehicles of others\n\n`{COMMAND}`, {max(row.date for row in rows.values())}; parameters, intervals, sizes "
-        "of causes and terms of every set are in `foreign.json`."
-    )
-    return (
-        "\n\n".join(p.strip() for p in (head, _ahead(rows), _numbers(rows, others), _answers(rows), notes) if p) + "\n"
-    )
 
+    def cell(values: Sequence[float], bold: Sequence[bool] = (False,) * 4) -> str:
+        texts = ["–" if np.isnan(v) else f"{v:.2f}" for v in values]
+        return ", ".join(f"**{text}**" if strong else text for text, strong in zip(texts, bold, strict=False))
 
-def _answers(rows: Mapping[str, Row]) -> str:
-    """Verdict, error and causes of every set."""
-    lines = []
+    # Half-second errors of all sets beside each other; verdict, error and causes of every set.
+    ahead, answers, numbers = list[tuple[str, ...]](), list[tuple[str, ...]](), list[Number]()
     for name, row in rows.items():
+        numbers += of_set(name, SETS[name], {"identify": row.identified, "diagnose": row.diagnosed})
         if row.diagnosed is None:
-            lines.append((name, "refused", "", row.failed.partition("; fix")[0].partition(": ")[2]))
+            answers.append((name, "refused", "", row.failed.partition("; fix")[0].partition(": ")[2]))
             continue
         error = row.diagnosed["validation"]
         found = [f["effect"] if f["confident"] else f"({f['effect']})" for f in row.diagnosed["findings"]]
         told = f"{error['mse_nominal']:.3g} → {error['mse_extended']:.3g}"
-        lines.append((name, row.diagnosed["verdict"], told, ", ".join(found)))
-    heads = ("data", "verdict", "error on held-out data [noise variances]", "causes (brackets: not confident)")
-    return "\n".join(table(heads, lines))
-
-
-def _ahead(rows: Mapping[str, Row]) -> str:
-    """Half-second errors of all sets beside each other."""
-    lines = [
+        answers.append((name, row.diagnosed["verdict"], told, ", ".join(found)))
+        if "ridge" in row.prediction:
+            ours, *rivals = (row.prediction[who] for who in ("physical file", "ridge", "random features"))
+            best = [mine < min(theirs) for mine, *theirs in zip(ours, *rivals, strict=True)]
+            ahead.append((name, cell(ours, best), *map(cell, rivals), cell(row.velocity[::-1])))
+    parts = [
+        f"# Vehicles of others\n\n`{COMMAND}`, {max(row.date for row in rows.values())}; parameters, intervals, sizes "
+        "of causes and terms of every set are in `foreign.json`.",
         f"Errors {AHEAD:g} s ahead on unseen flights, relative to predicting no change: {', '.join(QUANTITIES)}; "
         "bold: better than ridge and random features. Iris: the other half of the same flight. A benchmark, no goal: "
         "rotor speeds were logged in closed loop, so they already answer the disturbances to come, and a model that "
-        "takes torque for less than it is predicts better. The file is physics "
-        "that may fly; bands of its predictions: `quadid score`.",
-        "",
+        "takes torque for less than it is predicts better. The file is physics that may fly; bands of its "
+        "predictions: `quadid score`.",
+        "\n".join(table(("data", "file", "ridge", "random features", "position error, scale of its velocity"), ahead)),
+        outside_table([*numbers, *others]),
+        "\n".join(table(ANSWERS, answers)),
+        notes,
     ]
-    shown = []
-    for name, row in rows.items():
-        if "ridge" not in row.prediction or row.diagnosed is None:
-            continue
-        ours = row.prediction["physical file"]
-        rivals = np.min([row.prediction[who] for who in _LEARNT], axis=0)
-        best = [f"**{_share(a)}**" if a < b else _share(a) for a, b in zip(ours, rivals, strict=True)]
-        cells = [", ".join(best), *(", ".join(_share(s) for s in row.prediction[who]) for who in _LEARNT)]
-        cells.append(f"{_share(row.velocity[1])}, {_share(row.velocity[0])}")
-        shown.append((name, *cells))
-    heads = ("data", "file", "ridge", "random features", "position error, scale of its velocity")
-    return "\n".join([*lines, *table(heads, shown)]) if shown else ""
-
-
-def _share(value: float) -> str:
-    return "–" if np.isnan(value) else f"{value:.2f}"
-
-
-def _numbers(rows: Mapping[str, Row], others: Sequence[Number]) -> str:
-    """Every number whose truth is known, beside it."""
-    own = [
-        n
-        for name, row in rows.items()
-        for n in of_set(name, SETS[name], {"identify": row.identified, "diagnose": row.diagnosed})
-    ]
-    return outside_table([*own, *others])
+    return "\n\n".join(part.strip() for part in parts if part) + "\n"
 
 
 # --- What about a hundred lines of learning reach: ridge regression, also on random features

@@ -11,6 +11,7 @@ the controller's output, and to the rate asked for, give the open loops as they 
 import math
 from collections.abc import Callable, Iterator, Mapping
 from functools import cache
+from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -287,33 +288,21 @@ def rows_of(name: str, form: str, seed: int) -> Iterator[tuple[object, ...]]:
             )
 
 
-def promises(seed: int) -> str:
+def promises(seed: int) -> list[str]:
     """Every loop of every vehicle and autopilot, as Markdown."""
     rows = []
-    for name in VEHICLES:
-        for form in AUTOPILOTS:
-            for row in rows_of(name, form, seed):
-                rows.append(row)
-                print(*row, sep=" | ", flush=True)
-    heads = (
-        "vehicle",
-        "autopilot",
-        "loop",
-        "bandwidth [Hz]",
-        "phase margin [deg]",
-        "gain margin [dB]",
-        "overshoot [%]",
-        "outside of the band",
-    )
-    return "\n".join(
-        [
-            f"`make gains`, seed {seed}. Each individual is identified from a minute of flight, from guesses off by up "
-            "to 35 %; its gains are flown by the autopilot's own law around the truth. Promised, then obtained; last "
-            "the largest distance of the response to a unit step from its band over the 95 % intervals.",
-            "",
-            *table(heads, rows),
-        ]
-    )
+    for name, form in product(VEHICLES, AUTOPILOTS):
+        for row in rows_of(name, form, seed):
+            rows.append(row)
+            print(*row, sep=" | ", flush=True)
+    units = ("bandwidth [Hz]", "phase margin [deg]", "gain margin [dB]", "overshoot [%]", "outside of the band")
+    return [
+        f"`make gains`, seed {seed}. Each individual is identified from a minute of flight, from guesses off by up to "
+        "35 %; its gains are flown by the autopilot's own law around the truth. Promised, then obtained; last the "
+        "largest distance of the response to a unit step from its band over the 95 % intervals.",
+        "",
+        *table(("vehicle", "autopilot", "loop", *units), rows),
+    ]
 
 
 if __name__ == "__main__":

@@ -13,12 +13,12 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from functools import cache
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from quadid_evaluation.harness import options
 
@@ -47,37 +47,53 @@ EPOCH = 1_700_000_000
 """UNIX time at which it begins [s]."""
 
 
+class Size(NamedTuple):
+    """Files, lines of Python and named numbers."""
+
+    files: int
+    lines: int
+    numbers: int
+
+
+def size(paths: Iterable[Path]) -> Size:
+    """Size of some files, as on disk."""
+    texts = [path.read_text(encoding="utf-8") for path in paths]
+    lines, numbers = (len(text.splitlines()) for text in texts), (len(named_numbers(ast.parse(t))) for t in texts)
+    return Size(len(texts), sum(lines), sum(numbers))
+
+
 def count(root: Path = ROOT) -> dict[str, dict[str, int]]:
     """Lines of Python (`lines`) and named numbers (`numbers`) of product, evaluation and tests, as on disk."""
-    figures: dict[str, dict[str, int]] = {"lines": {}, "numbers": {}}
-    for name, rooms in (("product", PRODUCT), ("evaluation", EVALUATION), ("tests", TESTS)):
-        texts = [text for folder in rooms.values() for text in _texts(root / folder).values()]
-        figures["lines"][name] = sum(map(_lines, texts))
-        figures["numbers"][name] = sum(len(named_numbers(ast.parse(text))) for text in texts)
-    return figures
+    groups = {"product": PRODUCT, "evaluation": EVALUATION, "tests": TESTS}
+    sizes = {name: size(p for f in rooms.values() for p in (root / f).rglob("*.py")) for name, rooms in groups.items()}
+    return {kind: {name: getattr(one, kind) for name, one in sizes.items()} for kind in ("lines", "numbers")}
 
 
 def rooms(root: Path = ROOT) -> list[str]:
     """One line a room: files, lines, named numbers; the packages of the largest room below it."""
     rows: list[str] = []
     for label, folder in {**PRODUCT, **EVALUATION, **TESTS}.items():
-        texts = _texts(root / folder)
-        rows.append(_row(label, list(texts.values())))
-        if label == DEEP:
-            parts: dict[str, list[str]] = {}
-            for path, text in texts.items():
-                inner = path.relative_to(root / folder).parts
-                parts.setdefault(inner[0] if len(inner) > 1 else "shared by all", []).append(text)
-            rows += [_row(f"  {name}", parts[name]) for name in sorted(parts)]
+        paths = sorted((root / folder).rglob("*.py"))
+        parts: dict[str, list[Path]] = {label: paths}
+        for path in paths if label == DEEP else ():
+            first, *inner = path.relative_to(root / folder).parts
+            parts.setdefault(f"  {first if inner else 'shared by all'}", []).append(path)
+        for name, own in sorted(parts.items(), key=lambda part: (part[0] != label, part[0])):
+            one = size(own)
+            rows.append(f"{name:<24}{one.files:>6} files{one.lines:>8} lines{one.numbers:>6} numbers")
     return rows
 
 
 def named_numbers(module: ast.Module) -> list[str]:
-    """Names in capitals, leading underscore or not, that stand for numbers."""
+    """Names in capitals, leading underscore or not, that stand for numbers and other constants only."""
     out: list[str] = []
     for node in module.body:
-        targets = node.targets if isinstance(node, ast.Assign) else [node.target] if _annotated(node) else []
-        if targets and node.value is not None and _numeric(node.value):
+        if not isinstance(node, ast.Assign | ast.AnnAssign) or node.value is None:
+            continue
+        leaves = [n for n in ast.walk(node.value) if isinstance(n, ast.Constant | ast.Call)]
+        values = [n.value for n in leaves if isinstance(n, ast.Constant)]
+        if leaves and len(values) == len(leaves) and all(type(value) in (int, float) for value in values):
+            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
             names = [n.id for target in targets for n in ast.walk(target) if isinstance(n, ast.Name)]
             out += [n for n in names if n.isupper()]
     return out
@@ -138,10 +154,9 @@ def _fly_through(log: Path, vehicle: Vehicle, folder: Path, follow: Callable[[],
     for topic in topics.values():
         entry = inputs[topic.name]
         decode = generate_dynamic(topic.type, topic.definition)[topic.type]
-        arrived[topic.name] = []
-        intake.open(
-            entry, topic.name, Decoder(entry, chooser, len(vehicle.rotors), decode), _taken(arrived[topic.name])
-        )
+        queue = arrived[topic.name] = []
+        decoder = Decoder(entry, chooser, len(vehicle.rotors), decode)
+        intake.open(entry, topic.name, decoder, lambda queue=queue: queue.pop(0) if queue else None)
     service = Service(
         vehicle, SessionSettings(), InlineWorker(), Store(folder / f"{time.monotonic_ns()}.db", vehicle.name)
     )
@@ -164,20 +179,15 @@ def _fly_through(log: Path, vehicle: Vehicle, folder: Path, follow: Callable[[],
     raise RuntimeError(f"no set was published from {SECONDS:g} s of flight: nothing was followed to its end")
 
 
-def _taken(queue: list[bytes]) -> Callable[[], bytes | None]:
-    return lambda: queue.pop(0) if queue else None
-
-
 @contextmanager
 def _followed() -> Iterator[set[str]]:
     """Collects the product's files whose functions are called within; imports do not count."""
-    folders = {str(ROOT / folder) + "/": ROOT for folder in PRODUCT.values()}
+    folders = tuple(f"{ROOT / folder}/" for folder in PRODUCT.values())
     files: set[str] = set()
 
     @cache
     def ours(filename: str) -> str:
-        found = next((root for folder, root in folders.items() if filename.startswith(folder)), None)
-        return str(Path(filename).relative_to(found)) if found is not None else ""
+        return str(Path(filename).relative_to(ROOT)) if filename.startswith(folders) else ""
 
     def note(frame: FrameType, event: str, argument: Any) -> None:
         if event == "call" and frame.f_code.co_name != "<module>" and (name := ours(frame.f_code.co_filename)):
@@ -190,32 +200,6 @@ def _followed() -> Iterator[set[str]]:
     finally:
         sys.setprofile(None)
         threading.setprofile(None)
-
-
-def _texts(folder: Path) -> dict[Path, str]:
-    return {path: path.read_text(encoding="utf-8") for path in sorted(folder.rglob("*.py"))}
-
-
-def _lines(text: str) -> int:
-    return len(text.splitlines())
-
-
-def _row(label: str, texts: Sequence[str]) -> str:
-    numbers = sum(len(named_numbers(ast.parse(text))) for text in texts)
-    return f"{label:<24}{len(texts):>6} files{sum(map(_lines, texts)):>8} lines{numbers:>6} numbers"
-
-
-def _annotated(node: ast.stmt) -> bool:
-    return isinstance(node, ast.AnnAssign)
-
-
-def _numeric(value: ast.expr) -> bool:
-    """True if an expression contains numbers and other constants only."""
-    leaves = [n for n in ast.walk(value) if isinstance(n, ast.Constant | ast.Call)]
-    return bool(leaves) and all(
-        isinstance(n, ast.Constant) and isinstance(n.value, int | float) and not isinstance(n.value, bool)
-        for n in leaves
-    )
 
 
 def main() -> int:

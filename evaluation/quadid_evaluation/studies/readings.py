@@ -97,23 +97,17 @@ def loop_output(log: Path) -> FloatArray:
     return np.column_stack([np.interp(np.arange(t[0], t[-1], LOOP), t, output) for output in outputs])
 
 
-def main() -> None:
-    """Prints a row for each flight and interval: rms error of slow torque in parts of the flight."""
-    data = DATA / "ardupilot_sitl"
+if __name__ == "__main__":
     rows = []
     for name in ("x.bin", "quad_sq.bin"):
-        output = loop_output(data / name)
+        output = loop_output(DATA / "ardupilot_sitl" / name)
         for runs, second in INTERVALS:
             apart = f"{runs * LOOP * 1e3:g}" + (f", and {second * LOOP * 1e3:g} later" if second else "")
             cells = [name, apart]
-            for a, b in PARTS:
+            for a, b in PARTS:  # rms error of slow torque in parts of the flight
                 part = output[round(a / LOOP) : round(b / LOOP)]
                 found = errors(part[:, 0], runs, second) + errors(part[:, 1], runs, second)
                 cells.append(f"{np.sqrt(np.mean(np.square(found))):.1%}")
             rows.append(cells)
     heads = ("flight", "between readings [ms]", *(f"{a:g} to {b:g} s" for a, b in PARTS))
     print(*table(heads, rows), sep="\n")
-
-
-if __name__ == "__main__":
-    main()

@@ -16,16 +16,14 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import rclpy
 from quadid_node.inputs import message_class, to_message
-from quadid_node.publish import LATCHED_QOS
 from quadid_replay import write_mcap
 from quadid_replay.columns import flip_attitude, flip_body
 from quadid_replay.motors import RPM
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 
 from quadid.data.window import Recording
@@ -33,7 +31,9 @@ from quadid.flight import fly
 from quadid.flight.setup import TABLE_2
 from quadid.parameters import NOMINAL_NAMES
 from quadid.vehicle import Vehicle
+from quadid_evaluation.benchmarks.ros_flight import beside
 from quadid_evaluation.harness import options, put, table
+from quadid_evaluation.studies.autopilot import stored
 
 ROOT = Path(__file__).resolve().parents[3]
 SOURCES = ("canonical", "px4", "mavros")
@@ -205,82 +205,31 @@ def publish(stack: str, recording: Recording) -> None:
     rclpy.shutdown()
 
 
-class Seen(NamedTuple):
-    """Figures of one run.
-
-    Attributes:
-        first: from the first message to the first set [s]; NaN for none.
-        errors: largest relative error of each nominal parameter over all sets, shape (6,); NaN for none.
-        backlog: largest of the status [s].
-        load: mean of the machine's load over the last minute, while it flew.
-    """
-
-    first: float
-    sets: int
-    errors: np.ndarray[Any, np.dtype[np.float64]]
-    backlog: float
-    fits: int
-    load: float
-
-
-def run(source: str, log: Path, seconds: float, environment: dict[str, str]) -> Seen:
-    """One node beside one stream; listens to both until the stream ends."""
-    from quadid_msgs.msg import FitStatus, ParameterSet
-
-    folder = log.parent / source
-    folder.mkdir()
-    said = folder / "node.txt"
-    context = rclpy.Context()
-    context.init()
-    ear = rclpy.create_node("ear", context=context)
-    executor = SingleThreadedExecutor(context=context)
-    executor.add_node(ear)
-    sets, statuses, loads = list[tuple[float, Any]](), list[Any](), list[float]()
-    ear.create_subscription(
-        ParameterSet,
-        "quadid/parameters",
-        lambda m: sets.append((time.monotonic(), m)) if m.state == ParameterSet.STATE_ACCEPTED else None,
-        LATCHED_QOS,
-    )
-    ear.create_subscription(FitStatus, "quadid/status", statuses.append, 10)
-    given = (f"source:={source}", "vehicle:=pelican", f"history:={folder / 'history.sqlite'}", "diagnose:=0.0")
-    node = [sys.executable, "-m", "quadid_node.identify", "--ros-args", *(a for g in given for a in ("-p", g))]
-    player = [sys.executable, "-m", "quadid_node.replay_node", str(log)]
+def run(source: str, log: Path, seconds: float, environment: dict[str, str]) -> tuple[object, ...]:
+    """One node beside one stream: the cells of a row under `HEADS`."""
+    player = ["quadid_node.replay_node", str(log)]
     if source != "canonical":
-        player = [sys.executable, "-m", __spec__.name, "--publish", source, "--seconds", str(seconds)]
-    with ExitStack() as ends:
-        out = ends.enter_context(said.open("w"))
-        service = subprocess.Popen(node, stdout=out, stderr=out, env=environment)
-        ends.callback(service.kill)
-        while "ready: identifies" not in said.read_text():
-            if service.poll() is not None:
-                raise SystemExit(f"the node ended:\n{said.read_text()}")
-            executor.spin_once(timeout_sec=0.5)
-        stream = subprocess.Popen(player, env=environment, stdout=out, stderr=out)
-        ends.callback(stream.kill)
-        while not statuses or not statuses[-1].header.stamp.sec:
-            executor.spin_once(timeout_sec=0.1)
-        begin = time.monotonic()
-        while stream.poll() is None:
-            executor.spin_once(timeout_sec=0.5)
-            loads.append(os.getloadavg()[0])
-        if stream.returncode:
-            raise SystemExit(f"the stream ended:\n{said.read_text()}")
-        service.terminate()
-        service.wait(60.0)
-    executor.shutdown()
-    ear.destroy_node()
-    context.shutdown()
-    told = [dict(zip(m.names, m.values, strict=True)) for _, m in sets]
-    errors = [[abs(values[n] / TABLE_2[n] - 1.0) for n in NOMINAL_NAMES] for values in told]
-    return Seen(
-        sets[0][0] - begin if sets else math.nan,
+        player = [__spec__.name, "--publish", source, "--seconds", str(seconds)]
+    kept, given = log.parent / source, (f"source:={source}", "vehicle:=pelican", "diagnose:=0.0")
+    found = beside(player, kept, given, 1.0, more=environment)
+    notes = found["minutes"]
+    begin = next((note["t"] for note in notes if note["messages"]), math.nan)
+    sets = [s for s in stored(Path("pelican"), kept / "h.sqlite", [], seconds).published if s["state"] == "accepted"]
+    told = [{p["name"]: p["value"] for p in s["parameters"]} for s in sets]
+    errors = [max((abs(values[n] / TABLE_2[n] - 1.0) for values in told), default=math.nan) for n in NOMINAL_NAMES]
+    return (
+        source,
+        f"{np.mean([point['load'] for point in found['points']]):.1f}",
+        f"{max(note['backlog'] for note in notes):.2f} s",
+        notes[-1]["fits"],
         len(sets),
-        np.max(errors, axis=0) if errors else np.full(len(NOMINAL_NAMES), np.nan),
-        max(s.backlog for s in statuses),
-        statuses[-1].fits,
-        float(np.mean(loads)),
+        f"{min((s['wall'] for s in sets), default=math.nan) - begin:.0f} s",
+        f"{', '.join(f'{100 * e:.2g}' for e in errors)} %",
     )
+
+
+WORST = f"largest error of {', '.join(NOMINAL_NAMES)}"
+HEADS = ("preset", "load", "largest backlog", "fits", "sets", "first set", WORST)
 
 
 def flight(seconds: float) -> Recording:
@@ -295,7 +244,6 @@ def main() -> None:
         publish(given.publish, flight(given.seconds))
         return
     seconds, rows = 60.0 * given.minutes, list[tuple[object, ...]]()
-    os.environ["ROS_DOMAIN_ID"] = str(1 + os.getpid() % 100)
     with tempfile.TemporaryDirectory() as scratch, ExitStack() as ends:
         log = Path(scratch, "flight.mcap")
         write_mcap(log, flight(seconds))
@@ -303,16 +251,11 @@ def main() -> None:
         for _ in range(math.ceil(max(given.load - os.getloadavg()[0], 0.0))):
             ends.callback(subprocess.Popen([sys.executable, "-c", "while True: pass"]).kill)
         for source in SOURCES:
-            seen = run(source, log, seconds, environment)
-            errors = ", ".join(f"{100 * e:.2g}" for e in seen.errors)
-            counts = (f"{seen.load:.1f}", f"{seen.backlog:.2f} s", seen.fits, seen.sets, f"{seen.first:.0f} s")
-            rows.append((source, *counts, f"{errors} %"))
+            rows.append(run(source, log, seconds, environment))
             print(*rows[-1], sep=" | ", flush=True)
-    worst = f"largest error of {', '.join(NOMINAL_NAMES)}"
-    heads = ("preset", "load", "largest backlog", "fits", "sets", "first set", worst)
     told = f"{given.minutes:g} min of flight a preset, {RATE:g} Hz a channel, {os.cpu_count()} processors."
     title, name = "The ROS node on a loaded machine", f"load {given.load:g}, {given.minutes:g} minutes"
-    put(given, "ros-load.md", title, name, [told, "", *table(heads, rows)])
+    put(given, "ros-load.md", title, name, [told, "", *table(HEADS, rows)])
 
 
 if __name__ == "__main__":

@@ -439,7 +439,7 @@ def main() -> None:
     changes = () if not given.changes else (*MASSES, *ROTORS) if file.command.kind == "pwm" else MASSES
     done, moments = flown(given, changes)
     before = replace(done, events=[e for e in done.events if not moments or e["wall"] < moments[0]])
-    text = [section("ArduCopter", "flown by this study", [row(one, before)], 1e9), *before.alarms]
+    text = [section("ArduCopter", "flown by this study", [row(one, before)], 1e9), *before.told("change")]
     if changes:
         text += ["", changes_seen(changes, moments, done)]
     put(given, "autopilot.md", TITLE, "ArduCopter SITL", "\n".join(text))

@@ -20,7 +20,7 @@ from mutmut.mutation.diff_apply import get_diff_for_mutant
 from mutmut.stats import status_by_exit_code
 
 from quadid_evaluation.harness import judged as by_hand
-from quadid_evaluation.harness import options
+from quadid_evaluation.harness import options, table
 
 MUTATED = ("gate", "session")
 """Modules of quadid/online that are spoilt (`[tool.mutmut]` in pyproject.toml)."""
@@ -69,6 +69,17 @@ def survivor(module: str, name: str, judged: Mapping[str, Mapping[str, str]]) ->
 
 def page(counts: Mapping[str, Counter[str]], left: Mapping[str, Sequence[Survivor]]) -> str:
     """Markdown: counts, then survivors by module."""
+    rows: list[tuple[object, ...]] = []
+    for module, c in counts.items():
+        unnoticed, waiting = sum(c[v] for v in UNNOTICED), c["not checked"]
+        noticed = c.total() - unnoticed - waiting
+        share = f"{100.0 * noticed / max(noticed + unnoticed, 1):.1f} %"
+        told = (
+            (c.total(), noticed, c["timeout"], unnoticed, waiting, share) if c else (*["–"] * 4, "**not run yet**", "–")
+        )
+        rows.append((f"`online/{module}.py`", *told))
+    heads = ("module", "mutants", "detected", "by time limit", "undetected", "not run", "detected of those run")
+    counted = Counter(_kind(s) for found in left.values() for s in found)
     lines = [
         "# Mutation tests of gate, active set and session",
         "",
@@ -76,22 +87,10 @@ def page(counts: Mapping[str, Counter[str]], left: Mapping[str, Sequence[Survivo
         "`[tool.mutmut]` fails or exceeds its time limit. Undetected ones are judged in "
         "`evaluation/quadid_evaluation/studies/mutation/judged.yaml`.",
         "",
-        "| module | mutants | detected | by time limit | undetected | not run | detected of those run |",
-        "|---|---|---|---|---|---|---|",
+        *table(heads, rows),
+        "",
+        "Undetected: " + "; ".join(f"{count} {what}" for what, count in counted.most_common()) + ".",
     ]
-    for module, c in counts.items():
-        if not c:
-            lines.append(f"| `online/{module}.py` | – | – | – | – | **not run yet** | – |")
-            continue
-        unnoticed, waiting = sum(c[v] for v in UNNOTICED), c["not checked"]
-        noticed = c.total() - unnoticed - waiting
-        share = 100.0 * noticed / max(noticed + unnoticed, 1)
-        lines.append(
-            f"| `online/{module}.py` | {c.total()} | {noticed} | {c['timeout']} | {unnoticed} | {waiting} "
-            f"| {share:.1f} % |"
-        )
-    counted = Counter(_kind(s) for found in left.values() for s in found)
-    lines += ["", "Undetected: " + "; ".join(f"{count} {what}" for what, count in counted.most_common()) + "."]
     return "\n".join(lines) + "\n"
 
 
