@@ -212,11 +212,14 @@ def run(source: str, log: Path, seconds: float, environment: dict[str, str]) -> 
         player = [__spec__.name, "--publish", source, "--seconds", str(seconds)]
     kept, given = log.parent / source, (f"source:={source}", "vehicle:=pelican", "diagnose:=0.0")
     found = beside(player, kept, given, 1.0, more=environment)
+    code, told = found["stream"]
+    if code:
+        raise SystemExit(f"the stream ended:\n{told}")
     notes = found["minutes"]
     begin = next((note["t"] for note in notes if note["messages"]), math.nan)
     sets = [s for s in stored(Path("pelican"), kept / "h.sqlite", [], seconds).published if s["state"] == "accepted"]
-    told = [{p["name"]: p["value"] for p in s["parameters"]} for s in sets]
-    errors = [max((abs(values[n] / TABLE_2[n] - 1.0) for values in told), default=math.nan) for n in NOMINAL_NAMES]
+    values = [{p["name"]: p["value"] for p in s["parameters"]} for s in sets]
+    errors = [max((abs(one[n] / TABLE_2[n] - 1.0) for one in values), default=math.nan) for n in NOMINAL_NAMES]
     return (
         source,
         f"{np.mean([point['load'] for point in found['points']]):.1f}",

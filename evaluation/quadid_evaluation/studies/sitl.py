@@ -363,7 +363,7 @@ def responses(log: Path) -> dict[tuple[str, str], tuple[float, FloatArray]]:
     return out
 
 
-def gains_flown(given: Given) -> str:
+def gains_flown(given: Given) -> list[str]:
     """Promise and flight of the gains that the autopilot had, and of those that are proposed, as Markdown."""
     rows, found, settings = [], None, SETTINGS
     for when in ("as it came", "proposed"):
@@ -388,15 +388,13 @@ def gains_flown(given: Given) -> str:
                 )
             )
     heads = ("gains", "loop", "bandwidth [Hz]", "overshoot [%]", "rise, 10 to 90 % [ms]", "outside of the band")
-    return "\n".join(
-        [
-            "`python -m quadid_evaluation.studies.sitl --gains`: steps of ArduCopter in its own simulator, with the "
-            "gains of its defaults, then with those proposed for a file fitted to its flight. Promised, then flown; "
-            "last the largest distance of the response to a unit step from its band over the 95 % intervals.",
-            "",
-            *table(heads, rows),
-        ]
-    )
+    return [
+        "`python -m quadid_evaluation.studies.sitl --gains`: steps of ArduCopter in its own simulator, with the gains "
+        "of its defaults, then with those proposed for a file fitted to its flight. Promised, then flown; last the "
+        "largest distance of the response to a unit step from its band over the 95 % intervals.",
+        "",
+        *table(heads, rows),
+    ]
 
 
 PERIOD = 1.0 / 400.0
