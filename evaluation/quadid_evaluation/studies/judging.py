@@ -157,6 +157,11 @@ def held(name: str, rate: float) -> Made:
     return made
 
 
+def stepped(size: float) -> Made:
+    """Roll, pitch and yaw in steps [deg]."""
+    return of("attitude", lambda q: from_euler(np.radians(size * np.round(np.degrees(euler(q)) / size))))
+
+
 def enu(r: Recording, v: Vehicle) -> Log:
     """World axes east, north, up; the body stays forward, right, down."""
     q, swap = r.channels["attitude"].values, np.array([0.0, np.sqrt(0.5), np.sqrt(0.5), 0.0])
@@ -282,16 +287,8 @@ MISTAKES: tuple[Mistake, ...] = (
     Mistake("attitude 100 ms late", late("attitude", 0.1), "attitude comes"),
     Mistake("attitude 200 ms late", late("attitude", 0.2), "attitude comes"),
     Mistake("accelerometer 50 ms late", late("accel", 0.05), "accelerometer answers the rotors"),
-    Mistake(
-        "attitude in steps of 1 deg",
-        of("attitude", lambda q: from_euler(np.radians(np.round(np.degrees(euler(q)))))),
-        "in steps",
-    ),
-    Mistake(
-        "attitude in steps of 5 deg",
-        of("attitude", lambda q: from_euler(np.radians(5.0 * np.round(np.degrees(euler(q)) / 5.0)))),
-        "in steps",
-    ),
+    Mistake("attitude in steps of 1 deg", stepped(1.0), "in steps"),
+    Mistake("attitude in steps of 5 deg", stepped(5.0), "in steps"),
     Mistake("attitude held at 10 Hz", held("attitude", 10.0), "^$|attitude.*Hz"),
     Mistake("IMU turned by 10 deg", imu_turned, "turned against the attitude"),
     Mistake("gyro clipped", of("gyro", clipped), "limit of its range"),
