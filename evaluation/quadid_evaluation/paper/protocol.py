@@ -109,8 +109,8 @@ def reproduce(
     columns = {"initial": Column(problem.theta(problem.start))}
     for i, name in enumerate(("quasi_newton", "pso_polish")):
         advance(f"{name} on the paper's objective", i / 2)
-        box = (problem.start, problem.lower, problem.upper)
-        found = minimise(name, problem.cost, *box, BUDGET, seed, problem.residual, time.perf_counter)
+        inside = (problem.start, problem.lower, problem.upper)
+        found = minimise(name, problem.cost, *inside, BUDGET, seed, problem.residual, time.perf_counter)
         columns[name] = Column(problem.theta(found.x), found.evaluations, found.seconds)
     runs = []
     for i in range(plan.seeds):
