@@ -488,7 +488,7 @@ def check_conventions(recording: Recording, vehicle: Vehicle, cut: LogPart) -> C
     Raises:
         LogError: units, frames or a motor order that cannot be right; names the fix.
     """
-    from quadid.checks import FATAL, CheckResult, inspect
+    from quadid.checks import CheckResult, inspect
     from quadid.checks.findings import farthest
 
     found = inspect(recording, vehicle)
@@ -497,7 +497,7 @@ def check_conventions(recording: Recording, vehicle: Vehicle, cut: LogPart) -> C
     stranger = next((c.message for c in found.checks if c.name == "hover" and c.verdict is CheckResult.WARNING), "")
     for check in found.checks:
         # A check without numbers could not be made; what comes next gives the better reason.
-        if check.verdict is CheckResult.ERROR and check.name in FATAL and check.numbers:
+        if check.verdict is CheckResult.ERROR and check.numbers:
             fix = f"{check.fix}, or insist with --unchecked" if check.fix else "insist with --unchecked"
             of_rotors = stranger if check.name in ("motor_order", "rotor_timing") else ""
             fix = f"use the vehicle file of this log; else {fix}" if of_rotors else fix

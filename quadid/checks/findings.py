@@ -26,6 +26,9 @@ class CheckResult(StrEnum):
     UNKNOWN = "unknown"
 
 
+OK, WARNING, ERROR, UNKNOWN = CheckResult
+
+
 @dataclass(frozen=True)
 class ChannelFacts:
     """One channel of a log.
@@ -140,7 +143,7 @@ class Inspection:
     @property
     def usable(self) -> bool:
         """True where something flies, a parameter can be identified, and no check finds the data wrong."""
-        wrong = any(check.verdict is CheckResult.ERROR for check in self.checks)
+        wrong = any(check.verdict is ERROR for check in self.checks)
         return bool(self.flying) and any(outlook.possible for outlook in self.parameters) and not wrong
 
     def to_dict(self) -> dict[str, Any]:

@@ -9,21 +9,22 @@ from typing import NamedTuple
 
 import numpy as np
 
-from quadid.checks.findings import Check, CheckResult, estimates_off
+from quadid.checks.findings import ERROR, OK, UNKNOWN, WARNING, Check, estimates_off
 from quadid.checks.motion import (
+    ALLOWED,
     FEWEST,
     FEWEST_SAMPLES,
     TURN,
-    Factor,
-    Spans,
-    Turns,
+    Log,
     attitude_steps_check,
+    changes_of_turn,
     factors,
     is_turning,
+    turn_moments,
     within,
 )
 from quadid.data.grid import GAP, linear
-from quadid.data.window import Channel, Recording, fresh_rows, measured_period, sample_period
+from quadid.data.window import Channel, fresh_rows, measured_period, sample_period
 from quadid.effects import butterworth_delay
 from quadid.rotation import conjugate, euler, rotated, turn
 from quadid.types import BoolArray, FloatArray
@@ -32,15 +33,13 @@ from quadid.vehicle import GRAVITY, Vehicle
 # --- Units and frames, tested by physics: gravity, gyro against attitude, velocity against attitude and accelerometer
 
 
-DEGREES = 57.29577951308232
-"""Degrees in a radian."""
 _CLEAR = 0.5
 """R^2 above which a relation between two channels is believed."""
 _MOTION = 0.03
 """Rotation rate [rad/s] an axis must have, as standard deviation, to be checked."""
-_STEP, _FEWEST_STEPS, _MOST_ROWS = 0.1, 20, 100
-"""Attitudes are compared over steps of at least this [s], of which there must be so many: noise and repeated readings
-matter little then.  Steps of more rows are in another unit of time: no attitude comes at more than 1 kHz."""
+_STEP, _MOST_ROWS = 0.1, 100
+"""Attitudes are compared over steps of at least this [s]: noise and repeated readings matter little then.  Steps of
+more rows are in another unit of time: no attitude comes at more than 1 kHz."""
 _UNIT = 1.5
 """Two channels of one motion whose sizes are farther apart are of no use together."""
 _JUMP = 8.0
@@ -59,6 +58,10 @@ _SMOOTHED = 0.8
 _TILT, _PARTS = np.radians(4.0), 5
 """Least angle [rad] between gyro and attitude that is reported; also as many times its error as there are parts."""
 _AXES = ("x", "y", "z")
+_gravity = partial(Check, "gravity")
+_rates_are = partial(Check, "gyro_attitude")
+_velocity_is = partial(Check, "velocity_attitude")
+_position_is = partial(Check, "position_velocity")
 
 
 class AxisMap(NamedTuple):
@@ -118,60 +121,52 @@ def fit_axes(source: FloatArray, target: FloatArray) -> AxisMap:
     return best
 
 
-def _fit_without_jumps(source: FloatArray, target: FloatArray) -> AxisMap:
-    """Fits twice, the second time without rows far off (estimators reset their heading, and rows jump with it)."""
-    fit = fit_axes(source, target)
-    if not np.isfinite(fit.scale):
-        return fit
-    miss = np.linalg.norm(target - fit.scale * source[:, fit.axes] * np.array(fit.signs), axis=1)
-    return fit_axes(*(rows[miss <= _JUMP * np.median(miss)] for rows in (source, target)))
-
-
-def gravity_check(recording: Recording, spans: Spans) -> Check:
+def gravity_check(log: Log) -> Check:
     """Length and direction of the mean specific force: 9.8 m/s^2 along -z in FRD."""
-    accel = recording.channels.get("accel")
+    accel, attitude = (log.recording.channels.get(name) for name in ("accel", "attitude"))
     if accel is None:
-        return Check("gravity", CheckResult.UNKNOWN, "no accelerometer")
-    inside = within(accel.t, spans) if spans else np.ones(len(accel.t), dtype=np.bool_)
+        return _gravity(UNKNOWN, "no accelerometer")
+    inside = within(accel.t, log.spans) if log.spans else np.ones(len(accel.t), dtype=np.bool_)
     values = accel.values[inside]
     if not len(values):
-        return Check("gravity", CheckResult.UNKNOWN, "no accelerometer sample in flight")
+        return _gravity(UNKNOWN, "no accelerometer sample in flight")
     length = float(np.median(np.linalg.norm(values, axis=1)))
     z = float(np.median(values[:, 2]))
     steady = float(np.linalg.norm(np.median(values, axis=0)))
-    check = partial(Check, "gravity", numbers={"length": length, "z": z})
+    check = partial(_gravity, numbers={"length": length, "z": z})
     message = f"specific force has length {length:.4g} and z {z:.4g} (medians; about 9.81 and -9.81 m/s^2 expected)"
     # Specific force on the ground has the length that it must have, where there are samples enough to tell.
     resting = np.linalg.norm(accel.values[~inside], axis=1)
     if not (len(resting) >= 50 and abs(float(np.median(resting)) / GRAVITY - 1.0) < 0.1):
         for unit, factor in (("g", GRAVITY), ("milli-g (or cm/s^2)", GRAVITY * 1e-3)):
             if 0.7 < length * factor / GRAVITY < 1.6 and steady > 0.5 * length:
-                fix = f"multiply acceleration by {factor:.6g}"
-                return check(CheckResult.ERROR, f"{message}: it seems to be in {unit}", fix)
-        if spans and steady < 0.3 * GRAVITY:
-            fix = "log specific force, not linear acceleration"
-            return check(CheckResult.ERROR, f"{message}: gravity is missing", fix)
+                return check(ERROR, f"{message}: it seems to be in {unit}", f"multiply acceleration by {factor:.6g}")
+        if log.spans and steady < 0.3 * GRAVITY:
+            return check(ERROR, f"{message}: gravity is missing", "log specific force, not linear acceleration")
         if not 0.5 < length / GRAVITY < 2.0:
-            return check(CheckResult.ERROR, f"{message}: this is no specific force in m/s^2", "log raw acceleration")
-    # A vehicle that lies on its back does not turn.
-    flown = z > 0.5 * length and bool(spans) and is_turning(recording.channels.get("gyro"), spans, _MOTION)
-    if z > -0.5 * length and not flown and _attitude_explains(accel, recording.channels.get("attitude"), inside):
-        return check(CheckResult.UNKNOWN, f"{message}; its attitude agrees: the vehicle lies or turns this way")
-    if not spans and z > -0.8 * length:
-        return check(CheckResult.UNKNOWN, f"{message}; the vehicle does not fly in this log and may lie this way")
+            return check(ERROR, f"{message}: this is no specific force in m/s^2", "log raw acceleration")
+    # A vehicle that lies on its back does not turn: there the attitude turns what is felt to one g upwards.
+    flown = z > 0.5 * length and bool(log.spans)
+    flown = flown and is_turning(log.recording.channels.get("gyro"), log.spans, _MOTION)
+    if z > -0.5 * length and not flown and attitude is not None and len(attitude.t) > 1:
+        world = np.median(_in_world(accel, attitude)[inside], axis=0)
+        if np.linalg.norm(world + [0.0, 0.0, GRAVITY]) < 0.3 * GRAVITY:
+            return check(UNKNOWN, f"{message}; its attitude agrees: the vehicle lies or turns this way")
+    if not log.spans and z > -0.8 * length:
+        return check(UNKNOWN, f"{message}; the vehicle does not fly in this log and may lie this way")
     if z > 0.5 * length:
         turned = f"{message}: z points up (FLU, as ROS has it) or the sign is reversed"
-        return check(CheckResult.ERROR, turned, _downwards(recording, accel, inside))
+        return check(ERROR, turned, _downwards(log, accel, inside))
     if z > -0.5 * length:
-        return check(CheckResult.ERROR, f"{message}: gravity is not along z", "check the axes of the IMU")
-    return check(CheckResult.OK, message)
+        return check(ERROR, f"{message}: gravity is not along z", "check the axes of the IMU")
+    return check(OK, message)
 
 
-def _downwards(recording: Recording, accel: Channel, inside: BoolArray) -> str:
+def _downwards(log: Log, accel: Channel, inside: BoolArray) -> str:
     """Advice what to turn where the specific force points up: what gyro, attitude and velocity agree with."""
-    attitude, velocity = recording.channels.get("attitude"), recording.channels.get("velocity")
+    attitude, velocity = (log.recording.channels.get(name) for name in ("attitude", "velocity"))
     body = "turn body vectors to FRD: negate y and z"
-    if attitude is None or len(attitude.t) < 2 or gyro_check(recording).verdict is not CheckResult.OK:
+    if attitude is None or len(attitude.t) < 2 or gyro_check(log).verdict is not OK:
         return body
     if float(np.median(_in_world(accel, attitude)[inside, 2])) < 0.0:
         return f"{body}, and turn the attitude with them"
@@ -188,231 +183,160 @@ def _downwards(recording: Recording, accel: Channel, inside: BoolArray) -> str:
     return " or ".join(fixes)
 
 
-def _attitude_explains(accel: Channel, attitude: Channel | None, inside: BoolArray) -> bool:
-    """Tests that the attitude turns the specific force of the rows `inside` to one g upwards."""
-    if attitude is None or len(attitude.t) < 2:
-        return False
-    world = np.median(_in_world(accel, attitude)[inside], axis=0)
-    return bool(np.linalg.norm(world + [0.0, 0.0, GRAVITY]) < 0.3 * GRAVITY)
-
-
-def attitude_check(recording: Recording, found: "Response | None") -> Check:
-    """Attitude against gyro (axes, signs, degrees for radians) and against gravity (a world with z down).
-
-    Args:
-        recording: the log.
-        found: of `response`.
-    """
-    rates = gyro_check(recording, found)
-    if rates.numbers.get("r2", 1.0) < _CLEAR and (coarse := attitude_steps_check(recording)) is not None:
-        rates = Check(rates.name, CheckResult.UNKNOWN, f"{coarse.message}: too coarse to compare with the gyro")
-    accel, attitude = recording.channels.get("accel"), recording.channels.get("attitude")
-    if rates.verdict is CheckResult.ERROR or accel is None or attitude is None or len(attitude.t) < 2:
+def attitude_check(log: Log) -> Check:
+    """Attitude against gyro (axes, signs, degrees for radians) and against gravity (a world with z down)."""
+    rates = gyro_check(log, log.once(response_of))
+    if rates.numbers.get("r2", 1.0) < _CLEAR and (coarse := attitude_steps_check(log.recording)) is not None:
+        rates = _rates_are(UNKNOWN, f"{coarse.message}: too coarse to compare with the gyro")
+    known = log.channels("accel", "attitude", least=2)
+    if rates.verdict is ERROR or known is None:
         return rates
+    accel, attitude = known
     tame = np.linalg.norm(accel.values, axis=1) < 20.0 * GRAVITY  # single wild readings are no scale
     vertical = _in_world(accel, attitude)[tame, 2]
     if not len(vertical):
         return rates
     down, up, seconds = float(np.median(vertical)), -float(np.mean(vertical)), float(np.ptp(accel.t))
+    if down >= 0.5 * GRAVITY:
+        message = f"the attitude turns what the accelerometer reads to point down ({down:.3g} m/s^2)"
+        fix = "convert attitude, velocity and position to NED; ROS uses east, north, up (ENU)"
+        return _rates_are(ERROR, f"{message}: its world has z up", fix, {"down": down})
     # What is felt makes up for gravity on the average, upwards and along the body's axes, but for 5 m/s of speed.
     most = 0.7 + 5.0 / max(seconds, 1e-3)
-    if down < 0.5 * GRAVITY and most < abs(up - GRAVITY) < 0.5 * GRAVITY:
-        return Check(
-            "gravity",
-            CheckResult.ERROR if abs(up - GRAVITY) > 2.0 * most else CheckResult.WARNING,
-            f"specific force is {up:.3g} m/s^2 upwards on the average of {seconds:.3g} s, which must be "
-            f"{GRAVITY:.2f}: scale or zero of the accelerometer is wrong, and b with it",
-            f"calibrate it; if it is the scale, multiply acceleration by {GRAVITY / up:.3g}",
-            {"up": up},
-            estimates_off(mass=up / GRAVITY) if up > 0.0 else {},
+    if most < abs(up - GRAVITY) < 0.5 * GRAVITY:
+        message = (
+            f"specific force is {up:.3g} m/s^2 upwards on the average of {seconds:.3g} s, which must be {GRAVITY:.2f}: "
+            "scale or zero of the accelerometer is wrong, and b with it"
         )
-    if down < 0.5 * GRAVITY:
-        q = linear(attitude.t, attitude.values, accel.t)
-        upwards = np.broadcast_to([0.0, 0.0, -GRAVITY], accel.values.shape)  # makes up for gravity alone
-        felt = rotated(conjugate(q / np.linalg.norm(q, axis=1, keepdims=True)), upwards)
-        aside = np.mean((accel.values - felt)[tame], axis=0)[:2]
-        size = float(np.linalg.norm(aside))
-        if rates.verdict is CheckResult.WARNING or size < most:
-            return rates
-        return Check(
-            "gravity",
-            CheckResult.ERROR if size > 3.0 * most else CheckResult.WARNING,
-            f"specific force is {aside[0]:+.2g} m/s^2 along x and {aside[1]:+.2g} along y on the average of "
-            f"{seconds:.3g} s, more than gravity and attitude explain: the accelerometer's zero is wrong, or the "
-            "attitude",
-            "calibrate it level, or subtract this",
-            {"aside": size},
-        )
-    return Check(
-        rates.name,
-        CheckResult.ERROR,
-        f"the attitude turns what the accelerometer reads to point down ({down:.3g} m/s^2): its world has z up",
-        "convert attitude, velocity and position to NED; ROS uses east, north, up (ENU)",
-        {"down": down},
+        verdict = ERROR if abs(up - GRAVITY) > 2.0 * most else WARNING
+        fix = f"calibrate it; if it is the scale, multiply acceleration by {GRAVITY / up:.3g}"
+        return _gravity(verdict, message, fix, {"up": up}, estimates_off(mass=up / GRAVITY) if up > 0.0 else {})
+    q = linear(attitude.t, attitude.values, accel.t)
+    upwards = np.broadcast_to([0.0, 0.0, -GRAVITY], accel.values.shape)  # makes up for gravity alone
+    felt = rotated(conjugate(q / np.linalg.norm(q, axis=1, keepdims=True)), upwards)
+    aside = np.mean((accel.values - felt)[tame], axis=0)[:2]
+    size = float(np.linalg.norm(aside))
+    if rates.verdict is WARNING or size < most:
+        return rates
+    message = (
+        f"specific force is {aside[0]:+.2g} m/s^2 along x and {aside[1]:+.2g} along y on the average of "
+        f"{seconds:.3g} s, more than gravity and attitude explain: the accelerometer's zero is wrong, or the attitude"
     )
+    fix = "calibrate it level, or subtract this"
+    return _gravity(ERROR if size > 3.0 * most else WARNING, message, fix, {"aside": size})
 
 
-def gyro_check(recording: Recording, found: "Response | None" = None) -> Check:
+# --- Gyro against the turning of the attitude: readings of the quaternion, then what of the rates cannot be
+
+
+Rates = tuple[FloatArray, ...]
+"""Mean rates by gyro and by attitude over the same steps [rad/s], both (m, 3), and what goes with them."""
+
+
+def gyro_check(log: Log, found: "Response | None" = None) -> Check:
     """Gyro against differentiated attitude: axes, signs and scale (degrees for radians); `found` is of `response`."""
-    gyro, attitude = recording.channels.get("gyro"), recording.channels.get("attitude")
-    if gyro is None or attitude is None or min(len(gyro.t), len(attitude.t)) < 20:
-        return Check("gyro_attitude", CheckResult.UNKNOWN, "needs gyro and attitude")
+    if (known := log.channels("gyro", "attitude")) is None:
+        return _rates_are(UNKNOWN, "needs gyro and attitude")
+    gyro, attitude = known
     if (period := measured_period(gyro.t, gyro.values)) > _STEP:
-        slow = f"gyro at {1.0 / period:.2g} Hz is too slow to compare with the attitude"
-        return Check("gyro_attitude", CheckResult.UNKNOWN, slow)
+        return _rates_are(UNKNOWN, f"gyro at {1.0 / period:.2g} Hz is too slow to compare with the attitude")
     if measured_period(attitude.t, attitude.values) > 0.5 * _STEP:  # slow readings may be written again and again
-        fresh = fresh_rows(attitude.values)
-        attitude = replace(attitude, t=attitude.t[fresh], values=attitude.values[fresh])
-    best: tuple[str, AxisMap] | None = None
+        attitude = _fresh(attitude)
     given = attitude.values
     own = _moving_rates(gyro, attitude.t, given)
     readings = {"as given": given, "world to body": conjugate(given), "x y z w (scalar last)": given[:, [3, 0, 1, 2]]}
+    fits: dict[str, AxisMap] = {}
+
+    def likely(reading: str) -> float:
+        """R^2, with a bonus for axes that agree and one for taking the numbers as given."""
+        fit = fits[reading]
+        return fit.r2 + (0.1 if fit.straight else 0.0) + (0.05 if reading == "as given" else 0.0)
+
     for name, q in readings.items():
-        if best is not None and _likely(*best) >= _likely("", AxisMap((0, 1, 2), (1, 1, 1), 1.0, 1.0)):
+        if fits and max(map(likely, fits)) >= 1.1:
             break  # no other can be likelier
         measured, derived = own if q is given else _moving_rates(gyro, attitude.t, q)
-        if len(measured) < 20:
-            if name == "as given":  # as much noise moves every reading of it: no other is more likely for it
-                break
-            continue
-        fit = _fit_without_jumps(measured, derived)
-        if best is None or _likely(name, fit) > _likely(*best):
-            best = (name, fit)
-    if best is None:
-        return Check("gyro_attitude", CheckResult.UNKNOWN, "too little rotation to compare gyro and attitude")
-    found = found if best[0] == "as given" else None
-    rows = _without_jumps(*own)
+        if len(measured) >= FEWEST_SAMPLES:
+            fits[name] = fit_axes(measured, derived)
+            if np.isfinite(fits[name].scale):  # once more without rows far off: estimators reset their heading
+                axes, signs, scale, _ = fits[name]
+                miss = np.linalg.norm(derived - scale * measured[:, axes] * np.array(signs), axis=1)
+                near = miss <= _JUMP * np.median(miss)
+                fits[name] = fit_axes(measured[near], derived[near])
+        elif name == "as given":  # as much noise moves every reading of it: no other is more likely for it
+            break
+    if not fits:
+        return _rates_are(UNKNOWN, "too little rotation to compare gyro and attitude")
+    reading = max(fits, key=likely)
+    given_fits, fit, rows = reading == "as given", fits[reading], _without_jumps(*own)
+    if given_fits and found is not None and abs(found.late) - 3.0 * found.sigma >= _TOO_LATE:
+        later, sooner = ("gyro", "attitude") if found.late > 0.0 else ("attitude", "gyro")
+        message = f"{later} comes {1e3 * abs(found.late):.0f} ms after the {sooner}"
+        fix = f"stamp the {later} when it is measured, on the clock of the {sooner}"
+        return _rates_are(ERROR, message, fix, {"lag_s": found.late})
+    smoothed = given_fits and found is not None and (found.left < _SMOOTHED or found.named)
     return (
-        _apart(found)
-        or (best[0] == "as given" and _angle_rates(gyro, attitude))
+        (_angle_rates(gyro, attitude) if given_fits else None)
         or _one_axis(rows)
         or _bias_step(*own)
-        or (best[0] == "as given" and best[1].straight and _turned(rows))
-        or _judge_rates(gyro, attitude, *best, smoothed=found is not None and (found.left < _SMOOTHED or found.named))
+        or (_tilted(rows) if given_fits and fit.straight else None)
+        or _judge_rates(gyro, attitude, reading, fit, smoothed)
     )
 
 
-def _one_axis(rows: tuple[FloatArray, ...]) -> Check | None:
-    """An error where one axis is still or has a scale of its own, a warning where one is far off zero.
+def _moving_rates(gyro: Channel, t: FloatArray, q: FloatArray) -> Rates:
+    """Rates over steps long enough for the motion to stand above the attitude's noise; none if still.
 
-    Args:
-        rows: rates by gyro and attitude, both (m, 3).
+    White attitude noise adds a variance that falls with the square of the step and motion one that does not, so two
+    steps separate them: motion = (4 var(2 step) - var(step)) / 3.
     """
-    if len(rows[0]) < FEWEST_SAMPLES:
-        return None
-    (size, turned), offset = (np.std(x, axis=0) for x in rows), np.mean(rows[0] - rows[1], axis=0)
-    together = np.mean((rows[0] - rows[0].mean(axis=0)) * (rows[1] - rows[1].mean(axis=0)), axis=0)
-    correlation = together / (size * turned + 1e-12)
-    follows = correlation > 0.9
-    scale = turned / np.maximum(size, 1e-300)
-    agrees = follows & (scale < _UNIT) & (scale > 1.0 / _UNIT) & (size > _MOTION)
-    if not agrees.any():
-        return None
-    check = partial(Check, "gyro_attitude")
-    for axis, name in enumerate(_AXES):
-        still = [which for which, x in (("gyro", size), ("attitude", turned)) if x[axis] < 1e-6]
-        numbers = {"scale": float(scale[axis]), "offset": float(offset[axis])}
-        if len(still) == 1 and max(size[axis], turned[axis]) > 3.0 * _MOTION:
-            message = f"{still[0]} does not turn about {name}, where the other does"
-            return check(CheckResult.ERROR, message, "log all of its axes", numbers)
-        if abs(correlation[axis]) < 0.3 and size[axis] > 0.2 and np.count_nonzero(agrees) == 2:
-            message = f"gyro does not follow the attitude about {name} (correlation {correlation[axis]:.2f})"
-            return check(CheckResult.ERROR, message, f"check {name} of both, or a heading that was held", numbers)
-        if follows[axis] and not agrees[axis] and size[axis] > _MOTION:
-            message = f"attitude rate / gyro = {scale[axis]:.3g} about {name}, not about every axis"
-            return check(
-                CheckResult.ERROR, message, f"multiply the gyro's {name} by it, or correct the attitude", numbers
-            )
-    worst = int(np.argmax(np.abs(offset)))
-    if abs(offset[worst]) < 0.1 or not agrees[worst]:  # [rad/s]; of recorded flights up to 0.04
-        return None
-    message = f"gyro reads {offset[worst]:+.2g} rad/s about {_AXES[worst]} more than the attitude turns"
-    return check(
-        CheckResult.WARNING, message, "calibrate it at rest, or subtract this", {"offset": float(offset[worst])}
-    )
+    stride = max(1, round(_STEP / sample_period(t)))
+    if stride > _MOST_ROWS:  # times in minutes or hours
+        stride = len(t) // (3 * FEWEST_SAMPLES) + 1
+    rates = _rates(gyro, t[::stride], q[::stride])
+    kept = _without_jumps(*rates)
+    # Resets are few: where more rows differ, gyro and attitude do not agree.
+    measured, derived = kept if len(kept[0]) > (1.0 - _FEW) * len(rates[0]) else rates
+    longer = _without_jumps(*_rates(gyro, t[:: 2 * stride], q[:: 2 * stride]))[1]
+    if len(longer) < FEWEST_SAMPLES:
+        return longer[:0], longer[:0]
+    # Without the few rows that turn most: resets that noise hides are no motion, and what is, the gyro reads, too.
+    variances = []
+    for turned in (derived, longer):
+        size = np.linalg.norm(turned - np.median(turned, axis=0), axis=1)
+        variances.append(np.var(turned[size <= np.quantile(size, 1.0 - _FEW)], axis=0))
+    total, twice = variances
+    motion = np.maximum((4.0 * twice - total) / 3.0, 0.0)
+    if max(np.max(np.sqrt(motion)), np.max(np.std(measured, axis=0))) < _MOTION:
+        return longer[:0], longer[:0]
+    # Over longer steps a flip turns by more than half a turn, and looks like another one.
+    angle = float(np.max(np.linalg.norm(derived, axis=1))) * stride * sample_period(t)
+    if np.sum(motion) > 0.8 * np.sum(total) or 4.0 * angle > np.pi or len(t) < FEWEST_SAMPLES * 4 * stride:
+        return measured, derived
+    return _rates(gyro, t[:: 4 * stride], q[:: 4 * stride])
 
 
-def _sizes(gyro: Channel, attitude: Channel) -> list[Factor]:
-    """Turns of the attitude over those of the gyro about x, y and z; empty where they are too slow or too few."""
-    step = max(sample_period(attitude.t), 0.1 * TURN)
-    at, q = _on_steps(gyro, attitude, step)
-    if step > 0.25 * TURN or len(at) < FEWEST * TURN / step:
-        return []
-    turns = Turns.of(linear(gyro.t, gyro.values, at), q, step, TURN)
-    felt, turned, rate = _without_jumps(turns.gyro, turns.attitude, turns.rate)
-    turns = Turns(felt, rate, turned, TURN)
-    number = len(felt) * step / TURN
-    if number < FEWEST:
-        return []
-    return [factors(axis, number, turns.moments(axis, step))[0] for axis in range(3)]
+def _rates(gyro: Channel, t: FloatArray, q: FloatArray) -> Rates:
+    """Mean rates over each step between attitudes that has no gap."""
+    keep = usable_steps(t, gyro.t)
+    mean = np.diff(running_integral(gyro, t), axis=0)[keep] / np.diff(t)[keep, None]
+    return mean, turn(q[:-1], q[1:])[keep] / np.diff(t)[keep, None]
 
 
-def _on_steps(gyro: Channel, attitude: Channel, step: float) -> tuple[FloatArray, FloatArray]:
-    """Times `step` [s] apart (n,) at which both are known, and the attitude there (n, 4), NaN in gaps of either."""
-    at = np.arange(max(gyro.t[0], attitude.t[0]), min(gyro.t[-1], attitude.t[-1]), step)
-    q = linear(attitude.t, attitude.values, at)
-    q[~usable_steps(attitude.t, gyro.t)[np.searchsorted(attitude.t[1:-1], at, "right")]] = np.nan
-    return at, q
+def _without_jumps(measured: FloatArray, derived: FloatArray, *more: FloatArray) -> Rates:
+    """Rates without rows in which the attitude jumps and the gyro does not: an estimator reset its heading there."""
+    if not len(derived):
+        return measured, derived, *more
+    # Where both go together, a jump need be no faster than the motion.
+    apart, turned = (np.linalg.norm(rows, axis=1) for rows in (derived - measured, derived))
+    jumps = _jumps(measured, derived) | (apart > _JUMP * np.maximum(np.median(apart), 0.1 * np.median(turned)))
+    return tuple(rows[~jumps] for rows in (measured, derived, *more))
 
 
-def _turned(rows: tuple[FloatArray, ...]) -> Check | None:
-    """A gyro that is turned by some degrees against the attitude, in all parts of the log alike (Kabsch 1976)."""
-    if len(rows[0]) < 2 * FEWEST_SAMPLES:
-        return None
-
-    def turning(measured: FloatArray, derived: FloatArray) -> FloatArray:
-        u, _, v = np.linalg.svd((measured - measured.mean(axis=0)).T @ (derived - derived.mean(axis=0)))
-        return np.asarray((u @ np.diag([1.0, 1.0, np.linalg.det(u @ v)]) @ v).T)
-
-    def angles_of(m: FloatArray) -> FloatArray:
-        return np.array([np.arctan2(m[2, 1], m[2, 2]), -np.arcsin(m[2, 0]), np.arctan2(m[1, 0], m[0, 0])])
-
-    parts = [angles_of(turning(*part)) for part in zip(*(np.array_split(r, _PARTS) for r in rows), strict=True)]
-    m, error = turning(*rows), np.linalg.norm(np.std(parts, axis=0)) / np.sqrt(_PARTS)
-    angles = angles_of(m)
-    size = float(np.linalg.norm(angles))
-    # Where each axis goes with its own, noise turns more.
-    if not max(_TILT, _PARTS * float(error)) <= size < 0.5 * np.pi:
-        return None
-    # What an axis reads of the others' acceleration is no answer to its torque.
-    read = np.diff(rows[0], axis=0)
-    sizes = np.sum(read**2, axis=0) / np.sum(read * (read @ m.T), axis=0)
-    roll, pitch, yaw = np.degrees(angles)
-    rotation = ", ".join(f"{angle:.3f}" for angle in angles)
-    return Check(
-        "gyro_attitude",
-        CheckResult.ERROR if size > 2.0 * _TILT else CheckResult.WARNING,
-        f"gyro is turned against the attitude: roll {roll:.2g}, pitch {pitch:.2g}, yaw {yaw:.2g} deg",
-        f"mounting: {{rotation: [{rotation}]}} in the vehicle file, or correct the attitude",
-        {"angle_rad": size},
-        estimates_off(turning=sizes.tolist()) if sizes.min() > 0.0 else {},
-    )
-
-
-def _bias_step(measured: FloatArray, derived: FloatArray) -> Check | None:
-    """An error where the gyro follows the attitude, or both stand still, but for one step of its bias."""
-    n = len(measured)
-    if n < 20 or fit_axes(measured, derived).r2 >= _CLEAR:
-        return None
-    apart = measured - derived
-    count = np.arange(5, n - 4)[:, None]
-    before = np.cumsum(apart, axis=0)[4 : n - 5] / count
-    size = (apart.sum(axis=0) - before * count) / (n - count) - before
-    share = size**2 * count * (n - count) / n
-    k, axis = (int(i) for i in np.unravel_index(np.argmax(share), share.shape))
-    after = np.arange(n) >= count[k, 0]
-    left = measured - np.outer(after, np.where(np.arange(3) == axis, size[k], 0.0))
-    fit, noise = fit_axes(left, derived), float(np.var((left - derived)[:, axis]))
-    still = np.max(np.std(left, axis=0)) < _MOTION
-    if share[k, axis] < 8.0**2 * noise or not (still or (fit.straight and fit.r2 >= _CLEAR)):
-        return None
-    return Check(
-        "gyro_attitude",
-        CheckResult.ERROR,
-        f"the gyro's bias about {_AXES[axis]} stepped by {size[k, axis]:+.2g} rad/s; without that the attitude agrees",
-        "use the flight before it, and calibrate the gyro at rest",
-        {"step": float(size[k, axis])},
-    )
+def _jumps(measured: FloatArray, derived: FloatArray) -> BoolArray:
+    """True for rows in which the attitude jumps and the gyro does not."""
+    turned, felt = (np.linalg.norm(rows, axis=1) for rows in (derived, measured))
+    return np.asarray((turned > _JUMP * np.nanmedian(turned)) & (felt < 0.5 * _JUMP * np.nanmedian(felt)))
 
 
 def _angle_rates(gyro: Channel, attitude: Channel) -> Check | None:
@@ -422,10 +346,9 @@ def _angle_rates(gyro: Channel, attitude: Channel) -> Check | None:
     """
     stride = max(1, round(_STEP / sample_period(attitude.t)))
     t, q = attitude.t[::stride], attitude.values[::stride]
-    measured, turned = _rates(gyro, t, q)
     keep = usable_steps(t, gyro.t)
     angles = np.diff(np.unwrap(euler(q), axis=0), axis=0)[keep] / np.diff(t)[keep, None]
-    measured, turned, angles = _without_jumps(measured, turned, angles)
+    measured, turned, angles = _without_jumps(*_rates(gyro, t, q), angles)
     if len(angles) < FEWEST_SAMPLES:
         return None
     # What this difference, as it is, takes of what the gyro misses beside its bias: on the axis about which they differ
@@ -439,14 +362,137 @@ def _angle_rates(gyro: Channel, attitude: Channel) -> Check | None:
     share = 1.0 - float(left.sum() / max(was.sum(), 1e-300))
     if share < _CLEAR or not np.all(left < was):
         return None
-    return Check(
-        "gyro_attitude",
-        CheckResult.ERROR,
-        "gyro is the rates of roll, pitch and yaw angle (Euler rates), not those about the body's axes",
+    message = "gyro is the rates of roll, pitch and yaw angle (Euler rates), not those about the body's axes"
+    fix = (
         "log the gyro; or p = phi' - psi' sin(theta), q = theta' cos(phi) + psi' sin(phi) cos(theta), "
-        "r = psi' cos(phi) cos(theta) - theta' sin(phi)",
-        {"share": share},
+        "r = psi' cos(phi) cos(theta) - theta' sin(phi)"
     )
+    return _rates_are(ERROR, message, fix, {"share": share})
+
+
+def _one_axis(rows: Rates) -> Check | None:
+    """An error where one axis is still or has a scale of its own, a warning where one is far off zero."""
+    if len(rows[0]) < FEWEST_SAMPLES:
+        return None
+    (size, turned), offset = (np.std(x, axis=0) for x in rows), np.mean(rows[0] - rows[1], axis=0)
+    together = np.mean((rows[0] - rows[0].mean(axis=0)) * (rows[1] - rows[1].mean(axis=0)), axis=0)
+    correlation = together / (size * turned + 1e-12)
+    follows = correlation > 0.9
+    scale = turned / np.maximum(size, 1e-300)
+    agrees = follows & (scale < _UNIT) & (scale > 1.0 / _UNIT) & (size > _MOTION)
+    if not agrees.any():
+        return None
+    for axis, name in enumerate(_AXES):
+        check = partial(_rates_are, ERROR, numbers={"scale": float(scale[axis]), "offset": float(offset[axis])})
+        still = [which for which, x in (("gyro", size), ("attitude", turned)) if x[axis] < 1e-6]
+        if len(still) == 1 and max(size[axis], turned[axis]) > 3.0 * _MOTION:
+            return check(f"{still[0]} does not turn about {name}, where the other does", "log all of its axes")
+        if abs(correlation[axis]) < 0.3 and size[axis] > 0.2 and np.count_nonzero(agrees) == 2:
+            message = f"gyro does not follow the attitude about {name} (correlation {correlation[axis]:.2f})"
+            return check(message, f"check {name} of both, or a heading that was held")
+        if follows[axis] and not agrees[axis] and size[axis] > _MOTION:
+            message = f"attitude rate / gyro = {scale[axis]:.3g} about {name}, not about every axis"
+            return check(message, f"multiply the gyro's {name} by it, or correct the attitude")
+    worst = int(np.argmax(np.abs(offset)))
+    most = float(offset[worst])
+    if abs(most) < 0.1 or not agrees[worst]:  # [rad/s]; of recorded flights up to 0.04
+        return None
+    message = f"gyro reads {most:+.2g} rad/s about {_AXES[worst]} more than the attitude turns"
+    return _rates_are(WARNING, message, "calibrate it at rest, or subtract this", {"offset": most})
+
+
+def _bias_step(measured: FloatArray, derived: FloatArray) -> Check | None:
+    """An error where the gyro follows the attitude, or both stand still, but for one step of its bias."""
+    n = len(measured)
+    if n < FEWEST_SAMPLES or fit_axes(measured, derived).r2 >= _CLEAR:
+        return None
+    # Size of a step after each row, and the variance that it takes
+    apart, count = measured - derived, np.arange(5, n - 4)[:, None]
+    before = np.cumsum(apart, axis=0)[4 : n - 5] / count
+    size = (apart.sum(axis=0) - before * count) / (n - count) - before
+    share = size**2 * count * (n - count) / n
+    k, axis = (int(i) for i in np.unravel_index(np.argmax(share), share.shape))
+    left, step = measured.copy(), float(size[k, axis])
+    left[count[k, 0] :, axis] -= step
+    fit, noise = fit_axes(left, derived), float(np.var((left - derived)[:, axis]))
+    still = np.max(np.std(left, axis=0)) < _MOTION
+    if share[k, axis] < _JUMP**2 * noise or not (still or (fit.straight and fit.r2 >= _CLEAR)):
+        return None
+    message = f"the gyro's bias about {_AXES[axis]} stepped by {step:+.2g} rad/s; without that the attitude agrees"
+    return _rates_are(ERROR, message, "use the flight before it, and calibrate the gyro at rest", {"step": step})
+
+
+def _tilted(rows: Rates) -> Check | None:
+    """A gyro that is turned by some degrees against the attitude, in all parts of the log alike (Kabsch 1976)."""
+    if len(rows[0]) < 2 * FEWEST_SAMPLES:
+        return None
+
+    def turning(measured: FloatArray, derived: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Rotation between the rates, and its roll, pitch and yaw [rad]."""
+        u, _, v = np.linalg.svd((measured - measured.mean(axis=0)).T @ (derived - derived.mean(axis=0)))
+        m = (u @ np.diag([1.0, 1.0, np.linalg.det(u @ v)]) @ v).T
+        return m, np.array([np.arctan2(m[2, 1], m[2, 2]), -np.arcsin(m[2, 0]), np.arctan2(m[1, 0], m[0, 0])])
+
+    parts = [turning(*part)[1] for part in zip(*(np.array_split(r, _PARTS) for r in rows), strict=True)]
+    (m, angles), error = turning(*rows), np.linalg.norm(np.std(parts, axis=0)) / np.sqrt(_PARTS)
+    size = float(np.linalg.norm(angles))
+    # Where each axis goes with its own, noise turns more.
+    if not max(_TILT, _PARTS * float(error)) <= size < 0.5 * np.pi:
+        return None
+    # What an axis reads of the others' acceleration is no answer to its torque.
+    read = np.diff(rows[0], axis=0)
+    sizes = np.sum(read**2, axis=0) / np.sum(read * (read @ m.T), axis=0)
+    roll, pitch, yaw = np.degrees(angles)
+    message = f"gyro is turned against the attitude: roll {roll:.2g}, pitch {pitch:.2g}, yaw {yaw:.2g} deg"
+    rotation = ", ".join(f"{angle:.3f}" for angle in angles)
+    fix = f"mounting: {{rotation: [{rotation}]}} in the vehicle file, or correct the attitude"
+    off = estimates_off(turning=sizes.tolist()) if sizes.min() > 0.0 else {}
+    return _rates_are(ERROR if size > 2.0 * _TILT else WARNING, message, fix, {"angle_rad": size}, off)
+
+
+def _judge_rates(gyro: Channel, attitude: Channel, reading: str, fit: AxisMap, smoothed: bool) -> Check:
+    """Judgement of axes and scale of the best fit; a smoothed gyro lacks quick turning, which is no matter of scale."""
+    check = partial(_rates_are, numbers={"scale": fit.scale, "r2": fit.r2})
+    if fit.r2 < _CLEAR:
+        remedy = "check units, axes and time stamps of both; quaternions are scalar first, body to world"
+        return check(ERROR, f"gyro does not follow the attitude (R^2 {fit.r2:.2f})", remedy)
+    if reading != "as given":
+        message = f"attitude fits the gyro only when read as {reading} (R^2 {fit.r2:.2f})"
+        return check(ERROR, message, "write wxyz quaternions, body to world, FRD to NED")
+    if not fit.straight:
+        remedy = "body axes must be FRD for both; ROS' FLU has y and z reversed"
+        if (fit.axes, fit.signs) == ((1, 0, 2), (1, 1, -1)):
+            remedy = "that is an attitude in world axes east, north, up (ENU): turn it, velocity and position into NED"
+        return check(ERROR, f"gyro axes differ from the attitude's: {fit} (R^2 {fit.r2:.2f})", remedy)
+    for scale, unit in ((60.0, "minutes"), (3600.0, "hours")):
+        if fit.r2 > 0.9 and 0.97 < fit.scale / scale < 1.03:
+            message = f"attitude rate / gyro = {fit.scale:.4g}: time seems to be in {unit}"
+            return check(ERROR, message, f"multiply times by {scale:g}")
+    degree = math.radians(1.0)
+    for scale, what in ((degree, "gyro seems to be in deg/s"), (1.0 / degree, "attitude seems to be in degrees")):
+        if 0.75 < fit.scale / scale < 1.33:
+            return check(ERROR, f"{what} (attitude rate / gyro = {fit.scale:.3g})", "convert to radians")
+    message = f"attitude rate / gyro = {fit.scale:.3f} (R^2 {fit.r2:.2f})"
+    if fit.absurd:
+        remedy = f"multiply gyro by {fit.scale:.3g}, or correct the attitude"
+        return check(ERROR, f"{message}: the scale of one is wrong", remedy)
+    # Turns of the attitude over those of the gyro about each axis, unless they are too slow or too few
+    step = max(sample_period(attitude.t), 0.1 * TURN)
+    at, q = _on_steps(gyro, attitude, step)
+    by_axis = []
+    if not smoothed and step <= 0.25 * TURN and len(at) >= FEWEST * TURN / step:
+        turns = _without_jumps(*changes_of_turn(linear(gyro.t, gyro.values, at), q, step))
+        if (seconds := len(turns[0]) * step) >= FEWEST * TURN:
+            by_axis = [factors(axis, seconds, turn_moments(turns, axis, step))[0] for axis in range(3)]
+    sizes = np.array([f.value if f.disagrees and f.value > 0.0 else 1.0 for f in by_axis] or [fit.scale] * 3)
+    message = ", ".join(str(f) for f in by_axis if f.known) or message
+    if smoothed or np.all(sizes == 1.0) or not by_axis and 0.85 * fit.r2 < fit.scale < 1.15:
+        return check(OK, message)
+    remedy = "check scales and filters of both; multiply the gyro by this if the attitude is right"
+    return check(WARNING, message, remedy, off=estimates_off(turning=(1.0 / sizes).tolist()))
+
+
+# --- The gyro beside the attitude by frequency: late, low-passed, or no sensor of its own
 
 
 class Response(NamedTuple):
@@ -469,14 +515,19 @@ class Response(NamedTuple):
         return abs(self.late) - 3.0 * self.sigma > _LATE
 
 
+def response_of(log: Log) -> Response | None:
+    """As `response`, of a log; None where it lacks one of them."""
+    known = log.channels("gyro", "attitude")
+    return None if known is None else response(*known)
+
+
 def response(gyro: Channel, attitude: Channel) -> Response | None:
     """Gyro beside differentiated attitude in bands of frequency, by cross-spectra; None where too few are clear.
 
     Both are means over the same steps, so that rates and steps of the channels do not matter.  Noise of the gyro makes
     the share that it reads too large and that of the attitude leaves it, so that a share below 1 is a filter's.
     """
-    fresh = fresh_rows(attitude.values)
-    attitude = replace(attitude, t=attitude.t[fresh], values=attitude.values[fresh])
+    attitude = _fresh(attitude)
     step = max(0.01, sample_period(attitude.t))
     slowest = max(step, measured_period(gyro.t, gyro.values))
     rows = round(float(np.clip(np.ptp(attitude.t) / 6.0, 1.0, 2.0)) / step)
@@ -489,11 +540,10 @@ def response(gyro: Channel, attitude: Channel) -> Response | None:
             return None
         felt, turned = (x / step for x in (np.diff(running_integral(shifted, at), axis=0), turn(q[:-1], q[1:])))
         felt[_jumps(felt, turned)] = np.nan
-        parts = np.lib.stride_tricks.sliding_window_view(np.hstack([felt, turned]), rows, axis=0)[:: rows // 2]
-        parts = parts[np.isfinite(parts).all(axis=(1, 2))]
-        if len(parts) < 5:
+        spectra = tapered_spectra(np.hstack([felt, turned]), rows)
+        if len(spectra) < 5:
             return None
-        one, other = np.split(np.fft.rfft((parts - parts.mean(-1, keepdims=True)) * np.hanning(rows))[..., 1:], 2, 1)
+        one, other = np.split(spectra[..., 1:], 2, 1)
         cross, power, beside = (np.sum(x, axis=(0, 1)) for x in (other * one.conj(), abs(one) ** 2, abs(other) ** 2))
         agree = np.real(np.exp(-2j * np.pi * np.outer(lags, hz)) @ cross)
         late += float(lags[np.argmax(agree)]) if first else 0.0
@@ -502,9 +552,8 @@ def response(gyro: Channel, attitude: Channel) -> Response | None:
     bands = [place == k for k in np.unique(place) if 0 < k < len(_BANDS)]
     both, own, its, hz = (np.array([np.sum(x[k]) for k in bands]) for x in (cross, power, beside, hz * abs(cross)))
     hz, coherence = hz / (abs(both) + 1e-300), abs(both) ** 2 / (own * its + 1e-300) + 1e-12
-    error = np.sqrt(
-        np.maximum(1.0 - coherence, 0.0) / (2.0 * coherence) / [0.7 * len(parts) * np.count_nonzero(k) for k in bands]
-    )
+    samples = [0.7 * len(spectra) * np.count_nonzero(k) for k in bands]
+    error = np.sqrt(np.maximum(1.0 - coherence, 0.0) / (2.0 * coherence) / samples)
     clear = coherence > _SURE
     if np.count_nonzero(clear) < 2:
         return None
@@ -519,18 +568,56 @@ def response(gyro: Channel, attitude: Channel) -> Response | None:
     share = share / share[np.flatnonzero(clear)[0]]
     known = (error < 0.1) & (hz < 0.1 / slowest)
     quick = np.where(known, abs(both) * hz**2, 0.0)
-    return Response(
-        late + lag_mean,
-        sigma,
-        float(np.min((share * (1.0 + 2.0 * error))[known], initial=1.0)),
-        float(quick.sum() / np.sum(quick / np.minimum(share, 1.0))) if known.any() else 1.0,
-    )
+    left = float(np.min((share * (1.0 + 2.0 * error))[known], initial=1.0))
+    read = float(quick.sum() / np.sum(quick / np.minimum(share, 1.0))) if known.any() else 1.0
+    return Response(late + lag_mean, sigma, left, read)
 
 
-def _filtered(found: Response | None, known: Mapping[str, Mapping[str, float]]) -> Check | None:
-    """A warning where gyro or attitude are late beyond `known` effects, or the gyro misses quick turning."""
+def tapered_spectra(values: FloatArray, rows: int) -> FloatArray:
+    """Spectra of half overlapping parts of `rows` rows of (n, columns), Hann-tapered, without those with NaN.
+
+    Shape (parts, columns, rows // 2 + 1), complex.
+    """
+    parts = np.lib.stride_tricks.sliding_window_view(values, rows, axis=0)[:: rows // 2]
+    parts = parts[np.isfinite(parts).all(axis=(1, 2))]
+    return np.asarray(np.fft.rfft((parts - parts.mean(axis=-1, keepdims=True)) * np.hanning(rows)))
+
+
+def gyro_source_check(log: Log) -> Check | None:
+    """A warning where the gyro is the attitude, differentiated, an error where its noise rules, or it was filtered.
+
+    Noise of the attitude is then that of the gyro, row by row: their difference is far below what changes from one
+    row to the next but one, which is what a sensor of its own and a central difference leave.
+    """
+    if (known := log.channels("gyro", "attitude")) is None:
+        return None
+    gyro, attitude = known[0], _fresh(known[1])
+    inside = (attitude.t >= gyro.t[0]) & (attitude.t <= gyro.t[-1])
+    t, q = attitude.t[inside], attitude.values[inside]
+    if len(t) < FEWEST_SAMPLES or np.min(np.diff(t)) <= 0.0:
+        return None
+
+    def middle(rows: FloatArray) -> float:
+        return float(np.median(np.linalg.norm(rows, axis=1)))
+
+    rates = turn(q[:-1], q[1:]) / np.diff(t)[:, None]
+    bends, read = middle(np.diff(rates, 2, axis=0)), linear(gyro.t, gyro.values, t)
+    missed = (read[:-1] - rates, read[1:] - rates, read[1:-1] - 0.5 * (rates[1:] + rates[:-1]))
+    least = min(map(middle, missed))
+    if least >= 0.05 * bends:
+        return _filtered(log.once(response_of), log.described)
+    noisy = bends > 0.5 * middle(rates)
+    message = "gyro is the attitude, differentiated: it measures nothing by itself" + ", and is mostly noise" * noisy
+    fix = "log the gyro; noise and delay of the attitude are in both"
+    numbers = {"missed_rad_s": least, "bends_rad_s": bends}
+    return Check("gyro_source", ERROR if noisy else WARNING, message, fix, numbers)
+
+
+def _filtered(found: Response | None, vehicle: Vehicle | None) -> Check | None:
+    """A warning where gyro or attitude are late beyond the vehicle's effects, or the gyro misses quick turning."""
     if found is None:
         return None
+    known: Mapping[str, Mapping[str, float]] = {} if vehicle is None else vehicle.effects
     lag = known.get("imu_lag", {}).get("cutoff", math.inf)
     late = found.late - butterworth_delay(lag) + known.get("attitude_delay", {}).get("delay", 0.0)
     smoothed = found.left < _SMOOTHED and "imu_lag" not in known
@@ -543,238 +630,89 @@ def _filtered(found: Response | None, known: Mapping[str, Mapping[str, float]]) 
         delay = f"{later} comes {1e3 * abs(late):.0f} ms after the {sooner}"
         notes.append(f"{delay}, as low-passed at {butterworth_delay(abs(late)):.2g} Hz or stamped late")
     if smoothed:
-        notes.append(
-            f"gyro has {found.left:.0%} of the attitude's quick turning: it was "
-            + ("low-passed" if sure and late > 0.0 else "smoothed without a delay")
-        )
+        how = "low-passed" if sure and late > 0.0 else "smoothed without a delay"
+        notes.append(f"gyro has {found.left:.0%} of the attitude's quick turning: it was {how}")
     models = "`attitude_delay` models a delay" if sure and late < 0.0 else "`imu_lag` models a filter"
     fix = f"log the raw {later if sure else 'gyro'}" + f"; {models}" * sure
-    return Check(
-        "gyro_source",
-        CheckResult.WARNING,
-        "; ".join(notes),
-        fix,
-        {"late_s": late, "left": found.left},
-        estimates_off(turning=(found.read,) * 3) if later == "gyro" or smoothed else {},
-    )
+    off = estimates_off(turning=(found.read,) * 3) if later == "gyro" or smoothed else {}
+    return Check("gyro_source", WARNING, "; ".join(notes), fix, {"late_s": late, "left": found.left}, off)
 
 
-def gyro_source_check(recording: Recording, vehicle: Vehicle | None, found: Response | None) -> Check | None:
-    """A warning where the gyro is the attitude, differentiated, an error where its noise rules, or it was filtered.
-
-    Noise of the attitude is then that of the gyro, row by row: their difference is far below what changes from one
-    row to the next but one, which is what a sensor of its own and a central difference leave.
-    """
-    gyro, attitude = recording.channels.get("gyro"), recording.channels.get("attitude")
-    if gyro is None or attitude is None or min(len(gyro.t), len(attitude.t)) < FEWEST_SAMPLES:
-        return None
-    fresh = fresh_rows(attitude.values)
-    t, q = attitude.t[fresh], attitude.values[fresh]
-    inside = (t >= gyro.t[0]) & (t <= gyro.t[-1])
-    t, q = t[inside], q[inside]
-    if len(t) < FEWEST_SAMPLES or np.min(np.diff(t)) <= 0.0:
-        return None
-    rates = turn(q[:-1], q[1:]) / np.diff(t)[:, None]
-    bends = float(np.median(np.linalg.norm(np.diff(rates, 2, axis=0), axis=1)))
-    at_rows = linear(gyro.t, gyro.values, t)
-    missed = (at_rows[:-1] - rates, at_rows[1:] - rates, at_rows[1:-1] - 0.5 * (rates[1:] + rates[:-1]))
-    least = min(float(np.median(np.linalg.norm(rows, axis=1))) for rows in missed)
-    if least >= 0.05 * bends:
-        return _filtered(found, {} if vehicle is None else vehicle.effects)
-    noisy = bends > 0.5 * float(np.median(np.linalg.norm(rates, axis=1)))
-    return Check(
-        "gyro_source",
-        CheckResult.ERROR if noisy else CheckResult.WARNING,
-        "gyro is the attitude, differentiated: it measures nothing by itself" + ", and is mostly noise" * noisy,
-        "log the gyro; noise and delay of the attitude are in both",
-        {"missed_rad_s": least, "bends_rad_s": bends},
-    )
+# --- Velocity against attitude and accelerometer, and against the change of position
 
 
-def _moving_rates(gyro: Channel, t: FloatArray, q: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Rates as of `_rates` over steps long enough for the motion to stand above the attitude's noise; none if still.
-
-    White attitude noise adds a variance that falls with the square of the step and motion one that does not, so two
-    steps separate them: motion = (4 var(2 step) - var(step)) / 3.
-    """
-    stride = max(1, round(_STEP / sample_period(t)))
-    if stride > _MOST_ROWS:  # times in minutes or hours
-        stride = len(t) // (3 * _FEWEST_STEPS) + 1
-    rates = _rates(gyro, t[::stride], q[::stride])
-    kept = _without_jumps(*rates)
-    # Resets are few: where more rows differ, gyro and attitude do not agree.
-    measured, derived = kept if len(kept[0]) > (1.0 - _FEW) * len(rates[0]) else rates
-    longer = _without_jumps(*_rates(gyro, t[:: 2 * stride], q[:: 2 * stride]))[1]
-    if len(longer) < _FEWEST_STEPS:
-        return longer[:0], longer[:0]
-    total, twice = _steady_variance(derived), _steady_variance(longer)
-    motion = np.maximum((4.0 * twice - total) / 3.0, 0.0)
-    if max(np.max(np.sqrt(motion)), np.max(np.std(measured, axis=0))) < _MOTION:
-        return longer[:0], longer[:0]
-    # Over longer steps a flip turns by more than half a turn, and looks like another one.
-    angle = float(np.max(np.linalg.norm(derived, axis=1))) * stride * sample_period(t)
-    if np.sum(motion) > 0.8 * np.sum(total) or 4.0 * angle > np.pi or len(t) < 20 * 4 * stride:
-        return measured, derived
-    return _rates(gyro, t[:: 4 * stride], q[:: 4 * stride])
-
-
-def _steady_variance(rates: FloatArray) -> FloatArray:
-    """Variance about each axis without the few rows that turn most: resets that noise hides are no motion.
-
-    What a vehicle does for so short a time only is seen by the gyro.
-    """
-    size = np.linalg.norm(rates - np.median(rates, axis=0), axis=1)
-    return np.asarray(np.var(rates[size <= np.quantile(size, 1.0 - _FEW)], axis=0))
-
-
-def _without_jumps(measured: FloatArray, derived: FloatArray, *more: FloatArray) -> tuple[FloatArray, ...]:
-    """Rates without rows in which the attitude jumps and the gyro does not: an estimator reset its heading there."""
-    if not len(derived):
-        return measured, derived, *more
-    # Where both go together, a jump need be no faster than the motion.
-    apart, turned = (np.linalg.norm(rows, axis=1) for rows in (derived - measured, derived))
-    jumps = _jumps(measured, derived) | (apart > _JUMP * np.maximum(np.median(apart), 0.1 * np.median(turned)))
-    return tuple(rows[~jumps] for rows in (measured, derived, *more))
-
-
-def _jumps(measured: FloatArray, derived: FloatArray) -> BoolArray:
-    """True for rows in which the attitude jumps and the gyro does not."""
-    turned, felt = (np.linalg.norm(rows, axis=1) for rows in (derived, measured))
-    return np.asarray((turned > _JUMP * np.nanmedian(turned)) & (felt < 0.5 * _JUMP * np.nanmedian(felt)))
-
-
-def _apart(found: Response | None) -> Check | None:
-    """An error where the gyro follows the attitude at another time only."""
-    if found is None or abs(found.late) - 3.0 * found.sigma < _TOO_LATE:
-        return None
-    which = ("gyro", "attitude") if found.late > 0.0 else ("attitude", "gyro")
-    return Check(
-        "gyro_attitude",
-        CheckResult.ERROR,
-        f"{which[0]} comes {1e3 * abs(found.late):.0f} ms after the {which[1]}",
-        f"stamp the {which[0]} when it is measured, on the clock of the {which[1]}",
-        {"lag_s": found.late},
-    )
-
-
-def _likely(reading: str, fit: AxisMap) -> float:
-    """R^2, with a bonus for axes that agree and one for taking the numbers as given."""
-    return fit.r2 + (0.1 if fit.straight else 0.0) + (0.05 if reading == "as given" else 0.0)
-
-
-def _judge_rates(gyro: Channel, attitude: Channel, reading: str, fit: AxisMap, smoothed: bool) -> Check:
-    """Judgement of axes and scale of the best fit; a smoothed gyro lacks quick turning, which is no matter of scale."""
-    check = partial(Check, "gyro_attitude", numbers={"scale": fit.scale, "r2": fit.r2})
-    if fit.r2 < _CLEAR:
-        message = f"gyro does not follow the attitude (R^2 {fit.r2:.2f})"
-        remedy = "check units, axes and time stamps of both; quaternions are scalar first, body to world"
-        return check(CheckResult.ERROR, message, remedy)
-    if reading != "as given":
-        message = f"attitude fits the gyro only when read as {reading} (R^2 {fit.r2:.2f})"
-        return check(CheckResult.ERROR, message, "write wxyz quaternions, body to world, FRD to NED")
-    if not fit.straight:
-        message = f"gyro axes differ from the attitude's: {fit} (R^2 {fit.r2:.2f})"
-        remedy = "body axes must be FRD for both; ROS' FLU has y and z reversed"
-        if (fit.axes, fit.signs) == ((1, 0, 2), (1, 1, -1)):
-            remedy = "that is an attitude in world axes east, north, up (ENU): turn it, velocity and position into NED"
-        return check(CheckResult.ERROR, message, remedy)
-    for scale, unit in ((60.0, "minutes"), (3600.0, "hours")):
-        if fit.r2 > 0.9 and 0.97 < fit.scale / scale < 1.03:
-            message = f"attitude rate / gyro = {fit.scale:.4g}: time seems to be in {unit}"
-            return check(CheckResult.ERROR, message, f"multiply times by {scale:g}")
-    for scale, what in ((1.0 / DEGREES, "gyro seems to be in deg/s"), (DEGREES, "attitude seems to be in degrees")):
-        if 0.75 < fit.scale / scale < 1.33:
-            return check(CheckResult.ERROR, f"{what} (attitude rate / gyro = {fit.scale:.3g})", "convert to radians")
-    message = f"attitude rate / gyro = {fit.scale:.3f} (R^2 {fit.r2:.2f})"
-    if fit.absurd:
-        remedy = f"multiply gyro by {fit.scale:.3g}, or correct the attitude"
-        return check(CheckResult.ERROR, f"{message}: the scale of one is wrong", remedy)
-    by_axis = () if smoothed else _sizes(gyro, attitude)
-    sizes = np.array([f.value if f.disagrees and f.value > 0.0 else 1.0 for f in by_axis] or [fit.scale] * 3)
-    message = ", ".join(str(f) for f in by_axis if f.known) or message
-    if smoothed or np.all(sizes == 1.0) or not by_axis and 0.85 * fit.r2 < fit.scale < 1.15:
-        return check(CheckResult.OK, message)
-    remedy = "check scales and filters of both; multiply the gyro by this if the attitude is right"
-    return check(CheckResult.WARNING, message, remedy, off=estimates_off(turning=(1.0 / sizes).tolist()))
-
-
-def velocity_check(recording: Recording) -> Check:
+def velocity_check(log: Log) -> Check:
     """Change of world velocity against rotated specific force and gravity: world frame of attitude and velocity.
 
     Where no velocity is logged, it is that of the position.
     """
-    channels = recording.channels
-    accel, attitude = channels.get("accel"), channels.get("attitude")
-    velocity = channels.get("velocity") or _flown(channels.get("position"))
-    if accel is None or attitude is None or velocity is None or min(map(len, (accel.t, attitude.t, velocity.t))) < 20:
-        return Check("velocity_attitude", CheckResult.UNKNOWN, "needs accelerometer, attitude and velocity or position")
+    velocity, position = log.recording.channels.get("velocity"), log.channels("position")
+    if velocity is None and position is not None:
+        # Change of the position [m/s] over steps of at least 0.5 s, at their middles
+        stride = max(1, round(0.5 / sample_period(position[0].t)))
+        t, place = position[0].t[::stride], position[0].values[::stride]
+        flown = np.diff(place, axis=0) / np.diff(t)[:, None]
+        velocity = Channel("position", 0.5 * (t[1:] + t[:-1]), flown, position[0].source)
+    known = log.channels("accel", "attitude")
+    if known is None or velocity is None or len(velocity.t) < FEWEST_SAMPLES:
+        return _velocity_is(UNKNOWN, "needs accelerometer, attitude and velocity or position")
+    accel, attitude = known
     if not 0.5 < np.median(np.linalg.norm(accel.values, axis=1)) / GRAVITY < 2.0:
-        return Check("velocity_attitude", CheckResult.UNKNOWN, "needs specific force in m/s^2")
-    gained, derived = _velocity_gains(accel, attitude, velocity)
-    level = _level_velocity(gained, derived, velocity.name)
-    if level.verdict is CheckResult.ERROR or len(gained) < 20:
+        return _velocity_is(UNKNOWN, "needs specific force in m/s^2")
+    name, (gained, derived) = velocity.name, _velocity_gains(accel, attitude, velocity)
+    level = _velocity_is(UNKNOWN, "too little horizontal acceleration to compare")
+    if len(gained) < FEWEST_SAMPLES:
         return level
+    if np.max(np.std(gained[:, :2], axis=0)) >= 0.2:
+        fit = fit_axes(derived[:, :2], gained[:, :2])
+        check = partial(_velocity_is, numbers={"scale": fit.scale, "r2": fit.r2})
+        message = f"{name} follows tilt and thrust (scale {fit.scale:.3g}, R^2 {fit.r2:.2f})"
+        if fit.r2 < _CLEAR:
+            level = check(UNKNOWN, f"{name} does not follow tilt and thrust clearly (R^2 {fit.r2:.2f})")
+        elif not fit.straight:
+            message = f"world axes of {name} differ from the attitude's: {fit} (R^2 {fit.r2:.2f})"
+            return check(ERROR, message, "use NED for both; ROS' ENU swaps x and y")
+        elif fit.absurd:
+            return check(ERROR, f"{message}: its scale is wrong", f"divide {name} by {fit.scale:.3g}")
+        else:
+            level = check(OK, message)
     # Vertical changes that are clearly the reverse of what the force makes.
     up, down = gained[:, 2], derived[:, 2]
     if not (min(np.std(up), np.std(down)) > 0.05 and np.corrcoef(up, down)[0, 1] < -0.8):
         return level
-    return Check(
-        "velocity_attitude",
-        CheckResult.ERROR,
-        f"vertical {velocity.name} rises where the force pushes down: it points up",
-        f"negate {'vz, and z if it points up too' if velocity.name == 'velocity' else 'z'}: the world is NED",
-        {"vertical": -1.0},
-    )
-
-
-def _flown(position: Channel | None) -> Channel | None:
-    """Change of the position [m/s] over steps of at least 0.5 s, at their middles, as a channel of its name."""
-    if position is None or len(position.t) < FEWEST_SAMPLES:
-        return None
-    stride = max(1, round(0.5 / sample_period(position.t)))
-    t, place = position.t[::stride], position.values[::stride]
-    return Channel("position", 0.5 * (t[1:] + t[:-1]), np.diff(place, axis=0) / np.diff(t)[:, None], position.source)
-
-
-def _level_velocity(gained: FloatArray, derived: FloatArray, name: str) -> Check:
-    """Horizontal axes of `velocity_check`, of the channel `name`."""
-    if len(gained) < 20 or np.max(np.std(gained[:, :2], axis=0)) < 0.2:
-        return Check("velocity_attitude", CheckResult.UNKNOWN, "too little horizontal acceleration to compare")
-    fit = fit_axes(derived[:, :2], gained[:, :2])
-    check = partial(Check, "velocity_attitude", numbers={"scale": fit.scale, "r2": fit.r2})
-    if fit.r2 < _CLEAR:
-        return check(CheckResult.UNKNOWN, f"{name} does not follow tilt and thrust clearly (R^2 {fit.r2:.2f})")
-    if not fit.straight:
-        message = f"world axes of {name} differ from the attitude's: {fit} (R^2 {fit.r2:.2f})"
-        return check(CheckResult.ERROR, message, "use NED for both; ROS' ENU swaps x and y")
-    message = f"{name} follows tilt and thrust (scale {fit.scale:.3g}, R^2 {fit.r2:.2f})"
-    if fit.absurd:
-        return check(CheckResult.ERROR, f"{message}: its scale is wrong", f"divide {name} by {fit.scale:.3g}")
-    return check(CheckResult.OK, message)
-
-
-def _rates(gyro: Channel, t: FloatArray, q: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Returns mean gyro and rotation over each interval between attitudes [rad/s], both (m, 3)."""
-    keep = usable_steps(t, gyro.t)
-    mean = np.diff(running_integral(gyro, t), axis=0)[keep] / np.diff(t)[keep, None]
-    return mean, turn(q[:-1], q[1:])[keep] / np.diff(t)[keep, None]
+    message = f"vertical {name} rises where the force pushes down: it points up"
+    fix = f"negate {'vz, and z if it points up too' if name == 'velocity' else 'z'}: the world is NED"
+    return _velocity_is(ERROR, message, fix, {"vertical": -1.0})
 
 
 def _velocity_gains(accel: Channel, attitude: Channel, velocity: Channel) -> tuple[FloatArray, FloatArray]:
-    """Returns mean acceleration [m/s^2] over steps of at least 0.2 s, of the velocity and from force, both (m, 3)."""
-    force = _in_world(accel, attitude) + np.array([0.0, 0.0, GRAVITY])
+    """Mean acceleration [m/s^2] over steps of at least 0.2 s, of the velocity and from force, both (m, 3)."""
+    world = Channel("accel", accel.t, _in_world(accel, attitude) + np.array([0.0, 0.0, GRAVITY]))
     stride = max(1, round(0.2 / sample_period(velocity.t)))
     t, speed = velocity.t[::stride], velocity.values[::stride]
     keep = usable_steps(t, accel.t) & usable_steps(t, attitude.t)
-    world = Channel("accel", accel.t, force)
-    derived = np.diff(running_integral(world, t), axis=0)[keep] / np.diff(t)[keep, None]
-    return np.diff(speed, axis=0)[keep] / np.diff(t)[keep, None], derived
+    gained, derived = (np.diff(x, axis=0)[keep] / np.diff(t)[keep, None] for x in (speed, running_integral(world, t)))
+    return gained, derived
 
 
 def _in_world(accel: Channel, attitude: Channel) -> FloatArray:
     """Specific force in the attitude's world [m/s^2], shape (n, 3), at the accelerometer's times."""
     q = linear(attitude.t, attitude.values, accel.t)
     return rotated(q / np.linalg.norm(q, axis=1, keepdims=True), accel.values)
+
+
+def _fresh(channel: Channel) -> Channel:
+    """The channel without rows that repeat a reading."""
+    fresh = fresh_rows(channel.values)
+    return replace(channel, t=channel.t[fresh], values=channel.values[fresh])
+
+
+def _on_steps(gyro: Channel, attitude: Channel, step: float) -> tuple[FloatArray, FloatArray]:
+    """Times `step` [s] apart (n,) at which both are known, and the attitude there (n, 4), NaN in gaps of either."""
+    at = np.arange(max(gyro.t[0], attitude.t[0]), min(gyro.t[-1], attitude.t[-1]), step)
+    q = linear(attitude.t, attitude.values, at)
+    q[~usable_steps(attitude.t, gyro.t)[np.searchsorted(attitude.t[1:-1], at, "right")]] = np.nan
+    return at, q
 
 
 def usable_steps(t: FloatArray, other: FloatArray) -> BoolArray:
@@ -796,40 +734,40 @@ def running_integral(channel: Channel, at: FloatArray) -> FloatArray:
     return linear(channel.t, total, at)
 
 
-# --- Whether logged velocity is the change of logged position: an estimator that scales one of them is wrong in one
-
-
-STRETCH = 1.0
-"""Changes are compared over this time [s]: slow enough for delays and low-passes of either channel not to count."""
-CLEAR = 0.98
+_STRETCH = 1.0
+"""Changes of position are compared over this [s]: slow enough for delays and low-passes of either not to count."""
+_SAME = 0.98
 """Correlation above which two changes are the same motion, seen by two channels."""
-LEAST_MOTION = 0.1
+_LEAST_MOTION = 0.1
 """Change of position [m], as standard deviation, below which its noise may decide."""
-SCALE = 0.03
-"""Deviation from scale 1 that matters to whoever predicts positions …"""
 
 
-def position_check(recording: Recording) -> Check | None:
+def position_check(log: Log) -> Check | None:
     """Integral of the velocity against the change of position: scale and correlation; None where one is not logged.
 
-    Horizontal axes together, the vertical one by itself.
+    Horizontal axes together, the vertical one by itself: an estimator that scales one of them is wrong in one.
     """
-    position, velocity = (recording.channels.get(n) for n in ("position", "velocity"))
+    channels = (log.read or log.recording).channels
+    position, velocity = (channels.get(name) for name in ("position", "velocity"))
     if position is None or velocity is None or min(len(position.t), len(velocity.t)) < FEWEST_SAMPLES:
         return None
-    moved, flown, independent = _changes(position, velocity)
+    # Changes of position and integrals of velocity over overlapping stretches, both (m, 3), and independent ones
+    period = sample_period(position.t)
+    steps, every = max(round(_STRETCH / period), 1), max(round(0.1 * _STRETCH / period), 1)
+    broken = np.concatenate([[0], np.cumsum(~usable_steps(position.t, velocity.t))])
+    start = np.arange(0, len(position.t) - steps, every)
+    start = start[broken[start + steps] == broken[start]]
+    path = running_integral(velocity, position.t)
+    moved, flown = (x[start + steps] - x[start] for x in (position.values, path))
+    finite = np.isfinite(moved).all(axis=1) & np.isfinite(flown).all(axis=1)
+    moved, flown, independent = moved[finite], flown[finite], float(np.count_nonzero(finite)) * every / steps
     if independent < 4.0:
-        return Check("position_velocity", CheckResult.UNKNOWN, "too few stretches without a gap to compare")
+        return _position_is(UNKNOWN, "too few stretches without a gap to compare")
     fit = fit_axes(moved, flown)
     turned = fit.axes != (0, 1, 2) or min(fit.signs[:2]) < 0
-    if np.max(np.std(moved[:, :2], axis=0)) > LEAST_MOTION and fit.r2 > CLEAR**2 and turned:
-        return Check(
-            "position_velocity",
-            CheckResult.WARNING,
-            f"world axes of velocity differ from those of position: {fit} (R^2 {fit.r2:.2f})",
-            "use NED for both; ROS' ENU swaps x and y",
-            {"r2": fit.r2},
-        )
+    if np.max(np.std(moved[:, :2], axis=0)) > _LEAST_MOTION and fit.r2 > _SAME**2 and turned:
+        message = f"world axes of velocity differ from those of position: {fit} (R^2 {fit.r2:.2f})"
+        return _position_is(WARNING, message, "use NED for both; ROS' ENU swaps x and y", {"r2": fit.r2})
     numbers: dict[str, float] = {}
     scales: list[str] = []
     off: list[str] = []
@@ -837,53 +775,35 @@ def position_check(recording: Recording) -> Check | None:
     for where, axes in (("horizontally", (0, 1)), ("vertically", (2,))):
         p, v = (x[:, axes] - x[:, axes].mean(axis=0) for x in (moved, flown))
         correlation = float(np.sum(p * v) / np.sqrt(max(np.sum(p * p) * np.sum(v * v), 1e-300)))
-        if where == "vertically" and np.max(np.std(p, axis=0)) > 0.2 * LEAST_MOTION and correlation < -0.8:
-            return Check(
-                "position_velocity",
-                CheckResult.ERROR,
-                f"position rises where velocity falls (correlation {correlation:.2f}): one of them points up",
-                "negate z or vz: the world is NED, its z down",
-                {"correlation": correlation},
-            )
-        if np.max(np.std(p, axis=0)) < LEAST_MOTION or correlation < CLEAR:
+        motion = np.max(np.std(p, axis=0))
+        if where == "vertically" and motion > 0.2 * _LEAST_MOTION and correlation < -0.8:
+            message = f"position rises where velocity falls (correlation {correlation:.2f}): one of them points up"
+            fix = "negate z or vz: the world is NED, its z down"
+            return _position_is(ERROR, message, fix, {"correlation": correlation})
+        if motion < _LEAST_MOTION or correlation < _SAME:
             continue
         # Both have errors: the ratio of their sizes, not a regression of one on the other.
         scale = float(np.sqrt(np.sum(v * v) / np.sum(p * p)))
         error = scale * np.sqrt(max(1.0 - correlation**2, 0.0) / (independent * len(axes)))
         numbers |= {f"scale {where}": scale, f"correlation {where}": correlation}
         scales.append(f"{scale:.3f} ± {error:.3f} {where} (correlation {correlation:.4f})")
-        # Beyond chance, and enough to matter to whoever predicts positions.
         unit |= not 1.0 / _UNIT < scale < _UNIT
-        if abs(scale - 1.0) > max(SCALE, 4.0 * error):
+        # Beyond chance, and enough to matter to whoever predicts positions
+        if abs(scale - 1.0) > max(ALLOWED, 4.0 * error):
             off.append(f"{abs(scale - 1.0):.1%} {'larger' if scale > 1.0 else 'smaller'} {where}")
     if not scales:
         message = "velocity does not follow the change of position clearly, or the vehicle hardly moves"
-        return Check("position_velocity", CheckResult.UNKNOWN, message)
+        return _position_is(UNKNOWN, message)
     measured = f"velocity against change of position: {', '.join(scales)}"
     if unit:
         fix = "write position in m and velocity in m/s"
-        return Check("position_velocity", CheckResult.ERROR, f"{measured}: they are in different units", fix, numbers)
+        return _position_is(ERROR, f"{measured}: they are in different units", fix, numbers)
     if not off:
-        return Check("position_velocity", CheckResult.OK, measured, numbers=numbers)
-    return Check(
-        "position_velocity",
-        CheckResult.WARNING,
+        return _position_is(OK, measured, numbers=numbers)
+    message = (
         f"the logged velocity is {' and '.join(off)} than the logged change of position ({measured}): the scale of one "
         "of them is wrong; a simulation fitted to such a log misses positions by as much, unless it has "
-        "`velocity_scale`",
-        "check the scale of the positioning system and of the estimator's velocity (flow sensor, marker distances)",
-        numbers,
+        "`velocity_scale`"
     )
-
-
-def _changes(position: Channel, velocity: Channel) -> tuple[FloatArray, FloatArray, float]:
-    """Changes of position and integrals of velocity over overlapping stretches, both (m, 3), and independent ones."""
-    period = sample_period(position.t)
-    steps, every = max(round(STRETCH / period), 1), max(round(0.1 * STRETCH / period), 1)
-    broken = np.concatenate([[0], np.cumsum(~usable_steps(position.t, velocity.t))])
-    start = np.arange(0, len(position.t) - steps, every)
-    start = start[broken[start + steps] == broken[start]]
-    path = running_integral(velocity, position.t)
-    moved, flown = (x[start + steps] - x[start] for x in (position.values, path))
-    known = np.isfinite(moved).all(axis=1) & np.isfinite(flown).all(axis=1)
-    return moved[known], flown[known], float(np.count_nonzero(known)) * every / steps
+    fix = "check the scale of the positioning system and of the estimator's velocity (flow sensor, marker distances)"
+    return _position_is(WARNING, message, fix, numbers)

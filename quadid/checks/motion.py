@@ -1,30 +1,75 @@
-"""Times of flight, facts of channels, checks of their timing and resolution; turns by gyro and attitude."""
+"""Subject of all checks; times of flight, facts of channels and their timing; turns by gyro and attitude."""
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, TypeVar
 
 import numpy as np
 
-from quadid.checks.findings import ChannelFacts, Check, CheckResult
+from quadid.checks.findings import ERROR, OK, WARNING, ChannelFacts, Check
 from quadid.data.grid import holes, longest_step, moving_mean
-from quadid.data.rotor_signal import rotor_channel
+from quadid.data.rotor_signal import RotorSignal, rotor_channel, rotor_signal
 from quadid.data.window import CHANNELS, Channel, Recording, at_limit, copied, measured_period, sample_period, true_runs
 from quadid.model.layout import ThrustModel
 from quadid.rotation import euler, integrated, turn
 from quadid.types import BoolArray, FloatArray
 from quadid.vehicle import GRAVITY, Vehicle
 
+Answer = TypeVar("Answer")
+Spans = tuple[tuple[float, float], ...]
+FEWEST_SAMPLES = 20
+"""Samples of each channel that a comparison needs."""
+
+
+@dataclass(frozen=True, eq=False)
+class Log:
+    """Subject of the checks.
+
+    Attributes:
+        recording: in body axes.
+        described: its vehicle, where one is given.
+        spans: in which it flies [s].
+        read: the recording as it was read, where that is another.
+    """
+
+    recording: Recording
+    described: Vehicle | None = None
+    spans: Spans = ()
+    read: Recording | None = None
+    _answers: dict[Callable[["Log"], Any], Any] = field(default_factory=dict, init=False, repr=False)
+
+    @property
+    def vehicle(self) -> Vehicle:
+        """The vehicle, for checks that are asked with one only."""
+        assert self.described is not None
+        return self.described
+
+    @cached_property
+    def signal(self) -> RotorSignal:
+        """Rotor speeds; raises QuadidError where the log has none of this vehicle."""
+        return rotor_signal(self.recording, self.vehicle)
+
+    def channels(self, *names: str, least: int = FEWEST_SAMPLES) -> tuple[Channel, ...] | None:
+        """Channels of these names; None where one is absent or has fewer samples than `least`."""
+        found = [self.recording.channels.get(name) for name in names]
+        kept = tuple(channel for channel in found if channel is not None and len(channel.t) >= least)
+        return kept if len(kept) == len(names) else None
+
+    def once(self, compute: Callable[["Log"], Answer]) -> Answer:
+        """Result of a function of this log, which is computed when first asked for."""
+        if compute not in self._answers:
+            self._answers[compute] = compute(self)
+        answer: Answer = self._answers[compute]
+        return answer
+
+
 # --- When the vehicle flies, from its motors or its vibration
 
 
-Spans = tuple[tuple[float, float], ...]
-
 HOPELESS = 16.0
 """A thrust coefficient that is wrong by more does not show the weight."""
-_NOTHING = 0.1
-"""A rotor below this share of the median speed of all is ignored."""
 _SHORTEST = 1.0
 """Shorter spans are none [s]."""
 _GROUND = 3.0
@@ -40,54 +85,52 @@ def flying_spans(recording: Recording, vehicle: Vehicle | None) -> Spans:
     the square of the command, and hover is what is felt as one g.  A vehicle that feels less than its weight falls, and
     so flies, whatever its rotors do; one that feels it along an unusual direction for half a second lies somewhere.
     """
-    channels = recording.channels
-    rotors, _ = rotor_channel(recording, vehicle)
-    if rotors is not None:
-        accel = channels.get("accel")
-        load = None if accel is None or len(accel.t) < 10 else _load(accel)
-        felt = None if load is None or accel is None else np.interp(rotors.t, accel.t, load)
-        thrust, hover = _thrust(rotors, vehicle, felt)
-        if hover <= 0.0:
+    accel, (rotors, _) = recording.channels.get("accel"), rotor_channel(recording, vehicle)
+    if rotors is None:
+        if accel is None or len(accel.t) <= 10:
             return ()
-        t, on = rotors.t, thrust > 0.5 * hover  # flying carries half the weight at least
-        if accel is not None and len(accel.t) > 10:
-            on &= np.interp(t, accel.t, _felt(accel)) > 0.5
-        if not on.any():
-            return ()
-        # What carries the weight: where mostly more than that is felt, as in climbs, rotors usually give more.
-        carrying = usual = float(np.median(thrust[on]))
-        if felt is not None:
-            usual = float(np.median((thrust / np.maximum(felt, 0.1))[on]))
-            carrying = usual * min(1.0, float(np.median(felt[on])))
-            inside = (t >= t[on][0]) & (t <= t[on][-1])
-            # Who feels less than this share of his weight falls.
-            on |= inside & (felt < 0.8)
-            inside = (t > t[on][0] + _SHORTEST) & (t < t[on][-1] - _SHORTEST)
-            on[inside] &= ~_stands(t[inside], thrust[inside] / usual, felt[inside], channels.get("gyro"))
-        # Below, the ground still carries its share.
-        carried = t[on & (thrust > 0.9 * carrying)]
-        return tuple(later for span in _spans(t, on) if (later := _from_carried(span, carried)))
-    if "accel" in channels and len(channels["accel"].t) > 10:
-        # True where the accelerometer's length varies by more than at rest (0.3 m/s^2 over 25 samples)
-        length = np.linalg.norm(channels["accel"].values, axis=1)
+        # The accelerometer's length varies by more than at rest (0.3 m/s^2 over 25 samples).
+        length = np.linalg.norm(accel.values, axis=1)
         mean, square = moving_mean(length, 25), moving_mean(length**2, 25)
-        return _spans(channels["accel"].t, np.asarray(np.sqrt(np.maximum(square - mean**2, 0.0)) > 0.3))
-    return ()
+        return _spans(accel.t, np.asarray(np.sqrt(np.maximum(square - mean**2, 0.0)) > 0.3))
+    t, felt = rotors.t, None
+    if accel is not None and len(accel.t) >= 10:
+        # Specific force [g] over 0.2 s, whichever unit it is in
+        length, width = np.linalg.norm(accel.values, axis=1), max(1, round(0.2 / sample_period(accel.t)))
+        middle = float(np.median(length))
+        unit = next((u for u in (GRAVITY, 1.0, 1e3) if 0.5 < middle / u < 4.0), None)
+        felt = None if unit is None else np.interp(t, accel.t, moving_mean(length / unit, width))
+    thrust, hover = _thrust(rotors, vehicle, felt)
+    if hover <= 0.0:
+        return ()
+    on = thrust > 0.5 * hover  # flying carries half the weight at least
+    if accel is not None and len(accel.t) > 10:
+        # ... and feels the force, over half a second, along its usual direction.
+        usually, width = np.median(accel.values, axis=0), max(1, round(0.5 / sample_period(accel.t)))
+        share = accel.values @ usually / float(usually @ usually or 1.0)
+        on &= np.interp(t, accel.t, moving_mean(share, width) > 0.3) > 0.5
+    if not on.any():
+        return ()
+    # What carries the weight: where mostly more than that is felt, as in climbs, rotors usually give more.
+    carrying = usual = float(np.median(thrust[on]))
+    if felt is not None:
+        usual = float(np.median((thrust / np.maximum(felt, 0.1))[on]))
+        carrying = usual * min(1.0, float(np.median(felt[on])))
+        on |= (t >= t[on][0]) & (t <= t[on][-1]) & (felt < 0.8)  # who feels less of his weight falls
+        inside = (t > t[on][0] + _SHORTEST) & (t < t[on][-1] - _SHORTEST)
+        on[inside] &= ~_stands(t[inside], thrust[inside] / usual, felt[inside], recording.channels.get("gyro"))
+    # Each span begins where the rotors first carry: before, the ground still takes its share.
+    carried, out = t[on & (thrust > 0.9 * carrying)], []
+    for begin, end in _spans(t, on):
+        first = carried[np.searchsorted(carried, begin) :][:1]
+        out += [(float(first[0]), end)] if len(first) and end - first[0] >= _SHORTEST else []
+    return tuple(out)
 
 
-def proposed_cuts(spans: Spans, first: float, last: float) -> Spans:
-    """Flights without take-off and landing [s after `first`, to a tenth]; none where the log holds little else.
-
-    Args:
-        spans: when it flies [s].
-        first: sample that is used when nothing is cut [s].
-        last: sample, likewise [s].
-    """
-    flights, joined = _joined(spans, _SHORTEST), _joined(spans, _GROUND)
-    apart, whole = _trimmed(flights, first, last), sum(b - a for a, b in joined)
-    if len(flights) > len(joined) and sum(b - a for a, b in apart) > 0.7 * whole:
-        return apart  # between them it stood somewhere
-    return () if last - first - whole < _GROUND else _trimmed(joined, first, last)
+def _spans(t: FloatArray, on: BoolArray) -> Spans:
+    runs = [(float(t[first]), float(t[end - 1])) for first, end in zip(*true_runs(on), strict=True)]
+    # An interruption of half a second ends no span.
+    return tuple((a, b) for a, b in _joined(runs, 0.5) if b - a >= _SHORTEST)
 
 
 def _joined(spans: Sequence[tuple[float, float]], most: float) -> list[tuple[float, float]]:
@@ -101,13 +144,28 @@ def _joined(spans: Sequence[tuple[float, float]], most: float) -> list[tuple[flo
     return out
 
 
-def _trimmed(flights: Sequence[tuple[float, float]], first: float, last: float) -> Spans:
-    """Flights of 5 s or more, without the time next to the ground [s after `first`, to a tenth]."""
-    cuts = [
-        (0.0 if a - first < _MARGIN else a + _MARGIN - first, (b if last - b < _MARGIN else b - _MARGIN) - first)
-        for a, b in flights
-    ]
-    return tuple((round(a, 1), round(b, 1)) for a, b in cuts if b - a >= 5.0)
+def proposed_cuts(spans: Spans, first: float, last: float) -> Spans:
+    """Flights of 5 s or more without take-off and landing [s after `first`, to a tenth]; none where little else is.
+
+    Args:
+        spans: when it flies [s].
+        first: sample that is used when nothing is cut [s].
+        last: sample, likewise [s].
+    """
+
+    def trimmed(flights: Sequence[tuple[float, float]]) -> Spans:
+        """Flights without the time next to the ground."""
+        cuts = [
+            (0.0 if a - first < _MARGIN else a + _MARGIN - first, (b if last - b < _MARGIN else b - _MARGIN) - first)
+            for a, b in flights
+        ]
+        return tuple((round(a, 1), round(b, 1)) for a, b in cuts if b - a >= 5.0)
+
+    flights, joined = _joined(spans, _SHORTEST), _joined(spans, _GROUND)
+    apart, whole = trimmed(flights), sum(b - a for a, b in joined)
+    if len(flights) > len(joined) and sum(b - a for a, b in apart) > 0.7 * whole:
+        return apart  # between them it stood somewhere
+    return () if last - first - whole < _GROUND else trimmed(joined)
 
 
 def within(t: FloatArray, spans: Spans) -> BoolArray:
@@ -137,9 +195,9 @@ def _stands(t: FloatArray, thrust: FloatArray, felt: FloatArray, gyro: Channel |
     width = max(1, round(0.3 / sample_period(t)))
     fresh = np.append(~copied(gyro.values), True)  # a gyro that is stuck does not show that nothing turns
     turning = np.interp(t, gyro.t, np.where(fresh, np.linalg.norm(gyro.values, axis=1), 1.0))
-    load, still = moving_mean(thrust / np.maximum(felt, 0.1), width), moving_mean(turning, width) < 0.15
+    still = moving_mean(turning, width) < 0.15
     carried = moving_mean(np.abs(felt - 1.0), width) < 0.15  # where a fall ends it passes 1
-    little = load < 0.75
+    little = moving_mean(thrust / np.maximum(felt, 0.1), width) < 0.75
     if np.mean(little) > 0.3:  # then speeds disagree with the thrust, and nothing follows from them
         return np.zeros(len(t), dtype=bool)
     stands = little & still & carried
@@ -148,69 +206,38 @@ def _stands(t: FloatArray, thrust: FloatArray, felt: FloatArray, gyro: Channel |
 
 def _thrust(channel: Channel, vehicle: Vehicle | None, felt: FloatArray | None) -> tuple[FloatArray, float]:
     """Returns relative thrust and the value that hovers; `felt` is the specific force [g], shape (n,)."""
-    values = channel.values
-    if channel.name == "motor_command" and np.median(np.abs(values)) > 100.0:
+    values, commands = channel.values, channel.name == "motor_command"
+    if commands and np.median(np.abs(values)) > 100.0:
         low, high = vehicle.command.range if vehicle is not None else (1000.0, 2000.0)
         values = np.clip((values - low) / (high - low), 0.0, None)
-    # A rotor that is ignored, for it is dead or its signal is, has the others' median; no ground carries.
+    # A rotor below a tenth of the others is dead, or its signal is, and has their median: no ground carries.
     usual = np.median(values, axis=1, keepdims=True)
-    values = np.where(values < _NOTHING * usual, usual, values)
+    values = np.where(values < 0.1 * usual, usual, values)
     thrust = np.asarray(np.sum(values**2, axis=1))
+    most = np.quantile(thrust, 0.95)
     # Commands that never exceed 15 % of full are idling motors.
-    if channel.name == "motor_command" and np.quantile(thrust, 0.95) < 0.15**2 * values.shape[1]:
+    if commands and most < 0.15**2 * values.shape[1]:
         return thrust, 0.0
-    if channel.name == "rotor_speed" and vehicle is not None and values.shape[1] == len(vehicle.rotors):
+    if not commands and vehicle is not None and values.shape[1] == len(vehicle.rotors):
         modelled, hover = ThrustModel.stated(vehicle).total(values), vehicle.mass * GRAVITY
         highest = float(np.max(modelled))  # of losses that no rotor has it may be negative
         typical = float(np.median(modelled[modelled >= 0.25 * highest])) if highest > 0.0 else 0.0
         if 1.0 / HOPELESS < typical / hover < HOPELESS:
             return modelled, hover
-    strong = thrust > 0.5 * np.quantile(thrust, 0.95)
+    strong = thrust > 0.5 * most
     if felt is not None and (strong := strong & (felt > 0.5)).any():
         return thrust, float(np.median(thrust[strong] / felt[strong]))
-    powered = thrust[thrust > 0.25 * np.quantile(thrust, 0.95)]
+    powered = thrust[thrust > 0.25 * most]
     return thrust, float(np.median(powered)) if len(powered) else 0.0
-
-
-def _load(accel: Channel) -> FloatArray | None:
-    """Specific force [g] averaged over 0.2 s, shape (n,), whichever unit it is in; None where it is in none."""
-    length = np.linalg.norm(accel.values, axis=1)
-    middle = float(np.median(length))
-    unit = next((u for u in (GRAVITY, 1.0, 1e3) if 0.5 < middle / u < 4.0), None)
-    width = max(1, round(0.2 / sample_period(accel.t)))
-    return None if unit is None else np.asarray(moving_mean(length / unit, width))
-
-
-def _felt(accel: Channel) -> FloatArray:
-    """Returns 1 where the specific force, averaged over 0.5 s, points along its usual direction, else 0; any unit."""
-    usual = np.median(accel.values, axis=0)
-    share = accel.values @ usual / float(usual @ usual or 1.0)
-    width = max(1, round(0.5 / sample_period(accel.t)))
-    return np.asarray(moving_mean(share, width) > 0.3, dtype=np.float64)
-
-
-def _from_carried(span: tuple[float, float], carried: FloatArray) -> tuple[float, float] | None:
-    """A span from the first of the rising times [s] in it at which rotors carry; None where that is too short."""
-    first = float(carried[at]) if (at := int(np.searchsorted(carried, span[0]))) < len(carried) else np.inf
-    return (first, span[1]) if span[1] - first >= _SHORTEST else None
-
-
-def _spans(t: FloatArray, on: BoolArray) -> Spans:
-    runs = [(float(t[first]), float(t[end - 1])) for first, end in zip(*true_runs(on), strict=True)]
-    # An interruption of half a second ends no span.
-    return tuple((a, b) for a, b in _joined(runs, 0.5) if b - a >= _SHORTEST)
 
 
 # --- Timing of channels and values that do not move: rates, gaps, jitter, stuck and saturated signals, clock faults
 
 
-FEWEST_SAMPLES = 20
-"""Samples of each channel that a comparison needs."""
 _GRID = 0.02
 """Step of the grid [s] for which gaps are reported, that of the fit."""
-IMU = "gyro", "accel"
-_STUCK = 0.5
-"""An IMU channel that does not change for this long [s] in flight is stuck; others after ten times as long."""
+STUCK = 1.0
+"""A sensor that repeats itself to the bit for longer than this [s] of moving flight is stuck."""
 
 
 def channel_facts(recording: Recording, flying: Spans = ()) -> tuple[ChannelFacts, ...]:
@@ -234,6 +261,7 @@ def _facts(channel: Channel, flying: Spans) -> ChannelFacts:
     stuck = float(np.max(channel.t[end] - channel.t[first], initial=0.0))
     if inside.sum() > 1 and np.min(np.ptp(channel.values[inside], axis=0)) == 0.0:
         stuck = float(np.ptp(channel.t[inside]))  # one axis of it
+    limited = channel.name in ("gyro", "accel", "motor_command")
     return ChannelFacts(
         name=channel.name,
         unit=CHANNELS[channel.name][1],
@@ -248,106 +276,69 @@ def _facts(channel: Channel, flying: Spans) -> ChannelFacts:
         longest_gap=float(steps[long].max()) if long.any() else 0.0,
         repeated=float(np.mean(same)) if len(same) else 0.0,
         stuck=stuck,
-        saturated=sum(end.samples for end in at_limit(channel.values))
-        if channel.name in ("gyro", "accel", "motor_command")
-        else 0,
+        saturated=sum(end.samples for end in at_limit(channel.values)) if limited else 0,
         dropped=dict(channel.faults),
     )
 
 
-def timing_checks(recording: Recording, facts: tuple[ChannelFacts, ...]) -> list[Check]:
-    """Checks clocks, gaps, jitter and stuck sensors.
+def timing_checks(recording: Recording, facts: Sequence[ChannelFacts]) -> list[Check]:
+    """Checks clocks, gaps, jitter, stuck and saturated sensors, and the resolution of the attitude.
 
     Args:
         recording: the log.
         facts: of its channels.
     """
-    checks = [_clock_check(recording, facts)]
     coarse = attitude_steps_check(recording)
-    checks += [] if coarse is None else [coarse]
+    checks = [_clock_check(recording, facts), *([] if coarse is None else [coarse])]
+
+    def warn(name: str, message: str, fix: str, **numbers: float) -> None:
+        checks.append(Check(name, WARNING, message, fix, numbers))
+
     for f in facts:
         rows = (f.count - 1) / max(f.last - f.first, 1e-9)
-        if f.name == "attitude" and coarse is not None:
-            continue  # a value that rests between its steps is no interpolated one
-        if not f.gaps and rows > 1.5 * f.rate and f.name != "battery":  # a voltage may rest
-            message = f"{f.name}: {rows:.3g} rows a second were interpolated between samples at {f.rate:.3g} Hz"
-            checks.append(
-                Check("timing", CheckResult.WARNING, message, "log it at this rate, or without the interpolated rows")
-            )
-    gaps = {f.name: f for f in facts if f.gaps}
-    if gaps:
-        worst = max(gaps.values(), key=lambda f: f.longest_gap)
-        text = ", ".join(f"{f.name} {f.gaps}" for f in gaps.values())
-        checks.append(
-            Check(
-                "timing",
-                CheckResult.WARNING,
-                f"gaps: {text}; the longest lasts {worst.longest_gap:.3g} s ({worst.name})",
-                "windows are cut there; log to a faster card or at a lower rate",
-                {"gaps": float(sum(f.gaps for f in facts)), "longest_s": worst.longest_gap},
-            )
-        )
-    unsteady = [f for f in facts if f.name in ("gyro", "accel", "rotor_speed", "motor_command") and f.jitter > 0.25]
-    for f in unsteady:
-        message = f"{f.name}: steps vary by {f.jitter:.0%} of their median: stamps are unsteady or samples are lost"
-        checks.append(Check("timing", CheckResult.WARNING, message, "stamp at the sensor", {"jitter": f.jitter}))
+        # A voltage may rest, and what rests between coarse steps is no interpolated value.
+        resting = f.name == "battery" or f.name == "attitude" and coarse is not None
+        if not f.gaps and rows > 1.5 * f.rate and not resting:
+            between = f"{f.name}: {rows:.3g} rows a second were interpolated between samples at {f.rate:.3g} Hz"
+            warn("timing", between, "log it at this rate, or without the interpolated rows")
+    if gaps := [f for f in facts if f.gaps]:
+        worst = max(gaps, key=lambda f: f.longest_gap)
+        text = f"{', '.join(f'{f.name} {f.gaps}' for f in gaps)}; the longest lasts {worst.longest_gap:.3g} s"
+        fix = "windows are cut there; log to a faster card or at a lower rate"
+        numbers = {"gaps": float(sum(f.gaps for f in facts)), "longest_s": worst.longest_gap}
+        warn("timing", f"gaps: {text} ({worst.name})", fix, **numbers)
     for f in facts:
-        if f.name in IMU and f.stuck > _STUCK or f.stuck > 10.0 * _STUCK and f.name in ("velocity", "position"):
-            message = f"{f.name}: does not change for {f.stuck:.2g} s of flight, or one axis does not ({f.source})"
-            checks.append(
-                Check("stuck", CheckResult.WARNING, message, "check this sensor or topic", {"stuck_s": f.stuck})
-            )
-        if f.name in IMU and f.saturated:
+        if f.name in ("gyro", "accel", "rotor_speed", "motor_command") and f.jitter > 0.25:
+            varies = f"steps vary by {f.jitter:.0%} of their median: stamps are unsteady or samples are lost"
+            warn("timing", f"{f.name}: {varies}", "stamp at the sensor", jitter=f.jitter)
+    for f in facts:
+        imu = f.name in ("gyro", "accel")
+        # Half a second of an IMU, five of an estimate
+        if imu and f.stuck > 0.5 * STUCK or f.name in ("velocity", "position") and f.stuck > 5.0 * STUCK:
+            rests = f"does not change for {f.stuck:.2g} s of flight, or one axis does not ({f.source})"
+            warn("stuck", f"{f.name}: {rests}", "check this sensor or topic", stuck_s=f.stuck)
+        if imu and f.saturated:
             share = f.saturated / f.count
             # Inertias come out 2 % too large where 6 % of the rates are clipped, 8 % at 16 %.
-            verdict = CheckResult.ERROR if f.name == "gyro" and share > 0.05 else CheckResult.WARNING
-            message = f"{f.name}: {f.saturated} samples ({share:.2g} of all) at the limit of its range"
+            verdict = ERROR if f.name == "gyro" and share > 0.05 else WARNING
+            clipped = f"{f.name}: {f.saturated} samples ({share:.2g} of all) at the limit of its range"
             fix = "choose a larger range or fly more gently"
-            checks.append(Check("saturated", verdict, message, fix, {"share": share}))
+            checks.append(Check("saturated", verdict, clipped, fix, {"share": share}))
     return checks
 
 
-def _clock_check(recording: Recording, facts: tuple[ChannelFacts, ...]) -> Check:
+def _clock_check(recording: Recording, facts: Sequence[ChannelFacts]) -> Check:
     dropped: dict[str, int] = {}
     for f in facts:
         for reason, count in f.dropped.items():
             dropped[reason] = dropped.get(reason, 0) + count
-    numbers = {"breaks": float(len(recording.breaks)), **{k: float(v) for k, v in dropped.items()}}
-    if not recording.breaks and not dropped:
-        return Check("clock", CheckResult.OK, "time rises steadily, no sample was dropped", numbers=numbers)
-    parts = [f"{len(recording.breaks)} breaks (reboots or clock steps)"] if recording.breaks else []
+    breaks = len(recording.breaks)
+    numbers = {"breaks": float(breaks), **{k: float(v) for k, v in dropped.items()}}
+    if not breaks and not dropped:
+        return Check("clock", OK, "time rises steadily, no sample was dropped", numbers=numbers)
+    parts = [f"{breaks} breaks (reboots or clock steps)"] if breaks else []
     parts += [f"{count} samples dropped: {reason.replace('_', ' ')}" for reason, count in dropped.items()]
-    return Check(
-        "clock",
-        CheckResult.WARNING,
-        "; ".join(parts),
-        "nothing is joined across breaks" if recording.breaks else "",
-        numbers,
-    )
-
-
-def _quantum(values: FloatArray) -> float:
-    """Step between the levels of a coarse signal, shape (n,), in its unit; 0 where nearly every sample has its own."""
-    levels = np.unique(values)
-    steps = np.diff(levels)[np.diff(levels) > 1e-6]  # equal but for rounding
-    return 0.0 if not len(steps) or len(steps) > 0.2 * len(values) else float(np.min(steps))
-
-
-def _turn_quantum(q: FloatArray) -> float:
-    """Step of rounded quaternions, shape (n, 4), [rad]; 0 for others.
-
-    Their components are to each other as small whole numbers, also where they were made unit again.
-    """
-    q = q[np.all(q != 0.0, axis=1)]
-    q = q[:: len(q) // 500 + 1]
-    if len(q) < FEWEST_SAMPLES:
-        return 0.0
-    largest = np.max(np.abs(q), axis=1)
-    whole = np.arange(1.0, 400.0)
-    ratios = whole[:, None, None] * (q / largest[:, None])
-    found = np.all(np.abs(ratios - np.rint(ratios)) < 1e-4, axis=2)
-    rounded = found.any(axis=0)
-    return float(2.0 * np.median(largest / whole[found.argmax(axis=0)])) if rounded.mean() > 0.9 else 0.0
+    return Check("clock", WARNING, "; ".join(parts), "nothing is joined across breaks" if breaks else "", numbers)
 
 
 def attitude_steps_check(recording: Recording) -> Check | None:
@@ -355,16 +346,25 @@ def attitude_steps_check(recording: Recording) -> Check | None:
     attitude = recording.channels.get("attitude")
     if attitude is None or len(attitude.t) < FEWEST_SAMPLES:
         return None
-    step = max(*(_quantum(c) for c in euler(attitude.values).T), _turn_quantum(attitude.values))
+    step = 0.0
+    for angle in euler(attitude.values).T:
+        levels = np.diff(np.unique(angle))
+        levels = levels[levels > 1e-6]  # equal but for rounding
+        if 0 < len(levels) <= 0.2 * len(angle):  # else nearly every sample has a level of its own
+            step = max(step, float(np.min(levels)))
+    # Components of rounded quaternions are to each other as small whole numbers, also where they were made unit again.
+    q = attitude.values[np.all(attitude.values != 0.0, axis=1)]
+    q = q[:: len(q) // 500 + 1]
+    if len(q) >= FEWEST_SAMPLES:
+        largest, whole = np.max(np.abs(q), axis=1), np.arange(1.0, 400.0)
+        ratios = whole[:, None, None] * (q / largest[:, None])
+        found = np.all(np.abs(ratios - np.rint(ratios)) < 1e-4, axis=2)
+        if found.any(axis=0).mean() > 0.9:
+            step = max(step, float(2.0 * np.median(largest / whole[found.argmax(axis=0)])))
     if step < 0.005:
         return None
-    return Check(
-        "attitude_steps",
-        CheckResult.WARNING,
-        f"attitude comes in steps of {np.degrees(step):.2g} deg ({attitude.source})",
-        "log it with more digits",
-        {"step_rad": step},
-    )
+    message = f"attitude comes in steps of {np.degrees(step):.2g} deg ({attitude.source})"
+    return Check("attitude_steps", WARNING, message, "log it with more digits", {"step_rad": step})
 
 
 # --- Turns by the attitude over those by the gyro, from physics that needs no model of the vehicle
@@ -382,7 +382,7 @@ ERRORS = 2.0
 TURN = 0.2
 """Gyro and attitude are compared over turns of this length [s]."""
 MOVING = 0.1
-"""An axis that turns slower than this on average [rad/s] is not used: gyro noise would make the factor too small."""
+"""An axis that turns slower than this [rad/s] is hardly moved: gyro noise would make a factor too small."""
 FEWEST = 15
 """Turns from which a factor is computed, at least,"""
 KNOWN = 0.05
@@ -425,52 +425,53 @@ class Factor:
         return f"{self.what} = {self.value:.3f} +- {self.sigma:.3f}"
 
 
-class Turns(NamedTuple):
-    """Changes of turn by the gyro (n, 3), of its rate (n, 3), and of turn by the attitude (n, 3), from every row.
+def changes_of_turn(gyro: FloatArray, q: FloatArray, step: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Changes, from every row, of turn by the gyro, of turn by the attitude and of rate, each (n, 3).
 
-    `over` [s] is the length of each turn.
+    Args:
+        gyro: rates [rad/s], (m, 3).
+        q: attitudes (m, 4); rows of NaN, here or there, are left out.
+        step: of the rows [s].
     """
-
-    gyro: FloatArray
-    rate: FloatArray
-    attitude: FloatArray
-    over: float
-
-    @classmethod
-    def of(cls, gyro: FloatArray, q: FloatArray, step: float, over: float = TURN) -> "Turns":
-        """Changes of turn of rates (n, 3) [rad/s] and attitudes (n, 4), `step` [s] apart; rows of NaN are left out."""
-        long = max(round(over / step), 1)
-        # A turn from every row: readings in step with the sticks would put all others at one phase of their motion.
-        starts = np.arange(max(len(gyro) - long, 0))
-        if len(starts) <= long:
-            return cls(none := np.empty((0, 3)), none, none, over)
-        turns = (
-            integrated(np.stack([gyro[k : k + long + 1] for k in starts], axis=1), step),
-            gyro[starts + long] - gyro[starts],
-            turn(q[starts], q[starts + long]),
-        )
-        by_gyro, rate, by_attitude = (t[long:] - t[:-long] for t in turns)
-        good = np.isfinite(by_gyro + rate + by_attitude).all(axis=1)
-        return cls(by_gyro[good], rate[good], by_attitude[good], over)
-
-    def moments(self, axis: int, step: float) -> FloatArray:
-        """Sums of products of (changes of turn by the gyro about x, y, z, of rate, of turn by the attitude), (5, 5)."""
-        rows = np.column_stack([self.gyro, self.rate[:, axis], self.attitude[:, axis]])
-        return rows.T @ rows / max(round(self.over / step), 1)
+    long = max(round(TURN / step), 1)
+    # A turn from every row: readings in step with the sticks would put all others at one phase of their motion.
+    starts = np.arange(max(len(gyro) - long, 0))
+    if len(starts) <= long:
+        return np.empty((0, 3)), np.empty((0, 3)), np.empty((0, 3))
+    turns = (
+        integrated(np.stack([gyro[k : k + long + 1] for k in starts], axis=1), step),
+        turn(q[starts], q[starts + long]),
+        gyro[starts + long] - gyro[starts],
+    )
+    by_gyro, by_attitude, rate = (t[long:] - t[:-long] for t in turns)
+    good = np.isfinite(by_gyro + rate + by_attitude).all(axis=1)
+    return by_gyro[good], by_attitude[good], rate[good]
 
 
-def factors(axis: int, turns: float, moments: FloatArray) -> list[Factor]:
+def turn_moments(changes: Sequence[FloatArray], axis: int, step: float) -> FloatArray:
+    """Sums of products of (changes of turn by the gyro about x, y, z, of rate, of turn by the attitude), (5, 5).
+
+    Args:
+        changes: of `changes_of_turn`, from rows `step` [s] apart.
+        axis: of rate and attitude: 0, 1 or 2.
+    """
+    by_gyro, by_attitude, rate = changes
+    rows = np.column_stack([by_gyro, rate[:, axis], by_attitude[:, axis]])
+    return rows.T @ rows / max(round(TURN / step), 1)
+
+
+def factors(axis: int, seconds: float, moments: FloatArray) -> list[Factor]:
     """Size of the attitude's turns over the gyro's about an axis, then what it has of the gyro's other axes.
 
     Args:
         axis: 0, 1 or 2.
-        turns: in the moments, by the seconds of data over the length of a turn.
-        moments: as of `Turns.moments`, (5, 5).
+        seconds: of data in the moments.
+        moments: as of `turn_moments`, (5, 5).
     """
     gram, cross = moments[:4, :4], moments[:4, 4]
     inverse = np.linalg.pinv(gram, hermitian=True)
     slope = inverse @ cross
-    left = max(float(moments[4, 4] - slope @ cross), 0.0) / (turns - 4.0)
+    left = max(float(moments[4, 4] - slope @ cross), 0.0) / (seconds / TURN - 4.0)
     sigma = np.sqrt(left * np.diag(inverse))
     own = [axis, 3]
     size = math.sqrt(float(slope[own] @ gram[np.ix_(own, own)] @ slope[own]) / gram[axis, axis])

@@ -80,36 +80,31 @@ def hypotheses(vehicle: Vehicle, shares: FloatArray, trim: FloatArray) -> list[H
     """
     rotors = range(len(vehicle.rotors))
     single = [rotor_effect(vehicle, j, float(shares[j]), trim) for j in rotors]
+    odds = {kind: float(np.log(p)) for kind, p in _KINDS.items()}
     out = []
     for count in range(1, min(MOST_ROTORS, len(rotors) - 1) + 1):
         chosen = list(combinations(rotors, count))
-        odds = np.log(_KINDS["weak_rotor"] * _ANOTHER ** (count - 1) / len(chosen))
-        blocks = [np.array([[LOSS**2, LOSS**2], [LOSS**2, LOSS**2 + apart**2]]) for apart, _ in DRAG_APART]
-        priors = [np.kron(np.eye(count), block) for block in blocks]
+        each = odds["weak_rotor"] + (count - 1) * np.log(_ANOTHER) - np.log(len(chosen))
+        centre, positive = np.zeros(2 * count), tuple(range(0, 2 * count, 2))
         for group in chosen:
             effect = np.hstack([single[j] for j in group])
-            positive = tuple(range(0, 2 * count, 2))
-            for prior, (_, part) in zip(priors, DRAG_APART, strict=True):
-                log_odds = float(odds + np.log(part))
-                out.append(Hypothesis("weak_rotor", group, effect, prior, np.zeros(2 * count), positive, log_odds))
-    return [*out, *_of_mass()]
-
-
-def _of_mass() -> Sequence[Hypothesis]:
-    """Added masses of several sizes at a place, a shifted CG, and more effort alone."""
+            for apart, part in DRAG_APART:
+                alike = np.array([[LOSS**2, LOSS**2], [LOSS**2, LOSS**2 + apart**2]])
+                prior = np.asarray(np.kron(np.eye(count), alike), dtype=np.float64)
+                log_odds = float(each + np.log(part))
+                out.append(Hypothesis("weak_rotor", group, effect, prior, centre, positive, log_odds))
+    # Added masses of several sizes at a place, a shifted CG, and more effort alone
     shift = np.array([[0.0, -1.0], [1.0, 0.0], [0.0, 0.0], [0.0, 0.0]])  # per x and y of the CG, in arms
     effort = np.array([[0.0], [0.0], [0.0], [1.0]])
-    odds = {kind: float(np.log(p)) for kind, p in _KINDS.items()}
     weights = np.exp(-0.5 * (np.array(_MASSES) / MASS) ** 2)
-    out = []
     for mass, weight in zip(_MASSES, weights / weights.sum(), strict=True):
         prior = np.diag([(REACH * mass) ** 2, (REACH * mass) ** 2, (_STEP * mass) ** 2])
         centre = np.array([0.0, 0.0, mass])
         log_odds = odds["payload"] + float(np.log(weight))
         out.append(Hypothesis("payload", (), np.hstack([shift, effort]), prior, centre, (), log_odds))
-    none = np.zeros(2)
-    out.append(Hypothesis("cg_offset", (), shift, SHIFT**2 * np.eye(2), none, (), odds["cg_offset"]))
-    out.append(Hypothesis("effort", (), effort, np.array([[MASS**2]]), none[:1], (), odds["effort"]))
+    for kind, effect, size in (("cg_offset", shift, SHIFT), ("effort", effort, MASS)):
+        none = np.zeros(effect.shape[1])
+        out.append(Hypothesis(kind, (), effect, size**2 * np.eye(len(none)), none, (), odds[kind]))
     return out
 
 
@@ -120,22 +115,6 @@ _DRAWS = 8192
 """Healthy flights that are drawn to estimate how rare an evidence of change is among them."""
 LEAST_CHANCE = 1.0 / (_DRAWS + 1)
 """The smallest `p_unchanged`: no drawn flight speaks for a change as much."""
-
-
-class Explained(NamedTuple):
-    """One explanation after the fact.
-
-    Attributes:
-        log_evidence: of the change of trim, with the prior odds.
-        value: posterior mean of the parameters, shape (parameters,).
-        p_value: chance that healthy flights differ so much along this explanation.
-    """
-
-    hypothesis: Hypothesis
-    log_evidence: float
-    value: FloatArray
-    covariance: FloatArray
-    p_value: float
 
 
 def distance(change: FloatArray, deviation: FloatArray, freedom: FloatArray) -> FloatArray:
@@ -159,22 +138,6 @@ def exact(change: FloatArray) -> FloatArray:
     return np.concatenate([change[..., :3], -np.expm1(-change[..., 3:])], axis=-1)
 
 
-class _Fitted(NamedTuple):
-    """Explanations with as many parameters each, of several changes of trim.
-
-    Attributes:
-        log_evidence: with the prior odds, shape (explanations, changes).
-        value: posterior means, shape (explanations, changes, parameters).
-        covariance: posterior covariances of the Gaussian case, shape (explanations, parameters, parameters).
-        scale: what these are multiplied with, shape (explanations, changes).
-    """
-
-    log_evidence: FloatArray
-    value: FloatArray
-    covariance: FloatArray
-    scale: FloatArray
-
-
 def log_student(
     quadratic: FloatArray, log_determinant: FloatArray, freedom: float, dimensions: int = len(AXES)
 ) -> FloatArray:
@@ -182,38 +145,31 @@ def log_student(
     return np.asarray(-0.5 * (freedom + dimensions) * np.log1p(quadratic / freedom) - 0.5 * log_determinant)
 
 
-def _fit(changes: FloatArray, deviation: FloatArray, freedom: float, alike: Sequence[Hypothesis]) -> _Fitted:
-    """Evidence and posterior of explanations with as many parameters each, of changes of shape (changes, 4).
+def _evidence(
+    one: Hypothesis, changes: FloatArray, deviation: FloatArray, freedom: float
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Log evidence of changes (changes, 4) with the prior odds, posterior mean of the parameters, and its covariance.
 
     A change is Student-t with the spread's mean degrees of freedom v and p = 4 dimensions:
-    log t = -(v + p)/2 log(1 + Q/v) - log|S|/2, S = D + A P A', Q = r' S^-1 r with r the
-    change beyond the prior mean's, to a constant.  Parameters that cannot
-    be negative restrict the Gaussian posterior; the restriction's odds (posterior over prior) count.
+    log t = -(v + p)/2 log(1 + Q/v) - log|S|/2, S = D + A P A', Q = r' S^-1 r with r the change beyond the prior
+    mean's, to a constant.  Parameters that cannot be negative restrict the Gaussian posterior; the restriction's odds
+    (posterior over prior) count.
+
+    Returns:
+        Shapes (changes,), (changes, parameters), (changes, parameters, parameters).
     """
-    a, p, centre = (
-        np.stack(part) for part in zip(*((one.effect, one.prior, one.centre) for one in alike), strict=True)
-    )
-    log_odds = np.array([one.log_odds for one in alike])
-    positive = np.array([[k in one.positive for k in range(p.shape[1])] for one in alike])
-    spread = np.diag(deviation**2) + a @ p @ a.transpose(0, 2, 1)
+    spread = np.diag(deviation**2) + one.effect @ one.prior @ one.effect.T
     inverse = np.linalg.inv(spread)
-    gain = inverse @ a @ p
-    beyond = changes - np.einsum("hkj,hj->hk", a, centre)[:, None]
-    value = centre[:, None] + beyond @ gain
-    quadratic = (beyond @ inverse * beyond).sum(axis=-1)
+    gain = inverse @ one.effect @ one.prior
+    beyond = changes - one.effect @ one.centre
+    value = one.centre + beyond @ gain
+    quadratic = (beyond @ inverse * beyond).sum(axis=1)
     scale = (freedom + quadratic) / (freedom + len(AXES))
-    covariance = p - p @ a.transpose(0, 2, 1) @ gain
-    evidence = log_student(quadratic, np.linalg.slogdet(spread)[1][:, None], freedom)
-    deviations = np.sqrt(scale[..., None] * np.diagonal(covariance, axis1=1, axis2=2)[:, None])
-    some = positive.any(axis=0)
-    odds = (log_ndtr((value / deviations)[..., some]) + np.log(2.0)) * positive[:, None, some]
-    return _Fitted(evidence + odds.sum(axis=-1) + log_odds[:, None], value, covariance, scale)
-
-
-def _by_size(offered: Sequence[Hypothesis]) -> list[list[Hypothesis]]:
-    """Explanations with as many parameters each, together."""
-    sizes = sorted({len(one.centre) for one in offered})
-    return [[one for one in offered if len(one.centre) == size] for size in sizes]
+    covariance = scale[:, None, None] * (one.prior - one.prior @ one.effect.T @ gain)
+    evidence = log_student(quadratic, np.linalg.slogdet(spread)[1], freedom) + one.log_odds
+    for k in one.positive:
+        evidence += log_ndtr(value[:, k] / np.sqrt(covariance[:, k, k])) + np.log(2.0)
+    return evidence, value, covariance
 
 
 def _changed_over_unchanged(
@@ -221,10 +177,9 @@ def _changed_over_unchanged(
 ) -> FloatArray:
     """Logarithm of the evidence that something changed over that nothing did, to a constant, shape (changes,)."""
     deviation, freedom = healthy.predictive(flights), float(healthy.freedom.mean())
-    fitted = [_fit(changes, deviation, freedom, alike).log_evidence for alike in _by_size(offered)]
+    changed = np.logaddexp.reduce([_evidence(one, changes, deviation, freedom)[0] for one in offered])
     quadratic, log_determinant = ((changes / deviation) ** 2).sum(axis=1), 2.0 * np.log(deviation).sum()
-    unchanged = log_student(quadratic, log_determinant, freedom)
-    return np.asarray(np.logaddexp.reduce(np.vstack(fitted)) - unchanged)
+    return np.asarray(changed - log_student(quadratic, log_determinant, freedom))
 
 
 def p_unchanged(change: FloatArray, healthy: Healthy, flights: int, vehicle: Vehicle) -> float:
@@ -235,7 +190,9 @@ def p_unchanged(change: FloatArray, healthy: Healthy, flights: int, vehicle: Veh
     points of a Sobol sequence in the predictive distribution of the spread.
     """
     offered = hypotheses(vehicle, healthy.shares, healthy.mean)
-    drawn = _evidence_of_draws(_Question(_bytes(healthy, offered), healthy, flights, tuple(offered)))
+    numbers = [healthy.mean, healthy.deviation, healthy.freedom, healthy.predictive(1), healthy.shares]
+    key = tuple(part.tobytes() for part in (*numbers, *(one.effect for one in offered)))
+    drawn = _evidence_of_draws(_Question(key, healthy, flights, tuple(offered)))
     own = _changed_over_unchanged(exact(change)[None], healthy, flights, offered)
     return float((1 + np.count_nonzero(drawn >= own)) / (len(drawn) + 1))
 
@@ -248,11 +205,6 @@ class _Question:
     healthy: Healthy = field(compare=False)
     flights: int
     offered: tuple[Hypothesis, ...] = field(compare=False)
-
-
-def _bytes(healthy: Healthy, offered: Sequence[Hypothesis]) -> tuple[bytes, ...]:
-    numbers = [healthy.mean, healthy.deviation, healthy.freedom, healthy.predictive(1), healthy.shares]
-    return tuple(part.tobytes() for part in (*numbers, *(one.effect for one in offered)))
 
 
 @lru_cache(maxsize=32)
@@ -271,21 +223,39 @@ def _healthy_points(*freedom: float) -> FloatArray:
     return np.column_stack([stdtrit(v, column) for v, column in zip(freedom, points.T, strict=True)])
 
 
-def _explain(change: FloatArray, healthy: Healthy, flights: int, alike: Sequence[Hypothesis]) -> list[Explained]:
-    """Explanations with as many parameters each, of one change."""
-    deviation, freedom = healthy.predictive(flights), float(healthy.freedom.mean())
-    fitted = _fit(change[None], deviation, freedom, alike)
-    # F test of the part of the change that explanations' free parameters account for, shape (explanations,).
-    z = change / deviation
-    scaled = np.stack([one.effect for one in alike]) / deviation[:, None]
-    basis, sizes, _ = np.linalg.svd(scaled, full_matrices=False)
-    kept = sizes > 1e-9 * sizes[:, :1]
-    part = (np.einsum("hkj,k->hj", basis, z) ** 2 * kept).sum(axis=1)
-    count = kept.sum(axis=1)
-    chances = np.asarray(fdtrc(count, freedom, part / count))
-    value, covariance = fitted.value[:, 0], fitted.scale[:, 0, None, None] * fitted.covariance
-    each = zip(alike, fitted.log_evidence[:, 0].tolist(), value, covariance, chances.tolist(), strict=True)
-    return [Explained(*one) for one in each]
+class Explained(NamedTuple):
+    """One explanation after the fact.
+
+    Attributes:
+        log_evidence: of the change of trim, with the prior odds.
+        value: posterior mean of the parameters, shape (parameters,).
+        p_value: chance that healthy flights differ so much along this explanation.
+    """
+
+    hypothesis: Hypothesis
+    log_evidence: float
+    value: FloatArray
+    covariance: FloatArray
+    p_value: float
+
+    def number(self, k: int, scale: float = 1.0) -> tuple[float, tuple[float, float]]:
+        """A parameter times a scale, and its 95 % interval."""
+        value, half = float(self.value[k]) * scale, Z95 * float(np.sqrt(self.covariance[k, k])) * scale
+        return value, (value - half, value + half)
+
+    def added(self, k: int) -> tuple[float, tuple[float, float]]:
+        """A part of the loaded vehicle's mass as a fraction of the vehicle's without it, with its interval."""
+        value, (low, high) = self.number(k)
+        return value / (1.0 - value), (low / (1.0 - low), high / (1.0 - high))
+
+    @property
+    def names(self) -> tuple[tuple[str, ...], tuple[int, ...]]:
+        """Names of the contract, and the rotors from 1."""
+        kind = self.hypothesis.kind
+        if kind == "effort":
+            return ("thrust_drop" if self.value[0] > 0.0 else "mass_change",), ()  # alike but for the command's kind
+        effects = ("cg_offset", "mass_change") if kind == "payload" else (kind,)
+        return effects, tuple(j + 1 for j in self.hypothesis.rotors)
 
 
 def compare(change: FloatArray, healthy: Healthy, flights: int, offered: Sequence[Hypothesis]) -> list[Explained]:
@@ -293,10 +263,17 @@ def compare(change: FloatArray, healthy: Healthy, flights: int, offered: Sequenc
 
     Those of one kind and rotors count as one, with the best's values.
     """
+    deviation, freedom = healthy.predictive(flights), float(healthy.freedom.mean())
     groups: dict[tuple[str, tuple[int, ...]], list[Explained]] = {}
-    for alike in _by_size(offered):
-        for one in _explain(change, healthy, flights, alike):
-            groups.setdefault((one.hypothesis.kind, one.hypothesis.rotors), []).append(one)
+    for one in offered:
+        evidence, value, covariance = _evidence(one, change[None], deviation, freedom)
+        # F test of the part of the change that the explanation's free parameters account for
+        basis, sizes, _ = np.linalg.svd(one.effect / deviation[:, None], full_matrices=False)
+        kept = sizes > 1e-9 * sizes[0]
+        count, part = int(np.count_nonzero(kept)), float((((change / deviation) @ basis) ** 2 * kept).sum())
+        chance = float(fdtrc(count, freedom, part / max(count, 1)))
+        explained = Explained(one, float(evidence[0]), value[0], covariance[0], chance)
+        groups.setdefault((one.kind, one.rotors), []).append(explained)
     found = []
     for group in groups.values():
         best = max(group, key=lambda one: one.log_evidence)
@@ -333,12 +310,15 @@ class Rival(NamedTuple):
         return {"effect": self.effects[0], **more, **rotors, "p_value": self.p_value, "probability": self.share}
 
 
+Number = tuple[str, str, float, tuple[float, float] | None]
+"""Name, unit, value and 95 % interval of a parameter, or None."""
+
+
 @dataclass(frozen=True)
 class Change:
     """One thing that changed.
 
     Attributes:
-        parameters: (name, unit, value, 95 % interval or None).
         p_value: chance that healthy flights differ so much along this explanation.
         share: probability of the explanations that hold it, among all.
         confident: whether it is certain enough to act on.
@@ -346,7 +326,7 @@ class Change:
     """
 
     effect: str
-    parameters: tuple[tuple[str, str, float, tuple[float, float] | None], ...]
+    parameters: tuple[Number, ...]
     p_value: float
     share: float
     confident: bool
@@ -435,40 +415,22 @@ def assess(flights: Sequence[FlightTrim], baseline: Sequence[FlightTrim], vehicl
     rest = exact(change) - (found[0].hypothesis.effect @ found[0].value if named else 0.0)
     p_rest = p_healthy(rest, deviation, healthy.freedom)
     unexplained = p_rest < 1e-3
-    unfamiliar = _unfamiliar(flights, baseline)
-    lacking = 0 if named or unexplained or unfamiliar else _lacking(change, healthy, len(flights), vehicle)
+    # Flights of a kind that no baseline flight is: they turn much more, where rates are known
+    now, usual = (max(flight.turning for flight in part) for part in (flights, baseline))
+    unfamiliar = ""
+    if now > max(3.0 * usual, 0.3):  # not of NaN
+        unfamiliar = f"these flights turn by {now:.2g} rad/s (rms), the baseline flights by {usual:.2g} rad/s at most"
+    # Baseline flights of the same spread that would make this a change if added, up to `ENOUGH` in all
+    lacking = 0
+    for count in () if named or unexplained or unfamiliar else range(healthy.flights + 1, ENOUGH + 1):
+        if p_unchanged(change, healthy.known_from(count), len(flights), vehicle) < SIGNIFICANT:
+            lacking = count - healthy.flights
+            break
     verdict = "unknown" if unexplained or lacking or unfamiliar else "changed" if named else "unchanged"
     changes = () if unexplained else _changes(found, vehicle, verdict == "changed", not unfamiliar)
-    score = float(np.sqrt((far**2).sum()))
-    return Health(
-        verdict,
-        lacking,
-        changes,
-        score,
-        p_rest if unexplained else p_value,
-        trim,
-        far,
-        healthy,
-        tuple(flights),
-        tuple(baseline),
-        unfamiliar,
-    )
-
-
-def _unfamiliar(flights: Sequence[FlightTrim], baseline: Sequence[FlightTrim]) -> str:
-    """Reason why no baseline flight is of the kind of these flights; empty where one is, or rates are not known."""
-    now, known = (max(flight.turning for flight in part) for part in (flights, baseline))
-    if not now > max(3.0 * known, 0.3):  # also of NaN
-        return ""
-    return f"these flights turn by {now:.2g} rad/s (rms), the baseline flights by {known:.2g} rad/s at most"
-
-
-def _lacking(change: FloatArray, healthy: Healthy, flights: int, vehicle: Vehicle) -> int:
-    """Baseline flights of the same spread that would make this a change if added, up to `ENOUGH` in all; 0: none do."""
-    for count in range(healthy.flights + 1, ENOUGH + 1):
-        if p_unchanged(change, healthy.known_from(count), flights, vehicle) < SIGNIFICANT:
-            return count - healthy.flights
-    return 0
+    score, p_value = float(np.sqrt((far**2).sum())), p_rest if unexplained else p_value
+    known = healthy, tuple(flights), tuple(baseline)
+    return Health(verdict, lacking, changes, score, p_value, trim, far, *known, unfamiliar)
 
 
 def changes_of(
@@ -497,98 +459,53 @@ def _changes(found: Sequence[Explained], vehicle: Vehicle, changed: bool, steady
     shares = np.exp([one.log_evidence - found[0].log_evidence for one in found])
     shares /= shares.sum()
     others = zip(found[1 : _RIVALS + 1], shares[1 : _RIVALS + 1], strict=True)
-    best, lost = found[0], tuple(Rival(*_names(one), one.p_value, float(share)) for one, share in others)
+    best, lost = found[0], tuple(Rival(*one.names, one.p_value, float(share)) for one, share in others)
+    kind, whole = best.hypothesis.kind, float(shares[0])
 
     def held(*rotors: int) -> float:
         """Probability of the explanations that hold one of these rotors."""
         return float(sum(s for e, s in zip(found, shares, strict=True) if {*rotors} & {*e.hypothesis.rotors}))
 
-    if best.hypothesis.kind == "weak_rotor":
+    def change(effect: str, numbers: Sequence[Number], evidence: str, *rivals: Rival, share: float = whole) -> Change:
+        sure = changed and share > _SURE
+        return Change(effect, tuple(numbers), best.p_value, share, sure, (*rivals, *lost), evidence)
+
+    if kind == "weak_rotor":
         out = []
         for k, rotor in enumerate(best.hypothesis.rotors):
-            # The rotor above or below another one; None for none
+            # The rotor above or below this one; none for none
             away = np.linalg.norm(vehicle.rotor_positions[:, :2] - vehicle.rotor_positions[rotor, :2], axis=1)
-            near = [k for k in np.flatnonzero(away < 0.1 * vehicle.arm).tolist() if k != rotor]
-            partner, sure = (int(near[0]) if near else None), held(rotor)
-            if partner is not None and partner not in best.hypothesis.rotors and not (steady and sure > _SURE):
-                out.append(_weak_rotor(best, k, held(rotor, partner), changed, lost, partner))
-            else:
-                out.append(_weak_rotor(best, k, sure, changed, lost))
+            near = [k for k in np.flatnonzero(away < 0.1 * vehicle.arm).tolist() if k != rotor][:1]
+            if set(near) & {*best.hypothesis.rotors} or steady and held(rotor) > _SURE:
+                near = []
+            which = " or ".join(str(j + 1) for j in (rotor, *near))
+            loss, drag = best.number(2 * k), best.number(2 * k + 1)
+            less, dragged = (f"{100.0 * abs(v):.0f} % {'less' if v >= 0.0 else 'more'}" for v, _ in (loss, drag))
+            sentence = f"For the same command rotor {which} produces {less} thrust and {dragged} drag torque"
+            numbers: list[Number] = [
+                ("rotor", "", float(rotor + 1), None),
+                ("loss", "", *loss),
+                ("drag_loss", "", *drag),
+            ]
+            numbers += [("or_rotor", "", float(j + 1), None) for j in near]
+            out.append(change(kind, numbers, f"{sentence} than in the baseline.", share=held(rotor, *near)))
         return tuple(sorted(out, key=lambda c: -abs(c.parameters[1][2])))
-    return _changes_of_mass(best, vehicle, float(shares[0]), changed, lost)
-
-
-def _names(one: Explained) -> tuple[tuple[str, ...], tuple[int, ...]]:
-    """An explanation in names of the contract, and its rotors from 1."""
-    kind = one.hypothesis.kind
     if kind == "effort":
-        return ("thrust_drop" if one.value[0] > 0.0 else "mass_change",), ()  # alike but for the command's kind
-    effects = ("cg_offset", "mass_change") if kind == "payload" else (kind,)
-    return effects, tuple(j + 1 for j in one.hypothesis.rotors)
-
-
-def _interval(one: Explained, k: int, scale: float = 1.0) -> tuple[float, tuple[float, float]]:
-    value, half = float(one.value[k]) * scale, Z95 * float(np.sqrt(one.covariance[k, k])) * scale
-    return value, (value - half, value + half)
-
-
-def _added(one: Explained, k: int) -> tuple[float, tuple[float, float]]:
-    """A part of the loaded vehicle's mass as a fraction of the vehicle's without it, with its interval."""
-    value, (low, high) = _interval(one, k)
-    return value / (1.0 - value), (low / (1.0 - low), high / (1.0 - high))
-
-
-def _weak_rotor(
-    one: Explained, k: int, share: float, changed: bool, lost: tuple[Rival, ...], partner: int | None = None
-) -> Change:
-    rotor = one.hypothesis.rotors[k] + 1
-    loss, loss_ci = _interval(one, 2 * k)
-    drag, drag_ci = _interval(one, 2 * k + 1)
-    which = f"{rotor}" if partner is None else f"{rotor} or {partner + 1}"
-    sentence = (
-        f"For the same command rotor {which} produces {_less(loss)} thrust and {_less(drag)} drag torque than in the "
-        "baseline."
-    )
-    parameters = (
-        ("rotor", "", float(rotor), None),
-        ("loss", "", loss, loss_ci),
-        ("drag_loss", "", drag, drag_ci),
-        *(() if partner is None else (("or_rotor", "", float(partner + 1), None),)),
-    )
-    return Change("weak_rotor", parameters, one.p_value, share, changed and share > _SURE, lost, sentence)
-
-
-def _less(share: float) -> str:
-    """A loss in words: ``22 % less``."""
-    return f"{100.0 * abs(share):.0f} % {'less' if share >= 0.0 else 'more'}"
-
-
-def _changes_of_mass(
-    one: Explained, vehicle: Vehicle, share: float, changed: bool, lost: tuple[Rival, ...]
-) -> tuple[Change, ...]:
-    """A payload as mass_change and cg_offset, a shifted CG, or effort alone."""
-    kind, sure = one.hypothesis.kind, changed and share > _SURE
-
-    def change(effect: str, parameters: Any, sentence: str, rivals: Any = lost) -> Change:
-        return Change(effect, tuple(parameters), one.p_value, share, sure, rivals, sentence)
-
-    if kind == "effort":
-        value, (low, high) = _added(one, 0)
-        more = (
-            f"All rotors together need {100.0 * value:+.1f} % command for the same force, their balance is as it was."
-        )
+        value, interval = best.added(0)
+        command = f"All rotors together need {100.0 * value:+.1f} % command for the same force"
         # Of measured speeds rather a mass; of commands rather the battery, which they do not show.
-        thrust = value > 0.0 and vehicle.command.kind != "rotor_speed"
-        rival = Rival(("mass_change" if thrust else "thrust_drop",), (), one.p_value, share)
-        if thrust:
-            return (change("thrust_drop", [("fraction", "", *_interval(one, 0))], more, (rival, *lost)),)
-        return (change("mass_change", [("fraction", "", value, (low, high))], more, (rival, *lost)),)
-    arm = vehicle.arm
-    place = [(name, "m", *_interval(one, k, arm)) for k, name in enumerate("xy")]
+        effects, number = ("mass_change", "thrust_drop"), (value, interval)
+        if value > 0.0 and vehicle.command.kind != "rotor_speed":
+            effects, number = ("thrust_drop", "mass_change"), best.number(0)
+        rival = Rival(effects[1:], (), best.p_value, whole)
+        text = f"{command}, their balance is as it was."
+        return (change(effects[0], [("fraction", "", *number)], text, rival),)
+    # A shifted CG, alone or with the payload that shifts it
+    place = [(name, "m", *best.number(k, vehicle.arm)) for k, name in enumerate("xy")]
     where = ", ".join(f"{1e3 * p[2]:+.1f} mm along {p[0]}" for p in place)
     shift = change("cg_offset", place, f"The centre of gravity moved by {where}; the yaw trim stayed.")
     if kind == "cg_offset":
         return (shift,)
-    mass, interval = _added(one, 2)
+    mass, interval = best.added(2)
     more = f"The rotors carry {100.0 * mass:.1f} % more, off centre."
     return (change("mass_change", [("fraction", "", mass, interval)], more), shift)

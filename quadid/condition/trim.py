@@ -12,7 +12,8 @@ from quadid.data.rotor_signal import rotor_signal
 from quadid.data.window import Recording, sample_period
 from quadid.errors import NotIdentifiableError
 from quadid.jsonable import jsonable
-from quadid.types import BoolArray, FloatArray, IndexArray
+from quadid.rotation import euler
+from quadid.types import BoolArray, FloatArray
 from quadid.vehicle import GRAVITY, Vehicle
 
 # --- What one flight shows of its trim: how the rotors share the load when nothing is commanded
@@ -92,7 +93,7 @@ def flight_trim(recording: Recording, vehicle: Vehicle) -> FlightTrim:
     rotors = rotor_signal(recording, vehicle)
     spans = [(a + _CLIMB_OUT, b - _CLIMB_OUT) for a, b in flying_spans(recording, vehicle)]
     starts = [np.arange(a, b - BLOCK + 1e-9, BLOCK) for a, b in spans if b - a >= BLOCK]
-    edges = np.concatenate(starts) if starts else np.empty(0)
+    edges = np.concatenate([np.empty(0), *starts])
     load, kept = _block_means(rotors.t, rotors.values**2, edges)
     if kept.sum() < _FEWEST:
         raise NotIdentifiableError(
@@ -102,31 +103,34 @@ def flight_trim(recording: Recording, vehicle: Vehicle) -> FlightTrim:
         )
     edges, load = edges[kept], load[kept]
     force, from_what = _specific_force(recording, edges)
-    total = load.sum(axis=1)
-    trims = trim_of_load(load, force, vehicle)
-    motion, moved = _motion(recording, edges)
-    mean, rest = _at_rest(trims, motion)
-    parts = [mean + rest[places].mean(axis=0) for places in _parts(edges)]
+    trims, (motion, moved) = trim_of_load(load, force, vehicle), _motion(recording, edges)
+    # Each trim regressed on motion with its prior: the trim at rest and what remains
+    noise = np.median(np.abs(trims - np.median(trims, axis=0)), axis=0) / 0.6745 + 1e-6
+    mean, rest = np.empty(len(AXES)), np.empty_like(trims)
+    design = np.column_stack([np.ones(len(motion)), motion])
+    for k, column in enumerate(trims.T):
+        ridge = np.diag([0.0, *[float(noise[k] ** 2)] * motion.shape[1]])
+        solved = np.linalg.solve(design.T @ design + ridge, design.T @ column)
+        mean[k], rest[:, k] = solved[0], column - design @ solved
+    # Parts of the flight: between landings, else thirds
+    places = np.split(np.arange(len(edges)), np.flatnonzero(np.diff(edges) > 2.0 * BLOCK) + 1)
+    places = [part for part in places if len(part) >= 3]
+    places = places if len(places) > 1 else np.array_split(np.arange(len(edges)), 3)
+    turning = math.nan
+    if (gyro := recording.channels.get("gyro")) is not None and len(gyro.t) > 1:
+        rates = moving_mean(gyro.values, max(1, round(_TURN / sample_period(gyro.t))))
+        squares, enough = _block_means(gyro.t, rates**2, edges)
+        turning = float(np.sqrt(squares[enough].sum(axis=1).mean())) if enough.any() else math.nan
     return FlightTrim(
         recording.name,
         mean,
-        np.array(parts),
-        (load / total[:, None]).mean(axis=0),
+        np.array([mean + rest[part].mean(axis=0) for part in places]),
+        (load / load.sum(axis=1)[:, None]).mean(axis=0),
         wander(rest),
         len(edges) * BLOCK,
         f"{rotors.source}; {from_what}; {moved}",
-        _turning(recording, edges),
+        turning,
     )
-
-
-def _turning(recording: Recording, edges: FloatArray) -> float:
-    """Rate of turning in the blocks that begin at `edges`, see `FlightTrim.turning`."""
-    gyro = recording.channels.get("gyro")
-    if gyro is None or len(gyro.t) < 2:
-        return math.nan
-    rates = moving_mean(gyro.values, max(1, round(_TURN / sample_period(gyro.t))))
-    squares, enough = _block_means(gyro.t, rates**2, edges)
-    return float(np.sqrt(squares[enough].sum(axis=1).mean())) if enough.any() else math.nan
 
 
 def wander(rest: FloatArray) -> FloatArray:
@@ -159,55 +163,27 @@ def _specific_force(recording: Recording, edges: FloatArray) -> tuple[FloatArray
 
 
 def _motion(recording: Recording, edges: FloatArray) -> tuple[FloatArray, str]:
-    """Motion that moves a trim beside the vehicle itself, over its prior size: velocity, else what stands for it."""
-    velocity = _velocity(recording, edges)
+    """Motion that moves a trim beside the vehicle itself, over its prior size: velocity, else what stands for it.
+
+    Velocity is the mean of each block [m/s], shape (blocks, 3), turned with the heading where that is known.
+    """
+    known = {name: channel for name, channel in recording.channels.items() if len(channel.t) > 1}
+    position, velocity, attitude = (known.get(name) for name in ("position", "velocity", "attitude"))
     if velocity is not None:
-        return velocity * _AIR_SLOPE, "motion from position or velocity"
-    accel = recording.channels.get("accel")
-    if accel is not None:
-        force, _ = _block_means(accel.t, accel.values[:, :2], edges)
-        return force * _AIR_SLOPE, "motion from in-plane force"
-    return np.empty((len(edges), 0)), "no motion"
-
-
-def _velocity(recording: Recording, edges: FloatArray) -> FloatArray | None:
-    """Mean velocity of each block [m/s], shape (blocks, 3), turned with the heading where it is known; else None."""
-    position, velocity = recording.channels.get("position"), recording.channels.get("velocity")
-    if velocity is not None and len(velocity.t) > 1:
         means, _ = _block_means(velocity.t, velocity.values, edges)
-    elif position is not None and len(position.t) > 1:
+    elif position is not None:
         begin, end = (linear(position.t, position.values, edges + late) for late in (0.0, BLOCK))
         means = (end - begin) / BLOCK
+    elif (accel := recording.channels.get("accel")) is not None:
+        force, _ = _block_means(accel.t, accel.values[:, :2], edges)
+        return force * _AIR_SLOPE, "motion from in-plane force"
     else:
-        return None
-    attitude = recording.channels.get("attitude")
-    if attitude is not None and len(attitude.t) > 1:
-        w, x, y, z = linear(attitude.t, attitude.values, edges + 0.5 * BLOCK).T
-        heading = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+        return np.empty((len(edges), 0)), "no motion"
+    if attitude is not None:
+        heading = euler(linear(attitude.t, attitude.values, edges + 0.5 * BLOCK))[:, 2]
         c, s = np.cos(heading), np.sin(heading)
         means = np.column_stack([c * means[:, 0] + s * means[:, 1], c * means[:, 1] - s * means[:, 0], means[:, 2]])
-    return means
-
-
-def _at_rest(trims: FloatArray, motion: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Regresses trims on motion with its prior; returns the trim at rest (4,) and what remains, shape (blocks, 4)."""
-    noise = np.median(np.abs(trims - np.median(trims, axis=0)), axis=0) / 0.6745 + 1e-6
-    out = np.empty(trims.shape[1])
-    rest = np.empty_like(trims)
-    for k, column in enumerate(trims.T):
-        design = np.column_stack([np.ones(len(motion)), motion])
-        ridge = np.diag([0.0, *[float(noise[k] ** 2)] * motion.shape[1]])
-        solved = np.linalg.solve(design.T @ design + ridge, design.T @ column)
-        out[k], rest[:, k] = solved[0], column - design @ solved
-    return out, rest
-
-
-def _parts(edges: FloatArray) -> Sequence[IndexArray]:
-    """Blocks of each part of a flight: between landings, else thirds."""
-    breaks = np.flatnonzero(np.diff(edges) > 2.0 * BLOCK) + 1
-    parts = np.split(np.arange(len(edges)), breaks)
-    long = [part for part in parts if len(part) >= 3]
-    return long if len(long) > 1 else np.array_split(np.arange(len(edges)), 3)
+    return means * _AIR_SLOPE, "motion from position or velocity"
 
 
 # --- How far healthy flights of one vehicle differ: the yardstick of every change
@@ -221,15 +197,15 @@ PRIOR_FLIGHTS = 4.0
 """Weight of the prior spread, in degrees of freedom."""
 LEAST = np.array([0.005, 0.005, 0.005, 0.01])
 """Smallest prior spread of `AXES`: rotors of healthy vehicles share the load to 1 % each and better never."""
-_GROUPS = ((0, 1), (2,), (3,))
-"""Trims that share a variance."""
+_SHARED = np.array([[0.5, 0.5, 0.0, 0.0], [0.5, 0.5, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
+"""Means over the trims that share a variance."""
 
 
 class Healthy(NamedTuple):
     """Healthy trim and its spread.
 
     Attributes:
-        mean: shape (4,), see `trims.AXES`.
+        mean: shape (4,), see `AXES`.
         deviation: standard deviation between healthy flights, shape (4,).
         freedom: degrees of freedom of each, shape (4,).
         shares: each rotor's share of the load, shape (rotors,).
@@ -250,6 +226,11 @@ class Healthy(NamedTuple):
         return self._replace(flights=flights, freedom=_freedom(flights))
 
 
+def _freedom(flights: int) -> FloatArray:
+    """Degrees of freedom of each trim's variance, shape (4,)."""
+    return np.asarray(PRIOR_FLIGHTS + (flights - 1) / np.diag(_SHARED))
+
+
 def healthy_spread(baseline: Sequence[FlightTrim]) -> Healthy:
     """Mean and spread of healthy flights.
 
@@ -257,27 +238,15 @@ def healthy_spread(baseline: Sequence[FlightTrim]) -> Healthy:
         baseline: one flight or more.
     """
     means = np.array([flight.mean for flight in baseline])
-    centre = means.mean(axis=0)
+    centre, freedom = means.mean(axis=0), _freedom(len(means))
     inner = [flight.parts - flight.parts.mean(axis=0) for flight in baseline]
     parts = sum(float(len(rows) - 1) for rows in inner)
     within = np.sqrt(sum((rows**2).sum(axis=0) for rows in inner) / max(parts, 1.0))
     # Flights differ twice as much as parts of one flight.
-    prior = np.maximum(2.0 * within, LEAST)
-    squares = ((means - centre) ** 2).sum(axis=0)
-    freedom = _freedom(len(means))
-    variance = np.zeros(len(AXES))
-    for group in map(list, _GROUPS):
-        variance[group] = (PRIOR_FLIGHTS * np.mean(prior[group] ** 2) + squares[group].sum()) / freedom[group]
+    prior = _SHARED @ np.maximum(2.0 * within, LEAST) ** 2
+    squares = _SHARED @ ((means - centre) ** 2).sum(axis=0) / np.diag(_SHARED)
     shares = np.mean([flight.shares for flight in baseline], axis=0)
-    return Healthy(centre, np.sqrt(variance), freedom, len(means), shares)
-
-
-def _freedom(flights: int) -> FloatArray:
-    """Degrees of freedom of each trim's variance, shape (4,)."""
-    out = np.zeros(len(AXES))
-    for group in map(list, _GROUPS):
-        out[group] = PRIOR_FLIGHTS + len(group) * (flights - 1)
-    return out
+    return Healthy(centre, np.sqrt((PRIOR_FLIGHTS * prior + squares) / freedom), freedom, len(means), shares)
 
 
 # --- Trims of flights as plain data, for whoever keeps them

@@ -118,11 +118,10 @@ class HealthWatch:
         if self._healthy is None:
             if len(self._trims) > 1:
                 return None
-            n = len(self._vehicle.rotors)
+            none = (math.nan,) * len(self._vehicle.rotors)
             text = f"no baseline: {len(self.history)} of {ENOUGH} healthy flights are known; this flight becomes one"
-            return HealthReport(
-                t, "unknown", False, math.nan, (), (math.nan,) * n, ((math.nan, math.nan),) * n, _NO_MASS, text
-            )
+            ranges = ((math.nan, math.nan),) * len(none)
+            return HealthReport(t, "unknown", False, math.nan, (), none, ranges, _NO_MASS, text)
         return self._judged(t, self._healthy)
 
     def airborne(self, load: FloatArray) -> bool:
@@ -134,15 +133,12 @@ class HealthWatch:
 
     def landed(self) -> FlightTrim | None:
         """Ends a flight; returns its trim where it is healthy and long enough to be kept, and keeps it."""
-        trims, alarmed = np.array(self._trims), self._alarm is not None
-        shares = np.mean(self._shares, axis=0) if self._shares else np.empty(0)
-        self._land()
-        if len(trims) < 30 or alarmed:  # steady seconds that make a flight worth keeping
-            return None
-        mean = trims.mean(axis=0)
-        parts = np.array([part.mean(axis=0) for part in np.array_split(trims, 3)])
-        kept = FlightTrim("", mean, parts, shares, wander(trims), float(len(trims)), "in flight")
-        self.history.append(kept)
+        trims, kept = np.array(self._trims), None
+        if len(trims) >= 30 and self._alarm is None:  # steady seconds that make a flight worth keeping
+            parts = np.array([part.mean(axis=0) for part in np.array_split(trims, 3)])
+            shares = np.mean(self._shares, axis=0)
+            kept = FlightTrim("", trims.mean(axis=0), parts, shares, wander(trims), float(len(trims)), "in flight")
+            self.history.append(kept)
         self._land()
         return kept
 
@@ -169,8 +165,7 @@ class HealthWatch:
         if before >= 10:
             # The yardstick for seconds of the same flight
             mean, freedom = self._before / before, np.full(len(AXES), 10.0 * len(self.history))
-            own = healthy._replace(mean=mean, deviation=self._wander, freedom=freedom, flights=max(before // RECENT, 1))
-            against.append(own)
+            against.append(Healthy(mean, self._wander, freedom, max(before // RECENT, 1), healthy.shares))
         chances = [p_healthy(now - one.mean, one.predictive(1), one.freedom) for one in against]
         worst = int(np.argmin(chances))
         rare = chances[worst] < RARE
@@ -197,10 +192,8 @@ class HealthWatch:
         loss, interval = [0.0] * n, [(0.0, 0.0)] * n
         for one in changes:
             if one.effect == "weak_rotor":
-                numbers = {name: (value, ci) for name, _, value, ci in one.parameters}
-                j = int(numbers["rotor"][0]) - 1
-                loss[j] = numbers["loss"][0]
-                interval[j] = numbers["loss"][1] or (np.nan, np.nan)
+                (_, _, rotor, _), (_, _, value, ci), *_ = one.parameters
+                loss[int(rotor) - 1], interval[int(rotor) - 1] = value, ci or (np.nan, np.nan)
         far = distance(change, against.predictive(1), against.freedom)
         text = " ".join(one.evidence for one in changes) or "as in healthy flights"
         score, mass = float(np.sqrt((far**2).sum())), self._mass(now, changes)

@@ -7,8 +7,22 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from quadid.checks import STAGES, CheckResult, Log
-from quadid.checks.motion import ALLOWED, AXES, FEWEST, MOVING, TURN, TURN_FACTOR, Factor, Turns, factors
+from quadid.checks import LIVE
+from quadid.checks.findings import ERROR
+from quadid.checks.motion import (
+    ALLOWED,
+    AXES,
+    FEWEST,
+    MOVING,
+    STUCK,
+    TURN,
+    TURN_FACTOR,
+    Factor,
+    Log,
+    changes_of_turn,
+    factors,
+    turn_moments,
+)
 from quadid.checks.rotors import better_description, lagged_of, motor_order_check
 from quadid.data.grid import moving_mean
 from quadid.data.window import Window, as_recording, at_limit, copied, true_runs
@@ -77,10 +91,10 @@ class Consistency:
         step, q, self._compared = float(rows.t[1] - rows.t[0]), rows.columns["attitude"], True
         if "gyro" in rows.columns:
             gyro = rows.columns["gyro"]
-            turns = Turns.of(gyro, q, step)
+            changes = changes_of_turn(gyro, q, step)
             moving = np.sqrt(np.mean(gyro[np.isfinite(gyro).all(axis=1)] ** 2, axis=0)) > MOVING
-            for axis in np.flatnonzero(moving).tolist() if len(turns.gyro) else ():
-                self._turns[axis].add(len(turns.gyro) * step, turns.moments(axis, step))
+            for axis in np.flatnonzero(moving).tolist() if len(changes[0]) else ():
+                self._turns[axis].add(len(changes[0]) * step, turn_moments(changes, axis, step))
         if "accel" in rows.columns:
             new = round(seconds / step)
             force = -np.sum(down(q[-new:]) * rows.columns["accel"][-new:], axis=1)
@@ -94,11 +108,10 @@ class Consistency:
             f
             for axis, t in enumerate(self._turns)
             if t.seconds > FEWEST * TURN
-            for f in factors(axis, t.seconds / TURN, t.sum)
+            for f in factors(axis, t.seconds, t.sum)
         ]
         if self._force.seconds > 0.0:
-            # The mean of an acceleration is a change of velocity over a time.
-            # ... which stays within 1.5 m/s.
+            # The mean of an acceleration is a change of velocity, which stays within 1.5 m/s, over a time.
             sigma = math.sqrt(2.0) * 1.5 / self._force.seconds / GRAVITY
             mean = float(self._force.sum) / self._force.seconds / GRAVITY
             found.append(Factor(GRAVITY_FACTOR, mean, sigma))
@@ -127,7 +140,7 @@ class Consistency:
         for axis, told in enumerate(self._turns[:2]):
             turns, leaked = Factor(f"{AXES[axis]} {TURN_FACTOR}", 1.0, math.inf), 0.0
             if told.seconds > FEWEST * TURN:
-                (turns, *leaks), size = factors(axis, told.seconds / TURN, told.sum), np.sqrt(np.diag(told.sum))
+                (turns, *leaks), size = factors(axis, told.seconds, told.sum), np.sqrt(np.diag(told.sum))
                 beyond = [max(abs(f.value) - f.sigma, 0.0) for f in leaks]
                 leaked = float(np.array(beyond) @ np.delete(size[:3], axis) / size[axis])
             what, value, sigma = turns.what, turns.value, turns.sigma
@@ -140,8 +153,6 @@ class Consistency:
 # --- Is this window fit to be learned from?  Stuck, saturated or mis-scaled sensors, and whether the vehicle flies
 
 
-STUCK_SECONDS = 1.0
-"""A sensor that repeats itself to the bit for longer than this [s] is stuck, if the vehicle moves meanwhile."""
 IMPACT = 8.0 * GRAVITY
 """Specific force [m/s^2] that only a crash brings."""
 
@@ -184,7 +195,7 @@ def judge(cut: WindowCut, vehicle: Vehicle, thrust: ThrustModel, known: bool, un
 
 
 def _broken(window: Window) -> str:
-    still = round(STUCK_SECONDS / window.dt)
+    still = round(STUCK / window.dt)
     for name in ("gyro", "accel", "attitude", "rotor_speed"):
         values = getattr(window, name)
         if values is None:
@@ -192,7 +203,7 @@ def _broken(window: Window) -> str:
         here = np.flatnonzero(np.isfinite(values).all(axis=1))
         for first, end in zip(*true_runs(copied(values[here])), strict=True):
             if end - first > still and _moves(window, name, here[first : end + 1]):
-                return f"{name} is stuck: it repeated the same value for more than {STUCK_SECONDS:g} s"
+                return f"{name} is stuck: it repeated the same value for more than {STUCK:g} s"
         if name in ("gyro", "accel") and (ends := at_limit(values[here])):
             return f"{name} axis {'xyz'[ends[0].axis]} is saturated at {ends[0].level:.4g}: widen its range"
     return ""
@@ -235,10 +246,9 @@ def mistake(cut: WindowCut, vehicle: Vehicle, known: bool) -> str:
 def wrong_unit(windows: Sequence[Window]) -> str:
     """Names the wrong unit or frame of windows, and how to mend it; empty for nothing."""
     for window in windows:
-        recording = as_recording([window])
-        log = Log(recording, None, ((window.t0, window.t0 + window.dt * len(window)),), recording)
-        for check in (question.test(log) for stage in STAGES for question in stage if question.live):
-            if check is not None and check.verdict is CheckResult.ERROR:
+        log = Log(as_recording([window]), spans=((window.t0, window.t0 + window.dt * len(window)),))
+        for check in map(log.once, LIVE):
+            if check is not None and check.verdict is ERROR:
                 return f"{check.message}; {check.fix}; on ROS topics FLU and ENU: PX4 has FRD and NED"
     return ""
 
@@ -247,7 +257,7 @@ def _wrong_order(cut: WindowCut, vehicle: Vehicle) -> str:
     rate = min((1.0 / (cut.spacing * window.dt) for window in cut.windows), default=0.0)
     lagged = lagged_of(cut.windows, vehicle, rate)
     check = motor_order_check(lagged, vehicle, better_description(lagged, vehicle))
-    return f"motor order: {check.message}; {check.fix}" if check.verdict is CheckResult.ERROR else ""
+    return f"motor order: {check.message}; {check.fix}" if check.verdict is ERROR else ""
 
 
 def _weight_share(window: Window, vehicle: Vehicle, thrust: ThrustModel) -> FloatArray:

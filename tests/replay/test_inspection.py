@@ -11,7 +11,7 @@ from quadid_replay import open_log
 
 from quadid.checks import Check, CheckResult, Inspection, inspect, proposed_cuts
 from quadid.checks.frames import fit_axes, gyro_check
-from quadid.checks.motion import Spans
+from quadid.checks.motion import Log, Spans
 from quadid.data.window import Channel, Recording
 from quadid.flight import fly
 from quadid.types import FloatArray
@@ -93,7 +93,7 @@ def test_axes_that_hardly_turn_are_not_called_swapped(axis: int) -> None:
     attitude[:, 1:] += 0.002 * rng.standard_normal((len(t), 3))
     attitude /= np.linalg.norm(attitude, axis=1, keepdims=True)
     channels = {"gyro": Channel("gyro", t, gyro), "attitude": Channel("attitude", t, attitude)}
-    found = gyro_check(Recording("roll", "csv", channels))
+    found = gyro_check(Log(Recording("roll", "csv", channels)))
     assert found.verdict is CheckResult.OK, found.message
 
 

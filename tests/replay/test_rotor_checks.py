@@ -13,6 +13,7 @@ from scipy.signal import butter, filtfilt, lfilter
 
 from quadid import simulate
 from quadid.checks import Check, CheckResult, flying_spans, inspect
+from quadid.checks.motion import Log
 from quadid.checks.rotors import gyro_filter_check
 from quadid.data.rotor_signal import rotor_signal
 from quadid.data.window import Channel, Recording, measured_period, sample_period
@@ -220,12 +221,12 @@ def test_a_gyro_behind_a_slow_filter_is_named_where_speeds_are_measured(data_dir
     gyro = recording.channels["gyro"]
     late = np.asarray(lfilter(*butter(2, 2.5, fs=1.0 / sample_period(gyro.t)), gyro.values, axis=0))
     slow = replace(recording, channels={**recording.channels, "gyro": replace(gyro, values=late)})
-    check = gyro_filter_check(slow, vehicle, flying_spans(slow, vehicle))
+    check = gyro_filter_check(Log(slow, vehicle, flying_spans(slow, vehicle)))
     assert check is not None
     assert "low-passed" in check.message
     assert "imu_lag" in check.fix
     modelled = vehicle.model_copy(update={"effects": {"imu_lag": {"cutoff": 2.5}}})
-    assert gyro_filter_check(slow, modelled, flying_spans(slow, modelled)) is None
+    assert gyro_filter_check(Log(slow, modelled, flying_spans(slow, modelled))) is None
 
 
 def test_an_arm_that_no_inertia_fits_is_asked_for(data_dir: Path) -> None:
@@ -343,7 +344,8 @@ def test_the_gyro_filter_is_not_asked_for_without_torque_or_motion(still: str) -
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert (
-            gyro_filter_check(replace(recording, channels={**recording.channels, still: held}), vehicle, spans) is None
+            gyro_filter_check(Log(replace(recording, channels={**recording.channels, still: held}), vehicle, spans))
+            is None
         )
 
 
