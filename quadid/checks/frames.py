@@ -28,7 +28,7 @@ from quadid.data.window import Channel, fresh_rows, measured_period, sample_peri
 from quadid.effects import butterworth_delay
 from quadid.rotation import conjugate, euler, rotated, turn
 from quadid.types import BoolArray, FloatArray
-from quadid.vehicle import GRAVITY, Vehicle
+from quadid.vehicle import GRAVITY
 
 # --- Units and frames, tested by physics: gravity, gyro against attitude, velocity against attitude and accelerometer
 
@@ -37,26 +37,18 @@ _CLEAR = 0.5
 """R^2 above which a relation between two channels is believed."""
 _MOTION = 0.03
 """Rotation rate [rad/s] an axis must have, as standard deviation, to be checked."""
-_STEP, _MOST_ROWS = 0.1, 100
-"""Attitudes are compared over steps of at least this [s]: noise and repeated readings matter little then.  Steps of
-more rows are in another unit of time: no attitude comes at more than 1 kHz."""
+_STEP = 0.1
+"""Attitudes are compared over steps of at least this [s]: noise and repeated readings matter little then."""
 _UNIT = 1.5
 """Two channels of one motion whose sizes are farther apart are of no use together."""
 _JUMP = 8.0
 """An attitude step of so many times the usual one, beside half as much of the gyro's, is no motion."""
-_FEW = 0.05
-"""Share of steps in which an estimator may reset its heading."""
-_FARTHEST, _LATE, _TOO_LATE = 0.3, 0.013, 0.08
-"""Gyro and attitude are compared at times so far apart at most [s]; more than the second is named, for an autopilot's
-own filter at 20 Hz makes 12 ms, more than the third an error."""
-_BANDS = np.geomspace(0.4, 23.0, 11)
-"""Edges of bands of frequency [Hz] in which they are compared."""
-_SURE = 0.8
-"""Least coherence of a band that shows a delay; less is motion beside errors of the attitude that have a memory."""
+_LATE, _TOO_LATE = 0.013, 0.08
+"""Time between gyro and attitude [s] that is named, for filters of autopilots at 20 Hz make 12 ms; and an error."""
 _SMOOTHED = 0.8
 """Share that a smoothed gyro reads at most, somewhere, of what it reads of slow turning."""
-_TILT, _PARTS = np.radians(4.0), 5
-"""Least angle [rad] between gyro and attitude that is reported; also as many times its error as there are parts."""
+_PARTS = 5
+"""Parts of a log that show an error of its rates alike."""
 _AXES = ("x", "y", "z")
 _gravity = partial(Check, "gravity")
 _rates_are = partial(Check, "gyro_attitude")
@@ -291,12 +283,12 @@ def _moving_rates(gyro: Channel, t: FloatArray, q: FloatArray) -> Rates:
     steps separate them: motion = (4 var(2 step) - var(step)) / 3.
     """
     stride = max(1, round(_STEP / sample_period(t)))
-    if stride > _MOST_ROWS:  # times in minutes or hours
+    if stride > 100:  # no attitude comes at more than 1 kHz: times in minutes or hours
         stride = len(t) // (3 * FEWEST_SAMPLES) + 1
     rates = _rates(gyro, t[::stride], q[::stride])
     kept = _without_jumps(*rates)
-    # Resets are few: where more rows differ, gyro and attitude do not agree.
-    measured, derived = kept if len(kept[0]) > (1.0 - _FEW) * len(rates[0]) else rates
+    # Resets are few, a twentieth of the steps: where more rows differ, gyro and attitude do not agree.
+    measured, derived = kept if len(kept[0]) > 0.95 * len(rates[0]) else rates
     longer = _without_jumps(*_rates(gyro, t[:: 2 * stride], q[:: 2 * stride]))[1]
     if len(longer) < FEWEST_SAMPLES:
         return longer[:0], longer[:0]
@@ -304,7 +296,7 @@ def _moving_rates(gyro: Channel, t: FloatArray, q: FloatArray) -> Rates:
     variances = []
     for turned in (derived, longer):
         size = np.linalg.norm(turned - np.median(turned, axis=0), axis=1)
-        variances.append(np.var(turned[size <= np.quantile(size, 1.0 - _FEW)], axis=0))
+        variances.append(np.var(turned[size <= np.quantile(size, 0.95)], axis=0))
     total, twice = variances
     motion = np.maximum((4.0 * twice - total) / 3.0, 0.0)
     if max(np.max(np.sqrt(motion)), np.max(np.std(measured, axis=0))) < _MOTION:
@@ -437,7 +429,8 @@ def _tilted(rows: Rates) -> Check | None:
     (m, angles), error = turning(*rows), np.linalg.norm(np.std(parts, axis=0)) / np.sqrt(_PARTS)
     size = float(np.linalg.norm(angles))
     # Where each axis goes with its own, noise turns more.
-    if not max(_TILT, _PARTS * float(error)) <= size < 0.5 * np.pi:
+    tilt = math.radians(4.0)
+    if not max(tilt, _PARTS * float(error)) <= size < 0.5 * np.pi:
         return None
     # What an axis reads of the others' acceleration is no answer to its torque.
     read = np.diff(rows[0], axis=0)
@@ -447,7 +440,7 @@ def _tilted(rows: Rates) -> Check | None:
     rotation = ", ".join(f"{angle:.3f}" for angle in angles)
     fix = f"mounting: {{rotation: [{rotation}]}} in the vehicle file, or correct the attitude"
     off = estimates_off(turning=sizes.tolist()) if sizes.min() > 0.0 else {}
-    return _rates_are(ERROR if size > 2.0 * _TILT else WARNING, message, fix, {"angle_rad": size}, off)
+    return _rates_are(ERROR if size > 2.0 * tilt else WARNING, message, fix, {"angle_rad": size}, off)
 
 
 def _judge_rates(gyro: Channel, attitude: Channel, reading: str, fit: AxisMap, smoothed: bool) -> Check:
@@ -531,7 +524,7 @@ def response(gyro: Channel, attitude: Channel) -> Response | None:
     step = max(0.01, sample_period(attitude.t))
     slowest = max(step, measured_period(gyro.t, gyro.values))
     rows = round(float(np.clip(np.ptp(attitude.t) / 6.0, 1.0, 2.0)) / step)
-    hz, lags = np.fft.rfftfreq(rows, step)[1:], np.arange(-_FARTHEST, _FARTHEST + 1e-9, 0.005)
+    hz, lags = np.fft.rfftfreq(rows, step)[1:], np.arange(-0.3, 0.3 + 1e-9, 0.005)
     late = 0.0
     for first in (True, False):  # once more where both agree best: else parts hold different ends of the motion
         shifted = Channel("gyro", gyro.t - late, gyro.values)
@@ -548,13 +541,13 @@ def response(gyro: Channel, attitude: Channel) -> Response | None:
         agree = np.real(np.exp(-2j * np.pi * np.outer(lags, hz)) @ cross)
         late += float(lags[np.argmax(agree)]) if first else 0.0
     # Sums over bands that both can hold: phase, the gyro's share and its relative error, and coherence.
-    place = np.digitize(hz, _BANDS) * (hz < 0.4 / slowest)
-    bands = [place == k for k in np.unique(place) if 0 < k < len(_BANDS)]
+    place = np.digitize(hz, np.geomspace(0.4, 23.0, 11)) * (hz < 0.4 / slowest)
+    bands = [place == k for k in np.unique(place) if 0 < k < 11]
     both, own, its, hz = (np.array([np.sum(x[k]) for k in bands]) for x in (cross, power, beside, hz * abs(cross)))
     hz, coherence = hz / (abs(both) + 1e-300), abs(both) ** 2 / (own * its + 1e-300) + 1e-12
     samples = [0.7 * len(spectra) * np.count_nonzero(k) for k in bands]
     error = np.sqrt(np.maximum(1.0 - coherence, 0.0) / (2.0 * coherence) / samples)
-    clear = coherence > _SURE
+    clear = coherence > 0.8  # less is motion beside errors of the attitude that have a memory
     if np.count_nonzero(clear) < 2:
         return None
     # Time by the phases, weighted by their errors, of half a millisecond at least; what scatters more is less sure.
@@ -605,7 +598,7 @@ def gyro_source_check(log: Log) -> Check | None:
     missed = (read[:-1] - rates, read[1:] - rates, read[1:-1] - 0.5 * (rates[1:] + rates[:-1]))
     least = min(map(middle, missed))
     if least >= 0.05 * bends:
-        return _filtered(log.once(response_of), log.described)
+        return _filtered(log)
     noisy = bends > 0.5 * middle(rates)
     message = "gyro is the attitude, differentiated: it measures nothing by itself" + ", and is mostly noise" * noisy
     fix = "log the gyro; noise and delay of the attitude are in both"
@@ -613,11 +606,11 @@ def gyro_source_check(log: Log) -> Check | None:
     return Check("gyro_source", ERROR if noisy else WARNING, message, fix, numbers)
 
 
-def _filtered(found: Response | None, vehicle: Vehicle | None) -> Check | None:
+def _filtered(log: Log) -> Check | None:
     """A warning where gyro or attitude are late beyond the vehicle's effects, or the gyro misses quick turning."""
-    if found is None:
+    if (found := log.once(response_of)) is None:
         return None
-    known: Mapping[str, Mapping[str, float]] = {} if vehicle is None else vehicle.effects
+    known: Mapping[str, Mapping[str, float]] = {} if log.described is None else log.described.effects
     lag = known.get("imu_lag", {}).get("cutoff", math.inf)
     late = found.late - butterworth_delay(lag) + known.get("attitude_delay", {}).get("delay", 0.0)
     smoothed = found.left < _SMOOTHED and "imu_lag" not in known
@@ -734,12 +727,8 @@ def running_integral(channel: Channel, at: FloatArray) -> FloatArray:
     return linear(channel.t, total, at)
 
 
-_STRETCH = 1.0
-"""Changes of position are compared over this [s]: slow enough for delays and low-passes of either not to count."""
 _SAME = 0.98
-"""Correlation above which two changes are the same motion, seen by two channels."""
-_LEAST_MOTION = 0.1
-"""Change of position [m], as standard deviation, below which its noise may decide."""
+"""Correlation above which two changes of position are the same motion, seen by two channels."""
 
 
 def position_check(log: Log) -> Check | None:
@@ -751,9 +740,10 @@ def position_check(log: Log) -> Check | None:
     position, velocity = (channels.get(name) for name in ("position", "velocity"))
     if position is None or velocity is None or min(len(position.t), len(velocity.t)) < FEWEST_SAMPLES:
         return None
-    # Changes of position and integrals of velocity over overlapping stretches, both (m, 3), and independent ones
+    # Changes of position and integrals of velocity, both (m, 3), over overlapping stretches of a second, which is slow
+    # enough for delays and low-passes of either not to count; and the number of independent ones
     period = sample_period(position.t)
-    steps, every = max(round(_STRETCH / period), 1), max(round(0.1 * _STRETCH / period), 1)
+    steps, every = max(round(1.0 / period), 1), max(round(0.1 / period), 1)
     broken = np.concatenate([[0], np.cumsum(~usable_steps(position.t, velocity.t))])
     start = np.arange(0, len(position.t) - steps, every)
     start = start[broken[start + steps] == broken[start]]
@@ -765,7 +755,8 @@ def position_check(log: Log) -> Check | None:
         return _position_is(UNKNOWN, "too few stretches without a gap to compare")
     fit = fit_axes(moved, flown)
     turned = fit.axes != (0, 1, 2) or min(fit.signs[:2]) < 0
-    if np.max(np.std(moved[:, :2], axis=0)) > _LEAST_MOTION and fit.r2 > _SAME**2 and turned:
+    least = 0.1  # [m], as standard deviation; below, noise of the position may decide
+    if np.max(np.std(moved[:, :2], axis=0)) > least and fit.r2 > _SAME**2 and turned:
         message = f"world axes of velocity differ from those of position: {fit} (R^2 {fit.r2:.2f})"
         return _position_is(WARNING, message, "use NED for both; ROS' ENU swaps x and y", {"r2": fit.r2})
     numbers: dict[str, float] = {}
@@ -776,11 +767,11 @@ def position_check(log: Log) -> Check | None:
         p, v = (x[:, axes] - x[:, axes].mean(axis=0) for x in (moved, flown))
         correlation = float(np.sum(p * v) / np.sqrt(max(np.sum(p * p) * np.sum(v * v), 1e-300)))
         motion = np.max(np.std(p, axis=0))
-        if where == "vertically" and motion > 0.2 * _LEAST_MOTION and correlation < -0.8:
+        if where == "vertically" and motion > 0.2 * least and correlation < -0.8:
             message = f"position rises where velocity falls (correlation {correlation:.2f}): one of them points up"
             fix = "negate z or vz: the world is NED, its z down"
             return _position_is(ERROR, message, fix, {"correlation": correlation})
-        if motion < _LEAST_MOTION or correlation < _SAME:
+        if motion < least or correlation < _SAME:
             continue
         # Both have errors: the ratio of their sizes, not a regression of one on the other.
         scale = float(np.sqrt(np.sum(v * v) / np.sum(p * p)))

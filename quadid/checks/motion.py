@@ -51,6 +51,12 @@ class Log:
         """Rotor speeds; raises QuadidError where the log has none of this vehicle."""
         return rotor_signal(self.recording, self.vehicle)
 
+    @property
+    def commanded(self) -> bool:
+        """True where the rotor signal is one of commands."""
+        channel, _ = rotor_channel(self.recording, self.vehicle)
+        return channel is not None and channel.name == "motor_command"
+
     def channels(self, *names: str, least: int = FEWEST_SAMPLES) -> tuple[Channel, ...] | None:
         """Channels of these names; None where one is absent or has fewer samples than `least`."""
         found = [self.recording.channels.get(name) for name in names]
@@ -72,10 +78,6 @@ HOPELESS = 16.0
 """A thrust coefficient that is wrong by more does not show the weight."""
 _SHORTEST = 1.0
 """Shorter spans are none [s]."""
-_GROUND = 3.0
-"""Rotors that carry nothing for longer than this [s] stand on the ground; a log with more of it is worth trimming."""
-_MARGIN = 2.0
-"""Left out after take-off and before landing [s]: feet, ground and the air above it push, too."""
 
 
 def flying_spans(recording: Recording, vehicle: Vehicle | None) -> Spans:
@@ -147,6 +149,8 @@ def _joined(spans: Sequence[tuple[float, float]], most: float) -> list[tuple[flo
 def proposed_cuts(spans: Spans, first: float, last: float) -> Spans:
     """Flights of 5 s or more without take-off and landing [s after `first`, to a tenth]; none where little else is.
 
+    Left out are 2 s at either end: feet, ground and the air above it push, too.
+
     Args:
         spans: when it flies [s].
         first: sample that is used when nothing is cut [s].
@@ -156,16 +160,17 @@ def proposed_cuts(spans: Spans, first: float, last: float) -> Spans:
     def trimmed(flights: Sequence[tuple[float, float]]) -> Spans:
         """Flights without the time next to the ground."""
         cuts = [
-            (0.0 if a - first < _MARGIN else a + _MARGIN - first, (b if last - b < _MARGIN else b - _MARGIN) - first)
+            (0.0 if a - first < 2.0 else a + 2.0 - first, (b if last - b < 2.0 else b - 2.0) - first)
             for a, b in flights
         ]
         return tuple((round(a, 1), round(b, 1)) for a, b in cuts if b - a >= 5.0)
 
-    flights, joined = _joined(spans, _SHORTEST), _joined(spans, _GROUND)
+    # Rotors that carry nothing for longer than 3 s stand on the ground; a log with more of it is worth trimming.
+    flights, joined = _joined(spans, _SHORTEST), _joined(spans, 3.0)
     apart, whole = trimmed(flights), sum(b - a for a, b in joined)
     if len(flights) > len(joined) and sum(b - a for a, b in apart) > 0.7 * whole:
         return apart  # between them it stood somewhere
-    return () if last - first - whole < _GROUND else trimmed(joined)
+    return () if last - first - whole < 3.0 else trimmed(joined)
 
 
 def within(t: FloatArray, spans: Spans) -> BoolArray:
@@ -377,16 +382,12 @@ def attitude_steps_check(recording: Recording) -> Check | None:
 
 ALLOWED = 0.03
 """Calibrated sensors differ by less than this share."""
-ERRORS = 2.0
-"""... and these many standard deviations, when they are compared."""
 TURN = 0.2
 """Gyro and attitude are compared over turns of this length [s]."""
 MOVING = 0.1
 """An axis that turns slower than this [rad/s] is hardly moved: gyro noise would make a factor too small."""
 FEWEST = 15
-"""Turns from which a factor is computed, at least,"""
-KNOWN = 0.05
-"""... and the standard deviation from which on it is used: noise makes a ratio of small turns too large."""
+"""Turns from which a factor is computed, at least."""
 AXES = ("roll", "pitch", "yaw")
 TURN_FACTOR = "turn by the attitude over that by the gyro"
 
@@ -408,8 +409,8 @@ class Factor:
 
     @property
     def known(self) -> bool:
-        """True if it is known well enough to be compared."""
-        return self.sigma <= KNOWN
+        """True if it is known well enough to be compared: noise makes a ratio of small turns too large."""
+        return self.sigma <= 0.05
 
     @property
     def off(self) -> float:
@@ -418,8 +419,8 @@ class Factor:
 
     @property
     def disagrees(self) -> bool:
-        """True if it is known, and cannot be what it ought to be."""
-        return self.known and abs(self.off) > ALLOWED + ERRORS * self.sigma
+        """True if it is known, and cannot be what it ought to be, within two standard deviations."""
+        return self.known and abs(self.off) > ALLOWED + 2.0 * self.sigma
 
     def __str__(self) -> str:
         return f"{self.what} = {self.value:.3f} +- {self.sigma:.3f}"

@@ -14,7 +14,7 @@ from quadid.checks.frames import tapered_spectra
 from quadid.checks.motion import HOPELESS, MOVING, STUCK, Log, Spans, is_turning, within
 from quadid.chi_square import exceeded
 from quadid.data.grid import bridged, linear, moving_mean, to_windows
-from quadid.data.rotor_signal import INERTIA_RATE, RotorSignal, rotor_channel
+from quadid.data.rotor_signal import INERTIA_RATE, RotorSignal
 from quadid.data.window import Channel, Recording, Window, measured_period, sample_period, true_runs
 from quadid.errors import QuadidError
 from quadid.model.layout import ThrustModel, voltage_at
@@ -38,7 +38,7 @@ def readings_check(log: Log) -> Check | None:
     t, speeds = signal.t[inside], signal.values[inside]
     if len(t) < 20:
         return None
-    commands, gyro = _commanded(log), log.recording.channels.get("gyro")
+    commands, gyro = log.commanded, log.recording.channels.get("gyro")
 
     def error(message: str, fix: str = "", **numbers: float) -> Check:
         fix = fix or ("check which outputs drive the motors, and that all of them were logged" if commands else _FIX)
@@ -99,23 +99,14 @@ def readings_check(log: Log) -> Check | None:
     return None
 
 
-def _commanded(log: Log) -> bool:
-    channel, _ = rotor_channel(log.recording, log.vehicle)
-    return channel is not None and channel.name == "motor_command"
-
-
 # --- Rotors against each other and against the thrust felt: half a second without balance turns a vehicle over
-
-
-_BIN = 0.5
-"""Means over this long [s] are compared: fast motion has passed by then."""
-_COMMANDED = "these are commands: a damaged rotor is driven harder, which `quadid health` measures; or they mean thrust"
 
 
 def rotor_speed_check(log: Log) -> Check:
     """Each rotor against the others and all against the thrust felt; the first that cannot be true is named."""
     signal, spans, accel = log.signal, log.spans, log.recording.channels.get("accel")
-    edges = np.arange(spans[0][0], spans[-1][1] + 0.5 * _BIN, _BIN) if spans else np.empty(0)
+    # Means over half a second are compared: fast motion has passed by then.
+    edges = np.arange(spans[0][0], spans[-1][1] + 0.25, 0.5) if spans else np.empty(0)
     if len(edges) < 4 or np.count_nonzero(within(signal.t, spans)) < 20:
         return _speeds_are(UNKNOWN, "too little flight to compare the rotors")
     flown = np.any([(edges[:-1] >= a) & (edges[1:] <= b) for a, b in spans], axis=0)
@@ -128,7 +119,8 @@ def rotor_speed_check(log: Log) -> Check:
         return np.column_stack(sums) / np.maximum(count, 1)[:, None], np.asarray(flown & (count > 2))
 
     def wrong(message: str, **numbers: float) -> Check:
-        verdict, fix = (WARNING, _COMMANDED) if _commanded(log) else (ERROR, _FIX)
+        driven = "a damaged rotor is driven harder, which `quadid health` measures; or they mean thrust"
+        verdict, fix = (WARNING, f"these are commands: {driven}") if log.commanded else (ERROR, _FIX)
         return _speeds_are(verdict, f"{message} ({signal.source})", fix, numbers)
 
     # Mean roll and pitch moment of the rotors; yaw is left free, for a vehicle may turn for long.  Of one hovering
@@ -143,43 +135,38 @@ def rotor_speed_check(log: Log) -> Check:
         found = _misread(np.median(share[odd], axis=0), lever)
         if found is None:
             return wrong("the rotor speeds are far from balance", share=part)
-        text = f"rotor {found.rotor + 1} reads {found.ratio:.2f} times the speed that balance needs for {part:.0%} of "
-        return wrong(f"{text}the flight", rotor=found.rotor + 1.0, speed_ratio=found.ratio, share=part)
+        _, rotor, ratio = found
+        text = f"rotor {rotor + 1} reads {ratio:.2f} times the speed that balance needs for {part:.0%} of the flight"
+        return wrong(text, rotor=rotor + 1.0, speed_ratio=ratio, share=part)
     # Thrust felt over squared speeds: a payload of half the weight changes it by 1.5.
     if accel is not None:
         force, felt = means(accel.t, -accel.values[:, 2:])
         used = known & felt & (total > 0.0)
         low, high = np.quantile(force[used, 0] / total[used], [0.1, 0.9]) if used.any() else (1.0, 1.0)
         if np.count_nonzero(used) >= 10 and not (low > 0.0 and high < 1.8 * low):
-            ratio = float(high / low) if low > 0.0 else float("inf")
-            text = f"thrust felt per rotor speed squared changes by a factor of {ratio:.2g} within the flight"
-            return wrong(f"{text}: the rotor speeds disagree with the accelerometer", thrust_range=ratio)
+            change = float(high / low) if low > 0.0 else math.inf
+            text = f"thrust felt per rotor speed squared changes by a factor of {change:.2g} within the flight"
+            return wrong(f"{text}: the rotor speeds disagree with the accelerometer", thrust_range=change)
     return _speeds_are(OK, "the rotors agree with each other and with the thrust felt")
 
 
-class _Odd(NamedTuple):
-    """Remaining difference of the rotors' shares from each other and from balance, once one rotor is corrected.
-
-    With that rotor (from 0) and its number as believed over that which balance needs.
-    """
-
-    misfit: float
-    rotor: int
-    ratio: float
+Odd = tuple[float, int, float]
+"""Remaining difference of the rotors' shares from each other and from balance, once one rotor is corrected; that rotor
+(from 0), and its number as believed over that which balance needs."""
 
 
 def _misfit(share: FloatArray, lever: FloatArray) -> float:
     return float(np.hypot(np.std(share), np.linalg.norm(share @ lever)) / np.mean(share))
 
 
-def _misread(share: FloatArray, lever: FloatArray) -> _Odd | None:
+def _misread(share: FloatArray, lever: FloatArray) -> Odd | None:
     """The rotor whose square, set to what balance needs, leaves the least, and its speed over that."""
     fits = []
     for rotor, arm in enumerate(lever):
         needed = share.copy()
         needed[rotor] -= float(share @ lever @ arm / (arm @ arm))
         if needed[rotor] > 0.0:
-            fits.append(_Odd(_misfit(needed, lever), rotor, float(np.sqrt(share[rotor] / needed[rotor]))))
+            fits.append((_misfit(needed, lever), rotor, float(np.sqrt(share[rotor] / needed[rotor]))))
     return min(fits, default=None)
 
 
@@ -205,26 +192,21 @@ def balance_check(log: Log) -> Check | None:
         needed = 1.0 - float(share @ lever @ arm / (share[rotor] * (arm @ arm)))
         if needed > 0.0:
             scale = np.where(np.arange(len(lever)) == rotor, needed, 1.0)[:, None]
-            fits.append(_Odd(_misfit(share, lever * scale), rotor, 1.0 / needed))
+            fits.append((_misfit(share, lever * scale), rotor, 1.0 / needed))
     if placed := [odd for odd in sorted(fits) if odd < read]:
-        farther = " or ".join(f"{odd.rotor + 1} stood {1.0 / odd.ratio:.2f}" for odd in placed)
-        message = (
-            f"{here} {farther} times as far from it as in the vehicle file: then inertias are wrong, else the centre "
-            "of gravity is there"
-        )
-        numbers = {"off": off, "rotor": placed[0].rotor + 1.0, "arm_ratio": placed[0].ratio}
-        places = {odd.rotor: vehicle.rotor_positions[odd.rotor, :2] / odd.ratio for odd in placed}
-        moved = [_described(vehicle, {rotor: place}) for rotor, place in places.items()]
+        farther = " or ".join(f"{rotor + 1} stood {1.0 / ratio:.2f}" for _, rotor, ratio in placed)
+        message = f"{here} {farther} times as far from it as in the vehicle file: then inertias are wrong"
+        moved = [_described(vehicle, {k: vehicle.rotor_positions[k, :2] / ratio}) for _, k, ratio in placed]
         doubt = farthest([rotors_off(vehicle, speeds, speeds, other) for other in moved])
-        return check(message, "measure where that rotor is, and where the vehicle balances", numbers, doubt)
-    message = (
-        f"{here} {read.rotor + 1} read {read.ratio:.2f} times its speed: then b and inertias are wrong, else the "
-        "centre of gravity is there"
-    )
+        numbers = {"off": off, "rotor": placed[0][1] + 1.0, "arm_ratio": placed[0][2]}
+        fix = "measure where that rotor is, and where the vehicle balances"
+        return check(f"{message}, else the centre of gravity is there", fix, numbers, doubt)
+    _, rotor, ratio = read
+    message = f"{here} {rotor + 1} read {ratio:.2f} times its speed: then b and inertias are wrong"
     fix = "check that rotor's reading, propeller and place in the vehicle file, and where the vehicle balances"
-    numbers = {"off": off, "rotor": read.rotor + 1.0, "speed_ratio": read.ratio}
-    true = speeds / np.where(np.arange(len(lever)) == read.rotor, read.ratio, 1.0)
-    return check(message, fix, numbers, rotors_off(vehicle, speeds, true))
+    doubt = rotors_off(vehicle, speeds, speeds / np.where(np.arange(len(lever)) == rotor, ratio, 1.0))
+    numbers = {"off": off, "rotor": rotor + 1.0, "speed_ratio": ratio}
+    return check(f"{message}, else the centre of gravity is there", fix, numbers, doubt)
 
 
 # --- Whether the rotor signal stands in one place in time before the motion that it causes
@@ -237,14 +219,10 @@ _STEP = 0.01
 """Lags are compared at multiples of this [s]; the peak is found between them."""
 _FARTHEST = 25
 _BLOCK = 7.5
-_QUIET = 0.1
-"""A block with less than this share of the motion of the liveliest is a hover: what disturbs it has lags of its own."""
 _CLEAR = 0.3
 """Correlation above which the peak of a block counts."""
-_ABOUT = -0.45, 0.45, -0.9, 0.9, -1.35, 1.35, -1.8, 1.8
-"""Lags [s] about which peaks are looked for where none is clear near 0."""
-_LATE, _TOO_LATE = 0.015, 0.025
-"""Torque after its effect [s] that is named, and that is refused."""
+_LATE = 0.015
+"""Torque after its effect [s] that is named; 10 ms more is refused."""
 _SLOW_MOTION = 0.4
 """Motion slower than about 1/0.4 s is left out: there aerodynamics and the controller rule [s]."""
 
@@ -256,12 +234,6 @@ class _Placed(NamedTuple):
     clear: BoolArray
     lively: int
     correlation: float
-
-    @property
-    def sure(self) -> bool:
-        """True where most lags are clear and one: no chance places them so."""
-        own = self.lags[self.clear]
-        return self.correlation > 0.7 and 2 * len(own) > self.lively > 1 and bool(np.ptp(own) < 2.0 * _LATE)
 
 
 def rotor_timing_check(log: Log) -> Check:
@@ -275,20 +247,23 @@ def rotor_timing_check(log: Log) -> Check:
     found = _placed(log, gyro, slowest, 0.0)
     if found is None:
         return check(UNKNOWN, "too little flight to place the rotor signal in time")
-    if found.correlation < 0.5:  # a clock of its own may be seconds off
-        far = (_placed(log, gyro, slowest, about) for about in _ABOUT)
-        found = next((one for one in far if one is not None and one.sure), found)
-    lags, placed, correlation = found.lags, found.clear, found.correlation
+    if found.correlation < 0.5:  # a clock of its own may be seconds off; no chance makes most lags clear and one
+        for about in (0.45 * sign * step for step in (1.0, 2.0, 3.0, 4.0) for sign in (-1.0, 1.0)):
+            far = _placed(log, gyro, slowest, about) or found
+            own = far.lags[far.clear]
+            if far.correlation > 0.7 and 2 * len(own) > far.lively > 1 and np.ptp(own) < 2.0 * _LATE:
+                found = far
+                break
+    lags, placed, lively, correlation = found
     clear = lags[placed]
     check = partial(check, numbers={"correlation": correlation})
-    if len(clear) < max(2, found.lively // 2):
+    if len(clear) < max(2, lively // 2):
         message = f"torque and angular acceleration correlate by {correlation:.2f} only, at any lag"
         return check(UNKNOWN, message, "fly with more roll and pitch motion")
     # Lags of each axis about their own median, for other motion excites it; a clock moves both alike.
-    own = [np.median(lags[placed[:, axis], axis]) if placed[:, axis].any() else 0.0 for axis in range(2)]
-    both = placed.any(axis=1)
-    about = np.average(lags - own, axis=1, weights=placed + 1e-12)[both]
-    low, high = np.quantile(about, [0.1, 0.9])
+    usual = [np.median(lags[placed[:, axis], axis]) if placed[:, axis].any() else 0.0 for axis in range(2)]
+    moved = np.average(lags - usual, axis=1, weights=placed + 1e-12)[placed.any(axis=1)]
+    low, high = np.quantile(moved, [0.1, 0.9])
     lag, wander = float(np.median(clear)), float(high - low)
     check = partial(check, numbers={"correlation": correlation, "lag_s": lag, "wander_s": wander})
     message = (
@@ -300,7 +275,7 @@ def rotor_timing_check(log: Log) -> Check:
         return check(UNKNOWN, f"{message}: too weak to be sure that it is the clock")
     if wander > 0.02:  # [s]; a centre of gravity a tenth of the arm off makes 16 ms
         return check(ERROR, f"{message}: the rotor signal is not in time with the gyro", fix)
-    if -_TOO_LATE < lag < -_LATE:
+    if -_LATE - 0.01 < lag < -_LATE:
         smoothed = f"{message}: rotor speeds are late, or the states were smoothed without a delay"
         return check(WARNING, smoothed, "log raw states; `rotor_telemetry_delay` models a delay")
     if lag < -_LATE:
@@ -312,10 +287,10 @@ def rotor_timing_check(log: Log) -> Check:
 
 def _placed(log: Log, gyro: Channel, slowest: float, about: float) -> _Placed | None:
     """Peaks of every block near a lag [s] of signals that come every so often [s]; None without a block."""
-    signal, width, blocks = log.signal, _smoothing(slowest), []
+    signal, blocks = log.signal, []
     for times in _blocks(log.spans):
         answered = _answered(signal._replace(t=signal.t + about), gyro, log.vehicle, times)
-        torque, motion = (_quick(rows, width) for rows in answered)
+        torque, motion = (_quick(rows, slowest) for rows in answered)
         peaks = np.array([_peak(torque[:, axis], motion[:, axis]) for axis in range(2)])
         blocks.append(peaks + [about, 0.0, 0.0])
         lag, score, _ = max(peaks.tolist(), key=lambda peak: peak[1])
@@ -324,7 +299,7 @@ def _placed(log: Log, gyro: Channel, slowest: float, about: float) -> _Placed | 
     if not blocks:
         return None
     lags, scores, sizes = np.moveaxis(np.array(blocks), -1, 0)
-    lively = sizes >= _QUIET * sizes.max(axis=0)
+    lively = sizes >= 0.1 * sizes.max(axis=0)  # less is a hover: what disturbs it has lags of its own
     return _Placed(lags, lively & (scores > _CLEAR), int(lively.sum()), float(np.median(scores[lively])))
 
 
@@ -333,11 +308,11 @@ def accel_timing_check(log: Log) -> Check | None:
     accel, signal, timing = log.recording.channels.get("accel"), log.signal, log.once(motor_checks).get("rotor_timing")
     if accel is None or timing is None or "lag_s" not in timing.numbers:
         return None
-    width = _smoothing(max(measured_period(c.t, c.values) for c in (signal, accel)))
+    slowest = max(measured_period(c.t, c.values) for c in (signal, accel))
     peaks = []
     for at in _blocks(log.spans):
         thrust = np.sum(_read(signal.t, signal.values, at, power=2), axis=1, keepdims=True)
-        both = (_quick(rows, width)[:, 0] for rows in (thrust, -_read(accel.t, accel.values[:, 2:], at)))
+        both = (_quick(rows, slowest)[:, 0] for rows in (thrust, -_read(accel.t, accel.values[:, 2:], at)))
         peaks.append(_peak(*both))
     clear = [lag for lag, correlation, _ in peaks if correlation > _CLEAR + 0.1]
     late = float(np.median(clear)) - timing.numbers["lag_s"] if clear and 2 * len(clear) >= len(peaks) else 0.0
@@ -347,11 +322,6 @@ def accel_timing_check(log: Log) -> Check | None:
     message = f"{later} answers the rotors {1e3 * abs(late):.0f} ms after the {sooner}"
     fix = f"stamp the {later} when it is measured, and log it without a filter"
     return Check("accel_timing", WARNING, message, fix, {"late_s": late})
-
-
-def _smoothing(slowest: float) -> int:
-    """Rows over which signals that come every so often [s] are smoothed."""
-    return max(3, round(2.5 * slowest / _STEP) | 1)
 
 
 def _blocks(spans: Spans) -> Iterator[FloatArray]:
@@ -375,9 +345,9 @@ def _read(t: FloatArray, values: FloatArray, at: FloatArray, power: int = 1) -> 
     return linear(t[near], values[near] ** power, at)
 
 
-def _quick(values: FloatArray, width: int) -> FloatArray:
-    """Band of frequencies that both signals hold: smoothed over `width` rows, slow motion left out."""
-    smooth = moving_mean(values, width)
+def _quick(values: FloatArray, slowest: float) -> FloatArray:
+    """Band of frequencies that signals hold which come every so often [s]: smoothed, and slow motion left out."""
+    smooth = moving_mean(values, max(3, round(2.5 * slowest / _STEP) | 1))
     return np.asarray(smooth - moving_mean(smooth, round(_SLOW_MOTION / _STEP) | 1, mirrored=True))
 
 
@@ -397,8 +367,6 @@ def _peak(torque: FloatArray, motion: FloatArray) -> tuple[float, float, float]:
 
 _OCTAVES = 1.0, 1.5, 2.25, 3.4, 5.0, 7.5, 11.0
 """Edges of bands [Hz] in which the motion that torque makes is compared: its size over that of the torque."""
-_FLAT = 0.4
-"""Share of a slower band's answer that is left where the gyro was filtered; bodies answer torque alike at each."""
 
 
 def gyro_filter_check(log: Log) -> Check | None:
@@ -436,7 +404,8 @@ def gyro_filter_check(log: Log) -> Check | None:
     left, low, high, lag = min(found, default=(1.0, 0, 0, 0.0))
     smoothed = lag < 0.75 * math.acos(min(left, 1.0))
     measured = vehicle.command.sampling == "instant" and "imu_lag" not in vehicle.effects
-    if left > _FLAT or not (smoothed or measured):
+    # Bodies answer torque alike at each frequency; motors leave more than two fifths.
+    if left > 0.4 or not (smoothed or measured):
         return None
     slower, quicker = (math.sqrt(_OCTAVES[k - 1] * _OCTAVES[k]) for k in (low, high))
     # With what is late fitted along, inertias are too large by what the gyro misses of all acceleration by torque.
@@ -476,7 +445,12 @@ def hover_check(log: Log) -> Check:
         message = f"no flight in this log: its rotor speeds carry at most {most:.0%} of the weight"
         fix = "did it fly? Else check mass, the unit of the rotor speeds, and b"
         return check(WARNING, message, fix, {"most_load": most}, _heavier(1.0 / most))
-    speeds = signal.values[inside] * _supply(log, signal.t[inside])
+    speeds, t = signal.values[inside], signal.t[inside]
+    exponent = vehicle.effects.get("supply_voltage", {}).get("exponent", 0.0)
+    battery = log.recording.channels.get("battery")
+    volts = voltage_at(t, battery.t, battery.values[:, 0]) if exponent and battery is not None else None
+    if volts is not None:
+        speeds = speeds * ((volts / (vehicle.reference_voltage or float(volts.mean()))) ** exponent)[:, None]
     guess, thrust = vehicle.parameters["b"], float(np.mean(model.total(speeds)))
     needed = guess.initial * weight / thrust if thrust > 0.0 else np.inf
     low, high = guess.limits
@@ -508,31 +482,13 @@ def _heavier(factor: float) -> Off:
     return estimates_off(mass=factor) if 0.0 < factor < np.inf else {}
 
 
-def _supply(log: Log, t: FloatArray) -> FloatArray:
-    """Factor on the speeds at times `t` [s] by the supply voltage, shape (n, 1) or (1,); 1 where none is known."""
-    exponent = log.vehicle.effects.get("supply_voltage", {}).get("exponent", 0.0)
-    battery = log.recording.channels.get("battery")
-    volts = voltage_at(t, battery.t, battery.values[:, 0]) if exponent and battery is not None else None
-    if volts is None:
-        return np.ones(1)
-    return np.asarray((volts / (log.vehicle.reference_voltage or float(volts.mean()))) ** exponent)[:, None]
-
-
 # --- Torque against motion at each lag of the motors: their order and spins, and the turn of the frame
 
 
-_TURNING = 2.0, 0.2
-"""Motion about z between these times [s] shows the spins: faster, it is mostly what a loop answers to its own noise."""
-_LAGS = 5
-"""Motors answer late: torque up to this many rows earlier is tried."""
 _SETTLED = 0.25
 """Correlation in roll and pitch that settles an order."""
 _GAIN, _CHANGE = 0.3, 0.1
 """Likelihood that another order or frame, or other spins, must gain for each sample; what each change costs."""
-_CHANCE = 5e-3
-"""Probability with which chance may gain as much."""
-_TURNED = 8
-"""Orders that are tried with a turned frame, too."""
 _MOST_ROTORS = 6
 """Beyond this turns, mirror images and exchanges of the order are tried, not all permutations."""
 
@@ -584,12 +540,14 @@ def lagged_of(windows: Sequence[Window], vehicle: Vehicle, rate: float) -> Lagge
     windows = [replace(w, rotor_speed=_turned(w, vehicle)) for w in windows]
     thrust, b = ThrustModel.stated(vehicle), vehicle.parameters["b"].initial
     acted = [thrust.single(w.rotor_speed) / b for w in windows]
-    fast = [_in_band(windows, acted, lag, _SLOW_MOTION, 0.0) for lag in range(_LAGS)]
+    # Motors answer late: torque up to four rows earlier is tried.
+    fast = [_in_band(windows, acted, lag, _SLOW_MOTION, 0.0) for lag in range(5)]
     if len(fast[0][0]) < 100:
         return "too little flight to check the motor order"
     grams = [_Gram(f.T @ f, f.T @ motion, np.sum(motion**2, axis=0)) for f, motion, _ in fast]
     still = float(np.max(np.std(fast[0][1], axis=0))) < 0.05
-    return Lagged(grams, _in_band(windows, acted, 0, *_TURNING), still)
+    # Motion about z between 2 s and 0.2 s shows the spins: faster, it is mostly what a loop answers to its own noise.
+    return Lagged(grams, _in_band(windows, acted, 0, 2.0, 0.2), still)
 
 
 def _turned(w: Window, vehicle: Vehicle) -> FloatArray:
@@ -641,8 +599,8 @@ def motor_checks(log: Log) -> dict[str, Check]:
     lagged, time, balance = log.once(lagged_motion), rotor_timing_check(log), rotor_speed_check(log)
     first = better_description(lagged, log.vehicle)
     for early in (0.0, 0.05, 0.1) if first is not None else ():
-        moved = replace(log, recording=_rotors_earlier(log.recording, early))
-        moved = replace(moved, read=None if log.read is None else _rotors_earlier(log.read, early))
+        turned, read = (_rotors_earlier(one, early) for one in (log.recording, log.read or log.recording))
+        moved = replace(log, recording=turned, read=read)
         other = better_description(lagged_motion(moved), log.vehicle) if early else first
         if other is None:
             break
@@ -742,8 +700,8 @@ def better_description(lagged: Lagged | str, vehicle: Vehicle) -> Other | None:
     ]
     own = max((one for one in tried if one[2] == rotors), key=lambda one: one[0])
     # The most likely orders, and the own one, with the frame turned as roll and pitch then answer.
-    for order in {rotors, *(one[2] for one in sorted(tried, key=lambda one: -one[0])[:_TURNED])}:
-        angle = _answer(grams, reordered(vehicle, order)).turned
+    for order in {rotors, *(one[2] for one in sorted(tried, key=lambda one: -one[0])[:8])}:
+        angle = _answer(grams, reordered(vehicle, order))[2]
         if abs(angle) > math.radians(20.0):  # a smaller turn is none
             for sign in (1.0, -1.0):
                 (axes,) = _correlations(grams, _rotated(vehicle, angle), [order], sign)
@@ -849,7 +807,7 @@ def _spins(lagged: Lagged, vehicle: Vehicle) -> tuple[list[Order], float]:
         np.sum(both**2, axis=1)[:, None] + 1e-300
     )
     independent = rows / max(2.0 * float(memory[0] @ memory[1]) - 1.0, 1.0)
-    own, chance = _gain(found[:1]), exceeded(_CHANCE, 1) / independent
+    own, chance = _gain(found[:1]), exceeded(5e-3, 1) / independent  # chance gains more once in 200 logs
     if gain[best] <= own or _gain(found[best : best + 1]) <= own + chance:
         return [], float(found[0])
     # Roll and pitch show which of them it is, but for partners on one arm: they have one command.
@@ -880,30 +838,21 @@ def _yaw_and_drag(slow: Rows, vehicle: Vehicle, alone: bool) -> FloatArray:
     return np.asarray((both - others @ (others.T @ both)).T)
 
 
-class _Answer(NamedTuple):
-    """Answer of the vehicle in roll and pitch to torque over b: inertia times acceleration = A torque, A = k R(alpha).
+def _answer(grams: Sequence[_Gram], vehicle: Vehicle) -> tuple[FloatArray, float, float]:
+    """Answer in roll and pitch to torque over b: inertia times acceleration = A torque, A = k R(alpha) least-squares.
 
-    Attributes:
-        explained: share of the variance of roll and pitch, (2,).
-        scale: k, b times the factor by which arms (or inertias) are wrong.
-        turned: alpha [rad]: the frame stands so much further about z.
+    Returns:
+        At the lag that explains most: its shares of the variance of roll and pitch, (2,); k, b times the factor by
+        which arms (or inertias) are wrong; and alpha [rad]: the frame stands so much further about z.
     """
-
-    explained: FloatArray
-    scale: float
-    turned: float
-
-
-def _answer(grams: Sequence[_Gram], vehicle: Vehicle) -> _Answer:
-    """Least-squares map from torque to motion at the lag at which it explains most."""
     arms, inertia, found = vehicle.torque_arms[:, :2], vehicle.initial[2:4], []
     for gram in grams:
         cross = arms.T @ gram.motion[:, :2] * inertia
         a = np.linalg.lstsq(arms.T @ gram.thrust @ arms, cross, rcond=None)[0]
         along, across = 0.5 * (a[0, 0] + a[1, 1]), 0.5 * (a[0, 1] - a[1, 0])
         explained = np.sum(a * cross, axis=0) / (gram.power[:2] * inertia**2 + 1e-300)
-        found.append(_Answer(explained, math.hypot(along, across), math.atan2(across, along)))
-    return max(found, key=lambda answer: float(np.sum(answer.explained)))
+        found.append((np.asarray(explained), math.hypot(along, across), math.atan2(across, along)))
+    return max(found, key=lambda answer: float(np.sum(answer[0])))
 
 
 def reordered(vehicle: Vehicle, order: Order) -> Vehicle:
@@ -944,13 +893,9 @@ def _listed(rotors: Sequence[Order]) -> str:
 # that the whole frame is turned is seen always.
 
 
-_KNOWN = 0.1
-"""Relative standard deviation up to which a parameter counts as known."""
 _SHARE, _SPREAD = 0.2, (0.25, 0.2, 0.2)
 """J_xx over mass and squared arm of most vehicles (0.11 of a heavy octocopter, 0.32 of a light one), and how far it,
 guesses of inertia and guesses of b spread (standard deviations of the logarithm, on twenty vehicles)."""
-_ASKED, _DOUBTED = 1.9, 2.5
-"""Standard deviations from which another arm or mass is so likely that it is asked for, and that intervals hold it."""
 
 
 def mass_check(log: Log) -> Check | None:
@@ -983,10 +928,13 @@ def _known_thrust(vehicle: Vehicle) -> tuple[float, float] | None:
 
 
 def _known(vehicle: Vehicle, name: str) -> tuple[float, float] | None:
+    """A parameter and its relative standard deviation, where that is a tenth at most."""
     prior = vehicle.parameters[name]
-    if prior.sigma is None or prior.sigma > _KNOWN * prior.initial:
-        return None
-    return prior.initial, prior.sigma / prior.initial
+    return (
+        None
+        if prior.sigma is None or prior.sigma > 0.1 * prior.initial
+        else (prior.initial, prior.sigma / prior.initial)
+    )
 
 
 def geometry_check(log: Log) -> Check:
@@ -1040,10 +988,10 @@ def _unlikely(vehicle: Vehicle, scale: float, hover: float, numbers: dict[str, f
     power = np.einsum("ki,ij,kj->k", ways, weights, ways)
     found = ways @ weights @ off / power
     surprise = np.abs(found) * np.sqrt(power)
-    asked = np.flatnonzero(surprise >= _ASKED)
+    # What is so likely is asked for: both where either would do, for nothing shows which, or that both are wrong.
+    asked = np.flatnonzero(surprise >= 1.9)
     if not len(asked):
         return None
-    # Where either would do, nothing shows which, or that both are wrong: both are asked for.
     stated, fits, doubts = [], [], []
     for k in asked.tolist():
         kind, now, unit = (("arm", vehicle.arm, "m"), ("mass", vehicle.mass, "kg"))[k]
@@ -1056,7 +1004,7 @@ def _unlikely(vehicle: Vehicle, scale: float, hover: float, numbers: dict[str, f
         f"x and y {size:.2g} times mass times arm squared ({_SHARE:g} on most vehicles) and {hover / scale:.2g} times "
         f"its guess, and b {hover / guessed:.2g} times its guess"
     )
-    doubt = farthest(doubts) if surprise.max() > _DOUBTED else {}
+    doubt = farthest(doubts) if surprise.max() > 2.5 else {}  # then intervals hold it, too
     return Check("geometry", WARNING, message, f"measure {', and '.join(fits)}", {**numbers, "size": size}, doubt)
 
 

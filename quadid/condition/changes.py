@@ -36,8 +36,7 @@ SHIFT = 0.05
 MOST_ROTORS = 3
 """Most rotors that are damaged at once."""
 _KINDS = {"weak_rotor": 0.7, "payload": 0.2, "cg_offset": 0.06, "effort": 0.04}
-"""Prior odds of the kinds of change; a further damaged rotor costs `_ANOTHER`."""
-_ANOTHER = 0.3
+"""Prior odds of the kinds of change; each further damaged rotor costs a factor of 0.3."""
 _STEP = 0.15
 _MASSES = tuple(float(mass) for mass in 0.01 * np.exp(2.0 * _STEP * np.arange(13)))
 """Added masses that are tried, from 1 % in steps of twice `_STEP` (relative), each with that standard deviation."""
@@ -84,7 +83,7 @@ def hypotheses(vehicle: Vehicle, shares: FloatArray, trim: FloatArray) -> list[H
     out = []
     for count in range(1, min(MOST_ROTORS, len(rotors) - 1) + 1):
         chosen = list(combinations(rotors, count))
-        each = odds["weak_rotor"] + (count - 1) * np.log(_ANOTHER) - np.log(len(chosen))
+        each = odds["weak_rotor"] + (count - 1) * np.log(0.3) - np.log(len(chosen))
         centre, positive = np.zeros(2 * count), tuple(range(0, 2 * count, 2))
         for group in chosen:
             effect = np.hstack([single[j] for j in group])
@@ -290,7 +289,6 @@ HEALTHY_SCORE = float(np.sqrt(chdtri(len(AXES), SIGNIFICANT)))
 """The score that one healthy flight in a hundred exceeds."""
 _SURE = 0.75
 """A change is named with confidence where explanations that hold it have this much of the probability."""
-_RIVALS = 3
 ENOUGH = 5
 """Baseline flights that a verdict of no change needs, unless it would be the same with as many."""
 
@@ -458,7 +456,7 @@ def _changes(found: Sequence[Explained], vehicle: Vehicle, changed: bool, steady
     """
     shares = np.exp([one.log_evidence - found[0].log_evidence for one in found])
     shares /= shares.sum()
-    others = zip(found[1 : _RIVALS + 1], shares[1 : _RIVALS + 1], strict=True)
+    others = zip(found[1:4], shares[1:4], strict=True)
     best, lost = found[0], tuple(Rival(*one.names, one.p_value, float(share)) for one, share in others)
     kind, whole = best.hypothesis.kind, float(shares[0])
 

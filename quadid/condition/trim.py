@@ -30,8 +30,6 @@ AXES = ("roll", "pitch", "yaw", "effort")
 """Parts of a trim; effort is the logarithm of rotor thrust commanded per specific force."""
 BLOCK = 1.0
 """Trims are means over this long [s]."""
-_CLIMB_OUT = 1.5
-"""Seconds after take-off and before landing that are no steady flight."""
 _TURN = 0.2
 """Rates are averaged over this long [s], so that a propeller that shakes is no livelier flight."""
 _FEWEST = 5
@@ -91,7 +89,8 @@ def flight_trim(recording: Recording, vehicle: Vehicle) -> FlightTrim:
         NotIdentifiableError: too little steady flight.
     """
     rotors = rotor_signal(recording, vehicle)
-    spans = [(a + _CLIMB_OUT, b - _CLIMB_OUT) for a, b in flying_spans(recording, vehicle)]
+    # 1.5 s after take-off and before landing are no steady flight.
+    spans = [(a + 1.5, b - 1.5) for a, b in flying_spans(recording, vehicle)]
     starts = [np.arange(a, b - BLOCK + 1e-9, BLOCK) for a, b in spans if b - a >= BLOCK]
     edges = np.concatenate([np.empty(0), *starts])
     load, kept = _block_means(rotors.t, rotors.values**2, edges)

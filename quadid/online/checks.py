@@ -180,29 +180,44 @@ def judge(cut: WindowCut, vehicle: Vehicle, thrust: ThrustModel, known: bool, un
         known: whether it was identified or is a guess.
         units: False: units and frames of a good window are left to its fit.
     """
-    # First whether the rotors lift: at rest sensors and rotors may well repeat themselves.
+    # Mean thrust over weight of a flying vehicle; a thrust coefficient that is a guess leaves more room.
+    low, high = (0.4, 4.0) if known else (0.2, 5.0)
+    still = carried = ""
     for window in cut.windows:
-        lift = _lift(window, _weight_share(window, vehicle, thrust), known)
-        if lift != Quality():
-            return lift
+        # First whether the rotors lift, second by second from the end: at rest sensors may repeat themselves.
+        share, second = thrust.total(window.rotor_speed) / (vehicle.mass * GRAVITY), max(round(1.0 / window.dt), 1)
+        first = len(share) % second or second
+        means = [float(part.mean()) for part in np.split(share, np.arange(first, len(share), second))]
+        if idle := [i for i, mean in enumerate(means) if not mean > low]:
+            until = float(window.t[0]) + window.dt * (first + idle[-1] * second)
+            return Quality(grounded=f"rotors carry {min(means):.0%} of the weight: on the ground", until=until)
+        if not max(means) < high and low < float(np.mean(means)) / (30.0 / np.pi) ** 2 < high:
+            return Quality(fault="rotor speeds look like rpm, wanted rad/s")
+        if not max(means) < high:
+            return Quality(grounded=f"rotors carry {max(means):.0%} of the weight: not this vehicle, or not flying")
         if fault := _broken(window):
             return Quality(fault=fault)
-    still = next((why for w in cut.windows if (why := _not_flying(w))), "")
-    carried = next((why for w in cut.windows if (why := _floor(w, _weight_share(w, vehicle, thrust)))), "")
+        # Then whether it is flight, whatever they give
+        felt = window.accel
+        if window.attitude is not None and np.any(down(window.attitude)[:, 2] < 0.0):
+            still = still or "tumbled, or lying on its side"
+        elif felt is not None and np.nanmax(np.linalg.norm(felt, axis=1), initial=0.0) > IMPACT:
+            still = still or f"a knock of more than {IMPACT / GRAVITY:.0f} g: landing or crash"
+        carried = carried or _floor(window, share)
     if (units or still or carried) and (fault := mistake(cut, vehicle, known)):
         return Quality(fault=fault)
     return Quality(grounded=still or carried, carried=not still and bool(carried))
 
 
 def _broken(window: Window) -> str:
-    still = round(STUCK / window.dt)
+    """The sensor that is stuck or saturated; empty where none is."""
     for name in ("gyro", "accel", "attitude", "rotor_speed"):
         values = getattr(window, name)
         if values is None:
             continue
         here = np.flatnonzero(np.isfinite(values).all(axis=1))
         for first, end in zip(*true_runs(copied(values[here])), strict=True):
-            if end - first > still and _moves(window, name, here[first : end + 1]):
+            if end - first > round(STUCK / window.dt) and _moves(window, name, here[first : end + 1]):
                 return f"{name} is stuck: it repeated the same value for more than {STUCK:g} s"
         if name in ("gyro", "accel") and (ends := at_limit(values[here])):
             return f"{name} axis {'xyz'[ends[0].axis]} is saturated at {ends[0].level:.4g}: widen its range"
@@ -231,68 +246,6 @@ def _moves(window: Window, name: str, rows: IndexArray) -> bool:
     return bool(np.nanstd(lift) > 0.02 * abs(np.nanmean(lift)))
 
 
-def mistake(cut: WindowCut, vehicle: Vehicle, known: bool) -> str:
-    """Names the wrong unit or frame, or the wrong order of rotors, that would be fitted into the parameters.
-
-    Args:
-        known: whether it was identified: then its rotors are in order.
-
-    Returns:
-        What is wrong and how to mend it; empty for nothing.
-    """
-    return wrong_unit(cut.windows) or ("" if known else _wrong_order(cut, vehicle))
-
-
-def wrong_unit(windows: Sequence[Window]) -> str:
-    """Names the wrong unit or frame of windows, and how to mend it; empty for nothing."""
-    for window in windows:
-        log = Log(as_recording([window]), spans=((window.t0, window.t0 + window.dt * len(window)),))
-        for check in map(log.once, LIVE):
-            if check is not None and check.verdict is ERROR:
-                return f"{check.message}; {check.fix}; on ROS topics FLU and ENU: PX4 has FRD and NED"
-    return ""
-
-
-def _wrong_order(cut: WindowCut, vehicle: Vehicle) -> str:
-    rate = min((1.0 / (cut.spacing * window.dt) for window in cut.windows), default=0.0)
-    lagged = lagged_of(cut.windows, vehicle, rate)
-    check = motor_order_check(lagged, vehicle, better_description(lagged, vehicle))
-    return f"motor order: {check.message}; {check.fix}" if check.verdict is ERROR else ""
-
-
-def _weight_share(window: Window, vehicle: Vehicle, thrust: ThrustModel) -> FloatArray:
-    """Thrust over weight, shape (n,)."""
-    return np.asarray(thrust.total(window.rotor_speed) / (vehicle.mass * GRAVITY))
-
-
-def _lift(window: Window, share: FloatArray, known: bool) -> Quality:
-    """Verdict on whether the rotors carry the vehicle by thrust over weight (n,), second by second, from the end."""
-    # Mean thrust over weight of a flying vehicle; a thrust coefficient that is a guess leaves more room.
-    low, high = (0.4, 4.0) if known else (0.2, 5.0)
-    second = max(round(1.0 / window.dt), 1)
-    first = len(share) % second or second
-    means = [float(part.mean()) for part in np.split(share, np.arange(first, len(share), second))]
-    if idle := [i for i, mean in enumerate(means) if not mean > low]:
-        until = float(window.t[0]) + window.dt * (first + idle[-1] * second)
-        return Quality(grounded=f"rotors carry {min(means):.0%} of the weight: on the ground", until=until)
-    if not max(means) < high and low < float(np.mean(means)) / (30.0 / np.pi) ** 2 < high:
-        return Quality(fault="rotor speeds look like rpm, wanted rad/s")
-    if not max(means) < high:
-        return Quality(grounded=f"rotors carry {max(means):.0%} of the weight: not this vehicle, or not flying")
-    return Quality()
-
-
-def _not_flying(window: Window) -> str:
-    """Reason why a window with turning rotors is not flight, whatever they give; empty where it is."""
-    if window.attitude is not None and np.any(down(window.attitude)[:, 2] < 0.0):
-        return "tumbled, or lying on its side"
-    if window.accel is None or not np.isfinite(window.accel).any():
-        return ""
-    if float(np.nanmax(np.linalg.norm(window.accel, axis=1))) > IMPACT:
-        return f"a knock of more than {IMPACT / GRAVITY:.0f} g: landing or crash"
-    return ""
-
-
 def _floor(window: Window, thrust: FloatArray) -> str:
     """The accelerometer must follow the thrust where the thrust varies enough to tell.
 
@@ -306,15 +259,39 @@ def _floor(window: Window, thrust: FloatArray) -> str:
     given = thrust[:rows].reshape(-1, width)
     both = np.isfinite(force).all(axis=1)
     x, y = given[both].mean(axis=1), force[both].mean(axis=1)
-    if len(x) < 10:
+    if len(x) < 10 or np.ptp(x) == 0.0:
         return ""
     x, y = x - x.mean(), y - y.mean()
     power = float(x @ x)
-    if power == 0.0:
-        return ""
     slope = float(x @ y) / power
     error = float(np.sqrt(np.sum((y - slope * x) ** 2) / max(len(x) - 2, 1) / power))
     # On the ground it does not follow at all.
     if slope + 3.0 * error < 0.2 and error < 0.2:
         return f"specific force follows thrust with slope {slope:.2f} only: something carries the vehicle"
+    return ""
+
+
+def mistake(cut: WindowCut, vehicle: Vehicle, known: bool) -> str:
+    """Names the wrong unit or frame, or the wrong order of rotors, that would be fitted into the parameters.
+
+    Args:
+        known: whether it was identified: then its rotors are in order.
+
+    Returns:
+        What is wrong and how to mend it; empty for nothing.
+    """
+    if (fault := wrong_unit(cut.windows)) or known:
+        return fault
+    lagged = lagged_of(cut.windows, vehicle, min((1.0 / (cut.spacing * w.dt) for w in cut.windows), default=0.0))
+    check = motor_order_check(lagged, vehicle, better_description(lagged, vehicle))
+    return f"motor order: {check.message}; {check.fix}" if check.verdict is ERROR else ""
+
+
+def wrong_unit(windows: Sequence[Window]) -> str:
+    """Names the wrong unit or frame of windows, and how to mend it; empty for nothing."""
+    for window in windows:
+        log = Log(as_recording([window]), spans=((window.t0, window.t0 + window.dt * len(window)),))
+        for check in map(log.once, LIVE):
+            if check is not None and check.verdict is ERROR:
+                return f"{check.message}; {check.fix}; on ROS topics FLU and ENU: PX4 has FRD and NED"
     return ""
