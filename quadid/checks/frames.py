@@ -50,7 +50,7 @@ _SMOOTHED = 0.8
 _PARTS = 5
 """Parts of a log that show an error of its rates alike."""
 _AXES = ("x", "y", "z")
-_gravity = partial(Check, "gravity")
+_gravity_is = partial(Check, "gravity")
 _rates_are = partial(Check, "gyro_attitude")
 _velocity_is = partial(Check, "velocity_attitude")
 _position_is = partial(Check, "position_velocity")
@@ -117,15 +117,15 @@ def gravity_check(log: Log) -> Check:
     """Length and direction of the mean specific force: 9.8 m/s^2 along -z in FRD."""
     accel, attitude = (log.recording.channels.get(name) for name in ("accel", "attitude"))
     if accel is None:
-        return _gravity(UNKNOWN, "no accelerometer")
+        return _gravity_is(UNKNOWN, "no accelerometer")
     inside = within(accel.t, log.spans) if log.spans else np.ones(len(accel.t), dtype=np.bool_)
     values = accel.values[inside]
     if not len(values):
-        return _gravity(UNKNOWN, "no accelerometer sample in flight")
+        return _gravity_is(UNKNOWN, "no accelerometer sample in flight")
     length = float(np.median(np.linalg.norm(values, axis=1)))
     z = float(np.median(values[:, 2]))
     steady = float(np.linalg.norm(np.median(values, axis=0)))
-    check = partial(_gravity, numbers={"length": length, "z": z})
+    check = partial(_gravity_is, numbers={"length": length, "z": z})
     message = f"specific force has length {length:.4g} and z {z:.4g} (medians; about 9.81 and -9.81 m/s^2 expected)"
     # Specific force on the ground has the length that it must have, where there are samples enough to tell.
     resting = np.linalg.norm(accel.values[~inside], axis=1)
@@ -177,7 +177,7 @@ def _downwards(log: Log, accel: Channel, inside: BoolArray) -> str:
 
 def attitude_check(log: Log) -> Check:
     """Attitude against gyro (axes, signs, degrees for radians) and against gravity (a world with z down)."""
-    rates = gyro_check(log, log.once(response_of))
+    rates = gyro_check(log, log.once(response))
     if rates.numbers.get("r2", 1.0) < _CLEAR and (coarse := attitude_steps_check(log.recording)) is not None:
         rates = _rates_are(UNKNOWN, f"{coarse.message}: too coarse to compare with the gyro")
     known = log.channels("accel", "attitude", least=2)
@@ -202,7 +202,7 @@ def attitude_check(log: Log) -> Check:
         )
         verdict = ERROR if abs(up - GRAVITY) > 2.0 * most else WARNING
         fix = f"calibrate it; if it is the scale, multiply acceleration by {GRAVITY / up:.3g}"
-        return _gravity(verdict, message, fix, {"up": up}, estimates_off(mass=up / GRAVITY) if up > 0.0 else {})
+        return _gravity_is(verdict, message, fix, {"up": up}, estimates_off(mass=up / GRAVITY) if up > 0.0 else {})
     q = linear(attitude.t, attitude.values, accel.t)
     upwards = np.broadcast_to([0.0, 0.0, -GRAVITY], accel.values.shape)  # makes up for gravity alone
     felt = rotated(conjugate(q / np.linalg.norm(q, axis=1, keepdims=True)), upwards)
@@ -215,7 +215,7 @@ def attitude_check(log: Log) -> Check:
         f"{seconds:.3g} s, more than gravity and attitude explain: the accelerometer's zero is wrong, or the attitude"
     )
     fix = "calibrate it level, or subtract this"
-    return _gravity(ERROR if size > 3.0 * most else WARNING, message, fix, {"aside": size})
+    return _gravity_is(ERROR if size > 3.0 * most else WARNING, message, fix, {"aside": size})
 
 
 # --- Gyro against the turning of the attitude: readings of the quaternion, then what of the rates cannot be
@@ -266,7 +266,8 @@ def gyro_check(log: Log, found: "Response | None" = None) -> Check:
         message = f"{later} comes {1e3 * abs(found.late):.0f} ms after the {sooner}"
         fix = f"stamp the {later} when it is measured, on the clock of the {sooner}"
         return _rates_are(ERROR, message, fix, {"lag_s": found.late})
-    smoothed = given_fits and found is not None and (found.left < _SMOOTHED or found.named)
+    late = found is not None and abs(found.late) - 3.0 * found.sigma > _LATE
+    smoothed = given_fits and found is not None and (found.left < _SMOOTHED or late)
     return (
         (_angle_rates(gyro, attitude) if given_fits else None)
         or _one_axis(rows)
@@ -502,25 +503,16 @@ class Response(NamedTuple):
     left: float
     read: float
 
-    @property
-    def named(self) -> bool:
-        """True if one comes so much later than the other that it is said."""
-        return abs(self.late) - 3.0 * self.sigma > _LATE
 
-
-def response_of(log: Log) -> Response | None:
-    """As `response`, of a log; None where it lacks one of them."""
-    known = log.channels("gyro", "attitude")
-    return None if known is None else response(*known)
-
-
-def response(gyro: Channel, attitude: Channel) -> Response | None:
+def response(log: Log) -> Response | None:
     """Gyro beside differentiated attitude in bands of frequency, by cross-spectra; None where too few are clear.
 
     Both are means over the same steps, so that rates and steps of the channels do not matter.  Noise of the gyro makes
     the share that it reads too large and that of the attitude leaves it, so that a share below 1 is a filter's.
     """
-    attitude = _fresh(attitude)
+    if (known := log.channels("gyro", "attitude")) is None:
+        return None
+    gyro, attitude = known[0], _fresh(known[1])
     step = max(0.01, sample_period(attitude.t))
     slowest = max(step, measured_period(gyro.t, gyro.values))
     rows = round(float(np.clip(np.ptp(attitude.t) / 6.0, 1.0, 2.0)) / step)
@@ -608,7 +600,7 @@ def gyro_source_check(log: Log) -> Check | None:
 
 def _filtered(log: Log) -> Check | None:
     """A warning where gyro or attitude are late beyond the vehicle's effects, or the gyro misses quick turning."""
-    if (found := log.once(response_of)) is None:
+    if (found := log.once(response)) is None:
         return None
     known: Mapping[str, Mapping[str, float]] = {} if log.described is None else log.described.effects
     lag = known.get("imu_lag", {}).get("cutoff", math.inf)

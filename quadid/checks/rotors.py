@@ -196,7 +196,7 @@ def balance_check(log: Log) -> Check | None:
     if placed := [odd for odd in sorted(fits) if odd < read]:
         farther = " or ".join(f"{rotor + 1} stood {1.0 / ratio:.2f}" for _, rotor, ratio in placed)
         message = f"{here} {farther} times as far from it as in the vehicle file: then inertias are wrong"
-        moved = [_described(vehicle, {k: vehicle.rotor_positions[k, :2] / ratio}) for _, k, ratio in placed]
+        moved = [_built(vehicle, {k: vehicle.rotor_positions[k, :2] / ratio}) for _, k, ratio in placed]
         doubt = farthest([rotors_off(vehicle, speeds, speeds, other) for other in moved])
         numbers = {"off": off, "rotor": placed[0][1] + 1.0, "arm_ratio": placed[0][2]}
         fix = "measure where that rotor is, and where the vehicle balances"
@@ -666,7 +666,7 @@ def motor_order_check(lagged: Lagged | str, vehicle: Vehicle, other: Other | Non
     if len(vehicle.rotors) > 4:
         pairs = list(combinations(range(len(vehicle.rotors)), 2))
         now = [_drag_explains(lagged.slow, vehicle, alone) for alone in (False, True)]
-        found = [_drag_explains(lagged.slow, _spun(vehicle, pair), alone=False) for pair in pairs]
+        found = [_drag_explains(lagged.slow, _built(vehicle, spun=pair), alone=False) for pair in pairs]
         least, gains = max(_gain(np.array(now)[:, None]) + [_GAIN, -_CHANGE]), _gain(np.array(found)[:, None])
         if tilted := [pair for pair, more in zip(pairs, gains, strict=True) if more > least]:
             pair = _listed(tilted)
@@ -736,7 +736,7 @@ def better_description(lagged: Lagged | str, vehicle: Vehicle) -> Other | None:
         which = _listed(spins)
         told.append(f"rotor {which} {'turns' if max(map(len, spins)) == 1 else 'turn'} the other way")
         fix.append(f"negate the spin of rotor {which} in the vehicle file")
-    return Other(_spun(new, spins[0]) if spins else new, " and ".join(told), " and ".join(fix), axes, angle)
+    return Other(_built(new, spun=spins[0]) if spins else new, " and ".join(told), " and ".join(fix), axes, angle)
 
 
 def _orders(rotors: int) -> list[Order]:
@@ -794,14 +794,14 @@ def _spins(lagged: Lagged, vehicle: Vehicle) -> tuple[list[Order], float]:
     """
     count = len(vehicle.rotors)
     turned = [which for size in (0, 1, 2, count) for which in combinations(range(count), size)]
-    found = np.array([_drag_explains(lagged.slow, _spun(vehicle, which)) for which in turned])
+    found = np.array([_drag_explains(lagged.slow, _built(vehicle, spun=which)) for which in turned])
     wrong = np.array([len(which) for which in turned])
     # Without turning on purpose, what yaw follows is a matter of chance.
     gain = np.where(found > 2.0 * _SETTLED, _gain(found[:, None]) - _CHANGE * wrong.clip(max=2), -np.inf)
     best = int(np.argmax(gain[1:])) + 1
     # Neither yaw acceleration nor drag is white: independent samples in their correlation are fewer, after M. S.
     # Bartlett, Journal of the Royal Statistical Society 98 (1935) 536.
-    both = _yaw_and_drag(lagged.slow, _spun(vehicle, turned[best]), True)
+    both = _yaw_and_drag(lagged.slow, _built(vehicle, spun=turned[best]), True)
     rows = both.shape[1]
     memory = np.fft.irfft(np.abs(np.fft.rfft(both, 2 * rows)) ** 2)[:, :rows] / (
         np.sum(both**2, axis=1)[:, None] + 1e-300
@@ -812,7 +812,7 @@ def _spins(lagged: Lagged, vehicle: Vehicle) -> tuple[list[Order], float]:
         return [], float(found[0])
     # Roll and pitch show which of them it is, but for partners on one arm: they have one command.
     near = 1 + np.flatnonzero(gain[1:] > gain[best] - max(_CHANGE, chance))
-    whole = _gain(np.array([[_drag_explains(lagged.slow, _spun(vehicle, turned[k]), alone=False)] for k in near]))
+    whole = _gain(np.array([[_drag_explains(lagged.slow, _built(vehicle, spun=turned[k]), alone=False)] for k in near]))
     return [turned[k] for k in near[whole > whole.max() - _CHANGE]], float(found[best])
 
 
@@ -860,25 +860,20 @@ def reordered(vehicle: Vehicle, order: Order) -> Vehicle:
     return vehicle.model_copy(update={"rotors": tuple(vehicle.rotors[order.index(k)] for k in range(len(order)))})
 
 
-def _described(vehicle: Vehicle, places: Mapping[int, FloatArray], turned: Sequence[int] = ()) -> Vehicle:
+def _built(vehicle: Vehicle, places: Mapping[int, FloatArray] | None = None, spun: Order = ()) -> Vehicle:
     """The vehicle with some rotors, counted from 0, at other places (x, y) [m], or with their spins the other way."""
-    rotors = list(vehicle.rotors)
-    for k in {*places, *turned}:
+    rotors, places = list(vehicle.rotors), places or {}
+    for k in {*places, *spun}:
         x, y = np.asarray(places.get(k, rotors[k].position[:2])).tolist()
-        spin = -rotors[k].spin if k in turned else rotors[k].spin
+        spin = -rotors[k].spin if k in spun else rotors[k].spin
         rotors[k] = rotors[k].model_copy(update={"position": (x, y, rotors[k].position[2]), "spin": spin})
     return vehicle.model_copy(update={"rotors": tuple(rotors)})
-
-
-def _spun(vehicle: Vehicle, turned: Sequence[int]) -> Vehicle:
-    """The vehicle with the spins of some rotors, counted from 0, the other way."""
-    return _described(vehicle, {}, turned)
 
 
 def _rotated(vehicle: Vehicle, angle: float) -> Vehicle:
     """The vehicle with its rotor positions turned about z by an angle [rad]."""
     cos, sin = math.cos(angle), math.sin(angle)
-    return _described(vehicle, dict(enumerate(vehicle.rotor_positions[:, :2] @ [[cos, sin], [-sin, cos]])))
+    return _built(vehicle, dict(enumerate(vehicle.rotor_positions[:, :2] @ [[cos, sin], [-sin, cos]])))
 
 
 def _listed(rotors: Sequence[Order]) -> str:
@@ -900,7 +895,7 @@ guesses of inertia and guesses of b spread (standard deviations of the logarithm
 
 def mass_check(log: Log) -> Check | None:
     """Weighs the vehicle by its known thrust coefficient; None where that is not known or nothing flew."""
-    vehicle, known = log.vehicle, _known_thrust(log.vehicle)
+    vehicle, known = log.vehicle, log.vehicle.stand_thrust or _known(log.vehicle, "b")
     from_hover = log.once(hover_check).numbers.get("b_from_hover", 0.0)
     if known is None or from_hover <= 0.0:
         return None
@@ -920,11 +915,6 @@ def mass_check(log: Log) -> Check | None:
         return check(OK, message)
     fix = f"weigh the vehicle: {mass:.3g} kg would fit; or check the thrust stand and the unit of the rotor speeds"
     return check(WARNING, message, fix, off=_heavier(1.0 / factor))
-
-
-def _known_thrust(vehicle: Vehicle) -> tuple[float, float] | None:
-    """Thrust coefficient and its relative standard deviation, where it rests on more than a guess."""
-    return _known(vehicle, "b") if vehicle.stand_thrust is None else vehicle.stand_thrust
 
 
 def _known(vehicle: Vehicle, name: str) -> tuple[float, float] | None:
@@ -954,8 +944,8 @@ def geometry_check(log: Log) -> Check:
         return check(UNKNOWN, few)
     numbers = {"turned_rad": angle, "explained": explained}
     turned = f"rotor positions agree with the motion within {abs(math.degrees(angle)):.0f} deg"
-    thrust, inertias = _known_thrust(vehicle), [_known(vehicle, n) for n in ("J_xx", "J_yy")]
-    if thrust is None or not all(inertias):
+    thrust = vehicle.stand_thrust or _known(vehicle, "b")
+    if thrust is None or not all(_known(vehicle, name) for name in ("J_xx", "J_yy")):
         hover = log.once(hover_check).numbers.get("b_from_hover", 0.0)
         message = f"{turned}; the arm itself shows only relative to the inertia"
         return _unlikely(vehicle, scale, hover, numbers) or check(OK, message, numbers=numbers)
@@ -967,7 +957,7 @@ def geometry_check(log: Log) -> Check:
         f"roll and pitch answer {factor:.2f} times as strongly as the stated arm of {vehicle.arm:.3g} m lets expect"
     )
     fix = f"measure the arm: {factor * vehicle.arm:.3g} m, {factor:.2f} times it, would fit; or the inertias are wrong"
-    return check(WARNING, message, fix, off=_farther(factor))
+    return check(WARNING, message, fix, off=estimates_off(torque=(factor, factor, 1.0)))
 
 
 def _unlikely(vehicle: Vehicle, scale: float, hover: float, numbers: dict[str, float]) -> Check | None:
@@ -998,7 +988,8 @@ def _unlikely(vehicle: Vehicle, scale: float, hover: float, numbers: dict[str, f
         low, high = now * np.exp(-found[k] + np.array([-2.0, 2.0]) / np.sqrt(power[k]))
         stated.append(f"the {kind} {now:.3g} {unit}")
         fits.append(f"the {kind}: {low:.2g} to {high:.2g} {unit} would fit")
-        doubts.append(_heavier(math.exp(found[k])) if k else _farther(math.exp(-found[k])))
+        farther = math.exp(-found[k])
+        doubts.append(_heavier(1.0 / farther) if k else estimates_off(torque=(farther, farther, 1.0)))
     message = (
         f"{'are' if len(stated) > 1 else 'is'} {' and '.join(stated)} right? Weight and motion make the inertia about "
         f"x and y {size:.2g} times mass times arm squared ({_SHARE:g} on most vehicles) and {hover / scale:.2g} times "
@@ -1006,8 +997,3 @@ def _unlikely(vehicle: Vehicle, scale: float, hover: float, numbers: dict[str, f
     )
     doubt = farthest(doubts) if surprise.max() > 2.5 else {}  # then intervals hold it, too
     return Check("geometry", WARNING, message, f"measure {', and '.join(fits)}", {**numbers, "size": size}, doubt)
-
-
-def _farther(factor: float) -> Off:
-    """Errors of the estimates if the rotors are so many times as far from the centre as in the vehicle file."""
-    return estimates_off(torque=(factor, factor, 1.0))

@@ -359,7 +359,7 @@ class Health:
         score: how far the flights are from healthy ones, in standard deviations of these.
         p_value: chance that a healthy flight looks as changed; where nothing explains a change, that one is as far
             from what explains best.
-        trim: of the flights in question, shape (4,), see `trims.AXES`.
+        trim: of the flights in question, shape (4,), see `AXES`.
         distance: of each trim from healthy, in standard deviations, shape (4,).
         healthy: the baseline's trim and spread.
         unfamiliar: why the flights are of a kind that no baseline flight is; the verdict is unknown then.  Else empty.
@@ -425,34 +425,17 @@ def assess(flights: Sequence[FlightTrim], baseline: Sequence[FlightTrim], vehicl
             lacking = count - healthy.flights
             break
     verdict = "unknown" if unexplained or lacking or unfamiliar else "changed" if named else "unchanged"
-    changes = () if unexplained else _changes(found, vehicle, verdict == "changed", not unfamiliar)
+    changes = () if unexplained else changes_of(found, vehicle, verdict == "changed", not unfamiliar)
     score, p_value = float(np.sqrt((far**2).sum())), p_rest if unexplained else p_value
     known = healthy, tuple(flights), tuple(baseline)
     return Health(verdict, lacking, changes, score, p_value, trim, far, *known, unfamiliar)
 
 
-def changes_of(
-    change: FloatArray, healthy: Healthy, flights: int, vehicle: Vehicle, shares: FloatArray, changed: bool
-) -> tuple[Change, ...]:
-    """The best explanation of a change of trim.
-
-    Args:
-        change: of trim, shape (4,).
-        healthy: what it counts from, and the spread.
-        flights: number of flights that the change is the mean of.
-        vehicle: geometry.
-        shares: each rotor's share of the load with the change, shape (rotors,).
-        changed: whether it is one; else nothing is named with confidence.
-    """
-    offered = hypotheses(vehicle, shares, healthy.mean)
-    return _changes(compare(exact(change), healthy, flights, offered), vehicle, changed)
-
-
-def _changes(found: Sequence[Explained], vehicle: Vehicle, changed: bool, steady: bool = True) -> tuple[Change, ...]:
-    """The best explanation as changes, largest first, with the explanations that lost.
+def changes_of(found: Sequence[Explained], vehicle: Vehicle, changed: bool, steady: bool = True) -> tuple[Change, ...]:
+    """The best of the explanations of `compare` as changes, largest first, with the explanations that lost.
 
     Of two rotors on one axis only the yaw trim tells which one is weak; where it does not, or the flights are no
-    `steady` ones, as motion moves that trim most, both are named.
+    `steady` ones, as motion moves that trim most, both are named.  Unless `changed`, nothing is named with confidence.
     """
     shares = np.exp([one.log_evidence - found[0].log_evidence for one in found])
     shares /= shares.sum()

@@ -13,7 +13,7 @@ from typing import ClassVar, Literal
 import numpy as np
 from scipy.special import stdtrit
 
-from quadid.condition.changes import Change, changes_of, distance, p_healthy
+from quadid.condition.changes import Change, changes_of, compare, distance, exact, hypotheses, p_healthy
 from quadid.condition.trim import AXES, FlightTrim, Healthy, healthy_spread, trim_of_load, wander
 from quadid.types import FloatArray
 from quadid.vehicle import GRAVITY, Vehicle
@@ -187,7 +187,8 @@ class HealthWatch:
         changes: tuple[Change, ...] = ()
         if verdict == "changed":
             shares = np.mean(self._shares[-RECENT:], axis=0)
-            changes = changes_of(change, against, 1, self._vehicle, shares, changed=True)
+            found = compare(exact(change), against, 1, hypotheses(self._vehicle, shares, against.mean))
+            changes = changes_of(found, self._vehicle, changed=True)
         n = len(self._vehicle.rotors)
         loss, interval = [0.0] * n, [(0.0, 0.0)] * n
         for one in changes:

@@ -129,10 +129,11 @@ def test_a_filter_that_the_vehicle_file_has_is_not_named(flight: Flight) -> None
 
 def test_late_and_early_are_measured_to_milliseconds(flight: Flight) -> None:
     recording, _ = flight
-    gyro, attitude = recording.channels["gyro"], recording.channels["attitude"]
-    own = response(gyro, attitude)
+    gyro = recording.channels["gyro"]
+    own = response(Log(recording))
     for seconds in (-0.11, -0.04, 0.02, 0.16):
-        moved = response(replace(gyro, values=late(seconds)(gyro)), attitude)
+        channels = {**recording.channels, "gyro": replace(gyro, values=late(seconds)(gyro))}
+        moved = response(Log(replace(recording, channels=channels)))
         assert own is not None
         assert moved is not None
         assert moved.late - own.late == pytest.approx(seconds, abs=0.004)
@@ -141,7 +142,7 @@ def test_late_and_early_are_measured_to_milliseconds(flight: Flight) -> None:
 def test_attitude_of_which_only_noise_is_left_tells_nothing() -> None:
     """A heading that drifts in hover goes with the gyro's noise by chance."""
     hover = quadid.simulate("pelican_x", seconds=40.0, seed=3, profile="hover", rate=100.0).flight.recording
-    assert response(hover.channels["gyro"], hover.channels["attitude"]) is None
+    assert response(Log(hover)) is None
 
 
 # --- Rates of angles, or the end of a swing
