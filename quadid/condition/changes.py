@@ -33,8 +33,6 @@ REACH = 0.7
 """An added mass sits this far from the centre, in arms (standard deviation of each coordinate)."""
 SHIFT = 0.05
 """Prior standard deviation of a shift of the CG without mass, in arms: a battery that has slid."""
-MOST_ROTORS = 3
-"""Most rotors that are damaged at once."""
 _KINDS = {"weak_rotor": 0.7, "payload": 0.2, "cg_offset": 0.06, "effort": 0.04}
 """Prior odds of the kinds of change; each further damaged rotor costs a factor of 0.3."""
 _STEP = 0.15
@@ -81,7 +79,7 @@ def hypotheses(vehicle: Vehicle, shares: FloatArray, trim: FloatArray) -> list[H
     single = [rotor_effect(vehicle, j, float(shares[j]), trim) for j in rotors]
     odds = {kind: float(np.log(p)) for kind, p in _KINDS.items()}
     out = []
-    for count in range(1, min(MOST_ROTORS, len(rotors) - 1) + 1):
+    for count in range(1, min(3, len(rotors) - 1) + 1):  # rotors that are damaged at once
         chosen = list(combinations(rotors, count))
         each = odds["weak_rotor"] + (count - 1) * np.log(0.3) - np.log(len(chosen))
         centre, positive = np.zeros(2 * count), tuple(range(0, 2 * count, 2))

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from quadid.checks.motion import flying_spans
+from quadid.checks.motion import TURN, flying_spans
 from quadid.data.grid import linear, moving_mean
 from quadid.data.rotor_signal import rotor_signal
 from quadid.data.window import Recording, sample_period
@@ -30,8 +30,6 @@ AXES = ("roll", "pitch", "yaw", "effort")
 """Parts of a trim; effort is the logarithm of rotor thrust commanded per specific force."""
 BLOCK = 1.0
 """Trims are means over this long [s]."""
-_TURN = 0.2
-"""Rates are averaged over this long [s], so that a propeller that shakes is no livelier flight."""
 _FEWEST = 5
 """A flight with fewer blocks shows no trim."""
 _AIR_SLOPE = 0.02
@@ -48,7 +46,7 @@ class FlightTrim(NamedTuple):
         wander: standard deviation of means of three seconds about the flight's, shape (4,).
         seconds: of steady flight.
         channels: what the effort and the motion were taken from, for people.
-        turning: root mean square of the rates in steady flight, averaged over `_TURN` [rad/s]; NaN without a gyro.
+        turning: root mean square of the rates in steady flight, averaged over `TURN` [rad/s]; NaN without a gyro.
     """
 
     name: str
@@ -117,7 +115,8 @@ def flight_trim(recording: Recording, vehicle: Vehicle) -> FlightTrim:
     places = places if len(places) > 1 else np.array_split(np.arange(len(edges)), 3)
     turning = math.nan
     if (gyro := recording.channels.get("gyro")) is not None and len(gyro.t) > 1:
-        rates = moving_mean(gyro.values, max(1, round(_TURN / sample_period(gyro.t))))
+        # Averaged, so that a propeller that shakes is no livelier flight
+        rates = moving_mean(gyro.values, max(1, round(TURN / sample_period(gyro.t))))
         squares, enough = _block_means(gyro.t, rates**2, edges)
         turning = float(np.sqrt(squares[enough].sum(axis=1).mean())) if enough.any() else math.nan
     return FlightTrim(
@@ -194,8 +193,6 @@ def _motion(recording: Recording, edges: FloatArray) -> tuple[FloatArray, str]:
 
 PRIOR_FLIGHTS = 4.0
 """Weight of the prior spread, in degrees of freedom."""
-LEAST = np.array([0.005, 0.005, 0.005, 0.01])
-"""Smallest prior spread of `AXES`: rotors of healthy vehicles share the load to 1 % each and better never."""
 _SHARED = np.array([[0.5, 0.5, 0.0, 0.0], [0.5, 0.5, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
 """Means over the trims that share a variance."""
 
@@ -241,8 +238,9 @@ def healthy_spread(baseline: Sequence[FlightTrim]) -> Healthy:
     inner = [flight.parts - flight.parts.mean(axis=0) for flight in baseline]
     parts = sum(float(len(rows) - 1) for rows in inner)
     within = np.sqrt(sum((rows**2).sum(axis=0) for rows in inner) / max(parts, 1.0))
-    # Flights differ twice as much as parts of one flight.
-    prior = _SHARED @ np.maximum(2.0 * within, LEAST) ** 2
+    # Flights differ twice as much as parts of one flight; rotors of healthy vehicles share the load to 1 % each and
+    # better never.
+    prior = _SHARED @ np.maximum(2.0 * within, [0.005, 0.005, 0.005, 0.01]) ** 2
     squares = _SHARED @ ((means - centre) ** 2).sum(axis=0) / np.diag(_SHARED)
     shares = np.mean([flight.shares for flight in baseline], axis=0)
     return Healthy(centre, np.sqrt((PRIOR_FLIGHTS * prior + squares) / freedom), freedom, len(means), shares)
