@@ -1,6 +1,5 @@
 """Publication: on the disk before on the wire, one service a topic, neighbours named."""
 
-import math
 import os
 import random
 import sqlite3
@@ -292,24 +291,6 @@ def test_a_waiting_set_is_on_the_disk_before_its_number_is_told(tmp_path: Path) 
     said(service, numbered(held.sequence))
     assert numbers_of(tmp_path / "h.sqlite") == [held.sequence]
     service.close()
-
-
-@pytest.mark.parametrize("value", [-1.0, 0.0, math.nan, math.inf])
-def test_a_restored_set_is_checked_as_a_fresh_estimate(tmp_path: Path, value: float, happened: Happened) -> None:
-    path = tmp_path / "h.sqlite"
-    store = Store(path, "pelican")
-    store.numbered(replace(online_set(TRUE), sequence=7, approved_by="auto"))
-    store.close(60.0)
-    with sqlite3.connect(path) as db:
-        (data,) = db.execute("SELECT data FROM sets").fetchone()
-        text = "null" if not math.isfinite(value) else repr(value)
-        db.execute("UPDATE sets SET data = ?", (data.replace(f'"value": {TRUE["b"]!r}', f'"value": {text}', 1),))
-    store = Store(path, "pelican")
-    service = service_with(store)
-    assert service.session.active_set.in_force is None
-    assert not [o for o in said(service, event("is not taken up again")) if isinstance(o, Publish)]
-    store.close(60.0)
-    happened(25, f"b = {value} written into the stored set: not taken up, not published, said")
 
 
 def test_the_writer_outlives_what_no_history_can_hold(tmp_path: Path, happened: Happened) -> None:
