@@ -532,7 +532,7 @@ class MavlinkLink:
     def traffic(self) -> Traffic:
         """Messages of the link."""
         wire = self._wire
-        problems = [self._source.problem, self._decoder.order.problem, wire.memory.problem if wire.memory else ""]
+        problems = [self._source.problem, self._decoder.order.problem, wire.mav.problem]
         for own, most, whose in ((True, FRAMES_A_SECOND, "the vehicle"), (False, OTHERS_A_SECOND, "others")):
             if self._clock() - self._flooded[own] < FLOODED:
                 problems.append(f"a flood: more than {most} frames of {whose} in a second, the rest is dropped unread")

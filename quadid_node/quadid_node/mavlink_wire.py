@@ -21,70 +21,6 @@ from quadid_replay.mavlink_messages import extend_dialect, two_rows
 from quadid.errors import QuadidError
 from quadid.files import read_regular, written_whole
 
-# --- Time stamps of signatures over a restart, as the MAVLink specification asks: what was sent before it is a replay
-
-
-SAVED_EVERY = 1.0
-"""[s]"""
-UNITS = 100_000
-"""Units of a signature's time stamp in a second."""
-_MOST_STREAMS = 256
-
-
-def memory_path(folder: Path, key: bytes) -> Path:
-    """The file that remembers the streams signed with a key."""
-    return folder / f"signing-{hashlib.sha256(key).hexdigest()[:16]}.json"
-
-
-class SigningMemory:
-    """Keeps the newest time stamps of one key in a file.
-
-    Attributes:
-        problem: why they are not kept, or empty.
-    """
-
-    def __init__(self, path: Path, signing: Any, clock: Callable[[], float] = time.monotonic) -> None:
-        """Reads what was kept into pymavlink's `signing`.
-
-        What came after the last save is not in the file: it is refused too, being at most `SAVED_EVERY` newer.
-        """
-        self._path, self._signing, self._clock = path, signing, clock
-        self._saved_at = -1e9
-        self._saved: dict[Any, int] = {}
-        self.problem = ""
-        try:
-            kept = json.loads(read_regular(path))
-            streams = {tuple(int(n) for n in name.split(".")): int(stamp) for name, stamp in kept["streams"].items()}
-            newest = int(kept["newest"])
-        except FileNotFoundError:
-            return
-        except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
-            self.problem = f"time stamps of signatures in {path} cannot be read ({error}): only this clock guards now"
-            return
-        unsaved = round(SAVED_EVERY * UNITS)
-        signing.stream_timestamps.update({stream: stamp + unsaved for stream, stamp in streams.items()})
-        signing.timestamp = max(signing.timestamp, newest + unsaved)
-
-    def keep(self, at_once: bool = False) -> None:
-        """Saves what has changed, once a second."""
-        now, streams = self._clock(), self._signing.stream_timestamps
-        if not (at_once or now - self._saved_at >= SAVED_EVERY) or streams == self._saved:
-            return
-        self._saved_at = now
-        last = sorted(streams.items(), key=lambda entry: -entry[1])[:_MOST_STREAMS]
-        kept = {"newest": last[0][1], "streams": {".".join(map(str, stream)): stamp for stream, stamp in last}}
-        try:
-            self._path.parent.mkdir(parents=True, exist_ok=True)
-            with written_whole(self._path) as part, part.open("w", encoding="ascii") as file:
-                json.dump(kept, file)
-                file.flush()
-                os.fsync(file.fileno())
-        except OSError as error:
-            self.problem = f"time stamps of signatures cannot be kept in {self._path} ({error.strerror})"
-            return
-        self._saved, self.problem = dict(streams), ""
-
-
 # --- Who speaks on a MAVLink link: one source for the vehicle, and the few peers that are answered
 
 
@@ -211,8 +147,14 @@ class Peers:
 
 dialect: Any = extend_dialect(ardupilotmega)
 _Coder: Any = dialect.MAVLink
+UNITS = 100_000
+"""Units of a signature's timestamp in a second;"""
 SIGNING_EPOCH = 1420070400
-"""Signature timestamps count 10 us units from 2015-01-01."""
+"""... they are counted from 2015-01-01 [s, UNIX]."""
+SAVED_EVERY = 1.0
+"""Timestamps are saved so often [s],"""
+_MOST_STREAMS = 256
+"""... those of so many streams."""
 MOST_BEHIND = 60 * UNITS
 """A new stream may be this far behind the newest signature seen [10 us]: older ones are replays."""
 LAST_PORT = 65535
@@ -277,17 +219,70 @@ def is_autopilot(frame: bytes) -> bool:
     return message_id(frame) == 0 and frame[place : place + 1] not in (b"", bytes([dialect.MAV_AUTOPILOT_INVALID]))
 
 
+def memory_path(folder: Path, key: bytes) -> Path:
+    """The file that remembers the streams signed with a key."""
+    return folder / f"signing-{hashlib.sha256(key).hexdigest()[:16]}.json"
+
+
 class SafeMavlink(_Coder):
     """pymavlink's coder with its signature check mended: nothing of a frame is believed before its signature.
 
     pymavlink notes a frame's timestamp first and checks the signature afterwards, so that one forged frame from the far
-    future locks the true sender out.
+    future locks the true sender out.  The newest timestamps outlive a restart, as the MAVLink specification asks: what
+    was sent before it is a replay.
 
     Attributes:
         behind: how far the newest stream refused for its age alone is behind [s]; 0 when the last one was believed.
+        problem: why timestamps are not kept over a restart, or empty.
     """
 
-    behind = 0.0
+    def __init__(self, system: int, component: int, key: bytes | None = None, memory: Path | None = None) -> None:
+        """Speaks as a component of a system.
+
+        Args:
+            key: signs what is sent; what comes is refused where it is not signed with it.
+            memory: file that keeps the newest timestamps.  What came after its last save is refused too, being at most
+                `SAVED_EVERY` newer.
+        """
+        super().__init__(None, srcSystem=system, srcComponent=component)
+        self.behind, self.problem = 0.0, ""
+        self._memory, self._saved_at, self._saved = memory, -math.inf, dict[Any, int]()
+        if key is not None:
+            self.signing.secret_key, self.signing.sign_outgoing = key, True
+            self.signing.timestamp = int((time.time() - SIGNING_EPOCH) * UNITS)
+        if key is None or memory is None:
+            return
+        try:
+            kept = json.loads(read_regular(memory))
+            streams = {tuple(int(n) for n in name.split(".")): int(stamp) for name, stamp in kept["streams"].items()}
+            newest = int(kept["newest"])
+        except FileNotFoundError:
+            return
+        except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
+            self.problem = f"time stamps of signatures in {memory} cannot be read ({error}): only this clock guards now"
+            return
+        unsaved = round(SAVED_EVERY * UNITS)
+        self.signing.stream_timestamps.update({stream: stamp + unsaved for stream, stamp in streams.items()})
+        self.signing.timestamp = max(self.signing.timestamp, newest + unsaved)
+
+    def keep(self, at_once: bool = False) -> None:
+        """Saves timestamps that have changed, once a second."""
+        now, streams, path = time.monotonic(), self.signing.stream_timestamps, self._memory
+        if path is None or not (at_once or now - self._saved_at >= SAVED_EVERY) or streams == self._saved:
+            return
+        self._saved_at = now
+        last = sorted(streams.items(), key=lambda entry: -entry[1])[:_MOST_STREAMS]
+        kept = {"newest": last[0][1], "streams": {".".join(map(str, stream)): stamp for stream, stamp in last}}
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with written_whole(path) as part, part.open("w", encoding="ascii") as file:
+                json.dump(kept, file)
+                file.flush()
+                os.fsync(file.fileno())
+        except OSError as error:
+            self.problem = f"time stamps of signatures cannot be kept in {path} ({error.strerror})"
+            return
+        self._saved, self.problem = dict(streams), ""
 
     def check_signature(self, msgbuf: bytearray, srcSystem: int, srcComponent: int) -> bool:
         """Checks signature, then timestamp; notes the timestamp only of a frame that passed both."""
@@ -361,7 +356,6 @@ class Wire:
         drained: whether nothing of the vehicle was left unread when messages were looked for last.
         listened: for how long somebody has listened to everything that came [s].
         held_back: when a message was last not sent because too much is asked for [s].
-        memory: of time stamps of signatures over a restart; None without a key, or a file for them.
     """
 
     def __init__(
@@ -392,13 +386,7 @@ class Wire:
         self._serves = self._datagrams and bool(self._conn.udp_server)
         if self._serves:
             self._conn.port.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVED)
-        self.mav = SafeMavlink(None, srcSystem=system, srcComponent=component)
-        self.memory: SigningMemory | None = None
-        if key is not None:
-            self.mav.signing.secret_key = key
-            self.mav.signing.sign_outgoing = True
-            self.mav.signing.timestamp = int((time.time() - SIGNING_EPOCH) * UNITS)
-            self.memory = SigningMemory(memory, self.mav.signing) if memory is not None else None
+        self.mav = SafeMavlink(system, component, key, memory)
         self._buffer = bytearray()
         self._own: socket.socket | None = None
         self._own_address: Any = None
@@ -454,8 +442,7 @@ class Wire:
             if port is ports[0]:
                 self.drained = drained
                 self.listened += min(pause, STALL) * drained
-        if self.memory is not None:
-            self.memory.keep()
+        self.mav.keep()
 
     def follow(self, address: Any) -> None:
         """Gives what comes from one address a buffer of its own, so that the others' floods leave it alone.
@@ -506,8 +493,7 @@ class Wire:
 
     def close(self) -> None:
         """Closes the link."""
-        if self.memory is not None:
-            self.memory.keep(at_once=True)
+        self.mav.keep(at_once=True)
         if self._own is not None:
             self._own.close()
         self._conn.close()

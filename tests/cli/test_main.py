@@ -10,13 +10,12 @@ import sys
 import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
 from quadid_evaluation.paper.compare import Methods
 from quadid_node.history import read_history
-from quadid_node.mavlink_wire import SigningMemory, read_key
+from quadid_node.mavlink_wire import SafeMavlink, read_key
 from quadid_node.wire_format import repeat
 from quadid_node.zenoh import config_of
 from quadid_replay import open_log
@@ -387,7 +386,9 @@ def test_links_under_the_names_of_what_is_written_over_time_are_replaced(
         path.symlink_to(mine)
         logs.append(path)
     done.vehicle.save(saved)
-    SigningMemory(stamps, SimpleNamespace(stream_timestamps={(1, 1, 1): 5}, timestamp=0)).keep(at_once=True)
+    coder = SafeMavlink(1, 1, bytes(32), stamps)
+    coder.signing.stream_timestamps[1, 1, 1] = 5
+    coder.keep(at_once=True)
     assert done.save_series(tmp_path) == series
     assert mine.read_text() == "precious"
     assert not [path for path in (*logs, *series) if path.is_symlink()]
@@ -430,8 +431,7 @@ def test_a_link_of_the_system_to_a_redirected_file_stays(tmp_path: Path, happene
 
 def test_a_pipe_where_time_stamps_of_signatures_were_kept_is_said(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "kept.json")
-    signing = SimpleNamespace(stream_timestamps={}, timestamp=0)
-    assert "no regular file" in SigningMemory(tmp_path / "kept.json", signing).problem
+    assert "no regular file" in SafeMavlink(1, 1, bytes(32), tmp_path / "kept.json").problem
 
 
 # --- What commands print fits a narrow terminal: lines fold, and every value stands there whole

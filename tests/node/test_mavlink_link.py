@@ -167,7 +167,7 @@ def test_a_flood_is_bounded_and_the_peer_list_does_not_grow(port: int, happened:
 @given(st.lists(st.binary(max_size=400), max_size=8), st.booleans())
 def test_any_bytes_give_frames_or_nothing(chunks: list[bytes], whole: bool) -> None:
     buffer = bytearray()
-    mav = SafeMavlink(None)
+    mav = SafeMavlink(1, 1)
     for chunk in chunks:
         buffer += chunk
         for frame in frames(buffer, whole):
