@@ -382,14 +382,12 @@ class StoredSet(NamedTuple):
         item: the set; None where there is none, or none that can be read.
         why_none: why it cannot be taken up; empty where it can, or where there is none.
         confirmed: whether a flight of the last run confirmed it; after a restart a set is stale until one does.
-        rests: `rests_on` of the vehicle that it was estimated for, as far as the history says.
         row: its columns.
     """
 
     item: OnlineSet | None
     why_none: str = ""
     confirmed: bool = True
-    rests: Mapping[str, Any] = MappingProxyType({})
     row: Mapping[str, Any] = MappingProxyType({})
 
     @property
@@ -421,7 +419,8 @@ def in_force(db: sqlite3.Connection, name: str, gate: GateSettings, vehicle: Veh
         return last
     told = stored(db, name, SAID, gate, vehicle).item or last.item
     item = replace(last.item, outdated=told.outdated, outdated_code=told.outdated_code)
-    other = [] if vehicle is None else [n for n, now in rests_on(vehicle).items() if last.rests.get(n, now) != now]
+    then, now = json.loads(last.row["data"]), rests_on(vehicle) if vehicle is not None else {}
+    other = [name for name in now if then.get(name) not in (None, now[name])]
     if other and not item.outdated:
         item = replace(item, outdated=f"it rests on other {' and '.join(other)} than the vehicle file has now")
     if vehicle is not None and not item.outdated and not abs(item.mass / vehicle.mass - 1.0) <= _SAME_MASS:
@@ -444,10 +443,8 @@ def stored(db: sqlite3.Connection, name: str, which: str, gate: GateSettings, ve
         return StoredSet(None)
     (row,), found = rows, None
     try:
-        data = json.loads(row["data"])
-        found = set_from_dict(data)
-        why = why_none(found, row["sequence"], gate, vehicle)
-        return StoredSet(found, why, rests={n: v for n, v in data.items() if v is not None}, row=row)
+        found = set_from_dict(json.loads(row["data"]))
+        return StoredSet(found, why_none(found, row["sequence"], gate, vehicle), row=row)
     except UNREADABLE as error:
         return StoredSet(found, f"{type(error).__name__}: {str(error)[:120]}")
 
