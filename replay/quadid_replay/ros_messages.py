@@ -158,7 +158,10 @@ def _run(*paths: str) -> Callable[[Any], list[float]]:
     def numbers(message: Any) -> list[float]:
         out: list[float] = []
         for value in (get(message) for get in getters):
-            out += value if hasattr(value, "__len__") else [value]
+            if hasattr(value, "__len__"):
+                out.extend(value)  # not +=, which adds an array of ROS' own messages to the numbers themselves
+            else:
+                out.append(value)
         return out
 
     return numbers

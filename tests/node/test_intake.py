@@ -151,6 +151,22 @@ def test_a_damaged_message_spoils_only_itself(messages: list[Message]) -> None:
     assert whole.failed == single.failed == 1
 
 
+def test_messages_whose_arrays_are_numpys_are_read_as_others(messages: list[Message]) -> None:
+    """As ROS' own decoder makes them: a live IMU was not read for a while."""
+    imu = [data for topic, data in messages if topic == "imu"][:5]
+    entry, name = next(e for e in INPUTS if e.topic == "imu"), "sensor_msgs/msg/Imu"
+    decode = generate_dynamic(name, schema_text(name))[name]
+
+    def with_arrays(data: bytes) -> Any:
+        message = decode(data)
+        for field in ("orientation", "angular_velocity", "linear_acceleration"):
+            setattr(message, f"{field}_covariance", np.array(getattr(message, f"{field}_covariance")))
+        return message
+
+    reader = Decoder(entry, SourceSelector(best_ranks(INPUTS)), 4, with_arrays)
+    assert flat(reader.take(imu)) == flat(decoder(entry, SourceSelector(best_ranks(INPUTS))).take(imu)) != []
+
+
 def imu_decoder() -> Decoder:
     """Decoder of the IMU beside a topic that tells the attitude."""
     chooser = SourceSelector(best_ranks(INPUTS))
