@@ -10,15 +10,16 @@ import os
 import sqlite3
 import sys
 import time
-from collections import defaultdict
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache
+from itertools import islice
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from tempfile import TemporaryDirectory
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import typer
 from quadid_replay import open_log
@@ -28,7 +29,6 @@ from quadid_replay.opening import stored_size
 from quadid.app.fleet_page import Fleet, Row, health_trend, summarise
 from quadid.app.logs import (
     GRID,
-    Log,
     OutputError,
     check_conventions,
     check_folder,
@@ -39,7 +39,6 @@ from quadid.app.logs import (
 )
 from quadid.app.options import OUT, Described, NamedColumns, Rate, Seed, Typed, vehicle_if
 from quadid.app.outcome import Advance, silent
-from quadid.data.window import Recording
 from quadid.errors import LogError, NotIdentifiableError, QuadidError, VehicleError
 from quadid.files import check_beside, read_regular
 from quadid.sanitise import one_line
@@ -132,6 +131,7 @@ def fleet(
 
 EARLIEST = 946_684_800.0
 """Times before the year 2000 are seconds since boot, not dates [s]."""
+_VALUE = ("unit", "value", "low", "high")
 
 
 @dataclass(frozen=True)
@@ -169,19 +169,12 @@ def identify_one(job: Job) -> Row:
     begin = time.perf_counter()
     row = blank(job)
     try:
-        cut, vehicle = parse_part(job.path), Vehicle.from_yaml(job.vehicle, job.unit)
-        recording = open_log(cut.path, columns=vehicle.columns)
-        checked = check_conventions(recording, vehicle, cut)
-        row |= _seen(cut.of(recording), vehicle, checked.doubts)
-        require_gyro(recording)
-        log = on_grid(cut.path, recording, vehicle, job.rate, cut, checked)
-        row |= {"seconds": log.grid.seconds_used, "warnings": list(dict.fromkeys([*row["warnings"], *log.warnings]))}
-        row |= {"status": "done", "reason": "", **_identified(job, log)}
-    except NotIdentifiableError as error:
-        row |= {"status": "refused", "reason": one_line(str(error), 500)}
+        _identify(job, row)
+        row |= {"status": "done", "reason": ""}
     except (QuadidError, OSError) as error:
-        status = "refused" if row["trims"] else "unreadable"  # what shows its trim has been read
-        row |= {"status": status, "reason": one_line(str(error), 500)}
+        # What shows its trim has been read.
+        unusable = isinstance(error, NotIdentifiableError) or row["trims"]
+        row |= {"status": "refused" if unusable else "unreadable", "reason": one_line(str(error), 500)}
     except Exception as error:  # noqa: BLE001 - one log's defect is reported in its row and must not stop the rest
         row |= {"status": "failed", "reason": f"{type(error).__name__}: {one_line(str(error), 500)}"}
     return {**row, "took": time.perf_counter() - begin, "worker": os.getpid()}
@@ -189,50 +182,44 @@ def identify_one(job: Job) -> Row:
 
 def blank(job: Job) -> Row:
     """The row of a log of which nothing is known yet but its file."""
-    return {
-        "name": job.name, "unit": job.unit, "size": job.size, "modified": job.modified, "key": job.key,
-        "sha256": None, "started": 1e-9 * job.modified, "dated_by": "file", "format": None, "seconds": None,
-        "mse_initial": None, "mse_fitted": None, "verdict": None, "parameters": [], "findings": [], "trims": [],
-        "warnings": [],
-    }  # fmt: skip
+    empty: Row = dict.fromkeys(TABLES["logs"]) | {part: [] for part in (*PARTS, "warnings")}
+    known = ("name", "unit", "size", "modified", "key")
+    return empty | {key: getattr(job, key) for key in known} | {"started": 1e-9 * job.modified, "dated_by": "file"}
 
 
-def _seen(recording: Recording, vehicle: Vehicle, doubts: Sequence[str]) -> Row:
-    """Facts of a flight, whether or not anything can be fitted to it; its trim where it flew steadily."""
+def _identify(job: Job, row: Row) -> None:
+    """Adds to the row of a log what is found, step by step: what was found before an error stays in it."""
+    from quadid.app.diagnose import diagnose
+    from quadid.app.identify import identify
     from quadid.condition.trim import flight_to_dict, flight_trim
 
-    row: Row = {
-        "vehicle": vehicle.name,
-        "sha256": recording.sha256,
-        "format": recording.format,
-        "warnings": [f"{recording.name}: {text}" for text in (*recording.warnings, *doubts)],
-    }
-    if (first := recording.span[0]) > EARLIEST:  # the log has a date
+    cut, vehicle = parse_part(job.path), Vehicle.from_yaml(job.vehicle, job.unit)
+    recording = open_log(cut.path, columns=vehicle.columns)
+    checked = check_conventions(recording, vehicle, cut)
+    # Facts of the flight, whether or not anything can be fitted to it.
+    flown = cut.of(recording)
+    row |= {"vehicle": vehicle.name, "sha256": flown.sha256, "format": flown.format}
+    row["warnings"] += [f"{flown.name}: {text}" for text in (*flown.warnings, *checked.doubts)]
+    if (first := flown.span[0]) > EARLIEST:  # the log has a date
         row |= {"started": first, "dated_by": "log"}
+    # Its trim, where it flew steadily.
     try:
-        trim = flight_trim(recording, vehicle)
+        row["trims"] = [{"trim": json.dumps(flight_to_dict(flight_trim(flown, vehicle)))}]
     except NotIdentifiableError as error:
-        return row | {"warnings": [*row["warnings"], f"no trim: {error.found}"]}
-    return row | {"trims": [{"trim": json.dumps(flight_to_dict(trim))}]}
-
-
-def _identified(job: Job, log: Log) -> Row:
-    from quadid.app.identify import identify
-
+        row["warnings"].append(f"no trim: {error.found}")
+    # Its parameters, and what the simulation gets wrong.
+    require_gyro(recording)
+    log = on_grid(cut.path, recording, vehicle, job.rate, cut, checked)
+    row |= {"seconds": log.grid.seconds_used, "warnings": list(dict.fromkeys([*row["warnings"], *log.warnings]))}
     found = identify(log, seed=job.seed)
-    error, columns = found.result["sets"][0]["mse"], ("unit", "value", "low", "high", "status")
-    row: Row = {
-        "mse_initial": error["initial"],
-        "mse_fitted": error["fitted"],
-        "parameters": [{"parameter": r["name"], **{k: r[k] for k in columns}} for r in found.records()],
-    }
+    named = [{"parameter": r["name"], **{k: r[k] for k in (*_VALUE, "status")}} for r in found.records()]
+    causes: Row = {}
     if job.diagnose:
-        from quadid.app.diagnose import diagnose
-
         done = diagnose(log, seed=job.seed)
-        kept = ("effect", "confident", "parameter", "unit", "value", "low", "high", "mse_before", "mse_after")
-        row |= {"verdict": done.result["verdict"], "findings": [{k: r[k] for k in kept} for r in done.records()]}
-    return row
+        kept = ("effect", "confident", "parameter", *_VALUE, "mse_before", "mse_after")
+        causes = {"verdict": done.result["verdict"], "findings": [{k: r[k] for k in kept} for r in done.records()]}
+    errors = found.result["sets"][0]["mse"]
+    row |= {"mse_initial": errors["initial"], "mse_fitted": errors["fitted"], "parameters": named, **causes}
 
 
 # --- Jobs on Dask: an embedded cluster of processes, or one that is already there
@@ -371,54 +358,35 @@ def results(client: Any, jobs: Sequence[Job], work: Callable[[Job], Row] = ident
     Raises:
         ClusterError: no worker lives for `STARTING` seconds.
     """
+    from distributed import KilledWorker
+    from distributed.client import FutureCancelledError
+
     threads = sum(client.nthreads().values())
     if threads == 0:
         raise ClusterError("the cluster has no workers", "at least one", "start one with `dask worker ADDRESS`")
     # A dying worker takes along jobs that waited in it.  So these come again, as many as there are workers, and at last
     # one by one, where only a log that kills its worker is lost.
-    ahead = [AHEAD * threads, *[threads] * (ATTEMPTS - 2), 1]
-    for most in ahead:
-        jobs = yield from _answered(_stream(client, jobs, work, most))
-    yield from map(_lost, jobs)
-
-
-def _answered(ended: Iterator[tuple[Any, Job]]) -> Generator[Row, None, list[Job]]:
-    """Yields the rows of ended futures; returns the jobs whose worker died, or the result before it was fetched."""
-    from distributed import KilledWorker
-    from distributed.client import FutureCancelledError
-
-    died = []
-    for future, job in ended:
-        try:
-            row = dict(future.result()) if future.status == "finished" else None
-        except (KilledWorker, FutureCancelledError):
-            row = None
-        if row is None:
-            died.append(job)
-        else:
-            yield row
-    return died
-
-
-def _stream(client: Any, jobs: Sequence[Job], work: Callable[[Job], Row], ahead: int) -> Iterator[tuple[Any, Job]]:
-    """Ended futures with their jobs, in the order in which they end; at most `ahead` are handed out."""
-    waiting = iter(jobs)
-    ended: SimpleQueue[Any] = SimpleQueue()
-    running: dict[str, Job] = {}
-
-    def hand_out(job: Job) -> None:
-        future = client.submit(work, job, pure=False, retries=0)
-        running[future.key] = job
-        future.add_done_callback(ended.put)
-
-    for _, job in zip(range(ahead), waiting, strict=False):
-        hand_out(job)
-    while running:
-        future = _next_of(ended, client)
-        yield future, running.pop(future.key)
-        following = next(waiting, None)
-        if following is not None:
-            hand_out(following)
+    for ahead in (AHEAD * threads, *[threads] * (ATTEMPTS - 2), 1):
+        waiting, running, ended, died = iter(jobs), dict[str, Job](), SimpleQueue[Any](), list[Job]()
+        following = list(islice(waiting, ahead))
+        while following or running:
+            for job in following:
+                future = client.submit(work, job, pure=False, retries=0)
+                running[future.key] = job
+                future.add_done_callback(ended.put)
+            future = _next_of(ended, client)
+            job, following = running.pop(future.key), list(islice(waiting, 1))
+            try:
+                row = dict(future.result()) if future.status == "finished" else None
+            except (KilledWorker, FutureCancelledError):  # also where it dies before the result is fetched
+                row = None
+            if row is None:
+                died.append(job)
+            else:
+                yield row
+        jobs = died
+    reason = f"{ATTEMPTS} workers died with this log: too much memory (see --memory), or a crash in a library"
+    yield from ({**blank(job), "status": "failed", "reason": reason} for job in jobs)
 
 
 def _next_of(ended: SimpleQueue[Any], client: Any) -> Any:
@@ -443,11 +411,6 @@ def _no_worker(how: str) -> ClusterError:
     )
 
 
-def _lost(job: Job) -> Row:
-    reason = f"{ATTEMPTS} workers died with this log: too much memory (see --memory), or a crash in a library"
-    return {**blank(job), "status": "failed", "reason": reason, "took": None}
-
-
 # --- The logs of a folder, and which vehicle of the fleet each belongs to
 
 
@@ -456,13 +419,12 @@ SUFFIXES = (".mcap", ".tlog", ".bin", ".ulg")
 """Suffixes of logs: such a file is tried, and its refusal reported, even if its content is not recognised."""
 
 
-@dataclass(frozen=True)
-class Found:
+class Found(NamedTuple):
     """Logs of a folder as jobs, files that are no logs, and logs with the bytes of a job's (name of copy and job)."""
 
     jobs: tuple[Job, ...]
     others: tuple[str, ...]
-    copies: tuple[tuple[str, str], ...] = ()
+    copies: tuple[tuple[str, str], ...]
 
 
 def find_jobs(
@@ -489,43 +451,36 @@ def find_jobs(
     if not root.is_dir():
         fix = "name the folder that it is in" if root.exists() else "check the path"
         raise LogError(f"no folder {root}", "a folder with flight logs", fix)
-    jobs, others, texts, secret = list[Job](), list[str](), dict[Path, str](), _secret()
+    jobs, others, secret = list[Job](), list[str](), _secret()
+    read: Callable[[Path], Vehicle] = cache(Vehicle.named)
     for path in _files(root, leave_out):
-        name, folder = (_text(p.relative_to(root)) for p in (path, path.parent))
-        if not _is_log(path):
-            others.append(name)
-            continue
-        try:
-            status = path.stat()
-        except OSError:  # its folder does not let us, or its path is too long
-            others.append(name)
-            continue
-        text = _vehicle_text(path.parent, root, default, texts)
-        made_from = f"{status.st_size} {status.st_mtime_ns} {rate!r} {seed} {diagnose} {__version__}"
-        key = hmac.new(secret, "\0".join((name, made_from, text)).encode(errors="replace"), "sha256").hexdigest()[:32]
-        jobs.append(
-            Job(
-                str(path),
-                name,
-                _vehicle_name(text, folder),
-                text,
-                status.st_size,
-                status.st_mtime_ns,
-                key,
-                rate,
-                seed,
-                diagnose,
-            )
+        name, folder = (
+            # As every database and page can hold it.
+            os.fsencode(p.relative_to(root).as_posix()).decode(errors="backslashreplace")
+            for p in (path, path.parent)
         )
+        try:
+            status = path.stat() if _is_log(path) else None
+        except OSError:  # its folder does not let us, or its path is too long
+            status = None
+        if status is None:
+            others.append(name)
+            continue
+        above = (place / VEHICLE_FILE for place in path.parents if place.is_relative_to(root))
+        file = next((file for file in above if file.is_file()), None)
+        if file is None and default is None:
+            need, fix = f"a {VEHICLE_FILE} in that folder or above it", "add one, or give --vehicle"
+            raise VehicleError(f"no vehicle for {path.parent}", need, fix)
+        text = default or "" if file is None else read(file).to_yaml()
+        unit = Vehicle.from_yaml(text).name if folder == "." else folder
+        size, modified = status.st_size, status.st_mtime_ns
+        made_from = f"{name}\0{size} {modified} {rate!r} {seed} {diagnose} {__version__}\0{text}"
+        key = hmac.new(secret, made_from.encode(errors="replace"), "sha256").hexdigest()[:32]
+        jobs.append(Job(str(path), name, unit, text, size, modified, key, rate, seed, diagnose))
     if not jobs:
         raise LogError(f"no flight log below {root} ({len(others)} other files)", "MCAP, tlog, DataFlash, ULog or CSV")
     copies = _copies(jobs)
-    return Found(tuple(job for job in jobs if job.name not in copies), tuple(others), tuple(copies.items()))
-
-
-def _text(path: Path) -> str:
-    r"""A path as text that every database and page can hold; bytes that are none as ``\xff``."""
-    return os.fsencode(path.as_posix()).decode(errors="backslashreplace")
+    return Found(tuple(job for job in jobs if job.name not in copies), tuple(others), tuple(sorted(copies.items())))
 
 
 def _secret() -> bytes:
@@ -546,12 +501,12 @@ def _secret() -> bytes:
 
 def _copies(jobs: Sequence[Job]) -> dict[str, str]:
     """Logs with the bytes of another, and which: the file that was changed first, as a copy may have a later date."""
-    same_size: dict[int, list[Job]] = defaultdict(list)
-    for job in sorted(jobs, key=lambda job: (job.modified, job.name)):
-        same_size[job.size].append(job)
+    sizes = Counter(job.size for job in jobs)
     first: dict[bytes, str] = {}
     out = {}
-    for job in (job for some in same_size.values() if len(some) > 1 for job in some if job.size):
+    for job in sorted(jobs, key=lambda job: (job.modified, job.name)):
+        if not job.size or sizes[job.size] < 2:
+            continue
         try:
             stored_size(Path(job.path))
             with open(job.path, "rb") as file:
@@ -560,7 +515,7 @@ def _copies(jobs: Sequence[Job]) -> dict[str, str]:
             continue  # its row has the reason
         if first.setdefault(digest, job.name) != job.name:
             out[job.name] = first[digest]
-    return dict(sorted(out.items()))
+    return out
 
 
 def _files(root: Path, leave_out: Path | None) -> Iterator[Path]:
@@ -595,28 +550,6 @@ def _is_log(path: Path) -> bool:
     return True
 
 
-def _vehicle_text(folder: Path, root: Path, default: str | None, texts: dict[Path, str]) -> str:
-    for place in (folder, *folder.parents):
-        file = place / VEHICLE_FILE
-        if file in texts:
-            return texts[file]
-        if file.is_file():
-            texts[file] = Vehicle.named(file).to_yaml()
-            return texts[file]
-        if place == root:
-            break
-    if default is None:
-        raise VehicleError(
-            f"no vehicle for {folder}", f"a {VEHICLE_FILE} in that folder or above it", "add one, or give --vehicle"
-        )
-    return default
-
-
-@lru_cache(maxsize=64)
-def _vehicle_name(text: str, folder: str) -> str:
-    return Vehicle.from_yaml(text).name if folder == "." else folder
-
-
 # --- Results of a fleet on disk: SQLite while it runs, so that a stopped run goes on where it was; Parquet at its end
 
 
@@ -634,17 +567,13 @@ TABLES: dict[str, dict[str, str]] = {
 }
 """Columns of each table with their kinds: times in [s], started since 1970, size in bytes, modified in ns; the trim of
 a flight as JSON, for the comparison with other flights of its vehicle."""
-
-
-def _columns(kinds: Mapping[str, str]) -> str:
-    return ", ".join(f'"{name}" {kind}' for name, kind in kinds.items())
-
-
 PARTS = ("parameters", "findings", "trims")
 """Tables with rows of a log."""
+_NAMES = {table: ", ".join(f'"{name}"' for name in kinds) for table, kinds in TABLES.items()}
+_KINDS = {table: ", ".join(f'"{name}" {kind}' for name, kind in kinds.items()) for table, kinds in TABLES.items()}
 SCHEMA = "".join(
     [
-        *(f"CREATE TABLE IF NOT EXISTS {table} ({_columns(kinds)});" for table, kinds in TABLES.items()),
+        *(f"CREATE TABLE IF NOT EXISTS {table} ({kinds});" for table, kinds in _KINDS.items()),
         *(f"CREATE INDEX IF NOT EXISTS {table}_log ON {table} (log);" for table in PARTS),
     ]
 )
@@ -676,14 +605,14 @@ class Store:
 
     def put(self, row: Mapping[str, Any]) -> None:
         """Writes one log's outcome in place of an older one."""
-        name = row["name"]
+        name, warnings = row["name"], json.dumps(row["warnings"], ensure_ascii=False)
+        parts = {table: [{"log": name, **part} for part in row[table]] for table in PARTS}
         with self._connection:
-            for table in PARTS:
-                self._connection.execute(f"DELETE FROM {table} WHERE log = ?", (name,))
-                self._insert(table, [{"log": name, **part} for part in row[table]])
-            warnings = json.dumps(row["warnings"], ensure_ascii=False)
-            self._connection.execute("DELETE FROM logs WHERE name = ?", (name,))
-            self._insert("logs", [{"vehicle": None, **row, "warnings": warnings}])
+            for table, rows in {**parts, "logs": [{**row, "warnings": warnings}]}.items():
+                column, values = _name_column(table), [[one[c] for c in TABLES[table]] for one in rows]
+                marks = ", ".join("?" * len(TABLES[table]))
+                self._connection.execute(f"DELETE FROM {table} WHERE {column} = ?", (name,))
+                self._connection.executemany(f"INSERT INTO {table} ({_NAMES[table]}) VALUES ({marks})", values)
 
     def keep(self, jobs: Sequence[Job]) -> None:
         """Forgets all that is not a result of one of these jobs: of other files, settings or authors."""
@@ -697,11 +626,9 @@ class Store:
 
     def rows(self, table: str) -> list[Row]:
         """All rows of a table, in the order of their log's name."""
-        columns = list(TABLES[table])
-        first = "name" if table == "logs" else "log"
-        quoted = ", ".join(f'"{c}"' for c in columns)
-        found = self._connection.execute(f"SELECT {quoted} FROM {table} ORDER BY {first}, rowid")
-        return [dict(zip(columns, values, strict=True)) for values in found]
+        order = f"ORDER BY {_name_column(table)}, rowid"
+        found = self._connection.execute(f"SELECT {_NAMES[table]} FROM {table} {order}")
+        return [dict(zip(TABLES[table], values, strict=True)) for values in found]
 
     def write_parquet(self, folder: Path) -> list[Path]:
         """Writes every table as a Parquet file that pandas, polars, DuckDB and Spark read; returns their paths."""
@@ -717,11 +644,9 @@ class Store:
                 pq.write_table(pa.Table.from_pylist(self.rows(table), schema=schema), part, compression="zstd")
         return files
 
-    def _insert(self, table: str, rows: list[Row]) -> None:
-        columns = list(TABLES[table])
-        listed, marks = ", ".join(f'"{c}"' for c in columns), ", ".join("?" * len(columns))
-        values = [[row[c] for c in columns] for row in rows]
-        self._connection.executemany(f"INSERT INTO {table} ({listed}) VALUES ({marks})", values)
+
+def _name_column(table: str) -> str:
+    return "name" if table == "logs" else "log"
 
 
 @contextmanager

@@ -4,7 +4,7 @@ import json
 import math
 import shlex
 from collections import Counter, defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
@@ -53,133 +53,72 @@ def summarise(
         median, spread, flights), ``drifts``, ``outliers``, ``common`` (findings by number of flights), ``reasons``
         (failures and copies by reason), ``copies``.
     """
+    from scipy import stats
+
     by_name = {log["name"]: log for log in logs}
-    series = _series(by_name, parameters)
+    units: dict[str, JsonDict] = {
+        unit: {"unit": unit, "logs": 0, "done": 0, "parameters": []} for unit in sorted({log["unit"] for log in logs})
+    }
+    for log in logs:
+        units[log["unit"]]["logs"] += 1
+        units[log["unit"]]["done"] += log["status"] == "done"
+    # Identified values by vehicle and parameter, in the order of time.
+    series: dict[tuple[str, str], list[Json]] = defaultdict(list)
+    for row in parameters:
+        known = row["status"] == "identified" and row["low"] is not None and row["high"] is not None
+        if known and row["value"] and math.isfinite(row["high"] - row["low"]) and row["log"] in by_name:
+            log = by_name[row["log"]]
+            series[log["unit"], row["parameter"]].append({**row, "started": log["started"]})
+    tests = sum(len({r["started"] for r in rows}) >= FEWEST_FOR_DRIFT for rows in series.values())
+    drifts, outliers = list[JsonDict](), list[JsonDict]()
+    for (unit, name), rows in sorted(series.items()):
+        rows.sort(key=lambda r: r["started"])
+        t, value, low, high = np.array([[r[key] for key in ("started", "value", "low", "high")] for r in rows]).T
+        middle = float(np.median(value))
+        spread = 1.4826 * float(np.median(np.abs(value - middle)))
+        of, days = rows[0]["unit"], float(np.ptp(t)) / DAY
+        relative = {"median": middle, "spread": spread / abs(middle) if middle else math.nan}
+        units[unit]["parameters"].append({"parameter": name, "unit": of, "flights": len(rows), **relative})
+        # Rises or falls with time by Kendall's tau; how fast, by Theil and Sen's slope.
+        if len(set(t)) >= FEWEST_FOR_DRIFT:
+            p_value = float(stats.kendalltau(t, value / middle).pvalue) * tests
+            if p_value < FALSE_ALARM:
+                slope = stats.theilslopes(value / middle, t / DAY)
+                per_day, *ci95 = map(float, (slope.slope, slope.low_slope, slope.high_slope))
+                moved = {"change": per_day * days, "days": days, "per_day": per_day, "ci95": ci95}
+                drifts.append({"unit": unit, "parameter": name, **moved, "p_value": p_value, "flights": len(rows)})
+        # Far from the vehicle's median, measured by its spread and the flight's own interval.
+        scale = np.hypot(spread, (high - low) / (2.0 * Z95))
+        distance = np.divide(value - middle, scale, out=np.zeros(len(rows)), where=scale > 0.0)
+        for row, far in zip(rows, distance.tolist(), strict=True):
+            if len(rows) >= FEWEST_FOR_OUTLIERS and abs(far) > FAR:
+                there = {"value": row["value"], "median": middle, "unit_of_value": of, "deviations": far}
+                outliers.append({"log": row["log"], "unit": unit, "parameter": name, **there})
     return {
         "counts": dict(Counter(log["status"] for log in logs)),
         "rough": sum(log["mse_fitted"] is not None and not log["mse_fitted"] <= ROUGH for log in logs),
-        "units": _units(logs, series),
-        "drifts": _drifts(series),
-        "outliers": _outliers(series),
+        "units": list(units.values()),
+        "drifts": sorted(drifts, key=lambda d: -abs(d["change"])),
+        "outliers": sorted(outliers, key=lambda o: -abs(o["deviations"])),
         "common": _common(by_name, findings),
         "reasons": _reasons(logs, copies),
         "copies": [{"log": log, "of": of} for log, of in copies],
     }
 
 
-def _series(by_name: Mapping[str, Json], parameters: Sequence[Json]) -> dict[tuple[str, str], list[Json]]:
-    """Identified values by vehicle and parameter, in the order of time."""
-    out: dict[tuple[str, str], list[Json]] = defaultdict(list)
-    for row in parameters:
-        log = by_name.get(row["log"])
-        known = row["status"] == "identified" and row["low"] is not None and row["high"] is not None
-        if log is not None and known and row["value"] and math.isfinite(row["high"] - row["low"]):
-            out[log["unit"], row["parameter"]].append({**row, "started": log["started"]})
-    for rows in out.values():
-        rows.sort(key=lambda r: r["started"])
-    return dict(sorted(out.items()))
-
-
-def _units(logs: Sequence[Json], series: Mapping[tuple[str, str], list[Json]]) -> list[dict[str, Any]]:
-    out = []
-    for unit in sorted({log["unit"] for log in logs}):
-        mine = [log for log in logs if log["unit"] == unit]
-        rows = [
-            {"parameter": name, "unit": values[0]["unit"], "flights": len(values), **_centre(values)}
-            for (owner, name), values in series.items()
-            if owner == unit
-        ]
-        done = sum(log["status"] == "done" for log in mine)
-        out.append({"unit": unit, "logs": len(mine), "done": done, "parameters": rows})
-    return out
-
-
-def _centre(rows: Sequence[Json]) -> dict[str, float]:
-    values = np.array([r["value"] for r in rows])
-    middle = float(np.median(values))
-    spread = 1.4826 * float(np.median(np.abs(values - middle)))
-    return {"median": middle, "spread": spread / abs(middle) if middle else math.nan}
-
-
-def _drifts(series: Mapping[tuple[str, str], list[Json]]) -> list[dict[str, Any]]:
-    """Parameters that rise or fall with time, by Kendall's tau; how fast, by Theil and Sen's slope."""
-    from scipy import stats
-
-    fit_for = {
-        key: rows
-        for key, rows in series.items()
-        if len(rows) >= FEWEST_FOR_DRIFT and len({r["started"] for r in rows}) >= FEWEST_FOR_DRIFT
-    }
-    out = []
-    for (unit, name), rows in fit_for.items():
-        t = np.array([r["started"] for r in rows]) / DAY
-        relative = np.array([r["value"] for r in rows]) / float(np.median([r["value"] for r in rows]))
-        p_value = float(stats.kendalltau(t, relative).pvalue) * len(fit_for)
-        if p_value < FALSE_ALARM:
-            slope = stats.theilslopes(relative, t)
-            change = float(slope.slope) * float(np.ptp(t))
-            out.append(
-                {
-                    "unit": unit,
-                    "parameter": name,
-                    "change": change,
-                    "days": float(np.ptp(t)),
-                    "per_day": float(slope.slope),
-                    "ci95": [float(slope.low_slope), float(slope.high_slope)],
-                    "p_value": p_value,
-                    "flights": len(rows),
-                }
-            )
-    return sorted(out, key=lambda d: -abs(d["change"]))
-
-
-def _outliers(series: Mapping[tuple[str, str], list[Json]]) -> list[dict[str, Any]]:
-    """Flights far from the vehicle's median, measured by the vehicle's spread and the flight's own interval."""
-    out = []
-    for (unit, name), rows in series.items():
-        if len(rows) < FEWEST_FOR_OUTLIERS:
-            continue
-        centre = _centre(rows)
-        for row in rows:
-            own = (row["high"] - row["low"]) / (2.0 * Z95)
-            scale = math.hypot(centre["spread"] * abs(centre["median"]), own)
-            distance = (row["value"] - centre["median"]) / scale if scale > 0.0 else 0.0
-            if abs(distance) > FAR:
-                out.append(
-                    {
-                        "log": row["log"],
-                        "unit": unit,
-                        "parameter": name,
-                        "value": row["value"],
-                        "median": centre["median"],
-                        "unit_of_value": row["unit"],
-                        "deviations": distance,
-                    }
-                )
-    return sorted(out, key=lambda o: -abs(o["deviations"]))
-
-
-def _common(by_name: Mapping[str, Json], findings: Sequence[Json]) -> list[dict[str, Any]]:
-    diagnosed: Counter[str] = Counter(log["unit"] for log in by_name.values() if log["verdict"] is not None)
+def _common(by_name: Mapping[str, Json], findings: Sequence[Json]) -> list[JsonDict]:
+    """Confident findings of each vehicle by the number of flights that show them."""
+    diagnosed = Counter(log["unit"] for log in by_name.values() if log["verdict"] is not None)
     seen: dict[tuple[str, str], dict[str, Json]] = defaultdict(dict)
     for row in findings:
-        log = by_name.get(row["log"])
-        if log is not None and row["confident"]:
-            seen[log["unit"], row["effect"]].setdefault(row["log"], row)
-    out = [
-        {
-            "unit": unit,
-            "effect": effect,
-            "flights": len(rows),
-            "of": diagnosed[unit],
-            "parameter": (first := next(iter(rows.values())))["parameter"],
-            "unit_of_value": first["unit"],
-            "median": float(np.median([r["value"] for r in rows.values()])),
-            "lowest": min(r["value"] for r in rows.values()),
-            "highest": max(r["value"] for r in rows.values()),
-        }
-        for (unit, effect), rows in seen.items()
-    ]
+        if row["confident"] and (log := by_name.get(row["log"])) is not None:
+            seen[log["unit"], row["effect"]].setdefault(row["log"], row)  # the first number of it
+    out = []
+    for (unit, effect), rows in seen.items():
+        first, values = next(iter(rows.values())), [r["value"] for r in rows.values()]
+        sizes = {"median": float(np.median(values)), "lowest": min(values), "highest": max(values)}
+        number = {"parameter": first["parameter"], "unit_of_value": first["unit"], **sizes}
+        out.append({"unit": unit, "effect": effect, "flights": len(rows), "of": diagnosed[unit], **number})
     return sorted(out, key=lambda c: (-c["flights"], c["unit"], c["effect"]))
 
 
@@ -256,6 +195,59 @@ def date(seconds: float) -> str:
     return str(np.datetime_as_string(np.datetime64(round(seconds), "s"))).replace("T", " ")
 
 
+_COLUMNS: dict[str, tuple[str, str, str, dict[str, Callable[[Json], str]]]] = {
+    "drifts": (
+        "drift",
+        "Drift",
+        "Kendall's rank test, corrected for the number of tests; slope after Theil and Sen.",
+        {
+            "Vehicle": lambda d: d["unit"],
+            "Parameter": lambda d: d["parameter"],
+            "Change": lambda d: f"{100 * d['change']:+.2g} % in {d['days']:.3g} days".replace("-", "−"),
+            "Rate, 95 % interval": lambda d: f"{' … '.join(number(100 * end, 2) for end in d['ci95'])} % a day",
+            "Chance without drift": lambda d: number(d["p_value"], 2),
+            "Flights": lambda d: str(d["flights"]),
+        },
+    ),
+    "outliers": (
+        "outliers",
+        "Outliers",
+        "In robust standard deviations of the vehicle.",
+        {
+            "Log": lambda o: o["log"],
+            "Parameter": lambda o: o["parameter"],
+            "Value": lambda o: f"{number(o['value'])} {unit_text(o['unit_of_value'])}",
+            "Median of the vehicle": lambda o: number(o["median"]),
+            "Deviations": lambda o: number(o["deviations"], 2),
+        },
+    ),
+    "common": (
+        "common",
+        "What the simulation gets wrong, flight after flight",
+        "",
+        {
+            "Vehicle": lambda c: c["unit"],
+            "Finding": lambda c: c["effect"].replace("_", " "),
+            "Flights": lambda c: f"{c['flights']} of {c['of']}",
+            "Median": lambda c: f"{c['parameter']} = {number(c['median'])} {c['unit_of_value']}".rstrip(),
+            "Range": lambda c: f"{number(c['lowest'])} … {number(c['highest'])}",
+        },
+    ),
+    "reasons": (
+        "unusable",
+        "Logs without an answer",
+        "",
+        {
+            "Outcome": lambda r: r["status"],
+            "Reason": lambda r: r["reason"],
+            "Logs": lambda r: str(r["logs"]),
+            "Which": lambda r: ", ".join(r["names"][:5]) + (" …" if r["logs"] > 5 else ""),
+        },
+    ),
+}
+"""Section of each kind of entry of a summary: identifier, title, sentence, and its columns."""
+
+
 def summary_sections(summary: Json) -> list[JsonDict]:
     """Findings of `summarise`, a section a kind; none for kinds without a row."""
     head, tables = ("Parameter", "Median", "Unit", "Spread", "Flights"), list[JsonDict]()
@@ -268,60 +260,12 @@ def summary_sections(summary: Json) -> list[JsonDict]:
             title = f"{unit['unit']}: {unit['done']} of {unit['logs']} logs gave an answer"
             tables.append({**rows_of(head, rows, title, "compact"), "open": not tables})
     spread = f"Spread between flights: robust standard deviation over the median.{_left_out(summary['units'])}"
-    parts: dict[tuple[str, str, str], tuple[Sequence[str], list[tuple[str, ...]]]] = {
-        ("drift", "Drift", "Kendall's rank test, corrected for the number of tests; slope after Theil and Sen."): (
-            ("Vehicle", "Parameter", "Change", "Rate, 95 % interval", "Chance without drift", "Flights"),
-            [
-                (
-                    d["unit"],
-                    d["parameter"],
-                    f"{100 * d['change']:+.2g} % in {d['days']:.3g} days".replace("-", "−"),
-                    f"{number(100 * d['ci95'][0], 2)} … {number(100 * d['ci95'][1], 2)} % a day",
-                    number(d["p_value"], 2),
-                    str(d["flights"]),
-                )
-                for d in summary["drifts"]
-            ],
-        ),
-        ("outliers", "Outliers", "In robust standard deviations of the vehicle."): (
-            ("Log", "Parameter", "Value", "Median of the vehicle", "Deviations"),
-            [
-                (
-                    o["log"],
-                    o["parameter"],
-                    f"{number(o['value'])} {unit_text(o['unit_of_value'])}",
-                    number(o["median"]),
-                    number(o["deviations"], 2),
-                )
-                for o in summary["outliers"]
-            ],
-        ),
-        ("common", "What the simulation gets wrong, flight after flight", ""): (
-            ("Vehicle", "Finding", "Flights", "Median", "Range"),
-            [
-                (
-                    c["unit"],
-                    c["effect"].replace("_", " "),
-                    f"{c['flights']} of {c['of']}",
-                    f"{c['parameter']} = {number(c['median'])} {c['unit_of_value']}".rstrip(),
-                    f"{number(c['lowest'])} … {number(c['highest'])}",
-                )
-                for c in summary["common"]
-            ],
-        ),
-        ("unusable", "Logs without an answer", ""): (
-            ("Outcome", "Reason", "Logs", "Which"),
-            [
-                (r["status"], r["reason"], str(r["logs"]), ", ".join(r["names"][:5]) + (" …" if r["logs"] > 5 else ""))
-                for r in summary["reasons"]
-            ],
-        ),
-    }
     out = [section("vehicles", "Vehicles", spread, tables=tables)] if tables else []
-    for (identifier, name, intro), (columns, found) in parts.items():
-        if found:
+    for kind, (identifier, name, intro, columns) in _COLUMNS.items():
+        if found := summary[kind]:
             fold = f"All {len(found)}" if len(found) > FOLDED else ""
-            table = rows_of(columns, found[:MOST_ROWS], fold, "compact")
+            shown = [[text(entry) for text in columns.values()] for entry in found[:MOST_ROWS]]
+            table = rows_of(tuple(columns), shown, fold, "compact")
             out.append(section(identifier, name, intro + _left_out(found), tables=[table]))
     return out
 
@@ -493,43 +437,35 @@ def _counted(time: Json) -> str:
     return "" if time.get("type") == "date" else " Flights are counted in the order of their files' dates."
 
 
-def _health(rows: Sequence[Json], logs: Sequence[Json]) -> dict[str, Any] | None:
+def _health(rows: Sequence[Json], logs: Sequence[Json]) -> JsonDict | None:
     """Score of every flight over time, and what changed."""
     from quadid.condition.changes import HEALTHY_SCORE
 
-    judged = [row for row in rows if not row["baseline"]]
-    if not judged:
+    by_unit: dict[str, list[Json]] = defaultdict(list)
+    for row in rows:
+        if not row["baseline"]:
+            by_unit[row["unit"]].append(row)
+    if not by_unit:
         return None
-    by_unit: dict[str, list[Json]] = {}
-    for row in judged:
-        by_unit.setdefault(row["unit"], []).append(row)
     places, time = _when(logs)
-    data = []
-    for i, (unit, own) in enumerate(sorted(by_unit.items())[:MOST_UNITS]):
-        score = np.array([row["score"] for row in own])
-        text = [f"{row['log']}: {row['verdict']}" for row in own]
-        line = trace(f"unit{i}", unit, None, score, mode="lines+markers", text=text)
-        data.append({**line, "x": [places[row["log"]] for row in own]})
-    layout = {
-        "xaxis": time,
-        "yaxis": axis("healthy spreads", rangemode="tozero"),
-        "hovermode": "closest",
-        "showlegend": True,
-        "shapes": [level(HEALTHY_SCORE)],
-    }
-    drawn = figure("fleet-health", "Distance from healthy", data, layout, 280)
-    changed = []
-    for unit, own in sorted(by_unit.items()):
+    data, changed = [], []
+    for i, (unit, own) in enumerate(sorted(by_unit.items())):
+        if i < MOST_UNITS:
+            score, text = np.array([row["score"] for row in own]), [f"{row['log']}: {row['verdict']}" for row in own]
+            line = trace(f"unit{i}", unit, None, score, mode="lines+markers", text=text)
+            data.append({**line, "x": [places[row["log"]] for row in own]})
         if some := [row for row in own if has_changed(row)]:
             count, last = f"{len(some)} of {len(own)}", some[-1]
             changed.append((unit, count, some[0]["log"], last["log"], _what_changed(last)))
+    scores, shapes = axis("healthy spreads", rangemode="tozero"), [level(HEALTHY_SCORE)]
+    layout = {"xaxis": time, "yaxis": scores, "hovermode": "closest", "showlegend": True, "shapes": shapes}
+    drawn = figure("fleet-health", "Distance from healthy", data, layout, 280)
     table = rows_of(("Vehicle", "Flights changed", "First", "Last", "Changed"), changed[:MOST_ROWS], kind="compact")
     counts = Counter(row["unit"] for row in rows if row["baseline"]).values()
     most = "up to " * (len(set(counts)) > 1) + str(max(counts))
     intro = (
         f"Each flight against the first {most} of its vehicle, which are assumed healthy. 99 of 100 healthy flights "
-        f"are below {HEALTHY_SCORE:.1f}, the line."
-        f"{_counted(time)}"
+        f"are below {HEALTHY_SCORE:.1f}, the line.{_counted(time)}"
     )
     return section("health", "Health over flights", intro, [drawn], [table] if changed else [])
 
@@ -538,37 +474,32 @@ def _what_changed(row: Json) -> str:
     return "; ".join(map(change_words, row["changes"])) or "by nothing that has a name"
 
 
-def _over_time(logs: Sequence[Json], parameters: Sequence[Json]) -> dict[str, Any] | None:
+def _over_time(logs: Sequence[Json], parameters: Sequence[Json]) -> JsonDict | None:
+    """Every parameter of every vehicle over its flights, a view each."""
     started = {log["name"]: (log["started"], log["unit"]) for log in logs if log["status"] == "done"}
-    when = _when(logs)
-    rows = [p for p in parameters if p["status"] == "identified" and p["log"] in started]
-    names = dict.fromkeys(p["parameter"] for p in rows)
-    views = [_view(name, [p for p in rows if p["parameter"] == name], started, *when) for name in names]
+    places, time = _when(logs)
+    by_name: dict[str, dict[str, list[Json]]] = {}
+    for p in parameters:
+        if p["status"] == "identified" and p["log"] in started:
+            by_name.setdefault(p["parameter"], {}).setdefault(started[p["log"]][1], []).append(p)
+    views = []
+    for name, by_unit in by_name.items():
+        data, of = [], next(iter(by_unit.values()))[0]["unit"]
+        for i, (unit, flown) in enumerate(sorted(by_unit.items())[:MOST_UNITS]):
+            own = sorted(flown, key=lambda p: started[p["log"]][0])
+            own = own[:: max(1, math.ceil(len(own) * len(by_unit) * 6 / MOST_POINTS))]
+            value = np.array([p["value"] for p in own])
+            ends = ([_gap(p["high"], p["value"]) for p in own], [_gap(p["value"], p["low"]) for p in own])
+            bars = {"type": "data", "symmetric": False, **dict(zip(("array", "arrayminus"), ends, strict=True))}
+            line = trace(f"unit{i}", unit, None, value, mode="markers", error_y=bars, text=[p["log"] for p in own])
+            data.append({**line, "x": [places[p["log"]] for p in own]})
+        layout = {"xaxis": time, "yaxis": axis(f"{name} [{of}]"), "hovermode": "closest", "showlegend": True}
+        views.append({"label": name, "data": data, "layout": layout})
     if not views:
         return None
-    intro = f"Every flight with its 95 % interval; a vehicle is a folder.{_counted(when[1])}"
+    intro = f"Every flight with its 95 % interval; a vehicle is a folder.{_counted(time)}"
     drawn = {"id": "fleet-parameters", "title": "Value of each flight", "views": views, "height": 280}
     return section("over-time", "Parameters over time", intro, [drawn])
-
-
-def _view(
-    name: str, rows: Sequence[Json], started: Mapping[str, tuple[float, str]], places: Json, time: Json
-) -> dict[str, Any]:
-    """One parameter of every vehicle over its flights."""
-    mine = sorted(rows, key=lambda p: started[p["log"]][0])
-    units = list(dict.fromkeys(started[p["log"]][1] for p in mine))
-    data = []
-    for i, unit in enumerate(sorted(units)[:MOST_UNITS]):
-        own = [p for p in mine if started[p["log"]][1] == unit]
-        own = own[:: max(1, math.ceil(len(own) * len(units) * 6 / MOST_POINTS))]
-        value = np.array([p["value"] for p in own])
-        upper = np.array([_gap(p["high"], p["value"]) for p in own])
-        lower = np.array([_gap(p["value"], p["low"]) for p in own])
-        bars = {"type": "data", "symmetric": False, "array": upper.tolist(), "arrayminus": lower.tolist()}
-        line = trace(f"unit{i}", unit, None, value, mode="markers", error_y=bars, text=[p["log"] for p in own])
-        data.append({**line, "x": [places[p["log"]] for p in own]})
-    layout = {"xaxis": time, "yaxis": axis(f"{name} [{mine[0]['unit']}]"), "hovermode": "closest", "showlegend": True}
-    return {"label": name, "data": data, "layout": layout}
 
 
 def _gap(high: float | None, low: float | None) -> float:

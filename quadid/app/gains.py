@@ -20,11 +20,12 @@ from quadid.chi_square import Z95
 from quadid.errors import LogError, ParameterError, nearest
 from quadid.files import read_regular
 from quadid.model.rate_loop import AxisPlant, Loops, RateGains, design, slowed, with_rate
+from quadid.parameters import INERTIAS, NOMINAL_UNITS
 from quadid.report.autopilots import AUTOPILOTS, AXES, Autopilot, authority, hover, moments
 from quadid.report.page import axis as axis_of
 from quadid.report.page import figure, section, trace
 from quadid.report.programs import Facts
-from quadid.report.tables import Column, TextTable, heads, number
+from quadid.report.tables import TextTable, heads, number
 from quadid.report.verdict import Verdict
 from quadid.types import Json, JsonDict
 from quadid.vehicle import Vehicle
@@ -35,6 +36,8 @@ STEP, SHARE = 1.0, 0.5
 """A step of the rate by this much [rad/s] may take this share of the moment that the rotors have beside hover."""
 UNSTATED = 0.2
 """Half-width of the interval of a delay or lag, relative: vehicle files hold none for effects."""
+_SIZES = ("b", "d", *INERTIAS)
+"""Parameters of a vehicle that set the gains."""
 _LINE = re.compile(
     r"^\s*(?:set\s+|\d+\s+\d+\s+)?([A-Za-z_]\w*)\s*[\s,=]\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)(?=[\s,]|$)",
     re.MULTILINE,
@@ -42,6 +45,7 @@ _LINE = re.compile(
 """A line of a parameter file: of QGroundControl, of Mission Planner or MAVProxy, of Betaflight's `diff` and `dump`."""
 
 
+_MARGINS = ("phase_margin", "gain_margin")
 _FILES = {
     "px4": (".params", "1\t1\t{name}\t{value}\t9\n"),
     "ardupilot": (".param", "{name},{value}\n"),
@@ -104,7 +108,35 @@ class Gains(Reported):
             for g in self.result["gains"]
         )
         chosen = TextTable(f"Gains for {self.result['program']}", columns, rows)
-        return [chosen, loop_table(self.result), used_table(self.result)]
+        # Promises of every loop, and the basis of the gains.
+        loops = []
+        for a in self.result["axes"]:
+            for when, part in (("", a), (", now", a["before"])):
+                for loop in ("rate", "attitude"):
+                    if found := part and part[loop]:
+                        top = found["overshoot"]
+                        each = (f"{found[key]:.0f}, least {found[f'{key}_least']:.0f}" for key in _MARGINS)
+                        loops.append(
+                            (
+                                f"{a['axis']} {loop}{when}",
+                                number(found["bandwidth"], 3),
+                                " .. ".join(number(v, 3) for v in found["bandwidth_range"]),
+                                *each,
+                                f"{100.0 * top:.0f} %" if math.isfinite(top) else "unstable",
+                            )
+                        )
+        promised = heads(
+            "loop | bandwidth [Hz] > | over the intervals >1 | phase margin [deg] > | gain margin [dB] >2 | overshoot >"
+        )
+        used = tuple(
+            (u["name"], f"{number(u['value'])} {u['unit']}", " .. ".join(map(number, u["ci95"])), u["source"])
+            for u in self.result["used"]
+        )
+        return [
+            chosen,
+            TextTable("Loops, and the least margins over the 95 % intervals", promised, tuple(loops)),
+            TextTable("What they rest on", heads("number | value > | 95 % interval > | from <1"), used),
+        ]
 
     def save(self, folder: str | Path = ".") -> Path:
         """Writes the proposed parameters in the autopilot's own form, into a folder or a file; returns the path."""
@@ -125,15 +157,11 @@ class Gains(Reported):
     def page(self, command: str = LIBRARY) -> str:
         """The page: gains, step responses with bands before and after, what limits the bandwidth."""
         result, (chosen, loops, used) = self.result, self.tables()
-        steps = [
-            step_figure(axis, angle, self.loops[axis], self.before.get(axis))
-            for axis in AXES
-            for angle in (False, True)
-        ]
+        steps = [self.step_figure(axis, angle) for axis in AXES for angle in (False, True)]
         taken = tuple(
             (a["axis"], number(a["at"], 3), *(f"{v:.0f}" for v in a["phase_taken"].values())) for a in result["axes"]
         )
-        columns = (Column("axis"), Column("at [Hz]"), *(Column(name) for name in result["axes"][0]["phase_taken"]))
+        columns = heads(" | ".join(("axis", "at [Hz]", *result["axes"][0]["phase_taken"])))
         phases = TextTable("Phase that each part takes where the fastest loop crosses 0 dB [deg]", columns, taken)
         sections = [
             section("gains", "Gains", chosen.title, tables=[chosen.part()]),
@@ -144,57 +172,19 @@ class Gains(Reported):
         subtitle = f"{result['program']}, phase margin {result['phase_margin']:g} degrees; nothing was sent"
         return self.rendered(f"Gains for {result['vehicle']}", subtitle, sections, provenance([], command))
 
-
-def loop_table(result: Json) -> TextTable:
-    """Promises of every loop."""
-    columns = heads(
-        "loop | bandwidth [Hz] > | over the intervals >1 | phase margin [deg] > | gain margin [dB] >2 | overshoot >"
-    )
-    rows = []
-    for a in result["axes"]:
-        for when, part in (("", a), (", now", a["before"])):
-            for loop in ("rate", "attitude"):
-                r = part and part[loop]
-                if r:
-                    top = f"{100.0 * r['overshoot']:.0f} %" if math.isfinite(r["overshoot"]) else "unstable"
-                    rows.append(
-                        (
-                            f"{a['axis']} {loop}{when}",
-                            number(r["bandwidth"], 3),
-                            " .. ".join(number(v, 3) for v in r["bandwidth_range"]),
-                            f"{r['phase_margin']:.0f}, least {r['phase_margin_least']:.0f}",
-                            f"{r['gain_margin']:.0f}, least {r['gain_margin_least']:.0f}",
-                            top,
-                        )
-                    )
-    return TextTable("Loops, and the least margins over the 95 % intervals", columns, tuple(rows))
-
-
-def used_table(result: Json) -> TextTable:
-    """Basis of the gains."""
-    heads = (("number", False), ("value", True), ("95 % interval", True))
-    columns = (*(Column(text, right) for text, right in heads), Column("from", rank=1))
-    rows = []
-    for u in result["used"]:
-        interval = " .. ".join(number(v) for v in u["ci95"])
-        rows.append((u["name"], f"{number(u['value'])} {u['unit']}", interval, u["source"]))
-    return TextTable("What they rest on", columns, tuple(rows))
-
-
-def step_figure(name: str, angle: bool, now: Loops, before: Loops | None) -> JsonDict:
-    """Response to a unit step with its band over the intervals, before and after."""
-    what = "attitude" if angle else "rate"
-    data = []
-    for role, label, loops in (("before", "now", before), ("after", "proposed", now)):
-        if loops is None or not loops.stable or (angle and loops.attitude == 0.0):
-            continue
-        t, y = loops.step(angle)
-        for edge, values in (("", y[0]), (", least", y.min(axis=0)), (", most", y.max(axis=0))):
-            dash = {"line": {"dash": "dot"}} if edge else {}
-            data.append(trace(role, label + edge, np.asarray(t), np.asarray(values), **dash))
-    layout = {"xaxis": axis_of("time (s)"), "yaxis": axis_of(f"{name} {what} over what is asked for")}
-    caption = "dotted: least and most over the 95 % intervals"
-    return figure(f"step-{name}-{what}", f"{name.capitalize()} {what}", data, layout, 260, caption=caption)
+    def step_figure(self, axis: str, angle: bool) -> JsonDict:
+        """Response of an axis to a unit step of its rate or `angle`, with its band over the intervals."""
+        data, what = [], "attitude" if angle else "rate"
+        for role, label, known in (("before", "now", self.before), ("after", "proposed", self.loops)):
+            loops = known.get(axis)
+            if loops is not None and loops.stable and not (angle and loops.attitude == 0.0):
+                t, y = loops.step(angle)
+                for edge, values in (("", y[0]), (", least", y.min(axis=0)), (", most", y.max(axis=0))):
+                    dash = {"line": {"dash": "dot"}} if edge else {}
+                    data.append(trace(role, label + edge, np.asarray(t), np.asarray(values), **dash))
+        layout = {"xaxis": axis_of("time (s)"), "yaxis": axis_of(f"{axis} {what} over what is asked for")}
+        caption = "dotted: least and most over the 95 % intervals"
+        return figure(f"step-{axis}-{what}", f"{axis.capitalize()} {what}", data, layout, 260, caption=caption)
 
 
 def gains(
@@ -247,13 +237,8 @@ def gains(
     inertia = np.diag(facts.inertia)
     most = SHARE * authority(facts, at) / inertia / STEP
     fixed = _on_board(autopilot, known, described)
-    # Parameters of the vehicle that set the gains
-    units = {"b": "N s^2/rad^2", "d": "N m s^2/rad^2"}
-    used = [
-        Used(n, units.get(n, "kg m^2"), facts.value(n), *facts.interval(n), facts.origin(n))
-        for n in ("b", "d", *_INERTIA)
-    ]
-    used += [*late, *fixed.values()]
+    sizes = [Used(n, NOMINAL_UNITS[n], facts.value(n), *facts.interval(n), facts.origin(n)) for n in _SIZES]
+    used = [*sizes, *late, *fixed.values()]
     # Axis by axis: the fastest loop that keeps its margins, slower where that is wanted, in the autopilot's parameters.
     designed, gain = list[Loops](), dict[str, float]()
     cutoff, per = fixed["derivative filter"].value, turning / inertia  # angular acceleration of one unit of output
@@ -283,7 +268,20 @@ def gains(
         now = [known.get(name) for name in names]
         if None not in now[:3]:
             before[axis] = _loops(best.plant, [v or 0.0 for v in now], per[k], autopilot, cutoff)
-        axes.append(_axis(axis, loops[axis], before.get(axis), best, bool(best.rate.p >= 0.999 * most[k])))
+        crossover = float(best.margins().crossover[0])
+        phases = best.plant.phases(crossover, best.rate)
+        held = bool(best.rate.p >= 0.999 * most[k])
+        axes.append(
+            {
+                "axis": axis,
+                **_promises(loops[axis]),
+                "before": _promises(before[axis]) if axis in before else None,
+                "largest_bandwidth": float(best.bandwidth()[0]),
+                "limited_by": "moment of the rotors" if held else max(phases, key=lambda name: phases[name]),
+                "phase_taken": phases,
+                "at": crossover,
+            }
+        )
         for term, n, old in zip(("P", "I", "D", "attitude"), names, now, strict=True):
             if n:
                 chosen.setdefault(n, {"name": n, "axis": axis, "term": term, "value": gain[n], "current": old})
@@ -298,8 +296,8 @@ def gains(
         "file": None,
         "gains": list(chosen.values()),
         "used": [
-            {"name": u.name, "unit": u.unit, "value": u.value, "ci95": [u.low, u.high], "source": u.source}
-            for u in used
+            {"name": name, "unit": unit, "value": value, "ci95": [low, high], "source": source}
+            for name, unit, value, low, high, source in used
         ],
         "warnings": warnings + [f"{a}: the present gains are unstable" for a, b in before.items() if not b.stable],
     }
@@ -308,7 +306,7 @@ def gains(
 
 def _check_identified(vehicle: Vehicle, anyway: bool) -> list[str]:
     """Raises UnprovenError where a parameter that sets a gain was not identified; with `anyway` warns."""
-    guessed = [n for n in ("b", "d", "J_xx", "J_yy", "J_zz") if vehicle.parameters[n].sigma is None]
+    guessed = [n for n in _SIZES if vehicle.parameters[n].sigma is None]
     lacking = f"{', '.join(guessed)}: not identified, guesses of the vehicle file without a sigma" if guessed else ""
     if vehicle.proof is not None and vehicle.proof.lacking:
         lacking = "; ".join(filter(None, (lacking, f"not proven: {vehicle.proof.lacking}")))
@@ -373,8 +371,8 @@ def _plant(facts: Facts, axis: int, late: list[Used], fixed: Mapping[str, Used])
     About hover b (w_h - w_0) is the root of b times the load, so thrust goes with the root of b, drag torque with
     d over that root; errors of the parameters are taken as independent.
     """
-    relative = {n: (facts.vehicle.parameters[n].sigma or 0.0) / facts.value(n) for n in ("b", "d", *_INERTIA)}
-    spread = math.hypot(0.5 * relative["b"], relative[_INERTIA[axis]], relative["d"] * (axis == 2))
+    relative = {n: (facts.vehicle.parameters[n].sigma or 0.0) / facts.value(n) for n in _SIZES}
+    spread = math.hypot(0.5 * relative["b"], relative[INERTIAS[axis]], relative["d"] * (axis == 2))
     ends = (math.exp(-Z95 * spread), math.exp(Z95 * spread))
     corners = [*itertools.product(ends, *((u.low, u.high) for u in late))]
     gain, lag, wait = np.array([(1.0, late[0].value, late[1].value), *corners]).T
@@ -393,9 +391,6 @@ def _plant(facts: Facts, axis: int, late: list[Used], fixed: Mapping[str, Used])
     return AxisPlant(gain, lag, wait + held, lead, fixed["gyro filter"].value, error, target, damping)
 
 
-_INERTIA = ("J_xx", "J_yy", "J_zz")
-
-
 def _parameters(loops: Loops, per: float, autopilot: Autopilot) -> list[float]:
     """P, I, D and attitude gain in the autopilot's unit, as it stores them or to three digits."""
     wanted = (*(g / per for g in loops.rate[:3]), loops.attitude)
@@ -409,22 +404,6 @@ def _loops(plant: AxisPlant, values: list[float], per: float, autopilot: Autopil
     """The loops that these parameters of the autopilot make."""
     p, i, d = (v * unit * per for v, unit in zip(values[:3], autopilot.units[:3], strict=True))
     return Loops(plant, RateGains(p, i, d, cutoff), values[3] * autopilot.units[3], autopilot.on_error)
-
-
-def _axis(axis: str, now: Loops, before: Loops | None, best: Loops, held: bool) -> Json:
-    """Promises of one axis."""
-    crossover = float(best.margins().crossover[0])
-    phases = best.plant.phases(crossover, best.rate)
-    largest = max(phases, key=lambda name: phases[name])
-    return {
-        "axis": axis,
-        **_promises(now),
-        "before": None if before is None else _promises(before),
-        "largest_bandwidth": float(best.bandwidth()[0]),
-        "limited_by": "moment of the rotors" if held else largest,
-        "phase_taken": phases,
-        "at": crossover,
-    }
 
 
 def _promises(loops: Loops) -> Json:

@@ -90,6 +90,11 @@ class Outcome(ABC):
         """Remarks for the user, from logs and from the work itself."""
         return list(self.result.get("warnings", ()))
 
+    @property
+    def failure(self) -> Exception | None:
+        """Error with which the command ends once it has shown this; None where it is what was asked for."""
+        return None
+
     def write(self, folder: Path, kept: str | None = None) -> list[tuple[str, Path]]:
         """Writes the files of the command and names them in `result`.
 

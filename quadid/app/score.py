@@ -20,13 +20,16 @@ from quadid.parameters import NOMINAL_UNITS
 from quadid.report.page import axis, band, figure, level, section, stacked, trace
 from quadid.report.tables import Cell, Column, TextTable, heads, number
 from quadid.report.verdict import Verdict, percent, score_verdict
-from quadid.types import FloatArray, Json
+from quadid.types import FloatArray, Json, JsonDict
 from quadid.vehicle import Vehicle
 
 HORIZONS = (1, 10, 50)
 OPEN = 0.1
 """Longest horizon with bands [s] while rotor speeds are those of the log: what was flown in closed loop answers the
 disturbances to come."""
+
+Coverage = dict[str, dict[str, dict[str, float] | None] | None]
+"""Shares of outcomes inside each band by horizon and quantity; None where none is predicted."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -49,30 +52,30 @@ class Scored(Reported):
 
     def tables(self) -> list[TextTable]:
         """Errors after every horizon, pooled and a log; what lies inside the predicted bands."""
-        # Open-loop prediction errors, pooled and for each file
-        result = self.result
-        many = len(result["files"]) > 1
-        columns = (
-            Column("log"),
-            Column("after", right=True),
-            *(
-                Column(f"{name} [{unit}]", right=True, rank=max(2 - i, 0))
-                for i, (name, unit) in enumerate(result["units"].items())
-            ),
-        )
+        result, units = self.result, self.result["units"]
+        many, last = len(result["files"]) > 1, list(result["horizons"])[-1]
         rows = []
         for entry in [*(result["files"] if many else []), result]:
             label = entry.get("log", "all" if many else result["files"][0]["log"])
-            for horizon, errors in entry["horizons"].items():
-                rows.append((label, str(horizon), *(_error(errors[n]) for n in result["units"])))
+            total = f"sum 1..{entry['sum']['to']}"
+            for after, errors in {**entry["horizons"], total: entry["sum"]}.items():
+                values = ("ran away" if errors[n] == math.inf else number(errors[n]) for n in units)
+                rows.append((label, after, *values))
                 label = ""
-            total = entry["sum"]
-            rows.append(("", f"sum 1..{total['to']}", *(_error(total[n]) for n in result["units"])))
-        last = list(result["horizons"])[-1]
         for label, key in (("noise floor", "noise_floor"), ("no change predicted", "no_change")):
-            rows.append((label, last, *(number(result[key][last][n]) for n in result["units"])))
+            rows.append((label, last, *(number(result[key][last][n]) for n in units)))
         title = f"Open-loop prediction error of '{result['vehicle']}' after n samples, mean of {result['samples']} runs"
-        return [TextTable(title, columns, tuple(rows)), coverage_table(self.result)]
+        ranked = zip(units.items(), (2, 1, 0, 0), strict=True)
+        quantities = (Column(f"{name} [{unit}]", right=True, rank=rank) for (name, unit), rank in ranked)
+        errors = TextTable(title, (*heads("log | after >"), *quantities), tuple(rows))
+        inside = []
+        for after, known in result["coverage"].items():
+            for name, shares in (known or {"": None}).items():
+                told = ["–"] * 3 if shares is None else [f"{100.0 * shares[b]:.0f} %" for b in ("50", "80", "95")]
+                inside.append((after, name, *told))
+        columns = heads("after > | of | 50 % band > | 80 % band > | 95 % band >")
+        title = "Outcomes inside the predicted bands, n samples after a filtered state"
+        return [errors, TextTable(title, columns, tuple(inside))]
 
     @property
     def sentences(self) -> list[Cell]:
@@ -110,45 +113,29 @@ class Scored(Reported):
         from quadid.identification.predict import SHARE
 
         result, (errors, inside) = self.result, self.tables()
-        steps = [int(h) for h in result["horizons"]]
-        units = result["units"]
-        known = [n for n in units if not all(math.isnan(errors[n]) for errors in result["horizons"].values())]
+        after, units = result["horizons"], result["units"]
+        x = np.array([int(h) for h in after], dtype=np.float64)
+        known = [n for n in units if not all(math.isnan(errors[n]) for errors in after.values())]
         places, layout = stacked([(f"{n} [{units[n]}]", {"type": "log"}) for n in known], "samples ahead")
         lines = (
             ("before", "no change predicted", result["no_change"]),
             ("floor", "noise floor", result["noise_floor"]),
-            ("after", "error", result["horizons"]),
+            ("after", "error", after),
         )
-        drawn_bands = [
-            part
-            for i, (name, where) in enumerate(zip(known, places, strict=True))
-            for part in band(
-                "after",
-                "of the runs",
-                np.array(steps, dtype=np.float64),
-                *np.array([result["spread"][str(h)][name] for h in steps], dtype=np.float64).T,
-                **where,
-            )
-        ]
-        data = drawn_bands + [
-            trace(
-                role,
-                label,
-                np.array(steps, dtype=np.float64),
-                np.array([math.nan if (v := of[str(h)][name]) is None else v for h in steps], dtype=np.float64),
-                mode="lines+markers",
-                showlegend=i == 0,
-                legendgroup=role,
-                **where,
-            )
-            for i, (name, where) in enumerate(zip(known, places, strict=True))
-            for role, label, of in lines
-        ]
+        bands, data = list[JsonDict](), list[JsonDict]()
+        for i, (name, where) in enumerate(zip(known, places, strict=True)):
+            low, high = np.array([result["spread"][h][name] for h in after], dtype=np.float64).T
+            bands += band("after", "of the runs", x, low, high, **where)
+            for role, label, of in lines:
+                y = np.array([of[h][name] for h in after], dtype=np.float64)
+                style = {"mode": "lines+markers", "showlegend": i == 0, "legendgroup": role}
+                data.append(trace(role, label, x, y, **style, **where))
         caption = (
             f"mean error from the measured state on, and the band in which {100 * SHARE:.0f} % of the runs lie; at "
             "the noise floor an error is no larger than the sensors' own"
         )
-        drawn = figure("horizons", "Error over the horizon", data, layout, 130 * len(known) + 70, caption=caption)
+        height = 130 * len(known) + 70
+        drawn = figure("horizons", "Error over the horizon", bands + data, layout, height, caption=caption)
         sections = [
             section("errors", "Prediction errors", errors.title, [drawn], [errors.part()]),
             section("bands", "Predicted bands", result["bands"], tables=[inside.part()]),
@@ -200,56 +187,42 @@ def score(
         for log in opened
         if fitted_before(described, log)
     ]
-    notes = (*seen, *unmet(opened, result), *(text for log in opened for text in log.warnings))
-    return Scored(result, notes, tuple(opened))
-
-
-def unmet(logs: Sequence[Log], result: Json) -> list[str]:
-    """Says where logs measure a quantity so seldom that no run of these horizons begins and ends at a reading."""
-    out = []
+    # A quantity measured so seldom that no run of these horizons begins and ends at a reading.
     for name in ("position", "velocity"):
-        slow = [log.recording.channels[name] for log in logs if any(getattr(w, name) is not None for w in log.windows)]
-        if slow and all(math.isnan(errors[name]) for errors in result["horizons"].values()):
-            rate = 1.0 / max(sample_period(channel.t) for channel in slow)
-            told = f"{name} is measured at {rate:.3g} Hz: no run of these horizons begins and ends at a reading"
-            out.append(f"{told}; --rate {rate:.3g} compares it")
-    return out
+        having = [log for log in opened if any(getattr(w, name) is not None for w in log.windows)]
+        if having and all(math.isnan(errors[name]) for errors in result["horizons"].values()):
+            hz = 1.0 / max(sample_period(log.recording.channels[name].t) for log in having)
+            told = f"{name} is measured at {hz:.3g} Hz: no run of these horizons begins and ends at a reading"
+            seen.append(f"{told}; --rate {hz:.3g} compares it")
+    return Scored(result, (*seen, *(text for log in opened for text in log.warnings)), tuple(opened))
 
 
 def ahead(horizons: str | Sequence[int | str], windows: Sequence[Window]) -> list[int]:
-    """Samples of the grid that horizons stand for, as ``1,10,0.5s`` or one by one; raises as `samples`."""
-    return [samples(h, windows) for h in (horizons.split(",") if isinstance(horizons, str) else horizons)]
-
-
-def samples(horizon: int | str, windows: Sequence[Window]) -> int:
-    """Samples of the grid that a horizon stands for: a number of them, or a time as ``0.1s``.
+    """Samples of the grid that horizons stand for: numbers of them, or times as ``0.1s``, one by one or with commas.
 
     Raises:
         ParameterError: neither, or a time on grids of several rates.
     """
-    if not isinstance(horizon, str):
-        return horizon
-    text = horizon.strip()
-    try:
-        if not text.endswith("s"):
-            return int(text)
-        seconds = float(text[:-1])
-        if not 0.0 < seconds < math.inf:
-            raise ValueError(text)
-    except ValueError as error:
-        raise ParameterError(
-            f"--horizons {text}", "whole numbers of samples, or times in seconds", "for example --horizons 1,10,0.5s"
-        ) from error
-    steps = {round(w.dt, 9) for w in windows}
-    if len(steps) > 1:
-        rates = ", ".join(f"{1.0 / step:.4g}" for step in sorted(steps))
-        raise ParameterError(f"--horizons {text} on logs of {rates} Hz", "one rate", "give --rate, or samples")
-    return max(round(seconds / windows[0].dt), 1)
+    out, steps = [], {round(w.dt, 9) for w in windows}
+    for horizon in horizons.split(",") if isinstance(horizons, str) else horizons:
+        text = str(horizon).strip()
+        try:
+            value = float(text[:-1]) if text.endswith("s") else int(text)
+            if text.endswith("s") and not 0.0 < value < math.inf:
+                raise ValueError(text)
+        except ValueError as error:
+            allowed = "whole numbers of samples, or times in seconds"
+            raise ParameterError(f"--horizons {text}", allowed, "for example --horizons 1,10,0.5s") from error
+        if text.endswith("s") and len(steps) > 1:
+            rates = ", ".join(f"{1.0 / step:.4g}" for step in sorted(steps))
+            raise ParameterError(f"--horizons {text} on logs of {rates} Hz", "one rate", "give --rate, or samples")
+        out.append(max(round(value / windows[0].dt), 1) if text.endswith("s") else int(value))
+    return out
 
 
 def coverage(
     logs: Sequence[Log], vehicle: Vehicle, theta: FloatArray, wanted: Sequence[int], closed_loop: bool
-) -> tuple[dict[str, dict[str, dict[str, float] | None] | None], str]:
+) -> tuple[Coverage, str]:
     """Shares of outcomes inside the predicted bands by horizon and quantity, and what the bands rest on.
 
     Args:
@@ -275,19 +248,12 @@ def coverage(
             continue
         found = forecast.covered(near) if autopilot is None else forecast.covered_in_loop(near, autopilot)
         for h, by_quantity in found.items():
-            sums = total.setdefault(h, {})
             for name, counts in by_quantity.items():
-                sums[name] = sums.get(name, 0.0) + counts
-    out: dict[str, dict[str, dict[str, float] | None] | None] = {}
-    for h in wanted:
-        out[str(h)] = (
-            None
-            if h not in total
-            else {
-                name: dict(zip(BANDS, (c[:-1] / c[-1]).tolist(), strict=True)) if c[-1] else None
-                for name, c in total[h].items()
-            }
-        )
+                total.setdefault(h, {})[name] = total[h].get(name, 0.0) + counts
+    out: Coverage = dict.fromkeys(map(str, wanted))
+    for h, sums in total.items():
+        shares = {name: (c[:-1] / c[-1]).tolist() if c[-1] else None for name, c in sums.items()}
+        out[str(h)] = {name: found and dict(zip(BANDS, found, strict=True)) for name, found in shares.items()}
     source = "of the vehicle file" if vehicle.random is not None else "found in the first third of each log"
     told = [f"Bands: random forces {source}; sensor noise, trim and biases from the first third of each log"]
     if autopilot is not None:
@@ -297,26 +263,6 @@ def coverage(
     if any(h not in total for h in wanted):
         told.append(f"none beyond {OPEN:g} s from logged rotor speeds, which already contain the controller's answer")
     return out, f"{'; '.join([*told, *reasons])}."
-
-
-def coverage_table(result: Json) -> TextTable:
-    """Shares of outcomes inside the predicted bands of 50, 80 and 95 %.
-
-    Args:
-        result: of the form ``quadid.score/1``.
-    """
-    bands = ("50", "80", "95")
-    columns = (Column("after", right=True), Column("of"), *(Column(f"{band} % band", right=True) for band in bands))
-    rows = []
-    for horizon, quantities in result["coverage"].items():
-        for name, shares in (quantities or {"": None}).items():
-            told = ["–"] * len(bands) if shares is None else [f"{100.0 * shares[band]:.0f} %" for band in bands]
-            rows.append((horizon, name, *told))
-    return TextTable("Outcomes inside the predicted bands, n samples after a filtered state", columns, tuple(rows))
-
-
-def _error(value: float | None) -> str:
-    return "ran away" if value == math.inf else number(value)
 
 
 # --- Two vehicle files on the same flights: which predicts better, by how much, and how they differ
@@ -408,15 +354,12 @@ class Compared(Reported):
             found = [result["horizons"][h][name] for h in result["horizons"]]
             for key, edge in (("ratio", ""), (0, ", 95 %"), (1, ", 95 %")):
                 values = [e["ratio"] if key == "ratio" else e["ci95"][key] for e in found]
-                y = np.array([np.nan if v is None else v for v in values], dtype=np.float64)
+                y = np.array(values, dtype=np.float64)
                 if np.isfinite(y).any():
                     more = {"line": {"dash": "dot"}, "showlegend": False} if edge else {"mode": "lines+markers"}
                     data.append(trace(role, name + edge, after, y, **more))
-        layout = {
-            "xaxis": axis("samples after the start"),
-            "yaxis": axis("error of B over that of A"),
-            "shapes": [level(1.0)],
-        }
+        ratio = axis("error of B over that of A")
+        layout = {"xaxis": axis("samples after the start"), "yaxis": ratio, "shapes": [level(1.0)]}
         caption = "below 1: B predicts better; dotted: 95 % interval"
         ratios = figure("ratios", "Errors of B over those of A", data, layout, 320, caption=caption)
         sections = [
@@ -533,16 +476,10 @@ def _means(blocks: Sequence[FloatArray], seed: int) -> tuple[FloatArray, FloatAr
 
 def _entry(mean: FloatArray, drawn: FloatArray) -> Json:
     """Errors of both, the ratio of B's to A's, and its interval; None for what the logs lack."""
-    if not np.isfinite(mean).all() or not mean[0] > 0.0:
-        told = [None if math.isnan(m) else float(m) for m in mean]
-        return {"a": told[0], "b": told[1], "ratio": None, "ci95": [None, None]}
-    low, high = np.nanquantile(drawn[:, 1] / drawn[:, 0], [0.025, 0.975])
-    return {
-        "a": float(mean[0]),
-        "b": float(mean[1]),
-        "ratio": float(mean[1] / mean[0]),
-        "ci95": [float(low), float(high)],
-    }
+    a, b = (None if math.isnan(m) else m for m in mean.tolist())
+    if a is None or b is None or not (math.isfinite(a) and math.isfinite(b) and a > 0.0):
+        return {"a": a, "b": b, "ratio": None, "ci95": [None, None]}
+    return {"a": a, "b": b, "ratio": b / a, "ci95": np.nanquantile(drawn[:, 1] / drawn[:, 0], [0.025, 0.975]).tolist()}
 
 
 def _overall(mean: FloatArray) -> float:
@@ -557,20 +494,12 @@ def _parameters(a: Vehicle, b: Vehicle) -> list[Json]:
     """Parameters of both with 95 % intervals; how far they are apart in standard deviations, where both have one."""
     out: list[Json] = []
     for name, unit in NOMINAL_UNITS.items():
-        one, two = a.parameters[name], b.parameters[name]
-        apart = None
-        if one.sigma and two.sigma:
-            apart = (two.initial - one.initial) / math.hypot(one.sigma, two.sigma)
-        ends = [None if p.sigma is None else [p.initial - Z95 * p.sigma, p.initial + Z95 * p.sigma] for p in (one, two)]
-        out.append(
-            {
-                "name": name,
-                "unit": unit,
-                "a": one.initial,
-                "a_ci95": ends[0],
-                "b": two.initial,
-                "b_ci95": ends[1],
-                "apart": apart,
-            }
-        )
+        entry: JsonDict = {"name": name, "unit": unit}
+        for side, vehicle in (("a", a), ("b", b)):
+            value, sigma = vehicle.parameters[name].initial, vehicle.parameters[name].sigma
+            ends = None if sigma is None else [value - Z95 * sigma, value + Z95 * sigma]
+            entry |= {side: value, f"{side}_ci95": ends}
+        sigmas = [v.parameters[name].sigma for v in (a, b)]
+        apart = (entry["b"] - entry["a"]) / math.hypot(*(s or 0.0 for s in sigmas)) if all(sigmas) else None
+        out.append({**entry, "apart": apart})
     return out

@@ -79,6 +79,16 @@ class Drawn(Outcome):
         told = [f"diverged, {d['diverged']}" if d["diverged"] else "flown" for d in self.result["draws"]]
         return [Cell(f"{name}: {what}") for name, what in zip(self.names, told, strict=True)]
 
+    @property
+    def failure(self) -> Exception | None:
+        """The error where no vehicle lasted."""
+        from quadid.flight import FlightError
+
+        if any(not d["diverged"] for d in self.result["draws"]):
+            return None
+        fix = "another manoeuvre, or gains that fit the vehicle"
+        return FlightError(f"all {len(self.names)} vehicles diverged", fix=fix)
+
 
 def simulate(
     vehicle: str | Path | Vehicle = "pelican",

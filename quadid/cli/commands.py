@@ -35,7 +35,7 @@ class Command:
     """One command.
 
     Attributes:
-        function: ``module:name`` of a function of the library, or of the command line itself.
+        function: ``module:name``: one of the library, or of the command line, which may also print and write by itself.
         reading: options of how its logs are read.
         check: ``module:name`` of what refuses wrong arguments before any log is read.
         simulates: whether it needs the kernels of a fit once it has a vehicle.
@@ -65,6 +65,8 @@ COMMANDS = {
             "quadid simulate udpout:127.0.0.1:14550 --seconds 60",
         ),
         "quadid.cli.simulate:simulate",
+        check="quadid.cli.simulate:check_target",
+        out="",
     ),
     "init": Command(
         "Write a vehicle file to fill in, or fill it in from a log.",
@@ -137,6 +139,7 @@ COMMANDS = {
         "Show what the online service would have published for a log.",
         ("quadid replay flight.mcap --vehicle pelican --speed max --out result.mcap",),
         "quadid.cli.replay:replay",
+        out="",
     ),
     "serve": Command(
         "Run the online service on a MAVLink link; no ROS needed.",
@@ -157,6 +160,7 @@ COMMANDS = {
         "List stored parameter sets: what, when, from which data, by whom.",
         ("quadid history --vehicle mine.yaml --events 20",),
         "quadid.cli.history:history",
+        out="",
     ),
     "export": Command(
         "Write the parameters for another program.",
@@ -203,8 +207,7 @@ COMMANDS = {
 def load(name: str) -> Any:
     """Imports one command, ready to run."""
     command = COMMANDS[name]
-    function = _imported(command.function)
-    function = in_words(function) if command.function.startswith("quadid.cli.") else of_library(command, function)
+    function = as_command(command, _imported(command.function))
     alone = typer.Typer(rich_markup_mode=None, add_completion=False)
     # A backspace character alone on a line keeps click from joining the lines.
     examples = "\n".join(("\b", "Examples:", *(f"  {line}" for line in command.examples)))
@@ -237,24 +240,13 @@ def with_help(option: ParameterInfo, text: str, kind: Any) -> ParameterInfo:
     return option
 
 
-def in_words(function: Callable[..., None]) -> Callable[..., None]:
-    """A function of the command line; the help of its options is in its docstring."""
-    function.__doc__, words = documented(function)
-    for name, kind in inspect.get_annotations(function, eval_str=True).items():
-        option = next((one for one in get_args(kind)[1:] if isinstance(one, ParameterInfo)), None)
-        if option is not None:
-            typed = get_args(kind)[0]
-            function.__annotations__[name] = Annotated[typed, with_help(option, words.get(name, ""), typed)]
-    return function
-
-
-def of_library(command: Command, function: Callable[..., Outcome]) -> Callable[..., None]:
-    """The function with the parameters of its command, which prints and writes its outcome."""
+def as_command(command: Command, function: Callable[..., Outcome | None]) -> Callable[..., None]:
+    """The function with the parameters of its command, which prints and writes its outcome, if it returns one."""
     from quadid.app import options
     from quadid.app.outcome import Fitted, Reported
 
     signature, (about, words) = inspect.signature(function, eval_str=True), documented(function)
-    outcome: type[Outcome] = signature.return_annotation
+    outcome: type[Outcome] | None = signature.return_annotation
     typed: dict[str, options.Typed] = {}
     shown: dict[str, tuple[Any, Any]] = {}
     for name, parameter in signature.parameters.items():
@@ -267,15 +259,20 @@ def of_library(command: Command, function: Callable[..., Outcome]) -> Callable[.
                 described = with_help(option.option, words.get(name, ""), option.kind)
                 shown[name] = Annotated[option.kind, described], option.default
     shown |= {name: options.READING[name] for name in command.reading}
-    page_name = outcome.page_name if issubclass(outcome, Reported) else None
-    shown |= {"report": (options.ReportFile, None)} if page_name == "" else {}
-    shown |= {"series": (options.SeriesFolder, None)} if issubclass(outcome, Fitted) else {}
-    shown |= {"json": (options.JsonTarget, None)}
-    if command.out:
+    page_name = None
+    if outcome is not None:
+        page_name = outcome.page_name if issubclass(outcome, Reported) else None
+        shown |= {"report": (options.ReportFile, None)} if page_name == "" else {}
+        shown |= {"series": (options.SeriesFolder, None)} if issubclass(outcome, Fitted) else {}
+        shown |= {"json": (options.JsonTarget, None)}
+    if outcome is not None and command.out:
         asked = Annotated[Path | None, typer.Option("--out", metavar="DIR", help=command.out)]
         shown |= {"out": (options.OutFolder, Path()) if command.out == FOLDER else (asked, None)}
 
     def run(**given: Any) -> None:
+        if outcome is None:
+            function(**given)
+            return
         if page_name:
             given["report"] = given["out"] / page_name
         _run(command, function, outcome, signature, typed, given)
@@ -297,7 +294,7 @@ def of_library(command: Command, function: Callable[..., Outcome]) -> Callable[.
 
 def _run(
     command: Command,
-    function: Callable[..., Outcome],
+    function: Callable[..., Any],
     outcome: type[Outcome],
     signature: inspect.Signature,
     typed: Mapping[str, Any],
@@ -315,7 +312,7 @@ def _run(
     texts = [text for one in logged for text in ([one] if isinstance(one, str) else one)]
     json, report, series, out = (given.get(name) for name in ("json", "report", "series", "out"))
     terminal.check_file(json, "--json")
-    folder = None if out is None else check_folder(out, "--out")
+    folder = check_folder(out, "--out") if command.out and out is not None else None
     names = [file_name(parse_part(text).path.name) for text in texts]
     if series is not None and issubclass(outcome, Fitted):
         check_folder(series, "--series", *(name + end for name in names for end in outcome.over_time))
@@ -359,8 +356,8 @@ def _run(
             terminal.warn([f"no answer; why, and the data as they are: {write_text(report, text)}"])
         raise
     terminal.show(done, json, files)
-    if unanswered is not None:
-        raise unanswered
+    if (failure := unanswered or done.failure) is not None:
+        raise failure
 
 
 def opened(

@@ -7,9 +7,8 @@ import typer
 
 from quadid.app.export import export as exported
 from quadid.app.export import forms
-from quadid.app.logs import check_folder
-from quadid.app.options import VEHICLE, JsonTarget, OutFolder
-from quadid.cli import terminal
+from quadid.app.options import VEHICLE
+from quadid.app.outcome import Outcome
 from quadid.report.programs import FORMATS
 from quadid.vehicle import Vehicle
 
@@ -28,9 +27,7 @@ def export(
     history: Annotated[Path | None, typer.Option(metavar="FILE")] = None,
     name: Annotated[str | None, typer.Option("--id", metavar="NAME")] = None,
     anyway: Annotated[bool, typer.Option("--anyway")] = False,
-    json: JsonTarget = None,
-    out: OutFolder = Path(),
-) -> None:
+) -> Outcome:
     """Write the parameters for another program, with units and where each came from; nothing is sent to a vehicle.
 
     Args:
@@ -38,10 +35,8 @@ def export(
         name: name in the history whose set is exported; default the vehicle's.
         anyway: also export values that are unproven or out of date.
     """
-    terminal.check_file(json, "--json")
     if what:
-        terminal.conclude(forms(), json)
-        return
+        return forms()
     if vehicle is None:
         raise typer.BadParameter("no vehicle: use --vehicle, or --list", param_hint="--vehicle")
     described, source = Vehicle.named(vehicle), Path(vehicle).name
@@ -49,8 +44,7 @@ def export(
         described, source = _in_force(described, history, name or described.name)
     elif name is not None:
         raise typer.BadParameter("it names sets of a history: give --history FILE too", param_hint="--id")
-    done = exported(described, form, source=source, anyway=anyway)
-    terminal.conclude(done, json, folder=check_folder(out, "--out"), kept=vehicle)
+    return exported(described, form, source=source, anyway=anyway)
 
 
 def _in_force(vehicle: Vehicle, history: Path, name: str) -> tuple[Vehicle, str]:

@@ -1,5 +1,7 @@
 """`quadid history`: stored parameter sets: what, when, from which data, who approved."""
 
+from __future__ import annotations
+
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,10 +10,9 @@ from typing import Annotated, Any
 
 import typer
 
-from quadid.app.options import JsonTarget, shipped_names
+from quadid.app.options import shipped_names
 from quadid.app.outcome import Outcome
 from quadid.chi_square import Z95
-from quadid.cli import terminal
 from quadid.errors import VehicleError
 from quadid.report.tables import Cell, Column, TextTable, heads, number
 from quadid.vehicle import Vehicle
@@ -22,8 +23,7 @@ def history(
     file: Annotated[Path | None, typer.Option("--history", metavar="FILE")] = None,
     candidates: Annotated[int, typer.Option(metavar="N", min=0)] = 0,
     events: Annotated[int, typer.Option("--events", metavar="N", min=0, help="Also the newest N events.")] = 0,
-    json: JsonTarget = None,
-) -> None:
+) -> Stored:
     """Show the stored parameter sets of a vehicle: what, when, from which data, who approved.
 
     Args:
@@ -33,7 +33,6 @@ def history(
     """
     from quadid_node.history import StoreError, default_path, read_history, read_in_force
 
-    terminal.check_file(json, "--json")
     path, name, described = file or default_path(), vehicle, None
     found = read_history(path, name, candidates, events)
     names = [entry["name"] for entry in found["vehicles"]]
@@ -50,14 +49,8 @@ def history(
         found = read_history(path, name, candidates, events)
     last = read_in_force(path, name, described)
     force = None if last.item is None else {"sequence": last.item.sequence, "doubt": last.doubt}
-    result = {
-        "schema": "quadid.history/1",
-        "vehicle": name,
-        "history": str(path.absolute()),
-        "in_force": force,
-        **found,
-    }
-    terminal.conclude(Stored(result), json)
+    told = {"schema": "quadid.history/1", "vehicle": name, "history": str(path.absolute()), "in_force": force}
+    return Stored({**told, **found})
 
 
 @dataclass(frozen=True, repr=False)

@@ -12,7 +12,7 @@ from quadid_replay import TopicWriter
 
 from quadid.app import options
 from quadid.app.logs import written_whole
-from quadid.app.outcome import Outcome
+from quadid.app.outcome import Advance, Outcome, silent
 from quadid.errors import QuadidError
 from quadid.report.tables import Cell, TextTable, parameter_table
 
@@ -22,9 +22,6 @@ if TYPE_CHECKING:
     from quadid_node.service import Service
 
     from quadid.data.window import Recording
-
-NOTHING = 3
-"""Exit code when the log was played but no set was published."""
 
 
 class ReplayError(QuadidError):
@@ -47,8 +44,9 @@ def replay(
     seed: options.Seed = 0,
     preset: options.Preset = "auto",
     columns: options.Columns = None,
-    json: options.JsonTarget = None,
-) -> None:
+    *,
+    advance: Advance = silent,
+) -> Replayed:
     """Drive the online session from a log: the sets, findings and reasons that a live service would have published.
 
     Args:
@@ -62,12 +60,11 @@ def replay(
     from quadid_node.service import Service, session_settings
     from quadid_node.worker import InlineWorker
 
-    from quadid.app.kernels import FIT
+    from quadid.app.kernels import FIT, prepare
     from quadid.app.logs import parse_columns, parse_part, read_log
     from quadid.cli import terminal
     from quadid.vehicle import Vehicle
 
-    terminal.check_file(json, "--json")
     terminal.check_file(out, "--out")
     pace = _pace(speed)
     described = Vehicle.named(vehicle)
@@ -77,35 +74,33 @@ def replay(
     cut = parse_part(log)
     if as_recorded and cut.path != Path(log):
         raise ReplayError(f"--as-recorded of {log}, a part", "whole recordings", f"--as-recorded {cut.path}")
-    with terminal.progress(FIT) as advance:
-        advance(f"reading {cut.path.name}", 0.0)
-        recording = cut.of(read_log(cut.path, preset, described, parse_columns(columns or [])))
-        if as_recorded:
-            beginning = _beginning(Path(log), described.name)
-            described = beginning.vehicle
-            service = Service(described, beginning.settings, InlineWorker(), restored=beginning.restored, live=False)
-            blocks = arrivals(Path(log), beginning.source, len(described.rotors))
-        else:
-            service = Service(described, settings, InlineWorker(), live=False)
-            blocks = stream(recording)
-        rows = sum(len(c.t) for c in recording.channels.values())
-        outputs = play(service, blocks, pace, lambda count: advance("replay", min(count / max(rows, 1), 1.0)))
-        result = summary(recording, service, outputs, candidates)
-        if out is not None:
-            advance(f"writing {out.name}", 1.0)
-            # Writes what would have been published as MCAP: topics, types and stamps as of the live service
-            from quadid_node.messages import RESULTS, TOPICS
+    prepare(FIT, advance)
+    advance(f"reading {cut.path.name}", 0.0)
+    recording = cut.of(read_log(cut.path, preset, described, parse_columns(columns or [])))
+    if as_recorded:
+        beginning = _beginning(Path(log), described.name)
+        described = beginning.vehicle
+        service = Service(described, beginning.settings, InlineWorker(), restored=beginning.restored, live=False)
+        blocks = arrivals(Path(log), beginning.source, len(described.rotors))
+    else:
+        service = Service(described, settings, InlineWorker(), live=False)
+        blocks = stream(recording)
+    rows = sum(len(c.t) for c in recording.channels.values())
+    outputs = play(service, blocks, pace, lambda count: advance("replay", min(count / max(rows, 1), 1.0)))
+    result = summary(recording, service, outputs, candidates)
+    if out is not None:
+        advance(f"writing {out.name}", 1.0)
+        # What would have been published as MCAP: topics, types and stamps as of the live service
+        from quadid_node.messages import RESULTS, TOPICS
 
-            with written_whole(out.absolute()) as part, TopicWriter(part) as writer:
-                for output in outputs:
-                    if output.topic in RESULTS:
-                        message = RESULTS[output.topic].message(output, described.name, "")
-                        stamp = message["header"]["stamp"]
-                        writer.write(*TOPICS[output.topic], message, stamp["sec"] * 10**9 + stamp["nanosec"])
-            result["out"] = str(out.absolute())
-    terminal.conclude(Replayed(result), json)
-    if not result["published"]:
-        raise typer.Exit(NOTHING)
+        with written_whole(out.absolute()) as part, TopicWriter(part) as writer:
+            for output in outputs:
+                if output.topic in RESULTS:
+                    message = RESULTS[output.topic].message(output, described.name, "")
+                    stamp = message["header"]["stamp"]
+                    writer.write(*TOPICS[output.topic], message, stamp["sec"] * 10**9 + stamp["nanosec"])
+        result["out"] = str(out.absolute())
+    return Replayed(result)
 
 
 def _pace(speed: str) -> float:
@@ -183,6 +178,11 @@ class Replayed(Outcome):
         else:
             told.append(f"nothing published: {result['status']['phase']}: {result['status']['reason']}")
         return [Cell(text) for text in told]
+
+    @property
+    def failure(self) -> Exception | None:
+        """The exit code 3 of a log that was played, but of which no set was published."""
+        return None if self.result["published"] else typer.Exit(3)
 
     def tables(self) -> list[TextTable]:
         """The parameters of the last set."""

@@ -7,8 +7,9 @@ from typing import Annotated, Any
 
 import typer
 
-from quadid.app.options import JsonTarget, Seed, VehicleName
-from quadid.app.outcome import Advance, silent
+from quadid.app.kernels import prepare
+from quadid.app.options import Seed, VehicleName
+from quadid.app.outcome import Advance, Outcome, silent
 from quadid.app.simulate import Draw, Drawn, SimulateError, check_suffix, simulate_draws
 from quadid.app.simulate import simulate as fly
 from quadid.cli import terminal
@@ -30,8 +31,9 @@ def simulate(
     extra: Annotated[list[str] | None, typer.Option(metavar="CHANNEL")] = None,
     spread: Annotated[float, typer.Option(metavar="F", min=0.0, max=0.9)] = 0.0,
     draws: Annotated[int | None, typer.Option(metavar="N")] = None,
-    json: JsonTarget = None,
-) -> None:
+    *,
+    advance: Advance = silent,
+) -> Outcome:
     """Fly the closed-loop vehicle, controlled at 1 kHz, and log it at 50 Hz.
 
     Args:
@@ -43,8 +45,9 @@ def simulate(
         spread: draw the true parameters within this fraction of the type.
         draws: fly N vehicles within the file's uncertainty, each under its random forces; the logs are numbered.
     """
-    check_target(out)
-    terminal.check_file(json, "--json")
+    live = out.startswith(LIVE)
+    if draws is not None and live:
+        raise SimulateError(f"--draws {draws} to {out}", "a file", "leave one of them out")
     how: dict[str, Any] = {
         "seconds": seconds,
         "effects": effect or (),
@@ -55,27 +58,15 @@ def simulate(
         "extras": extra or (),
         "spread": spread,
     }
-    live = out.startswith(LIVE)
-    if draws is not None and live:
-        raise SimulateError(f"--draws {draws} to {out}", "a file", "leave one of them out")
-    with terminal.progress(("flight",)) as advance:
-        advance("flying", 0.0)
-        if draws is not None:
-            drawn = simulate_draws(vehicle, draws, seed, **how)
-            result = saved(Path(out), drawn)
-        else:
-            done = fly(vehicle, seed=seed, **how)
-            if live:
-                stream(out, done.flight.recording, advance)
-            done.result["log"] = out if live else str(done.save(out))
-    if draws is None:
-        terminal.conclude(done, json)
-        return
-    terminal.conclude(result, json)
-    if result.result["diverged"] == draws:
-        from quadid.flight import FlightError
-
-        raise FlightError(f"all {draws} vehicles diverged", fix="another manoeuvre, or gains that fit the vehicle")
+    prepare(("flight",), advance)
+    advance("flying", 0.0)
+    if draws is not None:
+        return saved(Path(out), simulate_draws(vehicle, draws, seed, **how))
+    done = fly(vehicle, seed=seed, **how)
+    if live:
+        stream(out, done.flight.recording, advance)
+    done.result["log"] = out if live else str(done.save(out))
+    return done
 
 
 def saved(target: Path, draws: Sequence[Draw]) -> Drawn:
