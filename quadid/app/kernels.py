@@ -5,15 +5,12 @@ What calls the same pieces is one part, or each process would compile them again
 
 from __future__ import annotations
 
-import gc
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pkgutil import resolve_name
-from threading import Thread
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 if TYPE_CHECKING:
     from quadid.app.outcome import Advance
@@ -21,19 +18,16 @@ if TYPE_CHECKING:
     from quadid.vehicle import Vehicle
 
 
-@dataclass(frozen=True)
-class Part:
+class Part(NamedTuple):
     """Kernels that one process compiles.
 
     Attributes:
         run: calls each of them once, as a fit or a flight does.
         names: the functions on disk, each as the module of quadid and its name.
-        functions: how many functions are compiled for them, about; for a share done.
     """
 
     run: Callable[[], None]
     names: tuple[str, ...]
-    functions: int
 
     def kernels(self) -> list[Any]:
         """The functions on disk."""
@@ -54,26 +48,6 @@ def on_disk(kernel: Any) -> bool:
         return True
     now = cache._index_key((), cpu_target.target_context.codegen())[1:]
     return any(key[1:] == now for key in cache._cache_file._load_index())
-
-
-def compiled(name: str, counted: Callable[[int], None]) -> None:
-    """Compiles one part, in a process of its own; `counted` is called with the number of functions that are done."""
-    from numba.core import event
-
-    gc.disable()  # a compiler makes many objects that live on: looking through them takes a tenth of its time
-
-    class Count(event.Listener):
-        done = 0
-
-        def on_start(self, event: Any) -> None:
-            pass
-
-        def on_end(self, event: Any) -> None:
-            self.done += 1
-            counted(self.done)
-
-    with event.install_listener("numba:compile", Count()):
-        PARTS[name].run()
 
 
 def _hover() -> tuple[Vehicle, Window]:
@@ -136,12 +110,11 @@ PARTS = {
     "simulation": Part(
         _simulation,
         ("model.rollout_kernel:roll_segments", "model.rotor_kernel:rotor_table", "model.closed_loop:fly_closed_loop"),
-        110,
     ),
     "estimate": Part(
-        _estimate, tuple(f"estimate.kalman:{name}" for name in ("moments", "filter_pass", "replay", "backward")), 30
+        _estimate, tuple(f"estimate.kalman:{name}" for name in ("moments", "filter_pass", "replay", "backward"))
     ),
-    "flight": Part(_flight, ("flight.fly:march",), 30),
+    "flight": Part(_flight, ("flight.fly:march",)),
 }
 """Kernels of an identification or a diagnosis, in two parts, and the flown vehicle of `quadid simulate`."""
 FIT = ("simulation", "estimate")
@@ -151,7 +124,8 @@ FIT = ("simulation", "estimate")
 
 
 STAGE = "compiling, once on this machine"
-_CHILD = "from quadid.app.kernels import compiled; compiled({!r}, lambda done: print(done, flush=True))"
+_CHILD = "import gc; gc.disable(); from quadid.app.kernels import PARTS; PARTS[{!r}].run()"
+"""A compiler makes many objects that live on: looking through them takes a tenth of its time."""
 
 
 def prepare(parts: Sequence[str], advance: Advance) -> list[str]:
@@ -161,24 +135,14 @@ def prepare(parts: Sequence[str], advance: Advance) -> list[str]:
     to compile, the work itself compiles, and says why it cannot.
     """
     wanted = missing(tuple(parts))
-    done = dict.fromkeys(wanted, 0)
-
-    def follow(name: str) -> None:
-        with subprocess.Popen(
-            [sys.executable, "-P", "-c", _CHILD.format(name)],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
-            text=True,
-        ) as child:
-            assert child.stdout is not None
-            for line in child.stdout:
-                done[name] = int(line)
-
-    threads = [Thread(target=follow, args=(name,), daemon=True) for name in wanted]
-    for thread in threads:
-        thread.start()
-    total = sum(PARTS[name].functions for name in wanted)
-    while any(thread.is_alive() for thread in threads):
-        advance(STAGE, min(sum(done.values()) / total, 0.99))
+    kernels = [kernel for name in wanted for kernel in PARTS[name].kernels()]
+    children = [
+        subprocess.Popen(
+            [sys.executable, "-P", "-c", _CHILD.format(name)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        )
+        for name in wanted
+    ]
+    while any(child.poll() is None for child in children):
+        advance(STAGE, sum(map(on_disk, kernels)) / len(kernels))
         time.sleep(0.2)
     return wanted
