@@ -158,39 +158,25 @@ def _betaflight(facts: Facts, known: Known, at: Hover) -> FloatArray:
     return np.asarray(sides * (1.0 - idle))
 
 
-def _named(pattern: str, axes: tuple[str, ...], terms: tuple[str, ...]) -> tuple[tuple[str, ...], ...]:
-    return tuple(tuple(pattern.format(axis, term) for term in terms) for axis in axes)
-
-
 _NONE = ("", math.inf)
 _DEGREES = math.degrees(1.0) / 1000.0
 AUTOPILOTS: dict[str, Autopilot] = {
     "px4": Autopilot(
         "PX4",
-        tuple(
-            (*rates, f"MC_{axis.upper()}_P")
-            for rates, axis in zip(_named("MC_{}RATE_{}", ("ROLL", "PITCH", "YAW"), ("P", "I", "D")), AXES, strict=True)
-        ),
+        tuple((*(f"MC_{axis}RATE_{term}" for term in "PID"), f"MC_{axis}_P") for axis in ("ROLL", "PITCH", "YAW")),
         (1.0, 1.0, 1.0, 1.0), None,
         ("IMU_GYRO_CUTOFF", 40.0), ("IMU_DGYRO_CUTOFF", 30.0), ("IMU_GYRO_RATEMAX", 400.0), _NONE, _NONE, False, _px4,
     ),
     "ardupilot": Autopilot(
         "ArduPilot",
-        tuple(
-            (*rates, f"ATC_ANG_{axis}_P")
-            for rates, axis in zip(
-                _named("ATC_RAT_{}_{}", ("RLL", "PIT", "YAW"), ("P", "I", "D")), ("RLL", "PIT", "YAW"), strict=True
-            )
-        ),
+        tuple((*(f"ATC_RAT_{axis}_{term}" for term in "PID"), f"ATC_ANG_{axis}_P") for axis in ("RLL", "PIT", "YAW")),
         (1.0, 1.0, 1.0, 1.0), None,
         ("INS_GYRO_FILTER", 20.0), ("ATC_RAT_RLL_FLTD", 20.0), ("SCHED_LOOP_RATE", 400.0),
         ("ATC_RAT_YAW_FLTE", 2.5), ("ATC_RAT_RLL_FLTT", 20.0), True, _ardupilot,
     ),
     "betaflight": Autopilot(
         "Betaflight",
-        tuple(
-            (f"p_{axis}", f"i_{axis}", f"d_{axis}", "angle_p_gain" if axis != "yaw" else "") for axis in AXES
-        ),
+        tuple((*(f"{term}_{axis}" for term in "pid"), "angle_p_gain" if axis != "yaw" else "") for axis in AXES),
         (0.032029 * _DEGREES, 0.244381 * _DEGREES, 0.000529 * _DEGREES, 0.1), 0,
         ("gyro_lpf1_static_hz", 250.0), ("dterm_lpf1_static_hz", 50.0), ("pid_rate", 4000.0), _NONE, _NONE,
         False, _betaflight,

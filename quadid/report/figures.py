@@ -34,7 +34,8 @@ GROUPS: dict[str, tuple[str, tuple[int, ...]]] = {
 }
 PARAMETERS = ("current parameters", "proposed parameters")
 MODELS = ("model without the findings", "model with the findings")
-LABELS = {"phi": "φ", "theta": "θ", "psi": "ψ"}
+LABELS = [{"phi": "φ", "theta": "θ", "psi": "ψ"}.get(name, name) for name in CHANNEL_NAMES]
+"""Names of the outputs for people."""
 DECADES = 30.0
 """Ratio of bars from which they are drawn on a logarithmic axis."""
 WHOLE_POINTS = 800
@@ -74,17 +75,11 @@ def channel_figures(
             views = [
                 {"label": "Most excited part, every sample", **_stack(scored, detail, here, labels)},
                 {"label": "Whole log", **_stack(scored, whole, here, labels)},
-            ]
-            shown = views if len(whole) > len(detail) else views[1:]
-            residual = {"label": "Residual, every sample", **_stack(scored, detail, here, labels, residual=True)}
-            shown = [*shown, residual, _spectra(scored, here, labels)]
-            out.append({"id": f"{prefix}-{key}", "title": title, "views": shown, "height": 130 * len(here) + 70})
+                {"label": "Residual, every sample", **_stack(scored, detail, here, labels, residual=True)},
+                _spectra(scored, here, labels),
+            ][len(whole) <= len(detail) :]
+            out.append({"id": f"{prefix}-{key}", "title": title, "views": views, "height": 130 * len(here) + 70})
     return out
-
-
-def _label(channel: int) -> str:
-    """Name of an output for people."""
-    return LABELS.get(CHANNEL_NAMES[channel], CHANNEL_NAMES[channel])
 
 
 def _stack(
@@ -101,9 +96,14 @@ def _stack(
             lines = [(role, label, measured - y) for role, label, y in lines]
         else:
             lines.insert(0, ("measured", "measured", measured))
-        drawn.append((lines, _focus(lines[-1][2] if residual else measured)))
+        # Axis limits that show the measurement.
+        good = lines[-1][2] if residual else measured
+        good = good[np.isfinite(good)]
+        low, high = (float(good.min()), float(good.max())) if len(good) else (-1.0, 1.0)
+        margin = 0.15 * max(high - low, 1e-3)
+        drawn.append((lines, (low - margin, high + margin)))
     panels = [
-        (f"{_label(c)} [{CHANNEL_UNITS[c]}]", {"range": list(limits)})
+        (f"{LABELS[c]} [{CHANNEL_UNITS[c]}]", {"range": list(limits)})
         for c, (_, limits) in zip(channels, drawn, strict=True)
     ]
     places, layout = stacked(panels, "time [s]")
@@ -126,7 +126,7 @@ def _spectra(scored: ScoredSet, channels: Sequence[int], labels: tuple[str, str]
     rows = min(max(round(2.0 * SCORE_SECONDS / step), 8), SPECTRUM_ROWS, len(after.t))
     parts = len(after.t) // rows
     low, high = (math.sqrt(exceeded(p, 2 * parts) / (2 * parts)) for p in (0.975, 0.025))
-    panels = [(f"{_label(c)} [{CHANNEL_UNITS[c]}/√Hz]", {"type": "log"}) for c in channels]
+    panels = [(f"{LABELS[c]} [{CHANNEL_UNITS[c]}/√Hz]", {"type": "log"}) for c in channels]
     places, layout = stacked(panels, "frequency [Hz]")
     data = []
     for i, (c, where) in enumerate(zip(channels, places, strict=True)):
@@ -182,16 +182,6 @@ def _joined(stretches: Sequence[FloatArray]) -> FloatArray:
     first, *others = stretches
     hole = np.full((1, *first.shape[1:]), np.nan)
     return np.concatenate([first, *(part for other in others for part in (hole, other))])
-
-
-def _focus(measured: FloatArray) -> tuple[float, float]:
-    """Axis limits that show the measurement."""
-    good = measured[np.isfinite(measured)]
-    if len(good) == 0:
-        return -1.0, 1.0
-    low, high = float(good.min()), float(good.max())
-    margin = 0.15 * max(high - low, 1e-3)
-    return low - margin, high + margin
 
 
 def thinned(values: FloatArray, points: int) -> IndexArray:
@@ -254,9 +244,7 @@ def parameter_figure(parameters: Sequence[Mapping[str, Any]], truth: Mapping[str
     names = [p["name"] for p in shown]
     scale = np.array([p["initial"] for p in shown])
     value = np.array([p["value"] for p in shown]) / scale
-    interval = (
-        np.array([[np.nan if v is None else v for v in p["ci95"]] for p in shown]).reshape(-1, 2) / scale[:, None]
-    )
+    interval = np.array([p["ci95"] for p in shown], dtype=np.float64).reshape(-1, 2) / scale[:, None]
     upper, lower = listed(interval[:, 1] - value), listed(value - interval[:, 0])
     bars = {"type": "data", "symmetric": False, "array": upper, "arrayminus": lower}
     common = {"y": names, "mode": "markers", "type": "scatter"}
@@ -447,61 +435,43 @@ def _signals(shooting: Shooting, residual: FloatArray, settled: Linearised) -> d
     """Quantities at the samples of all segments, (segments, length); rates are simulated ones, free of gyro noise."""
     starts = settled.states.at(settled.n_pre, shooting.rollouts, shooting.segments).x0
     parts: list[dict[str, FloatArray]] = []
-    place = 0
+    place, before = 0, settled.n_pre
     for rollout, segments, x0 in zip(shooting.rollouts, shooting.segments, starts, strict=True):
-        rows = segments.rows
-        mine = residual[place : place + len(rows)]
+        w, rows, dt = rollout.window, segments.rows, rollout.window.dt
+        rates = rollout.measured[rows][..., :3] - residual[place : place + len(rows), :, :3]
         place += len(rows)
-        signals = _of_window(rollout.window, rows, rollout.measured[rows][..., :3] - mine[..., :3], shooting)
-        parts.append(signals | _in_the_air(rollout.window, rows, x0[:, _VELOCITY], settled.n_pre))
+        # Time, rotors, and rates with their rate of change.
+        start = w.log_span[0] if np.isfinite(w.log_span[0]) else w.t0
+        level = np.mean(w.rotor_speed**2, axis=1)
+        level = level / level.mean()
+        part = {
+            "time": w.t[rows] - start,
+            "thrust": level[rows],
+            "thrust_rate": np.gradient(level, dt)[rows],
+            "rotor_speed": w.rotor_speed.mean(axis=1)[rows],
+            "spin_rate": np.gradient(w.rotor_speed @ shooting.vehicle.spins, dt)[rows],
+        }
+        for i, name in enumerate("pqr"):
+            part |= {name: rates[..., i], f"{name}_dot": np.gradient(rates[..., i], dt, axis=1)}
+        # Velocity and height as logged.
+        v = None if w.velocity is None else w.velocity[rows]
+        part |= {} if v is None else {name: v[..., i] for i, name in enumerate(("v_n", "v_e", "v_d"))}
+        part |= {} if w.position is None else {"height": -w.position[rows, 2]}
+        if w.attitude is not None:
+            # Heading; velocity as measured, else from that fitted `before` rows ahead of each segment and the
+            # accelerometer; in the body.
+            q_w, x, y, z = w.attitude[rows].transpose(2, 0, 1)
+            part["heading"] = np.arctan2(2.0 * (q_w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+            if v is None and w.accel is not None:
+                along = np.concatenate([rows[:, :1] + np.arange(1 - before, 0), rows], axis=1)
+                pull = rotated(w.attitude[along], w.accel[along]) + [0.0, 0.0, GRAVITY]
+                v = (x0[:, None, _VELOCITY] + dt * np.cumsum(pull, axis=1))[:, before - 1 :]
+            if v is not None:
+                body = rotated(conjugate(w.attitude[rows]), v)
+                part |= {name: body[..., i] for i, name in enumerate(("v_x", "v_y", "v_z"))}
+        parts.append(part)
     shared = set.intersection(*(set(p) for p in parts))
     return {name: np.concatenate([p[name] for p in parts]) for name in shared}
-
-
-def _of_window(window: Window, rows: IndexArray, rates: FloatArray, shooting: Shooting) -> dict[str, FloatArray]:
-    dt, speed = window.dt, window.rotor_speed
-    square = np.mean(speed**2, axis=1)
-    spins = shooting.vehicle.spins
-    start = window.log_span[0] if np.isfinite(window.log_span[0]) else window.t0
-    level = square / square.mean()
-    out = {
-        "time": window.t[rows] - start,
-        "thrust": level[rows],
-        "thrust_rate": np.gradient(level, dt)[rows],
-        "rotor_speed": speed.mean(axis=1)[rows],
-        "spin_rate": np.gradient(speed @ spins, dt)[rows],
-    }
-    for i, name in enumerate("pqr"):
-        out[name] = rates[..., i]
-        out[f"{name}_dot"] = np.gradient(rates[..., i], dt, axis=1)
-    if window.velocity is not None:
-        out |= {name: window.velocity[rows, i] for i, name in enumerate(("v_n", "v_e", "v_d"))}
-    if window.position is not None:
-        out["height"] = -window.position[rows, 2]
-    return out
-
-
-def _in_the_air(window: Window, rows: IndexArray, start: FloatArray, n_pre: int) -> dict[str, FloatArray]:
-    """Heading, and body velocity: measured, else from the velocity fitted at each start and the accelerometer.
-
-    Args:
-        rows: of the samples, (segments, length).
-        start: fitted velocity `n_pre` rows before each segment [m/s], (segments, 3).
-        n_pre: rows between the start and the segment.
-    """
-    if window.attitude is None:
-        return {}
-    w, x, y, z = window.attitude[rows].transpose(2, 0, 1)
-    out = {"heading": np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))}
-    v = None if window.velocity is None else window.velocity[rows]
-    if v is None and window.accel is not None:
-        along = np.concatenate([rows[:, :1] + np.arange(1 - n_pre, 0), rows], axis=1)
-        pull = rotated(window.attitude[along], window.accel[along]) + [0.0, 0.0, GRAVITY]
-        v = (start[:, None] + window.dt * np.cumsum(pull, axis=1))[:, n_pre - 1 :]
-    if v is not None:
-        body = rotated(conjugate(window.attitude[rows]), v)
-        out |= {"v_x": body[..., 0], "v_y": body[..., 1], "v_z": body[..., 2]}
-    return out
 
 
 def _binned(
@@ -528,8 +498,7 @@ def _binned(
     spread = np.linspace(values.min(), values.max(), BINS + 1)
     edges = spread if quantity == "time" else np.quantile(values, np.linspace(0.0, 1.0, BINS + 1))
     label = np.clip(np.searchsorted(edges, signal, side="right") - 1, 0, BINS - 1)
-    x = np.array([np.mean(signal[good & (label == i)]) if (good & (label == i)).any() else np.nan for i in range(BINS)])
-    (mean_b, error_b), (mean_a, error_a) = (_means(r, label, good) for r in both)
+    (x, _), (mean_b, error_b), (mean_a, error_a) = (_means(of, label, good) for of in (signal, *both))
     told = np.isfinite(error_b) & np.isfinite(error_a) & (error_b > 0.0) & (error_a > 0.0)
     if np.count_nonzero(told) < BINS // 2:
         return None

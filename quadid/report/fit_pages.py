@@ -54,8 +54,6 @@ from quadid.vehicle import Vehicle
 SECONDS = 2.0
 """Length of the stretches whose spectra are averaged: lines half a hertz apart are resolved."""
 MOST_POINTS = 400
-_AXES = ("forward", "to the right", "downwards")
-_ROLES = ("measured", "before", "after")
 
 
 def flight_section(recording: Recording, vehicle: Vehicle, place: int) -> dict[str, Any] | None:
@@ -64,26 +62,30 @@ def flight_section(recording: Recording, vehicle: Vehicle, place: int) -> dict[s
     Args:
         recording: as read, each channel at its own rate.
     """
-    spans = flying_spans(recording, vehicle)
-    drawn, said = _vibration(recording, vehicle, spans, f"log{place}-vibration") if spans else (None, "")
-    modes, rotors = mode_rows(recording), _rotor_figure(recording, vehicle, f"log{place}-rotors")
-    figures = [f for f in (rotors, drawn) if f is not None]
+    figures, said = list[JsonDict](), ""
+    rotors, _ = rotor_channel(recording, vehicle)
+    # The rotor signal over the whole log, as it was read.
+    if rotors is not None and len(rotors.t) > 1:
+        rows = thinned(rotors.values, WHOLE_POINTS)
+        t, signal = rotors.t[rows] - recording.first_imu_time, rotors.name.replace("_", " ")
+        data = [trace(f"unit{i}", f"rotor {i + 1}", t, column) for i, column in enumerate(rotors.values[rows].T)]
+        layout: JsonDict = {"xaxis": axis("time [s]"), "yaxis": axis(f"{signal} [{CHANNELS[rotors.name][1]}]")}
+        figures.append(figure(f"log{place}-rotors", "Rotor signals", data, layout, 280))
+    # Amplitude spectrum of the accelerometer in the air, and where the rotors are in it.
+    spans, accel = flying_spans(recording, vehicle), recording.channels.get("accel")
+    if spans and accel is not None and (found := spectrum(accel, spans)) is not None:
+        frequency, density = found
+        roles = zip(("measured", "before", "after"), ("forward", "to the right", "downwards"), strict=True)
+        data = [trace(role, name, frequency, density[:, i]) for i, (role, name) in enumerate(roles)]
+        shown, said = _turning(rotors, spans, float(frequency[-1]))
+        scale = axis("(m/s²)/√Hz", type="log")
+        layout = {"xaxis": axis("frequency (Hz)"), "yaxis": scale, "shapes": [upright(turns) for turns in shown]}
+        figures.append(figure(f"log{place}-vibration", "Vibration in the air", data, layout, 300))
+    modes = mode_rows(recording)
     if not figures and not modes:
         return None
     tables = [rows_of(("flight mode", "from (s)", "to (s)"), modes)] if modes else []
     return section(f"flight-{place}", f"Flight of {recording.name}", said, figures, tables, kind="folded")
-
-
-def _rotor_figure(recording: Recording, vehicle: Vehicle, identifier: str) -> JsonDict | None:
-    """The rotor signal over the whole log, as it was read; None where there is none."""
-    rotors, _ = rotor_channel(recording, vehicle)
-    if rotors is None or len(rotors.t) < 2:
-        return None
-    rows = thinned(rotors.values, WHOLE_POINTS)
-    t = rotors.t[rows] - recording.first_imu_time
-    data = [trace(f"unit{i}", f"rotor {i + 1}", t, column) for i, column in enumerate(rotors.values[rows].T)]
-    layout = {"xaxis": axis("time [s]"), "yaxis": axis(f"{rotors.name.replace('_', ' ')} [{CHANNELS[rotors.name][1]}]")}
-    return figure(identifier, "Rotor signals", data, layout, 280)
 
 
 def mode_rows(recording: Recording) -> list[list[str]]:
@@ -97,27 +99,6 @@ def mode_rows(recording: Recording) -> list[list[str]]:
     return [
         [name, f"{max(begin - zero, 0.0):.1f}", f"{stop - zero:.1f}"] for (begin, name), stop in held if stop > zero
     ]
-
-
-def _vibration(
-    recording: Recording, vehicle: Vehicle, spans: Spans, identifier: str
-) -> tuple[dict[str, Any] | None, str]:
-    """Amplitude spectrum of the accelerometer in the air, and a sentence about where the rotors are in it."""
-    accel = recording.channels.get("accel")
-    found = None if accel is None else spectrum(accel, spans)
-    if found is None:
-        return None, ""
-    frequency, density = found
-    data = [
-        trace(role, name, frequency, density[:, i]) for i, (role, name) in enumerate(zip(_ROLES, _AXES, strict=True))
-    ]
-    turning, said = _turning(recording, vehicle, spans, float(frequency[-1]))
-    layout = {
-        "xaxis": axis("frequency (Hz)"),
-        "yaxis": axis("(m/s²)/√Hz", type="log"),
-        "shapes": [] if turning is None else [upright(turning)],
-    }
-    return figure(identifier, "Vibration in the air", data, layout, 300), said
 
 
 def spectrum(accel: Channel, spans: Spans) -> tuple[FloatArray, FloatArray] | None:
@@ -143,16 +124,15 @@ def spectrum(accel: Channel, spans: Spans) -> tuple[FloatArray, FloatArray] | No
     return each[0][0][keep], np.sqrt(power[keep])
 
 
-def _turning(recording: Recording, vehicle: Vehicle, spans: Spans, highest: float) -> tuple[float | None, str]:
-    """Frequencies at which the mean rotor speed in flight shows in the spectrum [Hz], and that in words."""
-    rotors, _ = rotor_channel(recording, vehicle)
+def _turning(rotors: Channel | None, spans: Spans, highest: float) -> tuple[list[float], str]:
+    """Frequency at which the mean rotor speed in flight shows in a spectrum [Hz], if it does, and that in words."""
     if rotors is None or rotors.name != "rotor_speed":
-        return None, "The rotor speed is not logged; peaks are most often rotors out of balance."
+        return [], "The rotor speed is not logged; peaks are most often rotors out of balance."
     turns = float(np.mean(rotors.values[within(rotors.t, spans)])) / (2.0 * np.pi)
     if turns <= highest:
-        return turns, f"The rotors turn {turns:.0f} times a second (dashed): a peak there is imbalance."
+        return [turns], f"The rotors turn {turns:.0f} times a second (dashed): a peak there is imbalance."
     folded = abs(turns - 2.0 * highest * round(turns / (2.0 * highest)))
-    return None, (
+    return [], (
         f"The rotors turn {turns:.0f} times a second, faster than this log can show ({highest:.0f} Hz): without a "
         f"filter before sampling their imbalance appears at {folded:.0f} Hz."
     )
@@ -175,17 +155,17 @@ def excitation_part(found: Excitation, seconds: float) -> dict[str, Any]:
         found: bounds from the flight.
         seconds: length of the flight that they were computed from.
     """
-    rows = []
-    for name, bound, alone in zip(found.names, found.bound.tolist(), found.alone.tolist(), strict=True):
-        rows.append((name, _sigma(bound), _sigma(alone), _advice(name, bound, alone, seconds)))
-    sharp = all(b <= SHARP for b in found.bound.tolist())
+    rows = [
+        (name, _sigma(bound), _sigma(alone), _advice(name, bound, alone, seconds))
+        for name, bound, alone in zip(found.names, found.bound.tolist(), found.alone.tolist(), strict=True)
+    ]
     intro = (
         f"Smallest possible standard deviation from these {seconds:.0f} s, whatever the method, were the model right "
         "(Cramér–Rao bound): with all parameters unknown, and with all others known. If they differ much, the flight "
         "couples parameters."
     )
     table = rows_of(_HEAD, rows, classes=("", "number", "number", ""))
-    done = ["Nothing more needs to be flown for these."] if sharp else []
+    done = ["Nothing more needs to be flown for these."] if np.all(found.bound <= SHARP) else []
     return section("excitation", "What to fly next", intro, (), [table], after=done)
 
 
@@ -237,18 +217,23 @@ def identify_sections(
     # Errors of every log before and after, and how well channels fit
     names = [n for n in FIT_NAMES if any(n in s["fit_percent"] for s in entries)]
     head = ("Log", "Used for", "Error before", "Error after", *(f"Fit {n}" for n in names))
-    rows = [
-        (
-            s["log"],
-            "fitting" if s["role"] == "train" else "validation",
-            number(s["mse"]["initial"], 3),
-            number(s["mse"]["fitted"], 3),
-            *(fit(s["fit_percent"].get(n)) for n in names),
-        )
-        for s in entries
-    ]
+    rows = []
+    for s in entries:
+        use, errors = "fitting" if s["role"] == "train" else "validation", (s["mse"]["initial"], s["mse"]["fitted"])
+        fits = (fit(s["fit_percent"].get(n)) for n in names)
+        rows.append((s["log"], use, *(number(error, 3) for error in errors), *fits))
     table = rows_of(head, rows, classes=("", "", "number", "number strong", *["number"] * len(names)))
-    title, parts = "How well the simulation predicts", set_parts(entries, sets)
+    # The first few logs with their figures, unseen ones first
+    parts, drawn = [], min(len(sets), MOST_LOGS)
+    ordered = sorted(zip(entries, sets, strict=True), key=lambda pair: pair[0]["role"] == "train")
+    for i, (entry, scored) in enumerate(ordered[:drawn]):
+        each = ((n, number(e["value"], 3), unit(e["unit"])) for n, e in entry["rmse"].items())
+        found = [(*known, fit(entry["fit_percent"].get(known[0]))) for known in each]
+        channels = measures(("Channel", "Root mean squared error", "Unit", "Fit"), found, (1, 3))
+        figures = [error_figure(scored, f"log{i}-error"), *channel_figures(scored, f"log{i}", drawn)]
+        name, kind = _named(entry["log"], entry["role"]), "folded" if i else "open"
+        parts.append(part(name, "", figures, [channels], lines=[quiet(_KEYS, "quiet hint")], kind=kind))
+    title = "How well the simulation predicts"
     predicted = section("fit", title, _PREDICTION, (), [table], parts=parts, menu="Prediction")
     return [*([lacking] if lacking else []), shown, *more, predicted, *after]
 
@@ -278,21 +263,14 @@ def parameter_section(
     for p in parameters:
         n, margin = digits(p), percent(relative_halfwidth(p)).replace(" ", "\u00a0")
         low, high = (number(v, n) for v in p["ci95"])
+        interval = Markup("{} … {} {}").format(low, high, quiet(f"(±{margin})", "quiet nobreak"))
         chip = Markup('<span class="chip {}">{}</span>').format(p["status"], status_words(p))
-        rows.append(
-            [
-                parameter_name(p["name"]),
-                number(p["initial"]),
-                number(p["value"], n),
-                Markup("{} … {} {}").format(low, high, quiet(f"(±{margin})", "quiet nobreak")),
-                unit(p["unit"]),
-                chip,
-                reason(p, stuck).replace(" %", "\u00a0%"),
-            ]
-        )
+        values = (number(p["initial"]), number(p["value"], n), interval)
+        why = reason(p, stuck).replace(" %", "\u00a0%")
+        rows.append([parameter_name(p["name"]), *values, unit(p["unit"]), chip, why])
     if truth:
-        head.insert(4, "Truth")
-        classes.insert(4, "number")
+        for column, cell in ((head, "Truth"), (classes, "number")):
+            column.insert(4, cell)
         for row, p in zip(rows, parameters, strict=True):
             row.insert(4, number(truth.get(p["name"])))
     table = rows_of(head, rows, classes=classes)
@@ -300,26 +278,9 @@ def parameter_section(
     return section("parameters", "Parameters", tables=[table], parts=[below], kind="plain")
 
 
-def _used(role: str) -> str:
-    return "fitted" if role == "train" else "validation"
-
-
-def set_parts(entries: Sequence[Json], sets: Sequence[ScoredSet]) -> list[JsonDict]:
-    """The first few logs of a result with their figures, unseen ones first."""
-    shown = min(len(sets), MOST_LOGS)
-    ordered = sorted(zip(entries, sets, strict=True), key=lambda pair: pair[0]["role"] == "train")
-    out = []
-    for i, (entry, scored) in enumerate(ordered[:shown]):
-        rows = [
-            (n, number(e["value"], 3), unit(e["unit"]), fit(entry["fit_percent"].get(n)))
-            for n, e in entry["rmse"].items()
-        ]
-        channels = measures(("Channel", "Root mean squared error", "Unit", "Fit"), rows, (1, 3))
-        title = Markup("{} {}").format(entry["log"], quiet(f"({_used(entry['role'])})"))
-        figures = [error_figure(scored, f"log{i}-error"), *channel_figures(scored, f"log{i}", shown)]
-        keys, kind = [quiet(_KEYS, "quiet hint")], "folded" if i else "open"
-        out.append(part(title, "", figures, [channels], lines=keys, kind=kind))
-    return out
+def _named(log: str, role: str, what: str = "") -> Markup:
+    """A log as a title: its name, what is shown of it, and what it was used for."""
+    return Markup("{}{} {}").format(log, what, quiet(f"({'fitted' if role == 'train' else 'validation'})"))
 
 
 def quality_section(logs: Sequence[Json], noise: NoiseModel) -> JsonDict:
@@ -374,25 +335,20 @@ def diagnose_verdict(result: Json) -> Verdict:
     where = "held-out blocks of the same flight" if held_out else "validation flights"
     change = _change(v, bool(result["findings"]))
     missing = (result.get("missing") or {}).get("statement")
-    details: tuple[str, ...] = (
-        *([missing] if missing else []),
-        f"The error on {where} {change} noise variances (1 is the noise floor).",
-    )
+    details = [missing] if missing else []
+    details.append(f"The error on {where} {change} noise variances (1 is the noise floor).")
     deciding = v.get("deciding")
     if result["findings"] and deciding and deciding["seconds"] != SCORE_SECONDS:
-        details = (
-            *details,
-            f"In simulations of {deciding['seconds']:g} s, on which the causes were chosen, "
-            f"it {_change(deciding, True)}.",
-        )
+        chosen = f"In simulations of {deciding['seconds']:g} s, on which the causes were chosen, it"
+        details.append(f"{chosen} {_change(deciding, True)}.")
     level, left = _LEVELS[verdict], v.get("mse_extended_refitted") or v["mse_extended"]
     steps = _next_steps(result)
     if level == "good" and (held_out or left is None or left > NOISE_LEVEL):
         level = "fair"
     if held_out:
-        details = (*details, "Not validated: no unseen flight was given.")
+        details.append("Not validated: no unseen flight was given.")
         steps = ("To validate it, add another flight with --validate.", *steps)
-    return Verdict(level, headline, details, steps)
+    return Verdict(level, headline, tuple(details), steps)
 
 
 def _change(errors: Json, found: bool) -> str:
@@ -414,12 +370,11 @@ def _short(value: float | None) -> str:
 
 
 def _next_steps(result: Json) -> tuple[str, ...]:
-    sure = [f for f in result["findings"] if f["confident"] and not f.get("ordinary")]
-    named = [f["effect"] for f in sure if f["effect"] in EFFECTS][:3]
-    out = [
-        f"{effect.replace('_', ' ').capitalize()}: {advice[0].lower()}{advice[1:]}"
-        for effect, advice in ((e, EFFECTS[e].advice) for e in named)
-    ]
+    sure = [f["effect"] for f in result["findings"] if f["confident"] and not f.get("ordinary")]
+    out = []
+    for effect in [name for name in sure if name in EFFECTS][:3]:
+        advice = EFFECTS[effect].advice
+        out.append(f"{effect.replace('_', ' ').capitalize()}: {advice[0].lower()}{advice[1:]}")
     if result["verdict"] in ("partly_explained", "unknown"):
         where = f"is in {', '.join(result['unexplained'])}" if result["unexplained"] else "is spread over all channels"
         out.append(f"The unexplained error {where}: a livelier flight (`quadid excite`) may show its cause.")
@@ -457,7 +412,7 @@ def diagnosis_part(
     pictured = list(sets)[:MOST_LOGS] if findings else []
     logs = [
         part(
-            Markup("{}: the simulation with and without what was found {}").format(s.log, quiet(f"({_used(s.role)})")),
+            _named(s.log, s.role, ": the simulation with and without what was found"),
             figures=[
                 error_figure(s, f"{prefix}-log{i}-error", MODELS),
                 *channel_figures(s, f"{prefix}-log{i}", len(pictured) + 2, MODELS),
@@ -494,14 +449,16 @@ def finding_part(finding: Json, floor: float, identifier: str, seen: ResidualMap
     """
     name, gain = finding["effect"].replace("_", " "), finding["gain"]
     low, high = gain.get("ci95", (None, None))
-    gained = [
-        f"The error of {gain['seconds']:g} s runs on unseen data falls by "
-        f"{_short(_less(gain['mse_before'], gain['mse_after']))} noise variances"
-    ]
+    before, after = gain["mse_before"], gain["mse_after"]
+    less = _short(None if before is None or after is None else before - after)
+    gained = f"The error of {gain['seconds']:g} s runs on unseen data falls by {less} noise variances"
     if low is not None and high is not None:
-        gained.append(f" (95 % interval {low:.3g} to {high:.3g})")
-    if finding["p_value"] is not None:
-        gained.append(f"; {chance(finding['p_value'])}")
+        gained += f" (95 % interval {low:.3g} to {high:.3g})"
+    gained += "." if finding["p_value"] is None else f"; {chance(finding['p_value'])}."
+    if before and after:
+        without, having = (percent(min(floor / error, 1.0)) for error in (before, after))
+        noise = "Share of the error that is sensor noise, which no model can remove"
+        gained += f" {noise}: {without} without {name}, {having} with."
     rivals = [f"{a['effect'].replace('_', ' ')} ({_short(a['mse_after'])})" for a in finding["alternatives"]]
     rejected = (
         f"Rejected alternatives, with the error they leave: {', '.join(rivals)}."
@@ -523,7 +480,7 @@ def finding_part(finding: Json, floor: float, identifier: str, seen: ResidualMap
             Markup("").join(map(_value, finding["parameters"])),
             " ".join([*parts, *(text for key, text in _REMARKS.items() if finding.get(key))]).strip(),
         ],
-        after=[f"{''.join(gained)}. {_noise_sentence(gain, floor, name)}".rstrip(), quiet(rejected)],
+        after=[gained, quiet(rejected)],
         kind="finding",
     )
 
@@ -539,21 +496,6 @@ def _value(p: Json) -> Markup:
     return Markup('<span class="value">{} {}</span>').format(size, quiet(f"({low} … {high})"))
 
 
-def _less(before: float | None, after: float | None) -> float | None:
-    return None if before is None or after is None else before - after
-
-
-def _noise_sentence(gain: Json, floor: float, name: str) -> str:
-    """Share of the error that is sensor noise that no model removes, without and with the cause."""
-    shares = [min(floor / v, 1.0) if v else None for v in (gain["mse_before"], gain["mse_after"])]
-    if None in shares:
-        return ""
-    without, having = (percent(s) for s in shares if s is not None)
-    return (
-        f"Share of the error that is sensor noise, which no model can remove: {without} without {name}, {having} with."
-    )
-
-
 def missing_section(missing: Json, log: str, parts: Mapping[str, Sequence[Missing]]) -> dict[str, Any]:
     """The missing force and moment as part of a page: over time on one log, and by axis over the deciding logs.
 
@@ -562,12 +504,8 @@ def missing_section(missing: Json, log: str, parts: Mapping[str, Sequence[Missin
         log: name of the one that is drawn.
         parts: its stretches by model.
     """
-    models = list(parts)
-    head = [
-        "",
-        *(f"{'without' if m == 'nominal' else 'with'} the findings" if len(models) > 1 else "rms" for m in models),
-    ]
-    rows = []
+    models, rows = list(parts), []
+    head = ["without the findings", "with the findings"] if len(models) > 1 else ["rms"]
     for key in ("force", "moment"):
         entry = missing[key]
         for a in "xyz":
@@ -575,23 +513,15 @@ def missing_section(missing: Json, log: str, parts: Mapping[str, Sequence[Missin
             cells = [f"{number(entry[m][a], 2)} {unit(entry['unit'])}, {percent(entry[m][a] / of)}" for m in models]
             rows.append((f"{key} {a}", *cells, f"{number(of, 3)} {unit(entry['unit'])} ({entry['of_what']})"))
     table = rows_of(
-        [*head, "of"],
+        ["", *head, "of"],
         rows,
         "Size by axis (rms, body axes), with its share",
         classes=["", *["number"] * len(models), ""],
     )
-    intro = (
-        f"{log}, estimated with random forces in the model, in body axes. The band contains the true value 95 % of the "
-        "time."
-    )
-    return section(
-        "missing",
-        "Force and moment that the simulation misses",
-        intro,
-        missing_figures(parts, "missing"),
-        [table],
-        menu="What is missing",
-    )
+    how = "estimated with random forces in the model, in body axes"
+    intro = f"{log}, {how}. The band contains the true value 95 % of the time."
+    title = "Force and moment that the simulation misses"
+    return section("missing", title, intro, missing_figures(parts, "missing"), [table], menu="What is missing")
 
 
 def remaining(result: Json, sets: Sequence[ScoredSet]) -> list[JsonDict]:

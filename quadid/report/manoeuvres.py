@@ -4,7 +4,6 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from itertools import groupby
-from typing import Any
 
 from quadid.errors import ParameterError, nearest
 from quadid.report.templating import render
@@ -121,17 +120,12 @@ def written_as(plan: ManoeuvrePlan, form: str, hover_throttle: float) -> dict[st
         raise ParameterError(
             f"too short for sweeps of one axis after the other: {plan.seconds:g} s", "36 s or more", "use --seconds 60"
         )
-    return {
-        f".sid_{i}_{sweep['axis']}.param": render(
-            "manoeuvres/system_id.param", {**facts, **_sweep(plan, i, sweep, hover_throttle)}
-        )
-        for i, sweep in enumerate(plan.sweeps, 1)
-    }
-
-
-def _sweep(plan: ManoeuvrePlan, i: int, sweep: Json, hover_throttle: float) -> dict[str, Any]:
-    axis, size = str(sweep["axis"]), float(sweep["amplitude"])
-    what = f"sweeps of SystemID mode, {i} of {len(plan.sweeps)} ({axis})"
-    magnitude = size * hover_throttle if axis == "throttle" else math.degrees(size)
-    header = plan.header(plan.promise_sweeps, what)
-    return {"sweep": sweep, "axis": SID_AXES[axis], "magnitude": magnitude, "header": header}
+    texts = {}
+    for i, sweep in enumerate(plan.sweeps, 1):
+        axis, size = str(sweep["axis"]), float(sweep["amplitude"])
+        magnitude = size * hover_throttle if axis == "throttle" else math.degrees(size)
+        what = f"sweeps of SystemID mode, {i} of {len(plan.sweeps)} ({axis})"
+        facts |= {"header": plan.header(plan.promise_sweeps, what), "sweep": sweep}
+        facts |= {"axis": SID_AXES[axis], "magnitude": magnitude}
+        texts[f".sid_{i}_{axis}.param"] = render("manoeuvres/system_id.param", facts)
+    return texts

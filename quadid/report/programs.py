@@ -219,25 +219,23 @@ class Facts:
         Args:
             used: effects that the form carries, and those of their optional numbers that it does.
         """
-        left = [name for name in self.vehicle.effects if name not in used]
-        left += [number for name in self.vehicle.effects if name in used for number in self._optional(name, used)]
+        left = []
+        for name, values in self.vehicle.effects.items():
+            if name not in used:
+                left.append(name)
+                continue
+            # Optional numbers that say something.
+            for p in EFFECTS[name].parameters:
+                silent = self.effect(name, p.beside) if p.beside else p.neutral
+                if p.optional and p.name in values and values[p.name] != silent and f"{name}.{p.name}" not in used:
+                    left.append(f"{name}.{p.name}")
         left += [f"residual ({t.formula})" for t in self.vehicle.residual if "residual" not in used]
         left += ["random"] if self.vehicle.random is not None and "random" not in used else []
         lines = [f"NOT PROVEN: {self.unproven}."] if self.unproven else []
         lines += [f"Written by quadid from {self.source} ({self.vehicle.name}); SI units.", "Sources of the values:"]
         lines += [f"  {n} = {self.value(n):.6g} {unit}: {self.origin(n)}" for n, unit in NOMINAL_UNITS.items()]
         lines.append(f"  mass = {self.vehicle.mass:g} kg and geometry: from the vehicle file, taken as known")
-        if left:
-            lines.append(f"Effects that have no place here: {', '.join(left)}")
-        return lines
-
-    def _optional(self, name: str, used: tuple[str, ...]) -> list[str]:
-        """Optional numbers of an effect that say something and are not among `used`."""
-        there = [p for p in EFFECTS[name].parameters if p.optional and p.name in self.vehicle.effects[name]]
-        said = [
-            p for p in there if self.effect(name, p.name) != (self.effect(name, p.beside) if p.beside else p.neutral)
-        ]
-        return [f"{name}.{p.name}" for p in said if f"{name}.{p.name}" not in used]
+        return [*lines, f"Effects that have no place here: {', '.join(left)}"] if left else lines
 
 
 # --- What single programs want to know of a vehicle beside `Facts`, by the names that their templates use
@@ -270,14 +268,27 @@ def px4(facts: Facts) -> dict[str, Any]:
     single rotors.  PX4 sends its thrust setpoint to the ESCs as it is unless THR_MDL_FAC says otherwise, so
     MPC_THR_HOVER is a share of command, not of thrust.
     """
-    lost = () if facts.max_speed is not None else ("weak_rotor",)
     refused = _no_cross(facts, "no SIH_*: PX4 simulates")
-    rows = [] if refused else _in_hardware(facts)
+    effects, k, mass, speed = facts.vehicle.effects, facts.effect, facts.vehicle.mass, facts.max_speed
+    rows = list[tuple[str, float]]()
+    if not refused:
+        # Simulation in hardware (SIH), a quad X: mass, inertia, arms, full thrust and torque, damping, motor lag.
+        j, (across, along, _) = facts.inertia, np.mean(np.abs(facts.arms[:, [1, 0, 2]]), axis=0).tolist()
+        rows.append(("SIH_MASS", mass))
+        rows += [(f"SIH_I{a}{b}", j["XYZ".index(a), "XYZ".index(b)]) for a, b in ("XX", "YY", "ZZ", "XY", "XZ", "YZ")]
+        rows += [("SIH_L_ROLL", across), ("SIH_L_PITCH", along)]
+        if speed is not None and facts.full_thrust is not None:
+            torque = facts.torque_per_thrust * float(np.mean(facts.thrust)) * speed**2
+            rows += [("SIH_T_MAX", float(np.mean(facts.full_thrust))), ("SIH_Q_MAX", torque)]
+        damping = 0.5 * (j[0, 0] * k("rate_damping", "l_p") + j[1, 1] * k("rate_damping", "m_q"))
+        rows += [("SIH_KDV", mass * facts.mean_drag)] if "rotor_drag" in effects else []
+        rows += [("SIH_KDW", damping)] if "rate_damping" in effects else []
+        rows += [("SIH_T_TAU", k("motor_lag", "tau"))] if "motor_lag" in effects else []
     # Drag of EKF2: momentum drag of the propellers [1/s], ballistic coefficients [kg/m^2]; only what was fitted
-    rows += [("EKF2_MCOEF", facts.mean_drag)] if "rotor_drag" in facts.vehicle.effects else []
-    c = facts.effect("parasitic_drag", "c")
+    rows += [("EKF2_MCOEF", facts.mean_drag)] if "rotor_drag" in effects else []
+    c = k("parasitic_drag", "c")
     rows += [(f"EKF2_BCOEF_{axis}", 0.5 * AIR_DENSITY / c) for axis in "XY" if c > 0.0]
-    return {"lost": lost, "rows": rows, "refused": refused}
+    return {"lost": () if speed is not None else ("weak_rotor",), "rows": rows, "refused": refused}
 
 
 def _no_cross(facts: Facts, what: str) -> str:
@@ -291,29 +302,6 @@ def _no_cross(facts: Facts, what: str) -> str:
     wrong = np.abs(moments - _SIH * np.array(size)[:, None]).max(axis=1) > SAME_MOMENT * np.abs(moments).max(axis=1)
     axes = [axis for axis, off in zip(("roll", "pitch", "yaw"), wrong, strict=True) if off]
     return f"{shape}; {', '.join(axes)} of this vehicle would come out wrong" if axes else ""
-
-
-def _in_hardware(facts: Facts) -> list[tuple[str, float]]:
-    """Simulation in hardware (SIH), a quad X: mass, inertia, arms, full thrust and torque, damping, motor lag."""
-    j, k, effects = facts.inertia, facts.effect, facts.vehicle.effects
-    rows = [("SIH_MASS", facts.vehicle.mass)]
-    rows += [(f"SIH_I{a}{b}", j["XYZ".index(a), "XYZ".index(b)]) for a, b in ("XX", "YY", "ZZ", "XY", "XZ", "YZ")]
-    rows += [
-        ("SIH_L_ROLL", float(np.mean(np.abs(facts.arms[:, 1])))),
-        ("SIH_L_PITCH", float(np.mean(np.abs(facts.arms[:, 0])))),
-    ]
-    if facts.max_speed is not None and facts.full_thrust is not None:
-        rows += [
-            ("SIH_T_MAX", float(np.mean(facts.full_thrust))),
-            ("SIH_Q_MAX", facts.torque_per_thrust * float(np.mean(facts.thrust)) * facts.max_speed**2),
-        ]
-    if "rotor_drag" in effects:
-        rows.append(("SIH_KDV", facts.vehicle.mass * facts.mean_drag))
-    if "rate_damping" in effects:
-        rows.append(("SIH_KDW", 0.5 * (j[0, 0] * k("rate_damping", "l_p") + j[1, 1] * k("rate_damping", "m_q"))))
-    if "motor_lag" in effects:
-        rows.append(("SIH_T_TAU", k("motor_lag", "tau")))
-    return rows
 
 
 def ardupilot(facts: Facts) -> dict[str, Any]:
@@ -375,7 +363,18 @@ def agilicious(facts: Facts) -> dict[str, Any]:
     Raises:
         ParameterError: not four rotors in a cross that turn as Agilicious assumes.
     """
-    places = {name: _in_quadrant(facts, x, y) for name, (x, y, _) in _AGILICIOUS.items()}
+    places = dict[str, RotorFacts]()
+    for name, (x, y, _) in _AGILICIOUS.items():
+        # The only rotor in a quadrant, FLU, about the geometric centre
+        flu = facts.vehicle.rotor_positions @ TO_FLU
+        here = [r for r, p in zip(facts.rotors, flu, strict=True) if p[0] * x > 0.0 and p[1] * y > 0.0]
+        if len(facts.rotors) != len(_AGILICIOUS) or len(here) != 1:
+            raise ParameterError(
+                f"{facts.vehicle.name}: {len(facts.rotors)} rotors, not one in each quadrant",
+                "four rotors in a cross, as Agilicious has them",
+                "export to another form",
+            )
+        places[name] = here[0]
     wrong = [name for name, rotor in places.items() if rotor.spin != _AGILICIOUS[name][2]]
     if wrong:
         raise ParameterError(
@@ -384,19 +383,6 @@ def agilicious(facts: Facts) -> dict[str, Any]:
             "change the allocation in Agilicious, or export to another form",
         )
     return {"places": list(places.items())}
-
-
-def _in_quadrant(facts: Facts, x: int, y: int) -> RotorFacts:
-    """The only rotor in a quadrant, FLU, about the geometric centre."""
-    places = facts.vehicle.rotor_positions
-    here = [r for r, p in zip(facts.rotors, places, strict=True) if p[0] * x > 0.0 and -p[1] * y > 0.0]
-    if len(facts.rotors) != len(_AGILICIOUS) or len(here) != 1:
-        raise ParameterError(
-            f"{facts.vehicle.name}: {len(facts.rotors)} rotors, not one in each quadrant",
-            "four rotors in a cross, as Agilicious has them",
-            "export to another form",
-        )
-    return here[0]
 
 
 def rotorpy(facts: Facts) -> dict[str, Any]:

@@ -59,18 +59,32 @@ class TextTable:
 
     def lines(self, width: int) -> list[tuple[Cell, ...]]:
         """Lines of pieces with their tones, for a terminal of `width` columns."""
+        heading = tuple(Cell(column.heading, "head") for column in self.columns)
+        table = [heading, *(tuple(map(_cell, row)) for row in self.rows)]
+        widths = [max(len(cell.text) for cell in column) for column in zip(*table, strict=True)]
+        aligned = [str.rjust if column.right else str.ljust for column in self.columns]
+
+        def wide(columns: Sequence[int]) -> int:
+            return sum(widths[i] for i in columns) + len(SPACE) * (len(columns) - 1)
+
+        # Columns that fit, those of rank 0 in any case; the highest rank goes first.
+        kept = list(range(len(self.columns)))
+        going = sorted((i for i in kept if self.columns[i].rank > 0), key=lambda i: (-self.columns[i].rank, -i))
+        while going and wide(kept) > width:
+            kept.remove(going.pop(0))
+        # What the width does not hold beside each other stands below, beside the first column, which names the rows.
+        blocks = [kept[:1]]
+        for i in kept[1:]:
+            if len(blocks[-1]) > 1 and wide([*blocks[-1], i]) > width:
+                blocks.append(kept[:1])
+            blocks[-1] = [*blocks[-1], i]
         out: list[tuple[Cell, ...]] = [
             (Cell(line, "title"),) for line in textwrap.wrap(self.title, max(width, 20)) or [""]
         ]
-        for n, kept in enumerate(self._blocks(width)):
+        for n, block in enumerate(blocks):
             out += [(Cell(""),)] * (n > 0)
-            widths = [self._width(i) for i in kept]
-            shown = [self.columns[i] for i in kept]
-            out.append(tuple(Cell(_put(c.heading, w, c.right), "head") for c, w in zip(shown, widths, strict=True)))
-            for row in self.rows:
-                cells = [_cell(row[i]) for i in kept]
-                put = zip(cells, shown, widths, strict=True)
-                out.append(tuple(Cell(_put(cell.text, w, c.right), cell.tone) for cell, c, w in put))
+            for row in table:
+                out.append(tuple(Cell(aligned[i](row[i].text, widths[i]), row[i].tone) for i in block))
         return out
 
     def text(self, width: int = 80) -> str:
@@ -90,36 +104,9 @@ class TextTable:
         rows = [[raised(_cell(value).text) for value in row] for row in self.rows]
         return rows_of([raised(c.heading) for c in self.columns], rows)
 
-    def _blocks(self, width: int) -> list[list[int]]:
-        """Columns that stand beside each other: those kept, below each other where the width does not hold them.
-
-        The first column, which names the rows, begins every block.
-        """
-        # Indices of the columns that fit `width`, those of rank 0 in any case
-        kept = list(range(len(self.columns)))
-        going = sorted((i for i in kept if self.columns[i].rank > 0), key=lambda i: (-self.columns[i].rank, -i))
-        while going and self._wide(kept) > width:
-            kept.remove(going.pop(0))
-        blocks = [kept[:1]]
-        for i in kept[1:]:
-            if len(blocks[-1]) > 1 and self._wide([*blocks[-1], i]) > width:
-                blocks.append(kept[:1])
-            blocks[-1] = [*blocks[-1], i]
-        return blocks
-
-    def _wide(self, columns: Sequence[int]) -> int:
-        return sum(self._width(i) for i in columns) + len(SPACE) * (len(columns) - 1)
-
-    def _width(self, i: int) -> int:
-        return max(len(self.columns[i].heading), *(len(_cell(row[i]).text) for row in self.rows), 0)
-
 
 def _cell(value: str | Cell) -> Cell:
     return value if isinstance(value, Cell) else Cell(value)
-
-
-def _put(text: str, width: int, right: bool) -> str:
-    return text.rjust(width) if right else text.ljust(width)
 
 
 # --- Results as tables for people: the same on a terminal, in a notebook and in a text
