@@ -39,6 +39,7 @@ class Diagnosed(Fitted):
     """
 
     title = "Diagnosis"
+    columns = (*NUMBER_COLUMNS, "mse_before", "mse_after", "p_value")
     found: Diagnosis
     noise: NoiseModel
     nominal: Vehicle
@@ -74,17 +75,9 @@ class Diagnosed(Fitted):
             *([parameter_table(parameters)] if parameters else []),
         ]
 
-    @property
-    def columns(self) -> tuple[str, ...]:
-        """Those of `records`."""
-        return (*NUMBER_COLUMNS, "mse_before", "mse_after", "p_value")
-
     def records(self) -> list[dict[str, Any]]:
         """One row a number of a finding."""
-        return [
-            dict(zip(self.columns, (*row, f["gain"]["mse_before"], f["gain"]["mse_after"], f["p_value"]), strict=True))
-            for f, row in number_rows(self.result["findings"])
-        ]
+        return number_rows(self.result["findings"], self.columns)
 
     def plot(self, log: int = -1, group: str = "rates") -> Any:
         """Measured and simulated outputs of one log, without and with the findings, as a plotly figure."""
@@ -96,10 +89,8 @@ class Diagnosed(Fitted):
         """The page: findings with their pictures, parameters, residuals."""
         from quadid.report.fit_pages import diagnosis_part, findings_section, parameter_section, quality_section
 
-        rows = provenance(self.logs, command) + [
-            {"name": "seed", "value": str(self.result["seed"])},
-            {"name": "vehicle file", "value": self.result["vehicle_file"] or "not written"},
-        ]
+        file = self.result["vehicle_file"] or "not written"
+        rows = provenance(self.logs, command, {"seed": self.result["seed"], "vehicle file": file})
         parameters = self.result.get("parameters")
         sections = [
             None if self.forces is None else self.forces.section(),
@@ -166,7 +157,7 @@ def diagnose(
     # Share that the confident findings take on flights that were not fitted, or without any all of them.
     sure = {f.effect for f in found.findings if f.confident} or {f.effect for f in found.findings}
     doubtful = [n for c in model.causes if c.effect not in sure for n in c.names]
-    removed = None if forces is None else forces.removed(Layout(fit.vehicle).without(model.theta, doubtful))
+    removed = None if forces is None else forces.taken("nominal", Layout(fit.vehicle).without(model.theta, doubtful))
     if found.verdict is Explanation.PARTLY_EXPLAINED and removed is not None and removed < LEAST_REMOVED:
         told = (
             f"the causes remove only {100.0 * removed:.0f} % of the squared missing force and moment: none is confident"
@@ -199,7 +190,7 @@ def diagnose(
     advance("gain of each cause", 0.0)
     for entry in result["findings"]:
         names = [n for c in model.causes if c.effect == entry["effect"] for n in c.names]
-        taken = None if forces is None else forces.taken(Layout(fit.vehicle).without(model.theta, names))
+        taken = None if forces is None else forces.taken(Layout(fit.vehicle).without(model.theta, names), "extended")
         entry["gain"]["missing_removed"] = taken
     advance("random forces", 0.0)
     beside = None if forces is None else forces.beside(physical, terms=True)

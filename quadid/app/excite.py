@@ -16,7 +16,6 @@ from quadid.app.identify import check_seed, search
 from quadid.app.logs import Given, Log, file_name, read, write_texts
 from quadid.app.options import VEHICLE, Described, Seed, Typed
 from quadid.app.outcome import LIBRARY, Advance, Reported, provenance, silent
-from quadid.data.window import Window
 from quadid.errors import ParameterError
 from quadid.parameters import NOMINAL_NAMES
 from quadid.report.manoeuvres import ManoeuvrePlan, check_form, half_width, written_as
@@ -30,7 +29,6 @@ from quadid.vehicle import Vehicle
 if TYPE_CHECKING:
     from quadid.experiment import Proposal
     from quadid.flight import Segment
-    from quadid.identification.fit import Fit
     from quadid.identification.uncertainty import Uncertainty
 
 MOST_SECONDS = 600.0
@@ -42,6 +40,8 @@ ROOM = 2.0
 LEAST_ROOM = 10.0
 LEAST_GAIN = 1.1
 """Narrower than after a gentle flight by less than this factor, an interval is not worth a manoeuvre."""
+KINDS = ("now", "gentle_flight", "manoeuvre", "one_axis_at_a_time")
+"""Half-widths of a parameter: now, and after each kind of flight."""
 HOVER_THROTTLE = 0.35
 """Share of full throttle at hover where the vehicle file does not know: what ArduPilot begins with (MOT_THST_HOVER)."""
 
@@ -58,6 +58,7 @@ class Proposed(Reported):
     """
 
     endings = (".manoeuvre*", ".sticks.txt", ".sid_*.param")
+    rows = "parameters"
     result: dict[str, Any]
     proposal: Proposal
     manoeuvre: str
@@ -90,9 +91,8 @@ class Proposed(Reported):
 
     def tables(self) -> list[TextTable]:
         """Half-widths now, and after each kind of flight."""
-        keys = ("now", "gentle_flight", "manoeuvre", "one_axis_at_a_time")
-        rows = tuple((p["name"], *(half_width(p[key]) for key in keys)) for p in self.result["parameters"])
-        heads = (Column("parameter"), *(Column(key.replace("_", " "), right=True) for key in keys))
+        rows = tuple((p["name"], *(half_width(p[key]) for key in KINDS)) for p in self.result["parameters"])
+        heads = (Column("parameter"), *(Column(key.replace("_", " "), right=True) for key in KINDS))
         title = f"Relative 95 % half-width (±) before and after {self.result['seconds']:g} s"
         return [TextTable(title, heads, rows)]
 
@@ -117,29 +117,19 @@ class Proposed(Reported):
             ),
         ]
 
-    def records(self) -> list[dict[str, Any]]:
-        """One row a parameter."""
-        return list(self.result["parameters"])
-
     def page(self, command: str = LIBRARY) -> str:
         """The page: what it would gain, how it looks when flown, where it may be flown."""
         result, window = self.result, self.proposal.flight.window
         assert window.attitude is not None
         names = [p["name"] for p in result["parameters"]]
-        bars = [
-            {
-                "role": role,
-                "name": label,
-                "type": "bar",
-                "x": names,
-                "y": [100.0 * min(p[key], 2.0) for p in result["parameters"]],
-            }
-            for role, label, key in (
-                ("measured", "now", "now"),
-                ("before", "after a gentle flight", "gentle_flight"),
-                ("after", "after the manoeuvre", "manoeuvre"),
-            )
-        ]
+        bars = []
+        for role, label, key in (
+            ("measured", "now", "now"),
+            ("before", "after a gentle flight", "gentle_flight"),
+            ("after", "after the manoeuvre", "manoeuvre"),
+        ):
+            y = [100.0 * min(p[key], 2.0) for p in result["parameters"]]
+            bars.append({"role": role, "name": label, "type": "bar", "x": names, "y": y})
         widths = {"yaxis": axis("half-width (%)", type="log"), "xaxis": {"type": "category"}}
         angles = np.degrees(np.unwrap(euler(window.attitude), axis=0))
         lines = [
@@ -155,30 +145,20 @@ class Proposed(Reported):
             ("tilt", f"{peak['tilt_deg']:.0f}°", f"{e['abort_tilt_deg']:.0f}°"),
             ("battery", "–", f"{e['battery_percent']:g} % left"),
         ]
+        promised = f"Relative half-width of the 95 % interval, predicted by {self.plan.rests_on}."
+        widths_drawn, halves = figure("gain-bars", "Half-widths", bars, widths, 320), self.tables()[0].part()
+        moved = "Stick movements one after the other, and the attitude that the simulation flies."
+        flown, moves = figure("attitude", "Attitude", lines, tilted, 320), grouped(result["movements"])
+        movements = rows_of(("movement", "times", "amplitude, rms"), moves)
+        kept = "Scripts start only inside the envelope and stop outside it."
+        needed = rows_of(("", "needed in simulation", "envelope"), limits)
         sections = [
-            section(
-                "gain",
-                "What it would gain",
-                f"Relative half-width of the 95 % interval, predicted by {self.plan.rests_on}.",
-                [figure("gain-bars", "Half-widths", bars, widths, 320)],
-                [self.tables()[0].part()],
-            ),
-            section(
-                "manoeuvre",
-                "The manoeuvre",
-                "Stick movements one after the other, and the attitude that the simulation flies.",
-                [figure("attitude", "Attitude", lines, tilted, 320)],
-                [rows_of(("movement", "times", "amplitude, rms"), grouped(result["movements"]))],
-            ),
-            section(
-                "envelope",
-                "Where it may be flown",
-                "Scripts start only inside the envelope and stop outside it.",
-                tables=[rows_of(("", "needed in simulation", "envelope"), limits)],
-            ),
+            section("gain", "What it would gain", promised, [widths_drawn], [halves]),
+            section("manoeuvre", "The manoeuvre", moved, [flown], [movements]),
+            section("envelope", "Where it may be flown", kept, tables=[needed]),
         ]
-        flown = f"{result['seconds']:g} s, at most {peak['tilt_deg']:.0f}° of tilt and {peak['rate_deg_s']:.0f}°/s"
-        return self.rendered(f"What to fly next: {result['vehicle']}", flown, sections, provenance(self.logs, command))
+        about = f"{result['seconds']:g} s, at most {peak['tilt_deg']:.0f}° of tilt and {peak['rate_deg_s']:.0f}°/s"
+        return self.rendered(f"What to fly next: {result['vehicle']}", about, sections, provenance(self.logs, command))
 
     def save(self, folder: str | Path = ".", forms: Sequence[str] = ()) -> list[Path]:
         """Writes the manoeuvre, and what flies it in each of `forms` (`quadid.report.manoeuvres.FORMS`).
@@ -210,30 +190,15 @@ def check_limits(
         check_form(form)
     if not 2.0 <= height[0] < height[1] <= 500.0:
         raise ParameterError(f"--height {height[0]:g}:{height[1]:g}", _HEIGHTS, "for example 10:40")
-    if not 6.5 <= seconds <= MOST_SECONDS:
-        raise ParameterError(f"--seconds {seconds:g}", f"6.5 to {MOST_SECONDS:g} s")
-    if not 2.0 <= tilt <= 60.0:
-        raise ParameterError(f"--tilt {tilt:g} degrees", "2 to 60 degrees")
-    if not 10.0 <= rate_limit <= 1000.0:
-        raise ParameterError(f"--rate-limit {rate_limit:g} deg/s", "10 to 1000 deg/s")
+    for option, value, unit, low, high in (
+        ("seconds", seconds, "", 6.5, MOST_SECONDS),
+        ("tilt", tilt, " degrees", 2.0, 60.0),
+        ("rate-limit", rate_limit, " deg/s", 10.0, 1000.0),
+    ):
+        if not low <= value <= high:
+            raise ParameterError(f"--{option} {value:g}{unit}", f"{low:g} to {high:g}{unit or ' s'}")
     if not 0.0 <= battery < 100.0:
         raise ParameterError(f"--battery {battery:g} %", "0 to 99 per cent")
-
-
-def knowledge(
-    vehicle: Vehicle, windows: Sequence[Window], seed: int, advance: Advance
-) -> tuple[Vehicle, FloatArray, Fit | None]:
-    """State of knowledge: vehicle with believed values, information (6, 6) of the log parameters, fit of the logs.
-
-    Without logs that is the vehicle file: its sigma, else half of its bounds on the log scale.
-    """
-    from quadid.identification.result import fitted_vehicle
-
-    if windows:
-        fit = search("pso_polish", windows, vehicle, seed, advance)
-        return fitted_vehicle(fit), np.asarray(np.linalg.inv(fit.uncertainty.covariance), dtype=np.float64), fit
-    sigma = np.array([vehicle.parameters[name].log_sigma for name in NOMINAL_NAMES])
-    return vehicle, np.diag(1.0 / sigma**2), None
 
 
 def halves_after(found: Uncertainty, before: Uncertainty | None) -> FloatArray:
@@ -289,6 +254,7 @@ def propose(
     """
     from quadid.estimate.missing import Vehicles, random_forces
     from quadid.experiment import AsLogged, Limits, TrialFlights, design_manoeuvre, manoeuvre_file
+    from quadid.identification.result import fitted_vehicle
     from quadid.model.layout import Layout
     from quadid.report.programs import Facts
 
@@ -298,7 +264,13 @@ def propose(
     described = Vehicle.named(vehicle)
     given = read(logs, described)
     windows = [w for log in given for w in log.windows]
-    believed, known, before = knowledge(described, windows, seed, advance)
+    # State of knowledge: that of the vehicle file (its sigma, else half of its bounds on the log scale), or the fit of
+    # the logs, and the information (6, 6) of the log parameters.
+    believed, before = described, None
+    known = np.diag([1.0 / described.parameters[name].log_sigma ** 2 for name in NOMINAL_NAMES])
+    if windows:
+        before = search("pso_polish", windows, described, seed, advance)
+        believed, known = fitted_vehicle(before), np.asarray(np.linalg.inv(before.uncertainty.covariance))
     simulator = TrialFlights(believed, None if before is None else before.noise, seed)
     proposal = design_manoeuvre(simulator, known, limits, seconds, advance)
     random, like = believed.random, given[-1] if given else None
@@ -325,7 +297,6 @@ def propose(
         )
     plan = made_into_plan(believed.name, proposal, tilt, height, battery, random is not None)
     halves, worst = (proposal.now, proposal.pilot, proposal.after, proposal.swept), int(np.argmax(proposal.pilot))
-    told = ("name", "now", "gentle_flight", "manoeuvre", "one_axis_at_a_time")
     result = {
         "schema": "quadid.excite/1",
         "vehicle": believed.name,
@@ -337,8 +308,8 @@ def propose(
         ],
         "room": dict(zip(("sideways_m", "up_m", "down_m"), proposal.room.tolist(), strict=True)),
         "parameters": [
-            dict(zip(told, row, strict=True))
-            for row in zip(NOMINAL_NAMES, *(half.tolist() for half in halves), strict=True)
+            {"name": name, **dict(zip(KINDS, row, strict=True))}
+            for name, row in zip(NOMINAL_NAMES, np.column_stack(halves).tolist(), strict=True)
         ],
         "worst": NOMINAL_NAMES[worst],
         "gain": float(np.log1p(proposal.pilot[worst]) / np.log1p(proposal.after[worst])),

@@ -334,56 +334,48 @@ class Fleet(Reported):
         level: Level = "good" if fit == total and not changed else "fair" if fit >= 0.5 * total else "poor"
         gave = f"{done} of {total} logs gave parameters."
         headline = f"{len(changed)} of {len(last)} vehicles have changed." if changed else gave
-        words = (
-            ("refused", "cannot support a fit"),
-            ("unreadable", "cannot be read or used"),
-            ("failed", "stopped this program"),
-        )
         details = [f"{row['unit']} has changed: {_what_changed(row)}." for row in changed[:3]]
         details += [gave] if changed else []
-        details += [f"{counts[key]} {text}." for key, text in words if counts.get(key)]
+        words = {
+            "refused": "cannot support a fit",
+            "unreadable": "cannot be read or used",
+            "failed": "stopped this program",
+        }
+        details += [f"{counts[key]} {text}." for key, text in words.items() if counts.get(key)]
         if copies := len(summary["copies"]):
             told = "log is a copy of another and is" if copies == 1 else "logs are copies of others and are"
             details.append(f"{copies} {told} not counted.")
         if rough:
             what = "answer misses much of its flight" if rough == 1 else "answers miss much of their flights"
             details.append(f"{rough} {what} (errors above {ROUGH:g} times what the model expects): not to be used.")
-        details += [
-            f"{d['unit']}: {d['parameter']} {'rose' if d['change'] > 0 else 'fell'} by {percent(abs(d['change']))} "
-            f"in {d['days']:.3g} days."
-            for d in summary["drifts"][:3]
-        ]
+        for d in summary["drifts"][:3]:
+            moved = f"{'rose' if d['change'] > 0 else 'fell'} by {percent(abs(d['change']))}"
+            details.append(f"{d['unit']}: {d['parameter']} {moved} in {d['days']:.3g} days.")
         steps = ["`quadid fleet --diagnose` names what the simulation gets wrong."] if rough else []
         if changed:
-            today = shlex.quote(changed[0]["log"])
-            steps.append(
-                f"To see how certain this is: `quadid health {today} --baseline …` (the vehicle's first flights)."
-            )
+            again = f"`quadid health {shlex.quote(changed[0]['log'])} --baseline …` (the vehicle's first flights)"
+            steps.append(f"To see how certain this is: {again}.")
         if summary["drifts"]:
             steps.append("A parameter that drifts: look for wear of propellers and motors, or a changed payload.")
         if summary["outliers"]:
-            log = summary["outliers"][0]["log"]
-            steps.append(f"Look at the largest outlier: `quadid diagnose {log}`.")
+            steps.append(f"Look at the largest outlier: `quadid diagnose {summary['outliers'][0]['log']}`.")
         if counts.get("refused") or counts.get("unreadable"):
             steps.append("`quadid inspect LOG` names what an unusable log lacks and how to log it.")
         if counts.get("failed"):
             steps.append("Please report failures of this program; the last table names the logs.")
-        if not steps:
-            steps.append("Nothing to do. The tables are in SQLite and Parquet for questions of your own.")
-        return Verdict(level, headline, tuple(details), tuple(steps))
+        nothing = "Nothing to do. The tables are in SQLite and Parquet for questions of your own."
+        return Verdict(level, headline, tuple(details), tuple(steps or [nothing]))
 
     def tables(self) -> list[TextTable]:
         """Parameters of every vehicle."""
         rows = []
         for unit in self.result["units"]:
-            for i, p in enumerate(unit["parameters"] or [None]):
-                head = (unit["unit"], str(unit["logs"]), str(unit["done"])) if i == 0 else ("", "", "")
-                tail = (
-                    ("", "", "", "")
-                    if p is None
-                    else (p["parameter"], plain_number(p["median"]), p["unit"], f"{100 * p['spread']:.2g} %")
-                )
-                rows.append((*head, *tail))
+            head = (unit["unit"], str(unit["logs"]), str(unit["done"]))
+            for p in unit["parameters"]:
+                rows.append((*head, p["parameter"], plain_number(p["median"]), p["unit"], f"{100 * p['spread']:.2g} %"))
+                head = ("", "", "")
+            if not unit["parameters"]:
+                rows.append((*head, "", "", "", ""))
         columns = heads("vehicle | logs >1 | answers >2 | parameter | median > | unit | spread >")
         return [TextTable("Vehicles", columns, tuple(rows))]
 

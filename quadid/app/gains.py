@@ -76,6 +76,7 @@ class Gains(Reported):
     """
 
     endings = (".gains.*",)
+    rows = "gains"
     result: dict[str, Any]
     loops: Mapping[str, Loops]
     before: Mapping[str, Loops]
@@ -143,10 +144,6 @@ class Gains(Reported):
         ending, line = _FILES[self.result["format"]]
         text = "".join(line.format(**g) for g in self.result["gains"])
         return write_texts(folder, {f"{file_name(self.result['vehicle'])}.gains{ending}": text})[0]
-
-    def records(self) -> list[dict[str, Any]]:
-        """One row a gain."""
-        return [dict(g) for g in self.result["gains"]]
 
     def write(self, folder: Path, kept: str | None = None) -> list[tuple[str, Path]]:
         """Writes the proposed parameters, as `save`."""
@@ -346,7 +343,7 @@ def _lateness(vehicle: Vehicle, motor_lag: float | None, delay: float | None) ->
 
 def _on_board(autopilot: Autopilot, known: Mapping[str, float], vehicle: Vehicle) -> dict[str, Used]:
     """Filters and period of the autopilot's loop: as given, as the vehicle file has it, or its defaults."""
-    out = {}
+    out = dict[str, Used]()
     parts = {
         "gyro filter": autopilot.gyro,
         "derivative filter": autopilot.derivative,
@@ -354,14 +351,13 @@ def _on_board(autopilot: Autopilot, known: Mapping[str, float], vehicle: Vehicle
         "yaw error filter": autopilot.yaw_error,
         "target filter": autopilot.target,
     }
+    held = vehicle.effects.get("imu_lag", {}).get("cutoff")
     for name, (parameter, default) in parts.items():
         value, source = known.get(parameter, default), parameter if parameter in known else f"default of {parameter}"
-        held = vehicle.effects.get("imu_lag", {}).get("cutoff")
         if name == "gyro filter" and held is not None and parameter not in known:
             value, source = held, "imu_lag of the vehicle file"
         value = value if value > 0.0 else math.inf  # 0 turns a filter off
-        if parameter:
-            out[name] = Used(name, "Hz", value, value, value, source)
+        out |= {name: Used(name, "Hz", value, value, value, source)} if parameter else {}
     return out
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import combinations
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
@@ -16,10 +17,10 @@ from quadid.app.options import LogNames, OfVehicle, Preset, Typed, Unchecked
 from quadid.app.outcome import LIBRARY, NUMBER_COLUMNS, Reported, number_rows, provenance
 from quadid.data.window import Recording
 from quadid.errors import LogError, NotIdentifiableError
-from quadid.report.page import axis, figure, rows_of, section
+from quadid.report.page import axis, figure, rows_of, section, trace
 from quadid.report.tables import Cell, TextTable, heads
 from quadid.report.templating import render
-from quadid.report.verdict import Level, Verdict
+from quadid.report.verdict import Verdict
 from quadid.types import Json
 from quadid.vehicle import Vehicle
 
@@ -40,6 +41,7 @@ class HealthOutcome(Reported):
     """
 
     title = "Health"
+    columns = (*NUMBER_COLUMNS, "p_value")
     result: dict[str, Any]
     found: Health
     vehicle: Vehicle
@@ -55,16 +57,9 @@ class HealthOutcome(Reported):
         changes = [change_table(self.result["changes"])] if self.result["changes"] else []
         return [*changes, trim_table(self.result)]
 
-    @property
-    def columns(self) -> tuple[str, ...]:
-        """Those of `records`."""
-        return (*NUMBER_COLUMNS, "p_value")
-
     def records(self) -> list[dict[str, Any]]:
         """One row a number of a change."""
-        return [
-            dict(zip(self.columns, (*row, c["p_value"]), strict=True)) for c, row in number_rows(self.result["changes"])
-        ]
+        return number_rows(self.result["changes"], self.columns)
 
     def page(self, command: str = LIBRARY) -> str:
         """The page: what changed, a picture of the airframe, how far each flight is from healthy ones."""
@@ -79,31 +74,29 @@ class HealthOutcome(Reported):
             "From above, nose up. Dashed: the command of each rotor in the baseline flights. Filled, with its change: "
             "now. Red: damaged; yellow: suspected."
         )
-        rows = [
-            (
-                change_words(c),
-                c["evidence"] + ("" if c["confident"] else " Not certain."),
-                ", ".join(map(rival_words, c["alternatives"])) or "none",
-            )
-            for c in result["changes"]
-        ]
+        rows = []
+        for c in result["changes"]:
+            found_by = c["evidence"] + ("" if c["confident"] else " Not certain.")
+            rows.append((change_words(c), found_by, ", ".join(map(rival_words, c["alternatives"])) or "none"))
         changes = [rows_of(("Change", "Found", "Rejected alternatives (probability)"), rows)] if rows else []
         intro = _INTROS["lacking" if result["baseline_lacking"] or result["unfamiliar"] else result["verdict"]]
-        flown = [
-            (role, flight.name, distance(flight.mean - healthy.mean, healthy.predictive(1), healthy.freedom).tolist())
-            for role, part in (("measured", found.baseline), ("after", found.flights))
-            for flight in part
-        ]
+        # Every flight's trims in healthy spreads from the baseline's mean, those of one kind beside each other.
+        flown, ticks = [], np.arange(len(AXES))
+        for role, label, part in (("measured", "baseline", found.baseline), ("after", "now", found.flights)):
+            far = [distance(one.mean - healthy.mean, healthy.predictive(1), healthy.freedom) for one in part]
+            aside = 0.06 * (np.arange(len(part)) - 0.5 * (len(part) - 1))
+            x, names = (ticks[:, None] + aside).ravel(), [one.name for one in part]
+            flown.append(trace(role, label, x, np.array(far).T.ravel(), mode="markers", text=names * len(AXES)))
+        axes = {"xaxis": {"tickvals": ticks.tolist(), "ticktext": list(AXES)}, "yaxis": axis("healthy spreads")}
+        spread = figure("trims", "Every flight", flown, axes, 300, caption="distance from the baseline's mean")
         trims = trim_table(result)
         sections = [
             section("airframe", "Airframe", caption, picture=picture),
             section("changes", "What changed", intro, tables=changes),
-            section("trim", "Trim", trims.title, [trim_figure(flown, AXES)], [trims.part()]),
+            section("trim", "Trim", trims.title, [spread], [trims.part()]),
         ]
-        origin = provenance([], command) + [
-            {"name": recording.name, "value": f"sha256 {recording.sha256 or 'unknown'}"}
-            for recording in self.recordings
-        ]
+        origin = provenance([], command)
+        origin += [{"name": r.name, "value": f"sha256 {r.sha256 or 'unknown'}"} for r in self.recordings]
         n, m = len(result["logs"]), len(result["baseline"])
         subtitle = f"{n} flight{'s' * (n != 1)} against {m} baseline flight{'s' * (m != 1)}"
         return self.rendered(f"Health of {result['vehicle']}", subtitle, sections, origin)
@@ -182,22 +175,18 @@ def _open(given: Flight, vehicle: Vehicle, preset: str, unchecked: bool, warning
 
 def _distinct(tested: Sequence[Recording], healthy: Sequence[Recording]) -> None:
     """Raises LogError where a flight counts twice: it would be compared with itself, or narrow the spread."""
-    seen: list[tuple[str, Recording]] = []
-    for place, part in (("in question", tested), ("in the baseline", healthy)):
-        for one in part:
-            for before, other in seen:
-                shared = one.span[0] < other.span[1] and other.span[0] < one.span[1]  # parts of a log may be apart
-                if one.sha256 and one.sha256 == other.sha256 and shared:
-                    copy = "is" if one.name == other.name else f"holds the bytes of {other.name}: the flight is"
-                    where = f"twice {place}" if place == before else f"{before} and {place}"
-                    raise LogError(f"{one.name} {copy} {where}", "each flight once", "leave one of the two out")
-            seen.append((place, one))
+    placed = [("in question", one) for one in tested] + [("in the baseline", one) for one in healthy]
+    for (before, other), (place, one) in combinations(placed, 2):
+        shared = one.span[0] < other.span[1] and other.span[0] < one.span[1]  # parts of a log may be apart
+        if one.sha256 and one.sha256 == other.sha256 and shared:
+            copy = "is" if one.name == other.name else f"holds the bytes of {other.name}: the flight is"
+            where = f"twice {place}" if place == before else f"{before} and {place}"
+            raise LogError(f"{one.name} {copy} {where}", "each flight once", "leave one of the two out")
 
 
 # --- Health for people: verdict, tables, and the page with a picture of the airframe
 
 
-_LEVELS: dict[str, Level] = {"unchanged": "good", "changed": "poor", "unknown": "poor"}
 _WORDS = {
     "mass_change": "mass",
     "cg_offset": "centre of gravity",
@@ -256,10 +245,16 @@ def rival_words(rival: Json) -> str:
 
 def health_verdict(result: Json) -> Verdict:
     """Judges a result of the form ``quadid.health/1``."""
+    from quadid.condition.changes import LEAST_CHANCE
+
     verdict, changes = result["verdict"], result["changes"]
     n = len(result["baseline"])
     against = f"{n} baseline flight{'s' * (n != 1)}, score {result['score']:.1f}"
-    details = [f"A healthy flight would look this different {_how_often(result['p_value'])} ({against})."]
+    # At the least chance the bound that 95 % of draws without one keep to (rule of three).
+    p_value, once = result["p_value"], f"less than once in {1.0 / (3.0 * LEAST_CHANCE):,.0f} flights"
+    if p_value > LEAST_CHANCE:
+        once = f"about once in {float(f'{1.0 / p_value:.2g}'):,.0f} flights" if p_value < 0.5 else "in most flights"
+    details = [f"A healthy flight would look this different {once} ({against})."]
     suspects = ", ".join(change_words(c) for c in changes)
     if reason := result["unfamiliar"]:
         likely = [f"If anything, {suspects}."] if suspects else []
@@ -284,8 +279,8 @@ def health_verdict(result: Json) -> Verdict:
     if not changes[0]["confident"]:
         details.append("Other explanations are nearly as probable, see below.")
     details += [f"Less certain: {'; '.join(change_words(c) for c in rest)}."] if rest else []
-    steps = dict.fromkeys([*_first(result), *(_step(c) for c in sure)])
-    return Verdict(_LEVELS[verdict], headline, tuple(details), tuple(steps))
+    steps = dict.fromkeys([*_first(result), *(_STEPS[c["effect"]].format(rotor=_which(c)) for c in sure)])
+    return Verdict("poor", headline, tuple(details), tuple(steps))
 
 
 def _first(result: Json) -> tuple[str, ...]:
@@ -294,38 +289,19 @@ def _first(result: Json) -> tuple[str, ...]:
     return (_ONE_VEHICLE,) if abs(effort) > _LARGE else ()
 
 
-def _how_often(p_value: float) -> str:
-    """``about once in 4,000 flights``; at `LEAST_CHANCE` the bound that 95 % of such draws keep to (rule of three)."""
-    from quadid.condition.changes import LEAST_CHANCE
-
-    if p_value <= LEAST_CHANCE:
-        return f"less than once in {1.0 / (3.0 * LEAST_CHANCE):,.0f} flights"
-    return f"about once in {float(f'{1.0 / p_value:.2g}'):,.0f} flights" if p_value < 0.5 else "in most flights"
-
-
-def _step(change: Json) -> str:
-    text = _STEPS[change["effect"]]
-    return text.format(rotor=_which(change)) if "{rotor}" in text else text
-
-
 def change_table(changes: Sequence[Json]) -> TextTable:
     """Changes with intervals, and the explanations that lost."""
     columns = heads("change | value | 95 % interval | p >1 | probability >2 | rejected alternative <3")
     rows: list[tuple[str | Cell, ...]] = []
     for c in changes:
-        first = True
-        rival = c["alternatives"][0] if c["alternatives"] else None
-        other = rival_words(rival) if rival else ""
-        name = Cell(c["effect"].replace("_", " "), "poor" if c["confident"] else "fair")
-        for p in c["parameters"]:
-            if p["name"] in ("rotor", "or_rotor"):
-                name = Cell(f"weak rotor {_which(c)}", name.tone)
-                continue
+        weak = f"weak rotor {_which(c)}" if c["effect"] == "weak_rotor" else c["effect"].replace("_", " ")
+        rival = rival_words(c["alternatives"][0]) if c["alternatives"] else ""
+        name, judged = Cell(weak, "poor" if c["confident"] else "fair"), (c["p_value"], c["probability"])
+        for i, p in enumerate(p for p in c["parameters"] if p["name"] not in ("rotor", "or_rotor")):
             low, high = p["ci95"]
             row = (f"{p['name']} = {p['value']:.3g} {p['unit']}".rstrip(), f"{low:.3g} .. {high:.3g}")
-            more = (f"{c['p_value']:.1g}", f"{c['probability']:.2f}", other) if first else ("", "", "")
-            rows.append((name if first else "", *row, *more))
-            first = False
+            more = (f"{judged[0]:.1g}", f"{judged[1]:.2f}", rival) if i == 0 else ("", "", "")
+            rows.append((name if i == 0 else "", *row, *more))
     return TextTable("What changed since the baseline flights", columns, tuple(rows))
 
 
@@ -348,30 +324,6 @@ def trim_table(result: Json) -> TextTable:
         "command per force, from the baseline; distance in spreads (standard deviations) of healthy flights"
     )
     return TextTable(title, columns, rows)
-
-
-def trim_figure(rows: Sequence[tuple[str, str, Sequence[float]]], names: Sequence[str]) -> Json:
-    """Every flight's trims in healthy spreads from the baseline's mean.
-
-    Args:
-        rows: role (baseline or flight), name and distances of each flight.
-        names: of the trims.
-    """
-    data = [
-        {
-            "role": role,
-            "name": label,
-            "type": "scatter",
-            "mode": "markers",
-            "text": [n for _, n, _ in part],
-            "x": [k + 0.06 * (i - 0.5 * (len(part) - 1)) for k in range(len(names)) for i in range(len(part))],
-            "y": [float(d[k]) for k in range(len(names)) for _, _, d in part],
-        }
-        for role, label in (("measured", "baseline"), ("after", "now"))
-        for part in [[r for r in rows if r[0] == role]]
-    ]
-    layout = {"xaxis": {"tickvals": list(range(len(names))), "ticktext": list(names)}, "yaxis": axis("healthy spreads")}
-    return figure("trims", "Every flight", data, layout, 300, caption="distance from the baseline's mean")
 
 
 # --- The airframe from above as inline SVG: every rotor with its load against the baseline, damage and shift marked

@@ -33,7 +33,7 @@ from quadid.data.window import Window
 from quadid.errors import ParameterError, nearest
 from quadid.model.layout import Layout, with_reference_voltage
 from quadid.parameters import NOMINAL_NAMES, ParameterSet
-from quadid.report.tables import Cell, Column, TextTable, number, parameter_table
+from quadid.report.tables import Cell, Column, TextTable, heads, number, parameter_table
 from quadid.report.verdict import Verdict, identify_verdict
 from quadid.sanitise import LONGEST_LINE, plain
 from quadid.types import FloatArray, Json
@@ -157,25 +157,13 @@ class Identified(Fitted):
 
     def tables(self, truth: Mapping[str, float] | None = None) -> list[TextTable]:
         """Parameters, beside the truth of a simulation, and how well each log is followed."""
-        columns = (
-            Column("log"),
-            Column("role"),
-            Column("current", right=True),
-            Column("fitted", right=True),
-            *(Column(f"fit {n}", right=True, rank=1) for n in FITS),
-        )
+        columns = (*heads("log | role | current > | fitted >"), *(Column(f"fit {n}", right=True, rank=1) for n in FITS))
         rows = []
         for s in self.result["sets"]:
+            errors = (number(s["mse"][key], 3) for key in ("initial", "fitted"))
             fits = [s["fit_percent"].get(n) for n in FITS]
-            rows.append(
-                (
-                    s["log"],
-                    s["role"],
-                    number(s["mse"]["initial"], 3),
-                    number(s["mse"]["fitted"], 3),
-                    *("-" if v is None or not math.isfinite(v) else f"{max(v, -999.0):.0f} %" for v in fits),
-                )
-            )
+            told = ("-" if v is None or not math.isfinite(v) else f"{max(v, -999.0):.0f} %" for v in fits)
+            rows.append((s["log"], s["role"], *errors, *told))
         title = "Squared errors, relative to what the model expects (1: as large as expected)"
         followed = TextTable(title, columns, tuple(rows))
         return [parameter_table(self.result["parameters"], truth), followed]
@@ -222,15 +210,10 @@ class Identified(Fitted):
         from quadid.report.fit_pages import correlation_section, flight_section
 
         result, fit = self.result, self.fit
-        rows = provenance(self.logs, command) + [
-            {"name": "seed", "value": str(result["seed"])},
-            {
-                "name": "search",
-                "value": f"{result['optimizer']}, {fit.evaluations} simulations of the data; {fit.outcome.value}",
-            },
-            {"name": "vehicle file", "value": result["vehicle_file"] or "not written"},
-            {"name": "taken as known", "value": known(fit.vehicle)},
-        ]
+        searched = f"{result['optimizer']}, {fit.evaluations} simulations of the data; {fit.outcome.value}"
+        file = result["vehicle_file"] or "not written"
+        own = {"seed": result["seed"], "search": searched, "vehicle file": file, "taken as known": known(fit.vehicle)}
+        rows = provenance(self.logs, command, own)
         flights = [flight_section(log.recording, fit.vehicle, i) for i, log in enumerate(self.logs[:MOST_LOGS])]
         more = [correlation_section(fit.parameters), *(f for f in flights if f is not None)]
         lacking = None if self.forces is None else self.forces.section()

@@ -93,6 +93,7 @@ def init(
 class Shipped(Outcome):
     """The vehicles that ship; `result` has the form ``quadid.vehicles/1``."""
 
+    rows = "vehicles"
     result: dict[str, Any]
 
     def tables(self) -> list[TextTable]:
@@ -103,10 +104,6 @@ class Shipped(Outcome):
             for r in self.records()
         )
         return [TextTable("Vehicles that ship (--vehicle NAME)", columns, rows)]
-
-    def records(self) -> list[dict[str, Any]]:
-        """One row a vehicle."""
-        return list(self.result["vehicles"])
 
 
 def vehicles() -> Shipped:
@@ -147,6 +144,7 @@ _RADIUS = (0.55, 1.0)
 _THRUST = (0.006, 0.03)
 """Thrust over air density, disc area and squared tip speed, of propellers made for it."""
 _AIR = 1.2
+_ASSUMED = ("MOT_THST_EXPO", "MOT_SPIN_MIN", "MOT_THST_HOVER", "MOT_BAT_VOLT_MAX", "MOT_BAT_VOLT_MIN", "THR_MDL_FAC")
 
 
 class _Command(NamedTuple):
@@ -197,25 +195,30 @@ def vehicle_text(recording: Recording, name: str, mass: float | None = None, arm
     b = weight * GRAVITY / squares
     known_size = arm is not None or not frame.scaled
     judged = known_size and channel is not None and channel.name == "rotor_speed"
+    weigh = "" if mass is not None else "  FILL IN: weigh it as it flies"
     mark = "  FILL IN: the arm is a guess; the autopilot stores none" if frame.scaled and arm is None else ""
-    rotor_lines = [f"rotors:                 # forward, right, down [m]; {frame.name}{mark}"]
-    for r in frame.rotors:
-        rotor_lines.append(f"  - {{position: [{r.x:.4f}, {r.y:.4f}, {r.z:.4f}], spin: {r.spin:+d}}}")
-    text = (
-        "\n".join(
-            [
-                f"name: {json.dumps(name)}",
-                f"mass: {weight:g}             {'# kg' if mass is not None else '# kg  FILL IN: weigh it as it flies'}",
-                *rotor_lines,
-                f"command: {command.line}",
-                *_guesses(frame, weight, b, _possible_thrust(frame) if judged else None),
-                *_effects(recording),
-                *(f"# {note}" for note in notes),
-                *_remarks(recording),
-            ]
-        )
-        + "\n"
-    )
+    places = [f"  - {{position: [{r.x:.4f}, {r.y:.4f}, {r.z:.4f}], spin: {r.spin:+d}}}" for r in frame.rotors]
+    # The autopilot's own filter of gyro and accelerometer, where the log holds what has passed it
+    known, gyro = recording.autopilot, recording.channels.get("gyro")
+    filtered = gyro is not None and gyro.source.startswith(("IMU", "RAW_IMU", "SCALED_IMU", "HIGHRES_IMU"))
+    cutoff, effects = known.get("INS_GYRO_FILTER", 0.0), list[str]()
+    if filtered and 1.0 <= cutoff <= 500.0 and known.get("INS_ACCEL_FILTER") == cutoff:
+        lag = f"  imu_lag: {{cutoff: {cutoff:g}}}    # INS_GYRO_FILTER, INS_ACCEL_FILTER of this log"
+        effects = ["effects:", lag]
+    # Assumptions of the autopilot on thrust and battery, for the reader
+    held = [f"{name} {known[name]:g}" for name in _ASSUMED if name in known]
+    lines = [
+        f"name: {json.dumps(name)}",
+        f"mass: {weight:g}             # kg{weigh}",
+        f"rotors:                 # forward, right, down [m]; {frame.name}{mark}",
+        *places,
+        f"command: {command.line}",
+        *_guesses(frame, weight, b, _possible_thrust(frame) if judged else None),
+        *effects,
+        *(f"# {note}" for note in notes),
+        *([f"# The autopilot assumes: {', '.join(held)}"] if held else []),
+    ]
+    text = "".join(f"{line}\n" for line in lines)
     Vehicle.from_yaml(text, name)  # what is handed out is valid
     return text
 
@@ -269,21 +272,3 @@ def _guesses(frame: Frame, mass: float, b: float, possible: tuple[float, float] 
         f"  J_zz: {1.9 * inertia:.3g}",
         f"  J_r: {{initial: {inertia / 400.0:.3g}, bounds: [{inertia / 40000.0:.3g}, {inertia / 20.0:.3g}]}}",
     ]
-
-
-def _effects(recording: Recording) -> list[str]:
-    """The autopilot's own filter of gyro and accelerometer, where the log holds what has passed it."""
-    gyro = recording.channels.get("gyro")
-    known = recording.autopilot
-    filtered = gyro is not None and gyro.source.startswith(("IMU", "RAW_IMU", "SCALED_IMU", "HIGHRES_IMU"))
-    cutoff = known.get("INS_GYRO_FILTER", 0.0)
-    if not filtered or not 1.0 <= cutoff <= 500.0 or known.get("INS_ACCEL_FILTER") != cutoff:
-        return []
-    return ["effects:", f"  imu_lag: {{cutoff: {cutoff:g}}}    # INS_GYRO_FILTER, INS_ACCEL_FILTER of this log"]
-
-
-def _remarks(recording: Recording) -> list[str]:
-    """Assumptions of the autopilot on thrust and battery, for the reader."""
-    names = ("MOT_THST_EXPO", "MOT_SPIN_MIN", "MOT_THST_HOVER", "MOT_BAT_VOLT_MAX", "MOT_BAT_VOLT_MIN", "THR_MDL_FAC")
-    held = [f"{name} {recording.autopilot[name]:g}" for name in names if name in recording.autopilot]
-    return [f"# The autopilot assumes: {', '.join(held)}"] if held else []

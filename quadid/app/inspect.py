@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -13,20 +14,16 @@ from quadid.app.logs import (
     LONGEST,
     Flight,
     Log,
-    LogPart,
     file_name,
-    flown_parts,
     gridded,
     left_on_ground,
-    names_of,
     parse_part,
     read_log,
-    standing,
     write_text,
 )
 from quadid.app.options import Described, NamedColumns, Preset, Start, Stop, Typed, vehicle_if
 from quadid.app.outcome import Outcome, json_text
-from quadid.data.window import Recording, beginning
+from quadid.data.window import beginning
 from quadid.errors import QuadidError
 from quadid.parameters import NOMINAL_UNITS
 from quadid.report.tables import Cell, Column, TextTable, Tone, heads, number
@@ -35,8 +32,7 @@ from quadid.sanitise import LONGEST_LINE, plain
 from quadid.vehicle import Vehicle
 
 if TYPE_CHECKING:
-    from quadid.checks import Check, Inspection
-    from quadid.checks.motion import Spans
+    from quadid.checks import Inspection
 
 
 @dataclass(frozen=True, repr=False)
@@ -44,6 +40,7 @@ class Inspected(Outcome):
     """Contents of a log; `result` has the form ``quadid.inspect/1``."""
 
     endings = (".inspect.json",)
+    rows = "channels"
     result: dict[str, Any]
     found: Inspection
 
@@ -92,10 +89,6 @@ class Inspected(Outcome):
         self.result["files"] = [str(path)]
         return [("Written", write_text(path, json_text(self.result)))]
 
-    def records(self) -> list[dict[str, Any]]:
-        """One row a channel."""
-        return list(self.result["channels"])
-
 
 def inspect(
     log: Annotated[Flight, Typed(str, typer.Argument(metavar="LOG"), ...)],
@@ -123,6 +116,7 @@ def inspect(
         LogError: not readable, or nothing in the span.
         VehicleError: no such vehicle.
     """
+    from quadid.checks import Check, CheckResult
     from quadid.checks import inspect as inspect_recording
 
     if isinstance(log, Log):
@@ -134,44 +128,28 @@ def inspect(
     if whole is None:
         whole = read_log(cut.path, preset, described, columns)
     found = replace(inspect_recording(cut.of(whole), described), zero=whole.first_imu_time)
-    flown = flown_parts(whole, found.flying, cut)
+    flown = cut.flown(whole, found.flying)
     if described is not None and found.usable:  # after an error nothing later is asked: it would be as wrong
-        refused, rows = _refused(whole, described, cut, flown), _excitation(whole, described, cut, flown)
-        found = replace(found, excitation=rows, checks=(*found.checks, *refused))
-    use, found = names_of(cut, flown), replace(found, warnings=(*found.warnings, *standing(whole, found.flying, cut)))
+        from quadid.identification.fit import check_windows
+        from quadid.identification.uncertainty import excitation
+
+        # An error with the reason for which `identify` would not fit the log.
+        try:
+            check_windows(gridded(whole, described, None, cut, flown)[0])
+        except QuadidError as error:
+            refused = Check("data", CheckResult.ERROR, error.found, error.fix or f"allowed: {error.allowed}")
+            found = replace(found, checks=(*found.checks, refused))
+        # Expected relative standard deviation per parameter; none where the inspection itself says what is missing.
+        with contextlib.suppress(QuadidError):
+            shown = excitation(beginning(gridded(whole, described, GRID, cut, flown)[0], LONGEST)[0], described)
+            sigmas = zip(shown.names, shown.bound.tolist(), shown.alone.tolist(), strict=True)
+            rows = [
+                {"name": n, "unit": NOMINAL_UNITS[n], "relative_sigma": bound, "relative_sigma_alone": alone}
+                for n, bound, alone in sigmas
+            ]
+            found = replace(found, excitation=tuple(rows))
+    use, found = cut.names(flown), replace(found, warnings=(*found.warnings, *cut.standing(whole, found.flying)))
     return Inspected({**found.to_dict(), "use": use, "log": str(cut.path.resolve()), "files": []}, found)
-
-
-def _refused(recording: Recording, vehicle: Vehicle, cut: LogPart, flown: Spans) -> tuple[Check, ...]:
-    """An error with the reason for which `identify` would not fit the log; none where it would."""
-    from quadid.checks import Check, CheckResult
-    from quadid.identification.fit import check_windows
-
-    try:
-        check_windows(gridded(recording, vehicle, None, cut, flown)[0])
-    except QuadidError as error:
-        return (Check("data", CheckResult.ERROR, error.found, error.fix or f"allowed: {error.allowed}"),)
-    return ()
-
-
-def _excitation(recording: Recording, vehicle: Vehicle, cut: LogPart, flown: Spans) -> tuple[dict[str, Any], ...]:
-    """Expected relative standard deviation per parameter, from up to `LONGEST` s of flight; none when refused."""
-    from quadid.identification.uncertainty import excitation
-
-    try:
-        windows, _ = beginning(gridded(recording, vehicle, GRID, cut, flown)[0], LONGEST)
-        found = excitation(windows, vehicle)
-    except QuadidError:
-        return ()  # the inspection itself says what is missing or too slow
-    return tuple(
-        {
-            "name": name,
-            "unit": NOMINAL_UNITS[name],
-            "relative_sigma": float(bound),
-            "relative_sigma_alone": float(alone),
-        }
-        for name, bound, alone in zip(found.names, found.bound, found.alone, strict=True)
-    )
 
 
 # --- An inspection as tables for people

@@ -176,93 +176,88 @@ class LogPart:
 
     def of(self, recording: Recording) -> Recording:
         """The part of a recording; raises LogError where that is empty."""
-        if self.start is None and self.stop is None:
+        if not self.asked:
             return recording
         low, high = self.span(recording)
-        inside = {name: (c.t >= low) & (c.t <= high) for name, c in recording.channels.items()}
-        channels = {
-            name: replace(c, t=c.t[inside[name]], values=c.values[inside[name]])
-            for name, c in recording.channels.items()
-            if inside[name].any()
-        }
+        channels = {}
+        for name, c in recording.channels.items():
+            if (inside := (c.t >= low) & (c.t <= high)).any():
+                channels[name] = replace(c, t=c.t[inside], values=c.values[inside])
         if not channels:
             # Nothing is there: which span was asked for, and which there is
-            zero = recording.first_imu_time
-            first, last = recording.span
-            asked = f"between {self.start} and {self.stop} s" if self.stop is not None else f"after {self.start} s"
-            if self.start is None:
-                asked = f"before {self.stop} s"
-            there = f", {first - zero:.1f} to {last - zero:.1f} s" if last > first else ""
+            ends = {"after": self.start, "before": self.stop}
+            asked = " and ".join(f"{side} {limit} s" for side, limit in ends.items() if limit is not None)
+            if None not in ends.values():
+                asked = f"between {self.start} and {self.stop} s"
+            first, last = (t - recording.first_imu_time for t in recording.span)
+            there = f", {first:.1f} to {last:.1f} s" if last > first else ""
             raise LogError(f"{recording.name}: nothing {asked}", f"a span inside the log{there}")
         return replace(recording, channels=channels, breaks=tuple(b for b in recording.breaks if low <= b <= high))
+
+    @property
+    def asked(self) -> bool:
+        """A part was asked for, which is used as it is."""
+        return self.start is not None or self.stop is not None
+
+    def in_the_air(self, recording: Recording, flying: Spans) -> Spans:
+        """Stretches in the air of a log that also stands on the ground [s, after its first IMU sample], else none.
+
+        Args:
+            flying: when it flies [s, in the time of the recording].
+        """
+        from quadid.checks import proposed_cuts
+
+        imu = [c.t for n, c in recording.channels.items() if n in ("gyro", "accel") and len(c.t)]
+        if not imu:
+            return ()
+        low, high = self.span(recording)
+        first, last = max(low, recording.first_imu_time), min(high, max(float(t[-1]) for t in imu))
+        inside = tuple((max(a, first), min(b, last)) for a, b in flying if b > first and a < last)
+        begin = round(first - recording.first_imu_time, 1)
+        return tuple((round(begin + a, 1), round(begin + b, 1)) for a, b in proposed_cuts(inside, first, last))
+
+    def flown(self, recording: Recording, flying: Spans) -> Spans:
+        """Stretches to use, as `in_the_air`, where no part was asked for."""
+        return () if self.asked else self.in_the_air(recording, flying)
+
+    def names(self, parts: Spans) -> list[str]:
+        """Parts of the log as one asks for them: ``flight.bin@73.2:227.3``."""
+        return [f"{self.path.name}@{a:g}:{b:g}" for a, b in parts]
+
+    def standing(self, recording: Recording, flying: Spans) -> list[str]:
+        """A sentence where a part that was asked for also stands on the ground, with the part that does not; else none.
+
+        Who asks for all of a log, ``flight.bin@0:``, knows.
+        """
+        names = self.names(self.in_the_air(recording, flying)) if self.start or self.stop is not None else []
+        told = f"this part also stands on the ground, which carries the vehicle: use {' '.join(names)}"
+        return [told] if names else []
 
 
 def parse_part(text: str, start: float | None = None, stop: float | None = None) -> LogPart:
     """Splits ``LOG@76:216`` into its parts, unless a file of that name exists; own limits go before the common ones."""
     found, (before, sign, _) = _CUT.fullmatch(text), text.rpartition("@")
-    if found is None and sign and not Path(text).exists() and Path(before).exists():
-        raise LogError(f"cannot read the span of '{text}'", SPAN)
-    if found is None or Path(text).exists():
-        cut = LogPart(Path(text), start, stop)
-    else:
+    path = Path(text)
+    if not path.exists():
         try:
-            own = [float(found[key]) if found[key] else None for key in ("start", "stop")]
+            if found is not None:
+                path, first, last = Path(found["path"]), found["start"], found["stop"]
+                start, stop = float(first) if first else start, float(last) if last else stop
+            elif sign and Path(before).exists():
+                raise ValueError(text)
         except ValueError as error:
             raise LogError(f"cannot read the span of '{text}'", SPAN) from error
-        cut = LogPart(Path(found["path"]), start if own[0] is None else own[0], stop if own[1] is None else own[1])
-    for limit in (cut.start, cut.stop):
-        if limit is not None and not math.isfinite(limit):
-            raise LogError(f"{text}: a span from {cut.start} to {cut.stop} s", "seconds")
-    if cut.start is not None and cut.stop is not None and not cut.start < cut.stop:
-        raise LogError(f"{text}: a span from {cut.start:g} to {cut.stop:g} s", "start before stop", "swap them")
-    return cut
-
-
-def flown_parts(recording: Recording, flying: Spans, cut: LogPart) -> Spans:
-    """Parts to use of a log that also stands on the ground [s, after its first IMU sample]; none where it hardly does.
-
-    A part that was asked for is used as it is.
-
-    Args:
-        flying: when it flies [s, in the time of the recording].
-    """
-    return () if cut.start is not None or cut.stop is not None else _in_the_air(recording, flying, cut)
-
-
-def _in_the_air(recording: Recording, flying: Spans, cut: LogPart) -> Spans:
-    """Parts in the air of one that was asked for, or of a whole log; as `flown_parts`, none where it hardly stands."""
-    from quadid.checks import proposed_cuts
-
-    imu = [c.t for n, c in recording.channels.items() if n in ("gyro", "accel") and len(c.t)]
-    if not imu:
-        return ()
-    low, high = cut.span(recording)
-    first, last = max(low, recording.first_imu_time), min(high, max(float(t[-1]) for t in imu))
-    inside = tuple((max(a, first), min(b, last)) for a, b in flying if b > first and a < last)
-    begin = round(first - recording.first_imu_time, 1)
-    return tuple((round(begin + a, 1), round(begin + b, 1)) for a, b in proposed_cuts(inside, first, last))
-
-
-def names_of(cut: LogPart, parts: Spans) -> list[str]:
-    """Parts of a log as one asks for them: ``flight.bin@73.2:227.3``."""
-    return [f"{cut.path.name}@{a:g}:{b:g}" for a, b in parts]
+    if not all(limit is None or math.isfinite(limit) for limit in (start, stop)):
+        raise LogError(f"{text}: a span from {start} to {stop} s", "seconds")
+    if start is not None and stop is not None and not start < stop:
+        raise LogError(f"{text}: a span from {start:g} to {stop:g} s", "start before stop", "swap them")
+    return LogPart(path, start, stop)
 
 
 def left_on_ground(names: Sequence[str]) -> str:
     """Used parts of a log that also stands on the ground, by the names of its parts, and how to use all of it."""
     whole = names[0].rpartition("@")[0]
     return f"time on the ground is left out: fits use {' '.join(names)}; to use all of it: {whole}@0:"
-
-
-def standing(recording: Recording, flying: Spans, cut: LogPart) -> list[str]:
-    """A sentence where a part that was asked for also stands on the ground, with the part that does not; else none.
-
-    Who asks for all of a log, ``flight.bin@0:``, knows.
-    """
-    if not cut.start and cut.stop is None:
-        return []
-    names = names_of(cut, _in_the_air(recording, flying, cut))
-    return [f"this part also stands on the ground, which carries the vehicle: use {' '.join(names)}"] if names else []
 
 
 # --- From names of logs and vehicles to checked windows on a grid
@@ -441,7 +436,7 @@ def on_grid(
     """A checked log on the grid; of one that also stands on the ground, what is in the air."""
     doubts, flown, off = checked
     windows, report = gridded(recording, vehicle, rate, cut, flown)
-    left_out = [left_on_ground(names_of(cut, flown))] if flown else []
+    left_out = [left_on_ground(cut.names(flown))] if flown else []
     return Log(path, recording, vehicle, windows, report, cut, (*doubts, *left_out), flown, off)
 
 
@@ -492,7 +487,7 @@ def check_conventions(recording: Recording, vehicle: Vehicle, cut: LogPart) -> C
     from quadid.checks.findings import farthest
 
     found = inspect(recording, vehicle)
-    flown = flown_parts(recording, found.flying, cut)
+    flown = cut.flown(recording, found.flying)
     # Rotors at a speed that cannot carry this vehicle: what else is wrong about them is that of another one.
     stranger = next((c.message for c in found.checks if c.name == "hover" and c.verdict is CheckResult.WARNING), "")
     for check in found.checks:
@@ -501,10 +496,10 @@ def check_conventions(recording: Recording, vehicle: Vehicle, cut: LogPart) -> C
             fix = f"{check.fix}, or insist with --unchecked" if check.fix else "insist with --unchecked"
             of_rotors = stranger if check.name in ("motor_order", "rotor_timing") else ""
             fix = f"use the vehicle file of this log; else {fix}" if of_rotors else fix
-            parts = " ".join(names_of(cut, flown))
+            parts = " ".join(cut.names(flown))
             fix = f"{fix}; or leave out the ground: use {parts}" if parts else fix
             raise LogError(f"{recording.name}: {'; '.join(filter(None, (of_rotors, check.message)))}", fix=fix)
-    doubts = (*doubts_of(found.checks), *standing(recording, found.flying, cut))
+    doubts = (*doubts_of(found.checks), *cut.standing(recording, found.flying))
     return Checked(doubts, flown, farthest([check.off for check in found.checks]))
 
 
@@ -545,7 +540,6 @@ def check_unseen(train: Sequence[Log], held: Sequence[Log], vehicle: Vehicle | N
                     "a flight, or a part of one, that is not fitted",
                     "use another flight for --validate, or parts that do not overlap: LOG@0:60 --validate LOG@60:120",
                 )
-
     for log in held:
         for flight in () if vehicle is None else fitted_before(vehicle, log):
             raise LogError(

@@ -27,6 +27,13 @@ SECONDS, ROWS = 120.0, 12000
 AXES = ("x", "y", "z")
 
 
+def recorded(name: str, t: FloatArray, values: Mapping[str, FloatArray], source: str) -> Recording:
+    """Rows of channels as a recording; those that were not measured, or ran away, are left out."""
+    known = {channel: np.isfinite(rows).all(axis=1) for channel, rows in values.items()}
+    channels = {c: Channel(c, t[here], values[c][here], source) for c, here in known.items() if here.any()}
+    return Recording(name, "series", channels)
+
+
 @dataclass(frozen=True)
 class MissingForces:
     """Missing force and moment of models on every log.
@@ -66,15 +73,18 @@ class MissingForces:
         force: dict[str, Any] = {"unit": "N"}
         moment: dict[str, Any] = {"unit": "N m"}
         for model in self.models:
-            parts = [part for i in which for part in self.parts[model][i]]
             for entry, is_force in ((force, True), (moment, False)):
-                found, interval = size(parts, is_force)
+                found, interval = size(self._stretches(model, which), is_force)
                 entry[model] = _by_axis(found)
-                entry[f"{model}_ci95"] = {a: [float(x) for x in pair] for a, pair in zip(AXES, interval.T, strict=True)}
-            if model == self.models[0]:
-                force |= {"of": parts[0].weight, "of_what": "weight"}
-                moment |= {"of": _by_axis(control_size(parts)), "of_what": "rms control moment"}
+                entry[f"{model}_ci95"] = dict(zip(AXES, interval.T.tolist(), strict=True))
+        first = self._stretches(self.models[0], which)
+        force |= {"of": first[0].weight, "of_what": "weight"}
+        moment |= {"of": _by_axis(control_size(first)), "of_what": "rms control moment"}
         return {"force": force, "moment": moment}
+
+    def _stretches(self, model: str, which: Sequence[int] | None = None) -> list[Missing]:
+        """Stretches of these logs as a model sees them; of those that judge by default."""
+        return [part for i in (self.deciding if which is None else which) for part in self.parts[model][i]]
 
     @property
     def deciding(self) -> list[int]:
@@ -87,19 +97,16 @@ class MissingForces:
 
         each = []
         for model in self.models:
-            parts = [part for i in self.deciding for part in self.parts[model][i]]
+            parts = self._stretches(model)
             force, moment = (size(parts, is_force)[0] for is_force in (True, False))
             total, weight = float(np.linalg.norm(force)), parts[0].weight
             shares = ", ".join(percent(share).removesuffix(" %") for share in moment / control_size(parts))
             each.append((f"{total:.2g} N ({percent(total / weight)} of the weight)", f"{shares} %"))
         (force_then, moment_then), (force_now, moment_now) = each[0], each[-1]
         unseen = "validation flights" if "validate" in self.roles else "these flights"
-        start = (
-            f"On {unseen} the simulation misses {force_then} and {moment_then} of the rms roll, pitch and yaw moment"
-        )
-        if not self.extends:
-            return f"{start} of the rotors."
-        return f"{start} of the rotors; with what was found {force_now} and {moment_now}."
+        missed = f"the simulation misses {force_then} and {moment_then} of the rms roll, pitch and yaw moment"
+        found = f"; with what was found {force_now} and {moment_now}" if self.extends else ""
+        return f"On {unseen} {missed} of the rotors{found}."
 
     def section(self) -> JsonDict:
         """Part of a page: what is missing on the last deciding log over time, and its size by axis on all of them."""
@@ -141,27 +148,22 @@ class MissingForces:
                 return Beside(found, share, random_forces(of(after, "train")))
         return Beside((), None, random_forces(of(before, "train")))
 
-    def taken(self, without: FloatArray) -> float:
-        """Share of the squared missing force and moment of a model that the last one takes away.
+    def taken(self, before: str | FloatArray, after: str | FloatArray) -> float:
+        """Share of the squared missing force and moment of one model that another takes away.
 
         Args:
-            without: parameter vector of that model; compared on logs that were not fitted, else on all.
+            before, after: names of models, or parameter vectors; compared on logs that were not fitted, else on all.
         """
         from quadid.estimate.missing import removed
 
-        return removed(self._unseen(without), self._parts(self.models[-1]))
-
-    def removed(self, theta: FloatArray) -> float:
-        """Share of what the first model misses that this parameter vector takes away, on the same logs."""
-        from quadid.estimate.missing import removed
-
-        return removed(self._parts(self.models[0]), self._unseen(theta))
-
-    def _parts(self, model: str) -> list[Missing]:
-        return [part for i in self.deciding for part in self.parts[model][i]]
-
-    def _unseen(self, theta: FloatArray) -> list[Missing]:
-        return [part for i in self.deciding for part in self.flights.missing(self.flown[i], theta)]
+        return removed(
+            *(
+                self._stretches(model)
+                if isinstance(model, str)
+                else [part for i in self.deciding for part in self.flights.missing(self.flown[i], model)]
+                for model in (before, after)
+            )
+        )
 
     def over_time(self, i: int, model: str | None = None) -> OverTime:
         """Missing force [N] and moment [N m] of log `i`, innovations, and the sigma of each; of the last model else.
@@ -209,12 +211,8 @@ class MissingForces:
         t, out = self._joined(i, self.models[0], "t"), {}
         for model in self.models:
             values = self._joined(i, model, "innovation")
-            found = {n: values[:, at : at + 3] for n, at in (("gyro", GYRO), ("accel", ACCEL))}
-            known = {n: np.isfinite(v).all(axis=1) for n, v in found.items()}
-            channels = {
-                n: Channel(n, t[known[n]], v[known[n]], "innovation") for n, v in found.items() if known[n].any()
-            }
-            out[f"innovation/{model}"] = Recording(self.logs[i].name, "series", channels)
+            three = {name: values[:, at : at + 3] for name, at in (("gyro", GYRO), ("accel", ACCEL))}
+            out[f"innovation/{model}"] = recorded(self.logs[i].name, t, three, "innovation")
         return out
 
     def _joined(self, i: int, model: str, name: str) -> FloatArray:

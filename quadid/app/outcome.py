@@ -8,7 +8,7 @@ import json
 import platform
 import re
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from html import escape
 from pathlib import Path
@@ -20,16 +20,16 @@ from quadid_replay import write_compared
 from quadid_replay.columns import from_euler
 
 from quadid.app.logs import LONGEST, Log, free_name, write_text, written_whole
-from quadid.app.missing import Beside, MissingForces
+from quadid.app.missing import Beside, MissingForces, recorded
 from quadid.app.over_time import OverTime, imported
 from quadid.chi_square import Z95
-from quadid.data.window import CHANNEL_NAMES, Channel, Recording, beginning, sample_period
+from quadid.data.window import CHANNEL_NAMES, beginning, sample_period
 from quadid.errors import LogError, NotIdentifiableError
 from quadid.jsonable import jsonable
 from quadid.report.page import measures, number, part, quiet, render
 from quadid.report.tables import Cell, TextTable
 from quadid.report.verdict import Verdict
-from quadid.types import FloatArray, Json, JsonDict
+from quadid.types import Json, JsonDict
 from quadid.vehicle import Vehicle
 from quadid.version import __version__
 
@@ -59,11 +59,15 @@ class Outcome(ABC):
     Attributes:
         title: what was asked for, for the page of a failure; empty where there is none.
         endings: of files that it writes under the names of its vehicle and logs, `*` for what is not known before.
+        rows: entry of `result` that is the main table.
+        columns: of a main table that may have no row; else they are those of its rows.
         result: plain data of the command's JSON, without the files that only the command writes.
     """
 
     title: ClassVar[str] = ""
     endings: ClassVar[tuple[str, ...]] = ()
+    rows: ClassVar[str] = ""
+    columns: ClassVar[tuple[str, ...]] = ()
     result: dict[str, Any]
 
     def tables(self) -> list[TextTable]:
@@ -134,21 +138,15 @@ class Outcome(ABC):
 
     def to_frame(self) -> pd.DataFrame:
         """The main table with plain numbers as a pandas data frame, whose rows are found by their names, if any."""
-        records = self.records()
         pandas = imported("pandas")
-        frame = pandas.DataFrame(records) if records else pandas.DataFrame(columns=list(self.columns))
+        frame = pandas.DataFrame(self.records(), columns=self.columns or None)
         if "name" in frame:
             frame.index = pandas.Index(frame["name"].to_numpy())
         return frame
 
-    @property
-    def columns(self) -> Sequence[str]:
-        """Columns of a main table that may have no row; else those of its rows."""
-        return ()
-
     def records(self) -> list[dict[str, Any]]:
         """Rows of the main table with plain numbers."""
-        return []
+        return [dict(row) for row in self.result.get(self.rows, ())]
 
 
 class UnansweredError(NotIdentifiableError):
@@ -167,14 +165,18 @@ NUMBER_COLUMNS = ("name", "effect", "confident", "parameter", "unit", "value", "
 """Columns of a table with one row a number of a finding."""
 
 
-def number_rows(found: Sequence[Json]) -> Iterator[tuple[Json, tuple[Any, ...]]]:
-    """Each finding with each of its numbers, as `NUMBER_COLUMNS`."""
+def number_rows(found: Sequence[Json], columns: Sequence[str]) -> list[dict[str, Any]]:
+    """Each number of each finding with these columns: `NUMBER_COLUMNS`, and entries of the finding or its gain."""
+    out = []
     for one in found:
         for p in one["parameters"]:
             low, high = p["ci95"] or (None, None)
             sigma = None if low is None or high is None else (high - low) / (2.0 * Z95)
-            name = f"{one['effect']}.{p['name']}"
-            yield one, (name, one["effect"], one["confident"], p["name"], p["unit"], p["value"], sigma, low, high)
+            number = {"unit": p["unit"], "value": p["value"], "sigma": sigma, "low": low, "high": high}
+            name = {"name": f"{one['effect']}.{p['name']}", "parameter": p["name"]}
+            row = {**one, **one.get("gain", {}), **name, **number}
+            out.append({column: row[column] for column in columns})
+    return out
 
 
 def with_ends(entry: Json) -> dict[str, Any]:
@@ -199,20 +201,6 @@ _CHANNELS = {"gyro": 0, "attitude": 3, "accel": 6, "velocity": 9, "position": 12
 """First of the three columns of each channel in a `quadid.identification.result.Series`."""
 YAW = 5
 """Its column of the yaw, which is unwrapped."""
-
-
-def _recording(name: str, t: FloatArray, values: FloatArray) -> Recording:
-    """Outputs (n, channels) as a recording; rows that were not measured, or ran away, are left out."""
-    channels = {}
-    for channel, first in _CHANNELS.items():
-        three = values[:, first : first + 3]
-        known = np.isfinite(three).all(axis=1)
-        if three.shape[1] and known.any():
-            rows = three[known]
-            channels[channel] = Channel(
-                channel, t[known], from_euler(rows) if channel == "attitude" else rows, "simulation"
-            )
-    return Recording(name, "series", channels)
 
 
 # --- What every report holds: the quality of the logs and where everything came from; and the page of a failure
@@ -345,12 +333,12 @@ class Fitted(Reported):
         out: list[Path] = []
         for i, (scored, log) in enumerate(zip(self.sets, self.logs, strict=True)):
             t, measured = scored.fitted.series.t, scored.fitted.series.measured
-            columns = (
-                ("measured", measured),
-                ("simulated", scored.fitted.series.simulated),
-                ("before", scored.initial.series.simulated),
-            )
-            parts = {name: _recording(log.name, t, values) for name, values in columns}
+            simulated, before = scored.fitted.series.simulated, scored.initial.series.simulated
+            parts = {}
+            for name, values in (("measured", measured), ("simulated", simulated), ("before", before)):
+                three = {c: values[:, k : k + 3] for c, k in _CHANNELS.items() if k < values.shape[1]}
+                three |= {"attitude": from_euler(three["attitude"])} if "attitude" in three else {}
+                parts[name] = recorded(log.name, t, three, "simulation")
             epoch = round(1e9 * (log.recording.epoch or 0.0))
             table, bag = (free_name(folder, log.name, f"simulated.{kind}", out) for kind in ("csv", "mcap"))
             with written_whole(table) as path:
@@ -400,13 +388,14 @@ def quality(log: Log) -> JsonDict:
     return part(title, tables=[channels], lines=[f"{'; '.join(summary)}."])
 
 
-def provenance(logs: Sequence[Log], command: str = LIBRARY) -> list[dict[str, str]]:
-    """Files with hashes, versions, command line and time."""
+def provenance(logs: Sequence[Log], command: str = LIBRARY, more: Mapping[str, Any] | None = None) -> list[JsonDict]:
+    """Files with hashes, versions, command line and time; then `more` by name."""
     versions = [f"{name} {importlib.metadata.version(name)}" for name in _LIBRARIES]
     rows = [
         ("command", command),
         ("made", f"{datetime.datetime.now(datetime.UTC):%Y-%m-%d %H:%M:%S UTC}"),
         ("versions", ", ".join([f"quadid {__version__}", f"Python {platform.python_version()}", *versions])),
         *((log.name, f"{log.path}  sha256 {log.recording.sha256 or 'unknown'}") for log in logs),
+        *(more or {}).items(),
     ]
-    return [{"name": name, "value": value} for name, value in rows]
+    return [{"name": name, "value": str(value)} for name, value in rows]

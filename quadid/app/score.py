@@ -203,20 +203,23 @@ def ahead(horizons: str | Sequence[int | str], windows: Sequence[Window]) -> lis
     Raises:
         ParameterError: neither, or a time on grids of several rates.
     """
-    out, steps = [], {round(w.dt, 9) for w in windows}
+    out, steps = list[int](), {round(w.dt, 9) for w in windows}
     for horizon in horizons.split(",") if isinstance(horizons, str) else horizons:
-        text = str(horizon).strip()
+        if not isinstance(horizon, str):
+            out.append(horizon)
+            continue
+        text, timed = horizon.strip(), horizon.strip().endswith("s")
         try:
-            value = float(text[:-1]) if text.endswith("s") else int(text)
-            if text.endswith("s") and not 0.0 < value < math.inf:
+            value = float(text[:-1]) if timed else int(text)
+            if timed and not 0.0 < value < math.inf:
                 raise ValueError(text)
         except ValueError as error:
             allowed = "whole numbers of samples, or times in seconds"
             raise ParameterError(f"--horizons {text}", allowed, "for example --horizons 1,10,0.5s") from error
-        if text.endswith("s") and len(steps) > 1:
+        if timed and len(steps) > 1:
             rates = ", ".join(f"{1.0 / step:.4g}" for step in sorted(steps))
             raise ParameterError(f"--horizons {text} on logs of {rates} Hz", "one rate", "give --rate, or samples")
-        out.append(max(round(value / windows[0].dt), 1) if text.endswith("s") else int(value))
+        out.append(max(round(value / windows[0].dt), 1) if timed else int(value))
     return out
 
 
@@ -248,8 +251,9 @@ def coverage(
             continue
         found = forecast.covered(near) if autopilot is None else forecast.covered_in_loop(near, autopilot)
         for h, by_quantity in found.items():
+            sums = total.setdefault(h, {})
             for name, counts in by_quantity.items():
-                total.setdefault(h, {})[name] = total[h].get(name, 0.0) + counts
+                sums[name] = sums.get(name, 0.0) + counts
     out: Coverage = dict.fromkeys(map(str, wanted))
     for h, sums in total.items():
         shares = {name: (c[:-1] / c[-1]).tolist() if c[-1] else None for name, c in sums.items()}
@@ -424,7 +428,14 @@ def compare_vehicles(
             f"at least {FEWEST_BLOCKS} for an interval",
             "use longer flights, or shorter horizons",
         )
-    total, drawn = _means(blocks, seed)
+    # Mean errors of both, (2, horizons, 4), and of drawn blocks, (draws, 2, horizons, 4).
+    known = [~np.isnan(block).any(axis=0) for block in blocks]
+    sums = np.array([np.where(k, block, 0.0).sum(axis=1) for block, k in zip(blocks, known, strict=True)])
+    counts = np.array([k.sum(axis=0) for k in known], dtype=np.float64)
+    picked = np.random.default_rng(seed).multinomial(len(blocks), np.full(len(blocks), 1.0 / len(blocks)), DRAWS)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        total = np.asarray(sums.sum(axis=0) / counts.sum(axis=0))
+        drawn = np.asarray(np.tensordot(picked, sums, 1) / np.tensordot(picked, counts, 1)[:, None])
     wanted = tuple(dict.fromkeys(steps))
     entries = {
         str(h): {name: _entry(total[:, i, q], drawn[:, :, i, q]) for q, name in enumerate(QUANTITIES)}
@@ -460,18 +471,6 @@ def compare_vehicles(
         "warnings": [*dict.fromkeys([*warnings, *(text for log in opened[0] for text in log.warnings)])],
     }
     return Compared(result, tuple(opened[0]))
-
-
-def _means(blocks: Sequence[FloatArray], seed: int) -> tuple[FloatArray, FloatArray]:
-    """Mean errors of both, (2, horizons, 4), and of drawn blocks, (draws, 2, horizons, 4)."""
-    known = [~np.isnan(block).any(axis=0) for block in blocks]
-    sums = np.array([np.where(k, block, 0.0).sum(axis=1) for block, k in zip(blocks, known, strict=True)])
-    counts = np.array([k.sum(axis=0) for k in known], dtype=np.float64)
-    picked = np.random.default_rng(seed).multinomial(len(blocks), np.full(len(blocks), 1.0 / len(blocks)), DRAWS)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        total = sums.sum(axis=0) / counts.sum(axis=0)
-        drawn = np.tensordot(picked, sums, 1) / np.tensordot(picked, counts, 1)[:, None]
-    return np.asarray(total), np.asarray(drawn)
 
 
 def _entry(mean: FloatArray, drawn: FloatArray) -> Json:

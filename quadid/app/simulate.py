@@ -43,6 +43,7 @@ class SimulateError(QuadidError):
 class Simulated(Outcome):
     """A simulated flight; `result` has the form ``quadid.simulate/1``, its ``log`` None until written."""
 
+    rows = "parameters"
     result: dict[str, Any]
     flight: Flight
 
@@ -56,10 +57,6 @@ class Simulated(Outcome):
         """Flight, and where it was logged."""
         r, log = self.result, f" and logged to {self.result['log']}" if self.result["log"] else ""
         return [Cell(f"{r['vehicle']}: {r['rows']} rows at {r['rows'] / r['seconds']:.4g} Hz flown{log}")]
-
-    def records(self) -> list[dict[str, Any]]:
-        """One row a true parameter."""
-        return list(self.result["parameters"])
 
     def __repr__(self) -> str:
         r, effects = self.result, ", ".join(self.result["effects"]) or "none"
@@ -215,19 +212,12 @@ def simulate_draws(vehicle: str | Path | Vehicle, draws: int, seed: int = 1, **h
 
 def believed(vehicle: Vehicle) -> ParameterSet:
     """The values of a vehicle file with their standard deviations."""
-    priors = {name: vehicle.parameters[name] for name in NOMINAL_UNITS}
-    listed = [
-        Parameter(
-            name,
-            NOMINAL_UNITS[name],
-            prior.initial,
-            prior.sigma or 0.0,
-            prior.initial,
-            prior.limits,
-            Status.IDENTIFIED if prior.sigma else Status.PRIOR_DOMINATED,
-        )
-        for name, prior in priors.items()
-    ]
+    listed = []
+    for name, unit in NOMINAL_UNITS.items():
+        prior = vehicle.parameters[name]
+        status = Status.IDENTIFIED if prior.sigma else Status.PRIOR_DOMINATED
+        spread = (prior.sigma or 0.0, prior.initial, prior.limits, status)
+        listed.append(Parameter(name, unit, prior.initial, *spread))
     return ParameterSet(tuple(listed), vehicle.covariance)
 
 

@@ -243,6 +243,7 @@ def with_help(option: ParameterInfo, text: str, kind: Any) -> ParameterInfo:
 def as_command(command: Command, function: Callable[..., Outcome | None]) -> Callable[..., None]:
     """The function with the parameters of its command, which prints and writes its outcome, if it returns one."""
     from quadid.app import options
+    from quadid.app.logs import check_folder
     from quadid.app.outcome import Fitted, Reported
 
     signature, (about, words) = inspect.signature(function, eval_str=True), documented(function)
@@ -274,6 +275,7 @@ def as_command(command: Command, function: Callable[..., Outcome | None]) -> Cal
             function(**given)
             return
         if page_name:
+            check_folder(given["out"], "--out")
             given["report"] = given["out"] / page_name
         _run(command, function, outcome, signature, typed, given)
 
@@ -302,7 +304,7 @@ def _run(
 ) -> None:
     from quadid.app.kernels import FIT, prepare
     from quadid.app.logs import check_folder, file_name, parse_part, write_text
-    from quadid.app.outcome import Fitted, UnansweredError
+    from quadid.app.outcome import Fitted, Reported, UnansweredError
     from quadid.cli import terminal
     from quadid.errors import QuadidError
     from quadid.vehicle import Vehicle
@@ -344,8 +346,16 @@ def _run(
                 done = function(**told, **({"advance": advance} if "advance" in signature.parameters else {}))
             except UnansweredError as error:
                 done, unanswered = error.outcome, error
+            # Its files, which its JSON names; a vehicle file that was read is not overwritten.
             advance("writing", 1.0)
-            files = terminal.write(done, report, folder, series, given.get("vehicle"))
+            files = [] if folder is None else done.write(folder, given.get("vehicle"))
+            if report is not None and isinstance(done, Reported):
+                done.result["report"] = str(report.absolute())
+                files.append(("Report", done.report(report, terminal.command_line())))
+            if series is not None and isinstance(done, Fitted):
+                written = done.save_series(series)
+                done.result["series"] = [str(path) for path in written]
+                files += [("Over time", path) for path in written]
     except QuadidError as error:
         # The report of an attempt that failed says why, and shows the data.
         if done is None and report is not None and vehicle is not None and outcome.title:

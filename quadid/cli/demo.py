@@ -16,7 +16,7 @@ from quadid_evaluation.paper.page import all_tables, paper_markdown, paper_secti
 
 from quadid.app.diagnose import Diagnosed, diagnose
 from quadid.app.identify import Identified, identify
-from quadid.app.kernels import FIT
+from quadid.app.kernels import FIT, prepare
 from quadid.app.logs import Log, check_folder, load, write_recording, write_text, written_whole
 from quadid.app.options import JsonTarget, OutFolder, Seed
 from quadid.app.outcome import Advance, provenance
@@ -48,7 +48,8 @@ def demo(
     folder = check_folder(out, "--out", *WRITTEN)
     for name in FOLDERS:
         check_folder(folder / name, "--out", *WRITTEN)
-    with terminal.progress((*FIT, "flight")) as advance:
+    with terminal.progress() as advance:
+        prepare((*FIT, "flight"), advance)
         shown = run(QUICK_SECONDS if quick else SECONDS, seed, folder, advance)
         advance("writing the report", 1.0)
         page = write_text(folder / "report.html", html(shown, seed, terminal.command_line()))
@@ -94,47 +95,30 @@ def run(seconds: float, seed: int, folder: Path, advance: Advance) -> Shown:
     Args:
         seconds: length of each of the three flights.
     """
-    from quadid.flight import TruthParameters
+    from quadid.flight import TruthParameters, fly
 
     vehicle = Vehicle.named(VEHICLE)
-    truth = TruthParameters.of(vehicle).as_dict()
-    flights = [
-        fly_and_load(vehicle, folder / f"set{i + 1}.mcap", seconds, 10 * seed + i, {}, advance) for i in range(3)
-    ]
-    same, apart = (folder / name for name in FOLDERS)
-    shorter = min(seconds, HIDDEN_SECONDS)
-    other = [
-        fly_and_load(vehicle, apart / f"flight{i + 1}.mcap", shorter, 10 * seed + 5 + i, HIDDEN, advance)
-        for i in range(2)
-    ]
+
+    def flown(path: Path, seconds: float, seed: int, effects: Mapping[str, Mapping[str, float]]) -> Log:
+        """Flies once, writes the log as MCAP, and reads it back as any other log."""
+        advance(f"fly {path.stem}", 0.0)
+        write_recording(path, fly(vehicle, seconds=seconds, seed=seed, effects=effects).recording)
+        advance(f"fly {path.stem}", 1.0)
+        return load(path, vehicle)
 
     def named(task: str) -> Advance:
         return lambda stage, share: advance(f"{task}: {stage}", share)
 
+    same, apart = (folder / name for name in FOLDERS)
+    flights = [flown(folder / f"set{i + 1}.mcap", seconds, 10 * seed + i, {}) for i in range(3)]
+    shorter = min(seconds, HIDDEN_SECONDS)
+    other = [flown(apart / f"flight{i + 1}.mcap", shorter, 10 * seed + 5 + i, HIDDEN) for i in range(2)]
     identified = identify(flights[:1], flights[1:], seed=seed, advance=named("identify"))
     diagnosed = diagnose(flights[:1], flights[1:], seed=seed, advance=named("diagnose"))
     hidden = diagnose(other[:1], other[1:], seed=seed, advance=named("diagnose hidden effect"))
     for done, place in ((identified, folder), (diagnosed, same), (hidden, apart)):
         done.write(place)
-    return Shown(identified, diagnosed, hidden, truth)
-
-
-def fly_and_load(
-    vehicle: Vehicle,
-    path: Path,
-    seconds: float,
-    seed: int,
-    effects: Mapping[str, Mapping[str, float]],
-    advance: Advance,
-) -> Log:
-    """Flies once, writes the log as MCAP, and reads it back as any other log."""
-    from quadid.flight import fly
-
-    advance(f"fly {path.stem}", 0.0)
-    flight = fly(vehicle, seconds=seconds, seed=seed, effects=effects)
-    write_recording(path, flight.recording)
-    advance(f"fly {path.stem}", 1.0)
-    return load(path, vehicle)
+    return Shown(identified, diagnosed, hidden, TruthParameters.of(vehicle).as_dict())
 
 
 def summary(shown: Shown, page: str) -> dict[str, Any]:
@@ -154,7 +138,7 @@ def html(shown: Shown, seed: int, command: str) -> str:
     """The report: identification with the truth beside it, then both diagnoses."""
     done = shown.identified
     logs: Sequence[Log] = [*done.logs, *shown.hidden.logs]
-    rows = [*provenance(logs, command), {"name": "seed", "value": str(seed)}]
+    rows = provenance(logs, command, {"seed": seed})
     hidden = shown.hidden
     same = diagnosis_part(
         shown.diagnosed.result,
@@ -196,7 +180,8 @@ def reproduce(
     check_folder(folder / _FIGURES, "--out", "figure-*")
     flights = check_folder(folder / "flights", "--out", "set?.mcap", "pelican.yaml")
     plan = protocol.QUICK if quick else protocol.Plan()
-    with terminal.progress(FIT) as advance:
+    with terminal.progress() as advance:
+        prepare(FIT, advance)
         command = f"quadid reproduce{' --quick' if quick else ''} --seed {seed}"
         result, scores = protocol.reproduce(flights, plan, seed, advance, command)
         advance("draw", 0.0)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -62,7 +61,21 @@ class Stored(Outcome):
     def tables(self) -> list[TextTable]:
         """Time, author and data of the set; then the values."""
         sets = self.result["sets"]
-        return [_story(sets, f"Parameter sets of {self.result['vehicle']}"), _values(sets)] if sets else []
+        if not sets:
+            return []
+        told, values = list[tuple[str, ...]](), list[tuple[str, ...]]()
+        shown = sets[-1]["parameters"][:6]
+        for item in sets:
+            seconds = f"{(item['stop'] or 0.0) - (item['start'] or 0.0):.0f}"
+            rests_on = f"{item['reference']}, +-{Z95 * item['reference_sd']:.0%}"
+            made = (_when(item["wall"]), item["state"], item["approved_by"], seconds, number(item["mse"], 3), rests_on)
+            told.append((str(item["sequence"]), *made))
+            found = {p["name"]: p["value"] for p in item["parameters"]}
+            values.append((str(item["sequence"]), *(number(found.get(p["name"])) for p in shown)))
+        columns = heads("set > | when | state | by | data [s] > | error > | rests on")
+        each = (Column("set", right=True), *(Column(f"{p['name']} [{p['unit']}]", right=True) for p in shown))
+        title = f"Parameter sets of {self.result['vehicle']}"
+        return [TextTable(title, columns, tuple(told)), TextTable("Values", each, tuple(values))]
 
     @property
     def sentences(self) -> list[Cell]:
@@ -80,35 +93,6 @@ class Stored(Outcome):
         for item in self.result["events"]:
             told.append(f"{_when(item['wall'])}  {item['level']:7} {item['kind']}: {item['text']}")
         return [Cell(text) for text in told]
-
-
-def _story(sets: Sequence[dict[str, Any]], title: str) -> TextTable:
-    """Time, author and data of a set."""
-    columns = heads("set > | when | state | by | data [s] > | error > | rests on")
-    rows = tuple(
-        (
-            str(item["sequence"]),
-            _when(item["wall"]),
-            item["state"],
-            item["approved_by"],
-            f"{(item['stop'] or 0.0) - (item['start'] or 0.0):.0f}",
-            number(item["mse"], 3),
-            f"{item['reference']}, +-{Z95 * item['reference_sd']:.0%}",
-        )
-        for item in sets
-    )
-    return TextTable(title, columns, rows)
-
-
-def _values(sets: Sequence[dict[str, Any]]) -> TextTable:
-    """The parameters of every set, with units."""
-    shown = sets[-1]["parameters"][:6]
-    columns = (Column("set", right=True), *(Column(f"{p['name']} [{p['unit']}]", right=True) for p in shown))
-    rows = []
-    for item in sets:
-        values = {p["name"]: p["value"] for p in item["parameters"]}
-        rows.append((str(item["sequence"]), *(number(values.get(p["name"])) for p in shown)))
-    return TextTable("Values", columns, tuple(rows))
 
 
 def _when(wall: float) -> str:

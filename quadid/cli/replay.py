@@ -18,7 +18,6 @@ from quadid.report.tables import Cell, TextTable, parameter_table
 
 if TYPE_CHECKING:
     from quadid_node.messages import Output
-    from quadid_node.recording import Beginning
     from quadid_node.service import Service
 
     from quadid.data.window import Recording
@@ -56,7 +55,7 @@ def replay(
             run bit for bit.
         candidates: put every estimate into the JSON, not only the published sets.
     """
-    from quadid_node.recording import arrivals, play, stream
+    from quadid_node.recording import arrivals, play, read_beginning, stream
     from quadid_node.service import Service, session_settings
     from quadid_node.worker import InlineWorker
 
@@ -78,7 +77,12 @@ def replay(
     advance(f"reading {cut.path.name}", 0.0)
     recording = cut.of(read_log(cut.path, preset, described, parse_columns(columns or [])))
     if as_recorded:
-        beginning = _beginning(Path(log), described.name)
+        beginning = read_beginning(Path(log))
+        if beginning is None:
+            raise ReplayError(f"{cut.path.name} was not recorded by the node", fix="leave --as-recorded out")
+        if beginning.vehicle.name != described.name:
+            whose = f"'{beginning.vehicle.name}', not '{described.name}'"
+            raise ReplayError(f"{cut.path.name} was recorded of {whose}", fix="change --vehicle")
         described = beginning.vehicle
         service = Service(described, beginning.settings, InlineWorker(), restored=beginning.restored, live=False)
         blocks = arrivals(Path(log), beginning.source, len(described.rotors))
@@ -113,18 +117,6 @@ def _pace(speed: str) -> float:
     if not 0.0 < pace <= 1000.0:
         raise ReplayError(f"speed {pace:g}", "more than 0, at most 1000, or max")
     return pace
-
-
-def _beginning(log: Path, vehicle: str) -> Beginning:
-    """Start of the session of a node's recording; raises ReplayError when there is none, or of another one."""
-    from quadid_node.recording import read_beginning
-
-    found = read_beginning(log)
-    if found is None:
-        raise ReplayError(f"{log.name} was not recorded by the node", fix="leave --as-recorded out")
-    if found.vehicle.name != vehicle:
-        raise ReplayError(f"{log.name} was recorded of '{found.vehicle.name}', not '{vehicle}'", fix="change --vehicle")
-    return found
 
 
 def summary(

@@ -114,21 +114,18 @@ class _Console:
             return
         self._said = time.monotonic()
         traffic = self._link.traffic()
-        rates = ", ".join(f"{n} {r:.0f}" for n, r in sorted(traffic.rates.items()) if r > 0.5) or "nothing"
-        if traffic.denied:
-            rates += f" | refused by the autopilot: {', '.join(traffic.denied)}"
-        if traffic.refused:
-            rates += f" | {traffic.refused} frames refused"
-        if traffic.behind:
-            rates += (
-                f" | signed with our key, but {traffic.behind:.0f} s behind this clock: set the time of the vehicle"
-            )
-        rates += "".join(f" | {problem}" for problem in traffic.problems)
-        status = health.status
-        rates += f" | {status.backlog:.1f} s behind the data, {status.skipped} fits left out" * (status.backlog > 1.0)
-        self._console.print(
-            f"{status.phase.value}: {status.reason} | Hz: {rates} | fit process {health.worker}", soft_wrap=True
-        )
+        status, late = health.status, f"signed with our key, but {traffic.behind:.0f} s behind this clock"
+        told = [
+            f"{status.phase.value}: {status.reason}",
+            "Hz: " + (", ".join(f"{n} {r:.0f}" for n, r in sorted(traffic.rates.items()) if r > 0.5) or "nothing"),
+            f"refused by the autopilot: {', '.join(traffic.denied)}" * bool(traffic.denied),
+            f"{traffic.refused} frames refused" * bool(traffic.refused),
+            f"{late}: set the time of the vehicle" * bool(traffic.behind),
+            *traffic.problems,
+            f"{status.backlog:.1f} s behind the data, {status.skipped} fits left out" * (status.backlog > 1.0),
+            f"fit process {health.worker}",
+        ]
+        self._console.print(" | ".join(filter(None, told)), soft_wrap=True)
 
     def attend(self) -> None:
         """Nothing is asked through a terminal."""
@@ -289,42 +286,29 @@ def table(found: Mapping[str, Any]) -> Table:
     for name, kinds in found["vehicles"].items():
         health, force = kinds.get("health", {}), kinds.get("parameters", {})
         status = _mapping(health.get("status"))
-        color = "green" if kinds["alive"] else "red"
         state = f"{_plain(status.get('phase', 'unknown'))}: {_plain(status.get('reason', ''))}"
-        notes = f"\nreference: {_plain(force['reference'])}" if force.get("reference") else ""
-        notes += f"\nout of date: {_plain(force['outdated'])}" if force.get("outdated") else ""
-        diagnosis = kinds.get("diagnosis", {})
-        lines = []
-        for finding in _listing(diagnosis.get("findings"))[:5]:
+        held = [_plain(f"{force.get('sequence', '-')} {force.get('state', '')}")]
+        for label, key in (("reference", "reference"), ("out of date", "outdated")):
+            held += [f"{label}: {_plain(force[key])}"] if force.get(key) else []
+        values = []
+        for p in _listing(force.get("parameters"))[:12]:
+            value, sigma = p.get("value"), p.get("sigma")
+            if isinstance(value, int | float) and isinstance(sigma, int | float) and value:
+                values.append(f"{_plain(p.get('name'))} {value:.4g} +-{196.0 * sigma / abs(value):.1f} %")
+        causes = []
+        for finding in _listing(kinds.get("diagnosis", {}).get("findings"))[:5]:
             sure = "" if finding.get("confident") else " (?)"
-            lines.append(f"{_plain(finding.get('effect'))}{sure}: {_plain(finding.get('evidence'))}")
+            causes.append(f"{_plain(finding.get('effect'))}{sure}: {_plain(finding.get('evidence'))}")
+        rates = []
+        for feed, about in list(_mapping(health.get("feeds")).items())[:12]:
+            if isinstance(rate := _mapping(about).get("rate"), int | float):
+                rates.append(f"{_plain(feed)} {rate:.0f} Hz")
         out.add_row(
-            Text(_plain(name), style=color),
+            Text(_plain(name), style="green" if kinds["alive"] else "red"),
             Text(state if kinds["alive"] else "gone"),
-            Text(_plain(f"{force.get('sequence', '-')} {force.get('state', '')}") + notes),
-            Text(_parameters(force)),
-            Text("\n".join(lines)),
-            Text(_feeds(health)),
+            *(Text("\n".join(lines)) for lines in (held, values, causes, rates)),
         )
     return out
-
-
-def _parameters(force: Mapping[str, Any]) -> str:
-    lines = []
-    for p in _listing(force.get("parameters"))[:12]:
-        value, sigma = p.get("value"), p.get("sigma")
-        if isinstance(value, int | float) and isinstance(sigma, int | float) and value:
-            lines.append(f"{_plain(p.get('name'))} {value:.4g} +-{196.0 * sigma / abs(value):.1f} %")
-    return "\n".join(lines)
-
-
-def _feeds(health: Mapping[str, Any]) -> str:
-    lines = []
-    for name, feed in list(_mapping(health.get("feeds")).items())[:12]:
-        rate = _mapping(feed).get("rate")
-        if isinstance(rate, int | float):
-            lines.append(f"{_plain(name)} {rate:.0f} Hz")
-    return "\n".join(lines)
 
 
 def _mapping(value: Any) -> Mapping[str, Any]:

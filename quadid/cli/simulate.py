@@ -1,7 +1,7 @@
 """`quadid simulate`: flies the closed-loop vehicle and logs it, to a file or live over MAVLink."""
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -109,21 +109,14 @@ def stream(address: str, recording: Recording, advance: Advance = silent) -> Non
     mav = dialect.MAVLink(None, srcSystem=SYSTEM, srcComponent=COMPONENT)
     try:
         begin, end = recording.channels["gyro"].t[[0, -1]]
-        for t, message in in_real_time(mavlink_messages(recording)):
+        started: float | None = None
+        for t, message in mavlink_messages(recording):
+            # Each when its time has come, counted from the first.
+            now = time.monotonic()
+            started = now - t if started is None else started
+            time.sleep(max(started + t - now, 0.0))
             advance("sending", (t - begin) / (end - begin))
             link.write(message.pack(mav))
             mav.seq = (mav.seq + 1) % 256
     finally:
         link.close()
-
-
-def in_real_time(messages: Iterator[tuple[float, Any]]) -> Iterator[tuple[float, Any]]:
-    """Yields times [s] and messages when their time has come, counted from the first."""
-    begin: float | None = None
-    for t, message in messages:
-        now = time.monotonic()
-        if begin is None:
-            begin = now - t
-        if begin + t > now:
-            time.sleep(begin + t - now)
-        yield t, message

@@ -10,7 +10,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from quadid.app.kernels import prepare
 from quadid.app.logs import OutputError, check_place, write_text
 from quadid.app.outcome import Advance, Outcome, json_text, silent
 from quadid.errors import QuadidError, nearest
@@ -55,14 +54,9 @@ def warn(messages: tuple[str, ...] | list[str]) -> None:
 
 
 @contextmanager
-def progress(compiled: Sequence[str] = ()) -> Iterator[Advance]:
-    """Shows a progress bar on stderr while the block runs, if stderr is a terminal; yields how to advance it.
-
-    Args:
-        compiled: kernels that the block needs (`quadid.app.kernels.PARTS`), compiled first where they are not.
-    """
+def progress() -> Iterator[Advance]:
+    """Shows a progress bar on stderr while the block runs, if stderr is a terminal; yields how to advance it."""
     if not sys.stderr.isatty():
-        prepare(compiled, silent)
         yield silent
         return
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
@@ -79,7 +73,6 @@ def progress(compiled: Sequence[str] = ()) -> Iterator[Advance]:
         def advance(stage: str, share: float) -> None:
             bar.update(task, description=stage, completed=share)
 
-        prepare(compiled, advance)
         yield advance
 
 
@@ -151,31 +144,6 @@ def print_verdict(console: Console, verdict: Verdict) -> None:
         print_cell(console, Cell(line))
 
 
-def write(
-    done: Outcome,
-    report: Path | None = None,
-    folder: Path | None = None,
-    series: Path | None = None,
-    kept: str | None = None,
-) -> list[tuple[str, Path]]:
-    """Writes the files of a result but its JSON, which names them; returns them with labels.
-
-    Args:
-        series: folder for measured, simulated and missing over time.
-        kept: vehicle file that was read, which is not overwritten.
-    """
-    whole: Any = done  # which of these a command offers depends on its result
-    files = [] if folder is None else done.write(folder, kept)
-    if report is not None:
-        done.result["report"] = str(report.absolute())
-        files.append(("Report", whole.report(report, command_line())))
-    if series is not None:
-        written = whole.save_series(series)
-        done.result["series"] = [str(path) for path in written]
-        files += [("Over time", path) for path in written]
-    return files
-
-
 def show(done: Outcome, json: str | None, files: Sequence[tuple[str, Path]] = ()) -> None:
     """Prints a result, also as JSON, and names the files that were written."""
     write_json(done.result, json)
@@ -190,11 +158,6 @@ def show(done: Outcome, json: str | None, files: Sequence[tuple[str, Path]] = ()
     for label, path in files:
         out.print(f"{label}: {path}", soft_wrap=True)
     warn(done.warnings)
-
-
-def conclude(done: Outcome, json: str | None, folder: Path | None = None, kept: str | None = None) -> None:
-    """Writes and prints a result; arguments as of `write`."""
-    show(done, json, write(done, folder=folder, kept=kept))
 
 
 # --- Errors as one line for people: what was found, what is allowed, what to do

@@ -30,7 +30,7 @@ from quadid.cli.commands import COMMANDS
 from quadid.cli.history import Stored
 from quadid.cli.main import BLAS_THREADS, Loading
 from quadid.cli.replay import Replayed
-from quadid.cli.terminal import check_file, conclude
+from quadid.cli.terminal import check_file, show
 from quadid.effects import EFFECTS
 from quadid.errors import QuadidError, nearest
 from quadid.parameters import NOMINAL_UNITS
@@ -498,23 +498,20 @@ FLEET = {
 }  # fmt: skip
 SHOWN: dict[str, tuple[Callable[..., Any], tuple[str, ...]]] = {
     "excite": (
-        lambda: conclude(
+        lambda: show(
             Proposed(EXCITED, *[cast(Any, x) for x in (None, None, ManoeuvrePlan("p", 1.0, [], [], {}, {}, {}), 0.5)]),
             None,
         ),
         ("0.569 %", "0.567 %", "0.409 %", "0.543 %"),
     ),
     "compare": (
-        lambda: conclude(Methods(COMPARED), None),
+        lambda: show(Methods(COMPARED), None),
         ("differential_evolution", "1.234", "2.346", "3.457", "4000", "12.3", "1/3"),
     ),
-    "fleet": (
-        lambda: conclude(Fleet(FLEET, [], []), None),
-        ("airframe-07", "J_xx", "1.235e-05", "N s^2/rad^2", "1.2 %"),
-    ),
-    "replay": (lambda: conclude(Replayed(REPLAYED), None), ("1.2346e-05", "7.4074e-05", "identified", "held out gain")),
+    "fleet": (lambda: show(Fleet(FLEET, [], []), None), ("airframe-07", "J_xx", "1.235e-05", "N s^2/rad^2", "1.2 %")),
+    "replay": (lambda: show(Replayed(REPLAYED), None), ("1.2346e-05", "7.4074e-05", "identified", "held out gain")),
     "history": (
-        lambda: conclude(Stored(STORED), None),
+        lambda: show(Stored(STORED), None),
         ("operator", "rolled_back", "1.23", "1.235e-05", "7.407e-05", "predecessor"),
     ),
 }
