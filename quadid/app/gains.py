@@ -230,9 +230,9 @@ def gains(
     warnings = _check_identified(described, anyway)
     late = _lateness(described, motor_lag, delay)
     at = hover(facts)
-    turning = moments(facts, at, autopilot.outputs(facts, known, at))
+    turning = moments(at, autopilot.outputs(facts, known, at))
     inertia = np.diag(facts.inertia)
-    most = SHARE * authority(facts, at) / inertia / STEP
+    most = SHARE * authority(at) / inertia / STEP
     fixed = _on_board(autopilot, known, described)
     sizes = [Used(n, NOMINAL_UNITS[n], facts.value(n), *facts.interval(n), facts.origin(n)) for n in _SIZES]
     used = [*sizes, *late, *fixed.values()]

@@ -38,13 +38,12 @@ class Hover(NamedTuple):
     """Rotors about hover, by command 0..1 of full speed.
 
     Attributes:
-        thrust, drag: change of each rotor's thrust [N] and drag torque [N m] with its command, shape (rotors,).
+        lever: change of the moment about each axis with the command of each rotor [N m], shape (rotors, 3).
         most: thrust of each rotor at full command [N], shape (rotors,).
     """
 
     command: float
-    thrust: FloatArray
-    drag: FloatArray
+    lever: FloatArray
     most: FloatArray
 
 
@@ -90,18 +89,18 @@ def hover(facts: Facts) -> Hover:
     speed, most = model.hover_speed(weight), facts.full_thrust
     # The flight controller undoes the curve of its motors (kind thrust): thrust is linear in the command.
     turn = most / model.slope(weight) if facts.vehicle.command.kind == "thrust" else np.full(len(most), full)
-    return Hover(command, model.slope(weight) * turn, 2.0 * facts.value("d") * speed * turn, most)
+    thrust, drag = model.slope(weight) * turn, 2.0 * facts.value("d") * speed * turn
+    x, y, _ = facts.arms.T
+    return Hover(command, np.column_stack([-y * thrust, x * thrust, facts.vehicle.spins * drag]), most)
 
 
-def moments(facts: Facts, at: Hover, outputs: FloatArray) -> FloatArray:
+def moments(at: Hover, outputs: FloatArray) -> FloatArray:
     """Moment about each axis of a unit of output about it [N m], shape (3,).
 
     Raises:
         ParameterError: an axis that the outputs do not turn, or turn the wrong way.
     """
-    x, y, _ = facts.arms.T
-    lever = np.column_stack([-y * at.thrust, x * at.thrust, facts.vehicle.spins * at.drag])
-    out = np.einsum("ra,ra->a", lever, outputs)
+    out = np.einsum("ra,ra->a", at.lever, outputs)
     if not np.all(out > 0.0):
         raise ParameterError(
             f"outputs turn the vehicle by {out} N m", "positive about each axis", "check rotors and spins"
@@ -109,11 +108,9 @@ def moments(facts: Facts, at: Hover, outputs: FloatArray) -> FloatArray:
     return np.asarray(out)
 
 
-def authority(facts: Facts, at: Hover) -> FloatArray:
+def authority(at: Hover) -> FloatArray:
     """Largest moment from hover, up and down alike, at constant thrust [N m], shape (3,)."""
-    x, y, _ = facts.arms.T
-    lever = np.column_stack([-y * at.thrust, x * at.thrust, facts.vehicle.spins * at.drag])
-    return np.asarray(np.abs(lever).sum(axis=0) * min(at.command, 1.0 - at.command))
+    return np.asarray(np.abs(at.lever).sum(axis=0) * min(at.command, 1.0 - at.command))
 
 
 def _px4(facts: Facts, known: Known, at: Hover) -> FloatArray:
