@@ -95,21 +95,19 @@ def fit_axes(source: FloatArray, target: FloatArray) -> AxisMap:
     which any axis explains as well as any other.
     """
     x, y = source - source.mean(axis=0), target - target.mean(axis=0)
-    cross, power, total = y.T @ x, np.sum(x**2, axis=0), float(np.sum(y**2))
+    cross, power = y.T @ x, np.sum(x**2, axis=0)
+    size, whole = float(np.sum(power)), float(np.sum(power) * np.sum(y**2))
     straight = tuple(range(x.shape[1]))
     clear = cross**2 > _CLEAR * np.outer(np.sum(y**2, axis=0), power)
     best = AxisMap(straight, (1,) * x.shape[1], np.nan, 0.0)
-    for axes in permutations(range(x.shape[1])):
+    for axes in permutations(straight) if whole > 0.0 else ():
         for signs in product((1, -1), repeat=x.shape[1]):
             moved = [(i, a) for i, a, s in zip(straight, axes, signs, strict=True) if a != i or s < 0]
             if moved and not any(clear[place] for place in moved):
                 continue
-            gain = sum(s * cross[i, a] for i, (a, s) in enumerate(zip(axes, signs, strict=True)))
-            norm = float(sum(power[a] for a in axes))
-            if gain > 0.0 and norm > 0.0 and total > 0.0:
-                r2 = float(gain**2 / norm / total)
-                if r2 > best.r2 + 1e-9:
-                    best = AxisMap(axes, signs, float(gain / norm), r2)
+            gain = float(np.dot(signs, cross[straight, axes]))
+            if gain > 0.0 and gain**2 / whole > best.r2 + 1e-9:
+                best = AxisMap(axes, signs, gain / size, gain**2 / whole)
     return best
 
 

@@ -187,13 +187,8 @@ def is_turning(gyro: Channel | None, spans: Spans, least: float) -> bool:
 def _stands(t: FloatArray, thrust: FloatArray, felt: FloatArray, gyro: Channel | None) -> BoolArray:
     """Times at which something else carries the vehicle: its weight is felt, its rotors give less, it does not turn.
 
-    For 0.3 s they give less than three quarters of what is felt, and rates stay below 0.15 rad/s.
-
-    Args:
-        t: times (n,).
-        thrust: over what usually carries the weight (n,).
-        felt: specific force [g] (n,).
-        gyro: rates; without them nothing is found.
+    For 0.3 s they give less than three quarters of what is felt, and rates stay below 0.15 rad/s; without rates nothing
+    is found.  `thrust` is over what usually carries the weight, `felt` is the specific force [g], at times t [s].
     """
     if gyro is None or len(t) < 3:
         return np.zeros(len(t), dtype=bool)

@@ -272,13 +272,9 @@ def _floor(window: Window, thrust: FloatArray) -> str:
 
 
 def mistake(cut: WindowCut, vehicle: Vehicle, known: bool) -> str:
-    """Names the wrong unit or frame, or the wrong order of rotors, that would be fitted into the parameters.
+    """Names the wrong unit or frame, or order of rotors, that would be fitted, and how to mend it; empty for nothing.
 
-    Args:
-        known: whether it was identified: then its rotors are in order.
-
-    Returns:
-        What is wrong and how to mend it; empty for nothing.
+    Rotors of a vehicle that is `known`, for it was identified, are in order.
     """
     if (fault := wrong_unit(cut.windows)) or known:
         return fault
