@@ -11,7 +11,7 @@ import numpy as np
 
 from quadid.checks.findings import ERROR, OK, UNKNOWN, WARNING, Check, Off, estimates_off, farthest, rotors_off
 from quadid.checks.frames import tapered_spectra
-from quadid.checks.motion import HOPELESS, MOVING, STUCK, Log, Spans, is_turning, within
+from quadid.checks.motion import FEWEST_SAMPLES, HOPELESS, MOVING, STUCK, Log, Spans, is_turning, within
 from quadid.chi_square import exceeded
 from quadid.data.grid import bridged, linear, moving_mean, to_windows
 from quadid.data.rotor_signal import INERTIA_RATE, RotorSignal
@@ -36,7 +36,7 @@ def readings_check(log: Log) -> Check | None:
         return None
     inside = within(signal.t, log.spans)
     t, speeds = signal.t[inside], signal.values[inside]
-    if len(t) < 20:
+    if len(t) < FEWEST_SAMPLES:
         return None
     commands, gyro = log.commanded, log.recording.channels.get("gyro")
 
@@ -107,7 +107,7 @@ def rotor_speed_check(log: Log) -> Check:
     signal, spans, accel = log.signal, log.spans, log.recording.channels.get("accel")
     # Means over half a second are compared: fast motion has passed by then.
     edges = np.arange(spans[0][0], spans[-1][1] + 0.25, 0.5) if spans else np.empty(0)
-    if len(edges) < 4 or np.count_nonzero(within(signal.t, spans)) < 20:
+    if len(edges) < 4 or np.count_nonzero(within(signal.t, spans)) < FEWEST_SAMPLES:
         return _speeds_are(UNKNOWN, "too little flight to compare the rotors")
     flown = np.any([(edges[:-1] >= a) & (edges[1:] <= b) for a, b in spans], axis=0)
 
@@ -535,7 +535,7 @@ def lagged_motion(log: Log) -> Lagged | str:
 
 def lagged_of(windows: Sequence[Window], vehicle: Vehicle, rate: float) -> Lagged | str:
     """As `lagged_motion`, of windows in flight, with rotor readings at `rate` [Hz]."""
-    if rate < 30.0:
+    if rate < INERTIA_RATE:
         return f"rotor signal at {rate:.3g} Hz is too slow to check the motor order"
     windows = [replace(w, rotor_speed=_turned(w, vehicle)) for w in windows]
     thrust, b = ThrustModel.stated(vehicle), vehicle.parameters["b"].initial

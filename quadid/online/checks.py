@@ -104,17 +104,12 @@ class Consistency:
 
     def factors(self) -> tuple[Factor, ...]:
         """Every factor of which there are data: of the gyro by axis, what leaks into it, of the accelerometer."""
-        found = [
-            f
-            for axis, t in enumerate(self._turns)
-            if t.seconds > FEWEST * TURN
-            for f in factors(axis, t.seconds, t.sum)
-        ]
-        if self._force.seconds > 0.0:
+        told = [(axis, t) for axis, t in enumerate(self._turns) if t.seconds > FEWEST * TURN]
+        found = [f for axis, t in told for f in factors(axis, t.seconds, t.sum)]
+        if (seconds := self._force.seconds) > 0.0:
             # The mean of an acceleration is a change of velocity, which stays within 1.5 m/s, over a time.
-            sigma = math.sqrt(2.0) * 1.5 / self._force.seconds / GRAVITY
-            mean = float(self._force.sum) / self._force.seconds / GRAVITY
-            found.append(Factor(GRAVITY_FACTOR, mean, sigma))
+            sigma = math.sqrt(2.0) * 1.5 / seconds / GRAVITY
+            found.append(Factor(GRAVITY_FACTOR, float(self._force.sum) / seconds / GRAVITY, sigma))
         return tuple(found)
 
     @property
