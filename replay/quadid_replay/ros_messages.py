@@ -148,8 +148,8 @@ def _runs(*names: str, some: bool = False) -> Callable[[list[FloatArray], Any], 
     return lambda runs, extra: [(n, run, run.shape[1] > 0 or not some) for n, run in zip(names, runs, strict=True)]
 
 
-def _run(*paths: str) -> Callable[[Any], list[float]]:
-    """The numbers of a message in fields of these names, arrays whole; ``.xyzw`` stands for four fields."""
+def _run(*paths: str) -> tuple[Callable[[Any], list[float]]]:
+    """One run: the numbers in fields of these names, arrays whole; ``.xyzw`` stands for four fields."""
     fields: list[str] = []
     for stem, dot, axes in (path.rpartition(".") for path in paths):
         fields += [f"{stem}.{axis}" for axis in axes] if axes in ("xyz", "xyzw") else [stem + dot + axes]
@@ -164,7 +164,7 @@ def _run(*paths: str) -> Callable[[Any], list[float]]:
                 out.append(value)
         return out
 
-    return numbers
+    return (numbers,)
 
 
 def _wxyz(q: FloatArray) -> FloatArray:
@@ -214,9 +214,9 @@ def _px4_stamp(m: Any) -> int:
     return int(getattr(m, "timestamp_sample", 0) or m.timestamp) * 1000
 
 
-def _px4(name: str, values: Callable[[Any], Sequence[float]], published: bool = False) -> MessageType:
+def _px4(name: str, runs: tuple[Callable[[Any], Sequence[float]], ...], published: bool = False) -> MessageType:
     stamp = (lambda m: int(m.timestamp) * 1000) if published else _px4_stamp
-    return MessageType((values,), _runs(name), stamp=stamp)
+    return MessageType(runs, _runs(name), stamp=stamp)
 
 
 def _px4_speeds(m: Any) -> list[float]:
@@ -238,64 +238,56 @@ def _escs(name: str) -> MessageType:
 
 def _actuators(speed: str) -> MessageType:
     """mav_msgs (RotorS: angular_velocities) and actuator_msgs (Gazebo: velocity), both with `normalized`."""
-    return MessageType((_run(speed), _run("normalized")), _runs("rotor_speed", "motor_command", some=True))
+    return MessageType(_run(speed) + _run("normalized"), _runs("rotor_speed", "motor_command", some=True))
 
 
 def _set_if(valid: bool, values: list[float]) -> list[float]:
     return values if valid else [float("nan")] * len(values)
 
 
-_POSE, _TWIST = ("position.xyz", "orientation.xyzw"), ("linear.xyz", "angular.xyz")
+_IMU = (
+    *("orientation.xyzw", "orientation_covariance"),
+    *("angular_velocity.xyz", "angular_velocity_covariance"),
+    *("linear_acceleration.xyz", "linear_acceleration_covariance"),
+)
+_ODOMETRY = (
+    *("pose.pose.position.xyz", "pose.pose.orientation.xyzw", "pose.covariance"),
+    *("twist.twist.linear.xyz", "twist.twist.angular.xyz", "twist.covariance"),
+)
 TYPES: dict[str, MessageType] = {
-    "sensor_msgs/Imu": MessageType(
-        (
-            _run(
-                *("orientation.xyzw", "orientation_covariance"),
-                *("angular_velocity.xyz", "angular_velocity_covariance"),
-                *("linear_acceleration.xyz", "linear_acceleration_covariance"),
-            ),
-        ),
-        _imu_signals,
-    ),
+    "sensor_msgs/Imu": MessageType(_run(*_IMU), _imu_signals),
     "geometry_msgs/QuaternionStamped": MessageType(
-        (_run("quaternion.xyzw"),), lambda runs, extra: [("attitude", _wxyz(runs[0]), True)]
+        _run("quaternion.xyzw"), lambda runs, extra: [("attitude", _wxyz(runs[0]), True)]
     ),
-    "sensor_msgs/JointState": MessageType((_run("velocity"), _run("effort")), _joint_signals, _joint_order),
+    "sensor_msgs/JointState": MessageType(_run("velocity") + _run("effort"), _joint_signals, _joint_order),
     "nav_msgs/Odometry": MessageType(
-        (
-            _run(
-                *(*(f"pose.pose.{field}" for field in _POSE), "pose.covariance"),
-                *(*(f"twist.twist.{field}" for field in _TWIST), "twist.covariance"),
-            ),
-        ),
-        _odometry_signals,
-        extra=lambda m: m.child_frame_id == m.header.frame_id,
+        _run(*_ODOMETRY), _odometry_signals, lambda m: m.child_frame_id == m.header.frame_id
     ),
     "geometry_msgs/PoseStamped": MessageType(
-        (_run(*(f"pose.{field}" for field in _POSE)),),
+        _run("pose.position.xyz", "pose.orientation.xyzw"),
         lambda runs, extra: [("position", runs[0][:, :3], True), ("pose_attitude", _wxyz(runs[0][:, 3:]), True)],
     ),
     "geometry_msgs/TwistStamped": MessageType(
-        (_run(*(f"twist.{field}" for field in _TWIST)),), lambda runs, extra: [("velocity", runs[0][:, :3], True)]
+        _run("twist.linear.xyz", "twist.angular.xyz"), lambda runs, extra: [("velocity", runs[0][:, :3], True)]
     ),
-    "sensor_msgs/BatteryState": MessageType((_run("voltage"),), _runs("battery")),
-    "quadid_msgs/AttitudeCommand": MessageType((_run("roll", "pitch", "yaw", "throttle"),), _runs("euler_reference")),
-    "quadid_msgs/MotorCommand": MessageType((_run("values"),), _runs("motor_command")),
-    "mavros_msgs/RCOut": MessageType((_run("channels"),), _runs("outputs")),
+    "sensor_msgs/BatteryState": MessageType(_run("voltage"), _runs("battery")),
+    "quadid_msgs/AttitudeCommand": MessageType(_run("roll", "pitch", "yaw", "throttle"), _runs("euler_reference")),
+    "quadid_msgs/MotorCommand": MessageType(_run("values"), _runs("motor_command")),
+    "mavros_msgs/RCOut": MessageType(_run("channels"), _runs("outputs")),
     "mavros_msgs/ESCStatus": _escs("esc_status"),
     "mavros_msgs/ESCTelemetry": _escs("esc_telemetry"),
     "mavros_msgs/AttitudeTarget": MessageType(
-        (_run("orientation.w", "orientation.xyz", "thrust"),), _runs("quaternion_reference")
+        _run("orientation.w", "orientation.xyz", "thrust"), _runs("quaternion_reference")
     ),
     "mav_msgs/Actuators": _actuators("angular_velocities"),
     "actuator_msgs/Actuators": _actuators("velocity"),
     "px4_msgs/SensorCombined": MessageType(
-        (_run("gyro_rad"), _run("accelerometer_m_s2")),
+        _run("gyro_rad") + _run("accelerometer_m_s2"),
         _runs("gyro", "accel"),
         stamp=lambda m: int(m.timestamp - 0.5 * m.gyro_integral_dt) * 1000,  # a mean counts at its middle
     ),
     "px4_msgs/VehicleAttitude": _px4("frd_attitude", _run("q")),
-    "px4_msgs/VehicleAttitudeSetpoint": _px4("frd_reference", lambda m: [*m.q_d, -m.thrust_body[2]], True),
+    "px4_msgs/VehicleAttitudeSetpoint": _px4("frd_reference", (lambda m: [*m.q_d, -m.thrust_body[2]],), True),
     "px4_msgs/VehicleLocalPosition": MessageType(
         (lambda m: _set_if(m.xy_valid, [m.x, m.y, m.z]), lambda m: _set_if(m.v_xy_valid, [m.vx, m.vy, m.vz])),
         _runs("ned_position", "ned_velocity"),
@@ -304,7 +296,7 @@ TYPES: dict[str, MessageType] = {
     "px4_msgs/BatteryStatus": _px4("battery", _run("voltage_v"), True),
     "px4_msgs/ActuatorMotors": _px4("actuator_motors", _run("control"), True),
     "px4_msgs/ActuatorOutputs": _px4("outputs", _run("output"), True),
-    "px4_msgs/EscStatus": _px4("rotor_speed", _px4_speeds, True),
+    "px4_msgs/EscStatus": _px4("rotor_speed", (_px4_speeds,), True),
     "px4_msgs/VehicleStatus": _px4("vehicle_kind", _run("system_type"), True),
 }
 """Message types that are read, without the ``msg`` in the middle of their name."""
