@@ -392,39 +392,37 @@ def clean_channel(raw: RawChannel) -> Channel:
     Dropped: refused stamps, values that are not finite or absurd, single impossible readings, repeated stamps, samples
     out of order, quaternions that are none.
     """
-    stamped = np.isfinite(raw.t)
-    t, values = (raw.t, raw.values) if stamped.all() else (raw.t[stamped], raw.values[stamped])
-    faults = {"bad_stamp": len(stamped) - len(t)}
-    finite = np.asarray(np.isfinite(values).all(axis=1))
-    faults["not_finite"] = int(np.count_nonzero(~finite))
-    absurd = finite & (np.abs(values) > _ABSURD).any(axis=1)
-    faults["absurd"] = int(np.count_nonzero(absurd))
-    finite &= ~absurd
-    known = np.flatnonzero(finite)
-    slow = len(known) > 1 and raw.name in ("gyro", "accel") and float(np.median(np.diff(t[known]))) > _SLOW
+    t, values = raw.t, raw.values
+    faults: dict[str, int] = {}
+
+    def keep(good: BoolArray, reason: str) -> None:
+        nonlocal t, values
+        faults[reason] = faults.get(reason, 0) + int(np.count_nonzero(~good))
+        t, values = (t, values) if good.all() else (t[good], values[good])
+
+    keep(np.isfinite(t), "bad_stamp")
+    keep(np.asarray(np.isfinite(values).all(axis=1)), "not_finite")
+    keep(np.asarray((np.abs(values) <= _ABSURD).all(axis=1)), "absurd")
+    slow = len(t) > 1 and raw.name in ("gyro", "accel") and float(np.median(np.diff(t))) > _SLOW
     if raw.name in (*_MEASURED, "motor_command") and not slow:
         kind = raw.name == "rotor_speed", raw.name == "motor_command"
-        far = np.array([spikes(column, *kind) for column in values[known].T]).any(axis=0)
-        faults["impossible"] = raw.spikes + int(np.count_nonzero(far))
-        finite[known[far]] = False
+        faults["impossible"] = raw.spikes
+        far = np.array([spikes(column, *kind) for column in values.T])
+        keep(np.asarray(~far.any(axis=0)), "impossible")
     if raw.name == "attitude":
         values, good = unit_quaternions(values)
-        faults["not_attitude"] = int(np.count_nonzero(finite & ~good))
-        finite &= good
-    t, values = t[finite], values[finite]
-    if len(t) == 0:
-        return Channel(raw.name, t, values, raw.source, {k: n for k, n in faults.items() if n})
-    kept = rising(t)
-    before = np.maximum.accumulate(np.where(kept, np.arange(len(t)), 0))
-    faults["duplicate"] = int(np.count_nonzero(t[~kept] == t[before[~kept]]))
-    faults["backwards"] = int(np.count_nonzero(~kept)) - faults["duplicate"]
-    t, values = t[kept], values[kept]
-    begin, end = _confirmed(t)
-    faults["bad_stamp"] += len(t) - (end - begin)
-    t, values = t[begin:end], values[begin:end]
-    if raw.name == "attitude":
-        values = continuous_sign(values)
-    return Channel(raw.name, t, values, raw.source, {k: n for k, n in faults.items() if n})
+        keep(good, "not_attitude")
+    if len(t):
+        kept = rising(t)
+        before = np.maximum.accumulate(np.where(kept, np.arange(len(t)), 0))
+        faults["duplicate"] = int(np.count_nonzero(t[~kept] == t[before[~kept]]))
+        keep(kept, "backwards")
+        faults["backwards"] -= faults["duplicate"]
+        begin, end = _confirmed(t)
+        faults["bad_stamp"] += len(t) - (end - begin)
+        t, values = t[begin:end], values[begin:end]
+        values = continuous_sign(values) if raw.name == "attitude" else values
+    return Channel(raw.name, t, values, raw.source, {reason: n for reason, n in faults.items() if n})
 
 
 def assemble(
