@@ -38,14 +38,18 @@ class Topic(NamedTuple):
     unread: str = ""
 
 
-def usable_definition(kind: str, encoding: str, text: str) -> str:
-    """Returns the definition of a message type as ``ros2msg``: the one held, else that of `quadid_replay.schemas`.
+def described_topic(name: str, kind: str, encoding: str, form: str = "", text: str = "") -> Topic:
+    """The topic that a file describes; its definition is the one held, else that of `quadid_replay.schemas`.
 
-    Empty where there is none: an IDL (``ros2idl``), or none at all, of a type that is not known here.
+    Args:
+        name: of the topic, kind of its messages, and their encoding, as the file has them.
+        form: of the definition held, ``ros2msg`` or ``ros2idl``; empty where there is none.
+        text: the definition held.
     """
-    if encoding == "ros2msg" and text:
-        return text
-    return schema_text(kind) if "/" in kind and has_definition(kind) else ""
+    known = "/" in kind and has_definition(kind)
+    definition = text if form == "ros2msg" and text else schema_text(kind) if known else ""
+    unread = f"{plain(kind, 60)} is described in IDL" if form == "ros2idl" else ""
+    return Topic(plain(name), plain(kind), definition, plain(encoding), unread)
 
 
 # --- Metadata records at the beginning of an MCAP file, as `TopicWriter` puts them there
@@ -150,11 +154,8 @@ class McapFile:
         out = {}
         for number, channel in self._channels.items():
             schema = self._schemas.get(channel.schema_id)
-            held = schema.data.decode("utf-8", "replace") if schema else ""
-            text = usable_definition(schema.name, schema.encoding, held) if schema else ""
-            kind = schema.name if schema else ""
-            idl = f"{plain(schema.name, 60)} is described in IDL" if schema and schema.encoding == "ros2idl" else ""
-            out[number] = Topic(plain(channel.topic), plain(kind), text, plain(channel.message_encoding), idl)
+            told = (schema.encoding, schema.data.decode("utf-8", "replace")) if schema else ("", "")
+            out[number] = described_topic(channel.topic, schema.name if schema else "", channel.message_encoding, *told)
         return out
 
     def messages(self, wanted: Set[int]) -> Iterator[Message]:

@@ -17,7 +17,7 @@ from quadid.errors import LogError
 from quadid.sanitise import plain
 from quadid.types import FloatArray
 from quadid_replay.columns import RawChannel, assemble, fastest_first
-from quadid_replay.mcap_file import McapFile, Message, Topic, usable_definition
+from quadid_replay.mcap_file import McapFile, Message, Topic, described_topic
 from quadid_replay.motors import active_outputs, no_multirotor
 from quadid_replay.ros_messages import (
     AUTO,
@@ -114,13 +114,11 @@ class Database:
             query = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
             definitions = {str(k): (str(e), str(t)) for k, e, t in self._connection.execute(query)}
         rows = self._connection.execute("SELECT id, name, type, serialization_format FROM topics")
-        out = {}
-        for number, name, kind, encoding in rows:
-            if not isinstance(number, int):
-                continue
-            text = usable_definition(str(kind), *definitions.get(str(kind), ("", "")))
-            out[number] = Topic(plain(str(name)), plain(str(kind)), text, plain(str(encoding)))
-        return out
+        return {
+            number: described_topic(str(name), str(kind), str(encoding), *definitions.get(str(kind), ()))
+            for number, name, kind, encoding in rows
+            if isinstance(number, int)
+        }
 
     def _damaged(self, error: Exception) -> LogError:
         why = plain(str(error), 80) or "sizes that cannot be"
