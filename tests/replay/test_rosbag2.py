@@ -163,3 +163,13 @@ def test_a_database_whose_messages_are_computed_is_refused(tmp_path: Path, messa
     with pytest.raises(LogError, match="memory|no usable flight data|no rosbag2") as told:
         open_log(path)
     happened(25, f"rosbag2 of {path.stat().st_size >> 10} kB with '{messages[:40]}...': {str(told.value)[:80]}")
+
+
+def test_a_type_of_a_database_that_is_described_in_idl_is_named(tmp_path: Path, mcap: Path) -> None:
+    (database,) = folder_of(mcap, tmp_path / "bag", StoragePlugin.SQLITE3).glob("*.db3")
+    with sqlite3.connect(database) as connection:
+        connection.execute("UPDATE topics SET type = 'my_msgs/msg/Rpm' WHERE name LIKE '%battery'")
+        told = ("my_msgs/msg/Rpm", "ros2idl", "module my_msgs {};", "")
+        connection.execute("INSERT INTO message_definitions VALUES (NULL, ?, ?, ?, ?)", told)
+    connection.close()
+    assert any("battery" in note and "IDL" in note for note in open_log(database).warnings)
