@@ -200,12 +200,17 @@ def _l_shade(ledger: Ledger, start: FloatArray, seed: int) -> Stop:
     return Stop.CONVERGED if solver.stop is LShadeStop.CONVERGED else Stop.BUDGET
 
 
-def _particles(n: int, budget: int) -> int:
-    return max(SMALLEST_POPULATION, min(4 * n, 64, budget // 10))
+def algorithm_1(iterations: int) -> SwarmOptions:
+    """The paper's Algorithm 1 as printed; the weight and the coefficients, not printed, are those of Shi & Eberhart."""
+    return SwarmOptions("inertia", 2.0, 2.0, 0.9, 0.4, "in_turn", "clamp", None, iterations, patience=None)
 
 
-def _swarm(ledger: Ledger, start: FloatArray, seed: int, particles: int, options: SwarmOptions) -> Stop:
+def _swarm(ledger: Ledger, start: FloatArray, seed: int, budget: int, kept: int = 0, printed: bool = False) -> Stop:
+    """4 n particles that leave `kept` iterations of the budget; as published, or `printed`: the paper's Algorithm 1."""
     n = len(start)
+    particles = max(SMALLEST_POPULATION, min(4 * n, 64, budget // 10))
+    iterations = max(budget // particles - kept, 1)
+    options = algorithm_1(iterations) if printed else SwarmOptions(iterations=iterations, initial_points=start)
     swarm = Swarm(np.zeros(n), np.ones(n), particles, seed, options)
     while swarm.stop is SwarmStop.RUNNING:
         swarm.tell(ledger.cost(swarm.ask()))
@@ -214,30 +219,19 @@ def _swarm(ledger: Ledger, start: FloatArray, seed: int, particles: int, options
 
 
 def _pso(ledger: Ledger, start: FloatArray, seed: int) -> Stop:
-    """The constriction swarm, 4 n particles, the start among them."""
-    particles = _particles(len(start), ledger.budget)
-    options = SwarmOptions(iterations=ledger.budget // particles, initial_points=start)
-    return _swarm(ledger, start, seed, particles, options)
-
-
-def algorithm_1(iterations: int) -> SwarmOptions:
-    """The paper's Algorithm 1 as printed; the weight and the coefficients, not printed, are those of Shi & Eberhart."""
-    return SwarmOptions("inertia", 2.0, 2.0, 0.9, 0.4, "in_turn", "clamp", None, iterations, patience=None)
+    """The constriction swarm, the start among its particles."""
+    return _swarm(ledger, start, seed, ledger.budget)
 
 
 def _pso_algorithm_1(ledger: Ledger, start: FloatArray, seed: int) -> Stop:
     """The paper's Algorithm 1 as printed: one particle at a time, all particles random, inertia weight 0.9 to 0.4."""
-    particles = _particles(len(start), ledger.budget)
     ledger.cost(start[None])
-    return _swarm(ledger, start, seed, particles, algorithm_1(ledger.budget // particles))
+    return _swarm(ledger, start, seed, ledger.budget, printed=True)
 
 
 def _pso_polish(ledger: Ledger, start: FloatArray, seed: int) -> Stop:
     """A short swarm to find the basin (64 n evaluations, at most half the budget), then a local search."""
-    n, swarm_budget = len(start), min(64 * len(start), ledger.budget // 2)
-    particles = _particles(n, swarm_budget)
-    options = SwarmOptions(iterations=max(swarm_budget // particles - 1, 1), initial_points=start)
-    _swarm(ledger, start, seed, particles, options)
+    _swarm(ledger, start, seed, min(64 * len(start), ledger.budget // 2), kept=1)
     return _least_squares(ledger, start if ledger.best is None else ledger.best, seed)
 
 

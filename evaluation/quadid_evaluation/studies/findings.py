@@ -4,7 +4,6 @@
 """
 
 import ast
-import csv
 import json
 import os
 import re
@@ -17,10 +16,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import pandas
+
 from quadid_evaluation.harness import QUADID, options
 
 Answer = tuple[int, str, Mapping[str, Any]]
 """Exit code, what was said (stdout and stderr), and the JSON."""
+Call = Callable[[Path, Path], Sequence[str | Path]]
+"""Arguments of a command, of the folder of a finding and of one to write into."""
 
 
 def answer_of(arguments: Sequence[str | Path]) -> Answer:
@@ -47,12 +50,11 @@ class Finding:
     Attributes:
         folder: of the findings, below the data.
         what: done wrong, or meant, in a few words.
-        call: arguments of the command, of the folder and of one to write into.
     """
 
     folder: str
     what: str
-    call: Callable[[Path, Path], Sequence[str | Path]]
+    call: Call
     right: Callable[[Answer], bool]
     numbers: Callable[[Answer], str] = lambda answer: ""
 
@@ -82,7 +84,7 @@ def parameter(answer: Answer, name: str) -> float:
     return float(next(found, float("nan")))
 
 
-def inspect(log: str, vehicle: str = "") -> Callable[[Path, Path], Sequence[str | Path]]:
+def inspect(log: str, vehicle: str = "") -> Call:
     """Inspects a file of the folder, with a vehicle file of it, or a shipped one."""
     return lambda folder, out: ["inspect", folder / log, *_vehicle(folder, vehicle)]
 
@@ -91,7 +93,7 @@ def _vehicle(folder: Path, vehicle: str) -> list[str | Path]:
     return ["--vehicle", folder / vehicle if vehicle.endswith(".yaml") else vehicle] if vehicle else []
 
 
-def initialised(log: str) -> Callable[[Path, Path], Sequence[str | Path]]:
+def initialised(log: str) -> Call:
     """Inspects a log with the vehicle file that `init` makes of it."""
 
     def call(folder: Path, out: Path) -> Sequence[str | Path]:
@@ -101,25 +103,19 @@ def initialised(log: str) -> Callable[[Path, Path], Sequence[str | Path]]:
     return call
 
 
-def changed(
-    log: str, vehicle: str, change: Callable[[list[str], int, Mapping[str, int]], None]
-) -> Callable[[Path, Path], Sequence[str | Path]]:
-    """Inspects a CSV of the folder whose rows `change` alters: row, its number, and places of the columns."""
+def changed(log: str, vehicle: str, change: Callable[[pandas.DataFrame], None]) -> Call:
+    """Inspects a CSV of the folder whose columns of text `change` alters."""
 
     def call(folder: Path, out: Path) -> Sequence[str | Path]:
-        with (folder / log).open(newline="") as source, (out / "log.csv").open("w", newline="") as written:
-            rows, to = csv.reader(source), csv.writer(written)
-            head = next(rows)
-            to.writerow(head)
-            for number, row in enumerate(rows):
-                change(row, number, {name: k for k, name in enumerate(head)})
-                to.writerow(row)
+        rows = pandas.read_csv(folder / log, dtype=str)
+        change(rows)
+        rows.to_csv(out / "log.csv", index=False)
         return ["inspect", out / "log.csv", *_vehicle(folder, vehicle)]
 
     return call
 
 
-def script(log: str, vehicle: str) -> Callable[[Path, Path], Sequence[str | Path]]:
+def script(log: str, vehicle: str) -> Call:
     """Runs the folder's `mk.py`, and inspects what it writes."""
 
     def call(folder: Path, out: Path) -> Sequence[str | Path]:
@@ -130,21 +126,19 @@ def script(log: str, vehicle: str) -> Callable[[Path, Path], Sequence[str | Path
     return call
 
 
-def exchanged(row: list[str], number: int, at: Mapping[str, int]) -> None:
+def exchanged(rows: pandas.DataFrame) -> None:
     """Motors 1 and 3 exchanged."""
-    row[at["w1"]], row[at["w3"]] = row[at["w3"]], row[at["w1"]]
+    rows[["w1", "w3"]] = rows[["w3", "w1"]].to_numpy()
 
 
-def climbing(row: list[str], number: int, at: Mapping[str, int]) -> None:
+def climbing(rows: pandas.DataFrame) -> None:
     """Vertical velocity upwards."""
-    row[at["vz"]] = str(-float(row[at["vz"]]))
+    rows["vz"] = (-rows["vz"].astype(float)).astype(str)
 
 
-def dropped(row: list[str], number: int, at: Mapping[str, int]) -> None:
+def dropped(rows: pandas.DataFrame) -> None:
     """One frame in two hundred without rotor speeds."""
-    if number % 200 == 100:
-        for k in range(1, 7):
-            row[at[f"w{k}"]] = "0"
+    rows.loc[100::200, [f"w{k}" for k in range(1, 7)]] = "0"
 
 
 LOGS: tuple[Finding, ...] = (
@@ -203,7 +197,7 @@ _HEXA = "vehicles/2_hexa_wrong_logs"
 _X8 = "vehicles/5_x8_feedback_and_health"
 
 
-def compared(log: str) -> Callable[[Path, Path], Sequence[str | Path]]:
+def compared(log: str) -> Call:
     """Compares a flight of the folder with its five healthy ones."""
     return lambda folder, out: [
         "health",
@@ -258,7 +252,7 @@ MOVED = {"push_block": "push", "resampler._due": "resampler._stretches"}
 """Names that the attacks' scripts call by an old one; old paths of modules are known once quadid is imported."""
 
 
-def attack(lines: str) -> Callable[[Path, Path], Sequence[str | Path]]:
+def attack(lines: str) -> Call:
     """Runs lines of Bash in a copy of the folder, beside copies of the other attacks."""
 
     def call(folder: Path, out: Path) -> Sequence[str | Path]:
