@@ -200,7 +200,7 @@ def flown(case: Case) -> tuple[Window, Window, Vehicle]:
     craft = shipped(case)
     truth = draw_truth(craft, case.seed)
     extras = tuple(sorted(needs(case) & {"velocity", "position", "battery"}))
-    how = {"effects": case.hidden, "outside": case.outside, "extras": extras}
+    how: dict[str, Any] = {"effects": case.hidden, "outside": case.outside, "extras": extras}
     first, second = (fly(craft, truth, case.seconds, case.seed + 7919 * k, **how).window for k in range(2))
     return first, second, guessed_vehicle(case, truth.as_dict())
 

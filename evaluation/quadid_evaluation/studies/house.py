@@ -149,14 +149,14 @@ def _fly_through(log: Path, vehicle: Vehicle, folder: Path, follow: Callable[[],
 
     file, inputs = McapFile(log), {entry.topic: entry for entry in source("canonical").inputs}
     topics = file.topics
-    stamps, chooser = [0.0], SourceSelector(best_ranks(list(inputs.values())))
+    stamps, chooser = [0.0], SourceSelector(best_ranks(tuple(inputs.values())))
     intake, arrived = Intake(lambda: stamps[0]), dict[str, list[bytes]]()
     for topic in topics.values():
         entry = inputs[topic.name]
         decode = generate_dynamic(topic.type, topic.definition)[topic.type]
         queue = arrived[topic.name] = []
         decoder = Decoder(entry, chooser, len(vehicle.rotors), decode)
-        intake.open(entry, topic.name, decoder, lambda queue=queue: queue.pop(0) if queue else None)
+        intake.open(entry, topic.name, decoder, lambda queue=queue: queue.pop(0) if queue else None)  # type: ignore[misc]
     service = Service(
         vehicle, SessionSettings(), InlineWorker(), Store(folder / f"{time.monotonic_ns()}.db", vehicle.name)
     )

@@ -159,7 +159,7 @@ def px4(recording: Recording) -> Rows:
             t,
             "fmu/out/vehicle_attitude",
             "px4_msgs/VehicleAttitude",
-            lambda at, q=q: stamped(at, timestamp_sample=round(at * 1e6), q=q),
+            lambda at, q=q: stamped(at, timestamp_sample=round(at * 1e6), q=q),  # type: ignore[misc]
         )
     for t, speeds in zip(rotors.t, rotors.values, strict=True):
         reports = [{"esc_rpm": round(w / RPM), "actuator_function": 101 + i} for i, w in enumerate(speeds)]
@@ -176,7 +176,7 @@ def mavros(recording: Recording) -> Rows:
         return {"header": _header(at), **fields}
 
     for t, rates, force in zip(gyro.t, flip_body(gyro.values), flip_body(accel.values), strict=True):
-        motion = {"angular_velocity": _axes("xyz", rates), "linear_acceleration": _axes("xyz", force)}
+        motion: dict[str, Any] = {"angular_velocity": _axes("xyz", rates), "linear_acceleration": _axes("xyz", force)}
         fields = partial(stamped, orientation_covariance=absent, **motion)
         yield t, "mavros/imu/data_raw", "sensor_msgs/Imu", fields
     for t, q in zip(attitude.t, flip_attitude(attitude.values), strict=True):

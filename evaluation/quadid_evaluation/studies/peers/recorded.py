@@ -66,7 +66,7 @@ def recorded(name: str, data: Path) -> Flights:
 def rows(name: str, flights: Flights) -> Iterator[tuple[str, ...]]:
     """A row a program: errors, intervals, prediction of unseen flights, processor time."""
     vehicle, known = flights.vehicle, [n for n in NOMINAL_NAMES if n in flights.truth]
-    ours = {}
+    ours: dict[str, tuple[Any, float]] = {}
     for command in (quadid.identify, quadid.diagnose):
         begin = time.process_time()
         ours[command.__name__] = command(flights.train), time.process_time() - begin
@@ -86,13 +86,13 @@ def rows(name: str, flights: Flights) -> Iterator[tuple[str, ...]]:
         answers[f"quadid {program}"] = told, answer.vehicle, seconds
 
     seen = [w for log in flights.unseen for w in log.windows]
-    for program, (told, model, seconds) in answers.items():
+    for program, (found, model, seconds) in answers.items():
         cells, held = [], 0
         for n in known:
-            (low, high), (value, least, most, status) = flights.truth[n], told[n]
-            off = 100.0 * (value / np.clip(value, low, high) - 1.0)
+            (least, most), (value, low, high, status) = flights.truth[n], found[n]
+            off = 100.0 * (value / np.clip(value, least, most) - 1.0)
             cells.append(f"{n} {off:+.1f}" + (f" ({status})" if status not in ("", "identified") else ""))
-            held += bool(least <= high and low <= most)
+            held += bool(low <= most and least <= high)
         ahead = shares_of_no_change(seen, model, AHEAD)["rate"]
         yield name, program, ", ".join(cells), f"{held} of {len(known)}", f"{ahead:.2f}", f"{seconds:.1f}"
         name = ""
