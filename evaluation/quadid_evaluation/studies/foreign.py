@@ -16,9 +16,9 @@ from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from scipy.stats import binomtest
 
 import quadid
+from quadid.chi_square import Z95
 from quadid.data.window import Window
 from quadid.diagnosis import diagnose
 from quadid.errors import QuadidError
@@ -360,11 +360,12 @@ def bands(name: str, one: FlightSet, data: Path) -> list[Sequence[str]]:
 
 def _inside(counts: FloatArray, i: int) -> str:
     """Share inside one band, bold where it is not what is wanted, with its interval (Wilson 1927)."""
-    share, low, high = counts[i] / counts[-1], *WANTED.get(list(BANDS)[i], (0.0, 1.0))
-    around = binomtest(round(share * counts[-1] / PHASES), round(counts[-1] / PHASES)).proportion_ci(method="wilson")
+    n, share, (low, high) = counts[-1] / PHASES, counts[i] / counts[-1], WANTED.get(list(BANDS)[i], (0.0, 1.0))
+    middle = (share + 0.5 * Z95**2 / n) / (1.0 + Z95**2 / n)
+    half = Z95 * np.sqrt(share * (1.0 - share) / n + 0.25 * Z95**2 / n**2) / (1.0 + Z95**2 / n)
     text = f"{100.0 * share:.0f}"
     text = text if low <= share <= high else f"**{text}**"
-    return f"{text} [{100.0 * around.low:.0f}, {100.0 * around.high:.0f}]"
+    return f"{text} [{100.0 * (middle - half):.0f}, {100.0 * (middle + half):.0f}]"
 
 
 # --- The command
