@@ -313,10 +313,9 @@ class Service:
         """Snapshot for monitoring."""
         now = self._clock()
         feeds = {name: Feed(self._rate(name, now), max(self._looked - at, 0.0)) for name, at in self._arrived.items()}
-        restarts = getattr(self._worker, "restarts", 0)
         history = self._store.problem if self._store is not None else NO_HISTORY
         status = replace(self.session.status(), backlog=max((s for _, s in self._behind), default=0.0))
-        return ServiceHealth(status, feeds, self._worker.state, restarts, history, self._fit_seconds)
+        return ServiceHealth(status, feeds, self._worker.state, self._worker.restarts, history, self._fit_seconds)
 
     def close(self) -> None:
         """Ends workers and history; what was journalled is on the disk afterwards."""

@@ -21,7 +21,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from queue import SimpleQueue
-from typing import Any, Protocol
+from typing import Any
 
 from quadid.online.records import UNEXPECTED, Job, JobReply
 from quadid.vehicle import Vehicle
@@ -95,35 +95,10 @@ class Trouble:
     text: str
 
 
-class Worker(Protocol):
-    """Interface of a worker for the service."""
-
-    def submit(self, request: Job) -> None:
-        """Begins a fit."""
-
-    def poll(self) -> list[JobReply | Trouble]:
-        """Events since the last call."""
-
-    @property
-    def ready(self) -> bool:
-        """Checks whether kernels are warm and a fit can begin at once."""
-
-    @property
-    def state(self) -> str:
-        """One word for monitors."""
-
-    def sibling(self) -> Worker:
-        """Another one of its kind, for diagnoses, which take longer than fits may wait."""
-
-    def close(self) -> None:
-        """Ends it."""
-
-
 class InlineWorker:
     """Fits in the caller's own process, when polled: for replays, where only the result matters."""
 
-    ready = True
-    state = "inline"
+    ready, state, restarts = True, "inline", 0
 
     def __init__(self) -> None:
         self._waiting: list[Job] = []
@@ -138,7 +113,7 @@ class InlineWorker:
         return [job.run() for job in waiting]
 
     def sibling(self) -> InlineWorker:
-        """Another one."""
+        """Another one, for diagnoses, which take longer than fits may wait."""
         return InlineWorker()
 
     def close(self) -> None:
@@ -149,7 +124,6 @@ class ProcessWorker:
     """Fits in a child process of low priority.
 
     Attributes:
-        state: ``starting``, ``idle``, ``busy``, ``resting`` (before a restart) or ``closed``.
         restarts: how often a child was replaced.
     """
 
@@ -176,13 +150,18 @@ class ProcessWorker:
         self._tries = self._failures = self.restarts = 0
         self._since = self._last_failure = -1e9
         self._out: list[JobReply | Trouble] = []
-        self.state = "starting"
+        self._state = "starting"
         self._start()
+
+    @property
+    def state(self) -> str:
+        """One word for monitors: ``starting``, ``idle``, ``busy``, ``resting`` (before a restart) or ``closed``."""
+        return self._state
 
     @property
     def ready(self) -> bool:
         """Checks whether kernels are warm and a fit can begin at once."""
-        return self.state in ("idle", "busy")
+        return self._state in ("idle", "busy")
 
     @property
     def pid(self) -> int:
@@ -192,12 +171,12 @@ class ProcessWorker:
     def submit(self, request: Job) -> None:
         """Gives the child a request, or keeps it until there is a child that can take it."""
         self._request, self._tries = request, 0
-        if self.state == "idle":
+        if self._state == "idle":
             self._give()
 
     def poll(self) -> list[JobReply | Trouble]:
         """Takes answers, checks on the child, restarts it when it is time; never blocks."""
-        if self.state == "resting" and self._clock() >= self._since:
+        if self._state == "resting" and self._clock() >= self._since:
             self._start()
         if self._child is not None:
             self._receive()
@@ -213,7 +192,7 @@ class ProcessWorker:
     def close(self) -> None:
         """Ends the child."""
         self._end_child()
-        self.state = "closed"
+        self._state = "closed"
 
     # --- the child
 
@@ -230,24 +209,24 @@ class ProcessWorker:
         self._asked.put(self._vehicle)
         talk = (self._child, self._asked, self._heard)
         threading.Thread(target=_talk, args=talk, name=self._name, daemon=True).start()
-        self.state, self._since = "starting", self._clock()
+        self._state, self._since = "starting", self._clock()
         self._warm_up = WarmUp(self._child.pid, self._clock)
 
     def _give(self) -> None:
         self._asked.put(self._request)
-        self.state, self._since = "busy", self._clock()
+        self._state, self._since = "busy", self._clock()
 
     def _receive(self) -> None:
         """Takes answers, and gives the child what waits for it."""
         while not self._heard.empty():
-            item, self.state = self._heard.get(), "idle"
+            item, self._state = self._heard.get(), "idle"
             if item != READY:
                 self._out.append(item)
                 if self._request is not None and item.number == self._request.number:
                     self._request = None  # else: asked while this one took too long
             if self._request is not None:
                 self._give()
-        if self._failures and self._clock() - self._last_failure > CALM and self.state == "idle":
+        if self._failures and self._clock() - self._last_failure > CALM and self._state == "idle":
             self._failures = 0
 
     def _failure(self, child: subprocess.Popen[bytes]) -> str:
@@ -255,9 +234,9 @@ class ProcessWorker:
         code = child.poll()
         if code is not None:
             return f"ended by signal {-code}" if code < 0 else f"ended with code {code}"
-        if self.state == "starting":
+        if self._state == "starting":
             return self._warm_up.given_up()
-        hangs = self.state == "busy" and self._clock() - self._since > self._limit
+        hangs = self._state == "busy" and self._clock() - self._since > self._limit
         return f"hung for {self._limit:g} s" if hangs else ""
 
     def _replace(self, why: str, died: bool) -> None:
@@ -266,7 +245,7 @@ class ProcessWorker:
         pause = BACKOFF[min(self._failures, len(BACKOFF) - 1)]
         self._failures, self.restarts = self._failures + 1, self.restarts + 1
         self._last_failure = self._clock()
-        self.state, self._since = "resting", self._clock() + pause
+        self._state, self._since = "resting", self._clock() + pause
         self._out.append(Trouble("warning", f"the {self._name} process {why}; the next one starts in {pause:g} s"))
         self._tries += 1
         if self._request is not None and self._tries >= TRIES:
@@ -282,6 +261,10 @@ class ProcessWorker:
         child.kill()
         child.wait()
         self._asked.put(None)
+
+
+Worker = InlineWorker | ProcessWorker
+"""Who fits for a service."""
 
 
 def _talk(child: subprocess.Popen[bytes], asked: SimpleQueue[Any], heard: SimpleQueue[Any]) -> None:

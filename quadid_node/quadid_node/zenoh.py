@@ -21,7 +21,7 @@ from quadid.vehicle import Vehicle
 from quadid_node.messages import RESULTS, Output, ServiceHealth, status_to_dict
 from quadid_node.service import Service
 from quadid_node.wire_format import LARGEST, ParcelError, pack, unpack
-from quadid_node.worker import MEMORY_MB, STUDY_LIMIT, ProcessWorker, Trouble, Worker
+from quadid_node.worker import MEMORY_MB, STUDY_LIMIT, ProcessWorker, Trouble
 
 # --- Opens Zenoh sessions: peers of this network, a locator, or a configuration file with TLS and access control
 
@@ -540,45 +540,35 @@ class Ground:
             self.alive.add(name)
 
 
-class RemoteWorker:
-    """Asks a ground machine; falls back to the child process on board when there is none.
+class RemoteWorker(ProcessWorker):
+    """Asks a ground machine; the child process on board fits when there is none.
 
     Attributes:
         far: how many answers came from a ground machine.
     """
 
-    def __init__(self, local: ProcessWorker, ground: Ground, clock: Callable[[], float] = time.monotonic) -> None:
-        """Takes over `local`, which is closed with it."""
-        self._local, self._ground, self._clock = local, ground, clock
+    def __init__(self, vehicle: Vehicle, ground: Ground, *options: Any) -> None:
+        """Starts the child on board, with the `options` of one."""
+        self._ground = ground
         self._answers: queue.Queue[tuple[int, Any]] = queue.Queue(MOST_ANSWERS)
-        self._asked: Job | None = None
+        self._sent: Job | None = None
         self._until = 0.0
-        self._out: list[JobReply | Trouble] = []
         self._was_there = False
         self.far = 0
-
-    @property
-    def ready(self) -> bool:
-        """Checks whether the child on board is warm: only then nothing depends on the ground machine."""
-        return self._local.ready
+        super().__init__(vehicle, *options)
 
     @property
     def state(self) -> str:
         """As of the child; ``busy`` while a ground machine fits."""
-        return "busy" if self._asked is not None else self._local.state
-
-    @property
-    def restarts(self) -> int:
-        """Of the child."""
-        return self._local.restarts
+        return "busy" if self._sent is not None else self._state
 
     def submit(self, request: Job) -> None:
         """Begins a fit on the ground, or on board."""
         if not self._ground.there:
-            self._local.submit(request)
+            super().submit(request)
             return
         limit = STUDY_LIMIT if request.background else FAR_LIMIT
-        self._asked, self._until = request, self._clock() + limit
+        self._sent, self._until = request, self._clock() + limit
         try:
             self._ground.ask(request, self._answers, limit)
         except zenoh.ZError as error:
@@ -586,27 +576,25 @@ class RemoteWorker:
 
     def poll(self) -> list[JobReply | Trouble]:
         """Replies of either; never waits."""
-        self._out += self._local.poll()
         while not self._answers.empty():
             number, data = self._answers.get_nowait()
-            if self._asked is not None and number == self._asked.number:
-                self._take(self._asked, data)
-        if self._asked is not None and (not self._ground.alive or self._clock() > self._until):
+            if self._sent is not None and number == self._sent.number:
+                self._take(self._sent, data)
+        if self._sent is not None and (not self._ground.alive or self._clock() > self._until):
             self._fall_back("does not answer" if self._ground.alive else "vanished")
         there = self._ground.there
         if there and not self._was_there:
             self._out.append(Trouble("info", "a ground machine is there: fits go to it"))
         self._was_there = there
-        out, self._out = self._out, []
-        return out
+        return super().poll()
 
     def sibling(self) -> "RemoteWorker":
         """Another one, for diagnoses, on the same way to the ground."""
-        return RemoteWorker(self._local.sibling(), self._ground, self._clock)
+        return RemoteWorker(self._vehicle, self._ground, self._memory, self._clock, "diagnosis", STUDY_LIMIT)
 
     def close(self) -> None:
         """Ends child and session."""
-        self._local.close()
+        super().close()
         self._ground.close()
 
     def _take(self, asked: Job, data: bytes | None) -> None:
@@ -620,24 +608,24 @@ class RemoteWorker:
         elif reply.is_unexpected:
             self._fall_back("fails at the request")
         else:
-            self._asked = None
+            self._sent = None
             self.far += 1
             sentences: dict[str, Any] = {n: one_line(text) for n, text in vars(reply).items() if isinstance(text, str)}
             self._out.append(replace(reply, **sentences))
 
     def _fall_back(self, why: str) -> None:
-        request, self._asked = self._asked, None
+        request, self._sent = self._sent, None
         self._ground.rest()
         self._was_there = False
         self._out.append(Trouble("warning", f"the ground machine {why}: work on board for {REST:g} s or longer"))
         if request is not None:
-            self._local.submit(request)
+            super().submit(request)
 
 
 # --- Who fits for a service: the child process on board, or a ground machine where one is asked for
 
 
-def fit_worker(vehicle: Vehicle, name: str, where: str = "", memory_mb: int = MEMORY_MB) -> Worker:
+def fit_worker(vehicle: Vehicle, name: str, where: str = "", memory_mb: int = MEMORY_MB) -> ProcessWorker:
     """The child process on board; with a place on Zenoh, one that lets ground machines there fit as well.
 
     Args:
@@ -647,6 +635,4 @@ def fit_worker(vehicle: Vehicle, name: str, where: str = "", memory_mb: int = ME
     Raises:
         ZenohError: a configuration that is none.
     """
-    ground = Ground(where, name) if where else None
-    local = ProcessWorker(vehicle, memory_mb)
-    return RemoteWorker(local, ground) if ground is not None else local
+    return RemoteWorker(vehicle, Ground(where, name), memory_mb) if where else ProcessWorker(vehicle, memory_mb)

@@ -98,9 +98,8 @@ def ground_machine(router: str) -> Iterator[Start]:
 
 @pytest.fixture
 def worker(router: str) -> Iterator[RemoteWorker]:
-    local = ProcessWorker(PELICAN)
-    assert until(lambda: local.poll() == [] and local.ready)
-    remote = RemoteWorker(local, Ground(router, "quad1"))
+    remote = RemoteWorker(PELICAN, Ground(router, "quad1"))
+    assert until(lambda: remote.poll() == [] and remote.ready)
     yield remote
     remote.close()
 
@@ -158,15 +157,18 @@ def test_a_ground_machine_fits_and_what_it_leaves_is_fitted_on_board(
     assert any("vanished" in text and "on board" in text for text in told)
 
 
-def test_sentences_of_a_ground_machine_are_short_and_printable(request_: FitRequest, happened: Happened) -> None:
+def test_sentences_of_a_ground_machine_are_short_and_printable(
+    request_: FitRequest, monkeypatch: pytest.MonkeyPatch, happened: Happened
+) -> None:
     """They are shown and kept: 256 KiB of control characters a second were, too."""
-    long, local = "\x1b[2J\n" * 30_000, cast(ProcessWorker, InlineWorker())
+    long = "\x1b[2J\n" * 30_000
+    monkeypatch.setattr(ProcessWorker, "_start", lambda worker: None)
     for hostile in (FitReply(request_.number, problem=long), FitReply(request_.number, fault=long)):
 
         def ask(job: FitRequest, answers: queue.Queue[Any], _: float, item: FitReply = hostile) -> None:
             answers.put((job.number, pack(item)))
 
-        worker = RemoteWorker(local, cast(Ground, SimpleNamespace(there=True, alive={"it"}, ask=ask)))
+        worker = RemoteWorker(PELICAN, cast(Ground, SimpleNamespace(there=True, alive={"it"}, ask=ask)))
         worker.submit(request_)
         (told,) = [reply for reply in worker.poll() if isinstance(reply, FitReply)]
         assert told.problem + told.fault == one_line(long)

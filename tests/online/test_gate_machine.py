@@ -27,7 +27,7 @@ from hypothesis.stateful import (
 from quadid_node.history import Store, read_history
 from quadid_node.messages import Output
 from quadid_node.service import Service
-from quadid_node.worker import Trouble
+from quadid_node.worker import InlineWorker, Trouble
 
 from quadid.online import FitReply, FitRequest, GateSettings, Publish, SessionSettings, SetState
 from quadid.online.records import Job, JobReply, OnlineSet
@@ -53,10 +53,8 @@ def stream() -> list[Sample]:
     return [s for s in samples(flight(40.0, 6).recording) if s.channel in NEEDED]
 
 
-class Adversary:
+class Adversary(InlineWorker):
     """In place of the fit process: keeps requests until the test lets it answer."""
-
-    ready, state = True, "idle"
 
     def __init__(self) -> None:
         self.asked: list[Job] = []
@@ -71,9 +69,6 @@ class Adversary:
 
     def sibling(self) -> Adversary:
         return Adversary()
-
-    def close(self) -> None:
-        pass
 
 
 def estimate(request: FitRequest, factors: dict[str, float], sigma: float) -> FitReply:
