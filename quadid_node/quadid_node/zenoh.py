@@ -82,7 +82,8 @@ class LateSession:
             ZenohError: a configuration that is none.
         """
         config_of(where)
-        self.lock, self._closed, self._session = threading.Lock(), threading.Event(), None
+        self.lock, self._closed = threading.Lock(), threading.Event()
+        self._session: Any = None
 
         def connect() -> None:
             session = None
@@ -169,7 +170,7 @@ REPEAT = 5
 _JSON = zenoh.Encoding.APPLICATION_JSON
 
 
-class ZenohLink:
+class ZenohLink(LateSession):
     """Publishes one vehicle's results, and keeps the latest of each kind for late subscribers.
 
     A router that is not there yet is waited for in the background; one that goes away is found again by Zenoh itself.
@@ -194,7 +195,7 @@ class ZenohLink:
         self._publishers: dict[str, Any] = {}
         self._reports = 0
         self.problem = f"Zenoh at {where}: connecting"
-        self._session = LateSession(where, self._declare, lambda problem: setattr(self, "problem", problem), retry)
+        super().__init__(where, self._declare, lambda problem: setattr(self, "problem", problem), retry)
 
     def _declare(self, session: Any) -> None:
         self.problem = ""
@@ -228,7 +229,7 @@ class ZenohLink:
         self._reports += 1
         if self._reports % REPEAT == 0:
             # Sends again what a crowded network may have lost, since it never waits for one
-            with self._session.lock:
+            with self.lock:
                 for kind in ("parameters", "diagnosis", "vehicle_health"):
                     if kind in self._latest and kind in self._publishers:
                         self._publishers[kind].put(self._latest[kind], encoding=_JSON)
@@ -243,10 +244,6 @@ class ZenohLink:
             with query:
                 done, text = self._carry_out(name, str(query.selector.parameters))
                 query.reply(query.key_expr, json.dumps({"done": done, "text": text}), encoding=_JSON)
-
-    def close(self) -> None:
-        """Leaves."""
-        self._session.close()
 
     def _carry_out(self, name: str, asked: str) -> tuple[bool, str]:
         number = re.fullmatch(r"sequence=(\d{1,18})", asked)
@@ -264,7 +261,7 @@ class ZenohLink:
 
     def _put(self, kind: str, data: dict[str, Any]) -> None:
         payload = json.dumps({"vehicle": self._vehicle, **data}).encode()
-        with self._session.lock:
+        with self.lock:
             self._latest[kind] = payload
             if kind in self._publishers:
                 self._publishers[kind].put(payload, encoding=_JSON)
@@ -490,16 +487,15 @@ MOST_ANSWERS, MOST_GROUNDS = 8, 256
 """Most answers that wait to be looked at, and most ground machines that are kept apart; more are rejected."""
 
 
-class Ground:
+class Ground(LateSession):
     """The way to ground machines: a Zenoh session that is opened in the background."""
 
     def __init__(self, where: str, vehicle: str, clock: Callable[[], float] = time.monotonic) -> None:
         """Begins to connect; raises ZenohError for a configuration that is none."""
         self._key, self._clock = key_of(vehicle, "work/fit"), clock
-        self._session: Any = None
         self.alive: set[str] = set()
         self._rests_until = -1e9
-        self._late = LateSession(where, self._declare)
+        super().__init__(where, self._declare)
 
     @property
     def there(self) -> bool:
@@ -523,14 +519,8 @@ class Ground:
         """Asks no ground machine for a while."""
         self._rests_until = self._clock() + REST
 
-    def close(self) -> None:
-        """Leaves."""
-        self._late.close()
-        self._session = None
-
     def _declare(self, session: Any) -> None:
         self._watch = session.liveliness().declare_subscriber(ALIVE, self._on_token, history=True)
-        self._session = session
 
     def _on_token(self, sample: Any) -> None:
         name = str(sample.key_expr)
