@@ -46,7 +46,7 @@ class Beginning:
     restored: Restored
 
 
-class Recorder:
+class Recorder(TopicWriter):
     """An MCAP file of what arrives."""
 
     def __init__(self, path: Path, beginning: Beginning, inputs: Sequence[Input]) -> None:
@@ -65,21 +65,17 @@ class Recorder:
                 }
             ),
         }
-        self._writer = TopicWriter(path, {RECORD: record}, CHUNK_BYTES)
+        super().__init__(path, {RECORD: record}, CHUNK_BYTES)
         self._last = 0
         for entry in inputs:
             kind = entry.type.replace("/", "/msg/")
             if not has_definition(kind):
-                self._writer.define(kind, whole_text(kind, installed_definition))
+                self.define(kind, whole_text(kind, installed_definition))
 
     def take(self, topic: str, kind: str, data: bytes) -> None:
         """Writes a message; its log time never runs back, so that every reader keeps the order of arrival."""
         self._last = max(time.time_ns(), self._last + 1)
-        self._writer.write_cdr(topic, kind, data, self._last)
-
-    def close(self) -> None:
-        """Writes the end of the file."""
-        self._writer.close()
+        self.write_cdr(topic, kind, data, self._last)
 
 
 def installed_definition(package: str, kind: str) -> str:
