@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 from quadid_node.history import read_history, read_in_force
-from quadid_node.process import without_shared_memory
+from quadid_node.process import end_middleware, without_shared_memory
 from quadid_node.zenoh import FleetView
 from quadid_replay import write_mcap
 
@@ -255,6 +255,7 @@ def test_a_whole_number_is_a_number(window: str) -> None:
         made.destroy_node()
     finally:
         rclpy.try_shutdown()
+        end_middleware()  # or its services would stay listed beside those of the next test's node
 
 
 def test_no_event_of_a_topic_is_left_to_the_executor() -> None:
@@ -274,6 +275,7 @@ def test_no_event_of_a_topic_is_left_to_the_executor() -> None:
         configured.destroy_node()
     finally:
         rclpy.try_shutdown()
+        end_middleware()  # or its services would stay listed beside those of the next test's node
 
 
 @pytest.mark.parametrize(("number", "times"), [(signal.SIGTERM, 1), (signal.SIGINT, 2)], ids=["term", "int int"])
