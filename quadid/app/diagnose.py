@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +17,6 @@ from quadid.model.layout import Layout, with_reference_voltage
 from quadid.parameters import INERTIAS, NOMINAL_NAMES, Status, unreliable
 from quadid.report.tables import Cell, TextTable, heads, number, parameter_table
 from quadid.report.verdict import Verdict, digits
-from quadid.types import Json
 from quadid.vehicle import Vehicle
 
 if TYPE_CHECKING:
@@ -70,10 +69,24 @@ class Diagnosed(Fitted):
     def tables(self) -> list[TextTable]:
         """The findings, then the parameters beside them."""
         findings, parameters = self.result["findings"], self.result.get("parameters")
-        return [
-            *([finding_table(findings)] if findings else []),
-            *([parameter_table(parameters)] if parameters else []),
-        ]
+        rows = []
+        for finding in findings:
+            gain, rival = finding["gain"], min(finding["alternatives"], key=lambda a: a["mse_after"], default=None)
+            name = Cell(finding["effect"].replace("_", " "), "" if finding["confident"] else "fair")
+            other = f"{rival['effect'].replace('_', ' ')} ({number(rival['mse_after'], 3)})" if rival else ""
+            about = (name, number(gain["mse_before"], 3), number(gain["mse_after"], 3), other)
+            for i, p in enumerate(finding["parameters"]):
+                value, limits = f"rotor {p['value']:.0f}", ""
+                if p["name"] != "rotor":
+                    value = f"{p['name']} = {number(p['value'], digits(p))} {p['unit']}".rstrip()
+                    limits = " .. ".join(number(end, digits(p)) for end in p["ci95"] or (None, None))
+                first, before, after, rejected = about if i == 0 else ("",) * 4
+                rows.append((first, value, before, after, limits, rejected))
+        columns = heads("cause | value | without > | with > | 95 % interval <2 | rejected alternative <1")
+        runs = ", ".join(dict.fromkeys(f"{f['gain']['seconds']:g} s" for f in findings))
+        title = f"What the simulation gets wrong (error of {runs} runs in noise variances, 1 = noise floor)"
+        named = [TextTable(title, columns, tuple(rows))] if findings else []
+        return [*named, *([parameter_table(parameters)] if parameters else [])]
 
     def records(self) -> list[dict[str, Any]]:
         """One row a number of a finding."""
@@ -220,28 +233,3 @@ def _within_reach(found: Diagnosis, unreachable: Mapping[str, str], off: Mapping
     told += [f"{name} is not named with confidence: {unreachable[INERTIAS[0]]}" for name in dict.fromkeys(late)]
     findings = tuple(replace(f, confident=f.confident and f.effect not in late) for f in found.findings)
     return replace(found, findings=findings, parameters=parameters, warnings=(*found.warnings, *told))
-
-
-def finding_table(findings: Sequence[Json]) -> TextTable:
-    """Every named cause with its numbers, what it gains on unseen data, and the closest rejected alternative."""
-    columns = heads("cause | value | without > | with > | 95 % interval <2 | rejected alternative <1")
-    rows = []
-    for finding in findings:
-        gain, rival = finding["gain"], min(finding["alternatives"], key=lambda a: a["mse_after"], default=None)
-        first: list[str | Cell] = [
-            Cell(finding["effect"].replace("_", " "), "" if finding["confident"] else "fair"),
-            number(gain["mse_before"], 3),
-            number(gain["mse_after"], 3),
-            f"{rival['effect'].replace('_', ' ')} ({number(rival['mse_after'], 3)})" if rival else "",
-        ]
-        for p in finding["parameters"]:
-            value, limits = f"rotor {p['value']:.0f}", ""
-            if p["name"] != "rotor":
-                value = f"{p['name']} = {number(p['value'], digits(p))} {p['unit']}".rstrip()
-                limits = " .. ".join(number(end, digits(p)) for end in p["ci95"] or (None, None))
-            name, before, after, other = first
-            rows.append((name, value, before, after, limits, other))
-            first = [""] * 4
-    runs = ", ".join(dict.fromkeys(f"{f['gain']['seconds']:g} s" for f in findings))
-    title = f"What the simulation gets wrong (error of {runs} runs in noise variances, 1 = noise floor)"
-    return TextTable(title, columns, tuple(rows))

@@ -91,10 +91,10 @@ def fleet(
     """
     if columns and vehicle is None:
         raise VehicleError("columns without a vehicle", "columns of the vehicle that is given", "give vehicle, too")
-    known = None if vehicle is None else Vehicle.named(vehicle)
-    default = (
-        None if known is None else known.model_copy(update={"columns": {**known.columns, **(columns or {})}}).to_yaml()
-    )
+    default = None
+    if vehicle is not None:
+        known = Vehicle.named(vehicle)
+        default = known.model_copy(update={"columns": {**known.columns, **(columns or {})}}).to_yaml()
     target = Path(os.path.realpath(out))
     check_folder(target, "out", "fleet.*.parquet")
     found = find_jobs(Path(os.path.realpath(folder)), default, rate, seed, diagnose, target)

@@ -54,8 +54,19 @@ class HealthOutcome(Reported):
 
     def tables(self) -> list[TextTable]:
         """Changes, and each trim against the baseline."""
-        changes = [change_table(self.result["changes"])] if self.result["changes"] else []
-        return [*changes, trim_table(self.result)]
+        rows: list[tuple[str | Cell, ...]] = []
+        for c in self.result["changes"]:
+            weak = f"weak rotor {_which(c)}" if c["effect"] == "weak_rotor" else c["effect"].replace("_", " ")
+            rival = rival_words(c["alternatives"][0]) if c["alternatives"] else ""
+            name, judged = Cell(weak, "poor" if c["confident"] else "fair"), (c["p_value"], c["probability"])
+            for i, p in enumerate(p for p in c["parameters"] if p["name"] not in ("rotor", "or_rotor")):
+                low, high = p["ci95"]
+                row = (f"{p['name']} = {p['value']:.3g} {p['unit']}".rstrip(), f"{low:.3g} .. {high:.3g}")
+                more = (f"{judged[0]:.1g}", f"{judged[1]:.2f}", rival) if i == 0 else ("", "", "")
+                rows.append((name if i == 0 else "", *row, *more))
+        columns = heads("change | value | 95 % interval | p >1 | probability >2 | rejected alternative <3")
+        changes = TextTable("What changed since the baseline flights", columns, tuple(rows))
+        return [*([changes] if rows else []), trim_table(self.result)]
 
     def records(self) -> list[dict[str, Any]]:
         """One row a number of a change."""
@@ -287,22 +298,6 @@ def _first(result: Json) -> tuple[str, ...]:
     """First checks where the change is as large as between two vehicles."""
     (effort,) = (t["value"] - t["baseline"] for t in result["trim"] if t["name"] == "effort")
     return (_ONE_VEHICLE,) if abs(effort) > _LARGE else ()
-
-
-def change_table(changes: Sequence[Json]) -> TextTable:
-    """Changes with intervals, and the explanations that lost."""
-    columns = heads("change | value | 95 % interval | p >1 | probability >2 | rejected alternative <3")
-    rows: list[tuple[str | Cell, ...]] = []
-    for c in changes:
-        weak = f"weak rotor {_which(c)}" if c["effect"] == "weak_rotor" else c["effect"].replace("_", " ")
-        rival = rival_words(c["alternatives"][0]) if c["alternatives"] else ""
-        name, judged = Cell(weak, "poor" if c["confident"] else "fair"), (c["p_value"], c["probability"])
-        for i, p in enumerate(p for p in c["parameters"] if p["name"] not in ("rotor", "or_rotor")):
-            low, high = p["ci95"]
-            row = (f"{p['name']} = {p['value']:.3g} {p['unit']}".rstrip(), f"{low:.3g} .. {high:.3g}")
-            more = (f"{judged[0]:.1g}", f"{judged[1]:.2f}", rival) if i == 0 else ("", "", "")
-            rows.append((name if i == 0 else "", *row, *more))
-    return TextTable("What changed since the baseline flights", columns, tuple(rows))
 
 
 def trim_table(result: Json) -> TextTable:

@@ -213,7 +213,7 @@ def vehicle_text(recording: Recording, name: str, mass: float | None = None, arm
         f"rotors:                 # forward, right, down [m]; {frame.name}{mark}",
         *places,
         f"command: {command.line}",
-        *_guesses(frame, weight, b, _possible_thrust(frame) if judged else None),
+        *_guesses(frame, weight, b, judged),
         *effects,
         *(f"# {note}" for note in notes),
         *([f"# The autopilot assumes: {', '.join(held)}"] if held else []),
@@ -240,29 +240,24 @@ def _command(recording: Recording, channel: Channel | None) -> _Command:
     return _Command(f"{{kind: pwm, range: [{low:g}, {high:g}], {speed}", low, _MAX_SPEED / (high - low))
 
 
-def _possible_thrust(frame: Frame) -> tuple[float, float] | None:
-    """Thrust coefficients [N s^2/rad^2] that propellers of this frame can have; None where its rotors are in one place.
+def _guesses(frame: Frame, mass: float, b: float, judged: bool) -> list[str]:
+    """First guesses of the parameters; where `judged`, thrust of propellers that fit the frame.
 
-    They follow from its size, not from the logged speeds, which they are to judge.
+    The thrust coefficients [N s^2/rad^2] that they can have follow from its size, not from the logged speeds, which
+    they are to judge; rotors that are all in one place tell nothing.
     """
     place = np.array([(r.x, r.y) for r in frame.rotors])
+    arm = float(np.mean(np.linalg.norm(place, axis=1)))
     apart = np.linalg.norm(place[:, None] - place[None, :], axis=2)
     apart = apart[apart > 0.1 * np.max(apart)]  # those of one axle are none
-    if not apart.size:
-        return None
-    radius = 0.5 * float(np.min(apart))
-    low, high = (c * _AIR * np.pi * (share * radius) ** 4 for c, share in zip(_THRUST, _RADIUS, strict=True))
-    return low, high
-
-
-def _guesses(frame: Frame, mass: float, b: float, possible: tuple[float, float] | None) -> list[str]:
-    arm = float(np.mean([np.hypot(r.x, r.y) for r in frame.rotors]))
-    inertia, blade = 0.25 * mass * arm**2, _BLADE * arm
     thrust = f"  b: {b:.3g}"
-    if possible is not None:  # of propellers that fit this frame
-        b = min(max(b, possible[0]), possible[1])
-        bounds = f"[{0.995 * possible[0]:.3g}, {1.005 * possible[1]:.3g}]"
+    if judged and apart.size:
+        radius = 0.5 * float(np.min(apart))
+        low, high = (c * _AIR * np.pi * (share * radius) ** 4 for c, share in zip(_THRUST, _RADIUS, strict=True))
+        b = min(max(b, low), high)
+        bounds = f"[{0.995 * low:.3g}, {1.005 * high:.3g}]"
         thrust = f"  b: {{initial: {b:.3g}, bounds: {bounds}}}    # of propellers that fit this frame"
+    inertia, blade = 0.25 * mass * arm**2, _BLADE * arm
     return [
         "parameters:             # first guesses: docs/new-vehicle.md",
         thrust,
