@@ -11,7 +11,7 @@ import copy
 import importlib
 import inspect
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_args
@@ -240,11 +240,15 @@ def with_help(option: ParameterInfo, text: str, kind: Any) -> ParameterInfo:
     return option
 
 
-def as_command(command: Command, function: Callable[..., Outcome | None]) -> Callable[..., None]:
+def as_command(command: Command, function: Callable[..., Any]) -> Callable[..., None]:
     """The function with the parameters of its command, which prints and writes its outcome, if it returns one."""
     from quadid.app import options
-    from quadid.app.logs import check_folder
-    from quadid.app.outcome import Fitted, Reported
+    from quadid.app.kernels import FIT, prepare
+    from quadid.app.logs import check_folder, file_name, parse_part, write_text
+    from quadid.app.outcome import Fitted, Reported, UnansweredError
+    from quadid.cli import terminal
+    from quadid.errors import QuadidError
+    from quadid.vehicle import Vehicle
 
     signature, (about, words) = inspect.signature(function, eval_str=True), documented(function)
     outcome: type[Outcome] | None = signature.return_annotation
@@ -277,7 +281,65 @@ def as_command(command: Command, function: Callable[..., Outcome | None]) -> Cal
         if page_name:
             check_folder(given["out"], "--out")
             given["report"] = given["out"] / page_name
-        _run(command, function, outcome, signature, typed, given)
+        # Places to write to are looked at before any work.
+        logged = [given[n] for n in typed if typed[n].option.metavar == "LOG" and given[n]]
+        texts = [text for one in logged for text in ([one] if isinstance(one, str) else one)]
+        json, report, series, out = (given.get(name) for name in ("json", "report", "series", "out"))
+        terminal.check_file(json, "--json")
+        folder = check_folder(out, "--out") if command.out and out is not None else None
+        names = [file_name(parse_part(text).path.name) for text in texts]
+        if series is not None and issubclass(outcome, Fitted):
+            check_folder(series, "--series", *(name + end for name in names for end in outcome.over_time))
+        terminal.check_file(report, "--report")
+
+        # What was not typed is as the function has it.
+        told = {name: how.read(given[name]) for name, how in typed.items() if given[name] not in (None, [])}
+        if command.check:
+            check = _imported(command.check)
+            asked = inspect.signature(check).parameters
+            check(**{name: told.get(name, p.default) for name, p in signature.parameters.items() if name in asked})
+        vehicle = next((value for value in told.values() if isinstance(value, Vehicle)), None)
+        names += [file_name(vehicle.name)] if vehicle is not None else []
+        if folder is not None:
+            check_folder(folder, "--out", *(name + end for name in names for end in outcome.endings))
+        logs = [name for name in typed if typed[name].opened and name in told]
+        how = {name: given[name] for name in ("rate", *command.reading) if name in given}
+
+        done: Outcome | None = None
+        unanswered: UnansweredError | None = None
+        try:
+            with terminal.progress() as advance:
+                if vehicle is not None:
+                    told |= {name: opened(told[name], vehicle, advance, **how) for name in logs}
+                if command.simulates and (vehicle is not None or "advance" in signature.parameters):
+                    prepare(FIT, advance)
+                advance(function.__name__.replace("_", " "), 0.0)
+                try:
+                    done = function(**told, **({"advance": advance} if "advance" in signature.parameters else {}))
+                except UnansweredError as error:
+                    done, unanswered = error.outcome, error
+                # Its files, which its JSON names; a vehicle file that was read is not overwritten.
+                advance("writing", 1.0)
+                files = [] if folder is None else done.write(folder, given.get("vehicle"))
+                if report is not None and isinstance(done, Reported):
+                    done.result["report"] = str(report.absolute())
+                    files.append(("Report", done.report(report, terminal.command_line())))
+                if series is not None and isinstance(done, Fitted):
+                    written = done.save_series(series)
+                    done.result["series"] = [str(path) for path in written]
+                    files += [("Over time", path) for path in written]
+        except QuadidError as error:
+            # The report of an attempt that failed says why, and shows the data.
+            if done is None and report is not None and vehicle is not None and outcome.title:
+                from quadid.app.failure import failure_html
+
+                what, preset = f"{outcome.title} of {vehicle.name}", given.get("preset", "auto")
+                text = failure_html(error, what, texts, vehicle, preset, terminal.command_line())
+                terminal.warn([f"no answer; why, and the data as they are: {write_text(report, text)}"])
+            raise
+        terminal.show(done, json, files)
+        if (failure := unanswered or done.failure) is not None:
+            raise failure
 
     parameters = [
         inspect.Parameter(
@@ -292,82 +354,6 @@ def as_command(command: Command, function: Callable[..., Outcome | None]) -> Cal
     run.__dict__["__signature__"] = inspect.Signature(parameters)
     run.__annotations__ = {name: told for name, (told, _) in shown.items()}
     return run
-
-
-def _run(
-    command: Command,
-    function: Callable[..., Any],
-    outcome: type[Outcome],
-    signature: inspect.Signature,
-    typed: Mapping[str, Any],
-    given: Mapping[str, Any],
-) -> None:
-    from quadid.app.kernels import FIT, prepare
-    from quadid.app.logs import check_folder, file_name, parse_part, write_text
-    from quadid.app.outcome import Fitted, Reported, UnansweredError
-    from quadid.cli import terminal
-    from quadid.errors import QuadidError
-    from quadid.vehicle import Vehicle
-
-    # Places to write to are looked at before any work.
-    logged = [given[n] for n in typed if typed[n].option.metavar == "LOG" and given[n]]
-    texts = [text for one in logged for text in ([one] if isinstance(one, str) else one)]
-    json, report, series, out = (given.get(name) for name in ("json", "report", "series", "out"))
-    terminal.check_file(json, "--json")
-    folder = check_folder(out, "--out") if command.out and out is not None else None
-    names = [file_name(parse_part(text).path.name) for text in texts]
-    if series is not None and issubclass(outcome, Fitted):
-        check_folder(series, "--series", *(name + end for name in names for end in outcome.over_time))
-    terminal.check_file(report, "--report")
-
-    # What was not typed is as the function has it.
-    told = {name: how.read(given[name]) for name, how in typed.items() if given[name] not in (None, [])}
-    if command.check:
-        check = _imported(command.check)
-        asked = inspect.signature(check).parameters
-        check(**{name: told.get(name, p.default) for name, p in signature.parameters.items() if name in asked})
-    vehicle = next((value for value in told.values() if isinstance(value, Vehicle)), None)
-    names += [file_name(vehicle.name)] if vehicle is not None else []
-    if folder is not None:
-        check_folder(folder, "--out", *(name + end for name in names for end in outcome.endings))
-    logs = [name for name in typed if typed[name].opened and name in told]
-    how = {name: given[name] for name in ("rate", *command.reading) if name in given}
-
-    done: Outcome | None = None
-    unanswered: UnansweredError | None = None
-    try:
-        with terminal.progress() as advance:
-            if vehicle is not None:
-                told |= {name: opened(told[name], vehicle, advance, **how) for name in logs}
-            if command.simulates and (vehicle is not None or "advance" in signature.parameters):
-                prepare(FIT, advance)
-            advance(function.__name__.replace("_", " "), 0.0)
-            try:
-                done = function(**told, **({"advance": advance} if "advance" in signature.parameters else {}))
-            except UnansweredError as error:
-                done, unanswered = error.outcome, error
-            # Its files, which its JSON names; a vehicle file that was read is not overwritten.
-            advance("writing", 1.0)
-            files = [] if folder is None else done.write(folder, given.get("vehicle"))
-            if report is not None and isinstance(done, Reported):
-                done.result["report"] = str(report.absolute())
-                files.append(("Report", done.report(report, terminal.command_line())))
-            if series is not None and isinstance(done, Fitted):
-                written = done.save_series(series)
-                done.result["series"] = [str(path) for path in written]
-                files += [("Over time", path) for path in written]
-    except QuadidError as error:
-        # The report of an attempt that failed says why, and shows the data.
-        if done is None and report is not None and vehicle is not None and outcome.title:
-            from quadid.app.failure import failure_html
-
-            what, preset = f"{outcome.title} of {vehicle.name}", given.get("preset", "auto")
-            text = failure_html(error, what, texts, vehicle, preset, terminal.command_line())
-            terminal.warn([f"no answer; why, and the data as they are: {write_text(report, text)}"])
-        raise
-    terminal.show(done, json, files)
-    if (failure := unanswered or done.failure) is not None:
-        raise failure
 
 
 def opened(
