@@ -532,28 +532,30 @@ def _quadratic(J: FloatArray, plain: FloatArray, rows: BoolArray, root: FloatArr
 def _by_thrust(window: Window, problem: Problem, z: FloatArray, noise: Noise, gains: Gains) -> FloatArray:
     """Derivatives of whitened innovations by what thrust may have beside b, shape (R + 2, n, M).
 
-    To the filter each is other rotor speeds: those at which b and its curve give as much.  A loss of all rotors is b
-    itself; a rotor's is what it loses beyond their mean.
+    A rotor that loses turns as it did, with less thrust and drag torque.  A loss of all rotors is b itself; a rotor's
+    is what it loses beyond their mean.
     """
     p, track = problem.physics(z, 0), problem.tracks[0]._replace(beyond=gains.beyond)
-    above = window.rotor_speed - p[k.DEAD]
+    table, turns = k.moments(track, *k.turning(p)), np.arange(3 * k.MOMENTS) % k.MOMENTS >= 4
 
-    def whitened(square: FloatArray) -> FloatArray:
-        moved = from_window(
-            replace(window, rotor_speed=p[k.DEAD] + np.sqrt(np.maximum(square, 0.0))), problem.vehicle, air=True
-        )
-        table, out = k.moments(moved, *k.turning(p)), np.zeros((len(window), k.M))
-        k.replay(track, p, noise.psi, gains, table, out, np.empty((0, k.N_MEAN)))
+    def whitened(physics: FloatArray, moments: FloatArray) -> FloatArray:
+        out = np.zeros((len(window), k.M))
+        k.replay(track, physics, noise.psi, gains, moments, out, np.empty((0, k.N_MEAN)))
         return out
 
-    plain, out = whitened(above**2), []
+    plain, out = whitened(p, table), []
     for name in thrust_names(problem.vehicle):
-        step, square = NUDGE * problem.layout.entry(name).typical, above**2
+        step = NUDGE * problem.layout.entry(name).typical
         if name == SUPPORT:
-            square += step / p[k.B]
+            moved = p.copy()
+            moved[k.OFFSET] += step
+            nudged = whitened(moved, k.moments(track, *k.turning(moved)))
         else:
-            square[:, int(name.rsplit("_", 1)[1]) - 1] *= 1.0 - step
-        out.append((whitened(square) - plain) / NUDGE)
+            share = track.share.copy()
+            share[:, int(name.rsplit("_", 1)[1]) - 1] *= 1.0 - step
+            less = k.moments(track._replace(share=share), *k.turning(p))
+            nudged = whitened(p, np.where(turns, table, less))
+        out.append((nudged - plain) / NUDGE)
     by = np.array(out)
     by[1:] -= by[1:].mean(axis=0)
     return by
