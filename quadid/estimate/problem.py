@@ -96,7 +96,9 @@ SETTLING = 2
 RECKONED = 6.0
 """Time [s] after which drag has shown the velocity that a flight began with."""
 LEAST = 1e-2
-"""Share of its prior below which a random force or a delay is none."""
+"""Share of its prior below which a random force or a delay is none …"""
+UNSEEN = 0.5
+"""… and of the accelerometer's scatter: a simulator's may be a hundred times less than a vehicle's."""
 
 
 def control_moment(tracks: Sequence[Track], p: FloatArray) -> FloatArray:
@@ -158,6 +160,12 @@ def floor_of(tracks: Sequence[Track]) -> FloatArray:
     columns = [0, 1, 2, 4, 5, 6, 7, 8, 9, 10, 11, 12]
     steps = [[quantum(t.y[t.seen[:, m // 3], column]) for t in tracks] for m, column in enumerate(columns)]
     return np.asarray(np.maximum(np.max(steps, axis=1), 1e-5))
+
+
+def scatter_of(tracks: Sequence[Track]) -> float:
+    """Scatter of accelerometer readings about their neighbours, of the quietest axis [m/s^2]; infinite without any."""
+    bends = [np.diff(track.y[track.seen[:, 2], 7:10], 2, axis=0) for track in tracks]
+    return min((float(np.sqrt(np.mean(b**2, axis=0) / 6.0).min()) for b in bends if len(b)), default=np.inf)
 
 
 class Sensitivities(NamedTuple):
@@ -456,6 +464,8 @@ class Problem:
         out = np.empty((k.N_NOISE, 2))
         out[: k.M, 0], out[: k.M, 1] = floor_of(self.tracks), 100.0 * WHITE
         out[k.SIGMA : k.TIME, 0], out[k.SIGMA : k.TIME, 1] = LEAST * self.noise_scale, 100.0 * self.noise_scale
+        force = slice(k.SIGMA, k.SIGMA + 2)
+        out[force, 0] = np.minimum(out[force, 0], UNSEEN * scatter_of(self.tracks))
         out[k.ROTOR, 0] = max(out[k.ROTOR, 0], *(t.speed_noise[0] for t in self.tracks))
         out[k.ROTOR, 1] = max(out[k.ROTOR, 0], min(t.speed_noise[1] for t in self.tracks))
         step = max(float(np.median(np.diff(t.t))) for t in self.tracks)

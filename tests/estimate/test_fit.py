@@ -54,6 +54,13 @@ def test_truth_lies_inside_the_intervals_and_no_random_force_is_found() -> None:
     assert not tails(found.problem.tracks, found.problem.passes(found.z, found.psi)[1]).any()
 
 
+def test_in_a_simulators_quiet_air_a_random_force_is_less_than_its_accelerometer_shows() -> None:
+    """Held to a thousandth of gravity, it stood for the noise of logged rotor speeds and bent the thrust curve."""
+    flight = fly(PELICAN, draw_truth(PELICAN, 1), SECONDS, 1, noise_scale=0.005, extras=("velocity",))
+    found = estimate(Problem.of([from_window(flight.window, PELICAN)], PELICAN))
+    assert np.all(found.psi[k.SIGMA : k.SIGMA + 2] < 0.002)
+
+
 def test_a_velocity_that_nobody_measures_has_no_innovations_and_no_outliers() -> None:
     flight = fly(PELICAN, draw_truth(PELICAN, 1), SECONDS, 1)
     found = estimate(Problem.of([from_window(flight.window, PELICAN, air=True)], PELICAN, ("rotor_drag.k_x",)))
