@@ -87,7 +87,7 @@ reproduce: venv ## the paper's tables and figures, into docs/results
 
 STUDY = OPENBLAS_NUM_THREADS=1 $(BIN)/python -m
 
-.PHONY: findings mpc gains alarms autopilot peers health health-hours truth filter-error bands cases campaign ablation foreign paper-scale excite optimisers subspace kernel-speed bench
+.PHONY: findings mpc gains alarms autopilot peers health health-hours truth filter-error bands cases campaign ablation foreign paper-scale excite optimisers subspace control kernel-speed bench
 truth: venv ## errors against their bound, coverage, bias with noise, status (an hour)
 	$(STUDY) quadid_evaluation.studies.truth --out docs/results
 
@@ -149,6 +149,9 @@ optimisers: venv ## every optimiser on smooth and non-smooth problems, narrow an
 
 subspace: venv ## CVA and MOESP: poles of known systems, prediction of flights
 	$(STUDY) quadid_evaluation.studies.subspace --out docs/results
+
+control: venv ## tracking in wind and gusts with guessed, identified, extended and true parameters (ten minutes)
+	$(STUDY) quadid_evaluation.studies.control --out docs/results
 
 kernel-speed: dev ## nanoseconds per particle and step of the kernel; a step of `quadid.Simulator`, RotorPy, crazyflow, gym-pybullet-drones
 	SCIPY_ARRAY_API=1 $(STUDY) quadid_evaluation.benchmarks.speed --parts kernel step

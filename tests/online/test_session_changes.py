@@ -1,14 +1,16 @@
 """The session without simulator and fit: sudden changes, and studies beside the fits."""
 
 import re
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from quadid.checks.rotors import Lagged, lagged_of
+from quadid.data.window import Window
 from quadid.online import FitReply, FitRequest, Phase, Session, checks
 from quadid.online.change_job import ChangeReply, ChangeRequest, DiagnosisReply, DiagnosisRequest
-from quadid.online.grid_buffer import WindowCut
 from quadid.online.records import Action, Job, JobReply, OnlineFinding
 from quadid.vehicle import Vehicle
 from tests.faults.evidence import Happened
@@ -155,11 +157,11 @@ def test_the_order_of_rotors_is_asked_until_a_fit_is_taken_in_and_not_after_a_ch
 ) -> None:
     asked: list[float] = []
 
-    def question(cut: WindowCut, vehicle: Vehicle) -> str:
-        asked.append(float(cut.windows[-1].t[-1]))
-        return ""
+    def question(windows: Sequence[Window], vehicle: Vehicle, rate: float) -> Lagged | str:
+        asked.append(float(windows[-1].t[-1]))
+        return lagged_of(windows, vehicle, rate)
 
-    monkeypatch.setattr(checks, "_wrong_order", question)
+    monkeypatch.setattr(checks, "lagged_of", question)
 
     def work(request: Job) -> JobReply | None:
         if isinstance(request, ChangeRequest):
