@@ -18,7 +18,7 @@ from quadid.checks.rotors import (
     gyro_filter_check,
     hover_check,
     mass_check,
-    motor_checks,
+    order_checks,
     readings_check,
 )
 from quadid.data.window import Recording, in_body_axes
@@ -29,7 +29,7 @@ Question = Callable[[Log], Check | None]
 
 
 def _motors(name: str, log: Log) -> Check | None:
-    return log.once(motor_checks).get(name)
+    return log.once(order_checks).get(name)
 
 
 LIVE: tuple[Question, ...] = gravity_check, attitude_check, velocity_check

@@ -305,7 +305,7 @@ def _placed(log: Log, gyro: Channel, slowest: float, about: float) -> _Placed | 
 
 def accel_timing_check(log: Log) -> Check | None:
     """A warning where the accelerometer answers the rotors at another time than the gyro does, else None."""
-    accel, signal, timing = log.recording.channels.get("accel"), log.signal, log.once(motor_checks).get("rotor_timing")
+    accel, signal, timing = log.recording.channels.get("accel"), log.signal, log.once(order_checks).get("rotor_timing")
     if accel is None or timing is None or "lag_s" not in timing.numbers:
         return None
     slowest = max(measured_period(c.t, c.values) for c in (signal, accel))
@@ -590,7 +590,7 @@ def _in_band(windows: Sequence[Window], thrust: list[FloatArray], lag: int, slow
     return acted, gained, spun
 
 
-def motor_checks(log: Log) -> dict[str, Check]:
+def order_checks(log: Log) -> dict[str, Check]:
     """Time, order and spins of the motors, and rotors one by one.
 
     Another order is only judged, and advised, of a signal that is in time with it and in balance: else the time is

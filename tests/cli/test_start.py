@@ -259,6 +259,19 @@ def test_an_old_path_is_the_new_module_and_warns(old: str) -> None:
     assert found is importlib.import_module(old_paths.new_path(old))
 
 
+def test_no_old_path_takes_the_place_of_a_function() -> None:
+    """An import binds a module's last name in the package above it, which is today's."""
+    code = (
+        "import importlib, types; from quadid import old_paths; "
+        "parted = [old.rpartition('.')[::2] for old in old_paths.new_paths()]; "
+        "above = [(new, name) for room, name in parted if (new := old_paths.new_path(room))]; "
+        "there = [(new, name, getattr(importlib.import_module(new), name, types)) for new, name in above]; "
+        "print([(new, name) for new, name, value in there if not isinstance(value, types.ModuleType)])"
+    )
+    done = subprocess.run([sys.executable, "-W", "ignore", "-c", code], check=True, capture_output=True, text=True)
+    assert done.stdout == "[]\n"
+
+
 @pytest.mark.parametrize("one", FORMATS, ids=lambda one: one.name)
 def test_no_reader_of_logs_is_found_by_an_old_path(one: LogFormat) -> None:
     assert not old_paths.new_path("quadid_replay." + one.reader.split(":")[0])
