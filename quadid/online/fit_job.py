@@ -519,7 +519,7 @@ def _linearised(
     gains = problem.passes(own, noise.psi)[1]
     _, plain, by_own = problem.sensitivities(0, own, noise.psi, gains[0])
     J = np.tensordot(by_z, by_own, (0, 0))
-    J[len(own_names(vehicle)) :] += _by_thrust(window, problem, own, noise, gains[0])
+    J[len(own_names(vehicle)) :] += _by_thrust(problem, own, noise, gains[0], plain)
     return problem, own, by_z, gains, plain, J
 
 
@@ -529,8 +529,8 @@ def _quadratic(J: FloatArray, plain: FloatArray, rows: BoolArray, root: FloatArr
     return seen @ seen.T, J[:, rows].reshape(len(J), -1) @ plain[rows].ravel()
 
 
-def _by_thrust(window: Window, problem: Problem, z: FloatArray, noise: Noise, gains: Gains) -> FloatArray:
-    """Derivatives of whitened innovations by what thrust may have beside b, shape (R + 2, n, M).
+def _by_thrust(problem: Problem, z: FloatArray, noise: Noise, gains: Gains, plain: FloatArray) -> FloatArray:
+    """Derivatives of whitened innovations, `plain` (n, M), by what thrust may have beside b, shape (R + 2, n, M).
 
     A rotor that loses turns as it did, with less thrust and drag torque.  A loss of all rotors is b itself; a rotor's
     is what it loses beyond their mean.
@@ -539,11 +539,11 @@ def _by_thrust(window: Window, problem: Problem, z: FloatArray, noise: Noise, ga
     table, turns = k.moments(track, *k.turning(p)), np.arange(3 * k.MOMENTS) % k.MOMENTS >= 4
 
     def whitened(physics: FloatArray, moments: FloatArray) -> FloatArray:
-        out = np.zeros((len(window), k.M))
+        out = np.zeros_like(plain)
         k.replay(track, physics, noise.psi, gains, moments, out, np.empty((0, k.N_MEAN)))
         return out
 
-    plain, out = whitened(p, table), []
+    out = []
     for name in thrust_names(problem.vehicle):
         step = NUDGE * problem.layout.entry(name).typical
         if name == SUPPORT:

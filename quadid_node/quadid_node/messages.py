@@ -330,13 +330,13 @@ def entry(name: str, part: str, hardware: str, level: bytes, message: str, value
 # --- JSON
 
 
-_TOLD = ("name", "unit", "value", "sigma", "ci95", "initial", "bounds", "status", "relative_to")
-"""What others are told of a parameter."""
+_FIELDS = ("name", "unit", "value", "sigma", "ci95", "initial", "bounds", "status", "relative_to")
+"""Fields of a parameter in a message."""
 
 
 def set_to_dict(item: OnlineSet, covariance: bool = True) -> dict[str, Any]:
     """A set; times are stamps [s], parameters as in `quadid identify`'s JSON, with standard deviation and bounds."""
-    parameters = [{name: v for name in _TOLD if (v := getattr(p, name)) is not None} for p in item.parameters]
+    parameters = [{name: v for name in _FIELDS if (v := getattr(p, name)) is not None} for p in item.parameters]
     data: dict[str, Any] = jsonable(
         {**vars(item), "parameters": parameters, **({"covariance": item.parameters.covariance} if covariance else {})}
     )

@@ -64,7 +64,7 @@ COMMANDS: dict[str, tuple[str, Callable[[Service, Any], Answer]]] = {
     "rollback": ("std_srvs/Trigger", lambda service, _: service.roll_back("ros service")),
     "approve": ("quadid_msgs/Approve", lambda service, request: service.approve("ros service", request.sequence)),
 }
-"""What a person may ask for, by the service: its type, and what is done."""
+"""Services a person may call, by name: type, and the action taken."""
 Return = TransitionCallbackReturn
 IDLE = {
     "unconfigured": "not configured yet; next: ros2 lifecycle set {name} configure",

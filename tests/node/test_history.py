@@ -102,7 +102,7 @@ def filled(path: Path, sets: int = 2) -> Store:
 
 
 def left(path: Path, vehicle: Vehicle | None = None) -> Restored:
-    """What a history leaves to the next run."""
+    """State that a history hands to the next run."""
     with closing(Store(path, "pelican")) as store:
         return store.restore(vehicle=vehicle)
 

@@ -254,7 +254,7 @@ def difference(one: Graded, other: Graded) -> tuple[str, bool]:
 
 
 def cell(base: Mapping[str, Answer], answers: Sequence[Answer]) -> tuple[str, bool]:
-    """What a variant changes: right and wrong, its weightiest difference, effort; and whether a name is among it."""
+    """Effect of a variant: right and wrong, its weightiest difference, effort; and whether a name is among it."""
     pairs = [(base[a.flight].graded, a) for a in answers]
     found = []
     for b, a in pairs:

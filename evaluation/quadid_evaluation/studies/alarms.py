@@ -80,7 +80,7 @@ def watched(vehicle: Vehicle, flight: Flight, seed: int) -> Iterator[Seen]:
 
 
 def known_theta(vehicle: Vehicle, flight: Flight) -> FloatArray:
-    """Parameter vector of a session that knows the vehicle."""
+    """Parameter vector of a session whose vehicle is identified."""
     theta = Layout(vehicle).initial(vehicle)
     theta[: len(NOMINAL_NAMES)] = list(flight.truth.parameters.as_dict().values())
     return theta

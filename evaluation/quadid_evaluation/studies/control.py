@@ -22,7 +22,6 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import solve_continuous_are
-from scipy.signal import lfilter
 
 from quadid.flight import TruthParameters, draw_truth, fly
 from quadid.flight.airframe import PUSHES, STATES, Air, Body, Oddity, derivative, kernel, orthonormalise, rotor_wrench
@@ -32,6 +31,7 @@ from quadid.parameters import NOMINAL_NAMES
 from quadid.types import FloatArray
 from quadid.vehicle import GRAVITY, Vehicle
 from quadid_evaluation.harness import share, study, table
+from quadid_evaluation.studies.fast_loop import gauss_markov
 from quadid_evaluation.studies.truth import poor_guess
 
 # --- The controller
@@ -280,11 +280,10 @@ def unmixer(known: Known) -> FloatArray:
 
 def gusts(count: int, seed: int) -> FloatArray:
     """Random force along world axes and angular acceleration, first order, as `track` takes them, shape (count, 9)."""
-    pole = float(np.exp(-CONTROL / GUSTS["time"]))
-    noise = np.random.default_rng([seed, 5]).standard_normal((count, 6)) * np.sqrt(1.0 - pole**2)
+    sigma = np.repeat([GUSTS["push"], GUSTS["turn"]], 3) * [1.0, 1.0, 0.5, 1.0, 1.0, 0.3]
     out = np.zeros((count, PUSHES))
-    out[:, :6] = lfilter([1.0], [1.0, -pole], noise, axis=0) * np.repeat([GUSTS["push"], GUSTS["turn"]], 3)
-    return out * np.array([1.0, 1.0, 0.5, 1.0, 1.0, 0.3, 0.0, 0.0, 0.0])
+    out[:, :6] = gauss_markov(np.random.default_rng([seed, 5]), count, sigma, GUSTS["time"], CONTROL)
+    return out
 
 
 def flown(path: Reference, known: Known, setup: Setup, seed: int) -> tuple[float, float, float]:

@@ -83,9 +83,10 @@ def _between(a, b):  # type: ignore[no-untyped-def]
     return 2.0 * np.sign(c[0]) * c[1:]
 
 
-def _memory(rng: np.random.Generator, n: int, sigma: FloatArray, time: float) -> FloatArray:
-    keep, first = np.exp(-STEP / time), rng.standard_normal(3)
-    drive = np.sqrt(1.0 - keep**2) * rng.standard_normal((n, 3))
+def gauss_markov(rng: np.random.Generator, n: int, sigma: FloatArray, time: float, step: float = STEP) -> FloatArray:
+    """A Gauss-Markov process that begins as it goes on, (n, axes): of deviations `sigma`, correlated for `time` [s]."""
+    keep, first = np.exp(-step / time), rng.standard_normal(len(sigma))
+    drive = np.sqrt(1.0 - keep**2) * rng.standard_normal((n, len(sigma)))
     drive[0] = first
     return np.asarray(sigma * lfilter([1.0], [1.0, -keep], drive, axis=0))
 
@@ -117,8 +118,8 @@ def fly(
     mix = np.linalg.inv(np.array([p[0] * np.ones(4), -p[0] * y, p[0] * x, p[1] * vehicle.spins]))
     hold = round(0.4 / STEP)
     wanted = np.repeat(rng.uniform(-1.0, 1.0, (n // hold + 1, 3)), hold, axis=0)[:n] * [0.3, 0.3, 0.8]
-    moment = _memory(rng, n, share * np.array([7.0, 7.0, 0.8]), time)
-    level = _memory(rng, n, np.full(3, 0.02), 0.5)
+    moment = gauss_markov(rng, n, share * np.array([7.0, 7.0, 0.8]), time)
+    level = gauss_markov(rng, n, np.full(3, 0.02), 0.5)
     noise = gyro * rng.standard_normal((n, 3))
     out = _fly(n, every, p, mix, vehicle.rotor_positions, vehicle.spins, hover, wanted, noise, level, moment)
     rows = len(out)

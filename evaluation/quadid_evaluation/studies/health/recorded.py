@@ -74,7 +74,7 @@ class Judged:
 
     @property
     def of(self) -> str:
-        """What was done: ``healthy``, ``large`` (cuts from `LARGE` on, glued weights), ``small``, or nothing told."""
+        """State of the rotors: ``healthy``, ``large`` (cuts from `LARGE` on, glued weights), ``small``, or nothing."""
         one = self.flown
         if one.condition == "cut" and one.total >= LARGE or (one.condition == "weight" and "glued" in one.weight):
             return "large"
