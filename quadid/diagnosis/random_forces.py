@@ -7,7 +7,6 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.special import gammaln
 
 from quadid.data.window import Window
 from quadid.diagnosis.hypotheses import (
@@ -49,17 +48,11 @@ def stretches(track: Track) -> IndexArray:
     return np.unique(np.linspace(0, len(track.t), count, endpoint=False).astype(np.intp))
 
 
-def densities(g: Gains, tail: FloatArray) -> tuple[FloatArray, BoolArray]:
-    """-2 ln of the density of every scalar measurement of a pass, as `kalman.kalman` sums them, and which there are."""
+def densities(problem: Problem, g: Gains) -> tuple[FloatArray, BoolArray]:
+    """-2 ln of the density of every scalar measurement of a pass, with the price of its weight, and which there are."""
     seen = g.S > 0.0
     S = np.where(seen, g.S, 1.0)
-    out = np.where(seen, g.nu**2 / S, 0.0)
-    for group, k_inv in enumerate(tail.tolist()):
-        if k_inv > 0.0:
-            axes, degrees = slice(3 * group, 3 * group + 3), 1.0 / k_inv
-            at_zero = 2.0 * (gammaln(0.5 * degrees) - gammaln(0.5 * (degrees + 1.0))) + np.log(0.5 * degrees)
-            out[:, axes] = (1.0 + degrees) * np.log1p(k_inv * out[:, axes]) + at_zero
-    return np.where(seen, out + np.log(S), 0.0), seen
+    return np.where(seen, g.nu**2 / S + np.log(S) + problem.price(g), 0.0), seen
 
 
 def innovations(track: Track, p: FloatArray, psi: FloatArray, g: Gains) -> FloatArray:
@@ -69,14 +62,12 @@ def innovations(track: Track, p: FloatArray, psi: FloatArray, g: Gains) -> Float
     return out
 
 
-def costs(
-    tracks: Sequence[Track], gains: Sequence[Gains], tail: FloatArray
-) -> tuple[FloatArray, FloatArray, IndexArray, FloatArray]:
+def costs(problem: Problem, gains: Sequence[Gains]) -> tuple[FloatArray, FloatArray, IndexArray, FloatArray]:
     """Deviance of every stretch under the gains of a pass, its scalar measurements, its flight, its begin [s]."""
     parts = []
-    for j, (track, g) in enumerate(zip(tracks, gains, strict=True)):
+    for j, (track, g) in enumerate(zip(problem.tracks, gains, strict=True)):
         first = stretches(track)
-        cost, seen = (np.add.reduceat(a.sum(axis=1), first) for a in densities(g, tail))
+        cost, seen = (np.add.reduceat(a.sum(axis=1), first) for a in densities(problem, g))
         parts.append((cost, seen.astype(float), np.full(len(first), j), track.t[first]))
     cost, rows, window, time = (np.concatenate(column) for column in zip(*parts, strict=True))
     return cost, rows, window, time
@@ -94,7 +85,7 @@ def quadratic(problem: Problem, gains: Sequence[Gains], found: Sequence[Sensitiv
             gram[np.ix_(mine.entries, mine.entries)] = J @ J.T
             grams.append(gram)
             grads.append(grad)
-    return Quadratic(np.array(grams), np.array(grads), *costs(problem.tracks, gains, problem.tail))
+    return Quadratic(np.array(grams), np.array(grads), *costs(problem, gains))
 
 
 def _spans(track: Track) -> list[tuple[int, int]]:

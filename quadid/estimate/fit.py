@@ -166,7 +166,9 @@ def of_square(problem: Problem, z: FloatArray, psi: FloatArray, gains: Sequence[
     low, high = problem.noise_bounds[k.ROTOR]
     if psi[k.ROTOR] <= 1.01 * low:
         return 0.0
-    known = np.linalg.inv(problem.noise_information(z, psi, gains) + 0.5 * np.diag(problem.noise_curvature(psi)))
+    known = np.linalg.inv(
+        problem.held(z, psi, gains).noise_information(z, psi, gains) + 0.5 * np.diag(problem.noise_curvature(psi))
+    )
     return float(min(2.0 * np.sqrt(known[k.ROTOR, k.ROTOR]), (high / psi[k.ROTOR]) ** 2 / np.sqrt(12.0)))
 
 
@@ -181,8 +183,7 @@ def whitened(tracks: Sequence[Track], gains: Sequence[Gains]) -> tuple[FloatArra
     """Innovations of a pass over their standard deviations, shape (n, M) for each flight; 0 where not measured."""
     seen = [measured(track, g) for track, g in zip(tracks, gains, strict=True)]
     return tuple(
-        np.where(there, g.nu * np.sqrt(g.w / np.where(there, g.S, 1.0)), 0.0)
-        for there, g in zip(seen, gains, strict=True)
+        np.where(there, g.nu / np.sqrt(np.where(there, g.S, 1.0)), 0.0) for there, g in zip(seen, gains, strict=True)
     )
 
 
@@ -191,7 +192,7 @@ def tails(tracks: Sequence[Track], gains: Sequence[Gains]) -> FloatArray:
 
     A Student-t density has kurtosis 3 + 6 / (k - 4); what chance alone makes of a Gaussian's counts as none.
     """
-    out, plain = np.zeros(4), whitened(tracks, [g._replace(w=np.ones_like(g.w)) for g in gains])
+    out, plain = np.zeros(4), whitened(tracks, gains)
     for group in range(4):
         z = np.concatenate([w[:, 3 * group : 3 * group + 3] for w in plain])
         z = z[z[:, 0] != 0.0]
@@ -210,7 +211,8 @@ def scoring(
     Physics by sensitivities of the innovations under the gains of this turn; the noise numbers' logarithms, those that
     `noise` (N_NOISE,) frees, by the exact score of the full filter.  Gains are renewed after every step.  One that does
     not help is damped (Levenberg-Marquardt), the noise alone where physics alone helps: where it hardly acts, its
-    expected curvature is no guide.  Without `physics` the noise alone moves.
+    expected curvature is no guide.  Without `physics` the noise alone moves.  Weights of outliers are renewed before
+    every step, and held in it.
 
     Returns:
         Scaled parameters, noise numbers, objective, gains there; information (P, P) before the last step.
@@ -222,6 +224,9 @@ def scoring(
     below = above = np.zeros(len(z))
     renewed: list[Gains] = []
     for _ in range(turns if np.isfinite(value) else 0):
+        if problem.tail.any():
+            problem = problem.held(z, psi, gains)
+            value, gains = problem.passes(z, psi, gains)
         if physics:
             below, above, nudge = problem.corner(z, psi, gains)
             information, gradient = problem.normal_equations(z, psi, gains, nudge)

@@ -6,8 +6,11 @@ covariance, the likelihood of physics p and noise psi is
 
     -2 ln L = sum ln S + nu^2 / S                                                                             (1)
 
-over scalar measurements, each after those before it.  Where outliers are expected, nu^2 / S becomes the normalised
-Student-t density, and the same weight w = (k + 1) / (k + z^2) lowers the gain.
+over scalar measurements, each after those before it.  Where outliers are expected, noise has variance r / w with a
+weight w of its own at the price k (w - 1 - ln w): Student-t noise of k degrees of freedom, as a scale mixture (Ting,
+Theodorou & Schaal 2007, doi:10.1007/978-3-540-74976-9_45; Lange, Little & Taylor 1989,
+doi:10.1080/01621459.1989.10478852).  Given all readings, w = (k + 1) / (k + m) lowers the objective, m the mean of
+a reading's squared error over r.
 
 One step:
     q' = q (0, omega) / 2,  omega' = J^-1 (tau - omega x J omega) + tau_0 - damping omega + alpha             (2)
@@ -110,6 +113,7 @@ class Track(NamedTuple):
         read: whether they are readings: only the noise of a reading is no thrust.
         speed_noise: least and most standard deviation of a logged rotor speed [rad/s].
         still: standard deviation of a velocity that nobody measures [m/s]; 0: velocity plays no part.
+        weight: w of every scalar measurement, shape (n, M); no rows: none is held.
         beyond: what a larger model adds, see `whole_model`.
     """
 
@@ -128,6 +132,7 @@ class Track(NamedTuple):
     read: bool
     speed_noise: tuple[float, float]
     still: float
+    weight: FloatArray
     beyond: Beyond
 
 
@@ -136,7 +141,7 @@ class Gains(NamedTuple):
 
     Attributes:
         gain: K of each scalar measurement, shape (n, M, N).
-        nu, S, w: innovation, its variance (0: not measured), its weight, shapes (n, M).
+        nu, S, w: innovation, its variance (0: not measured), weight of its reading, shapes (n, M).
         slope: derivative of the accelerometer by rotation vector, velocity and alpha, shape (n, 3, 9).
         mean: after the updates, shape (n, N_MEAN).
         P: columns of the covariance there that belong to f, alpha, e, shape (n, N, 9).
@@ -768,25 +773,17 @@ def _felt(track: Track, row: FloatArray) -> float:
     return float(4.0 * row[2 * MOMENTS] * kept * track.waver[0])
 
 
-@_piece
-def _normaliser(degrees: float) -> float:
-    """-2 ln of the Student-t density at 0 against the Gaussian's."""
-    return 2.0 * (math.lgamma(0.5 * degrees) - math.lgamma(0.5 * (degrees + 1.0))) + math.log(0.5 * degrees)
-
-
-def kalman(track: Track, p: FloatArray, psi: FloatArray, tail: FloatArray, store: bool) -> tuple[float, Gains]:
+def kalman(track: Track, p: FloatArray, psi: FloatArray, store: bool) -> tuple[float, Gains]:
     """Filter pass over a flight.
 
     Args:
         track: the flight.
         p: physics, shape (N_PHYSICS,).
         psi: noise, shape (N_NOISE,).
-        tail: 1 / degrees of freedom of the Student-t density of gyro, attitude, accelerometer, velocity, shape (4,);
-            0: Gaussian.
         store: keep what `replay` and `backward` need; else their arrays are empty.
 
     Returns:
-        -2 ln L, and the gains.
+        -2 ln L without the price of weights, and the gains.
     """
     rows = len(track.t) if store else 1
     # Made here: numba crashes where Ctrl-C arrives while it makes a tuple of ours for what it returns.
@@ -794,7 +791,7 @@ def kalman(track: Track, p: FloatArray, psi: FloatArray, tail: FloatArray, store
         np.zeros((rows, M, N)),
         np.zeros((rows, M)),
         np.zeros((rows, M)),
-        np.zeros((rows, M)),
+        track.weight if len(track.weight) else np.ones((len(track.t), M)),
         np.zeros((rows, 3, 9)),
         np.zeros((rows, N_MEAN)),
         np.zeros((rows, N, 9)),
@@ -802,7 +799,7 @@ def kalman(track: Track, p: FloatArray, psi: FloatArray, tail: FloatArray, store
         turning(p),
         track.beyond,
     )
-    return filter_pass(track, p, psi, tail, store, g), g
+    return filter_pass(track, p, psi, store, g), g
 
 
 @_piece
@@ -815,7 +812,7 @@ def _take(P: FloatArray, PH: FloatArray, gain: FloatArray) -> None:
 
 
 @_piece
-def _update(track, psi, tail, k, nu, slope, P, PH, gain, where, what, dx, store, g):  # type: ignore[no-untyped-def]
+def _update(track, psi, k, nu, slope, P, PH, gain, where, what, dx, store, g):  # type: ignore[no-untyped-def]
     """Eq. 6 for all that is measured in row k, one scalar after the other; returns -2 ln of their density.
 
     P changes for the three axes of a sensor at once; until then PH of each axis is reduced by those before it.
@@ -827,7 +824,7 @@ def _update(track, psi, tail, k, nu, slope, P, PH, gain, where, what, dx, store,
         if not _is_measured(track, k, m):
             continue
         axis, count = m % 3, _places(m, slope, where, what)
-        v, S = nu[m], _white(track, psi, g.table[k], k, m)
+        v, S = nu[m], _white(track, psi, g.table[k], k, m) / g.w[k, m]
         for i in range(N):
             PH[axis, i] = 0.0
         for j in range(count):
@@ -844,20 +841,13 @@ def _update(track, psi, tail, k, nu, slope, P, PH, gain, where, what, dx, store,
                 PH[axis, i] -= along * PH[b, i]
         for j in range(count):
             S += what[j] * PH[axis, where[j]]
-        square, light = v * v / S, 1.0
-        k_inv = tail[m // 3] if track.seen[k, m // 3] else 0.0
-        if k_inv > 0.0:
-            light = min((1.0 + k_inv) / (1.0 + k_inv * square), 1.0)
-            total += (1.0 + 1.0 / k_inv) * math.log1p(k_inv * square) + _normaliser(1.0 / k_inv)
-        else:
-            total += square
-        total += math.log(S)
-        gain[axis] = light / S
+        total += v * v / S + math.log(S)
+        gain[axis] = 1.0 / S
         f = gain[axis] * v
         for i in range(N):
             dx[i] += f * PH[axis, i]
         if store:
-            g.nu[k, m], g.S[k, m], g.w[k, m] = v, S, light
+            g.nu[k, m], g.S[k, m] = v, S
             for i in range(N):
                 g.gain[k, m, i] = gain[axis] * PH[axis, i]
         if axis == 2:
@@ -866,8 +856,8 @@ def _update(track, psi, tail, k, nu, slope, P, PH, gain, where, what, dx, store,
 
 
 @_fast
-def filter_pass(track: Track, p: FloatArray, psi: FloatArray, tail: FloatArray, store: bool, g: Gains) -> float:
-    """Writes the gains of `kalman`; returns -2 ln L."""
+def filter_pass(track: Track, p: FloatArray, psi: FloatArray, store: bool, g: Gains) -> float:
+    """Writes the gains of `kalman` for their weights; returns -2 ln L."""
     n = len(track.t)
     air = _in_air(track)
     c, keep = _constants(p, track), np.empty(9)
@@ -890,7 +880,7 @@ def filter_pass(track: Track, p: FloatArray, psi: FloatArray, tail: FloatArray, 
         _sense_beyond(track.beyond, k - 1, slope)
         _expected(c, p, track.y[k], track.seen[k], g.table[k], air, x, nu)
         _read_beyond(track.beyond, k, step, nu)
-        total += _update(track, psi, tail, k, nu, slope, P, PH, taken, where, what, dx, store, g)
+        total += _update(track, psi, k, nu, slope, P, PH, taken, where, what, dx, store, g)
         _correct(dx, x)
         if store:
             _copy(x, g.mean[k])
@@ -992,7 +982,7 @@ def replay(
                 v -= what[j] * dx[where[j]]
             for i in range(N):
                 dx[i] += g.gain[k, m, i] * v
-            z = v * math.sqrt(g.w[k, m] / g.S[k, m])
+            z = v / math.sqrt(g.S[k, m])
             total += z * z
             if len(out) > 0:
                 out[k, m] = z
@@ -1025,7 +1015,7 @@ def _quadratic(G, l, L):  # type: ignore[no-untyped-def]
 @_fast
 def backward(
     track: Track, p: FloatArray, psi: FloatArray, g: Gains, smooth: bool
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
     """Smoother and score, Eqs. 7 to 9.
 
     Args:
@@ -1038,7 +1028,8 @@ def backward(
     Returns:
         Derivative of -2 ln L by the noise numbers, shape (N_NOISE,); smoothed f, alpha, e, shape (n, 9), and their
         variances, shape (n, 9); sum of G' N G Q over each rotor noise of `_wavering`, and of D r over that which the
-        accelerometer is compared with, shape (4,).
+        accelerometer is compared with, shape (4,); mean square of the error of every scalar measurement over its
+        variance r, given all of them, shape (n, M).
     """
     n = len(track.t)
     air = _in_air(track)
@@ -1047,7 +1038,7 @@ def backward(
     NK, G, turn, F = np.empty(N), np.empty(N), np.zeros((3, 3)), np.zeros((N, N))
     c, after, before = _constants(p, track), np.empty(N_MEAN), -1.0
     where, what, keep = np.zeros(10, dtype=np.int64), np.zeros(10), np.empty(9)
-    loose, borrowed = np.empty(4), np.zeros(4)
+    loose, borrowed, own = np.empty(4), np.zeros(4), np.ones((n, M))
     for k in range(n - 1, -1, -1):
         if k + 1 < n:
             h = track.t[k + 1] - track.t[k]
@@ -1110,7 +1101,7 @@ def backward(
             if g.S[k, m] == 0.0:
                 continue
             count = _places(m, g.slope[k], where, what)
-            S, K = g.S[k, m] / g.w[k, m], g.gain[k, m]
+            S, K = g.S[k, m], g.gain[k, m]
             u, D = g.nu[k, m] / S, 1.0 / S
             for i in range(N):
                 u -= K[i] * l[i]
@@ -1121,6 +1112,8 @@ def backward(
             for i in range(N):
                 D += K[i] * NK[i]
             if m < VELOCITY or track.seen[k, 3]:
+                noise = _white(track, psi, g.table[k], k, m) / g.w[k, m]
+                own[k, m] = (1.0 + noise * (u * u - D)) / g.w[k, m]
                 score[m] -= (u * u - D) / g.w[k, m] * 2.0 * psi[m]
             if m == ACCEL + 2:
                 felt = _felt(track, g.table[k])
@@ -1137,4 +1130,4 @@ def backward(
     for i in range(9):
         s = psi[SIGMA + _GROUP[i]]
         score[SIGMA + _GROUP[i]] -= (l[FO + i] ** 2 - L[FO + i, FO + i]) * 2.0 * s
-    return score, mean, variance, borrowed
+    return score, mean, variance, borrowed, own

@@ -104,7 +104,7 @@ def _smoothed(problem: Problem, z: FloatArray, psi: FloatArray) -> list[Missing]
     _, gains = problem.passes(z, psi)
     for j, (track, g) in enumerate(zip(problem.tracks, gains, strict=True)):
         p = problem.physics(z, j)
-        _, mean, variance, _ = k.backward(track, p, psi, g, True)
+        _, mean, variance, *_ = k.backward(track, p, psi, g, True)
         sigma = np.sqrt(np.maximum(variance, 0.0))
         scale = np.concatenate([np.full(3, track.mass), p[k.JX : k.JX + 3]])
         square = 0.5 * (g.table[:, 1:4] + g.table[:, k.MOMENTS + 1 : k.MOMENTS + 4])

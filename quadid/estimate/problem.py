@@ -89,6 +89,8 @@ ACTS = np.array(
     ]
 )
 """Powers of the six in what rotors make of specific thrust and of the angular accelerations."""
+RENEWALS = 2
+"""Times that weights of outliers are renewed before a pass that holds none."""
 AT_ONCE = 16
 """Points whose effects are simulated together: more would only take more memory."""
 SETTLING = 2
@@ -124,6 +126,7 @@ def cut(track: Track, first: int, last: int) -> Track:
         t=t,
         y=track.y[rows],
         seen=track.seen[rows],
+        weight=track.weight[rows],
         beyond=beyond,
         piece_t=track.piece_t[pieces],
         speed=track.speed[pieces],
@@ -187,7 +190,7 @@ class Problem:
         base: physics vector of what is not free, shape (N_PHYSICS,).
         theta: full vector of what is not free.
         models: one a flight, where more acts or is free than the filter has of its own.
-        tail: see `kalman.kalman`.
+        tail: 1 / degrees of freedom of the noise of gyro, attitude, accelerometer, velocity, shape (4,); 0: Gaussian.
         control: see `control_moment`; unit of what is random.
         borrowed: see `unbiased`, shape (4,).
     """
@@ -517,6 +520,16 @@ class Problem:
         total = self.penalty(z) + self.noise_penalty(psi)[0] + sum(value for value, _ in found)
         return (total if np.isfinite(total) else np.inf), [g for _, g in found]
 
+    def held(self, z: FloatArray, psi: FloatArray, gains: Sequence[Gains]) -> Problem:
+        """The problem with weights of outliers renewed by a pass, and held; the same where none are expected."""
+        if not self.tail.any():
+            return self
+        return replace(self, tracks=tuple(_each(lambda j: self._weighed(j, z, psi, gains[j]), len(gains))))
+
+    def _weighed(self, j: int, z: FloatArray, psi: FloatArray, g: Gains) -> Track:
+        square, tail = k.backward(self.tracks[j], self.physics(z, j), psi, g, False)[4], np.repeat(self.tail, 3)
+        return self.tracks[j]._replace(weight=(1.0 + tail) / (1.0 + tail * square))
+
     def along(self, z: FloatArray, psi: FloatArray) -> Problem:
         """The problem in which effects stay linear in the states, as simulated at z, unless one of them is free."""
         if not self.models or not set(self.names) <= set(PLACES):
@@ -532,12 +545,20 @@ class Problem:
             if near is None:
                 # First along states that follow the measurements: where random forces are small, those without effects
                 # run away.  Then along their own.
-                near = k.kalman(track, p, self.first_noise(), self.tail, True)[1]
-                first, own = k.kalman(self._simulated(j, z, psi, near), p, psi, self.tail, True)
+                near = k.kalman(track, p, self.first_noise(), True)[1]
+                first, own = k.kalman(self._simulated(j, z, psi, near), p, psi, True)
                 near = own if np.isfinite(first) else near
             track = self._simulated(j, z, psi, near)
-        value, gains = k.kalman(track, p, psi, self.tail, store)
-        return float(value), gains
+        renewals = RENEWALS if self.tail.any() and not len(track.weight) else 0
+        value, gains = k.kalman(track, p, psi, store or renewals > 0)
+        for _ in range(renewals):
+            value, gains = k.kalman(track._replace(weight=self._weighed(j, z, psi, gains).weight), p, psi, True)
+        return float(value) + float(np.sum(self.price(gains))), gains
+
+    def price(self, g: Gains) -> FloatArray:
+        """What the weights of outliers cost in -2 ln L, by measurement, shape (n, M)."""
+        degrees = 1.0 / np.repeat(np.where(self.tail > 0.0, self.tail, np.inf), 3)
+        return np.asarray(degrees * (g.w - 1.0 - np.log(g.w)))
 
     def _simulated(self, j: int, z: FloatArray, psi: FloatArray, near: Gains) -> Track:
         """Flight j with its effects simulated at z along the states that these gains give, until both settle.
@@ -576,9 +597,9 @@ class Problem:
                 moved = psi.copy()
                 if i < k.N_NOISE:
                     moved[i] *= np.exp(NUDGE)
-                g = k.kalman(part, p, moved, self.tail, True)[1]
+                g = k.kalman(part, p, moved, True)[1]
                 S = np.where(g.S > 0.0, g.S, 1.0)
-                return np.log(S)[SETTLED:].ravel(), (g.nu * np.sqrt(g.w))[SETTLED:].ravel()
+                return np.log(S)[SETTLED:].ravel(), g.nu[SETTLED:].ravel()
 
             *moved, (log_s, nu) = _each(innovations, k.N_NOISE + 1)
             by_s = np.array([(a - log_s) / NUDGE for a, _ in moved])

@@ -6,7 +6,7 @@ from scipy.interpolate import CubicSpline
 from quadid.data.grid import linear
 from quadid.data.rotor_signal import rotor_signal
 from quadid.data.window import Recording, Sampling, Window, copied, in_body_axes, sample_period
-from quadid.estimate.kalman import Track, nothing_beyond
+from quadid.estimate.kalman import M, Track, nothing_beyond
 from quadid.types import BoolArray, FloatArray
 from quadid.vehicle import Vehicle
 
@@ -106,7 +106,7 @@ def _track(
     return Track(
         t, y, seen, 0.5 * period, piece_t, pieces, share, vehicle.mass, len(vehicle.rotors), hubs,
         wavering(vehicle, vehicle.initial), float(np.median(between)),
-        vehicle.command.sampling == "instant", _speed_noise(speed[new]), still, nothing_beyond(),
+        vehicle.command.sampling == "instant", _speed_noise(speed[new]), still, np.empty((0, M)), nothing_beyond(),
     )  # fmt: skip
 
 
