@@ -27,7 +27,7 @@ ROUNDS = 4
 """Most times that effects are simulated anew, and that the noise of rotor speeds is taken out anew."""
 CHANCE = 4.0
 """Standard errors of the kurtosis beyond which innovations have outliers."""
-PATIENCE = 8
+PATIENCE = 4
 """Times a step is shortened before the search ends."""
 POOR = 0.25
 """Share of the gain that a step promises below which the next one is shorter."""
@@ -58,6 +58,11 @@ class Estimate:
     covariance: FloatArray
     objective: float
     whitened: tuple[FloatArray, ...]
+
+    @property
+    def finite(self) -> bool:
+        """Whether the search ended at numbers; where the filter ran away there are none."""
+        return all(np.isfinite(a).all() for a in (self.objective, self.z, self.covariance))
 
     def value(self, name: str, flight: int = -1) -> tuple[float, float]:
         """Value of a parameter and its standard deviation: relative for the nominal six, else in its unit."""
@@ -97,7 +102,7 @@ def estimate(problem: Problem, start: FloatArray | None = None) -> Estimate:
         nonlocal problem, z, psi, value, gains, information
         gains.clear()  # of a long flight, each list of them is a third of all memory
         tried = scoring(new, z, psi, MOST, ALL_NOISE)
-        if there := bool(np.isfinite(tried[2])):
+        if there := bool(np.isfinite(tried[2]) and np.isfinite(tried[4]).all()):
             problem, (z, psi, value, gains, information) = new, tried
         else:
             gains = problem.passes(z, psi)[1]
@@ -126,13 +131,13 @@ def estimate(problem: Problem, start: FloatArray | None = None) -> Estimate:
         if not moved(tilted) or (z - before) @ information @ (z - before) < FINE:
             break
     taken, noise = problem.taken
-    # 6. A loop faster than the log answers a random moment within a step: by half of what it may, give or take as much.
+    # 6. A loop faster than the log answers a random moment within a step: by nothing to all of what it may.
     within = problem.within_a_step(z, gains)
     inverse = np.linalg.inv(information)
     z = np.clip(z + 0.5 * inverse @ within.sum(axis=0), *problem.limits)
     # 7. Intervals: score over slope, and how well the noise of rotor speeds and that answer are known.
     by_square = taken * of_square(problem, z, psi, gains)
-    score = information + noise + 0.25 * within.T @ within + np.outer(by_square, by_square)
+    score = information + noise + within.T @ within / 12.0 + np.outer(by_square, by_square)
     covariance = inverse @ score @ inverse
     return Estimate(problem, z, psi, np.asarray(covariance), value, whitened(problem.tracks, gains))
 
@@ -225,8 +230,11 @@ def scoring(
     renewed: list[Gains] = []
     for _ in range(turns if np.isfinite(value) else 0):
         if problem.tail.any():
-            problem = problem.held(z, psi, gains)
-            value, gains = problem.passes(z, psi, gains)
+            held = problem.held(z, psi, gains)
+            anew, renewed = held.passes(z, psi, gains)
+            if not np.isfinite(anew):
+                break
+            problem, value, gains, renewed = held, anew, renewed, []
         if physics:
             below, above, nudge = problem.corner(z, psi, gains)
             information, gradient = problem.normal_equations(z, psi, gains, nudge)

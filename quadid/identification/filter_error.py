@@ -164,16 +164,16 @@ def _filtered(
     # What these flights show beside: in a climb b would stand in for inflow, J_zz for rotations that do not couple.
     velocity = all(w.velocity is not None for w in windows)
     asked = [name for name in SHOWN if name.split(".")[0] not in stated and (velocity or name != INFLOW)]
-    while asked and (shown := _shown(found, problem_of(windows, asked).settled(unsettled))):
+    while asked and found.finite and (shown := _shown(found, problem_of(windows, asked).settled(unsettled))):
         along += shown
         again = problem_of(windows).settled(unsettled)
         beyond = estimate(again, _without(found, again))
-        wrong = [name for name in shown if beyond.value(name)[0] < SHOWN[name]]
+        wrong = [name for name in shown if not (beyond.finite and beyond.value(name)[0] >= SHOWN[name])]
         if not wrong:
             found = beyond
             break
         along, asked = [n for n in along if n not in shown], [n for n in asked if n not in wrong]
-    if not (np.isfinite(found.objective) and np.isfinite(found.z).all() and np.isfinite(found.covariance).all()):
+    if not found.finite:
         return None
     problem, names = found.problem, [name for name, *_ in found.problem.entries]
     out, places = theta.copy(), np.array([names.index(n) for n in free.names])

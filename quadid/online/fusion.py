@@ -320,11 +320,12 @@ class Fusion:
         lost, turned = turned[:, size < 0.0], turned / sigma[:, None]
         vector = total.vector[part] - lost @ (lost.T @ (sigma * total.vector[part])) / sigma
         inverse = np.linalg.inv(np.diag(precision) + (turned * np.maximum(size, 0.0)) @ turned.T)
-        # A loop faster than the log answers a random moment within a step: by half of what it may, give or take that.
-        z = inverse @ (vector + precision * mean + loose[:-1].sum(axis=0))
+        # A loop faster than the log answers a random moment within a step: by nothing to all of twice `half`.
+        half, doubt = loose[:-1], loose[-1]
+        z = inverse @ (vector + precision * mean + half.sum(axis=0))
         for i in self._positive:
             z = z - inverse[:, i] / inverse[i, i] * min(z[i], 0.0)
-        spread = net + total.noise[part, part] + np.diag(precision) + loose.T @ loose
+        spread = net + total.noise[part, part] + np.diag(precision) + half.T @ half / 3.0 + np.outer(doubt, doubt)
         covariance = inverse @ spread @ inverse
         # Errors of the six by the length of rows: a share of the step to every second row, none where chance explains
         # that.
