@@ -8,19 +8,19 @@ covariance, the likelihood of physics p and noise psi is
 
 over scalar measurements, each after those before it.  Where outliers are expected, noise has variance r / w with a
 weight w of its own at the price k (w - 1 - ln w): Student-t noise of k degrees of freedom, as a scale mixture (Ting,
-Theodorou & Schaal 2007, doi:10.1007/978-3-540-74976-9_45; Lange, Little & Taylor 1989,
+Theodorou & Schaal 2007, doi:10.1007/978-3-540-74958-5_76; Lange, Little & Taylor 1989,
 doi:10.1080/01621459.1989.10478852).  Given all readings, w = (k + 1) / (k + m) lowers the objective, m the mean of
 a reading's squared error over r.
 
 One step:
     q' = q (0, omega) / 2,  omega' = J^-1 (tau - omega x J omega) + tau_0 - damping omega + alpha             (2)
     v' = R (F / m + f) + g                                                                                    (3)
-    a(t + h) = exp(-h / T) a(t) + w,  w ~ N(0, sigma^2 (1 - exp(-2 h / T))),  for a of f, alpha, e            (4)
+    a(t + h) = exp(-h / T) a(t) + n,  n ~ N(0, sigma^2 (1 - exp(-2 h / T))),  for a of f, alpha, e            (4)
     P <- F P F' + G Q G'                                                                                      (5)
-where Q holds, beside the w, the noise of logged rotor speeds, which acts as forces and moments that change with every
+where Q holds, beside the n, the noise of logged rotor speeds, which acts as forces and moments that change with every
 sample, and that of readings is in the thrust that the accelerometer is compared with (r);
-and for every scalar measurement y = h(x) + N(0, r):
-    S = H P H' + r,  K = P H' / S,  x <- x + K nu,  P <- P - K S K'                                           (6)
+and for every scalar measurement y = h(x) + N(0, r / w):
+    S = H P H' + r / w,  K = P H' / S,  x <- x + K nu,  P <- P - K S K'                                           (6)
 backwards (Bryson & Frazier; de Jong 1989; no inverse of P, which random forces of size zero leave singular):
     u = nu / S - K' l,  l <- l + H u,  D = 1 / S + K' N K,  N <- (I - K H)' N (I - K H) + H H' / S            (7)
     l <- F' l,  N <- F' N F;   smoothed x = x + P l with covariance P - P N P                                 (8)

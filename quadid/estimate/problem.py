@@ -468,7 +468,8 @@ class Problem:
         out[: k.M, 0], out[: k.M, 1] = floor_of(self.tracks), 100.0 * WHITE
         out[k.SIGMA : k.TIME, 0], out[k.SIGMA : k.TIME, 1] = LEAST * self.noise_scale, 100.0 * self.noise_scale
         force = slice(k.SIGMA, k.SIGMA + 2)
-        out[force, 0] = np.minimum(out[force, 0], UNSEEN * scatter_of(self.tracks))
+        unseen = max(UNSEEN * scatter_of(self.tracks), float(np.min(out[k.ACCEL : k.VELOCITY, 0])))
+        out[force, 0] = np.minimum(out[force, 0], unseen)
         out[k.ROTOR, 0] = max(out[k.ROTOR, 0], *(t.speed_noise[0] for t in self.tracks))
         out[k.ROTOR, 1] = max(out[k.ROTOR, 0], min(t.speed_noise[1] for t in self.tracks))
         step = max(float(np.median(np.diff(t.t))) for t in self.tracks)

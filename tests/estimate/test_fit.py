@@ -276,3 +276,13 @@ def test_outliers_lose_their_weight_and_pull_nothing() -> None:
         (value, sigma), (wanted, _) = found.value(name), clean.value(name)
         assert abs(np.log(value / wanted)) < sigma, name
         assert sigma < 1.3 * clean.value(name)[1], name
+
+
+def test_an_ideal_accelerometer_without_drag_leaves_random_forces_a_size() -> None:
+    """It reads exactly nothing along x and y: a least size of zero had no logarithm."""
+    flight = fly(PELICAN, draw_truth(PELICAN, 1), SECONDS, 1)
+    assert flight.window.accel is not None
+    still = replace(flight.window, accel=flight.window.accel * [0.0, 0.0, 1.0])
+    found = estimate(Problem.of([from_window(still, PELICAN)], PELICAN))
+    assert found.problem.noise_bounds[:, 0].min() > 0.0
+    assert found.finite

@@ -4,16 +4,18 @@
     python -m quadid_evaluation.studies.filter_error --parts exact speed --flights 20
 
 Parts: exact and gusty simulated flights, guesses far off, a loop faster than its log, a hidden motor lag, recorded
-vehicles, speed.  A part that is run alone replaces its own section of the page and leaves the others.
+vehicles, their single flights, speed.  A part that is run alone replaces its own section of the page.
 """
 
 import time
 from collections.abc import Callable, Mapping, Sequence
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
 from quadid_replay.opening import open_log
 
+import quadid
 from quadid.data.grid import grid_recording
 from quadid.effects import EFFECTS
 from quadid.estimate.fit import estimate
@@ -22,7 +24,7 @@ from quadid.estimate.problem import Problem
 from quadid.estimate.track import from_recording, from_window
 from quadid.flight import draw_truth, fly
 from quadid.identification.fit import FitOptions, fit
-from quadid.parameters import NOMINAL_NAMES
+from quadid.parameters import NOMINAL_NAMES, Status
 from quadid.types import FloatArray
 from quadid.vehicle import ParameterPrior, Vehicle
 from quadid_evaluation.harness import Given, options, pooled, put, table
@@ -51,6 +53,8 @@ RECORDED: tuple[tuple[str, tuple[str, ...], float | None], ...] = (
     ("iris", ("sideways.csv",), 50.0),
 )
 """Folder of the recorded data, flights, rate [Hz]; None: every channel at its own rate."""
+SINGLE = {"crazyflie_rpm": "figure8_??.csv", "brushed": "jana0?.csv", "nanodrone": "*_run?.csv"}
+"""Folder and pattern of flights that are identified one by one."""
 KNOWN = {
     "brushed": "b 2.02e-8 (thrust stand), J 1.5–1.9e-5, speeds act 4–8 ms late",
     "crazyflie_rpm": "b 3.70e-8",
@@ -198,6 +202,46 @@ def recorded(data: Path) -> list[str]:
     ]
 
 
+def single(data: Path) -> list[str]:
+    """Single flights of one vehicle, identified one by one: whether their intervals hold each other, what is left."""
+    rows, white = [], []
+    for folder, pattern in SINGLE.items():
+        vehicle = Vehicle.named(data / folder / "vehicle.yaml")
+        logs = [quadid.load(path, vehicle) for path in sorted((data / folder).glob(pattern))]
+        found = [quadid.identify(log).parameters for log in logs]
+        for name in ("b", "J_xx", "J_yy"):
+            known = [p[name] for p in found if p[name].status is Status.IDENTIFIED]
+            half = [np.log(p.ci95[1] / p.value) for p in known]
+            agree = [
+                abs(np.log(p.value / q.value)) < np.hypot(a, b)
+                for (p, a), (q, b) in combinations(zip(known, half, strict=True), 2)
+            ]
+            values = f"{min(p.value for p in known):.4g} to {max(p.value for p in known):.4g}" if known else "–"
+            width = f"{np.median(half):.1%}" if known else "–"
+            rows.append(
+                (f"`{folder}`", name, f"{len(known)} of {len(found)}", values, width, f"{sum(agree)} of {len(agree)}")
+            )
+        tracks = [[from_window(w, vehicle, air=True) for w in log.windows] for log in logs]
+        left = [w for track in tracks for w in estimate(Problem.of(track, vehicle, FREE)).whitened]
+        for group, channel in enumerate(("gyro", "attitude", "accelerometer", "velocity")):
+            parts = [w[w[:, 3 * group] != 0.0, 3 * group : 3 * group + 3] for w in left]
+            square = np.mean([np.mean(z**2) for z in parts if len(z)])
+            follows = [np.mean([np.mean(z[lag:] * z[:-lag]) for z in parts if len(z)]) / square for lag in range(1, 11)]
+            white.append(
+                (f"`{folder}`", channel, f"{square:.2f}", f"{follows[0]:+.2f}", f"{max(follows[1:], key=abs):+.2f}")
+            )
+    return [
+        "Values called identified by `identify`, and pairs of flights whose difference lies within both intervals.",
+        "",
+        *table(("data", "parameter", "identified", "values", "half-width, median", "pairs that agree"), rows),
+        "",
+        "Innovations over their standard deviations, parameters free as for recorded vehicles: mean square, and "
+        "autocorrelation at lag 1 and where it is largest at lags 2 to 10.",
+        "",
+        *table(("data", "channel", "mean square", "lag 1", "lags 2 to 10"), white),
+    ]
+
+
 def speed() -> list[str]:
     """Time of `identify` for a flight of 500 s at 50 Hz, calm and in gusts, and of one filter pass."""
     begin, craft = time.perf_counter(), Vehicle.shipped("pelican")
@@ -230,6 +274,7 @@ PARTS: Mapping[str, tuple[str, Callable[[Given], Sequence[str]]]] = {
     "loop": ("A loop faster than its log", lambda g: feedback(max(g.flights // 5, 4), g.processes)),
     "late": ("A hidden motor lag", lambda g: late(max(g.flights // 10, 4), g.processes)),
     "recorded": ("Recorded vehicles", lambda g: recorded(g.data)),
+    "single": ("Single flights of recorded vehicles", lambda g: single(g.data)),
     "speed": ("Speed", lambda g: speed()),
 }
 
