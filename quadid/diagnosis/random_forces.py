@@ -30,7 +30,7 @@ from quadid.identification.problem import Free
 from quadid.identification.uncertainty import Uncertainty
 from quadid.model.layout import places
 from quadid.parameters import NOMINAL_NAMES
-from quadid.types import BoolArray, FloatArray, IndexArray
+from quadid.types import FloatArray, IndexArray
 from quadid.vehicle import Vehicle
 
 # --- The likelihood near a model, by stretches of time
@@ -48,13 +48,6 @@ def stretches(track: Track) -> IndexArray:
     return np.unique(np.linspace(0, len(track.t), count, endpoint=False).astype(np.intp))
 
 
-def densities(problem: Problem, g: Gains) -> tuple[FloatArray, BoolArray]:
-    """-2 ln of the density of every scalar measurement of a pass, with the price of its weight, and which there are."""
-    seen = g.S > 0.0
-    S = np.where(seen, g.S, 1.0)
-    return np.where(seen, g.nu**2 / S + np.log(S) + problem.price(g), 0.0), seen
-
-
 def innovations(track: Track, p: FloatArray, psi: FloatArray, g: Gains) -> FloatArray:
     """Whitened innovations of a flight at physics p under the gains of a pass nearby, shape (n, M)."""
     out = np.zeros((len(track.t), k.M))
@@ -66,9 +59,11 @@ def costs(problem: Problem, gains: Sequence[Gains]) -> tuple[FloatArray, FloatAr
     """Deviance of every stretch under the gains of a pass, its scalar measurements, its flight, its begin [s]."""
     parts = []
     for j, (track, g) in enumerate(zip(problem.tracks, gains, strict=True)):
-        first = stretches(track)
-        cost, seen = (np.add.reduceat(a.sum(axis=1), first) for a in densities(problem, g))
-        parts.append((cost, seen.astype(float), np.full(len(first), j), track.t[first]))
+        first, seen = stretches(track), g.S > 0.0
+        S = np.where(seen, g.S, 1.0)
+        density = np.where(seen, g.nu**2 / S + np.log(S) + problem.price(g), 0.0)
+        cost, rows = (np.add.reduceat(a.sum(axis=1), first) for a in (density, seen))
+        parts.append((cost, rows.astype(float), np.full(len(first), j), track.t[first]))
     cost, rows, window, time = (np.concatenate(column) for column in zip(*parts, strict=True))
     return cost, rows, window, time
 

@@ -171,9 +171,8 @@ def of_square(problem: Problem, z: FloatArray, psi: FloatArray, gains: Sequence[
     low, high = problem.noise_bounds[k.ROTOR]
     if psi[k.ROTOR] <= 1.01 * low:
         return 0.0
-    known = np.linalg.inv(
-        problem.held(z, psi, gains).noise_information(z, psi, gains) + 0.5 * np.diag(problem.noise_curvature(psi))
-    )
+    data = problem.held(z, psi, gains).noise_information(z, psi, gains)
+    known = np.linalg.inv(data + 0.5 * np.diag(problem.noise_curvature(psi)))
     return float(min(2.0 * np.sqrt(known[k.ROTOR, k.ROTOR]), (high / psi[k.ROTOR]) ** 2 / np.sqrt(12.0)))
 
 
@@ -186,10 +185,8 @@ def measured(track: Track, g: Gains) -> BoolArray:
 
 def whitened(tracks: Sequence[Track], gains: Sequence[Gains]) -> tuple[FloatArray, ...]:
     """Innovations of a pass over their standard deviations, shape (n, M) for each flight; 0 where not measured."""
-    seen = [measured(track, g) for track, g in zip(tracks, gains, strict=True)]
-    return tuple(
-        np.where(there, g.nu / np.sqrt(np.where(there, g.S, 1.0)), 0.0) for there, g in zip(seen, gains, strict=True)
-    )
+    masked = ((measured(track, g), g) for track, g in zip(tracks, gains, strict=True))
+    return tuple(np.where(seen, g.nu / np.sqrt(np.where(seen, g.S, 1.0)), 0.0) for seen, g in masked)
 
 
 def tails(tracks: Sequence[Track], gains: Sequence[Gains]) -> FloatArray:

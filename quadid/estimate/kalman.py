@@ -6,11 +6,11 @@ covariance, the likelihood of physics p and noise psi is
 
     -2 ln L = sum ln S + nu^2 / S                                                                             (1)
 
-over scalar measurements, each after those before it.  Where outliers are expected, noise has variance r / w with a
-weight w of its own at the price k (w - 1 - ln w): Student-t noise of k degrees of freedom, as a scale mixture (Ting,
-Theodorou & Schaal 2007, doi:10.1007/978-3-540-74958-5_76; Lange, Little & Taylor 1989,
-doi:10.1080/01621459.1989.10478852).  Given all readings, w = (k + 1) / (k + m) lowers the objective, m the mean of
-a reading's squared error over r.
+over scalar measurements, each after those before it.  Where outliers are expected, noise has variance r / w, with a
+weight w of each reading at the price k (w - 1 - ln w): Student-t noise of k degrees of freedom as a scale mixture
+(Ting, Theodorou & Schaal 2007, doi:10.1007/978-3-540-74958-5_76; Lange, Little & Taylor 1989,
+doi:10.1080/01621459.1989.10478852).  w = (k + 1) / (k + m) lowers the sum, m the mean of its squared error over r,
+given all readings.
 
 One step:
     q' = q (0, omega) / 2,  omega' = J^-1 (tau - omega x J omega) + tau_0 - damping omega + alpha             (2)
@@ -773,25 +773,24 @@ def _felt(track: Track, row: FloatArray) -> float:
     return float(4.0 * row[2 * MOMENTS] * kept * track.waver[0])
 
 
-def kalman(track: Track, p: FloatArray, psi: FloatArray, store: bool) -> tuple[float, Gains]:
+def kalman(track: Track, p: FloatArray, psi: FloatArray) -> tuple[float, Gains]:
     """Filter pass over a flight.
 
     Args:
         track: the flight.
         p: physics, shape (N_PHYSICS,).
         psi: noise, shape (N_NOISE,).
-        store: keep what `replay` and `backward` need; else their arrays are empty.
 
     Returns:
         -2 ln L without the price of weights, and the gains.
     """
-    rows = len(track.t) if store else 1
+    rows = len(track.t)
     # Made here: numba crashes where Ctrl-C arrives while it makes a tuple of ours for what it returns.
     g = Gains(
         np.zeros((rows, M, N)),
         np.zeros((rows, M)),
         np.zeros((rows, M)),
-        track.weight if len(track.weight) else np.ones((len(track.t), M)),
+        track.weight if len(track.weight) else np.ones((rows, M)),
         np.zeros((rows, 3, 9)),
         np.zeros((rows, N_MEAN)),
         np.zeros((rows, N, 9)),
@@ -799,7 +798,7 @@ def kalman(track: Track, p: FloatArray, psi: FloatArray, store: bool) -> tuple[f
         turning(p),
         track.beyond,
     )
-    return filter_pass(track, p, psi, store, g), g
+    return filter_pass(track, p, psi, g), g
 
 
 @_piece
@@ -812,7 +811,7 @@ def _take(P: FloatArray, PH: FloatArray, gain: FloatArray) -> None:
 
 
 @_piece
-def _update(track, psi, k, nu, slope, P, PH, gain, where, what, dx, store, g):  # type: ignore[no-untyped-def]
+def _update(track, psi, k, nu, slope, P, PH, gain, where, what, dx, g):  # type: ignore[no-untyped-def]
     """Eq. 6 for all that is measured in row k, one scalar after the other; returns -2 ln of their density.
 
     P changes for the three axes of a sensor at once; until then PH of each axis is reduced by those before it.
@@ -846,17 +845,16 @@ def _update(track, psi, k, nu, slope, P, PH, gain, where, what, dx, store, g):  
         f = gain[axis] * v
         for i in range(N):
             dx[i] += f * PH[axis, i]
-        if store:
-            g.nu[k, m], g.S[k, m] = v, S
-            for i in range(N):
-                g.gain[k, m, i] = gain[axis] * PH[axis, i]
+        g.nu[k, m], g.S[k, m] = v, S
+        for i in range(N):
+            g.gain[k, m, i] = gain[axis] * PH[axis, i]
         if axis == 2:
             _take(P, PH, gain)
     return total
 
 
 @_fast
-def filter_pass(track: Track, p: FloatArray, psi: FloatArray, store: bool, g: Gains) -> float:
+def filter_pass(track: Track, p: FloatArray, psi: FloatArray, g: Gains) -> float:
     """Writes the gains of `kalman` for their weights; returns -2 ln L."""
     n = len(track.t)
     air = _in_air(track)
@@ -873,20 +871,18 @@ def filter_pass(track: Track, p: FloatArray, psi: FloatArray, store: bool, g: Ga
         P[FO + i, FO + i] = psi[SIGMA + _GROUP[i]] ** 2
     total, before = 0.0, -1.0
     for k in range(n):
-        at = k if store else 0
-        slope = g.slope[at]
+        slope = g.slope[k]
         # Update by all that was measured now, Eq. 6.
         _accel_slope(c, g.table[k], air, x, slope)
         _sense_beyond(track.beyond, k - 1, slope)
         _expected(c, p, track.y[k], track.seen[k], g.table[k], air, x, nu)
         _read_beyond(track.beyond, k, step, nu)
-        total += _update(track, psi, k, nu, slope, P, PH, taken, where, what, dx, store, g)
+        total += _update(track, psi, k, nu, slope, P, PH, taken, where, what, dx, g)
         _correct(dx, x)
-        if store:
-            _copy(x, g.mean[k])
-            for i in range(N):
-                for j in range(9):
-                    g.P[k, i, j] = P[i, FO + j]
+        _copy(x, g.mean[k])
+        for i in range(N):
+            for j in range(9):
+                g.P[k, i, j] = P[i, FO + j]
         if k + 1 == n:
             break
         # Predict up to the next measurement, Eqs. 2 to 5.
@@ -1022,7 +1018,7 @@ def backward(
         track: the flight.
         p: physics of the pass.
         psi: its noise.
-        g: of the pass, stored.
+        g: of the pass.
         smooth: whether the smoothed states are wanted; else they are zero.
 
     Returns:

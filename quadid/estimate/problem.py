@@ -89,12 +89,10 @@ ACTS = np.array(
     ]
 )
 """Powers of the six in what rotors make of specific thrust and of the angular accelerations."""
-RENEWALS = 2
-"""Times that weights of outliers are renewed before a pass that holds none."""
 AT_ONCE = 16
 """Points whose effects are simulated together: more would only take more memory."""
 SETTLING = 2
-"""Times that effects are simulated anew along the states that they move."""
+"""Times that effects are simulated anew along the states that they move, and weights of outliers by their readings."""
 RECKONED = 6.0
 """Time [s] after which drag has shown the velocity that a flight began with."""
 LEAST = 1e-2
@@ -468,8 +466,7 @@ class Problem:
         out[: k.M, 0], out[: k.M, 1] = floor_of(self.tracks), 100.0 * WHITE
         out[k.SIGMA : k.TIME, 0], out[k.SIGMA : k.TIME, 1] = LEAST * self.noise_scale, 100.0 * self.noise_scale
         force = slice(k.SIGMA, k.SIGMA + 2)
-        unseen = max(UNSEEN * scatter_of(self.tracks), float(np.min(out[k.ACCEL : k.VELOCITY, 0])))
-        out[force, 0] = np.minimum(out[force, 0], unseen)
+        out[force, 0] = np.minimum(out[force, 0], max(UNSEEN * scatter_of(self.tracks), out[k.ACCEL, 0]))
         out[k.ROTOR, 0] = max(out[k.ROTOR, 0], *(t.speed_noise[0] for t in self.tracks))
         out[k.ROTOR, 1] = max(out[k.ROTOR, 0], min(t.speed_noise[1] for t in self.tracks))
         step = max(float(np.median(np.diff(t.t))) for t in self.tracks)
@@ -505,9 +502,7 @@ class Problem:
 
     def objective(self, z: FloatArray, psi: FloatArray) -> float:
         """-2 ln of likelihood and prior; infinite where the filter has no finite step."""
-        total = self.penalty(z) + self.noise_penalty(psi)[0]
-        total += sum(_each(lambda j: self._pass(z, psi, j, False)[0], len(self.tracks)))
-        return total if np.isfinite(total) else float(np.inf)
+        return self.passes(z, psi)[0]
 
     def passes(self, z: FloatArray, psi: FloatArray, near: Sequence[Gains] = ()) -> tuple[float, list[Gains]]:
         """The same, and the gains of every flight.
@@ -517,7 +512,7 @@ class Problem:
             psi: noise numbers.
             near: gains of a pass nearby, along whose states effects are simulated first; else those without effects.
         """
-        found = _each(lambda j: self._pass(z, psi, j, True, near[j] if near else None), len(self.tracks))
+        found = _each(lambda j: self._pass(z, psi, j, near[j] if near else None), len(self.tracks))
         total = self.penalty(z) + self.noise_penalty(psi)[0] + sum(value for value, _ in found)
         return (total if np.isfinite(total) else np.inf), [g for _, g in found]
 
@@ -538,22 +533,19 @@ class Problem:
         tracks = [t._replace(beyond=g.beyond) for t, g in zip(self.tracks, self.passes(z, psi)[1], strict=True)]
         return replace(self, tracks=tuple(tracks), models=())
 
-    def _pass(
-        self, z: FloatArray, psi: FloatArray, j: int, store: bool, near: Gains | None = None
-    ) -> tuple[float, Gains]:
+    def _pass(self, z: FloatArray, psi: FloatArray, j: int, near: Gains | None) -> tuple[float, Gains]:
         track, p = self.tracks[j], self.physics(z, j)
         if self.models:
             if near is None:
                 # First along states that follow the measurements: where random forces are small, those without effects
                 # run away.  Then along their own.
-                near = k.kalman(track, p, self.first_noise(), True)[1]
-                first, own = k.kalman(self._simulated(j, z, psi, near), p, psi, True)
+                near = k.kalman(track, p, self.first_noise())[1]
+                first, own = k.kalman(self._simulated(j, z, psi, near), p, psi)
                 near = own if np.isfinite(first) else near
             track = self._simulated(j, z, psi, near)
-        renewals = RENEWALS if self.tail.any() and not len(track.weight) else 0
-        value, gains = k.kalman(track, p, psi, store or renewals > 0)
-        for _ in range(renewals):
-            value, gains = k.kalman(track._replace(weight=self._weighed(j, z, psi, gains).weight), p, psi, True)
+        value, gains = k.kalman(track, p, psi)
+        for _ in range(SETTLING if self.tail.any() and not len(track.weight) else 0):
+            value, gains = k.kalman(track._replace(weight=self._weighed(j, z, psi, gains).weight), p, psi)
         return float(value) + float(np.sum(self.price(gains))), gains
 
     def price(self, g: Gains) -> FloatArray:
@@ -598,7 +590,7 @@ class Problem:
                 moved = psi.copy()
                 if i < k.N_NOISE:
                     moved[i] *= np.exp(NUDGE)
-                g = k.kalman(part, p, moved, True)[1]
+                g = k.kalman(part, p, moved)[1]
                 S = np.where(g.S > 0.0, g.S, 1.0)
                 return np.log(S)[SETTLED:].ravel(), g.nu[SETTLED:].ravel()
 

@@ -665,7 +665,7 @@ def _add(
         rows = (starts + h)[(turns == i) & even]
         asked[name] = rows[track.seen[rows, group]]
         seen[asked[name], group] = True
-    _, gains = k.kalman(track._replace(seen=seen), p, psi, True)
+    _, gains = k.kalman(track._replace(seen=seen), p, psi)
     for name, rows in asked.items():
         out[name] += _inside(_errors(gains, rows, *_GROUPS[name]))
 

@@ -23,7 +23,7 @@ from tests.estimate.linear import NOISE, PELICAN, batch, dense_filter, physics, 
 def test_likelihood_and_means_are_those_of_a_dense_filter() -> None:
     track = tiny_flight()
     total, means = dense_filter(track)
-    value, gains = k.kalman(track, physics(), NOISE, True)
+    value, gains = k.kalman(track, physics(), NOISE)
     assert value == pytest.approx(total, rel=1e-9)
     np.testing.assert_allclose(gains.mean[:, 4:], means[:, 3:], atol=1e-9)
     np.testing.assert_allclose(2.0 * gains.mean[:, 1:4], means[:, :3], atol=1e-9)
@@ -32,7 +32,7 @@ def test_likelihood_and_means_are_those_of_a_dense_filter() -> None:
 def test_smoother_is_batch_least_squares() -> None:
     track = tiny_flight()
     mean, variance = batch(track)
-    _, gains = k.kalman(track, physics(), NOISE, True)
+    _, gains = k.kalman(track, physics(), NOISE)
     _, found, spread, *_ = k.backward(track, physics(), NOISE, gains, True)
     np.testing.assert_allclose(found, mean[:, k.FO :], atol=1e-9)
     np.testing.assert_allclose(spread, variance[:, k.FO :], rtol=1e-6)
@@ -44,7 +44,7 @@ def test_smoother_needs_no_attitude() -> None:
     seen = track.seen.copy()
     seen[:, 1] = False
     track = track._replace(seen=seen)
-    _, gains = k.kalman(track, physics(), NOISE, True)
+    _, gains = k.kalman(track, physics(), NOISE)
     _, found, spread, *_ = k.backward(track, physics(), NOISE, gains, True)
     assert (spread[:, : k.AE - k.FO] > 0.0).all()
     assert np.abs(found[0, : k.AE - k.FO]).max() > 0.0
@@ -90,24 +90,24 @@ def test_score_is_the_slope_of_the_likelihood(still: float) -> None:
         track.seen[:, 3] = False
         track = track._replace(still=still)
     p[k.DRAG] = p[k.DRAG + 1] = 0.3
-    _, gains = k.kalman(track, p, NOISE, True)
+    _, gains = k.kalman(track, p, NOISE)
     score = k.backward(track, p, NOISE, gains, False)[0] * NOISE
     for i in range(k.N_NOISE):
         by = np.zeros(k.N_NOISE)
         by[i] = 1e-4 * NOISE[i]
-        up, down = (k.kalman(track, p, NOISE + s * by, False)[0] for s in (1.0, -1.0))
+        up, down = (k.kalman(track, p, NOISE + s * by)[0] for s in (1.0, -1.0))
         assert score[i] == pytest.approx((up - down) / 2e-4, rel=2e-2, abs=0.3), i
 
 
 def test_what_noise_of_rotor_speeds_explains_is_the_slope_of_the_variances() -> None:
     """The sum of G' N G Q is the derivative of sum ln S by ln Q."""
     track, p = flown()
-    borrowed = k.backward(track, p, NOISE, k.kalman(track, p, NOISE, True)[1], True)[3]
+    borrowed = k.backward(track, p, NOISE, k.kalman(track, p, NOISE)[1], True)[3]
 
     def heights(speed: float) -> float:
         psi = NOISE.copy()
         psi[k.ROTOR] = speed
-        S = k.kalman(track, p, psi, True)[1].S
+        S = k.kalman(track, p, psi)[1].S
         return float(np.sum(np.log(S[S > 0.0])))
 
     up, down = (heights(NOISE[k.ROTOR] * np.exp(step)) for step in (1e-4, -1e-4))
@@ -120,8 +120,8 @@ def test_random_forces_of_size_zero_change_nothing() -> None:
     still, other = NOISE.copy(), NOISE.copy()
     still[k.SIGMA : k.SIGMA + 4] = other[k.SIGMA : k.SIGMA + 4] = 0.0
     other[k.TIME : k.TIME + 4] *= 3.0
-    value, gains = k.kalman(track, p, still, True)
-    assert value == k.kalman(track, p, other, False)[0]
+    value, gains = k.kalman(track, p, still)
+    assert value == k.kalman(track, p, other)[0]
     assert not gains.mean[:, k.FO + 1 : k.AE + 1].any()
     _, force, spread, *_ = k.backward(track, p, still, gains, True)
     assert not force[:, :6].any()
@@ -131,7 +131,7 @@ def test_random_forces_of_size_zero_change_nothing() -> None:
 def test_a_replay_of_the_same_physics_gives_the_same_innovations() -> None:
     track, p = flown()
     track = track._replace(weight=np.random.default_rng(0).uniform(0.1, 1.0, (len(track.t), k.M)))
-    _, g = k.kalman(track, p, NOISE, True)
+    _, g = k.kalman(track, p, NOISE)
     out = np.zeros((len(track.t), k.M))
     mean = np.empty_like(g.mean)
     total = k.replay(track, p, NOISE, g, g.table, out, mean)
@@ -147,7 +147,7 @@ def test_rotors_that_stand_still_have_no_drag() -> None:
     speed = np.zeros_like(flight.window.rotor_speed)
     p = physics()
     p[k.DRAG] = p[k.DRAG + 1] = 0.3
-    value, gains = k.kalman(from_window(replace(flight.window, rotor_speed=speed), PELICAN), p, NOISE, True)
+    value, gains = k.kalman(from_window(replace(flight.window, rotor_speed=speed), PELICAN), p, NOISE)
     assert np.isfinite(value)
     assert np.isfinite(gains.mean).all()
 
@@ -180,7 +180,7 @@ def still(p: FloatArray, track: k.Track) -> k.Gains:
     """A filter pass without random forces."""
     noise = NOISE.copy()
     noise[k.SIGMA : k.TIME] = 0.0
-    gains: k.Gains = k.kalman(track, p, noise, True)[1]
+    gains: k.Gains = k.kalman(track, p, noise)[1]
     return gains
 
 
@@ -285,10 +285,10 @@ def struck() -> tuple[k.Track, FloatArray]:
 def test_the_score_is_the_slope_of_the_likelihood_with_weights() -> None:
     track, p = struck()
     track = track._replace(weight=np.random.default_rng(0).uniform(0.1, 1.0, (len(track.t), k.M)))
-    score = k.backward(track, p, NOISE, k.kalman(track, p, NOISE, True)[1], False)[0]
+    score = k.backward(track, p, NOISE, k.kalman(track, p, NOISE)[1], False)[0]
     for i in (k.GYRO, k.ACCEL, k.ACCEL + 2, k.SIGMA, k.SIGMA + 1, k.SIGMA + 2, k.TIME):
         by = 1e-4 * NOISE[i] * (np.arange(k.N_NOISE) == i)
-        up, down = (k.kalman(track, p, NOISE + s * by, False)[0] for s in (1.0, -1.0))
+        up, down = (k.kalman(track, p, NOISE + s * by)[0] for s in (1.0, -1.0))
         assert score[i] * NOISE[i] == pytest.approx((up - down) / 2e-4, rel=2e-2, abs=0.3), i
 
 
@@ -297,7 +297,7 @@ def test_renewed_weights_lower_the_objective_until_they_stay() -> None:
     track, p = struck()
     problem = replace(Problem.of([track], PELICAN), tail=np.array([0.2, 0.2, 0.2, 0.2]))
     z, held = problem.at(p[:6]), problem
-    gains = [k.kalman(track, p, NOISE, True)[1]]
+    gains = [k.kalman(track, p, NOISE)[1]]
     values = [np.inf]
     for _ in range(12):
         held = held.held(z, NOISE, gains)
@@ -306,7 +306,7 @@ def test_renewed_weights_lower_the_objective_until_they_stay() -> None:
         values.append(value)
     assert values[1] - values[-1] > 10.0
     assert values[-2] - values[-1] < 0.5
-    assert problem.objective(z, NOISE) == pytest.approx(values[-1], abs=5.0)
+    assert values[-1] <= problem.objective(z, NOISE) < values[1]
     accel = gains[0].w[:, k.ACCEL : k.VELOCITY]
     assert accel[::37].max() < 0.2
     assert np.median(accel) > 0.9
