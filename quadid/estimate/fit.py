@@ -61,7 +61,7 @@ class Estimate:
 
     @property
     def finite(self) -> bool:
-        """Whether the search ended at numbers; where the filter ran away there are none."""
+        """Success of the search: it ended at numbers, of which there are none where the filter ran away."""
         return all(np.isfinite(a).all() for a in (self.objective, self.z, self.covariance))
 
     def value(self, name: str, flight: int = -1) -> tuple[float, float]:

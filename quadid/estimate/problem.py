@@ -520,11 +520,12 @@ class Problem:
         """The problem with weights of outliers renewed by a pass, and held; the same where none are expected."""
         if not self.tail.any():
             return self
-        return replace(self, tracks=tuple(_each(lambda j: self._weighed(j, z, psi, gains[j]), len(gains))))
+        weights = _each(lambda j: self._weights(j, z, psi, gains[j]), len(gains))
+        return replace(self, tracks=tuple(t._replace(weight=w) for t, w in zip(self.tracks, weights, strict=True)))
 
-    def _weighed(self, j: int, z: FloatArray, psi: FloatArray, g: Gains) -> Track:
+    def _weights(self, j: int, z: FloatArray, psi: FloatArray, g: Gains) -> FloatArray:
         square, tail = k.backward(self.tracks[j], self.physics(z, j), psi, g, False)[4], np.repeat(self.tail, 3)
-        return self.tracks[j]._replace(weight=(1.0 + tail) / (1.0 + tail * square))
+        return np.asarray((1.0 + tail) / (1.0 + tail * square))
 
     def along(self, z: FloatArray, psi: FloatArray) -> Problem:
         """The problem in which effects stay linear in the states, as simulated at z, unless one of them is free."""
@@ -545,13 +546,12 @@ class Problem:
             track = self._simulated(j, z, psi, near)
         value, gains = k.kalman(track, p, psi)
         for _ in range(SETTLING if self.tail.any() and not len(track.weight) else 0):
-            value, gains = k.kalman(track._replace(weight=self._weighed(j, z, psi, gains).weight), p, psi)
+            value, gains = k.kalman(track._replace(weight=self._weights(j, z, psi, gains)), p, psi)
         return float(value) + float(np.sum(self.price(gains))), gains
 
     def price(self, g: Gains) -> FloatArray:
-        """What the weights of outliers cost in -2 ln L, by measurement, shape (n, M)."""
-        degrees = 1.0 / np.repeat(np.where(self.tail > 0.0, self.tail, np.inf), 3)
-        return np.asarray(degrees * (g.w - 1.0 - np.log(g.w)))
+        """Price of the weights of outliers in -2 ln L, by measurement, shape (n, M)."""
+        return np.asarray((g.w - 1.0 - np.log(g.w)) / np.repeat(np.where(self.tail > 0.0, self.tail, np.inf), 3))
 
     def _simulated(self, j: int, z: FloatArray, psi: FloatArray, near: Gains) -> Track:
         """Flight j with its effects simulated at z along the states that these gains give, until both settle.

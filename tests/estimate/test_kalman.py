@@ -102,7 +102,7 @@ def test_score_is_the_slope_of_the_likelihood(still: float) -> None:
 def test_what_noise_of_rotor_speeds_explains_is_the_slope_of_the_variances() -> None:
     """The sum of G' N G Q is the derivative of sum ln S by ln Q."""
     track, p = flown()
-    borrowed = k.backward(track, p, NOISE, k.kalman(track, p, NOISE)[1], True)[3]
+    borrowed = k.backward(track, p, NOISE, k.kalman(track, p, NOISE)[1], False)[3]
 
     def heights(speed: float) -> float:
         psi = NOISE.copy()

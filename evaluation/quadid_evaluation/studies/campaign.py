@@ -333,7 +333,7 @@ HEADS = ("case", "hidden", "found", "error on the unseen flight")
 
 
 def row(g: Graded) -> tuple[str, ...]:
-    """One answer as cells under `HEADS`; the verdict is left out where the cell says the same."""
+    """One answer as cells under `HEADS`; the verdict is left out where the cell contains it."""
     what = {n: g.case.hidden.get(n, {}) for n in g.case.expected} or g.case.outside
     hidden = ", ".join(" ".join([name, *(f"{k} {v:.4g}" for k, v in values.items())]) for name, values in what.items())
     found = ", ".join(
