@@ -80,24 +80,14 @@ def open_log(path: str | Path, preset: str = AUTO, columns: Mapping[str, str] | 
     kind = kind_of(file, columns)
     allowed = limits(stored_size(file))
     request = {"path": str(file.absolute()), "preset": preset, "columns": dict(columns or {}), **allowed._asdict()}
-    ours, theirs = socket.socketpair()
-    with ours:
-        with theirs:
-            _PROCESS.ask(kind.name, theirs)
-        ours.settimeout(STANDING * allowed.seconds + LEAST_SECONDS)  # the child's own clock stops it before
-        try:
-            ours.sendall(json.dumps(request).encode() + b"\n")
-            with ours.makefile("rb") as stream:
-                answer = memoryview(stream.read(allowed.memory * _MIB))
-        except TimeoutError as error:
-            raise _stopped(file, -signal.SIGALRM, allowed) from error
-        except ConnectionError as error:
-            raise _stopped(file, -signal.SIGKILL, allowed) from error
+    # Asked twice where nobody answers at all: the process that stands ready ended with the request in its hands.
+    answer = _answer(file, kind.name, request, allowed) or _answer(file, kind.name, request, allowed)
     if len(answer) == allowed.memory * _MIB:
         raise _limited(file, "memory", allowed)
     try:
-        ended = os.waitstatus_to_exitcode(int.from_bytes(answer[-_STATUS_BYTES:], "little")) if len(answer) else 1
-        if ended:
+        if not answer:
+            raise _stopped(file, -signal.SIGKILL, allowed)
+        if ended := os.waitstatus_to_exitcode(int.from_bytes(answer[-_STATUS_BYTES:], "little")):
             raise _stopped(file, ended, allowed)
         return unpack(answer[:-_STATUS_BYTES])
     except ValueError as error:
@@ -194,6 +184,23 @@ def _limited(path: Path, name: str, allowed: ReadLimits) -> LogError:
         "open files": ("opens too many files", *only_read),
     }[name]
     return LogError(f"{path.name}: reading it {found}", fits, fix)
+
+
+def _answer(file: Path, kind: str, request: Mapping[str, Any], allowed: ReadLimits) -> memoryview:
+    """Answer of a child and its wait status; nothing where whoever took the request has ended without a word."""
+    ours, theirs = socket.socketpair()
+    with ours:
+        with theirs:
+            _PROCESS.ask(kind, theirs)
+        ours.settimeout(STANDING * allowed.seconds + LEAST_SECONDS)  # the child's own clock stops it before
+        try:
+            ours.sendall(json.dumps(request).encode() + b"\n")
+            with ours.makefile("rb") as stream:
+                return memoryview(stream.read(allowed.memory * _MIB))
+        except TimeoutError as error:
+            raise _stopped(file, -signal.SIGALRM, allowed) from error
+        except ConnectionError:
+            return memoryview(b"")
 
 
 # --- The answer of a child: a recording, or the reason why there is none

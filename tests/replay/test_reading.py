@@ -7,7 +7,9 @@ import shutil
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import msgspec
@@ -149,6 +151,19 @@ def test_a_reading_process_that_was_killed_is_started_again(tmp_path: Path) -> N
         assert process is not None
         process.kill()
         process.wait()
+
+
+def test_a_reading_process_that_is_killed_with_a_request_in_its_hands_is_asked_again(tmp_path: Path) -> None:
+    write_csv(tmp_path / "a.csv", full_recording(1.0, 50.0))
+    assert open_log(tmp_path / "a.csv").channels
+    process = quadid_replay.opening._PROCESS._process
+    assert process is not None
+    process.send_signal(signal.SIGSTOP)
+    with ThreadPoolExecutor() as pool:
+        read = pool.submit(open_log, tmp_path / "a.csv")
+        time.sleep(0.3)  # asked by now; a later request meets a dead process, as above
+        process.kill()
+        assert read.result().channels
 
 
 def test_an_answer_is_checked_at_the_door() -> None:
