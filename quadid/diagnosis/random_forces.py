@@ -222,7 +222,17 @@ class Flights:
                 theta[list(places(f"{spec.name}.time"))] = times.get(spec.name, -NEVER)
         rest = [e for e in layout.entries.values() if e.name not in PLACES and not e.name.endswith(".time")]
         own = set(names) <= set(PLACES) and not any(theta[e.index] != e.neutral for e in rest)
-        return replace(self.whole, names=tuple(names), theta=theta, models=() if own else self.whole.models)
+        problem = replace(self.whole, names=tuple(names), theta=theta)
+        return replace(problem, models=(), paths=()) if own else problem
+
+    def along(self, model: Model) -> tuple[Flights, Model]:
+        """The flights with effects simulated along the states of a model, and that model fitted so."""
+        flights = replace(self, whole=self.whole.along(self.whole.start(), model.psi, model.gains))
+        if not model.problem.models:
+            return flights, model
+        start = dict(zip(model.keys, model.z.tolist(), strict=True))
+        again = flights.fit(model.causes, start, model.psi, times_of(model, model.causes), model.tried)
+        return (flights, again) if again else (self, model)
 
     def nominal(self, theta: FloatArray) -> tuple[Flights, Model]:
         """The model without causes, from where the six are those of `theta`, and the flights with its unit of noise."""

@@ -36,6 +36,8 @@ def select(flights: Flights, known: Model) -> tuple[Model, tuple[Round[Model], .
     model, rounds = known, list[Round[Model]]()
     seen = {model.labels}
     while True:  # no model is visited twice
+        # Models are compared along the same states.
+        flights, model = flights.along(model)
         rounds.append(_round(flights, model, seen))
         if (accepted := rounds[-1].accepted) is None:
             return model, tuple(rounds)
@@ -145,7 +147,7 @@ class Everything:
         self._some = [c for c in flights.listed if not c.refines or c.requires in there]
         names = dict.fromkeys([*model.problem.names, *(n for c in self._some for n in c.names)])
         problem = flights.problem(tuple(names), times_of(model, model.causes))
-        problem = replace(problem, models=flights.whole.models)
+        problem = replace(problem, models=flights.whole.models, paths=flights.whole.paths)
         self._keys = problem.keys
         known = dict(zip(model.keys, model.z, strict=True))
         self._z = z = np.array([known.get(key, 0.0) for key in self._keys])

@@ -86,13 +86,13 @@ def estimate(problem: Problem, start: FloatArray | None = None) -> Estimate:
     part = problem.liveliest(FIRST_SECONDS)
     z, psi = part.start() if start is None else start, part.first_noise()
     # 1. Steps with random forces held large, so that no flight diverges from a bad guess.
-    z = scoring(part.along(z, psi), z, psi, NEAR, NO_NOISE)[0]
+    z = scoring(part.along(z, psi).frozen(z), z, psi, NEAR, NO_NOISE)[0]
     whole, z = problem.based_on(z)
     # 2. Let them shrink: noise and physics together, until the likelihood stays; near it, over all flights.
     part = whole.liveliest(FIRST_SECONDS)
-    near = part.along(z, psi)
+    near = part.along(z, psi).frozen(z)
     z, psi, _ = settle_noise(near, z, psi)
-    problem = whole.along(z, psi)
+    problem = whole.along(z, psi).frozen(z)
     if part is whole and not problem.objective(z, psi) <= near.objective(z, psi):  # effects that run away
         problem = near
     z, psi, value, gains, information = scoring(problem, z, psi, MOST, ALL_NOISE)
@@ -108,10 +108,10 @@ def estimate(problem: Problem, start: FloatArray | None = None) -> Estimate:
             gains = problem.passes(z, psi)[1]
         return there
 
-    # 3. Effects stay as simulated along states: simulate them anew where the search ended, until both stay.
+    # 3. Effects are simulated along states: take those where the search ended, until both stay.
     for _ in range(0 if problem is whole else ROUNDS):
         before = z
-        if not moved(whole.along(z, psi)) or (z - before) @ information @ (z - before) < FINE:
+        if not moved(whole.along(z, psi, gains).frozen(z)) or (z - before) @ information @ (z - before) < FINE:
             break
     # 4. Where innovations have outliers, their density has tails.
     tail = tails(problem.tracks, gains)
@@ -228,7 +228,7 @@ def scoring(
     for _ in range(turns if np.isfinite(value) else 0):
         if problem.tail.any():
             held = problem.held(z, psi, gains)
-            anew, renewed = held.passes(z, psi, gains)
+            anew, renewed = held.passes(z, psi)
             if not np.isfinite(anew):
                 break
             problem, value, gains, renewed = held, anew, renewed, []
@@ -253,12 +253,12 @@ def scoring(
             done = by_physics < FINE and by_noise < ENOUGH
             moved, changed = z + step, changed_noise(psi, bold)
             renewed.clear()  # what did not help makes room
-            better, renewed = problem.passes(moved, changed, gains)
+            better, renewed = problem.passes(moved, changed)
             if better < value or done:
                 break
             if by_physics > FINE and noise.any():
                 renewed.clear()
-                better, renewed = problem.passes(moved, psi, gains)
+                better, renewed = problem.passes(moved, psi)
             if better < value:
                 changed, by_noise, calm = psi, 0.0, more(calm)
                 break

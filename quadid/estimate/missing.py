@@ -204,7 +204,7 @@ def settled(
     problem = Problem.fixed([from_window(w, vehicle, air=air) for w in windows], vehicle, theta, windows)
     problem = problem if tail is None else replace(problem, tail=tail)
     z, noise = problem.start(), problem.first_noise() if psi is None else psi
-    problem = problem.along(z, noise)
+    problem = problem.along(z, noise).frozen(z)
     z, *_ = scoring(problem, z, noise, TRIMMING, NO_NOISE)
     return problem, z
 

@@ -92,7 +92,7 @@ ACTS = np.array(
 AT_ONCE = 16
 """Points whose effects are simulated together: more would only take more memory."""
 SETTLING = 2
-"""Times that effects are simulated anew along the states that they move, and weights of outliers by their readings."""
+"""Times that weights of outliers are found anew by their readings."""
 RECKONED = 6.0
 """Time [s] after which drag has shown the velocity that a flight began with."""
 LEAST = 1e-2
@@ -188,6 +188,7 @@ class Problem:
         base: physics vector of what is not free, shape (N_PHYSICS,).
         theta: full vector of what is not free.
         models: one a flight, where more acts or is free than the filter has of its own.
+        paths: states along which these simulate effects, filtered means (n, N_MEAN) of each flight; see `along`.
         tail: 1 / degrees of freedom of the noise of gyro, attitude, accelerometer, velocity, shape (4,); 0: Gaussian.
         control: see `control_moment`; unit of what is random.
         borrowed: see `unbiased`, shape (4,).
@@ -201,6 +202,7 @@ class Problem:
     models: tuple[WholeModel, ...]
     tail: FloatArray
     control: FloatArray
+    paths: tuple[FloatArray, ...] = ()
     borrowed: FloatArray = field(default_factory=lambda: np.zeros(4))
 
     @classmethod
@@ -258,7 +260,8 @@ class Problem:
         more = [e for e in layout.entries.values() if e.name not in PLACES]
         acts = not set(names) <= set(PLACES) or any(theta[e.index] != e.neutral for e in more)
         models = tuple(WholeModel(w, vehicle, PLACES) for w in windows) if acts else ()
-        return cls(tuple(tracks), vehicle, names, base, theta, models, np.zeros(4), control_moment(tracks, base))
+        new = cls(tuple(tracks), vehicle, names, base, theta, models, np.zeros(4), control_moment(tracks, base))
+        return new._followed(new.start(), [None] * len(tracks))
 
     def based_on(self, z: FloatArray) -> tuple[Problem, FloatArray]:
         """The problem whose control moment, and so its priors, is that at z instead of the guess; and z there."""
@@ -282,7 +285,8 @@ class Problem:
         """The same flights, of each the rows from a first one to before a last one."""
         tracks = tuple(cut(track, *span) for track, span in zip(self.tracks, rows, strict=True))
         models = tuple(model.cut(*span) for model, span in zip(self.models, rows, strict=True)) if self.models else ()
-        return replace(self, tracks=tracks, models=models)
+        paths = tuple(path[slice(*span)] for path, span in zip(self.paths, rows, strict=True)) if self.models else ()
+        return replace(self, tracks=tracks, models=models, paths=paths)
 
     @cached_property
     def layout(self) -> Layout:
@@ -504,15 +508,9 @@ class Problem:
         """-2 ln of likelihood and prior; infinite where the filter has no finite step."""
         return self.passes(z, psi)[0]
 
-    def passes(self, z: FloatArray, psi: FloatArray, near: Sequence[Gains] = ()) -> tuple[float, list[Gains]]:
-        """The same, and the gains of every flight.
-
-        Args:
-            z: scaled parameters.
-            psi: noise numbers.
-            near: gains of a pass nearby, along whose states effects are simulated first; else those without effects.
-        """
-        found = _each(lambda j: self._pass(z, psi, j, near[j] if near else None), len(self.tracks))
+    def passes(self, z: FloatArray, psi: FloatArray) -> tuple[float, list[Gains]]:
+        """The same, and the gains of every flight."""
+        found = _each(lambda j: self._pass(z, psi, j), len(self.tracks))
         total = self.penalty(z) + self.noise_penalty(psi)[0] + sum(value for value, _ in found)
         return (total if np.isfinite(total) else np.inf), [g for _, g in found]
 
@@ -527,44 +525,59 @@ class Problem:
         square, tail = k.backward(self.tracks[j], self.physics(z, j), psi, g, False)[4], np.repeat(self.tail, 3)
         return np.asarray((1.0 + tail) / (1.0 + tail * square))
 
-    def along(self, z: FloatArray, psi: FloatArray) -> Problem:
-        """The problem in which effects stay linear in the states, as simulated at z, unless one of them is free."""
+    def along(self, z: FloatArray, psi: FloatArray, near: Sequence[Gains] = ()) -> Problem:
+        """The problem whose effects are simulated along the states of a pass at this point.
+
+        So the objective is one function of z and psi; where its minimum has other states, take those, and search again.
+
+        Args:
+            z: scaled parameters.
+            psi: noise numbers.
+            near: gains of a pass there, whose states are taken; else those that come of a few passes.
+        """
+        if not self.models:
+            return self
+        if near:
+            return self._followed(z, near)
+        # First along states that follow the measurements: where random forces are small, those without effects run
+        # away.  Then along their own.
+        problem = self._followed(z, [None] * len(self.tracks))
+        value, gains = problem.passes(z, psi)
+        return problem._followed(z, gains) if np.isfinite(value) else problem
+
+    def frozen(self, z: FloatArray) -> Problem:
+        """The problem whose effects stay as simulated at z, but for their slope, unless one of them is free."""
         if not self.models or not set(self.names) <= set(PLACES):
             return self
-        tracks = [t._replace(beyond=g.beyond) for t, g in zip(self.tracks, self.passes(z, psi)[1], strict=True)]
-        return replace(self, tracks=tuple(tracks), models=())
+        tracks = tuple(self._simulated(j, z) for j in range(len(self.tracks)))
+        return replace(self, tracks=tracks, models=(), paths=())
 
-    def _pass(self, z: FloatArray, psi: FloatArray, j: int, near: Gains | None) -> tuple[float, Gains]:
-        track, p = self.tracks[j], self.physics(z, j)
-        if self.models:
-            if near is None:
-                # First along states that follow the measurements: where random forces are small, those without effects
-                # run away.  Then along their own.
-                near = k.kalman(track, p, self.first_noise())[1]
-                first, own = k.kalman(self._simulated(j, z, psi, near), p, psi)
-                near = own if np.isfinite(first) else near
-            track = self._simulated(j, z, psi, near)
+    def _followed(self, z: FloatArray, near: Sequence[Gains | None]) -> Problem:
+        """The problem with the states of these gains to simulate along; without, those that follow the measurements."""
+        if not self.models:
+            return self
+
+        def path(j: int) -> FloatArray:
+            track, g = self.tracks[j], near[j]
+            mean = k.kalman(track, self.physics(z, j), self.first_noise())[1].mean if g is None else g.mean
+            return reckoned(track, mean)
+
+        return replace(self, paths=tuple(_each(path, len(self.tracks))))
+
+    def _pass(self, z: FloatArray, psi: FloatArray, j: int) -> tuple[float, Gains]:
+        track, p = self._simulated(j, z) if self.models else self.tracks[j], self.physics(z, j)
         value, gains = k.kalman(track, p, psi)
         for _ in range(SETTLING if self.tail.any() and not len(track.weight) else 0):
             value, gains = k.kalman(track._replace(weight=self._weights(j, z, psi, gains)), p, psi)
         return float(value) + float(np.sum(self.price(gains))), gains
 
+    def _simulated(self, j: int, z: FloatArray) -> Track:
+        """Flight j with its effects simulated at z."""
+        return self.tracks[j]._replace(beyond=self.models[j].along(self.vector(z, j), self.paths[j]))
+
     def price(self, g: Gains) -> FloatArray:
         """Price of the weights of outliers in -2 ln L, by measurement, shape (n, M)."""
         return np.asarray((g.w - 1.0 - np.log(g.w)) / np.repeat(np.where(self.tail > 0.0, self.tail, np.inf), 3))
-
-    def _simulated(self, j: int, z: FloatArray, psi: FloatArray, near: Gains) -> Track:
-        """Flight j with its effects simulated at z along the states that these gains give, until both settle.
-
-        States that other sizes of the same effects gave differ by less than the step that led from there.
-        """
-        track, p, model, theta = self.tracks[j], self.physics(z, j), self.models[j], self.vector(z, j)
-        mean = near.mean
-        for _ in range(0 if len(near.beyond.added) else SETTLING):
-            track = track._replace(beyond=model.along(theta, reckoned(track, mean)))
-            mean = np.empty_like(mean)
-            k.replay(track, p, psi, near, moments_at(track, near, p), _NO_ROWS, mean)
-        return track._replace(beyond=model.along(theta, reckoned(track, mean)))
 
     def score(self, z: FloatArray, psi: FloatArray, gains: Sequence[Gains]) -> FloatArray:
         """Derivative of the objective by the noise numbers."""
@@ -680,10 +693,9 @@ class Problem:
         return least, most, nudge
 
     def _several(self, j: int, points: Sequence[FloatArray], psi: FloatArray, g: Gains) -> FloatArray:
-        """Whitened innovations of flight j, (points, n, M), near the point of the gains, effects along its states."""
+        """Whitened innovations of flight j, (points, n, M), near the point of the gains."""
         track = self.tracks[j]
         out = np.zeros((len(points), len(track.t), k.M))
-        mean = reckoned(track, g.mean) if self.models else g.mean
         # Trim and biases change no effect: what is the same is simulated once.
         same = np.array([self.vector(z, j) for z in points]) if self.models else np.zeros((len(points), 1))
         kinds, which = np.unique(same, axis=0, return_inverse=True)
@@ -691,8 +703,9 @@ class Problem:
             mine = np.flatnonzero((which.ravel() >= first) & (which.ravel() < first + AT_ONCE))
             tracks = [track] * len(mine)
             if self.models:
-                added = self.models[j].beyond(kinds[first : first + AT_ONCE], mean)[which.ravel()[mine] - first]
-                tracks = [track._replace(beyond=Beyond(a, g.beyond.slope, mean[:, 4:10].copy())) for a in added]
+                path = self.paths[j]
+                added = self.models[j].beyond(kinds[first : first + AT_ONCE], path)[which.ravel()[mine] - first]
+                tracks = [track._replace(beyond=Beyond(a, g.beyond.slope, path[:, 4:10].copy())) for a in added]
 
             def whiten(i: int, mine: IndexArray = mine, tracks: Sequence[Track] = tracks) -> None:
                 p = self.physics(points[mine[i]], j)

@@ -210,8 +210,8 @@ def _without(found: Estimate, more: Problem) -> FloatArray:
 def _shown(found: Estimate, more: Problem) -> list[str]:
     """Entries of a problem with more of them than an estimate that are proven beside it, each by a score test."""
     problem = found.problem
-    more = replace(more, base=problem.base, control=problem.control, tail=problem.tail)
     z, anywhere = _without(found, more), np.full(len(more.entries), np.inf)
+    more = replace(more, base=problem.base, control=problem.control, tail=problem.tail).along(z, found.psi)
     h, g = more.normal_equations(z, found.psi, more.passes(z, found.psi)[1])
     own = [i for i, (name, *_) in enumerate(more.entries) if name in problem.names]
     others = {name: [i] for i, (name, *_) in enumerate(more.entries) if i not in own}
@@ -328,6 +328,7 @@ def _with_causes(found: Estimate, near: Sequence[Sensitivities], wide: Problem) 
     index = {key: i for i, key in enumerate(wide.keys)}
     own = [index[key] for key in found.problem.keys]
     z, nudge = _without(found, wide), np.full(len(index), 1e-5)
+    wide = wide.along(z, found.psi)
     # Entries of a cause are freed together; rotors are causes by themselves.
     causes: dict[str, list[int]] = {}
     for (name, _), i in index.items():
@@ -360,6 +361,7 @@ def _with_causes(found: Estimate, near: Sequence[Sensitivities], wide: Problem) 
 def _on_coarse_grid(found: Estimate, half: Problem) -> FloatArray:
     """Errors by the length of rows: a share of the step to every second row, none where chance explains that."""
     z, psi = found.z, found.psi
+    half = half.along(z, psi)
     information, gradient = half.normal_equations(z, psi, half.passes(z, psi)[1])
     step = newton_step(information, gradient, 0.0, *(half.limits - z))
     chance = exceeded(CHANCE, 1) * (np.diag(np.linalg.inv(information)) + np.diag(found.covariance))

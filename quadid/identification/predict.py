@@ -486,7 +486,7 @@ class Forecast:
         tracks = [from_window(w, vehicle, air=t.still > 0.0) for w, t in zip(flown, problem.tracks, strict=True)]
         self.z, self.psi = z, psi
         whole = Problem.fixed(tracks, vehicle, theta, flown)
-        self.problem = replace(whole, control=problem.control, tail=problem.tail).along(z, psi)
+        self.problem = replace(whole, control=problem.control, tail=problem.tail).along(z, psi).frozen(z)
 
     def covered(self, samples: Sequence[int]) -> Shares:
         """Numbers of outcomes inside the bands predicted from the filtered state and the logged rotor speeds.

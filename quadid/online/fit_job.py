@@ -458,7 +458,7 @@ def _like(window: Window, vehicle: Vehicle, z: FloatArray, noise: Noise) -> tupl
     theta = problem.theta.copy()
     theta[problem.layout.entry(SUPPORT).index] = curve.offset + curve.beside(z)[1]
     problem = replace(problem, theta=theta, control=noise.control, tail=noise.tail)
-    return replace(problem.based_on(own)[0], control=noise.control), own, by_z
+    return replace(problem.based_on(own)[0], control=noise.control).along(own, noise.psi), own, by_z
 
 
 def _followed(request: FitRequest, noise: Noise) -> Noise:

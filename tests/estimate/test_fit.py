@@ -221,7 +221,7 @@ def test_gradient_by_any_entry_is_the_slope_of_the_squares() -> None:
         )
         assert gradient[i] * sigma[i] == pytest.approx((above - below) / 4e-3 * sigma[i], rel=1e-3, abs=0.01), name
         if not name.startswith(("rotor_drag", "axial_inflow", "parasitic_drag")):
-            up, down = (problem.passes(x, psi, gains)[0] for x in steps)
+            up, down = (problem.passes(x, psi)[0] for x in steps)
             assert gradient[i] * sigma[i] == pytest.approx((up - down) / 4e-3 * sigma[i], rel=0.02, abs=0.6), name
 
 
