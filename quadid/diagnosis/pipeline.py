@@ -144,15 +144,20 @@ def diagnose(
     plain = search.nominal
     alone = cache(lambda: nominal or fit_numbers(windows, schedule[-1], plain))
     data = _Data(windows, vehicle, validation, faults, nominal, alone)
-    answer = _concluded(data, schedule[-1], search, remainder(search.shooting, search.model, seed), report)
+    left = remainder(search.shooting, search.model, seed)
+    answer = rough = None
+    if judge(plain, search.model, left) is not Explanation.UNKNOWN:
+        answer = _concluded(data, schedule[-1], search, left, report)
     # Where something remains and no cause is sure: beside random forces.
-    left = answer[0].verdict not in (Explanation.NOTHING_FOUND, Explanation.EXPLAINED)
-    if left and not any(f.confident for f in answer[0].findings):
+    sure = (Explanation.NOTHING_FOUND, Explanation.EXPLAINED)
+    if answer is None or not (answer[0].verdict in sure or any(f.confident for f in answer[0].findings)):
         report("random forces", 0.0)
-        if (rough := in_rough_air(windows, search)) is not None:
-            search = with_causes_of(search, rough)
-            left_over = remainder(search.shooting, search.model, seed)
-            answer = _concluded(data, schedule[-1], search, left_over, report, rough)
+        rough = in_rough_air(windows, search)
+    if rough is not None:
+        search = with_causes_of(search, rough)
+        left = remainder(search.shooting, search.model, seed)
+    if answer is None or rough is not None:
+        answer = _concluded(data, schedule[-1], search, left, report, rough)
     report("done", 1.0)
     return answer
 

@@ -76,7 +76,7 @@ def quadratic(problem: Problem, gains: Sequence[Gains], found: Sequence[Sensitiv
             gram, grad = np.zeros((size, size)), np.zeros(size)
             J = mine.J[:, first:last]
             grad[mine.entries] = J.reshape(len(J), -1) @ mine.plain[first:last].ravel()
-            J = (J * problem.expected).reshape(len(J), -1)
+            J = mine.expected(slice(first, last))
             gram[np.ix_(mine.entries, mine.entries)] = J @ J.T
             grams.append(gram)
             grads.append(grad)

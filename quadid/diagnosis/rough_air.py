@@ -128,7 +128,7 @@ def follows(flights: Flights, model: Model) -> tuple[Follows, ...]:
             J = np.zeros((len(model.z) + len(names), *mine.plain.shape))
             J[mine.entries] = mine.J
             J[len(model.z) :] = _responses(site, stacked[j], model, j, mine.plain)
-            found.append(Sensitivities(list(range(len(J))), mine.plain, J))
+            found.append(mine._replace(entries=list(range(len(J))), J=J))
         out.append(_followed(site, names, found, model))
     return tuple(out)
 

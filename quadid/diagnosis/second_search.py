@@ -178,7 +178,7 @@ class Everything:
         """Sensitivities by all entries, those of other flights zero."""
         J = np.zeros((len(self._keys), *found.plain.shape))
         J[found.entries] = found.J
-        return Sensitivities(list(range(len(self._keys))), found.plain, J)
+        return found._replace(entries=list(range(len(self._keys))), J=J)
 
     @cached_property
     def unspent(self) -> float:

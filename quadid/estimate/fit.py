@@ -76,22 +76,27 @@ class Estimate:
         raise KeyError(name)
 
 
-def estimate(problem: Problem, start: FloatArray | None = None) -> Estimate:
+def estimate(problem: Problem, start: FloatArray | None = None, noise: FloatArray | None = None) -> Estimate:
     """Parameters, noise and random forces of the flights of a problem.
 
     Args:
         problem: the flights and what is free.
         start: scaled parameters where to begin; default the guess.
+        noise: noise numbers of an estimate nearby, at whose peak of the likelihood to stay; default: search for one.
     """
     part = problem.liveliest(FIRST_SECONDS)
-    z, psi = part.start() if start is None else start, part.first_noise()
+    z, psi = part.start() if start is None else start, part.first_noise() if noise is None else noise
     # 1. Steps with random forces held large, so that no flight diverges from a bad guess.
-    z = scoring(part.along(z, psi).frozen(z), z, psi, NEAR, NO_NOISE)[0]
+    if noise is None:
+        z = scoring(part.along(z, psi).frozen(z), z, psi, NEAR, NO_NOISE)[0]
     whole, z = problem.based_on(z)
     # 2. Let them shrink: noise and physics together, until the likelihood stays; near it, over all flights.
     part = whole.liveliest(FIRST_SECONDS)
     near = part.along(z, psi).frozen(z)
-    z, psi, _ = settle_noise(near, z, psi)
+    if noise is None:
+        z, psi, _ = settle_noise(near, z, psi)
+    else:
+        psi = np.clip(psi, *whole.noise_bounds.T)
     problem = whole.along(z, psi).frozen(z)
     if part is whole and not problem.objective(z, psi) <= near.objective(z, psi):  # effects that run away
         problem = near

@@ -19,7 +19,7 @@ from quadid.estimate.whole_model import WholeModel
 from quadid.model.layout import Layout
 from quadid.parameters import NOMINAL_NAMES
 from quadid.rotation import rotated
-from quadid.types import FloatArray, IndexArray
+from quadid.types import BoolArray, FloatArray, IndexArray
 from quadid.vehicle import GRAVITY, Vehicle
 
 T = TypeVar("T")
@@ -170,11 +170,23 @@ def scatter_of(tracks: Sequence[Track]) -> float:
 
 
 class Sensitivities(NamedTuple):
-    """Of one flight: entries, whitened innovations (n, M), their derivatives by the entries (entries, n, M)."""
+    """Whitened innovations of a flight and their derivatives.
+
+    Attributes:
+        entries: by which.
+        plain: whitened innovations, shape (n, M).
+        J: their derivatives, shape (entries, n, M).
+        root: root of the information of each that is expected with outliers, over that of a Gaussian, shape (n, M).
+    """
 
     entries: list[int]
     plain: FloatArray
     J: FloatArray
+    root: FloatArray
+
+    def expected(self, rows: slice | BoolArray = slice(None)) -> FloatArray:
+        """Derivatives of some rows whose products are the expected information, shape (entries, rows x M)."""
+        return np.asarray((self.J[:, rows] * self.root[rows]).reshape(len(self.J), -1))
 
 
 @dataclass(frozen=True)
@@ -625,10 +637,10 @@ class Problem:
         mean, sigma = self.prior
         information, gradient = np.diag(1.0 / sigma**2) - self.taken[1], (z - mean) / sigma**2 - self.taken[0]
         for j, g in enumerate(gains):
-            mine, plain, J = self.sensitivities(j, z, psi, g, nudge)
+            mine, plain, J, root = self.sensitivities(j, z, psi, g, nudge)
             with np.errstate(over="ignore", invalid="ignore"):
                 gradient[mine] += J.reshape(len(mine), -1) @ plain.ravel()
-                J *= self.expected
+                J *= root
                 information[np.ix_(mine, mine)] += J.reshape(len(mine), -1) @ J.reshape(len(mine), -1).T
         if not np.isfinite(information).all():
             return information, gradient
@@ -637,10 +649,15 @@ class Problem:
         turned = turned / sigma[:, None]
         return np.diag(1.0 / sigma**2) + (turned * np.maximum(own, 0.0)) @ turned.T, gradient
 
-    @property
-    def expected(self) -> FloatArray:
-        """Roots of the expected information of a Student-t density against that of a Gaussian as wide, shape (M,)."""
-        return np.repeat(np.sqrt((1.0 + self.tail) / (1.0 + 3.0 * self.tail)), 3)
+    def _expected(self, psi: FloatArray, g: Gains) -> FloatArray:
+        """Root of the expected information with outliers over that of a Gaussian as wide, shape (n, M).
+
+        Of noise alone with a Student-t density of k degrees of freedom it is 1 - 2 / (k + 3); where noise is a share s
+        of the innovation's variance, 1 - 2 sqrt(s) / (k + 3) (integrated numerically: right to 2 %).
+        """
+        share = np.divide(psi[: k.M] ** 2, g.w * g.S, out=np.zeros_like(g.S), where=g.S > 0.0)
+        lost = np.repeat(2.0 * self.tail / (1.0 + 3.0 * self.tail), 3)
+        return np.asarray(np.sqrt(1.0 - lost * np.sqrt(np.minimum(share, 1.0))))
 
     def sensitivities(
         self,
@@ -658,7 +675,7 @@ class Problem:
         plain, J = whitened[0], whitened[1:]
         J -= plain
         J /= steps[mine, mine][:, None, None]
-        return Sensitivities(mine, plain, J)
+        return Sensitivities(mine, plain, J, self._expected(psi, g))
 
     def corner(
         self, z: FloatArray, psi: FloatArray, gains: Sequence[Gains]

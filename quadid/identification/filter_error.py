@@ -160,14 +160,14 @@ def _filtered(
     if FORGOTTEN * lag > unsettled + windows[0].dt:
         unsettled = FORGOTTEN * lag
         again = problem_of(windows).settled(unsettled)
-        found = estimate(again, found.z * found.problem.size / again.size)
+        found = estimate(again, found.z * found.problem.size / again.size, found.psi)
     # What these flights show beside: in a climb b would stand in for inflow, J_zz for rotations that do not couple.
     velocity = all(w.velocity is not None for w in windows)
     asked = [name for name in SHOWN if name.split(".")[0] not in stated and (velocity or name != INFLOW)]
     while asked and found.finite and (shown := _shown(found, problem_of(windows, asked).settled(unsettled))):
         along += shown
         again = problem_of(windows).settled(unsettled)
-        beyond = estimate(again, _without(found, again))
+        beyond = estimate(again, _without(found, again), found.psi)
         wrong = [name for name in shown if not (beyond.finite and beyond.value(name)[0] >= SHOWN[name])]
         if not wrong:
             found = beyond
@@ -346,9 +346,9 @@ def _with_causes(found: Estimate, near: Sequence[Sensitivities], wide: Problem) 
     for j, (mine, g) in enumerate(zip(near, wide.passes(z, found.psi)[1], strict=True)):
         more = wide.sensitivities(j, z, found.psi, g, nudge, added)
         entries = [*(own[i] for i in mine.entries), *more.entries]
-        J = np.concatenate([mine.J, more.J])
-        gradient[entries] += J.reshape(len(J), -1) @ mine.plain.ravel()
-        J = (J * wide.expected).reshape(len(J), -1)
+        both = mine._replace(entries=entries, J=np.concatenate([mine.J, more.J]))
+        gradient[entries] += both.J.reshape(len(entries), -1) @ both.plain.ravel()
+        J = both.expected()
         information[np.ix_(entries, entries)] += J @ J.T
     least, most = wide.limits - z
     least[added], most[added] = np.maximum(least[added], -MET), np.minimum(most[added], MET)
@@ -378,12 +378,11 @@ def _blocks(problem: Problem, found: Sequence[Sensitivities]) -> tuple[FloatArra
     count = len(problem.entries)
     grams, slopes = np.zeros((BLOCKS, count, count)), np.zeros((BLOCKS, count))
     rows, begin = sum(len(track.t) for track in problem.tracks), 0
-    for mine, plain, J in found:
-        block = (begin + np.arange(len(plain))) * BLOCKS // rows
-        begin += len(plain)
+    for mine in found:
+        entries, block = mine.entries, (begin + np.arange(len(mine.plain))) * BLOCKS // rows
+        begin += len(mine.plain)
         for b in np.unique(block):
-            part = J[:, block == b].reshape(len(mine), -1)
-            slopes[b, mine] += part @ plain[block == b].ravel()
-            part = (J[:, block == b] * problem.expected).reshape(len(mine), -1)
-            grams[b][np.ix_(mine, mine)] += part @ part.T
+            slopes[b, entries] += mine.J[:, block == b].reshape(len(entries), -1) @ mine.plain[block == b].ravel()
+            part = mine.expected(block == b)
+            grams[b][np.ix_(entries, entries)] += part @ part.T
     return grams, slopes

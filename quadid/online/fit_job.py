@@ -25,7 +25,7 @@ from quadid.estimate import kalman as k
 from quadid.estimate.fit import ALL_NOISE, estimate, of_square, scoring
 from quadid.estimate.kalman import Gains
 from quadid.estimate.late_imu import MOST, delay_of, in_time
-from quadid.estimate.problem import TRIMMED, UPRIGHT, Problem
+from quadid.estimate.problem import TRIMMED, UPRIGHT, Problem, Sensitivities
 from quadid.estimate.track import from_window
 from quadid.identification.filter_error import INFLOW, UNCOUPLED, fitted_along, start_of
 from quadid.identification.fit import SWARM_SECONDS, swarm_search
@@ -476,8 +476,8 @@ def _estimates(request: FitRequest, z: FloatArray, noise: Noise) -> tuple[tuple[
     for window in request.learned or request.windows:
         # 1. Innovations and their derivatives, and the same on every second row.
         sparse = coarse(window)
-        problem, own, E, gains, plain, J = _linearised(window, vehicle, z, noise)
-        *_, half, half_J = _linearised(sparse, vehicle, z, noise)
+        problem, own, E, gains, near = _linearised(window, vehicle, z, noise)
+        *_, half = _linearised(sparse, vehicle, z, noise)
         # 2. What noise of rotor speeds makes of it, and an answer of the rotors within a step.
         slope, curvature = problem.unbiased(own, noise.psi, gains).taken
         slope, curvature = slope @ E, E.T @ curvature @ E
@@ -485,13 +485,13 @@ def _estimates(request: FitRequest, z: FloatArray, noise: Noise) -> tuple[tuple[
         for i, e in enumerate(out):
             start, stop = e.start - 0.5 * window.dt, e.stop - 0.5 * window.dt
             new, half_new = ((w.t > start) & (w.t < stop) for w in (window, sparse))
-            share, (information, score) = float(np.mean(new)), _quadratic(J, plain, new, problem.expected)
-            of_half = _quadratic(half_J, half, half_new, problem.expected)
+            share, (information, score) = float(np.mean(new)), _quadratic(near, new)
+            of_half = _quadratic(half, half_new)
             out[i] = replace(
                 e,
                 information=e.information + information,
                 score=e.score + score - share * slope,
-                cost=e.cost + float(np.sum(plain[new] ** 2)),
+                cost=e.cost + float(np.sum(near.plain[new] ** 2)),
                 rows=e.rows + 3.0 * np.count_nonzero(problem.tracks[0].seen[new]),
                 noise=e.noise + share * curvature,
                 loose=e.loose + share * unsure,
@@ -508,25 +508,24 @@ def _estimates(request: FitRequest, z: FloatArray, noise: Noise) -> tuple[tuple[
 
 def _linearised(
     window: Window, vehicle: Vehicle, z: FloatArray, noise: Noise
-) -> tuple[Problem, FloatArray, FloatArray, list[Gains], FloatArray, FloatArray]:
+) -> tuple[Problem, FloatArray, FloatArray, list[Gains], Sensitivities]:
     """Likelihood of a window near z.
 
     Returns:
-        The problem; its scaled parameters (N,) and their derivatives by z (N, P); gains; whitened innovations (n, M),
-        and their derivatives by z (P, n, M).
+        The problem; its scaled parameters (N,) and their derivatives by z (N, P); gains; sensitivities by z.
     """
     problem, own, by_z = _like(window, vehicle, z, noise)
     gains = problem.passes(own, noise.psi)[1]
-    _, plain, by_own = problem.sensitivities(0, own, noise.psi, gains[0])
-    J = np.tensordot(by_z, by_own, (0, 0))
-    J[len(own_names(vehicle)) :] += _by_thrust(problem, own, noise, gains[0], plain)
-    return problem, own, by_z, gains, plain, J
+    by_own = problem.sensitivities(0, own, noise.psi, gains[0])
+    J = np.tensordot(by_z, by_own.J, (0, 0))
+    J[len(own_names(vehicle)) :] += _by_thrust(problem, own, noise, gains[0], by_own.plain)
+    return problem, own, by_z, gains, by_own._replace(entries=list(range(len(J))), J=J)
 
 
-def _quadratic(J: FloatArray, plain: FloatArray, rows: BoolArray, root: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Information (P, P), which is expected by the square of a root, and half the gradient (P,) that some rows give."""
-    seen = (J[:, rows] * root).reshape(len(J), -1)
-    return seen @ seen.T, J[:, rows].reshape(len(J), -1) @ plain[rows].ravel()
+def _quadratic(near: Sensitivities, rows: BoolArray) -> tuple[FloatArray, FloatArray]:
+    """Expected information (P, P) and half the gradient (P,) that some rows give."""
+    seen = near.expected(rows)
+    return seen @ seen.T, near.J[:, rows].reshape(len(near.J), -1) @ near.plain[rows].ravel()
 
 
 def _by_thrust(problem: Problem, z: FloatArray, noise: Noise, gains: Gains, plain: FloatArray) -> FloatArray:

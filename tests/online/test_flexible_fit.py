@@ -129,7 +129,7 @@ def test_slopes_of_innovations_are_those_of_the_filter(name: str) -> None:
     z[:6], z[names.index("rotor_drag.k_x")], z[names.index(SUPPORT)] = np.log(PELICAN.initial), 1.2, 0.3
     problem = fit_job.problem_of(window, PELICAN)
     noise = Noise(problem.first_noise(), np.zeros(4), problem.control, 0.0)
-    *_, gains, _, J = fit_job._linearised(window, PELICAN, z, noise)
+    *_, gains, near = fit_job._linearised(window, PELICAN, z, noise)
 
     def innovations(step: float) -> FloatArray:
         moved, out = z.copy(), np.zeros((len(window), k.M))
@@ -142,4 +142,4 @@ def test_slopes_of_innovations_are_those_of_the_filter(name: str) -> None:
     slope = (innovations(1e-3) - innovations(-1e-3)) / 2e-3
     for group in (k.GYRO, k.ATTITUDE, k.ACCEL, k.VELOCITY):
         axes = slice(group, group + 3)
-        assert np.std(J[names.index(name)][:, axes] - slope[:, axes]) < 1e-3 * np.std(slope[:, axes])
+        assert np.std(near.J[names.index(name)][:, axes] - slope[:, axes]) < 1e-3 * np.std(slope[:, axes])
