@@ -35,7 +35,7 @@ ACTS = 3.0
 """Times its least value beyond which a random force acts."""
 FLAT = 1e-12
 """Curvature of scaled numbers below which a direction is as good as flat."""
-STALE = 0.2
+STALE = 0.7
 """Change of a noise number's logarithm after which the information is taken anew."""
 
 
@@ -227,6 +227,7 @@ def scoring(
     value, gains = problem.passes(z, psi)
     information, gradient = np.eye(len(z)), np.zeros(len(z))
     curvature, slope, at = np.eye(len(psi)), np.zeros(len(psi)), np.full(len(psi), np.inf)
+    last, sloped = np.log(psi), slope
     damping = calm = 0.0
     below = above = np.zeros(len(z))
     renewed: list[Gains] = []
@@ -245,10 +246,11 @@ def scoring(
         if noise.any():
             slope = problem.score(z, psi, gains) * psi
             if np.max(np.abs(log - at)) > STALE:
-                curvature, at = (
-                    2.0 * problem.noise_information(z, psi, gains) + np.diag(problem.noise_curvature(psi)),
-                    log,
-                )
+                data = problem.noise_information(z, psi, gains)
+                curvature, at = 2.0 * data + np.diag(problem.noise_curvature(psi)), log
+            else:
+                curvature = secant(curvature, log - last, slope - sloped)
+            last, sloped = log, slope
         if not (np.isfinite(information).all() and np.isfinite(curvature).all()):
             break  # readings so wild that they overflow lead nowhere
         for _ in range(PATIENCE):
@@ -278,6 +280,17 @@ def scoring(
         if done:
             break
     return z, psi, value, gains, information
+
+
+def secant(curvature: FloatArray, step: FloatArray, change: FloatArray) -> FloatArray:
+    """Curvature after the slope changed along a step: damped BFGS (J. Nocedal and S. J. Wright, procedure 18.2)."""
+    expected = curvature @ step
+    along, seen = float(step @ expected), float(step @ change)
+    if not along > 0.0:
+        return curvature
+    share = 1.0 if seen > 0.2 * along else 0.8 * along / (along - seen)
+    mixed = share * change + (1.0 - share) * expected
+    return curvature - np.outer(expected, expected) / along + np.outer(mixed, mixed) / float(step @ mixed)
 
 
 def more(damping: float) -> float:
