@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 from quadid_replay import open_log
 
@@ -9,6 +10,9 @@ import quadid
 from quadid.data.grid import to_windows
 from quadid.data.window import Window
 from quadid.diagnosis import diagnose
+from quadid.diagnosis.hypotheses import candidates, free_names
+from quadid.diagnosis.random_forces import Flights
+from quadid.model.layout import Layout
 from quadid.parameters import Status
 from quadid.vehicle import Vehicle
 
@@ -65,6 +69,29 @@ def test_a_crazyflie_without_attitude_has_its_lag_and_inertias_but_nothing_that_
     assert found.result["verdict"] == "unknown"
     assert not any(f["confident"] for f in found.result["findings"])
     assert not any(p["status"] == "identified" for p in found.result["parameters"])
+
+
+def test_models_in_rough_air_are_compared_by_one_likelihood(data_dir: Path) -> None:
+    """A cause of no size changes nothing, and a fit that ended gains nothing from another start at its end.
+
+    Along states that moved with each pass, -2 ln L of one model changed by ten to some hundred.
+    """
+    vehicle = Vehicle.from_yaml((data_dir / "arpl" / "vehicle.yaml").read_text(encoding="utf-8"))
+    window = windows_of(data_dir / "arpl", vehicle, "log15")[0].slice(0, 900)
+    listed = {c.label: c for c in candidates(Layout(vehicle), False, False)}
+    causes = tuple(listed[label] for label in ("motor_lag", "imu_lever_arm", "drag_torque_curve"))
+    flights, nominal = Flights.of([window], vehicle, [*listed.values()]).nominal(vehicle.initial)
+    start = dict(zip(nominal.keys, nominal.z.tolist(), strict=True))
+    first = flights.fit(causes, start, nominal.psi, {}, {})
+    assert first is not None
+    flights, model = flights.along(first)
+    start = dict(zip(model.keys, model.z.tolist(), strict=True))
+    larger = flights.problem(free_names((*causes, listed["imu_lag"])), {})
+    z = np.array([start.get(key, 0.0) for key in larger.keys])
+    assert larger.objective(z, model.psi) == pytest.approx(model.deviance, abs=1.0)
+    again = flights.fit(causes, start, model.psi, {}, {})
+    assert again is not None
+    assert model.deviance - 5.0 < again.deviance <= model.deviance + 0.1
 
 
 @pytest.mark.slow
