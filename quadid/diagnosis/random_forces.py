@@ -247,7 +247,7 @@ class Flights:
         flights = replace(self, whole=whole)
         nominal = flights.fit((), dict(zip(problem.keys, z, strict=True)), psi, {}, {})
         assert nominal is not None
-        return flights, nominal
+        return flights.along(nominal)
 
     def fit(
         self,

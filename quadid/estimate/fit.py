@@ -35,7 +35,7 @@ ACTS = 3.0
 """Times its least value beyond which a random force acts."""
 FLAT = 1e-12
 """Curvature of scaled numbers below which a direction is as good as flat."""
-STALE = 0.7
+STALE = 0.2
 """Change of a noise number's logarithm after which the information is taken anew."""
 
 
@@ -277,8 +277,9 @@ def scoring(
         else:
             damping, calm = more(damping), calm if changed is psi else more(calm)
         z, psi, value, gains, renewed = moved, changed, better, renewed, []
-        if done:
+        if done and (at is log or not noise.any()):
             break
+        at = np.full(len(psi), np.inf) if done else at  # only a look at where it is ends the search
     return z, psi, value, gains, information
 
 

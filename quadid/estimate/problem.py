@@ -272,8 +272,7 @@ class Problem:
         more = [e for e in layout.entries.values() if e.name not in PLACES]
         acts = not set(names) <= set(PLACES) or any(theta[e.index] != e.neutral for e in more)
         models = tuple(WholeModel(w, vehicle, PLACES) for w in windows) if acts else ()
-        new = cls(tuple(tracks), vehicle, names, base, theta, models, np.zeros(4), control_moment(tracks, base))
-        return new._followed(new.start(), [None] * len(tracks))
+        return cls(tuple(tracks), vehicle, names, base, theta, models, np.zeros(4), control_moment(tracks, base))
 
     def based_on(self, z: FloatArray) -> tuple[Problem, FloatArray]:
         """The problem whose control moment, and so its priors, is that at z instead of the guess; and z there."""
@@ -297,7 +296,7 @@ class Problem:
         """The same flights, of each the rows from a first one to before a last one."""
         tracks = tuple(cut(track, *span) for track, span in zip(self.tracks, rows, strict=True))
         models = tuple(model.cut(*span) for model, span in zip(self.models, rows, strict=True)) if self.models else ()
-        paths = tuple(path[slice(*span)] for path, span in zip(self.paths, rows, strict=True)) if self.models else ()
+        paths = tuple(path[slice(*span)] for path, span in zip(self.paths, rows, strict=True)) if self.paths else ()
         return replace(self, tracks=tracks, models=models, paths=paths)
 
     @cached_property
@@ -521,7 +520,7 @@ class Problem:
         return self.passes(z, psi)[0]
 
     def passes(self, z: FloatArray, psi: FloatArray) -> tuple[float, list[Gains]]:
-        """The same, and the gains of every flight."""
+        """The same, and the gains of every flight; where a problem has `models`, after `along`."""
         found = _each(lambda j: self._pass(z, psi, j), len(self.tracks))
         total = self.penalty(z) + self.noise_penalty(psi)[0] + sum(value for value, _ in found)
         return (total if np.isfinite(total) else np.inf), [g for _, g in found]
@@ -549,13 +548,15 @@ class Problem:
         """
         if not self.models:
             return self
-        if near:
-            return self._followed(z, near)
-        # First along states that follow the measurements: where random forces are small, those without effects run
-        # away.  Then along their own.
-        problem = self._followed(z, [None] * len(self.tracks))
-        value, gains = problem.passes(z, psi)
-        return problem._followed(z, gains) if np.isfinite(value) else problem
+        if not near:
+            # First along states that follow the measurements: where random forces are small, those without effects run
+            # away.  Then along their own.
+            near = _each(
+                lambda j: k.kalman(self.tracks[j], self.physics(z, j), self.first_noise())[1], len(self.tracks)
+            )
+            value, gains = self.along(z, psi, near).passes(z, psi)
+            near = gains if np.isfinite(value) else near
+        return replace(self, paths=tuple(reckoned(t, g.mean) for t, g in zip(self.tracks, near, strict=True)))
 
     def frozen(self, z: FloatArray) -> Problem:
         """The problem whose effects stay as simulated at z, but for their slope, unless one of them is free."""
@@ -563,18 +564,6 @@ class Problem:
             return self
         tracks = tuple(self._simulated(j, z) for j in range(len(self.tracks)))
         return replace(self, tracks=tracks, models=(), paths=())
-
-    def _followed(self, z: FloatArray, near: Sequence[Gains | None]) -> Problem:
-        """The problem with the states of these gains to simulate along; without, those that follow the measurements."""
-        if not self.models:
-            return self
-
-        def path(j: int) -> FloatArray:
-            track, g = self.tracks[j], near[j]
-            mean = k.kalman(track, self.physics(z, j), self.first_noise())[1].mean if g is None else g.mean
-            return reckoned(track, mean)
-
-        return replace(self, paths=tuple(_each(path, len(self.tracks))))
 
     def _pass(self, z: FloatArray, psi: FloatArray, j: int) -> tuple[float, Gains]:
         track, p = self._simulated(j, z) if self.models else self.tracks[j], self.physics(z, j)

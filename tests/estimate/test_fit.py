@@ -211,6 +211,7 @@ def test_gradient_by_any_entry_is_the_slope_of_the_squares() -> None:
     z = problem.start()
     for i, (name, _, _) in enumerate(problem.entries):
         z[i] += FREED.get(name, 0.0) / problem.size[i]
+    problem = problem.along(z, psi)
     _, gains = problem.passes(z, psi)
     information, gradient = problem.normal_equations(z, psi, gains)
     sigma = 1.0 / np.sqrt(np.diag(information))
