@@ -74,10 +74,7 @@ def quadratic(problem: Problem, gains: Sequence[Gains], found: Sequence[Sensitiv
     for track, mine in zip(problem.tracks, found, strict=True):
         for first, last in _spans(track):
             gram, grad = np.zeros((size, size)), np.zeros(size)
-            J = mine.J[:, first:last]
-            grad[mine.entries] = J.reshape(len(J), -1) @ mine.plain[first:last].ravel()
-            J = mine.expected(slice(first, last))
-            gram[np.ix_(mine.entries, mine.entries)] = J @ J.T
+            gram[np.ix_(mine.entries, mine.entries)], grad[mine.entries] = mine.quadratic(slice(first, last))
             grams.append(gram)
             grads.append(grad)
     return Quadratic(np.array(grams), np.array(grads), *costs(problem, gains))

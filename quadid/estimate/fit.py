@@ -84,22 +84,24 @@ def estimate(problem: Problem, start: FloatArray | None = None, noise: FloatArra
         start: scaled parameters where to begin; default the guess.
         noise: noise numbers of an estimate nearby, at whose peak of the likelihood to stay; default: search for one.
     """
-    part = problem.liveliest(FIRST_SECONDS)
-    z, psi = part.start() if start is None else start, part.first_noise() if noise is None else noise
-    # 1. Steps with random forces held large, so that no flight diverges from a bad guess.
+    z = problem.start() if start is None else start
     if noise is None:
+        # 1. Steps with random forces held large, so that no flight diverges from a bad guess.
+        part = problem.liveliest(FIRST_SECONDS)
+        psi = part.first_noise()
         z = scoring(part.along(z, psi).frozen(z), z, psi, NEAR, NO_NOISE)[0]
-    whole, z = problem.based_on(z)
-    # 2. Let them shrink: noise and physics together, until the likelihood stays; near it, over all flights.
-    part = whole.liveliest(FIRST_SECONDS)
-    near = part.along(z, psi).frozen(z)
-    if noise is None:
+        whole, z = problem.based_on(z)
+        # 2. Let them shrink: noise and physics together, until the likelihood stays; near it, over all flights.
+        part = whole.liveliest(FIRST_SECONDS)
+        near = part.along(z, psi).frozen(z)
         z, psi, _ = settle_noise(near, z, psi)
+        problem = whole.along(z, psi).frozen(z)
+        if part is whole and not problem.objective(z, psi) <= near.objective(z, psi):  # effects that run away
+            problem = near
     else:
-        psi = np.clip(psi, *whole.noise_bounds.T)
-    problem = whole.along(z, psi).frozen(z)
-    if part is whole and not problem.objective(z, psi) <= near.objective(z, psi):  # effects that run away
-        problem = near
+        whole, z = problem.based_on(z)
+        psi = np.asarray(np.clip(noise, *whole.noise_bounds.T))
+        problem = whole.along(z, psi).frozen(z)
     z, psi, value, gains, information = scoring(problem, z, psi, MOST, ALL_NOISE)
 
     def moved(new: Problem) -> bool:
@@ -243,9 +245,10 @@ def scoring(
             information, gradient = problem.normal_equations(z, psi, gains, nudge)
             below, above = np.maximum(below, -BOLD), np.minimum(above, BOLD)
         log = np.log(psi)
+        fresh = not noise.any() or np.max(np.abs(log - at)) > STALE
         if noise.any():
             slope = problem.score(z, psi, gains) * psi
-            if np.max(np.abs(log - at)) > STALE:
+            if fresh:
                 data = problem.noise_information(z, psi, gains)
                 curvature, at = 2.0 * data + np.diag(problem.noise_curvature(psi)), log
             else:
@@ -277,9 +280,9 @@ def scoring(
         else:
             damping, calm = more(damping), calm if changed is psi else more(calm)
         z, psi, value, gains, renewed = moved, changed, better, renewed, []
-        if done and (at is log or not noise.any()):
+        if done and fresh:
             break
-        at = np.full(len(psi), np.inf) if done else at  # only a look at where it is ends the search
+        at = np.full(len(psi), np.inf) if done else at  # what promises no more has to be looked at
     return z, psi, value, gains, information
 
 

@@ -184,9 +184,12 @@ class Sensitivities(NamedTuple):
     J: FloatArray
     root: FloatArray
 
-    def expected(self, rows: slice | BoolArray = slice(None)) -> FloatArray:
-        """Derivatives of some rows whose products are the expected information, shape (entries, rows x M)."""
-        return np.asarray((self.J[:, rows] * self.root[rows]).reshape(len(self.J), -1))
+    def quadratic(self, rows: slice | BoolArray = slice(None)) -> tuple[FloatArray, FloatArray]:
+        """Expected information (P, P) and half the gradient (P,) that some rows give, by the entries."""
+        J, count = self.J[:, rows], len(self.J)
+        gradient = J.reshape(count, -1) @ self.plain[rows].ravel()
+        J = (J * self.root[rows]).reshape(count, -1)
+        return J @ J.T, gradient
 
 
 @dataclass(frozen=True)
@@ -727,7 +730,7 @@ def moments_at(track: Track, g: Gains, p: FloatArray) -> FloatArray:
     return g.table if made_with == g.made_with else k.moments(track, *made_with)
 
 
-_NO_ROWS, _NO_MEANS = np.empty((0, k.M)), np.empty((0, k.N_MEAN))
+_NO_MEANS = np.empty((0, k.N_MEAN))
 _THREADS = ThreadPoolExecutor(max_workers=2, thread_name_prefix="filter")
 
 

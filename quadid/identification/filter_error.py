@@ -346,10 +346,9 @@ def _with_causes(found: Estimate, near: Sequence[Sensitivities], wide: Problem) 
     for j, (mine, g) in enumerate(zip(near, wide.passes(z, found.psi)[1], strict=True)):
         more = wide.sensitivities(j, z, found.psi, g, nudge, added)
         entries = [*(own[i] for i in mine.entries), *more.entries]
-        both = mine._replace(entries=entries, J=np.concatenate([mine.J, more.J]))
-        gradient[entries] += both.J.reshape(len(entries), -1) @ both.plain.ravel()
-        J = both.expected()
-        information[np.ix_(entries, entries)] += J @ J.T
+        of_both, slope = mine._replace(J=np.concatenate([mine.J, more.J])).quadratic()
+        gradient[entries] += slope
+        information[np.ix_(entries, entries)] += of_both
     least, most = wide.limits - z
     least[added], most[added] = np.maximum(least[added], -MET), np.minimum(most[added], MET)
 
@@ -382,7 +381,7 @@ def _blocks(problem: Problem, found: Sequence[Sensitivities]) -> tuple[FloatArra
         entries, block = mine.entries, (begin + np.arange(len(mine.plain))) * BLOCKS // rows
         begin += len(mine.plain)
         for b in np.unique(block):
-            slopes[b, entries] += mine.J[:, block == b].reshape(len(entries), -1) @ mine.plain[block == b].ravel()
-            part = mine.expected(block == b)
-            grams[b][np.ix_(entries, entries)] += part @ part.T
+            gram, slope = mine.quadratic(block == b)
+            slopes[b, entries] += slope
+            grams[b][np.ix_(entries, entries)] += gram
     return grams, slopes

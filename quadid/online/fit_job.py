@@ -37,7 +37,7 @@ from quadid.online.checks import wrong_unit
 from quadid.online.gate import with_room
 from quadid.online.records import Job, JobReply
 from quadid.parameters import NOMINAL_NAMES
-from quadid.types import BoolArray, FloatArray, check_shapes
+from quadid.types import FloatArray, check_shapes
 from quadid.vehicle import GRAVITY, Vehicle
 
 SIX = len(NOMINAL_NAMES)
@@ -485,8 +485,8 @@ def _estimates(request: FitRequest, z: FloatArray, noise: Noise) -> tuple[tuple[
         for i, e in enumerate(out):
             start, stop = e.start - 0.5 * window.dt, e.stop - 0.5 * window.dt
             new, half_new = ((w.t > start) & (w.t < stop) for w in (window, sparse))
-            share, (information, score) = float(np.mean(new)), _quadratic(near, new)
-            of_half = _quadratic(half, half_new)
+            share, (information, score) = float(np.mean(new)), near.quadratic(new)
+            of_half = half.quadratic(half_new)
             out[i] = replace(
                 e,
                 information=e.information + information,
@@ -520,12 +520,6 @@ def _linearised(
     J = np.tensordot(by_z, by_own.J, (0, 0))
     J[len(own_names(vehicle)) :] += _by_thrust(problem, own, noise, gains[0], by_own.plain)
     return problem, own, by_z, gains, by_own._replace(entries=list(range(len(J))), J=J)
-
-
-def _quadratic(near: Sensitivities, rows: BoolArray) -> tuple[FloatArray, FloatArray]:
-    """Expected information (P, P) and half the gradient (P,) that some rows give."""
-    seen = near.expected(rows)
-    return seen @ seen.T, near.J[:, rows].reshape(len(near.J), -1) @ near.plain[rows].ravel()
 
 
 def _by_thrust(problem: Problem, z: FloatArray, noise: Noise, gains: Gains, plain: FloatArray) -> FloatArray:

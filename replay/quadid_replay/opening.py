@@ -82,11 +82,11 @@ def open_log(path: str | Path, preset: str = AUTO, columns: Mapping[str, str] | 
     request = {"path": str(file.absolute()), "preset": preset, "columns": dict(columns or {}), **allowed._asdict()}
     # Asked twice where nobody answers at all: the process that stands ready ended with the request in its hands.
     answer = _answer(file, kind.name, request, allowed) or _answer(file, kind.name, request, allowed)
+    if not answer:
+        raise _stopped(file, -signal.SIGKILL, allowed)
     if len(answer) == allowed.memory * _MIB:
         raise _limited(file, "memory", allowed)
     try:
-        if not answer:
-            raise _stopped(file, -signal.SIGKILL, allowed)
         if ended := os.waitstatus_to_exitcode(int.from_bytes(answer[-_STATUS_BYTES:], "little")):
             raise _stopped(file, ended, allowed)
         return unpack(answer[:-_STATUS_BYTES])
