@@ -59,20 +59,23 @@ from quadid.vehicle import Vehicle
 # (`quadid.identification.filter_error`), the numbers of its causes with it.
 
 
-def fit_numbers(windows: Sequence[Window], short: Shooting, model: Model) -> Fit | None:
+def fit_numbers(
+    windows: Sequence[Window], short: Shooting, model: Model, noise: FloatArray | None = None
+) -> Fit | None:
     """The fit of `model` by the likelihood of innovations: the six and what belongs to the vehicle of its causes.
 
     Args:
         windows: the data.
         short: segments of them, for the vehicle and its names.
         model: the selected one.
+        noise: its noise numbers, if they are known.
 
     Returns:
         None where the filter has no finite answer.
     """
     flight = [n for c in model.causes if EFFECTS[c.effect].per_log for n in c.names]
     free = short.free([n for n in model.free.names if n not in flight])
-    found = filtered(windows, short.vehicle, model.theta, free, flight)
+    found = filtered(windows, short.vehicle, model.theta, free, flight, noise)
     return None if found is None else beside_random_forces(short, found, free)
 
 
@@ -190,7 +193,11 @@ def _concluded(
     # Numbers.
     report("numbers", 0.0)
     decisive, selected = search.shooting, search.model
-    found = nominal if nominal and not selected.causes else fit_numbers(windows, short, selected)
+    found = (
+        nominal
+        if nominal and not selected.causes
+        else fit_numbers(windows, short, selected, rough.model.psi if rough else None)
+    )
     model = selected if found is None else with_numbers(selected, found)
     # What each cause gains on unseen data.
     report("validation", 0.0)

@@ -22,7 +22,7 @@ from quadid.diagnosis.hypotheses import (
 )
 from quadid.effects import EFFECTS, NEVER
 from quadid.estimate import kalman as k
-from quadid.estimate.fit import ALL_NOISE, ENOUGH, MOST, NEAR, NO_NOISE, scoring, settle_noise, tails
+from quadid.estimate.fit import ALL_NOISE, MOST, NEAR, NO_NOISE, scoring, settle_noise, tails
 from quadid.estimate.kalman import Beyond, Gains, Track
 from quadid.estimate.problem import PER_FLIGHT, PLACES, Problem, Sensitivities, moments_at
 from quadid.estimate.track import from_window
@@ -38,8 +38,6 @@ from quadid.vehicle import Vehicle
 
 STRETCH = 1.0
 """Length of the stretches whose scores are summed [s]."""
-PROMISE = 2.0
-"""Times what its last few steps gained that a fit may gain by all that follow."""
 
 
 def stretches(track: Track) -> IndexArray:
@@ -261,21 +259,16 @@ class Flights:
         """
         problem = self.problem(free_names(causes), times)
         z = np.clip([start.get(key, 0.0) for key in problem.keys], *problem.limits)
-        deviance, before, gains = np.inf, np.inf, list[Gains]()
-        for _ in range(MOST // NEAR):
-            gains.clear()
-            try:
-                z, psi, deviance, gains, _ = scoring(problem, z, psi, NEAR, ALL_NOISE)
-            except np.linalg.LinAlgError:  # the filter ran away
-                return None
-            if not deviance < before - ENOUGH:
-                break
-            if deviance - wanted > PROMISE * (before - deviance):
-                return None
-            before = deviance
+        try:
+            z, psi, deviance, gains, _ = scoring(problem, z, psi, MOST, ALL_NOISE, wanted=wanted)
+        except np.linalg.LinAlgError:  # the filter ran away
+            return None
+        if not np.isfinite(deviance):
+            return None
+        problem = problem.weighted(gains)
         found = [problem.sensitivities(j, z, psi, g) for j, g in enumerate(gains)]
         near = quadratic(problem, gains, found, len(z))
-        if not (np.isfinite(deviance) and np.isfinite(near.information).all()):
+        if not np.isfinite(near.information).all():
             return None
         blocks, flights = (held_out(part, problem.prior[1] ** -2.0) for part in (near, near.by_flight))
         free = Free(tuple(problem.layout.entry(n) for n in free_names(causes)))

@@ -8,7 +8,7 @@ from scipy.optimize import lsq_linear
 
 from quadid.estimate import kalman as k
 from quadid.estimate.kalman import Gains, Track
-from quadid.estimate.problem import Problem
+from quadid.estimate.problem import Problem, measured, simulated
 from quadid.types import BoolArray, FloatArray
 
 BOLD = 1.5
@@ -35,6 +35,8 @@ ACTS = 3.0
 """Times its least value beyond which a random force acts."""
 FLAT = 1e-12
 """Curvature of scaled numbers below which a direction is as good as flat."""
+PROMISE = 2.0
+"""Times what the last `NEAR` steps gained that a search may gain by all that follow."""
 STALE = 0.2
 """Change of a noise number's logarithm after which the information is taken anew."""
 
@@ -110,7 +112,7 @@ def estimate(problem: Problem, start: FloatArray | None = None, noise: FloatArra
         gains.clear()  # of a long flight, each list of them is a third of all memory
         tried = scoring(new, z, psi, MOST, ALL_NOISE)
         if there := bool(np.isfinite(tried[2]) and np.isfinite(tried[4]).all()):
-            problem, (z, psi, value, gains, information) = new, tried
+            problem, (z, psi, value, gains, information) = new.weighted(tried[3]), tried
         else:
             gains = problem.passes(z, psi)[1]
         return there
@@ -178,16 +180,9 @@ def of_square(problem: Problem, z: FloatArray, psi: FloatArray, gains: Sequence[
     low, high = problem.noise_bounds[k.ROTOR]
     if psi[k.ROTOR] <= 1.01 * low:
         return 0.0
-    data = problem.held(z, psi, gains).noise_information(z, psi, gains)
+    data = problem.noise_information(z, psi, gains)
     known = np.linalg.inv(data + 0.5 * np.diag(problem.noise_curvature(psi)))
     return float(min(2.0 * np.sqrt(known[k.ROTOR, k.ROTOR]), (high / psi[k.ROTOR]) ** 2 / np.sqrt(12.0)))
-
-
-def measured(track: Track, g: Gains) -> BoolArray:
-    """Mask of innovations that are of measurements, shape (n, M): a velocity that nobody measured has only a prior."""
-    out = g.S > 0.0
-    out[:, k.VELOCITY :] &= track.seen[:, 3:]
-    return np.asarray(out)
 
 
 def whitened(tracks: Sequence[Track], gains: Sequence[Gains]) -> tuple[FloatArray, ...]:
@@ -213,7 +208,13 @@ def tails(tracks: Sequence[Track], gains: Sequence[Gains]) -> FloatArray:
 
 
 def scoring(
-    problem: Problem, z: FloatArray, psi: FloatArray, turns: int, noise: BoolArray, physics: bool = True
+    problem: Problem,
+    z: FloatArray,
+    psi: FloatArray,
+    turns: int,
+    noise: BoolArray,
+    physics: bool = True,
+    wanted: float = np.inf,
 ) -> tuple[FloatArray, FloatArray, float, list[Gains], FloatArray]:
     """Fisher scoring of physics and noise, whose information has no common part.
 
@@ -221,7 +222,8 @@ def scoring(
     `noise` (N_NOISE,) frees, by the exact score of the full filter.  Gains are renewed after every step.  One that does
     not help is damped (Levenberg-Marquardt), the noise alone where physics alone helps: where it hardly acts, its
     expected curvature is no guide.  Without `physics` the noise alone moves.  Weights of outliers are renewed before
-    every step, and held in it.
+    every step, and held in it; the gains have them.  The objective is infinite where the search was given up, since it
+    would hardly come down to what is `wanted`.
 
     Returns:
         Scaled parameters, noise numbers, objective, gains there; information (P, P) before the last step.
@@ -233,13 +235,20 @@ def scoring(
     damping = calm = 0.0
     below = above = np.zeros(len(z))
     renewed: list[Gains] = []
-    for _ in range(turns if np.isfinite(value) else 0):
+    before = np.inf
+    for turn in range(turns if np.isfinite(value) else 0):
+        if turn % NEAR == NEAR - 1:
+            if value - wanted > PROMISE * (before - value):
+                return z, psi, np.inf, gains, information
+            before = value
+        fallen = 0.0
         if problem.tail.any():
-            held = problem.held(z, psi, gains)
-            anew, renewed = held.passes(z, psi)
+            held, quieter = problem.reweighted(z, psi, gains, noise)
+            anew, renewed = held.passes(z, quieter, simulated(gains))
             if not np.isfinite(anew):
                 break
-            problem, value, gains, renewed = held, anew, renewed, []
+            fallen = value - anew
+            problem, psi, value, gains, renewed = held, quieter, anew, renewed, []
         if physics:
             below, above, nudge = problem.corner(z, psi, gains)
             information, gradient = problem.normal_equations(z, psi, gains, nudge)
@@ -258,23 +267,29 @@ def scoring(
             break  # readings so wild that they overflow lead nowhere
         for _ in range(PATIENCE):
             step = newton_step(information, gradient, damping, below, above)
-            bold = newton_step(curvature, slope, calm, *noise_box(problem.noise_bounds, psi, noise))
+            bold = newton_step(curvature, slope, calm, *noise_box(problem, psi, noise))
             by_physics, by_noise = -float(gradient @ step), -0.5 * float(slope @ bold)
-            done = by_physics < FINE and by_noise < ENOUGH
-            moved, changed = z + step, changed_noise(psi, bold)
+            done = by_physics < FINE and max(by_noise, fallen) < ENOUGH
+            moved, changed = z + step, changed_noise(psi, bold, problem.noise_bounds)
             renewed.clear()  # what did not help makes room
             better, renewed = problem.passes(moved, changed)
             if better < value or done:
                 break
             if by_physics > FINE and noise.any():
+                there = simulated(renewed)
                 renewed.clear()
-                better, renewed = problem.passes(moved, psi)
+                better, renewed = problem.passes(moved, psi, there)
             if better < value:
                 changed, by_noise, calm = psi, 0.0, more(calm)
                 break
             damping, calm = more(damping), more(calm)
-        if not better < value:
+        if not better < value and fresh:
             break
+        if not better < value or changed is psi:
+            at = np.full(len(psi), np.inf)  # a curvature by secants that led nowhere is taken anew
+        if not better < value:
+            damping = calm = 0.0
+            continue
         if value - better > POOR * (by_physics + by_noise):
             damping, calm = less(damping), calm if changed is psi else less(calm)
         else:
@@ -307,9 +322,13 @@ def less(damping: float) -> float:
     return 0.25 * damping if damping > 0.02 else 0.0
 
 
-def noise_box(bounds: FloatArray, psi: FloatArray, free: BoolArray) -> tuple[FloatArray, FloatArray]:
-    """Least and most step of the noise numbers, as `changed_noise` takes it: up by a factor, down to the bound."""
-    low, high = bounds[:, 0] / psi, np.minimum(bounds[:, 1] / psi, np.exp(BOLD))
+def noise_box(problem: Problem, psi: FloatArray, free: BoolArray) -> tuple[FloatArray, FloatArray]:
+    """Least and most step of the noise numbers, as `changed_noise` takes it: down to the bound, up by a factor.
+
+    What hardly acts may rise to where a search begins: by factors it would take a dozen steps.
+    """
+    bounds, leap = problem.noise_bounds, problem.first_noise() / psi
+    low, high = bounds[:, 0] / psi, np.minimum(bounds[:, 1] / psi, np.maximum(np.exp(BOLD), leap))
     low[k.TIME :] = np.maximum(low[k.TIME :], np.exp(-BOLD))
     box = np.array([low, high])
     box = np.where(np.arange(k.N_NOISE) < k.TIME, 0.5 * (box**2 - 1.0), np.log(box))
@@ -321,11 +340,16 @@ def noise_box(bounds: FloatArray, psi: FloatArray, free: BoolArray) -> tuple[Flo
     return least, most
 
 
-def changed_noise(psi: FloatArray, step: FloatArray) -> FloatArray:
-    """Noise numbers after a step of logarithms, as one of variances, where the likelihood is nearly a parabola."""
-    out = psi * np.exp(step)
-    out[: k.TIME] = psi[: k.TIME] * np.sqrt(1.0 + 2.0 * step[: k.TIME])
-    return out
+def changed_noise(psi: FloatArray, step: FloatArray, bounds: FloatArray) -> FloatArray:
+    """Noise numbers after a step of logarithms, as one of variances, where the likelihood is nearly a parabola.
+
+    For random forces that is the variance of what drives them, sigma^2 / T, which data show best.
+    """
+    longer = np.zeros(k.TIME)
+    longer[k.SIGMA : k.ROTOR] = step[k.TIME + np.minimum(np.arange(6), 4)]
+    variance = np.maximum(1.0 + 2.0 * step[: k.TIME] - longer, 0.0) * np.exp(longer)
+    by = np.concatenate([np.sqrt(variance), np.exp(step[k.TIME :])])
+    return np.asarray(np.clip(psi * by, *bounds.T))
 
 
 def best_step(

@@ -6,7 +6,7 @@ covariance, the likelihood of physics p and noise psi is
 
     -2 ln L = sum ln S + nu^2 / S                                                                             (1)
 
-over scalar measurements, each after those before it.  Where outliers are expected, noise has variance r / w, with a
+over scalar measurements, each after those before it.  Where outliers are expected, its noise has variance r / w, with a
 weight w of each reading at the price k (w - 1 - ln w): Student-t noise of k degrees of freedom as a scale mixture
 (Ting, Theodorou & Schaal 2007, doi:10.1007/978-3-540-74958-5_76; Lange, Little & Taylor 1989,
 doi:10.1080/01621459.1989.10478852).  w = (k + 1) / (k + m) lowers the sum, m the mean of its squared error over r,
@@ -37,7 +37,7 @@ from typing import Any, NamedTuple
 import numba as nb
 import numpy as np
 
-from quadid.model.simd import jit
+from quadid.model.simd import jit, lane_kernel
 from quadid.on_disk import kept
 from quadid.types import BoolArray, FloatArray
 from quadid.vehicle import GRAVITY
@@ -173,6 +173,7 @@ def _courses(track: Track, lag: float, dead: float, over: float) -> FloatArray:
     out, turning = np.zeros((pieces, MOMENTS, 7)), track.speed[0, :, 0].copy()
     for k in range(pieces):
         s = track.piece_t[k + 1] - track.piece_t[k] if k + 1 < pieces else 0.0
+        decays, fade = _decays(lag, s), math.exp(-s / lag) if lag > 0.0 else 0.0
         for i in range(rotors):
             r = track.speed[k, i, 1]
             a = track.speed[k, i, 0] - lag * r
@@ -190,22 +191,28 @@ def _courses(track: Track, lag: float, dead: float, over: float) -> FloatArray:
                 out[k, m, 1] += w * a
                 out[k, m, 2] += 0.5 * w * r
                 out[k, m, 4] += w * c
-            turning[i] = a + r * s + (c * math.exp(-s / lag) if lag > 0.0 else 0.0)
+            turning[i] = a + r * s + c * fade
         for m in range(MOMENTS):
             if k + 1 < pieces:
-                out[k + 1, m, 0] = _integral(out[k, m], lag, s)
+                out[k + 1, m, 0] = _integral(out[k, m], s, decays)
     return out
 
 
 @_piece
-def _integral(course: FloatArray, lag: float, s: float) -> float:
+def _decays(lag: float, s: float) -> tuple[float, float, float]:
+    """Integrals of exp(-r / T), r exp(-r / T) and exp(-2 r / T) over r from 0 to s; none without a lag T."""
+    if not (lag > 0.0 and s > 0.0):
+        return 0.0, 0.0, 0.0
+    fade = math.exp(-s / lag)
+    gone = lag * (1.0 - fade)
+    return gone, lag * (gone - s * fade), 0.5 * lag * (1.0 - fade * fade)
+
+
+@_piece
+def _integral(course: FloatArray, s: float, decays: tuple[float, float, float]) -> float:
     """Integral of a moment up to s after the begin of a piece."""
     total = course[0] + s * (course[1] + s * (course[2] + s * course[3]))
-    if lag > 0.0 and s > 0.0:
-        fade = math.exp(-s / lag)
-        gone = lag * (1.0 - fade)
-        total += gone * course[4] + lag * (gone - s * fade) * course[5] + 0.5 * lag * (1.0 - fade * fade) * course[6]
-    return float(total)
+    return float(total + decays[0] * course[4] + decays[1] * course[5] + decays[2] * course[6])
 
 
 @_piece
@@ -215,8 +222,9 @@ def _integrals(piece_t: FloatArray, courses: FloatArray, lag: float, t: float, a
         at -= 1
     while at + 1 < len(piece_t) and piece_t[at + 1] <= t:
         at += 1
+    decays = _decays(lag, t - piece_t[at])
     for m in range(MOMENTS):
-        out[m] = _integral(courses[at, m], lag, t - piece_t[at])
+        out[m] = _integral(courses[at, m], t - piece_t[at], decays)
     return at
 
 
@@ -672,17 +680,21 @@ def _transition(c, row, h, keep, air, x, after, F, turn):  # type: ignore[no-unt
 
 
 @_piece
-def _kick(h, air, i, turn, G):  # type: ignore[no-untyped-def]
-    """Writes the column of G in Eq. 5 of Gauss-Markov state i: its noise acts by half within the step."""
-    G[:] = 0.0
-    G[FO + i] = 1.0
-    if i < 3:
-        if air:
-            for j in range(3):
-                G[VE + j] = 0.5 * h * turn[j, i]
-    elif i < 6:
-        G[TH + i - 3] = h * h / 6.0
-        G[OM + i - 3] = 0.5 * h
+def _kick(h, air, i, turn, where, what):  # type: ignore[no-untyped-def]
+    """Writes places and values of G in Eq. 5 of Gauss-Markov state i, whose noise acts by half within the step.
+
+    Returns how many there are; its own place is the first.
+    """
+    where[0], what[0] = FO + i, 1.0
+    if i < 3 and air:
+        for j in range(3):
+            where[1 + j], what[1 + j] = VE + j, 0.5 * h * turn[j, i]
+        return 4
+    if 3 <= i < 6:
+        where[1], what[1] = OM + i - 3, 0.5 * h
+        where[2], what[2] = TH + i - 3, h * h / 6.0
+        return 3
+    return 1
 
 
 @_piece
@@ -696,36 +708,63 @@ def _wavering(track, row, h, out):  # type: ignore[no-untyped-def]
 
 
 @_piece
-def _push(h, air, i, turn, G):  # type: ignore[no-untyped-def]
-    """Writes the column of G of rotor noise `i` of `_wavering`, constant over the step."""
-    G[:] = 0.0
+def _push(h, air, i, turn, where, what):  # type: ignore[no-untyped-def]
+    """Writes places and values of G of rotor noise `i` of `_wavering`, constant over the step; returns how many."""
     if i > 0:
-        G[TH + i - 1], G[OM + i - 1] = 0.5 * h * h, h
-    elif air:
+        where[0], what[0] = OM + i - 1, h
+        where[1], what[1] = TH + i - 1, 0.5 * h * h
+        return 2
+    if air:
         for j in range(3):
-            G[VE + j] = h * turn[j, 2]
+            where[j], what[j] = VE + j, h * turn[j, 2]
+        return 3
+    return 0
 
 
 @_piece
-def _places(channel, slope, where, what):  # type: ignore[no-untyped-def]
-    """Writes the non-zero places and values of H of one scalar measurement; returns how many there are."""
-    axis = channel % 3
-    what[0], what[1] = 1.0, 1.0
-    if channel < ATTITUDE:
-        where[0] = OM + axis
-        return 1
-    if channel < ACCEL:
-        where[0], where[1] = TH + axis, AE + axis
-        return 2
-    if channel < VELOCITY:
-        where[0], count = FO + axis, 1
-        for j in range(9):
-            if slope[axis, j] != 0.0:
-                where[count], what[count] = (TH if j < 3 else VE - 3 if j < 6 else AL - 6) + j, slope[axis, j]
-                count += 1
-        return count
-    where[0] = VE + axis
-    return 1
+def _widen(q, count, where, what, P):  # type: ignore[no-untyped-def]
+    """Adds G q G' to P."""
+    root = math.sqrt(q)
+    for a in range(count):
+        what[a] *= root
+    for a in range(count):
+        for b in range(count):
+            P[where[a], where[b]] += what[a] * what[b]
+
+
+@_piece
+def _sensors(H: FloatArray) -> None:
+    """Writes H of Eq. 6, shape (M, N), but for the slope of the accelerometer."""
+    H[:] = 0.0
+    for i in range(3):
+        H[GYRO + i, OM + i] = H[ATTITUDE + i, TH + i] = H[ATTITUDE + i, AE + i] = 1.0
+        H[ACCEL + i, FO + i] = H[VELOCITY + i, VE + i] = 1.0
+
+
+@_piece
+def _sense(slope: FloatArray, H: FloatArray) -> None:
+    """Writes the slope of the accelerometer to H."""
+    for i in range(3):
+        for j in range(3):
+            H[ACCEL + i, TH + j] = slope[i, j]
+            H[ACCEL + i, VE + j] = slope[i, 3 + j]
+            H[ACCEL + i, AL + j] = slope[i, 6 + j]
+
+
+@_piece
+def _seen(m: int, slope: FloatArray, x: FloatArray) -> float:
+    """H x of scalar measurement m."""
+    axis = m % 3
+    if m < ATTITUDE:
+        return float(x[OM + axis])
+    if m < ACCEL:
+        return float(x[TH + axis] + x[AE + axis])
+    if m >= VELOCITY:
+        return float(x[VE + axis])
+    total = x[FO + axis]
+    for j in range(3):
+        total += slope[axis, j] * x[TH + j] + slope[axis, 3 + j] * x[VE + j] + slope[axis, 6 + j] * x[AL + j]
+    return float(total)
 
 
 @_piece
@@ -751,12 +790,12 @@ def _is_measured(track: Track, k: int, channel: int) -> bool:
 
 
 @_piece
-def _white(track: Track, psi: FloatArray, row: FloatArray, k: int, channel: int) -> float:
-    """Variance r of a scalar measurement, with that of the thrust which it is compared with."""
+def _white(track: Track, psi: FloatArray, row: FloatArray, k: int, channel: int, w: float) -> float:
+    """Variance r / w of a scalar measurement, and that of the thrust which it is compared with."""
     if channel >= VELOCITY and not track.seen[k, 3]:
         h = track.t[k] - track.t[k - 1] if k > 0 else STILL_TIME
         return float(track.still * track.still * 2.0 * STILL_TIME / h)
-    own = psi[channel] * psi[channel]
+    own = psi[channel] * psi[channel] / w
     return float(own + psi[ROTOR] ** 2 * _felt(track, row) if channel == ACCEL + 2 else own)
 
 
@@ -773,13 +812,14 @@ def _felt(track: Track, row: FloatArray) -> float:
     return float(4.0 * row[2 * MOMENTS] * kept * track.waver[0])
 
 
-def kalman(track: Track, p: FloatArray, psi: FloatArray) -> tuple[float, Gains]:
+def kalman(track: Track, p: FloatArray, psi: FloatArray, table: FloatArray | None = None) -> tuple[float, Gains]:
     """Filter pass over a flight.
 
     Args:
         track: the flight.
         p: physics, shape (N_PHYSICS,).
         psi: noise, shape (N_NOISE,).
+        table: rotor moments at these physics where they are known; see `moments`.
 
     Returns:
         -2 ln L without the price of weights, and the gains.
@@ -794,7 +834,7 @@ def kalman(track: Track, p: FloatArray, psi: FloatArray) -> tuple[float, Gains]:
         np.zeros((rows, 3, 9)),
         np.zeros((rows, N_MEAN)),
         np.zeros((rows, N, 9)),
-        moments(track, *turning(p)),
+        moments(track, *turning(p)) if table is None else table,
         turning(p),
         track.beyond,
     )
@@ -802,54 +842,42 @@ def kalman(track: Track, p: FloatArray, psi: FloatArray) -> tuple[float, Gains]:
 
 
 @_piece
-def _take(P: FloatArray, PH: FloatArray, gain: FloatArray) -> None:
-    """P <- P - sum of gain (P H)(P H)' over three measurements."""
-    for i in range(N):
-        a, b, c = gain[0] * PH[0, i], gain[1] * PH[1, i], gain[2] * PH[2, i]
+def _take(H: FloatArray, m: int, slope: FloatArray, r: float, P: FloatArray, PH: FloatArray, K: FloatArray) -> float:
+    """Covariance and gain of Eq. 6 for scalar measurement m of variance r; returns S."""
+    lane_kernel()
+    for j in range(N):
+        total = 0.0
+        for i in range(N):
+            total += H[m, i] * P[i, j]
+        PH[j] = total
+    S = r + _seen(m, slope, PH)
+    root = math.sqrt(1.0 / S)
+    for j in range(N):
+        K[j] = PH[j] / S
+        PH[j] *= root
+    for i in range(0, N, 3):  # three rows a loop, or the compiler writes it out without vectors
         for j in range(N):
-            P[i, j] -= a * PH[0, j] + b * PH[1, j] + c * PH[2, j]
+            for row in range(i, i + 3):
+                P[row, j] -= PH[row] * PH[j]
+    return float(S)
 
 
 @_piece
-def _update(track, psi, k, nu, slope, P, PH, gain, where, what, dx, g):  # type: ignore[no-untyped-def]
-    """Eq. 6 for all that is measured in row k, one scalar after the other; returns -2 ln of their density.
-
-    P changes for the three axes of a sensor at once; until then PH of each axis is reduced by those before it.
-    """
+def _update(track, psi, k, H, slope, nu, P, PH, K, dx, g):  # type: ignore[no-untyped-def]
+    """Eq. 6 for all that is measured in row k, one scalar after the other; returns -2 ln of their density."""
     total = 0.0
     for i in range(N):
         dx[i] = 0.0
     for m in range(M):
         if not _is_measured(track, k, m):
             continue
-        axis, count = m % 3, _places(m, slope, where, what)
-        v, S = nu[m], _white(track, psi, g.table[k], k, m) / g.w[k, m]
-        for i in range(N):
-            PH[axis, i] = 0.0
-        for j in range(count):
-            a, f = where[j], what[j]
-            v -= f * dx[a]
-            for i in range(N):
-                PH[axis, i] += f * P[a, i]
-        for b in range(axis):
-            along = 0.0
-            for j in range(count):
-                along += what[j] * PH[b, where[j]]
-            along *= gain[b]
-            for i in range(N):
-                PH[axis, i] -= along * PH[b, i]
-        for j in range(count):
-            S += what[j] * PH[axis, where[j]]
+        v = nu[m] - _seen(m, slope, dx)
+        S = _take(H, m, slope, _white(track, psi, g.table[k], k, m, g.w[k, m]), P, PH, K)
         total += v * v / S + math.log(S)
-        gain[axis] = 1.0 / S
-        f = gain[axis] * v
-        for i in range(N):
-            dx[i] += f * PH[axis, i]
         g.nu[k, m], g.S[k, m] = v, S
         for i in range(N):
-            g.gain[k, m, i] = gain[axis] * PH[axis, i]
-        if axis == 2:
-            _take(P, PH, gain)
+            dx[i] += v * K[i]
+            g.gain[k, m, i] = K[i]
     return total
 
 
@@ -860,10 +888,10 @@ def filter_pass(track: Track, p: FloatArray, psi: FloatArray, g: Gains) -> float
     air = _in_air(track)
     c, keep = _constants(p, track), np.empty(9)
     x, after = _start(track, p), np.empty(N_MEAN)
-    P, FP, F, turn = np.zeros((N, N)), np.zeros((N, N)), np.zeros((N, N)), np.zeros((3, 3))
-    dx, PH, G, nu = np.empty(N), np.empty((3, N)), np.empty(N), np.zeros(M)
-    taken = np.empty(3)
-    where, what, loose, step = np.zeros(10, dtype=np.int64), np.zeros(10), np.empty(4), np.zeros(12)
+    P, FP, PF, F, H = np.zeros((N, N)), np.empty((FO, N)), np.empty((N, FO)), np.zeros((N, N)), np.empty((M, N))
+    dx, PH, K, nu, turn = np.empty(N), np.empty(N), np.empty(N), np.zeros(M), np.zeros((3, 3))
+    where, what, loose, step = np.zeros(4, dtype=np.int64), np.zeros(4), np.empty(4), np.zeros(12)
+    _sensors(H)
     for i in range(3):
         P[TH + i, TH + i], P[OM + i, OM + i] = 0.09, 1.0
         P[VE + i, VE + i] = max(track.still, 1.0) ** 2 if air else 0.0
@@ -877,7 +905,8 @@ def filter_pass(track: Track, p: FloatArray, psi: FloatArray, g: Gains) -> float
         _sense_beyond(track.beyond, k - 1, slope)
         _expected(c, p, track.y[k], track.seen[k], g.table[k], air, x, nu)
         _read_beyond(track.beyond, k, step, nu)
-        total += _update(track, psi, k, nu, slope, P, PH, taken, where, what, dx, g)
+        _sense(slope, H)
+        total += _update(track, psi, k, H, slope, nu, P, PH, K, dx, g)
         _correct(dx, x)
         _copy(x, g.mean[k])
         for i in range(N):
@@ -897,49 +926,77 @@ def filter_pass(track: Track, p: FloatArray, psi: FloatArray, g: Gains) -> float
         _step_beyond(track.beyond, k, x, step)
         _copy(after, x)
         _go_beyond(track.beyond, step, dx, x)
-        _sandwich(F, P, FP, False)
+        _spread(F, P, FP, PF)
         for i in range(9):
-            _kick(h, air, i, turn, G)
-            q = psi[SIGMA + _GROUP[i]] ** 2 * (1.0 - keep[i] ** 2)
-            for a in range(N):
-                if G[a] != 0.0:
-                    for b in range(N):
-                        P[a, b] += q * G[a] * G[b]
+            count = _kick(h, air, i, turn, where, what)
+            _widen(psi[SIGMA + _GROUP[i]] ** 2 * (1.0 - keep[i] ** 2), count, where, what, P)
         _wavering(track, g.table[k], h, loose)
         for i in range(4):
-            _push(h, air, i, turn, G)
-            q = psi[ROTOR] ** 2 * loose[i]
-            for a in range(FO):
-                if G[a] != 0.0:
-                    for b in range(FO):
-                        P[a, b] += q * G[a] * G[b]
+            _widen(psi[ROTOR] ** 2 * loose[i], _push(h, air, i, turn, where, what), where, what, P)
     return total
 
 
 @_piece
-def _product(F: FloatArray, P: FloatArray, turned: bool, out: FloatArray) -> None:
-    """Writes F P, or F' P, of the sparse F of `_transition`."""
-    for i in range(N):
+def _spread(F: FloatArray, P: FloatArray, FP: FloatArray, PF: FloatArray) -> None:
+    """P <- F P F' of a symmetric P and F of `_transition`; FP (FO, N) and PF (N, FO) are room."""
+    lane_kernel()
+    for i in range(FO):
+        n = FO if i >= VE else AL  # velocity is moved by random forces, the others by random moments
         for j in range(N):
-            out[i, j] = 0.0
-    for i in range(N):
-        for m in range(i if i >= FO else 0, i + 1 if i >= FO else AE):  # rows of noise states have one entry
-            f = F[i, m]
-            if f != 0.0:
-                a, b = (m, i) if turned else (i, m)
-                for j in range(N):
-                    out[a, j] += f * P[b, j]
+            total = 0.0
+            for m in range(FO):
+                total += F[i, m] * P[m, j]
+            for m in range(n, n + 3):
+                total += F[i, m] * P[m, j]
+            FP[i, j] = total
+    for i in range(FO):
+        for j in range(N):
+            PF[j, i] = FP[i, j]
+    for i in range(FO):
+        n = FO if i >= VE else AL
+        for j in range(FO):
+            total = 0.0
+            for m in range(FO):
+                total += F[i, m] * PF[m, j]
+            for m in range(n, n + 3):
+                total += F[i, m] * PF[m, j]
+            P[i, j] = total
+    for i in range(FO, N):
+        for j in range(FO):
+            P[i, j] = P[j, i] = F[i, i] * PF[i, j]
+        for j in range(FO, N):
+            P[i, j] *= F[i, i] * F[j, j]
+    _even(P, FO)
 
 
 @_piece
-def _sandwich(F: FloatArray, P: FloatArray, FP: FloatArray, turned: bool) -> None:
-    """P <- F P F' of a symmetric P, or F' P F; FP is room, and holds (F P)' afterwards."""
-    _product(F, P, turned, FP)
+def _gather(F: FloatArray, L: FloatArray, LF: FloatArray) -> None:
+    """L <- F' L F of a symmetric L; LF holds L F afterwards."""
+    lane_kernel()
     for i in range(N):
-        for j in range(i):
-            FP[i, j], FP[j, i] = FP[j, i], FP[i, j]
-    _product(F, FP, turned, P)
-    for i in range(N):  # or rounding, which is not symmetric, grows
+        for j in range(N):
+            total = 0.0
+            for m in range(FO):
+                total += L[i, m] * F[m, j]
+            LF[i, j] = total
+        for j in range(FO, N):
+            LF[i, j] += L[i, j] * F[j, j]
+    for i in range(N):
+        for j in range(N):
+            total = 0.0
+            for m in range(FO):
+                total += F[m, i] * LF[m, j]
+            L[i, j] = total
+    for i in range(FO, N):
+        for j in range(N):
+            L[i, j] += F[i, i] * LF[i, j]
+    _even(L, N)
+
+
+@_piece
+def _even(P: FloatArray, size: int) -> None:
+    """Makes the first rows and columns of a matrix symmetric: rounding that is not would grow."""
+    for i in range(size):
         for j in range(i):
             P[i, j] = P[j, i] = 0.5 * (P[i, j] + P[j, i])
 
@@ -963,7 +1020,6 @@ def replay(
     air = _in_air(track)
     c, keep, x = _constants(p, track), np.empty(9), _start(track, p)
     dx, nu, step = np.empty(N), np.zeros(M), np.zeros(12)
-    where, what = np.zeros(10, dtype=np.int64), np.zeros(10)
     total, before = 0.0, -1.0
     for k in range(n):
         _expected(c, p, track.y[k], track.seen[k], table[k], air, x, nu)
@@ -972,10 +1028,7 @@ def replay(
         for m in range(M):
             if g.S[k, m] == 0.0:
                 continue
-            v = nu[m]
-            count = _places(m, g.slope[k], where, what)
-            for j in range(count):
-                v -= what[j] * dx[where[j]]
+            v = nu[m] - _seen(m, g.slope[k], dx)
             for i in range(N):
                 dx[i] += g.gain[k, m, i] * v
             z = v / math.sqrt(g.S[k, m])
@@ -997,15 +1050,35 @@ def replay(
 
 
 @_piece
-def _quadratic(G, l, L):  # type: ignore[no-untyped-def]
+def _quadratic(count, where, what, l, L):  # type: ignore[no-untyped-def]
     """G' l and G' L G of a column with few entries."""
     along, spread = 0.0, 0.0
-    for a in range(N):
-        if G[a] != 0.0:
-            along += G[a] * l[a]
-            for b in range(N):
-                spread += G[a] * L[a, b] * G[b]
+    for a in range(count):
+        along += what[a] * l[where[a]]
+        for b in range(count):
+            spread += what[a] * L[where[a], where[b]] * what[b]
     return along, spread
+
+
+@_piece
+def _put_back(H: FloatArray, m: int, K: FloatArray, S: float, L: FloatArray, LK: FloatArray) -> float:
+    """N of Eq. 7 for scalar measurement m, its gain and variance; returns D.  LK is room."""
+    lane_kernel()
+    for j in range(N):
+        total = 0.0
+        for i in range(N):
+            total += L[i, j] * K[i]
+        LK[j] = total
+    D = 1.0 / S
+    for i in range(N):
+        D += K[i] * LK[i]
+    for i in range(N):
+        LK[i] -= 0.5 * D * H[m, i]
+    for i in range(0, N, 3):
+        for j in range(N):
+            for row in range(i, i + 3):
+                L[row, j] -= H[m, row] * LK[j] + LK[row] * H[m, j]
+    return D
 
 
 @_fast
@@ -1030,10 +1103,11 @@ def backward(
     n = len(track.t)
     air = _in_air(track)
     score, mean, variance = np.zeros(N_NOISE), np.zeros((n, 9)), np.zeros((n, 9))
-    l, fl, L, FL = np.zeros(N), np.zeros(N), np.zeros((N, N)), np.zeros((N, N))
-    NK, G, turn, F = np.empty(N), np.empty(N), np.zeros((3, 3)), np.zeros((N, N))
+    l, fl, L, LF = np.zeros(N), np.zeros(N), np.zeros((N, N)), np.zeros((N, N))
+    LK, turn, F, H = np.empty(N), np.zeros((3, 3)), np.zeros((N, N)), np.empty((M, N))
     c, after, before = _constants(p, track), np.empty(N_MEAN), -1.0
-    where, what, keep = np.zeros(10, dtype=np.int64), np.zeros(10), np.empty(9)
+    where, what, keep = np.zeros(4, dtype=np.int64), np.zeros(4), np.empty(9)
+    _sensors(H)
     loose, borrowed, own = np.empty(4), np.zeros(4), np.ones((n, M))
     for k in range(n - 1, -1, -1):
         if k + 1 < n:
@@ -1047,14 +1121,14 @@ def backward(
             _bend(g.beyond, k, F)
             _wavering(track, g.table[k], h, loose)
             for i in range(4):
-                _push(h, air, i, turn, G)
-                along, spread = _quadratic(G, l, L)
+                count = _push(h, air, i, turn, where, what)
+                along, spread = _quadratic(count, where, what, l, L)
                 score[ROTOR] -= (along * along - spread) * 2.0 * psi[ROTOR] * loose[i]
                 borrowed[i] += spread * psi[ROTOR] ** 2 * loose[i]
             for i in range(9):
                 # d / d sigma^2 through Q, d / d T through Q and F, Eq. 9.
-                _kick(h, air, i, turn, G)
-                along, spread = _quadratic(G, l, L)
+                count = _kick(h, air, i, turn, where, what)
+                along, spread = _quadratic(count, where, what, l, L)
                 by_q = along * along - spread
                 s, T = psi[SIGMA + _GROUP[i]], psi[TIME + _CLOCK[i]]
                 score[SIGMA + _GROUP[i]] -= by_q * 2.0 * s * (1.0 - keep[i] ** 2)
@@ -1066,24 +1140,23 @@ def backward(
             for m in range(N):
                 for i in range(N):
                     fl[i] += F[m, i] * l[m]
-            _sandwich(F, L, FL, True)  # FL holds N F
+            _gather(F, L, LF)
             # d / d F for the decay of each Gauss-Markov state and its mean over the step.
             for i in range(9):
                 s, T = psi[SIGMA + _GROUP[i]], psi[TIME + _CLOCK[i]]
-                _kick(h, air, i, turn, G)  # F's column is (what acts in the step) (1 + keep) / 2, and keep itself
+                count = _kick(h, air, i, turn, where, what)
+                # F's column is (what acts in the step) (1 + keep) / 2, and keep itself
+                if 3 <= i < 6:
+                    what[2] *= 1.5
                 state = g.mean[k, FO + 1 + i]
                 for j in range(N):
                     state += g.P[k, j, i] * fl[j]
                 by_keep = 0.0
-                for a in range(N):
-                    part = G[a]
-                    if i >= 3 and i < 6 and a < OM:
-                        part *= 1.5
-                    if part != 0.0:
-                        inner = 0.0
-                        for j in range(N):
-                            inner += FL[a, j] * g.P[k, j, i]
-                        by_keep += part * (l[a] * state - inner)
+                for a in range(count):
+                    inner = 0.0
+                    for j in range(N):
+                        inner += LF[where[a], j] * g.P[k, j, i]
+                    by_keep += what[a] * (l[where[a]] * state - inner)
                 score[TIME + _CLOCK[i]] -= 2.0 * by_keep * keep[i] * h / (T * T)
             for i in range(N):
                 l[i] = fl[i]
@@ -1093,35 +1166,24 @@ def backward(
                 mean[k, i] += g.P[k, j, i] * l[j]
                 for m in range(N):
                     variance[k, i] -= g.P[k, j, i] * L[j, m] * g.P[k, m, i]
+        _sense(g.slope[k], H)
         for m in range(M - 1, -1, -1):
             if g.S[k, m] == 0.0:
                 continue
-            count = _places(m, g.slope[k], where, what)
-            S, K = g.S[k, m], g.gain[k, m]
-            u, D = g.nu[k, m] / S, 1.0 / S
+            K, u = g.gain[k, m], g.nu[k, m] / g.S[k, m]
             for i in range(N):
                 u -= K[i] * l[i]
-                NK[i] = 0.0
-            for j in range(N):
-                for i in range(N):
-                    NK[i] += L[j, i] * K[j]
             for i in range(N):
-                D += K[i] * NK[i]
+                l[i] += H[m, i] * u
+            D = _put_back(H, m, K, g.S[k, m], L, LK)
             if m < VELOCITY or track.seen[k, 3]:
-                noise = _white(track, psi, g.table[k], k, m) / g.w[k, m]
+                noise = psi[m] * psi[m] / g.w[k, m]
                 own[k, m] = (1.0 + noise * (u * u - D)) / g.w[k, m]
                 score[m] -= (u * u - D) / g.w[k, m] * 2.0 * psi[m]
             if m == ACCEL + 2:
                 felt = _felt(track, g.table[k])
-                score[ROTOR] -= (u * u - D) / g.w[k, m] * 2.0 * psi[ROTOR] * felt
+                score[ROTOR] -= (u * u - D) * 2.0 * psi[ROTOR] * felt
                 borrowed[0] += D * psi[ROTOR] ** 2 * felt
-            for a in range(count):
-                l[where[a]] += what[a] * u
-                for b in range(N):
-                    L[where[a], b] -= what[a] * NK[b]
-                    L[b, where[a]] -= what[a] * NK[b]
-                for b in range(count):
-                    L[where[a], where[b]] += what[a] * what[b] * D
     # The first covariance of the Gauss-Markov states is sigma^2.
     for i in range(9):
         s = psi[SIGMA + _GROUP[i]]

@@ -22,13 +22,12 @@ from quadid.estimate.fit import (
     NEAR_SECONDS,
     NO_NOISE,
     Estimate,
-    measured,
     scoring,
     settle_noise,
     tails,
     whitened,
 )
-from quadid.estimate.problem import Problem
+from quadid.estimate.problem import Problem, measured
 from quadid.estimate.track import from_window
 from quadid.model.layout import Layout
 from quadid.rotation import conjugate, rotated
@@ -205,8 +204,8 @@ def settled(
     problem = problem if tail is None else replace(problem, tail=tail)
     z, noise = problem.start(), problem.first_noise() if psi is None else psi
     problem = problem.along(z, noise).frozen(z)
-    z, *_ = scoring(problem, z, noise, TRIMMING, NO_NOISE)
-    return problem, z
+    z, _, _, gains, _ = scoring(problem, z, noise, TRIMMING, NO_NOISE)
+    return problem.weighted(gains), z
 
 
 def size(parts: Sequence[Missing], force: bool) -> tuple[FloatArray, FloatArray]:

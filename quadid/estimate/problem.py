@@ -169,6 +169,18 @@ def scatter_of(tracks: Sequence[Track]) -> float:
     return min((float(np.sqrt(np.mean(b**2, axis=0) / 6.0).min()) for b in bends if len(b)), default=np.inf)
 
 
+class Simulated(NamedTuple):
+    """Effects and rotor moments along a flight: of physics alone, whatever the noise.
+
+    Attributes:
+        beyond: see `Track.beyond`.
+        table: see `kalman.moments`.
+    """
+
+    beyond: Beyond
+    table: FloatArray
+
+
 class Sensitivities(NamedTuple):
     """Whitened innovations of a flight and their derivatives.
 
@@ -522,18 +534,49 @@ class Problem:
         """-2 ln of likelihood and prior; infinite where the filter has no finite step."""
         return self.passes(z, psi)[0]
 
-    def passes(self, z: FloatArray, psi: FloatArray) -> tuple[float, list[Gains]]:
-        """The same, and the gains of every flight; where a problem has `models`, after `along`."""
-        found = _each(lambda j: self._pass(z, psi, j), len(self.tracks))
+    def passes(self, z: FloatArray, psi: FloatArray, there: Sequence[Simulated] = ()) -> tuple[float, list[Gains]]:
+        """The same, and the gains of every flight; where a problem has `models`, after `along`.
+
+        `there` is what an earlier pass at the same z simulated, if any.
+        """
+        found = _each(lambda j: self._pass(z, psi, j, there[j] if there else None), len(self.tracks))
         total = self.penalty(z) + self.noise_penalty(psi)[0] + sum(value for value, _ in found)
         return (total if np.isfinite(total) else np.inf), [g for _, g in found]
 
-    def held(self, z: FloatArray, psi: FloatArray, gains: Sequence[Gains]) -> Problem:
-        """The problem with weights of outliers renewed by a pass, and held; the same where none are expected."""
+    def weighted(self, gains: Sequence[Gains]) -> Problem:
+        """The problem with the weights that outliers have in a pass; the same where none are expected."""
         if not self.tail.any():
             return self
+        return replace(self, tracks=tuple(t._replace(weight=g.w) for t, g in zip(self.tracks, gains, strict=True)))
+
+    def reweighted(
+        self, z: FloatArray, psi: FloatArray, gains: Sequence[Gains], noise: BoolArray
+    ) -> tuple[Problem, FloatArray]:
+        """The problem with weights of outliers renewed by a pass, and noise numbers for them.
+
+        Weights and the variance of readings may grow by the same factor, which changes the price alone.  It is least
+        where weights are 1 in the mean; steps there are those of parameter-expanded EM (Liu, Rubin & Wu 1998,
+        doi:10.1093/biomet/85.4.755).
+
+        Args:
+            z: scaled parameters.
+            psi: noise numbers.
+            gains: of a pass there.
+            noise: noise numbers that may change, shape (N_NOISE,).
+        """
+        if not self.tail.any():
+            return self, psi
         weights = _each(lambda j: self._weights(j, z, psi, gains[j]), len(gains))
-        return replace(self, tracks=tuple(t._replace(weight=w) for t, w in zip(self.tracks, weights, strict=True)))
+        seen = [measured(track, g) for track, g in zip(self.tracks, gains, strict=True)]
+        count = sum(s.sum(axis=0) for s in seen)
+        total = sum(np.sum(w * s, axis=0) for w, s in zip(weights, seen, strict=True))
+        mean = np.divide(total, count, out=np.ones(k.M), where=count > 0)
+        quieter = np.clip(psi[: k.M] / np.sqrt(mean), *self.noise_bounds[: k.M].T)
+        moved = np.where(noise, np.append(quieter, psi[k.M :]), psi)
+        factor = (moved[: k.M] / psi[: k.M]) ** 2
+        weights = [np.where(s, w * factor, w) for w, s in zip(weights, seen, strict=True)]
+        tracks = tuple(t._replace(weight=w) for t, w in zip(self.tracks, weights, strict=True))
+        return replace(self, tracks=tracks), moved
 
     def _weights(self, j: int, z: FloatArray, psi: FloatArray, g: Gains) -> FloatArray:
         square, tail = k.backward(self.tracks[j], self.physics(z, j), psi, g, False)[4], np.repeat(self.tail, 3)
@@ -568,11 +611,16 @@ class Problem:
         tracks = tuple(self._simulated(j, z) for j in range(len(self.tracks)))
         return replace(self, tracks=tracks, models=(), paths=())
 
-    def _pass(self, z: FloatArray, psi: FloatArray, j: int) -> tuple[float, Gains]:
-        track, p = self._simulated(j, z) if self.models else self.tracks[j], self.physics(z, j)
-        value, gains = k.kalman(track, p, psi)
+    def _pass(self, z: FloatArray, psi: FloatArray, j: int, there: Simulated | None = None) -> tuple[float, Gains]:
+        track, p = self.tracks[j], self.physics(z, j)
+        if there is None:
+            there = Simulated(
+                self._simulated(j, z).beyond if self.models else track.beyond, k.moments(track, *k.turning(p))
+            )
+        track = track._replace(beyond=there.beyond)
+        value, gains = k.kalman(track, p, psi, there.table)
         for _ in range(SETTLING if self.tail.any() and not len(track.weight) else 0):
-            value, gains = k.kalman(track._replace(weight=self._weights(j, z, psi, gains)), p, psi)
+            value, gains = k.kalman(track._replace(weight=self._weights(j, z, psi, gains)), p, psi, there.table)
         return float(value) + float(np.sum(self.price(gains))), gains
 
     def _simulated(self, j: int, z: FloatArray) -> Track:
@@ -601,13 +649,15 @@ class Problem:
             n, rows = len(track.t), max(STRETCH // len(self.tracks), 4 * SETTLED)
             first = max((n - rows) // 2, 0)
             part = cut(track._replace(beyond=gains[j].beyond), first, first + rows)
-            p = self.physics(z, j)
+            p, table = self.physics(z, j), gains[j].table[first : first + rows]
 
-            def innovations(i: int, part: Track = part, p: FloatArray = p) -> tuple[FloatArray, FloatArray]:
+            def innovations(
+                i: int, part: Track = part, p: FloatArray = p, table: FloatArray = table
+            ) -> tuple[FloatArray, FloatArray]:
                 moved = psi.copy()
                 if i < k.N_NOISE:
                     moved[i] *= np.exp(NUDGE)
-                g = k.kalman(part, p, moved)[1]
+                g = k.kalman(part, p, moved, table)[1]
                 S = np.where(g.S > 0.0, g.S, 1.0)
                 return np.log(S)[SETTLED:].ravel(), g.nu[SETTLED:].ravel()
 
@@ -722,6 +772,18 @@ class Problem:
 
             _each(whiten, len(mine))
         return out
+
+
+def measured(track: Track, g: Gains) -> BoolArray:
+    """Mask of innovations that are of measurements, shape (n, M): a velocity that nobody measured has only a prior."""
+    out = g.S > 0.0
+    out[:, k.VELOCITY :] &= track.seen[:, 3:]
+    return np.asarray(out)
+
+
+def simulated(gains: Sequence[Gains]) -> list[Simulated]:
+    """Simulations of a pass, for another one at the same physics."""
+    return [Simulated(g.beyond, g.table) for g in gains]
 
 
 def moments_at(track: Track, g: Gains, p: FloatArray) -> FloatArray:

@@ -110,7 +110,12 @@ class Filtered:
 
 
 def filtered(
-    windows: Sequence[Window], vehicle: Vehicle, theta: FloatArray, free: Free, per_flight: Sequence[str] = ()
+    windows: Sequence[Window],
+    vehicle: Vehicle,
+    theta: FloatArray,
+    free: Free,
+    per_flight: Sequence[str] = (),
+    noise: FloatArray | None = None,
 ) -> Filtered | None:
     """Fits `free` parameters by the likelihood of innovations, random forces and all noise with them.
 
@@ -120,19 +125,25 @@ def filtered(
         theta: where to start, full vector; holds the numbers of what is not free.
         free: the parameters.
         per_flight: entries that are free beside them, with a value for each flight.
+        noise: noise numbers of a model nearby, see `quadid.estimate.fit.estimate`.
 
     Returns:
         None where the filter has no finite answer.
     """
     try:
         with np.errstate(over="ignore", invalid="ignore"):
-            return _filtered(windows, vehicle, theta, free, per_flight)
+            return _filtered(windows, vehicle, theta, free, per_flight, noise)
     except np.linalg.LinAlgError:  # the filter ran away
         return None
 
 
 def _filtered(
-    windows: Sequence[Window], vehicle: Vehicle, theta: FloatArray, free: Free, per_flight: Sequence[str]
+    windows: Sequence[Window],
+    vehicle: Vehicle,
+    theta: FloatArray,
+    free: Free,
+    per_flight: Sequence[str],
+    noise: FloatArray | None,
 ) -> Filtered | None:
     # 1. The estimate, with what acts on every vehicle fitted along; gyro and accelerometer in time.
     layout, beside = Layout(vehicle), dict[str, dict[str, float]]()
@@ -155,7 +166,7 @@ def _filtered(
     # How rotors behind a lag began is not known.
     unsettled = FORGOTTEN * float(theta[layout.entry("motor_lag.tau").index])
     whole = problem_of(windows).settled(unsettled)
-    found = estimate(whole, start_of(whole, theta, along))
+    found = estimate(whole, start_of(whole, theta, along), noise)
     lag = found.value("motor_lag.tau")[0] if "motor_lag.tau" in whole.names else 0.0
     if FORGOTTEN * lag > unsettled + windows[0].dt:
         unsettled = FORGOTTEN * lag
