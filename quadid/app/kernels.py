@@ -96,7 +96,7 @@ def _estimate() -> None:
     problem = Problem.of([track], vehicle)
     p, psi = problem.physics(problem.start(), 0), problem.first_noise()
     _, gains = kalman.kalman(track, p, psi)
-    kalman.replay(track, p, psi, gains, gains.table, np.empty((0, kalman.M)), np.empty((0, kalman.N_MEAN)))
+    kalman.replay(track, p, psi, gains, gains.table, np.empty((len(track.t), kalman.M)))
     kalman.backward(track, p, psi, gains, True)
 
 

@@ -49,7 +49,7 @@ def stretches(track: Track) -> IndexArray:
 def innovations(track: Track, p: FloatArray, psi: FloatArray, g: Gains) -> FloatArray:
     """Whitened innovations of a flight at physics p under the gains of a pass nearby, shape (n, M)."""
     out = np.zeros((len(track.t), k.M))
-    k.replay(track, p, psi, g, moments_at(track, g, p), out, np.empty((0, k.N_MEAN)))
+    k.replay(track, p, psi, g, moments_at(track, g, p), out)
     return out
 
 

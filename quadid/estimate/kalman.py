@@ -1002,10 +1002,8 @@ def _even(P: FloatArray, size: int) -> None:
 
 
 @_fast
-def replay(
-    track: Track, p: FloatArray, psi: FloatArray, g: Gains, table: FloatArray, out: FloatArray, mean: FloatArray
-) -> float:
-    """Innovations of other physics under the gains of a filter pass, whitened, and the sum of their squares.
+def replay(track: Track, p: FloatArray, psi: FloatArray, g: Gains, table: FloatArray, out: FloatArray) -> None:
+    """Writes whitened innovations of other physics under the gains of a filter pass.
 
     Args:
         track: the flight.
@@ -1013,14 +1011,12 @@ def replay(
         psi: noise of the pass.
         g: of the pass.
         table: moments of the rotors at these physics; see `moments`.
-        out: shape (n, M), written; shape (0, M): only the sum is wanted.
-        mean: as in `Gains`, written; shape (0, N_MEAN): not wanted.
+        out: shape (n, M); what was not measured is left as it is.
     """
     n = len(track.t)
     air = _in_air(track)
     c, keep, x = _constants(p, track), np.empty(9), _start(track, p)
-    dx, nu, step = np.empty(N), np.zeros(M), np.zeros(12)
-    total, before = 0.0, -1.0
+    dx, nu, step, before = np.empty(N), np.zeros(M), np.zeros(12), -1.0
     for k in range(n):
         _expected(c, p, track.y[k], track.seen[k], table[k], air, x, nu)
         _read_beyond(track.beyond, k, step, nu)
@@ -1031,13 +1027,8 @@ def replay(
             v = nu[m] - _seen(m, g.slope[k], dx)
             for i in range(N):
                 dx[i] += g.gain[k, m, i] * v
-            z = v / math.sqrt(g.S[k, m])
-            total += z * z
-            if len(out) > 0:
-                out[k, m] = z
+            out[k, m] = v / math.sqrt(g.S[k, m])
         _correct(dx, x)
-        if len(mean) > 0:
-            _copy(x, mean[k])
         if k + 1 < n:
             h = track.t[k + 1] - track.t[k]
             if abs(h - before) > 1e-12:
@@ -1046,7 +1037,6 @@ def replay(
             _step_beyond(track.beyond, k, x, step)
             _advance(c, table[k], h, keep, air, x)
             _go_beyond(track.beyond, step, dx, x)
-    return total
 
 
 @_piece

@@ -768,7 +768,7 @@ class Problem:
 
             def whiten(i: int, mine: IndexArray = mine, tracks: Sequence[Track] = tracks) -> None:
                 p = self.physics(points[mine[i]], j)
-                k.replay(tracks[i], p, psi, g, moments_at(tracks[i], g, p), out[mine[i]], _NO_MEANS)
+                k.replay(tracks[i], p, psi, g, moments_at(tracks[i], g, p), out[mine[i]])
 
             _each(whiten, len(mine))
         return out
@@ -792,7 +792,6 @@ def moments_at(track: Track, g: Gains, p: FloatArray) -> FloatArray:
     return g.table if made_with == g.made_with else k.moments(track, *made_with)
 
 
-_NO_MEANS = np.empty((0, k.N_MEAN))
 _THREADS = ThreadPoolExecutor(max_workers=2, thread_name_prefix="filter")
 
 

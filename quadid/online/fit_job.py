@@ -533,7 +533,7 @@ def _by_thrust(problem: Problem, z: FloatArray, noise: Noise, gains: Gains, plai
 
     def whitened(physics: FloatArray, moments: FloatArray) -> FloatArray:
         out = np.zeros_like(plain)
-        k.replay(track, physics, noise.psi, gains, moments, out, np.empty((0, k.N_MEAN)))
+        k.replay(track, physics, noise.psi, gains, moments, out)
         return out
 
     out = []

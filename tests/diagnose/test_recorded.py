@@ -12,6 +12,7 @@ from quadid.data.window import Window
 from quadid.diagnosis import diagnose
 from quadid.diagnosis.hypotheses import candidates, free_names
 from quadid.diagnosis.random_forces import Flights
+from quadid.estimate import kalman as k
 from quadid.model.layout import Layout
 from quadid.parameters import Status
 from quadid.vehicle import Vehicle
@@ -92,6 +93,25 @@ def test_models_in_rough_air_are_compared_by_one_likelihood(data_dir: Path) -> N
     again = flights.fit(causes, start, model.psi, {}, {})
     assert again is not None
     assert model.deviance - 5.0 < again.deviance <= model.deviance + 0.1
+
+
+def test_a_search_ends_at_its_maximum_wherever_its_noise_begins(data_dir: Path) -> None:
+    """From an exact accelerometer and long, large random moments it ended 10,000 above in -2 ln L after 40 steps."""
+    vehicle = Vehicle.from_yaml((data_dir / "arpl" / "vehicle.yaml").read_text(encoding="utf-8"))
+    window = windows_of(data_dir / "arpl", vehicle, "log15")[0]
+    listed = {c.label: c for c in candidates(Layout(vehicle), False, False)}
+    labels = "command_delay", "cg_offset", "rate_damping", "accel_bias", "rotor_drag", "motor_lag", "imu_lever_arm"
+    causes = tuple(listed[label] for label in labels)
+    flights, nominal = Flights.of([window], vehicle, [*listed.values()]).nominal(vehicle.initial)
+    start = dict(zip(nominal.keys, nominal.z.tolist(), strict=True))
+    first = flights.fit(causes, start, nominal.psi, {}, {})
+    assert first is not None
+    noise, bounds = first.psi.copy(), first.problem.noise_bounds
+    noise[k.ACCEL : k.VELOCITY] = bounds[k.ACCEL : k.VELOCITY, 0]
+    noise[k.SIGMA + 2], noise[k.TIME + 2] = 3.0 * noise[k.SIGMA + 2], bounds[k.TIME + 2, 1]
+    again = flights.fit(causes, dict(zip(first.keys, first.z.tolist(), strict=True)), noise, {}, {})
+    assert again is not None
+    assert again.deviance == pytest.approx(first.deviance, abs=20.0)
 
 
 @pytest.mark.slow

@@ -136,7 +136,7 @@ def test_slopes_of_innovations_are_those_of_the_filter(name: str) -> None:
         moved[names.index(name)] += step
         problem, own, _ = fit_job._like(window, PELICAN, moved, noise)
         p, track = problem.physics(own, 0), problem.tracks[0]
-        k.replay(track, p, noise.psi, gains[0], k.moments(track, *k.turning(p)), out, np.empty((0, k.N_MEAN)))
+        k.replay(track, p, noise.psi, gains[0], k.moments(track, *k.turning(p)), out)
         return out
 
     slope = (innovations(1e-3) - innovations(-1e-3)) / 2e-3
